@@ -1,0 +1,3 @@
+"""Authenticated MAVLink between drones: one daemon per vehicle."""
+
+__version__ = "0.1.0"
