@@ -1,0 +1,260 @@
+"""Two nodes on a table: every datagram is handed over by the test, and ``now`` is a literal."""
+
+from __future__ import annotations
+
+import random
+from array import array
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any, TypeVar
+
+from uavlinkd.core import wire
+from uavlinkd.core.cookie import MacKeys
+from uavlinkd.core.crypto import AeadKey, KeyPair, MacKey, Secret
+from uavlinkd.core.drops import DropReason
+from uavlinkd.core.node import Node
+from uavlinkd.core.outputs import Deliver, Dropped, Output, Path, Transmit
+from uavlinkd.core.peer import Peer
+from uavlinkd.core.session import Session
+from uavlinkd.core.settings import Link, PeerSettings, Timers
+from uavlinkd.core.suites import SUITES_BY_NAME
+
+T = TypeVar("T")
+
+_KEYS = sorted((bytes([number]) * 32 for number in (1, 2)), key=lambda private: KeyPair(private).public)
+KEY_A, KEY_B = (KeyPair(private) for private in _KEYS)
+"""Alpha's public key is the smaller one."""
+KEY_C = KeyPair(bytes([3]) * 32)
+
+AT_A: Path = (0, "192.0.2.1", 14600)
+AT_B: Path = (0, "192.0.2.2", 14600)
+ELSEWHERE: Path = (0, "198.51.100.9", 4000)
+
+FRAME = bytes((0xFD, 9, 0, 0, 1, 1, 1, 0, 0, 0)) + bytes(9) + b"\x12\x34"
+QUIET = Timers(keepalive_s=1e6, echo_after_s=1e6, handshake_after_s=1e6, lost_after_s=1e6, probe_interval_s=0.0)
+"""No timer but those of handshakes and keys."""
+
+PLAIN = Link(suites=(SUITES_BY_NAME["x25519"],))
+
+
+def seeded(seed: int) -> Callable[[int], bytes]:
+    """Entropy that is the same each time."""
+    return random.Random(seed).randbytes
+
+
+@dataclass
+class Side:
+    """One node, where others see it, and its only peer."""
+
+    node: Node
+    at: Path
+    peer_name: str
+    peer_at: Path
+
+    @property
+    def peer(self) -> Peer:
+        """The state kept for the other side."""
+        return self.node.peers[self.peer_name]
+
+    @property
+    def session(self) -> Session:
+        """The session that sends."""
+        session = self.peer.sessions.current
+        assert session is not None
+        return session
+
+    def receive(self, datagram: bytes, now: float, source: Path | None = None) -> list[Output]:
+        """Hand a datagram over; it comes from the other side's place unless told otherwise."""
+        return self.node.receive(datagram, source or self.peer_at, now)
+
+    def send(self, now: float, *frames: bytes) -> list[Output]:
+        """Send frames (one, unless told otherwise) to the other side."""
+        return self.node.send(self.peer_name, frames or (FRAME,), now)
+
+    def timeout(self, now: float) -> list[Output]:
+        """Let the timers run."""
+        return self.node.handle_timeout(now)
+
+    def knows_the_way(self, now: float) -> None:
+        """From now on this side has the other's address, and so calls it."""
+        self.node.set_addresses(self.peer_name, [self.peer_at], now)
+
+    def envelope(self, now: float, payload: bytes = FRAME) -> bytes:
+        """Any payload sealed on the current session: what only the holder of the keys can make."""
+        return self.session.seal(payload, now)
+
+
+@dataclass
+class Pair:
+    """Alpha and bravo. Alpha calls; bravo only knows alpha's key, until :meth:`Side.knows_the_way`."""
+
+    link_a: Link = PLAIN
+    link_b: Link = PLAIN
+    psk_a: Secret | None = None
+    psk_b: Secret | None = None
+    seed: int = 1
+    now: float = 0.0
+    swapped: bool = False
+    """Alpha has the greater public key instead."""
+    a: Side = field(init=False)
+    b: Side = field(init=False)
+
+    def __post_init__(self) -> None:
+        private_a, private_b = _KEYS[::-1] if self.swapped else _KEYS
+        public_a, public_b = (KeyPair(private).public for private in (private_a, private_b))
+        node_a = Node(Secret(private_a), seeded(self.seed), self.now)
+        node_b = Node(Secret(private_b), seeded(self.seed + 1), self.now)
+        node_a.add_peer(PeerSettings("bravo", public_b, self.psk_a, self.link_a), self.now)
+        node_b.add_peer(PeerSettings("alpha", public_a, self.psk_b, self.link_b), self.now)
+        self.a = Side(node_a, AT_A, "bravo", AT_B)
+        self.b = Side(node_b, AT_B, "alpha", AT_A)
+        self.a.knows_the_way(self.now)
+
+    def initiation(self, now: float) -> bytes:
+        """Alpha's next initiation."""
+        return only(datagrams(self.a.timeout(now), wire.INITIATION))
+
+    def establish(self, now: float = 0.0) -> Pair:
+        """Initiation, response, confirmation: afterwards both sides send on the session."""
+        response = only(datagrams(self.b.receive(self.initiation(now), now)))
+        confirmation = only(datagrams(self.a.receive(response, now)))
+        self.b.receive(confirmation, now)
+        self.a.timeout(now)
+        self.b.timeout(now)
+        return self
+
+    def carries(self, now: float) -> bool:
+        """Whether a frame gets through each way."""
+        return self.crosses(self.a, self.b, now) and self.crosses(self.b, self.a, now)
+
+    @staticmethod
+    def crosses(source: Side, target: Side, now: float) -> bool:
+        """Whether a frame gets from one side to the other, after a question about its age if need be."""
+        arrived = exchange(target, source, source.send(now), now)
+        return payloads(arrived) == [FRAME]
+
+
+def run(pair: Pair, start: float, until: float, passes: Callable[[Side, bytes, float], bool]) -> Iterator[float]:
+    """Let both sides' timers run; ``passes(sender, datagram, now)`` says what arrives. Yields each moment."""
+    queue: list[tuple[Side, list[Output]]] = []
+    now = start
+    for _ in range(20000):
+        for side in (pair.a, pair.b):
+            if side.node.next_deadline() <= now:
+                queue.append((side, side.timeout(now)))
+        while queue:
+            side, outputs = queue.pop(0)
+            other = pair.b if side is pair.a else pair.a
+            for out in outputs:
+                if isinstance(out, Transmit) and out.path == other.at and passes(side, out.datagram, now):
+                    queue.append((other, other.receive(out.datagram, now)))
+        yield now
+        now = max(now, min(pair.a.node.next_deadline(), pair.b.node.next_deadline()))
+        if now > until:
+            return
+    raise AssertionError("the timers run in a circle")
+
+
+def exchange(one: Side, other: Side, outputs: list[Output], now: float) -> list[Output]:
+    """Hand over what ``other`` sends, and what either answers, until both are quiet. All outputs of ``one``."""
+    seen: list[Output] = []
+    while sent := datagrams(outputs):
+        answers = [out for each in sent for out in one.receive(each, now)]
+        seen += answers
+        outputs = [out for each in datagrams(answers) for out in other.receive(each, now)]
+    return seen
+
+
+def of(outputs: Iterable[Output], kind: type[T]) -> list[T]:
+    """The outputs of one kind."""
+    return [out for out in outputs if isinstance(out, kind)]
+
+
+def datagrams(outputs: Iterable[Output], *kinds: int) -> list[bytes]:
+    """What is to be transmitted, of these message types if any are given."""
+    return [out.datagram for out in of(outputs, Transmit) if not kinds or out.datagram[0] in kinds]
+
+
+def payloads(outputs: Iterable[Output]) -> list[bytes]:
+    """What was delivered."""
+    return [out.payload for out in of(outputs, Deliver)]
+
+
+def reasons(outputs: Iterable[Output]) -> list[DropReason]:
+    """Why something was dropped."""
+    return [out.reason for out in of(outputs, Dropped)]
+
+
+def only(values: list[T]) -> T:
+    """The one element."""
+    assert len(values) == 1, values
+    return values[0]
+
+
+def flipped(datagram: bytes, position: int, bit: int = 0) -> bytes:
+    """The datagram with one bit turned over."""
+    changed = bytearray(datagram)
+    changed[position] ^= 1 << bit
+    return bytes(changed)
+
+
+def with_macs(message: bytes, receiver_public_key: bytes, cookie: bytes | None = None) -> bytes:
+    """A handshake message with the macs that anyone can make who knows the receiver's public key."""
+    return MacKeys(receiver_public_key).add_macs(message, cookie)
+
+
+def repaired(datagram: bytes, receiver_public_key: bytes) -> bytes:
+    """An altered handshake message with its mac1 made right again."""
+    return with_macs(datagram[: -wire.MACS_BYTES], receiver_public_key)
+
+
+def exhaust(side: Side, now: float) -> None:
+    """Bring a node under load: its budget of initiations and of responses is spent."""
+    for bucket in (side.node._initiations, side.node._responses):
+        while bucket.take(now):
+            pass
+
+
+def lively(**changes: float) -> Link:
+    """A link whose timers are the ordinary ones but for these."""
+    return replace(PLAIN, timers=replace(Timers(), **changes))
+
+
+def quiet(**changes: Any) -> Link:
+    """A link on which only keys and handshakes have timers."""
+    return replace(PLAIN, timers=QUIET, **changes)
+
+
+_ONLY_COUNTED = frozenset(("drops", "_initiations", "_responses", "_entropy"))
+_OPAQUE = (KeyPair, AeadKey, MacKey)
+
+
+def state_of(thing: Any, *, ignoring: frozenset[str] = _ONLY_COUNTED) -> Any:
+    """All that an object remembers, comparable: what a forgery must leave as it was.
+
+    Left out are the counters of drops, the budgets that forgeries may spend and the generator.
+    """
+    return _picture(thing, ignoring, {})
+
+
+def _picture(thing: Any, ignoring: frozenset[str], seen: dict[int, int]) -> Any:
+    if thing is None or isinstance(thing, bool | int | float | str | bytes | type):
+        return thing
+    if isinstance(thing, Secret):
+        return thing.reveal()
+    if isinstance(thing, array):
+        return thing.tobytes()
+    if isinstance(thing, _OPAQUE) or callable(thing):
+        return id(thing)
+    if id(thing) in seen:
+        return f"<{seen[id(thing)]}>"
+    seen[id(thing)] = len(seen)
+    if isinstance(thing, dict):
+        return [(_picture(k, ignoring, seen), _picture(v, ignoring, seen)) for k, v in thing.items()]
+    if isinstance(thing, list | tuple | set | frozenset):
+        return [_picture(each, ignoring, seen) for each in thing]
+    slots = [name for kind in type(thing).__mro__ for name in getattr(kind, "__slots__", ())]
+    names = [name for name in [*slots, *getattr(thing, "__dict__", {})] if name not in ignoring]
+    if not names:
+        return id(thing)
+    return [type(thing).__name__, [(name, _picture(getattr(thing, name), ignoring, seen)) for name in names]]

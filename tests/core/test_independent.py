@@ -1,0 +1,379 @@
+"""The second implementation as initiator, a Node as responder: what the document says is enough to link."""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import random
+from base64 import b64encode
+
+import pytest
+from cryptography.exceptions import InvalidTag
+from cryptography.hazmat.primitives.asymmetric.mlkem import MLKEM768PrivateKey
+from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
+
+from tests.core import independent
+from tests.core.independent import FFDHE2048, MLKEM768, MLKEM1024, X25519, Initiator, Parameters
+from tests.core.independent import Session as IndependentSession
+from uavlinkd.core import constants, kem, wire
+from uavlinkd.core.crypto import Secret
+from uavlinkd.core.drops import DropReason
+from uavlinkd.core.node import Node
+from uavlinkd.core.outputs import (
+    Deliver,
+    Dropped,
+    Output,
+    PathChanged,
+    PeerClosed,
+    PeerUp,
+    SessionEstablished,
+    Transmit,
+)
+from uavlinkd.core.settings import Link, PeerSettings
+from uavlinkd.core.suites import SUITES, SUITES_BY_NAME
+
+NAME, HERE, ELSEWHERE = "initiator", (0, "192.0.2.1", 5790), (0, "198.51.100.7", 40000)
+FRAME = bytes.fromhex("fd0300002a0101000000") + b"abc" + b"\x12\x34"
+NODE_KEY = bytes(range(32))
+PSK = bytes(range(100, 132))
+
+
+class Pair:
+    """A Node that knows one peer, and that peer's key in the hands of the second implementation."""
+
+    def __init__(self, *, suite: int = X25519, psk: bytes | None = None, link: Link | None = None) -> None:
+        self.node = Node(Secret(NODE_KEY), random.Random(7).randbytes, 0.0)
+        self.static = X25519PrivateKey.generate()
+        self.suite, self.psk = suite, psk
+        secret = Secret(psk) if psk else None
+        settings = PeerSettings(
+            NAME, self.static.public_key().public_bytes_raw(), secret, link or Link(suites=(SUITES[suite],))
+        )
+        self.node.add_peer(settings, 0.0)
+
+    def initiator(self, parameters: Parameters | None = None) -> Initiator:
+        """A fresh handshake."""
+        psk = self.psk or bytes(32)
+        return Initiator(self.static, self.node.public_key, suite=self.suite, psk=psk, parameters=parameters)
+
+    def respond(self, initiation: bytes, now: float) -> bytes:
+        """The response of the Node, which does nothing else."""
+        (response,) = self.node.receive(initiation, HERE, now)
+        assert isinstance(response, Transmit)
+        assert response.path == HERE
+        assert len(response.datagram) <= len(initiation)
+        return response.datagram
+
+    def link(self, now: float = 1.0, parameters: Parameters | None = None) -> IndependentSession:
+        """A session that both ends have confirmed."""
+        initiator = self.initiator(parameters)
+        linked = initiator.read_response(self.respond(initiator.initiation(), now))
+        was_up = self.node.peers[NAME].is_up
+        established, *up = self.node.receive(linked.seal(b""), HERE, now)
+        assert isinstance(established, SessionEstablished)
+        assert established.generation == linked.parameters.generation
+        assert up == ([] if was_up else [PeerUp(NAME)])
+        return linked
+
+
+def with_mac1(public_key: bytes, covered: bytes) -> bytes:
+    """A handshake message as anyone can make it who knows the receiver's public key: mac1, no mac2."""
+    key = hashlib.sha256(b"uavlink/1 mac1" + public_key).digest()
+    return covered + hmac.digest(key, covered, "sha256")[:16] + bytes(16)
+
+
+def dropped(reason: DropReason, *, path: tuple[int, str, int] = HERE, peer: str | None = NAME) -> list[Output]:
+    """What the Node says of a datagram that it discarded."""
+    return [Dropped(reason, peer, path)]
+
+
+@pytest.mark.parametrize("suite", [X25519, FFDHE2048, MLKEM768, MLKEM1024], ids=lambda number: SUITES[number].name)
+@pytest.mark.parametrize("psk", [None, PSK], ids=["no psk", "psk"])
+@pytest.mark.parametrize("confidential", [False, True], ids=["authenticated", "confidential"])
+def test_independent_initiator_links(suite: int, psk: bytes | None, confidential: bool) -> None:
+    """Who follows the document shakes hands and exchanges frames, with every kind of group and in both modes."""
+    pair = Pair(suite=suite, psk=psk)
+    linked = pair.link(parameters=Parameters(confidential=confidential))
+    assert pair.node.receive(linked.seal(FRAME), HERE, 1.0) == [Deliver(NAME, FRAME)]
+    for number in range(3):
+        (envelope,) = pair.node.send(NAME, [FRAME, bytes([0xFD, number])], 1.0)
+        assert isinstance(envelope, Transmit)
+        assert linked.open(envelope.datagram) == FRAME + bytes([0xFD, number])
+
+
+@pytest.mark.parametrize("bits", [256, 512, 1024, 2048])
+@pytest.mark.parametrize("tag", [8, 12, 16, 32])
+@pytest.mark.parametrize("ours", [True, False], ids=["asked by initiator", "asked by responder"])
+def test_stronger_parameters_are_agreed(bits: int, tag: int, ours: bool) -> None:
+    """Whichever side asks, both use the longer tag and MAC key."""
+    weak, strong = (8, 256), (tag, bits)
+    asked, other = (strong, weak) if ours else (weak, strong)
+    pair = Pair(link=Link(tag_bytes=other[0], mac_key_bits=other[1]))
+    linked = pair.link(parameters=Parameters(0, False, *asked))
+    envelope = linked.seal(FRAME)
+    assert len(envelope) == wire.SHORT_HEADER_BYTES + len(FRAME) + tag
+    assert pair.node.receive(envelope, HERE, 1.0) == [Deliver(NAME, FRAME)]
+    (answer,) = pair.node.send(NAME, [FRAME], 1.0)
+    assert isinstance(answer, Transmit)
+    assert linked.open(answer.datagram) == FRAME
+
+
+def test_confidential_wins_and_fixes_the_tag() -> None:
+    """Asked by the responder alone, confidentiality holds for both, with a tag of 16 bytes whatever was asked."""
+    pair = Pair(link=Link(confidential=True, tag_bytes=32))
+    linked = pair.link()
+    assert linked.parameters.confidential
+    envelope = linked.seal(FRAME)
+    assert FRAME not in envelope
+    assert len(envelope) == wire.SHORT_HEADER_BYTES + len(FRAME) + 16
+    assert pair.node.receive(envelope, HERE, 1.0) == [Deliver(NAME, FRAME)]
+
+
+def test_counter_grows_into_the_long_form() -> None:
+    """At 65,536 the header has seven bytes; before that the long form is refused, though its tag is right."""
+    pair = Pair()
+    linked = pair.link()
+    linked.counter = 2**16 - 1
+    assert pair.node.receive(linked.seal(FRAME), HERE, 1.0) == [Deliver(NAME, FRAME)]
+    long = linked.seal(FRAME)
+    assert long[0] == 0x41
+    assert pair.node.receive(long, HERE, 1.0) == [Deliver(NAME, FRAME)]
+    linked.counter = 2**16 - 2
+    assert pair.node.receive(linked.seal(FRAME, long_form=True), HERE, 1.0) == dropped(DropReason.LONG_COUNTER)
+    ours = pair.node.peers[NAME].sessions.current
+    assert ours is not None
+    ours.send_counter = 2**16
+    (envelope,) = pair.node.send(NAME, [FRAME], 1.0)
+    assert isinstance(envelope, Transmit)
+    assert linked.open(envelope.datagram) == FRAME
+
+
+def test_envelope_counts_once() -> None:
+    """The second copy of an envelope, and one from behind the window, are dropped under their names."""
+    pair = Pair()
+    linked = pair.link()
+    first = linked.seal(FRAME)
+    assert pair.node.receive(first, HERE, 1.0) == [Deliver(NAME, FRAME)]
+    assert pair.node.receive(first, HERE, 1.0) == dropped(DropReason.REPLAYED)
+    edge, inside = linked.seal(FRAME), linked.seal(FRAME)
+    linked.counter = 2 + 2048
+    assert pair.node.receive(linked.seal(FRAME), HERE, 1.0) == [Deliver(NAME, FRAME)]
+    assert pair.node.receive(edge, HERE, 1.0) == dropped(DropReason.TOO_OLD)
+    assert pair.node.receive(inside, HERE, 1.0) == [Deliver(NAME, FRAME)]
+
+
+@pytest.mark.parametrize("confidential", [False, True], ids=["authenticated", "confidential"])
+def test_altered_envelope_leaves_no_trace(confidential: bool) -> None:
+    """With any byte behind the index altered, an envelope is dropped; the genuine one is then still new."""
+    pair = Pair()
+    linked = pair.link(parameters=Parameters(confidential=confidential))
+    envelope = linked.seal(FRAME)
+    for at in range(3, len(envelope)):
+        altered = envelope[:at] + bytes([envelope[at] ^ 0x80]) + envelope[at + 1 :]
+        assert pair.node.receive(altered, HERE, 1.0) == dropped(DropReason.BAD_TAG)
+    assert pair.node.receive(envelope, HERE, 1.0) == [Deliver(NAME, FRAME)]
+
+
+def test_altered_initiation_leaves_no_trace() -> None:
+    """With any byte altered and mac1 made anew, an initiation changes nothing; the genuine one is then answered."""
+    pair = Pair()
+    initiator = pair.initiator()
+    genuine = initiator.initiation()
+    for at in range(2, len(genuine) - 32, 7):
+        covered = genuine[:at] + bytes([genuine[at] ^ 1]) + genuine[at + 1 : -32]
+        assert pair.node.receive(with_mac1(pair.node.public_key, covered), HERE, 1.0 + at)[-1] in (
+            Dropped(DropReason.BAD_HANDSHAKE, None, HERE),
+            Dropped(DropReason.HEADER_MISMATCH, None, HERE),
+        )
+    assert initiator.read_response(pair.respond(genuine, 200.0)).parameters.generation == 1
+
+
+def test_stranger_is_not_answered() -> None:
+    """A sound handshake under a static key that is not configured gets no answer."""
+    pair = Pair()
+    stranger = Initiator(X25519PrivateKey.generate(), pair.node.public_key)
+    (told,) = pair.node.receive(stranger.initiation(), HERE, 1.0)
+    assert isinstance(told, Dropped)
+    assert (told.reason, told.peer, told.path) == (DropReason.UNKNOWN_PEER, None, HERE)
+    assert told.detail == f"key {b64encode(stranger.static.public_key().public_bytes_raw()).decode()}"
+
+
+def test_wrong_mac1_is_not_answered() -> None:
+    """Who does not know the Node's public key gets no answer."""
+    pair = Pair()
+    initiation = Initiator(pair.static, X25519PrivateKey.generate().public_key().public_bytes_raw()).initiation()
+    assert pair.node.receive(initiation, HERE, 1.0) == dropped(DropReason.BAD_MAC1, peer=None)
+
+
+def test_psk_is_needed() -> None:
+    """With another PSK the response does not open."""
+    pair = Pair(psk=PSK)
+    initiator = Initiator(pair.static, pair.node.public_key, psk=bytes(32))
+    response = pair.respond(initiator.initiation(), 1.0)
+    with pytest.raises(InvalidTag):
+        initiator.read_response(response)
+
+
+def test_secret_of_the_group_is_needed() -> None:
+    """Without the KEM's secret, all X25519 keys known, the response does not open."""
+    pair = Pair(suite=MLKEM768)
+    initiator = pair.initiator()
+    initiation = initiator.initiation()
+    initiator.mlkem = MLKEM768PrivateKey.generate()
+    with pytest.raises(InvalidTag):
+        initiator.read_response(pair.respond(initiation, 1.0))
+
+
+def test_unlisted_suite_is_refused() -> None:
+    """A suite that the configuration does not list for this peer gets no answer."""
+    pair = Pair(suite=MLKEM768)
+    initiation = Initiator(pair.static, pair.node.public_key, suite=X25519).initiation()
+    (told,) = pair.node.receive(initiation, HERE, 1.0)
+    assert isinstance(told, Dropped)
+    assert (told.reason, told.path, told.detail) == (DropReason.SUITE_NOT_ACCEPTED, HERE, "suite x25519")
+    assert told.peer in pair.node.peers, "the initiation is authentic: it is known whose it is"
+
+
+def test_initiation_is_answered_once() -> None:
+    """An exact copy of an initiation is dropped."""
+    pair = Pair()
+    initiation = pair.initiator().initiation()
+    pair.respond(initiation, 1.0)
+    assert pair.node.receive(initiation, HERE, 1.0) == dropped(DropReason.REPLAYED_INITIATION, peer=None)
+
+
+def test_restarted_initiator_outranks_its_past() -> None:
+    """An initiator that forgot everything ends up above the session that the Node still holds."""
+    pair = Pair()
+    before = pair.link(parameters=Parameters(generation=6))
+    assert before.parameters.generation == 7
+    after = pair.link(now=2.0)
+    assert after.parameters.generation == 8
+    (envelope,) = pair.node.send(NAME, [FRAME], 2.0)
+    assert isinstance(envelope, Transmit)
+    assert after.open(envelope.datagram) == FRAME
+    assert pair.node.receive(before.seal(FRAME), HERE, 2.0) == [Deliver(NAME, FRAME)]
+
+
+def test_nothing_is_sent_before_confirmation() -> None:
+    """Between the response and the first envelope of the initiator, frames have no session."""
+    pair = Pair()
+    pair.respond(pair.initiator().initiation(), 1.0)
+    assert pair.node.send(NAME, [FRAME], 1.0) == [Dropped(DropReason.NO_SESSION, NAME)]
+
+
+def test_cookie_lets_an_initiation_through() -> None:
+    """Under load the Node answers with a cookie, and then takes the initiation that proves to have it."""
+    pair = Pair()
+    for number in range(int(constants.INITIATIONS_BURST)):
+        junk = with_mac1(pair.node.public_key, bytes([1, 0, 0, 1]) + bytes([number]) * 111)
+        assert pair.node.receive(junk, ELSEWHERE, 1.0)[-1] != Dropped(DropReason.BAD_MAC1, None, ELSEWHERE)
+    initiator = pair.initiator()
+    initiation = initiator.initiation()
+    reply, drop = pair.node.receive(initiation, HERE, 1.0)
+    assert drop == Dropped(DropReason.COOKIE_REQUIRED, None, HERE)
+    assert isinstance(reply, Transmit)
+    cookie = initiator.read_cookie(reply.datagram)
+    again = pair.initiator()
+    proven = again.initiation(cookie)
+    # From another address the same message proves nothing.
+    assert pair.node.receive(proven, ELSEWHERE, 1.0)[-1] == Dropped(DropReason.COOKIE_REQUIRED, None, ELSEWHERE)
+    assert again.read_response(pair.respond(proven, 1.0)).parameters.generation == 1
+
+
+def test_echo_is_answered() -> None:
+    """An echo reply repeats the token, tells what was received and expected, and the first counter used lately."""
+    pair = Pair()
+    linked = pair.link()
+    linked.counter = 5  # four were lost
+    request = bytes([1]) + bytes.fromhex("cafe0001") + bytes(8)
+    (reply,) = pair.node.receive(linked.seal(request), HERE, 1.0)
+    assert isinstance(reply, Transmit)
+    assert linked.open(reply.datagram) == bytes.fromhex("02cafe0001000000020000000600000000")
+
+
+def test_frames_after_a_silence_come_out_with_the_peers_word() -> None:
+    """Section 11: what came is held, the question goes on that session, and *fresh* tells old from new."""
+    pair = Pair()
+    linked = pair.link()
+    old, new = linked.seal(FRAME), linked.seal(FRAME + b"\xfd\x01")
+    (question,) = pair.node.receive(old, HERE, 30.0)
+    assert pair.node.receive(new, HERE, 30.1) == []
+    assert isinstance(question, Transmit)
+    reply = independent.echo_reply(linked.open(question.datagram), fresh=linked.counter - 1)
+    outputs = pair.node.receive(linked.seal(reply), HERE, 30.2)
+    assert outputs == [Deliver(NAME, FRAME + b"\xfd\x01"), Dropped(DropReason.DELAYED, NAME, None)]
+    assert pair.node.receive(linked.seal(FRAME), HERE, 30.3) == [Deliver(NAME, FRAME)]
+
+
+def test_fresh_is_of_the_session_that_was_asked_on() -> None:
+    """The reply comes on the newest session, and tells of the one that carried the request."""
+    pair = Pair()
+    before = pair.link()
+    for number in range(3):
+        (envelope,) = pair.node.send(NAME, [FRAME], 1.0 + number)
+        assert isinstance(envelope, Transmit)
+        assert before.open(envelope.datagram) == FRAME
+    after = pair.link(now=3.9, parameters=Parameters(generation=1))
+    asked = 4.0  # frames 0, 1 and 2 were sent at 1, 2 and 3 s
+    (reply,) = pair.node.receive(before.seal(independent.echo_request(0xCAFE0001)), HERE, asked)
+    assert isinstance(reply, Transmit)
+    assert after.open(reply.datagram) == independent.echo_reply(independent.echo_request(0xCAFE0001), 1, 1, 1)
+
+
+def test_traffic_moves_after_the_path_response() -> None:
+    """A frame from elsewhere is challenged there; traffic goes on as before until the response comes from there."""
+    pair = Pair()
+    linked = pair.link()
+    challenge, deliver = pair.node.receive(linked.seal(FRAME), ELSEWHERE, 1.0)
+    assert deliver == Deliver(NAME, FRAME)
+    assert isinstance(challenge, Transmit)
+    assert challenge.path == ELSEWHERE
+    record = linked.open(challenge.datagram)
+    assert (record[0], len(record), record[9:]) == (3, 11, bytes(2))
+    (before,) = pair.node.send(NAME, [FRAME], 1.0)
+    assert isinstance(before, Transmit)
+    assert before.path == HERE
+    response = bytes([4]) + record[1:9]
+    assert pair.node.receive(linked.seal(response), HERE, 1.0) == dropped(DropReason.BAD_PATH_RESPONSE)
+    assert pair.node.receive(linked.seal(response), ELSEWHERE, 1.0)[-1] == PathChanged(NAME, ELSEWHERE)
+    (after,) = pair.node.send(NAME, [FRAME], 1.0)
+    assert isinstance(after, Transmit)
+    assert after.path == ELSEWHERE
+
+
+def test_challenge_is_answered() -> None:
+    """A path response goes to where the challenge came from, with its token, and is no longer than it."""
+    pair = Pair()
+    linked = pair.link()
+    challenge = linked.seal(bytes([3]) + b"token678" + bytes(2))
+    response = pair.node.receive(challenge, HERE, 1.0)[-1]
+    assert isinstance(response, Transmit)
+    assert linked.open(response.datagram) == bytes([4]) + b"token678"
+    assert len(response.datagram) <= len(challenge)
+
+
+def test_goodbye_ends_the_session() -> None:
+    """After a close the peer is gone and what still comes on its session is late; the Node says goodbye likewise."""
+    pair = Pair()
+    linked = pair.link()
+    assert pair.node.receive(linked.seal(bytes([5])), HERE, 1.0) == [PeerClosed(NAME)]
+    assert pair.node.receive(linked.seal(FRAME), HERE, 1.0) == dropped(DropReason.LATE, peer=None)
+    linked = pair.link(now=2.0)
+    (goodbye,) = pair.node.close(2.0)
+    assert isinstance(goodbye, Transmit)
+    assert linked.open(goodbye.datagram) == bytes([5])
+
+
+@pytest.mark.parametrize("record", [b"\x00", b"\x06", bytes([5, 0]), bytes([1]) + bytes(11), b"\x03" + b"1" * 10])
+def test_other_records_are_refused(record: bytes) -> None:
+    """An authentic payload that is neither frames nor a record of the document is dropped and counted."""
+    pair = Pair()
+    linked = pair.link()
+    assert pair.node.receive(linked.seal(record), HERE, 1.0) == dropped(DropReason.BAD_CONTROL)
+
+
+def test_independent_group_is_the_same() -> None:
+    """Both implementations computed the same prime, each in its own way."""
+    assert kem.ffdhe_prime(2048) == independent.FFDHE2048_PRIME
+    assert SUITES_BY_NAME["ffdhe2048"].number == FFDHE2048

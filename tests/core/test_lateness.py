@@ -1,0 +1,419 @@
+"""Authentic envelopes that somebody held back: what is refused, what waits, and what passes as before."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.core.harness import (
+    ELSEWHERE,
+    FRAME,
+    Pair,
+    Side,
+    datagrams,
+    exchange,
+    lively,
+    of,
+    only,
+    payloads,
+    quiet,
+    reasons,
+)
+from uavlinkd.core import constants as c
+from uavlinkd.core import wire
+from uavlinkd.core.drops import DropReason
+from uavlinkd.core.outputs import Dropped, PeerLost, PeerUp, Transmit
+from uavlinkd.core.session import Session
+from uavlinkd.core.suites import X25519
+
+SILENT = 30.0
+"""A moment at which nothing was heard for long."""
+
+
+@pytest.fixture
+def pair() -> Pair:
+    """A session at second 0, with timers for keys and handshakes only."""
+    return Pair(link_a=quiet(), link_b=quiet()).establish()
+
+
+def talk(pair: Pair, begin: float, end: float, interval_s: float = 0.1) -> None:
+    """Alpha sends a frame each so often, and each arrives."""
+    for number in range(round((end - begin) / interval_s) + 1):
+        assert pair.crosses(pair.a, pair.b, begin + number * interval_s)
+
+
+def frame(side: Side, now: float, number: int = 0) -> bytes:
+    """An envelope with one frame that is told from others by its number."""
+    return only(datagrams(side.send(now, numbered(number))))
+
+
+def numbered(number: int) -> bytes:
+    return FRAME[:-1] + bytes([number])
+
+
+def echo_in(side: Side, datagram: bytes) -> wire.Echo:
+    """The echo in an envelope to a side, read with its keys and past its session."""
+    _, counter, size = wire.parse_envelope_header(datagram)
+    session = next(each for each in side.peer.sessions.confirmed if datagram[1:3] == each.local_index.to_bytes(2))
+    payload = session._receive.open(datagram, size, counter)
+    assert payload is not None
+    echo = wire.parse_control(payload)
+    assert isinstance(echo, wire.Echo)
+    return echo
+
+
+# What came after it tells.
+
+
+def test_held_back_envelope_is_refused_once_others_came_two_seconds_ago(pair: Pair) -> None:
+    """Until then it is as good as any that was overtaken; from two seconds and two steps on it is delayed."""
+    held = [frame(pair.a, 1.0, number) for number in range(2)]
+    surely = 1.0 + c.LATE_AFTER_S + 2 * c.LATE_STEP_S
+    talk(pair, 1.0, surely)
+    assert reasons(pair.b.receive(held[0], surely)) == [DropReason.DELAYED]
+    talk(pair, surely, 8.0)
+    assert reasons(pair.b.receive(held[1], 8.0)) == [DropReason.DELAYED]
+    assert pair.b.peer.traffic.drops == {DropReason.DELAYED: 2}
+    assert pair.carries(8.0)
+
+
+def test_overtaken_envelope_is_delivered_within_two_seconds(pair: Pair) -> None:
+    """A radio's reordering is no attack: what others overtook by less than two seconds is delivered."""
+    held = frame(pair.a, 1.0)
+    talk(pair, 1.0, 0.99 + c.LATE_AFTER_S)
+
+    assert payloads(pair.b.receive(held, 0.999 + c.LATE_AFTER_S)) == [numbered(0)]
+    assert pair.b.peer.traffic.out_of_order == 1
+
+
+def test_delay_is_judged_at_the_moment_of_arrival_without_other_traffic(pair: Pair) -> None:
+    """Nothing has to arrive for time to pass: what waits while all is quiet for 1.9 s more is refused as well."""
+    held = frame(pair.a, 1.0)
+    talk(pair, 1.0, 1.6)
+    quiet_since = 1.6
+
+    assert reasons(pair.b.receive(held, quiet_since + 1.9)) == [DropReason.DELAYED]
+
+
+def test_replayed_envelope_is_a_replay_however_late(pair: Pair) -> None:
+    """What was accepted before is called by that name."""
+    once = frame(pair.a, 1.0)
+    assert payloads(pair.b.receive(once, 1.0)) == [numbered(0)]
+    talk(pair, 1.0, 8.0)
+
+    assert reasons(pair.b.receive(once, 8.0)) == [DropReason.REPLAYED]
+
+
+# After a silence the peer is asked.
+
+
+def test_frames_after_a_silence_wait_for_one_round_trip(pair: Pair) -> None:
+    """They are held, an echo asks at once, and all come out in their order when it is answered."""
+    first = pair.b.receive(frame(pair.a, SILENT, 1), SILENT)
+    assert payloads(first) == []
+    question = only(datagrams(first))
+    assert datagrams(pair.b.receive(frame(pair.a, SILENT, 2), SILENT + 0.05)) == []
+
+    answer = only(datagrams(pair.a.receive(question, SILENT + 0.1)))
+    assert payloads(pair.b.receive(answer, SILENT + 0.2)) == [numbered(1), numbered(2)]
+
+    assert payloads(pair.b.receive(frame(pair.a, SILENT + 0.2, 3), SILENT + 0.3)) == [numbered(3)]
+    assert not pair.b.peer.traffic.drops
+
+
+def test_frames_of_a_blackout_are_refused_and_new_ones_beside_them_pass(pair: Pair) -> None:
+    """All of thirty seconds was kept and comes at once: only what was sent lately is delivered."""
+    kept = [frame(pair.a, 1.0 + second, second) for second in range(30)]
+    now = 30.5
+    outputs = [out for each in kept for out in pair.b.receive(each, now)]
+    assert payloads(outputs) == []
+
+    answer = only(datagrams(pair.a.receive(only(datagrams(outputs)), now)))
+    released = pair.b.receive(answer, now)
+
+    assert payloads(released) == [numbered(28), numbered(29)]  # of the last two seconds, and a step
+    assert of(released, Dropped) == [Dropped(DropReason.DELAYED, "alpha", None, 28)]
+    assert pair.carries(now)
+
+
+def test_what_the_peer_called_old_stays_refused(pair: Pair) -> None:
+    """Its word is a floor: an envelope that is released after the answer is delayed, though higher than any heard."""
+    old = frame(pair.a, 1.0), frame(pair.a, 1.0)
+    answer = only(datagrams(pair.a.receive(only(datagrams(pair.b.receive(old[0], SILENT))), SILENT)))
+    assert reasons(pair.b.receive(answer, SILENT)) == [DropReason.DELAYED]
+
+    assert reasons(pair.b.receive(old[1], SILENT)) == [DropReason.DELAYED]
+    assert pair.carries(SILENT)
+
+
+def test_without_an_answer_what_is_held_is_given_up(pair: Pair) -> None:
+    """Four questions within a second, then it is dropped and counted; the next envelope begins again."""
+    questions = datagrams(pair.b.receive(frame(pair.a, SILENT), SILENT))
+    moments = []
+    while (now := pair.b.node.next_deadline()) <= SILENT + c.DOUBT_S:
+        outputs = pair.b.timeout(now)
+        questions += datagrams(outputs)
+        moments.append(now)
+
+    assert moments == [SILENT + 0.25, SILENT + 0.5, SILENT + 0.75, SILENT + 1.0]
+    assert len(questions) == 4
+    assert of(outputs, Dropped) == [Dropped(DropReason.DOUBTFUL, "alpha", None, 1)]
+    # The answers come too late: old as they are they vouch for nothing.
+    for each in questions:
+        assert pair.b.receive(only(datagrams(pair.a.receive(each, SILENT))), SILENT + 1.9) == []
+    assert len(datagrams(pair.b.receive(frame(pair.a, SILENT + 1.9, 7), SILENT + 1.9))) == 1
+    assert reasons(pair.b.timeout(SILENT + 1.9 + c.DOUBT_S)) == [DropReason.DOUBTFUL]
+    assert pair.crosses(pair.a, pair.b, 40.0)
+
+
+@pytest.mark.parametrize("number", range(4))
+def test_any_question_of_the_doubt_may_be_answered(pair: Pair, number: int) -> None:
+    """Lost questions and slow answers cost nothing as long as one comes within a second."""
+    questions = datagrams(pair.b.receive(frame(pair.a, SILENT), SILENT))
+    for _ in range(3):
+        questions += datagrams(pair.b.timeout(pair.b.node.next_deadline()))
+
+    answer = only(datagrams(pair.a.receive(questions[number], SILENT + 0.8)))
+
+    assert payloads(pair.b.receive(answer, SILENT + 0.95)) == [numbered(0)]
+    assert pair.b.timeout(SILENT + c.DOUBT_S) == []
+
+
+def test_answer_from_before_the_silence_vouches_for_nothing(pair: Pair) -> None:
+    """An answer that was held back with the frames is as old as they are."""
+    out = pair.b.receive(frame(pair.a, SILENT), SILENT)
+    old_answer = only(datagrams(pair.a.receive(only(datagrams(out)), SILENT)))
+    pair.b.timeout(SILENT + 1.0)
+    kept = frame(pair.a, SILENT + 1.0, 9)
+
+    later = SILENT + 20.0
+    assert payloads(pair.b.receive(kept, later)) == []
+    assert payloads(pair.b.receive(old_answer, later)) == []
+    assert reasons(pair.b.timeout(later + c.DOUBT_S)) == [DropReason.DOUBTFUL]
+
+
+def test_control_records_are_not_held_and_end_no_silence(pair: Pair) -> None:
+    """A challenge kept from before is answered; the frames behind it are asked about all the same."""
+    challenge = pair.a.envelope(1.0, wire.PathChallenge(bytes(8)).encode())
+    kept = frame(pair.a, 1.0)
+
+    assert only(of(pair.b.receive(challenge, SILENT), Transmit))
+    assert payloads(pair.b.receive(kept, SILENT)) == []
+
+
+def test_frames_within_two_seconds_of_the_handshake_need_no_question() -> None:
+    """The handshake is proof enough for the first of a session."""
+    pair = Pair(link_a=quiet(), link_b=quiet()).establish()
+    outputs = pair.b.receive(frame(pair.a, c.LATE_AFTER_S), c.LATE_AFTER_S)
+    assert payloads(outputs) == [numbered(0)]
+    assert datagrams(outputs) == []
+
+
+def test_a_link_that_never_falls_silent_needs_no_answers(pair: Pair) -> None:
+    """One way alone works, each frame within two seconds of the one before: all are delivered, nothing is asked."""
+    for number in range(60):
+        now = 1.9 * number
+        outputs = pair.b.receive(frame(pair.a, now, number), now)
+        assert payloads(outputs) == [numbered(number)]
+        assert datagrams(outputs) == []
+
+
+def test_what_is_held_is_bounded_and_counted(pair: Pair) -> None:
+    """A flood of an authentic peer after a silence pushes out its own oldest frames."""
+    dropped = 0
+    for number in range(100):
+        out = pair.b.receive(only(datagrams(pair.a.send(SILENT, b"\xfd" + bytes([number]) * 1100))), SILENT)
+        dropped += sum(each.amount for each in of(out, Dropped))
+        if number == 0:
+            question = only(datagrams(out))
+    answer = only(datagrams(pair.a.receive(question, SILENT)))
+    delivered = payloads(pair.b.receive(answer, SILENT))
+
+    assert len(delivered) + dropped == 100
+    assert [each[1] for each in delivered] == list(range(dropped, 100))
+    assert pair.b.peer.traffic.drops == {DropReason.DOUBTFUL: dropped}
+    assert sum(map(len, delivered)) <= c.HELD_BYTES
+
+
+def test_stretched_time_is_betrayed_by_the_round_trip() -> None:
+    """Each envelope is let through in order, a little later than the last: the first slow answer ends the trust."""
+    pair = Pair(link_a=quiet(), link_b=lively(keepalive_s=1e6, handshake_after_s=1e6, lost_after_s=1e6)).establish()
+    sent: list[bytes] = []
+    oldest_s, asked = 0.0, 0
+    pair.b.send(0.0)
+    for tenth in range(1, 200):  # a frame each 0.1 s; one envelope gets through each 0.2 s
+        now = tenth / 10
+        sent.append(frame(pair.a, now, tenth % 256))
+        outputs = pair.b.timeout(now)
+        if tenth % 2:
+            outputs += pair.b.receive(sent.pop(0), now)
+        for question in datagrams(outputs):
+            asked += 1
+            sent += datagrams(pair.a.receive(question, now))
+        oldest_s = max([oldest_s, *(now - (int(each[-1]) / 10) for each in payloads(outputs))])
+    assert asked > 4
+    assert pair.b.peer.traffic.drops[DropReason.DOUBTFUL] > 20
+    assert oldest_s < c.PROBE_INTERVAL_S + 2 * c.LATE_AFTER_S
+
+
+@pytest.mark.parametrize("ends_by", ["goodbye", "removal", "age", "daemon"])
+def test_frames_in_doubt_do_not_outlive_their_session(pair: Pair, ends_by: str) -> None:
+    """Whatever ends the session, what was held is counted and never delivered."""
+    now = c.REJECT_AFTER_S - 0.1
+    question = only(datagrams(pair.b.receive(frame(pair.a, now), now)))
+    answer = only(datagrams(pair.a.receive(question, now)))
+    peer = pair.b.peer
+    match ends_by:
+        case "goodbye":
+            outputs = pair.b.receive(pair.a.envelope(now, wire.Close().encode()), now)
+        case "removal":
+            outputs = pair.b.node.remove_peer("alpha", now)
+        case "age":
+            outputs = pair.b.timeout(c.REJECT_AFTER_S)
+        case _:
+            outputs = pair.b.node.close(now)
+    assert of(outputs, Dropped) == [Dropped(DropReason.DOUBTFUL, "alpha", None, 1)]
+    assert peer.traffic.drops == {DropReason.DOUBTFUL: 1}
+    assert payloads(pair.b.receive(answer, now)) == []
+
+
+# Who is up.
+
+
+def test_kept_envelopes_keep_no_link_up() -> None:
+    """Kept envelopes that are let through one by one do not hide that the link is lost; an answer brings it back."""
+    pair = Pair(link_a=quiet(), link_b=lively(keepalive_s=1e6)).establish()
+    kept = [frame(pair.a, 0.5, number) for number in range(8)]
+    pair.b.send(3.0)
+    lost_at = 0.0
+    for number, each in enumerate(kept):
+        now = 3.0 + number / 2
+        outputs = pair.b.receive(each, now) + pair.b.timeout(now)
+        assert payloads(outputs) == []
+        if of(outputs, PeerLost):
+            lost_at = now
+    assert 3.0 + c.LOST_AFTER_S <= lost_at <= 3.5 + c.LOST_AFTER_S
+
+    now = 10.0
+    pair.b.timeout(now)
+    question = only(datagrams(pair.b.receive(frame(pair.a, now, 9), now), wire.SHORT_ENVELOPE))
+    assert not pair.b.peer.is_up
+    outputs = pair.b.receive(only(datagrams(pair.a.receive(question, now))), now)
+    assert of(outputs, PeerUp) == [PeerUp("alpha")]
+    assert payloads(outputs) == [numbered(9)]
+
+
+# What is counted.
+
+
+def test_missing_envelopes_are_those_that_can_come_no_more(pair: Pair) -> None:
+    """What is overtaken is not missing; what did not come in two seconds is, and stays so over sessions."""
+    for number in range(30):
+        now = 1.0 + number / 10
+        envelope = frame(pair.a, now, number)
+        if number in (3, 4):
+            continue
+        pair.b.receive(envelope, now)
+    peer = pair.b.peer
+    assert peer.missing(3.0) == 0
+    assert peer.missing(4.0) == 2
+    before = peer.missing(60.0)
+    assert before == 2
+    frame(pair.a, 4.0)  # lost
+    pair.crosses(pair.a, pair.b, 4.0)
+    pair.b.receive(pair.a.envelope(4.0, wire.Close().encode()), 4.0)
+    assert peer.missing(4.0) == 3
+    assert peer.traffic.out_of_order == 0
+
+
+def test_reordered_envelopes_are_not_missing(pair: Pair) -> None:
+    """Ten in the opposite order, over and over: nine of each came after one that was sent later, none is missing."""
+    for batch in range(10):
+        now = 1.0 + batch / 2
+        for each in reversed([frame(pair.a, now, number) for number in range(10)]):
+            assert len(payloads(pair.b.receive(each, now))) == 1
+    assert pair.b.peer.traffic.out_of_order == 90
+    assert pair.b.peer.missing(60.0) == 0
+
+
+def test_unanswered_challenges_are_counted(pair: Pair) -> None:
+    """Each place where the peer's envelopes came from and nobody answered; one that was answered is none."""
+    question = only(of(pair.b.receive(frame(pair.a, 1.0), 1.0, ELSEWHERE), Transmit))
+    answer = only(datagrams(pair.a.receive(question.datagram, 1.0)))
+    pair.b.receive(answer, 1.1, ELSEWHERE)
+    assert pair.b.peer.path == ELSEWHERE
+    counted = pair.b.peer.traffic
+
+    pair.b.receive(frame(pair.a, 1.5), 1.5, (0, "203.0.113.1", 1))
+    pair.b.receive(frame(pair.a, 2.0), 2.0, (0, "203.0.113.2", 1))
+    assert counted.challenges_unanswered == 1
+    assert pair.b.node.next_deadline() <= 2.0 + c.CHALLENGE_LIFETIME_S
+    pair.b.timeout(2.0 + c.CHALLENGE_LIFETIME_S)
+    assert counted.challenges_unanswered == 2
+    pair.b.timeout(60.0)
+    assert counted.challenges_unanswered == 2
+
+
+# Sessions.
+
+
+def rekeyed(now: float, *, heard: bool = True) -> tuple[Pair, bytes]:
+    """A pair with a second session since ``now``, and an envelope that alpha sent on the first before."""
+    pair = Pair(link_a=quiet(), link_b=quiet()).establish()
+    if heard:
+        assert pair.carries(now - 0.5)
+    old = frame(pair.a, now - 0.5, 5)
+    called = pair.a.peer.caller.call(pair.a.peer.path, pair.a.peer.sessions.generation, now)
+    assert called is not None
+    response = only(datagrams(pair.b.receive(called.datagram, now)))
+    pair.b.receive(only(datagrams(pair.a.receive(response, now))), now)
+    assert len(pair.b.peer.sessions.confirmed) == 2
+    return pair, old
+
+
+def test_late_frame_of_the_session_before_is_asked_about_on_it() -> None:
+    """The question goes on the session in doubt, and the answer tells of that session, whichever carries it."""
+    pair, old = rekeyed(10.0, heard=False)
+    outputs = pair.b.receive(old, 10.1)
+    assert payloads(outputs) == []
+    question = only(datagrams(outputs))
+    assert question[1:3] == pair.b.peer.sessions.confirmed[1].remote_index.to_bytes(2)
+
+    answer = only(datagrams(pair.a.receive(question, 10.1)))
+    assert answer[1:3] == pair.b.session.local_index.to_bytes(2)
+    assert echo_in(pair.b, answer).fresh == pair.a.peer.sessions.confirmed[1].fresh(10.1)
+    assert payloads(pair.b.receive(answer, 10.2)) == [numbered(5)]
+
+
+def test_old_frame_of_the_session_before_is_refused() -> None:
+    """Held over a change of keys and longer: nothing of the old session is new any more."""
+    pair, old = rekeyed(10.0)
+    outputs = exchange(pair.b, pair.a, pair.b.receive(old, 20.0), 20.0)
+    assert payloads(outputs) == []
+    answer = [
+        out for each in datagrams(pair.b.receive(frame(pair.a, 20.0, 6), 20.0)) for out in pair.a.receive(each, 20.0)
+    ]
+    assert payloads([out for each in datagrams(answer) for out in pair.b.receive(each, 20.0)]) == [numbered(6)]
+
+
+def test_frames_on_a_session_that_ends_as_it_is_confirmed_are_counted() -> None:
+    """Four newer ones came before the late confirmation of the first: what it carries can be asked about nowhere."""
+    pair = Pair(link_a=quiet(), link_b=quiet())
+    peer = pair.a.peer
+    waiting = []
+    for _ in range(c.USABLE_PER_PEER + 1):
+        called = peer.caller.call(None, 0, 0.0) or peer.caller.call(pair.a.peer_at, 0, 0.0)
+        assert called is not None
+        waiting.append(only(datagrams(pair.b.receive(called.datagram, 0.0))))
+    sessions = []
+    for response in waiting:
+        index = wire.parse_response(response).receiver_index
+        pending = peer.caller.pending.get(index)
+        assert pending is not None
+        keys = peer.caller.receive_response(pending, wire.parse_response(response))
+        sessions.append(Session(peer, X25519, keys, index, 0.0, 180.0, is_initiator=True))
+    for number, each in enumerate(sessions[1:]):
+        pair.b.peer.sessions.unconfirmed[each.remote_index].session.created_at = float(number + 1)
+        pair.b.receive(each.seal(b"", 1.0), 1.0)
+    outputs = pair.b.receive(sessions[0].seal(FRAME, 9.0), 9.0)
+    assert reasons(outputs) == [DropReason.DOUBTFUL]
+    assert payloads(outputs) == []

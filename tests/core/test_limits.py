@@ -1,0 +1,92 @@
+"""Token buckets: how much others can make us do."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from uavlinkd.core.limits import SourceLimiter, TokenBucket, source_of
+
+
+def taken(bucket: TokenBucket, attempts: int, now: float) -> int:
+    """How many of so many attempts succeed."""
+    return sum(bucket.take(now) for _ in range(attempts))
+
+
+def test_bucket_starts_full() -> None:
+    """The whole burst is there at once, and not one more."""
+    assert taken(TokenBucket(2.0, 5, 100.0), 20, 100.0) == 5
+
+
+def test_bucket_refills_at_its_rate() -> None:
+    """A token comes back just when the rate gives it, not before."""
+    bucket = TokenBucket(2.0, 5, 100.0)
+    taken(bucket, 5, 100.0)
+
+    assert not bucket.take(100.499)
+    assert bucket.take(100.5)
+    assert not bucket.take(100.5)
+    assert taken(bucket, 20, 102.0) == 3
+
+
+def test_bucket_never_holds_more_than_its_burst() -> None:
+    """A year of silence buys no more than one burst."""
+    bucket = TokenBucket(2.0, 5, 0.0)
+
+    assert taken(bucket, 20, 3e7) == 5
+
+
+@given(st.lists(st.floats(0, 2), max_size=60), st.floats(0.5, 20), st.integers(1, 10))
+def test_bucket_never_exceeds_burst_and_rate(steps: list[float], rate: float, burst: int) -> None:
+    """Over any pattern of attempts, no more passes than the burst and the rate times the time."""
+    bucket = TokenBucket(rate, burst, 0.0)
+    now, passed = 0.0, 0
+    for step in steps:
+        now += step
+        passed += bucket.take(now)
+        assert passed <= burst + rate * now + 1e-6
+
+
+def test_sources_have_their_own_buckets() -> None:
+    """One source that sends too much takes nothing from another."""
+    limiter = SourceLimiter(1.0, 2, 10)
+
+    assert [limiter.take("loud", 0.0) for _ in range(4)] == [True, True, False, False]
+    assert limiter.take("quiet", 0.0)
+    assert [limiter.take("loud", 1.0), limiter.take("loud", 1.0)] == [True, False]
+
+
+def test_memory_for_sources_is_bounded() -> None:
+    """However many sources there are, no more than the capacity is remembered: those heard last."""
+    limiter = SourceLimiter(1.0, 1, 3)
+    for source in range(1000):
+        assert limiter.take(source, 0.0)
+        assert len(limiter._buckets) <= 3
+
+    assert list(limiter._buckets) == [997, 998, 999]
+
+
+def test_the_longest_silent_source_is_forgotten() -> None:
+    """A source that goes on sending stays known, so it cannot win a fresh burst by a crowd."""
+    limiter = SourceLimiter(1.0, 1, 2)
+    assert limiter.take("loud", 0.0)
+    for crowd in range(50):
+        limiter.take(crowd, 0.0)
+        assert not limiter.take("loud", 0.0)
+
+
+@pytest.mark.parametrize(
+    ("host", "source"),
+    [
+        ("10.0.0.1", "10.0.0.1"),
+        ("2001:db8:1:2::7", "2001:db8:1:2::/64"),
+        ("2001:db8:1:2:3:4:5:6", "2001:db8:1:2::/64"),
+        ("2001:db8::1", "2001:db8:0:0::/64"),
+        ("fe80::1%wlan0", "fe80:0:0:0::/64"),
+        ("::1", "0:0:0:0::/64"),
+    ],
+)
+def test_source_is_what_one_machine_may_own(host: str, source: str) -> None:
+    """An IPv4 address stands for itself, an IPv6 address for its /64."""
+    assert source_of(host) == source

@@ -1,0 +1,776 @@
+"""One peer's timers, confirmations, paths and goodbyes, between two nodes in the hands of the test."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import pytest
+
+from tests.core.harness import (
+    AT_A,
+    AT_B,
+    ELSEWHERE,
+    FRAME,
+    PLAIN,
+    Pair,
+    Side,
+    datagrams,
+    lively,
+    of,
+    only,
+    payloads,
+    quiet,
+    reasons,
+    run,
+    seeded,
+)
+from uavlinkd.core import constants as c
+from uavlinkd.core import wire
+from uavlinkd.core.crypto import Secret
+from uavlinkd.core.drops import DropReason
+from uavlinkd.core.node import Node
+from uavlinkd.core.outputs import (
+    Dropped,
+    Output,
+    Path,
+    PathChanged,
+    PeerClosed,
+    PeerLost,
+    PeerUp,
+    SessionEstablished,
+    Transmit,
+)
+from uavlinkd.core.settings import Link, PeerSettings
+from uavlinkd.core.suites import SUITES_BY_NAME
+
+RESPONDER_REKEY_S = c.REKEY_AFTER_S + c.RESPONDER_REKEY_SHARE * (c.REJECT_AFTER_S - c.REKEY_AFTER_S)
+ENVELOPES = (wire.SHORT_ENVELOPE, wire.LONG_ENVELOPE)
+
+
+@pytest.fixture
+def pair() -> Pair:
+    """A session at second 0, with timers for keys and handshakes only."""
+    return Pair(link_a=quiet(), link_b=quiet()).establish()
+
+
+@pytest.fixture
+def watchful() -> Pair:
+    """A session at second 0; alpha has every timer and has just heard bravo, which only answers."""
+    made = Pair(link_a=lively(), link_b=quiet()).establish()
+    hear(made, 0.0)
+    return made
+
+
+def hear(pair: Pair, now: float) -> None:
+    """Let alpha hear bravo."""
+    for each in datagrams(pair.b.send(now)):
+        pair.a.receive(each, now)
+
+
+def content(side: Side, datagram: bytes, now: float) -> bytes:
+    """What an envelope for this side holds: looked at with its keys, past its node."""
+    index, counter, size = wire.parse_envelope_header(datagram)
+    session = side.node._indices.owners[index]
+    assert session is side.session
+    return side.session.open(datagram, size, counter, now)
+
+
+def initiations(outputs: list[Output]) -> list[bytes]:
+    """The initiations among what is to be sent."""
+    return datagrams(outputs, wire.INITIATION)
+
+
+# Confirmation.
+
+
+def test_responder_sends_nothing_before_confirmation() -> None:
+    """A session that answers an initiation carries nothing until its initiator has shown that it has the keys."""
+    pair = Pair()
+    initiation = pair.initiation(0.0)
+    response = only(datagrams(pair.b.receive(initiation, 0.0)))
+    assert reasons(pair.b.send(0.0)) == [DropReason.NO_SESSION]
+    assert pair.b.peer.path is None
+
+    confirmation = only(datagrams(pair.a.receive(response, 0.0)))
+    assert reasons(pair.b.send(0.0)) == [DropReason.NO_SESSION]
+
+    outputs = pair.b.receive(confirmation, 0.0)
+    assert [type(out) for out in outputs] == [SessionEstablished, PeerUp, Transmit]  # the echo's reply
+    assert pair.carries(0.0)
+
+
+def test_what_is_established_is_told() -> None:
+    """Both ends tell of the new session, and of the one that replaces it."""
+    pair = Pair(link_a=Link(confidential=True), link_b=Link(tag_bytes=32))
+    response = only(datagrams(pair.b.receive(pair.initiation(0.0), 0.0)))
+    outputs = pair.a.receive(response, 0.0)
+
+    assert of(outputs, SessionEstablished) == [SessionEstablished("bravo", 1, "x25519", True, 16, True, False)]
+    assert of(outputs, PeerUp) == [PeerUp("bravo")]
+    told = of(pair.b.receive(only(datagrams(outputs)), 0.0), SessionEstablished)
+    assert told == [SessionEstablished("alpha", 1, "x25519", True, 16, False, False)]
+
+
+def test_lost_confirmation_is_repeated_by_the_first_frames() -> None:
+    """Where the keepalive that confirms is lost, the next envelope does its work and delivers its frames."""
+    pair = Pair()
+    response = only(datagrams(pair.b.receive(pair.initiation(0.0), 0.0)))
+    pair.a.receive(response, 0.0)
+
+    outputs = pair.b.receive(only(datagrams(pair.a.send(1.0))), 1.0)
+
+    assert [type(out) for out in outputs][:2] == [SessionEstablished, PeerUp]
+    assert payloads(outputs) == [FRAME]
+
+
+def test_unconfirmed_session_is_forgotten_after_ten_seconds() -> None:
+    """Just before its end a session can still be confirmed; at its end it is gone."""
+    for late, expected in ((c.UNCONFIRMED_LIFETIME_S - 0.001, True), (c.UNCONFIRMED_LIFETIME_S, False)):
+        pair = Pair()
+        response = only(datagrams(pair.b.receive(pair.initiation(0.0), 0.0)))
+        confirmation = only(datagrams(pair.a.receive(response, 0.0)))
+        assert pair.b.node.next_deadline() <= c.UNCONFIRMED_LIFETIME_S
+        pair.b.timeout(late)
+        assert bool(of(pair.b.receive(confirmation, late), SessionEstablished)) is expected
+
+
+# Parameters.
+
+
+@pytest.mark.parametrize(
+    ("link_a", "link_b", "confidential", "tag_bytes", "mac_key_bits", "max_envelope"),
+    [
+        (PLAIN, PLAIN, False, 16, 256, 1232),
+        (Link(confidential=True), PLAIN, True, 16, 256, 1232),
+        (PLAIN, Link(confidential=True), True, 16, 256, 1232),
+        (Link(tag_bytes=8), Link(tag_bytes=12), False, 12, 256, 1232),
+        (Link(tag_bytes=32), Link(tag_bytes=8), False, 32, 256, 1232),
+        (Link(mac_key_bits=512), Link(mac_key_bits=2048), False, 16, 2048, 1232),
+        (Link(max_envelope=400), Link(max_envelope=320), False, 16, 256, 320),
+    ],
+)
+def test_both_use_the_stronger_of_what_each_asks(
+    link_a: Link, link_b: Link, confidential: bool, tag_bytes: int, mac_key_bits: int, max_envelope: int
+) -> None:
+    """In each parameter the stronger side counts, at both ends alike."""
+    pair = Pair(link_a=link_a, link_b=link_b).establish()
+
+    assert pair.a.session.parameters == pair.b.session.parameters
+    assert pair.a.session.parameters == wire.Parameters(1, confidential, tag_bytes, mac_key_bits, max_envelope)
+    assert pair.carries(0.0)
+
+
+@pytest.mark.parametrize("name", ["x25519", "ffdhe2048", "mlkem768"])
+def test_a_link_of_each_kind_of_suite_carries_frames(name: str) -> None:
+    """Whatever the group, with a PSK or without, there is a session and frames get through."""
+    link = Link(suites=(SUITES_BY_NAME[name],))
+    psk = Secret(bytes(range(32)))
+
+    assert Pair(link_a=link, link_b=link).establish().carries(0.0)
+    assert Pair(link_a=link, link_b=link, psk_a=psk, psk_b=psk).establish().carries(0.0)
+
+
+# Sending.
+
+
+def test_frames_that_are_there_together_share_envelopes() -> None:
+    """As many frames as fit go into one envelope, in their order; none is larger than agreed."""
+    link = quiet(max_envelope=c.MIN_ENVELOPE_LIMIT)
+    pair = Pair(link_a=link, link_b=link).establish()
+    frames = [FRAME + bytes((number,)) * number for number in range(40)]
+
+    sent = datagrams(pair.a.send(1.0, *frames))
+    received = [payload for each in sent for payload in payloads(pair.b.receive(each, 1.0))]
+
+    assert b"".join(received) == b"".join(frames)
+    assert all(len(each) <= c.MIN_ENVELOPE_LIMIT for each in sent)
+    assert len(sent) < len(frames) / 4
+    sizes = [len(payload) for payload in received]
+    limit = pair.a.session.payload_limit
+    assert all(one + other > limit - len(frames[-1]) for one, other in pairwise(sizes))
+
+
+def test_frame_larger_than_an_envelope_is_dropped_alone(pair: Pair) -> None:
+    """What can never fit is counted, and the frames around it are sent."""
+    limit = pair.a.session.payload_limit
+    fits, too_large = b"\xfd" + bytes(limit - 1), b"\xfd" + bytes(limit)
+
+    outputs = pair.a.send(1.0, FRAME, too_large, fits, too_large)
+
+    assert of(outputs, Dropped) == [Dropped(DropReason.TOO_LARGE, "bravo")] * 2
+    delivered = [payload for each in datagrams(outputs) for payload in payloads(pair.b.receive(each, 1.0))]
+    assert delivered == [FRAME, fits]
+    assert pair.a.peer.traffic.drops[DropReason.TOO_LARGE] == 2
+
+
+def test_without_a_session_frames_are_counted_and_dropped() -> None:
+    """Nothing is kept for later: an old position is worth nothing."""
+    pair = Pair()
+
+    assert pair.a.send(0.0, FRAME, FRAME, FRAME) == [Dropped(DropReason.NO_SESSION, "bravo", None, 3)]
+    assert pair.establish().carries(0.0)
+
+
+def test_session_at_its_last_counter_sends_no_more() -> None:
+    """Frames beyond the last counter are dropped, timers stay quiet, and the other side is still heard."""
+    pair = Pair(link_a=lively(), link_b=quiet()).establish()
+    hear(pair, 0.0)
+    pair.a.session.send_counter = c.SESSION_ENVELOPE_LIMIT - 1
+    limit = pair.a.session.payload_limit
+    frames = [b"\xfd" + bytes(limit - 1)] * 2
+
+    outputs = pair.a.send(1.0, *frames)
+    assert len(datagrams(outputs)) == 1
+    assert reasons(outputs) == [DropReason.NO_SESSION]
+    assert reasons(pair.a.send(1.0)) == [DropReason.NO_SESSION]
+
+    hear(pair, 1.0)
+    for _ in range(50):
+        now = pair.a.node.next_deadline()
+        if now > 60.0:
+            break
+        assert datagrams(pair.a.timeout(now), *ENVELOPES) == []
+        assert pair.a.node.next_deadline() > now
+    assert initiations(pair.a.timeout(60.0)) or pair.a.peer.caller.pending
+
+
+def test_traffic_is_counted(pair: Pair) -> None:
+    """Envelopes and bytes are counted at both ends, and agree."""
+    ours, theirs = pair.a.peer.traffic, pair.b.peer.traffic
+    before = (ours.envelopes_sent, ours.bytes_sent, theirs.envelopes_received, theirs.bytes_received)
+    sent = datagrams(pair.a.send(1.0)) + datagrams(pair.a.send(1.0))
+    for each in sent:
+        pair.b.receive(each, 1.0)
+
+    after = (ours.envelopes_sent, ours.bytes_sent, theirs.envelopes_received, theirs.bytes_received)
+    size = sum(len(each) for each in sent)
+    assert [late - early for late, early in zip(after, before, strict=True)] == [2, size, 2, size]
+    assert ours.handshakes == theirs.handshakes == 1
+
+
+# The age of keys.
+
+
+def test_initiator_makes_new_keys_at_its_time(pair: Pair) -> None:
+    """Just before 120 s nothing happens; at 120 s the initiator calls, and the frames of the old session go on."""
+    assert initiations(pair.a.timeout(c.REKEY_AFTER_S - 0.001)) == []
+
+    initiation = only(initiations(pair.a.timeout(c.REKEY_AFTER_S)))
+
+    assert pair.carries(c.REKEY_AFTER_S)
+    response = only(datagrams(pair.b.receive(initiation, 120.1)))
+    outputs = pair.a.receive(response, 120.1)
+    assert only(of(outputs, SessionEstablished)).rekey
+    assert pair.a.session.parameters.generation == 2
+    pair.b.receive(only(datagrams(outputs)), 120.2)
+    assert pair.carries(120.2)
+
+
+def test_responder_makes_new_keys_later(pair: Pair) -> None:
+    """The responder waits a quarter of the time that is left, so that in the ordinary case one side calls."""
+    assert RESPONDER_REKEY_S == 135.0
+    assert initiations(pair.b.timeout(RESPONDER_REKEY_S - 0.001)) == []
+    assert len(initiations(pair.b.timeout(RESPONDER_REKEY_S))) == 1
+
+
+def test_half_of_all_counters_ask_for_new_keys(watchful: Pair) -> None:
+    """At 2^31 envelopes new keys are made; one before that they are not."""
+    for sent, expected in ((c.REKEY_AFTER_ENVELOPES - 2, 0), (c.REKEY_AFTER_ENVELOPES - 1, 1)):
+        now = 1.0 + expected
+        hear(watchful, now)
+        watchful.a.session.send_counter = sent
+        watchful.a.send(now)
+        due = now + c.ECHO_AFTER_S
+        assert len(initiations(watchful.a.timeout(due))) == expected
+
+
+def test_keys_are_refused_and_forgotten_at_180_seconds(pair: Pair) -> None:
+    """Just before, the session carries frames both ways; at 180 s neither side seals, opens or keeps it."""
+    before = c.REJECT_AFTER_S - 0.001
+    assert pair.carries(before)
+    late = datagrams(pair.a.send(before)) + datagrams(pair.a.send(before))
+    assert payloads(pair.b.receive(late[0], before)) == [FRAME]
+
+    assert reasons(pair.b.receive(late[1], c.REJECT_AFTER_S)) == [DropReason.SESSION_EXPIRED]
+    assert reasons(pair.a.send(c.REJECT_AFTER_S)) == [DropReason.NO_SESSION]
+    outputs = pair.a.timeout(c.REJECT_AFTER_S)
+    assert only(of(outputs, PeerLost)).silent_s == pytest.approx(0.001)
+    pair.b.timeout(c.REJECT_AFTER_S)
+    assert pair.a.peer.sessions.current is pair.b.peer.sessions.current is None
+    assert reasons(pair.b.receive(late[1], c.REJECT_AFTER_S)) == [DropReason.LATE]
+
+
+def test_an_index_rests_ten_minutes_after_its_session(pair: Pair) -> None:
+    """An envelope of an ended session is late for ten minutes, and unknown after that."""
+    envelope = only(datagrams(pair.a.send(1.0)))
+    pair.b.timeout(c.REJECT_AFTER_S)
+    end = c.REJECT_AFTER_S + c.INDEX_QUARANTINE_S
+
+    assert reasons(pair.b.receive(envelope, end - 0.001)) == [DropReason.LATE]
+    assert reasons(pair.b.receive(envelope, end)) == [DropReason.UNKNOWN_INDEX]
+
+
+# Silence.
+
+
+def test_keepalive_after_ten_quiet_seconds(watchful: Pair) -> None:
+    """When nothing was sent for 10 s an empty envelope goes out, just then."""
+    assert datagrams(watchful.a.timeout(c.KEEPALIVE_S - 0.001)) == []
+
+    keepalive = only(datagrams(watchful.a.timeout(c.KEEPALIVE_S)))
+
+    assert content(watchful.b, keepalive, c.KEEPALIVE_S) == b""
+
+
+def test_silence_is_asked_about_then_called_about_then_told(watchful: Pair) -> None:
+    """Sent and heard nothing: echo at 0.5 s, initiation at 1 s, lost at 3 s, each just then and not before."""
+    a, start = watchful.a, 2.0
+    a.timeout(start)
+    a.send(start)
+
+    assert datagrams(a.timeout(start + c.ECHO_AFTER_S - 0.001)) == []
+    echo = only(datagrams(a.timeout(start + c.ECHO_AFTER_S)))
+    record = wire.parse_control(content(watchful.b, echo, start))
+    assert isinstance(record, wire.Echo)
+    assert not record.is_reply
+
+    assert initiations(a.timeout(start + c.HANDSHAKE_AFTER_S - 0.001)) == []
+    assert len(initiations(a.timeout(start + c.HANDSHAKE_AFTER_S))) == 1
+
+    assert of(a.timeout(start + c.LOST_AFTER_S - 0.001), PeerLost) == []
+    assert of(a.timeout(start + c.LOST_AFTER_S), PeerLost) == [PeerLost("bravo", start + c.LOST_AFTER_S)]
+    assert of(a.timeout(start + c.LOST_AFTER_S + 1.0), PeerLost) == []
+
+
+def test_deadlines_come_when_something_is_due(watchful: Pair) -> None:
+    """Who only wakes at the deadlines that the node names does everything at its time."""
+    a, start = watchful.a, 2.0
+    a.timeout(start)
+    a.send(start)
+    events = dict[str, float]()
+    while (now := a.node.next_deadline()) <= start + c.LOST_AFTER_S:
+        for out in a.timeout(now):
+            kind = str(out.datagram[0]) if isinstance(out, Transmit) else type(out).__name__
+            events.setdefault(kind, now)
+
+    assert events == {
+        "64": start + c.ECHO_AFTER_S,
+        "1": start + c.HANDSHAKE_AFTER_S,
+        "PeerLost": start + c.LOST_AFTER_S,
+    }
+
+
+def test_a_lost_peer_that_is_heard_is_up_again(watchful: Pair) -> None:
+    """A valid envelope, once it is known to be new, ends the silence, and the calls with it."""
+    a, b = watchful.a, watchful.b
+    a.send(2.0)
+    a.timeout(2.0 + c.LOST_AFTER_S)
+    assert not a.peer.is_up
+
+    question = only(datagrams(a.receive(b.envelope(6.0, b""), 6.0)))
+    assert not a.peer.is_up
+    outputs = a.receive(only(datagrams(b.receive(question, 6.0))), 6.0)
+
+    assert of(outputs, PeerUp) == [PeerUp("bravo")]
+    assert initiations(a.timeout(9.0)) == []
+
+
+def test_an_echo_is_answered_with_what_was_received(watchful: Pair) -> None:
+    """The reply repeats the token and counts envelopes; the asker learns round trip and losses."""
+    a, b = watchful.a, watchful.b
+    a.send(2.0)  # lost
+    echo = only(datagrams(a.timeout(2.5)))
+
+    reply = only(datagrams(b.receive(echo, 2.6)))
+    assert a.receive(reply, 2.7) == []
+
+    assert a.peer.round_trip_s == pytest.approx(0.2)
+    expected, received = a.peer.traffic.reported
+    assert expected == a.session.send_counter
+    assert received == expected - 1
+
+
+def test_only_the_asked_echo_measures(watchful: Pair) -> None:
+    """A reply to another question, or a second one, says nothing about the round trip."""
+    a, b = watchful.a, watchful.b
+    for token, now in ((77, 1.0), (0, 1.1)):
+        a.receive(b.envelope(now, wire.Echo(True, token, 1, 1).encode()), now)
+    assert a.peer.round_trip_s is None
+
+    a.send(2.0)
+    reply = only(datagrams(b.receive(only(datagrams(a.timeout(2.5))), 2.5)))
+    record = wire.parse_control(content(a, reply, 2.5))
+    a.receive(b.envelope(2.6, record.encode()), 2.6)
+    a.receive(b.envelope(9.0, record.encode()), 9.0)
+    assert a.peer.round_trip_s == pytest.approx(0.1)
+
+
+def test_a_link_in_use_is_measured_now_and_then(watchful: Pair) -> None:
+    """Five seconds after frames were sent there is one echo, however well all is heard; idle links have none."""
+    idle = Pair(link_a=watchful.link_a, link_b=watchful.link_b).establish()
+    hear(idle, 0.0)
+    assert datagrams(idle.a.timeout(c.PROBE_INTERVAL_S + 1.0)) == []
+    a = watchful.a
+    start = 1.0
+    a.send(start)
+    hear(watchful, start)
+
+    assert datagrams(a.timeout(start + c.PROBE_INTERVAL_S - 0.001)) == []
+    assert len(datagrams(a.timeout(start + c.PROBE_INTERVAL_S))) == 1
+
+
+def test_probes_can_be_turned_off() -> None:
+    """A probe interval of zero means none."""
+    pair = Pair(link_a=lively(probe_interval_s=0.0, keepalive_s=60.0), link_b=quiet()).establish()
+    pair.a.send(1.0)
+    hear(pair, 1.0)
+
+    assert datagrams(pair.a.timeout(30.0)) == []
+
+
+def test_asking_and_answering_ends() -> None:
+    """Two watchful ends without traffic do not keep each other busy: echoes are not answered for ever."""
+    pair = Pair(link_a=lively(), link_b=lively()).establish()
+    sent = 0
+
+    def passes(side: Side, datagram: bytes, now: float) -> bool:
+        nonlocal sent
+        sent += now > 1.0
+        return True
+
+    for _ in run(pair, 0.0, 101.0, passes):
+        pass
+    assert pair.a.peer.is_up
+    assert pair.b.peer.is_up
+    assert sent <= 6 * 100 / c.KEEPALIVE_S + 8
+
+
+def test_answer_comes_on_the_session_that_sends() -> None:
+    """A peer that never had our newest session is not lulled by replies on the old one: it calls within seconds.
+
+    Alpha has new keys, and every envelope under them is lost until bravo has forgotten its side of them.
+    """
+    pair = Pair(link_a=lively(), link_b=lively()).establish()
+    end = c.REKEY_AFTER_S + c.UNCONFIRMED_LIFETIME_S + 4.0
+
+    def passes(side: Side, datagram: bytes, now: float) -> bool:
+        is_newest = side is pair.a and side.session.parameters.generation == 2
+        under_it = is_newest and datagram[1:3] == side.session.remote_index.to_bytes(2, "big")
+        return now >= end or datagram[0] not in ENVELOPES or not under_it
+
+    crossings = list[float]()
+    last = 0.0
+    for now in run(pair, 0.0, end + 3.0, passes):
+        if now >= last + 0.1:
+            last = now
+            for each in datagrams(pair.b.send(now)):
+                pair.a.receive(each, now)
+            for each in datagrams(pair.a.send(now)):
+                if passes(pair.a, each, now) and payloads(pair.b.receive(each, now)):
+                    crossings.append(now)
+    gaps = [later - earlier for earlier, later in pairwise(crossings)]
+    assert max(gaps) < 3.0
+    assert crossings[-1] > end
+
+
+# Both ends call.
+
+
+@pytest.mark.parametrize("swapped", [False, True])
+def test_both_initiate_at_once_and_settle(swapped: bool) -> None:
+    """When both call at the same moment both answer, and both send on the session of the smaller key's call."""
+    pair = Pair(swapped=swapped, link_a=quiet(), link_b=quiet())
+    pair.b.knows_the_way(0.0)
+    from_a, from_b = pair.initiation(0.0), only(initiations(pair.b.timeout(0.0)))
+    answer_to_a = only(datagrams(pair.b.receive(from_a, 0.1)))
+    answer_to_b = only(datagrams(pair.a.receive(from_b, 0.1)))
+    confirmation_a = datagrams(pair.a.receive(answer_to_a, 0.2))
+    confirmation_b = datagrams(pair.b.receive(answer_to_b, 0.2))
+    for each in confirmation_a:
+        pair.b.receive(each, 0.3)
+    for each in confirmation_b:
+        pair.a.receive(each, 0.3)
+
+    assert pair.carries(0.4)
+    assert (pair.a.session.local_index, pair.a.session.remote_index) == (
+        pair.b.session.remote_index,
+        pair.b.session.local_index,
+    )
+    assert pair.a.session.is_initiator == (pair.a.node.public_key < pair.b.node.public_key)
+
+
+def test_peer_that_restarted_is_linked_again(pair: Pair) -> None:
+    """A side that comes back without any memory gets a session of a greater generation, which then counts."""
+    fresh = Node(Secret(bytes([2]) * 32), seeded(9), 50.0)
+    if fresh.public_key != pair.b.node.public_key:
+        fresh = Node(Secret(bytes([1]) * 32), seeded(9), 50.0)
+    fresh.add_peer(PeerSettings("alpha", pair.a.node.public_key, None, quiet()), 50.0)
+    fresh.set_addresses("alpha", [AT_A], 50.0)
+    pair.b = Side(fresh, AT_B, "alpha", AT_A)
+
+    response = only(datagrams(pair.a.receive(only(initiations(pair.b.timeout(50.0))), 50.0)))
+    pair.a.receive(only(datagrams(pair.b.receive(response, 50.0))), 50.0)
+
+    assert pair.carries(50.0)
+    assert pair.a.session.parameters.generation == 2
+
+
+# Hints.
+
+
+def test_hint_about_a_peer_without_an_address_is_nothing_to_act_on() -> None:
+    """Nobody is called whose address is not known, now or later."""
+    pair = Pair(link_b=quiet())
+    outputs: list[Output] = []
+
+    pair.b.peer.hint(1.0, outputs)
+
+    assert outputs == []
+    assert pair.b.timeout(2.0) == []
+
+
+def stray() -> bytes:
+    """An envelope for a session that nobody has."""
+    return wire.envelope_header(0, 5) + bytes(24)
+
+
+def test_unknown_envelope_from_the_peers_place_is_a_hint() -> None:
+    """A side without a session initiates then, at once, and at most once a second."""
+    pair = Pair(link_a=quiet(), link_b=quiet())
+    pair.initiation(0.0)
+
+    assert len(initiations(pair.a.receive(stray(), 0.01))) == 1
+    assert datagrams(pair.a.receive(stray(), 0.02)) == []
+    assert datagrams(pair.a.receive(stray(), 0.01 + c.HINTS_INTERVAL_S - 0.001)) == []
+    assert len(datagrams(pair.a.receive(stray(), 0.01 + c.HINTS_INTERVAL_S))) == 1
+
+
+def test_unknown_envelope_from_elsewhere_is_no_hint() -> None:
+    """A stranger's envelope gets no answer and causes no call."""
+    pair = Pair(link_a=quiet(), link_b=quiet())
+    pair.initiation(0.0)
+
+    assert pair.a.receive(stray(), 1.0, ELSEWHERE) == [Dropped(DropReason.UNKNOWN_INDEX, None, ELSEWHERE)]
+
+
+def test_hint_is_ignored_while_the_session_is_alive(watchful: Pair) -> None:
+    """While the peer answers on a session, an envelope for another is false; once it is silent it may be true."""
+    watchful.a.timeout(0.0)
+    assert datagrams(watchful.a.receive(stray(), 1.0)) == []
+
+    watchful.a.send(2.0)
+    assert len(initiations(watchful.a.receive(stray(), 2.0 + c.ECHO_AFTER_S))) == 1
+
+
+# Goodbye.
+
+
+def test_goodbye_ends_the_session_at_both_ends(pair: Pair) -> None:
+    """A closing side forgets every key; the other stops sending and calls again only a second later."""
+    farewell = only(datagrams(pair.b.node.close(5.0)))
+    assert pair.b.peer.sessions.current is None
+    assert pair.b.node.next_deadline() == float("inf")
+
+    assert of(pair.a.receive(farewell, 5.0), PeerClosed) == [PeerClosed("bravo")]
+
+    assert not pair.a.peer.is_up
+    assert reasons(pair.a.send(5.0)) == [DropReason.NO_SESSION]
+    assert initiations(pair.a.timeout(5.0 + c.CLOSE_HOLDOFF_S - 0.001)) == []
+    assert len(initiations(pair.a.timeout(5.0 + c.CLOSE_HOLDOFF_S))) == 1
+
+
+def test_late_goodbye_does_not_end_the_newer_session(pair: Pair) -> None:
+    """A goodbye on an old session, delayed until there is a newer one, ends the old one alone."""
+    farewell = pair.b.envelope(1.0, wire.Close().encode())
+    pair.establish(c.REKEY_AFTER_S)
+
+    assert pair.a.receive(farewell, 121.0) == []
+
+    assert len(pair.a.peer.sessions.confirmed) == 1
+    assert pair.carries(121.0)
+
+
+def test_goodbye_cannot_be_replayed(pair: Pair) -> None:
+    """A goodbye of the time before does not count after a new handshake."""
+    farewell = only(datagrams(pair.a.node.close(5.0)))
+    pair.b.receive(farewell, 5.0)
+    pair.a.knows_the_way(7.0)  # alpha is started again
+    pair.establish(7.0)
+
+    assert reasons(pair.b.receive(farewell, 7.0)) == [DropReason.LATE]
+    assert pair.carries(7.0)
+
+
+def test_closing_without_a_session_says_nothing() -> None:
+    """A node that never had a session just stops, and takes no answer to its calls."""
+    pair = Pair()
+    response = only(datagrams(pair.b.receive(pair.initiation(0.0), 0.0)))
+
+    assert pair.a.node.close(0.0) == []
+    assert pair.b.node.close(0.0) == []
+    assert reasons(pair.a.receive(response, 0.0)) == [DropReason.UNEXPECTED_RESPONSE]
+
+
+def test_closing_after_the_keys_ended_says_nothing(pair: Pair) -> None:
+    """Keys that are too old do not even seal a goodbye."""
+    assert pair.a.node.close(c.REJECT_AFTER_S) == []
+
+
+# Paths.
+
+
+def challenge_from(pair: Pair, now: float, place: Path = ELSEWHERE) -> bytes:
+    """Alpha speaks from another place; bravo asks there. The question."""
+    outputs = pair.b.receive(only(datagrams(pair.a.send(now))), now, place)
+    question = only(of(outputs, Transmit))
+    assert question.path == place
+    assert payloads(outputs) == [FRAME]
+    return question.datagram
+
+
+def test_traffic_follows_a_peer_that_answers_from_its_new_place(pair: Pair) -> None:
+    """A valid envelope from a new place is asked about there; traffic moves when the answer comes, not before."""
+    question = challenge_from(pair, 1.0)
+    assert only(of(pair.b.send(1.0), Transmit)).path == AT_A
+
+    answer = only(of(pair.a.receive(question, 1.1), Transmit))
+    assert answer.path == AT_B
+    assert pair.b.receive(answer.datagram, 1.2, ELSEWHERE) == [PathChanged("alpha", ELSEWHERE)]
+
+    assert pair.b.peer.path == ELSEWHERE
+    assert only(of(pair.b.send(1.2), Transmit)).path == ELSEWHERE
+
+
+def test_forwarded_envelope_does_not_pull_the_traffic(pair: Pair) -> None:
+    """Who forwards a captured envelope from its own place gets one question there, and nothing more."""
+    challenge_from(pair, 1.0)
+
+    for moment in (1.0, 1.1, 2.0, 30.0):
+        assert {out.path for out in of(pair.b.send(moment), Transmit)} == {AT_A}
+
+
+def test_question_is_never_longer_than_what_came(pair: Pair) -> None:
+    """No more bytes go to an unproven place than came from it: a keepalive is too short to be asked about."""
+    for size in range(14):
+        envelope = pair.a.envelope(1.0, (FRAME + FRAME)[:size])
+        outputs = pair.b.receive(envelope, 1.0 + size, ELSEWHERE)
+        assert all(len(each) <= len(envelope) for each in datagrams(outputs))
+        assert bool(datagrams(outputs)) == (size >= len(wire.PathChallenge(bytes(8)).encode()))
+
+
+def test_answer_is_never_longer_than_its_question(pair: Pair) -> None:
+    """Even where the answer needs the longer header it is no longer than the question was."""
+    pair.a.session.send_counter = c.SHORT_COUNTER_LIMIT
+    question = pair.b.envelope(1.0, wire.PathChallenge(bytes(8)).encode())
+
+    answer = only(of(pair.a.receive(question, 1.0, ELSEWHERE), Transmit))
+
+    assert answer.path == ELSEWHERE
+    assert len(answer.datagram) <= len(question)
+
+
+@pytest.mark.parametrize("place", [AT_A, AT_B, (1, *ELSEWHERE[1:]), (0, ELSEWHERE[1], 9)])
+def test_answer_from_another_place_is_refused(pair: Pair, place: Path) -> None:
+    """The answer proves the place it comes from, and only the one that was asked."""
+    answer = only(datagrams(pair.a.receive(challenge_from(pair, 1.0), 1.0)))
+
+    assert DropReason.BAD_PATH_RESPONSE in reasons(pair.b.receive(answer, 1.1, place))
+    assert pair.b.peer.path == AT_A
+
+
+def test_answer_counts_for_five_seconds(pair: Pair) -> None:
+    """Just before its end an answer moves the traffic; at its end it does not."""
+    answer = only(datagrams(pair.a.receive(challenge_from(pair, 1.0), 1.0)))
+    late = reasons(pair.b.receive(answer, 1.0 + c.CHALLENGE_LIFETIME_S, ELSEWHERE))
+    assert late == [DropReason.BAD_PATH_RESPONSE]
+    assert pair.b.peer.path == AT_A
+
+    assert pair.carries(10.0)
+    answer = only(datagrams(pair.a.receive(challenge_from(pair, 10.0), 10.0)))
+    pair.b.receive(answer, 10.0 + c.CHALLENGE_LIFETIME_S - 0.001, ELSEWHERE)
+    assert pair.b.peer.path == ELSEWHERE
+
+
+def test_answer_with_another_token_is_refused(pair: Pair) -> None:
+    """A peer cannot claim a place that it does not hear, nor answer when it was not asked."""
+    made_up = wire.PathResponse(bytes(8)).encode()
+    unasked = pair.b.receive(pair.a.envelope(1.0, made_up), 1.0)
+    assert reasons(unasked) == [DropReason.BAD_PATH_RESPONSE]
+
+    challenge_from(pair, 2.0)
+    answered = pair.b.receive(pair.a.envelope(2.0, made_up), 2.0, ELSEWHERE)
+    assert reasons(answered) == [DropReason.BAD_PATH_RESPONSE]
+    assert pair.b.peer.path == AT_A
+
+
+def test_an_answer_counts_once(pair: Pair) -> None:
+    """After the traffic moved, the same token moves it no more."""
+    answer = only(datagrams(pair.a.receive(challenge_from(pair, 1.0), 1.0)))
+    record = content(pair.b, answer, 1.0)
+    pair.b.receive(pair.a.envelope(1.0, record), 1.0, ELSEWHERE)
+    assert pair.b.peer.path == ELSEWHERE
+
+    again = pair.b.receive(pair.a.envelope(1.0, record), 1.0, ELSEWHERE)
+    assert reasons(again) == [DropReason.BAD_PATH_RESPONSE]
+
+
+def test_questions_are_asked_four_times_a_second_at_most(pair: Pair) -> None:
+    """A new place is asked about at most each quarter second, however much comes from it."""
+    challenge_from(pair, 1.0)
+    for moment, expected in (
+        (1.001, 0),
+        (1.0 + c.CHALLENGE_INTERVAL_S - 0.001, 0),
+        (1.0 + c.CHALLENGE_INTERVAL_S, 1),
+    ):
+        outputs = pair.b.receive(only(datagrams(pair.a.send(moment))), moment, ELSEWHERE)
+        assert len(datagrams(outputs)) == expected
+
+
+def test_answer_to_the_first_question_counts_after_the_second(pair: Pair) -> None:
+    """Over a path slower than the questions come, the answer to any of them moves the traffic."""
+    first = challenge_from(pair, 1.0)
+    challenge_from(pair, 1.5)
+
+    answer = only(datagrams(pair.a.receive(first, 1.9)))
+
+    assert of(pair.b.receive(answer, 1.9, ELSEWHERE), PathChanged)
+
+
+def test_overtaken_envelope_asks_nothing(pair: Pair) -> None:
+    """Only the newest envelope says where a peer is now."""
+    old, new = only(datagrams(pair.a.send(1.0))), only(datagrams(pair.a.send(1.0)))
+    pair.b.receive(new, 1.0)
+
+    assert datagrams(pair.b.receive(old, 1.0, ELSEWHERE)) == []
+
+
+def test_envelope_of_a_previous_session_asks_nothing(pair: Pair) -> None:
+    """What is still under way from before a rekey says nothing about the path now."""
+    assert pair.carries(119.0)
+    old = only(datagrams(pair.a.send(119.0)))
+    pair.establish(c.REKEY_AFTER_S)
+
+    outputs = pair.b.receive(old, 120.0, ELSEWHERE)
+
+    assert payloads(outputs) == [FRAME]
+    assert datagrams(outputs) == []
+
+
+def test_authentic_nonsense_is_counted_and_harmless(pair: Pair) -> None:
+    """A control record that is none is dropped under its reason; the session goes on."""
+    outputs = pair.b.receive(pair.a.envelope(1.0, b"\x09nonsense"), 1.0)
+
+    assert reasons(outputs) == [DropReason.BAD_CONTROL]
+    assert pair.carries(1.0)
+
+
+def test_last_counter_cannot_crash_the_report() -> None:
+    """A captured peer that jumps to the last counter and asks for an echo gets its answer."""
+    pair = Pair(link_a=lively(), link_b=lively()).establish()
+    pair.a.session.send_counter = c.SESSION_ENVELOPE_LIMIT - 1
+    pair.b.receive(pair.a.envelope(1.0), 1.0)
+    pair.a.session.send_counter = c.SESSION_ENVELOPE_LIMIT - 9
+
+    assert datagrams(pair.b.receive(pair.a.envelope(1.0, wire.Echo(False, 1, 0, 0).encode()), 1.0))
+    pair.b.send(1.0)
+    assert datagrams(pair.b.timeout(1.0 + c.ECHO_AFTER_S))

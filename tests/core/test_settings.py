@@ -1,0 +1,38 @@
+"""The defaults of what a configuration may change."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from uavlinkd.core import constants as c
+from uavlinkd.core import wire
+from uavlinkd.core.settings import Link, PeerSettings, Timers
+from uavlinkd.core.suites import X25519
+
+
+def test_timers_default_to_the_constants() -> None:
+    """Each timer that a configuration may change begins with the documented number."""
+    for field in dataclasses.fields(Timers):
+        assert getattr(Timers(), field.name) == getattr(c, field.name.upper())
+
+
+def test_the_default_link_is_within_the_protocol() -> None:
+    """What is asked for by default is authentication by 16-byte tags, over the suite without a group."""
+    link = Link()
+
+    assert link.suites == (X25519,)
+    assert not link.confidential
+    assert link.tag_bytes in wire.TAG_LENGTHS
+    assert link.mac_key_bits in wire.MAC_KEY_LENGTHS
+    assert c.MIN_ENVELOPE_LIMIT <= link.max_envelope <= c.MAX_ENVELOPE_LIMIT
+
+
+def test_settings_are_frozen() -> None:
+    """What the core was told cannot change behind its back."""
+    settings = PeerSettings("bravo", bytes(32))
+
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        settings.link = Link()  # type: ignore[misc]
+    assert settings.psk is None

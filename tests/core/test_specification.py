@@ -1,0 +1,146 @@
+"""The specification against the code: every table of it that states a number or a name."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from uavlinkd.core import constants, wire
+from uavlinkd.core.drops import DropReason
+from uavlinkd.core.suites import SUITES
+
+CORE = Path(constants.__file__).parent
+ROOT = Path(__file__).parents[2]
+TEXT = (CORE / "README.md").read_text()
+
+
+def section(title: str) -> str:
+    """The text under the heading that begins with ``title``."""
+    found = re.search(rf"^(#+) {re.escape(title)}[^\n]*\n(.*?)(?=^#{{1,3}} |\Z)", TEXT, re.MULTILINE | re.DOTALL)
+    assert found, title
+    return found[2]
+
+
+def rows(text: str) -> list[list[str]]:
+    """The cells of every table row, without the rules under the headers."""
+    lines = [line for line in text.splitlines() if line.startswith("|") and not set(line) <= set("|- ")]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+
+
+def number(cell: str) -> float:
+    """``120 s``, ``2^31``, ``1.5 s``."""
+    value = cell.split(maxsplit=1)[0]
+    base, _, power = value.partition("^")
+    return float(int(base) ** int(power)) if power else float(value)
+
+
+DOCUMENTED = {
+    cells[0].strip("`"): number(cells[1])
+    for cells in rows(
+        section("14 Timers")
+        + "".join(section(title) for title in ("Liveness and keys", "Bounds on work and memory", "Shared numbers"))
+    )
+    if re.fullmatch(r"`[A-Z_]+`", cells[0])
+}
+DEFINED = {
+    name: value for name, value in vars(constants).items() if name.isupper() and isinstance(value, int | float)
+}
+
+
+@pytest.mark.parametrize("name", sorted(DEFINED | DOCUMENTED))
+def test_constant_is_the_documented_one(name: str) -> None:
+    """Every number of the protocol stands in the document with its value, and the document names no other."""
+    assert DOCUMENTED.get(name) == DEFINED.get(name)
+
+
+def test_names_in_capitals_are_constants() -> None:
+    """A constant that the text mentions exists."""
+    assert set(re.findall(r"`([A-Z]+(?:_[A-Z]+)+)`", TEXT)) <= set(DEFINED)
+
+
+def test_every_drop_reason_is_documented() -> None:
+    """The table of reasons is the closed list, in its order."""
+    table = rows(section("13 Receipt").split("Every reason:")[1])
+    assert [cells[0].strip("`") for cells in table[1:]] == [str(reason) for reason in DropReason]
+
+
+def test_checks_name_every_reason() -> None:
+    """Each reason has its place among the checks on receipt or on the way out, and a check names no other."""
+    checks, reasons = section("13 Receipt").split("Every reason:")
+    named = set(re.findall(r"`([a-z_]+\d?)`", checks)) - {"mac1", "mac2"}
+    outgoing = {cells[0].strip("`") for cells in rows(reasons) if cells[1].startswith("on the way out")}
+    assert outgoing == {"no_session", "too_large"}
+    assert named | outgoing == {str(reason) for reason in DropReason}
+
+
+def test_sizes_of_every_suite() -> None:
+    """Lengths of shares, ciphertexts and messages are those on the wire, and no response outgrows its initiation."""
+    table = [cells for cells in rows(section("5 Suites")) if cells[0].isdigit()]
+    assert [int(cells[0]) for cells in table] == list(SUITES)
+    for cells in table:
+        suite = SUITES[int(cells[0])]
+        sizes = suite.share_bytes, suite.ciphertext_bytes, wire.initiation_bytes(suite), wire.response_bytes(suite)
+        assert [suite.name, *map(str, sizes)] == [cells[1].strip("`"), cells[2], cells[3], cells[5], cells[6]]
+        assert sizes[3] <= sizes[2]
+
+
+def test_messages_that_cross_an_mtu() -> None:
+    """The table names each message over 1,280 bytes, with what it is over IPv6 and IPv4, and none else crosses."""
+    table = {tuple(cells[0].split()): cells[1:] for cells in rows(section("5 Suites")) if len(cells) == 5}
+    for suite in SUITES.values():
+        for kind, size in ("initiation", wire.initiation_bytes(suite)), ("response", wire.response_bytes(suite)):
+            cells = table.get((f"`{suite.name}`", kind))
+            if cells is None:
+                assert size + 48 <= 1280
+                continue
+            crosses = ["yes" if size + 48 > mtu else "no" for mtu in (1280, 1500)]
+            assert cells == [str(size + 48), str(size + 28), *crosses]
+
+
+def test_sizes_of_envelopes() -> None:
+    """Overheads are those of header and tag, for each form and tag length."""
+    table = {cells[0]: cells[1:] for cells in rows(section("11 Envelopes"))}
+    tags = [int(cell.removeprefix("tag ")) for cell in table["overhead in bytes"]]
+    assert tuple(tags) == wire.TAG_LENGTHS
+    assert table["short form"] == [str(wire.SHORT_HEADER_BYTES + tag) for tag in tags]
+    assert table["long form"] == [str(wire.LONG_HEADER_BYTES + tag) for tag in tags]
+
+
+def test_types_and_sizes_of_records() -> None:
+    """Each control record has the number and length that the document draws."""
+    drawn = re.findall(r"^    (\d) ([a-z ]+?)  +type.*?(\d+) bytes?$", section("12 Control"), re.MULTILINE)
+    records: dict[str, wire.Control] = {
+        "echo request": wire.Echo(False, 1, 2, 3),
+        "echo reply": wire.Echo(True, 1, 2, 3),
+        "path challenge": wire.PathChallenge(bytes(8)),
+        "path response": wire.PathResponse(bytes(8)),
+        "close": wire.Close(),
+    }
+    encoded = {name: record.encode() for name, record in records.items()}
+    assert [(name, int(kind), int(size)) for kind, name, size in drawn] == [
+        (name, data[0], len(data)) for name, data in encoded.items()
+    ]
+
+
+def test_odds_of_a_forgery() -> None:
+    """The table of forgeries is arithmetic: tries in a year by the chance of each."""
+    year_s = 365.25 * 86400
+    table = [cells for cells in rows(section("16 Limits")) if cells[0].isdigit()]
+    assert [int(cells[0]) for cells in table] == list(wire.TAG_LENGTHS)
+    for cells in table:
+        tags = 2.0 ** (8 * int(cells[0]))
+        expected = 1e3 * year_s / tags, 1e6 * year_s / tags, tags / 1e6 / year_s
+        assert [float(cell) for cell in cells[1:]] == [pytest.approx(value, rel=0.05) for value in expected]
+
+
+def test_links_lead_somewhere() -> None:
+    """Every link within the document has its heading, every file it names is there."""
+    headings = {
+        re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
+        for heading in re.findall(r"^#+ (.*)$", TEXT, re.MULTILINE)
+    }
+    assert set(re.findall(r"\]\(#([^)]*)\)", TEXT)) <= headings
+    for name in re.findall(r"`(tests/[^`]*)`", TEXT):
+        assert (ROOT / name).exists(), name

@@ -1,0 +1,126 @@
+"""The numbers of the protocol: first those that both ends must share, then our own.
+
+Durations are seconds on a monotonic clock. Timers that a configuration may change are in
+:class:`uavlinkd.core.settings.Timers`; their defaults are here.
+"""
+
+from __future__ import annotations
+
+# Specification constants. Changing one makes another protocol.
+
+PROTOCOL_NAME = b"uavlink/1"
+"""First part of the prologue and of every key label; the suite byte follows in the prologue."""
+
+KEY_BYTES = 32
+"""An X25519 key, a PSK, a ChaCha20-Poly1305 key, a SHA-256 hash."""
+AEAD_TAG_BYTES = 16
+"""Poly1305 (RFC 8439, section 2.5)."""
+MAC_BYTES = 16
+"""mac1, mac2 and a cookie."""
+COOKIE_NONCE_BYTES = 16
+PATH_TOKEN_BYTES = 8
+
+SESSION_ENVELOPE_LIMIT = 2**32
+"""Envelopes that one session's keys may seal, each way: the counter is 32 bits and never wraps."""
+SHORT_COUNTER_LIMIT = 2**16
+"""Counters below this travel in two bytes, others in four; either in the other's form is refused."""
+LATE_AFTER_S = 2.0
+"""What was sent longer ago than this is late: refused where that can be told, asked about where it cannot. Both ends
+must mean the same by it. Far above any radio's reordering; a command that old is no longer what its sender wants."""
+
+# Implementation constants. Ours; changing one does not change the wire.
+
+REKEY_AFTER_ENVELOPES = 2**31
+"""Half of what a session may carry: the other half is room for a handshake that has to be retried."""
+REKEY_AFTER_S = 120.0
+"""Age at which new keys are made (WireGuard's REKEY_AFTER_TIME)."""
+REJECT_AFTER_S = 180.0
+"""Age at which a session's keys are dropped (WireGuard's REJECT_AFTER_TIME): a minute of retries fits in between."""
+RESPONDER_REKEY_SHARE = 0.25
+"""The responder of a session waits this share of (reject - rekey) longer than its initiator, so that
+in the ordinary case one side rekeys, not both."""
+
+RETRY_MIN_S = 0.25
+"""First wait for a response. ArduPilot's ground-station failsafe trips after 5 s: several tries must fit."""
+RETRIES_PER_WAIT = 12
+"""So many tries before the wait doubles. A try over a link that loses 30 % each way fails in 51 % of cases: with ten
+tries in the first 3 s all of them fail once in 800 links, with two dozen in the first 10 s once in ten million."""
+RETRY_MAX_S = 1.5
+"""Longest wait between tries, for ever. With the jitter it stays under 2 s, so a link that comes back after
+any outage carries frames within that; a try each 1.5 s costs a dead link about 1 kbit/s with x25519."""
+RETRY_JITTER = 0.25
+"""Each wait is longer by up to this share, so that two ends do not stay in step."""
+KEEPALIVE_S = 10.0
+"""Silence after which an empty envelope keeps a NAT's mapping alive."""
+ECHO_AFTER_S = 0.5
+"""Sent, and heard nothing for this long: ask for an echo."""
+HANDSHAKE_AFTER_S = 1.0
+"""Sent, and heard nothing for this long: the other end may have restarted, so initiate too."""
+LOST_AFTER_S = 3.0
+"""Sent, and heard nothing for this long: the peer is lost. Inside every autopilot's failsafe."""
+PROBE_INTERVAL_S = 5.0
+"""How often a link in use measures its round trip and reports its losses."""
+CLOSE_HOLDOFF_S = 1.0
+"""After a peer said goodbye it is not called for this long: its daemon is stopping."""
+
+UNCONFIRMED_PER_PEER = 16
+"""Sessions that answer an initiation and wait for their first envelope."""
+UNCONFIRMED_LIFETIME_S = 10.0
+"""How long they wait: several retries of the initiator, on a slow path."""
+PENDING_LIFETIME_S = 10.0
+"""How long an own initiation may be answered."""
+ANSWERS_PER_S = 4.0
+"""Responses a second to one peer without a cookie. With 16 places, an honest handshake has two seconds at least to
+confirm before replayed initiations could push it out."""
+ANSWERS_BURST = 8
+PENDING_PER_PEER = 8
+"""Own initiations that may still be answered, so a slow path's response finds its initiation."""
+USABLE_PER_PEER = 3
+"""Current session and those kept for receiving: two that came up at once, and the one before them."""
+COOKIED_ANSWERS_PER_S = 20
+"""Responses a second to one peer with cookies, from all addresses: so it cannot use up the session indices."""
+REMEMBERED_INITIATIONS = 4096
+"""Ephemerals of a peer's authentic initiations: an exact replay costs a look-up, no key exchange."""
+INITIATIONS_PER_S = 50.0
+"""Messages a second that may reach a key exchange without a cookie. Beyond that we are under load."""
+INITIATIONS_BURST = 50
+COOKIED_PER_SOURCE_PER_S = 10.0
+"""Under load: initiations a second from one source that holds a cookie."""
+COOKIED_PER_SOURCE_BURST = 10
+COOKIED_PER_S = 200
+"""The same from all sources together: whoever owns many addresses still costs a bounded share of a core."""
+SOURCES_TRACKED = 1024
+"""Sources whose rate is remembered under load; the longest silent one is forgotten first."""
+COOKIE_SECRET_LIFETIME_S = 120.0
+"""The secret behind cookies changes this often; the one before it is honoured as long again."""
+COOKIE_HELD_S = 120.0
+"""How long a received cookie is used."""
+HINTS_INTERVAL_S = 1.0
+"""An unknown index from a peer's address makes us initiate at most this often."""
+INDEX_QUARANTINE_S = 600.0
+"""An index that carried a session is not used again for this long: a late envelope is late, not forged."""
+CHALLENGE_INTERVAL_S = 0.25
+"""A new path is challenged at most this often."""
+CHALLENGE_LIFETIME_S = 5.0
+"""How long a path challenge may be answered."""
+LATE_STEP_S = 0.25
+"""Counters of the past are remembered in such steps: what is late is so by up to two of them more."""
+DOUBT_S = 1.0
+"""How long frames that came after a silence wait for the peer's word on their age, and how old that word may be."""
+DOUBT_ASK_S = 0.25
+"""How often the peer is asked meanwhile: as often as for a handshake."""
+HELD_BYTES = 65536
+"""Of frames that wait so, on one session: the largest envelope fits; a second of a fast link does too."""
+HELD_OVERHEAD_BYTES = 64
+"""Counted with each of them, so that many small ones are bounded too."""
+ECHOES_REMEMBERED = 8
+"""Own echo requests on a session that may still be answered: more than one doubt asks."""
+
+REPLAY_WINDOW = 2048
+"""Envelopes that may overtake one another: four seconds of PX4's busiest mode, one frame each."""
+MIN_ENVELOPE_LIMIT = 320
+"""Smallest limit on an envelope: the largest MAVLink frame is 280 bytes, header and tag at most 39."""
+MAX_ENVELOPE_LIMIT = 65000
+"""Largest limit on an envelope: under what a UDP datagram over IPv4 holds (65,507)."""
+DEFAULT_ENVELOPE_LIMIT = 1232
+"""1,280 (least MTU of IPv6, RFC 8200 section 5) less 40 and 8 bytes of IPv6 and UDP header."""

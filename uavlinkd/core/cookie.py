@@ -1,0 +1,105 @@
+"""mac1, mac2 and cookies: what must be right before a handshake message costs a key exchange.
+
+WireGuard's design (whitepaper, section 5.4.7) with HMAC-SHA256, and without XChaCha20, which OpenSSL lacks:
+the cookie is sealed with ChaCha20-Poly1305 under a key made of the responder's public key and a fresh nonce.
+"""
+
+from __future__ import annotations
+
+from uavlinkd.core import constants as c
+from uavlinkd.core import wire
+from uavlinkd.core.crypto import AeadKey, Entropy, equal, hmac_sha256, sha256
+from uavlinkd.core.drops import Drop, DropReason
+from uavlinkd.core.outputs import Path
+
+_NO_COOKIE = bytes(c.MAC_BYTES)
+
+
+class MacKeys:
+    """The keys that follow from one static public key: anyone who knows it can make mac1 and open cookies."""
+
+    __slots__ = ("_cookie", "_mac1")
+
+    def __init__(self, public_key: bytes) -> None:
+        self._mac1 = sha256(c.PROTOCOL_NAME + b" mac1" + public_key)
+        self._cookie = sha256(c.PROTOCOL_NAME + b" cookie" + public_key)
+
+    def add_macs(self, message: bytes, cookie: bytes | None) -> bytes:
+        """The message with mac1 and mac2 behind it; mac2 is zero without a cookie."""
+        message += hmac_sha256(self._mac1, message)[: c.MAC_BYTES]
+        if cookie is None:
+            return message + _NO_COOKIE
+        return message + hmac_sha256(cookie, message)[: c.MAC_BYTES]
+
+    def check_mac1(self, datagram: bytes) -> None:
+        """Raise unless the sender knew our public key and nothing was altered since.
+
+        Raises:
+            Drop: ``BAD_MAC1``.
+        """
+        covered = datagram[: -wire.MACS_BYTES]
+        if not equal(hmac_sha256(self._mac1, covered)[: c.MAC_BYTES], mac1_of(datagram)):
+            raise Drop(DropReason.BAD_MAC1)
+
+    def seal_cookie(self, cookie: bytes, nonce: bytes, mac1: bytes) -> bytes:
+        """The cookie for the sender of the message that carried ``mac1``."""
+        return AeadKey(hmac_sha256(self._cookie, nonce)).seal(0, cookie, mac1)
+
+    def open_cookie(self, reply: wire.CookieReply, mac1: bytes) -> bytes:
+        """The cookie in a reply to our message that carried ``mac1``.
+
+        Raises:
+            Drop: ``BAD_COOKIE``.
+        """
+        cookie = AeadKey(hmac_sha256(self._cookie, reply.nonce)).open(0, reply.sealed, mac1)
+        if cookie is None:
+            raise Drop(DropReason.BAD_COOKIE)
+        return cookie
+
+
+def mac1_of(datagram: bytes) -> bytes:
+    """The mac1 that a handshake message carries."""
+    return datagram[-wire.MACS_BYTES : -c.MAC_BYTES]
+
+
+class CookieJar:
+    """Cookies for whoever sends to us: an HMAC of the source address, so nothing is remembered about anyone."""
+
+    def __init__(self, keys: MacKeys, entropy: Entropy, now: float) -> None:
+        self._keys = keys
+        self._entropy = entropy
+        self._secret = self._previous = entropy(c.KEY_BYTES)
+        self._changed_at = now
+
+    def has_valid_mac2(self, datagram: bytes, path: Path, now: float) -> bool:
+        """Whether mac2 was made with a cookie that we gave to this source, at most four minutes ago."""
+        self._change_secret(now)
+        covered, mac2 = datagram[: -c.MAC_BYTES], datagram[-c.MAC_BYTES :]
+        # Both are computed always: which secret fits is nobody's business.
+        fits = [
+            equal(hmac_sha256(_cookie(secret, path), covered)[: c.MAC_BYTES], mac2)
+            for secret in (self._secret, self._previous)
+        ]
+        return any(fits)
+
+    def reply(self, datagram: bytes, sender_index: int, path: Path, now: float) -> bytes:
+        """A cookie reply to the handshake message in ``datagram``; shorter than any of them."""
+        self._change_secret(now)
+        nonce = self._entropy(c.COOKIE_NONCE_BYTES)
+        sealed = self._keys.seal_cookie(_cookie(self._secret, path), nonce, mac1_of(datagram))
+        return wire.encode_cookie_reply(sender_index, nonce, sealed)
+
+    def _change_secret(self, now: float) -> None:
+        age = now - self._changed_at
+        if age < c.COOKIE_SECRET_LIFETIME_S:
+            return
+        fresh = self._entropy(c.KEY_BYTES)
+        # After a long silence the secret before this one is too old as well.
+        self._previous = self._secret if age < 2 * c.COOKIE_SECRET_LIFETIME_S else fresh
+        # When it was due, not now: a secret that nobody asked for lately would be honoured for longer.
+        self._secret, self._changed_at = fresh, now - age % c.COOKIE_SECRET_LIFETIME_S
+
+
+def _cookie(secret: bytes, path: Path) -> bytes:
+    _, host, port = path
+    return hmac_sha256(secret, f"{host} {port}".encode())[: c.MAC_BYTES]

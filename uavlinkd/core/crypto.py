@@ -1,0 +1,218 @@
+"""Primitives, typed: the only module that imports ``cryptography``. All of them are OpenSSL's underneath.
+
+A secret here does not print. What does not authenticate raises :class:`Drop` with its reason.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import warnings
+from typing import Protocol
+
+from cryptography.exceptions import InvalidTag
+from cryptography.hazmat.primitives.asymmetric import dh, mlkem
+from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X25519PublicKey
+from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
+from cryptography.hazmat.primitives.hashes import SHA256
+from cryptography.hazmat.primitives.hmac import HMAC
+
+from uavlinkd.core.constants import KEY_BYTES
+from uavlinkd.core.drops import Drop, DropReason
+
+Bytes = bytes | bytearray | memoryview
+
+
+class Entropy(Protocol):
+    """Where randomness comes from: ``os.urandom`` in the daemon, a seeded generator in a simulation."""
+
+    def __call__(self, size: int, /) -> bytes:
+        """``size`` unpredictable bytes."""
+
+
+class Secret:
+    """Bytes that print as nothing and compare in constant time."""
+
+    __slots__ = ("_value",)
+
+    def __init__(self, value: bytes) -> None:
+        self._value = value
+
+    def reveal(self) -> bytes:
+        """The bytes. Call it where they are used, and keep no copy."""
+        return self._value
+
+    def __repr__(self) -> str:
+        return "Secret(<redacted>)"
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Secret) and equal(self._value, other._value)
+
+    def __hash__(self) -> int:
+        return 0  # the same for all: a hash of the value would tell of it
+
+    def __reduce__(self) -> str:
+        raise TypeError("a secret is not pickled")
+
+
+def equal(a: Bytes, b: Bytes) -> bool:
+    """Whether two byte strings are the same, in time that tells nothing of where they differ."""
+    return hmac.compare_digest(a, b)
+
+
+def sha256(data: bytes) -> bytes:
+    """SHA-256 (FIPS 180-4)."""
+    return hashlib.sha256(data).digest()
+
+
+def hmac_sha256(key: bytes, data: bytes) -> bytes:
+    """HMAC-SHA256 (RFC 2104)."""
+    return hmac.digest(key, data, "sha256")
+
+
+def hkdf_expand(key: bytes, info: bytes, length: int) -> bytes:
+    """HKDF-Expand with SHA-256 (RFC 5869, section 2.3); ``length`` up to 8,160 bytes."""
+    output, block, counter = b"", b"", 1
+    while len(output) < length:
+        block = hmac_sha256(key, block + info + bytes((counter,)))
+        output += block
+        counter += 1
+    return output[:length]
+
+
+class MacKey:
+    """HMAC-SHA256 with its two inner states prepared once, so that a tag costs no key schedule."""
+
+    __slots__ = ("_prepared",)
+
+    def __init__(self, key: bytes) -> None:
+        self._prepared = HMAC(key, SHA256())
+
+    def __repr__(self) -> str:
+        return "MacKey(<redacted>)"
+
+    def tag(self, data: Bytes) -> bytes:
+        """The 32-byte tag over ``data``."""
+        mac = self._prepared.copy()
+        mac.update(data)
+        return mac.finalize()
+
+
+class AeadKey:
+    """ChaCha20-Poly1305 (RFC 8439). A nonce is a counter: never the same twice under one key."""
+
+    __slots__ = ("_cipher",)
+
+    def __init__(self, key: bytes) -> None:
+        self._cipher = ChaCha20Poly1305(key)
+
+    def __repr__(self) -> str:
+        return "AeadKey(<redacted>)"
+
+    def seal(self, counter: int, plaintext: Bytes, associated: bytes) -> bytes:
+        """Ciphertext and 16-byte tag. The nonce is 4 zero bytes and the counter, little-endian, as Noise's."""
+        return self._cipher.encrypt(_nonce(counter), plaintext, associated)
+
+    def open(self, counter: int, ciphertext: Bytes, associated: bytes) -> bytes | None:
+        """The plaintext, or None where the tag does not verify."""
+        try:
+            return self._cipher.decrypt(_nonce(counter), ciphertext, associated)
+        except InvalidTag:
+            return None
+
+
+def _nonce(counter: int) -> bytes:
+    return b"\0\0\0\0" + counter.to_bytes(8, "little")
+
+
+class KeyPair:
+    """An X25519 key pair (RFC 7748), static or ephemeral."""
+
+    __slots__ = ("_private", "public")
+
+    def __init__(self, private: bytes) -> None:
+        if len(private) != KEY_BYTES:
+            raise ValueError(f"an X25519 private key has {KEY_BYTES} bytes, not {len(private)}")
+        self._private = X25519PrivateKey.from_private_bytes(private)
+        self.public = self._private.public_key().public_bytes_raw()
+        """The public key, 32 bytes."""
+
+    def __repr__(self) -> str:
+        return "KeyPair(<redacted>)"
+
+    def exchange(self, public: bytes) -> bytes:
+        """The shared secret with the holder of ``public``.
+
+        Raises:
+            Drop: ``INVALID_KEY_SHARE`` for a point of low order, whose secret anybody knows (RFC 7748, section 6.1).
+        """
+        try:
+            return self._private.exchange(X25519PublicKey.from_public_bytes(public))
+        except ValueError:
+            raise Drop(DropReason.INVALID_KEY_SHARE) from None
+
+
+def x25519_public_key(private: bytes) -> bytes:
+    """The public key of a 32-byte private key."""
+    return KeyPair(private).public
+
+
+def is_usable_public_key(public: bytes) -> bool:
+    """Whether ``public`` has 32 bytes and is no point of low order."""
+    if len(public) != KEY_BYTES:
+        return False
+    try:
+        KeyPair(bytes(range(KEY_BYTES))).exchange(public)  # any private key tells: the result is zero for all
+    except Drop:
+        return False
+    return True
+
+
+def ffdhe_power(prime: int, base: int, exponent: bytes) -> bytes:
+    """``base ** exponent mod prime`` in constant time, big-endian, as long as the modulus.
+
+    ``prime`` is a safe prime of RFC 7919 and ``base`` is in 2 … prime-2. The exponent is big-endian.
+    Built on OpenSSL's DH exchange, which is modular exponentiation: the generator is 2, so a public
+    value is the "shared secret" with 2.
+    """
+    with warnings.catch_warnings():
+        # cryptography 50 announces that FFDH goes away some day; pyproject.toml bounds the version.
+        warnings.filterwarnings("ignore", message="Diffie-Hellman over finite fields")
+        numbers = dh.DHParameterNumbers(prime, 2)
+        any_public = dh.DHPublicNumbers(2, numbers)
+        private = dh.DHPrivateNumbers(int.from_bytes(exponent, "big"), any_public).private_key()
+        power = private.exchange(dh.DHPublicNumbers(base, numbers).public_key())
+    return power.rjust((prime.bit_length() + 7) // 8, b"\0")
+
+
+class MlkemPrivateKey(Protocol):
+    """What ML-KEM-768 and ML-KEM-1024 private keys share."""
+
+    def decapsulate(self, ciphertext: bytes) -> bytes:
+        """The shared secret; a wrong ciphertext gives a secret that nobody else has (FIPS 203)."""
+
+
+def mlkem_generate(bits: int, seed: bytes) -> tuple[MlkemPrivateKey, bytes]:
+    """Private key and encapsulation key of ML-KEM-``bits`` from a 64-byte seed d || z (FIPS 203, section 7.1)."""
+    if bits == 768:
+        small = mlkem.MLKEM768PrivateKey.from_seed_bytes(seed)
+        return small, small.public_key().public_bytes_raw()
+    large = mlkem.MLKEM1024PrivateKey.from_seed_bytes(seed)
+    return large, large.public_key().public_bytes_raw()
+
+
+def mlkem_encapsulate(bits: int, public: bytes) -> tuple[bytes, bytes]:
+    """Ciphertext and shared secret for the holder of ``public``.
+
+    The one place where the core does not take its randomness as an argument: FIPS 203 draws it inside,
+    and OpenSSL's generator does that here.
+
+    Raises:
+        Drop: ``INVALID_KEY_SHARE`` where the encapsulation key fails FIPS 203's checks (section 7.2).
+    """
+    kind = mlkem.MLKEM768PublicKey if bits == 768 else mlkem.MLKEM1024PublicKey
+    try:
+        secret, ciphertext = kind.from_public_bytes(public).encapsulate()
+    except ValueError:
+        raise Drop(DropReason.INVALID_KEY_SHARE) from None
+    return ciphertext, secret

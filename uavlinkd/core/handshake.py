@@ -1,0 +1,124 @@
+"""The two handshake messages: the Noise messages, the headers in front of them and what is sealed inside.
+
+Functions without state: each takes what it needs and returns what follows. Who may do this when, and what it
+changes, is ``node.py`` and ``peer.py``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from uavlinkd.core import noise, wire
+from uavlinkd.core.crypto import Entropy, KeyPair, Secret
+from uavlinkd.core.drops import Drop, DropReason
+from uavlinkd.core.noise import HandshakeState, Pattern
+from uavlinkd.core.settings import Link, PeerSettings
+from uavlinkd.core.suites import Suite
+from uavlinkd.core.wire import Parameters
+
+
+class Initiated(NamedTuple):
+    """The initiator's side after message 1."""
+
+    state: HandshakeState
+    parameters: Parameters
+    message: bytes  # without macs
+
+
+class Received(NamedTuple):
+    """The responder's side after a sound message 1. ``public_key`` is authenticated, its meaning not yet checked."""
+
+    state: HandshakeState
+    parameters: Parameters
+    public_key: bytes
+    initiation: wire.Initiation
+
+
+@dataclass(frozen=True, slots=True)
+class Keys:
+    """What a finished handshake gives to each side."""
+
+    transport: tuple[Secret, Secret]
+    handshake_hash: bytes
+    parameters: Parameters
+    remote_index: int
+
+
+def pattern_of(suite: Suite) -> Pattern:
+    """The Noise pattern of a suite."""
+    return noise.IK_HFS_PSK2 if suite.has_group else noise.IK_PSK2
+
+
+def parameters_of(link: Link, generation: int) -> Parameters:
+    """What this side asks of a session."""
+    return Parameters(generation, link.confidential, link.tag_bytes, link.mac_key_bits, link.max_envelope)
+
+
+def initiate(identity: KeyPair, peer: PeerSettings, index: int, generation: int, entropy: Entropy) -> Initiated:
+    """Message 1 to ``peer``: always the first suite of its list, whatever was lost or refused before."""
+    suite = peer.link.suites[0]
+    state = noise.initiator(
+        pattern_of(suite), suite, wire.prologue(suite), identity, peer.public_key, peer.psk or noise.NO_PSK
+    )
+    parameters = parameters_of(peer.link, generation)
+    header = wire.initiation_header(suite, index)
+    state, message = state.write(state.pattern.initiation, header[1:] + parameters.encode(), entropy)
+    return Initiated(state, parameters, header + message)
+
+
+def receive_initiation(identity: KeyPair, initiation: wire.Initiation) -> Received:
+    """Read message 1.
+
+    Raises:
+        Drop: ``BAD_HANDSHAKE``, ``INVALID_KEY_SHARE``, ``HEADER_MISMATCH`` or ``BAD_PARAMETERS``.
+    """
+    suite = initiation.suite
+    state = noise.responder(pattern_of(suite), suite, wire.prologue(suite), identity)
+    state, payload = state.read(state.pattern.initiation, initiation.noise)
+    parameters = _open_payload(payload, initiation.header)
+    return Received(state, parameters, state.rs, initiation)
+
+
+def respond(
+    received: Received, peer: PeerSettings, index: int, generation: int, entropy: Entropy
+) -> tuple[bytes, Keys]:
+    """Message 2 without macs, and the session's keys: the initiator has them too once it has read it.
+
+    Raises:
+        Drop: ``INVALID_KEY_SHARE``.
+    """
+    initiation = received.initiation
+    header = wire.response_header(initiation.suite, index, initiation.sender_index)
+    ours = parameters_of(peer.link, generation)
+    state = received.state.with_psk(peer.psk or noise.NO_PSK)
+    state, message = state.write(state.pattern.response, header[1:] + ours.encode(), entropy)
+    return header + message, _keys(state, ours.stronger(received.parameters), initiation.sender_index)
+
+
+def receive_response(initiated: Initiated, response: wire.Response) -> Keys:
+    """Read message 2.
+
+    Raises:
+        Drop: ``BAD_HANDSHAKE``, ``INVALID_KEY_SHARE``, ``HEADER_MISMATCH`` or ``BAD_PARAMETERS``.
+    """
+    if response.suite != initiated.state.suite:
+        raise Drop(DropReason.HEADER_MISMATCH)
+    state, payload = initiated.state.read(initiated.state.pattern.response, response.noise)
+    theirs = _open_payload(payload, response.header)
+    return _keys(state, initiated.parameters.stronger(theirs), response.sender_index)
+
+
+def _open_payload(payload: bytes, header: bytes) -> Parameters:
+    """The sender's parameters; the header in clear must be the one that it sealed in front of them.
+
+    Without this an altered index would leave two ends that agree on keys and never hear each other.
+    """
+    repeated, parameters = payload[: len(header) - 1], payload[len(header) - 1 :]
+    if repeated != header[1:]:
+        raise Drop(DropReason.HEADER_MISMATCH)
+    return wire.parse_parameters(parameters)
+
+
+def _keys(state: HandshakeState, parameters: Parameters, remote_index: int) -> Keys:
+    return Keys(state.symmetric.split(), state.symmetric.h, parameters, remote_index)

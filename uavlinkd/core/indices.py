@@ -1,0 +1,57 @@
+"""Session indices: 16-bit handles under which the peers address our sessions and pending initiations."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from uavlinkd.core.constants import INDEX_QUARANTINE_S
+from uavlinkd.core.crypto import Entropy
+from uavlinkd.core.drops import Drop, DropReason
+
+if TYPE_CHECKING:
+    from uavlinkd.core.caller import Pending
+    from uavlinkd.core.session import Session
+
+_DRAWS = 64  # with half of all indices taken, all draws fail once in 2^64
+
+
+class Indices:
+    """Who owns an index; unpredictable ones for newcomers; a quarantine for those that carried a session."""
+
+    def __init__(self, entropy: Entropy) -> None:
+        self._entropy = entropy
+        self._quarantine: dict[int, float] = {}  # free again at; a dict keeps order, so the oldest is first
+        self.owners: dict[int, Pending | Session] = {}
+
+    def pick(self, now: float) -> int:
+        """An index that nobody owns: 1 to 65535. It stays free until it is put into :attr:`owners`.
+
+        Raises:
+            Drop: ``NO_FREE_INDEX``.
+        """
+        self._release(now)
+        for _ in range(_DRAWS):
+            index = int.from_bytes(self._entropy(2), "big")
+            if index and index not in self.owners and index not in self._quarantine:
+                return index
+        raise Drop(DropReason.NO_FREE_INDEX)
+
+    def retire(self, index: int, now: float) -> None:
+        """The session at ``index`` has ended; what still arrives for it is late."""
+        self.owners.pop(index, None)
+        self._quarantine[index] = now + INDEX_QUARANTINE_S
+
+    def forget(self, index: int) -> None:
+        """Free an index that never carried a session."""
+        self.owners.pop(index, None)
+
+    def is_quarantined(self, index: int, now: float) -> bool:
+        """Whether a session ended at ``index`` lately."""
+        return self._quarantine.get(index, now) > now
+
+    def _release(self, now: float) -> None:
+        while self._quarantine:
+            oldest = next(iter(self._quarantine))
+            if self._quarantine[oldest] > now:
+                return
+            del self._quarantine[oldest]

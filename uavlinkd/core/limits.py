@@ -1,0 +1,54 @@
+"""Bounds on what others can make us do: a token bucket, and one bucket per source in bounded memory."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable
+
+
+class TokenBucket:
+    """At most ``rate`` events a second on average, ``burst`` at once. Starts full."""
+
+    __slots__ = ("_at", "_burst", "_rate", "_tokens")
+
+    def __init__(self, rate: float, burst: float, now: float) -> None:
+        self._rate = rate
+        self._burst = burst
+        self._tokens = burst
+        self._at = now
+
+    def take(self, now: float) -> bool:
+        """Take one token; False when there is none."""
+        self._tokens = min(self._burst, self._tokens + (now - self._at) * self._rate)
+        self._at = now
+        if self._tokens < 1.0:
+            return False
+        self._tokens -= 1.0
+        return True
+
+
+def source_of(host: str) -> str:
+    """Whom a numeric host stands for: itself, or its /64 in IPv6, of which a single machine has every address."""
+    if ":" not in host:
+        return host
+    head, gap, _ = host.partition("%")[0].partition("::")
+    groups = [group for group in head.split(":") if group][:4]
+    # Where the gap begins within the first four groups, zeros follow that are written nowhere.
+    return ":".join([*groups, *("0" for _ in range(4 - len(groups)) if gap)]) + "::/64"
+
+
+class SourceLimiter:
+    """A token bucket per source, for the ``capacity`` sources heard last."""
+
+    def __init__(self, rate: float, burst: float, capacity: int) -> None:
+        self._rate = rate
+        self._burst = burst
+        self._capacity = capacity
+        self._buckets: dict[Hashable, TokenBucket] = {}
+
+    def take(self, source: Hashable, now: float) -> bool:
+        """Take one token of this source; False when it has none."""
+        bucket = self._buckets.pop(source, None) or TokenBucket(self._rate, self._burst, now)
+        self._buckets[source] = bucket  # a dict keeps order: the longest silent source comes first
+        if len(self._buckets) > self._capacity:
+            del self._buckets[next(iter(self._buckets))]
+        return bucket.take(now)

@@ -1,0 +1,313 @@
+"""The protocol of one daemon: every peer, and the dispatch of what arrives at its socket.
+
+Three inputs: a datagram, frames to send, the passing of time. Each call returns what the shell has to do, in
+order. ``now`` is monotonic seconds and never goes back. Nothing here raises for anything that a peer or a stranger
+sends; any exception is a fault of ours.
+"""
+
+from __future__ import annotations
+
+from base64 import b64encode
+from collections import Counter
+from collections.abc import Iterable, Sequence
+
+from uavlinkd.core import constants as c
+from uavlinkd.core import handshake, wire
+from uavlinkd.core.caller import Pending
+from uavlinkd.core.cookie import CookieJar, MacKeys
+from uavlinkd.core.crypto import Entropy, KeyPair, Secret
+from uavlinkd.core.drops import Drop, DropReason
+from uavlinkd.core.indices import Indices
+from uavlinkd.core.limits import SourceLimiter, TokenBucket, source_of
+from uavlinkd.core.outputs import Dropped, Output, Path, Transmit
+from uavlinkd.core.peer import NEVER, Peer
+from uavlinkd.core.session import Session
+from uavlinkd.core.settings import PeerSettings
+
+_MAVLINK_STARTS = frozenset((0xFD, 0xFE))
+
+
+class Node:
+    """All peers of one identity.
+
+    Args:
+        private_key: the static X25519 key of this daemon.
+        entropy: gives unpredictable bytes.
+        now: monotonic seconds.
+        previous_private_key: the one before, while it is being changed: peers can be added that know us by it.
+    """
+
+    def __init__(
+        self, private_key: Secret, entropy: Entropy, now: float, previous_private_key: Secret | None = None
+    ) -> None:
+        self._identity = KeyPair(private_key.reveal())
+        self._entropy = entropy
+        self._mac_keys = MacKeys(self._identity.public)
+        self._cookies = CookieJar(self._mac_keys, entropy, now)
+        self._previous = None if previous_private_key is None else _Previous(previous_private_key, entropy, now)
+        self._indices = Indices(entropy)
+        self._by_keys: dict[tuple[bytes, bytes], Peer] = {}  # ours, theirs
+        self._by_address: dict[tuple[str, int], Peer] = {}
+        self._remembered: set[bytes] = set()  # ephemerals of authentic initiations, of every peer
+        # Two budgets: a flood of initiations must not keep our own handshakes from finishing.
+        self._initiations = TokenBucket(c.INITIATIONS_PER_S, c.INITIATIONS_BURST, now)
+        self._responses = TokenBucket(c.INITIATIONS_PER_S, c.INITIATIONS_BURST, now)
+        self._cookied = TokenBucket(c.COOKIED_PER_S, c.COOKIED_PER_S, now)
+        self._sources = SourceLimiter(c.COOKIED_PER_SOURCE_PER_S, c.COOKIED_PER_SOURCE_BURST, c.SOURCES_TRACKED)
+        self._deadline = NEVER
+        self.peers: dict[str, Peer] = {}
+        """By name."""
+        self.drops: Counter[DropReason] = Counter()
+        """Datagrams that no peer can be held to; what names a peer is counted there."""
+
+    @property
+    def public_key(self) -> bytes:
+        """This daemon's identity."""
+        return self._identity.public
+
+    # Peers.
+
+    def add_peer(self, settings: PeerSettings, now: float, *, by_previous_key: bool = False) -> None:
+        """Accept this peer from now on. Without an address it has to call.
+
+        ``by_previous_key``: as one that knows us by our previous key. While keys change nobody can tell who has
+        which, so a peer is added once for each pair of keys that may be right, by different names.
+
+        Raises:
+            ValueError: for a name or pair of keys that is there already, a key of ours, or one that we do not have.
+        """
+        own = [self._identity, *([self._previous.identity] if self._previous else [])]
+        identity = own[by_previous_key] if by_previous_key < len(own) else None
+        if identity is None:
+            raise ValueError(f"peer {settings.name} cannot know a previous key: there is none")
+        keys = identity.public, settings.public_key
+        if settings.name in self.peers or keys in self._by_keys:
+            raise ValueError(f"peer {settings.name} is there already")
+        if settings.public_key in [each.public for each in own]:
+            raise ValueError(f"peer {settings.name} has this daemon's own key")
+        peer = Peer(settings, identity, self._indices, self._entropy, now)
+        self.peers[settings.name] = self._by_keys[keys] = peer
+        self._deadline = min(self._deadline, now)
+
+    def remove_peer(self, name: str, now: float) -> list[Output]:
+        """Cut this peer off at once: its keys are forgotten, nothing of it is accepted any more."""
+        out: list[Output] = []
+        peer = self.peers.pop(name)
+        self._by_keys = {keys: each for keys, each in self._by_keys.items() if each is not peer}
+        self._by_address = {at: each for at, each in self._by_address.items() if each is not peer}
+        self._remembered.difference_update(peer.remembered)
+        peer.close(now, out)
+        return out
+
+    def set_addresses(self, name: str, addresses: Iterable[Path], now: float) -> None:
+        """Where to call this peer, the likeliest first. An authenticated path goes on being used."""
+        peer = self.peers[name]
+        peer.caller.addresses = tuple(addresses)
+        peer.deadline = min(peer.deadline, now)
+        self._deadline = min(self._deadline, now)
+        self._by_address = {at: each for at, each in self._by_address.items() if each is not peer}
+        for _, host, port in peer.caller.addresses:
+            self._by_address[host, port] = peer
+
+    # Inputs.
+
+    def send(self, peer_name: str, frames: Sequence[bytes], now: float) -> list[Output]:
+        """Send frames that are here together to a peer, in as few envelopes as hold them."""
+        peer = self.peers[peer_name]
+        out: list[Output] = []
+        peer.send(frames, now, out)
+        self._deadline = min(self._deadline, peer.deadline)
+        return out
+
+    def receive(self, datagram: bytes, path: Path, now: float) -> list[Output]:
+        """What to do about a datagram. Never raises, whatever the bytes."""
+        out: list[Output] = []
+        try:
+            self._receive(datagram, path, now, out)
+        except Drop as drop:  # the one place where a datagram is dropped
+            peer = self.peers.get(drop.peer) or self._claimed_peer(datagram)
+            (peer.traffic.drops if peer else self.drops)[drop.reason] += 1
+            out.append(Dropped(drop.reason, peer.name if peer else None, path, 1, drop.detail))
+        return out
+
+    def handle_timeout(self, now: float) -> list[Output]:
+        """Do what is due. Call it at :meth:`next_deadline`, or at any time."""
+        out: list[Output] = []
+        for peer in self.peers.values():
+            if peer.deadline <= now:
+                peer.handle_timeout(now, out)
+        self._deadline = min((peer.deadline for peer in self.peers.values()), default=NEVER)
+        return out
+
+    def next_deadline(self) -> float:
+        """When :meth:`handle_timeout` is to be called next; infinity for never."""
+        return self._deadline
+
+    def close(self, now: float) -> list[Output]:
+        """Say goodbye to every peer."""
+        out: list[Output] = []
+        for peer in self.peers.values():
+            peer.close(now, out)
+        self._deadline = NEVER
+        return out
+
+    # Dispatch, the cheapest check first.
+
+    def _receive(self, datagram: bytes, path: Path, now: float, out: list[Output]) -> None:
+        kind = datagram[0] if datagram else 0
+        if kind in (wire.SHORT_ENVELOPE, wire.LONG_ENVELOPE):
+            self._receive_envelope(datagram, path, now, out)
+        elif kind == wire.INITIATION:
+            self._receive_initiation(datagram, path, now, out)
+        elif kind == wire.RESPONSE:
+            self._receive_response(datagram, path, now, out)
+        elif kind == wire.COOKIE:
+            self._receive_cookie(datagram, now)
+        elif kind in _MAVLINK_STARTS:
+            raise Drop(DropReason.RAW_MAVLINK)
+        else:
+            raise Drop(DropReason.MALFORMED)
+
+    def _receive_envelope(self, datagram: bytes, path: Path, now: float, out: list[Output]) -> None:
+        index, counter, header_bytes = wire.parse_envelope_header(datagram)
+        session = self._indices.owners.get(index)
+        if not isinstance(session, Session):
+            if self._indices.is_quarantined(index, now):
+                raise Drop(DropReason.LATE)
+            self._hint(path, now, out)
+            raise Drop(DropReason.UNKNOWN_INDEX)
+        peer = session.peer
+        try:
+            peer.receive_envelope(session, datagram, header_bytes, counter, path, now, out)
+        finally:
+            self._deadline = min(self._deadline, peer.deadline)
+
+    def _hint(self, path: Path, now: float, out: list[Output]) -> None:
+        _, host, port = path
+        peer = self._by_address.get((host, port))
+        if peer is not None:
+            peer.hint(now, out)
+            self._deadline = min(self._deadline, peer.deadline)
+
+    def _receive_initiation(self, datagram: bytes, path: Path, now: float, out: list[Output]) -> None:
+        initiation = wire.parse_initiation(datagram)
+        identity, cookies = self._addressed(datagram)
+        index = initiation.sender_index
+        if initiation.ephemeral in self._remembered:  # before the budget: one recording must not use it up
+            raise Drop(DropReason.REPLAYED_INITIATION)
+        self._admit(self._initiations, self._cookied, cookies, datagram, index, path, now, out)
+        received = handshake.receive_initiation(identity, initiation)
+        peer = self._by_keys.get((identity.public, received.public_key))
+        if peer is None:
+            raise Drop(DropReason.UNKNOWN_PEER, f"key {b64encode(received.public_key).decode()}")
+        self._remember(peer, initiation.ephemeral)
+        try:
+            self._answer(peer, received, cookies, datagram, path, now, out)
+        except Drop as drop:
+            drop.peer = peer.name
+            raise
+
+    def _answer(
+        self,
+        peer: Peer,
+        received: handshake.Received,
+        cookies: CookieJar,
+        datagram: bytes,
+        path: Path,
+        now: float,
+        out: list[Output],
+    ) -> None:
+        # Recorded initiations of this peer can be replayed from anywhere: they may use up the answers to everybody,
+        # not those to the one who proves its address.
+        index = received.initiation.sender_index
+        self._admit(peer.answers, peer.cookied_answers, cookies, datagram, index, path, now, out)
+        peer.answer(received, path, now, out)
+        self._deadline = min(self._deadline, peer.deadline)
+
+    def _receive_response(self, datagram: bytes, path: Path, now: float, out: list[Output]) -> None:
+        response = wire.parse_response(datagram)
+        pending = self._indices.owners.get(response.receiver_index)
+        if not isinstance(pending, Pending):
+            raise Drop(DropReason.UNEXPECTED_RESPONSE)
+        _, cookies = self._addressed(datagram)
+        self._admit(self._responses, self._cookied, cookies, datagram, response.sender_index, path, now, out)
+        pending.peer.receive_response(pending, response, now, out)
+        self._deadline = min(self._deadline, pending.peer.deadline)
+
+    def _receive_cookie(self, datagram: bytes, now: float) -> None:
+        reply = wire.parse_cookie_reply(datagram)
+        owner = self._indices.owners.get(reply.receiver_index)
+        if isinstance(owner, Pending):
+            peer, mac1 = owner.peer, owner.mac1
+        elif owner is not None and (unconfirmed := owner.peer.sessions.unconfirmed.get(reply.receiver_index)):
+            peer, mac1 = owner.peer, unconfirmed.mac1
+        else:
+            raise Drop(DropReason.UNEXPECTED_COOKIE)
+        peer.receive_cookie(mac1, reply, now)
+        self._deadline = min(self._deadline, peer.deadline)
+
+    def _addressed(self, datagram: bytes) -> tuple[KeyPair, CookieJar]:
+        """Which of our keys a handshake message is for.
+
+        Raises:
+            Drop: ``BAD_MAC1``: none.
+        """
+        try:
+            self._mac_keys.check_mac1(datagram)
+        except Drop:
+            if self._previous is None:
+                raise
+            self._previous.mac_keys.check_mac1(datagram)
+            return self._previous.identity, self._previous.cookies
+        return self._identity, self._cookies
+
+    def _admit(
+        self,
+        budget: TokenBucket,
+        ceiling: TokenBucket,
+        cookies: CookieJar,
+        datagram: bytes,
+        sender_index: int,
+        path: Path,
+        now: float,
+        out: list[Output],
+    ) -> None:
+        """Whether this message may cost work: until the budget is spent, then with a cookie, by its source's share.
+
+        Raises:
+            Drop: ``COOKIE_REQUIRED`` (a cookie is on its way) or ``RATE_LIMITED``.
+        """
+        if budget.take(now):
+            return
+        if not cookies.has_valid_mac2(datagram, path, now):
+            out.append(Transmit(cookies.reply(datagram, sender_index, path, now), path))
+            raise Drop(DropReason.COOKIE_REQUIRED)
+        if not self._sources.take((ceiling, source_of(path[1])), now):
+            raise Drop(DropReason.RATE_LIMITED)
+        # The ceiling is for strangers with many addresses. Who proved an address of a peer does not queue with them.
+        if (path[1], path[2]) not in self._by_address and not ceiling.take(now):
+            raise Drop(DropReason.RATE_LIMITED)
+
+    def _remember(self, peer: Peer, ephemeral: bytes) -> None:
+        # A memory for each peer: none can make us forget what another sent.
+        self._remembered.add(ephemeral)
+        peer.remembered.append(ephemeral)
+        if len(peer.remembered) > c.REMEMBERED_INITIATIONS:
+            self._remembered.discard(peer.remembered.popleft())
+
+    def _claimed_peer(self, datagram: bytes) -> Peer | None:
+        """The peer whose session or handshake the header names: a claim, good for a counter and no more."""
+        index = wire.claimed_receiver_index(datagram)
+        owner = self._indices.owners.get(index) if index else None
+        return owner.peer if owner is not None else None
+
+
+class _Previous:
+    """The identity that we had, and what goes with it."""
+
+    __slots__ = ("cookies", "identity", "mac_keys")
+
+    def __init__(self, private_key: Secret, entropy: Entropy, now: float) -> None:
+        self.identity = KeyPair(private_key.reveal())
+        self.mac_keys = MacKeys(self.identity.public)
+        self.cookies = CookieJar(self.mac_keys, entropy, now)

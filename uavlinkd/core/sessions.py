@@ -1,0 +1,116 @@
+"""The sessions with one peer: next, current, previous.
+
+*Next* are sessions that answer an initiation and wait for the envelope that confirms them. *Current* is the one that
+sends. *Previous* are confirmed ones that only receive until they age out.
+
+Confirmed sessions are ranked by what both ends know: the generation agreed in the handshake, and between two of the
+same generation (both ends initiated at once) the one that the smaller static public key initiated. Both ends send on
+the highest that they hold, so they settle on the same one without a word about it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from uavlinkd.core import constants as c
+from uavlinkd.core.indices import Indices
+from uavlinkd.core.outputs import Path
+from uavlinkd.core.session import Session
+
+
+@dataclass(frozen=True, slots=True)
+class Unconfirmed:
+    """A session that answers an initiation; the first valid envelope on it confirms it."""
+
+    session: Session
+    path: Path
+    """Where the response went: whoever confirms has read it there."""
+    mac1: bytes
+    """Of the response, which a cookie reply refers to."""
+    expires_at: float
+
+
+class Sessions:
+    """At most :data:`c.USABLE_PER_PEER` confirmed and :data:`c.UNCONFIRMED_PER_PEER` unconfirmed sessions.
+
+    The table of indices, shared by all peers, is kept in step: an index that carried a confirmed session goes into
+    quarantine, any other is free at once.
+    """
+
+    __slots__ = ("_has_smaller_key", "_indices", "confirmed", "unconfirmed")
+
+    def __init__(self, indices: Indices, *, has_smaller_key: bool) -> None:
+        self._indices = indices
+        self._has_smaller_key = has_smaller_key
+        self.confirmed: list[Session] = []
+        """The highest rank first."""
+        self.unconfirmed: dict[int, Unconfirmed] = {}
+        """By our index, the oldest first."""
+
+    @property
+    def current(self) -> Session | None:
+        """The session that sends."""
+        return self.confirmed[0] if self.confirmed else None
+
+    @property
+    def generation(self) -> int:
+        """Of the current session; 0 without one."""
+        return self.confirmed[0].parameters.generation if self.confirmed else 0
+
+    def wait(self, unconfirmed: Unconfirmed) -> None:
+        """Keep a session until it is confirmed; when there are too many, the oldest goes."""
+        while len(self.unconfirmed) >= c.UNCONFIRMED_PER_PEER:
+            self._forget(next(iter(self.unconfirmed)))
+        index = unconfirmed.session.local_index
+        self.unconfirmed[index] = unconfirmed
+        self._indices.owners[index] = unconfirmed.session
+
+    def confirm(self, session: Session, now: float) -> list[Session]:
+        """A session is proven to be the peer's too: it takes the place that its rank gives it. What that ended."""
+        self._indices.owners[session.local_index] = session
+        self.confirmed = sorted([session, *self.confirmed], key=self._rank, reverse=True)
+        return self._end(self.confirmed[c.USABLE_PER_PEER :], now)
+
+    def end_up_to(self, session: Session, now: float) -> list[Session]:
+        """End this session and those ranked below it: a late goodbye does not end what came after a restart."""
+        return self._end([each for each in self.confirmed if self._rank(each) <= self._rank(session)], now)
+
+    def expire(self, now: float) -> list[Session]:
+        """Drop the keys of sessions that are too old, and answers that nobody confirmed. What ended."""
+        for index in [i for i, each in self.unconfirmed.items() if now >= each.expires_at]:
+            self._forget(index)
+        return self._end([each for each in self.confirmed if now >= each.reject_at], now)
+
+    def clear(self, now: float) -> list[Session]:
+        """Drop every key. What ended."""
+        for index in list(self.unconfirmed):
+            self._forget(index)
+        return self._end(list(self.confirmed), now)
+
+    def asked(self, token: int) -> tuple[Session | None, float]:
+        """On which session, and when, an echo was asked for by this token. It counts once."""
+        for session in self.confirmed:
+            if token in session.doubt.asked:
+                return session, session.doubt.asked.pop(token)
+        return None, 0.0
+
+    def next_expiry(self) -> float:
+        """When :meth:`expire` has something to do."""
+        moments = [each.reject_at for each in self.confirmed]
+        moments += [each.expires_at for each in self.unconfirmed.values()]
+        return min(moments, default=float("inf"))
+
+    def _rank(self, session: Session) -> tuple[int, bool, float]:
+        # The age decides only where an end restarted before its session was known to count, or lies.
+        by_smaller = session.is_initiator == self._has_smaller_key
+        return session.parameters.generation, by_smaller, session.created_at
+
+    def _end(self, sessions: list[Session], now: float) -> list[Session]:
+        for session in sessions:
+            self.confirmed.remove(session)
+            self._indices.retire(session.local_index, now)
+        return sessions
+
+    def _forget(self, index: int) -> None:
+        del self.unconfirmed[index]
+        self._indices.forget(index)

@@ -1,0 +1,49 @@
+"""What a configuration tells the core, as plain values. The checks that make errors readable are the shell's."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from uavlinkd.core import constants as c
+from uavlinkd.core.crypto import Secret
+from uavlinkd.core.suites import X25519, Suite
+
+
+@dataclass(frozen=True, slots=True)
+class Timers:
+    """Durations in seconds on the monotonic clock; the reasons are in :mod:`uavlinkd.core.constants`."""
+
+    rekey_after_s: float = c.REKEY_AFTER_S
+    reject_after_s: float = c.REJECT_AFTER_S
+    retry_min_s: float = c.RETRY_MIN_S
+    retry_max_s: float = c.RETRY_MAX_S
+    keepalive_s: float = c.KEEPALIVE_S
+    echo_after_s: float = c.ECHO_AFTER_S
+    handshake_after_s: float = c.HANDSHAKE_AFTER_S
+    lost_after_s: float = c.LOST_AFTER_S
+    probe_interval_s: float = c.PROBE_INTERVAL_S
+
+
+@dataclass(frozen=True, slots=True)
+class Link:
+    """How one peer is spoken to. ``suites`` are accepted, the first is offered.
+
+    Tag length, key length and confidentiality are the least this side takes: the stronger of both ends' counts.
+    """
+
+    suites: tuple[Suite, ...] = (X25519,)
+    confidential: bool = False
+    tag_bytes: int = 16
+    mac_key_bits: int = 256
+    max_envelope: int = c.DEFAULT_ENVELOPE_LIMIT
+    timers: Timers = field(default_factory=Timers)
+
+
+@dataclass(frozen=True, slots=True)
+class PeerSettings:
+    """A peer: its name here, its static X25519 public key, the PSK shared with it, if any."""
+
+    name: str
+    public_key: bytes
+    psk: Secret | None = None
+    link: Link = field(default_factory=Link)

@@ -1,0 +1,378 @@
+"""Bytes to fields and back, for every message of the protocol. Total parsers; no keys.
+
+All integers are big-endian. The README beside this file draws each message.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from uavlinkd.core import constants as c
+from uavlinkd.core.drops import Drop, DropReason
+from uavlinkd.core.suites import SUITES, Suite
+
+INITIATION, RESPONSE, COOKIE = 1, 2, 3
+SHORT_ENVELOPE, LONG_ENVELOPE = 0x40, 0x41
+
+MACS_BYTES = 2 * c.MAC_BYTES
+COOKIE_BYTES = 4 + c.COOKIE_NONCE_BYTES + c.MAC_BYTES + c.AEAD_TAG_BYTES
+_INITIATION_HEADER = struct.Struct(">BBH")
+_RESPONSE_HEADER = struct.Struct(">BBHH")
+_SHORT_HEADER = struct.Struct(">BHH")
+_LONG_HEADER = struct.Struct(">BHI")
+SHORT_HEADER_BYTES = _SHORT_HEADER.size
+LONG_HEADER_BYTES = _LONG_HEADER.size
+
+_NOISE_1_BYTES = c.KEY_BYTES + (c.KEY_BYTES + c.AEAD_TAG_BYTES) + c.AEAD_TAG_BYTES
+_NOISE_2_BYTES = c.KEY_BYTES + c.AEAD_TAG_BYTES
+
+
+# Parameters and handshake payloads.
+
+TAG_LENGTHS = (8, 12, 16, 32)
+MAC_KEY_LENGTHS = (256, 512, 1024, 2048)
+_PARAMETERS = struct.Struct(">IHBBHH")
+_CONFIDENTIAL = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Parameters:
+    """What a side asks of the session, sealed in its handshake message.
+
+    ::
+
+        offset size field
+        0      4    generation     of the session on which the sender sends to the peer, or 0
+        4      2    features       bits of protocol extensions; none is defined, others' are ignored
+        6      1    flags          bit 0: confidential
+        7      1    tag length     bytes: 8, 12, 16 or 32
+        8      2    MAC key bits   256, 512, 1024 or 2048
+        10     2    largest envelope that the sender takes, bytes
+    """
+
+    generation: int
+    confidential: bool
+    tag_bytes: int
+    mac_key_bits: int
+    max_envelope: int
+
+    SIZE = 12  # of the encoding
+
+    def encode(self) -> bytes:
+        """The twelve bytes drawn above."""
+        flags = _CONFIDENTIAL if self.confidential else 0
+        return _PARAMETERS.pack(self.generation, 0, flags, self.tag_bytes, self.mac_key_bits, self.max_envelope)
+
+    def stronger(self, other: Parameters) -> Parameters:
+        """What both ends use: in each the stronger of the two, and the smaller envelope.
+
+        The generation is one more than the newest of either, capped where it would overflow.
+        """
+        return Parameters(
+            generation=min(max(self.generation, other.generation) + 1, 2**32 - 1),
+            confidential=self.confidential or other.confidential,
+            tag_bytes=max(self.tag_bytes, other.tag_bytes),
+            mac_key_bits=max(self.mac_key_bits, other.mac_key_bits),
+            max_envelope=min(self.max_envelope, other.max_envelope),
+        )
+
+
+def parse_parameters(data: bytes) -> Parameters:
+    """The parameters in an authentic handshake payload of :attr:`Parameters.SIZE` bytes.
+
+    Raises:
+        Drop: ``BAD_PARAMETERS`` for values outside the protocol.
+    """
+    generation, _features, flags, tag_bytes, mac_key_bits, max_envelope = _PARAMETERS.unpack(data)
+    if tag_bytes not in TAG_LENGTHS or mac_key_bits not in MAC_KEY_LENGTHS or max_envelope < c.MIN_ENVELOPE_LIMIT:
+        raise Drop(DropReason.BAD_PARAMETERS)
+    return Parameters(generation, bool(flags & _CONFIDENTIAL), tag_bytes, mac_key_bits, max_envelope)
+
+
+# Handshake messages.
+
+
+def prologue(suite: Suite) -> bytes:
+    """What both ends mix into the transcript before the first message."""
+    return c.PROTOCOL_NAME + bytes((suite.number,))
+
+
+def initiation_bytes(suite: Suite) -> int:
+    """Length of an initiation of this suite."""
+    share = suite.share_bytes + c.AEAD_TAG_BYTES if suite.has_group else 0
+    payload = _INITIATION_HEADER.size - 1 + Parameters.SIZE
+    return _INITIATION_HEADER.size + _NOISE_1_BYTES + share + payload + MACS_BYTES
+
+
+def response_bytes(suite: Suite) -> int:
+    """Length of a response of this suite: never more than its initiation's."""
+    ciphertext = suite.ciphertext_bytes + c.AEAD_TAG_BYTES if suite.has_group else 0
+    payload = _RESPONSE_HEADER.size - 1 + Parameters.SIZE
+    return _RESPONSE_HEADER.size + _NOISE_2_BYTES + ciphertext + payload + MACS_BYTES
+
+
+def initiation_header(suite: Suite, sender_index: int) -> bytes:
+    """Type, suite, sender index. All but the type is repeated at the head of the sealed payload."""
+    return _INITIATION_HEADER.pack(INITIATION, suite.number, sender_index)
+
+
+def response_header(suite: Suite, sender_index: int, receiver_index: int) -> bytes:
+    """Type, suite, sender index, receiver index. All but the type is repeated in the sealed payload."""
+    return _RESPONSE_HEADER.pack(RESPONSE, suite.number, sender_index, receiver_index)
+
+
+class Initiation(NamedTuple):
+    """Message 1, cut into its fields.
+
+    ::
+
+        offset size field
+        0      1    type (1)
+        1      1    suite
+        2      2    sender index
+        4      n    Noise message 1, its length given by the suite
+        4+n    16   mac1 over all before it
+        20+n   16   mac2 over all before it, or zero
+    """
+
+    suite: Suite
+    sender_index: int
+    header: bytes
+    noise: bytes
+
+    @property
+    def ephemeral(self) -> bytes:
+        """The initiator's ephemeral public key: what tells one initiation from another."""
+        return self.noise[: c.KEY_BYTES]
+
+
+class Response(NamedTuple):
+    """Message 2, cut into its fields.
+
+    ::
+
+        offset size field
+        0      1    type (2)
+        1      1    suite
+        2      2    sender index
+        4      2    receiver index
+        6      n    Noise message 2, its length given by the suite
+        6+n    16   mac1 over all before it
+        22+n   16   mac2 over all before it, or zero
+    """
+
+    suite: Suite
+    sender_index: int
+    receiver_index: int
+    header: bytes
+    noise: bytes
+
+
+class CookieReply(NamedTuple):
+    """Message 3, cut into its fields.
+
+    ::
+
+        offset size field
+        0      1    type (3)
+        1      1    zero
+        2      2    receiver index
+        4      16   nonce
+        20     32   cookie, sealed
+    """
+
+    receiver_index: int
+    nonce: bytes
+    sealed: bytes
+
+
+def parse_initiation(datagram: bytes) -> Initiation:
+    """Cut message 1 into its fields. Any bytes give an Initiation or a Drop.
+
+    Raises:
+        Drop: ``MALFORMED``.
+    """
+    suite = SUITES.get(datagram[1]) if len(datagram) > _INITIATION_HEADER.size else None
+    if suite is None or len(datagram) != initiation_bytes(suite):
+        raise Drop(DropReason.MALFORMED)
+    _, _, sender_index = _INITIATION_HEADER.unpack_from(datagram)
+    size = _INITIATION_HEADER.size
+    return Initiation(suite, sender_index, datagram[:size], datagram[size:-MACS_BYTES])
+
+
+def parse_response(datagram: bytes) -> Response:
+    """Cut message 2 into its fields. Any bytes give a Response or a Drop.
+
+    Raises:
+        Drop: ``MALFORMED``.
+    """
+    suite = SUITES.get(datagram[1]) if len(datagram) > _RESPONSE_HEADER.size else None
+    if suite is None or len(datagram) != response_bytes(suite):
+        raise Drop(DropReason.MALFORMED)
+    _, _, sender_index, receiver_index = _RESPONSE_HEADER.unpack_from(datagram)
+    size = _RESPONSE_HEADER.size
+    return Response(suite, sender_index, receiver_index, datagram[:size], datagram[size:-MACS_BYTES])
+
+
+def encode_cookie_reply(receiver_index: int, nonce: bytes, sealed: bytes) -> bytes:
+    """Message 3."""
+    return _INITIATION_HEADER.pack(COOKIE, 0, receiver_index) + nonce + sealed
+
+
+def parse_cookie_reply(datagram: bytes) -> CookieReply:
+    """Cut message 3 into its fields. Any bytes give a CookieReply or a Drop.
+
+    Raises:
+        Drop: ``MALFORMED``.
+    """
+    if len(datagram) != COOKIE_BYTES or datagram[1] != 0:
+        raise Drop(DropReason.MALFORMED)
+    _, _, receiver_index = _INITIATION_HEADER.unpack_from(datagram)
+    return CookieReply(receiver_index, datagram[4:20], datagram[20:])
+
+
+# Envelopes.
+
+
+def envelope_header(receiver_index: int, counter: int) -> bytes:
+    """Type, receiver index, counter: five bytes while the counter is small, seven after that."""
+    if counter < c.SHORT_COUNTER_LIMIT:
+        return _SHORT_HEADER.pack(SHORT_ENVELOPE, receiver_index, counter)
+    return _LONG_HEADER.pack(LONG_ENVELOPE, receiver_index, counter)
+
+
+def parse_envelope_header(datagram: bytes) -> tuple[int, int, int]:
+    """Receiver index, counter and header length of an envelope; its first byte is one of the two types.
+
+    ::
+
+        offset size field
+        0      1    type (0x40, 0x41)
+        1      2    receiver index
+        3      2/4  counter: 2 bytes after 0x40, 4 bytes after 0x41
+        5/7    n    payload
+        5/7+n  t    tag
+
+    Raises:
+        Drop: ``MALFORMED`` when shorter than a header and the shortest tag, ``LONG_COUNTER``.
+    """
+    if datagram[0] == SHORT_ENVELOPE:
+        if len(datagram) < SHORT_HEADER_BYTES + TAG_LENGTHS[0]:
+            raise Drop(DropReason.MALFORMED)
+        _, receiver_index, counter = _SHORT_HEADER.unpack_from(datagram)
+        return receiver_index, counter, SHORT_HEADER_BYTES
+    if len(datagram) < LONG_HEADER_BYTES + TAG_LENGTHS[0]:
+        raise Drop(DropReason.MALFORMED)
+    _, receiver_index, counter = _LONG_HEADER.unpack_from(datagram)
+    if counter < c.SHORT_COUNTER_LIMIT:
+        raise Drop(DropReason.LONG_COUNTER)
+    return receiver_index, counter, LONG_HEADER_BYTES
+
+
+# Control records: the payload of an envelope whose first byte is below FRAMES_FROM.
+
+FRAMES_FROM = 0xF0
+ECHO_REQUEST, ECHO_REPLY, PATH_CHALLENGE, PATH_RESPONSE, CLOSE = 1, 2, 3, 4, 5
+_ECHO_REQUEST = struct.Struct(">BIII")
+_ECHO_REPLY = struct.Struct(">BIIII")
+_CHALLENGE_PADDING = bytes(2)
+CHALLENGE_BYTES = 1 + c.PATH_TOKEN_BYTES + len(_CHALLENGE_PADDING)
+
+
+class Echo(NamedTuple):
+    """An echo request or reply: the round trip, what its sender has received on this session, and what is new.
+
+    ::
+
+        offset size field
+        0      1    type: 1 request, 2 reply
+        1      4    token, repeated by the reply
+        5      4    envelopes received
+        9      4    envelopes expected: the highest counter and one
+        13     4    fresh, in a reply alone
+    """
+
+    is_reply: bool
+    token: int
+    received: int
+    expected: int
+    fresh: int = 0
+    """On the session that carried the request: the lowest counter that the replier used lately, or its next one."""
+
+    def encode(self) -> bytes:
+        """The thirteen bytes of a request or seventeen of a reply, as drawn above."""
+        if self.is_reply:
+            return _ECHO_REPLY.pack(ECHO_REPLY, self.token, self.received, self.expected, self.fresh)
+        return _ECHO_REQUEST.pack(ECHO_REQUEST, self.token, self.received, self.expected)
+
+
+class PathChallenge(NamedTuple):
+    """Eight bytes that come back only from where they were sent, and two of padding.
+
+    The padding keeps the response shorter than the challenge even where the header that it goes
+    under is the longer one: nobody gets more bytes back than were spent on asking.
+    """
+
+    token: bytes
+
+    def encode(self) -> bytes:
+        """Type 3, token 8, zero 2."""
+        return bytes((PATH_CHALLENGE,)) + self.token + _CHALLENGE_PADDING
+
+
+class PathResponse(NamedTuple):
+    """The token of a challenge."""
+
+    token: bytes
+
+    def encode(self) -> bytes:
+        """Type 4, token 8."""
+        return bytes((PATH_RESPONSE,)) + self.token
+
+
+class Close(NamedTuple):
+    """The sender ends its sessions with us: those up to the one that carries this record."""
+
+    def encode(self) -> bytes:
+        """Type 5."""
+        return bytes((CLOSE,))
+
+
+Control = Echo | PathChallenge | PathResponse | Close
+
+
+def parse_control(payload: bytes) -> Control:
+    """The control record in an authentic payload (not empty, first byte below :data:`FRAMES_FROM`).
+
+    Raises:
+        Drop: ``BAD_CONTROL``.
+    """
+    match payload[0], len(payload):
+        case 1, 13:
+            _, token, received, expected = _ECHO_REQUEST.unpack(payload)
+            return Echo(False, token, received, expected)
+        case 2, 17:
+            _, token, received, expected, fresh = _ECHO_REPLY.unpack(payload)
+            return Echo(True, token, received, expected, fresh)
+        case 3, 11 if payload.endswith(_CHALLENGE_PADDING):
+            return PathChallenge(payload[1:9])
+        case 4, 9:
+            return PathResponse(payload[1:])
+        case 5, 1:
+            return Close()
+        case _:
+            raise Drop(DropReason.BAD_CONTROL)
+
+
+def claimed_receiver_index(datagram: bytes) -> int:
+    """The receiver index in the header of any message that has one; 0, which is no index, of all else."""
+    kind = datagram[0] if len(datagram) >= LONG_HEADER_BYTES else 0
+    if kind in (SHORT_ENVELOPE, LONG_ENVELOPE):
+        return int.from_bytes(datagram[1:3], "big")
+    if kind == RESPONSE:
+        return int.from_bytes(datagram[4:6], "big")
+    if kind == COOKIE:
+        return int.from_bytes(datagram[2:4], "big")
+    return 0
