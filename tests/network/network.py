@@ -1,0 +1,418 @@
+"""A simulated network in virtual time: real nodes, emulated radios, NATs, restarts and attackers.
+
+Everything follows from one seed. Time jumps from event to event: the next arrival, deadline or scheduled action.
+Frames are numbered, so that what comes out can be held against what went in at every delivery.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from random import Random
+from types import TracebackType
+from typing import Protocol, Self
+
+from uavlinkd.core import constants as c
+from uavlinkd.core.crypto import Secret, x25519_public_key
+from uavlinkd.core.node import Node
+from uavlinkd.core.outputs import Deliver, Dropped, Output, Path, SessionEstablished, Transmit
+from uavlinkd.core.peer import Peer
+from uavlinkd.core.session import Session
+from uavlinkd.core.settings import Link, PeerSettings
+from uavlinkd.mitm.radio import Radio, RadioSettings
+
+Address = tuple[str, int]
+
+FRAME_BYTES = 24
+_FRAME_START = b"\xfd"
+_FLOW_SHOWN = 60
+_STEPS_AT_ONE_MOMENT = 20_000
+"""More events than this without time passing is a node that asks to be woken for ever."""
+_CHECK_BOUNDS_EVERY = 64
+
+
+@dataclass
+class Flow:
+    """Frames from one drone to another: what was sent, what came out."""
+
+    sender: str
+    receiver: str
+    sent_at: list[float] = field(default_factory=list)
+    """By number."""
+    delivered: dict[int, float] = field(default_factory=dict)
+    """When each number came out, in the order of coming out."""
+    last: int = -1
+    overtaken: int = 0
+    """Frames that came out after one with a greater number."""
+
+    def frame(self, now: float) -> bytes:
+        """The next frame: a start byte, sender, receiver, number."""
+        number = len(self.sent_at)
+        self.sent_at.append(now)
+        return self.bytes_of(number)
+
+    def bytes_of(self, number: int) -> bytes:
+        """The frame of this number, always the same."""
+        name = f"{self.sender}>{self.receiver}".encode().ljust(15, b".")
+        return _FRAME_START + name + number.to_bytes(8, "big")
+
+    def deliver(self, frame: bytes, now: float) -> None:
+        """Hold a frame that came out against what was sent."""
+        number = int.from_bytes(frame[-8:], "big")
+        assert number < len(self.sent_at), f"{self.sender} never sent {frame!r} to {self.receiver}"
+        assert frame == self.bytes_of(number), f"altered: {frame!r}"
+        assert number not in self.delivered, f"delivered twice: {frame!r}, first at {self.delivered[number]:.3f}"
+        self.delivered[number] = now
+        if number < self.last:
+            self.overtaken += 1
+        self.last = max(self.last, number)
+
+    def lost(self, since: float = 0.0, until: float = math.inf) -> list[int]:
+        """The numbers sent in this time that never came out."""
+        return [n for n, at in enumerate(self.sent_at) if since <= at < until and n not in self.delivered]
+
+    def first_delivery(self, since: float) -> float:
+        """When the first frame that was sent at ``since`` or later came out."""
+        return min((at for n, at in self.delivered.items() if self.sent_at[n] >= since), default=math.inf)
+
+
+class Drone:
+    """A daemon in the simulated network. A restart gives it a new :class:`Node` and keeps the key alone."""
+
+    def __init__(self, network: Network, name: str, addresses: Sequence[Address], clock: float) -> None:
+        self.name = name
+        self.addresses = list(addresses)
+        """By the number of its socket; an address may change at any time, which the node is not told."""
+        self.clock = clock
+        """What its clock showed when the network's showed zero."""
+        self.is_behind_nat = False
+        """Only whom it has sent to since its address is what it is can reach it."""
+        self.outputs: list[tuple[float, Output]] = []
+        """Everything but datagrams and frames, with the network's time."""
+        self.drops: Counter[str] = Counter()
+        self.contacted: set[tuple[Address, Address]] = set()
+        self.private_key = network.chance.randbytes(32)
+        self.public_key = x25519_public_key(self.private_key)
+        self.acquaintances: dict[str, tuple[PeerSettings, tuple[Path, ...]]] = {}
+        self.node: Node | None = None
+        """None while it is off."""
+        self._network = network
+
+    def knows(self, other: Drone, addresses: Iterable[Address] = (), link: Link | None = None) -> None:
+        """Configure a peer, and where it is said to be."""
+        settings = PeerSettings(other.name, other.public_key, link=link or Link())
+        self.acquaintances[other.name] = settings, tuple((0, host, port) for host, port in addresses)
+
+    def start(self, clock: float | None = None) -> None:
+        """A new node without state; ``clock`` is what its clock shows now."""
+        if clock is not None:
+            self.clock = clock - self._network.now
+        now = self.local_now
+        entropy = Random(self._network.chance.randbytes(16))
+        self.node = Node(Secret(self.private_key), entropy.randbytes, now)
+        for settings, paths in self.acquaintances.values():
+            self.node.add_peer(settings, now)
+            self.node.set_addresses(settings.name, paths, now)
+        self._network.note(f"{self.name} starts, its clock at {now:.3f}")
+
+    def stop(self) -> None:
+        """Power off, without goodbye."""
+        self.node = None
+        self._network.note(f"{self.name} is off")
+
+    def move(self, *addresses: Address) -> None:
+        """Other addresses from now on: another network, or the NAT has forgotten us."""
+        self.addresses = list(addresses)
+        self.contacted.clear()
+        self._network.note(f"{self.name} is at {addresses}")
+
+    @property
+    def local_now(self) -> float:
+        """What its clock shows."""
+        return self._network.now + self.clock
+
+    def peer(self, other: Drone) -> Peer:
+        """The node's state of the link with another drone."""
+        assert self.node is not None
+        return self.node.peers[other.name]
+
+    def session(self, other: Drone) -> Session | None:
+        """The session that sends to another drone."""
+        return self.peer(other).sessions.current if self.node is not None else None
+
+    def established(self) -> Iterator[tuple[float, SessionEstablished]]:
+        """When sessions came up here."""
+        return ((at, output) for at, output in self.outputs if isinstance(output, SessionEstablished))
+
+    def check_bounds(self) -> None:
+        """What others can make a node remember is bounded."""
+        if self.node is None:
+            return
+        for peer in self.node.peers.values():
+            assert len(peer.caller.pending) <= c.PENDING_PER_PEER
+            assert len(peer.sessions.unconfirmed) <= c.UNCONFIRMED_PER_PEER
+            assert len(peer.sessions.confirmed) <= c.USABLE_PER_PEER
+        per_peer = c.PENDING_PER_PEER + c.UNCONFIRMED_PER_PEER + c.USABLE_PER_PEER
+        assert len(self.node._indices.owners) <= per_peer * len(self.node.peers)
+        assert len(self.node._remembered) <= c.REMEMBERED_INITIATIONS
+
+
+class Attacker(Protocol):
+    """Sees every datagram as it is sent, and those that are sent to addresses of its own."""
+
+    def overhear(self, datagram: bytes, source: Address, destination: Address) -> None:
+        """A datagram was sent by a drone."""
+
+    def receive(self, datagram: bytes, source: Address, destination: Address) -> None:
+        """A datagram arrived at an address of the attacker."""
+
+
+class Network:
+    """Drones joined by radios, one for each pair of addresses and direction. Use it as a context manager."""
+
+    def __init__(self, seed: int | str, radio: RadioSettings | None = None) -> None:
+        self.seed = seed
+        self.now = 0.0
+        self.chance = Random(f"network {seed}")
+        self.radio = radio or RadioSettings()
+        """Of every pair of addresses that has none of its own in :attr:`radios_of`."""
+        self.radios_of: dict[tuple[Address, Address], RadioSettings] = {}
+        self.drones: dict[str, Drone] = {}
+        self.flows: dict[tuple[str, str], Flow] = {}
+        self.attackers: dict[Address, Attacker] = {}
+        self.listeners: list[Attacker] = []
+        self.cuts: set[tuple[str, str]] = set()
+        """Names of sender and receiver between which nothing passes."""
+        self.steps = 0
+        self._radios: dict[tuple[Address, Address], Radio] = {}
+        self._arrivals: list[tuple[float, int, Address, Address]] = []
+        self._actions: list[tuple[float, int, Callable[[], None]]] = []
+        self._number = 0
+        self._steps_at_now = 0
+        self._notes: deque[str] = deque(maxlen=_FLOW_SHOWN)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if error is not None:
+            error.add_note(
+                f"network seed {self.seed!r}, at {self.now:.3f} s after {self.steps} steps; the last of them:"
+            )
+            error.add_note("\n".join(self._notes))
+
+    # Set-up.
+
+    def add(self, name: str, *addresses: Address, clock: float = 0.0) -> Drone:
+        """A drone, not started yet. Without an address given it gets one of its own."""
+        at = addresses or ((f"10.0.0.{len(self.drones) + 1}", 5790),)
+        drone = self.drones[name] = Drone(self, name, at, clock)
+        return drone
+
+    def pair(self, link: Link | None = None, clocks: tuple[float, float] = (0.0, 0.0)) -> tuple[Drone, Drone]:
+        """Two drones that know each other's address, started now."""
+        a, b = self.add("a", clock=clocks[0]), self.add("b", clock=clocks[1])
+        a.knows(b, b.addresses, link)
+        b.knows(a, a.addresses, link)
+        a.start()
+        b.start()
+        return a, b
+
+    def at(self, moment: float, action: Callable[[], None]) -> None:
+        """Do something at a moment of the network's time."""
+        self._number += 1
+        heapq.heappush(self._actions, (moment, self._number, action))
+
+    def flow(self, sender: Drone, receiver: Drone) -> Flow:
+        """The frames from one drone to another."""
+        key = sender.name, receiver.name
+        return self.flows.setdefault(key, Flow(*key))
+
+    def traffic(self, sender: Drone, receiver: Drone, interval_s: float, until: float = math.inf) -> Flow:
+        """A frame each ``interval_s`` from now on, as long as the sender is on. Both directions need a call."""
+        flow = self.flow(sender, receiver)
+
+        def tick() -> None:
+            if sender.node is not None:
+                frame = flow.frame(self.now)
+                self._perform(sender, sender.node.send(receiver.name, [frame], sender.local_now))
+            if self.now + interval_s < until:
+                self.at(self.now + interval_s, tick)
+
+        self.at(self.now + self.chance.random() * interval_s, tick)
+        return flow
+
+    def talk(self, a: Drone, b: Drone, interval_s: float = 0.05, until: float = math.inf) -> tuple[Flow, Flow]:
+        """Traffic both ways."""
+        return self.traffic(a, b, interval_s, until), self.traffic(b, a, interval_s, until)
+
+    def cut(self, a: Drone, b: Drone) -> None:
+        """Nothing passes between two drones from now on, either way."""
+        self.cuts |= {(a.name, b.name), (b.name, a.name)}
+
+    def inject(self, datagram: bytes, source: Address, destination: Address) -> None:
+        """Send a datagram under any source address."""
+        self._send(datagram, source, destination)
+
+    def note(self, text: str) -> None:
+        """One line of the flow that is shown when a test fails."""
+        self._notes.append(f"{self.now:10.4f}  {text}")
+
+    # Time.
+
+    def run(self, duration_s: float) -> None:
+        """Let time pass."""
+        end = self.now + duration_s
+        while self._next_event() <= end:
+            self.step()
+        self.now = end
+
+    def run_until(self, condition: Callable[[], bool], within_s: float) -> float:
+        """Let time pass until a condition holds, and tell how long that took.
+
+        Raises:
+            AssertionError: where it does not within ``within_s``.
+        """
+        begin, end = self.now, self.now + within_s
+        while not condition():
+            assert self._next_event() <= end, f"not within {within_s} s: {self._states()}"
+            self.step()
+        return self.now - begin
+
+    def step(self) -> None:
+        """Jump to the next event and do what is due at it."""
+        moment = self._next_event()
+        assert moment < math.inf, "nothing will ever happen again"
+        self._steps_at_now = self._steps_at_now + 1 if moment <= self.now else 0
+        assert self._steps_at_now < _STEPS_AT_ONE_MOMENT, f"time stands still: {self._states()}"
+        self.now = max(self.now, moment)
+        self.steps += 1
+        if self._actions and self._actions[0][0] <= self.now:
+            heapq.heappop(self._actions)[2]()
+        elif self._arrivals and self._arrivals[0][0] <= self.now:
+            _, _, source, destination = heapq.heappop(self._arrivals)
+            radio = self._radio(source, destination)
+            arrived = radio.due(self.now)
+            if arrived:
+                self._expect(radio, source, destination)
+            for datagram in arrived:
+                self._arrive(datagram, source, destination)
+        else:
+            for drone in self.drones.values():
+                if drone.node is not None and drone.node.next_deadline() - drone.clock <= self.now:
+                    # A clock far from zero rounds: the node must not be woken before its own deadline.
+                    local_now = max(drone.local_now, drone.node.next_deadline())
+                    self._perform(drone, drone.node.handle_timeout(local_now))
+        if self.steps % _CHECK_BOUNDS_EVERY == 0:
+            for drone in self.drones.values():
+                drone.check_bounds()
+
+    def _next_event(self) -> float:
+        moment = self._actions[0][0] if self._actions else math.inf
+        if self._arrivals:
+            moment = min(moment, self._arrivals[0][0])
+        for drone in self.drones.values():
+            if drone.node is not None:
+                moment = min(moment, drone.node.next_deadline() - drone.clock)
+        return moment
+
+    # Datagrams.
+
+    def _perform(self, drone: Drone, outputs: list[Output]) -> None:
+        for output in outputs:
+            match output:
+                case Transmit(datagram, (socket, host, port)):
+                    source = drone.addresses[socket]
+                    drone.contacted.add((source, (host, port)))
+                    for listener in self.listeners:
+                        listener.overhear(datagram, source, (host, port))
+                    self._send(datagram, source, (host, port))
+                case Deliver(peer, payload):
+                    flow = self.flow(self.drones[peer], drone)
+                    assert payload
+                    assert len(payload) % FRAME_BYTES == 0
+                    for begin in range(0, len(payload), FRAME_BYTES):
+                        flow.deliver(payload[begin : begin + FRAME_BYTES], self.now)
+                case Dropped(reason, amount=amount):
+                    drone.drops[reason] += amount
+                case event:
+                    drone.outputs.append((self.now, event))
+                    self.note(f"{drone.name} {event}")
+
+    def _send(self, datagram: bytes, source: Address, destination: Address) -> None:
+        radio = self._radio(source, destination)
+        waiting = radio.next_deadline()
+        radio.send(datagram, self.now)
+        if radio.next_deadline() < waiting:
+            self._expect(radio, source, destination)
+
+    def _radio(self, source: Address, destination: Address) -> Radio:
+        key = source, destination
+        radio = self._radios.get(key)
+        if radio is None:
+            chance = Random(f"radio {self.seed} {key}")
+            radio = self._radios[key] = Radio(self.radios_of.get(key, self.radio), chance, self.now)
+        return radio
+
+    def set_radio(self, settings: RadioSettings) -> None:
+        """Other radios everywhere from now on; what is on its way stays on its way."""
+        self.radio = settings
+        for radio in self._radios.values():
+            radio.settings = settings
+
+    def _expect(self, radio: Radio, source: Address, destination: Address) -> None:
+        if radio.in_flight:
+            self._number += 1
+            heapq.heappush(self._arrivals, (radio.next_deadline(), self._number, source, destination))
+
+    def _arrive(self, datagram: bytes, source: Address, destination: Address) -> None:
+        attacker = self.attackers.get(destination)
+        if attacker is not None:
+            attacker.receive(datagram, source, destination)
+            return
+        for drone in self.drones.values():
+            if drone.node is None or destination not in drone.addresses:
+                continue
+            if drone.is_behind_nat and (destination, source) not in drone.contacted:
+                continue
+            if self._are_cut_off(source, drone):
+                continue
+            path = (drone.addresses.index(destination), *source)
+            self._perform(drone, drone.node.receive(datagram, path, drone.local_now))
+
+    def _are_cut_off(self, source: Address, receiver: Drone) -> bool:
+        return bool(self.cuts) and any(
+            source in self.drones[sender].addresses for sender, at in self.cuts if at == receiver.name
+        )
+
+    def _states(self) -> str:
+        lines = []
+        for drone in self.drones.values():
+            for peer in drone.node.peers.values() if drone.node is not None else ():
+                sessions = peer.sessions
+                lines.append(f"{drone.name}: {peer.name} {sessions.confirmed} {sessions.unconfirmed} {peer.path}")
+        return "\n".join(lines)
+
+
+def share_a_session(a: Drone, b: Drone) -> bool:
+    """Whether both send on the same session."""
+    mine, theirs = a.session(b), b.session(a)
+    return (
+        mine is not None
+        and theirs is not None
+        and mine.parameters.generation == theirs.parameters.generation
+        and mine.is_initiator != theirs.is_initiator
+        and (mine.local_index, mine.remote_index) == (theirs.remote_index, theirs.local_index)
+    )
+
+
+def session_name(a: Drone, b: Drone) -> tuple[int, int, int]:
+    """What tells the session that ``a`` sends on from all others: generation and both indices."""
+    session = a.session(b)
+    assert session is not None
+    return session.parameters.generation, session.local_index, session.remote_index

@@ -1,0 +1,82 @@
+"""New keys at full traffic: make before break."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import pytest
+
+from tests.network.network import Drone, Network, share_a_session
+from uavlinkd.core.settings import Link, Timers
+from uavlinkd.mitm.radio import RadioSettings
+
+EVERY_2_S = Link(timers=Timers(rekey_after_s=2.0, reject_after_s=6.0))
+
+
+def _want_new_keys(drone: Drone, other: Drone) -> None:
+    """Make a drone ask for new keys now, as if the session that it sends on were old."""
+    session = drone.session(other)
+    assert drone.node is not None
+    assert session is not None
+    session.created_at -= 1000.0
+    drone.node.set_addresses(other.name, drone.peer(other).caller.addresses, drone.local_now)  # looks at its timers
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.02, 0.3])
+@pytest.mark.parametrize("at_once", [False, True], ids=["in turn", "both at once"])
+def test_rekeying_at_full_traffic_loses_and_reorders_nothing(delay_s: float, at_once: bool) -> None:
+    """500 frames a second each way, new keys every two seconds or less: no frame lost, none overtaken."""
+    with Network(f"rekey {delay_s} {at_once}", RadioSettings(delay_s=delay_s)) as network:
+        a, b = network.pair(EVERY_2_S)
+        network.run_until(lambda: share_a_session(a, b), within_s=3)
+        network.run(1)
+        begin = network.now
+        flows = network.talk(a, b, interval_s=0.002)
+        for number in range(1, 10) if at_once else ():
+            for drone, other in ((a, b), (b, a)):
+                network.at(begin + 1.8 * number, partial(_want_new_keys, drone, other))
+        network.run(18)
+        for flow in flows:
+            assert not flow.lost(until=network.now - delay_s - 0.01)
+            assert flow.overtaken == 0
+        for drone in (a, b):
+            times = {round(at, 1) for at, _ in drone.established() if at > begin}
+            assert len(times) >= 6
+            # Over a round trip longer than the first retry, a second response comes when the first was enough.
+            assert set(drone.drops) <= ({"unexpected_response"} if delay_s == 0.3 else set()), drone.drops
+
+
+def test_rekeying_both_at_once_makes_sessions_of_both_and_one_is_used() -> None:
+    """Where both ends initiate in the same instant both handshakes are finished, and both ends send on one."""
+    with Network("crossed rekey", RadioSettings(delay_s=0.05)) as network:
+        a, b = network.pair()
+        network.talk(a, b, interval_s=0.002)
+        network.run_until(lambda: share_a_session(a, b), within_s=3)
+        network.run(2)
+        handshakes = a.peer(b).traffic.handshakes
+        _want_new_keys(a, b)
+        _want_new_keys(b, a)
+        network.run(1)
+        assert a.peer(b).traffic.handshakes == handshakes + 2
+        assert share_a_session(a, b)
+
+
+def test_rekeying_over_a_lossy_link_loses_only_what_the_link_lost() -> None:
+    """New keys every two seconds over a link that loses a fifth and reorders: every frame let through comes out."""
+    settings = RadioSettings(delay_s=0.05, jitter_s=0.02)
+    for seed in range(4):
+        with Network(f"lossy rekey {seed}", settings) as network:
+            a, b = network.pair(EVERY_2_S)
+            network.run_until(partial(share_a_session, a, b), within_s=3)
+            network.run(1)
+            network.set_radio(RadioSettings(delay_s=0.05, jitter_s=0.02, loss=0.2))
+            begin = network.now
+            flows = network.talk(a, b, interval_s=0.01)
+            network.run(20)
+            assert sum(at > begin for at, _ in a.established()) >= 6
+            for flow in flows:
+                sent = sum(begin <= at < network.now - 0.1 for at in flow.sent_at)
+                lost = len(flow.lost(begin, network.now - 0.1))
+                assert 0.16 * sent < lost < 0.24 * sent
+            for drone in (a, b):
+                assert set(drone.drops) <= {"no_session", "late", "unexpected_response"}, drone.drops

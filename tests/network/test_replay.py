@@ -1,0 +1,147 @@
+"""An attacker that recorded everything and sends it again, at any time, to anyone, under any address."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import pytest
+
+from tests.network.attackers import Recorder
+from tests.network.network import Address, Drone, Network, share_a_session
+from uavlinkd.core.settings import Link, Timers
+from uavlinkd.mitm.radio import RadioSettings
+
+MISCHIEF: Address = ("198.51.100.66", 6666)
+FAST_REKEY = Link(timers=Timers(rekey_after_s=1.0, reject_after_s=6.0))
+
+
+def _storm(network: Network, recorder: Recorder, per_s: float, duration_s: float) -> None:
+    """Replay at random for a while: as it was, to another drone, back to its sender, or from elsewhere."""
+    drones = list(network.drones.values())
+    chance = network.chance
+
+    def replay() -> None:
+        datagram, source, destination = chance.choice(recorder.recorded)
+        match chance.randrange(5):
+            case 0:
+                source, destination = destination, source
+            case 1:
+                destination = chance.choice(drones).addresses[0]
+            case 2:
+                source = ("198.51.100.1", 1024 + chance.randrange(60000))
+            case 3:
+                source, destination = chance.choice(drones).addresses[0], chance.choice(drones).addresses[0]
+        network.inject(datagram, source, destination)
+
+    for number in range(int(per_s * duration_s)):
+        network.at(network.now + number / per_s, replay)
+
+
+def _triangle(network: Network) -> tuple[Drone, Drone, Drone]:
+    drones = network.add("a"), network.add("b"), network.add("c")
+    for one in drones:
+        for other in drones:
+            if one is not other:
+                one.knows(other, other.addresses, FAST_REKEY)
+        one.start()
+    for one in drones:
+        for other in drones:
+            if one is not other:
+                network.traffic(one, other, 0.05)
+    return drones
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_replay_storm_delivers_nothing_twice_and_leaves_the_links_as_they_are(seed: int) -> None:
+    """500 replays a second against three linked drones: every frame once and in time, nothing lost."""
+    with Network(f"storm {seed}", RadioSettings(delay_s=0.02)) as network:
+        a, b, c = _triangle(network)
+        recorder = Recorder(network)
+        network.run(8)
+        begin = network.now
+        _storm(network, recorder, per_s=500, duration_s=10)
+        network.run(10)
+        for flow in network.flows.values():
+            assert not flow.lost(begin, network.now - 0.1), f"{flow.sender} to {flow.receiver}"
+            late = [n for n, at in flow.delivered.items() if flow.sent_at[n] > begin and at - flow.sent_at[n] > 0.03]
+            assert not late
+        assert all(drone.drops["replayed"] > 50 for drone in (a, b, c))
+        assert sum(drone.drops["replayed_initiation"] for drone in (a, b, c)) > 10
+
+
+@pytest.mark.parametrize("knows", ["both", "restarted", "other"])
+def test_link_comes_back_after_a_restart_amid_a_replay_storm(knows: str) -> None:
+    """The restarted drone remembers no initiation; old ones by the hundred do not keep it from its link."""
+    for seed in range(3):
+        with Network(f"storm and restart {knows} {seed}", RadioSettings(delay_s=0.02)) as network:
+            a, b = network.add("a"), network.add("b")
+            a.knows(b, b.addresses if knows != "other" else (), FAST_REKEY)
+            b.knows(a, a.addresses if knows != "restarted" else (), FAST_REKEY)
+            a.start()
+            b.start()
+            network.talk(a, b)
+            recorder = Recorder(network)
+            network.run(30)
+            initiations = [each for each in recorder.recorded if each[0][0] == 1]
+            assert len(initiations) >= 15
+            begin = network.now
+            a.start(0.0)
+            recorder.recorded = initiations * 4 + recorder.recorded[-1000:]
+            _storm(network, recorder, per_s=200, duration_s=10)
+            network.run_until(partial(share_a_session, a, b), within_s=3)
+            network.run(begin + 10 - network.now)
+            for flow in (network.flow(a, b), network.flow(b, a)):
+                assert not flow.lost(begin + 3, network.now - 0.1), f"{flow.sender} to {flow.receiver}"
+
+
+def test_replays_from_before_a_restart_start_no_handshake_on_a_living_link() -> None:
+    """Envelopes of forgotten sessions, sent again from the peer's own address, are no reason for new keys."""
+    with Network("old envelopes", RadioSettings(delay_s=0.02)) as network:
+        a, b = network.pair()
+        network.talk(a, b)
+        recorder = Recorder(network)
+        network.run(5)
+        network.listeners.clear()
+        a.start(0.0)
+        b.start(0.0)
+        network.run(3)
+        handshakes = [a.peer(b).traffic.handshakes, b.peer(a).traffic.handshakes]
+        begin = network.now
+        for number, (datagram, source, destination) in enumerate(recorder.recorded):
+            if datagram[0] == 0x40:
+                network.at(begin + number * 0.01, partial(network.inject, datagram, source, destination))
+        network.run(5)
+        assert a.drops["unknown_index"] > 50
+        assert b.drops["unknown_index"] > 50
+        assert [a.peer(b).traffic.handshakes, b.peer(a).traffic.handshakes] == handshakes
+        for flow in (network.flow(a, b), network.flow(b, a)):
+            assert not flow.lost(begin, network.now - 0.1)
+
+
+def test_link_comes_up_amid_a_storm_that_uses_up_all_answers() -> None:
+    """A drone starts while its old initiations are replayed at its peer by the hundred: it is linked within 3 s."""
+    for seed in range(2):
+        with Network(f"storm first {seed}", RadioSettings(delay_s=0.05)) as network:
+            a, b = network.add("a"), network.add("b")
+            often = Link(timers=Timers(rekey_after_s=0.05, reject_after_s=6.0))
+            a.knows(b, (), often)
+            b.knows(a, a.addresses, often)
+            a.start()
+            b.start()
+            network.talk(a, b)
+            recorder = Recorder(network)
+            network.run(120)
+            old = [datagram for datagram, _, to in recorder.recorded if datagram[0] == 1 and to == a.addresses[0]]
+            network.listeners.clear()
+            assert len(old) > 300
+            b.stop()
+            a.start(0.0)  # it remembers none of them
+            begin = network.now
+            for number, datagram in enumerate(old):
+                network.at(begin + number / 50, partial(network.inject, datagram, MISCHIEF, a.addresses[0]))
+            network.run(3)
+            assert a.drops["cookie_required"] > 50
+            b.start(0.0)
+            network.run_until(partial(share_a_session, a, b), within_s=3)
+            network.run(2)
+            assert share_a_session(a, b)

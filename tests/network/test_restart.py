@@ -1,0 +1,106 @@
+"""Drones that lose all state but their key, and a clock that starts anywhere."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.network.network import Drone, Network, share_a_session
+from uavlinkd.mitm.radio import RadioSettings
+
+BACK_WITHIN_S = 2.0
+CLOCKS = {"zero": 0.0, "1970": 1.0, "2106": 2.0**32 + 0.25}
+
+
+def _linked(network: Network, *, a_knows: bool = True, b_knows: bool = True) -> tuple[Drone, Drone]:
+    a, b = network.add("a", clock=1e9), network.add("b", clock=1e5)
+    a.knows(b, b.addresses if a_knows else ())
+    b.knows(a, a.addresses if b_knows else ())
+    a.start()
+    b.start()
+    network.talk(a, b)
+    network.run_until(lambda: share_a_session(a, b), within_s=3)
+    network.run(2.3)
+    return a, b
+
+
+def _assert_both_hear_within(network: Network, a: Drone, b: Drone, bound_s: float) -> None:
+    """Frames sent from now on come out at both ends within the bound, and go on coming."""
+    begin = network.now
+    network.run(bound_s)
+    for flow in (network.flow(a, b), network.flow(b, a)):
+        assert flow.first_delivery(begin) <= begin + bound_s, f"{flow.sender} to {flow.receiver} is silent"
+    network.run(3)
+    assert share_a_session(a, b)
+    for flow in (network.flow(a, b), network.flow(b, a)):
+        assert not flow.lost(begin + bound_s, network.now - 1)
+
+
+@pytest.mark.parametrize("clock", CLOCKS.values(), ids=CLOCKS)
+@pytest.mark.parametrize("delay_s", [0.0, 0.02, 0.1])
+@pytest.mark.parametrize("who_knows", ["both", "restarted", "other"])
+def test_link_is_back_after_a_restart_without_state(who_knows: str, delay_s: float, clock: float) -> None:
+    """One end restarts with its key alone and another clock: frames cross again within two seconds."""
+    for seed in range(5):
+        with Network(f"restart {who_knows} {delay_s} {clock} {seed}", RadioSettings(delay_s=delay_s)) as network:
+            a, b = _linked(network, a_knows=who_knows != "other", b_knows=who_knows != "restarted")
+            network.run(network.chance.random())
+            a.start(clock)
+            _assert_both_hear_within(network, a, b, BACK_WITHIN_S)
+
+
+@pytest.mark.parametrize("gap_s", [0.0, 0.4, 2.5])
+@pytest.mark.parametrize("a_alone_knows", [True, False])
+def test_link_is_back_after_both_restart(a_alone_knows: bool, gap_s: float) -> None:
+    """Both ends restart, at once or one after the other: frames cross again within two seconds of the last."""
+    for seed in range(5):
+        with Network(f"both restart {a_alone_knows} {gap_s} {seed}", RadioSettings(delay_s=0.1)) as network:
+            a, b = _linked(network, b_knows=not a_alone_knows)
+            a.start(0.0)
+            network.run(gap_s)
+            b.start(0.0)
+            _assert_both_hear_within(network, a, b, BACK_WITHIN_S)
+
+
+def test_link_is_back_after_a_long_absence() -> None:
+    """A drone that was off until all keys had aged out is linked again within two seconds of its start."""
+    with Network("absence", RadioSettings(delay_s=0.1)) as network:
+        a, b = _linked(network)
+        a.stop()
+        network.run(400)
+        assert b.session(a) is None
+        a.start(0.0)
+        _assert_both_hear_within(network, a, b, BACK_WITHIN_S)
+
+
+def test_restarting_again_and_again_leaves_a_link() -> None:
+    """Twenty restarts of either end at odd moments, the clock at zero each time: the link comes back after each."""
+    for seed in range(4):
+        with Network(f"restarts {seed}", RadioSettings(delay_s=0.05, loss=0.1)) as network:
+            a, b = _linked(network)
+            for _ in range(20):
+                network.chance.choice((a, b)).start(0.0)
+                network.run(network.chance.uniform(0.0, 2.0))
+            network.set_radio(RadioSettings(delay_s=0.05))
+            _assert_both_hear_within(network, a, b, BACK_WITHIN_S)
+
+
+def test_late_confirmation_from_before_a_restart_does_not_pull_traffic_back() -> None:
+    """A confirmation delayed past the restart of its sender makes an older session of equal rank: it is not used."""
+    with Network("late confirmation", RadioSettings(delay_s=0.05)) as network:
+        a, b = network.add("a"), network.add("b")
+        a.knows(b, b.addresses)
+        b.knows(a)
+        a.start()
+        b.start()
+        network.run(0.09)  # the response is on its way
+        network.set_radio(RadioSettings(delay_s=2.0))
+        network.run_until(lambda: a.session(b) is not None, within_s=1)
+        network.set_radio(RadioSettings(delay_s=0.05))
+        a.start(0.0)
+        network.talk(a, b)
+        network.run_until(lambda: share_a_session(a, b), within_s=1)
+        begin = network.now
+        network.run(4)
+        assert b.peer(a).traffic.handshakes == 2  # the late one came
+        assert share_a_session(a, b)
+        assert not network.flow(b, a).lost(begin, network.now - 0.1)

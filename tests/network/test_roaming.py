@@ -1,0 +1,137 @@
+"""Addresses that change under traffic, honestly and by mischief."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.network.attackers import Racer
+from tests.network.network import Address, Drone, Flow, Network, share_a_session
+from uavlinkd.core.outputs import PathChanged
+from uavlinkd.mitm.radio import RadioSettings
+
+BACK_WITHIN_S = 3.0
+MISCHIEF: Address = ("198.51.100.66", 6666)
+
+
+def _linked(network: Network, *, b_knows: bool = True, interval_s: float = 0.05) -> tuple[Drone, Drone]:
+    a, b = network.add("a"), network.add("b", clock=2.0**32)
+    a.knows(b, b.addresses)
+    b.knows(a, a.addresses if b_knows else ())
+    a.start()
+    b.start()
+    network.talk(a, b, interval_s)
+    network.run_until(lambda: share_a_session(a, b), within_s=4)
+    network.run(3)
+    return a, b
+
+
+def _flows(network: Network, a: Drone, b: Drone) -> tuple[Flow, Flow]:
+    return network.flow(a, b), network.flow(b, a)
+
+
+def _path_to(drone: Drone, other: Drone) -> Address:
+    path = drone.peer(other).path
+    assert path is not None
+    return path[1], path[2]
+
+
+@pytest.mark.parametrize("delay_s", [0.01, 0.1, 0.3])
+def test_traffic_follows_an_address_change_within_a_round_trip(delay_s: float) -> None:
+    """After the mover's next frame, its question and its answer, traffic goes to the new address; no new keys."""
+    for seed in range(5):
+        with Network(f"moves {delay_s} {seed}", RadioSettings(delay_s=delay_s)) as network:
+            a, b = _linked(network, b_knows=False)
+            handshakes = b.peer(a).traffic.handshakes
+            begin = network.now
+            a.move(("172.16.0.7", 40007))
+            network.run(0.06 + 3 * delay_s)
+            assert _path_to(b, a) == a.addresses[0]
+            assert b.peer(a).traffic.handshakes == handshakes
+            assert [event for at, event in b.outputs if at > begin] == [PathChanged("a", (0, *a.addresses[0]))]
+            back = network.now
+            network.run(2)
+            for flow in _flows(network, a, b):
+                assert not flow.lost(back, network.now - delay_s - 0.01)
+            assert not network.flow(a, b).lost(begin, back)
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.3])
+def test_nat_rebinding_under_traffic_is_followed(loss: float) -> None:
+    """A NAT that forgets its mapping every five seconds: each time both ways work again within three seconds."""
+    for seed in range(4):
+        with Network(f"nat {loss} {seed}", RadioSettings(delay_s=0.05, loss=loss)) as network:
+            a, b = _linked(network, b_knows=False)
+            a.is_behind_nat = True
+            for rebinding in range(6):
+                a.move(("203.0.113.1", 50000 + rebinding))
+                network.run(BACK_WITHIN_S)
+                back = network.now
+                network.run(2)
+                for flow in _flows(network, a, b):
+                    assert flow.first_delivery(back) < network.now, f"{flow.sender} to {flow.receiver}"
+                assert _path_to(b, a) == a.addresses[0]
+
+
+def test_both_ends_may_move_at_once_while_one_keeps_an_address() -> None:
+    """Both ends change their address in the same instant; one has a second address that the other knows."""
+    for seed in range(5):
+        with Network(f"both move {seed}", RadioSettings(delay_s=0.05)) as network:
+            a, b = network.add("a"), network.add("b", ("10.0.0.2", 5790), ("10.0.9.2", 5790))
+            a.knows(b, b.addresses)
+            b.knows(a, a.addresses)
+            a.start()
+            b.start()
+            network.talk(a, b)
+            network.run(5)
+            a.move(("172.16.0.7", 40007))
+            b.move(("172.16.0.8", 40008), ("10.0.9.2", 5790))
+            network.run(BACK_WITHIN_S)
+            back = network.now
+            network.run(3)
+            for flow in _flows(network, a, b):
+                assert not flow.lost(back, network.now - 0.1)
+
+
+def test_forwarding_from_a_third_address_does_not_attract_traffic() -> None:
+    """Every datagram arrives first from an address that answers nothing: it gets questions, and no frame ever."""
+    for seed in range(5):
+        with Network(f"mischief {seed}", RadioSettings(delay_s=0.02)) as network:
+            a, b = _linked(network)
+            racer = Racer(network, MISCHIEF, a, b, relays=False)
+            network.radios_of[MISCHIEF, b.addresses[0]] = RadioSettings(delay_s=0.001)
+            begin = network.now
+            network.run(10)
+            assert _path_to(b, a) == a.addresses[0]
+            assert racer.attracted  # questions
+            assert max(map(len, racer.attracted)) <= 32
+            assert len(racer.attracted) <= 10 * 4 + 1
+            for flow in _flows(network, a, b):
+                assert not flow.lost(begin, network.now - 0.1)
+
+
+@pytest.mark.parametrize("b_knows", [True, False])
+@pytest.mark.parametrize("both_ways", [True, False])
+def test_traffic_recovers_when_a_relaying_third_address_stops(both_ways: bool, b_knows: bool) -> None:
+    """An attacker that is the faster way gets the traffic; it stops, and frames cross again within three seconds."""
+    for seed in range(5):
+        with Network(f"relay {both_ways} {b_knows} {seed}", RadioSettings(delay_s=0.05)) as network:
+            a, b = _linked(network, b_knows=b_knows)
+            racers = [Racer(network, MISCHIEF, a, b, relays=True)]
+            if both_ways:
+                racers.append(Racer(network, ("198.51.100.67", 6667), b, a, relays=True))
+            for racer in racers:
+                for drone in (a, b):
+                    network.radios_of[racer.address, drone.addresses[0]] = RadioSettings(delay_s=0.001)
+                    network.radios_of[drone.addresses[0], racer.address] = RadioSettings(delay_s=0.001)
+            network.run(5)
+            assert _path_to(b, a) in {racer.address for racer in racers}
+            for racer in racers:
+                racer.is_active = False
+            stopped = network.now
+            network.run(BACK_WITHIN_S)
+            back = network.now
+            network.run(3)
+            for flow in _flows(network, a, b):
+                assert flow.first_delivery(stopped) < back
+                assert not flow.lost(back, network.now - 0.1)
+            assert _path_to(b, a) == a.addresses[0]
