@@ -1,0 +1,257 @@
+"""What messages are called, and which belong together.
+
+A *group* is a tuple of message names that a policy can allow or deny by one word. Groups may share messages.
+Each message of the dialect is in one of them at least, and in ``all``.
+
+Groups follow what a message can *do* to an autopilot. That matters for messages that both report and inform:
+DISTANCE_SENSOR is telemetry to a ground station, and to an autopilot an obstacle. Such a message is in
+`telemetry` and in `sensors`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache
+from typing import Final, NamedTuple
+
+from uavlinkd.mavlink.dialect_table import COMMANDS, MESSAGES
+
+ALL: Final = "all"
+
+
+class MessageFacts(NamedTuple):
+    """What the dialect says of one message. Lengths and offsets in bytes of the payload; None: no such field."""
+
+    name: str
+    crc_extra: int
+    min_length: int
+    max_length: int
+    target_system_at: int | None
+    target_component_at: int | None
+    command_at: int | None
+
+
+def facts(msgid: int) -> MessageFacts | None:
+    """What is known of a message, or None."""
+    row = MESSAGES.get(msgid)
+    return MessageFacts(*row) if row else None
+
+
+def name_of(msgid: int) -> str:
+    """The message's name; of an unknown one, its number."""
+    row = MESSAGES.get(msgid)
+    return row[0] if row else str(msgid)
+
+
+@cache
+def ids_by_name() -> Mapping[str, int]:
+    """Each message's id by its name."""
+    return {row[0]: msgid for msgid, row in MESSAGES.items()}
+
+
+def command_number(name: str) -> int | None:
+    """The number of a command, with or without ``MAV_CMD_`` in front; None if no dialect has it."""
+    name = name.upper()
+    return COMMANDS.get(name if name.startswith("MAV_CMD_") else f"MAV_CMD_{name}")
+
+
+def command_name(number: int) -> str:
+    """The command's name; of an unknown one, its number."""
+    return _command_names().get(number, str(number))
+
+
+def group(name: str) -> tuple[str, ...] | None:
+    """The names of the messages in a group, or None if there is no such group."""
+    return tuple(ids_by_name()) if name == ALL else GROUPS.get(name)
+
+
+@cache
+def _command_names() -> Mapping[int, str]:
+    return {number: name for name, number in COMMANDS.items()}
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(text.split())
+
+
+GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
+    # "I am here, of this kind, in this state."
+    "heartbeat": ("HEARTBEAT",),
+    # Where a vehicle is, how it moves and where it is going: what others need to fly beside it.
+    "position": _names(
+        "ATTITUDE ATTITUDE_QUATERNION GLOBAL_POSITION_INT LOCAL_POSITION_NED VFR_HUD "
+        "POSITION_TARGET_GLOBAL_INT HOME_POSITION EXTENDED_SYS_STATE"
+    ),
+    # What a vehicle reports of itself: nothing in here asks anyone for anything.
+    "telemetry": _names(
+        "HEARTBEAT SYS_STATUS SYSTEM_TIME GPS_RAW_INT GPS_STATUS SCALED_IMU RAW_IMU RAW_PRESSURE "
+        "SCALED_PRESSURE ATTITUDE ATTITUDE_QUATERNION LOCAL_POSITION_NED GLOBAL_POSITION_INT "
+        "RC_CHANNELS_SCALED RC_CHANNELS_RAW SERVO_OUTPUT_RAW MISSION_CURRENT MISSION_ITEM_REACHED "
+        "GPS_GLOBAL_ORIGIN SAFETY_ALLOWED_AREA ATTITUDE_QUATERNION_COV NAV_CONTROLLER_OUTPUT "
+        "GLOBAL_POSITION_INT_COV LOCAL_POSITION_NED_COV RC_CHANNELS DATA_STREAM VFR_HUD MANUAL_SETPOINT "
+        "ATTITUDE_TARGET POSITION_TARGET_LOCAL_NED POSITION_TARGET_GLOBAL_INT "
+        "LOCAL_POSITION_NED_SYSTEM_GLOBAL_OFFSET OPTICAL_FLOW HIGHRES_IMU OPTICAL_FLOW_RAD SIM_STATE "
+        "SCALED_IMU2 GPS2_RAW POWER_STATUS GPS_RTK GPS2_RTK SCALED_IMU3 DISTANCE_SENSOR TERRAIN_REPORT "
+        "SCALED_PRESSURE2 ACTUATOR_CONTROL_TARGET ALTITUDE SCALED_PRESSURE3 CONTROL_SYSTEM_STATE "
+        "BATTERY_STATUS AUTOPILOT_VERSION LANDING_TARGET FENCE_STATUS MAG_CAL_REPORT EFI_STATUS "
+        "ESTIMATOR_STATUS WIND_COV HIGH_LATENCY HIGH_LATENCY2 VIBRATION HOME_POSITION MESSAGE_INTERVAL "
+        "EXTENDED_SYS_STATE NAMED_VALUE_FLOAT NAMED_VALUE_INT NAMED_VALUE_STRING STATUSTEXT DEBUG DEBUG_VECT "
+        "DEBUG_FLOAT_ARRAY MEMORY_VECT BUTTON_CHANGE FLIGHT_INFORMATION MOUNT_ORIENTATION "
+        "UAVCAN_NODE_STATUS UAVCAN_NODE_INFO ODOMETRY SMART_BATTERY_INFO GENERATOR_STATUS "
+        "ACTUATOR_OUTPUT_STATUS ORBIT_EXECUTION_STATUS ONBOARD_COMPUTER_STATUS RAW_RPM AVAILABLE_MODES "
+        "CURRENT_MODE AVAILABLE_MODES_MONITOR AIRSPEED GLOBAL_POSITION_SENSOR GNSS_INTEGRITY "
+        "WHEEL_DISTANCE WINCH_STATUS HYGROMETER_SENSOR SENSOR_OFFSETS MEMINFO AP_ADC MOUNT_STATUS "
+        "LIMITS_STATUS WIND RANGEFINDER AIRSPEED_AUTOCAL COMPASSMOT_STATUS AHRS SIMSTATE HWSTATUS AHRS2 "
+        "BATTERY2 AHRS3 MAG_CAL_PROGRESS EKF_STATUS_REPORT PID_TUNING DEEPSTALL RPM AOA_SSA "
+        "ESC_TELEMETRY_1_TO_4 ESC_TELEMETRY_5_TO_8 ESC_TELEMETRY_9_TO_12 ESC_TELEMETRY_13_TO_16 "
+        "ESC_TELEMETRY_17_TO_20 ESC_TELEMETRY_21_TO_24 ESC_TELEMETRY_25_TO_28 ESC_TELEMETRY_29_TO_32 "
+        "MCU_STATUS ADAP_TUNING WATER_DEPTH RELAY_STATUS FW_SOARING_DATA SENS_POWER SENS_MPPT ASLCTRL_DATA "
+        "ASLCTRL_DEBUG ASLUAV_STATUS EKF_EXT ASL_OBCTRL SENS_ATMOS SENS_BATMON SENS_POWER_BOARD "
+        "SENSORPOD_STATUS SENSOR_AIRFLOW_ANGLES NAV_FILTER_BIAS UALBERTA_SYS_STATUS UTM_GLOBAL_POSITION "
+        "LOWEHEISER_GOV_EFI AVSS_PRS_SYS_STATUS AVSS_DRONE_POSITION AVSS_DRONE_IMU AVSS_DRONE_OPERATION_MODE "
+        "HERELINK_TELEM ICAROUS_HEARTBEAT ICAROUS_KINEMATIC_BANDS QSHOT_STATUS CUBEPILOT_RAW_RC "
+        "FRSKY_PASSTHROUGH_ARRAY OBSTACLE_DISTANCE OBSTACLE_DISTANCE_3D"
+    ),
+    # Other aircraft and ships around. Autopilots evade what they are told of here, and follow a FOLLOW_TARGET.
+    "traffic": _names("ADSB_VEHICLE COLLISION AIS_VESSEL FOLLOW_TARGET UTM_GLOBAL_POSITION"),
+    # An ADS-B transponder: what it sends, and its state.
+    "transponder": _names(
+        "UAVIONIX_ADSB_OUT_CFG UAVIONIX_ADSB_OUT_DYNAMIC UAVIONIX_ADSB_TRANSCEIVER_HEALTH_REPORT "
+        "UAVIONIX_ADSB_OUT_CFG_REGISTRATION UAVIONIX_ADSB_OUT_CFG_FLIGHTID UAVIONIX_ADSB_GET "
+        "UAVIONIX_ADSB_OUT_CONTROL UAVIONIX_ADSB_OUT_STATUS"
+    ),
+    # Remote identification of aircraft.
+    "identification": _names(
+        "OPEN_DRONE_ID_BASIC_ID OPEN_DRONE_ID_LOCATION OPEN_DRONE_ID_AUTHENTICATION OPEN_DRONE_ID_SELF_ID "
+        "OPEN_DRONE_ID_SYSTEM OPEN_DRONE_ID_OPERATOR_ID OPEN_DRONE_ID_MESSAGE_PACK OPEN_DRONE_ID_ARM_STATUS "
+        "OPEN_DRONE_ID_SYSTEM_UPDATE"
+    ),
+    # Anything that carries a MAV_CMD to be done at once, the older SET_MODE, and the answer to them.
+    "commands": _names("COMMAND_LONG COMMAND_INT COMMAND_ACK SET_MODE COMMAND_INT_STAMPED COMMAND_LONG_STAMPED"),
+    # A vehicle's side of what an operator starts: commands, parameters, missions, logs.
+    "answers": _names(
+        "COMMAND_ACK PARAM_VALUE PARAM_VALUE_ARRAY PARAM_ERROR PARAM_EXT_VALUE PARAM_EXT_ACK "
+        "MISSION_REQUEST MISSION_REQUEST_INT MISSION_COUNT MISSION_ITEM MISSION_ITEM_INT MISSION_ACK "
+        "MISSION_CURRENT MISSION_ITEM_REACHED MISSION_CHECKSUM FENCE_POINT RALLY_POINT LOG_ENTRY LOG_DATA "
+        "LOGGING_DATA LOGGING_DATA_ACKED REMOTE_LOG_DATA_BLOCK DATA_TRANSMISSION_HANDSHAKE "
+        "ENCAPSULATED_DATA OSD_PARAM_CONFIG_REPLY OSD_PARAM_SHOW_CONFIG_REPLY "
+        "CHANGE_OPERATOR_CONTROL_ACK TERRAIN_REQUEST TERRAIN_REPORT AUTOPILOT_VERSION"
+    ),
+    # What cameras, gimbals and other payloads report.
+    "payload-reports": _names(
+        "CAMERA_TRIGGER CAMERA_INFORMATION CAMERA_SETTINGS STORAGE_INFORMATION CAMERA_CAPTURE_STATUS "
+        "CAMERA_IMAGE_CAPTURED CAMERA_FEEDBACK CAMERA_STATUS CAMERA_FOV_STATUS CAMERA_TRACKING_IMAGE_STATUS "
+        "CAMERA_TRACKING_GEO_STATUS CAMERA_THERMAL_RANGE VIDEO_STREAM_INFORMATION VIDEO_STREAM_STATUS "
+        "HERELINK_VIDEO_STREAM_INFORMATION GOPRO_HEARTBEAT GOPRO_GET_RESPONSE GOPRO_SET_RESPONSE "
+        "GIMBAL_MANAGER_INFORMATION GIMBAL_MANAGER_STATUS GIMBAL_DEVICE_INFORMATION "
+        "GIMBAL_DEVICE_ATTITUDE_STATUS MOUNT_STATUS MOUNT_ORIENTATION GIMBAL_REPORT "
+        "GIMBAL_TORQUE_CMD_REPORT STORM32_GIMBAL_MANAGER_INFORMATION STORM32_GIMBAL_MANAGER_STATUS"
+    ),
+    # Reading and writing parameters.
+    "parameters": _names(
+        "PARAM_REQUEST_READ PARAM_REQUEST_LIST PARAM_VALUE PARAM_SET PARAM_MAP_RC PARAM_EXT_REQUEST_READ "
+        "PARAM_EXT_REQUEST_LIST PARAM_EXT_VALUE PARAM_EXT_SET PARAM_EXT_ACK PARAM_ERROR PARAM_VALUE_ARRAY "
+        "SET_MAG_OFFSETS OSD_PARAM_CONFIG OSD_PARAM_CONFIG_REPLY OSD_PARAM_SHOW_CONFIG "
+        "OSD_PARAM_SHOW_CONFIG_REPLY"
+    ),
+    # Only asking for parameters.
+    "parameter-reads": _names(
+        "PARAM_REQUEST_READ PARAM_REQUEST_LIST PARAM_EXT_REQUEST_READ PARAM_EXT_REQUEST_LIST OSD_PARAM_SHOW_CONFIG"
+    ),
+    # Missions, fences, rally points, home and origin, both ways.
+    "mission": _names(
+        "MISSION_REQUEST_PARTIAL_LIST MISSION_WRITE_PARTIAL_LIST MISSION_ITEM MISSION_REQUEST "
+        "MISSION_SET_CURRENT MISSION_CURRENT MISSION_REQUEST_LIST MISSION_COUNT MISSION_CLEAR_ALL "
+        "MISSION_ITEM_REACHED MISSION_ACK MISSION_REQUEST_INT MISSION_ITEM_INT MISSION_CHECKSUM "
+        "SAFETY_SET_ALLOWED_AREA SAFETY_ALLOWED_AREA FENCE_POINT FENCE_FETCH_POINT FENCE_STATUS "
+        "RALLY_POINT RALLY_FETCH_POINT SET_HOME_POSITION HOME_POSITION SET_GPS_GLOBAL_ORIGIN "
+        "GPS_GLOBAL_ORIGIN"
+    ),
+    # Only reading a mission back.
+    "mission-reads": _names(
+        "MISSION_REQUEST_LIST MISSION_REQUEST_PARTIAL_LIST MISSION_REQUEST MISSION_REQUEST_INT MISSION_ACK "
+        "FENCE_FETCH_POINT RALLY_FETCH_POINT"
+    ),
+    # Offboard control: position, velocity, attitude and actuators, many times a second.
+    "setpoints": _names(
+        "SET_ATTITUDE_TARGET SET_POSITION_TARGET_LOCAL_NED SET_POSITION_TARGET_GLOBAL_INT "
+        "SET_ACTUATOR_CONTROL_TARGET TRAJECTORY_REPRESENTATION_WAYPOINTS TRAJECTORY_REPRESENTATION_BEZIER"
+    ),
+    # A joystick in place of the pilot's transmitter.
+    "manual": _names("MANUAL_CONTROL RC_CHANNELS_OVERRIDE RADIO_RC_CHANNELS"),
+    # Measurements from outside that an autopilot steers by: whoever can send these can lead it astray.
+    "sensors": _names(
+        "GPS_INPUT VISION_POSITION_ESTIMATE VISION_SPEED_ESTIMATE VISION_POSITION_DELTA "
+        "GLOBAL_VISION_POSITION_ESTIMATE VICON_POSITION_ESTIMATE ATT_POS_MOCAP ODOMETRY OPTICAL_FLOW "
+        "OPTICAL_FLOW_RAD DISTANCE_SENSOR OBSTACLE_DISTANCE OBSTACLE_DISTANCE_3D LANDING_TARGET "
+        "FOLLOW_TARGET GLOBAL_POSITION_SENSOR RANGING_BEACON AIRSPEED WIND_COV"
+    ),
+    # Corrections for satellite positioning.
+    "rtk": _names("GPS_RTCM_DATA GPS_INJECT_DATA"),
+    # Terrain heights for the autopilot.
+    "terrain": _names("TERRAIN_REQUEST TERRAIN_DATA TERRAIN_CHECK TERRAIN_REPORT"),
+    # A simulator in place of the sensors.
+    "simulation": _names(
+        "HIL_STATE HIL_CONTROLS HIL_RC_INPUTS_RAW HIL_ACTUATOR_CONTROLS HIL_SENSOR HIL_GPS HIL_OPTICAL_FLOW "
+        "HIL_STATE_QUATERNION SIM_STATE SIMSTATE"
+    ),
+    # Asking for telemetry, at a rate.
+    "streams": _names("REQUEST_DATA_STREAM MESSAGE_INTERVAL DATA_STREAM AUTOPILOT_VERSION_REQUEST"),
+    # Clocks and round trips.
+    "time": _names("SYSTEM_TIME TIMESYNC PING"),
+    # Cameras: control, state, video.
+    "camera": _names(
+        "CAMERA_TRIGGER CAMERA_INFORMATION CAMERA_SETTINGS STORAGE_INFORMATION CAMERA_CAPTURE_STATUS "
+        "CAMERA_IMAGE_CAPTURED CAMERA_FEEDBACK CAMERA_STATUS CAMERA_FOV_STATUS CAMERA_TRACKING_IMAGE_STATUS "
+        "CAMERA_TRACKING_GEO_STATUS CAMERA_THERMAL_RANGE VIDEO_STREAM_INFORMATION VIDEO_STREAM_STATUS "
+        "HERELINK_VIDEO_STREAM_INFORMATION DIGICAM_CONFIGURE DIGICAM_CONTROL GOPRO_HEARTBEAT "
+        "GOPRO_GET_REQUEST GOPRO_GET_RESPONSE GOPRO_SET_REQUEST GOPRO_SET_RESPONSE"
+    ),
+    # Gimbals and mounts: control and state.
+    "gimbal": _names(
+        "GIMBAL_MANAGER_INFORMATION GIMBAL_MANAGER_STATUS GIMBAL_MANAGER_SET_ATTITUDE "
+        "GIMBAL_DEVICE_INFORMATION GIMBAL_DEVICE_SET_ATTITUDE GIMBAL_DEVICE_ATTITUDE_STATUS "
+        "AUTOPILOT_STATE_FOR_GIMBAL_DEVICE AUTOPILOT_STATE_FOR_GIMBAL_DEVICE_EXT "
+        "GIMBAL_MANAGER_SET_PITCHYAW GIMBAL_MANAGER_SET_MANUAL_CONTROL MOUNT_CONFIGURE MOUNT_CONTROL "
+        "MOUNT_STATUS MOUNT_ORIENTATION GIMBAL_REPORT GIMBAL_CONTROL GIMBAL_TORQUE_CMD_REPORT "
+        "STORM32_GIMBAL_MANAGER_INFORMATION STORM32_GIMBAL_MANAGER_STATUS STORM32_GIMBAL_MANAGER_CONTROL "
+        "STORM32_GIMBAL_MANAGER_CONTROL_PITCHYAW STORM32_GIMBAL_MANAGER_CORRECT_ROLL"
+    ),
+    # Lights, sounds.
+    "signals": _names("LED_CONTROL PLAY_TUNE"),
+    # State of radios. An autopilot slows down its telemetry when a RADIO_STATUS asks for it.
+    "radio": _names(
+        "RADIO RADIO_STATUS RADIO_CALIBRATION SATCOM_LINK_STATUS GSM_LINK_STATUS ISBD_LINK_STATUS "
+        "MLRS_RADIO_LINK_STATS MLRS_RADIO_LINK_INFORMATION MLRS_RADIO_LINK_FLOW_CONTROL AIRLINK_AUTH "
+        "AIRLINK_AUTH_RESPONSE WIFI_CONFIG_AP"
+    ),
+    # Files and logs. FILE_TRANSFER_PROTOCOL also writes: parameters, missions and scripts are files.
+    "files": _names(
+        "FILE_TRANSFER_PROTOCOL LOG_REQUEST_LIST LOG_ENTRY LOG_REQUEST_DATA LOG_DATA LOG_ERASE "
+        "LOG_REQUEST_END LOGGING_DATA LOGGING_DATA_ACKED LOGGING_ACK REMOTE_LOG_DATA_BLOCK "
+        "REMOTE_LOG_BLOCK_STATUS DATA_TRANSMISSION_HANDSHAKE ENCAPSULATED_DATA RESOURCE_REQUEST"
+    ),
+    # Bytes for a shell, a serial port, a bus or a program: no policy can see what they do.
+    "shell": _names(
+        "SERIAL_CONTROL TUNNEL V2_EXTENSION CAN_FRAME CANFD_FRAME CAN_FILTER_MODIFY DEVICE_OP_READ "
+        "DEVICE_OP_READ_REPLY DEVICE_OP_WRITE DEVICE_OP_WRITE_REPLY DATA16 DATA32 DATA64 DATA96"
+    ),
+    # New firmware.
+    "firmware": _names("CUBEPILOT_FIRMWARE_UPDATE_START CUBEPILOT_FIRMWARE_UPDATE_RESP"),
+    # Who may control, and secrets for it.
+    "control-access": _names(
+        "CHANGE_OPERATOR_CONTROL CHANGE_OPERATOR_CONTROL_ACK AUTH_KEY SECURE_COMMAND SECURE_COMMAND_REPLY"
+    ),
+    # A MAVLink 2 signing key in clear. Never crosses a link, whatever a policy says.
+    "signing": ("SETUP_SIGNING",),
+    # Made for testing MAVLink itself.
+    "test": _names(
+        "TEST_TYPES ARRAY_TEST_0 ARRAY_TEST_1 ARRAY_TEST_3 ARRAY_TEST_4 ARRAY_TEST_5 ARRAY_TEST_6 "
+        "ARRAY_TEST_7 ARRAY_TEST_8"
+    ),
+    # What must get through a slow radio first: life signs, commands and their answers.
+    "urgent": _names(
+        "HEARTBEAT COMMAND_LONG COMMAND_INT COMMAND_ACK SET_MODE COMMAND_INT_STAMPED COMMAND_LONG_STAMPED "
+        "MANUAL_CONTROL RC_CHANNELS_OVERRIDE"
+    ),
+}

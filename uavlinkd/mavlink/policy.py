@@ -1,0 +1,366 @@
+"""Who may say what: a policy for one peer or one local endpoint, each way.
+
+*In* is what comes from the peer or endpoint, *out* what goes to it. The keys, all optional unless said otherwise::
+
+    role = "operator"                    a preset to start from, see `roles`
+    system_ids = [1, "10-20"]            MAVLink systems it may speak as; "all" trusts it with every one
+    allow_in  = ["telemetry", "PING"]    what passes; without a role and this list, everything does
+    deny_in   = ["MAV_CMD_DO_FLIGHTTERMINATION"]            what does not, whatever allows it
+    allow_out, deny_out                  the same for the other way
+    rate_in   = { ATTITUDE = 10 }        frames a second of each message and system; also of a group's messages
+    rate_out                             the same for the other way
+    mavlink1 = true                      whether MAVLink 1 frames pass
+    ground_station = true                whether its HEARTBEAT may claim to be a ground station's
+
+A list's entries add up, a role's entries among them, and what is denied is denied whatever allows it. An entry is
+
+``telemetry``            a group of `dialect.GROUPS` (small letters), or ``all``
+``ATTITUDE``             a message by its name (capitals)
+``30``                   a message by its number: the way to name one that the dialect does not know
+``MAV_CMD_NAV_TAKEOFF``  a command by its name; ``command:22`` by its number. Allowing one lets it through in
+                         COMMAND_LONG and COMMAND_INT. Denying one keeps it out of all that carries commands, mission
+                         items among them, and of messages that do the same (SET_MODE is MAV_CMD_DO_SET_MODE).
+
+What a policy cannot see into passes or not as a whole: files, shells, tunnels, raw buses. A policy that denies a
+command and lets one of those through gets a warning, as the command may travel inside. A message that the dialect
+does not know, or in another definition than the dialect's, passes only where ``all`` or its number is allowed.
+
+SETUP_SIGNING carries a signing key in clear. It never passes, whatever a policy says.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final, NamedTuple
+
+from uavlinkd.mavlink import dialect
+from uavlinkd.mavlink.dialect_table import MESSAGES
+from uavlinkd.mavlink.frames import Frame, Header
+from uavlinkd.mavlink.policy_settings import PolicyError, PolicyProblem, Rules, Settings, read_settings
+
+__all__ = [
+    "ANY_OTHER",
+    "Gate",
+    "Policy",
+    "PolicyError",
+    "PolicyProblem",
+    "PolicyRow",
+    "Refusal",
+    "compile_policy",
+]
+
+ANY_OTHER: Final = -1  # stands for every message beyond those that are counted by themselves
+MAX_COUNTED: Final = 1024  # message ids and reasons counted by themselves, of one policy and way
+MAX_BUCKETS: Final = 4096  # messages and systems with a rate limit, likewise
+MAX_DECISIONS: Final = 1024  # message ids whose decision is remembered, likewise
+BURST_S: Final = 0.5  # how much of a second's frames may come at once
+
+SETUP_SIGNING: Final = 256
+HEARTBEAT: Final = 0
+TYPE_IN_HEARTBEAT: Final = 4  # offset in its payload
+MAV_TYPE_GCS: Final = 6
+
+COMMAND_CARRIERS: Final = frozenset(msgid for msgid, row in MESSAGES.items() if row[6] is not None)
+DIRECT_COMMANDS: Final = frozenset(dialect.ids_by_name()[name] for name in ("COMMAND_LONG", "COMMAND_INT"))
+
+# Messages that do what a command does.
+SAME_AS_COMMAND: Final[Mapping[int, int]] = {
+    dialect.ids_by_name()[message]: number
+    for message, command in (
+        ("SET_MODE", "DO_SET_MODE"),
+        ("MISSION_SET_CURRENT", "DO_SET_MISSION_CURRENT"),
+        ("SET_HOME_POSITION", "DO_SET_HOME"),
+        ("REQUEST_DATA_STREAM", "SET_MESSAGE_INTERVAL"),
+        ("MOUNT_CONFIGURE", "DO_MOUNT_CONFIGURE"),
+        ("MOUNT_CONTROL", "DO_MOUNT_CONTROL"),
+        ("DIGICAM_CONFIGURE", "DO_DIGICAM_CONFIGURE"),
+        ("DIGICAM_CONTROL", "DO_DIGICAM_CONTROL"),
+        ("GIMBAL_MANAGER_SET_PITCHYAW", "DO_GIMBAL_MANAGER_PITCHYAW"),
+        ("AUTOPILOT_VERSION_REQUEST", "REQUEST_AUTOPILOT_CAPABILITIES"),
+    )
+    if (number := dialect.command_number(command)) is not None
+}
+
+# Carries five command numbers at once, which are not looked at: refused where any command is denied.
+CARRIES_MANY_COMMANDS: Final = frozenset({dialect.ids_by_name()["TRAJECTORY_REPRESENTATION_WAYPOINTS"]})
+
+# What can carry a command where no policy sees it.
+OPAQUE: Final = (*dialect.GROUPS["shell"], "FILE_TRANSFER_PROTOCOL")
+
+
+class Refusal(StrEnum):
+    """Why a frame may not pass."""
+
+    FOREIGN_SYSTEM = "foreign_system"  # speaks as a system that it is not
+    MESSAGE_NOT_ALLOWED = "message_not_allowed"
+    UNKNOWN_MESSAGE = "unknown_message"  # not in the dialect, or not as the dialect defines it
+    COMMAND_NOT_ALLOWED = "command_not_allowed"
+    SETUP_SIGNING = "setup_signing"
+    MAVLINK1_NOT_ALLOWED = "mavlink1_not_allowed"
+    GROUND_STATION_NOT_ALLOWED = "ground_station_not_allowed"
+    RATE_LIMITED = "rate_limited"
+
+
+class PolicyRow(NamedTuple):
+    """One line of a policy's table for people."""
+
+    subject: str
+    incoming: str
+    outgoing: str
+
+
+@dataclass(frozen=True, slots=True)
+class _Condition:
+    """What a frame of one message must still meet."""
+
+    only_commands: frozenset[int] | None = None  # None: any
+    never_commands: frozenset[int] = frozenset()
+    refuses_ground_station: bool = False
+    per_second: float | None = None
+
+
+class Gate:
+    """One way of one policy."""
+
+    __slots__ = ("_buckets", "_decisions", "_ground_station", "_mavlink1", "_rates", "_rules", "_systems", "refused")
+
+    def __init__(
+        self,
+        rules: Rules,
+        rates: Mapping[int, float],
+        *,
+        systems: frozenset[int] | None,
+        mavlink1: bool,
+        ground_station: bool,
+    ) -> None:
+        self._rules = rules
+        self._rates = rates
+        self._systems = systems
+        self._mavlink1 = mavlink1
+        self._ground_station = ground_station
+        self._decisions: dict[int, Refusal | _Condition | None] = {}
+        self._buckets: dict[tuple[int, int], tuple[float, float]] = {}
+        self.refused: Counter[tuple[int, Refusal]] = Counter()  # by message id (or ANY_OTHER) and reason
+
+    def check(self, frame: Frame, now: float) -> Refusal | None:
+        """None if the frame may pass, else why not, which is counted. `now` in seconds, monotonic."""
+        verdict = self._verdict(frame.header)
+        refusal = self._unmet(verdict, frame, now) if isinstance(verdict, _Condition) else verdict
+        if refusal is not None:
+            counted = (frame.header.msgid, refusal)
+            if len(self.refused) >= MAX_COUNTED and counted not in self.refused:
+                counted = (ANY_OTHER, refusal)
+            self.refused[counted] += 1
+        return refusal
+
+    def always_passes(self, header: Header) -> bool:
+        """Whether every frame with this header passes, at any rate: `check` need not be asked."""
+        return self._verdict(header) is None
+
+    def _verdict(self, header: Header) -> Refusal | _Condition | None:
+        if self._systems is not None and header.system not in self._systems:
+            return Refusal.FOREIGN_SYSTEM
+        if not self._mavlink1 and header.is_mavlink1:
+            return Refusal.MAVLINK1_NOT_ALLOWED
+        # A message in another definition than the dialect's is another message under the same number.
+        key = header.msgid if header.is_known else ~header.msgid
+        try:
+            return self._decisions[key]
+        except KeyError:
+            return self._remember(key, self.decide(header.msgid, is_known=header.is_known))
+
+    def decide(self, msgid: int, *, is_known: bool) -> Refusal | _Condition | None:
+        """What holds for every frame of a message: it passes, is refused, or has conditions to meet."""
+        rules = self._rules
+        if msgid == SETUP_SIGNING:
+            return Refusal.SETUP_SIGNING
+        if rules.denies_all or msgid in rules.denied:
+            return Refusal.MESSAGE_NOT_ALLOWED
+        is_allowed = rules.allows_all or msgid in rules.allowed_numbers or (is_known and msgid in rules.allowed)
+        only_commands = None
+        if not is_allowed:
+            if not is_known:
+                return Refusal.UNKNOWN_MESSAGE
+            if msgid not in DIRECT_COMMANDS or not rules.allowed_commands:
+                return Refusal.MESSAGE_NOT_ALLOWED
+            only_commands = rules.allowed_commands
+        never_commands: frozenset[int] = frozenset()
+        if rules.denied_commands:
+            cannot_be_read = msgid in CARRIES_MANY_COMMANDS or (msgid in COMMAND_CARRIERS and not is_known)
+            if cannot_be_read or SAME_AS_COMMAND.get(msgid) in rules.denied_commands:
+                return Refusal.COMMAND_NOT_ALLOWED
+            if msgid in COMMAND_CARRIERS:
+                never_commands = rules.denied_commands
+        condition = _Condition(
+            only_commands,
+            never_commands,
+            refuses_ground_station=msgid == HEARTBEAT and not self._ground_station,
+            per_second=self._rates.get(msgid),
+        )
+        return None if condition == _UNCONDITIONAL else condition
+
+    def _remember(self, key: int, verdict: Refusal | _Condition | None) -> Refusal | _Condition | None:
+        if len(self._decisions) >= MAX_DECISIONS:
+            self._decisions.clear()  # only someone who sends random message ids gets here
+        self._decisions[key] = verdict
+        return verdict
+
+    def _unmet(self, condition: _Condition, frame: Frame, now: float) -> Refusal | None:
+        if condition.only_commands is not None and frame.header.command not in condition.only_commands:
+            return Refusal.COMMAND_NOT_ALLOWED
+        if frame.header.command in condition.never_commands:
+            return Refusal.COMMAND_NOT_ALLOWED
+        if condition.refuses_ground_station and _claims_to_be_ground_station(frame):
+            return Refusal.GROUND_STATION_NOT_ALLOWED
+        # Last, so that only frames which would pass use up the rate.
+        if condition.per_second is not None and not self._takes_token(frame, condition.per_second, now):
+            return Refusal.RATE_LIMITED
+        return None
+
+    def _takes_token(self, frame: Frame, per_second: float, now: float) -> bool:
+        # Not per component: a sender could choose another for each frame.
+        key = (frame.header.msgid, frame.header.system)
+        # Two at least: a frame a second that comes a moment early must not be lost to a limit of one a second.
+        most = max(2.0, per_second * BURST_S)
+        tokens, updated_at = self._buckets.get(key, (most, now))
+        tokens = min(most, tokens + max(0.0, now - updated_at) * per_second)
+        if key not in self._buckets and len(self._buckets) >= MAX_BUCKETS:
+            del self._buckets[next(iter(self._buckets))]
+        self._buckets[key] = (tokens - 1 if tokens >= 1 else tokens, now)
+        return tokens >= 1
+
+
+_UNCONDITIONAL = _Condition()
+
+
+def _claims_to_be_ground_station(frame: Frame) -> bool:
+    """Whether a HEARTBEAT has the type of a ground station: PX4 takes any for a sign that its own still lives."""
+    if not frame.header.is_known:
+        return True  # its type cannot be read
+    payload_at = 6 if frame.header.is_mavlink1 else 10
+    return frame.raw[1] > TYPE_IN_HEARTBEAT and frame.raw[payload_at + TYPE_IN_HEARTBEAT] == MAV_TYPE_GCS
+
+
+class Policy:
+    """What one peer or endpoint may say (`incoming`) and be told (`outgoing`)."""
+
+    __slots__ = ("_settings", "incoming", "outgoing", "warnings")
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self.incoming = Gate(
+            settings.rules_in,
+            settings.rates_in,
+            systems=settings.systems,
+            mavlink1=settings.mavlink1,
+            ground_station=settings.ground_station,
+        )
+        self.outgoing = Gate(
+            settings.rules_out,
+            settings.rates_out,
+            systems=None,
+            mavlink1=settings.mavlink1,
+            ground_station=True,
+        )
+        self.warnings = tuple(_warnings(settings))  # sentences for the operator, the gravest first
+
+    def describe(self) -> list[PolicyRow]:
+        """The policy as a table: each group of messages, and what holds beside them."""
+        settings = self._settings
+        rules = (settings.rules_in, settings.rules_out)
+        gates = (self.incoming, self.outgoing)
+        rows = [
+            PolicyRow("role", settings.role or "none", settings.role or "none"),
+            PolicyRow("may speak as", settings.systems_text, "-"),
+        ]
+        rows += [
+            PolicyRow(name, *(_group_text(gate, members) for gate in gates))
+            for name, members in dialect.GROUPS.items()
+        ]
+        rows.append(PolicyRow("commands by number", *(_commands_text(side) for side in rules)))
+        rows.append(PolicyRow("messages by number", *(_numbers_text(side) for side in rules)))
+        unknown = ("passes" if side.allows_all and not side.denies_all else "refused" for side in rules)
+        rows.append(PolicyRow("messages unknown to the dialect", *unknown))
+        version1 = "passes" if settings.mavlink1 else "refused"
+        rows.append(PolicyRow("MAVLink 1", version1, version1))
+        rows.append(
+            PolicyRow("ground station's HEARTBEAT", "passes" if settings.ground_station else "refused", "passes")
+        )
+        rows.append(PolicyRow("rates", _rates_text(settings.rates_in), _rates_text(settings.rates_out)))
+        return rows
+
+
+def compile_policy(data: Mapping[str, object], *, needs_system_ids: bool = True) -> Policy:
+    """The policy that plain data (see this module's head) describes. No data at all: everything passes.
+
+    `needs_system_ids`: a policy that says anything must say which systems the peer may speak as. Right for
+    peers; a local endpoint without `system_ids` may speak as any.
+
+    Raises:
+        PolicyError: with every problem in the data, each with its key and its remedy.
+    """
+    return Policy(read_settings(data, needs_system_ids=needs_system_ids))
+
+
+def _warnings(settings: Settings) -> list[str]:
+    if settings.is_empty:
+        return ["no policy: it may speak as any system and send anything but SETUP_SIGNING"]
+    found = []
+    if settings.systems is None:
+        found.append('system_ids is "all": it may speak as any system, the ground station\'s among them')
+    for way, rules in (("in", settings.rules_in), ("out", settings.rules_out)):
+        if not rules.denied_commands or rules.denies_all:
+            continue
+        ids = dialect.ids_by_name()
+        through = [
+            name
+            for name in OPAQUE
+            if ids[name] not in rules.denied
+            and (rules.allows_all or ids[name] in rules.allowed or ids[name] in rules.allowed_numbers)
+        ]
+        if through:
+            found.append(f"deny_{way} names commands that may still travel unseen inside {', '.join(through)}")
+    return found
+
+
+def _group_text(gate: Gate, members: tuple[str, ...]) -> str:
+    """Which of a group's messages pass."""
+    ids = dialect.ids_by_name()
+    verdicts = {name: gate.decide(ids[name], is_known=True) for name in members}
+    passing = [name for name, verdict in verdicts.items() if not isinstance(verdict, Refusal)]
+    limited = [
+        name
+        for name in passing
+        if isinstance(verdict := verdicts[name], _Condition)
+        and (verdict.only_commands is not None or verdict.never_commands)
+    ]
+    if not passing:
+        return "none" if members != ("SETUP_SIGNING",) else "never"
+    if len(passing) == len(members):
+        text = "all"
+    elif len(passing) * 2 > len(members):
+        text = f"all but {', '.join(name for name in members if name not in passing)}"
+    else:
+        text = f"only {', '.join(passing)}"
+    return text + (f" (by command: {', '.join(limited)})" if limited else "")
+
+
+def _commands_text(rules: Rules) -> str:
+    allowed = ", ".join(dialect.command_name(number) for number in sorted(rules.allowed_commands))
+    denied = ", ".join(dialect.command_name(number) for number in sorted(rules.denied_commands))
+    parts = ([f"allowed: {allowed}"] if allowed else []) + ([f"denied: {denied}"] if denied else [])
+    return "; ".join(parts) or "-"
+
+
+def _numbers_text(rules: Rules) -> str:
+    denied = sorted(number for number in rules.denied if number not in MESSAGES)
+    parts = [f"allowed: {', '.join(map(str, sorted(rules.allowed_numbers)))}"] if rules.allowed_numbers else []
+    parts += [f"denied: {', '.join(map(str, denied))}"] if denied else []
+    return "; ".join(parts) or "-"
+
+
+def _rates_text(rates: Mapping[int, float]) -> str:
+    return ", ".join(f"{dialect.name_of(msgid)} {rate:g}/s" for msgid, rate in sorted(rates.items())) or "-"

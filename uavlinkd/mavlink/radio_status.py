@@ -1,0 +1,172 @@
+"""RADIO_STATUS for a local autopilot, from what the link knows of itself.
+
+An autopilot sends as fast as its own port takes it, and knows nothing of the radio behind. Radios therefore
+insert RADIO_STATUS once a second, and autopilots slow down by it. What the two read, by their sources:
+
+* ArduPilot (libraries/GCS_MAVLink/GCS_Common.cpp, ``handle_radio_status``): ``txbuf``, free space in the
+  transmitter's buffer in percent. Under 20 each message adds 60 ms to the interval of its streams, under 50 it
+  adds 20 ms, up to 2 s; over 90 it takes 20 ms away, over 95 it takes 40 ms away. Parameter lists and file
+  transfer pause at 33 and under (50 in older releases). ``rssi`` / 254 is the radio's signal, 255 none known.
+  ``remrssi``: not 0 says that the ground heard us; a plane with FS_GCS_ENABL = 2 (heartbeat and REMRSSI) starts
+  its failsafe when it stays 0 (GCS_FAILSAFE_HB_RSSI).
+* PX4 (src/modules/mavlink/mavlink_main.cpp, ``update_radio_status``): under 25 each message cuts the rate by
+  20 %, under 35 by 2.5 %, and parameters stop; over 50 it rises by 2.5 %. All that where MAV_n_RADIO_CTL is on;
+  the rest is published.
+* QGroundControl (Vehicle, ``_handleRadioStatus``): shows ``rssi`` and ``remrssi`` as dBm, for system 51,
+  component 68 by the scale of a SiK radio (rssi / 1.9 - 127, up to 0), for others as a signed byte. It takes
+  none of it for a sign of life.
+
+Neither autopilot looks at the sender (ArduPilot's check for its ground station's system id excepts the message,
+and it does not forward it). SiK radios send as system 51, component 68 ('3', 'D'; MAV_COMP_ID_TELEMETRY_RADIO
+is 68), wfb-ng as 3, 68. 51 and 68 is the default here, because programs know it as a radio and show a scale
+that rises with the signal.
+
+What we say:
+
+=============  ==========================================================================================
+field          value
+=============  ==========================================================================================
+``txbuf``      by the worst of demand on the budget, loss on the way out and queueing delay: see LEVELS
+``rssi``       share of the peer's envelopes that reach us, 1 .. 254; 0: the peer is lost
+``remrssi``    share of our envelopes that reach the peer, 1 .. 254; 0: the peer is lost
+``noise``      255, not known; the same for ``remnoise``
+``rxerrors``   envelopes that were lost on the way to us, modulo 65536
+``fixed``      0: nothing is corrected
+=============  ==========================================================================================
+
+A lost peer is never hidden: rssi and remrssi are 0 from that moment. It is no reason to slow down, though:
+nothing is sent to it, and an autopilot told to slow down would take up to a minute to recover once the peer is
+back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from struct import Struct
+from typing import Final, NamedTuple
+
+from fastcrc.crc16 import mcrf4xx
+
+from uavlinkd.mavlink.dialect import facts, ids_by_name
+from uavlinkd.mavlink.frames import MAVLINK2
+
+SYSTEM: Final = 51
+COMPONENT: Final = 68
+UNKNOWN: Final = 255
+INTERVAL_S: Final = 1.0
+"""How often to send: both autopilots step by each message, made for a radio that sends one a second."""
+
+_PAYLOAD = Struct("<HHBBBBB")  # rxerrors, fixed, rssi, remrssi, txbuf, noise, remnoise
+_HEADER = Struct("<BBBBBBHB")  # length, incompat_flags, compat_flags, seq, system, component, message id 16 + 8
+_CRC = Struct("<H")
+_MSGID: Final = ids_by_name()["RADIO_STATUS"]
+
+
+class Level(NamedTuple):
+    """What is said in ``txbuf`` while none of the figures is above these."""
+
+    txbuf: int
+    demand: float
+    queueing_s: float
+    loss_out: float
+
+
+LEVELS: Final = (
+    Level(100, demand=0.60, queueing_s=0.10, loss_out=0.02),  # plenty of room: ArduPilot and PX4 speed up
+    Level(92, demand=0.80, queueing_s=0.25, loss_out=0.05),  # some room: both speed up, ArduPilot by half as much
+    Level(50, demand=1.00, queueing_s=0.50, loss_out=0.15),  # enough: neither changes its rate
+    Level(30, demand=1.25, queueing_s=1.00, loss_out=0.30),  # a bit too much: both slow down a little
+)
+TXBUF_FULL: Final = 10
+"""Beyond the last level: both slow down by their greatest step."""
+TXBUF_LOST: Final = 50
+_BASE_CREEP: Final = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class LinkFigures:
+    """The link, over the last few seconds. Losses are shares of envelopes, 0 to 1; others are clipped to that."""
+
+    is_up: bool
+    loss_in: float
+    loss_out: float
+    round_trip_s: float | None
+    demand: float = 0.0
+    receive_errors: int = 0
+
+
+def worst(figures: Sequence[LinkFigures]) -> LinkFigures:
+    """One link that stands for all of them, at least one: a program is told of the worst that is up."""
+    up = [each for each in figures if each.is_up] or figures
+    trips = [each.round_trip_s for each in up if each.round_trip_s is not None]
+    return LinkFigures(
+        is_up=any(each.is_up for each in figures),
+        loss_in=max(each.loss_in for each in up),
+        loss_out=max(each.loss_out for each in up),
+        round_trip_s=max(trips, default=None),
+        demand=max(each.demand for each in up),
+        receive_errors=sum(each.receive_errors for each in figures),
+    )
+
+
+class RadioStatusSource:
+    """RADIO_STATUS frames for one endpoint, with a MAVLink sequence of their own."""
+
+    __slots__ = ("_base_round_trip_s", "_component", "_seq", "_system")
+
+    def __init__(self, system: int = SYSTEM, component: int = COMPONENT) -> None:
+        self._system = system
+        self._component = component
+        self._seq = 0
+        self._base_round_trip_s: float | None = None
+
+    def frame(self, figures: LinkFigures) -> bytes:
+        """The next frame, MAVLink 2. Call it each INTERVAL_S."""
+        queueing_s = self._queueing_s(figures.round_trip_s)
+        rssi = _quality(figures.loss_in) if figures.is_up else 0
+        remrssi = _quality(figures.loss_out) if figures.is_up else 0
+        txbuf = _txbuf(figures, queueing_s) if figures.is_up else TXBUF_LOST
+        payload = _PAYLOAD.pack(figures.receive_errors % 65536, 0, rssi, remrssi, txbuf, UNKNOWN, UNKNOWN)
+        header = _HEADER.pack(
+            len(payload), 0, 0, self._seq, self._system, self._component, _MSGID & 0xFFFF, _MSGID >> 16
+        )
+        self._seq = (self._seq + 1) % 256
+        covered = header + payload
+        return bytes((MAVLINK2,)) + covered + _CRC.pack(mcrf4xx(covered + _CRC_EXTRA))
+
+    def _queueing_s(self, round_trip_s: float | None) -> float:
+        """How much longer than at its best a round trip takes: the wait in buffers on the way.
+
+        The best creeps towards what is measured, so that a longer path is not for ever taken for full buffers.
+        """
+        if round_trip_s is None:
+            return 0.0
+        base = self._base_round_trip_s
+        if base is None or round_trip_s <= base:
+            base = round_trip_s
+        else:
+            base += (round_trip_s - base) * _BASE_CREEP
+        self._base_round_trip_s = base
+        return round_trip_s - base
+
+
+def _txbuf(figures: LinkFigures, queueing_s: float) -> int:
+    for level in LEVELS:
+        if figures.demand <= level.demand and queueing_s <= level.queueing_s and figures.loss_out <= level.loss_out:
+            return level.txbuf
+    return TXBUF_FULL
+
+
+def _quality(loss: float) -> int:
+    """1 .. 254: a peer that is up is heard, however little."""
+    return max(1, round(254 * (1 - min(max(loss, 0.0), 1.0))))
+
+
+def _crc_extra() -> bytes:
+    found = facts(_MSGID)
+    assert found is not None
+    return bytes((found.crc_extra,))
+
+
+_CRC_EXTRA: Final = _crc_extra()

@@ -1,0 +1,74 @@
+"""Presets for policies: what a peer or endpoint is, and so what it may say.
+
+The roles are seen from the daemon whose configuration names them: ``role = "vehicle"`` on a ground station's peer
+means that this peer is a vehicle. `vehicle` and `operator` are each other's mirror image. Between two vehicles only
+`swarm-member` is right: a vehicle's answers to a ground station (file transfer, mission items) are writes to another
+autopilot.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final, NamedTuple
+
+
+class Role(NamedTuple):
+    """The lists that a policy starts from."""
+
+    about: str
+    allow_in: tuple[str, ...]
+    allow_out: tuple[str, ...]
+    ground_station: bool  # whether its HEARTBEAT may claim to be a ground station's
+
+
+# What a vehicle tells its operator.
+_FROM_VEHICLE: Final = (
+    *("heartbeat", "telemetry", "position", "traffic", "identification", "answers", "payload-reports"),
+    *("time", "FILE_TRANSFER_PROTOCOL", "RADIO", "RADIO_STATUS"),
+    *("UAVIONIX_ADSB_OUT_STATUS", "UAVIONIX_ADSB_TRANSCEIVER_HEALTH_REPORT"),
+    "MAV_CMD_ACCELCAL_VEHICLE_POS",  # ArduPilot's "now put me on my left side", asked of the person
+)
+# What an operator tells a vehicle: everything but shells, buses, firmware, secrets, and a simulator's sensors.
+_FROM_OPERATOR: Final = (
+    *("heartbeat", "commands", "parameters", "mission", "setpoints", "manual", "files", "streams", "time"),
+    *("rtk", "terrain", "camera", "gimbal", "signals", "traffic", "transponder", "identification", "STATUSTEXT"),
+    *("CHANGE_OPERATOR_CONTROL", "CHANGE_OPERATOR_CONTROL_ACK"),
+)
+# Questions that change nothing in the vehicle. No HEARTBEAT: it would keep the failsafe for a lost operator quiet.
+_FROM_OBSERVER: Final = (
+    *("parameter-reads", "mission-reads", "PING"),
+    *("MAV_CMD_REQUEST_MESSAGE", "MAV_CMD_REQUEST_PROTOCOL_VERSION", "MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES"),
+    *("MAV_CMD_REQUEST_CAMERA_INFORMATION", "MAV_CMD_REQUEST_STORAGE_INFORMATION"),
+)
+_TO_OBSERVER: Final = (
+    *("heartbeat", "telemetry", "position", "traffic", "identification", "answers", "payload-reports", "PING"),
+)
+# That it is there and where: enough to keep apart and to follow. No `traffic`: autopilots evade what it reports.
+_BETWEEN_MEMBERS: Final = ("heartbeat", "position")
+
+ROLES: Final[Mapping[str, Role]] = {
+    "vehicle": Role(
+        "a vehicle that is operated from here: reports, answers, asks for nothing",
+        allow_in=_FROM_VEHICLE,
+        allow_out=_FROM_OPERATOR,
+        ground_station=False,
+    ),
+    "operator": Role(
+        "a ground station that operates the vehicle here: commands, parameters, missions, files; no shell",
+        allow_in=_FROM_OPERATOR,
+        allow_out=_FROM_VEHICLE,
+        ground_station=True,
+    ),
+    "observer": Role(
+        "looks on: sees telemetry, may read parameters and the mission, changes nothing",
+        allow_in=_FROM_OBSERVER,
+        allow_out=_TO_OBSERVER,
+        ground_station=False,
+    ),
+    "swarm-member": Role(
+        "a vehicle that flies along: each tells the other that it is there and where, and no more",
+        allow_in=_BETWEEN_MEMBERS,
+        allow_out=_BETWEEN_MEMBERS,
+        ground_station=False,
+    ),
+}
