@@ -1,0 +1,159 @@
+"""UDP sockets as the daemon wants them."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator
+
+import pytest
+
+from tests.daemon.harness import free_port, has_ipv6, need
+from uavlinkd.addresses import Address
+from uavlinkd.endpoints.sockets import (
+    BUSY_S,
+    DATAGRAMS_PER_WAKE_UP,
+    PAUSE_S,
+    BindError,
+    Reader,
+    numeric_host,
+    udp_socket,
+)
+
+
+def test_it_is_bound_and_does_not_block() -> None:
+    """Reading an empty socket returns at once."""
+    port = free_port()
+    with udp_socket(Address("127.0.0.1", port)) as sock:
+        assert sock.getsockname() == ("127.0.0.1", port)
+        with pytest.raises(BlockingIOError):
+            sock.recv(1)
+
+
+def test_there_is_room_for_bursts() -> None:
+    """The buffers are larger than the system's own, where it lets us."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as plain, udp_socket(Address("127.0.0.1", 0)) as sock:
+        for option in (socket.SO_RCVBUF, socket.SO_SNDBUF):
+            assert sock.getsockopt(socket.SOL_SOCKET, option) >= plain.getsockopt(socket.SOL_SOCKET, option)
+
+
+def test_the_wildcard_of_ipv6_takes_no_ipv4() -> None:
+    """[::]:P and 0.0.0.0:P are two sockets."""
+    need(has_ipv6(), "an IPv6 loopback")
+    port = free_port()
+    with udp_socket(Address("::", port)), udp_socket(Address("0.0.0.0", port)):
+        pass
+
+
+def test_an_address_in_use_is_told() -> None:
+    """One line with the address and the reason; the failed socket is closed."""
+    with udp_socket(Address("127.0.0.1", 0)) as first:
+        address = Address(*first.getsockname())
+        with pytest.raises(BindError, match=rf"^cannot listen on {address}: Address already in use$"):
+            udp_socket(address)
+
+
+def test_an_address_of_another_machine_is_told() -> None:
+    """An address that this machine does not have."""
+    with pytest.raises(BindError, match=r"^cannot listen on 192\.0\.2\.1:5790: "):
+        udp_socket(Address("192.0.2.1", 5790))
+
+
+@pytest.mark.parametrize("host", ["drone1.local", "fe80::1%no-such-if"])
+def test_what_is_not_numeric_here_is_told(host: str) -> None:
+    """Names are never looked up, and a zone must be an interface of this machine."""
+    with pytest.raises(BindError, match=r"^cannot use "):
+        udp_socket(Address(host, 5790))
+
+
+@pytest.mark.parametrize(
+    ("sockaddr", "host"),
+    [
+        (("127.0.0.1", 5790), "127.0.0.1"),
+        (("2001:db8::1", 5790, 0, 0), "2001:db8::1"),
+        (("fe80::1", 5790, 0, 2), "fe80::1%2"),
+    ],
+)
+def test_a_zone_stays_with_its_address(sockaddr: tuple[str | int, ...], host: str) -> None:
+    """Of a link-local address the host alone leads nowhere."""
+    assert numeric_host(sockaddr) == host
+
+
+class Pair:
+    """A sender, and a reader of what it sends."""
+
+    def __init__(self) -> None:
+        self.receiver = udp_socket(Address("127.0.0.1", 0))
+        self.sender = udp_socket(Address("127.0.0.1", 0))
+        self.sender.connect(self.receiver.getsockname())
+        self.failures: list[OSError] = []
+        self.reader = Reader(self.receiver, self.failures.append)
+
+    def send(self, *datagrams: bytes) -> None:
+        for datagram in datagrams:
+            self.sender.send(datagram)
+
+    def read(self) -> list[bytes]:
+        """What one wake-up reads."""
+        arrived, _ = self.reader.read()
+        assert all(source == self.sender.getsockname() for _, source in arrived)
+        return [datagram for datagram, _ in arrived]
+
+
+@pytest.fixture
+def pair() -> Iterator[Pair]:
+    """Both on loopback."""
+    pair = Pair()
+    yield pair
+    pair.sender.close()
+    pair.receiver.close()
+
+
+@pytest.mark.parametrize("datagrams", [(), (b"a",), (b"a", b"b", b"c"), (b"", b"b"), (b"a", b"", b"c")])
+def test_one_wake_up_reads_all_that_is_there(pair: Pair, datagrams: tuple[bytes, ...]) -> None:
+    """None, one or many; an empty one may end a wake-up, and begins the next."""
+    pair.send(*datagrams)
+    got = pair.read()
+    assert got or not datagrams
+    while more := pair.read():
+        got += more
+    assert got == list(datagrams)
+    assert pair.failures == []
+
+
+def test_one_wake_up_reads_no_more_than_its_share(pair: Pair) -> None:
+    """The other sockets have their turn."""
+    pair.send(*[bytes([number]) for number in range(DATAGRAMS_PER_WAKE_UP + 3)])
+    assert len(pair.read()) == DATAGRAMS_PER_WAKE_UP
+    assert len(pair.read()) == 3
+
+
+def test_a_failure_is_told_and_reading_goes_on(pair: Pair) -> None:
+    """A connected socket hears of a refused datagram at the next read; what arrived is read all the same."""
+    failures: list[OSError] = []
+    reader = Reader(pair.sender, failures.append)
+    pair.receiver.close()
+    pair.sender.send(b"into the void")
+    assert reader.read()[0] == []
+    assert [type(each) for each in failures] == [ConnectionRefusedError]
+
+
+def test_a_busy_socket_is_read_after_a_pause(monkeypatch: pytest.MonkeyPatch, pair: Pair) -> None:
+    """Read again at once it lets datagrams gather; after a moment of quiet it does not."""
+    now = 100.0
+    pauses: list[float] = []
+
+    def pause(seconds: float) -> None:
+        nonlocal now
+        now += seconds
+        pauses.append(seconds)
+
+    monkeypatch.setattr("uavlinkd.endpoints.sockets.monotonic", lambda: now)
+    monkeypatch.setattr("uavlinkd.endpoints.sockets.sleep", pause)
+    pair.reader.read()
+    assert pauses == []
+    now += BUSY_S / 2
+    pair.reader.read()
+    assert pauses == [PAUSE_S]
+    now += 2 * BUSY_S
+    pair.reader.read()
+    assert pauses == [PAUSE_S]

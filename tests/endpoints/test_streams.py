@@ -1,0 +1,436 @@
+"""Frames into byte streams: in order, whole, not stale, and never more held back than there is room for."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import socket
+from collections import Counter
+from collections.abc import AsyncIterator
+from time import monotonic
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.endpoints.programs import Recorder, eventually, frame, large_frame
+from uavlinkd.endpoints.streams import (
+    OUTGOING_BYTES,
+    READ_BYTES,
+    STALLED_S,
+    Connection,
+    OutgoingFrames,
+    StreamEndpoint,
+)
+from uavlinkd.mavlink.frames import SplitCounters, StreamSplitter
+
+A, B, C = b"aaaa", b"bbbb", b"cccc"
+
+
+def outgoing(capacity_bytes: int = 12) -> tuple[OutgoingFrames, Counter[str]]:
+    dropped: Counter[str] = Counter()
+    return OutgoingFrames(1.0, dropped, capacity_bytes), dropped
+
+
+def test_frames_leave_whole_and_in_order() -> None:
+    """What fits is given out together, and again until it is marked as written."""
+    waiting, dropped = outgoing()
+    waiting.add([A, B], now=0.0)
+    waiting.add([C], now=0.5)
+    assert waiting.next_bytes(100, now=0.5) == waiting.next_bytes(100, now=0.5) == A + B + C
+    assert waiting.mark_written(12) == 3
+    assert (len(waiting), waiting.next_bytes(100, now=0.5), +dropped) == (0, b"", Counter())
+
+
+def test_oldest_frame_makes_room_for_the_newest() -> None:
+    """Where there is too little room it is the oldest that go, each counted, and not one more than must."""
+    waiting, dropped = outgoing(capacity_bytes=8)
+    waiting.add([A, B], now=0.0)
+    assert not dropped
+    waiting.add([C], now=0.1)
+    assert waiting.next_bytes(100, now=0.1) == B + C
+    assert dropped == {"outgoing_full": 1}
+
+
+@pytest.mark.parametrize(("now", "left"), [(1.0, A + B), (1.01, B), (1.5, B), (1.51, b"")])
+def test_frame_that_waited_too_long_is_dropped(now: float, left: bytes) -> None:
+    """At the greatest age a frame still goes; beyond it, it is counted as stale and not sent."""
+    waiting, dropped = outgoing()
+    waiting.add([A], now=0.0)
+    waiting.add([B], now=0.5)
+    assert waiting.next_bytes(100, now) == left
+    assert dropped["stale"] == 2 - len(left) // 4
+
+
+def test_stale_frames_are_not_counted_as_overflow() -> None:
+    """What makes room because of its age is counted under its age."""
+    waiting, dropped = outgoing(capacity_bytes=8)
+    waiting.add([A, B], now=0.0)
+    waiting.add([C], now=2.0)
+    assert dropped == {"stale": 2}
+    assert waiting.next_bytes(100, now=2.0) == C
+
+
+@pytest.mark.parametrize("written", [1, 2, 3])
+def test_half_written_frame_is_finished_first(written: int) -> None:
+    """Neither age nor a full buffer takes the rest of a frame away whose start has gone."""
+    waiting, dropped = outgoing(capacity_bytes=4)
+    waiting.add([A], now=0.0)
+    assert waiting.mark_written(written) == 0
+    waiting.add([B], now=50.0)
+    waiting.add([C], now=50.0)
+    assert waiting.next_bytes(1, now=50.0) == A[written:]
+    assert waiting.next_bytes(100, now=50.0) == A[written:] + C
+    assert dropped == {"outgoing_full": 1}
+    assert waiting.mark_written(4 - written + 4) == 2
+
+
+@pytest.mark.parametrize(("room", "given_out"), [(-1, b""), (0, b""), (1, A), (4, A), (5, A + B), (100, A + B + C)])
+def test_frame_begins_where_there_is_room_for_its_start(room: int, given_out: bytes) -> None:
+    """A frame larger than the room goes whole, or the narrowest wire would carry none."""
+    waiting, _ = outgoing()
+    waiting.add([A, B, C], now=0.0)
+    assert waiting.next_bytes(room, now=0.0) == given_out
+
+
+def test_what_waits_at_the_end_is_counted() -> None:
+    """A half-written frame is one that has not been sent."""
+    waiting, dropped = outgoing()
+    waiting.add([A, B, C], now=0.0)
+    assert waiting.mark_written(6) == 1
+    waiting.drop_all()
+    assert dropped == {"unsent": 2}
+    assert (len(waiting), waiting.next_bytes(100, now=0.0)) == (0, b"")
+
+
+STEPS = st.lists(
+    st.tuples(st.just("add"), st.integers(0, 6), st.sampled_from([0.0, 0.4, 1.1]))
+    | st.tuples(st.just("write"), st.integers(0, 90), st.integers(-1, 90)),
+    max_size=30,
+)
+
+
+@given(STEPS)
+def test_stream_is_whole_frames_in_order_whatever_the_kernel_takes(steps: list[tuple[str, int, float]]) -> None:
+    """Every frame is either on the wire whole and in its turn, or waits, or is in a counter."""
+    dropped: Counter[str] = Counter()
+    waiting = OutgoingFrames(1.0, dropped, capacity_bytes=100)
+    now, number, completed = 0.0, 0, 0
+    wire = bytearray()
+    for step, amount, detail in steps:
+        if step == "add":
+            now += detail
+            waiting.add([frame(number + each) for each in range(amount)], now)
+            number += amount
+        else:
+            taken = waiting.next_bytes(int(detail), now)[:amount]
+            wire += taken
+            completed += waiting.mark_written(len(taken))
+        assert number == completed + len(waiting) + dropped.total()
+    wire += (rest := waiting.next_bytes(10_000, now))
+    completed += waiting.mark_written(len(rest))
+    counters = SplitCounters()
+    sent = [each.raw for each in StreamSplitter(counters).feed(bytes(wire), now)]
+    assert b"".join(sent) == wire
+    assert len(sent) == completed
+    everything = iter([frame(each) for each in range(number)])
+    assert all(each in everything for each in sent)  # in order, none twice
+
+
+class Pair(StreamEndpoint):
+    """An endpoint of one connection, the other end of which is in the test's hand."""
+
+    def __init__(self, handler: Recorder) -> None:
+        super().__init__("pair", handler, 1.0)
+        ours, self.other = socket.socketpair()
+        for sock in (ours, self.other):
+            sock.setblocking(False)
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
+        self.channel = RationedChannel(ours)
+
+    def start(self) -> None:
+        self.connection = self.open_now()
+
+    def open_now(self) -> Connection:
+        return self.open(self.channel, "other", now=0.0)
+
+
+class RationedChannel:
+    """A socket with as much room as the test says."""
+
+    def __init__(self, sock: socket.socket) -> None:
+        self.sock = sock
+        self.left = 1 << 30
+        self.fileno = sock.fileno
+        self.aborted: bool | None = None
+        self.error: OSError | None = None
+
+    def write(self, data: bytes) -> int:
+        count = self.sock.send(data)
+        self.left -= count
+        return count
+
+    def read(self, size: int) -> bytes:
+        if self.error is not None:
+            raise self.error
+        return self.sock.recv(size)
+
+    def room(self) -> int:
+        if self.error is not None:
+            raise self.error
+        return self.left
+
+    def close(self, *, abort: bool) -> None:
+        self.aborted = abort
+        self.sock.close()
+
+
+@pytest.fixture
+async def pair() -> AsyncIterator[Pair]:
+    """Open, with its ``handler`` a Recorder."""
+    endpoint = Pair(Recorder())
+    endpoint.start()
+    yield endpoint
+    endpoint.close()
+    endpoint.other.close()
+
+
+def recorder(endpoint: StreamEndpoint) -> Recorder:
+    assert isinstance(endpoint.handler, Recorder)
+    return endpoint.handler
+
+
+def fill(pair: Pair, now: float) -> int:
+    """Write until something has to wait; how many frames that took."""
+    count = 0
+    while not pair.connection.outgoing:
+        pair.write(pair.connection.port, [large_frame(count)], now)
+        count += 1
+    return count
+
+
+def read_all(sock: socket.socket) -> bytes:
+    got = b""
+    try:
+        while chunk := sock.recv(65536):
+            got += chunk
+    except BlockingIOError:
+        pass
+    return got
+
+
+async def test_frames_are_sent_at_once(pair: Pair) -> None:
+    """Where the kernel has room ``write`` itself sends: nothing waits for the event loop."""
+    pair.write(pair.connection.port, [frame(1), frame(2)], now=0.0)
+    assert pair.other.recv(4096) == frame(1) + frame(2)
+    assert (pair.frames_sent, pair.bytes_sent) == (2, len(frame(1) + frame(2)))
+
+
+async def test_all_that_is_there_is_handed_over_together(pair: Pair) -> None:
+    """However it was cut when it was sent, what one wake-up finds is one batch."""
+    stream = b"".join(map(frame, range(20)))
+    for at in range(0, len(stream), 61):
+        pair.other.send(stream[at : at + 61])
+    pair.connection.on_readable(now=3.0)
+    assert recorder(pair).batches == [[frame(each) for each in range(20)]]
+    assert pair.connection.port.heard_at == 3.0
+    assert pair.bytes_received == len(stream)
+
+
+async def test_one_connection_reads_no_more_than_its_turn(pair: Pair) -> None:
+    """Whoever floods one connection does not keep the others from theirs."""
+    pair.channel.sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 18)
+    pair.other.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 18)
+    sent = pair.other.send(b"\xfe" * 100_000)
+    assert sent > 2 * READ_BYTES
+    pair.connection.on_readable(now=0.0)
+    assert pair.bytes_received == READ_BYTES
+
+
+async def test_frame_before_the_end_is_heard(pair: Pair) -> None:
+    """A program that says one thing and goes has said it."""
+    pair.other.send(frame(1))
+    pair.other.close()
+    await eventually(lambda: bool(recorder(pair).closed))
+    assert recorder(pair).heard == [frame(1)]
+    assert pair.failures == {"disconnected": 1}
+    assert pair.channel.aborted is False
+
+
+async def test_frame_behind_a_false_start_is_heard_at_the_end(pair: Pair) -> None:
+    """What the splitter held back as the rest of a frame is looked at again when nothing more can come."""
+    pair.other.send(b"\xfd\xff\x00" + frame(1))
+    pair.other.close()
+    await eventually(lambda: bool(recorder(pair).closed))
+    assert recorder(pair).heard == [frame(1)]
+
+
+async def test_other_side_that_is_gone_is_not_reported_from_within_write(pair: Pair) -> None:
+    """The daemon may be in the middle of a batch: it hears of it in the next round."""
+    pair.other.close()
+    pair.write(pair.connection.port, [frame(1)], now=0.0)
+    pair.write(pair.connection.port, [frame(2)], now=0.0)
+    assert recorder(pair).closed == []
+    await pair.connection.lost.wait()
+    pair.write(pair.connection.port, [frame(3)], now=0.0)
+    assert recorder(pair).closed == [pair.connection.port]
+    assert pair.failures == {"EPIPE": 1, "unsent": 3}
+    assert pair.channel.aborted is True
+    assert list(pair.ports) == []
+
+
+async def test_slow_reader_gets_whole_frames_and_the_newest(pair: Pair) -> None:
+    """What a slow reader misses is missed in whole frames, and all of it is counted."""
+    count = 1000
+    for number in range(count):
+        pair.write(pair.connection.port, [large_frame(number)], monotonic())
+    assert pair.failures["outgoing_full"] > 0
+    got = bytearray()
+    while pair.connection.outgoing:
+        got += read_all(pair.other)
+        await asyncio.sleep(0)
+    got += read_all(pair.other)
+    counters = SplitCounters()
+    frames = [each.raw for each in StreamSplitter(counters).feed(bytes(got), 0.0)]
+    assert (counters.garbage_bytes, len(b"".join(frames))) == (0, len(got))
+    assert frames[-100:] == [large_frame(number) for number in range(count - 100, count)]
+    assert count == len(frames) + pair.failures.total()
+    assert pair.frames_sent == len(frames)
+    assert pair.bytes_sent == len(got)
+
+
+async def test_bytes_held_back_are_bounded(pair: Pair) -> None:
+    """However much is written to who does not read, no more than the buffer's size waits."""
+    for number in range(0, 4000, 40):
+        pair.write(pair.connection.port, [large_frame(each) for each in range(number, number + 40)], now=0.0)
+    held = len(pair.connection.outgoing.next_bytes(1 << 30, now=0.0))
+    assert OUTGOING_BYTES - 300 < held < OUTGOING_BYTES + 300
+    assert pair.frames_sent + len(pair.connection.outgoing) + pair.failures["outgoing_full"] == 4000
+
+
+async def test_stale_frames_do_not_follow_an_outage(pair: Pair) -> None:
+    """When the other side reads again, it gets the frame half sent and what is new, and nothing between."""
+    began = monotonic()
+    count = fill(pair, began - 60)
+    pair.write(pair.connection.port, [large_frame(number) for number in range(count, count + 50)], began - 60)
+    pair.write(pair.connection.port, [frame(1), frame(2)], monotonic())
+    got = bytearray()
+    while pair.connection.outgoing:
+        got += read_all(pair.other)
+        await asyncio.sleep(0)
+    got += read_all(pair.other)
+    frames = [each.raw for each in StreamSplitter().feed(bytes(got), 0.0)]
+    assert b"".join(frames) == got
+    assert frames[-2:] == [frame(1), frame(2)]
+    assert len(frames) == pair.frames_sent == count + 52 - pair.failures["stale"]
+    assert pair.failures["stale"] >= 50
+
+
+@pytest.mark.parametrize("reads", [False, True])
+async def test_who_never_reads_is_closed(pair: Pair, reads: bool) -> None:
+    """After the time for that, not before, and not who read something in between."""
+    fill(pair, now=100.0)
+    pair.do_housekeeping(now=100.0 + STALLED_S - 0.01)
+    assert not pair.failures["stalled"]
+    if reads:
+        read_all(pair.other)
+        pair.connection.on_writable(now=120.0)
+    pair.do_housekeeping(now=100.0 + STALLED_S)
+    assert pair.failures["stalled"] == (0 if reads else 1)
+    if not reads:
+        await pair.connection.lost.wait()
+        assert pair.channel.aborted is True
+        assert pair.channel.sock.fileno() == -1
+
+
+async def test_kernel_is_given_no_more_than_the_channel_has_room_for(pair: Pair) -> None:
+    """Frames wait here, where they can get stale, and go as soon as there is room again."""
+    size = len(large_frame(0))
+    pair.channel.left = 2 * size
+    pair.write(pair.connection.port, [large_frame(number) for number in range(5)], monotonic())
+    assert read_all(pair.other) == large_frame(0) + large_frame(1)
+    assert len(pair.connection.outgoing) == 3
+    pair.channel.left = size
+    await eventually(lambda: pair.frames_sent == 3)
+    assert read_all(pair.other) == large_frame(2)
+
+
+async def test_channel_that_never_gets_room_has_stalled(pair: Pair) -> None:
+    """A stall is known as one even where all that waited got stale."""
+    pair.channel.left = 0
+    pair.write(pair.connection.port, [frame(1)], now := monotonic())
+    pair.do_housekeeping(now + STALLED_S - 0.01)
+    assert pair.failures == {"stale": 1}
+    pair.do_housekeeping(now + STALLED_S)
+    assert pair.failures == {"stale": 1, "stalled": 1}
+
+
+async def test_channel_that_got_room_with_nothing_to_send_has_not_stalled(pair: Pair) -> None:
+    """Nothing moved because nothing was there to move."""
+    pair.channel.left = 0
+    pair.write(pair.connection.port, [frame(1)], now := monotonic())
+    pair.do_housekeeping(now + 5)
+    pair.channel.left = 100
+    await eventually(lambda: pair.connection._room_timer is None)
+    pair.do_housekeeping(now + 10 * STALLED_S)
+    assert pair.failures == {"stale": 1}
+
+
+@pytest.mark.parametrize("noticed_by", ["reading", "writing", "waiting for room"])
+async def test_error_of_the_kernel_ends_the_connection(pair: Pair, noticed_by: str) -> None:
+    """Whatever is tried first: the error is counted by its name, once, and the port is reported as closed."""
+    if noticed_by == "waiting for room":
+        pair.channel.left = 0
+        pair.write(pair.connection.port, [frame(1)], monotonic())
+    pair.channel.error = OSError(errno.EIO, "unplugged")
+    if noticed_by == "reading":
+        pair.other.send(frame(2))
+    elif noticed_by == "writing":
+        pair.write(pair.connection.port, [frame(1)], monotonic())
+    await eventually(lambda: recorder(pair).closed == [pair.connection.port])
+    assert pair.failures == {"EIO": 1} | ({} if noticed_by == "reading" else {"unsent": 1})
+    assert pair.channel.sock.fileno() == -1
+
+
+@given(st.binary(max_size=600), st.integers(1, 100))
+async def test_any_bytes_are_survived(data: bytes, cut: int) -> None:
+    """No bytes raise; what is no frame is counted, and genuine frames after it are heard."""
+    handler = Recorder()
+    pair = Pair(handler)
+    pair.start()
+    try:
+        for at in range(0, len(data), cut):
+            pair.other.send(data[at : at + cut])
+            pair.connection.on_readable(now=0.0)
+        # After a silence: what could have been the start of a frame is none.
+        pair.connection.on_readable(now=0.1)
+        pair.other.send(frame(1))
+        pair.connection.on_readable(now=1.0)
+        assert handler.heard[-1:] == [frame(1)]
+        assert pair.counters.garbage_bytes + sum(map(len, handler.heard)) == len(data) + len(frame(1))
+        assert handler.closed == []
+    finally:
+        pair.close()
+        pair.other.close()
+
+
+async def test_endpoint_may_be_closed_while_it_reports(pair: Pair) -> None:
+    """Nothing is done with a connection that is closed by what it just said."""
+    recorder(pair).on_batch = pair.close
+    pair.other.send(frame(1))
+    pair.other.close()
+    await eventually(lambda: bool(recorder(pair).heard))
+    assert pair.channel.sock.fileno() == -1
+    assert recorder(pair).closed == []
+
+
+async def test_closed_endpoint_reports_nothing_more(pair: Pair) -> None:
+    """Neither a port lost just before nor one still there is reported as closed."""
+    pair.other.close()
+    pair.write(pair.connection.port, [frame(1)], now=0.0)
+    pair.close()
+    await asyncio.sleep(0)
+    assert recorder(pair).closed == []
+    assert pair.channel.sock.fileno() == -1
+    pair.write(pair.connection.port, [frame(2)], now=0.0)
+    assert pair.failures == {"EPIPE": 1, "unsent": 2}

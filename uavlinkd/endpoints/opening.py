@@ -1,0 +1,68 @@
+"""From an endpoint in the configuration to one that works."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from uavlinkd.config import Config, ConfigError
+from uavlinkd.config import Endpoint as EndpointConfig
+from uavlinkd.config.errors import Problem
+from uavlinkd.endpoints.ports import Endpoint, PortHandler
+from uavlinkd.endpoints.sockets import BindError, udp_socket
+from uavlinkd.endpoints.udp import UdpClient, UdpServer
+from uavlinkd.endpoints.url import EndpointUrl, Kind, NetworkUrl, SerialUrl
+
+# TCP and serial are imported where they are asked for: a daemon on UDP starts without them, and stays smaller.
+# ruff: noqa: PLC0415
+
+
+def open_new(
+    config: Config, wanted: Sequence[EndpointConfig], leaving: Mapping[EndpointUrl, Endpoint], handler: PortHandler
+) -> list[Endpoint]:
+    """Make endpoints of a new configuration while those that it closes are still open, by their URLs in ``leaving``.
+
+    Who listens where one of those does takes over its socket: so endpoints can get other names, or swap ports.
+
+    Raises:
+        ConfigError: where one cannot be opened; then none is, and the others are as they were.
+    """
+    opened: list[Endpoint] = []
+    for each in wanted:
+        try:
+            opened.append(open_endpoint(each, handler, leaving.get(each.url)))
+        except BindError as error:
+            for endpoint in opened:
+                endpoint.close()
+            remedy = "end what listens there, or write another port; if it is this daemon itself, restart it"
+            problem = Problem(str(config.path), f"endpoint.url ({each.name})", f"{error}: {remedy}")
+            raise ConfigError((problem,)) from None
+    return opened
+
+
+def open_endpoint(config: EndpointConfig, handler: PortHandler, instead_of: Endpoint | None = None) -> Endpoint:
+    """Make the endpoint, with what it listens on bound. It begins to work when it is started.
+
+    ``instead_of``: one with the same URL that is about to be closed.
+
+    Raises:
+        BindError: where its address cannot be listened on.
+    """
+    match config.url:
+        case NetworkUrl(Kind.UDPIN, address):
+            sock = instead_of.share_socket() if isinstance(instead_of, UdpServer) else udp_socket(address)
+            return UdpServer(config.name, sock, handler)
+        case NetworkUrl(Kind.UDPOUT, address):
+            return UdpClient(config.name, address, handler)
+        case NetworkUrl(Kind.TCPIN, address):
+            from uavlinkd.endpoints.tcp import TcpServer, tcp_listener
+
+            sock = instead_of.share_socket() if isinstance(instead_of, TcpServer) else tcp_listener(address)
+            return TcpServer(config.name, sock, handler, max_age_s=config.max_age_s)
+        case NetworkUrl(_, address):
+            from uavlinkd.endpoints.tcp import TcpClient
+
+            return TcpClient(config.name, address, handler, max_age_s=config.max_age_s)
+        case SerialUrl() as url:
+            from uavlinkd.endpoints.serial import SerialEndpoint
+
+            return SerialEndpoint(config.name, url, handler, max_age_s=config.max_age_s)

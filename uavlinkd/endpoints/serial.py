@@ -1,0 +1,117 @@
+"""Local MAVLink ports on serial devices: opened when they are there, and again when they come back."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from functools import partial
+from time import monotonic
+
+from serialx import BaseSerial, serial_for_url
+
+from uavlinkd.endpoints.ports import PortHandler, failure_name
+from uavlinkd.endpoints.streams import MAX_AGE_S, Connection, StreamEndpoint
+from uavlinkd.endpoints.url import SerialUrl
+
+RETRY_S = 0.5
+"""Between two attempts to open a device that is not there, or not ours to open."""
+IN_FLIGHT_S = 0.1
+"""The kernel is given no more than the wire carries in this time: what it has can get stale, but not be dropped."""
+_BITS_PER_BYTE = 10  # with start and stop bit
+
+
+class SerialChannel:
+    """An open serial device. Reads and writes go past the library, whose own wait for the device."""
+
+    def __init__(self, device: BaseSerial, baud: int) -> None:
+        self.device = device
+        self.in_flight_bytes = max(1, int(IN_FLIGHT_S * baud / _BITS_PER_BYTE))
+        self._fd = device.fileno()
+
+    def fileno(self) -> int:
+        """For the event loop."""
+        return self._fd
+
+    def read(self, size: int) -> bytes:
+        """What has come; no bytes, or an error, once the device is unplugged."""
+        return os.read(self._fd, size)
+
+    def write(self, data: bytes) -> int:
+        """Hand bytes to the kernel."""
+        return os.write(self._fd, data)
+
+    def room(self) -> int:
+        """How much less than it may hold the kernel has to send."""
+        return self.in_flight_bytes - self.device.num_unwritten_bytes()
+
+    def close(self, *, abort: bool) -> None:
+        """Close the device, and forget what was not sent: the kernel would wait half a minute for it to go."""
+        with suppress(OSError):
+            self.device.reset_write_buffer()
+        with suppress(OSError):
+            self.device.close()
+
+
+class SerialEndpoint(StreamEndpoint):
+    """A serial device: one port while it is there.
+
+    In ``failures`` there are besides: what attempts to open it ended with, by the kernel's name (``ENOENT``: it is
+    not there; ``EACCES``: not allowed; ``EBUSY``: another program has it).
+    """
+
+    def __init__(self, name: str, url: SerialUrl, handler: PortHandler, *, max_age_s: float = MAX_AGE_S) -> None:
+        super().__init__(name, handler, max_age_s)
+        self._url = url
+        self._task: asyncio.Task[None] | None = None
+        self._is_closed = False
+        # Opening and closing may wait for the device; one that hangs occupies this thread and no other.
+        self._opener = ThreadPoolExecutor(1, thread_name_prefix=f"serial-{name}")
+
+    def start(self) -> None:
+        """Begin to look for the device."""
+        self._task = asyncio.get_running_loop().create_task(self._keep_open())
+
+    def close(self) -> None:
+        """Stop looking, and close the device."""
+        self._is_closed = True
+        if self._task is not None:
+            self._task.cancel()
+        self._opener.shutdown(wait=False, cancel_futures=True)
+        super().close()
+
+    def dispose(self, connection: Connection) -> None:
+        """Nothing yet: closing may wait for the device, and is done where that delays no one."""
+
+    async def _keep_open(self) -> None:
+        loop = asyncio.get_running_loop()
+        while True:
+            try:
+                device = await loop.run_in_executor(self._opener, self._open_device)
+            except OSError as error:
+                self.failures[failure_name(error)] += 1
+            else:
+                channel = SerialChannel(device, self._url.baud)
+                connection = self.open(channel, self._url.device, monotonic())
+                await connection.lost.wait()
+                await loop.run_in_executor(self._opener, partial(channel.close, abort=True))
+            await asyncio.sleep(RETRY_S)
+
+    def _open_device(self) -> BaseSerial:
+        """Open the device; in a thread.
+
+        Raises:
+            OSError: whatever was wrong with it, a baud rate that it cannot do included.
+        """
+        device = serial_for_url(self._url.device, self._url.baud, exclusive=True)
+        try:
+            device.open()
+        except OSError:
+            raise
+        except Exception as error:  # of the library's or of termios' own kind; all mean that it is no use now
+            raise OSError(*error.args) from error
+        if self._is_closed:  # while it was being opened
+            device.close()
+            raise OSError("closed")
+        return device

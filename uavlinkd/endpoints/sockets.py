@@ -1,0 +1,140 @@
+"""UDP sockets as the daemon wants them: with room for bursts, one address family each, read in batches."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import socket
+import termios
+from array import array
+from collections.abc import Callable
+from time import monotonic, sleep
+from typing import Any
+
+import structlog
+
+from uavlinkd.addresses import Address
+
+BUFFER_BYTES = 1 << 20
+"""Asked of the kernel each way: some 500 of the largest envelopes. It may give less (net.core.rmem_max)."""
+
+DATAGRAMS_PER_WAKE_UP = 128
+"""Read from one socket; then the others have their turn."""
+RECEIVE_BYTES = 65536
+BUSY_S = 0.00025
+"""A socket that becomes readable again so soon after it was read is busy: above 4,000 times a second."""
+PAUSE_S = 0.00025
+"""How long datagrams then gather before they are read."""
+
+_FREEBIND = {
+    socket.AF_INET: (socket.IPPROTO_IP, 15),  # IP_FREEBIND, which Python does not name: linux/in.h
+    socket.AF_INET6: (socket.IPPROTO_IPV6, 78),  # IPV6_FREEBIND: linux/in6.h
+}
+
+
+class BindError(Exception):
+    """An address that cannot be listened on. The message is for the operator."""
+
+
+def numeric_host(sockaddr: tuple[Any, ...]) -> str:
+    """The host of an Internet socket address, for sending back to it.
+
+    A link-local IPv6 address keeps its zone (``fe80::1%2``): without it nobody knows on which link it is.
+    """
+    host, zone = str(sockaddr[0]), sockaddr[3] if len(sockaddr) > 3 else 0  # (host, port, flow, zone)
+    return f"{host}%{zone}" if zone else host
+
+
+def udp_socket(address: Address, *, may_come_later: bool = False) -> socket.socket:
+    """A UDP socket bound to a numeric address.
+
+    ``may_come_later``: an address that this machine does not have is one that it does not have yet. The socket works
+    from the moment at which an interface gets it: a drone's network may come up after the daemon, one of several may
+    never, and the others must not wait for it. It is logged, as it may be a mistake too.
+
+    Raises:
+        BindError: with the address and the reason.
+    """
+    try:
+        # The look-up only turns a zone ("%wlan0") into its number; a host name never gets here.
+        family, kind, proto, _, sockaddr = socket.getaddrinfo(
+            *address.sockaddr, type=socket.SOCK_DGRAM, flags=socket.AI_NUMERICHOST | socket.AI_PASSIVE
+        )[0]
+        sock = socket.socket(family, kind, proto)
+    except OSError as error:
+        raise BindError(f"cannot use {address}: {error.strerror or error}") from None
+    try:
+        sock.setblocking(False)
+        if family == socket.AF_INET6:
+            sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+        for option in (socket.SO_RCVBUF, socket.SO_SNDBUF):
+            sock.setsockopt(socket.SOL_SOCKET, option, BUFFER_BYTES)
+        try:
+            sock.bind(sockaddr)
+        except OSError as error:
+            if error.errno != errno.EADDRNOTAVAIL or not may_come_later:
+                raise
+            sock.setsockopt(*_FREEBIND[family], 1)
+            sock.bind(sockaddr)
+            structlog.get_logger().warning("address_not_here_yet", address=str(address))
+    except OSError as error:
+        sock.close()
+        raise BindError(f"cannot listen on {address}: {error.strerror or error}") from None
+    return sock
+
+
+Arrived = list[tuple[bytes, tuple[Any, ...]]]
+"""Datagrams, each with where it came from."""
+
+
+class Reader:
+    """Reads a socket in batches; at once when it becomes readable, unless it is busy.
+
+    A wake-up costs more than a datagram. So on a busy socket datagrams gather for a moment and are read together, as
+    network cards do with interrupts. The pause holds up the other sockets too; but who waits for them is not busy any
+    more, and does not pause.
+
+    ``on_failure`` hears what else a read may report, such as an earlier send's failure.
+    """
+
+    __slots__ = ("_on_failure", "_read_at", "_sock", "_waiting")
+
+    def __init__(self, sock: socket.socket, on_failure: Callable[[OSError], None]) -> None:
+        self._sock = sock
+        self._on_failure = on_failure
+        self._read_at = -BUSY_S
+        self._waiting = array("i", [0])
+
+    def read(self) -> tuple[Arrived, float]:
+        """What is there, up to :data:`DATAGRAMS_PER_WAKE_UP` datagrams, and the monotonic time of it."""
+        now = monotonic()
+        if now - self._read_at < BUSY_S:
+            sleep(PAUSE_S)
+            now = monotonic()
+        self._read_at = now
+        try:
+            arrived = [self._sock.recvfrom(RECEIVE_BYTES)]
+        except OSError as error:
+            return ([], now) if self._is_drained(error) else (self._drain(), now)
+        # At most rates a datagram comes alone. Asking is then cheaper than reading in vain: that raises. An empty
+        # datagram may be missed by it; the loop wakes up for it again.
+        fcntl.ioctl(self._sock, termios.FIONREAD, self._waiting)
+        if self._waiting[0]:
+            arrived += self._drain()
+        return arrived, now
+
+    def _drain(self) -> Arrived:
+        arrived: Arrived = []
+        for _ in range(DATAGRAMS_PER_WAKE_UP - 1):
+            try:
+                arrived.append(self._sock.recvfrom(RECEIVE_BYTES))
+            except OSError as error:
+                if self._is_drained(error):
+                    break
+        return arrived
+
+    def _is_drained(self, error: OSError) -> bool:
+        if isinstance(error, BlockingIOError):
+            return True
+        self._on_failure(error)
+        return False

@@ -1,0 +1,283 @@
+"""Local MAVLink ports on TCP: ``tcp`` connects, again and again; ``tcpin`` listens, for many clients.
+
+The kernel is told to hold little of what it cannot send: there a frame can be neither dropped nor overtaken.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import socket
+import struct
+from contextlib import suppress
+from secrets import SystemRandom
+from time import monotonic
+
+from uavlinkd.addresses import Address
+from uavlinkd.endpoints.ports import PortHandler, failure_name
+from uavlinkd.endpoints.sockets import BindError
+from uavlinkd.endpoints.streams import MAX_AGE_S, STALLED_S, StreamEndpoint
+from uavlinkd.threads import Threads
+
+CLIENTS_PER_ENDPOINT = 32
+"""Programs that one ``tcpin`` endpoint serves."""
+CLIENT_QUIET_S = 5.0
+"""When all places are taken, the client that was quiet longest, and this long, gives its own to a newcomer."""
+FIRST_WAIT_S = 0.25
+LONGEST_WAIT_S = 5.0
+"""Between two attempts to connect. Each wait is twice the one before, and up to a quarter longer, by chance."""
+CONNECT_TIMEOUT_S = 5.0
+"""For one address; a name may have several."""
+MAX_ADDRESSES = 8
+"""Tried of one name in one attempt."""
+ACCEPT_PAUSE_S = 1.0
+"""Without a file descriptor or memory for a client there is nothing to do but wait."""
+
+_SEND_BUFFER_BYTES = 16384
+_NOT_SENT_BYTES = 4096  # beyond what is on its way, where the kernel knows this option
+_ROOM_BYTES = 16384
+_BACKLOG = 32
+_Sockaddr = tuple[str | int, ...]  # of either family, as the kernel takes it
+_Found = tuple[socket.AddressFamily, _Sockaddr]
+
+# A web page can make the browser of this machine send any bytes to any local port, but only after these.
+_HTTP_METHODS = (b"GET ", b"POST ", b"HEAD ", b"PUT ", b"OPTIONS ", b"PATCH ", b"DELETE ", b"CONNECT ")
+
+
+def tcp_listener(address: Address) -> socket.socket:
+    """A TCP socket that listens on a numeric address.
+
+    Raises:
+        BindError: with the address and the reason.
+    """
+    try:
+        # The look-up only turns a zone ("%wlan0") into its number; a host name never gets here.
+        family, kind, proto, _, sockaddr = socket.getaddrinfo(
+            *address.sockaddr, type=socket.SOCK_STREAM, flags=socket.AI_NUMERICHOST | socket.AI_PASSIVE
+        )[0]
+        sock = socket.socket(family, kind, proto)
+    except OSError as error:
+        raise BindError(f"cannot use {address}: {error.strerror or error}") from None
+    try:
+        sock.setblocking(False)
+        if family == socket.AF_INET6:
+            sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # connections of before may still be ending
+        sock.bind(sockaddr)
+        sock.listen(_BACKLOG)
+    except OSError as error:
+        sock.close()
+        raise BindError(f"cannot listen on {address}: {error.strerror or error}") from None
+    return sock
+
+
+class SocketChannel:
+    """A connected TCP socket."""
+
+    def __init__(self, sock: socket.socket) -> None:
+        self._sock = sock
+        self.fileno = sock.fileno
+        self.read = sock.recv
+        self.write = sock.send
+
+    def room(self) -> int:
+        """As much as the kernel will take: it says itself when it has room again."""
+        return _ROOM_BYTES
+
+    def close(self, *, abort: bool) -> None:
+        """Close it; ``abort`` resets the connection."""
+        if abort:
+            _try_option(self._sock, socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        self._sock.close()
+
+
+class TcpServer(StreamEndpoint):
+    """``tcpin``: whoever connects, up to a bound, is a port until it ends.
+
+    In ``failures`` there are besides: ``too_many_clients``, who were not let in; ``displaced``, who had to give
+    their place; ``http``, who turned out to be a browser.
+    """
+
+    def __init__(
+        self, name: str, listener: socket.socket, handler: PortHandler, *, max_age_s: float = MAX_AGE_S
+    ) -> None:
+        super().__init__(name, handler, max_age_s)
+        self._listener = listener
+        self._resume: asyncio.TimerHandle | None = None
+
+    @property
+    def address(self) -> tuple[str, int]:
+        """Where it listens."""
+        host, port = self._listener.getsockname()[:2]
+        return host, port
+
+    def share_socket(self) -> socket.socket:
+        """Its socket once more, for another endpoint in its place. Each is closed by its own."""
+        return self._listener.dup()
+
+    def start(self) -> None:
+        """Accept whoever comes."""
+        asyncio.get_running_loop().add_reader(self._listener.fileno(), lambda: self.on_acceptable(monotonic()))
+
+    def on_acceptable(self, now: float) -> None:
+        """Let in who waits, as far as there are places."""
+        for _ in range(_BACKLOG):
+            try:
+                sock, sockaddr = self._listener.accept()
+            except BlockingIOError:
+                return
+            except OSError as error:
+                self.failures[failure_name(error)] += 1
+                if error.errno in _EXHAUSTED:  # else the one client is gone already
+                    self._pause()
+                    return
+                continue
+            if not self._has_place(now):
+                self.failures["too_many_clients"] += 1
+                sock.close()
+                continue
+            _prepare(sock)
+            self.open(SocketChannel(sock), str(Address(*sockaddr[:2])), now)
+
+    def objection(self, first_bytes: bytes) -> str | None:
+        """``http`` for what a browser begins with, whatever follows."""
+        return "http" if first_bytes.startswith(_HTTP_METHODS) else None
+
+    def close(self) -> None:
+        """Stop listening, and close every connection."""
+        if self._resume is not None:
+            self._resume.cancel()
+        if self._listener.fileno() >= 0:
+            asyncio.get_running_loop().remove_reader(self._listener.fileno())
+            self._listener.close()
+        super().close()
+
+    def _has_place(self, now: float) -> bool:
+        """Whether one more may come in, if need be in the place of who was quiet for long."""
+        if len(self._connections) < CLIENTS_PER_ENDPOINT:
+            return True
+        quietest = min(self._connections.values(), key=lambda each: each.silent_since)
+        if now - quietest.silent_since < CLIENT_QUIET_S:
+            return False
+        quietest.lose("displaced")
+        self.forget(quietest)
+        return True
+
+    def _pause(self) -> None:
+        loop = asyncio.get_running_loop()
+        loop.remove_reader(self._listener.fileno())
+        self._resume = loop.call_later(ACCEPT_PAUSE_S, self.start)
+
+
+class TcpClient(StreamEndpoint):
+    """``tcp``: connects, and connects again when that ends; for ever. The name is looked up each time.
+
+    In ``failures`` there are besides: what attempts ended with, by the kernel's name of it (``ECONNREFUSED``), as
+    ``connect_timeout`` or ``not_resolved``.
+    """
+
+    def __init__(self, name: str, address: Address, handler: PortHandler, *, max_age_s: float = MAX_AGE_S) -> None:
+        super().__init__(name, handler, max_age_s)
+        self._address = address
+        self._task: asyncio.Task[None] | None = None
+        # One thread of its own: a name server that does not answer must not keep others from theirs.
+        self._threads = Threads(1, f"look-up-{name}")
+
+    def start(self) -> None:
+        """Begin to connect."""
+        self._task = asyncio.get_running_loop().create_task(self._keep_connected())
+
+    def close(self) -> None:
+        """Stop connecting, and close the connection."""
+        if self._task is not None:
+            self._task.cancel()
+        super().close()
+
+    async def _keep_connected(self) -> None:
+        chance = SystemRandom()
+        wait_s = FIRST_WAIT_S
+        while True:
+            sock = await self._connect()
+            if sock is not None:
+                connection = self.open(SocketChannel(sock), str(self._address), monotonic())
+                await connection.lost.wait()
+                # A server that only accepts and closes is not asked at once again.
+                if connection.port.heard_at is not None or monotonic() - connection.opened_at >= LONGEST_WAIT_S:
+                    wait_s = FIRST_WAIT_S
+            await asyncio.sleep(wait_s * chance.uniform(1.0, 1.25))
+            wait_s = min(2 * wait_s, LONGEST_WAIT_S)
+
+    async def _connect(self) -> socket.socket | None:
+        """A socket connected to the first address that answers."""
+        for family, sockaddr in await self._resolve():
+            try:
+                sock = socket.socket(family, socket.SOCK_STREAM)
+            except OSError as error:
+                self.failures[failure_name(error)] += 1
+                continue
+            try:
+                await self._connect_socket(sock, sockaddr)
+            except TimeoutError:
+                self.failures["connect_timeout"] += 1
+            except OSError as error:
+                self.failures[failure_name(error)] += 1
+            except BaseException:
+                sock.close()
+                raise
+            else:
+                return sock
+            sock.close()
+        return None
+
+    async def _connect_socket(self, sock: socket.socket, sockaddr: _Sockaddr) -> None:
+        sock.setblocking(False)
+        _prepare(sock)
+        async with asyncio.timeout(CONNECT_TIMEOUT_S):
+            await asyncio.get_running_loop().sock_connect(sock, sockaddr)
+        if sock.getsockname() == sock.getpeername():
+            # Where nobody listens on a local port, the kernel may in time choose that port for our own side.
+            raise ConnectionRefusedError(errno.ECONNREFUSED, "connected to itself")
+
+    async def _resolve(self) -> list[_Found]:
+        try:
+            if self._address.ip is not None:
+                return _look_up(self._address, socket.AI_NUMERICHOST)
+            return await self._threads.run(_look_up, self._address, 0)
+        except (OSError, UnicodeError):
+            self.failures["not_resolved"] += 1
+            return []
+
+
+def _look_up(address: Address, flags: int) -> list[_Found]:
+    found = socket.getaddrinfo(*address.sockaddr, type=socket.SOCK_STREAM, flags=flags)
+    return [(family, (str(each[0]), int(each[1]), *each[2:])) for family, _, _, _, each in found[:MAX_ADDRESSES]]
+
+
+_EXHAUSTED = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM})
+
+# (level, name of the option, value); systems that do not know one do without.
+_OPTIONS = (
+    (socket.IPPROTO_TCP, "TCP_NODELAY", 1),
+    (socket.SOL_SOCKET, "SO_SNDBUF", _SEND_BUFFER_BYTES),
+    (socket.IPPROTO_TCP, "TCP_NOTSENT_LOWAT", _NOT_SENT_BYTES),
+    # A machine that vanished is noticed by its silence, and by what it does not acknowledge.
+    (socket.SOL_SOCKET, "SO_KEEPALIVE", 1),
+    (socket.IPPROTO_TCP, "TCP_KEEPIDLE", 10),
+    (socket.IPPROTO_TCP, "TCP_KEEPINTVL", 5),
+    (socket.IPPROTO_TCP, "TCP_KEEPCNT", 2),
+    (socket.IPPROTO_TCP, "TCP_USER_TIMEOUT", int(STALLED_S * 1000)),
+)
+
+
+def _prepare(sock: socket.socket) -> None:
+    """Make a socket hold little back, and notice when the other side is gone."""
+    sock.setblocking(False)
+    for level, name, value in _OPTIONS:
+        number = getattr(socket, name, None)
+        if number is not None:
+            _try_option(sock, level, number, value)
+
+
+def _try_option(sock: socket.socket, level: int, number: int, value: int | bytes) -> None:
+    with suppress(OSError):
+        sock.setsockopt(level, number, value)

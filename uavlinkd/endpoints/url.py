@@ -1,0 +1,215 @@
+"""MAVLink URLs: how a local endpoint is written.
+
+::
+
+    udpin:HOST:PORT     listen for datagrams           udpin:127.0.0.1:14550
+    udpout:HOST:PORT    send datagrams there           udpout:127.0.0.1:14540
+    tcpin:HOST:PORT     listen for connections         tcpin:127.0.0.1:5760
+    tcp:HOST:PORT       connect there                  tcp:127.0.0.1:5760
+    serial:DEVICE:BAUD  a serial port                  serial:/dev/ttyACM0:57600
+
+``udpin://HOST:PORT`` and so on mean the same. Other programs spell these in other ways; each of those is
+refused with the spelling that is meant, because some (``udp:``) mean opposite things in different programs.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from enum import StrEnum
+
+from uavlinkd.addresses import Address, AddressError, parse_address
+
+
+class UrlError(ValueError):
+    """Text that is no endpoint URL. The message says what to write."""
+
+
+class Kind(StrEnum):
+    """What an endpoint is. The value is the URL's scheme."""
+
+    UDPIN = "udpin"
+    UDPOUT = "udpout"
+    TCP = "tcp"
+    TCPIN = "tcpin"
+    SERIAL = "serial"
+
+
+_LISTENING = frozenset({Kind.UDPIN, Kind.TCPIN})
+
+
+@dataclass(frozen=True, slots=True)
+class NetworkUrl:
+    """An endpoint on UDP or TCP. The host of a listening one is numeric."""
+
+    kind: Kind
+    address: Address
+
+    def __str__(self) -> str:
+        return f"{self.kind}:{self.address}"
+
+    @property
+    def listens(self) -> bool:
+        """Whether others come to it."""
+        return self.kind in _LISTENING
+
+    @property
+    def is_exposed(self) -> bool:
+        """Whether its plain MAVLink can leave this machine, or come from another one."""
+        return not self.address.is_loopback
+
+
+@dataclass(frozen=True, slots=True)
+class SerialUrl:
+    """An endpoint on a serial port."""
+
+    device: str
+    baud: int
+
+    def __str__(self) -> str:
+        return f"{self.kind}:{self.device}:{self.baud}"
+
+    @property
+    def kind(self) -> Kind:
+        """Always ``SERIAL``."""
+        return Kind.SERIAL
+
+    @property
+    def listens(self) -> bool:
+        """Never: a wire has one other end."""
+        return False
+
+    @property
+    def is_exposed(self) -> bool:
+        """Never: a wire is reached with hands."""
+        return False
+
+
+EndpointUrl = NetworkUrl | SerialUrl
+
+_MAX_BAUD = 20_000_000
+_FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT, tcpin:HOST:PORT or serial:/dev/DEVICE:BAUD"
+
+# Schemes of other programs, and ours for the same thing.
+# pymavlink and MAVProxy: udp, udpbcast, mcast, ws; MAVSDK: tcpout, serial_flowcontrol, raw; mavp2p: udps,
+# udpc, udpb, tcps, tcpc; mavlink-server: udpserver, udpclient, tcpserver, tcpclient, tlogreader; MAVROS:
+# udp-b, udp-pb, tcp-l, serial-hwfc.
+_SAME = {
+    "udps": Kind.UDPIN,
+    "udpserver": Kind.UDPIN,
+    "udpc": Kind.UDPOUT,
+    "udpclient": Kind.UDPOUT,
+    "tcpc": Kind.TCP,
+    "tcpclient": Kind.TCP,
+    "tcpout": Kind.TCP,
+    "tcps": Kind.TCPIN,
+    "tcpserver": Kind.TCPIN,
+    "tcp-l": Kind.TCPIN,
+    "uart": Kind.SERIAL,
+}
+_BROADCASTS = frozenset({"udpb", "udpbcast", "udp-b", "udp-pb", "mcast"})
+_FLOW_CONTROLLED = frozenset({"serial-hwfc", "serial_flowcontrol"})
+_NOT_LINKS = frozenset({"ws", "wss", "wsserver", "zenoh", "raw", "file", "tlogreader", "tlogwriter", "http", "https"})
+
+_SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9_-]*):(//)?(.*)", re.DOTALL)
+_BARE_DEVICE = re.compile(r"(/dev/[\x21-\x2b\x2d-\x39\x3b-\x7e]+)(?:[,:](\d+))?")
+_BARE_ADDRESS = re.compile(r"[0-9.]+:\d+|\[[0-9A-Fa-f:.]+\]:\d+|\d+")
+_BAUD = re.compile(r"[0-9]{1,8}")
+_DEVICE = re.compile(r"/[\x21-\x7e]+")
+
+
+def parse_url(text: str) -> EndpointUrl:
+    """The endpoint that a URL names. ``str()`` of the result gives its usual form.
+
+    Raises:
+        UrlError: with what to write instead.
+    """
+    if device := _BARE_DEVICE.fullmatch(text):
+        raise UrlError(f"names a serial port alone: write serial:{device[1]}:{device[2] or 57600}")
+    if _BARE_ADDRESS.fullmatch(text):
+        where = text if ":" in text else f"127.0.0.1:{text}"
+        raise UrlError(f"does not say how: write udpin:{where} to listen or udpout:{where} to send there")
+    parts = _SCHEME.fullmatch(text)
+    if parts is None:
+        raise UrlError(f"is no MAVLink URL: write {_FORMS}")
+    scheme, rest = parts[1], parts[3].removesuffix("/")
+    if scheme not in set(Kind):
+        raise UrlError(_foreign(scheme.lower(), rest))
+    kind = Kind(scheme)
+    return _serial(rest) if kind is Kind.SERIAL else _network(kind, rest)
+
+
+def _network(kind: Kind, rest: str) -> NetworkUrl:
+    if "@" in rest:
+        raise UrlError(_two_addresses(kind.value))
+    if "?" in rest or "/" in rest:
+        raise UrlError(f"has more than host and port: write {kind}:HOST:PORT alone")
+    if rest.isascii() and rest.lstrip(":").isdigit():
+        port = rest.lstrip(":")
+        raise UrlError(f"names no host: write {kind}:127.0.0.1:{port}, which only this machine reaches")
+    listening = kind in _LISTENING
+    try:
+        address = parse_address(rest, allow_names=not listening)
+    except AddressError as error:
+        raise UrlError(f"after {kind}: the address {error}") from None
+    if address.is_wildcard and not listening:
+        raise UrlError(f"needs one machine to send to: write {kind}:127.0.0.1:{address.port} for this one")
+    return NetworkUrl(kind, address)
+
+
+def _serial(rest: str) -> SerialUrl:
+    if query := re.fullmatch(r"(/[\x21-\x7e]*)\?baud(?:rate)?=(\d+)", rest):
+        raise UrlError(f"the baud rate follows a colon: write serial:{query[1]}:{query[2]}")
+    if re.match(r"COM\d", rest, re.IGNORECASE):
+        raise UrlError("names a port of Windows: write its device here, such as serial:/dev/ttyACM0:57600")
+    # From the right: names under /dev/serial/by-path have colons in them.
+    device, comma, baud_text = rest.rpartition("," if "," in rest else ":")
+    if not _DEVICE.fullmatch(device) or not (baud_text.isascii() and baud_text.isdigit() and len(baud_text) <= 8):
+        raise UrlError("needs a device and a baud rate: write serial:/dev/ttyACM0:57600 with yours")
+    if comma == ",":
+        raise UrlError(f"the baud rate follows a colon: write serial:{device}:{baud_text}")
+    baud = int(baud_text)
+    if not 300 <= baud <= _MAX_BAUD:
+        raise UrlError(f"has an impossible baud rate: write one from 300 to {_MAX_BAUD}, such as 57600")
+    return SerialUrl(device, baud)
+
+
+def _foreign(scheme: str, rest: str) -> str:
+    """What to write for the spelling of another program, or for none known."""
+    if scheme in set(Kind):
+        return f"schemes are in small letters: write {scheme}:{_shown(rest)}"
+    if "@" in rest:
+        return _two_addresses(scheme)
+    if scheme == "udp":
+        where = _shown(rest.lstrip(":"))
+        return (
+            "udp: means listening to some programs and sending to others:"
+            f" write udpin:{where} to listen there or udpout:{where} to send there"
+        )
+    if scheme in _SAME:
+        return f"that is written {_SAME[scheme]}: here: write {_SAME[scheme]}:{_shown(rest)}"
+    if scheme in _BROADCASTS:
+        return (
+            "broadcast and multicast would hand the link to everyone on the network:"
+            " write one endpoint udpout:HOST:PORT for each receiver"
+        )
+    if scheme in _FLOW_CONTROLLED:
+        return f"serial ports with hardware flow control are not offered: write serial:{_shown(rest)}"
+    if scheme in _NOT_LINKS:
+        return f"{scheme}: is not carried: write {_FORMS}"
+    return f"has no known scheme: write {_FORMS}"
+
+
+def _two_addresses(scheme: str) -> str:
+    """MAVROS joins both addresses of a socket by an @."""
+    if scheme == "udp":
+        return (
+            "one address, not BIND@REMOTE: write udpin:HOST:PORT with the address to listen on, which answers"
+            " whoever sends there, or udpout:HOST:PORT with the remote one"
+        )
+    return f"one address, not BIND@REMOTE: write {_FORMS}"
+
+
+def _shown(rest: str) -> str:
+    """The rest of a URL where it is plain; a placeholder where it is not."""
+    return rest if re.fullmatch(r"[\[\]A-Za-z0-9.:/_-]{1,80}", rest) else "HOST:PORT"
