@@ -1,0 +1,144 @@
+"""The parameters of the simulated copter: ArduPilot's names, types and manners."""
+
+from __future__ import annotations
+
+import math
+import struct
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Final
+
+
+class Kind(IntEnum):
+    """MAV_PARAM_TYPE, those that ArduPilot uses. Values travel as a float32 number, whatever the kind."""
+
+    INT8 = 2
+    INT16 = 4
+    INT32 = 6
+    REAL32 = 9
+
+
+LARGEST_FLOAT32: Final = (2 - 2**-23) * 2.0**127
+
+_RANGES: Final = {
+    Kind.INT8: (-(2**7), 2**7 - 1),
+    Kind.INT16: (-(2**15), 2**15 - 1),
+    Kind.INT32: (-(2**31), 2**31 - 1),
+}
+
+
+def _float32(value: float) -> float:
+    """The nearest number that travels unchanged."""
+    return float(struct.unpack("<f", struct.pack("<f", value))[0])
+
+
+@dataclass(slots=True)
+class Parameter:
+    """One parameter. The value is what a float32 can hold."""
+
+    name: str
+    kind: Kind
+    value: float
+    read_only: bool = False
+
+
+def _defaults(system_id: int) -> list[Parameter]:
+    i8, i16, i32, real = Kind.INT8, Kind.INT16, Kind.INT32, Kind.REAL32
+    return [
+        Parameter("FORMAT_VERSION", i16, 120, read_only=True),
+        Parameter("SYSID_THISMAV", i16, system_id, read_only=True),
+        Parameter("SYSID_MYGCS", i16, 255),
+        Parameter("SYSID_ENFORCE", i8, 0),
+        Parameter("FRAME_CLASS", i8, 1),
+        Parameter("FRAME_TYPE", i8, 1),
+        Parameter("ARMING_CHECK", i32, 1),
+        Parameter("AHRS_ORIENTATION", i8, 0),
+        Parameter("ANGLE_MAX", i16, 3000),
+        Parameter("BATT_MONITOR", i8, 4),
+        Parameter("BATT_CAPACITY", i32, 5200),
+        Parameter("BATT_LOW_VOLT", real, 14.0),
+        Parameter("BATT_FS_LOW_ACT", i8, 0),
+        Parameter("COMPASS_USE", i8, 1),
+        Parameter("COMPASS_OFS_X", real, 4.2),
+        Parameter("COMPASS_OFS_Y", real, -17.25),
+        Parameter("COMPASS_OFS_Z", real, 8.5),
+        Parameter("DISARM_DELAY", i8, 10),
+        Parameter("FENCE_ENABLE", i8, 0),
+        Parameter("FENCE_ALT_MAX", real, 100.0),
+        Parameter("FENCE_RADIUS", real, 300.0),
+        Parameter("FLTMODE1", i8, 0),
+        Parameter("FLTMODE2", i8, 2),
+        Parameter("FLTMODE3", i8, 5),
+        Parameter("FLTMODE4", i8, 4),
+        Parameter("FLTMODE5", i8, 6),
+        Parameter("FLTMODE6", i8, 9),
+        Parameter("FS_GCS_ENABLE", i8, 1),
+        Parameter("FS_GCS_TIMEOUT", real, 5.0),
+        Parameter("GPS_TYPE", i8, 1),
+        Parameter("INS_ACCOFFS_X", real, 0.012),
+        Parameter("LAND_SPEED", i16, 100),
+        Parameter("LOG_BITMASK", i32, 176_126),
+        Parameter("MIS_TOTAL", i16, 0, read_only=True),
+        Parameter("MOT_SPIN_ARM", real, 0.1),
+        Parameter("PILOT_TKOFF_ALT", real, 500.0),
+        Parameter("RC1_MIN", i16, 1100),
+        Parameter("RC1_MAX", i16, 1900),
+        Parameter("RC2_MIN", i16, 1100),
+        Parameter("RC2_MAX", i16, 1900),
+        Parameter("RTL_ALT", i32, 1500),
+        Parameter("STAT_BOOTCNT", i16, 1, read_only=True),
+        Parameter("WPNAV_SPEED", real, 800.0),
+        Parameter("WPNAV_SPEED_DN", real, 150.0),
+        Parameter("WPNAV_SPEED_UP", real, 250.0),
+        Parameter("WPNAV_RADIUS", real, 200.0),
+    ]
+
+
+class Parameters:
+    """The table, in its order. Names are at most 16 ASCII letters."""
+
+    def __init__(self, system_id: int) -> None:
+        self.table = _defaults(system_id)
+        for parameter in self.table:
+            parameter.value = _float32(parameter.value)
+        self._index = {parameter.name: index for index, parameter in enumerate(self.table)}
+
+    def __len__(self) -> int:
+        return len(self.table)
+
+    def __getitem__(self, name: str) -> float:
+        return self.table[self._index[name]].value
+
+    def index_of(self, name: str) -> int | None:
+        """Where a name stands, None if nowhere."""
+        return self._index.get(name)
+
+    def at(self, index: int) -> Parameter | None:
+        """The parameter at an index, None outside the table."""
+        return self.table[index] if 0 <= index < len(self.table) else None
+
+    def set(self, name: str, value: float) -> bool:
+        """Store a value as its kind holds it. False, and nothing is changed, if that is not possible.
+
+        An integer kind takes the nearest integer, as ArduPilot does. NaN, infinity, what the kind cannot hold, a
+        read-only and an unknown name are refused.
+        """
+        index = self._index.get(name)
+        if index is None or self.table[index].read_only or not math.isfinite(value):
+            return False
+        parameter = self.table[index]
+        if parameter.kind is Kind.REAL32:
+            if abs(value) > LARGEST_FLOAT32:
+                return False
+            parameter.value = _float32(value)
+            return True
+        lowest, highest = _RANGES[parameter.kind]
+        rounded = math.floor(value + 0.5)
+        if not lowest <= rounded <= highest:
+            return False
+        parameter.value = rounded
+        return True
+
+    def preset(self, name: str, value: float) -> None:
+        """Write a value that the vehicle itself keeps, such as MIS_TOTAL."""
+        self.table[self._index[name]].value = value

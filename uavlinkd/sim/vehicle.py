@@ -1,0 +1,267 @@
+"""How the simulated copter moves: speeds and accelerations, no aerodynamics."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import Final
+
+# A step longer than this is cut into several, so a stalled process does not make the copter jump through the ground.
+MAX_STEP_S: Final = 0.1
+# After a longer silence the model does not catch up: the process was suspended, and the copter with it.
+MAX_CATCH_UP_S: Final = 5.0
+
+ACCELERATION_M_S2: Final = 2.5
+TURN_RATE_RAD_S: Final = 1.5
+EARTH_RADIUS_M: Final = 6_378_137.0
+GRAVITY_M_S2: Final = 9.806_65
+HOVER_CURRENT_A: Final = 18.0
+IDLE_CURRENT_A: Final = 0.6
+BATTERY_CAPACITY_MAH: Final = 5200.0
+
+
+class Mode(IntEnum):
+    """Flight modes, with ArduCopter's custom_mode numbers."""
+
+    STABILIZE = 0
+    ALT_HOLD = 2
+    AUTO = 3
+    GUIDED = 4
+    LOITER = 5
+    RTL = 6
+    LAND = 9
+    POSHOLD = 16
+    BRAKE = 17
+
+
+class Landed(IntEnum):
+    """MAV_LANDED_STATE."""
+
+    ON_GROUND = 1
+    IN_AIR = 2
+    TAKEOFF = 3
+    LANDING = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """A point on the globe: degrees (WGS 84) and metres above mean sea level."""
+
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float
+
+
+@dataclass(slots=True)
+class Axes:
+    """A vector north, east and up: metres from home, or metres a second."""
+
+    north: float = 0.0
+    east: float = 0.0
+    up: float = 0.0
+
+
+@dataclass(slots=True)
+class Speeds:
+    """What the pilot of the model may ask for, metres a second."""
+
+    climb_m_s: float = 2.5
+    descend_m_s: float = 1.5
+    land_m_s: float = 1.0
+    travel_m_s: float = 8.0
+
+
+@dataclass(slots=True)
+class Vehicle:
+    """Where the copter is, where it is going, and what it reports of itself.
+
+    It is driven by ``arm``, ``disarm``, ``take_off``, ``go_to``, ``set_mode`` and moved by ``step``. Positions are
+    relative to home, where it starts on the ground.
+    """
+
+    home: Place
+    speeds: Speeds = field(default_factory=Speeds)
+    return_altitude_m: float = 15.0
+    mode: Mode = Mode.STABILIZE
+    armed: bool = False
+    landed: Landed = Landed.ON_GROUND
+    position: Axes = field(default_factory=Axes)
+    velocity: Axes = field(default_factory=Axes)
+    target: Axes = field(default_factory=Axes)
+    yaw_rad: float = 0.0
+    roll_rad: float = 0.0
+    pitch_rad: float = 0.0
+    used_mah: float = 0.0
+
+    @property
+    def altitude_m(self) -> float:
+        """Metres above home."""
+        return self.position.up
+
+    @property
+    def place(self) -> Place:
+        """Where it is on the globe."""
+        return self.place_of(self.position)
+
+    @property
+    def ground_speed_m_s(self) -> float:
+        """Speed over ground."""
+        return math.hypot(self.velocity.north, self.velocity.east)
+
+    @property
+    def current_a(self) -> float:
+        """What the battery gives at this moment."""
+        return HOVER_CURRENT_A if self.armed and self.landed is not Landed.ON_GROUND else IDLE_CURRENT_A
+
+    @property
+    def battery_percent(self) -> int:
+        """What is left, 0 to 100."""
+        return max(0, round(100 * (1 - self.used_mah / BATTERY_CAPACITY_MAH)))
+
+    @property
+    def battery_v(self) -> float:
+        """Of a pack of four cells."""
+        return 4 * (3.5 + 0.7 * self.battery_percent / 100)
+
+    def place_of(self, point: Axes) -> Place:
+        """A point relative to home, on the globe."""
+        per_degree = math.radians(1) * EARTH_RADIUS_M
+        latitude = self.home.latitude_deg + point.north / per_degree
+        longitude = self.home.longitude_deg + point.east / (per_degree * self._meridians_close())
+        return Place(latitude, (longitude + 180) % 360 - 180, self.home.altitude_m + point.up)
+
+    def point_of(self, place: Place) -> Axes:
+        """A place on the globe, relative to home."""
+        per_degree = math.radians(1) * EARTH_RADIUS_M
+        east_deg = (place.longitude_deg - self.home.longitude_deg + 180) % 360 - 180
+        return Axes(
+            (place.latitude_deg - self.home.latitude_deg) * per_degree,
+            east_deg * per_degree * self._meridians_close(),
+            place.altitude_m - self.home.altitude_m,
+        )
+
+    def arm(self) -> None:
+        """Start the motors. Home of the climb is where it stands."""
+        self.armed = True
+        self.target = Axes(self.position.north, self.position.east, self.position.up)
+
+    def disarm(self) -> None:
+        """Stop the motors; in the air the copter drops to the ground."""
+        self.armed = False
+        self._touch_down()
+
+    def set_mode(self, mode: Mode) -> None:
+        """Change the flight mode: LAND comes down here, RTL at home, the others hold this position."""
+        self.mode = mode
+        if self.landed is Landed.ON_GROUND:
+            return
+        here = self.position
+        if mode is Mode.LAND:
+            self.land()
+        elif mode is Mode.RTL:
+            self.target = Axes(0.0, 0.0, max(here.up, self.return_altitude_m))
+            self.landed = Landed.IN_AIR
+        else:
+            self.target = Axes(here.north, here.east, here.up)
+            self.landed = Landed.IN_AIR
+
+    def take_off(self, altitude_m: float) -> None:
+        """Climb straight up to metres above home. Only when armed."""
+        self.target = Axes(self.position.north, self.position.east, altitude_m)
+        if self.landed is Landed.ON_GROUND:
+            self.landed = Landed.TAKEOFF
+
+    def land(self) -> None:
+        """Come straight down; on the ground the motors stop. Only when in the air."""
+        self.target = Axes(self.position.north, self.position.east, 0.0)
+        self.landed = Landed.LANDING
+
+    def go_to(self, point: Axes) -> None:
+        """Fly to a point relative to home. Only when in the air."""
+        self.target = Axes(point.north, point.east, max(point.up, 0.5))
+
+    def has_arrived(self, within_m: float = 1.0) -> bool:
+        """Whether the target is this near."""
+        return math.dist(
+            (self.position.north, self.position.east, self.position.up),
+            (self.target.north, self.target.east, self.target.up),
+        ) <= max(within_m, 0.1)
+
+    def step(self, duration_s: float) -> None:
+        """Move for so many seconds."""
+        left = min(max(duration_s, 0.0), MAX_CATCH_UP_S)
+        while left > 0:
+            step_s = min(left, MAX_STEP_S)
+            self._step(step_s)
+            left -= step_s
+
+    def _step(self, step_s: float) -> None:
+        self.used_mah = min(self.used_mah + self.current_a * step_s / 3.6, BATTERY_CAPACITY_MAH)
+        if not self.armed or self.landed is Landed.ON_GROUND:
+            return
+        if self.mode is Mode.RTL and self.landed is Landed.IN_AIR and self.has_arrived():
+            self.target = Axes(0.0, 0.0, 0.0)
+            self.landed = Landed.LANDING
+        wanted = self._wanted_velocity()
+        before = Axes(self.velocity.north, self.velocity.east, self.velocity.up)
+        self._accelerate(wanted, step_s)
+        self.position.north += self.velocity.north * step_s
+        self.position.east += self.velocity.east * step_s
+        self.position.up += self.velocity.up * step_s
+        self._lean(before, step_s)
+        if self.landed is Landed.TAKEOFF and self.position.up > 0.9 * self.target.up:
+            self.landed = Landed.IN_AIR
+        if self.landed is Landed.LANDING and self.position.up <= 0.05:
+            self._touch_down()
+            self.armed = False
+        self.position.up = max(self.position.up, 0.0)
+
+    def _wanted_velocity(self) -> Axes:
+        """Straight at the target, slowing so as to stop there."""
+        north, east = self.target.north - self.position.north, self.target.east - self.position.east
+        distance = math.hypot(north, east)
+        # The 0.8 leaves room for the step in which the braking is noticed.
+        speed = min(self.speeds.travel_m_s, 0.8 * math.sqrt(2 * ACCELERATION_M_S2 * distance), 2 * distance)
+        if self.landed is Landed.LANDING:
+            vertical = -self.speeds.land_m_s  # to the very ground: a landing does not end in a hover
+        else:
+            up = self.target.up - self.position.up
+            vertical = max(-self.speeds.descend_m_s, min(self.speeds.climb_m_s, 1.5 * up))
+        if distance < 1e-6:
+            return Axes(0.0, 0.0, vertical)
+        return Axes(speed * north / distance, speed * east / distance, vertical)
+
+    def _accelerate(self, wanted: Axes, step_s: float) -> None:
+        most = ACCELERATION_M_S2 * step_s
+        north, east = wanted.north - self.velocity.north, wanted.east - self.velocity.east
+        change = math.hypot(north, east)
+        share = 1.0 if change <= most else most / change
+        self.velocity.north += north * share
+        self.velocity.east += east * share
+        self.velocity.up += max(-most, min(most, wanted.up - self.velocity.up))
+
+    def _lean(self, before: Axes, step_s: float) -> None:
+        """Attitude from acceleration, heading from the way it flies."""
+        forward_n = (self.velocity.north - before.north) / step_s
+        forward_e = (self.velocity.east - before.east) / step_s
+        ahead = forward_n * math.cos(self.yaw_rad) + forward_e * math.sin(self.yaw_rad)
+        aside = -forward_n * math.sin(self.yaw_rad) + forward_e * math.cos(self.yaw_rad)
+        self.pitch_rad = -math.atan2(ahead, GRAVITY_M_S2)
+        self.roll_rad = math.atan2(aside, GRAVITY_M_S2)
+        if self.ground_speed_m_s > 0.5:
+            course = math.atan2(self.velocity.east, self.velocity.north)
+            turn = (course - self.yaw_rad + math.pi) % (2 * math.pi) - math.pi
+            most = TURN_RATE_RAD_S * step_s
+            self.yaw_rad += max(-most, min(most, turn))
+            self.yaw_rad = (self.yaw_rad + math.pi) % (2 * math.pi) - math.pi
+
+    def _touch_down(self) -> None:
+        self.position.up = 0.0
+        self.velocity = Axes()
+        self.roll_rad = self.pitch_rad = 0.0
+        self.landed = Landed.ON_GROUND
+
+    def _meridians_close(self) -> float:
+        # Not zero at a pole, where a longitude means nothing anyway.
+        return max(math.cos(math.radians(self.home.latitude_deg)), 1e-6)
