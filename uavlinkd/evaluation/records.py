@@ -1,0 +1,164 @@
+"""What a run leaves behind: one JSON line a measurement, and the same as CSV.
+
+The first line says on what machine, with which versions and which seed. A measurement that failed, did not finish in
+time or was not asked for is a record too, with the reason: nothing is left out.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any, Self, TypeVar
+
+T = TypeVar("T")
+
+Value = str | int | float | bool | None | list[float]
+"""What a record holds. Durations are seconds, sizes bytes or bits, as the name says."""
+
+
+class Status(StrEnum):
+    """What became of a measurement."""
+
+    OK = "ok"
+    FAILED = "failed"
+    NOT_FINISHED = "not finished"
+    """The time limit passed."""
+    SKIPPED = "skipped"
+    """It was not asked for."""
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """One measurement: of what ``kind``, at which ``point`` of the grid, and the ``values`` that were measured."""
+
+    kind: str
+    point: Mapping[str, Value]
+    values: Mapping[str, Value] = field(default_factory=dict)
+    status: Status = Status.OK
+    reason: str = ""
+    """Why there are no values; empty where there are."""
+
+    @property
+    def is_ok(self) -> bool:
+        """Whether it was measured."""
+        return self.status is Status.OK
+
+    def number(self, name: str) -> float:
+        """A measured number.
+
+        Raises:
+            KeyError: the record has none of that name.
+        """
+        value = self.values[name]
+        if isinstance(value, int | float):
+            return float(value)
+        raise KeyError(name)
+
+
+class RecordsError(Exception):
+    """Records that cannot be read. The message is for a person."""
+
+
+class RecordWriter:
+    """Appends records to ``NAME.jsonl`` as they come, and writes ``NAME.csv`` when all are there.
+
+    Each line is flushed: a run that is interrupted leaves what it has measured.
+    """
+
+    def __init__(self, folder: Path, name: str, run: Mapping[str, Value]) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        self._csv = folder / f"{name}.csv"
+        self._file: IO[str] = (folder / f"{name}.jsonl").open("w", encoding="utf-8")
+        self._run = run
+        self.records: list[Record] = []
+        """All so far."""
+        self._line({"run": dict(run)})
+
+    def add(self, record: Record) -> None:
+        """Write one."""
+        self.records.append(record)
+        line = {"kind": record.kind, "status": record.status.value, "reason": record.reason}
+        self._line({**line, "point": dict(record.point), "values": dict(record.values)})
+
+    def close(self) -> None:
+        """Write the CSV, and close."""
+        self._file.close()
+        write_csv(self._csv, self._run, self.records)
+
+    def _line(self, content: Mapping[str, object]) -> None:
+        self._file.write(json.dumps(content) + "\n")
+        self._file.flush()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def write_csv(path: Path, run: Mapping[str, Value], records: Iterable[Record]) -> None:
+    """One row a record: its kind, status and reason, its point, its numbers, and the facts of the run.
+
+    Lists (the latency of each frame) are in the JSON lines alone.
+    """
+    rows = [
+        {
+            "kind": record.kind,
+            "status": record.status.value,
+            "reason": record.reason,
+            **_scalars(record.point),
+            **_scalars(record.values),
+            **{f"run_{name}": value for name, value in _scalars(run).items()},
+        }
+        for record in records
+    ]
+    columns = list(dict.fromkeys(name for row in rows for name in row))
+    columns.sort(key=lambda name: name.startswith("run_"))  # stable: the facts of the run come last
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.DictWriter(file, columns)
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def read_records(path: Path) -> tuple[dict[str, Value], list[Record]]:
+    """The facts of a run, and its records.
+
+    Raises:
+        RecordsError: there are none, or a line is no record.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except OSError as error:
+        raise RecordsError(f"{path}: {error.strerror}") from None
+    if not lines:
+        raise RecordsError(f"{path}: is empty")
+    return _parse(path, 1, lines[0], _run_facts), [
+        _parse(path, number, line, _record) for number, line in enumerate(lines[1:], 2)
+    ]
+
+
+def _parse(path: Path, number: int, line: str, read: Callable[[Any], T]) -> T:
+    try:
+        return read(json.loads(line))
+    except (ValueError, KeyError, TypeError, AttributeError):
+        raise RecordsError(f"{path}: line {number} is no record of an evaluation") from None
+
+
+def _run_facts(content: Any) -> dict[str, Value]:
+    return dict(content["run"])
+
+
+def _record(content: Any) -> Record:
+    point, values = dict(content["point"]), dict(content["values"])
+    return Record(str(content["kind"]), point, values, Status(content["status"]), str(content["reason"]))
+
+
+def _scalars(values: Mapping[str, Value]) -> dict[str, Value]:
+    return {name: value for name, value in values.items() if not isinstance(value, list)}

@@ -1,0 +1,335 @@
+"""The report of the tampering evaluation: one HTML file with all in it, and the same as Markdown."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+from statistics import median
+
+from uavlinkd.evaluation.report import Section, Table
+from uavlinkd.evaluation.spread import duration
+from uavlinkd.evaluation.tampering import NAME, problems
+from uavlinkd.evaluation.tampering_figures import tampering_figures
+from uavlinkd.evaluation.tampering_plan import DATA, HANDSHAKE, KEYS
+from uavlinkd.evaluation.tampering_records import RECOVERY_LIMIT_S, RELAY, Flood, Run, Trial, Verdict, read_run
+
+TITLE = "What a man in the middle achieves: the paper's protocol and uavlinkd"
+_NOTHING = "-"
+_COLOURS = {
+    Verdict.SUCCEEDED: "#f4c7b8",
+    Verdict.DETECTED: "#cfe8d5",
+    Verdict.BLOCKED: "#dbe7f3",
+    Verdict.HARMLESS: "#eeeeee",
+    Verdict.BROKEN: "#f0c000",
+}
+_MEANINGS = {
+    Verdict.SUCCEEDED: "something forged, altered, replayed, reflected or misrouted came out at a local program, or "
+    "the attacker shares keys with a drone that takes it for another, or a drone answered where it must be silent, "
+    "or "
+    f"the link did not carry frames again within {RECOVERY_LIMIT_S:g} s after the attack",
+    Verdict.DETECTED: "none of that, and the drones noticed: a counter with a name, and a line in the log",
+    Verdict.BLOCKED: "none of that, but frames were missing or late while it lasted: who drops and delays shows no "
+    "datagram that could be refused, but achieves no more than that",
+    Verdict.HARMLESS: "none of that: every frame came out, and there was nothing to notice",
+    Verdict.BROKEN: "no attack: it never reached the wire",
+}
+
+
+def write_tampering_report(folder: Path) -> Path:
+    """Draw the figures and write the report from the records in ``folder``; where the HTML is.
+
+    Raises:
+        TamperingRecordsError: there are no records, or what is there is none.
+    """
+    run = read_run(folder / f"{NAME}.jsonl")
+    figures = tampering_figures(run)
+    for name, svg in figures.items():
+        (folder / f"{name}.svg").write_bytes(svg)
+    sections = make_sections(run, list(figures))
+    (folder / f"{NAME}.md").write_text(_to_markdown(sections, figures), encoding="utf-8")
+    html = folder / f"{NAME}.html"
+    html.write_text(_to_html(sections, figures), encoding="utf-8")
+    return html
+
+
+def has_tampering(folder: Path) -> bool:
+    """Whether the records in ``folder`` are those of this evaluation."""
+    return (folder / f"{NAME}.jsonl").exists()
+
+
+def write_tampering_page(folder: Path, page: Path) -> Path:
+    """The report as a Markdown page elsewhere, its figures in ``results/`` beside it.
+
+    Raises:
+        TamperingRecordsError: there are no records, or what is there is none.
+    """
+    run = read_run(folder / f"{NAME}.jsonl")
+    figures = tampering_figures(run)
+    results = page.parent / "results"
+    results.mkdir(exist_ok=True)
+    for name, svg in figures.items():
+        (results / f"{name}.svg").write_bytes(svg)
+    page.write_text(_to_markdown(make_sections(run, list(figures)), figures, "results/"), encoding="utf-8")
+    return page
+
+
+def make_sections(run: Run, figures: Sequence[str]) -> list[Section]:
+    """All that the report says."""
+    floods = [
+        Section(
+            f"{flood.rate_per_s:,.0f} spoofed initiations a second", f"flood-{flood.rate_per_s:g}", _on_flood(flood)
+        )
+        for flood in run.floods
+    ]
+    return [
+        Section("In short", "", _in_short(run)),
+        Section("Every attack, both systems", "", _legend(), _table(run)),
+        Section("What was accepted", "accepted" if "accepted" in figures else "", _ON_ACCEPTED),
+        Section("How soon the link is back", "recovery", _on_recovery(run)),
+        *floods,
+        Section("Attackers with keys", "", _ON_KEYS, _keys(run)),
+        Section("What the drones noticed", "", _ON_NOTICED, _noticed(run)),
+        Section("Where and how", "", _ON_RUN, _facts(run)),
+    ]
+
+
+_ON_ACCEPTED = [
+    "Frames that came out at a drone's local program and were not sent to it by the other's, or came out twice. Each "
+    "frame of the run is unique and is compared byte for byte."
+]
+_ON_KEYS = [
+    "The man in the middle proper holds no key. These attackers do: keys of their own, or stolen ones. Each runs the "
+    "protocol's own code, so it makes no mistakes. Answers of a drone are responses to initiations; a session is "
+    "what "
+    "would let the attacker speak. The captured drone has a session as itself, and says on it what only another may "
+    "say."
+]
+_ON_NOTICED = [
+    "The drop counters that grew, of all drones together, as `uavlinkd status` shows them; the log has a line for "
+    "each "
+    "(uavlinkd-drone0.log and so on, beside this file). Missing: envelopes that did not arrive, as status counts "
+    "them."
+]
+_ON_RUN = [
+    "Reproduce with `uavlinkd evaluate tampering --out DIR`. The seed fixes what the man in the middle chooses, not "
+    "keys. "
+    "Real daemons, each a process, with uavlink-mitm between them on loopback; frames numbered both ways all the "
+    "time. "
+    "Several stages ran beside one another on the machine, so times are those of a busy one."
+]
+
+
+def _in_short(run: Run) -> list[str]:
+    found = problems(run)
+    ours, paper = run.of("uavlinkd"), run.of("paper")
+    accepted = sum(sum(trial.faults.values()) for trial in ours)
+    attempts = sum(trial.attempts for trial in ours)
+    relay = next((trial for trial in paper if trial.attack == RELAY), None)
+    text = [
+        f"Against uavlinkd {len(ours)} attacks made {attempts:,} attempts. Frames accepted that were forged, "
+        "altered, "
+        f"replayed, reflected or misrouted: {accepted}. "
+        + ("Nothing succeeded." if not found else "NOT AS IT MUST BE: " + "; ".join(found) + ".")
+    ]
+    if relay is not None:
+        text.append(
+            f"Against the paper's protocol the two-sided relay made {relay.sessions} key exchanges with the drones, "
+            "read "
+            f"{relay.achieved.get('frames_read', 0)} frames, and had {relay.faults.get('forged or altered', 0)} "
+            "altered "
+            "frames accepted, each with an HMAC that fits. The paper's own two attacks, a public key tampered with "
+            "or "
+            "replaced, are detected there, because then the two sides have different keys; whoever makes an "
+            "exchange of "
+            "his own with each side is not."
+        )
+    succeeded = [trial.attack for trial in paper if trial.verdict is Verdict.SUCCEEDED]
+    if succeeded:
+        text.append(f"What succeeds against the paper's protocol: {', '.join(succeeded)}.")
+    return text
+
+
+def _legend() -> list[str]:
+    return [f"{verdict.value}: {meaning}." for verdict, meaning in _MEANINGS.items()]
+
+
+def _table(run: Run) -> Table:
+    paper = {trial.attack: trial for trial in run.of("paper")}
+    order = {HANDSHAKE: 0, KEYS: 1, DATA: 2}
+    rows = []
+    for trial in sorted(run.of("uavlinkd"), key=lambda each: (order.get(each.group, 3), each.attack)):
+        theirs = paper.get(trial.attack)
+        rows.append(
+            [
+                trial.attack,
+                trial.group,
+                _verdict(theirs) if theirs else _NOTHING,
+                f"{theirs.attempts:,}" if theirs else _NOTHING,
+                trial.verdict.value,
+                f"{trial.attempts:,}",
+                str(sum(trial.faults.values())),
+                f"{trial.frames_lost:,} of {trial.frames_sent:,}",
+                _recovery(trial),
+            ]
+        )
+    head = [
+        "attack",
+        "kind",
+        "the paper's protocol",
+        "attempts",
+        "uavlinkd",
+        "attempts",
+        "false frames accepted",
+        "genuine frames lost meanwhile",
+        "back after",
+    ]
+    return Table(head, rows)
+
+
+def _verdict(trial: Trial) -> str:
+    if trial.verdict is Verdict.SUCCEEDED:
+        return f"{trial.verdict.value}: {'; '.join(trial.successes)}"
+    return trial.verdict.value
+
+
+def _recovery(trial: Trial) -> str:
+    return "not in 5 s" if trial.recovery_s is None else duration(trial.recovery_s)
+
+
+def _on_recovery(run: Run) -> list[str]:
+    times = [trial.recovery_s for trial in run.of("uavlinkd") if trial.recovery_s is not None]
+    if not times:
+        return []
+    return [
+        f"From the end of an attack until frames sent after it had come out at both ends: median "
+        f"{duration(median(times))}, "
+        f"longest {duration(max(times))}, without anyone's help."
+    ]
+
+
+def _on_flood(flood: Flood) -> list[str]:
+    inside = [i for i, at in enumerate(flood.at_s) if flood.begin_s + 0.3 <= at < flood.end_s]
+    before = [i for i, at in enumerate(flood.at_s) if at < flood.begin_s]
+    if not inside or not before:
+        return []
+    flooded = next(iter(flood.cpu_share))
+    rate = flood.initiations / (flood.end_s - flood.begin_s)
+    parts = [
+        f"{flood.initiations:,} initiations from a process of their own, {rate:,.0f} a second, went straight to the "
+        f"port of {flooded}; the genuine frames went through the man in the middle, who had no part in it"
+    ]
+    for name, shares in flood.cpu_share.items():
+        quiet, busy = (median([shares[i] for i in part]) for part in (before, inside))
+        sizes = flood.memory_bytes[name]
+        base, grown = sizes[before[-1]] / 2**20, (max(sizes) - sizes[before[-1]]) / 2**20
+        parts.append(
+            f"{name} used {100 * quiet:.0f} % of a core before and {100 * busy:.0f} % under it; "
+            f"to its {base:.1f} MiB of memory came {grown:.1f}"
+        )
+    # To the end of the samples: what was on its way in the last of the flood comes out after it.
+    since = [i for i, at in enumerate(flood.at_s) if at >= flood.begin_s]
+    sent, delivered = sum(flood.sent_hz[i] for i in since), sum(flood.delivered_hz[i] for i in since)
+    share = min(100.0, 100 * delivered / sent) if sent else 0.0
+    return [f"{'. '.join(parts)}. Of the genuine frames since its beginning {share:.1f} % came out."]
+
+
+def _keys(run: Run) -> Table:
+    rows = []
+    for trial in run.trials:
+        if trial.group != KEYS:
+            continue
+        if trial.system == "paper":
+            rows.append(
+                [
+                    f"{trial.attack} (the paper's protocol)",
+                    trial.notes,
+                    str(trial.sessions),
+                    _NOTHING,
+                    str(trial.sessions),
+                    str(trial.achieved["frames_read"]),
+                    str(sum(trial.faults.values())),
+                ]
+            )
+            continue
+        each = list(trial.achieved.values())
+        rows.append(
+            [
+                trial.attack,
+                trial.notes,
+                str(sum(one["initiations"] for one in each)),
+                str(sum(one["answers"] for one in each)),
+                str(sum(one["sessions"] for one in each)),
+                str(sum(one["frames_read"] for one in each)),
+                str(sum(trial.faults.values())),
+            ]
+        )
+    head = ["attacker", "what it has", "initiations", "answers", "sessions", "frames read", "false frames accepted"]
+    return Table(head, rows)
+
+
+def _noticed(run: Run) -> Table:
+    rows = []
+    for trial in run.of("uavlinkd"):
+        reasons = ", ".join(f"{count:,} {reason}" for reason, count in trial.reasons.items())
+        events = sorted({name for counts in trial.events.values() for name in counts})
+        told = ", ".join(name for name in events if "dropped" not in name)
+        rows.append([trial.attack, reasons or _NOTHING, told or _NOTHING])
+    return Table(["attack", "counted", "also in the log"], rows)
+
+
+def _facts(run: Run) -> Table:
+    rows = [
+        [name.replace("_", " "), _NOTHING if value in (None, []) else str(value)] for name, value in run.facts.items()
+    ]
+    return Table(["", ""], rows)
+
+
+# Two forms of the same.
+
+_CSS = """
+body { font: 16px/1.5 system-ui, sans-serif; max-width: 76rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
+p { max-width: 50rem; } img { max-width: 100%; height: auto; }
+table { border-collapse: collapse; font-size: 0.85rem; display: block; overflow-x: auto; }
+th, td { border-bottom: 1px solid #ddd; padding: 0.25rem 0.6rem; text-align: left; vertical-align: top; }
+"""
+
+
+def _to_html(sections: Sequence[Section], figures: dict[str, bytes]) -> str:
+    parts = [
+        f'<!doctype html>\n<html lang="en">\n<meta charset="utf-8">\n<title>{escape(TITLE)}</title>',
+        f"<style>{_CSS}</style>\n<h1>{escape(TITLE)}</h1>",
+    ]
+    for section in sections:
+        parts.append(f"<h2>{escape(section.title)}</h2>")
+        if section.figure in figures:
+            data = base64.b64encode(figures[section.figure]).decode("ascii")
+            parts.append(f'<img alt="{escape(section.title)}" src="data:image/svg+xml;base64,{data}">')
+        parts += [f"<p>{escape(paragraph)}</p>" for paragraph in section.paragraphs]
+        if section.table is not None:
+            head = "".join(f"<th>{escape(cell)}</th>" for cell in section.table.head)
+            rows = ["".join(_cell(cell) for cell in row) for row in section.table.rows]
+            parts.append(f"<table><tr>{head}</tr>\n" + "\n".join(f"<tr>{row}</tr>" for row in rows) + "</table>")
+    return "\n".join([*parts, "</html>", ""])
+
+
+def _cell(text: str) -> str:
+    verdict = next((each for each in Verdict if text.partition(":")[0] == each.value), None)
+    colour = f' style="background: {_COLOURS[verdict]}"' if verdict else ""
+    return f"<td{colour}>{escape(text)}</td>"
+
+
+def _to_markdown(sections: Sequence[Section], figures: dict[str, bytes], place: str = "") -> str:
+    parts = [f"# {TITLE}"]
+    for section in sections:
+        parts.append(f"## {section.title}")
+        if section.figure in figures:
+            parts.append(f"![{section.title}]({place}{section.figure}.svg)")
+        parts += section.paragraphs
+        if section.table is not None:
+            lines = [section.table.head, ["---"] * len(section.table.head), *section.table.rows]
+            parts.append(
+                "\n".join("| " + " | ".join(each.replace("|", "\\|") for each in line) + " |" for line in lines)
+            )
+    return "\n\n".join(parts) + "\n"
