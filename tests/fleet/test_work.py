@@ -1,0 +1,287 @@
+"""Fleets on disk: what the commands write, and what a failure leaves."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable
+from itertools import combinations
+from pathlib import Path
+
+import pytest
+
+from uavlinkd import keys
+from uavlinkd.config import Config, load_config
+from uavlinkd.fleet import work
+from uavlinkd.fleet.manifest import Fleet, Kind, Settings, read_manifest
+from uavlinkd.fleet.plan import FleetError
+
+
+def snapshot(folder: Path) -> dict[str, bytes]:
+    """Every file of a folder."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def loaded(folder: Path, name: str) -> Config:
+    """A member's configuration as its daemon reads it."""
+    return load_config(folder / name / f"{name}.toml", {})
+
+
+def check_fleet(folder: Path) -> Fleet:
+    """Load every member, and see that each pair agrees on who is who; the fleet."""
+    fleet = read_manifest(folder)
+    configs = {member.name: loaded(folder, member.name) for member in fleet.members}
+    for member in fleet.members:
+        config = configs[member.name]
+        assert keys.encode_key(config.public_key) == member.public_key
+        peers = {peer.name: peer for peer in config.peers}
+        assert set(peers) == {peer.name for peer in fleet.peers_of(member)}
+        for name, peer in peers.items():
+            assert peer.settings.public_key == configs[name].public_key
+            back = next(each for each in configs[name].peers if each.name == member.name)
+            assert peer.settings.psk == back.settings.psk
+            assert (peer.settings.psk is not None) == fleet.settings.psk
+    return fleet
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A fleet of three drones, a ground station and an observer, with PSKs."""
+    folder = tmp_path / "fleet"
+    work.init(folder, Settings(psk=True), drones=3, ground_stations=1, observers=1)
+    return folder
+
+
+def test_new_fleet_is_one_that_every_daemon_takes(folder: Path) -> None:
+    """Each configuration loads without a warning, and both ends of each pair agree on keys."""
+    fleet = check_fleet(folder)
+    names = ["drone1", "drone2", "drone3", "ground-station", "observer"]
+    assert [member.name for member in fleet.members] == names
+    assert [member.system_id for member in fleet.members] == [1, 2, 3, 255, 254]
+    assert all(loaded(folder, name).warnings == () for name in names)
+
+
+def test_roles_are_those_of_the_pair(folder: Path) -> None:
+    """Drones fly along with each other, obey ground stations, are watched by observers; nobody else is linked."""
+    roles = {
+        (config.name, peer.name): (peer.policy["role"], peer.policy["system_ids"])
+        for config in (loaded(folder, name) for name in ("drone1", "ground-station", "observer"))
+        for peer in config.peers
+    }
+    assert roles == {
+        ("drone1", "drone2"): ("swarm-member", (2,)),
+        ("drone1", "drone3"): ("swarm-member", (3,)),
+        ("drone1", "ground-station"): ("operator", (255,)),
+        ("drone1", "observer"): ("observer", (254,)),
+        **{("ground-station", f"drone{n}"): ("vehicle", (n,)) for n in (1, 2, 3)},
+        **{("observer", f"drone{n}"): ("vehicle", (n,)) for n in (1, 2, 3)},
+    }
+
+
+def test_private_keys_are_in_their_own_folder_alone(folder: Path) -> None:
+    """No private key stands anywhere but in one file of mode 0600; a PSK in the folders of its pair alone."""
+    files = snapshot(folder)
+    for name in ("drone1", "drone2", "drone3", "ground-station", "observer"):
+        key = (folder / name / f"{name}.key").read_bytes().strip()
+        assert [path for path, content in files.items() if key in content] == [f"{name}/{name}.key"]
+    psk = (folder / "drone1" / "drone2.psk").read_bytes().strip()
+    assert sorted(path for path, content in files.items() if psk in content) == [
+        "drone1/drone2.psk",
+        "drone2/drone1.psk",
+    ]
+    for path in folder.rglob("*"):
+        if path.suffix in (".key", ".psk"):
+            assert path.stat().st_mode & 0o777 == 0o600, path
+    psks = [content for path, content in files.items() if path.endswith(".psk")]
+    assert len(set(psks)) == len(psks) / 2
+
+
+def test_manifest_tells_public_facts_only(folder: Path) -> None:
+    """Nothing secret stands in fleet.toml."""
+    text = (folder / "fleet.toml").read_text()
+    for path in folder.rglob("*"):
+        if path.suffix in (".key", ".psk"):
+            assert path.read_text().strip() not in text
+
+
+def test_fleet_is_made_whole_or_not_at_all(tmp_path: Path) -> None:
+    """A plan that gives bad configurations leaves nothing behind, and a fleet that is there is left alone."""
+    with pytest.raises(FleetError, match="no good configuration"):
+        work.init(tmp_path / "a" / "b", Settings(drone_url="udpin:127.0.0.1:5790"), 2, 0, 0)
+    assert list((tmp_path / "a").iterdir()) == []
+    work.init(tmp_path / "fleet", Settings(), 2, 0, 0)
+    before = snapshot(tmp_path)
+    with pytest.raises(FleetError, match="is there already"):
+        work.init(tmp_path / "fleet", Settings(), 2, 0, 0)
+    assert snapshot(tmp_path) == before
+
+
+@pytest.mark.parametrize(
+    ("settings", "amounts", "reason"),
+    [
+        (Settings(), (0, 0, 0), "at least one"),
+        (Settings(), (-1, 3, 0), "at least one"),
+        (Settings(), (200, 56, 0), "at most 255"),
+        (Settings(address_plan="10.13.0.0/29"), (7, 0, 0), "no address for drone7"),
+        (Settings(address_plan="10.13.0.1/24"), (1, 0, 0), "neither a network"),
+        (Settings(address_plan="10.13.0.{m}:5790"), (1, 0, 0), "gives no address"),
+        (Settings(address_plan="{{}}"), (1, 0, 0), "gives no address"),
+        (Settings(suite="rot13"), (1, 0, 0), "no suite"),
+        (Settings(control_socket="{x}"), (1, 0, 0), "nothing else in braces"),
+    ],
+)
+def test_impossible_fleets_are_refused(
+    tmp_path: Path, settings: Settings, amounts: tuple[int, int, int], reason: str
+) -> None:
+    """What cannot be is refused with its reason, and nothing is written."""
+    with pytest.raises(FleetError, match=reason):
+        work.init(tmp_path / "fleet", settings, *amounts)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_added_member_is_known_to_the_others(folder: Path) -> None:
+    """A new drone is everybody's peer and they are its, with a PSK for each pair; the others' keys stay."""
+    before = snapshot(folder)
+    result = work.add(folder, "scout", Kind.DRONE)
+    fleet = check_fleet(folder)
+    assert set(result.changed) == {each.name for each in fleet.members}
+    assert fleet.member("scout").system_id == 4
+    assert str(fleet.member("scout").address) == "10.13.0.4:5790"
+    after = snapshot(folder)
+    assert all(after[path] == content for path, content in before.items() if not path.endswith(".toml"))
+
+
+def test_second_ground_station_counts_down(folder: Path) -> None:
+    """Ground stations have ids and addresses from the top, and no link with each other or observers."""
+    work.add(folder, "truck", Kind.GROUND_STATION)
+    member = check_fleet(folder).member("truck")
+    assert (member.system_id, str(member.address)) == (253, "10.13.0.252:5790")
+    assert {peer.name for peer in loaded(folder, "truck").peers} == {"drone1", "drone2", "drone3"}
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "reason"),
+    [
+        ("drone2", {}, "already"),
+        ("../drone9", {}, "is no name"),
+        ("drone9", {"system_id": 3}, "system id of drone3"),
+        ("drone9", {"system_id": 254}, "address of ground-station"),
+        ("drone9", {"system_id": 256}, "from 1 to 255"),
+    ],
+)
+def test_impossible_members_are_refused(folder: Path, name: str, options: dict[str, int], reason: str) -> None:
+    """A member that cannot be is refused, and nothing changes."""
+    before = snapshot(folder)
+    with pytest.raises(FleetError, match=reason):
+        work.add(folder, name, Kind.DRONE, system_id=options.get("system_id"))
+    assert snapshot(folder) == before
+
+
+def test_removed_member_is_forgotten_by_the_others(folder: Path) -> None:
+    """Nobody has its key or a PSK with it any more; its own folder is left to its owner."""
+    result = work.remove(folder, "drone2")
+    assert set(result.changed) == {"drone1", "drone3", "ground-station", "observer"}
+    check_fleet(folder)
+    key = keys.public_key_text((folder / "drone2" / "drone2.key").read_text())
+    left = {path: content for path, content in snapshot(folder).items() if not path.startswith("drone2/")}
+    assert not [path for path, content in left.items() if key.encode() in content]
+    assert not [path for path in left if path.endswith("drone2.psk")]
+
+
+def test_edits_of_a_person_are_kept(folder: Path) -> None:
+    """What was changed or remarked by hand in the others' files is there after members came and went."""
+    path = folder / "drone1" / "drone1.toml"
+    text = path.read_text().replace(
+        'role = "operator"\n',
+        'role = "operator"  # our captain\ndeny_in = ["files",\n  "MAV_CMD_DO_FLIGHTTERMINATION"]\n',
+    )
+    path.write_text(text + "\n[log]\nlevel = 'warning'  # quiet\n")
+    work.add(folder, "scout", Kind.DRONE)
+    work.remove(folder, "drone3")
+    work.rotate(folder, "drone2", at_once=True)
+    after = path.read_text()
+    assert "# our captain" in after
+    assert "level = 'warning'  # quiet" in after
+    table = tomllib.loads(after)
+    assert [peer["name"] for peer in table["peer"]] == ["drone2", "ground-station", "observer", "scout"]
+    assert table["peer"][1]["deny_in"] == ["files", "MAV_CMD_DO_FLIGHTTERMINATION"]
+    assert table["log"] == {"level": "warning"}
+    check_fleet(folder)
+
+
+def test_files_that_cannot_be_edited_safely_are_refused(folder: Path) -> None:
+    """Where an edit by lines would not be the edit that is meant, nothing is changed at all."""
+    path = folder / "drone3" / "drone3.toml"
+    path.write_text(path.read_text() + 'description = """\n[[peer]]\nname = "drone1"\n[x]\n"""\n')
+    before = snapshot(folder)
+    with pytest.raises(FleetError, match="cannot be kept"):
+        work.remove(folder, "drone1")
+    assert snapshot(folder) == before
+
+
+def test_folders_that_went_to_their_vehicles_are_not_needed(folder: Path, tmp_path: Path) -> None:
+    """A configuration that is not here is written anew, whole, for the folder where it went."""
+    (folder / "drone1").rename(tmp_path / "drone1")
+    work.add(folder, "scout", Kind.DRONE)
+    (folder / "drone1" / "drone1.toml").replace(tmp_path / "drone1" / "drone1.toml")
+    (folder / "drone1" / "scout.psk").replace(tmp_path / "drone1" / "scout.psk")
+    (folder / "drone1").rmdir()
+    (tmp_path / "drone1").rename(folder / "drone1")
+    check_fleet(folder)
+
+
+ACTIONS: dict[str, Callable[[Path], object]] = {
+    "add": lambda folder: work.add(folder, "scout", Kind.DRONE),
+    "remove": lambda folder: work.remove(folder, "drone1"),
+    "rotate": lambda folder: work.rotate(folder, "drone1"),
+    "rotate at once": lambda folder: work.rotate(folder, "drone1", at_once=True),
+}
+
+
+@pytest.mark.parametrize("action", ACTIONS.values(), ids=ACTIONS)
+def test_failed_write_leaves_everything_as_it_was(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, action: Callable[[Path], object]
+) -> None:
+    """Where the last file cannot be written, those before it are as they were."""
+    genuine = work._write
+    failed: list[Path] = []
+
+    def fail_at_the_manifest(path: Path, content: bytes) -> None:
+        if path.name == "fleet.toml" and not failed:
+            failed.append(path)
+            raise OSError(28, "No space left on device", str(path))
+        genuine(path, content)
+
+    before = snapshot(folder)
+    monkeypatch.setattr(work, "_write", fail_at_the_manifest)
+    with pytest.raises(FleetError, match="No space left"):
+        action(folder)
+    assert snapshot(folder) == before
+    assert not (folder / "scout").exists()
+
+
+def test_key_changed_at_once_leaves_nothing_of_the_old(folder: Path) -> None:
+    """A key in wrong hands is replaced everywhere, and so is each PSK that lay beside it."""
+    old = {path: content for path, content in snapshot(folder).items() if path.startswith("drone1/")}
+    work.rotate(folder, "drone1", at_once=True)
+    fleet = check_fleet(folder)
+    assert fleet.member("drone1").previous_public_key is None
+    secrets = [content for path, content in old.items() if not path.endswith(".toml")]
+    public = keys.public_key_text(old["drone1/drone1.key"].decode())
+    for content in snapshot(folder).values():
+        assert public.encode() not in content
+        assert content not in secrets
+
+
+def test_all_system_ids_can_be_given(tmp_path: Path) -> None:
+    """A fleet of 255 has every id and as many different addresses."""
+    fleet = Fleet(Settings(address_plan="{name}.example.org:5790"))
+    key = keys.public_key_text(keys.generate_private_key())
+    for number in range(1, 256):
+        kind = Kind.GROUND_STATION if number % 5 == 0 else Kind.DRONE
+        fleet = fleet.with_member(fleet.new_member(f"m{number}", kind, key))
+    assert {member.system_id for member in fleet.members} == set(range(1, 256))
+    assert len({member.address for member in fleet.members}) == 255
+    for a, b in combinations(fleet.members, 2):
+        assert a.system_id < b.system_id or not (a.is_drone and b.is_drone)
+    with pytest.raises(FleetError):
+        fleet.new_member("one-more", Kind.DRONE, key)
