@@ -1,0 +1,156 @@
+"""``HOST:PORT`` and ``[IPv6]:PORT``, as they stand in a configuration."""
+
+from __future__ import annotations
+
+import re
+import socket
+from dataclasses import dataclass
+from ipaddress import IPv4Address, IPv6Address, ip_address
+
+DEFAULT_PORT = 5790
+"""The port that our examples listen on. A convention: the port is always written."""
+
+_MAX_PORT = 65535
+_PORT = re.compile(r"[0-9]{1,5}")
+_ZONE = re.compile(r"[A-Za-z0-9_.-]{1,15}")
+_LABEL = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?")
+_MAX_NAME = 253
+
+
+class AddressError(ValueError):
+    """Text that is no address. The message says what to write.
+
+    It repeats only what was recognised in the text, because what stands in the wrong place may be a key.
+    """
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Address:
+    """A UDP or TCP address: a numeric host or a name, and a port."""
+
+    host: str
+    port: int
+
+    def __str__(self) -> str:
+        return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
+
+    @property
+    def sockaddr(self) -> tuple[str, int]:
+        """What ``getaddrinfo`` and asyncio take."""
+        return self.host, self.port
+
+    @property
+    def ip(self) -> IPv4Address | IPv6Address | None:
+        """The numeric host; none where it is a name."""
+        try:
+            return ip_address(self.host)
+        except ValueError:
+            return None
+
+    @property
+    def family(self) -> socket.AddressFamily:
+        """``AF_UNSPEC`` for a name: it may have addresses of both."""
+        match self.ip:
+            case IPv4Address():
+                return socket.AF_INET
+            case IPv6Address():
+                return socket.AF_INET6
+            case _:
+                return socket.AF_UNSPEC
+
+    @property
+    def is_loopback(self) -> bool:
+        """Whether only this machine can reach it."""
+        return self.ip is not None and self.ip.is_loopback
+
+    @property
+    def is_wildcard(self) -> bool:
+        """Whether it stands for every address of the machine."""
+        return self.ip is not None and self.ip.is_unspecified
+
+
+def overlaps(a: Address, b: Address) -> bool:
+    """Whether two sockets cannot listen on both: same port, and same host or one of them every host."""
+    if a.port != b.port or a.family != b.family:
+        return False
+    return a.ip == b.ip or a.is_wildcard or b.is_wildcard
+
+
+def parse_address(text: str, *, allow_names: bool) -> Address:
+    """An address.
+
+    ``localhost`` is 127.0.0.1 here: a name that resolves elsewhere must not widen who can connect.
+
+    Raises:
+        AddressError: with what to write instead.
+    """
+    host, port = _split(text)
+    if host in ("", "*"):
+        raise AddressError(f"names no host: write 0.0.0.0:{port} for all IPv4, [::]:{port} for all IPv6")
+    try:
+        ip = ip_address(host)
+    except ValueError:
+        if text.startswith("["):
+            raise AddressError("has no IPv6 address in its brackets: write names without brackets") from None
+        return Address("127.0.0.1", port) if host == "localhost" else _named(host, port, allow_names)
+    if isinstance(ip, IPv6Address) and ip.scope_id is not None and not _ZONE.fullmatch(ip.scope_id):
+        raise AddressError("has a zone that is no network interface: write one, such as [fe80::1%wlan0]:5790")
+    if isinstance(ip, IPv6Address) and not text.startswith("["):
+        raise AddressError(f"an IPv6 address stands in brackets: write [{ip}]:{port}")
+    if isinstance(ip, IPv4Address) and text.startswith("["):
+        raise AddressError(f"only IPv6 addresses stand in brackets: write {ip}:{port}")
+    if isinstance(ip, IPv6Address) and ip.ipv4_mapped is not None:
+        raise AddressError(f"an IPv4 address is written as one: {ip.ipv4_mapped}:{port}")
+    if ip.is_multicast or host == "255.255.255.255":
+        raise AddressError("is a multicast or broadcast address: write the address of one machine")
+    return Address(str(ip), port)
+
+
+def _split(text: str) -> tuple[str, int]:
+    """The host without brackets, and a valid port."""
+    if text.startswith("["):
+        host, bracket, rest = text[1:].partition("]")
+        if not bracket:
+            raise AddressError(f'has no closing bracket: write "[ADDRESS]:PORT", such as [::]:{DEFAULT_PORT}')
+        port_text = rest[1:] if rest.startswith(":") else ""
+    else:
+        host, colon, port_text = text.rpartition(":")
+        if not colon or _is_ip(text):
+            port_text = ""
+    if not port_text:
+        raise AddressError(_without_port(text))
+    if not (_PORT.fullmatch(port_text) and 0 < int(port_text) <= _MAX_PORT):
+        raise AddressError(f'does not end in a port: write "HOST:PORT" with a port from 1 to {_MAX_PORT}')
+    return host, int(port_text)
+
+
+def _is_ip(text: str) -> bool:
+    """Whether all of the text is an address: ``::1:5790`` is one, and was not meant so."""
+    try:
+        ip_address(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _without_port(text: str) -> str:
+    host = text.removesuffix(":") if text.count(":") == 1 else text.strip("[]")
+    if not _is_ip(host):
+        return f'has no port: write "HOST:PORT"; uavlinkd\'s usual port is {DEFAULT_PORT}'
+    if ":" in host:
+        # Whether ::1:5790 was meant to end in a port cannot be told.
+        return f'is IPv6 without brackets, or without a port: write "[ADDRESS]:PORT", as in [::1]:{DEFAULT_PORT}'
+    return f"has no port: write {host}:{DEFAULT_PORT}"
+
+
+def _named(host: str, port: int, allowed: bool) -> Address:
+    if not allowed:
+        raise AddressError(
+            f"must be a numeric address of this machine: write 0.0.0.0:{port} for all of IPv4,"
+            f" [::]:{port} for all of IPv6, or one of its addresses"
+        )
+    labels = host.removesuffix(".").split(".")
+    # A last label of digits alone is a mistyped IPv4 address (RFC 1123, section 2.1).
+    if len(host) > _MAX_NAME or not all(map(_LABEL.fullmatch, labels)) or labels[-1].isdigit():
+        raise AddressError('is neither an IP address nor a host name: write one, such as "10.13.0.2:5790"')
+    return Address(host.lower(), port)

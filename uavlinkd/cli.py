@@ -1,0 +1,347 @@
+"""The commands: arguments in, exit status out, nothing else.
+
+0: done. 1: it could not be done, and one line says why. 2: the command line or the configuration is wrong.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import math
+import os
+import resource
+import sys
+from collections.abc import Callable, Coroutine, Sequence
+from contextlib import suppress
+from pathlib import Path
+
+from uavlinkd import __version__
+from uavlinkd.evaluation.commands import add_report_parser, add_timing_parser
+from uavlinkd.evaluation.tampering_commands import add_tampering_parser
+from uavlinkd.fleet.commands import add_parser as add_fleet
+
+OK, FAILED, WRONG = 0, 1, 2
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit status."""
+    options = _parser().parse_args(arguments)
+    command: Callable[[argparse.Namespace], int] = options.command
+    try:
+        return command(options)
+    except KeyboardInterrupt:
+        return OK
+    except BrokenPipeError:  # the reader of our output left: `uavlinkd check | head`
+        with suppress(OSError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return FAILED
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="uavlinkd",
+        description="The authenticated link between drones: carries MAVLink so that nobody on the way can "
+        "forge, alter, replay or redirect a frame.",
+    )
+    parser.add_argument("--version", action="version", version=f"uavlinkd {__version__}")
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+
+    def add(name: str, does: Callable[[argparse.Namespace], int], text: str) -> argparse.ArgumentParser:
+        command = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+        command.set_defaults(command=does)
+        return command
+
+    run = add("run", _run, "run the daemon")
+    run.add_argument("--config", metavar="FILE", type=Path, required=True)
+
+    status = add("status", _status, "show how a running daemon is; exit status 0 only if every peer is up")
+    _add_daemon(status)
+    status.add_argument("--watch", action="store_true", help="go on showing it, each second, until interrupted")
+    status.add_argument("--json", action="store_true", help="print all there is as JSON")
+
+    reload = add("reload", _reload, "have a running daemon read its configuration again")
+    _add_daemon(reload)
+
+    peer = add("peer", _peer_list, "list a running daemon's peers and their keys")
+    peer.add_argument("action", choices=["list"])
+    _add_daemon(peer)
+
+    check = add("check", _check, "check a configuration and show what it amounts to")
+    check.add_argument("--config", metavar="FILE", type=Path, required=True)
+
+    keygen = add("keygen", _keygen, "make a private key and print its public key")
+    keygen.add_argument(
+        "--out", metavar="FILE", type=Path, help="write the private key there (mode 0600), or to stdout"
+    )
+
+    pubkey = add("pubkey", _pubkey, "print the public key of a private key on standard input, or in FILE")
+    pubkey.add_argument("file", metavar="FILE", type=Path, nargs="?")
+
+    psk = add("psk", _psk, "make a pre-shared key for one pair of peers")
+    psk.add_argument("--out", metavar="FILE", type=Path, help="write it there (mode 0600), or to stdout")
+
+    sim = add("sim", _sim, "fly a simulated autopilot, or play a recorded flight")
+    sim.add_argument("--url", default="udpout:127.0.0.1:14550", help="where its MAVLink goes (default: %(default)s)")
+    sim.add_argument("--system-id", type=int, default=1, metavar="ID", help="1 to 255 (default: %(default)s)")
+    sim.add_argument("--rate", type=float, default=10.0, metavar="HZ", help="of ATTITUDE (default: %(default)s)")
+    sim.add_argument("--seconds", type=float, metavar="N", help="end after N seconds")
+    sim.add_argument("--seed", type=int, default=0, metavar="N", help="of its sensors' noise (default: %(default)s)")
+    sim.add_argument("--tlog", type=Path, metavar="FILE", help="play this recorded flight instead")
+    sim.add_argument("--speed", type=float, default=1.0, metavar="N", help="N times as fast; 0: as fast as it goes")
+
+    demo = add("demo", _demo, "show two daemons, an autopilot at each, on this machine")
+    demo.add_argument("--seconds", type=float, metavar="N", help="of traffic (default: 15, or 3 for each attack)")
+    demo.add_argument(
+        "--attack",
+        metavar="NAME[,key=value]",
+        help="stand between the drones and attack, as `uavlink-mitm --list` has it, or all; exit status 0 if nothing"
+        " forged, altered or replayed came out and the link is up after it, whatever was dropped",
+    )
+    demo.add_argument("--json", action="store_true", help="print the summary as JSON on the last line")
+    add_fleet(commands)
+    text = "compare the paper's method with uavlinkd: how long it takes, what an attacker achieves"
+    evaluate = commands.add_parser("evaluate", help=text, description=text[0].upper() + text[1:] + ".")
+    evaluations = evaluate.add_subparsers(title="evaluations", metavar="WHAT", required=True)
+    add_timing_parser(evaluations)
+    add_tampering_parser(evaluations)
+    add_report_parser(evaluations)
+    return parser
+
+
+def _add_daemon(command: argparse.ArgumentParser) -> None:
+    which = command.add_mutually_exclusive_group(required=True)
+    which.add_argument("--config", metavar="FILE", type=Path, help="the daemon's configuration")
+    which.add_argument("--socket", metavar="PATH", type=Path, help="the daemon's control socket")
+
+
+# The daemon.
+
+
+def _run(options: argparse.Namespace) -> int:
+    with suppress(OSError, ValueError):  # a core dump would hold every key
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+    from uavlinkd.config.errors import ConfigError
+    from uavlinkd.config.reader import ConfigReader
+
+    reader = ConfigReader(options.config)  # which works while the rest is imported
+    if not sys.stderr.isatty():
+        # structlog imports rich, for tracebacks on a terminal, wherever it finds it: 4 MB that JSON has no use for.
+        sys.modules.setdefault("rich", None)  # type: ignore[arg-type]
+    from uavlinkd.control import ControlError
+    from uavlinkd.daemon import Daemon
+    from uavlinkd.endpoints.sockets import BindError
+    from uavlinkd.log import set_up_logging
+
+    try:
+        config = reader.result()
+    except ConfigError as error:
+        return _fail(error, WRONG)
+    set_up_logging(config.log.level, config.log.format)
+
+    async def work() -> None:
+        await Daemon(config).run()
+
+    try:
+        _run_loop(work())
+    except (BindError, ControlError) as error:
+        return _fail(error)
+    return OK
+
+
+def _run_loop(work: Coroutine[None, None, None]) -> None:
+    """On uvloop where it is installed, else on asyncio's own loop."""
+    try:
+        import uvloop
+    except ImportError:
+        asyncio.run(work)
+    else:
+        with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
+            runner.run(work)
+
+
+def _check(options: argparse.Namespace) -> int:
+    from uavlinkd.config import ConfigError, load_config
+    from uavlinkd.topology import print_topology
+
+    try:
+        config = load_config(options.config, os.environ)
+    except ConfigError as error:
+        return _fail(error, WRONG)
+    print_topology(config)
+    return OK
+
+
+def _control_socket(options: argparse.Namespace) -> Path:
+    """Where the daemon is asked.
+
+    Raises:
+        ControlError: its configuration names no socket, or cannot be read.
+    """
+    from uavlinkd.config import ConfigError, load_config
+    from uavlinkd.control import ControlError
+
+    if options.socket is not None:
+        return Path(options.socket)
+    try:
+        config = load_config(options.config, os.environ)
+    except ConfigError as error:
+        raise ControlError(str(error)) from None
+    if config.control_socket is None:
+        raise ControlError(f'{options.config} names no control_socket: add control_socket = "{config.name}.sock"')
+    return config.control_socket
+
+
+def _status(options: argparse.Namespace) -> int:
+    import json
+    import time
+
+    from rich.console import Console
+    from rich.live import Live
+
+    from uavlinkd.control import ControlError, ask
+    from uavlinkd.status_screen import all_up, render_status
+
+    try:
+        socket = _control_socket(options)
+        status = ask(socket, "status")
+        if options.json:
+            print(json.dumps(status))
+        elif not options.watch:
+            Console().print(render_status(status))
+        else:
+            with Live(render_status(status), auto_refresh=False, screen=True) as live:
+                while True:
+                    time.sleep(1.0)
+                    status = ask(socket, "status")
+                    live.update(render_status(status), refresh=True)
+    except ControlError as error:
+        return _fail(error)
+    return OK if all_up(status) else FAILED
+
+
+def _reload(options: argparse.Namespace) -> int:
+    from uavlinkd.control import ControlError, ask
+
+    def say_so() -> None:
+        print("the daemon has not answered yet: it reads its file, or is busy. Waiting on", file=sys.stderr)
+
+    try:
+        problems = ask(_control_socket(options), "reload", on_waiting=say_so)["problems"]
+    except ControlError as error:
+        return _fail(error)
+    return _fail("\n".join(problems), WRONG) if problems else OK
+
+
+def _peer_list(options: argparse.Namespace) -> int:
+    from rich.console import Console
+
+    from uavlinkd.control import ControlError, ask
+    from uavlinkd.status_screen import render_peers
+
+    try:
+        Console().print(render_peers(ask(_control_socket(options), "status")))
+    except ControlError as error:
+        return _fail(error)
+    return OK
+
+
+# Keys.
+
+
+def _keygen(options: argparse.Namespace) -> int:
+    from uavlinkd.keys import generate_private_key, public_key_text
+
+    private = generate_private_key()
+    if options.out is None:
+        print(private)
+        print(f"public key: {public_key_text(private)}", file=sys.stderr)
+        return OK
+    return _write_secret(options.out, private) or _print(public_key_text(private))
+
+
+def _pubkey(options: argparse.Namespace) -> int:
+    from uavlinkd.keys import KeyFileError, encode_key, public_key_text, read_secret_file
+
+    if options.file is not None:
+        try:
+            private = encode_key(read_secret_file(options.file).reveal())
+        except KeyFileError as error:
+            return _fail(error)
+    else:
+        private = sys.stdin.readline().strip()
+    try:
+        return _print(public_key_text(private))
+    except ValueError as error:
+        return _fail(error)
+
+
+def _psk(options: argparse.Namespace) -> int:
+    from uavlinkd.keys import generate_psk
+
+    psk = generate_psk()
+    return _print(psk) if options.out is None else _write_secret(options.out, psk)
+
+
+def _write_secret(path: Path, text: str) -> int:
+    from uavlinkd.keys import KeyFileError, write_secret_file
+
+    try:
+        write_secret_file(path, text)
+    except KeyFileError as error:
+        return _fail(error)
+    return OK
+
+
+# Simulation.
+
+
+def _sim(options: argparse.Namespace) -> int:
+    from uavlinkd.sim.autopilot import AutopilotSettings
+    from uavlinkd.sim.flight import fly
+    from uavlinkd.sim.links import LinkError
+    from uavlinkd.sim.replay import replay
+    from uavlinkd.sim.tlog import TlogError
+
+    if not (math.isfinite(options.speed) and options.speed >= 0):
+        return _fail("--speed is a number from 0", WRONG)
+
+    async def work() -> None:
+        if options.tlog is not None:
+            print(await replay(options.tlog, options.url, speed=options.speed, seconds=options.seconds))
+            return
+        settings = AutopilotSettings(system_id=options.system_id, attitude_rate_hz=options.rate, seed=options.seed)
+        print(await fly(options.url, settings, seconds=options.seconds))
+
+    try:
+        asyncio.run(work())
+    except (LinkError, TlogError, OSError, ValueError) as error:
+        return _fail(error)
+    return OK
+
+
+def _demo(options: argparse.Namespace) -> int:
+    from uavlinkd.mitm.attack import AttackError
+    from uavlinkd.sim.demo import DemoError, run_demo
+
+    if options.seconds is not None and not (math.isfinite(options.seconds) and options.seconds > 0):
+        return _fail("--seconds is a number above 0", WRONG)
+    try:
+        summary = asyncio.run(run_demo(options.seconds, show=not options.json, attack=options.attack))
+    except AttackError as error:
+        return _fail(error, WRONG)
+    except DemoError as error:
+        return _fail(error)
+    if options.json:
+        print(summary.to_json())
+    return OK if summary.is_good else FAILED
+
+
+def _print(text: str) -> int:
+    print(text)
+    return OK
+
+
+def _fail(problem: object, status: int = FAILED) -> int:
+    print(problem, file=sys.stderr)
+    return status

@@ -1,0 +1,258 @@
+"""Reading a configuration file: TOML, then each section, then what lies between them, then the key files."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from uavlinkd.config import checks, policies
+from uavlinkd.config.advice import advice
+from uavlinkd.config.errors import ConfigError, Problem
+from uavlinkd.config.model import Config, Endpoint, Log, Peer, Recording, Routing
+from uavlinkd.config.problems import Problems, Values
+from uavlinkd.config.schema import (
+    EndpointSection,
+    FileSection,
+    LinkSection,
+    LogSection,
+    MetricsSection,
+    PeerSection,
+    RecordingSection,
+    RoutingSection,
+    Section,
+)
+from uavlinkd.core.crypto import Secret, x25519_public_key
+from uavlinkd.core.settings import Link, PeerSettings, Timers
+from uavlinkd.keys import KeyFileError, find_secret_file, read_secret_file
+from uavlinkd.mavlink.egress import EgressSettings
+
+_MAX_FILE_BYTES = 1 << 20
+
+
+def load_config(path: Path, environ: Mapping[str, str]) -> Config:
+    """The configuration in a file. Of ``environ``, only ``CREDENTIALS_DIRECTORY`` is looked at.
+
+    Raises:
+        ConfigError: with every problem of the file. Nothing is replaced by a default because it is wrong.
+    """
+    table = _read_toml(path)
+    problems = Problems(str(path))
+    top = problems.read(FileSection, table, "")
+    link = problems.read(LinkSection, _table(problems, table, "link"), "link")
+    log = problems.read(LogSection, _table(problems, table, "log"), "log")
+    routing = problems.read(RoutingSection, _table(problems, table, "routing"), "routing")
+    metrics = problems.read(MetricsSection, _table(problems, table, "metrics"), "metrics")
+    recording = problems.read(RecordingSection, _table(problems, table, "recording"), "recording")
+    endpoints = _sections(problems, table, "endpoint", EndpointSection)
+    peers = _sections(problems, table, "peer", PeerSection)
+
+    private = _secret(problems, top, "private_key_file", path.parent, environ)
+    previous = _secret(problems, top, "previous_private_key_file", path.parent, environ)
+    psks = [_secret(problems, peer, "psk_file", path.parent, environ) for peer in peers]
+    public = _public(private) if private else None
+
+    checks.names(problems, endpoints)
+    checks.names(problems, peers)
+    checks.public_keys(problems, peers, public, private.reveal() if private else None)
+    checks.previous_keys(problems, top, peers, public, None if previous is None else _public(previous))
+    checks.reachability(problems, top, peers)
+    checks.endpoints(problems, top, endpoints)
+    checks.metrics(problems, metrics, endpoints)
+    checks.recording(problems, recording, peers)
+    checks.timers(problems, link)
+    for endpoint in endpoints:
+        policies.check(problems, endpoint, needs_system_ids=False)
+    for peer, psk in zip(peers, psks, strict=True):
+        checks.timers(problems, peer, link)
+        policies.check(problems, peer, needs_system_ids=True)
+        if psk is not None and psk == private:
+            problems.add(
+                peer.place.key("psk_file"),
+                "holds this daemon's private key, which nobody else may see: make a PSK with `uavlinkd psk`",
+            )
+    problems.raise_any()
+
+    assert private is not None  # its absence is a problem, raised above
+    listen = tuple(top.good.get("listen", ()))
+    good_endpoints = tuple(map(_endpoint, endpoints))
+    good_peers = tuple(_peer(peer, psk, link) for peer, psk in zip(peers, psks, strict=True))
+    good_routing = Routing(**RoutingSection.model_construct(**routing.good).model_dump())
+    return Config(
+        path=path,
+        name=top.good["name"],
+        private_key=private,
+        public_key=_public(private),
+        listen=listen,
+        endpoints=good_endpoints,
+        peers=good_peers,
+        routing=good_routing,
+        control_socket=_beside(path, top.good.get("control_socket")),
+        metrics=metrics.good.get("listen"),
+        recording=_recording(path, recording),
+        log=Log(**LogSection.model_construct(**log.good).model_dump()),
+        previous_private_key=previous,
+        key_grace_s=FileSection.model_construct(**top.good).key_grace_s,
+        warnings=tuple(advice(listen, good_endpoints, good_peers, good_routing, metrics.good.get("listen"))),
+    )
+
+
+def _public(private: Secret) -> bytes:
+    return x25519_public_key(private.reveal())
+
+
+def _beside(path: Path, name: str | None) -> Path | None:
+    """A file named in the configuration, which is relative to it."""
+    return None if name is None else path.absolute().parent / name
+
+
+def _recording(path: Path, section: Values) -> Recording | None:
+    keys = RecordingSection.model_construct(**section.good)
+    folder = _beside(path, keys.folder)
+    if folder is None:
+        return None
+    return Recording(folder, keys.max_file_bytes, keys.max_files, keys.min_free_bytes)
+
+
+def _endpoint(section: Values) -> Endpoint:
+    keys = EndpointSection.model_construct(**section.good)
+    return Endpoint(
+        name=keys.name,
+        url=keys.url,
+        policy=policies.data(section),
+        max_age_s=keys.max_age_s,
+        radio_status=keys.radio_status,
+    )
+
+
+def _peer(peer: Values, psk: Secret | None, link: Values) -> Peer:
+    keys = LinkSection.model_construct(**checks.inherited(link, peer))
+    return Peer(
+        settings=PeerSettings(
+            name=peer.good["name"],
+            public_key=peer.good["public_key"],
+            psk=psk,
+            link=Link(
+                suites=tuple(keys.suites),
+                confidential=keys.confidential,
+                tag_bytes=keys.tag_bits // 8,
+                mac_key_bits=keys.mac_key_bits,
+                max_envelope=keys.max_envelope_bytes,
+                timers=Timers(
+                    rekey_after_s=keys.rekey_after_s,
+                    reject_after_s=keys.reject_after_s,
+                    retry_min_s=keys.retry_min_s,
+                    retry_max_s=keys.retry_max_s,
+                    keepalive_s=keys.keepalive_s,
+                    echo_after_s=keys.echo_after_s,
+                    handshake_after_s=keys.handshake_after_s,
+                    lost_after_s=keys.lost_after_s,
+                    probe_interval_s=keys.probe_interval_s,
+                ),
+            ),
+        ),
+        addresses=tuple(peer.good.get("addresses", ())),
+        previous_public_key=peer.good.get("previous_public_key"),
+        policy=policies.data(peer),
+        egress=EgressSettings(
+            budget_bits_s=keys.budget_bits_s,
+            coalesce_s=keys.coalesce_s,
+            max_age_s=keys.max_age_s,
+        ),
+    )
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
+    """The file's tables.
+
+    Raises:
+        ConfigError: it cannot be read, or is no TOML: nothing more can be said about it then.
+    """
+    try:
+        with path.open("rb") as file:
+            content = file.read(_MAX_FILE_BYTES + 1)
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not a file name"
+        raise ConfigError((Problem(str(path), "", f"cannot be read: {reason}"),)) from None
+    if len(content) > _MAX_FILE_BYTES:
+        raise ConfigError((Problem(str(path), "", "is over a megabyte: this is no configuration"),))
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = content.count(b"\n", 0, error.start) + 1
+        column = error.start - content.rfind(b"\n", 0, error.start)
+        raise ConfigError((_syntax(path, line, column, "is no text in UTF-8: save the file as UTF-8"),)) from None
+    try:
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise ConfigError((_toml_problem(path, text, error),)) from None
+
+
+_AT = re.compile(r"(.*) \(at (?:line (\d+), column (\d+)|end of document)\)", re.DOTALL)
+_VALUE_HINT = "text must be in quotes, true and false in small letters"
+
+
+def _toml_problem(path: Path, text: str, error: Exception) -> Problem:
+    """Where TOML's grammar ends. Of the message, only what stands before a quotation is repeated."""
+    found = _AT.fullmatch(str(error))
+    if found is None:
+        return Problem(str(path), "", "is no TOML that can be read: a number too long, or brackets too deep")
+    lines = text.split("\n")
+    line, column = (int(found[2]), int(found[3])) if found[2] else (len(lines), len(lines[-1]) + 1)
+    message = f"is no TOML here: {_without_names(found[1])}"
+    return _syntax(path, line, column, f"{message}; {_VALUE_HINT}" if "nvalid value" in message else message)
+
+
+def _without_names(message: str) -> str:
+    """``Cannot declare ('a', 'b') twice`` quotes keys: they are left out, the line says which."""
+    return re.sub(r"\s*(\(.*\)|'.*'|\".*\")", "", message)
+
+
+def _syntax(path: Path, line: int, column: int, message: str) -> Problem:
+    return Problem(f"{path}:{line}:{column}", "", message)
+
+
+def _table(problems: Problems, table: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    """A section that stands once."""
+    value = table.get(key, {})
+    if isinstance(value, dict):
+        return value
+    problems.add(key, f"must be a section: write [{key}], in single brackets, and its keys below")
+    return {}
+
+
+def _sections(problems: Problems, table: Mapping[str, Any], key: str, model: type[Section]) -> list[Values]:
+    """The sections of a kind that stands many times."""
+    value = table.get(key, [])
+    sections = value if isinstance(value, list) else [value]
+    if sections is not value or not all(isinstance(section, dict) for section in sections):
+        problems.add(key, f"must be a list of sections: write [[{key}]], in double brackets, for each")
+    return [
+        problems.read(model, section, f"{key}[{number}]")
+        for number, section in enumerate(sections)
+        if isinstance(section, dict)
+    ]
+
+
+def _secret(problems: Problems, section: Values, key: str, folder: Path, environ: Mapping[str, str]) -> Secret | None:
+    """The key in the file that a section names, if it names one."""
+    name = section.good.get(key)
+    if name is None:
+        return None
+    path, is_credential = find_secret_file(name, folder, environ)
+    place = section.place.key(key)
+    if not os.path.lexists(path):
+        where = shlex.quote(str(path))
+        make = f"uavlinkd keygen --out {where}" if key == "private_key_file" else f"umask 077; uavlinkd psk >{where}"
+        credential = " and no systemd credential of that name" if environ.get("CREDENTIALS_DIRECTORY") else ""
+        problems.add(place, f"there is no file {path}{credential}: make it with `{make}`")
+        return None
+    try:
+        return read_secret_file(path, credential=is_credential)
+    except KeyFileError as error:
+        problems.add(place, str(error))
+        return None

@@ -1,0 +1,185 @@
+"""What is wrong in a configuration file, said to the person who wrote it.
+
+A message gives the file, the key, what is wrong and what to write instead. It never repeats a value: what stands
+in the wrong place may be a secret.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from difflib import get_close_matches
+from typing import Any, NamedTuple
+
+from pydantic import ValidationError
+from pydantic_core import ErrorDetails
+
+from uavlinkd.config.errors import ConfigError, Problem
+from uavlinkd.config.schema import (
+    EndpointSection,
+    FileSection,
+    LinkSection,
+    LogSection,
+    MetricsSection,
+    PeerSection,
+    PolicySection,
+    RecordingSection,
+    RoutingSection,
+    Section,
+)
+
+
+class Place(NamedTuple):
+    """A section of the file: ``peer[1]``, and the name that was given to it there."""
+
+    section: str
+    name: str = ""
+
+    def key(self, key: str) -> str:
+        """``peer[1].public_key (drone1)``."""
+        path = ".".join(part for part in (self.section, key) if part)
+        return f"{path} ({self.name})" if self.name else path
+
+
+class Values(NamedTuple):
+    """What a section gives and is good, by key; and the keys whose values are not."""
+
+    place: Place
+    good: dict[str, Any]
+    bad: frozenset[str]
+
+
+class Problems:
+    """The problems of one file, in the order in which they are found."""
+
+    def __init__(self, file: str) -> None:
+        self._file = file
+        self._found: list[Problem] = []
+
+    def add(self, key: str, message: str) -> None:
+        """Note one."""
+        self._found.append(Problem(self._file, key, message))
+
+    def raise_any(self) -> None:
+        """Raise ConfigError, unless there is none."""
+        if self._found:
+            raise ConfigError(tuple(self._found))
+
+    def read(self, model: type[Section], table: Mapping[str, Any], section: str) -> Values:
+        """Check one section by its model and note what is wrong in it."""
+        good: dict[str, Any] = {}
+        bad: set[str] = set()
+        try:
+            model.model_validate(table, context=good)
+        except ValidationError as error:
+            place = Place(section, good.get("name", "") if section else "")
+            for details in error.errors(include_url=False, include_input=False):
+                bad.add(str(details["loc"][0]))
+                self.add(place.key(_path(details["loc"])), _message(details, model))
+        # A list with one bad item is not kept, but a key may have been kept before a check of all of it.
+        return Values(
+            Place(section, good.get("name", "") if section else ""),
+            {key: value for key, value in good.items() if key not in bad},
+            frozenset(bad),
+        )
+
+
+_BARE_KEY = re.compile(r"[A-Za-z0-9_-]{1,32}")
+
+
+def _path(location: tuple[int | str, ...]) -> str:
+    """``suites[0]``. A key that is no plain word is not repeated: it may be a secret, or control a terminal."""
+    parts = [
+        f"[{part}]" if isinstance(part, int) else part if _BARE_KEY.fullmatch(part) else "…" for part in location
+    ]
+    return "".join(parts)
+
+
+def _message(details: ErrorDetails, model: type[Section]) -> str:
+    """What is wrong and what to write, in our words for each kind of error that the schema can give."""
+    key = str(details["loc"][0])
+    context = details.get("ctx", {})
+    match details["type"]:
+        case "missing":
+            return f"is missing: write {key} = {_example(model, key)}"
+        case "extra_forbidden":
+            return unknown_key(key, model)
+        case "value_error":
+            return str(context["error"])
+        case "bool_type":
+            # Who writes the key wants what is not the default.
+            other = str(not model.model_fields[key].default).lower()
+            return f"must be true or false, without quotes: write {key} = {other}"
+        case "int_type":
+            return f"must be a whole number, without quotes: write {key} = {_example(model, key)}"
+        case "finite_number":
+            return f"must be a finite number: write {key} = {_example(model, key)}"
+        case "float_type":
+            return f"must be a number, without quotes: write {key} = {_example(model, key)}"
+        case "greater_than_equal":
+            return f"is too small: write {context['ge']:g} or more"
+        case "less_than_equal":
+            return f"is too large: write {context['le']:g} or less"
+        case "literal_error":
+            return f"must be {context['expected']}"
+        case "list_type":
+            return f"must be a list: write {key} = {_example(model, key)}"
+        case _:  # a kind of error that the schema does not give today
+            return f"cannot be used: write {key} = {_example(model, key)}"
+
+
+def _example(model: type[Section], key: str) -> str:
+    """A value as it is written in TOML: the schema's example, else the default."""
+    field = model.model_fields[key]
+    if field.examples:
+        return str(field.examples[0])
+    return f"{field.default:g}"
+
+
+_SECTIONS: dict[str, type[Section]] = {
+    "at the top, before the first [section]": FileSection,
+    "in [link] or in a [[peer]]": LinkSection,
+    "in a [[peer]] or an [[endpoint]]": PolicySection,
+    "in a [[peer]]": PeerSection,
+    "in an [[endpoint]]": EndpointSection,
+    "in [log]": LogSection,
+    "in [routing]": RoutingSection,
+    "in [metrics]": MetricsSection,
+    "in [recording]": RecordingSection,
+}
+
+# What WireGuard, mavlink-router and plain expectation call our keys.
+_OTHERS_CALL_IT = {
+    "private_key": "private_key_file, the name of a file that holds the key: a key never stands in this file",
+    "key": "private_key_file, or public_key in a [[peer]]",
+    "psk": "psk_file, the name of a file that holds the key: a key never stands in this file",
+    "preshared_key": "psk_file, the name of a file that holds the key: a key never stands in this file",
+    "listen_port": 'listen, with an address: listen = ["0.0.0.0:5790"]',
+    "port": 'listen, with an address: listen = ["0.0.0.0:5790"]',
+    "persistent_keepalive": "keepalive_s, in seconds",
+    "mtu": "max_envelope_bytes, the size of the UDP payload",
+    "encrypt": "confidential = true",
+    "encryption": "confidential = true",
+    "suite": 'suites, a list: suites = ["x25519"]',
+    "interface": "name, private_key_file and listen at the top of the file",
+    "udp_endpoint": "[[endpoint]], with name and url",
+    "uart_endpoint": "[[endpoint]], with name and url",
+}
+_OTHERS_CALL_IT_IN_A_PEER = {"endpoint": 'addresses, a list: addresses = ["10.13.0.2:5790"]'}
+
+
+def unknown_key(key: str, model: type[Section]) -> str:
+    """What to write for a key that the section does not have."""
+    plain = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|[ -]", "_", key).lower()
+    if model is PeerSection and plain in _OTHERS_CALL_IT_IN_A_PEER:
+        return f"is not known here: write {_OTHERS_CALL_IT_IN_A_PEER[plain]}"
+    if plain in _OTHERS_CALL_IT:
+        return f"is not known: write {_OTHERS_CALL_IT[plain]}"
+    for where, other in _SECTIONS.items():
+        if key in other.model_fields and key not in model.model_fields:
+            return f"does not belong here: write it {where}"
+    known = list(model.model_fields)
+    if close := get_close_matches(plain, known, n=1, cutoff=0.7):
+        written = f"[[{close[0]}]]" if model is FileSection and close[0] in ("peer", "endpoint") else close[0]
+        return f"is not known: did you mean {written}?"
+    return f"is not known here: the keys are {', '.join(known)}"

@@ -1,0 +1,294 @@
+"""The keys of a configuration file, with their ranges and defaults: one class a section.
+
+What is checked here concerns one value alone. What concerns several is in :mod:`uavlinkd.config.checks`.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Annotated, Any, Literal
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    PlainValidator,
+    ValidationInfo,
+    field_validator,
+)
+
+from uavlinkd.addresses import Address, parse_address
+from uavlinkd.core import constants as c
+from uavlinkd.core.crypto import is_usable_public_key
+from uavlinkd.core.suites import SUITES_BY_NAME, X25519, Suite
+from uavlinkd.endpoints.url import EndpointUrl, parse_url
+from uavlinkd.keys import decode_key, is_canonical_public_key
+from uavlinkd.mavlink.egress import EgressSettings
+
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}")
+# A key in base64 or hex, whole or nearly: such a thing is never repeated in a message.
+_LIKE_A_KEY = re.compile(r"[A-Za-z0-9+/_-]{40,}={0,2}")
+_FINITE_FIELD = re.compile(r"(?:modp|ffdhe?|dhe?)?[-_ ]?(\d{1,5})(?:[-_ ]?bits?)?")
+# IKE's numbers for small groups: RFC 2409 section 6, RFC 5114 section 2.1.
+_SMALL_IKE_GROUPS = {"group1": 768, "group2": 1024, "group22": 1024}
+_BREAKABLE_BITS = 1024
+_LEAST_BUDGET = 1000
+_EGRESS = EgressSettings()
+_AGES = (0.1, 60.0)
+_KEY_GRACE_S = 7 * 24 * 3600.0
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise ValueError("must be text in quotes")
+    return value
+
+
+def _name(value: Any) -> str:
+    # Names stand in logs, metrics and file names: no character in them may mean something there.
+    if not _NAME.fullmatch(_text(value)):
+        raise ValueError("must be a name of up to 63 letters, digits, dots, hyphens and underscores")
+    return str(value)
+
+
+def _file_name(value: Any) -> str:
+    text = _text(value)
+    if _LIKE_A_KEY.fullmatch(text.strip()):
+        raise ValueError("holds a key, not the name of a file: write the key to a file of mode 0600 and name that")
+    if not text or not text.isprintable():
+        raise ValueError('must name a file: write a name such as "drone0.key"')
+    return text
+
+
+def _public_key(value: Any) -> bytes:
+    try:
+        key = decode_key(_text(value))
+    except ValueError as error:
+        raise ValueError(f"{error}: write what `uavlinkd pubkey` prints on the peer") from None
+    if not is_usable_public_key(key):
+        raise ValueError(
+            "is a point of low order, with which everybody knows the shared secret:"
+            " write what `uavlinkd pubkey` prints on the peer"
+        )
+    if not is_canonical_public_key(key):
+        raise ValueError(
+            "is no key that X25519 gives, perhaps a private one, which nobody else may see:"
+            " write what `uavlinkd pubkey` prints on the peer"
+        )
+    return key
+
+
+def _suite(value: Any) -> Suite:
+    if isinstance(value, int) and not isinstance(value, bool):
+        value = str(value)
+    text = _text(value).strip().lower()
+    if (suite := SUITES_BY_NAME.get(text)) and text == value:
+        return suite
+    sized = _FINITE_FIELD.fullmatch(text)
+    bits = _SMALL_IKE_GROUPS.get(text) or (int(sized[1]) if sized else None)
+    if bits is not None and 0 < bits <= _BREAKABLE_BITS:
+        raise ValueError(
+            f"is a Diffie-Hellman group of {bits} bits: groups of {_BREAKABLE_BITS} bits and less are refused."
+            " One long computation in advance, within a state's reach, breaks every exchange in such a group"
+            " (Logjam, 2015), so they are there for measurements only;"
+            ' write "x25519", or "ffdhe2048" and above'
+        )
+    names = ", ".join(SUITES_BY_NAME)
+    raise ValueError(f"is no suite: write one of {names}")
+
+
+def _suites(values: list[Suite]) -> list[Suite]:
+    if not values:
+        raise ValueError('must name a suite: write ["x25519"]')
+    if len(set(values)) != len(values):
+        raise ValueError("names a suite twice: write each once, the one to offer first")
+    return values
+
+
+def _addresses(values: list[Address]) -> list[Address]:
+    if len(set(values)) != len(values):
+        raise ValueError("names an address twice: write each once")
+    return values
+
+
+def _budget(value: int) -> int:
+    if 0 < value < _LEAST_BUDGET:
+        raise ValueError(f"is too small: write {_LEAST_BUDGET} or more, in bits a second, or 0 for no limit")
+    return value
+
+
+def _peer_address(value: Any) -> Address:
+    address = parse_address(_text(value), allow_names=True)
+    if address.is_wildcard:
+        raise ValueError('is every address of this machine: write the peer\'s own, such as "10.13.0.2:5790"')
+    return address
+
+
+Name = Annotated[str, PlainValidator(_name)]
+FileName = Annotated[str, PlainValidator(_file_name)]
+ListenAddress = Annotated[Address, PlainValidator(lambda value: parse_address(_text(value), allow_names=False))]
+
+
+def _seconds(default: float, least: float, most: float) -> Any:
+    return Field(default=default, ge=least, le=most, allow_inf_nan=False)
+
+
+class Section(BaseModel):
+    """Unknown keys are refused, nothing is converted, and no message repeats what was written."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, hide_input_in_errors=True)
+
+    @field_validator("*")
+    @classmethod
+    def _keep(cls, value: Any, info: ValidationInfo) -> Any:
+        """Put each good value that the file gives into the context, if there is one.
+
+        So the checks across values can be made on what is good while something else is wrong, and every
+        problem is told at once.
+        """
+        if info.context is not None:
+            info.context[info.field_name] = value
+        return value
+
+
+class LinkSection(Section):
+    """``[link]``, and the same keys in ``[[peer]]``: how peers are spoken to."""
+
+    suites: Annotated[list[Annotated[Suite, PlainValidator(_suite)]], AfterValidator(_suites)] = Field(
+        default=[X25519], examples=['["x25519"]']
+    )
+    """Accepted, the first is offered."""
+    confidential: bool = False
+    """Whether frames are encrypted too. Both ends use the stronger of what they ask for."""
+    tag_bits: Literal[64, 96, 128, 256] = 128
+    """Length of an envelope's HMAC tag. Does not concern confidential links, whose tag has 128 bits."""
+    mac_key_bits: Literal[256, 512, 1024, 2048] = 256
+    max_envelope_bytes: int = Field(
+        default=c.DEFAULT_ENVELOPE_LIMIT, ge=c.MIN_ENVELOPE_LIMIT, le=c.MAX_ENVELOPE_LIMIT
+    )
+    """Largest datagram that carries frames. The default passes every IPv6 path (MTU 1,280 less 48 for IPv6 and
+    UDP); the least holds the largest MAVLink frame; the most fits a UDP datagram. Over the path's MTU less 48
+    (28 for IPv4) the network splits datagrams, and losing one part loses all."""
+
+    keepalive_s: float = _seconds(c.KEEPALIVE_S, 0.1, 3600)
+    echo_after_s: float = _seconds(c.ECHO_AFTER_S, 0.05, 300)
+    handshake_after_s: float = _seconds(c.HANDSHAKE_AFTER_S, 0.1, 600)
+    lost_after_s: float = _seconds(c.LOST_AFTER_S, 0.2, 1200)
+    retry_min_s: float = _seconds(c.RETRY_MIN_S, 0.05, 60)
+    retry_max_s: float = _seconds(c.RETRY_MAX_S, 0.05, 60)
+    rekey_after_s: float = _seconds(c.REKEY_AFTER_S, 1, 3600)
+    reject_after_s: float = _seconds(c.REJECT_AFTER_S, 1, 7200)
+    probe_interval_s: float = _seconds(c.PROBE_INTERVAL_S, 0.1, 3600)
+
+    budget_bits_s: Annotated[int, AfterValidator(_budget)] = Field(default=_EGRESS.budget_bits_s, ge=0, le=10**9)
+    """At most so many bits a second go to the peer, with IP's and UDP's headers. 0: no limit."""
+    coalesce_s: float = _seconds(_EGRESS.coalesce_s, 0, 0.5)
+    """So long a frame may wait for others to share its envelope. 0: only with those that are there already."""
+    max_age_s: float = _seconds(_EGRESS.max_age_s, *_AGES)
+    """A frame that waited longer for its turn is dropped: nothing stale arrives."""
+
+
+class PolicySection(Section):
+    """The keys in ``[[peer]]`` and ``[[endpoint]]`` which say what may be said there.
+
+    They are checked together, by :func:`uavlinkd.mavlink.policy.compile_policy`, which knows what they mean.
+    """
+
+    role: Any = None
+    system_ids: Any = None
+    allow_in: Any = None
+    deny_in: Any = None
+    allow_out: Any = None
+    deny_out: Any = None
+    rate_in: Any = None
+    rate_out: Any = None
+    mavlink1: Any = None
+    ground_station: Any = None
+
+
+class PeerSection(LinkSection, PolicySection):
+    """``[[peer]]``: another daemon."""
+
+    name: Name = Field(examples=['"drone1"'])
+    public_key: Annotated[bytes, PlainValidator(_public_key)] = Field(
+        examples=['"…", what `uavlinkd pubkey` prints on the peer']
+    )
+    addresses: Annotated[list[Annotated[Address, PlainValidator(_peer_address)]], AfterValidator(_addresses)] = Field(
+        default=[], examples=['["10.13.0.2:5790"]']
+    )
+    """Where it is called. Without any, it calls."""
+    psk_file: FileName | None = Field(default=None, examples=['"drone0-drone1.psk"'])
+    previous_public_key: Annotated[bytes, PlainValidator(_public_key)] | None = Field(
+        default=None, examples=['"…", what its public key was']
+    )
+    """While the peer's key changes: accepted too, until a session was made with the new one, or the grace is over."""
+
+
+class EndpointSection(PolicySection):
+    """``[[endpoint]]``: a local MAVLink port."""
+
+    name: Name = Field(examples=['"autopilot"'])
+    url: Annotated[EndpointUrl, PlainValidator(lambda value: parse_url(_text(value)))] = Field(
+        examples=['"udpin:127.0.0.1:14550"']
+    )
+    max_age_s: float = _seconds(_EGRESS.max_age_s, *_AGES)
+    """A frame that waited longer for a TCP connection or a serial port to take it is dropped."""
+    radio_status: bool = False
+    """Whether a RADIO_STATUS a second, made of the link's own loss and round-trip figures, goes to this endpoint."""
+
+
+class RoutingSection(Section):
+    """``[routing]``."""
+
+    relay: bool = False
+    """Whether what comes from a peer may go to other peers."""
+    unknown_targets: Literal["flood", "drop"] = "flood"
+    """Where a frame goes whose target was never heard: to every other port, or nowhere."""
+
+
+class MetricsSection(Section):
+    """``[metrics]``."""
+
+    listen: ListenAddress | None = Field(default=None, examples=['"127.0.0.1:9790"'])
+    """Where Prometheus is answered, over HTTP. None unless named."""
+
+
+class RecordingSection(Section):
+    """``[recording]``."""
+
+    folder: FileName | None = Field(default=None, examples=['"recordings"'])
+    """Where what crosses the link is kept as telemetry logs. Relative to the file; nothing is kept unless named."""
+    max_file_bytes: int = Field(default=64_000_000, ge=10_000, le=10**12, examples=["64_000_000"])
+    max_files: int = Field(default=100, ge=2, le=100_000)
+    min_free_bytes: int = Field(default=1_000_000_000, ge=100_000, le=10**15, examples=["1_000_000_000"])
+    """So much of the disk is left to others: rather than that, the oldest recordings are deleted."""
+
+
+class LogSection(Section):
+    """``[log]``."""
+
+    level: Literal["debug", "info", "warning", "error"] = "info"
+    format: Literal["auto", "console", "json"] = "auto"
+
+
+class FileSection(Section):
+    """The top of the file. Its sections are read one by one, so that each problem has its place."""
+
+    name: Name = Field(examples=['"drone0"'])
+    private_key_file: FileName = Field(examples=['"drone0.key"'])
+    listen: list[ListenAddress] = Field(default=[], examples=['["0.0.0.0:5790"]'])
+    """Where peers reach this daemon. Without any, it only calls."""
+    previous_private_key_file: FileName | None = Field(default=None, examples=['"drone0.previous.key"'])
+    """While this daemon's key changes: peers that do not know the new one yet are linked by this."""
+    key_grace_s: float = _seconds(_KEY_GRACE_S, 1, 365 * 24 * 3600)
+    """So long previous keys are good, from when the daemon has them: read at its start, or in a reload."""
+    control_socket: FileName | None = Field(default=None, examples=['"drone0.sock"'])
+    """A Unix socket on which the daemon tells its owner how it is. Relative to the file; none unless named."""
+    link: Any = None
+    log: Any = None
+    routing: Any = None
+    metrics: Any = None
+    recording: Any = None
+    endpoint: Any = None
+    peer: Any = None

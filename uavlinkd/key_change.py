@@ -1,0 +1,48 @@
+"""While a daemon's key changes, a peer may have either key, and may know either of ours.
+
+The core then has the peer once for each pair of keys that may be right, by different names. Whichever pair both ends
+hold makes a session, so files with the new keys may arrive in any order. A session of the current pair is the proof
+that the other end has changed as well: the other pairs are given up then, for as long as the daemon runs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+from uavlinkd.config import Peer
+from uavlinkd.core.settings import PeerSettings
+
+
+class KeyPairing(NamedTuple):
+    """A peer of the core: with which key of theirs, and by which of ours it knows us."""
+
+    settings: PeerSettings
+    by_our_previous: bool = False
+
+
+def pairings(peer: Peer, has_previous_key: bool) -> list[KeyPairing]:
+    """The pairs of keys that may be right, the current one first."""
+    current = peer.settings
+    found = [KeyPairing(current)]
+    if peer.previous_public_key is not None:
+        found.append(KeyPairing(replace(current, name=f"{peer.name} {_THEIRS}", public_key=peer.previous_public_key)))
+    if has_previous_key:
+        found += [
+            KeyPairing(replace(each.settings, name=f"{each.settings.name} {_OURS}"), by_our_previous=True)
+            for each in found
+        ]
+    return found
+
+
+_THEIRS, _OURS = "(previous key)", "(our previous key)"
+
+
+def is_by_our_previous(core_name: str) -> bool:
+    """Whether that peer of the core knows us by our previous key."""
+    return core_name.endswith(_OURS)
+
+
+def link_name(core_name: str) -> str:
+    """The peer as the configuration names it: names have no spaces."""
+    return core_name.partition(" ")[0]

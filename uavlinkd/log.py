@@ -1,0 +1,132 @@
+"""Logs: set up once by the commands, and summed up where things repeat.
+
+Event names are stable, ``snake_case`` and in the past tense; facts are fields. No key, tag or payload is ever one.
+"""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections import Counter
+from typing import TextIO
+
+import structlog
+from structlog.typing import FilteringBoundLogger, Processor
+
+from uavlinkd.core.drops import DropReason
+
+SUMMARY_INTERVAL_S = 10.0
+"""What repeats is logged at once when it begins, then summed up this often."""
+
+MEANINGS: dict[str, str] = {
+    DropReason.MALFORMED: "datagrams that are no message of this protocol",
+    DropReason.RAW_MAVLINK: "bare MAVLink at the port for peers: anyone could have sent it",
+    DropReason.UNEXPECTED_RESPONSE: "responses to no handshake of ours",
+    DropReason.BAD_MAC1: "handshake messages altered on the way, or from someone without our public key",
+    DropReason.COOKIE_REQUIRED: "more handshakes than are answered at once: senders must prove their address",
+    DropReason.RATE_LIMITED: "more handshakes from one source than its share",
+    DropReason.REPLAYED_INITIATION: "initiations that were answered before: somebody replays them",
+    DropReason.INVALID_KEY_SHARE: "handshakes with a public value that no honest peer sends",
+    DropReason.BAD_HANDSHAKE: "handshakes altered on the way, or made with another key or PSK than configured here",
+    DropReason.UNKNOWN_PEER: "initiations with a key that is not configured here",
+    DropReason.SUITE_NOT_ACCEPTED: "initiations with a suite that is not in this peer's list",
+    DropReason.HEADER_MISMATCH: "handshakes whose header was altered on the way",
+    DropReason.BAD_PARAMETERS: "handshakes with parameters outside the protocol",
+    DropReason.NO_FREE_INDEX: "no session index left",
+    DropReason.UNEXPECTED_COOKIE: "cookies for no message of ours",
+    DropReason.BAD_COOKIE: "cookies that do not open",
+    DropReason.UNKNOWN_INDEX: "envelopes for sessions unknown here: this side or the other restarted, or garbage",
+    DropReason.LATE: "envelopes for sessions that have ended",
+    DropReason.SESSION_EXPIRED: "envelopes under keys that are too old",
+    DropReason.LONG_COUNTER: "envelopes with a counter in the wrong form",
+    DropReason.REPLAYED: "replayed envelopes, or copies that the network made",
+    DropReason.TOO_OLD: "envelopes far behind the newest: replayed, or held back",
+    DropReason.DELAYED: "envelopes held back on the way for seconds",
+    DropReason.DOUBTFUL: "frames after a silence, which the peer did not confirm to be new",
+    DropReason.BAD_TAG: "envelopes altered or forged on the way",
+    DropReason.BAD_CONTROL: "control records of an authentic peer that are none",
+    DropReason.BAD_PATH_RESPONSE: "answers to no path challenge",
+    DropReason.NO_SESSION: "frames for a peer with which there is no link now",
+    DropReason.TOO_LARGE: "frames larger than the peer takes",
+    "envelopes_missing": "envelopes that the peer sent and that never came: a bad radio, or somebody drops them",
+    "envelopes_out_of_order": "envelopes that came after later ones: several paths, or somebody reorders them",
+    "challenges_unanswered": "the peer's envelopes came from places where it is not: somebody forwards them",
+    "echoes_unanswered": "questions that the peer did not answer: it does not hear, or somebody keeps the answers",
+    "handshakes_unanswered": "calls for new keys repeated while the peer was up: a bad radio, or somebody drops them",
+    "cookies_taken": "the peer asked to prove our address: it is under load, or somebody pretends to be it",
+    "stale": "frames that waited in the system while this process stood still",
+}
+"""What a person should understand by a reason."""
+
+
+DISTURBANCES = (
+    "envelopes_missing",
+    "envelopes_out_of_order",
+    "challenges_unanswered",
+    "echoes_unanswered",
+    "handshakes_unanswered",
+    "cookies_taken",
+)
+"""What is counted of a peer where no datagram is to blame, by its name in the status."""
+
+
+def set_up_logging(level: str, fmt: str, stream: TextIO = sys.stderr) -> None:
+    """Configure structlog for this process: a console on a terminal, JSON lines elsewhere (``fmt`` ``auto``)."""
+    console = fmt == "console" or (fmt == "auto" and stream.isatty())
+    stamp: list[Processor] = [
+        structlog.processors.add_log_level,
+        structlog.processors.TimeStamper(fmt="%H:%M:%S.%f" if console else "iso", utc=not console),
+    ]
+    render: list[Processor]
+    if console:
+        render = [structlog.dev.ConsoleRenderer(colors=stream.isatty(), pad_event_to=24)]
+    else:
+        render = [structlog.processors.format_exc_info, structlog.processors.JSONRenderer()]
+    structlog.configure(
+        processors=[*stamp, *render],
+        wrapper_class=structlog.make_filtering_bound_logger(getattr(logging, level.upper())),
+        logger_factory=structlog.WriteLoggerFactory(file=stream),
+        cache_logger_on_first_use=True,
+    )
+
+
+class DropSummary:
+    """Turns floods of drops into a line a reason: one when it begins, then one each :data:`SUMMARY_INTERVAL_S`.
+
+    Bounded: reasons are a closed list, peers and endpoints those of the configuration.
+    """
+
+    def __init__(self, log: FilteringBoundLogger) -> None:
+        self._log = log
+        self._waiting: Counter[tuple[str, str, str]] = Counter()
+        self._quiet_until: dict[tuple[str, str, str], float] = {}
+        self._last: dict[tuple[str, str, str], str] = {}
+        self.next_flush = float("inf")
+        """When :meth:`flush` has something to write; infinity for never."""
+
+    def add(self, event: str, reason: str, where: str, amount: int, now: float, last: str = "") -> None:
+        """Count ``amount`` drops; ``where`` names the peer or endpoint, empty for neither.
+
+        ``last`` is what a person wants to know of one of them, such as whence it came.
+        """
+        key = (event, reason, where)
+        self._waiting[key] += amount
+        self._last[key] = last
+        if now >= self._quiet_until.get(key, now):
+            self._write(key, now)
+        else:
+            self.next_flush = min(self.next_flush, self._quiet_until[key])
+
+    def flush(self, now: float) -> None:
+        """Write what has gathered since its last line, where that is long enough ago."""
+        for key in [each for each in self._waiting if now >= self._quiet_until[each]]:
+            self._write(key, now)
+        self.next_flush = min((self._quiet_until[key] for key in self._waiting), default=float("inf"))
+
+    def _write(self, key: tuple[str, str, str], now: float) -> None:
+        event, reason, where = key
+        facts = {"count": self._waiting.pop(key), "meaning": MEANINGS.get(reason, reason.replace("_", " "))}
+        self._quiet_until[key] = now + SUMMARY_INTERVAL_S
+        last = self._last.pop(key, "")
+        named = {"who": where} if where else {}
+        self._log.warning(event, reason=reason, **named, **facts, **({"last": last} if last else {}))

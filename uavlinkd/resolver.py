@@ -1,0 +1,77 @@
+"""Host names to addresses, again and again: networks come and go, and so do the addresses behind names."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from structlog.typing import FilteringBoundLogger
+
+from uavlinkd.addresses import Address
+from uavlinkd.endpoints.sockets import numeric_host
+from uavlinkd.threads import Threads
+
+Resolved = list[tuple[socket.AddressFamily, str, int]]
+
+FIRST_WAIT_S = 0.5
+LONGEST_WAIT_S = 10.0
+"""Between look-ups while an answer is wanted."""
+
+
+_THREADS = Threads(8, "look-up")
+"""Names that nobody answers for can hold up so many others, and no more threads than systemd's unit allows."""
+
+
+async def resolve(addresses: Sequence[Address]) -> tuple[Resolved, list[str]]:
+    """Every numeric address behind ``addresses``, in their order; and the names that have none now."""
+    resolved: Resolved = []
+    failed: list[str] = []
+    for address in addresses:
+        try:
+            if address.ip is None:
+                found = await _THREADS.run(_look_up, address, 0)
+            else:
+                found = _look_up(address, socket.AI_NUMERICHOST)  # which asks nobody
+        except (OSError, UnicodeError):
+            failed.append(address.host)
+            continue
+        for family, _, _, _, sockaddr in found:
+            each = (family, numeric_host(sockaddr), int(sockaddr[1]))
+            if each not in resolved:
+                resolved.append(each)
+    return resolved, failed
+
+
+def _look_up(address: Address, flags: int) -> list[tuple[Any, ...]]:
+    return socket.getaddrinfo(*address.sockaddr, type=socket.SOCK_DGRAM, flags=flags)
+
+
+async def keep_resolving(
+    addresses: Sequence[Address],
+    is_wanted: Callable[[], bool],
+    on_resolved: Callable[[Resolved], None],
+    log: FilteringBoundLogger,
+) -> None:
+    """Look the names up now, and again while ``is_wanted`` says that what they gave does not answer.
+
+    Runs until cancelled. ``on_resolved`` is called with what is new. Names that fail are logged once each time
+    that they begin to fail.
+    """
+    known: Resolved = []
+    failing: set[str] = set()
+    wait_s = FIRST_WAIT_S
+    while True:
+        if not known or failing or is_wanted():
+            found, failed = await resolve(addresses)
+            for name in set(failed) - failing:
+                log.warning("name_not_resolved", host=name)
+            failing = set(failed)
+            if found and found != known:
+                known = found
+                on_resolved(found)
+            wait_s = min(2 * wait_s, LONGEST_WAIT_S)
+        else:
+            wait_s = FIRST_WAIT_S
+        await asyncio.sleep(wait_s)

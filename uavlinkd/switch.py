@@ -1,0 +1,113 @@
+"""The switch: takes frames from a port, asks policy and router, and hands them to the ports where they belong.
+
+A port is a local program or a peer. Work is done by the batch: what came in one wake-up leaves in one call a port.
+And what policy and router answer about a header is remembered, where the answer is the same for every frame with it:
+then a frame costs a look-up, and the question whether it came by another way already.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from uavlinkd.endpoints.ports import LocalPort
+from uavlinkd.mavlink.frames import Frame, Header
+from uavlinkd.mavlink.policy import Policy, Refusal
+from uavlinkd.mavlink.routing import Router
+from uavlinkd.peer_link import PeerLink
+
+MAX_FLOWS = 2048
+"""Headers of one source, of which the way is remembered."""
+
+Port = LocalPort | PeerLink
+Refused = Callable[[str, Refusal], None]
+"""Takes who was refused, the name of a peer or endpoint, and why."""
+
+
+class Switch:
+    """Knows every port and its policy. All times are monotonic seconds."""
+
+    def __init__(self, router: Router[Port], refused: Refused) -> None:
+        self.router = router
+        self._refused = refused
+        self._policies: dict[Port, Policy] = {}
+        self._flows: dict[Port, dict[Header, tuple[Port, ...]]] = {}
+        self._edition = -1  # of the router's answers in the flows
+
+    def add(self, port: Port, policy: Policy) -> None:
+        """From now on frames may come from and go to this port, as far as the policy lets them."""
+        self._policies[port] = policy
+        self._flows[port] = {}
+        self.router.add_port(port, is_peer=isinstance(port, PeerLink))
+
+    def set_policy(self, port: Port, policy: Policy) -> None:
+        """Other rules for a port that is there."""
+        self._policies[port] = policy
+        self._forget_flows()
+
+    def remove(self, port: Port) -> None:
+        """Forget the port."""
+        del self._policies[port]
+        del self._flows[port]
+        self.router.remove_port(port)
+
+    def forward(self, source: Port, frames: Sequence[Frame], now: float, waited_s: float = 0.0) -> None:
+        """Carry frames from ``source`` to where they belong. What policy refuses is counted and goes nowhere.
+
+        ``waited_s``: how long the first of them has waited for the others.
+        """
+        router = self.router
+        if now >= router.refresh_at or router.edition != self._edition:
+            router.refresh(now)
+            self._forget_flows()
+        flows = self._flows[source]
+        batches: dict[Port, list[Frame]] = {}
+        for frame in frames:
+            ports = flows.get(frame.header)
+            if ports is None:
+                ports = self._way_of(frame, source, now)
+            elif not router.is_first(frame.raw, source, now):
+                continue
+            for port in ports:
+                if port in batches:
+                    batches[port].append(frame)
+                else:
+                    batches[port] = [frame]
+        for port, batch in batches.items():
+            port.send(batch, now, waited_s)
+
+    def _way_of(self, frame: Frame, source: Port, now: float) -> tuple[Port, ...]:
+        """Where this one frame goes. Remembered for all of its header, if nothing about it depends on the frame."""
+        incoming = self._policies[source].incoming
+        refusal = incoming.check(frame, now)
+        if refusal is not None:
+            self._refused(_owner(source), refusal)
+            return ()
+        routed = self.router.route(frame, source, now)
+        passed: list[Port] = []
+        always = bool(routed) and incoming.always_passes(frame.header)
+        for port in routed:
+            outgoing = self._policies[port].outgoing
+            refusal = outgoing.check(frame, now)
+            if refusal is not None:
+                self._refused(_owner(port), refusal)
+            else:
+                passed.append(port)
+            always = always and outgoing.always_passes(frame.header)
+        ways = tuple(passed)
+        if always:
+            if self.router.edition != self._edition:
+                self._forget_flows()
+            flows = self._flows[source]
+            if len(flows) >= MAX_FLOWS:
+                flows.clear()
+            flows[frame.header] = ways
+        return ways
+
+    def _forget_flows(self) -> None:
+        for flows in self._flows.values():
+            flows.clear()
+        self._edition = self.router.edition
+
+
+def _owner(port: Port) -> str:
+    return port.name if isinstance(port, PeerLink) else port.endpoint.name
