@@ -1,0 +1,267 @@
+"""Live reload between real daemons: what did not change goes on without losing a frame, what went is cut off."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.daemon.harness import DaemonProcess, Program, Sockaddr, Stage, assert_same, frame, heartbeat, to_toml
+from uavlinkd.control import ask
+
+COUNT = 200
+"""Frames each way between two reloads, and during each."""
+
+
+async def reload(daemon: DaemonProcess) -> list[str]:
+    """Have it read what is in ``daemon.config`` now; the problems that it found."""
+    daemon.write_config()
+    problems: list[str] = (await asyncio.to_thread(ask, daemon.folder / "control.sock", "reload", 30.0))["problems"]
+    return problems
+
+
+async def program_at(stage: Stage, daemon: DaemonProcess, endpoint: str, into: Sockaddr) -> Program:
+    """A program that the daemon knows at this endpoint."""
+    program = await stage.program()
+    program.send(heartbeat(), into)
+    await daemon.until(lambda status: str(program) in status["endpoints"][endpoint]["programs"])
+    return program
+
+
+def url_of(at: Sockaddr) -> str:
+    """Of an endpoint there."""
+    return f"udpin:{at[0]}:{at[1]}"
+
+
+async def talk(a: Program, into_a: Sockaddr, b: Program, into_b: Sockaddr, stop: asyncio.Event) -> list[list[bytes]]:
+    """Numbered frames both ways in a steady rhythm, until told to stop; what each said."""
+    said: list[list[bytes]] = [[], []]
+    number = 0
+    while not stop.is_set() or number < COUNT:
+        for which, (program, into) in enumerate(((a, into_a), (b, into_b))):
+            said[which].append(frame(number, which + 1))
+            program.send(said[which][-1], into)
+        number += 1
+        await asyncio.sleep(0.001)
+    return said
+
+
+async def test_untouched_peers_lose_no_frame(stage: Stage) -> None:
+    """Peers come, change and go, a bad file is refused, while two others talk: all frames arrive once, in order."""
+    a, b, c = (stage.daemon(f"drone{n}") for n in range(3))
+    into_a, into_b = a.add_endpoint("one"), b.add_endpoint("one")
+    stage.introduce(a, b)
+    stage.introduce(a, c)
+    with_c = list(a.config["peer"])
+    a.config["peer"] = with_c[:1]
+    await stage.start(a, b)
+    await c.start()
+    at_a, at_b = await program_at(stage, a, "one", into_a), await program_at(stage, b, "one", into_b)
+    at_a.clear()
+    at_b.clear()
+    before = (await b.status())["peers"][a.name]
+    stop = asyncio.Event()
+    talking = asyncio.create_task(talk(at_a, into_a, at_b, into_b, stop))
+
+    a.config["peer"] = with_c
+    assert await reload(a) == []
+    await a.until_linked()
+    with_c[1] |= {"role": "observer", "system_ids": [3]}
+    assert await reload(a) == []
+    a.config["peer"] = with_c[:1]
+    assert await reload(a) == []
+    a.config["colour"] = 1
+    assert "colour: is not known here" in "\n".join(await reload(a))
+    del a.config["colour"]
+    for _ in range(3):
+        a.write_config()
+        await a.send_signal(signal.SIGHUP)
+    a.config["peer"] = with_c
+    assert await reload(a) == []
+    await a.until_linked()
+
+    stop.set()
+    said_by_a, said_by_b = await talking
+    assert len(said_by_a) >= COUNT
+    await at_b.until_heard(said_by_a[-1])
+    await at_a.until_heard(said_by_b[-1])
+    assert_same(at_b.received, b"".join(said_by_a))
+    heard = bytes(at_a.received)
+    assert_same(heard, b"".join(said_by_b))
+    after = (await b.status())["peers"][a.name]
+    assert after["handshakes"] == before["handshakes"]
+    print(f"{len(said_by_a)} frames each way during {len(a.events('configuration_reloaded'))} reloads, none lost")
+
+
+async def test_a_peer_that_is_taken_out_is_cut_off_at_once(stage: Stage) -> None:
+    """From the answer to the reload on nothing of it is accepted, nothing goes to it; its calls are a stranger's."""
+    a, b = stage.pair()
+    into_a, into_b = a.add_endpoint("one"), b.add_endpoint("one")
+    await stage.start(a, b)
+    at_a, at_b = await program_at(stage, a, "one", into_a), await program_at(stage, b, "one", into_b)
+    at_b.send(frame(1), into_b)
+    await at_a.until_heard(frame(1))
+    peers, a.config["peer"] = a.config["peer"], []
+    assert await reload(a) == []
+    at_a.clear()
+    at_b.clear()
+    for number in range(2, 50):
+        at_b.send(frame(number), into_b)
+        at_a.send(frame(number, 2), into_a)
+    await b.until(lambda status: status["peers"][a.name]["state"] != "up")
+    await a.until(lambda status: status["drops"].get("unknown_peer", 0) > 0)
+    assert not at_a.received
+    assert not at_b.received
+    assert (await a.status())["peers"] == {}
+    a.config["peer"] = peers
+    assert await reload(a) == []
+    await a.until_linked()
+
+
+async def test_endpoints_swap_ports_and_change_names(stage: Stage) -> None:
+    """A socket whose address stays is handed over: what programs sent meanwhile is not lost."""
+    a, b = stage.pair()
+    first, second = a.add_endpoint("first"), a.add_endpoint("second")
+    listener = a.add_endpoint("tcp", f"tcpin:127.0.0.1:{first[1]}")
+    into_b = b.add_endpoint("one")
+    await stage.start(a, b)
+    at_b = await program_at(stage, b, "one", into_b)
+    one, two, _ = a.config["endpoint"]
+    one["url"], two["url"] = two["url"], one["url"]
+    assert await reload(a) == []
+    at_first = await program_at(stage, a, "second", first)
+    at_second = await program_at(stage, a, "first", second)
+    for each in a.config["endpoint"]:
+        each["name"] += "-of-old"
+    at_b.clear()
+    reloading = asyncio.create_task(reload(a))
+    said: list[bytes] = []
+    while not reloading.done() or len(said) < COUNT:
+        said.append(frame(len(said)))
+        at_first.send(said[-1], first)
+        await asyncio.sleep(0.002)
+    assert await reloading == []
+    at_first.send(last := frame(len(said)), first)
+    await at_b.until_heard(last)
+    assert_same(at_b.received, b"".join([*said, last]))
+    status = await a.until(lambda status: str(at_first) in status["endpoints"]["second-of-old"]["programs"])
+    assert set(status["endpoints"]) == {"first-of-old", "second-of-old", "tcp-of-old"}
+    _, writer = await asyncio.open_connection(*listener)
+    writer.write(heartbeat())
+    await a.until(lambda status: len(status["endpoints"]["tcp-of-old"]["programs"]) == 1)
+    writer.close()
+    at_second.send(other := frame(len(said) + 1), second)
+    await at_b.until_heard(other)
+
+
+async def test_an_endpoint_that_cannot_be_opened_refuses_the_whole_file(stage: Stage) -> None:
+    """The file, the key and what to do are told; the endpoint that could be opened is closed again."""
+    a, b = stage.pair()
+    into_a = a.add_endpoint("one")
+    await stage.start(a, b)
+    taken = await stage.program()
+    free = a.add_endpoint("two")
+    a.add_endpoint("three", url_of(taken.address))
+    problems = await reload(a)
+    assert len(problems) == 1
+    assert problems[0].startswith(f"{a.config_file}: endpoint.url (three): cannot listen on {taken}: Address already")
+    assert "write another port" in problems[0]
+    assert set((await a.status())["endpoints"]) == {"one"}
+    await stage.program(*free)  # nobody listens there
+    await program_at(stage, a, "one", into_a)
+
+
+async def test_reloads_are_made_one_after_the_other(stage: Stage) -> None:
+    """The second waits until the first has read its file, and what it reads stays. Each takes as long as it takes."""
+    a, b = stage.pair()
+    await stage.start(a, b)
+    peers = a.config["peer"]
+    a.config_file.unlink()
+    os.mkfifo(a.config_file)
+    socket = a.folder / "control.sock"
+    first = asyncio.create_task(asyncio.to_thread(ask, socket, "reload", 0.5, lambda: None))
+    await write_to(a.config_file, to_toml({**a.config, "peer": []}), before_the_end=a)
+    second = asyncio.create_task(asyncio.to_thread(ask, socket, "reload", 0.5, lambda: None))
+    assert await first == {"problems": []}
+    assert (await a.status())["peers"] == {}
+    await write_to(a.config_file, to_toml({**a.config, "peer": peers}))
+    assert await second == {"problems": []}
+    await a.until_linked()
+    assert [each.get("peers_removed") for each in a.events("configuration_reloaded")] == [[b.name], None]
+    a.config_file.unlink()
+
+
+async def write_to(fifo: Path, text: str, before_the_end: DaemonProcess | None = None) -> None:
+    """Give a file that is read: the daemon answers while it waits for it."""
+    writer = await asyncio.to_thread(os.open, fifo, os.O_WRONLY)  # which waits for the reader
+    if before_the_end is not None:
+        assert (await before_the_end.status())["peers"]
+    await asyncio.to_thread(os.write, writer, text.encode())
+    os.close(writer)
+
+
+async def test_many_hangups_are_no_more_than_two_reloads_at_a_time(stage: Stage) -> None:
+    """The last file wins however many signals came."""
+    a, b = stage.pair()
+    await stage.start(a, b)
+    peers, a.config["peer"] = a.config["peer"], []
+    a.write_config()
+    for _ in range(20):
+        await a.send_signal(signal.SIGHUP)
+    a.config["peer"] = peers
+    a.write_config()
+    await a.send_signal(signal.SIGHUP)
+    assert await reload(a) == []
+    await a.until_linked()
+    assert len(a.events("configuration_reloaded")) <= 21
+
+
+async def test_the_end_may_come_during_a_reload(stage: Stage) -> None:
+    """Clean and soon, with no word of the process that reads the file."""
+    a, b = stage.pair()
+    await stage.start(a, b)
+    a.config_file.unlink()
+    os.mkfifo(a.config_file)
+    await a.send_signal(signal.SIGHUP)
+    writer = await asyncio.to_thread(os.open, a.config_file, os.O_WRONLY)  # which waits for the reader
+    assert await a.stop() == 0
+    os.close(writer)
+    a.config_file.unlink()
+    assert a.plain_lines == []
+
+
+STUCK = """
+import socket, time
+genuine = socket.getaddrinfo
+def getaddrinfo(host, *arguments, **options):
+    if str(host).endswith(".test"):
+        open(__file__ + ".asked", "w").close()
+        time.sleep(600)
+    return genuine(host, *arguments, **options)
+socket.getaddrinfo = getaddrinfo
+"""
+
+
+@pytest.mark.parametrize("where", ["peer", "udpout", "tcp"])
+async def test_the_end_does_not_wait_for_a_name_server(stage: Stage, where: str) -> None:
+    """A name that nobody answers for holds up neither the other peer nor the end."""
+    a, b = stage.pair()
+    if where == "peer":
+        a.config["peer"].append({**a.config["peer"][0], "name": "far", "addresses": ["far.test:5790"]})
+        a.config["peer"][-1]["public_key"] = stage.daemon("far").public_key
+    else:
+        a.add_endpoint("far", f"{where}:far.test:14550")
+    hook = stage.folder / "hook" / "sitecustomize.py"
+    hook.parent.mkdir()
+    hook.write_text(STUCK)
+    await a.start({"PYTHONPATH": os.pathsep.join([str(hook.parent), *sys.path])})
+    await b.start()
+    await a.until(lambda status: status["peers"][b.name]["state"] == "up" and Path(f"{hook}.asked").exists())
+    loop = asyncio.get_running_loop()
+    began = loop.time()
+    assert await a.stop() == 0
+    assert loop.time() - began < 5
