@@ -1,0 +1,112 @@
+"""The units in systemd/, by systemd's own tools."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from collections import defaultdict
+from pathlib import Path
+
+import pytest
+
+from tests.daemon.harness import need
+from uavlinkd.daemon import HOUSEKEEPING_S
+
+UNITS = Path(__file__).parents[1] / "systemd"
+NAMES = sorted(path.name for path in UNITS.glob("*.service"))
+THRESHOLD = "20"
+"""Of `systemd-analyze security`, in tenths: an exposure below 2.0."""
+
+
+def analyze(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    """``systemd-analyze``."""
+    path = shutil.which("systemd-analyze")
+    need(path is not None, "systemd-analyze, of Debian's package systemd")
+    return subprocess.run([str(path), *map(str, arguments)], capture_output=True, text=True, check=False)
+
+
+def settings(name: str) -> dict[str, list[str]]:
+    """What a unit says, by key, with %i in place of what it stands for."""
+    found: defaultdict[str, list[str]] = defaultdict(list)
+    for line in (UNITS / name).read_text().splitlines():
+        if line and not line.startswith(("#", "[")):
+            key, _, value = line.partition("=")
+            found[key].append(value)
+    return found
+
+
+def test_there_is_a_unit_for_each_purpose() -> None:
+    """The daemon, several daemons, and the man in the middle."""
+    assert NAMES == ["uavlink-mitm.service", "uavlinkd.service", "uavlinkd@.service"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_unit_has_nothing_wrong(tmp_path: Path, name: str) -> None:
+    """In a file system where it is installed as it says."""
+    units = tmp_path / "etc/systemd/system"
+    units.mkdir(parents=True)
+    instance = name.replace("@", "@drone0")
+    shutil.copy(UNITS / name, units / instance)
+    for program in ("opt/uavlinkd/bin/uavlinkd", "opt/uavlinkd/bin/uavlink-mitm", "bin/sh"):
+        (tmp_path / program).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / program).write_text("#!/bin/sh\n")
+        (tmp_path / program).chmod(0o755)
+    for target in ("sysinit", "basic", "multi-user", "shutdown"):
+        (units / f"{target}.target").write_text("[Unit]\nDescription=there\n")
+    done = analyze("verify", "--man=no", f"--root={tmp_path}", instance)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def test_verification_sees_a_mistake(tmp_path: Path) -> None:
+    """The test above could fail."""
+    units = tmp_path / "etc/systemd/system"
+    units.mkdir(parents=True)
+    text = (UNITS / "uavlinkd.service").read_text()
+    (units / "uavlinkd.service").write_text(text.replace("PrivateTmp=", "PrivateTemp="))
+    done = analyze("verify", "--man=no", f"--root={tmp_path}", "uavlinkd.service")
+    assert "PrivateTemp" in done.stderr
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_unit_is_hardened(name: str) -> None:
+    """Its exposure, by systemd's measure."""
+    done = analyze("security", "--offline=true", f"--threshold={THRESHOLD}", "--no-pager", UNITS / name)
+    assert done.returncode == 0, done.stdout + done.stderr
+    exposure = re.search(r"Overall exposure level for .*: (\d+\.\d)", done.stdout)
+    assert exposure is not None
+    assert float(exposure[1]) < 2.0
+
+
+@pytest.mark.parametrize("name", ["uavlinkd.service", "uavlinkd@.service"])
+def test_drone_is_never_given_up(name: str) -> None:
+    """Restarted for ever, quickly, by a watchdog that hears of the loop; and started without a network."""
+    unit = settings(name)
+    assert unit["Type"] == ["notify"]
+    assert unit["NotifyAccess"] == ["main"]
+    assert (unit["Restart"], unit["StartLimitIntervalSec"]) == (["always"], ["0"])
+    assert unit["RestartSec"] == ["250ms"]
+    watchdog = re.fullmatch(r"(\d+)s", unit["WatchdogSec"][0])
+    assert watchdog is not None
+    assert int(watchdog[1]) / 2 > 2 * HOUSEKEEPING_S  # it is told in time though the timer is coarse
+    assert not {"After", "Wants", "Requires", "BindsTo"} & set(unit)
+    assert unit["ExecReload"] == ["/bin/sh -c 'kill -HUP $MAINPID'"]
+
+
+@pytest.mark.parametrize("name", ["uavlinkd.service", "uavlinkd@.service"])
+def test_keys_are_handed_over_and_serial_ports_allowed(name: str) -> None:
+    """By systemd, to a user of the moment; of devices, serial ports alone."""
+    unit = settings(name)
+    assert (unit["DynamicUser"], unit["SupplementaryGroups"], unit["UMask"]) == (["yes"], ["dialout"], ["0077"])
+    assert unit["LoadCredential"][0].startswith("keys:/etc/uavlinkd/")
+    assert unit["DevicePolicy"] == ["closed"]
+    assert all(re.fullmatch(r"char-tty[A-Z]+ rw", each) for each in unit["DeviceAllow"])
+    assert not any("KEY" in each.upper() for each in unit["Environment"])
+
+
+def test_instances_are_apart_and_otherwise_alike() -> None:
+    """Each has a configuration, keys and folders of its own; nothing else differs from the single service."""
+    one, many = settings("uavlinkd.service"), settings("uavlinkd@.service")
+    differing = {key for key in one.keys() | many.keys() if one[key] != many[key]}
+    assert differing == {"Description", "ExecStart", "LoadCredential", "RuntimeDirectory", "StateDirectory"}
+    assert all("%i" in value for key in differing for value in many[key])
