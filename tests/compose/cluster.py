@@ -1,0 +1,319 @@
+"""A fleet of real daemons on hosts of their own, and what can befall a host: for containers and network namespaces.
+
+The test's own process stands beside each daemon: it opens sockets in the hosts' network namespaces, so a program that
+speaks MAVLink there needs no process. That takes root.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import ctypes
+import os
+import socket
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Callable, Coroutine, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from tests.daemon.harness import BUFFER_BYTES, Program
+from uavlinkd.control import ControlError, ask
+from uavlinkd.mavlink.frames import SplitCounters, split_datagram
+
+PATIENCE_S = 30.0
+"""How long anything may take that has to happen and is not what a test measures."""
+POLL_S = 0.02
+LINKED_S = 5.0
+"""All links are up so long after the last daemon was started."""
+ENDPOINT = ("127.0.0.1", 14550)
+"""Where each daemon listens for its autopilot or ground control program."""
+COMPONENT = 191
+"""Of the frames that the tests send: an onboard computer's, which no autopilot uses."""
+HELLO = 0xFFFF_FFFF
+"""The number of the frame by which a program makes itself known."""
+_CLONE_NEWNET = 0x4000_0000
+
+Status = dict[str, Any]
+SYSTEM_IDS = {"drone1": 1, "drone2": 2, "drone3": 3, "ground-station": 255}
+
+
+class Cluster(ABC):
+    """Hosts by name, a daemon on each. What is done to a host is done when the call returns."""
+
+    names: Sequence[str] = tuple(SYSTEM_IDS)
+    cut_s = 0.0
+    """How long the test cuts a host from the network at least."""
+
+    @abstractmethod
+    def namespace_of(self, name: str) -> Path:
+        """The network namespace of a host."""
+
+    @abstractmethod
+    def control_socket_of(self, name: str) -> Path:
+        """The control socket of the daemon there."""
+
+    @abstractmethod
+    async def stop(self, name: str) -> None:
+        """End the daemon as a shutdown does."""
+
+    @abstractmethod
+    async def kill(self, name: str) -> None:
+        """End it as a power failure does."""
+
+    @abstractmethod
+    async def start(self, name: str) -> None:
+        """Start it again."""
+
+    @abstractmethod
+    async def pause(self, name: str) -> None:
+        """Stop its processes where they are."""
+
+    @abstractmethod
+    async def resume(self, name: str) -> None:
+        """Let them go on."""
+
+    @abstractmethod
+    async def cut(self, name: str) -> None:
+        """Take the host off the network."""
+
+    @abstractmethod
+    async def join(self, name: str, *, elsewhere: bool = False) -> None:
+        """Put it on the network again; ``elsewhere``: with another address."""
+
+    @abstractmethod
+    def logs(self) -> str:
+        """All that the daemons wrote."""
+
+    def status(self, name: str) -> Status | None:
+        """What the daemon says; None where it does not answer."""
+        with suppress(ControlError, OSError, LookupError):
+            return ask(self.control_socket_of(name), "status", timeout_s=1.0)
+        return None
+
+    def states(self, name: str) -> dict[str, str]:
+        """How its peers are, as it says."""
+        status = self.status(name)
+        return {} if status is None else {peer: each["state"] for peer, each in status["peers"].items()}
+
+    def is_linked(self, name: str) -> bool:
+        """Whether this host and all others say that they are up."""
+        states = self.states(name)
+        others = [each for each in self.names if each != name]
+        return all(states.get(each) == "up" for each in others) and all(
+            self.states(each).get(name) == "up" for each in others
+        )
+
+    def are_all_linked(self) -> bool:
+        """Whether every pair is up, at both ends."""
+        return all(
+            len(states) == len(self.names) - 1 and set(states.values()) == {"up"}
+            for states in map(self.states, self.names)
+        )
+
+    def is_missed(self, name: str) -> bool:
+        """Whether all others have noticed that it is gone."""
+        return all(self.states(each).get(name) != "up" for each in self.names if each != name)
+
+    async def until_linked(self) -> None:
+        """Wait until all daemons listen, and see that all links are up in time from there.
+
+        Raises:
+            AssertionError: they are not.
+        """
+        starting = await until(lambda: all(map(self.status, self.names)), "all daemons listen")
+        took = await until(self.are_all_linked, "all links are up")
+        print(f"all daemons listened after {starting:.2f} s, and all links were up {took:.2f} s later")
+        assert took < LINKED_S
+
+    async def program(self, name: str) -> Program:
+        """A program beside the daemon there, which the daemon knows."""
+        loop = asyncio.get_running_loop()
+        sock = socket_in(self.namespace_of(name))
+        _, program = await loop.create_datagram_endpoint(lambda: Program(sock), sock=sock)
+
+        def is_known() -> bool:
+            program.send(heartbeat(SYSTEM_IDS[name], HELLO), ENDPOINT)
+            status = self.status(name)
+            endpoints = () if status is None else status["endpoints"].values()
+            return any(f"127.0.0.1:{program.address[1]}" in each for each in map(_programs, endpoints))
+
+        await until(is_known, f"{name} knows a program")
+        return program
+
+
+def _programs(endpoint: Status) -> str:
+    return " ".join(endpoint["programs"])
+
+
+async def until(condition: Callable[[], bool], what: str, timeout_s: float = PATIENCE_S) -> float:
+    """Wait for a condition; the seconds that it took.
+
+    Raises:
+        AssertionError: it does not hold in time.
+    """
+    began = time.monotonic()
+    while not condition():
+        took = time.monotonic() - began
+        assert took < timeout_s, f"not in {timeout_s:g} s: {what}"
+        await asyncio.sleep(POLL_S)
+    return time.monotonic() - began
+
+
+def socket_in(namespace: Path) -> socket.socket:
+    """A UDP socket on loopback in a network namespace. A thread goes there, opens it, and ends."""
+    opened: list[socket.socket | OSError] = []
+
+    def work() -> None:
+        try:
+            with namespace.open("rb") as file:
+                if ctypes.CDLL(None, use_errno=True).setns(file.fileno(), _CLONE_NEWNET):
+                    raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
+            sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
+            sock.setblocking(False)
+            sock.bind(("127.0.0.1", 0))
+            opened.append(sock)
+        except OSError as error:
+            opened.append(error)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    (result,) = opened
+    if isinstance(result, OSError):
+        raise result
+    return result
+
+
+def heartbeat(system: int, number: int) -> bytes:
+    """A HEARTBEAT that differs from that of every other number: every role may say and hear it."""
+    codec = mavlink.MAVLink(None, system, COMPONENT)
+    codec.seq = number % 256
+    return bytes(mavlink.MAVLink_heartbeat_message(18, 8, 0, number, 4, 3).pack(codec))
+
+
+class Conversation:
+    """Programs beside some daemons, of which each says numbered frames, to be heard once by each other."""
+
+    _numbers_used = 0
+    """In conversations before: a daemon takes the same frame, soon after, for one that came by another way."""
+
+    def __init__(self, cluster: Cluster, names: Sequence[str]) -> None:
+        self._cluster = cluster
+        self._names = names
+        self._programs: dict[str, Program] = {}
+        self._first = self.said = self._numbers_used
+        """The numbers of the first frame that counts, and of the next; each says one of every number."""
+        self._forgotten = {heartbeat(system, HELLO) for system in SYSTEM_IDS.values()}
+
+    async def open(self) -> None:
+        """Make the programs known."""
+        for name in self._names:
+            self._programs[name] = await self._cluster.program(name)
+
+    def close(self) -> None:
+        """Close the programs' sockets."""
+        Conversation._numbers_used = self.said
+        for program in self._programs.values():
+            program.close()
+
+    def say(self) -> None:
+        """One frame by each."""
+        for name, program in self._programs.items():
+            program.send(heartbeat(SYSTEM_IDS[name], self.said), ENDPOINT)
+        self.said += 1
+
+    async def say_many(self, amount: int, interval_s: float = 0.005) -> None:
+        """So many by each, in that rhythm."""
+        for _ in range(amount):
+            self.say()
+            await asyncio.sleep(interval_s)
+
+    async def during(self, work: Coroutine[None, None, None]) -> int:
+        """Talk for as long as that work takes; how many frames each said."""
+        stop = asyncio.Event()
+
+        async def talk() -> None:
+            while not stop.is_set():
+                self.say()
+                await asyncio.sleep(0.02)
+
+        before = self.said
+        talking = asyncio.create_task(talk())
+        try:
+            await work
+        finally:
+            stop.set()
+            await talking
+        return self.said - before
+
+    def heard(self, name: str) -> Counter[bytes]:
+        """The tests' frames that came to one of the programs, byte for byte."""
+        frames = split_datagram(bytes(self._programs[name].received), SplitCounters())
+        ours = (each for each in frames if each.header.component == COMPONENT)
+        return Counter(each.raw for each in ours if each.raw not in self._forgotten)
+
+    def expected(self, name: str) -> Counter[bytes]:
+        """What each other said, once."""
+        return Counter(
+            heartbeat(SYSTEM_IDS[other], number)
+            for other in self._names
+            if other != name
+            for number in range(self._first, self.said)
+        )
+
+    def forget(self) -> None:
+        """Begin anew: what was said so far does not count, whether it was heard or is still on its way."""
+        self._forgotten |= {
+            heartbeat(SYSTEM_IDS[name], number) for name in self._names for number in range(self._first, self.said)
+        }
+        self._first = self.said
+
+    def check_nothing_else(self) -> None:
+        """Whatever was heard was said, and is heard once.
+
+        Raises:
+            AssertionError: something was forged, or repeated.
+        """
+        for name in self._names:
+            forged = self.heard(name) - self.expected(name)
+            assert not forged, f"{name} heard {forged.total()} frames too much"
+
+    async def check(self) -> None:
+        """All that was said is heard once by each other, and nothing else is.
+
+        Raises:
+            AssertionError: with what is missing or too much.
+        """
+        with suppress(AssertionError):
+            await until(lambda: all(self.heard(name) >= self.expected(name) for name in self._names), "", 5.0)
+        for name in self._names:
+            heard, expected = self.heard(name), self.expected(name)
+            assert heard == expected, (
+                f"{name} missed {(expected - heard).total()} of {expected.total()} frames,"
+                f" and heard {(heard - expected).total()} too much"
+            )
+
+
+async def run(*command: str, environ: dict[str, str] | None = None, check: bool = True) -> str:
+    """Run a command to its end; what it printed.
+
+    Raises:
+        AssertionError: it failed.
+    """
+    process = await asyncio.create_subprocess_exec(
+        *command,
+        stdin=asyncio.subprocess.DEVNULL,
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.STDOUT,
+        env={**os.environ, **(environ or {})},
+    )
+    output, _ = await process.communicate()
+    text = output.decode(errors="replace")
+    assert not (check and process.returncode), f"{' '.join(command)} failed:\n{text}"
+    return text

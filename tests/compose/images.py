@@ -1,0 +1,123 @@
+"""Images for containers: of the project's code as it is here, on whatever base this machine can have."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from functools import cache
+from pathlib import Path
+
+HERE = Path(__file__).parent
+PROJECT = HERE.parent.parent
+PUBLIC_BASE = "python:3.11-slim"
+LOCAL_BASE = "uavlinkd-test-base:bookworm"
+IMAGE = "uavlinkd-test"
+
+
+def why_not() -> str | None:
+    """Why no container can be run here, or None."""
+    if shutil.which("docker") is None:
+        return "docker, which is not installed"
+    if subprocess.run(["docker", "info"], capture_output=True, check=False).returncode:
+        return "a Docker engine that answers (docker info fails)"
+    if compose_command() is None:
+        return "docker compose, which is not installed"
+    if os.geteuid():
+        return "root, to look into the containers' network namespaces"
+    if has_image(IMAGE) or has_image(LOCAL_BASE) or shutil.which("debootstrap") or pull(PUBLIC_BASE):
+        return None
+    return f"an image to build on: a registry that gives {PUBLIC_BASE}, or debootstrap"
+
+
+def compose_command() -> list[str] | None:
+    """Compose as a plugin of docker, or as the program that it was before."""
+    for command in (["docker", "compose"], ["docker-compose"]):
+        if shutil.which(command[0]) and not _try(*command, "version"):
+            return command
+    return None
+
+
+@cache
+def build() -> str:
+    """The image, with today's code; its name. What did not change comes from the engine's cache.
+
+    Raises:
+        subprocess.CalledProcessError: a step failed; its output was printed.
+    """
+    base = base_image()
+    with tempfile.TemporaryDirectory(prefix="uavlinkd-image-") as folder:
+        context = Path(folder)
+        for name in ("Dockerfile", ".dockerignore"):
+            shutil.copy(HERE / name, context)
+        # Built in a copy: building leaves nothing in the project's folder.
+        source = context / "source"
+        source.mkdir()
+        for name in ("pyproject.toml", "README.md", "LICENSE"):
+            shutil.copy(PROJECT / name, source)
+        shutil.copytree(PROJECT / "uavlinkd", source / "uavlinkd", ignore=shutil.ignore_patterns("__pycache__"))
+        version = _python_of(base)
+        _run(sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--wheel-dir", context / "wheels", source)
+        requirements = json.loads(_output(sys.executable, "-c", _REQUIREMENTS, source / "pyproject.toml"))
+        _run(
+            *(sys.executable, "-m", "pip", "download", "-q", "--dest", context / "wheels"),
+            *("--only-binary=:all:", f"--python-version={version}", *requirements),
+        )
+        shutil.rmtree(source)
+        _run("docker", "build", "--quiet", "--build-arg", f"BASE={base}", "--tag", IMAGE, context)
+    return IMAGE
+
+
+_REQUIREMENTS = """
+import json, sys, tomllib
+with open(sys.argv[1], "rb") as file:
+    print(json.dumps(tomllib.load(file)["project"]["dependencies"]))
+"""
+
+
+def base_image() -> str:
+    """A Debian with Python: from the registry where there is one, else from Debian's packages, with systemd too."""
+    if has_image(LOCAL_BASE):
+        return LOCAL_BASE
+    if has_image(PUBLIC_BASE) or pull(PUBLIC_BASE):
+        return PUBLIC_BASE
+    with tempfile.TemporaryDirectory(prefix="uavlinkd-base-") as folder:
+        root = Path(folder) / "root"
+        _run("debootstrap", "--variant=minbase", "--include=python3,python3-venv,systemd", "bookworm", root)
+        leave_out = [f"--exclude=./{each}" for each in ("var/cache/apt/*", "var/lib/apt/lists/*", "usr/share/doc/*")]
+        with subprocess.Popen(["tar", "-C", root, *leave_out, "-c", "."], stdout=subprocess.PIPE) as tar:
+            subprocess.run(["docker", "import", "-", LOCAL_BASE], stdin=tar.stdout, check=True, capture_output=True)
+    return LOCAL_BASE
+
+
+def has_image(name: str) -> bool:
+    """Whether the engine has it."""
+    return not _try("docker", "image", "inspect", name)
+
+
+def pull(name: str) -> bool:
+    """Fetch it from the registry; whether that went."""
+    return not _try("docker", "pull", "--quiet", name)
+
+
+def _python_of(image: str) -> str:
+    code = "import sys; print('%d.%d' % sys.version_info[:2])"
+    return _output("docker", "run", "--rm", "--network", "none", image, "python3", "-c", code).strip()
+
+
+def _try(*command: str) -> int:
+    return subprocess.run(command, capture_output=True, check=False).returncode
+
+
+def _run(*command: str | Path) -> None:
+    done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
+    if done.returncode:
+        print(done.stdout)
+    done.check_returncode()
+
+
+def _output(*command: str | Path) -> str:
+    return subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout

@@ -1,0 +1,113 @@
+"""What befalls one host of a cluster while the others talk: the same for containers and for namespaces."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import time
+from collections.abc import Awaitable, Callable
+
+from tests.compose.cluster import Cluster, Conversation, until
+
+BACK_S = 2.0
+"""A link is up again so long after its host can be reached."""
+OUTAGE_S = float(os.environ.get("UAVLINKD_OUTAGE_S", "0"))
+"""How long a host is cut from the network at least; 60 is the full test. Every outage lasts until all others have
+noticed it."""
+
+VICTIM = "drone3"
+OTHERS = ("drone1", "drone2", "ground-station")
+
+
+async def check_frames(cluster: Cluster, amount: int = 200) -> None:
+    """Each vehicle's frames reach all others once."""
+    conversation = Conversation(cluster, cluster.names)
+    try:
+        await conversation.open()
+        await conversation.say_many(amount)
+        await conversation.check()
+    finally:
+        conversation.close()
+
+
+async def check_outage(
+    cluster: Cluster,
+    begin: Callable[[], Awaitable[None]],
+    end: Callable[[], Awaitable[None]],
+    lasting_s: float = 0.0,
+) -> float:
+    """An outage of the victim: the others' frames all pass meanwhile, and its links are back in time.
+
+    ``end`` returns once the host can be reached again. How long its links took from there, in seconds.
+    """
+    took: list[float] = []
+    lasted: list[float] = []
+
+    async def outage() -> None:
+        await begin()
+        began = time.monotonic()
+        await until(lambda: cluster.is_missed(VICTIM), f"{VICTIM} is missed")
+        await asyncio.sleep(max(0.0, began + lasting_s - time.monotonic()))
+        lasted.append(time.monotonic() - began)
+        await end()
+        took.append(await until(lambda: cluster.is_linked(VICTIM), f"{VICTIM} is back"))
+
+    conversation = Conversation(cluster, OTHERS)
+    try:
+        await conversation.open()
+        said = await conversation.during(outage())
+        await conversation.check()
+    finally:
+        conversation.close()
+    print(f"gone for {lasted[0]:.1f} s, back after {took[0]:.2f} s; meanwhile each other said {said} frames")
+    assert took[0] < BACK_S
+    return took[0]
+
+
+async def stopped(cluster: Cluster) -> float:
+    """The daemon is stopped and started."""
+    return await check_outage(cluster, lambda: cluster.stop(VICTIM), lambda: _start(cluster))
+
+
+async def killed(cluster: Cluster) -> float:
+    """The daemon is killed and started."""
+    return await check_outage(cluster, lambda: cluster.kill(VICTIM), lambda: _start(cluster))
+
+
+async def paused(cluster: Cluster) -> float:
+    """The daemon does nothing for a while."""
+    return await check_outage(cluster, lambda: cluster.pause(VICTIM), lambda: cluster.resume(VICTIM))
+
+
+async def cut_off(cluster: Cluster) -> float:
+    """The host is cut from the network."""
+    return await check_outage(cluster, lambda: cluster.cut(VICTIM), lambda: cluster.join(VICTIM), cluster.cut_s)
+
+
+async def moved(cluster: Cluster) -> float:
+    """The host is restarted with another address."""
+
+    async def begin() -> None:
+        await cluster.stop(VICTIM)
+        await cluster.cut(VICTIM)
+
+    async def end() -> None:
+        await cluster.join(VICTIM, elsewhere=True)
+        await _start(cluster)
+
+    return await check_outage(cluster, begin, end)
+
+
+async def _start(cluster: Cluster) -> None:
+    """Reachable is a daemon that is started once it listens."""
+    await cluster.start(VICTIM)
+    await until(lambda: cluster.status(VICTIM) is not None, f"{VICTIM} listens")
+
+
+OUTAGES: dict[str, Callable[[Cluster], Awaitable[float]]] = {
+    "stopped": stopped,
+    "killed": killed,
+    "paused": paused,
+    "cut_off": cut_off,
+    "moved": moved,
+}
