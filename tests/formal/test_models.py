@@ -1,0 +1,99 @@
+"""The symbolic models say of the protocol what README.md says, wherever ProVerif is there to be asked."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+import pytest
+
+from tests.formal import models
+from uavlinkd.core import noise
+from uavlinkd.core.noise import Token
+
+_LIMIT_S = float(os.environ.get("PROVERIF_LIMIT_S", models.LIMIT_S))
+
+_each_model = pytest.mark.parametrize("model", models.models(), ids=lambda model: model.stem)
+
+
+@_each_model
+def test_proverif_says_what_the_model_expects(model: Path) -> None:
+    """Each query has exactly the result that stands above it: true is proved, false comes with an attack."""
+    program = models.proverif()
+    if program is None:
+        pytest.skip("no ProVerif: put proverif on the PATH, or its path into PROVERIF")
+    done = models.run(model, program, _LIMIT_S)
+    assert done.results == models.expected(model), "\n".join(done.lines)
+
+
+@_each_model
+def test_every_query_states_its_result(model: Path) -> None:
+    """No query is without an expectation, so none can turn unnoticed."""
+    queries = re.findall(r"^query\b", model.read_text(), re.MULTILINE)
+    assert 0 < len(queries) == len(models.expected(model))
+
+
+@_each_model
+def test_model_uses_ingredients_that_exist(model: Path) -> None:
+    """A misspelt ingredient would silently leave out what it names."""
+    uses = models.ingredients(model)
+    assert uses is None or (uses and uses <= models.known_ingredients())
+
+
+@_each_model
+def test_readme_lists_every_result(model: Path) -> None:
+    """The page shows each model with as many results as it has queries, and the same ones."""
+    page = (models.FOLDER / "README.md").read_text()
+    block = re.search(rf"^{model.stem}: .*\n((?:    RESULT .*\n)+)", page, re.MULTILINE)
+    assert block is not None
+    assert models.results(block[1]) == models.expected(model)
+
+
+def test_ingredients_without_which_an_attack_is_found_are_in_every_other_model() -> None:
+    """What the models ``without_*`` leave out one at a time, no other model leaves out."""
+    needed = {"es", "ee", "se", "ss", "indices", "confirmation"}
+    for model in models.models():
+        uses = models.ingredients(model)
+        if uses is not None:
+            assert needed - uses == {model.stem.removeprefix("without_")} & needed
+
+
+_TOKEN_OF = {
+    "bytes(E)": "e",
+    "bytes(R)": "e",
+    "dh_initiator(e, B)": "es",
+    "dh_initiator(a, B)": "ss",
+    "dh_initiator(e, R)": "ee",
+    "dh_initiator(a, R)": "se",
+    "dh_responder(b, E)": "es",
+    "dh_responder(b, A)": "ss",
+    "dh_responder(r, E)": "ee",
+    "dh_responder(r, A)": "se",
+    "decapsulate(d, sealed)": "ekem1",
+    "kem_secret(s, z)": "ekem1",
+    "psk": "psk",
+}
+
+
+@pytest.mark.parametrize("role", ["Initiator", "Responder"])
+@pytest.mark.parametrize("pattern", [noise.IK_PSK2, noise.IK_HFS_PSK2], ids=lambda pattern: pattern.name)
+def test_model_mixes_keys_in_the_order_of_the_code(pattern: noise.Pattern, role: str) -> None:
+    """Both roles of the model put into the chaining key what the code's pattern puts there, in its order."""
+    kem = {"kem"} if Token.EKEM1 in pattern.response else set()
+    text = models.select(frozenset({"es", "ss", "ee", "se"} | kem))
+    body = text[text.index(f"let {role}(") :].partition("split_1")[0]
+    in_model, result_of = [], ""
+    for name, value in re.findall(r"let (x|ck) = (.*) in$", body, re.MULTILINE):
+        if name == "x":
+            result_of = value
+        elif mixed := re.fullmatch(r"hkdf3?_ck\(ck, (.*)\)", value):
+            in_model.append(_TOKEN_OF[result_of if mixed[1] == "x" else mixed[1]])
+    silent = {Token.S, Token.E1}  # these put nothing into the chaining key
+    assert in_model == [token.value for token in pattern.initiation + pattern.response if token not in silent]
+
+
+def test_protocol_stands_as_proverif_reads_it_without_any_ingredient_in_a_comment() -> None:
+    """Every marked line is either there or not: none is left with its mark misread as a plain comment."""
+    for line in models.PROTOCOL.read_text().splitlines():
+        assert ("(*+" in line or "(*-" in line) == bool(re.match(r"\(\*[+-]\w+\*\) ", line)), line
