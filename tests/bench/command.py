@@ -1,0 +1,134 @@
+"""What a frame costs: uavlinkd beside what else carries MAVLink between two hosts. Takes root, Linux, iproute2.
+
+``python -m tests.bench report DIR`` draws the table and the figure again from the records in DIR.
+"""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import FrameType
+
+from tests.bench.contenders import Contender, all_contenders
+from tests.bench.frames import FrameSet, load_frames
+from tests.bench.measure import NO_LOSS
+from tests.bench.namespaces import CableKind, NamespaceError, why_not
+from tests.bench.report import write_report
+from tests.bench.run import QUICK, SCALES, Plan, Run, laboratory
+from tests.bench.traffic import TrafficError
+from uavlinkd.evaluation.machine import machine_facts
+from uavlinkd.evaluation.records import RecordsError, RecordWriter, Value
+
+OK, FAILED = 0, 1
+RECORDS = "records"
+_ENDING = (signal.SIGINT, signal.SIGTERM)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Exit status: 0 done, 1 failed, 2 the command line is wrong."""
+    given = sys.argv[1:] if arguments is None else list(arguments)
+    if given[:1] == ["report"]:
+        return _report(given[1:])
+    return _measure(given)
+
+
+def _report(arguments: Sequence[str]) -> int:
+    parser = argparse.ArgumentParser(prog="python -m tests.bench report", description="Draw again what was measured.")
+    parser.add_argument("folder", type=Path, help="where the records are")
+    parser.add_argument("--page", type=Path, help="write it there (RESULTS.md in the folder), the figure beside it")
+    options = parser.parse_args(arguments)
+    try:
+        print(write_report(options.folder, RECORDS, options.page))
+    except RecordsError as error:
+        print(error, file=sys.stderr)
+        return FAILED
+    return OK
+
+
+def _measure(arguments: Sequence[str]) -> int:
+    contenders = {each.name: each for each in all_contenders()}
+    names = [*contenders, *SCALES]
+    parser = argparse.ArgumentParser(prog="python -m tests.bench", description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path("bench-results"), help="where records, table and figure go")
+    parser.add_argument("--rounds", type=int, help=f"how often each is measured, in turn ({Plan().rounds})")
+    parser.add_argument("--only", nargs="+", choices=names, metavar="NAME", help=f"of {', '.join(names)}")
+    parser.add_argument("--quick", action="store_true", help="one short round, without the highest rates")
+    parser.add_argument(
+        "--cable",
+        type=CableKind,
+        choices=list(CableKind),
+        default=CableKind.PLAIN,
+        help="what becomes of datagrams that are sent in one call: cut up before the cable (plain), merged again on"
+        " receipt as network cards' drivers do (card), or left in one piece as between virtual machines (whole)",
+    )
+    options = parser.parse_args(arguments)
+    plan = replace(QUICK if options.quick else Plan(), cable=options.cable)
+    if options.rounds is not None:
+        if options.rounds < 1:
+            parser.error("--rounds must be 1 or more")
+        plan = replace(plan, rounds=options.rounds)
+    reason = why_not()
+    if reason is not None:
+        print(f"cannot measure: {reason}", file=sys.stderr)
+        return FAILED
+    wanted = options.only or names
+    chosen = [each for name, each in contenders.items() if name in wanted]
+    scales = [name for name in SCALES if name in wanted]
+    return _run(plan, options.out, chosen, scales, _command(options))
+
+
+def _command(options: argparse.Namespace) -> str:
+    """How to do the same again, wherever."""
+    words = ["python -m tests.bench", "--out DIR"]
+    words += [f"--rounds {options.rounds}"] if options.rounds else []
+    words += ["--only", *options.only] if options.only else []
+    words += ["--quick"] if options.quick else []
+    words += [f"--cable {options.cable}"] if options.cable is not CableKind.PLAIN else []
+    return " ".join(words)
+
+
+def _run(plan: Plan, out: Path, contenders: Sequence[Contender], scales: Sequence[str], command: str) -> int:
+    previous = {number: signal.signal(number, _interrupt) for number in _ENDING}
+    frames = load_frames()
+    facts = {**machine_facts(), **_facts(plan, frames, contenders), "command": command}
+    try:
+        with laboratory(frames, plan.cable) as bench, RecordWriter(out, RECORDS, facts) as writer:
+            Run(plan, bench, writer, lambda line: print(line, flush=True)).all(contenders, scales)
+    except KeyboardInterrupt:
+        print(f"interrupted: what was measured until then is in {out}", file=sys.stderr)
+        return FAILED
+    except (NamespaceError, TrafficError) as error:
+        print(f"cannot measure: {error}", file=sys.stderr)
+        return FAILED
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+    print(write_report(out, RECORDS))
+    return OK
+
+
+def _facts(plan: Plan, frames: FrameSet, contenders: Sequence[Contender]) -> dict[str, Value]:
+    limit = Path("/proc/sys/net/core/rmem_max")
+    versions = {f"version_{each.name}": each.version() for each in contenders if each.why_not() is None}
+    return {
+        "frames": frames.source,
+        "frames_distinct": len(set(frames.frames)),
+        "frame_bytes": round(frames.mean_bytes, 1),
+        "cable": plan.cable.value,
+        "rounds": plan.rounds,
+        "seconds_at_rate": list(plan.seconds),
+        "step_s": plan.step_s,
+        "no_loss": NO_LOSS,
+        "net_core_rmem_max": int(limit.read_text()) if limit.exists() else None,
+        **{name: version for name, version in versions.items() if version is not None},
+    }
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    for each in _ENDING:  # what was begun is to be cleared away in peace
+        signal.signal(each, signal.SIG_IGN)
+    raise KeyboardInterrupt

@@ -1,0 +1,113 @@
+"""Programs that know MAVLink: mavlink-router, MAVProxy, and what people write with pymavlink to sign frames."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Final
+
+from tests.bench.contenders import (
+    INTO,
+    INTO_PORT,
+    LINK_PORT,
+    Contender,
+    Running,
+    needs_module,
+    needs_program,
+    program_version,
+)
+from tests.bench.namespaces import Cable, Host
+from tests.bench.traffic import REPOSITORY, SINK_PORT
+
+
+class MavlinkRouter(Contender):
+    """mavlink-router on both hosts. No package of it is in Debian: it is measured where somebody built it."""
+
+    def __init__(self) -> None:
+        super().__init__("mavlink-router", "mavlink-router, without security")
+
+    def why_not(self) -> str | None:
+        return needs_program("mavlink-routerd")
+
+    def version(self) -> str | None:
+        return program_version("mavlink-routerd", "--version")
+
+    def start(self, cable: Cable, folder: Path) -> Running:
+        right = self._side(cable.right, folder / "right", ("0.0.0.0", LINK_PORT), ("127.0.0.1", SINK_PORT))
+        left = self._side(cable.left, folder / "left", INTO, (cable.right.address, LINK_PORT))
+        return Running([left], [right])
+
+    @staticmethod
+    def _side(host: Host, folder: Path, into: tuple[str, int], out: tuple[str, int]) -> subprocess.Popen[bytes]:
+        folder.mkdir()
+        config = folder / "main.conf"
+        config.write_text(
+            "[General]\nTcpServerPort=0\nReportStats=false\n"
+            f"[UdpEndpoint into]\nMode=Server\nAddress={into[0]}\nPort={into[1]}\n"
+            f"[UdpEndpoint out]\nMode=Normal\nAddress={out[0]}\nPort={out[1]}\n"
+        )
+        return host.start(["mavlink-routerd", "--conf-file", str(config)], folder=folder, log=folder / "router.log")
+
+
+class Mavproxy(Contender):
+    """MAVProxy on both hosts, without console, map and modules; it logs as it always does."""
+
+    def __init__(self) -> None:
+        super().__init__("mavproxy", "MAVProxy, without security")
+
+    def why_not(self) -> str | None:
+        return needs_module("MAVProxy")
+
+    def version(self) -> str | None:
+        return version("MAVProxy")
+
+    def start(self, cable: Cable, folder: Path) -> Running:
+        right = self._side(cable.right, folder / "right", f"0.0.0.0:{LINK_PORT}", f"127.0.0.1:{SINK_PORT}")
+        left = self._side(cable.left, folder / "left", f"127.0.0.1:{INTO_PORT}", f"{cable.right.address}:{LINK_PORT}")
+        return Running([left], [right])
+
+    @staticmethod
+    def _side(host: Host, folder: Path, into: str, out: str) -> subprocess.Popen[bytes]:
+        folder.mkdir()
+        program = Path(sys.executable).with_name("mavproxy.py")
+        options = ("--daemon", "--non-interactive", "--streamrate=-1", "--default-modules=", "--mav20")
+        return host.start(
+            [sys.executable, str(program), f"--master=udpin:{into}", f"--out=udpout:{out}", *options],
+            folder=folder,
+            log=folder / "mavproxy.log",
+            environ={"HOME": str(folder)},
+        )
+
+
+class PymavlinkSigning(Contender):
+    """The relays of :mod:`tests.bench.signing`: the left one signs, the right one takes only what is signed."""
+
+    def __init__(self) -> None:
+        super().__init__("pymavlink-signing", "a pymavlink relay that signs, and one that verifies")
+
+    def why_not(self) -> str | None:
+        return needs_module("pymavlink")
+
+    def version(self) -> str | None:
+        return version("pymavlink")
+
+    def start(self, cable: Cable, folder: Path) -> Running:
+        key = folder / "signing.key"
+        key.touch(0o600)
+        key.write_bytes(os.urandom(32))
+        verify = (f"udpin:0.0.0.0:{LINK_PORT}", f"udpout:127.0.0.1:{SINK_PORT}")
+        sign = (f"udpin:127.0.0.1:{INTO_PORT}", f"udpout:{cable.right.address}:{LINK_PORT}")
+        right = self._side(cable.right, "verify", verify, key, folder / "right.log")
+        return Running([self._side(cable.left, "sign", sign, key, folder / "left.log")], [right])
+
+    @staticmethod
+    def _side(host: Host, what: str, urls: Sequence[str], key: Path, log: Path) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", "tests.bench.signing", what, *urls, str(key)]
+        return host.start(command, folder=REPOSITORY, log=log, environ={"MAVLINK20": "1"})
+
+
+PROGRAMS: Final = (MavlinkRouter(), Mavproxy(), PymavlinkSigning())

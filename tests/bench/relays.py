@@ -1,0 +1,108 @@
+"""Empty relays: what takes a datagram from one socket and sends it from another, in four ways, and does no more.
+
+They are what a figure is compared with: nothing that carries frames in Python can do less with them.
+``relays KIND PORT HOST PORT``: from this port on all addresses to that address.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import sys
+from collections.abc import Callable
+from typing import Final, cast
+
+Address = tuple[str, int]
+
+DATAGRAMS_PER_WAKE_UP: Final = 128
+BUFFER_BYTES: Final = 1 << 20
+"""As uavlinkd asks for; the kernel may give less (net.core.rmem_max)."""
+RECEIVE_BYTES: Final = 65536
+
+
+def bound(port: int, *, blocking: bool) -> socket.socket:
+    """A UDP socket on this port of all addresses."""
+    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    for option in (socket.SO_RCVBUF, socket.SO_SNDBUF):
+        sock.setsockopt(socket.SOL_SOCKET, option, BUFFER_BYTES)
+    sock.setblocking(blocking)
+    sock.bind(("0.0.0.0", port))
+    return sock
+
+
+def relay_blocking(port: int, to: Address) -> None:
+    """One blocking receive, one send."""
+    into, out = bound(port, blocking=True), bound(0, blocking=True)
+    out.connect(to)
+    receive, send = into.recv, out.send
+    while True:
+        try:
+            send(receive(RECEIVE_BYTES))
+        except OSError:  # nobody listens there yet
+            continue
+
+
+class _Out(asyncio.DatagramProtocol):
+    def error_received(self, exc: Exception) -> None:
+        """Nobody listens there yet."""
+
+
+class _Into(asyncio.DatagramProtocol):
+    def __init__(self, out: asyncio.DatagramTransport) -> None:
+        self._send = out.sendto
+
+    def datagram_received(self, data: bytes, addr: object) -> None:
+        self._send(data)
+
+
+async def relay_protocol(port: int, to: Address) -> None:
+    """A DatagramProtocol on each side, on whatever loop runs."""
+    loop = asyncio.get_running_loop()
+    sock = bound(0, blocking=False)
+    sock.connect(to)
+    out, _ = await loop.create_datagram_endpoint(_Out, sock=sock)
+    await loop.create_datagram_endpoint(lambda: _Into(out), sock=bound(port, blocking=False))
+    await asyncio.Event().wait()
+
+
+async def relay_add_reader(port: int, to: Address) -> None:
+    """asyncio's loop wakes us up, and the socket is drained."""
+    into, out = bound(port, blocking=False), bound(0, blocking=False)
+    out.connect(to)
+    receive, send = into.recv, out.send
+
+    def drain() -> None:
+        for _ in range(DATAGRAMS_PER_WAKE_UP):
+            try:
+                datagram = receive(RECEIVE_BYTES)
+            except BlockingIOError:
+                return
+            try:
+                send(datagram)
+            except OSError:  # nobody listens there yet, or a full queue
+                continue
+
+    asyncio.get_running_loop().add_reader(into, drain)
+    await asyncio.Event().wait()
+
+
+def main() -> None:
+    """Run one until it is ended."""
+    kind, port, to = sys.argv[1], int(sys.argv[2]), (sys.argv[3], int(sys.argv[4]))
+    if kind == "blocking":
+        relay_blocking(port, to)
+    elif kind == "asyncio":
+        asyncio.run(relay_protocol(port, to))
+    elif kind == "add-reader":
+        asyncio.run(relay_add_reader(port, to))
+    elif kind == "uvloop":
+        import uvloop
+
+        with asyncio.Runner(loop_factory=cast(Callable[[], asyncio.AbstractEventLoop], uvloop.new_event_loop)) as run:
+            run.run(relay_protocol(port, to))
+    else:
+        sys.exit(f"no relay of the kind {kind!r}")
+
+
+if __name__ == "__main__":
+    main()

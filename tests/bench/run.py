@@ -1,0 +1,166 @@
+"""A run: the contenders in turn, round by round, and what is written down of each."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from tests.bench import scale
+from tests.bench.contenders import Contender, NotMeasuredError, Running, last_words
+from tests.bench.frames import FrameSet, write_frames
+from tests.bench.measure import Bench, at_rate, highest_rate, rotated, until_carried
+from tests.bench.namespaces import Cable, CableKind, NamespaceError
+from tests.bench.traffic import SINK_PORT, Traffic, Worker
+from uavlinkd.evaluation.records import Record, RecordWriter, Status, Value
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """How much is measured. Times in seconds."""
+
+    rounds: int = 5
+    rates: tuple[int, ...] = (1_000, 10_000)
+    seconds: tuple[float, ...] = (5.0, 3.0)
+    """For each rate."""
+    step_s: float = 1.0
+    """One try of the search for the highest rate; 0: it is not searched."""
+    packed: int = 8
+    """Frames a datagram, in the second search."""
+    peers: tuple[tuple[int, float], ...] = ((2, 50.0), (2, 5_000.0), (200, 50.0))
+    """How many peers of one daemon, and how many frames a second each sends."""
+    peers_s: float = 5.0
+    memory: tuple[int, ...] = (1, 10, 100)
+    """With how many peers the memory is looked at."""
+    starts: int = 3
+    """In each round."""
+    cable: CableKind = CableKind.PLAIN
+
+
+PATIENCE = 20
+"""A contender has so many times 0.6 s to carry its first frame."""
+QUICK = Plan(rounds=1, seconds=(2.0, 2.0), step_s=0.0, peers_s=2.0)
+SCALES = ("peers", "memory", "start")
+"""What is measured of uavlinkd alone."""
+
+
+@contextmanager
+def laboratory(frames: FrameSet, kind: CableKind = CableKind.PLAIN) -> Iterator[Bench]:
+    """Two hosts, the generator and the sink."""
+    with tempfile.TemporaryDirectory(prefix="uavbench-") as folder, Cable(kind) as cable:
+        path = Path(folder) / "frames"
+        write_frames(path, frames.frames)
+        sink = Worker(cable.right, "sink", str(SINK_PORT))
+        yield Bench(cable, Traffic(Worker(cable.left, "generator", str(path)), sink), path)
+
+
+@contextmanager
+def at_work(contender: Contender, bench: Bench) -> Iterator[Running]:
+    """A contender, started and carrying frames.
+
+    Raises:
+        NotMeasuredError: it does not.
+    """
+    reason = contender.why_not()
+    if reason is not None:
+        raise NotMeasuredError(reason)
+    with tempfile.TemporaryDirectory(prefix="uavbench-") as folder:
+        try:
+            running = contender.start(bench.cable, Path(folder))
+            until_carried(bench, running, PATIENCE)
+            yield running
+        except (NotMeasuredError, NamespaceError) as error:
+            raise NotMeasuredError(f"{error}{last_words(Path(folder))}") from None
+        finally:
+            bench.cable.left.end_all_but(bench.traffic.processes)
+            bench.cable.right.end_all_but(bench.traffic.processes)
+
+
+class Run:
+    """Measures, and writes down what it finds."""
+
+    def __init__(self, plan: Plan, bench: Bench, writer: RecordWriter, say: Say) -> None:
+        self._plan = plan
+        self._bench = bench
+        self._writer = writer
+        self._say = say
+
+    def all(self, contenders: Sequence[Contender], scales: Sequence[str]) -> None:
+        """All of them in each round. A contender that is not installed is said to be once, and left out then."""
+        left = {each.name: each for each in contenders}
+        for number in range(self._plan.rounds):
+            for name in rotated(list(left), number):
+                self._say(f"round {number + 1} of {self._plan.rounds}: {name}")
+                if not self._contender(left[name], number):
+                    del left[name]
+            self._scales(scales, number)
+
+    def _contender(self, contender: Contender, number: int) -> bool:
+        """Measure one; whether it is to be tried in the next round."""
+        try:
+            with at_work(contender, self._bench) as running:
+                self._measure(contender.name, number, running)
+        except NotMeasuredError as error:
+            self._failed("contender", {"contender": contender.name, "round": number}, str(error))
+        return contender.why_not() is None
+
+    def _scales(self, scales: Sequence[str], number: int) -> None:
+        plan, bench = self._plan, self._bench
+        for name in scales:
+            self._say(f"round {number + 1} of {plan.rounds}: uavlinkd, {name}")
+            if name == "peers":
+                for peers, rate in plan.peers:
+                    point: dict[str, Value] = {"round": number, "peers": peers, "rate_each": rate}
+                    self.record(name, point, partial(scale.with_peers, bench, peers, rate, plan.peers_s))
+            elif name == "memory":
+                for peers in plan.memory:
+                    self.record(name, {"round": number, "peers": peers}, partial(scale.memory, bench, peers))
+            else:
+                for turn in range(plan.starts):
+                    self.record(name, {"round": number, "turn": turn}, scale.start)
+
+    def _measure(self, name: str, number: int, running: Running) -> None:
+        plan, bench = self._plan, self._bench
+        for rate, seconds in zip(plan.rates, plan.seconds, strict=True):
+            point: dict[str, Value] = {"contender": name, "round": number, "rate": rate, "per_datagram": 1}
+            self.record("rate", point, partial(at_rate, bench, running, rate, seconds))
+        if plan.step_s:
+            for per_datagram in (1, plan.packed):
+                point = {"contender": name, "round": number, "per_datagram": per_datagram}
+                self.record("highest", point, partial(highest_rate, bench, running, plan.step_s, per_datagram))
+
+    def record(self, kind: str, point: Mapping[str, Value], measure: Callable[[], Mapping[str, Value]]) -> None:
+        """Measure, and write it down, or why it was not measured."""
+        try:
+            values = measure()
+        except NotMeasuredError as error:
+            self._failed(kind, point, str(error))
+            return
+        self._writer.add(Record(kind, point, values))
+        self._say("  " + ", ".join(f"{name} {_short(value)}" for name, value in values.items() if name in _TOLD))
+
+    def _failed(self, kind: str, point: Mapping[str, Value], reason: str) -> None:
+        self._writer.add(Record(kind, point, status=Status.FAILED, reason=reason))
+        self._say(f"  not measured: {reason}")
+
+
+_TOLD = (
+    "rate",
+    "loss",
+    "cpu_left_us",
+    "cpu_right_us",
+    "wire_bytes_per_frame",
+    "highest",
+    "late_p99_s",
+    "ready_s",
+    "rss",
+)
+
+
+def _short(value: Value) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

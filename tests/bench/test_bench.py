@@ -1,0 +1,294 @@
+"""The instrument itself: it carries frames, its figures are sane, it finds what it is to find and leaves nothing."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import cast
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from tests.bench import scale
+from tests.bench.checks import Check
+from tests.bench.contenders import Contender, NotMeasuredError, Running, all_contenders
+from tests.bench.findings import Findings
+from tests.bench.frames import PROBE_EVERY, SYSTEM, is_probe, load_frames, probe, said_by
+from tests.bench.generator import pack, send_evenly
+from tests.bench.measure import Bench, at_rate, highest_rate
+from tests.bench.namespaces import Cable, why_not
+from tests.bench.report import page_text, write_report
+from tests.bench.run import at_work, laboratory
+from tests.bench.sink import Count
+from tests.bench.traffic import REPOSITORY, Flow, Traffic
+from tests.daemon.harness import need
+from uavlinkd.evaluation.records import Record, RecordWriter, Status, Value
+
+PLAIN_HEADERS = 28
+"""Of IPv4 and UDP."""
+CONTENDERS = {each.name: each for each in all_contenders()}
+
+
+def messages(data: bytes) -> list[str]:
+    """What pymavlink, which shares nothing with us, finds in these bytes."""
+    found = mavlink.MAVLink(None).parse_buffer(data) or []
+    return [each.get_type() for each in found]
+
+
+def namespaces() -> set[str]:
+    """Of this bench, on this machine."""
+    listed = subprocess.run(["ip", "netns", "list"], capture_output=True, text=True, check=True).stdout
+    return {line.split()[0] for line in listed.splitlines() if line.startswith("uavbench-")}
+
+
+@pytest.fixture(scope="module")
+def bench() -> Iterator[Bench]:
+    """Two hosts; none of it is left afterwards."""
+    reason = why_not()
+    need(reason is None, f"root and iproute2: {reason}")
+    with laboratory(load_frames()) as made:
+        ours = {made.cable.left.name, made.cable.right.name}
+        assert ours <= namespaces()
+        yield made
+    assert not ours & namespaces()
+
+
+@pytest.mark.parametrize("name", ["relay-blocking", "uavlinkd"])
+def test_frames_arrive_and_figures_are_sane(bench: Bench, name: str) -> None:
+    """At 1,000 frames a second every frame arrives, at costs and sizes that can be."""
+    with at_work(CONTENDERS[name], bench) as running:
+        values = at_rate(bench, running, 1_000, 1.0)
+    figures = {key: value for key, value in values.items() if isinstance(value, int | float)}
+    assert figures["sent"] == 1_000
+    assert figures["received"] == pytest.approx(1_000, abs=20), figures
+    assert figures["garbage"] == 0
+    assert 900 < figures["rate"] < 1_100
+    for side in ("left", "right"):
+        assert 1 < figures[f"cpu_{side}_us"] < 5_000
+        assert 5e6 < figures[f"rss_{side}"] < 200e6
+    size = load_frames().mean_bytes
+    assert size / 2 < figures["wire_bytes_per_frame"] < size + PLAIN_HEADERS + 60
+    latencies = values["latencies_s"]
+    assert isinstance(latencies, list)
+    assert len(latencies) == 1_000 // PROBE_EVERY
+    assert 0 < min(latencies) <= max(latencies) < 5
+
+
+def test_plain_udp_has_the_bytes_of_its_headers(bench: Bench) -> None:
+    """The counters of the cable say IP's bytes: with nothing between, those of the frames and of one header each."""
+    with at_work(CONTENDERS["plain-udp"], bench) as running:
+        values = at_rate(bench, running, 1_000, 1.0)
+    sizes = [len(each) for each in load_frames().frames[:1_000]]
+    expected = sum(sizes) + len(sizes) * PLAIN_HEADERS
+    assert values["wire_bytes"] == pytest.approx(expected, rel=0.01)  # ARP, now and then
+
+
+def test_many_peers_into_one_daemon(bench: Bench) -> None:
+    """All are linked, each says its part, and the daemon alone is measured."""
+    values = scale.with_peers(bench, 3, 100, 1.0)
+    assert values["sent"] == 300
+    assert values["received"] == pytest.approx(300, abs=15)
+    assert isinstance(values["cpu_right_us"], float)
+    assert 1 < values["cpu_right_us"] < 50_000
+    assert "cpu_left_us" not in values
+
+
+def test_start_is_from_exec_to_ready() -> None:
+    """The daemon says that it is ready, and has used some time and memory by then."""
+    values = scale.start()
+    assert isinstance(values["ready_s"], float)
+    assert isinstance(values["cpu_s"], float)
+    assert isinstance(values["rss"], int)
+    assert 0.02 < values["cpu_s"] < 30
+    assert 0.02 < values["ready_s"] < scale.READY_S
+    assert 5e6 < values["rss"] < 200e6
+
+
+def test_contender_that_carries_nothing_is_not_measured(
+    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is said with its reason, and nothing of it is left."""
+    monkeypatch.setattr("tests.bench.run.PATIENCE", 2)
+
+    class Deaf(Contender):
+        def start(self, cable: Cable, folder: Path) -> Running:
+            process = cable.left.start(["sleep", "60"])
+            pids.append(process.pid)
+            return Running([process], [])
+
+    pids: list[int] = []
+    with pytest.raises(NotMeasuredError, match="carries no frame"), at_work(Deaf("deaf", ""), bench):
+        pytest.fail("it was measured")
+    assert pids
+    assert not any(Path("/proc", str(pid)).exists() for pid in pids)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_interrupted_run_leaves_nothing(tmp_path: Path, number: signal.Signals) -> None:
+    """Neither namespaces nor processes; what was measured is there."""
+    reason = why_not()
+    need(reason is None, f"root and iproute2: {reason}")
+    command = [sys.executable, "-m", "tests.bench", "--only", "relay-blocking", "--out", str(tmp_path)]
+    with subprocess.Popen(command, cwd=REPOSITORY, stdout=subprocess.PIPE, stderr=subprocess.STDOUT) as run:
+        assert run.stdout is not None
+        said = run.stdout.readline()  # the first contender begins
+        assert b"relay-blocking" in said
+        inside = {each for each in namespaces() if f"-{run.pid}-" in each}
+        assert len(inside) == 2
+        run.send_signal(number)
+        assert run.wait(30) == 1
+        assert b"interrupted" in run.stdout.read()
+    assert not inside & namespaces()
+    assert (tmp_path / "records.jsonl").exists()
+
+
+def test_without_root_it_says_so(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Nothing is begun."""
+    from tests.bench.command import main
+
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    assert main(["--quick"]) == 1
+    assert "root" in capsys.readouterr().err
+
+
+class Leaky:
+    """Traffic that comes through whole up to a rate, and loses what is beyond that and does not fit a buffer."""
+
+    def __init__(self, capacity: float, buffer: int) -> None:
+        self._capacity = capacity
+        self._buffer = buffer
+
+    def flow(self, target: tuple[str, int], rate: float, seconds: float, per_datagram: int = 1) -> Flow:
+        """All that fits."""
+        sent, came = round(rate * seconds), round(self._capacity * seconds)
+        received = min(sent, came + self._buffer)
+        return Flow(sent, received, 0, 0, 0, seconds, min(sent, came), (), {})
+
+
+@pytest.mark.parametrize("capacity", [0, 700, 1_999, 3_000, 26_000, 190_000])
+def test_search_finds_the_highest_rate(capacity: float) -> None:
+    """Within its 5 %, from below, wherever it is."""
+    bench = Bench(cast(Cable, None), cast(Traffic, Leaky(capacity, 0)), Path())
+    values = highest_rate(bench, Running([], []), 1.0)
+    assert isinstance(values["highest"], float | int)
+    assert capacity / 1.06 <= values["highest"] <= capacity * 1.01
+
+
+def test_search_is_not_deceived_by_buffers() -> None:
+    """What waits in one at the end of a try would be lost in a longer one."""
+    bench = Bench(cast(Cable, None), cast(Traffic, Leaky(10_000, 1_000_000)), Path())
+    values = highest_rate(bench, Running([], []), 1.0)
+    assert isinstance(values["highest"], float | int)
+    assert 9_500 < values["highest"] < 11_200
+
+
+def test_frames_are_genuine_and_each_twentieth_carries_the_time() -> None:
+    """As pymavlink reads them; said by another system they are too."""
+    frames = load_frames().frames
+    assert len(frames) % PROBE_EVERY == 0
+    assert [number for number, each in enumerate(frames) if is_probe(each)] == list(
+        range(0, len(frames), PROBE_EVERY)
+    )
+    some = frames[: 10 * PROBE_EVERY]
+    kinds = messages(b"".join(some))
+    assert len(kinds) == len(some)
+    assert "BAD_DATA" not in kinds
+    assert kinds[0] == "PING"
+    assert messages(b"".join(said_by(each, 77) for each in some)) == kinds
+
+
+def test_sink_counts_frames_and_not_datagrams() -> None:
+    """Any number in a datagram; those of other systems, and what is no frame, apart."""
+    count = Count(SYSTEM)
+    frames = load_frames().frames
+    now = time.monotonic_ns()
+    count.add(b"".join(frames[1:4]), now)
+    count.add(bytes(probe()), 5_000)  # said at 0
+    count.add(said_by(frames[1], 9) + b"nonsense", now)
+    assert (count.frames, count.others, count.garbage, count.datagrams) == (4, 1, 1, 3)
+    assert count.latencies_ns == [5_000]
+
+
+def test_generator_keeps_its_pace() -> None:
+    """As many datagrams as ordered, in the time that they take, those with the time with times that rise."""
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as into,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out,
+    ):
+        into.bind(("127.0.0.1", 0))
+        into.settimeout(5)
+        out.connect(into.getsockname())
+        before = time.monotonic_ns()
+        sent = send_evenly(out, pack(load_frames().frames, 2), per_s=500, seconds=0.4, per_datagram=2)
+        datagrams = [into.recv(2_000) for _ in range(200)]
+    assert (sent.frames, sent.refused) == (400, 0)
+    assert 0.39 < sent.seconds < 5
+    assert sent.late_p50_s <= sent.late_p99_s <= sent.late_most_s
+    assert all(len(messages(each)) == 2 for each in datagrams)
+    count = Count(SYSTEM)
+    for each in datagrams:
+        count.add(each, 0)
+    said = [-each for each in count.latencies_ns]
+    assert len(said) == 400 // PROBE_EVERY
+    assert before < said[0]
+    assert all(one < next_one for one, next_one in pairwise(said))
+
+
+def records_of(contender: str, cpu_us: float, latency_s: float) -> Iterator[Record]:
+    """Three rounds at one rate, the last of them disturbed."""
+    for number, factor in enumerate((1.0, 1.1, 9.0)):
+        values: dict[str, Value] = {"cpu_left_us": cpu_us * factor, "cpu_right_us": cpu_us * factor, "loss": 0.0}
+        values |= {"latencies_s": [latency_s * factor] * 10, "rss_left": 1e7, "rss_right": 1e7}
+        values |= {"wire_bytes_per_frame": 60.0, "late_p99_s": 1e-4, "late_most_s": 1e-3, "together_most": 2}
+        yield Record("rate", {"contender": contender, "round": number, "rate": 1_000, "per_datagram": 1}, values)
+
+
+def test_page_says_what_was_measured_reached_and_not(tmp_path: Path) -> None:
+    """Medians, ratios to the relay of the run, verdicts with by how much, and why something is missing."""
+    with RecordWriter(tmp_path, "records", {"cpu": "one"}) as writer:
+        for each in (*records_of("relay-uvloop", 20.0, 1e-4), *records_of("uavlinkd", 50.0, 2e-4)):
+            writer.add(each)
+        point: dict[str, Value] = {"contender": "nebula", "round": 0}
+        writer.add(Record("contender", point, status=Status.FAILED, reason="not installed: nebula"))
+    text = write_report(tmp_path, "records")
+    assert text == (tmp_path / "RESULTS.md").read_text()
+    assert "| uavlinkd | 55.0 µs (2.50) |" in text
+    assert "at most 1.3 times the uvloop relay | 55 µs | 28.6 µs | not reached: 1.92 times too much |" in text
+    assert "- contender: contender nebula: not installed: nebula" in text
+    assert "not measured" in text
+    pytest.importorskip("matplotlib", reason="the figure takes the evaluation extra")
+    drawn = (tmp_path / "costs.svg").read_text()
+    assert drawn.lstrip().startswith("<?xml")
+    write_report(tmp_path, "records")
+    assert (tmp_path / "costs.svg").read_text() == drawn
+
+
+def test_page_of_nothing_can_be_read() -> None:
+    """A run that was interrupted at once."""
+    assert "not measured" in page_text(Findings({}, []), None)
+
+
+@pytest.mark.parametrize(
+    ("check", "verdict"),
+    [
+        (Check("", 1.0, 1.0, "µs"), "reached"),
+        (Check("", 1.0, 1.0, "µs", strictly=True), "not reached: 1.00 times too much"),
+        (Check("", 2.0, 1.0, "µs"), "not reached: 2.00 times too much"),
+        (Check("", 2.0, 8.0, "/s", at_least=True), "not reached: 4.00 times too little"),
+        (Check("", 8.0, 2.0, "/s", at_least=True), "reached"),
+        (Check("", 0.5, 0.0, "%"), "not reached"),
+        (Check("", 0.0, 0.0, "%"), "reached"),
+        (Check("", None, 1.0, "µs"), "not measured"),
+        (Check("", 1.0, None, "µs"), "not measured"),
+    ],
+)
+def test_verdicts(check: Check, verdict: str) -> None:
+    """Reached, by how much not, or not measured."""
+    assert check.verdict == verdict
