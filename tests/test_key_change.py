@@ -1,0 +1,143 @@
+"""Which pairs of keys may be right while keys change, and what a configuration may say of them."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from uavlinkd import keys
+from uavlinkd.config import Config, ConfigError, Peer, load_config
+from uavlinkd.config.changes import compare
+from uavlinkd.core.settings import PeerSettings
+from uavlinkd.key_change import is_by_our_previous, link_name, pairings
+from uavlinkd.topology import print_topology
+
+OWN, PREVIOUS, THEIRS, THEIRS_BEFORE = (keys.generate_private_key() for _ in range(4))
+
+
+def load(folder: Path, own: str = "", theirs: str = "") -> Config:
+    """A configuration with these lines at the top, and in its one peer."""
+    for name, key in (("a.key", OWN), ("a.previous.key", PREVIOUS)):
+        if not (folder / name).exists():
+            keys.write_secret_file(folder / name, key)
+    path = folder / "a.toml"
+    path.write_text(
+        f'name = "a"\nprivate_key_file = "a.key"\nlisten = ["0.0.0.0:5790"]\n{own}\n'
+        f'[[peer]]\nname = "b"\npublic_key = "{keys.public_key_text(THEIRS)}"\n{theirs}\n'
+        f'[[peer]]\nname = "c"\npublic_key = "{keys.public_key_text(keys.generate_private_key())}"\n'
+    )
+    return load_config(path, {})
+
+
+def was(private: str) -> str:
+    """The line that names a previous public key."""
+    return f'previous_public_key = "{keys.public_key_text(private)}"'
+
+
+OUR_LINE = 'previous_private_key_file = "a.previous.key"'
+
+
+def test_every_pair_of_keys_that_may_be_right_is_tried() -> None:
+    """Two keys of ours and two of theirs make four, the current ones first; each has a name that leads back."""
+    now, before = bytes([1]) * 32, bytes([2]) * 32
+    peer = Peer(PeerSettings("b", now), (), previous_public_key=before)
+    found = pairings(peer, has_previous_key=True)
+
+    assert [(each.settings.public_key, each.by_our_previous) for each in found] == [
+        (now, False),
+        (before, False),
+        (now, True),
+        (before, True),
+    ]
+    names = [each.settings.name for each in found]
+    assert names[0] == "b"
+    assert len(set(names)) == 4
+    assert {link_name(name) for name in names} == {"b"}
+    assert [is_by_our_previous(name) for name in names] == [False, False, True, True]
+    assert len(pairings(Peer(PeerSettings("b", now), ()), has_previous_key=False)) == 1
+
+
+def test_previous_keys_are_loaded(tmp_path: Path) -> None:
+    """Both kinds of previous keys, and how long they are good, come from the file."""
+    config = load(tmp_path, f"{OUR_LINE}\nkey_grace_s = 60", was(THEIRS_BEFORE))
+    assert config.previous_private_key is not None
+    assert config.previous_private_key.reveal() == keys.decode_key(PREVIOUS)
+    assert config.key_grace_s == 60
+    before = keys.decode_key(keys.public_key_text(THEIRS_BEFORE))
+    assert [each.previous_public_key for each in config.peers] == [before, None]
+
+
+def test_previous_keys_are_shown(tmp_path: Path) -> None:
+    """`uavlinkd check` says which keys are good too, and for how long."""
+    text = printed(load(tmp_path, f"{OUR_LINE}\nkey_grace_s = 60", was(THEIRS_BEFORE)))
+    assert f"before      {keys.public_key_text(PREVIOUS)}" in text
+    assert "good too, until the new one is confirmed: 60 s at most" in text
+    assert f"or {keys.short_form(keys.decode_key(keys.public_key_text(THEIRS_BEFORE)))}" in text
+    assert "7 days at most" in printed(load(tmp_path, OUR_LINE))
+    assert "before" not in printed(load(tmp_path))
+
+
+def printed(config: Config) -> str:
+    """What `uavlinkd check` prints of it."""
+    file = io.StringIO()
+    print_topology(config, Console(file=file, width=200, force_terminal=False))
+    return file.getvalue()
+
+
+def test_without_previous_keys_there_are_none(tmp_path: Path) -> None:
+    """A file that names none accepts none."""
+    config = load(tmp_path)
+    assert config.previous_private_key is None
+    assert [each.previous_public_key for each in config.peers] == [None, None]
+
+
+@pytest.mark.parametrize(
+    ("own", "theirs", "key"),
+    [
+        ('previous_private_key_file = "a.key"', "", "previous_private_key_file"),
+        ('previous_private_key_file = "none.key"', "", "previous_private_key_file"),
+        ("key_grace_s = 0", "", "key_grace_s"),
+        ("", was(THEIRS), "peer[0].previous_public_key (b)"),
+        ("", was(OWN), "peer[0].previous_public_key (b)"),
+        (OUR_LINE, was(PREVIOUS), "peer[0].previous_public_key (b)"),
+        ("", 'previous_public_key = "none"', "peer[0].previous_public_key (b)"),
+    ],
+)
+def test_impossible_previous_keys_are_refused(tmp_path: Path, own: str, theirs: str, key: str) -> None:
+    """A previous key is another than every key that is somebody's now."""
+    with pytest.raises(ConfigError) as error:
+        load(tmp_path, own, theirs)
+    assert [each.key for each in error.value.problems] == [key]
+
+
+def test_previous_keys_of_two_peers_differ(tmp_path: Path) -> None:
+    """Nor may it be what another peer has, or had; or ours be what a peer has."""
+    mine, first, second = (keys.generate_private_key() for _ in range(3))
+    keys.write_secret_file(tmp_path / "a.key", mine)
+    keys.write_secret_file(tmp_path / "a.previous.key", PREVIOUS)
+    path = tmp_path / "a.toml"
+    top = f'name = "a"\nprivate_key_file = "a.key"\nlisten = ["0.0.0.0:5790"]\n{OUR_LINE}\n'
+
+    def peer(name: str, private: str, before: str) -> str:
+        return f'[[peer]]\nname = "{name}"\npublic_key = "{keys.public_key_text(private)}"\n{before}\n'
+
+    for b, c, place in (
+        (peer("b", first, was(second)), peer("c", second, ""), "peer[0].previous_public_key (b)"),
+        (peer("b", first, was(OWN)), peer("c", second, was(OWN)), "peer[1].previous_public_key (c)"),
+        (peer("b", PREVIOUS, ""), peer("c", second, ""), "peer[0].public_key (b)"),
+    ):
+        path.write_text(top + b + c)
+        with pytest.raises(ConfigError) as error:
+            load_config(path, {})
+        assert [each.key for each in error.value.problems] == [place]
+
+
+def test_previous_key_may_go_while_the_daemon_runs_and_not_come(tmp_path: Path) -> None:
+    """Its end is a reload; its beginning comes with a new key, and so with a restart."""
+    without, having = load(tmp_path), load(tmp_path, OUR_LINE)
+    compare(having, without)
+    with pytest.raises(ConfigError, match="previous_private_key_file"):
+        compare(without, having)

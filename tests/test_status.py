@@ -1,0 +1,86 @@
+"""What a daemon tells about itself: plain values that any reader of JSON gets, and no secret."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from tests.daemon.harness import DaemonProcess, Stage, frame
+
+
+async def pair_with_traffic(stage: Stage) -> tuple[DaemonProcess, DaemonProcess]:
+    """Two daemons, a program at each, and one frame each way."""
+    a, b = stage.pair(probe_interval_s=0.1)
+    into_a, into_b = a.add_endpoint("autopilot"), b.add_endpoint("autopilot")
+    await stage.start(a, b)
+    one, other = await stage.program(), await stage.program()
+    one.send(frame(1, 1), into_a)
+    await b.until(lambda status: status["peers"]["drone0"]["frames_received"] == 1)
+    other.send(frame(2, 2), into_b)
+    await one.until_heard(frame(2, 2))
+    return a, b
+
+
+async def test_the_link_is_described() -> None:
+    """State, path, suite, mode, tag and ages, as they are."""
+    async with Stage() as stage:
+        a, b = await pair_with_traffic(stage)
+        status = await a.until(lambda status: status["peers"]["drone1"]["round_trip_s"] is not None)
+        peer = status["peers"]["drone1"]
+        assert status["name"] == "drone0"
+        assert status["public_key"] == a.public_key
+        assert (peer["state"], peer["public_key"], peer["path"]) == ("up", b.public_key, b.address)
+        session = peer["session"]
+        assert (session["suite"], session["mode"], session["tag_bits"]) == ("x25519", "authenticated", 128)
+        assert session["lost_in"] == session["lost_out"] == 0
+        signs = ("envelopes_missing", "envelopes_out_of_order", "challenges_unanswered", "echoes_unanswered")
+        assert [peer[key] for key in signs] == [0] * 4
+        assert peer["cookies_taken"] == 0
+        assert peer["handshakes_unanswered"] >= 0  # a busy machine may answer late
+        assert 0 <= peer["round_trip_s"] < 1  # both ends may turn within one tick of the clock
+        assert 0 <= peer["heard_s"] < 10
+        assert 0 <= peer["handshake_s"] < 10
+        assert peer["handshakes"] >= 1
+
+
+async def test_traffic_is_counted_the_same_at_both_ends() -> None:
+    """Frames and bytes that one daemon got from its program are those that the other gave to its own."""
+    async with Stage() as stage:
+        a, b = await pair_with_traffic(stage)
+        there, here = await b.status(), await a.status()
+        size = len(frame(1, 1))
+        assert here["endpoints"]["autopilot"]["frames_received"] == 1
+        assert here["endpoints"]["autopilot"]["bytes_received"] == size
+        assert here["endpoints"]["autopilot"]["frames_sent"] == 1
+        assert here["endpoints"]["autopilot"]["bytes_sent"] == len(frame(2, 2))
+        assert there["peers"]["drone0"]["frames_received"] == 1
+        assert here["peers"]["drone1"]["frames_received"] == 1
+
+
+async def test_before_and_after_a_link() -> None:
+    """A peer that was never there is ``waiting``, one that went is ``lost``; nothing is made up for either."""
+    async with Stage() as stage:
+        a, b = stage.pair()
+        await stage.start(a, linked=False)
+        waiting = (await a.status())["peers"]["drone1"]
+        assert waiting["state"] == "waiting"
+        assert [waiting[key] for key in ("path", "heard_s", "handshake_s", "round_trip_s", "session")] == [None] * 5
+        await stage.start(b)
+        await a.until_linked()
+        await b.stop()
+        lost = (await a.until(lambda status: status["peers"]["drone1"]["state"] == "lost"))["peers"]["drone1"]
+        assert lost["session"] is None
+        assert lost["heard_s"] >= 0
+
+
+async def test_it_is_strict_json() -> None:
+    """No NaN, no infinity: every reader of JSON takes it."""
+
+    def refuse(constant: str) -> Any:
+        raise AssertionError(constant)
+
+    async with Stage() as stage:
+        a, _ = await pair_with_traffic(stage)
+        await a.status()
+        for each in a.statuses:
+            json.loads(each, parse_constant=refuse)
