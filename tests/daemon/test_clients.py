@@ -31,6 +31,7 @@ async def flying(
     ground.add_endpoint("station", ground_url)
     await stage.start(drone, ground)
     async with Flight(flight_url, AutopilotSettings(system_id=SYSTEM)) as flight:
+        await drone.until(lambda status: bool(status["endpoints"]["autopilot"]["programs"]))
         yield flight, drone, ground
 
 
