@@ -10,14 +10,14 @@ import asyncio
 import ctypes
 import os
 import socket
-import threading
 import time
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Coroutine, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -37,8 +37,10 @@ COMPONENT = 191
 HELLO = 0xFFFF_FFFF
 """The number of the frame by which a program makes itself known."""
 _CLONE_NEWNET = 0x4000_0000
+_LOSSES = ("drops", "refused", "waiting_dropped", "malformed", "envelopes_missing", "faults", "failures")
 
 Status = dict[str, Any]
+_T = TypeVar("_T")
 SYSTEM_IDS = {"drone1": 1, "drone2": 2, "drone3": 3, "ground-station": 255}
 
 
@@ -99,6 +101,17 @@ class Cluster(ABC):
         """How its peers are, as it says."""
         status = self.status(name)
         return {} if status is None else {peer: each["state"] for peer, each in status["peers"].items()}
+
+    def lost(self, name: str) -> str:
+        """What the daemon there dropped since it began, by reason, and its kernel: for when frames are missing."""
+        status = self.status(name) or {}
+        told: dict[str, Any] = {each: status.get(each) for each in ("drops", "unrouted", "send_failures")}
+        for kind in ("peers", "endpoints"):
+            for each, counts in status.get(kind, {}).items():
+                told[each] = {key: counts[key] for key in _LOSSES if counts.get(key)}
+        snmp = there(self.namespace_of(name), Path("/proc/thread-self/net/snmp").read_text)
+        told["kernel"] = [line for line in snmp.splitlines() if line.startswith("Udp:")]
+        return f"{name}: {told}"
 
     def is_linked(self, name: str) -> bool:
         """Whether this host and all others say that they are up."""
@@ -164,30 +177,30 @@ async def until(condition: Callable[[], bool], what: str, timeout_s: float = PAT
     return time.monotonic() - began
 
 
+def there(namespace: Path, work: Callable[[], _T]) -> _T:
+    """Do something in a network namespace: a thread goes there, does it, and ends."""
+
+    def go() -> _T:
+        with namespace.open("rb") as file:
+            if ctypes.CDLL(None, use_errno=True).setns(file.fileno(), _CLONE_NEWNET):
+                raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
+        return work()
+
+    with ThreadPoolExecutor(max_workers=1) as executor:
+        return executor.submit(go).result()
+
+
 def socket_in(namespace: Path) -> socket.socket:
-    """A UDP socket on loopback in a network namespace. A thread goes there, opens it, and ends."""
-    opened: list[socket.socket | OSError] = []
+    """A UDP socket on loopback in a network namespace."""
 
-    def work() -> None:
-        try:
-            with namespace.open("rb") as file:
-                if ctypes.CDLL(None, use_errno=True).setns(file.fileno(), _CLONE_NEWNET):
-                    raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
-            sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-            sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
-            sock.setblocking(False)
-            sock.bind(("127.0.0.1", 0))
-            opened.append(sock)
-        except OSError as error:
-            opened.append(error)
+    def opened() -> socket.socket:
+        sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
+        sock.setblocking(False)
+        sock.bind(("127.0.0.1", 0))
+        return sock
 
-    thread = threading.Thread(target=work)
-    thread.start()
-    thread.join()
-    (result,) = opened
-    if isinstance(result, OSError):
-        raise result
-    return result
+    return there(namespace, opened)
 
 
 def heartbeat(system: int, number: int) -> bytes:
@@ -296,7 +309,8 @@ class Conversation:
             heard, expected = self.heard(name), self.expected(name)
             assert heard == expected, (
                 f"{name} missed {(expected - heard).total()} of {expected.total()} frames,"
-                f" and heard {(heard - expected).total()} too much"
+                f" and heard {(heard - expected).total()} too much\n"
+                + "\n".join(map(self._cluster.lost, self._names))
             )
 
 
