@@ -225,9 +225,20 @@ class Conversation:
         self._forgotten = {heartbeat(system, HELLO) for system in SYSTEM_IDS.values()}
 
     async def open(self) -> None:
-        """Make the programs known."""
+        """Make the programs known, and see that all hear each other: a daemon that stood still drops at first."""
         for name in self._names:
             self._programs[name] = await self._cluster.program(name)
+        await until(self._does_latest_arrive, "a frame of each is heard by all others")
+        self.forget()
+
+    def _does_latest_arrive(self) -> bool:
+        """Whether what was said last is heard by all; if not, more is said."""
+        if self.said > self._first:
+            latest = {name: heartbeat(SYSTEM_IDS[name], self.said - 1) for name in self._names}
+            if all(self.heard(name).keys() >= set(latest.values()) - {latest[name]} for name in self._names):
+                return True
+        self.say()
+        return False
 
     def close(self) -> None:
         """Close the programs' sockets."""
@@ -308,10 +319,19 @@ class Conversation:
         for name in self._names:
             heard, expected = self.heard(name), self.expected(name)
             assert heard == expected, (
-                f"{name} missed {(expected - heard).total()} of {expected.total()} frames,"
-                f" and heard {(heard - expected).total()} too much\n"
+                f"{name} missed {(expected - heard).total()} of {expected.total()} frames, and heard"
+                f" {(heard - expected).total()} too much.\nMissed: {self._named(expected - heard)}\n"
                 + "\n".join(map(self._cluster.lost, self._names))
             )
+
+    def _named(self, frames: Counter[bytes]) -> str:
+        """Frames by the system that said them and by number."""
+        told: dict[str, list[int]] = {}
+        for other in self._names:
+            for number in range(self._first, self.said):
+                if heartbeat(SYSTEM_IDS[other], number) in frames:
+                    told.setdefault(other, []).append(number - self._first)
+        return str(told)
 
 
 async def run(*command: str, environ: dict[str, str] | None = None, check: bool = True) -> str:
