@@ -670,7 +670,7 @@ def test_answer_is_never_longer_than_its_question(pair: Pair) -> None:
 
 
 def test_question_from_an_unproven_place_gets_its_answer_alone(pair: Pair) -> None:
-    """An answer and a question of one's own together would be more than came; the next frame from there is asked about."""
+    """Together with a question of one's own it would be more than came; the next frame from there is asked about."""
     question = pair.b.envelope(1.0, wire.PathChallenge(bytes(8)).encode())
 
     answers = datagrams(pair.a.receive(question, 1.0, ELSEWHERE))
