@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Final
 
 from tests.fuzz import corpus
-from tests.fuzz.engine import Target, hunt
+from tests.fuzz.engine import Target
 from tests.fuzz.registry import TARGETS
 from tests.fuzz.worker import PROGRESS
 
@@ -167,28 +167,20 @@ def minimised(target: Target, work: Path, scratch: Path) -> list[bytes]:
     return corpus.packed(into)
 
 
-def coverage_of(targets: Sequence[Target]) -> str:
-    """Lines and branches that the kept corpora reach, in a table."""
-    import io
-
-    import coverage
-
-    measured = coverage.Coverage(branch=True, source=["uavlinkd"], data_file=None, config_file=False)
-    measured.start()
-    for module in [name for name in sys.modules if name.split(".")[0] == "uavlinkd" or name.startswith("tests.")]:
-        if module != __name__ and not module.endswith((".coverage", "fuzz.command")):
-            del sys.modules[module]  # to see their first lines run
-    from tests.fuzz.registry import TARGETS as again
-
-    for target in targets:
-        fresh = again[target.name]
-        run = fresh.make()
-        for data in [*fresh.seeds(), *corpus.load(target.name)]:
-            run(data)
-    measured.stop()
-    out = io.StringIO()
-    measured.report(file=out, skip_empty=True, show_missing=False, include=_RELEVANT)
-    return out.getvalue()
+def coverage_of(names: Sequence[str]) -> str:
+    """Lines and branches that the seeds and the kept corpora of these targets reach, in a table."""
+    with tempfile.TemporaryDirectory(prefix="uavlinkd-fuzz-coverage-") as scratch:
+        board = Path(scratch) / "progress"
+        board.write_bytes(bytes(PROGRESS.size))
+        data = f"--data-file={scratch}/data"
+        measure = ["run", "--branch", "--source=uavlinkd", data, "-m", "tests.fuzz.worker"]
+        run = [sys.executable, "-m", "coverage"]
+        for name in names:
+            subprocess.run(
+                [*run, *measure[:1], "--append", *measure[1:], name, "replay", board], cwd=ROOT, check=True
+            )
+        report = [*run, "report", data, "--skip-empty", f"--include={','.join(_RELEVANT)}"]
+        return subprocess.run(report, cwd=ROOT, check=True, capture_output=True, text=True).stdout
 
 
 _RELEVANT: Final = [
@@ -221,7 +213,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(f"{target.name:<11} {target.about} ({len(corpus.load(target.name))} inputs kept)")
         return 0
     if given.coverage:
-        print(coverage_of(targets))
+        print(coverage_of([each.name for each in targets]))
         return 0
     if given.replay is not None:
         for target in targets:
@@ -258,12 +250,3 @@ def _tail(log: str) -> str:
     """The traceback in a log."""
     at = log.find("Traceback")
     return log[at:][:3000] if at >= 0 else log[-3000:]
-
-
-def replayed(target: Target) -> int:
-    """Run the target's seeds and kept corpus here; how many there are."""
-    inputs = corpus.load(target.name)
-    result = hunt(target, seeds=inputs, runs=len(target.seeds()) + len(inputs))
-    if result.escape is not None:
-        raise result.escape
-    return result.executions

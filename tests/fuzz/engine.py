@@ -109,7 +109,7 @@ class Script:
 
 
 def variations(seeds: Sequence[bytes], seed: int, target: Target) -> Iterator[bytes]:
-    """Endless inputs: variations of the seeds and, where any bytes are a script, new ones. The same for the same seed.
+    """Endless inputs, the same for the same seed: variations of the seeds; where any bytes are a script, new ones.
 
     No coverage guides them, so they cost less than a fuzzer's, and need nothing.
     """

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Final
 
 from fastcrc.crc16 import mcrf4xx
 
 from tests.fuzz.engine import TALLY, Run, Script
 from tests.test_switch import Program, policy
+from uavlinkd import switch as switching
 from uavlinkd.mavlink import frames as splitting
 from uavlinkd.mavlink import policy as policing
 from uavlinkd.mavlink import routing
@@ -25,7 +27,7 @@ from uavlinkd.mavlink.frames import (
 )
 from uavlinkd.mavlink.policy import Refusal
 from uavlinkd.mavlink.routing import Router
-from uavlinkd.switch import MAX_FLOWS, Port, Switch
+from uavlinkd.switch import Port, Switch
 
 KNOWN: Final = (0, 4, 11, 20, 23, 30, 33, 39, 44, 73, 75, 76, 77, 110, 253, 256)
 """Messages that frames are made of: telemetry, parameters, missions, commands, files, SETUP_SIGNING."""
@@ -39,7 +41,8 @@ def made(script: Script) -> bytes:
     """A frame, or what is nearly one: its checksum is right unless the script says otherwise."""
     how = script.byte()
     msgid = KNOWN[how & 15] if how & 0xC0 else UNKNOWN[how % 3]
-    system, component = script.byte() & 7, script.byte() & 3
+    system, component = script.byte(), script.byte()
+    system = system if system & 0xC0 == 0xC0 else system & 7
     body = script.take(script.byte() & 63) or b"\0"
     definition = MESSAGES.get(msgid)
     if definition and how & 0x10:
@@ -166,11 +169,16 @@ def make_datagrams() -> Run:
     return run
 
 
-POLICIES: Final = (
+POLICIES: Final[tuple[dict[str, object], ...]] = (
     {},
     {"system_ids": [1, 2, "4-5"], "role": "vehicle"},
     {"system_ids": [1, 2, 3], "allow_in": ["telemetry", "HEARTBEAT", "30", "MAV_CMD_NAV_TAKEOFF"], "mavlink1": False},
-    {"system_ids": "all", "deny_in": ["MAV_CMD_DO_FLIGHTTERMINATION"], "deny_out": ["files"], "rate_in": {"ATTITUDE": 2}},
+    {
+        "system_ids": "all",
+        "deny_in": ["MAV_CMD_DO_FLIGHTTERMINATION"],
+        "deny_out": ["files"],
+        "rate_in": {"ATTITUDE": 2},
+    },
     {"system_ids": [6], "role": "operator", "ground_station": False},
     {"system_ids": [7], "role": "observer"},
 )
@@ -178,9 +186,30 @@ _CLAIMS: Final = (None, {1, 2, 4, 5}, {1, 2, 3}, None, {6}, {7})
 """The systems that each policy lets speak."""
 
 
+_BOUNDS = (
+    (routing, ("MAX_ADDRESSES_PER_PORT", "MAX_FRAMES_REMEMBERED", "MAX_DECISIONS")),
+    (policing, ("MAX_COUNTED", "MAX_BUCKETS", "MAX_DECISIONS")),
+    (switching, ("MAX_FLOWS",)),
+)
+
+
+@contextmanager
+def small_tables() -> Iterator[None]:
+    """Tables that hold eight: a script reaches the end of each, and sees whether it is one."""
+    before = [(module, name, getattr(module, name)) for module, names in _BOUNDS for name in names]
+    for module, name, _ in before:
+        setattr(module, name, 8)
+    try:
+        yield
+    finally:
+        for module, name, limit in before:
+            setattr(module, name, limit)
+
+
 def make_switch() -> Run:
     """Six programs, each with a policy, at one switch: who may not speak is not heard, and nothing comes back."""
 
+    @small_tables()
     def run(data: bytes) -> None:
         script = Script(data)
         refused: Counter[Refusal] = Counter()
@@ -229,7 +258,7 @@ def _check_tables(router: Router[Port], switch: Switch, policies: list[policing.
     assert len(router._seen) <= routing.MAX_FRAMES_REMEMBERED
     assert len(router._decisions) <= routing.MAX_DECISIONS
     for flows in switch._flows.values():
-        assert len(flows) <= MAX_FLOWS
+        assert len(flows) <= switching.MAX_FLOWS
     for each in policies:
         for gate in (each.incoming, each.outgoing):
             assert len(gate.refused) <= policing.MAX_COUNTED + len(Refusal), "too much is counted by itself"
@@ -239,12 +268,13 @@ def _check_tables(router: Router[Port], switch: Switch, policies: list[policing.
 
 def make_gate() -> Run:
     """One policy asked about any frames: what it lets pass at any rate it lets pass; its memory is bounded."""
-    wanted: tuple[Callable[[], policing.Policy], ...] = tuple(lambda each=each: policy(**each) for each in POLICIES)
+    wanted = POLICIES
 
+    @small_tables()
     def run(data: bytes) -> None:
         script = Script(data)
         number = script.byte() % len(wanted)
-        gate = wanted[number]().incoming
+        gate = policy(**wanted[number]).incoming
         now = 0.0
         while script:
             now += script.byte() / 256
@@ -269,4 +299,10 @@ def seeds() -> list[bytes]:
     one = b"".join(
         bytes((2, how, system, 1, 9)) + bytes(range(9)) for how in range(0, 256, 7) for system in (1, 2, 6)
     )
-    return [bytes(range(16)) + b"\0" + one, b"\xff" * 16 + b"\0" + one, bytes(16) + b"\xff\xfe\xfd" + one, one, one[1:]]
+    return [
+        bytes(range(16)) + b"\0" + one,
+        b"\xff" * 16 + b"\0" + one,
+        bytes(16) + b"\xff\xfe\xfd" + one,
+        one,
+        one[1:],
+    ]

@@ -16,12 +16,10 @@ from tests.fuzz.stages import GROUPS, LINKS, NOW, Chance, copier, pair_of
 from uavlinkd.core import constants as c
 from uavlinkd.core import handshake, noise, wire
 from uavlinkd.core.crypto import KeyPair
-from uavlinkd.core.drops import Drop, DropReason
+from uavlinkd.core.drops import DropReason
 from uavlinkd.core.limits import TokenBucket
 from uavlinkd.core.noise import HandshakeState, Token
 from uavlinkd.core.outputs import Dropped, Output, SessionEstablished, Transmit
-from uavlinkd.core.settings import PeerSettings
-from uavlinkd.core.suites import Suite
 
 LINK: Final = replace(LINKS[0], suites=GROUPS)
 KEY_D: Final = KeyPair(bytes((4,)) * 32)
@@ -34,7 +32,7 @@ _REFUSALS = (DropReason.HEADER_MISMATCH, DropReason.BAD_PARAMETERS)
 def write(
     state: HandshakeState, tokens: tuple[Token, ...], payload: bytes, share: bytes | None, chance: Chance
 ) -> tuple[HandshakeState, bytes]:
-    """WriteMessage; ``share``: these bytes in place of an honest key share or ciphertext, and nobody knows the secret."""
+    """WriteMessage; ``share``: these bytes in place of an honest share or ciphertext, and nobody knows the secret."""
     if share is None or not state.suite.has_group:
         return state.write(tokens, payload, chance)
     message = b""
@@ -127,9 +125,7 @@ def call(pair: Pair, script: Script, chance: Chance) -> None:
     header = wire.initiation_header(suite, script.word())
     payload = _payload(script, header)
     share = _share(script, suite.share_bytes)
-    start = noise.initiator(
-        handshake.pattern_of(suite), suite, wire.prologue(suite), caller, KEY_B.public
-    )
+    start = noise.initiator(handshake.pattern_of(suite), suite, wire.prologue(suite), caller, KEY_B.public)
     state, message = write(start, start.pattern.initiation, payload, share, chance)
     datagram = with_macs(header + message, KEY_B.public)
     path = (AT_A, ELSEWHERE)[what >> 6 & 1]
@@ -246,5 +242,11 @@ def seeds() -> list[bytes]:
     )
     ffdhe = b"".join(bytes((2, 1, 2, 0, 0, share)) for share in (0, 8, 16, 1, 2, 3))
     answers = b"".join(bytes((7, 1, 2, how, 0, 3)) for how in (0, 4, 8, 16)) + bytes((0, 0, 5, 0x7C, 1, 3, 3))
-    return [b"\0" + calls[:700], b"\5" + calls[-700:], b"\7" + ffdhe, b"\x08" + answers, b"\x0d" + answers,
-            b"\x08" + calls[:300]]
+    return [
+        b"\0" + calls[:700],
+        b"\5" + calls[-700:],
+        b"\7" + ffdhe,
+        b"\x08" + answers,
+        b"\x0d" + answers,
+        b"\x08" + calls[:300],
+    ]

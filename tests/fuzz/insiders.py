@@ -138,7 +138,7 @@ class Insider:
     def _pass(self, seconds: float) -> None:
         """Time goes by, and the victim's timers run."""
         until = self.now + seconds
-        for _ in range(64):
+        for _ in range(12):
             due = self.node.next_deadline()
             if due > until:
                 break
@@ -246,10 +246,14 @@ def make_sealed() -> Run:
 def sealed_seeds() -> list[bytes]:
     """Each kind of step; doubts, closes and roaming among them."""
     every = b"".join(
-        bytes((kind | path << 5, record, 1, 2, 3, 4, 5)) for path in range(3) for kind in range(16) for record in range(8)
+        bytes((kind | path << 5, record, 1, 2, 3, 4, 5))
+        for path in range(3)
+        for kind in range(16)
+        for record in range(8)
     )
-    doubt = bytes((6, 200, 3, 5, 1, 2, 3, 4, 5, 4, 1, 0, 0, 0, 6, 30, 4, 1, 255, 255, 255))
+    doubt = bytes((6, 200, 3, 5, 1, 2, 3, 4, 5, 4, 0x31, 0, 0, 0, 6, 30, 4, 0x31, 255, 255, 255))
+    calls = bytes((10, 0) * 8 + (6, 64) + (10, 0) * 4 + (6, 64)) + bytes((10, 0) * 4 + (6, 64)) * 3
     roaming = bytes((12 | 0x40, 5, 4 | 0x40, 4, 9, 3, 12, 9, 2, 10, 1, 12, 4, 6, 7, 255))
     parts = [every[at : at + len(every) // 4] for at in range(0, len(every), len(every) // 4)]
     found = [bytes((CHECKS_THE_SEQUEL | link,)) + part for link, part in enumerate(parts)]
-    return [*found, bytes((CHECKS_THE_SEQUEL,)) + doubt * 6 + roaming * 4]
+    return [*found, bytes((CHECKS_THE_SEQUEL,)) + doubt * 6 + roaming * 4, bytes((0,)) + calls, bytes((1,)) + doubt]

@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from tests.core.harness import Pair, exchange, of, state_of, with_macs
+from tests.core.harness import exchange, of, state_of, with_macs
 from tests.fuzz.engine import TALLY, Run, Script
 from tests.fuzz.stages import LINKS, Stage, copier, idle, initiator, responder, session, with_suite
 from uavlinkd.core import constants as c
@@ -79,7 +79,9 @@ class Outsider:
             counted += peer.traffic.drops
         assert counted == Counter(reasons), f"dropped {reasons}, counted {counted}"
         if cookies_taken:
-            assert state_of(self._node, ignoring=_SPENT_WITH_COOKIES) == self._before_cookies, "a forgery left a trace"
+            assert state_of(self._node, ignoring=_SPENT_WITH_COOKIES) == self._before_cookies, (
+                "a forgery left a trace"
+            )
         else:
             assert state_of(self._node, ignoring=_SPENT) == self._before, "a forgery left a trace"
         if checks_the_sequel:
@@ -102,10 +104,10 @@ class Outsider:
                 return script.take(script.byte() & 63), False
 
     def _altered(self, script: Script, *, is_varied: bool) -> tuple[bytes, bool]:
-        """One of the recorded datagrams with up to four bytes changed, cut or longer, with ``mac1`` made right or not.
+        """One of the recorded datagrams with a few bytes changed, cut or longer, with ``mac1`` made right or not.
 
-        ``is_varied``: one byte more, chosen by the whole script, so that a script with one change in it does not offer
-        the same datagrams again but for one.
+        ``is_varied``: one byte more, chosen by the whole script, so that a script with one change in it does not
+        offer the same datagrams again but for one.
         """
         templates = self._stage.templates
         what = script.byte()

@@ -41,10 +41,14 @@ TARGETS: Final = {
             handshakes.seeds,
             512,
         ),
-        Target("stream", "a program's MAVLink on a serial port or TCP, cut anywhere", frames.make_stream, frames.seeds),
+        Target(
+            "stream", "a program's MAVLink on a serial port or TCP, cut anywhere", frames.make_stream, frames.seeds
+        ),
         Target("frames", "a program's datagrams, and a peer's payloads", frames.make_datagrams, frames.seeds),
         Target("gate", "frames at a policy", frames.make_gate, frames.seeds),
-        Target("switch", "frames from six ports through policies, router and switch", frames.make_switch, frames.seeds),
+        Target(
+            "switch", "frames from six ports through policies, router and switch", frames.make_switch, frames.seeds
+        ),
         Target(
             "control",
             "the control socket's requests",
@@ -63,12 +67,22 @@ TARGETS: Final = {
             is_text=True,
         ),
         Target(
-            "config", "the daemon's configuration", files.make_config, files.config_seeds, 4096, files.WORDS, is_text=True
+            "config",
+            "the daemon's configuration",
+            files.make_config,
+            files.config_seeds,
+            4096,
+            files.WORDS,
+            is_text=True,
         ),
-        Target("mitm", "the man in the middle's settings", files.make_mitm, files.mitm_seeds, 4096, files.WORDS, True),
+        Target(
+            "mitm", "the man in the middle's settings", files.make_mitm, files.mitm_seeds, 4096, files.WORDS, True
+        ),
         Target("manifest", "a fleet's manifest", files.make_manifest, files.manifest_seeds, 4096, files.WORDS, True),
         Target("key", "a key file", files.make_key, files.key_seeds, 300),
         Target("tlog", "a recorded flight", files.make_tlog, files.tlog_seeds),
-        Target("anatomy", "a datagram as the man in the middle takes it apart", files.make_anatomy, files.anatomy_seeds),
+        Target(
+            "anatomy", "a datagram as the man in the middle takes it apart", files.make_anatomy, files.anatomy_seeds
+        ),
     )
 }

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import atexit
 import json
+from functools import cache
 from pathlib import Path
 
 from tests.fuzz.engine import TALLY, Run
@@ -53,6 +55,13 @@ class Connection(asyncio.Transport):
         self.is_aborted = True
 
 
+@cache
+def _loop() -> asyncio.AbstractEventLoop:
+    loop = asyncio.new_event_loop()
+    atexit.register(loop.close)
+    return loop
+
+
 def _reader(data: bytes, limit: int, loop: asyncio.AbstractEventLoop) -> asyncio.StreamReader:
     """The bytes, and then nothing more."""
     reader = asyncio.StreamReader(limit=limit, loop=loop)
@@ -63,7 +72,7 @@ def _reader(data: bytes, limit: int, loop: asyncio.AbstractEventLoop) -> asyncio
 
 def make_control() -> Run:
     """One connection a script: it gets one line of JSON or nothing, and is closed; only what is known is asked."""
-    loop = asyncio.new_event_loop()
+    loop = _loop()
     asked: list[str] = []
 
     def answer(request: str) -> dict[str, object] | None:
@@ -95,7 +104,7 @@ def make_control() -> Run:
 
 def make_metrics() -> Run:
     """One connection a script: a well-formed answer or none; the content only to a request for it."""
-    loop = asyncio.new_event_loop()
+    loop = _loop()
     server = MetricsServer(Address("127.0.0.1", 9000), lambda: b"metric 1\n", "text/plain")
 
     def run(data: bytes) -> None:
@@ -122,7 +131,17 @@ def make_metrics() -> Run:
 
 def control_seeds() -> list[bytes]:
     """Requests that are known, and some that are not."""
-    return [b"status\n", b"reload\n", b"  status \r\n", b"peer\n", b"\n", b"", b"x" * 300, b"status", "réload\n".encode()]
+    return [
+        b"status\n",
+        b"reload\n",
+        b"  status \r\n",
+        b"peer\n",
+        b"\n",
+        b"",
+        b"x" * 300,
+        b"status",
+        "réload\n".encode(),
+    ]
 
 
 def metrics_seeds() -> list[bytes]:

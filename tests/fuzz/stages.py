@@ -86,7 +86,7 @@ class Stage:
     """Cookie replies that fit: whoever sees the datagrams of two whose public keys it knows can make them."""
 
     def __post_init__(self) -> None:
-        """An envelope of no session comes from the peer's address: the victim calls it, and not again for a second."""
+        """An envelope of no session comes from the peer's address: the victim calls, and not again for a second."""
         self.victim.receive(bytes((wire.SHORT_ENVELOPE,)) + bytes(40), self.now)
 
     @property

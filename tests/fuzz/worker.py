@@ -1,7 +1,7 @@
 """One target in a process of its own: ``python -m tests.fuzz.worker TARGET ENGINE PROGRESS [ARGUMENT ...]``.
 
-The engine is ``atheris``, which libFuzzer's arguments are handed to, or ``seeded``. Numbers go to a small file that
-the command reads, also when this process ends without a word.
+The engine is ``atheris``, which libFuzzer's arguments are handed to, ``seeded``, or ``replay``, which runs the seeds
+and the kept corpus once. Numbers go to a small file that the command reads, also when this process ends abruptly.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ PROGRESS: Final = struct.Struct("<QQQ")
 """Scripts run, inputs offered, and about how many of them were different."""
 ESCAPED: Final = 77
 """Exit code, as libFuzzer's."""
-_PLANTS: Final = "tests.fuzz.plants"
 
 
 def _board(path: str) -> mmap.mmap:
@@ -25,7 +24,13 @@ def _board(path: str) -> mmap.mmap:
         return mmap.mmap(file.fileno(), PROGRESS.size)
 
 
-def fuzz_with_atheris(name: str, board: mmap.mmap, arguments: list[str], plant: str | None = None) -> None:
+def _plant(name: str) -> None:
+    from tests.fuzz.plants import PLANTS
+
+    PLANTS[name].put()
+
+
+def fuzz_with_atheris(name: str, board: mmap.mmap, arguments: list[str], plant: str | None) -> None:
     """Hand the target over to libFuzzer. Does not return."""
     import atheris
 
@@ -34,9 +39,7 @@ def fuzz_with_atheris(name: str, board: mmap.mmap, arguments: list[str], plant: 
     from tests.fuzz.engine import TALLY
 
     if plant is not None:
-        from tests.fuzz.plants import PLANTS
-
-        PLANTS[plant].put()
+        _plant(plant)
     run = TARGETS[name].make()
     executions = 0
 
@@ -71,17 +74,38 @@ def fuzz_seeded(name: str, board: mmap.mmap, arguments: list[str]) -> None:
         sys.exit(ESCAPED)
 
 
+def replay(name: str) -> int:
+    """Run a target's seeds and its kept corpus; how many there are.
+
+    Raises:
+        Exception: what escaped.
+    """
+    from tests.fuzz import corpus
+    from tests.fuzz.registry import TARGETS
+
+    target = TARGETS[name]
+    run = target.make()
+    inputs = [*target.seeds(), *corpus.load(name)]
+    for data in inputs:
+        run(data)
+    return len(inputs)
+
+
 def main() -> None:
     """What the command starts."""
     name, engine, progress, *arguments = sys.argv[1:]
     board = _board(progress)
+    plant = None
+    if arguments and arguments[0].startswith("plant="):
+        plant = arguments.pop(0).removeprefix("plant=")
     if engine == "atheris":
-        plant = None
-        if arguments and arguments[0].startswith("plant="):
-            plant = arguments.pop(0).removeprefix("plant=")
         fuzz_with_atheris(name, board, arguments, plant)
-    else:
+    elif engine == "seeded":
+        if plant is not None:
+            _plant(plant)
         fuzz_seeded(name, board, arguments)
+    else:
+        replay(name)
 
 
 if __name__ == "__main__":
