@@ -25,6 +25,8 @@ from uavlinkd.core.suites import SUITES, SUITES_BY_NAME
 
 CHECKS_THE_SEQUEL: Final = 0xF0
 """In a script's first byte, all of them: afterwards the genuine datagram comes, and the link must work."""
+BUDGET: Final = 8
+"""Handshake messages of a script that reach a key exchange."""
 _SPENT = frozenset(("drops", "_initiations", "_responses", "_entropy"))
 _SPENT_WITH_COOKIES = _SPENT | {"_cookie", "retry_at", "cookies_taken", "deadline", "_deadline"}
 _KINDS = (*range(1, 4), 0x40, 0x41, 0xFD, 0xFE, 0)
@@ -167,9 +169,9 @@ class Outsider:
 
 
 def _refill(node: Node, now: float) -> None:
-    """Full budgets and no drops, as at the beginning."""
-    node._initiations = TokenBucket(c.INITIATIONS_PER_S, c.INITIATIONS_BURST, now)
-    node._responses = TokenBucket(c.INITIATIONS_PER_S, c.INITIATIONS_BURST, now)
+    """Budgets as at the beginning, and no drops. Small ones, so that scripts come to where cookies are asked for."""
+    node._initiations = TokenBucket(1.0, BUDGET, now)
+    node._responses = TokenBucket(1.0, BUDGET, now)
     node.drops.clear()
     for peer in node.peers.values():
         peer.traffic.drops.clear()
@@ -227,7 +229,7 @@ def seeds() -> list[bytes]:
         steps = bytearray((CHECKS_THE_SEQUEL | stage,))
         for template in range(8):
             for place in (0, 1, 3, 5, 8, 20, 60, 118):
-                how, what = (place & 3) << 4, template << 4 | (8 if place & 1 else 0)
+                how, what = (place & 3) << 4 | place & 1, template << 4 | (8 if place & 1 else 0)
                 steps += bytes((how, what, 0, place, 1 << (place & 7)))
         found.append(bytes(steps))
     kinds = b"".join(
