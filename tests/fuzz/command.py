@@ -103,7 +103,8 @@ def fuzz(
                 cwd=ROOT,
                 stdout=log,
                 stderr=subprocess.STDOUT,
-                env={**os.environ, "PYTHONHASHSEED": "0"},
+                # libFuzzer ends a process without its leave: what it left behind goes with the scratch folder.
+                env={**os.environ, "PYTHONHASHSEED": "0", "TMPDIR": scratch},
             )
             try:
                 code = process.wait(None if seconds is None else seconds + GRACE_S)
@@ -122,7 +123,7 @@ def fuzz(
             escapes.mkdir(parents=True, exist_ok=True)
             escape.write_bytes(crashes[0].read_bytes() if crashes else b"")
         elif keeps or folder is not None:
-            smallest = minimised(target, work, Path(scratch))
+            smallest = corpus.minimised(target.make(), corpus.packed(work))
             corpus.save(target.name, smallest, folder or corpus.KEPT)
             if keeps:
                 corpus.save(target.name, smallest)
@@ -160,19 +161,6 @@ def _arguments(
     return [*options, str(work)]
 
 
-def minimised(target: Target, work: Path, scratch: Path) -> list[bytes]:
-    """The smallest inputs of a folder that together reach all that it reaches (libFuzzer's merge)."""
-    into = scratch / "merged"
-    into.mkdir()
-    board = scratch / "merge-progress"
-    board.write_bytes(bytes(PROGRESS.size))
-    command = [sys.executable, "-m", "tests.fuzz.worker", target.name, "atheris", str(board), "-merge=1"]
-    subprocess.run(
-        [*command, f"-max_len={target.max_bytes}", str(into), str(work)], cwd=ROOT, check=True, capture_output=True
-    )
-    return corpus.packed(into)
-
-
 def coverage_of(names: Sequence[str]) -> str:
     """Lines and branches that the seeds and the kept corpora of these targets reach, in a table."""
     with tempfile.TemporaryDirectory(prefix="uavlinkd-fuzz-coverage-") as scratch:
@@ -206,7 +194,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--engine", choices=("atheris", "seeded"), help="atheris where it is installed")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--corpus", type=Path, help="a folder of corpora, read beside the kept ones and written to")
-    parser.add_argument("--keep", action="store_true", help="merge what was found into the kept corpus (atheris)")
+    parser.add_argument("--keep", action="store_true", help="merge what was found into the kept corpus")
     parser.add_argument("--escapes", type=Path, default=Path(), help="where what escapes is kept")
     parser.add_argument("--replay", type=Path, metavar="FILE", help="run one input of one target, in this process")
     parser.add_argument("--coverage", action="store_true", help="lines and branches that the kept corpus reaches")
@@ -226,8 +214,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
             target.make()(given.replay.read_bytes())
         return 0
     engine = given.engine or ("atheris" if has_atheris() else "seeded")
-    if (given.keep or given.corpus) and not has_atheris():
-        parser.error("minimising a corpus needs atheris: pip install 'uavlinkd[fuzz]'")
     seconds = 60.0 if given.seconds is None and given.runs is None else given.seconds
     print(HEADING, flush=True)
     results = []

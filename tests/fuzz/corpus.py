@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterable
+import sys
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Final
+from types import FrameType
+from typing import Any, Final
+
+import uavlinkd
 
 KEPT: Final = Path(__file__).parent / "corpus"
 MAX_FILE_BYTES: Final = 20_000
@@ -36,6 +40,39 @@ def save(name: str, inputs: Iterable[bytes], folder: Path = KEPT) -> int:
     folder.mkdir(parents=True, exist_ok=True)
     path_of(name, folder).write_text("".join(lines))
     return len(lines)
+
+
+def minimised(run: Callable[[bytes], None], inputs: Iterable[bytes]) -> list[bytes]:
+    """Of these, the smallest first, each that goes from a line of the product to another as none before it did."""
+    package = str(Path(uavlinkd.__file__).parent)
+    known: set[tuple[str, int, int]] = set()
+    kept = []
+    for data in sorted(inputs, key=lambda each: (len(each), each)):
+        steps: set[tuple[str, int, int]] = set()
+
+        def enter(frame: FrameType, event: str, argument: Any, steps: set[tuple[str, int, int]] = steps) -> Any:
+            name = frame.f_code.co_filename
+            if not name.startswith(package):
+                return None
+            before = frame.f_code.co_firstlineno
+
+            def step(frame: FrameType, event: str, argument: Any) -> Any:
+                nonlocal before
+                steps.add((name, before, frame.f_lineno))
+                before = frame.f_lineno
+                return step
+
+            return step
+
+        sys.settrace(enter)
+        try:
+            run(data)
+        finally:
+            sys.settrace(None)
+        if not steps <= known:
+            known |= steps
+            kept.append(data)
+    return kept
 
 
 def unpack(inputs: Iterable[bytes], folder: Path) -> None:

@@ -191,12 +191,14 @@ def _remembers_for_ever(right: Any) -> Any:
 
 
 def _blind_look_up(right: Any) -> Any:
-    def sections(problems: Any, table: Any, key: str, model: Any) -> Any:
-        if isinstance(table.get(key), dict):
-            raise KeyError(key)
-        return right(problems, table, key, model)
+    endings = {"y": "a private key", "k": "a PSK", "=": "a key itself"}
 
-    return sections
+    def secret(problems: Any, section: Any, key: str, folder: Any, environ: Any) -> Any:
+        if name := section.good.get(key):
+            endings[name[-1]]  # a KeyError for names that nobody thought of
+        return right(problems, section, key, folder, environ)
+
+    return secret
 
 
 def _back_to_sender(right: Any) -> Any:
@@ -298,7 +300,7 @@ PLANTS: Final = {
         lambda _: re.compile(rb"(\S*) (/[!-~]*).*"),
     ),
     "loader lets a KeyError through": Plant(
-        "config", "a section where a list is expected", config_load, "_sections", _blind_look_up
+        "config", "the end of a file's name is looked up blindly", config_load, "_secret", _blind_look_up
     ),
     "a key is repeated": Plant(
         "config",
