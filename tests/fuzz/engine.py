@@ -120,8 +120,8 @@ def variations(seeds: Sequence[bytes], seed: int, target: Target) -> Iterator[by
             yield chance.randbytes(chance.choice((target.max_bytes, chance.randint(1, target.max_bytes))))
             continue
         data = bytearray(chance.choice(known))
-        for _ in range(1 << chance.randrange(5)):
-            _vary(data, known, chance, target.words)
+        for _ in range(1 << chance.randrange(3 if target.is_text else 5)):
+            (_vary_text if target.is_text else _vary)(data, known, chance, target.words)
         yield bytes(data[: target.max_bytes])
 
 
@@ -149,6 +149,30 @@ def _vary(data: bytearray, known: Sequence[bytes], chance: random.Random, words:
             data[at : at + chance.randint(0, 8)] = chance.choice(words)
         case _:
             data[at : at + 4] = chance.randbytes(4)
+
+
+def _vary_text(data: bytearray, known: Sequence[bytes], chance: random.Random, words: tuple[bytes, ...]) -> None:
+    """By lines, values and printable characters: most of what comes is still text of its kind."""
+    lines = bytes(data).split(b"\n")
+    number = chance.randrange(len(lines))
+    line = lines[number]
+    at = chance.randrange(len(line) + 1)
+    match chance.randrange(7):
+        case 0:
+            del lines[number]
+        case 1:
+            lines.insert(chance.randrange(len(lines) + 1), line)
+        case 2:
+            lines.insert(number, chance.choice(chance.choice(known).split(b"\n")))
+        case 3 if b"=" in line:
+            lines[number] = line.partition(b"=")[0] + b"= " + chance.choice(words)
+        case 4:
+            lines[number] = line[:at] + chance.choice(words) + line[at:]
+        case 5:
+            lines[number] = line[:at] + line[at + chance.randint(1, 4) :]
+        case _:
+            lines[number] = line[:at] + bytes((chance.randrange(0x20, 0x7F),)) + line[at + 1 :]
+    data[:] = b"\n".join(lines)
 
 
 class Hunt(NamedTuple):

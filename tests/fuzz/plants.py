@@ -191,14 +191,11 @@ def _remembers_for_ever(right: Any) -> Any:
 
 
 def _blind_look_up(right: Any) -> Any:
-    endings = {"y": "a private key", "k": "a PSK", "=": "a key itself"}
+    def names(problems: Any, sections: Any) -> Any:
+        assert len({each.good["name"] for each in sections}) >= 0  # a KeyError where a name is missing or wrong
+        return right(problems, sections)
 
-    def secret(problems: Any, section: Any, key: str, folder: Any, environ: Any) -> Any:
-        if name := section.good.get(key):
-            endings[name[-1]]  # a KeyError for names that nobody thought of
-        return right(problems, section, key, folder, environ)
-
-    return secret
+    return names
 
 
 def _back_to_sender(right: Any) -> Any:
@@ -300,7 +297,7 @@ PLANTS: Final = {
         lambda _: re.compile(rb"(\S*) (/[!-~]*).*"),
     ),
     "loader lets a KeyError through": Plant(
-        "config", "the end of a file's name is looked up blindly", config_load, "_secret", _blind_look_up
+        "config", "a name is looked up blindly", config_load.checks, "names", _blind_look_up
     ),
     "a key is repeated": Plant(
         "config",
