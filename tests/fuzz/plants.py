@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from uavlinkd import control, keys, metrics_server
+from uavlinkd.config import checks as config_checks
 from uavlinkd.config import load as config_load
 from uavlinkd.core import caller, cookie, freshness, handshake, peer, replay, session, sessions, wire
 from uavlinkd.core import node as core_node
@@ -297,7 +298,7 @@ PLANTS: Final = {
         lambda _: re.compile(rb"(\S*) (/[!-~]*).*"),
     ),
     "loader lets a KeyError through": Plant(
-        "config", "a name is looked up blindly", config_load.checks, "names", _blind_look_up
+        "config", "a name is looked up blindly", config_checks, "names", _blind_look_up
     ),
     "a key is repeated": Plant(
         "config",
