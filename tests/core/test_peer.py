@@ -669,6 +669,19 @@ def test_answer_is_never_longer_than_its_question(pair: Pair) -> None:
     assert len(answer.datagram) <= len(question)
 
 
+def test_question_from_an_unproven_place_gets_its_answer_alone(pair: Pair) -> None:
+    """Together with a question of one's own it would be more than came; the next frame from there is asked about."""
+    question = pair.b.envelope(1.0, wire.PathChallenge(bytes(8)).encode())
+
+    answers = datagrams(pair.a.receive(question, 1.0, ELSEWHERE))
+
+    assert sum(map(len, answers)) <= len(question)
+    (answer,) = answers
+    assert wire.parse_control(answer[wire.SHORT_HEADER_BYTES : -16]) == wire.PathResponse(bytes(8))
+    asked = only(of(pair.a.receive(pair.b.envelope(1.0), 1.0, ELSEWHERE), Transmit))
+    assert (asked.path, asked.datagram[wire.SHORT_HEADER_BYTES]) == (ELSEWHERE, wire.PATH_CHALLENGE)
+
+
 @pytest.mark.parametrize("place", [AT_A, AT_B, (1, *ELSEWHERE[1:]), (0, ELSEWHERE[1], 9)])
 def test_answer_from_another_place_is_refused(pair: Pair, place: Path) -> None:
     """The answer proves the place it comes from, and only the one that was asked."""

@@ -95,6 +95,14 @@ def test_private_keys_are_in_their_own_folder_alone(folder: Path) -> None:
     assert len(set(psks)) == len(psks) / 2
 
 
+@pytest.mark.parametrize("damage", [b"\xff", b"[fleet", b"a = " + b"[" * 5000])
+def test_damaged_manifest_is_refused_with_its_place(tmp_path: Path, damage: bytes) -> None:
+    """Whatever is in the file: no traceback, and the file is named. Brackets can be too deep for the reader."""
+    (tmp_path / "fleet.toml").write_bytes(damage)
+    with pytest.raises(FleetError, match=r"fleet\.toml cannot be read: it is no TOML"):
+        read_manifest(tmp_path)
+
+
 def test_manifest_tells_public_facts_only(folder: Path) -> None:
     """Nothing secret stands in fleet.toml."""
     text = (folder / "fleet.toml").read_text()

@@ -33,6 +33,7 @@ from uavlinkd.core.settings import PeerSettings
 from uavlinkd.core.traffic import Traffic
 
 NEVER = float("inf")
+_CHALLENGED = bytes((wire.PATH_CHALLENGE,))  # gets an answer: with a question beside it, more would go back than came
 
 
 class Peer:
@@ -181,7 +182,7 @@ class Peer:
             self._doubt(session, now, out)
         if counter != session.window.highest:
             self.traffic.out_of_order += 1
-        elif path != self.path and session is self.sessions.current:
+        elif path != self.path and session is self.sessions.current and payload[:1] != _CHALLENGED:
             self._challenge_path(session, path, len(datagram), now, out)
         if not payload:
             return

@@ -199,7 +199,7 @@ def read_manifest(folder: Path) -> Fleet:
         raise FleetError(
             f"there is no fleet in {folder}: make one with `uavlinkd fleet init --out {folder}`"
         ) from None
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it is no TOML"
         raise FleetError(f"{path} cannot be read: {reason}") from None
     try:

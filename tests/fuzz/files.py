@@ -1,0 +1,295 @@
+"""Files, and datagrams as the attacker's own tools take them apart: each reader raises its own error alone."""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import tempfile
+import tomllib
+from pathlib import Path
+from typing import Final
+
+from tests.core.harness import FRAME, PLAIN
+from tests.fuzz.engine import TALLY, Run, Script
+from tests.fuzz.stages import initiator, session
+from uavlinkd.config import Config, ConfigError
+from uavlinkd.config.load import load_config
+from uavlinkd.config.reader import _taken_over, handed_over
+from uavlinkd.core import wire
+from uavlinkd.core.suites import SUITES
+from uavlinkd.fleet.manifest import FILE_NAME, read_manifest, write_manifest
+from uavlinkd.fleet.plan import FleetError
+from uavlinkd.keys import KeyFileError, decode_key, encode_key, read_secret_file
+from uavlinkd.mitm import anatomy
+from uavlinkd.mitm.settings import ProxySettings, SettingsError, load_proxy_settings
+from uavlinkd.sim.tlog import TlogError, parse_tlog
+
+SECRET: Final = encode_key(bytes(range(7, 39)))
+"""A private key; a person may paste it where it does not belong."""
+PUBLIC: Final = "Ya1BcyCMNCoxhVU/dI5z9wlfOD9PHricYw/gaSC3swU="
+CONFIGS: Final = Path(__file__).resolve().parents[2] / "configs"
+WORDS: Final = tuple(
+    each.encode()
+    for each in (
+        *(
+            "[link]\n",
+            "[[peer]]\n",
+            "\n[peer]\n",
+            "\n[endpoint]\n",
+            "[[endpoint]]\n",
+            "[routing]\n",
+            "[metrics]\n",
+            "[recording]\n",
+            "[log]\n",
+            "[peer]\n",
+            "[endpoint]\n",
+        ),
+        *("name = ", "public_key = ", "addresses = ", "url = ", "suites = ", "system_ids = ", "role = ", "listen = "),
+        *(
+            "psk_file = ",
+            "tag_bits = ",
+            "rate_in = {",
+            "allow_in = [",
+            "deny_out = [",
+            "keepalive_s = ",
+            "budget_bits_s = ",
+        ),
+        *(
+            "true",
+            "nan",
+            "inf",
+            "-1",
+            "1e999",
+            "9" * 40,
+            '"',
+            "'''",
+            "[[",
+            "{",
+            "}",
+            "]",
+            "\n",
+            ",",
+            "=",
+            "\\u0000",
+            "\0",
+        ),
+        *(
+            "1979-05-27T07:32:00Z",
+            "udpin:",
+            "udpout:[::]:1",
+            "serial:/dev/x:1",
+            "tcpin:",
+            "[fe80::1%x]:1",
+            f'"{SECRET}"',
+        ),
+        *(
+            "[[member]]\n",
+            'kind = "drone"',
+            "{name}",
+            "{n:1000}",
+            "{n.real}",
+            "[[attack]]\n",
+            "[[radio]]\n",
+            "[[link]]\n",
+        ),
+    )
+)
+
+
+def _folder() -> Path:
+    """A folder with the files that the configurations name; it goes away with the process."""
+    folder = tempfile.TemporaryDirectory(prefix="uavlinkd-fuzz-")
+    atexit.register(folder.cleanup)
+    path = Path(folder.name)
+    for name in ("drone0.key", "drone1.key", "ground-station.key", "observer.key"):
+        (path / name).touch(mode=0o600)
+        (path / name).write_text(SECRET + "\n")
+    (path / "pair.psk").touch(mode=0o600)
+    (path / "pair.psk").write_text(encode_key(bytes(range(9, 41))) + "\n")
+    return path
+
+
+def make_config() -> Run:
+    """The daemon's configuration: itself, or a ConfigError that repeats no key and says what to do."""
+    folder = _folder()
+    file = folder / "fuzz.toml"
+
+    def run(data: bytes) -> None:
+        TALLY.add(data)
+        file.write_bytes(data)
+        try:
+            config = load_config(file, {})
+        except ConfigError as error:
+            problems, told = error.problems, str(error)
+        else:
+            problems, told = (), ""
+        assert SECRET not in told, "a key is repeated"
+        assert all(each.message for each in problems), "a problem without a word"
+        if told:
+            return
+        assert tomllib.loads(data.decode("utf-8-sig"))
+        assert isinstance(config, Config)
+        assert SECRET not in repr(config), "a key can be read"
+        assert _taken_over(handed_over(config), file) == config, "not the same on the other side of the pipe"
+        for peer in config.peers:
+            peer.make_policy()
+
+    return run
+
+
+def make_mitm() -> Run:
+    """The man in the middle's settings."""
+    file = _folder() / "fuzz.toml"
+
+    def run(data: bytes) -> None:
+        TALLY.add(data)
+        file.write_bytes(data)
+        with contextlib.suppress(SettingsError):
+            assert isinstance(load_proxy_settings(file), ProxySettings)
+
+    return run
+
+
+def make_manifest() -> Run:
+    """The fleet's manifest: what is read is written and read again the same."""
+    folder = _folder()
+
+    def run(data: bytes) -> None:
+        TALLY.add(data)
+        (folder / FILE_NAME).write_bytes(data)
+        try:
+            fleet = read_manifest(folder)
+        except FleetError:
+            return
+        (folder / FILE_NAME).write_text(write_manifest(fleet), encoding="utf-8")
+        assert read_manifest(folder) == fleet, "a manifest that changes when it is written"
+
+    return run
+
+
+def make_key() -> Run:
+    """A key file: 32 bytes in their one spelling, or a KeyFileError that does not repeat it."""
+    file = _folder() / "drone0.key"
+
+    def run(data: bytes) -> None:
+        TALLY.add(data)
+        file.write_bytes(data)
+        text = data.decode("ascii", errors="replace")
+        try:
+            secret, told = read_secret_file(file), ""
+        except KeyFileError as error:
+            secret, told = None, str(error)
+        assert len(text.strip()) < 8 or text.strip() not in told, "a key is repeated"
+        if secret is None:
+            return
+        assert encode_key(secret.reveal()) == text.strip(), "a key with two spellings"
+        assert decode_key(text) == secret.reveal()
+
+    return run
+
+
+def make_tlog() -> Run:
+    """A recorded flight: records that stand in it, in their order, or a TlogError; strict is never more lenient."""
+
+    def run(data: bytes) -> None:
+        TALLY.add(data)
+        try:
+            log = parse_tlog(data)
+        except TlogError:
+            return
+        whole = [each.time_us.to_bytes(8, "big") + each.frame for each in log.records]
+        position = 0
+        for record in whole:
+            position = data.find(record, position) + len(record)
+            assert position >= len(record), "a record that is not in the log"
+        assert sum(map(len, whole)) + log.skipped_bytes == len(data), "bytes are unaccounted for"
+        try:
+            strict = parse_tlog(data, strict=True)
+        except TlogError:
+            assert log.skipped_bytes, "strict refuses what has no fault"
+        else:
+            assert strict == log
+
+    return run
+
+
+def make_anatomy() -> Run:
+    """What the man in the middle sees in a datagram: parts that are all of it; nothing raises."""
+
+    def run(data: bytes) -> None:
+        script = Script(data)
+        while script:
+            size = script.word() & 0x1FF
+            datagram = script.take(size)
+            if size & 1 and datagram:
+                suite = list(SUITES.values())[datagram[0] % len(SUITES)]
+                wanted = (wire.initiation_bytes if size & 2 else wire.response_bytes)(suite)
+                kind = wire.INITIATION if size & 2 else wire.RESPONSE
+                datagram = (bytes((kind, suite.number)) + datagram).ljust(wanted, b"\0")[:wanted]
+            TALLY.add(datagram)
+            parts = anatomy.parts_of(datagram)
+            if parts is not None:
+                assert parts.join() == datagram, "parts that are not the whole"
+                assert len(parts.ephemeral) == 32
+            anatomy.has_cookie(datagram)
+            anatomy.suite_of(datagram)
+            envelope = anatomy.envelope_of(datagram)
+            assert (envelope is not None) <= (anatomy.kind_of(datagram) is anatomy.Kind.ENVELOPE)
+            assert len(anatomy.message_ids(datagram)) * 8 <= len(datagram)
+            changed = anatomy.with_mac1(datagram, bytes(32))
+            assert len(changed) == len(datagram)
+            assert changed[:-32] == datagram[:-32], "more than mac1 was changed"
+
+    return run
+
+
+def config_seeds() -> list[bytes]:
+    """Every configuration that comes with the package."""
+    small = [
+        'name = "a"\nprivate_key_file = "drone0.key"\nlisten = ["0.0.0.0:1"]\n',
+        f'[[peer]]\nname = "b"\npublic_key = "{PUBLIC}"\nsystem_ids = [1]\n',
+        f'psk_file = "{SECRET}"\n',
+        '[[endpoint]]\nname = "e"\nurl = "tcpin:127.0.0.1:2"\n',
+    ]
+    whole = "".join((small[0], small[1], small[3]))
+    found = [path.read_bytes() for path in sorted(CONFIGS.glob("*.toml")) if path.name != "mitm.toml"]
+    return [*(each.encode() for each in (*small, whole)), *found, b"a = " + b"[" * 4000]
+
+
+def mitm_seeds() -> list[bytes]:
+    """The one that comes with the package."""
+    small = [
+        '[[peer]]\nname = "a"\n[[peer]]\nname = "b"\n[[link]]\nbetween = ["a", "b"]\n'
+        'listen = ["0.0.0.0:1", "0.0.0.0:2"]\n',
+        '[[attack]]\nname = "replay-data"\nlimit = 5\n',
+        '[[radio]]\nway = "both"\nloss = 0.5\n',
+    ]
+    return [*(each.encode() for each in (*small, "".join(small))), (CONFIGS / "mitm.toml").read_bytes()]
+
+
+def manifest_seeds() -> list[bytes]:
+    """A fleet of three."""
+    members = "".join(
+        f'[[member]]\nname = "{name}"\nkind = "{kind}"\nsystem_id = {number}\npublic_key = "{PUBLIC}"\n'
+        f'address = "10.13.0.{number}:5790"\n'
+        for name, kind, number in (("d1", "drone", 1), ("gs", "ground-station", 254), ("o", "observer", 250))
+    )
+    return [f'[fleet]\nsuite = "mlkem768"\npsk = true\n{members}'.encode(), b"[fleet]\n", b"a = " + b"[" * 4000]
+
+
+def key_seeds() -> list[bytes]:
+    """Keys, and what is nearly one."""
+    return [each.encode() for each in (SECRET, SECRET + "\n", f"  {SECRET}\r\n", SECRET[:-1], "A" * 43 + "=", PUBLIC)]
+
+
+def tlog_seeds() -> list[bytes]:
+    """Records whole, broken and cut."""
+    record = (1_700_000_000_000_000).to_bytes(8, "big") + FRAME
+    v1 = record[:8] + b"\xfe\x09\x01\x01\x01\x00" + bytes(11)
+    return [record * 3, record + v1 + record, record + b"junk" + record * 2, record * 2 + record[:12], b""]
+
+
+def anatomy_seeds() -> list[bytes]:
+    """Datagrams of each kind."""
+    known = [*initiator(PLAIN).templates, *session(PLAIN).templates]
+    return [b"".join((len(each) & 0x1FE).to_bytes(2, "big") + each[: len(each) & 0x1FE] for each in known)]

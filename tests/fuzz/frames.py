@@ -1,0 +1,308 @@
+"""MAVLink from programs and peers: the splitters, then policy, router and switch behind them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Final
+
+from fastcrc.crc16 import mcrf4xx
+
+from tests.fuzz.engine import TALLY, Run, Script
+from tests.test_switch import Program, policy
+from uavlinkd import switch as switching
+from uavlinkd.mavlink import frames as splitting
+from uavlinkd.mavlink import policy as policing
+from uavlinkd.mavlink import routing
+from uavlinkd.mavlink.dialect_table import MESSAGES
+from uavlinkd.mavlink.frames import (
+    MAVLINK1,
+    MAX_FRAME_BYTES,
+    Frame,
+    SplitCounters,
+    StreamSplitter,
+    split_datagram,
+    split_payload,
+)
+from uavlinkd.mavlink.policy import Refusal
+from uavlinkd.mavlink.routing import Router
+from uavlinkd.switch import Port, Switch
+
+KNOWN: Final = (0, 4, 11, 20, 23, 30, 33, 39, 44, 73, 75, 76, 77, 110, 253, 256)
+"""Messages that frames are made of: telemetry, parameters, missions, commands, files, SETUP_SIGNING."""
+UNKNOWN: Final = (60_000, 250, 16_777_215)
+
+LAST_STEPS: Final = {mcrf4xx(bytes((extra,)), 0) for extra in range(256)}
+"""What one more byte can do to the low byte of a checksum."""
+
+
+def made(script: Script) -> bytes:
+    """A frame, or what is nearly one: its checksum is right unless the script says otherwise."""
+    how = script.byte()
+    msgid = KNOWN[how & 15] if how & 0xC0 else UNKNOWN[how % 3]
+    system, component = script.byte(), script.byte()
+    system = system if system & 0xC0 == 0xC0 else system & 7
+    body = script.take(script.byte() & 63) or b"\0"
+    definition = MESSAGES.get(msgid)
+    if definition and how & 0x10:
+        body = body[: definition[3]].ljust(definition[2], b"\1")
+    if how & 0x20 and msgid < 256:
+        covered = bytes((len(body), 1, system, component, msgid)) + body
+        start, signature = b"\xfe", b""
+    else:
+        flags = int(how & 0xE0 == 0xE0)
+        covered = bytes((len(body), flags, 0, 1, system, component)) + msgid.to_bytes(3, "little") + body
+        start, signature = b"\xfd", bytes(13 * flags)
+    checksum = mcrf4xx(covered + bytes((definition[1] if definition else 77,)))
+    if how & 0xC8 == 0x88:
+        checksum ^= 1 << (script.byte() & 15)
+    return start + covered + checksum.to_bytes(2, "little") + signature
+
+
+def check_frame(frame: Frame) -> None:
+    """A frame is what its own bytes say, read here anew; where its message is known its checksum is right."""
+    raw, header = frame
+    if raw[0] == MAVLINK1:
+        length, msgid, body_at = 8 + raw[1], raw[5], 6
+        system, component = raw[3], raw[4]
+    else:
+        assert raw[0] == 0xFD, "a frame without a start"
+        assert raw[2] <= 1, "a frame with unknown flags"
+        length, msgid, body_at = 12 + raw[1] + 13 * raw[2], int.from_bytes(raw[7:10], "little"), 10
+        system, component = raw[5], raw[6]
+    assert len(raw) == length, "a frame of another length than its header's"
+    assert (header.msgid, header.system, header.component) == (msgid, system, component), "another frame's header"
+    checksum_at = body_at + raw[1]
+    wanted = int.from_bytes(raw[checksum_at : checksum_at + 2], "little")
+    if header.is_known:
+        assert mcrf4xx(raw[1:checksum_at] + bytes((MESSAGES[msgid][1],))) == wanted, "a bad checksum"
+    else:
+        assert mcrf4xx(raw[1:checksum_at]) >> 8 ^ wanted in LAST_STEPS, "no checksum, whatever the definition"
+
+
+def facts_of(frame: Frame) -> tuple[object, ...]:
+    """A frame, to be compared: headers are compared by identity, and are forgotten now and then."""
+    header = frame.header
+    return frame.raw, header.is_known, header.target_system, header.target_component, header.command
+
+
+def check_split(data: bytes, found: list[Frame], counters: SplitCounters, held: int = 0) -> None:
+    """What was found stands in the data, in its order; every byte is in a frame, garbage, or held."""
+    position = 0
+    for frame in found:
+        at = data.find(frame.raw, position)
+        assert at >= 0, "a frame that was not sent"
+        position = at + len(frame.raw)
+        check_frame(frame)
+    size = sum(len(each.raw) for each in found)
+    assert size + counters.garbage_bytes + held == len(data), "bytes are unaccounted for"
+    assert counters.frames == len(found), "frames are unaccounted for"
+    assert len(splitting._messages) <= splitting.MAX_REMEMBERED, "too many headers are remembered"
+
+
+def _stream(script: Script) -> bytes:
+    """Frames, pieces of frames and noise, one after another."""
+    parts = []
+    while script:
+        match script.byte() & 3:
+            case 0:
+                parts.append(script.take(1 + (script.byte() & 31)))
+            case 1:
+                frame = made(script)
+                parts.append(frame[: script.byte() % len(frame)])
+            case _:
+                parts.append(made(script))
+    return b"".join(parts)
+
+
+def make_stream() -> Run:
+    """A byte stream, cut into chunks anywhere: the same frames as whole, whatever the cuts."""
+
+    def run(data: bytes) -> None:
+        cuts, rest = data[:16], data[16:]
+        stream = _stream(Script(rest[1:])) if rest[:1] < b"\xc0" else rest[1:]
+        splitter = StreamSplitter()
+        found: list[Frame] = []
+        position, number = 0, 0
+        while position < len(stream):
+            size = 1 + (cuts[number % len(cuts)] if cuts else 64)
+            chunk = stream[position : position + size]
+            TALLY.add(chunk)
+            found += splitter.feed(chunk, 0.0)
+            assert splitter.pending_bytes < MAX_FRAME_BYTES, "more is held than a frame"
+            position += size
+            number += 1
+        check_split(stream, found, splitter.counters, splitter.pending_bytes)
+        found += splitter.end()
+        check_split(stream, found, splitter.counters)
+        whole = StreamSplitter()
+        uncut = [*whole.feed(stream, 0.0), *whole.end()]
+        assert list(map(facts_of, found)) == list(map(facts_of, uncut)), "the cuts change what is found"
+        assert splitter.counters == whole.counters
+
+    return run
+
+
+def make_datagrams() -> Run:
+    """A local program's datagram, and the same bytes as the payload of an envelope."""
+
+    def run(data: bytes) -> None:
+        script = Script(data)
+        while script:
+            if script.byte() & 3:
+                datagram = b"".join(made(script) for _ in range(1 + script.byte() % 4))
+            else:
+                datagram = script.take(script.byte())
+            TALLY.add(datagram)
+            counters = SplitCounters()
+            check_split(datagram, split_datagram(datagram, counters), counters)
+            counters = SplitCounters()
+            frames = split_payload(datagram, counters)
+            check_split(datagram, frames, counters)
+            again = SplitCounters()
+            whole = b"".join(each.raw for each in frames)
+            found_again = split_payload(whole, again)
+            assert list(map(facts_of, found_again)) == list(map(facts_of, frames)), "what was found is lost"
+            assert again.garbage_bytes == 0
+
+    return run
+
+
+POLICIES: Final[tuple[dict[str, object], ...]] = (
+    {},
+    {"system_ids": [1, 2, "4-5"], "role": "vehicle"},
+    {"system_ids": [1, 2, 3], "allow_in": ["telemetry", "HEARTBEAT", "30", "MAV_CMD_NAV_TAKEOFF"], "mavlink1": False},
+    {
+        "system_ids": "all",
+        "deny_in": ["MAV_CMD_DO_FLIGHTTERMINATION"],
+        "deny_out": ["files"],
+        "rate_in": {"ATTITUDE": 2},
+    },
+    {"system_ids": [6], "role": "operator", "ground_station": False},
+    {"system_ids": [7], "role": "observer"},
+)
+_CLAIMS: Final = (None, {1, 2, 4, 5}, {1, 2, 3}, None, {6}, {7})
+"""The systems that each policy lets speak."""
+
+
+_BOUNDS = (
+    (routing, ("MAX_ADDRESSES_PER_PORT", "MAX_FRAMES_REMEMBERED", "MAX_DECISIONS")),
+    (policing, ("MAX_COUNTED", "MAX_BUCKETS", "MAX_DECISIONS")),
+    (switching, ("MAX_FLOWS",)),
+)
+
+
+@contextmanager
+def small_tables() -> Iterator[None]:
+    """Tables that hold eight: a script reaches the end of each, and sees whether it is one."""
+    before = [(module, name, getattr(module, name)) for module, names in _BOUNDS for name in names]
+    for module, name, _ in before:
+        setattr(module, name, 8)
+    try:
+        yield
+    finally:
+        for module, name, limit in before:
+            setattr(module, name, limit)
+
+
+def make_switch() -> Run:
+    """Six programs, each with a policy, at one switch: who may not speak is not heard, and nothing comes back."""
+
+    @small_tables()
+    def run(data: bytes) -> None:
+        script = Script(data)
+        refused: Counter[Refusal] = Counter()
+        router = Router[Port]()
+        switch = Switch(router, lambda _, why: refused.update((why,)))
+        programs = [Program(str(number)) for number in range(len(POLICIES))]
+        policies = [policy(**each) for each in POLICIES]
+        for program, each in zip(programs, policies, strict=True):
+            switch.add(program.port, each)
+        now = 0.0
+        while script:
+            what = script.byte()
+            if what & 0xF0 == 0xF0:
+                now += (what & 15) ** 2
+                switch.router.refresh(now)
+                continue
+            number = what % len(programs)
+            raw = b"".join(made(script) for _ in range(1 + (what >> 6)))
+            TALLY.add(raw)
+            frames = split_datagram(raw, SplitCounters())
+            switch.forward(programs[number].port, frames, now)
+            _check_told(programs, number, frames)
+        _check_tables(router, switch, policies)
+
+    return run
+
+
+def _check_told(programs: list[Program], source: int, frames: list[Frame]) -> None:
+    """Nobody was told more than was sent, its sender nothing; no system that it may not speak as, nor keys."""
+    sent = Counter(each.raw for each in frames)
+    by_raw = {each.raw: each.header for each in frames}
+    assert not programs[source].told, "a frame went back to where it came from"
+    for program in programs:
+        for raw, amount in Counter(program.told).items():
+            assert amount <= sent[raw], "told more often than sent"
+            header = by_raw[raw]
+            claims = _CLAIMS[source]
+            assert claims is None or header.system in claims, "somebody spoke as another system"
+            assert header.msgid != policing.SETUP_SIGNING, "a signing key was passed on"
+        program.told.clear()
+
+
+def _check_tables(router: Router[Port], switch: Switch, policies: list[policing.Policy]) -> None:
+    for heard in router._heard_at.values():
+        assert len(heard) <= routing.MAX_ADDRESSES_PER_PORT, "too many addresses"
+    assert len(router._seen) <= routing.MAX_FRAMES_REMEMBERED
+    assert len(router._decisions) <= routing.MAX_DECISIONS
+    for flows in switch._flows.values():
+        assert len(flows) <= switching.MAX_FLOWS
+    for each in policies:
+        for gate in (each.incoming, each.outgoing):
+            assert len(gate.refused) <= policing.MAX_COUNTED + len(Refusal), "too much is counted by itself"
+            assert len(gate._decisions) <= policing.MAX_DECISIONS
+            assert len(gate._buckets) <= policing.MAX_BUCKETS
+
+
+def make_gate() -> Run:
+    """One policy asked about any frames: what it lets pass at any rate it lets pass; its memory is bounded."""
+    wanted = POLICIES
+
+    @small_tables()
+    def run(data: bytes) -> None:
+        script = Script(data)
+        number = script.byte() % len(wanted)
+        gate = policy(**wanted[number]).incoming
+        now = 0.0
+        while script:
+            now += script.byte() / 256
+            raw = made(script)
+            TALLY.add(raw)
+            for frame in split_datagram(raw, SplitCounters()):
+                always = gate.always_passes(frame.header)
+                refusal = gate.check(frame, now)
+                assert not (always and refusal), "what always passes was refused"
+                claims = _CLAIMS[number]
+                assert refusal or claims is None or frame.header.system in claims, "spoke as another system"
+                assert refusal or frame.header.msgid != policing.SETUP_SIGNING, "a signing key may pass"
+        assert len(gate.refused) <= policing.MAX_COUNTED + len(Refusal)
+        assert len(gate._decisions) <= policing.MAX_DECISIONS
+        assert len(gate._buckets) <= policing.MAX_BUCKETS
+
+    return run
+
+
+def seeds() -> list[bytes]:
+    """Frames of each kind, whole, broken and cut."""
+    one = b"".join(
+        bytes((2, how, system, 1, 9)) + bytes(range(9)) for how in range(0, 256, 7) for system in (1, 2, 6)
+    )
+    return [
+        bytes(range(16)) + b"\0" + one,
+        b"\xff" * 16 + b"\0" + one,
+        bytes(16) + b"\xff\xfe\xfd" + one,
+        one,
+        one[1:],
+    ]

@@ -1,0 +1,252 @@
+"""Handshake messages that are sealed with the right keys, around any header, parameters and key share.
+
+To bravo, as an initiator whom it knows or not; to alpha, as the responder that it calls. What says other things in
+clear than inside, or asks for what the protocol does not have, is refused by its own reason. What is accepted gives
+keys to both ends. Tables stay within their bounds; afterwards an honest handshake completes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Final
+
+from tests.core.harness import AT_A, AT_B, ELSEWHERE, KEY_A, KEY_B, KEY_C, Pair, datagrams, of, only, with_macs
+from tests.fuzz.engine import TALLY, Run, Script
+from tests.fuzz.stages import GROUPS, LINKS, NOW, Chance, copier, pair_of
+from uavlinkd.core import constants as c
+from uavlinkd.core import handshake, noise, wire
+from uavlinkd.core.crypto import KeyPair
+from uavlinkd.core.drops import DropReason
+from uavlinkd.core.limits import TokenBucket
+from uavlinkd.core.noise import HandshakeState, Token
+from uavlinkd.core.outputs import Dropped, Output, SessionEstablished, Transmit
+
+LINK: Final = replace(LINKS[0], suites=GROUPS)
+KEY_D: Final = KeyPair(bytes((4,)) * 32)
+CALLERS: Final = (KEY_A, KEY_A, KEY_C, KEY_D)
+"""Two whom bravo knows, and one whom it does not."""
+OFTEN: Final = (GROUPS[0], GROUPS[0], GROUPS[0], GROUPS[1])
+_REFUSALS = (DropReason.HEADER_MISMATCH, DropReason.BAD_PARAMETERS)
+
+
+def write(
+    state: HandshakeState, tokens: tuple[Token, ...], payload: bytes, share: bytes | None, chance: Chance
+) -> tuple[HandshakeState, bytes]:
+    """WriteMessage; ``share``: these bytes in place of an honest share or ciphertext, and nobody knows the secret."""
+    if share is None or not state.suite.has_group:
+        return state.write(tokens, payload, chance)
+    message = b""
+    for token in tokens:
+        symmetric = state.symmetric
+        if token is Token.E:
+            e = KeyPair(chance(c.KEY_BYTES))
+            message += e.public
+            state = replace(state, e=e, symmetric=state._mix_ephemeral(e.public))
+        elif token in (Token.S, Token.E1, Token.EKEM1):
+            symmetric, sealed = symmetric.encrypt_and_hash(state.s.public if token is Token.S else share)
+            message += sealed
+            state = replace(state, symmetric=symmetric)
+        else:
+            state = state._mix(token)
+    symmetric, sealed = state.symmetric.encrypt_and_hash(payload)
+    return replace(state, symmetric=symmetric), message + sealed
+
+
+def _payload(script: Script, header: bytes) -> bytes:
+    """What is sealed: the header and parameters, most of them as they should be."""
+    how = script.byte()
+    parameters = bytearray(
+        wire.Parameters(
+            generation=script.long() if how & 1 else script.byte(),
+            confidential=bool(how & 2),
+            tag_bytes=wire.TAG_LENGTHS[how >> 2 & 3],
+            mac_key_bits=wire.MAC_KEY_LENGTHS[how >> 4 & 3],
+            max_envelope=max(c.MIN_ENVELOPE_LIMIT, script.word() if how & 1 else 1232),
+        ).encode()
+    )
+    payload = bytearray(header[1:]) + parameters
+    if how & 0x40:
+        payload[script.byte() % len(payload)] ^= script.byte()
+    if how & 0x80:
+        piece = script.take(1 + (script.byte() & 15))
+        at = script.byte() % len(payload)
+        payload[at : at + len(piece)] = piece
+        payload = payload[: len(header) - 1 + wire.Parameters.SIZE].ljust(
+            len(header) - 1 + wire.Parameters.SIZE, b"\0"
+        )
+    return bytes(payload)
+
+
+def _share(script: Script, size: int) -> bytes | None:
+    """An honest share (None), or one that is any bytes: also the values that no group takes."""
+    how = script.byte()
+    match how & 7:
+        case 0:
+            return (how >> 3 & 3).to_bytes(max(size, 1), "big")[-size:] if size else b""
+        case 1:
+            return b"\xff" * size
+        case 2:
+            return script.take(32).ljust(size, b"\5")[:size]
+        case _:
+            return None
+
+
+def expected(payload: bytes, header: bytes) -> DropReason | None:
+    """Why an authentic payload behind this header must be refused, by its bytes alone."""
+    if payload[: len(header) - 1] != header[1:]:
+        return DropReason.HEADER_MISMATCH
+    *_, tag_bytes = payload[: len(header) + 7]
+    mac_key_bits = int.from_bytes(payload[len(header) + 7 : len(header) + 9], "big")
+    largest = int.from_bytes(payload[len(header) + 9 :], "big")
+    if tag_bytes not in (8, 12, 16, 32) or mac_key_bits not in (256, 512, 1024, 2048) or largest < 320:
+        return DropReason.BAD_PARAMETERS
+    return None
+
+
+def _refill(pair: Pair, now: float) -> None:
+    """A budget that does not run out: what is behind it is looked for here."""
+    for node in (pair.a.node, pair.b.node):
+        node._initiations = TokenBucket(c.INITIATIONS_PER_S, c.INITIATIONS_BURST, now)
+        node._responses = TokenBucket(c.INITIATIONS_PER_S, c.INITIATIONS_BURST, now)
+        for peer in node.peers.values():
+            peer.answers = TokenBucket(c.ANSWERS_PER_S, c.ANSWERS_BURST, now)
+
+
+def _refused(outputs: list[Output]) -> DropReason:
+    (dropped,) = outputs
+    assert isinstance(dropped, Dropped), f"not refused: {outputs}"
+    return dropped.reason
+
+
+def call(pair: Pair, script: Script, chance: Chance) -> None:
+    """An initiation to bravo."""
+    what = script.byte()
+    caller, suite = CALLERS[what & 3], OFTEN[what >> 2 & 3] if what & 0x30 else GROUPS[2]
+    header = wire.initiation_header(suite, script.word())
+    payload = _payload(script, header)
+    share = _share(script, suite.share_bytes)
+    start = noise.initiator(handshake.pattern_of(suite), suite, wire.prologue(suite), caller, KEY_B.public)
+    state, message = write(start, start.pattern.initiation, payload, share, chance)
+    datagram = with_macs(header + message, KEY_B.public)
+    path = (AT_A, ELSEWHERE)[what >> 6 & 1]
+    TALLY.add(datagram)
+    outputs = pair.b.node.receive(datagram, path, NOW)
+    if reason := expected(payload, header):
+        assert _refused(outputs) is reason, f"{reason} was not the reason: {outputs}"
+    elif caller is KEY_D:
+        assert _refused(outputs) is DropReason.UNKNOWN_PEER
+    elif type(outputs[0]) is Dropped:
+        assert share is not None, f"an honest share was refused: {outputs}"
+        assert _refused(outputs) is DropReason.INVALID_KEY_SHARE
+    else:
+        (sent,) = outputs
+        assert isinstance(sent, Transmit), f"more than an answer: {outputs}"
+        assert sent.path == path, "the answer went elsewhere"
+        assert len(sent.datagram) <= len(datagram), "an answer longer than its question"
+        if share is None:
+            _check_answer(state, wire.parse_parameters(payload[len(header) - 1 :]), sent.datagram)
+
+
+def _check_answer(state: HandshakeState, asked: wire.Parameters, datagram: bytes) -> None:
+    """The caller can read the answer, and what is agreed is no weaker than either end asked."""
+    initiated = handshake.Initiated(state, asked, b"")
+    agreed = handshake.receive_response(initiated, wire.parse_response(datagram)).parameters
+    ours = handshake.parameters_of(LINK, 0)
+    assert agreed.generation > min(asked.generation, 2**32 - 2)
+    assert agreed.confidential == (asked.confidential or ours.confidential)
+    assert agreed.tag_bytes >= max(asked.tag_bytes, ours.tag_bytes)
+    assert agreed.mac_key_bits >= max(asked.mac_key_bits, ours.mac_key_bits)
+    assert agreed.max_envelope <= min(asked.max_envelope, ours.max_envelope)
+
+
+def answer(pair: Pair, script: Script, initiation: bytes, chance: Chance) -> bool:
+    """A response to alpha, from who has bravo's key; whether it made a session."""
+    received = handshake.receive_initiation(KEY_B, wire.parse_initiation(initiation))
+    suite = received.initiation.suite
+    what = script.byte()
+    header = wire.response_header(suite, script.word(), received.initiation.sender_index)
+    payload = _payload(script, header)
+    share = _share(script, suite.ciphertext_bytes)
+    pattern = handshake.pattern_of(suite)
+    _, message = write(received.state.with_psk(noise.NO_PSK), pattern.response, payload, share, chance)
+    datagram = with_macs(header + message, KEY_A.public)
+    if what & 7 == 7 and pair.a.peer.caller.pending:  # one that nobody can have sealed
+        datagram = datagram[:-33] + bytes((datagram[-33] ^ 1,)) + datagram[-32:]
+        datagram = with_macs(datagram[: -wire.MACS_BYTES], KEY_A.public)
+    TALLY.add(datagram)
+    outputs = pair.a.node.receive(datagram, AT_B, NOW)
+    if type(outputs[0]) is Dropped:
+        reason = _refused(outputs)
+        if reason in _REFUSALS:
+            assert expected(payload, header) is reason
+        return False
+    assert expected(payload, header) is None, f"accepted what is none: {outputs}"
+    assert what & 7 != 7, f"accepted an altered response: {outputs}"
+    assert len(of(outputs, SessionEstablished)) == 1
+    return True
+
+
+def _check_bounds(pair: Pair) -> None:
+    for side in (pair.a, pair.b):
+        owned = 0
+        for peer in side.node.peers.values():
+            assert len(peer.sessions.unconfirmed) <= c.UNCONFIRMED_PER_PEER, "too many unconfirmed sessions"
+            owned += len(peer.sessions.unconfirmed) + len(peer.caller.pending) + len(peer.sessions.confirmed)
+        assert len(side.node._indices.owners) == owned, "an index that nobody owns"
+
+
+def make() -> Run:
+    """Both roles, in each kind of group."""
+    pairs = []
+    for suite in GROUPS:
+        pair = pair_of(replace(LINK, suites=(suite, *(each for each in GROUPS if each is not suite))))
+        pairs.append((copier(pair), pair.initiation(NOW)))
+        pairs[-1] = copier(pair), pairs[-1][1]
+
+    def run(data: bytes) -> None:
+        script = Script(data)
+        first = script.byte()
+        copy, initiation = pairs[(0, 0, 0, 0, 0, 1, 1, 2)[first & 7]]
+        pair = copy()
+        chance = Chance(5)
+        if first & 8:
+            while script and not answer(pair, script, initiation, chance):
+                _refill(pair, NOW)
+        else:
+            while script:
+                _refill(pair, NOW)
+                call(pair, script, chance)
+                _check_bounds(pair)
+        _check_sequel(pair, initiation)
+
+    return run
+
+
+def _check_sequel(pair: Pair, initiation: bytes) -> None:
+    """Alpha's own initiation is answered; where alpha has no session by then, the answer completes the handshake."""
+    _check_bounds(pair)
+    _refill(pair, NOW)
+    response = only(datagrams(pair.b.receive(initiation, NOW)))
+    if pair.a.peer.sessions.current is None:
+        assert of(pair.a.receive(response, NOW), SessionEstablished), "the genuine response makes no session"
+        assert pair.carries(NOW), "the link does not carry frames"
+
+
+def seeds() -> list[bytes]:
+    """Callers, suites, parameters and shares of each kind."""
+    calls = b"".join(
+        bytes((caller | 0x10, 1, 2, how, generation, 0, 0, 0, share, 9, 9))
+        for caller in range(16)
+        for how, generation in ((0, 0), (0x3F, 255), (0x40, 3), (0x80, 7))
+        for share in (3, 2)
+    )
+    ffdhe = b"".join(bytes((2, 1, 2, 0, 0, share)) for share in (0, 8, 16, 1, 2, 3))
+    answers = b"".join(bytes((7, 1, 2, how, 0, 3)) for how in (0, 4, 8, 16)) + bytes((0, 0, 5, 0x7C, 1, 3, 3))
+    return [
+        b"\0" + calls[:700],
+        b"\5" + calls[-700:],
+        b"\7" + ffdhe,
+        b"\x08" + answers,
+        b"\x0d" + answers,
+        b"\x08" + calls[:300],
+    ]

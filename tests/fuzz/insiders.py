@@ -1,0 +1,259 @@
+"""What lies behind the tag: a configured peer that holds its keys, and says what it likes.
+
+The peer makes handshakes as it likes, seals any payload under any counter on any of its sessions, sends recorded
+envelopes again, from several addresses, and lets time pass. After each datagram: what is delivered was sealed by the
+peer, as often at most; an address that proved nothing gets no more bytes than it sent; tables stay within their
+bounds. Afterwards an honest handshake gives a link that works.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Final
+
+from tests.core.harness import AT_A, ELSEWHERE, FRAME, KEY_A, KEY_B, Pair, of
+from tests.fuzz.engine import TALLY, Run, Script
+from tests.fuzz.stages import LINKS, NOW, Chance, copier, pair_of
+from uavlinkd.core import constants as c
+from uavlinkd.core import handshake, wire
+from uavlinkd.core.cookie import MacKeys
+from uavlinkd.core.outputs import Deliver, Dropped, Output, Path, Transmit
+from uavlinkd.core.session import Session
+from uavlinkd.core.settings import Link, PeerSettings, Timers
+
+PATHS: Final = (AT_A, AT_A, ELSEWHERE, (0, "2001:db8::9", 5))
+CHECKS_THE_SEQUEL: Final = 0xE0
+_LIVELY = Timers()
+
+
+class Insider:
+    """The hostile peer's end, and the victim's: alpha's keys against bravo."""
+
+    def __init__(self, pair: Pair, link: Link) -> None:
+        self.pair = pair
+        self.node = pair.b.node
+        self.peer = pair.b.peer
+        self.now = NOW
+        self.link = link
+        self.sessions: list[Session] = [pair.a.session]
+        self.sealed: Counter[bytes] = Counter()
+        self.delivered: Counter[bytes] = Counter()
+        self.recorded: list[bytes] = []
+        self.tokens: list[bytes] = [bytes(8)]
+        self.echoes: list[int] = [0]
+        self._chance = Chance(77)
+        self._to_bravo = MacKeys(KEY_B.public)
+
+    # What it does.
+
+    def step(self, script: Script) -> None:
+        """One thing that a script says."""
+        what = script.byte()
+        match what & 15:
+            case 0 | 1 | 2:
+                self._offer(self._seal(script.take(script.byte() & 63), script, what), what)
+            case 3:
+                self._offer(self._seal(b"\xfd" + script.take(script.byte()), script, what), what)
+            case 4 | 5:
+                self._offer(self._seal(self._record(script), script, what), what)
+            case 6:
+                self._pass(script.byte() / 64)
+            case 7:
+                self._pass((script.byte() / 16) ** 2)  # to beyond a session's life
+            case 8:
+                if self.recorded:
+                    self._offer(self.recorded[script.word() % len(self.recorded)], what)
+            case 9:
+                self._take(self.node.send("alpha", [FRAME] * (script.byte() & 7), self.now), None)
+            case 10:
+                self.call(script.byte(), what, self.link)
+            case 11:
+                for _ in range(script.byte() & 63):  # many frames at once, of any size
+                    self._offer(self._seal(b"\xfe" + bytes(script.byte() << 4), script, what), what)
+            case 12:
+                self._offer(self._seal(b"", script, what), what)
+            case _:
+                self._offer(self._seal(self._record(script), script, what | 0x80), what)
+
+    def call(self, generation: int, what: int, link: Link) -> Session | None:
+        """A sound handshake; the session if there was an answer."""
+        bravo = PeerSettings("bravo", KEY_B.public, None, link)
+        index = 1 + int.from_bytes(self._chance(2), "big") % 65535
+        initiated = handshake.initiate(KEY_A, bravo, index, generation, self._chance)
+        outputs = self._offer(self._to_bravo.add_macs(initiated.message, None), what)
+        for sent in of(outputs, Transmit):
+            if sent.datagram[0] != wire.RESPONSE:
+                continue
+            response = wire.parse_response(sent.datagram)
+            keys = handshake.receive_response(initiated, response)
+            session = Session(
+                self.pair.a.peer, response.suite, keys, index, self.now, c.REJECT_AFTER_S, is_initiator=True
+            )
+            self.sessions.append(session)
+            del self.sessions[:-8]
+            return session
+        return None
+
+    def _record(self, script: Script) -> bytes:
+        """A control record that is one, or nearly."""
+        which = script.byte()
+        token = self.echoes[which >> 4 & 3 & (len(self.echoes) - 1)]
+        match which & 7:
+            case 0:
+                return wire.Echo(False, script.word(), script.long(), script.long()).encode()
+            case 1:
+                return wire.Echo(True, token, script.byte(), script.byte(), script.byte()).encode()
+            case 2:
+                return wire.Echo(True, script.long(), script.long(), script.long(), script.long()).encode()
+            case 3:
+                return wire.PathChallenge(script.take(8).ljust(8, b"\0")).encode()
+            case 4:
+                return wire.PathResponse(self.tokens[-1]).encode()
+            case 5:
+                return wire.PathResponse(script.take(8).ljust(8, b"\0")).encode()
+            case 6:
+                return wire.Close().encode()
+            case _:
+                return bytes((script.byte() % wire.FRAMES_FROM,)) + script.take(script.byte() & 31)
+
+    def _seal(self, payload: bytes, script: Script, what: int) -> bytes:
+        """An envelope around anything; sometimes on an older session, or under a counter of its choice."""
+        session = self.sessions[-1]
+        if what & 0x80:
+            how = script.byte()
+            session = self.sessions[-1 - (how & 7) % len(self.sessions)]
+            if how & 8:
+                session.send_counter = script.long()
+            elif how & 16:
+                session.send_counter = max(0, session.send_counter - script.word())
+            elif how & 32:
+                session.send_counter += script.word()
+        session.send_counter %= c.SESSION_ENVELOPE_LIMIT
+        datagram = session.seal(payload, self.now)
+        self.sealed[payload] += 1
+        self.recorded.append(datagram)
+        del self.recorded[:-64]
+        return datagram
+
+    def _pass(self, seconds: float) -> None:
+        """Time goes by, and the victim's timers run."""
+        until = self.now + seconds
+        for _ in range(12):
+            due = self.node.next_deadline()
+            if due > until:
+                break
+            self.now = max(self.now, due)
+            self._take(self.node.handle_timeout(self.now), None)
+        self.now = until
+        self._take(self.node.handle_timeout(self.now), None)
+
+    # What must hold.
+
+    def _offer(self, datagram: bytes, what: int) -> list[Output]:
+        path = PATHS[what >> 5 & 3]
+        TALLY.add(datagram)
+        before = self.peer.path
+        outputs = self.node.receive(datagram, path, self.now)
+        unproven = [each.datagram for each in of(outputs, Transmit) if each.path not in (before, self.peer.path)]
+        assert all(each.path in (path, before, self.peer.path) for each in of(outputs, Transmit)), "sent elsewhere"
+        assert sum(map(len, unproven)) <= len(datagram), "more bytes to an unproven address than came from there"
+        self._take(outputs, path)
+        return outputs
+
+    def _take(self, outputs: list[Output], path: Path | None) -> None:
+        refused = 0
+        for out in outputs:
+            if type(out) is Transmit:
+                self._see(out)
+            elif type(out) is Deliver:
+                assert out.peer == "alpha", "delivered in another's name"
+                assert out.payload[0] >= wire.FRAMES_FROM, "a control record was delivered"
+                self.delivered[out.payload] += 1
+                assert self.delivered[out.payload] <= self.sealed[out.payload], "delivered more often than sent"
+            elif type(out) is Dropped and out.path is not None:
+                refused += 1
+        assert refused <= (path is not None), f"one datagram, {refused} drops"
+
+    def _see(self, sent: Transmit) -> None:
+        """Learn from what the victim says what an honest peer would learn."""
+        if sent.datagram[0] not in (wire.SHORT_ENVELOPE, wire.LONG_ENVELOPE):
+            return
+        index, counter, header_bytes = wire.parse_envelope_header(sent.datagram)
+        for session in self.sessions:
+            if session.local_index == index:
+                payload = session._receive.open(sent.datagram, header_bytes, counter)
+                if payload and payload[0] < wire.FRAMES_FROM:
+                    self._learn(wire.parse_control(payload))
+
+    def _learn(self, control: wire.Control) -> None:
+        if isinstance(control, wire.PathChallenge):
+            self.tokens = [*self.tokens[-3:], control.token]
+        elif isinstance(control, wire.Echo) and not control.is_reply:
+            self.echoes = [*self.echoes[-3:], control.token]
+
+    def check_bounds(self) -> None:
+        peer, sessions = self.peer, self.peer.sessions
+        assert len(sessions.confirmed) <= c.USABLE_PER_PEER, "too many sessions"
+        assert len(sessions.unconfirmed) <= c.UNCONFIRMED_PER_PEER, "too many unconfirmed sessions"
+        assert len(peer.caller.pending) <= c.PENDING_PER_PEER, "too many initiations"
+        owned = len(sessions.confirmed) + len(sessions.unconfirmed) + len(peer.caller.pending)
+        assert len(self.node._indices.owners) == owned, "an index that nobody owns"
+        assert len(peer.remembered) == len(self.node._remembered) <= c.REMEMBERED_INITIATIONS
+        for session in sessions.confirmed:
+            doubt = session.doubt
+            assert len(doubt.asked) <= c.ECHOES_REMEMBERED, "too many echoes"
+            assert doubt._held_bytes <= c.HELD_BYTES or len(doubt._held) == 1, "too much is held"
+            assert len(session._heard_lately._steps) <= 16, "too many steps"
+
+    def check_sequel(self) -> None:
+        """Whatever it did: after a while an honest handshake gives a link that carries frames both ways."""
+        self._pass(c.REJECT_AFTER_S)
+        session = self.call(0, 0, self.link)
+        assert session is not None, "no answer to an honest handshake"
+        confirmation = wire.Echo(False, 1, 0, 0).encode()
+        self.sessions.append(session)
+        for payload in (confirmation, FRAME):
+            self.sealed[payload] += 1
+            before = self.delivered[FRAME]
+            self._offer(session.seal(payload, self.now), 0)
+        assert self.delivered[FRAME] == before + 1, "a frame on a new session was not delivered"
+        outputs = self.node.send("alpha", [FRAME], self.now)
+        (envelope,) = (each.datagram for each in of(outputs, Transmit))
+        index, counter, header_bytes = wire.parse_envelope_header(envelope)
+        assert index == session.local_index
+        assert session._receive.open(envelope, header_bytes, counter) == FRAME, "a frame that cannot be opened"
+
+
+def make_sealed() -> Run:
+    """Payloads and control records under genuine keys."""
+    links = [Link(timers=_LIVELY), *LINKS[1:]]
+    pairs = [copier(pair_of(link).establish(NOW)) for link in links]
+
+    def run(data: bytes) -> None:
+        script = Script(data)
+        first = script.byte()
+        which = first % len(links)
+        insider = Insider(pairs[which](), links[which])
+        while script:
+            insider.step(script)
+            insider.check_bounds()
+        if first & CHECKS_THE_SEQUEL == CHECKS_THE_SEQUEL:
+            insider.check_sequel()
+
+    return run
+
+
+def sealed_seeds() -> list[bytes]:
+    """Each kind of step; doubts, closes and roaming among them."""
+    every = b"".join(
+        bytes((kind | path << 5, record, 1, 2, 3, 4, 5))
+        for path in range(3)
+        for kind in range(16)
+        for record in range(8)
+    )
+    doubt = bytes((6, 200, 3, 5, 1, 2, 3, 4, 5, 4, 0x31, 0, 0, 0, 6, 30, 4, 0x31, 255, 255, 255))
+    calls = bytes((10, 0) * 8 + (6, 64) + (10, 0) * 4 + (6, 64)) + bytes((10, 0) * 4 + (6, 64)) * 3
+    roaming = bytes((12 | 0x40, 5, 4 | 0x40, 4, 9, 3, 12, 9, 2, 10, 1, 12, 4, 6, 7, 255))
+    parts = [every[at : at + len(every) // 4] for at in range(0, len(every), len(every) // 4)]
+    found = [bytes((CHECKS_THE_SEQUEL | link,)) + part for link, part in enumerate(parts)]
+    return [*found, bytes((CHECKS_THE_SEQUEL,)) + doubt * 6 + roaming * 4, bytes((0,)) + calls, bytes((1,)) + doubt]

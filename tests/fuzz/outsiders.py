@@ -1,0 +1,238 @@
+"""Datagrams from who holds no key of the two peers: to a node before a handshake, during one, and on a session.
+
+The attacker has recorded what went by. It sends that, altered, and anything else, from any address; where it knows
+the victim's public key it repairs ``mac1``. For every datagram: nothing is emitted, but a cookie to who repaired
+``mac1``; exactly one drop is counted. After all of them the node is as it was, and what it waited for still works.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import Final
+
+from tests.core.harness import exchange, of, state_of, with_macs
+from tests.fuzz.engine import TALLY, Run, Script
+from tests.fuzz.stages import LINKS, Stage, copier, idle, initiator, responder, session, with_suite
+from uavlinkd.core import constants as c
+from uavlinkd.core import wire
+from uavlinkd.core.drops import DropReason
+from uavlinkd.core.limits import TokenBucket
+from uavlinkd.core.node import Node
+from uavlinkd.core.outputs import Dropped, Output, Path, SessionEstablished, Transmit
+from uavlinkd.core.suites import SUITES, SUITES_BY_NAME
+
+CHECKS_THE_SEQUEL: Final = 0xF0
+"""In a script's first byte, all of them: afterwards the genuine datagram comes, and the link must work."""
+BUDGET: Final = 8
+"""Handshake messages of a script that reach a key exchange."""
+_SPENT = frozenset(("drops", "_initiations", "_responses", "_entropy"))
+_SPENT_WITH_COOKIES = _SPENT | {"_cookie", "retry_at", "cookies_taken", "deadline", "_deadline"}
+_KINDS = (*range(1, 4), 0x40, 0x41, 0xFD, 0xFE, 0)
+_HANDSHAKE_SIZES = tuple(
+    size(suite) for suite in SUITES.values() for size in (wire.initiation_bytes, wire.response_bytes)
+)
+_SUITE_NUMBERS = tuple(SUITES)
+_REPAIRED = (wire.INITIATION, wire.RESPONSE)
+
+
+class Outsider:
+    """Runs scripts against one stage, which is as before after each."""
+
+    def __init__(self, stage: Stage) -> None:
+        self._stage = stage
+        self._node = stage.victim.node
+        self._receiver = self._node.public_key
+        self._chance = 0
+        # As they are, these are no forgeries. mac2 means nothing until the node is under load.
+        self._genuine = {*(stage.genuine, *stage.others)}
+        self._genuine |= {each[: -c.MAC_BYTES] for each in self._genuine if each[0] in _REPAIRED}
+        self._copy = copier(stage.pair)
+        self._take_pictures()
+
+    def run(self, script: Script, *, checks_the_sequel: bool) -> None:
+        """Offer every datagram of a script, then look at what is left."""
+        stage = self._stage
+        receive, genuine, sources, cookies = self._node.receive, self._genuine, stage.sources, stage.cookies
+        reasons: list[DropReason] = []
+        cookies_taken = 0
+        self._chance = zlib.crc32(script.data)
+        now = stage.now
+        self._reset()
+        while script:
+            how = script.byte()
+            datagram, is_repaired = self._datagram(script, how)
+            if datagram in genuine or datagram[: -c.MAC_BYTES] in genuine:
+                continue
+            path = sources[how >> 4 & 3]
+            now += (how >> 6) / 4096  # a script lasts up to half a second
+            TALLY.add(datagram)
+            outputs = receive(datagram, path, now)
+            if len(outputs) == 1 and type(outputs[0]) is Dropped:
+                reasons.append(outputs[0].reason)
+            elif not outputs and datagram in cookies:
+                cookies_taken += 1
+            else:
+                assert is_repaired, f"a stranger who knows no key got {outputs}"
+                reasons.append(_judge_cookie(outputs, datagram, path))
+        counted = Counter(self._node.drops)
+        for peer in self._node.peers.values():
+            counted += peer.traffic.drops
+        assert counted == Counter(reasons), f"dropped {reasons}, counted {counted}"
+        if cookies_taken:
+            assert state_of(self._node, ignoring=_SPENT_WITH_COOKIES) == self._before_cookies, (
+                "a forgery left a trace"
+            )
+        else:
+            assert state_of(self._node, ignoring=_SPENT) == self._before, "a forgery left a trace"
+        if checks_the_sequel:
+            self._check_sequel(now)
+        if checks_the_sequel or cookies_taken:
+            self._restore()
+
+    def _datagram(self, script: Script, how: int) -> tuple[bytes, bool]:
+        """The next datagram, and whether its sender made it with the victim's public key."""
+        match how & 7:
+            case 0 | 1 | 2 | 3 as kind:
+                return self._altered(script, is_varied=kind > 0)
+            case 4:
+                return self._of_right_length(script), False
+            case 5:
+                return with_macs(self._of_right_length(script)[: -wire.MACS_BYTES], self._receiver), True
+            case 6:
+                return bytes((_KINDS[script.byte() & 7],)) + script.take(script.byte() & 63), False
+            case _:
+                return script.take(script.byte() & 63), False
+
+    def _altered(self, script: Script, *, is_varied: bool) -> tuple[bytes, bool]:
+        """One of the recorded datagrams with a few bytes changed, cut or longer, with ``mac1`` made right or not.
+
+        ``is_varied``: one byte more, chosen by the whole script, so that a script with one change in it does not
+        offer the same datagrams again but for one.
+        """
+        templates = self._stage.templates
+        what = script.byte()
+        altered = bytearray(templates[(what >> 4) % len(templates)])
+        if is_varied:
+            self._chance = (self._chance * 1103515245 + 12345) & 0xFFFFFFFF
+            altered[(self._chance >> 8) % len(altered)] ^= 1 + (self._chance >> 24) % 255
+        for _ in range(1 + (what & 3)):
+            if altered:
+                altered[script.word() % len(altered)] ^= script.byte()
+        if what & 4:
+            if script.byte() & 1:
+                altered += script.take(script.byte() & 31)
+            else:
+                del altered[script.word() % (len(altered) + 1) :]
+        datagram = bytes(altered)
+        if what & 8 and len(datagram) > wire.MACS_BYTES:
+            return with_macs(datagram[: -wire.MACS_BYTES], self._receiver), True
+        return datagram, False
+
+    def _of_right_length(self, script: Script) -> bytes:
+        """A handshake message or cookie of which nothing but the length is right."""
+        what = script.byte()
+        kind = 1 + what % 3
+        if kind == wire.COOKIE:
+            return (bytes((kind, 0)) + script.take(what >> 2)).ljust(wire.COOKIE_BYTES, b"\7")
+        suite = SUITES[_SUITE_NUMBERS[(what >> 2) % len(_SUITE_NUMBERS)]]
+        size = (wire.initiation_bytes if kind == wire.INITIATION else wire.response_bytes)(suite)
+        return (bytes((kind, suite.number)) + script.take(script.byte() & 31)).ljust(size, b"\7")[:size]
+
+    def _check_sequel(self, now: float) -> None:
+        """What the victim waits for comes, at last: it completes, and frames cross both ways."""
+        stage = self._stage
+        victim, other = stage.victim, stage.other
+        _refill(victim.node, now)
+        outputs = victim.receive(stage.genuine, now)
+        assert not of(outputs, Dropped), f"the genuine datagram was dropped: {outputs}"
+        seen = [*outputs, *exchange(other, victim, outputs, now)]
+        assert victim.peer.sessions.current, "the genuine datagram made no session"
+        assert victim.peer.is_up or of(seen, SessionEstablished)
+        assert stage.pair.carries(now), "the link does not carry frames any more"
+
+    def _reset(self) -> None:
+        """What a run may spend and count."""
+        _refill(self._node, self._stage.now)
+
+    def _restore(self) -> None:
+        """The stage as it was."""
+        self._stage.pair = self._copy()
+        self._node = self._stage.victim.node
+        self._take_pictures()
+
+    def _take_pictures(self) -> None:
+        self._reset()
+        self._before = state_of(self._node, ignoring=_SPENT)
+        self._before_cookies = state_of(self._node, ignoring=_SPENT_WITH_COOKIES)
+
+
+def _refill(node: Node, now: float) -> None:
+    """Budgets as at the beginning, and no drops. Small ones, so that scripts come to where cookies are asked for."""
+    node._initiations = TokenBucket(1.0, BUDGET, now)
+    node._responses = TokenBucket(1.0, BUDGET, now)
+    node.drops.clear()
+    for peer in node.peers.values():
+        peer.traffic.drops.clear()
+
+
+def _judge_cookie(outputs: Sequence[Output], datagram: bytes, path: Path) -> DropReason:
+    """The only answer that who knows the public key may get: a cookie, to itself, and no longer than the question."""
+    assert len(outputs) == 2, f"more than a cookie: {outputs}"
+    sent, dropped = outputs
+    assert isinstance(sent, Transmit), f"more than a cookie: {outputs}"
+    assert isinstance(dropped, Dropped), f"more than a cookie: {outputs}"
+    assert dropped.reason is DropReason.COOKIE_REQUIRED
+    assert sent.datagram[0] == wire.COOKIE
+    assert sent.path == path, "a cookie went elsewhere"
+    assert len(sent.datagram) <= len(datagram), "an answer longer than its question"
+    return dropped.reason
+
+
+def _make(stages: Callable[[], Sequence[Stage]]) -> Run:
+    outsiders = [Outsider(each) for each in stages()]
+
+    def run(data: bytes) -> None:
+        script = Script(data)
+        first = script.byte()
+        outsider = outsiders[(first & ~CHECKS_THE_SEQUEL) % len(outsiders)]
+        outsider.run(script, checks_the_sequel=first & CHECKS_THE_SEQUEL == CHECKS_THE_SEQUEL)
+
+    return run
+
+
+def make_idle() -> Run:
+    """Before any handshake."""
+    return _make(lambda: [idle(LINKS[0]), idle(with_suite(LINKS[0], SUITES_BY_NAME["mlkem768"]))])
+
+
+def make_initiator() -> Run:
+    """While an initiation of its own waits for the response."""
+    return _make(lambda: [initiator(LINKS[0]), initiator(with_suite(LINKS[0], SUITES_BY_NAME["mlkem768"]))])
+
+
+def make_responder() -> Run:
+    """While an answer of its own waits to be confirmed."""
+    return _make(lambda: [responder(LINKS[0]), responder(LINKS[3])])
+
+
+def make_session() -> Run:
+    """On an established session, of each kind of envelope."""
+    return _make(lambda: [*(session(link) for link in LINKS), session(LINKS[0], counter=2**16 + 5)])
+
+
+def seeds() -> list[bytes]:
+    """Some of each kind: every recorded datagram with a byte changed here and there."""
+    found = []
+    for stage in range(5):
+        steps = bytearray((CHECKS_THE_SEQUEL | stage,))
+        for template in range(8):
+            for place in (0, 1, 3, 5, 8, 20, 60, 118):
+                how, what = (place & 3) << 4 | place & 1, template << 4 | (8 if place & 1 else 0)
+                steps += bytes((how, what, 0, place, 1 << (place & 7)))
+        found.append(bytes(steps))
+    kinds = b"".join(
+        bytes((how, kind, size)) + bytes(range(size)) for how in (4, 5, 6, 7) for kind in range(8) for size in (0, 40)
+    )
+    return [*found, b"\xf0" + kinds, b"\x01" + kinds]
