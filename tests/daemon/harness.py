@@ -288,6 +288,10 @@ class DaemonProcess:
         """All that it answered, as JSON."""
         self.exit_status: int | None = None
         """Of the last process; None while it runs."""
+        self.launcher: tuple[str, ...] = ()
+        """What starts the program, such as ``ip netns exec NAME``. It becomes the program: there is one process."""
+        self.environ: dict[str, str] = {}
+        """What stands in its environment besides ours, however it is started."""
         self._process: asyncio.subprocess.Process | None = None
         self._reading: asyncio.Task[None] | None = None
         self._changes = Changes()
@@ -352,11 +356,11 @@ class DaemonProcess:
         self.exit_status = None
         master, slave = os.openpty() if on_terminal else (None, asyncio.subprocess.PIPE)
         self._process = await asyncio.create_subprocess_exec(
-            *(sys.executable, *self._program(), "run", "--config", str(self.config_file)),
+            *(*self.launcher, sys.executable, *self._program(), "run", "--config", str(self.config_file)),
             stdin=asyncio.subprocess.DEVNULL,
             stdout=slave if on_terminal else asyncio.subprocess.PIPE,
             stderr=slave if on_terminal else asyncio.subprocess.STDOUT,
-            env={**os.environ, **(environ or {})},
+            env={**os.environ, **self.environ, **(environ or {})},
         )
         if master is not None:
             os.close(slave)
