@@ -53,7 +53,7 @@ FAULTS: Mapping[str, Fault] = {
     "name_service_silent": Fault("a name server that answers nothing", machine.name_service_silent, True),
     "recording_disk_full": Fault("the disk for recordings is full", machine.recording_disk_full, True),
     "log_disk_full": Fault("the disk for the log is full", machine.log_disk_full, True),
-    "clock_jumps": Fault("the clock leaps to 2036 and to 1971", machine.clock_jumps),
+    "clock_jumps": Fault("the clock leaps ten years ahead, and 54 back", machine.clock_jumps),
     "suspended": Fault("the process is stopped (`SIGSTOP`)", machine.suspended),
     "garbage": Fault("a peer seals garbage with its valid keys", machine.garbage_with_valid_keys),
 }
