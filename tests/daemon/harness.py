@@ -26,7 +26,7 @@ import signal
 import socket
 import sys
 import tempfile
-from base64 import b64encode
+from base64 import b64encode, urlsafe_b64encode
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -577,6 +577,7 @@ def secret_forms(secret: str) -> list[str]:
     """How a key could stand in text, whole or its first half."""
     raw = keys.decode_key(secret)
     forms = [secret.rstrip("="), raw.hex(), repr(raw)[2:-1], str(list(raw))[1:-1]]
+    forms += [urlsafe_b64encode(raw).decode().rstrip("="), urlsafe_b64encode(raw[:15]).decode()]
     forms += [b64encode(raw[:15]).decode(), raw[:16].hex(), repr(raw[:16])[2:-1], raw.hex(" "), raw.hex(":")]
     return forms + [form.upper() for form in forms if form == form.lower()]
 

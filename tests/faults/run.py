@@ -42,7 +42,7 @@ class Fault:
 
 
 FAULTS: Mapping[str, Fault] = {
-    "descriptors": Fault("no file descriptors (`RLIMIT_NOFILE`)", machine.descriptors),
+    "descriptors": Fault("no file descriptors (`RLIMIT_NOFILE`)", machine.descriptors, True),
     "buffers_full": Fault("no room in the socket's buffer (`EAGAIN`)", network.buffers_full, True),
     "firewall": Fault("a firewall forbids sending (`EPERM`)", network.firewall, True),
     "route_prohibited": Fault("the route is prohibited (`EACCES`)", network.route_prohibited, True),
