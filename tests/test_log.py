@@ -9,7 +9,8 @@ import json
 import os
 import sys
 from collections.abc import Iterator
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 import structlog
@@ -236,12 +237,7 @@ def test_a_full_disk_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_what_the_loop_could_not_do_is_a_line(recorder: Recorder, summary: DropSummary) -> None:
     """An error of the system that asyncio reports to nobody is summed up; any other keeps its traceback."""
     asked: list[dict[str, object]] = []
-
-    class Loop(asyncio.AbstractEventLoop):
-        def default_exception_handler(self, context: dict[str, object]) -> None:
-            asked.append(context)
-
-    loop = Loop()
+    loop = cast(asyncio.AbstractEventLoop, SimpleNamespace(default_exception_handler=asked.append))
     for _ in range(100):
         summary.on_loop_failure(loop, {"message": "accept() failed", "exception": OSError(errno.EMFILE, "full")})
     ((event, facts),) = recorder.lines

@@ -9,7 +9,7 @@ STALL_S = 2.5
 FLUSH_S = 0.25
 """How long after that what is read counts as having waited."""
 TURN_S = 0.05
-"""More than this between two turns is one more wait, for a busy processor, and does not count: the sockets are not yet
+"""More than this between two turns is one more wait, for a busy processor: it does not count, the sockets are not yet
 empty."""
 FLUSH_AT_MOST_S = 1.0
 """With all waits. A link with little traffic has no more turns than that, and is not to wait longer."""

@@ -22,6 +22,8 @@ from tests.faults.network import FAULT_S
 from tests.faults.talk import NOBODY, Log, Outcome, Talk, grew, prepare, told
 from tests.waiting import until
 
+SUSPENDED_S = float(os.environ.get("UAVLINKD_SIGSTOP_S", FAULT_S))
+"""How long a process is stopped; 30 in CI."""
 LINES_AT_MOST = 12
 """That a daemon may log for one of these faults, and two more each ten seconds."""
 
@@ -343,7 +345,7 @@ async def suspended(stage: Stage) -> Outcome:
     log = Log(a)
     await a.send_signal(signal.SIGSTOP)
     began = monotonic()
-    await asyncio.sleep(FAULT_S)
+    await asyncio.sleep(SUSPENDED_S)
     ended = monotonic()
     await a.send_signal(signal.SIGCONT)
     recovered_s = await talk.back(ended)

@@ -12,7 +12,7 @@ from tests.faults.cable import ADDRESSES, PORT, Cable
 from tests.faults.talk import Log, Outcome, grew, told
 
 FAULT_S = float(os.environ.get("UAVLINKD_FAULT_S", "4"))
-"""How long a fault lasts: longer than a peer may be silent (3 s). 30 in CI."""
+"""How long a fault lasts: longer than a peer may be silent (3 s)."""
 _NET = f"{ADDRESSES[0].rpartition('.')[0]}.0/24"
 
 Step = Callable[[Cable], Awaitable[None]]

@@ -13,7 +13,7 @@ from tests.daemon.harness import DaemonProcess, Stage
 from tests.faults import machine, network
 from tests.faults.talk import Outcome
 
-AT_ONCE = 6
+AT_ONCE = 8
 """Faults that are there at the same time: mostly they wait."""
 BACK_S = 2.0
 """All works again so long after the end of any fault."""
@@ -42,6 +42,7 @@ class Fault:
 
 
 FAULTS: Mapping[str, Fault] = {
+    "suspended": Fault("the process is stopped (`SIGSTOP`)", machine.suspended),
     "descriptors": Fault("no file descriptors (`RLIMIT_NOFILE`)", machine.descriptors, True),
     "buffers_full": Fault("no room in the socket's buffer (`EAGAIN`)", network.buffers_full, True),
     "firewall": Fault("a firewall forbids sending (`EPERM`)", network.firewall, True),
@@ -54,7 +55,6 @@ FAULTS: Mapping[str, Fault] = {
     "recording_disk_full": Fault("the disk for recordings is full", machine.recording_disk_full, True),
     "log_disk_full": Fault("the disk for the log is full", machine.log_disk_full, True),
     "clock_jumps": Fault("the clock leaps ten years ahead, and 54 back", machine.clock_jumps),
-    "suspended": Fault("the process is stopped (`SIGSTOP`)", machine.suspended),
     "garbage": Fault("a peer seals garbage with its valid keys", machine.garbage_with_valid_keys),
 }
 
