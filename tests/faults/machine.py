@@ -55,8 +55,8 @@ async def descriptors(stage: Stage) -> Outcome:
     recovered_s = monotonic() - ended
     assert talk.lost(began, ended) == 0, "the link does without new descriptors"
     talk.stop()
-    did = "the link lost no frame; " + "; ".join([await scene.told() for scene in scenes[:1]])
-    return Outcome(did, recovered_s, max(log.amount for log in logs))
+    did = [await scene.told() for scene in scenes]
+    return Outcome(f"the link lost no frame; {did[0]}", recovered_s, max(log.amount for log in logs))
 
 
 class _Exhausted:
