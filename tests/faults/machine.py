@@ -231,6 +231,7 @@ async def clock_jumps(stage: Stage) -> Outcome:
     a.environ = environ
     await stage.start(a, b)
     await talk.start()
+    await a.until(lambda status: status["recording"]["frames"] > 0)
     began, log = monotonic(), Log(a)
     recovered_s = 0.0
     recordings = a.folder / "recordings"
