@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
+import errno
 import io
 import json
+import os
+import sys
 from collections.abc import Iterator
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 import structlog
@@ -186,3 +191,58 @@ def test_quiet_is_quiet(recorder: Recorder, summary: DropSummary) -> None:
     assert recorder.counts() == [1]
     summary.add("datagrams_dropped", "bad_tag", "", 1, 2000.0)
     assert recorder.counts() == [1, 1]
+
+
+def lines_of(descriptor: int) -> list[dict[str, object]]:
+    """What is in a pipe, parsed."""
+    return [json.loads(line) for line in os.read(descriptor, 1 << 20).splitlines()]
+
+
+def log_into(descriptor: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have this process log there, as a daemon does to its standard error."""
+    stream = os.fdopen(descriptor, "w", closefd=False)
+    monkeypatch.setattr(sys, "__stderr__", stream)
+    set_up_logging("info", "json", stream)
+
+
+def test_a_reader_that_stopped_holds_nobody_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lines that find the pipe full are lost and counted; the first that is taken again says how many were."""
+    reader, writer = os.pipe()
+    log_into(writer, monkeypatch)
+    log = structlog.get_logger()
+    for number in range(2000):  # far more than a pipe holds, whole or in part
+        log.info("peer_up", number=number, filling="x" * 100)
+    kept = os.read(reader, 1 << 20).splitlines()
+    assert 100 < len(kept) < 2000
+    log.info("peer_lost")
+    after = [json.loads(line) for line in os.read(reader, 1 << 20).splitlines() if line]
+    assert [each["event"] for each in after][-1] == "peer_lost"
+    assert after[-1]["lines_lost_before"] >= 2000 - len(kept)
+    log.info("peer_up")
+    (last,) = lines_of(reader)
+    assert "lines_lost_before" not in last
+    os.close(reader)
+    log.info("nobody_reads")  # raises nothing
+    os.close(writer)
+
+
+def test_a_full_disk_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A log that cannot be written raises nothing where it is written to."""
+    descriptor = os.open("/dev/full", os.O_WRONLY)
+    log_into(descriptor, monkeypatch)
+    structlog.get_logger().warning("peer_lost")
+    os.close(descriptor)
+
+
+def test_what_the_loop_could_not_do_is_a_line(recorder: Recorder, summary: DropSummary) -> None:
+    """An error of the system that asyncio reports to nobody is summed up; any other keeps its traceback."""
+    asked: list[dict[str, object]] = []
+    loop = cast(asyncio.AbstractEventLoop, SimpleNamespace(default_exception_handler=asked.append))
+    for _ in range(100):
+        summary.on_loop_failure(loop, {"message": "accept() failed", "exception": OSError(errno.EMFILE, "full")})
+    ((event, facts),) = recorder.lines
+    assert (event, facts["reason"], facts["last"]) == ("calls_failed", "EMFILE", "accept() failed")
+    assert asked == []
+    mistake = {"message": "a mistake", "exception": KeyError("x")}
+    summary.on_loop_failure(loop, mistake)
+    assert asked == [mistake]

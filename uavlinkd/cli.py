@@ -9,7 +9,6 @@ import argparse
 import asyncio
 import math
 import os
-import resource
 import sys
 from collections.abc import Callable, Coroutine, Sequence
 from contextlib import suppress
@@ -118,9 +117,9 @@ def _add_daemon(command: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    with suppress(OSError, ValueError):  # a core dump would hold every key
-        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    from uavlinkd.core_dumps import forbid_core_dumps
 
+    forbid_core_dumps()
     from uavlinkd.config.errors import ConfigError
     from uavlinkd.config.reader import ConfigReader
 

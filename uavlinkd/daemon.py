@@ -103,6 +103,7 @@ class Daemon:
         stop = asyncio.Event()
         for number in (signal.SIGTERM, signal.SIGINT):
             self._loop.add_signal_handler(number, stop.set)
+        self._loop.set_exception_handler(self._drops.on_loop_failure)
         self._loop.add_signal_handler(signal.SIGHUP, self._on_hangup)
         await self.start()
         try:
@@ -446,5 +447,4 @@ class Daemon:
                 except ConfigError as error:
                     return {"problems": str(error).splitlines()}
                 return {"problems": []}
-            case _:
-                return None
+        return None

@@ -5,15 +5,20 @@ Event names are stable, ``snake_case`` and in the past tense; facts are fields. 
 
 from __future__ import annotations
 
+import asyncio
 import logging
+import os
+import select
 import sys
 from collections import Counter
-from typing import TextIO
+from time import monotonic
+from typing import Any, TextIO, cast
 
 import structlog
-from structlog.typing import FilteringBoundLogger, Processor
+from structlog.typing import EventDict, FilteringBoundLogger, Processor
 
 from uavlinkd.core.drops import DropReason
+from uavlinkd.endpoints.ports import failure_name
 
 SUMMARY_INTERVAL_S = 10.0
 """What repeats is logged at once when it begins, then summed up this often."""
@@ -70,10 +75,51 @@ DISTURBANCES = (
 """What is counted of a peer where no datagram is to blame, by its name in the status."""
 
 
+class LogFile:
+    """Where the lines of a daemon go: it may be full, slow or gone, and nobody waits for it.
+
+    A line that it does not take is lost, and counted; the next one that it takes says how many were.
+    """
+
+    def __init__(self, descriptor: int) -> None:
+        self.lost = 0
+        self._descriptor = descriptor
+        self._is_cut = False
+        self._room = select.poll()
+        self._room.register(descriptor, select.POLLOUT)
+
+    def write(self, line: str) -> None:
+        """Write a line, or lose it."""
+        data = line.encode("utf-8", "backslashreplace")
+        rest = memoryview(b"\n" + data if self._is_cut else data)
+        try:
+            # Whoever reads a pipe may have stopped. One that is writable takes PIPE_BUF bytes without waiting.
+            while rest and self._room.poll(0):
+                rest = rest[os.write(self._descriptor, rest[: select.PIPE_BUF]) :]
+                self._is_cut = True
+        except OSError:  # a full disk; a reader that has gone
+            pass
+        if rest:
+            self.lost += 1
+        else:
+            self.lost, self._is_cut = 0, False
+
+    def flush(self) -> None:
+        """Nothing: no line waits."""
+
+    def tell_lost(self, _: object, __: str, event: EventDict) -> EventDict:
+        """For structlog: how many lines before this one were lost."""
+        if self.lost:
+            event["lines_lost_before"] = self.lost
+        return event
+
+
 def set_up_logging(level: str, fmt: str, stream: TextIO = sys.stderr) -> None:
     """Configure structlog for this process: a console on a terminal, JSON lines elsewhere (``fmt`` ``auto``)."""
     console = fmt == "console" or (fmt == "auto" and stream.isatty())
+    file = LogFile(stream.fileno()) if stream is sys.__stderr__ else None
     stamp: list[Processor] = [
+        *([] if file is None else [file.tell_lost]),
         structlog.processors.add_log_level,
         structlog.processors.TimeStamper(fmt="%H:%M:%S.%f" if console else "iso", utc=not console),
     ]
@@ -85,7 +131,7 @@ def set_up_logging(level: str, fmt: str, stream: TextIO = sys.stderr) -> None:
     structlog.configure(
         processors=[*stamp, *render],
         wrapper_class=structlog.make_filtering_bound_logger(getattr(logging, level.upper())),
-        logger_factory=structlog.WriteLoggerFactory(file=stream),
+        logger_factory=structlog.WriteLoggerFactory(file=stream if file is None else cast(TextIO, file)),
         cache_logger_on_first_use=True,
     )
 
@@ -130,3 +176,11 @@ class DropSummary:
         last = self._last.pop(key, "")
         named = {"who": where} if where else {}
         self._log.warning(event, reason=reason, **named, **facts, **({"last": last} if last else {}))
+
+    def on_loop_failure(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        """For an event loop: what it could not do, and nobody else could be told."""
+        error = context.get("exception")
+        if isinstance(error, OSError):  # no descriptor left for who wants to connect, and the like
+            self.add("calls_failed", failure_name(error), "", 1, monotonic(), str(context["message"]))
+        else:
+            loop.default_exception_handler(context)

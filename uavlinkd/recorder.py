@@ -29,8 +29,9 @@ from uavlinkd.tlog_files import STAMP_BYTES, FolderInUseError, TlogFolder
 
 MAX_BUFFERED_BYTES = 4 << 20
 """Of all peers; what comes while the disk takes longer than that is not recorded."""
-RETRY_S = 10.0
-"""After a failure nothing is tried for so long."""
+RETRY_S = 0.5
+"""After a failure nothing is kept for so long, and the next housekeeping tries again: a disk with room again is used
+within 2 s."""
 CLOCK_STEP_S = 2.0
 """A clock that is this far from where it was has been set; less is the drift of an honest one."""
 STOP_WAIT_S = 2.0

@@ -16,9 +16,11 @@ from uavlinkd.threads import Threads
 Resolved = list[tuple[socket.AddressFamily, str, int]]
 
 FIRST_WAIT_S = 0.5
-LONGEST_WAIT_S = 10.0
-"""Between look-ups while an answer is wanted."""
-
+LONGEST_WAIT_S = 1.0
+"""Between look-ups while an answer is wanted: a link is up within 2 s of the name server's return."""
+QUESTIONS_AT_ONCE = 4
+"""About the names of one peer. A question to a name server that is silent takes the system 5 s to repeat and 10 s to
+give up (resolv.conf(5)), and is of no use when the server is back; so others are asked meanwhile."""
 
 _THREADS = Threads(8, "look-up")
 """Names that nobody answers for can hold up so many others, and no more threads than systemd's unit allows."""
@@ -62,16 +64,36 @@ async def keep_resolving(
     known: Resolved = []
     failing: set[str] = set()
     wait_s = FIRST_WAIT_S
-    while True:
-        if not known or failing or is_wanted():
-            found, failed = await resolve(addresses)
-            for name in set(failed) - failing:
-                log.warning("name_not_resolved", host=name)
-            failing = set(failed)
-            if found and found != known:
-                known = found
-                on_resolved(found)
-            wait_s = min(2 * wait_s, LONGEST_WAIT_S)
-        else:
-            wait_s = FIRST_WAIT_S
-        await asyncio.sleep(wait_s)
+    asking: set[asyncio.Task[tuple[Resolved, list[str]]]] = set()
+    try:
+        while True:
+            if not known or failing or is_wanted():
+                if len(asking) < QUESTIONS_AT_ONCE:
+                    asking.add(asyncio.ensure_future(resolve(addresses)))
+                answered, asking = await asyncio.wait(
+                    asking, timeout=LONGEST_WAIT_S, return_when=asyncio.FIRST_COMPLETED
+                )
+                if not answered:
+                    continue
+                found, failed = answered.pop().result()
+                for name in set(failed) - failing:
+                    log.warning("name_not_resolved", host=name)
+                failing = set(failed)
+                if found and found != known:
+                    known = found
+                    on_resolved(found)
+                if not failed:
+                    _forget(asking)
+                wait_s = min(2 * wait_s, LONGEST_WAIT_S)
+            else:
+                wait_s = FIRST_WAIT_S
+            await asyncio.sleep(wait_s)
+    finally:
+        _forget(asking)
+
+
+def _forget(asking: set[asyncio.Task[tuple[Resolved, list[str]]]]) -> None:
+    """What these answer would be old when it is looked at."""
+    for task in asking:
+        task.cancel()
+    asking.clear()

@@ -26,7 +26,7 @@ import signal
 import socket
 import sys
 import tempfile
-from base64 import b64encode
+from base64 import b64encode, urlsafe_b64encode
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -288,6 +288,10 @@ class DaemonProcess:
         """All that it answered, as JSON."""
         self.exit_status: int | None = None
         """Of the last process; None while it runs."""
+        self.launcher: tuple[str, ...] = ()
+        """What starts the program, such as ``ip netns exec NAME``. It becomes the program: there is one process."""
+        self.environ: dict[str, str] = {}
+        """What stands in its environment besides ours, however it is started."""
         self._process: asyncio.subprocess.Process | None = None
         self._reading: asyncio.Task[None] | None = None
         self._changes = Changes()
@@ -352,11 +356,11 @@ class DaemonProcess:
         self.exit_status = None
         master, slave = os.openpty() if on_terminal else (None, asyncio.subprocess.PIPE)
         self._process = await asyncio.create_subprocess_exec(
-            *(sys.executable, *self._program(), "run", "--config", str(self.config_file)),
+            *(*self.launcher, sys.executable, *self._program(), "run", "--config", str(self.config_file)),
             stdin=asyncio.subprocess.DEVNULL,
             stdout=slave if on_terminal else asyncio.subprocess.PIPE,
             stderr=slave if on_terminal else asyncio.subprocess.STDOUT,
-            env={**os.environ, **(environ or {})},
+            env={**os.environ, **self.environ, **(environ or {})},
         )
         if master is not None:
             os.close(slave)
@@ -573,6 +577,7 @@ def secret_forms(secret: str) -> list[str]:
     """How a key could stand in text, whole or its first half."""
     raw = keys.decode_key(secret)
     forms = [secret.rstrip("="), raw.hex(), repr(raw)[2:-1], str(list(raw))[1:-1]]
+    forms += [urlsafe_b64encode(raw).decode().rstrip("="), urlsafe_b64encode(raw[:15]).decode()]
     forms += [b64encode(raw[:15]).decode(), raw[:16].hex(), repr(raw[:16])[2:-1], raw.hex(" "), raw.hex(":")]
     return forms + [form.upper() for form in forms if form == form.lower()]
 

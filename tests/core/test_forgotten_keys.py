@@ -1,0 +1,72 @@
+"""Keys of the past are dropped: no object that holds them is left anywhere in the process."""
+
+from __future__ import annotations
+
+import gc
+
+import pytest
+
+from tests.core.harness import Pair, quiet
+from uavlinkd.core import constants as c
+from uavlinkd.core.caller import Pending
+from uavlinkd.core.noise import HandshakeState, SymmetricState
+from uavlinkd.core.session import Authenticated, Confidential, Session
+from uavlinkd.core.settings import Link
+
+REKEYS = 6
+KEEPERS = (Session, Authenticated, Confidential, HandshakeState, SymmetricState, Pending)
+
+
+class Census:
+    """Objects that hold keys, but for those that were there before."""
+
+    def __init__(self) -> None:
+        gc.collect()
+        self._before = {id(each): each for each in gc.get_objects() if isinstance(each, KEEPERS)}
+
+    def count(self, *kinds: type) -> int:
+        """How many there are now."""
+        gc.collect()
+        return sum(isinstance(each, kinds) and id(each) not in self._before for each in gc.get_objects())
+
+
+@pytest.mark.parametrize("confidential", [False, True])
+def test_rekeying_leaves_no_more_sessions_than_may_be_used(confidential: bool) -> None:
+    """Of many sessions those remain that may still receive; when they are too old, the current one alone."""
+    census = Census()
+    link = quiet(confidential=confidential)
+    pair = Pair(link_a=link, link_b=link)
+    now = 0.0
+    for _ in range(REKEYS):
+        pair.establish(now)
+        now += c.REKEY_AFTER_S
+    assert 2 <= census.count(Session) <= 2 * c.USABLE_PER_PEER
+    pair.establish(now)
+    now += c.REKEY_AFTER_S - 1.0  # the one before it is now older than sessions get
+    for side in (pair.a, pair.b):
+        side.timeout(now)
+    assert census.count(Session) == 2
+    assert census.count(Authenticated, Confidential) == 4, "one each way, at each end"
+    assert census.count(HandshakeState, SymmetricState, Pending) == 0, "handshakes that are over keep nothing"
+
+
+def test_nothing_is_left_of_a_peer_that_is_removed() -> None:
+    """Cut off, its keys are gone at once, those of a handshake that was under way too."""
+    census = Census()
+    pair = Pair(link_a=quiet(), link_b=quiet()).establish(0.0)
+    pair.initiation(c.REKEY_AFTER_S)
+    assert census.count(*KEEPERS) > 4
+    pair.a.node.remove_peer("bravo", c.REKEY_AFTER_S)
+    pair.b.node.remove_peer("alpha", c.REKEY_AFTER_S)
+    assert census.count(*KEEPERS) == 0
+
+
+def test_census_sees_what_is_kept() -> None:
+    """A session that somebody holds is counted: what this file looks for would be found."""
+    census = Census()
+    pair = Pair(link_a=Link(), link_b=Link()).establish(0.0)
+    kept = pair.a.session
+    pair.a.node.remove_peer("bravo", 0.0)
+    pair.b.node.remove_peer("alpha", 0.0)
+    assert census.count(Session) == 1
+    assert kept.parameters.generation == 1

@@ -1,0 +1,44 @@
+"""``python -m tests.faults [NAME …]``: have each fault happen to real daemons, and print what came of it.
+
+A table in Markdown. Exit status 0 only if the daemons were back in time from each. UAVLINKD_FAULT_S says how long a
+fault lasts (4 s). Most take root.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import io
+import sys
+import traceback
+
+from tests.faults.run import BACK_S, FAULTS, fault_seconds, happen, markdown, why_not
+from tests.faults.talk import Outcome
+
+
+def main() -> int:
+    """Exit status: 0 all were back in time, 1 not."""
+    parser = argparse.ArgumentParser(prog="python -m tests.faults", description=__doc__)
+    parser.add_argument("fault", nargs="*", default=[], choices=[[], *FAULTS], metavar="NAME", help=", ".join(FAULTS))
+    parser.add_argument("--markdown", action="store_true", help="the table alone, without what daemons said")
+    options = parser.parse_args()
+    chosen = options.fault or list(FAULTS)
+    reason = why_not()
+    if reason is not None and any(FAULTS[name].takes_root for name in chosen):
+        print(f"needs {reason}", file=sys.stderr)
+        return 1
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said):
+        outcomes = asyncio.run(happen(chosen))
+    failed = [each for each in outcomes.values() if not isinstance(each, Outcome) or each.recovered_s > BACK_S]
+    if failed and not options.markdown:
+        print(said.getvalue())
+        for each in failed:
+            if isinstance(each, BaseException):
+                traceback.print_exception(each)
+    print(f"Each fault lasted {fault_seconds()} s.\n\n{markdown(outcomes)}")
+    return 1 if failed else 0
+
+
+sys.exit(main())

@@ -1,0 +1,1 @@
+"""A long run of real daemons over the emulated radio: ``python -m tests.soak``."""

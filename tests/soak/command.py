@@ -1,0 +1,63 @@
+"""A soak: real daemons over an emulated radio that loses, delays and pauses, with new keys every few seconds.
+
+Two drones and a ground station talk for as long as asked. Into the folder go a line of JSON a sample (samples.jsonl),
+a figure (soak.png) and a verdict (summary.json). Exit status 0 only if the verdict is good. ``python -m tests.soak
+report DIR`` makes figure and verdict of what is in DIR so far, also while the run goes on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from tests.soak.figure import draw
+from tests.soak.judge import SAMPLES, judge, read_samples
+from tests.soak.run import Plan, record
+
+OK, FAILED = 0, 1
+FIGURE, SUMMARY = "soak.png", "summary.json"
+SAMPLES_AT_MOST = 1500
+"""A long run is sampled less often."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Exit status: 0 the verdict is good, 1 it is not, 2 the command line is wrong."""
+    given = sys.argv[1:] if arguments is None else list(arguments)
+    if given[:1] == ["report"]:
+        parser = argparse.ArgumentParser(prog="python -m tests.soak report", description="The verdict so far.")
+        parser.add_argument("folder", type=Path, help="what --out named")
+        return report(parser.parse_args(given[1:]).folder)
+    parser = argparse.ArgumentParser(prog="python -m tests.soak", description=__doc__)
+    parser.add_argument("--minutes", type=float, required=True, help="how long they talk")
+    parser.add_argument("--rate", type=float, default=50.0, help="frames a second from each program (50)")
+    parser.add_argument("--rekey-s", type=float, default=5.0, help="seconds between new keys (5)")
+    parser.add_argument("--seed", type=int, default=0, help="of the radio's luck")
+    parser.add_argument("--out", type=Path, required=True, help="folder for the results")
+    options = parser.parse_args(given)
+    if not (options.minutes > 0 and 0 < options.rate <= 1000 and options.rekey_s >= 1):
+        parser.error("--minutes is above 0, --rate up to 1000, --rekey-s 1 or more")
+    seconds = 60 * options.minutes
+    every_s = max(1.0 if seconds < 120 else 5.0, seconds / SAMPLES_AT_MOST)
+    plan = Plan(seconds, options.rate, options.rekey_s, every_s, options.seed)
+    options.out.mkdir(parents=True, exist_ok=True)
+    with (options.out / SAMPLES).open("w", encoding="ascii") as samples:
+        asyncio.run(record(plan, samples, lambda line: print(line, flush=True)))
+    return report(options.out)
+
+
+def report(folder: Path) -> int:
+    """Write figure and verdict of what was measured so far."""
+    samples = read_samples(folder)
+    if not samples:
+        print(f"nothing has been measured yet in {folder}", file=sys.stderr)
+        return FAILED
+    summary = judge(samples)
+    (folder / FIGURE).write_bytes(draw(samples))
+    text = json.dumps(summary, indent=2)
+    (folder / SUMMARY).write_text(text + "\n")
+    print(text)
+    return OK if summary["verdict"] == "good" else FAILED

@@ -1,0 +1,203 @@
+"""The soak itself: a short one holds, and each thing that may go wrong in a long one would be told."""
+
+from __future__ import annotations
+
+import copy
+import io
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.soak.command import FIGURE, OK, SUMMARY, report
+from tests.soak.flows import SETTLED_S, Flow, frame, numbers_in
+from tests.soak.judge import JUDGED_FROM_S, SAMPLES, judge, read_samples, slope
+from tests.soak.run import Plan, record
+
+SECONDS = 14.0
+"""With start and rest some 20: long enough for an outage and two changes of keys."""
+_PNG = b"\x89PNG\r\n\x1a\n"
+
+
+async def test_a_short_soak_loses_nothing_but_what_the_radio_dropped(tmp_path: Path) -> None:
+    """Every frame that came out of the radio is delivered once, in the radio's order, over new keys and an outage."""
+    samples = io.StringIO()
+    await record(Plan(SECONDS, every_s=2.0), samples, print)
+    (tmp_path / SAMPLES).write_text(samples.getvalue())
+    assert report(tmp_path) == OK
+    summary = json.loads((tmp_path / SUMMARY).read_text())
+    assert summary["is_complete"]
+    for flow in summary["flows"].values():
+        assert flow["sent"] == flow["delivered"] + flow["radio_lost"] > 0.5 * SECONDS * Plan(0).rate
+        assert flow["radio_lost"] > 0.02 * flow["sent"]
+        assert flow["out_of_order"] > 0, "that was a gentle radio"
+    assert all(generation >= 2 for generation in summary["rekeys"].values())
+    assert any(drops.get("replayed") for drops in summary["drops"].values()), "copies that the radio made"
+    assert (tmp_path / FIGURE).read_bytes().startswith(_PNG)
+
+
+def test_numbers_are_found_among_other_bytes() -> None:
+    """Of the system asked for, several in an envelope, in their order."""
+    envelope = b"\x40\x01\xfd" + frame(7, 1) + frame(0xFD12, 2) + frame(9, 1) + bytes(16)
+    assert numbers_in(envelope, 1) == [7, 9]
+    assert numbers_in(envelope, 2) == [0xFD12]
+    assert numbers_in(envelope[:30], 1) == []
+
+
+def _sent(flow: Flow, number: int) -> None:
+    flow.on_sent(number, 0.0)
+
+
+def _through(flow: Flow, number: int) -> None:
+    _sent(flow, number)
+    flow.on_entered(number)
+    flow.on_left(number)
+
+
+def _delivered(flow: Flow) -> None:
+    _through(flow, 1)
+    flow.on_delivered(1, 0.5)
+
+
+def _radio_lost(flow: Flow) -> None:
+    _sent(flow, 1)
+    flow.on_entered(1)
+
+
+def _daemon_lost(flow: Flow) -> None:
+    _through(flow, 1)
+
+
+def _not_sent(flow: Flow) -> None:
+    _sent(flow, 1)
+
+
+FATES: dict[str, Callable[[Flow], None]] = {
+    "delivered": _delivered,
+    "radio_lost": _radio_lost,
+    "daemon_lost": _daemon_lost,
+    "not_sent": _not_sent,
+}
+
+
+@pytest.mark.parametrize("fate", FATES)
+def test_each_fate_is_counted_as_what_it_is(fate: str) -> None:
+    """Once it is settled, and not before."""
+    flow = Flow()
+    FATES[fate](flow)
+    flow.settle(SETTLED_S - 0.001)
+    assert flow.counts()["sent"] == 0
+    flow.settle(SETTLED_S)
+    assert {name: amount for name, amount in flow.counts().items() if amount} == {"sent": 1, fate: 1}
+
+
+def test_copies_strangers_and_disorder_are_counted() -> None:
+    """A second delivery, one of nothing that was sent, one that overtook by the radio or by a daemon."""
+    flow = Flow()
+    for number in (1, 2, 3):
+        _sent(flow, number)
+        flow.on_entered(number)
+    for number in (2, 1, 3):  # the radio's order
+        flow.on_left(number)
+    for number in (2, 1, 1):
+        flow.on_delivered(number, 0.1)
+    flow.on_delivered(9, 0.1)
+    counts = flow.counts()
+    assert (counts["duplicated"], counts["invented"], counts["out_of_order"], counts["reordered"]) == (1, 1, 1, 0)
+    other = Flow()
+    for number in (1, 2):
+        _through(other, number)
+    for number in (2, 1):
+        other.on_delivered(number, 0.1)
+    assert other.counts()["reordered"] == 1
+
+
+def _sample(at_s: float, *, at_rest: bool = False) -> dict[str, Any]:
+    flow = Flow()
+    _delivered(flow)
+    flow.settle(SETTLED_S)
+    return {
+        "at_s": at_s,
+        "at_rest": at_rest,
+        "processes": {"drone0": {"rss_kb": 40_000, "fds": 9}},
+        "flows": {"drone0>ground": {**flow.counts(), "p50_s": 0.04, "p99_s": 0.05}},
+        "taps": {"drone0>ground": {"entered": 10, "left": 9}},
+        "radio": {"drone0>ground": {"sent": 10, "lost": 1, "lost_in_outage": 1, "duplicated": 1}},
+        "radio_troubles": {},
+        "peers": {"drone0: ground": {"generation": 3, "state": "up", "drops": {}}},
+        "lost_peers": {"drone0": 0},
+    }
+
+
+def _good_run() -> list[dict[str, Any]]:
+    hour = [_sample(60.0 * minute) for minute in range(61)]
+    return [*hour, _sample(3605.0, at_rest=True)]
+
+
+def test_a_good_run_is_judged_good() -> None:
+    """So that the faults below are told for themselves."""
+    assert judge(_good_run())["verdict"] == "good"
+
+
+def _leak(samples: list[dict[str, Any]]) -> None:
+    for sample in samples:
+        sample["processes"]["drone0"]["rss_kb"] += int(sample["at_s"] / 3)
+
+
+def _descriptor(samples: list[dict[str, Any]]) -> None:
+    samples[30]["processes"]["drone0"]["fds"] = 10
+
+
+def _last(*path: str, value: object) -> Callable[[list[dict[str, Any]]], None]:
+    def change(samples: list[dict[str, Any]]) -> None:
+        place = samples[-1]
+        for each in path[:-1]:
+            place = place[each]
+        place[path[-1]] = value
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("harm", "problem"),
+    [
+        (_leak, "memory grew by"),
+        (_descriptor, "file descriptors changed"),
+        (_last("flows", "drone0>ground", "daemon_lost", value=1), "came out of the radio and were not delivered"),
+        (_last("flows", "drone0>ground", "not_sent", value=1), "never given to the radio"),
+        (_last("flows", "drone0>ground", "duplicated", value=1), "delivered twice"),
+        (_last("flows", "drone0>ground", "reordered", value=1), "out of order"),
+        (_last("flows", "drone0>ground", "invented", value=1), "nobody had sent"),
+        (_last("flows", "drone0>ground", "delivered", value=0), "nothing was delivered"),
+        (_last("taps", "drone0>ground", "left", value=8), "the taps saw"),
+        (_last("radio_troubles", value={"Connection refused": 1}), "troubles"),
+        (_last("peers", "drone0: ground", "generation", value=0), "no new keys"),
+    ],
+)
+def test_each_fault_of_a_long_run_is_told(harm: Callable[[list[dict[str, Any]]], None], problem: str) -> None:
+    """One thing wrong, one problem."""
+    samples = copy.deepcopy(_good_run())
+    harm(samples)
+    (told,) = judge(samples)["problems"]
+    assert problem in told
+
+
+def test_memory_of_a_short_run_is_not_judged() -> None:
+    """Caches fill at first; the summary says that nothing was judged rather than that it was flat."""
+    samples = [_sample(at_s) for at_s in (100.0, 200.0, JUDGED_FROM_S - 1)]
+    _leak(samples)
+    assert judge(samples)["memory"]["drone0"]["is_flat"] is None
+
+
+def test_a_line_that_is_cut_off_is_left_out(tmp_path: Path) -> None:
+    """A run that was killed can be reported."""
+    (tmp_path / SAMPLES).write_text('{"at_s": 1}\n{"at_s": 2}\n{"at')
+    assert [each["at_s"] for each in read_samples(tmp_path)] == [1, 2]
+
+
+def test_slope_is_that_of_the_line() -> None:
+    """By least squares."""
+    assert slope([(0, 1), (1, 3), (2, 5)]) == 2
+    assert slope([(0, 1), (1, 2), (2, 1)]) == 0
