@@ -302,8 +302,18 @@ async def name_service_silent(stage: Stage) -> Outcome:
     return await _name_service(stage, is_silent=True)
 
 
+def _free_host() -> str:
+    """An address of loopback on whose port for names nobody listens."""
+    chance = random.SystemRandom()
+    while True:
+        host = f"127.{chance.randrange(1, 255)}.{chance.randrange(1, 255)}.53"
+        with suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+            sock.bind((host, 53))
+            return host
+
+
 async def _name_service(stage: Stage, *, is_silent: bool) -> Outcome:
-    host = f"127.0.{random.SystemRandom().randrange(70, 250)}.53"
+    host = _free_host()
     a, b = stage.daemon("drone0"), stage.daemon("drone1")
     psk = stage.psk()
     a.add_peer(b, [f"drone1.fault.test:{b.sockaddr[1]}"], psk)
@@ -353,7 +363,7 @@ async def suspended(stage: Stage) -> Outcome:
     await a.send_signal(signal.SIGCONT)
     recovered_s = await talk.back(ended)
     for speaker, hearer in (talk.voices, talk.voices[::-1]):
-        # What is younger than that is not late by the protocol: the core may hold it until the peer has vouched for it.
+        # What is younger is not late by the protocol: the core may hold it until the peer has vouched for it.
         old = {n for n, at in speaker.sent_at.items() if began + 0.1 < at < ended - LATE_AFTER_S - 2 * LATE_STEP_S}
         assert not [n for n in old if speaker.frame(n) in hearer.heard_at], "what had waited came as if it were new"
     talk.check_no_copies()
