@@ -44,9 +44,13 @@ def measure(node: Node) -> Sizes:
     )
 
 
-def check(node: Node) -> None:
-    """No table is larger than it may be, none has more than the others account for, no removed peer is in any."""
-    for table, size in measure(node).items():
+def check(node: Node) -> Sizes:
+    """No table is larger than it may be, none has more than the others account for, no removed peer is in any.
+
+    The sizes, where that holds.
+    """
+    sizes = measure(node)
+    for table, size in sizes.items():
         assert size <= LIMITS[table], f"{table}: {size} are more than {LIMITS[table]}"
     peers = node.peers.values()
     owners = node._indices.owners
@@ -60,3 +64,4 @@ def check(node: Node) -> None:
     assert len(node._by_keys) == len(node.peers)
     assert all(node.peers.get(peer.name) is peer for peer in node._by_address.values())
     assert len(node._by_address) <= sum(len(peer.caller.addresses) for peer in peers)
+    return sizes

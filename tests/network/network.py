@@ -16,7 +16,7 @@ from random import Random
 from types import TracebackType
 from typing import Protocol, Self
 
-from tests.network.bounds import Sizes, check, measure
+from tests.network.bounds import Sizes, check
 from uavlinkd.core import wire
 from uavlinkd.core.cookie import MacKeys
 from uavlinkd.core.crypto import Secret, x25519_public_key
@@ -189,8 +189,7 @@ class Drone:
     def check_bounds(self) -> None:
         """What others can make a node remember is bounded."""
         if self.node is not None:
-            check(self.node)
-            self.largest |= measure(self.node)
+            self.largest |= check(self.node)
 
     def check_is_no_call(self, datagram: bytes) -> None:
         """A removed peer is a stranger: no handshake message is for its key."""
