@@ -55,7 +55,9 @@ class Stage:
 
 
 def _stage(link: Link | None = None, *, knows_keys: bool = True) -> Stage:
-    return Stage(Network("teeth", RadioSettings(delay_s=0.01)), link, knows_keys=knows_keys)
+    network = Network("teeth", RadioSettings(delay_s=0.01))
+    network.checks_bounds = False
+    return Stage(network, link, knows_keys=knows_keys)
 
 
 @pytest.mark.parametrize("attack", ["alter-frame", "bit-flip", "splice", "forge-data", "extend", "truncate"])
@@ -66,7 +68,7 @@ def test_receiver_without_tag_check_delivers_what_nobody_sent(attack: str, monke
     stage.begin(f"{attack},begin_s=0.1")
     with pytest.raises(AssertionError) as caught:
         stage.network.run(5)
-    assert caught.traceback[-1].name in ("deliver", "_perform"), "the payload that came out is no frame that was sent"
+    assert caught.traceback[-1].name in ("deliver", "perform"), "the payload that came out is no frame that was sent"
 
 
 def test_receiver_without_tag_check_accepts_a_false_tag(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import heapq
 import math
+from bisect import bisect_left
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -15,8 +16,11 @@ from random import Random
 from types import TracebackType
 from typing import Protocol, Self
 
-from uavlinkd.core import constants as c
+from tests.network.bounds import Sizes, check
+from uavlinkd.core import wire
+from uavlinkd.core.cookie import MacKeys
 from uavlinkd.core.crypto import Secret, x25519_public_key
+from uavlinkd.core.drops import Drop
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Deliver, Dropped, Output, Path, SessionEstablished, Transmit
 from uavlinkd.core.peer import Peer
@@ -27,11 +31,13 @@ from uavlinkd.mitm.radio import Radio, RadioSettings
 Address = tuple[str, int]
 
 FRAME_BYTES = 24
+_HANDSHAKE = (wire.INITIATION, wire.RESPONSE)
 _FRAME_START = b"\xfd"
 _FLOW_SHOWN = 60
 _STEPS_AT_ONE_MOMENT = 20_000
 """More events than this without time passing is a node that asks to be woken for ever."""
-_CHECK_BOUNDS_EVERY = 64
+_CHECK_BOUNDS_EVERY = 16
+"""So many events, at one drone after another."""
 
 
 @dataclass
@@ -47,6 +53,10 @@ class Flow:
     last: int = -1
     overtaken: int = 0
     """Frames that came out after one with a greater number."""
+    refused_before: float = 0.0
+    """Nothing that was sent before may come out: the receiver has lost its keys since, or removed the sender."""
+    oldest_s: float = 0.0
+    """The greatest age of a frame that came out."""
 
     def frame(self, now: float) -> bytes:
         """The next frame: a start byte, sender, receiver, number."""
@@ -65,6 +75,9 @@ class Flow:
         assert number < len(self.sent_at), f"{self.sender} never sent {frame!r} to {self.receiver}"
         assert frame == self.bytes_of(number), f"altered: {frame!r}"
         assert number not in self.delivered, f"delivered twice: {frame!r}, first at {self.delivered[number]:.3f}"
+        sent_at = self.sent_at[number]
+        assert sent_at >= self.refused_before, f"{frame!r} of {sent_at:.3f} was not to come out any more"
+        self.oldest_s = max(self.oldest_s, now - sent_at)
         self.delivered[number] = now
         if number < self.last:
             self.overtaken += 1
@@ -72,7 +85,8 @@ class Flow:
 
     def lost(self, since: float = 0.0, until: float = math.inf) -> list[int]:
         """The numbers sent in this time that never came out."""
-        return [n for n, at in enumerate(self.sent_at) if since <= at < until and n not in self.delivered]
+        first, end = bisect_left(self.sent_at, since), bisect_left(self.sent_at, until)
+        return [number for number in range(first, end) if number not in self.delivered]
 
     def first_delivery(self, since: float) -> float:
         """When the first frame that was sent at ``since`` or later came out."""
@@ -97,6 +111,10 @@ class Drone:
         self.private_key = network.chance.randbytes(32)
         self.public_key = x25519_public_key(self.private_key)
         self.acquaintances: dict[str, tuple[PeerSettings, tuple[Path, ...]]] = {}
+        self.removed: dict[str, tuple[PeerSettings, tuple[Path, ...]]] = {}
+        """Peers that were taken out of the configuration, and can be put back."""
+        self.largest: Sizes = Counter()
+        """The most that each table of its nodes ever held."""
         self.node: Node | None = None
         """None while it is off."""
         self._network = network
@@ -106,8 +124,29 @@ class Drone:
         settings = PeerSettings(other.name, other.public_key, link=link or Link())
         self.acquaintances[other.name] = settings, tuple((0, host, port) for host, port in addresses)
 
+    def remove(self, other: Drone) -> None:
+        """Take a peer out of the configuration: from now on it is a stranger."""
+        self.removed[other.name] = self.acquaintances.pop(other.name)
+        self._network.note(f"{self.name} removes {other.name}")
+        self._network.flow(other, self).refused_before = math.inf
+        if self.node is not None:
+            self._network.perform(self, self.node.remove_peer(other.name, self.local_now))
+            assert other.name not in self.node.peers
+
+    def restore(self, other: Drone) -> None:
+        """Put a removed peer back. What it sent so far stays refused."""
+        settings, paths = self.acquaintances[other.name] = self.removed.pop(other.name)
+        self._network.note(f"{self.name} has {other.name} back")
+        self._network.flow(other, self).refused_before = self._network.now
+        if self.node is not None:
+            self.node.add_peer(settings, self.local_now)
+            self.node.set_addresses(settings.name, paths, self.local_now)
+
     def start(self, clock: float | None = None) -> None:
         """A new node without state; ``clock`` is what its clock shows now."""
+        for flow in self._network.flows.values():
+            if flow.receiver == self.name and flow.sender in self.acquaintances:
+                flow.refused_before = self._network.now
         if clock is not None:
             self.clock = clock - self._network.now
         now = self.local_now
@@ -149,15 +188,17 @@ class Drone:
 
     def check_bounds(self) -> None:
         """What others can make a node remember is bounded."""
-        if self.node is None:
-            return
-        for peer in self.node.peers.values():
-            assert len(peer.caller.pending) <= c.PENDING_PER_PEER
-            assert len(peer.sessions.unconfirmed) <= c.UNCONFIRMED_PER_PEER
-            assert len(peer.sessions.confirmed) <= c.USABLE_PER_PEER
-        per_peer = c.PENDING_PER_PEER + c.UNCONFIRMED_PER_PEER + c.USABLE_PER_PEER
-        assert len(self.node._indices.owners) <= per_peer * len(self.node.peers)
-        assert len(self.node._remembered) <= c.REMEMBERED_INITIATIONS
+        if self.node is not None:
+            self.largest |= check(self.node)
+
+    def check_is_no_call(self, datagram: bytes) -> None:
+        """A removed peer is a stranger: no handshake message is for its key."""
+        for settings, _ in self.removed.values():
+            try:
+                MacKeys(settings.public_key).check_mac1(datagram)
+            except Drop:
+                continue
+            raise AssertionError(f"{self.name} calls {settings.name}, which it has removed")
 
 
 class Attacker(Protocol):
@@ -187,11 +228,16 @@ class Network:
         self.cuts: set[tuple[str, str]] = set()
         """Names of sender and receiver between which nothing passes."""
         self.steps = 0
+        self.datagrams = 0
+        """Put on their way, by whomever."""
+        self.checks_bounds = True
+        """Whether the tables of the nodes are looked at; not where a check was taken out of them on purpose."""
         self._radios: dict[tuple[Address, Address], Radio] = {}
         self._arrivals: list[tuple[float, int, Address, Address]] = []
         self._actions: list[tuple[float, int, Callable[[], None]]] = []
         self._number = 0
         self._steps_at_now = 0
+        self._in_turn: deque[Drone] = deque()
         self._notes: deque[str] = deque(maxlen=_FLOW_SHOWN)
 
     def __enter__(self) -> Self:
@@ -212,6 +258,7 @@ class Network:
         """A drone, not started yet. Without an address given it gets one of its own."""
         at = addresses or ((f"10.0.0.{len(self.drones) + 1}", 5790),)
         drone = self.drones[name] = Drone(self, name, at, clock)
+        self._in_turn.append(drone)
         return drone
 
     def pair(self, link: Link | None = None, clocks: tuple[float, float] = (0.0, 0.0)) -> tuple[Drone, Drone]:
@@ -234,13 +281,16 @@ class Network:
         return self.flows.setdefault(key, Flow(*key))
 
     def traffic(self, sender: Drone, receiver: Drone, interval_s: float, until: float = math.inf) -> Flow:
-        """A frame each ``interval_s`` from now on, as long as the sender is on. Both directions need a call."""
+        """A frame each ``interval_s`` from now on, while the sender is on and has the receiver for a peer.
+
+        Both directions need a call.
+        """
         flow = self.flow(sender, receiver)
 
         def tick() -> None:
-            if sender.node is not None:
+            if sender.node is not None and receiver.name in sender.node.peers:
                 frame = flow.frame(self.now)
-                self._perform(sender, sender.node.send(receiver.name, [frame], sender.local_now))
+                self.perform(sender, sender.node.send(receiver.name, [frame], sender.local_now))
             if self.now + interval_s < until:
                 self.at(self.now + interval_s, tick)
 
@@ -268,8 +318,8 @@ class Network:
     def run(self, duration_s: float) -> None:
         """Let time pass."""
         end = self.now + duration_s
-        while self._next_event() <= end:
-            self.step()
+        while (moment := self._next_event()) <= end:
+            self._step(moment)
         self.now = end
 
     def run_until(self, condition: Callable[[], bool], within_s: float) -> float:
@@ -280,14 +330,18 @@ class Network:
         """
         begin, end = self.now, self.now + within_s
         while not condition():
-            assert self._next_event() <= end, f"not within {within_s} s: {self._states()}"
-            self.step()
+            moment = self._next_event()
+            assert moment <= end, f"not within {within_s} s: {self._states()}"
+            self._step(moment)
         return self.now - begin
 
     def step(self) -> None:
         """Jump to the next event and do what is due at it."""
         moment = self._next_event()
         assert moment < math.inf, "nothing will ever happen again"
+        self._step(moment)
+
+    def _step(self, moment: float) -> None:
         self._steps_at_now = self._steps_at_now + 1 if moment <= self.now else 0
         assert self._steps_at_now < _STEPS_AT_ONE_MOMENT, f"time stands still: {self._states()}"
         self.now = max(self.now, moment)
@@ -307,10 +361,10 @@ class Network:
                 if drone.node is not None and drone.node.next_deadline() - drone.clock <= self.now:
                     # A clock far from zero rounds: the node must not be woken before its own deadline.
                     local_now = max(drone.local_now, drone.node.next_deadline())
-                    self._perform(drone, drone.node.handle_timeout(local_now))
-        if self.steps % _CHECK_BOUNDS_EVERY == 0:
-            for drone in self.drones.values():
-                drone.check_bounds()
+                    self.perform(drone, drone.node.handle_timeout(local_now))
+        if self.checks_bounds and self.steps % _CHECK_BOUNDS_EVERY == 0:
+            self._in_turn.rotate()
+            self._in_turn[0].check_bounds()
 
     def _next_event(self) -> float:
         moment = self._actions[0][0] if self._actions else math.inf
@@ -323,16 +377,20 @@ class Network:
 
     # Datagrams.
 
-    def _perform(self, drone: Drone, outputs: list[Output]) -> None:
+    def perform(self, drone: Drone, outputs: list[Output]) -> None:
+        """Do what a node asks for."""
         for output in outputs:
             match output:
                 case Transmit(datagram, (socket, host, port)):
+                    if drone.removed and datagram[0] in _HANDSHAKE:
+                        drone.check_is_no_call(datagram)
                     source = drone.addresses[socket]
                     drone.contacted.add((source, (host, port)))
                     for listener in self.listeners:
                         listener.overhear(datagram, source, (host, port))
                     self._send(datagram, source, (host, port))
                 case Deliver(peer, payload):
+                    assert peer in drone.acquaintances, f"{drone.name} has removed {peer}"
                     flow = self.flow(self.drones[peer], drone)
                     assert payload
                     assert len(payload) % FRAME_BYTES == 0
@@ -341,10 +399,12 @@ class Network:
                 case Dropped(reason, amount=amount):
                     drone.drops[reason] += amount
                 case event:
+                    assert event.peer not in drone.removed, event
                     drone.outputs.append((self.now, event))
                     self.note(f"{drone.name} {event}")
 
     def _send(self, datagram: bytes, source: Address, destination: Address) -> None:
+        self.datagrams += 1
         radio = self._radio(source, destination)
         waiting = radio.next_deadline()
         radio.send(datagram, self.now)
@@ -383,7 +443,7 @@ class Network:
             if self._are_cut_off(source, drone):
                 continue
             path = (drone.addresses.index(destination), *source)
-            self._perform(drone, drone.node.receive(datagram, path, drone.local_now))
+            self.perform(drone, drone.node.receive(datagram, path, drone.local_now))
 
     def _are_cut_off(self, source: Address, receiver: Drone) -> bool:
         return bool(self.cuts) and any(

@@ -1,85 +1,104 @@
-"""Everything at once, drawn by lot: losses, cuts, restarts, moves, replays. Then the network behaves."""
+"""Everything at once, drawn by lot: losses, cuts, restarts, moves, floods, removals. Then the network behaves.
+
+A few of the histories that ``python -m tests.network`` plays by the thousand, and that it finds what is broken.
+"""
 
 from __future__ import annotations
 
 import os
-from functools import partial
-from random import Random
+from collections.abc import Callable
+from typing import Any
 
 import pytest
 
-from tests.network.attackers import Recorder
-from tests.network.network import Drone, Network, share_a_session
-from uavlinkd.core.settings import Link, Timers
-from uavlinkd.mitm.radio import Bursts, RadioSettings
+from tests.network.command import main
+from tests.network.histories import BUSY, HOURS, LARGE, Plan, Played, play
+from uavlinkd.core.caller import Caller
+from uavlinkd.core.indices import Indices
+from uavlinkd.core.node import Node
+from uavlinkd.core.outputs import Output
+from uavlinkd.core.peer import Peer
+from uavlinkd.core.replay import ReplayWindow
 
-SEEDS = int(os.environ.get("UAVLINKD_CHAOS_SEEDS", "24"))
-"""How many drawn histories are played."""
-BACK_WITHIN_S = 3.0
-CLOCKS = (0.0, 1.0, 2.0**32)
-
-
-def _draw_radio(lot: Random) -> RadioSettings:
-    return RadioSettings(
-        loss=lot.choice((0.0, 0.1, 0.3, 0.6)),
-        bursts=lot.choice((None, None, Bursts(to_bad=0.02, to_good=0.1))),
-        delay_s=lot.choice((0.0, 0.02, 0.1, 0.3)),
-        jitter_s=lot.choice((0.0, 0.05)),
-        duplication=lot.choice((0.0, 0.2)),
-        reordering=lot.choice((0.0, 0.1)),
-        bits_per_s=lot.choice((None, None, 200_000.0)),
-    )
-
-
-def _disturb(network: Network, drones: list[Drone], anchor: Drone, recorder: Recorder, lot: Random) -> None:
-    """One misfortune. Only the anchor's address is stable, and it alone is in every configuration."""
-    drone, other = lot.sample(drones, 2)
-    match lot.randrange(7):
-        case 0:
-            network.set_radio(_draw_radio(lot))
-        case 1:
-            network.cut(drone, other)
-        case 2:
-            network.cuts.clear()
-        case 3:
-            drone.start(lot.choice(CLOCKS))
-        case 4 if drone is not anchor:
-            drone.move((f"172.16.{lot.randrange(250)}.1", lot.randrange(1024, 65536)))
-        case 5:
-            network.cuts.add((drone.name, other.name))
-        case _:
-            for datagram, source, destination in lot.choices(recorder.recorded[-5000:], k=50):
-                network.inject(datagram, lot.choice((source, destination)), destination)
+SEEDS = int(os.environ.get("UAVLINKD_CHAOS_SEEDS", "8"))
+"""How many drawn histories are played: most of them small and busy."""
 
 
 @pytest.mark.parametrize("batch", range(8))
 def test_links_are_back_soon_after_any_history(batch: int) -> None:
-    """Half a minute of misfortunes drawn by lot; three seconds after the last, every link with the anchor works."""
+    """Misfortunes drawn by lot; three seconds after the last, every pair is up, and nothing was as it must not be."""
     for seed in range(batch, SEEDS, 8):
-        with Network(f"chaos {seed}", RadioSettings(delay_s=0.05)) as network:
-            lot = Random(f"chaos lot {seed}")
-            drones = [network.add(f"d{number}", clock=lot.choice(CLOCKS)) for number in range(lot.randint(2, 4))]
-            anchor = drones[0]
-            timers = Timers(rekey_after_s=lot.choice((2.0, 10.0, 120.0)), reject_after_s=180.0)
-            for drone in drones[1:]:
-                drone.knows(anchor, anchor.addresses, Link(timers=timers))
-                # A configured address that the drone has left is of no use, and must do no harm.
-                anchor.knows(drone, lot.choice(((), drone.addresses)), Link(timers=timers))
-            for drone in drones:
-                drone.start()
-            for drone in drones[1:]:
-                network.talk(anchor, drone, interval_s=lot.choice((0.02, 0.1, 0.2)))
-            recorder = Recorder(network)
-            for _ in range(15):
-                network.at(lot.uniform(2, 30), partial(_disturb, network, drones, anchor, recorder, lot))
-            network.run(30)
-            network.cuts.clear()
-            network.set_radio(RadioSettings(delay_s=0.05))
-            network.run(BACK_WITHIN_S)
-            back = network.now
-            network.run(2)
-            for flow in network.flows.values():
-                lost = flow.lost(back, network.now - 0.1)
-                assert not lost, f"{flow.sender} to {flow.receiver}: {len(lost)} lost since {back}"
-            for drone in drones[1:]:  # at once, but for a change of keys that is on its way
-                network.run_until(partial(share_a_session, anchor, drone), within_s=0.1)
+        _assert_sound(play(seed, BUSY))
+
+
+@pytest.mark.parametrize(("plan", "seed"), [(LARGE, 4), (HOURS, 4)], ids=["large", "hours"])
+def test_a_large_fleet_and_a_long_flight(plan: Plan, seed: int) -> None:
+    """One history of a dozen drones or more, and one of hours with its changes of keys."""
+    _assert_sound(play(seed, plan))
+
+
+def _assert_sound(played: Played) -> None:
+    assert not played.violations, played.violations[0][1]
+    assert played.judged
+    assert played.delivered
+
+
+def _nothing(*_: Any, **__: Any) -> None:
+    """What is planted in the place of a check."""
+
+
+def _keeps_a_removed_peer(node: Node, name: str, now: float) -> list[Output]:
+    node._by_keys = {keys: each for keys, each in node._by_keys.items() if each.name != name}
+    del node.peers[name]
+    return []
+
+
+def _calls_once(caller: Caller, candidates: int, now: float) -> None:
+    caller.retry_at = now + 100.0
+
+
+def _raises(peer: Peer, *_: Any) -> None:
+    raise KeyError(peer.name)
+
+
+PLANTS: dict[str, tuple[type, str, Callable[..., Any], str]] = {
+    "no replay window": (ReplayWindow, "check", _nothing, "delivered twice"),
+    "a removed peer keeps its keys": (Node, "remove_peer", _keeps_a_removed_peer, "d1 has removed d0"),
+    "indices leak": (Indices, "forget", _nothing, "indices are owned"),
+    "one call is all": (Caller, "_schedule", _calls_once, "not within"),
+    "an exception": (Peer, "hint", _raises, "KeyError"),
+}
+
+
+@pytest.mark.parametrize(("where", "name", "plant", "told"), PLANTS.values(), ids=PLANTS)
+def test_a_planted_bug_is_found(
+    monkeypatch: pytest.MonkeyPatch, where: type, name: str, plant: Callable[..., Any], told: str
+) -> None:
+    """Each thing that must hold fails a history once it is broken, soon."""
+    monkeypatch.setattr(where, name, plant)
+    found: list[str] = []
+    for seed in (2, 1, 3, 0):  # the short ones first
+        found += [what for _, what in play(seed, BUSY).violations]
+        if any(told in what for what in found):
+            return
+    pytest.fail(f"not found, but {found}")
+
+
+def test_the_same_seed_plays_the_same_history() -> None:
+    """A seed is all that is needed to see it again."""
+    first, again = play(10, BUSY), play(10, BUSY)
+    first.cpu_s = again.cpu_s = 0.0
+    assert first == again
+
+
+def test_the_command_tells_what_was_played(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Sound histories give 0 and a table; one that is not gives 1 and the seed to see it again."""
+    assert main(["--minutes", "0.1", "--first-seed", "18", "--handshakes", "20"]) == 0
+    told = capsys.readouterr().out
+    assert "virtual minutes" in told
+    assert "30 % loss each way, one knows: 20 handshakes" in told
+    monkeypatch.setattr(Indices, "forget", _nothing)
+    assert main(["--seed", "18"]) == 1
+    assert "indices are owned" in capsys.readouterr().out

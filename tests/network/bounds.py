@@ -1,0 +1,67 @@
+"""Everything in a node that grows with what others send, beside the limit that the specification gives it."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+from uavlinkd.core import constants as c
+from uavlinkd.core.node import Node
+
+Sizes = Counter[str]
+"""How much is in each table. Those of one peer or session by the fullest one."""
+
+LIMITS: dict[str, int] = {
+    "pending initiations of a peer": c.PENDING_PER_PEER,
+    "unconfirmed sessions of a peer": c.UNCONFIRMED_PER_PEER,
+    "confirmed sessions of a peer": c.USABLE_PER_PEER,
+    "remembered initiations of a peer": c.REMEMBERED_INITIATIONS,
+    "sources under load": c.SOURCES_TRACKED,
+    "echoes asked on a session": c.ECHOES_REMEMBERED,
+    "bytes held on a session": c.HELD_BYTES,
+    "steps of the past of a session": int(c.LATE_AFTER_S / c.LATE_STEP_S) + 3,
+    "indices in use or quarantine": 2**16 - 1,
+}
+
+
+def measure(node: Node) -> Sizes:
+    """The size of every table."""
+    peers = node.peers.values()
+    sessions = [session for peer in peers for session in peer.sessions.confirmed]
+    lately = [each for session in sessions for each in (session._heard_lately, session._sent_lately)]
+    indices = node._indices
+    return Counter(
+        {
+            "pending initiations of a peer": max((len(peer.caller.pending) for peer in peers), default=0),
+            "unconfirmed sessions of a peer": max((len(peer.sessions.unconfirmed) for peer in peers), default=0),
+            "confirmed sessions of a peer": max((len(peer.sessions.confirmed) for peer in peers), default=0),
+            "remembered initiations of a peer": max((len(peer.remembered) for peer in peers), default=0),
+            "sources under load": len(node._sources._buckets),
+            "echoes asked on a session": max((len(session.doubt.asked) for session in sessions), default=0),
+            "bytes held on a session": max((session.doubt._held_bytes for session in sessions), default=0),
+            "steps of the past of a session": max((len(each._steps) for each in lately), default=0),
+            "indices in use or quarantine": len(indices.owners) + len(indices._quarantine),
+        }
+    )
+
+
+def check(node: Node) -> Sizes:
+    """No table is larger than it may be, none has more than the others account for, no removed peer is in any.
+
+    The sizes, where that holds.
+    """
+    sizes = measure(node)
+    for table, size in sizes.items():
+        assert size <= LIMITS[table], f"{table}: {size} are more than {LIMITS[table]}"
+    peers = node.peers.values()
+    owners = node._indices.owners
+    held = sum(len(p.caller.pending) + len(p.sessions.unconfirmed) + len(p.sessions.confirmed) for p in peers)
+    assert len(owners) == held, f"{len(owners)} indices are owned, {held} by a peer"
+    assert all(node.peers.get(owner.peer.name) is owner.peer for owner in owners.values()), (
+        "a removed peer owns an index"
+    )
+    assert not owners.keys() & node._indices._quarantine.keys(), "an index in quarantine is in use"
+    assert len(node._remembered) == sum(len(peer.remembered) for peer in peers)
+    assert len(node._by_keys) == len(node.peers)
+    assert all(node.peers.get(peer.name) is peer for peer in node._by_address.values())
+    assert len(node._by_address) <= sum(len(peer.caller.addresses) for peer in peers)
+    return sizes

@@ -1,0 +1,125 @@
+"""``python -m tests.network``: histories until so much virtual time is through, and what came of them.
+
+    python -m tests.network                          an hour of virtual time or more
+    python -m tests.network --minutes 100000 --processes 4 --first-seed 1000
+    python -m tests.network --seed 1234              one history again, told in full
+    python -m tests.network --handshakes 10000       and how long handshakes take at 30 % loss each way
+
+Exit code 1: something that must hold did not. The seed is named.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Iterator, Sequence
+from itertools import count
+from multiprocessing import get_context
+
+from tests.network import handshakes
+from tests.network.bounds import LIMITS
+from tests.network.histories import UP_WITHIN_S, Played, play
+
+_TOLD_EVERY_S = 30.0
+_AT_ONCE = 4
+"""Histories that a process is given at a time."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Play, tell, and judge."""
+    options = _parser().parse_args(arguments)
+    if options.seed is not None:
+        return _again(options.seed)
+    is_sound = True
+    if options.minutes > 0:
+        total, wall_s = _play(options)
+        print("\n".join(table(total, wall_s)))
+        is_sound = not total.violations
+    if options.handshakes:
+        is_sound &= _handshakes(options.handshakes)
+    return 0 if is_sound else 1
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m tests.network", description="Histories in virtual time.")
+    parser.add_argument("--minutes", type=float, default=60, help="of virtual time, at least (60)")
+    parser.add_argument("--seconds", type=float, default=float("inf"), help="of real time, at most")
+    parser.add_argument("--processes", type=int, default=1, help="how many play (1)")
+    parser.add_argument("--first-seed", type=int, default=0, help="the others follow it (0)")
+    parser.add_argument("--seed", type=int, help="play this one history again")
+    parser.add_argument("--handshakes", type=int, default=0, help="how many to time, of either kind (none)")
+    return parser
+
+
+def _again(seed: int) -> int:
+    played = play(seed)
+    for _, what in played.violations:
+        print(what)
+    print("\n".join(table(played, played.cpu_s)))
+    return 1 if played.violations else 0
+
+
+def _play(options: argparse.Namespace) -> tuple[Played, float]:
+    total, began = Played(), time.monotonic()
+    told_at = began
+    for played in _histories(options.first_seed, options.processes):
+        total.add(played)
+        for seed, what in played.violations:
+            print(f"--seed {seed} breaks:\n{what}", flush=True)
+        now = time.monotonic()
+        minutes = sum(total.virtual_s.values()) / 60
+        is_over = minutes >= options.minutes or now - began >= options.seconds
+        if now - told_at >= _TOLD_EVERY_S:
+            told_at = now
+            histories = sum(total.histories.values())
+            print(f"{now - began:6.0f} s: {histories} histories, {minutes:,.0f} virtual minutes", flush=True)
+        if is_over:
+            break
+    return total, time.monotonic() - began
+
+
+def _histories(first: int, processes: int) -> Iterator[Played]:
+    if processes == 1:
+        yield from map(play, count(first))
+        return
+    with get_context("spawn").Pool(processes) as pool:
+        batch = processes * _AT_ONCE
+        for begin in count(first, batch):
+            yield from pool.imap_unordered(play, range(begin, begin + batch))
+
+
+def _handshakes(tries: int) -> bool:
+    is_sound = True
+    for mode in handshakes.MODES:
+        times = [handshakes.handshake_time(mode, 0.3, seed) for seed in range(tries)]
+        wrong = handshakes.broken(times)
+        print(f"30 % loss each way, {mode}: {tries:,} handshakes took (s) {handshakes.distribution(times)} {wrong}")
+        is_sound &= not wrong
+    return is_sound
+
+
+def table(total: Played, wall_s: float) -> list[str]:
+    """What was played and what was seen, a line each."""
+    minutes = sum(total.virtual_s.values()) / 60
+    rate = minutes / total.cpu_s if total.cpu_s else 0.0
+    kinds = [f"{kind}: {n:,} of {total.virtual_s[kind] / 60:,.0f} min" for kind, n in sorted(total.histories.items())]
+    sizes = [f"{nodes}: {n:,}" for nodes, n in sorted(total.sizes.items())]
+    rows = {
+        "histories": f"{sum(total.histories.values()):,} ({'; '.join(kinds)})",
+        "virtual minutes": f"{minutes:,.0f}",
+        "by number of nodes": ", ".join(sizes),
+        "frames sent": f"{total.sent:,}",
+        "frames delivered": f"{total.delivered:,}",
+        "datagrams": f"{total.datagrams:,}, the attackers' too",
+        "sessions made": f"{total.sessions:,}, counted at each end",
+        **{f"  {name}": f"{amount:,}" for name, amount in sorted(total.events.items())},
+        "judged": f"{total.judged:,} times, {total.pairs:,} pairs",
+        "worst until all up": f"{total.worst_up_s:.2f} s, bound {UP_WITHIN_S:.0f} s",
+        "oldest frame": f"{total.oldest_s:.2f} s when it came out",
+        **{f"  {name}": f"{total.largest[name]:,}, limit {limit:,}" for name, limit in LIMITS.items()},
+        "wall time": f"{wall_s:,.0f} s",
+        "processor time": f"{total.cpu_s:,.0f} s, {rate:,.0f} minutes a second",
+        "violations": ", ".join(f"--seed {seed}" for seed, _ in total.violations) or "none",
+    }
+    width = max(map(len, rows))
+    return [f"{name:<{width}}  {value}" for name, value in rows.items()]
