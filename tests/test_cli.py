@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.daemon.harness import need
 from uavlinkd import __version__, keys
 from uavlinkd.cli import FAILED, OK, WRONG, main
 from uavlinkd.sim import demo
@@ -95,8 +96,8 @@ def test_pubkey_of_an_absent_file_is_told(tmp_path: Path, capsys: pytest.Capture
 def test_keys_are_those_of_wireguard(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """``wg pubkey`` agrees with ours, and we take what ``wg genkey`` and ``wg genpsk`` make."""
     wg = shutil.which("wg")
-    if wg is None:
-        pytest.skip("wg is not installed")
+    need(wg is not None, "wg, of wireguard-tools")
+    assert wg is not None
     main(["keygen"])
     private = capsys.readouterr().out
     theirs = subprocess.run([wg, "pubkey"], input=private, capture_output=True, text=True, check=True).stdout

@@ -14,6 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.daemon.harness import need
 from uavlinkd import keys
 from uavlinkd.keys import KeyFileError
 
@@ -75,9 +76,9 @@ def test_public_key_is_the_one_of_published_vectors() -> None:
         assert keys.public_key_text(f"{text}\n") == keys.encode_key(bytes.fromhex(public))
 
 
-@pytest.mark.skipif(shutil.which("wg") is None, reason="WireGuard's tools are not installed")
 def test_public_key_is_the_one_that_wireguard_gives() -> None:
     """``wg pubkey`` and ours answer the same."""
+    need(shutil.which("wg") is not None, "wg, of wireguard-tools")
     private = keys.generate_private_key()
     theirs = subprocess.run(["wg", "pubkey"], input=private, capture_output=True, text=True, check=True).stdout
     assert keys.public_key_text(private) == theirs.strip()

@@ -59,13 +59,16 @@ STAGES = {
 
 
 @pytest.mark.parametrize("when", ["before", "after"])
-@pytest.mark.parametrize("forge", [flipped, truncated, noise, with_valid_mac1])
-@pytest.mark.parametrize("at", STAGES)
+@pytest.mark.parametrize(
+    ("at", "forge"),
+    [
+        *((at, forge) for at in STAGES for forge in (flipped, truncated, noise)),
+        *((at, with_valid_mac1) for at in ("initiation", "response")),  # an envelope has none
+    ],
+)
 async def test_forgeries_change_nothing(stage: Stage, at: str, forge: Forge, when: str) -> None:
     """The first genuine message completes the handshake, whatever comes before and after it from the same address."""
     end, kind = STAGES[at]
-    if forge is with_valid_mac1 and kind == wire.SHORT_ENVELOPE:
-        pytest.skip("an envelope has no mac1")
     relay, a, b = await through_relay(stage)
     receiver = b if end is End.B else a
     mac_keys = MacKeys(decode_key(receiver.public_key))
