@@ -12,7 +12,7 @@ import socket
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from time import monotonic
+from time import monotonic, sleep
 from typing import Any
 
 from tests.daemon.fleet import Rogue
@@ -77,13 +77,19 @@ class _Exhausted:
         """Take what is left away, and then ask for some."""
         pid = self.daemon.pid
         self._limits = resource.prlimit(pid, resource.RLIMIT_NOFILE)
-        taken = {int(each) for each in os.listdir(f"/proc/{pid}/fd")}
+        taken = self._descriptors()
+        for _ in range(5):  # one that is open for a moment must not be taken for one that stays
+            sleep(0.05)
+            taken &= self._descriptors()
         # Below the first free number: the others may be above, they stay open.
         first_free = next(number for number in range(len(taken) + 1) if number not in taken)
         resource.prlimit(pid, resource.RLIMIT_NOFILE, (first_free, self._limits[1]))
         self._clients = [self._connect() for _ in range(3)]
         self._ends = os.openpty()
         self._device.symlink_to(os.ttyname(self._ends[1]))
+
+    def _descriptors(self) -> set[int]:
+        return {int(each) for each in os.listdir(f"/proc/{self.daemon.pid}/fd")}
 
     def _connect(self) -> socket.socket:
         return socket.create_connection(self._tcp)
@@ -113,12 +119,12 @@ class _Exhausted:
             "serial": status["endpoints"]["serial"]["failures"],
             "recording": status["recording"]["failures"],
         }
-        for failures in counts.values():
-            assert failures.get("EMFILE"), counts
         for client in self._clients:
             client.close()
         for end in self._ends:
             os.close(end)
+        for failures in counts.values():
+            assert failures.get("EMFILE"), counts
         return "; ".join(f"{what}: {told({'EMFILE': each['EMFILE']})}" for what, each in counts.items())
 
 
