@@ -155,7 +155,8 @@ class Bench:
         while ledger.recovery_s is None and monotonic() < ended_at + GIVE_UP_S:  # noqa: ASYNC110  sockets, not tasks
             await asyncio.sleep(_LOOK_S / 4)
         recovery_s = ledger.recovery_s
-        await asyncio.sleep(_TOLD_S if plan.takes_away or not settings.quick else _SETTLE_S)
+        tells_late = plan.takes_away and stage.system != PAPER  # the paper's drones tell at once, or never
+        await asyncio.sleep(_TOLD_S if tells_late or not settings.quick else _SETTLE_S)
         after_stats, after = await stage.middle.statistics(), await stage.notices()
         done_counts = _difference(after_stats.of(names), stats.of(names))
         sent, delivered = ledger.count(begin, end)
