@@ -13,11 +13,9 @@ from typing import Final
 from tests.bench.contenders import INTO_PORT, LINK_PORT, LOCAL_SINK, Contender, Running, needs_module, until
 from tests.bench.frames import SYSTEM
 from tests.bench.namespaces import Cable, Host
+from tests.daemon.harness import WITHOUT_UVLOOP
 from uavlinkd import keys
 from uavlinkd.control import ControlError, ask
-
-_NO_UVLOOP: Final = "import sys; sys.modules['uvloop'] = None; from uavlinkd.cli import main; sys.exit(main())"
-"""As if it were not installed: an import of it fails."""
 
 
 class Uavlinkd(Contender):
@@ -77,7 +75,7 @@ def configuration(name: str, *, peers: Sequence[str], endpoint: str, link: str =
 
 def daemon_command(config: Path, *, uvloop: bool = True) -> list[str]:
     """How a daemon is run."""
-    program = ["-m", "uavlinkd"] if uvloop else ["-c", _NO_UVLOOP]
+    program = ["-m", "uavlinkd"] if uvloop else ["-c", WITHOUT_UVLOOP]
     return [sys.executable, *program, "run", "--config", str(config)]
 
 

@@ -45,6 +45,26 @@ def numeric_host(sockaddr: tuple[Any, ...]) -> str:
     return f"{host}%{zone}" if zone else host
 
 
+def unbound_socket(address: Address, kind: socket.SocketKind) -> tuple[socket.socket, tuple[Any, ...]]:
+    """A socket of one address family, not blocking, and the numeric address that it is to be bound to.
+
+    Raises:
+        BindError: with the address and the reason.
+    """
+    try:
+        # The look-up only turns a zone ("%wlan0") into its number; a host name never gets here.
+        family, _, proto, _, sockaddr = socket.getaddrinfo(
+            *address.sockaddr, type=kind, flags=socket.AI_NUMERICHOST | socket.AI_PASSIVE
+        )[0]
+        sock = socket.socket(family, kind, proto)
+    except OSError as error:
+        raise BindError(f"cannot use {address}: {error.strerror or error}") from None
+    sock.setblocking(False)
+    if family == socket.AF_INET6:
+        sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+    return sock, sockaddr
+
+
 def udp_socket(address: Address, *, may_come_later: bool = False) -> socket.socket:
     """A UDP socket bound to a numeric address.
 
@@ -55,18 +75,8 @@ def udp_socket(address: Address, *, may_come_later: bool = False) -> socket.sock
     Raises:
         BindError: with the address and the reason.
     """
+    sock, sockaddr = unbound_socket(address, socket.SOCK_DGRAM)
     try:
-        # The look-up only turns a zone ("%wlan0") into its number; a host name never gets here.
-        family, kind, proto, _, sockaddr = socket.getaddrinfo(
-            *address.sockaddr, type=socket.SOCK_DGRAM, flags=socket.AI_NUMERICHOST | socket.AI_PASSIVE
-        )[0]
-        sock = socket.socket(family, kind, proto)
-    except OSError as error:
-        raise BindError(f"cannot use {address}: {error.strerror or error}") from None
-    try:
-        sock.setblocking(False)
-        if family == socket.AF_INET6:
-            sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
         for option in (socket.SO_RCVBUF, socket.SO_SNDBUF):
             sock.setsockopt(socket.SOL_SOCKET, option, BUFFER_BYTES)
         try:
@@ -74,7 +84,7 @@ def udp_socket(address: Address, *, may_come_later: bool = False) -> socket.sock
         except OSError as error:
             if error.errno != errno.EADDRNOTAVAIL or not may_come_later:
                 raise
-            sock.setsockopt(*_FREEBIND[family], 1)
+            sock.setsockopt(*_FREEBIND[sock.family], 1)
             sock.bind(sockaddr)
             structlog.get_logger().warning("address_not_here_yet", address=str(address))
     except OSError as error:

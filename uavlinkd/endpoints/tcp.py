@@ -15,7 +15,7 @@ from time import monotonic
 
 from uavlinkd.addresses import Address
 from uavlinkd.endpoints.ports import PortHandler, failure_name
-from uavlinkd.endpoints.sockets import BindError
+from uavlinkd.endpoints.sockets import BindError, unbound_socket
 from uavlinkd.endpoints.streams import MAX_AGE_S, STALLED_S, StreamEndpoint
 from uavlinkd.threads import Threads
 
@@ -50,18 +50,8 @@ def tcp_listener(address: Address) -> socket.socket:
     Raises:
         BindError: with the address and the reason.
     """
+    sock, sockaddr = unbound_socket(address, socket.SOCK_STREAM)
     try:
-        # The look-up only turns a zone ("%wlan0") into its number; a host name never gets here.
-        family, kind, proto, _, sockaddr = socket.getaddrinfo(
-            *address.sockaddr, type=socket.SOCK_STREAM, flags=socket.AI_NUMERICHOST | socket.AI_PASSIVE
-        )[0]
-        sock = socket.socket(family, kind, proto)
-    except OSError as error:
-        raise BindError(f"cannot use {address}: {error.strerror or error}") from None
-    try:
-        sock.setblocking(False)
-        if family == socket.AF_INET6:
-            sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # connections of before may still be ending
         sock.bind(sockaddr)
         sock.listen(_BACKLOG)

@@ -2,41 +2,21 @@
 
 from __future__ import annotations
 
-import base64
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from html import escape
 from pathlib import Path
 
 from uavlinkd.core.suites import SUITES_BY_NAME
 from uavlinkd.evaluation import prose
 from uavlinkd.evaluation.figures import all_figures
 from uavlinkd.evaluation.findings import DAEMON_SIZES, Findings
+from uavlinkd.evaluation.page import Section, Table, to_html, to_markdown
 from uavlinkd.evaluation.records import Status, read_records
 from uavlinkd.evaluation.spread import duration, spread
 
 NAME = "timing"
 TITLE = "How long a link takes: the paper's method and uavlinkd's"
 _NOTHING = "-"
-
-
-@dataclass(frozen=True, slots=True)
-class Table:
-    """Cells as text."""
-
-    head: Sequence[str]
-    rows: Sequence[Sequence[str]]
-
-
-@dataclass(frozen=True, slots=True)
-class Section:
-    """A heading, a figure where there is one, paragraphs, a table where there is one."""
-
-    title: str
-    figure: str = ""
-    paragraphs: Sequence[str] = field(default_factory=list)
-    table: Table | None = None
 
 
 def write_report(folder: Path) -> Path:
@@ -48,9 +28,9 @@ def write_report(folder: Path) -> Path:
     findings = Findings(*read_records(folder / f"{NAME}.jsonl"))
     figures = _write_figures(findings, folder)
     sections = make_sections(findings)
-    (folder / "report.md").write_text(to_markdown(sections, figures), encoding="utf-8")
+    (folder / "report.md").write_text(to_markdown(TITLE, sections, figures), encoding="utf-8")
     html = folder / "report.html"
-    html.write_text(to_html(sections, figures), encoding="utf-8")
+    html.write_text(to_html(TITLE, sections, figures), encoding="utf-8")
     return html
 
 
@@ -64,7 +44,7 @@ def write_page(folder: Path, page: Path) -> Path:
     beside = page.parent / "results"
     beside.mkdir(parents=True, exist_ok=True)
     figures = _write_figures(findings, beside)
-    page.write_text(to_markdown(make_sections(findings), figures, "results/"), encoding="utf-8")
+    page.write_text(to_markdown(TITLE, make_sections(findings), figures, "results/"), encoding="utf-8")
     return page
 
 
@@ -303,50 +283,3 @@ def _run(findings: Findings) -> Table:
     if end:
         rows.append(["elapsed s", f"{end[0].number('elapsed_s'):.0f}"])
     return Table(["", ""], rows)
-
-
-# Two forms of the same.
-
-_CSS = """
-body { font: 16px/1.5 system-ui, sans-serif; max-width: 70rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
-p { max-width: 50rem; } img { max-width: 100%; height: auto; }
-table { border-collapse: collapse; font-size: 0.85rem; display: block; overflow-x: auto; }
-th, td { border-bottom: 1px solid #ddd; padding: 0.25rem 0.6rem; text-align: left; vertical-align: top; }
-"""
-
-
-def to_html(sections: Sequence[Section], figures: dict[str, bytes]) -> str:
-    """One file that needs no other."""
-    parts = [
-        f'<!doctype html>\n<html lang="en">\n<meta charset="utf-8">\n<title>{escape(TITLE)}</title>',
-        f"<style>{_CSS}</style>\n<h1>{escape(TITLE)}</h1>",
-    ]
-    for section in sections:
-        parts.append(f"<h2>{escape(section.title)}</h2>")
-        if section.figure in figures:
-            data = base64.b64encode(figures[section.figure]).decode("ascii")
-            parts.append(f'<img alt="{escape(section.title)}" src="data:image/svg+xml;base64,{data}">')
-        parts += [f"<p>{escape(paragraph)}</p>" for paragraph in section.paragraphs]
-        if section.table is not None:
-            head = "".join(f"<th>{escape(cell)}</th>" for cell in section.table.head)
-            rows = ["".join(f"<td>{escape(cell)}</td>" for cell in row) for row in section.table.rows]
-            parts.append(f"<table><tr>{head}</tr>\n" + "\n".join(f"<tr>{row}</tr>" for row in rows) + "</table>")
-    return "\n".join([*parts, "</html>", ""])
-
-
-def to_markdown(sections: Sequence[Section], figures: dict[str, bytes], where: str = "") -> str:
-    """For a page in a repository; ``where`` is the folder of the figures, seen from there."""
-    parts = [f"# {TITLE}"]
-    for section in sections:
-        parts.append(f"## {section.title}")
-        if section.figure in figures:
-            parts.append(f"![{section.title}]({where}{section.figure}.svg)")
-        parts += section.paragraphs
-        if section.table is not None:
-            lines = [section.table.head, ["---"] * len(section.table.head), *section.table.rows]
-            parts.append("\n".join("| " + " | ".join(_safe(cell) for cell in line) + " |" for line in lines))
-    return "\n\n".join(parts) + "\n"
-
-
-def _safe(cell: str) -> str:
-    return cell.replace("|", "\\|").replace("\n", " ")

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 from statistics import median
 
-from uavlinkd.evaluation.report import Section, Table
+from uavlinkd.evaluation.page import Section, Table, to_html, to_markdown
 from uavlinkd.evaluation.spread import duration
 from uavlinkd.evaluation.tampering import NAME, problems
 from uavlinkd.evaluation.tampering_figures import tampering_figures
@@ -48,9 +47,9 @@ def write_tampering_report(folder: Path) -> Path:
     for name, svg in figures.items():
         (folder / f"{name}.svg").write_bytes(svg)
     sections = make_sections(run, list(figures))
-    (folder / f"{NAME}.md").write_text(_to_markdown(sections, figures), encoding="utf-8")
+    (folder / f"{NAME}.md").write_text(to_markdown(TITLE, sections, figures), encoding="utf-8")
     html = folder / f"{NAME}.html"
-    html.write_text(_to_html(sections, figures), encoding="utf-8")
+    html.write_text(to_html(TITLE, sections, figures, _cell), encoding="utf-8")
     return html
 
 
@@ -71,7 +70,7 @@ def write_tampering_page(folder: Path, page: Path) -> Path:
     results.mkdir(exist_ok=True)
     for name, svg in figures.items():
         (results / f"{name}.svg").write_bytes(svg)
-    page.write_text(_to_markdown(make_sections(run, list(figures)), figures, "results/"), encoding="utf-8")
+    page.write_text(to_markdown(TITLE, make_sections(run, list(figures)), figures, "results/"), encoding="utf-8")
     return page
 
 
@@ -286,50 +285,7 @@ def _facts(run: Run) -> Table:
     return Table(["", ""], rows)
 
 
-# Two forms of the same.
-
-_CSS = """
-body { font: 16px/1.5 system-ui, sans-serif; max-width: 76rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
-p { max-width: 50rem; } img { max-width: 100%; height: auto; }
-table { border-collapse: collapse; font-size: 0.85rem; display: block; overflow-x: auto; }
-th, td { border-bottom: 1px solid #ddd; padding: 0.25rem 0.6rem; text-align: left; vertical-align: top; }
-"""
-
-
-def _to_html(sections: Sequence[Section], figures: dict[str, bytes]) -> str:
-    parts = [
-        f'<!doctype html>\n<html lang="en">\n<meta charset="utf-8">\n<title>{escape(TITLE)}</title>',
-        f"<style>{_CSS}</style>\n<h1>{escape(TITLE)}</h1>",
-    ]
-    for section in sections:
-        parts.append(f"<h2>{escape(section.title)}</h2>")
-        if section.figure in figures:
-            data = base64.b64encode(figures[section.figure]).decode("ascii")
-            parts.append(f'<img alt="{escape(section.title)}" src="data:image/svg+xml;base64,{data}">')
-        parts += [f"<p>{escape(paragraph)}</p>" for paragraph in section.paragraphs]
-        if section.table is not None:
-            head = "".join(f"<th>{escape(cell)}</th>" for cell in section.table.head)
-            rows = ["".join(_cell(cell) for cell in row) for row in section.table.rows]
-            parts.append(f"<table><tr>{head}</tr>\n" + "\n".join(f"<tr>{row}</tr>" for row in rows) + "</table>")
-    return "\n".join([*parts, "</html>", ""])
-
-
 def _cell(text: str) -> str:
     verdict = next((each for each in Verdict if text.partition(":")[0] == each.value), None)
     colour = f' style="background: {_COLOURS[verdict]}"' if verdict else ""
     return f"<td{colour}>{escape(text)}</td>"
-
-
-def _to_markdown(sections: Sequence[Section], figures: dict[str, bytes], place: str = "") -> str:
-    parts = [f"# {TITLE}"]
-    for section in sections:
-        parts.append(f"## {section.title}")
-        if section.figure in figures:
-            parts.append(f"![{section.title}]({place}{section.figure}.svg)")
-        parts += section.paragraphs
-        if section.table is not None:
-            lines = [section.table.head, ["---"] * len(section.table.head), *section.table.rows]
-            parts.append(
-                "\n".join("| " + " | ".join(each.replace("|", "\\|") for each in line) + " |" for line in lines)
-            )
-    return "\n\n".join(parts) + "\n"
