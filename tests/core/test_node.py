@@ -610,7 +610,7 @@ def test_stranger_costs_two_key_exchanges(monkeypatch: pytest.MonkeyPatch) -> No
 
 def test_memory_for_initiations_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     """The last so many initiations are remembered; the one before them is answered as if it were new."""
-    assert c.REMEMBERED_INITIATIONS == 4096
+    assert c.REMEMBERED_INITIATIONS == 1024
     pair = established()
     for number in range(c.REMEMBERED_INITIATIONS + 100):
         pair.b.node._remember(pair.b.peer, number.to_bytes(32, "big"))

@@ -34,7 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.soak", description=__doc__)
     parser.add_argument("--minutes", type=float, required=True, help="how long they talk")
     parser.add_argument("--rate", type=float, default=50.0, help="frames a second from each program (50)")
-    parser.add_argument("--rekey-s", type=float, default=5.0, help="seconds between new keys (5)")
+    parser.add_argument("--rekey-s", type=float, default=2.0, help="seconds between new keys (2)")
     parser.add_argument("--seed", type=int, default=0, help="of the radio's luck")
     parser.add_argument("--out", type=Path, required=True, help="folder for the results")
     options = parser.parse_args(given)

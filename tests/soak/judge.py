@@ -13,8 +13,8 @@ JUDGED_FROM_S = 600.0
 MAY_GROW_SHARE = 0.01
 """Flat is what grew by less than this over the last three quarters of the run, by a straight line through them,"""
 MAY_GROW_KB = 256.0
-"""or by less than this. A peer's last 4,096 initiations are remembered (some 200 bytes each), a rekey adds one: with
-new keys each five seconds that alone takes 150 kB an hour, for six hours."""
+"""or by less than this. A peer's last 1,024 initiations are remembered (some 200 bytes each), a rekey adds one: with
+new keys each two seconds that memory is full after 34 minutes."""
 LOST_BY_RADIO = ("lost", "lost_in_burst", "lost_in_outage", "queue_full", "too_many_in_flight")
 
 Sample = dict[str, Any]

@@ -62,7 +62,7 @@ class Plan:
     seconds: float
     rate: float = 50.0
     """Frames a second, from each program."""
-    rekey_s: float = 5.0
+    rekey_s: float = 2.0
     every_s: float = 5.0
     """Between two samples."""
     seed: int = 0
