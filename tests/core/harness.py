@@ -22,6 +22,7 @@ from uavlinkd.core.suites import SUITES_BY_NAME
 T = TypeVar("T")
 
 _KEYS = sorted((bytes([number]) * 32 for number in (1, 2)), key=lambda private: KeyPair(private).public)
+_, PRIVATE_B = _KEYS
 KEY_A, KEY_B = (KeyPair(private) for private in _KEYS)
 """Alpha's public key is the smaller one."""
 KEY_C = KeyPair(bytes([3]) * 32)

@@ -1,8 +1,9 @@
 """Datagrams from who holds no key of the two peers: to a node before a handshake, during one, and on a session.
 
 The attacker has recorded what went by. It sends that, altered, and anything else, from any address; where it knows
-the victim's public key it repairs ``mac1``. For every datagram: nothing is emitted, but a cookie to who repaired
-``mac1``; exactly one drop is counted. After all of them the node is as it was, and what it waited for still works.
+the victim's public key it repairs ``mac1``, and proves its address with the cookies that it gets. For every datagram:
+nothing is emitted, but a cookie to who repaired ``mac1``; exactly one drop is counted. After all of them the node is
+as it was, and what it waited for still works.
 """
 
 from __future__ import annotations
@@ -10,14 +11,27 @@ from __future__ import annotations
 import zlib
 from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Final
 
-from tests.core.harness import exchange, of, state_of, with_macs
+from tests.core.harness import exchange, of, state_of
 from tests.fuzz.engine import TALLY, Run, Script
-from tests.fuzz.stages import LINKS, Stage, copier, idle, initiator, responder, session, with_suite
+from tests.fuzz.stages import (
+    LINKS,
+    PSK,
+    Stage,
+    copier,
+    idle,
+    idle_in_key_change,
+    initiator,
+    responder,
+    session,
+    with_suite,
+)
 from uavlinkd.core import constants as c
 from uavlinkd.core import wire
-from uavlinkd.core.drops import DropReason
+from uavlinkd.core.cookie import MacKeys, mac1_of
+from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.limits import TokenBucket
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Dropped, Output, Path, SessionEstablished, Transmit
@@ -27,7 +41,7 @@ CHECKS_THE_SEQUEL: Final = 0xF0
 """In a script's first byte, all of them: afterwards the genuine datagram comes, and the link must work."""
 BUDGET: Final = 8
 """Handshake messages of a script that reach a key exchange."""
-_SPENT = frozenset(("drops", "_initiations", "_responses", "_entropy"))
+_SPENT = frozenset(("drops", "_initiations", "_responses", "_cookied", "_sources", "_entropy"))
 _SPENT_WITH_COOKIES = _SPENT | {"_cookie", "retry_at", "cookies_taken", "deadline", "_deadline"}
 _KINDS = (*range(1, 4), 0x40, 0x41, 0xFD, 0xFE, 0)
 _HANDSHAKE_SIZES = tuple(
@@ -43,7 +57,8 @@ class Outsider:
     def __init__(self, stage: Stage) -> None:
         self._stage = stage
         self._node = stage.victim.node
-        self._receiver = self._node.public_key
+        self._receivers = tuple(MacKeys(each) for each in stage.public_keys)
+        self._cookies: dict[Path, bytes] = {}  # that the victim gave, to whoever asked from there
         self._chance = 0
         # As they are, these are no forgeries. mac2 means nothing until the node is under load.
         self._genuine = {*(stage.genuine, *stage.others)}
@@ -58,14 +73,15 @@ class Outsider:
         reasons: list[DropReason] = []
         cookies_taken = 0
         self._chance = zlib.crc32(script.data)
+        self._cookies.clear()
         now = stage.now
         self._reset()
         while script:
             how = script.byte()
-            datagram, is_repaired = self._datagram(script, how)
+            path = sources[how >> 4 & 3]
+            datagram, is_repaired = self._datagram(script, how, self._cookies.get(path) if how & 8 else None)
             if datagram in genuine or datagram[: -c.MAC_BYTES] in genuine:
                 continue
-            path = sources[how >> 4 & 3]
             now += (how >> 6) / 4096  # a script lasts up to half a second
             TALLY.add(datagram)
             outputs = receive(datagram, path, now)
@@ -75,7 +91,7 @@ class Outsider:
                 cookies_taken += 1
             else:
                 assert is_repaired, f"a stranger who knows no key got {outputs}"
-                reasons.append(_judge_cookie(outputs, datagram, path))
+                reasons.append(self._judge_cookie(outputs, datagram, path))
         counted = Counter(self._node.drops)
         for peer in self._node.peers.values():
             counted += peer.traffic.drops
@@ -91,22 +107,22 @@ class Outsider:
         if checks_the_sequel or cookies_taken:
             self._restore()
 
-    def _datagram(self, script: Script, how: int) -> tuple[bytes, bool]:
+    def _datagram(self, script: Script, how: int, cookie: bytes | None) -> tuple[bytes, bool]:
         """The next datagram, and whether its sender made it with the victim's public key."""
         match how & 7:
             case 0 | 1 | 2 | 3 as kind:
-                return self._altered(script, is_varied=kind > 0)
+                return self._altered(script, cookie, is_varied=kind > 0)
             case 4:
                 return self._of_right_length(script), False
             case 5:
-                return with_macs(self._of_right_length(script)[: -wire.MACS_BYTES], self._receiver), True
+                return self._receivers[0].add_macs(self._of_right_length(script)[: -wire.MACS_BYTES], cookie), True
             case 6:
                 return bytes((_KINDS[script.byte() & 7],)) + script.take(script.byte() & 63), False
             case _:
                 return script.take(script.byte() & 63), False
 
-    def _altered(self, script: Script, *, is_varied: bool) -> tuple[bytes, bool]:
-        """One of the recorded datagrams with a few bytes changed, cut or longer, with ``mac1`` made right or not.
+    def _altered(self, script: Script, cookie: bytes | None, *, is_varied: bool) -> tuple[bytes, bool]:
+        """One of the recorded datagrams with a few bytes changed, cut or longer, with its macs made right or not.
 
         ``is_varied``: one byte more, chosen by the whole script, so that a script with one change in it does not
         offer the same datagrams again but for one.
@@ -127,7 +143,8 @@ class Outsider:
                 del altered[script.word() % (len(altered) + 1) :]
         datagram = bytes(altered)
         if what & 8 and len(datagram) > wire.MACS_BYTES:
-            return with_macs(datagram[: -wire.MACS_BYTES], self._receiver), True
+            receiver = self._receivers[(what >> 1) % len(self._receivers)]
+            return receiver.add_macs(datagram[: -wire.MACS_BYTES], cookie), True
         return datagram, False
 
     def _of_right_length(self, script: Script) -> bytes:
@@ -139,6 +156,23 @@ class Outsider:
         suite = SUITES[_SUITE_NUMBERS[(what >> 2) % len(_SUITE_NUMBERS)]]
         size = (wire.initiation_bytes if kind == wire.INITIATION else wire.response_bytes)(suite)
         return (bytes((kind, suite.number)) + script.take(script.byte() & 31)).ljust(size, b"\7")[:size]
+
+    def _judge_cookie(self, outputs: Sequence[Output], datagram: bytes, path: Path) -> DropReason:
+        """The only answer that who knows the public key may get: a cookie, to itself, no longer than the question."""
+        assert len(outputs) == 2, f"more than a cookie: {outputs}"
+        sent, dropped = outputs
+        assert isinstance(sent, Transmit), f"more than a cookie: {outputs}"
+        assert isinstance(dropped, Dropped), f"more than a cookie: {outputs}"
+        assert dropped.reason is DropReason.COOKIE_REQUIRED
+        assert sent.datagram[0] == wire.COOKIE
+        assert sent.path == path, "a cookie went elsewhere"
+        assert len(sent.datagram) <= len(datagram), "an answer longer than its question"
+        reply, mac1 = wire.parse_cookie_reply(sent.datagram), mac1_of(datagram)
+        for receiver in self._receivers:
+            with suppress(Drop):
+                self._cookies[path] = receiver.open_cookie(reply, mac1)
+                return dropped.reason
+        raise AssertionError("a cookie that nobody can open")
 
     def _check_sequel(self, now: float) -> None:
         """What the victim waits for comes, at last: it completes, and frames cross both ways."""
@@ -177,19 +211,6 @@ def _refill(node: Node, now: float) -> None:
         peer.traffic.drops.clear()
 
 
-def _judge_cookie(outputs: Sequence[Output], datagram: bytes, path: Path) -> DropReason:
-    """The only answer that who knows the public key may get: a cookie, to itself, and no longer than the question."""
-    assert len(outputs) == 2, f"more than a cookie: {outputs}"
-    sent, dropped = outputs
-    assert isinstance(sent, Transmit), f"more than a cookie: {outputs}"
-    assert isinstance(dropped, Dropped), f"more than a cookie: {outputs}"
-    assert dropped.reason is DropReason.COOKIE_REQUIRED
-    assert sent.datagram[0] == wire.COOKIE
-    assert sent.path == path, "a cookie went elsewhere"
-    assert len(sent.datagram) <= len(datagram), "an answer longer than its question"
-    return dropped.reason
-
-
 def _make(stages: Callable[[], Sequence[Stage]]) -> Run:
     outsiders = [Outsider(each) for each in stages()]
 
@@ -204,17 +225,25 @@ def _make(stages: Callable[[], Sequence[Stage]]) -> Run:
 
 def make_idle() -> Run:
     """Before any handshake."""
-    return _make(lambda: [idle(LINKS[0]), idle(with_suite(LINKS[0], SUITES_BY_NAME["mlkem768"]))])
+    return _make(
+        lambda: [
+            idle(LINKS[0]),
+            idle(with_suite(LINKS[0], SUITES_BY_NAME["mlkem768"])),
+            idle(LINKS[0], PSK),
+            idle_in_key_change(LINKS[0]),
+        ]
+    )
 
 
 def make_initiator() -> Run:
     """While an initiation of its own waits for the response."""
-    return _make(lambda: [initiator(LINKS[0]), initiator(with_suite(LINKS[0], SUITES_BY_NAME["mlkem768"]))])
+    links = (LINKS[0], with_suite(LINKS[0], SUITES_BY_NAME["mlkem768"]))
+    return _make(lambda: [*(initiator(link) for link in links), initiator(LINKS[0], PSK)])
 
 
 def make_responder() -> Run:
     """While an answer of its own waits to be confirmed."""
-    return _make(lambda: [responder(LINKS[0]), responder(LINKS[3])])
+    return _make(lambda: [responder(LINKS[0]), responder(LINKS[3]), responder(LINKS[0], PSK)])
 
 
 def make_session() -> Run:

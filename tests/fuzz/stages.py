@@ -10,10 +10,24 @@ from dataclasses import dataclass, replace
 from types import BuiltinFunctionType, FunctionType, ModuleType
 from typing import Any, Final, TypeVar
 
-from tests.core.harness import AT_A, AT_B, ELSEWHERE, KEY_C, PLAIN, Pair, Side, datagrams, only, quiet
+from tests.core.harness import (
+    AT_A,
+    AT_B,
+    ELSEWHERE,
+    KEY_B,
+    KEY_C,
+    PLAIN,
+    PRIVATE_B,
+    Pair,
+    Side,
+    datagrams,
+    only,
+    quiet,
+)
 from uavlinkd.core import wire
 from uavlinkd.core.cookie import MacKeys, mac1_of
 from uavlinkd.core.crypto import AeadKey, KeyPair, MacKey, Secret
+from uavlinkd.core.node import Node
 from uavlinkd.core.noise import HandshakeState
 from uavlinkd.core.outputs import Path
 from uavlinkd.core.session import Authenticated, Confidential
@@ -24,6 +38,7 @@ T = TypeVar("T")
 
 NOW: Final = 100.0
 """When the scripts begin."""
+PSK: Final = Secret(bytes(range(32)))
 GROUPS: Final = tuple(SUITES_BY_NAME[name] for name in ("x25519", "mlkem768", "ffdhe2048"))
 
 
@@ -84,9 +99,12 @@ class Stage:
     sources: tuple[Path, ...] = (ELSEWHERE, AT_A, AT_B, (1, "2001:db8::7", 9))
     cookies: tuple[bytes, ...] = ()
     """Cookie replies that fit: whoever sees the datagrams of two whose public keys it knows can make them."""
+    public_keys: tuple[bytes, ...] = ()
+    """The victim's: by these ``mac1`` is made right."""
 
     def __post_init__(self) -> None:
         """An envelope of no session comes from the peer's address: the victim calls, and not again for a second."""
+        self.public_keys = self.public_keys or (self.victim.node.public_key,)
         self.victim.receive(bytes((wire.SHORT_ENVELOPE,)) + bytes(40), self.now)
 
     @property
@@ -100,9 +118,15 @@ class Stage:
         return self.pair.b if self.is_alpha else self.pair.a
 
 
-def pair_of(link_a: Link = PLAIN, link_b: Link | None = None, seed: int = 1) -> Pair:
+def pair_of(link_a: Link = PLAIN, link_b: Link | None = None, seed: int = 1, psk: Secret | None = None) -> Pair:
     """Alpha and bravo, who calls alpha too; bravo also knows charlie, who has no address."""
-    pair = Pair(link_a=link_a, link_b=link_b or link_a, seed=seed, now=NOW)
+    pair = Pair(link_a=link_a, link_b=link_b or link_a, psk_a=psk, psk_b=psk, seed=seed, now=NOW)
+    _make_small(pair, seed)
+    pair.b.node.add_peer(PeerSettings("charlie", KEY_C.public, None, link_a), NOW)
+    return pair
+
+
+def _make_small(pair: Pair, seed: int) -> None:
     for number, side in enumerate((pair.a, pair.b)):
         chance = Chance(seed + number)
         node = side.node
@@ -110,8 +134,6 @@ def pair_of(link_a: Link = PLAIN, link_b: Link | None = None, seed: int = 1) -> 
         node._entropy = node._cookies._entropy = node._indices._entropy = chance
         for peer in node.peers.values():
             peer._entropy = peer.caller._entropy = peer._challenger._entropy = chance
-    pair.b.node.add_peer(PeerSettings("charlie", KEY_C.public, None, link_a), NOW)
-    return pair
 
 
 def _cookie_for(message: bytes, receiver: bytes, index: int) -> bytes:
@@ -119,16 +141,29 @@ def _cookie_for(message: bytes, receiver: bytes, index: int) -> bytes:
     return wire.encode_cookie_reply(index, nonce, MacKeys(receiver).seal_cookie(b"c" * 16, nonce, mac1_of(message)))
 
 
-def idle(link: Link) -> Stage:
+def idle(link: Link, psk: Secret | None = None) -> Stage:
     """Bravo has heard nothing from anybody."""
-    pair = pair_of(link)
+    pair = pair_of(link, psk=psk)
     initiation = pair.initiation(NOW)
     return Stage(pair, False, initiation, (initiation,))
 
 
-def initiator(link: Link) -> Stage:
-    """Alpha has sent an initiation and waits for the response; bravo, who calls too, has sent one as well."""
+def idle_in_key_change(link: Link) -> Stage:
+    """Bravo has a new key, and takes its former one as well; alpha, who calls, knows the former."""
     pair = pair_of(link)
+    alpha = pair.b.peer.settings
+    node = pair.b.node = Node(Secret(bytes([7]) * 32), Chance(2), NOW, Secret(PRIVATE_B))
+    node.add_peer(alpha, NOW, by_previous_key=True)
+    node.add_peer(replace(alpha, name="alpha by the new key"), NOW)
+    _make_small(pair, 1)
+    initiation = pair.initiation(NOW)
+    keys = node.public_key, KEY_B.public
+    return Stage(pair, False, initiation, (initiation,), public_keys=keys)
+
+
+def initiator(link: Link, psk: Secret | None = None) -> Stage:
+    """Alpha has sent an initiation and waits for the response; bravo, who calls too, has sent one as well."""
+    pair = pair_of(link, psk=psk)
     initiation = pair.initiation(NOW)
     response = only(datagrams(pair.b.receive(initiation, NOW)))
     pair.b.knows_the_way(NOW)
@@ -138,9 +173,9 @@ def initiator(link: Link) -> Stage:
     return Stage(pair, True, response, (response, crossing, initiation, cookie), (crossing,), cookies=(cookie,))
 
 
-def responder(link: Link) -> Stage:
+def responder(link: Link, psk: Secret | None = None) -> Stage:
     """Bravo has answered and waits for the envelope that confirms the session."""
-    pair = pair_of(link)
+    pair = pair_of(link, psk=psk)
     initiation = pair.initiation(NOW)
     response = only(datagrams(pair.b.receive(initiation, NOW)))
     confirmation = only(datagrams(pair.a.receive(response, NOW)))
