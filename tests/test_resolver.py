@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import socket
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -142,3 +144,24 @@ async def test_an_answer_that_vanishes_is_kept(names: Names) -> None:
         await following.until(lambda: bool(logs))
         assert len(following.told) == 1
         await following.stop()
+
+
+async def test_a_silent_server_is_asked_each_second(monkeypatch: pytest.MonkeyPatch) -> None:
+    """However long it is silent: the system repeats a question after 5 s and gives up after 10 (here tenths)."""
+    put: list[float] = []
+
+    def look_up(*_: Any, **__: Any) -> Any:
+        for _again in (False, True):
+            put.append(time.monotonic())
+            time.sleep(0.5)
+        raise socket.gaierror(socket.EAI_AGAIN, "Temporary failure in name resolution")
+
+    monkeypatch.setattr(socket, "getaddrinfo", look_up)
+    monkeypatch.setattr(resolver, "FIRST_WAIT_S", 0.05)
+    monkeypatch.setattr(resolver, "LONGEST_WAIT_S", 0.1)
+    following = Following([Address("drone1.test", 5790)])
+    await asyncio.sleep(3.0)
+    await following.stop()
+    put.sort()
+    assert len(put) > 25
+    assert max(after - before for before, after in itertools.pairwise(put)) < 0.25

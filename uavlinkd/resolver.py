@@ -18,9 +18,9 @@ Resolved = list[tuple[socket.AddressFamily, str, int]]
 FIRST_WAIT_S = 0.5
 LONGEST_WAIT_S = 1.0
 """Between look-ups while an answer is wanted: a link is up within 2 s of the name server's return."""
-QUESTIONS_AT_ONCE = 4
+QUESTIONS_AT_ONCE = 5
 """About the names of one peer. A question to a name server that is silent takes the system 5 s to repeat and 10 s to
-give up (resolv.conf(5)), and is of no use when the server is back; so others are asked meanwhile."""
+give up (resolv.conf(5)); with five of them, begun a second apart, one is put or repeated each second."""
 
 _THREADS = Threads(8, "look-up")
 """Names that nobody answers for can hold up so many others, and no more threads than systemd's unit allows."""
@@ -65,10 +65,13 @@ async def keep_resolving(
     failing: set[str] = set()
     wait_s = FIRST_WAIT_S
     asking: set[asyncio.Task[tuple[Resolved, list[str]]]] = set()
+    loop = asyncio.get_running_loop()
+    asked_at = loop.time()
     try:
         while True:
             if not known or failing or is_wanted():
                 if len(asking) < QUESTIONS_AT_ONCE:
+                    asked_at = loop.time()
                     asking.add(asyncio.ensure_future(resolve(addresses)))
                 answered, asking = await asyncio.wait(
                     asking, timeout=LONGEST_WAIT_S, return_when=asyncio.FIRST_COMPLETED
@@ -87,7 +90,8 @@ async def keep_resolving(
                 wait_s = min(2 * wait_s, LONGEST_WAIT_S)
             else:
                 wait_s = FIRST_WAIT_S
-            await asyncio.sleep(wait_s)
+                asked_at = loop.time()
+            await asyncio.sleep(asked_at + wait_s - loop.time())
     finally:
         _forget(asking)
 

@@ -80,8 +80,8 @@ USABLE_PER_PEER = 3
 COOKIED_ANSWERS_PER_S = 20
 """Responses a second to one peer with cookies, from all addresses: so it cannot use up the session indices."""
 REMEMBERED_INITIATIONS = 1024
-"""Ephemerals of a peer's authentic initiations: an exact replay costs a look-up, no key exchange. Some 200 bytes each:
-with 200 peers 40 MB, not before 34 hours of flight."""
+"""Ephemerals of a peer's authentic initiations: an exact replay costs a look-up, no key exchange. Some 200 bytes
+each: with 200 peers 40 MB, and not before 34 hours of flight."""
 INITIATIONS_PER_S = 50.0
 """Messages a second that may reach a key exchange without a cookie. Beyond that we are under load."""
 INITIATIONS_BURST = 50
