@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from uavlinkd import sdnotify
 from uavlinkd.sdnotify import UNSENT_MESSAGES, Supervisor
 
 PID = 4242
@@ -46,11 +47,12 @@ def manager(path: str) -> Iterator[Manager]:
     manager.sock.close()
 
 
-def test_life_is_told_in_order(manager: Manager, path: str) -> None:
-    """Ready, reloading with the time of the monotonic clock in microseconds, ready again, stopping."""
+def test_life_is_told_in_order(manager: Manager, path: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ready, reloading with the time of systemd's monotonic clock in microseconds, ready again, stopping."""
+    monkeypatch.setattr(sdnotify, "monotonic", lambda: 12.5)
     supervisor = Supervisor({"NOTIFY_SOCKET": path}, PID)
     supervisor.ready()
-    supervisor.reloading(12.5)
+    supervisor.reloading()
     supervisor.ready()
     supervisor.stopping()
     assert manager.heard() == ["READY=1", "RELOADING=1\nMONOTONIC_USEC=12500000", "READY=1", "STOPPING=1"]
@@ -72,7 +74,7 @@ def test_without_a_manager_nothing_happens(name: str | None) -> None:
     """No variable, or one that names no Unix socket."""
     supervisor = Supervisor({} if name is None else {"NOTIFY_SOCKET": name, "WATCHDOG_USEC": "1000000"}, PID)
     supervisor.ready()
-    supervisor.reloading(1.0)
+    supervisor.reloading()
     supervisor.turn("1 of 1 peers up", 2.0)
     supervisor.stopping()
 
@@ -81,7 +83,7 @@ def test_a_manager_that_is_gone_costs_nothing(path: str) -> None:
     """Nothing is raised where nobody listens; what must arrive waits, a bounded number of messages."""
     supervisor = Supervisor({"NOTIFY_SOCKET": path}, PID)
     for _ in range(UNSENT_MESSAGES):
-        supervisor.reloading(1.0)
+        supervisor.reloading()
         supervisor.ready()
     supervisor.turn("0 of 1 peers up", 2.0)
     manager = Manager(path)

@@ -11,12 +11,12 @@ import os
 import select
 import sys
 from collections import Counter
-from time import monotonic
 from typing import Any, TextIO, cast
 
 import structlog
 from structlog.typing import EventDict, FilteringBoundLogger, Processor
 
+from uavlinkd.clock import monotonic
 from uavlinkd.core.drops import DropReason
 from uavlinkd.endpoints.ports import failure_name
 

@@ -11,9 +11,9 @@ import re
 from collections.abc import Callable
 from http import HTTPStatus
 from ipaddress import ip_address
-from time import monotonic
 
 from uavlinkd.addresses import Address
+from uavlinkd.clock import monotonic
 from uavlinkd.endpoints.tcp import tcp_listener
 from uavlinkd.metrics import CONTENT_TYPE, Status, exposition
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import socket
 from collections import deque
 from collections.abc import Mapping
+from time import monotonic
 
 NEVER = float("inf")
 UNSENT_MESSAGES = 16
@@ -37,10 +38,10 @@ class Supervisor:
         self._note = f"; {note}" if note else ""
         self._tell("READY=1")
 
-    def reloading(self, now: float) -> None:
+    def reloading(self) -> None:
         """The configuration is being read again; :meth:`ready` ends it."""
         # systemd from 253 on compares the time with that of its signal, on the same clock.
-        self._tell(f"RELOADING=1\nMONOTONIC_USEC={now * 1e6:.0f}")
+        self._tell(f"RELOADING=1\nMONOTONIC_USEC={monotonic() * 1e6:.0f}")
 
     def stopping(self) -> None:
         """The end has begun; nothing is told after it."""

@@ -7,10 +7,10 @@ import os
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
-from time import monotonic
 
 from serialx import BaseSerial, serial_for_url
 
+from uavlinkd.clock import monotonic
 from uavlinkd.endpoints.ports import PortHandler, failure_name
 from uavlinkd.endpoints.streams import MAX_AGE_S, Connection, StreamEndpoint
 from uavlinkd.endpoints.url import SerialUrl

@@ -11,9 +11,9 @@ import asyncio
 from abc import ABC, abstractmethod
 from collections import Counter, deque
 from collections.abc import Sequence
-from time import monotonic
 from typing import Protocol
 
+from uavlinkd.clock import monotonic
 from uavlinkd.endpoints.ports import LocalPort, PortHandler, failure_name
 from uavlinkd.mavlink.frames import SplitCounters, StreamSplitter
 

@@ -11,9 +11,9 @@ import socket
 import struct
 from contextlib import suppress
 from secrets import SystemRandom
-from time import monotonic
 
 from uavlinkd.addresses import Address
+from uavlinkd.clock import monotonic
 from uavlinkd.endpoints.ports import PortHandler, failure_name
 from uavlinkd.endpoints.sockets import BindError, unbound_socket
 from uavlinkd.endpoints.streams import MAX_AGE_S, STALLED_S, StreamEndpoint
