@@ -6,12 +6,12 @@ import asyncio
 import socket
 from collections import Counter
 from collections.abc import Callable, Sequence
-from time import monotonic
 from typing import Any
 
 from structlog.typing import FilteringBoundLogger
 
 from uavlinkd.addresses import Address
+from uavlinkd.clock import monotonic
 from uavlinkd.core.outputs import Path
 from uavlinkd.endpoints.ports import failure_name
 from uavlinkd.endpoints.sockets import Reader, numeric_host, udp_socket
@@ -75,6 +75,7 @@ class PeerSockets:
     def _on_readable(self, number: int, reader: Reader) -> None:
         arrived, now = reader.read()
         self._on_arrived([(datagram, _path(number, source)) for datagram, source in arrived], now)
+        reader.done()
 
     def send(self, datagram: bytes, path: Path) -> None:
         """Hand a datagram to the kernel."""

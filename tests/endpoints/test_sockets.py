@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 from collections.abc import Iterator
+from time import sleep
 
 import pytest
 
@@ -92,9 +93,10 @@ class Pair:
         for datagram in datagrams:
             self.sender.send(datagram)
 
-    def read(self) -> list[bytes]:
+    def read(self, *, has_gathered: bool = False) -> list[bytes]:
         """What one wake-up reads."""
-        arrived, _ = self.reader.read()
+        arrived, _ = self.reader.read(has_gathered=has_gathered)
+        self.reader.done()
         assert all(source == self.sender.getsockname() for _, source in arrived)
         return [datagram for datagram, _ in arrived]
 
@@ -109,21 +111,20 @@ def pair() -> Iterator[Pair]:
 
 
 @pytest.mark.parametrize("datagrams", [(), (b"a",), (b"a", b"b", b"c"), (b"", b"b"), (b"a", b"", b"c")])
-def test_one_wake_up_reads_all_that_is_there(pair: Pair, datagrams: tuple[bytes, ...]) -> None:
-    """None, one or many; an empty one may end a wake-up, and begins the next."""
-    pair.send(*datagrams)
-    got = pair.read()
-    assert got or not datagrams
-    while more := pair.read():
-        got += more
-    assert got == list(datagrams)
-    assert pair.failures == []
+def test_two_wake_ups_read_all_that_is_there(pair: Pair, datagrams: tuple[bytes, ...]) -> None:
+    """None, one or many: the first at once, what comes with it the next time; all where they had gathered."""
+    for gathered in (False, True):
+        pair.send(*datagrams)
+        assert pair.read(has_gathered=gathered) == list(datagrams if gathered else datagrams[:1])
+        assert pair.read() == list(datagrams[:0] if gathered else datagrams[1:])
+        assert pair.failures == []
+        sleep(2 * BUSY_S)
 
 
 def test_one_wake_up_reads_no_more_than_its_share(pair: Pair) -> None:
     """The other sockets have their turn."""
     pair.send(*[bytes([number]) for number in range(DATAGRAMS_PER_WAKE_UP + 3)])
-    assert len(pair.read()) == DATAGRAMS_PER_WAKE_UP
+    assert len(pair.read(has_gathered=True)) == DATAGRAMS_PER_WAKE_UP
     assert len(pair.read()) == 3
 
 
@@ -149,11 +150,17 @@ def test_a_busy_socket_is_read_after_a_pause(monkeypatch: pytest.MonkeyPatch, pa
 
     monkeypatch.setattr("uavlinkd.endpoints.sockets.monotonic", lambda: now)
     monkeypatch.setattr("uavlinkd.endpoints.sockets.sleep", pause)
-    pair.reader.read()
+    pair.read()
     assert pauses == []
     now += BUSY_S / 2
-    pair.reader.read()
+    pair.read()
     assert pauses == [PAUSE_S]
     now += 2 * BUSY_S
-    pair.reader.read()
+    pair.read()
     assert pauses == [PAUSE_S]
+    now += BUSY_S / 2
+    pair.read(has_gathered=True)
+    assert pauses == [PAUSE_S]
+    now += BUSY_S / 2
+    pair.read()
+    assert pauses == [PAUSE_S, PAUSE_S]

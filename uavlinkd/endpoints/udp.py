@@ -10,11 +10,11 @@ import socket
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Sequence
-from time import monotonic
 
 import structlog
 
 from uavlinkd.addresses import Address
+from uavlinkd.clock import monotonic
 from uavlinkd.endpoints.ports import LocalPort, PortHandler, failure_name
 from uavlinkd.endpoints.sockets import Arrived, BindError, Reader, numeric_host, udp_socket
 from uavlinkd.mavlink.frames import Frame, SplitCounters, split_datagram
@@ -84,11 +84,12 @@ class UdpEndpoint(ABC):
             self._gathering = loop.call_later(self._gather_s, self._on_gathered, reader, self._gather_s)
         else:
             self.take(*reader.read())
+            reader.done()
 
     def _on_gathered(self, reader: Reader, waited_s: float) -> None:
         self._gathering = None
         self._watch(reader)
-        self.take(*reader.read(), waited_s)
+        self.take(*reader.read(has_gathered=True), waited_s)
 
     def take(self, datagrams: Arrived, now: float, waited_s: float = 0.0) -> None:
         """Hand over the frames of each sender in their order; the first of them has waited so long already."""
