@@ -26,9 +26,9 @@ def session(index: int, generation: int = 1, *, initiator: bool = True, now: flo
     return Session(cast(Any, None), X25519, keys, index, now, 180.0, is_initiator=initiator)
 
 
-def unconfirmed(index: int, expires_at: float = 10.0) -> Unconfirmed:
+def unconfirmed(index: int, expires_at: float = 10.0, *, is_expected: bool = False) -> Unconfirmed:
     """A session that waits for its first envelope."""
-    return Unconfirmed(session(index, initiator=False), PATH, bytes(16), expires_at)
+    return Unconfirmed(session(index, initiator=False), PATH, is_expected, bytes(16), expires_at)
 
 
 @pytest.fixture
@@ -105,6 +105,18 @@ def test_waiting_sessions_are_bounded_and_the_oldest_goes(sessions: Sessions) ->
     assert list(sessions.unconfirmed) == list(range(3, 19))
     assert owners(sessions) == list(range(3, 19))
     assert not sessions._indices.is_quarantined(1, 0.0)
+
+
+def test_who_calls_from_where_it_is_goes_last(sessions: Sessions) -> None:
+    """Calls from elsewhere, such as replayed ones, do not push out one from the peer's own place."""
+    sessions.wait(unconfirmed(1))
+    sessions.wait(unconfirmed(2, is_expected=True))
+    for index in range(3, c.UNCONFIRMED_PER_PEER + 10):
+        sessions.wait(unconfirmed(index))
+    assert list(sessions.unconfirmed) == [2, *range(11, 26)]
+    for index in range(30, 30 + c.UNCONFIRMED_PER_PEER):
+        sessions.wait(unconfirmed(index, is_expected=True))
+    assert list(sessions.unconfirmed) == list(range(30, 46))
 
 
 def test_waiting_session_expires(sessions: Sessions) -> None:

@@ -351,8 +351,8 @@ class Peer:
         message, keys = handshake.respond(received, self.settings, index, self.sessions.generation, self._entropy)
         datagram = self.caller.add_macs(message, now)
         session = Session(self, suite, keys, index, now, self.timers.reject_after_s, is_initiator=False)
-        expires_at = now + c.UNCONFIRMED_LIFETIME_S
-        self.sessions.wait(Unconfirmed(session, path, mac1_of(datagram), expires_at))
+        is_expected, expires_at = path in self.caller.candidates(self.path), now + c.UNCONFIRMED_LIFETIME_S
+        self.sessions.wait(Unconfirmed(session, path, is_expected, mac1_of(datagram), expires_at))
         self._wake_at(expires_at)
         self._transmit(Transmit(datagram, path), out)
 

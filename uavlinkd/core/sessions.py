@@ -25,6 +25,8 @@ class Unconfirmed:
     session: Session
     path: Path
     """Where the response went: whoever confirms has read it there."""
+    is_expected: bool
+    """Whether that is where the peer is, as far as is known: others must not push it out."""
     mac1: bytes
     """Of the response, which a cookie reply refers to."""
     expires_at: float
@@ -58,9 +60,11 @@ class Sessions:
         return self.confirmed[0].parameters.generation if self.confirmed else 0
 
     def wait(self, unconfirmed: Unconfirmed) -> None:
-        """Keep a session until it is confirmed; when there are too many, the oldest goes."""
+        """Keep a session until it is confirmed; when there are too many, the oldest that was not expected goes."""
         while len(self.unconfirmed) >= c.UNCONFIRMED_PER_PEER:
-            self._forget(next(iter(self.unconfirmed)))
+            oldest = next(iter(self.unconfirmed))
+            unexpected = (index for index, each in self.unconfirmed.items() if not each.is_expected)
+            self._forget(next(unexpected, oldest))
         index = unconfirmed.session.local_index
         self.unconfirmed[index] = unconfirmed
         self._indices.owners[index] = unconfirmed.session
