@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,11 +12,14 @@ from rich.console import Console
 from uavlinkd import keys
 from uavlinkd.config import Config, ConfigError, Peer, load_config
 from uavlinkd.config.changes import compare
+from uavlinkd.core.crypto import KeyPair, Secret
+from uavlinkd.core.node import Node
 from uavlinkd.core.settings import PeerSettings
-from uavlinkd.key_change import is_by_our_previous, link_name, pairings
+from uavlinkd.key_change import is_by_our_previous, is_by_their_previous, link_name, pairings
+from uavlinkd.peer_link import PeerLink
 from uavlinkd.topology import print_topology
 
-OWN, PREVIOUS, THEIRS, THEIRS_BEFORE = (keys.generate_private_key() for _ in range(4))
+OWN, PREVIOUS, THEIRS, THEIRS_BEFORE, OTHER = (keys.generate_private_key() for _ in range(5))
 
 
 def load(folder: Path, own: str = "", theirs: str = "") -> Config:
@@ -27,7 +31,7 @@ def load(folder: Path, own: str = "", theirs: str = "") -> Config:
     path.write_text(
         f'name = "a"\nprivate_key_file = "a.key"\nlisten = ["0.0.0.0:5790"]\n{own}\n'
         f'[[peer]]\nname = "b"\npublic_key = "{keys.public_key_text(THEIRS)}"\n{theirs}\n'
-        f'[[peer]]\nname = "c"\npublic_key = "{keys.public_key_text(keys.generate_private_key())}"\n'
+        f'[[peer]]\nname = "c"\npublic_key = "{keys.public_key_text(OTHER)}"\n'
     )
     return load_config(path, {})
 
@@ -57,7 +61,23 @@ def test_every_pair_of_keys_that_may_be_right_is_tried() -> None:
     assert len(set(names)) == 4
     assert {link_name(name) for name in names} == {"b"}
     assert [is_by_our_previous(name) for name in names] == [False, False, True, True]
+    assert [is_by_their_previous(name) for name in names] == [False, True, False, True]
     assert len(pairings(Peer(PeerSettings("b", now), ()), has_previous_key=False)) == 1
+
+
+def test_the_end_of_their_change_leaves_ours() -> None:
+    """Their previous key is out of the file: the peer is still accepted where it knows us by our previous one."""
+    now, before = (KeyPair(keys.decode_key(each)).public for each in (THEIRS, THEIRS_BEFORE))
+    node = Node(Secret(keys.decode_key(OWN)), bytes, 0.0, Secret(keys.decode_key(PREVIOUS)))
+    config = Peer(PeerSettings("b", now), (), previous_public_key=before)
+    link = PeerLink(config, node, lambda _: None, 0.0)
+    link.join(0.0, has_previous_key=True, grace_s=10.0)
+    assert len(node.peers) == 4
+    link.change(replace(config, previous_public_key=None), 1.0)
+    assert list(node.peers) == ["b", "b (our previous key)"]
+    assert link.accepts_previous_keys
+    link.give_up_previous(2.0)
+    assert list(node.peers) == ["b"]
 
 
 def test_previous_keys_are_loaded(tmp_path: Path) -> None:
@@ -133,6 +153,22 @@ def test_previous_keys_of_two_peers_differ(tmp_path: Path) -> None:
         with pytest.raises(ConfigError) as error:
             load_config(path, {})
         assert [each.key for each in error.value.problems] == [place]
+
+
+def test_a_peers_previous_key_comes_with_a_new_link(tmp_path: Path) -> None:
+    """A link accepts what it was made to accept: a previous key more makes it anew, one less does not."""
+    without, having = load(tmp_path), load(tmp_path, theirs=was(THEIRS_BEFORE))
+    coming, going = compare(without, having), compare(having, without)
+    assert coming.removed_peers == ("b",)
+    assert [each.name for each in coming.added_peers] == ["b"]
+    assert (going.removed_peers, going.added_peers) == ((), ())
+    assert [each.name for each in going.changed_peers] == ["b"]
+
+
+def test_grace_is_fixed(tmp_path: Path) -> None:
+    """It began with the links."""
+    with pytest.raises(ConfigError, match="key_grace_s"):
+        compare(load(tmp_path, OUR_LINE), load(tmp_path, f"{OUR_LINE}\nkey_grace_s = 60"))
 
 
 def test_previous_key_may_go_while_the_daemon_runs_and_not_come(tmp_path: Path) -> None:

@@ -10,12 +10,12 @@ import asyncio
 import os
 import signal
 from contextlib import suppress
-from time import monotonic
 from typing import TYPE_CHECKING
 
 import structlog
 
 from uavlinkd.addresses import Address
+from uavlinkd.clock import monotonic
 from uavlinkd.config import Config, ConfigError
 from uavlinkd.config import Endpoint as EndpointConfig
 from uavlinkd.config import Peer as PeerConfig
@@ -29,7 +29,7 @@ from uavlinkd.core.peer import NEVER
 from uavlinkd.endpoints.opening import open_endpoint, open_new
 from uavlinkd.endpoints.ports import Endpoint, LocalPort
 from uavlinkd.event_log import EventLog
-from uavlinkd.key_change import link_name
+from uavlinkd.key_change import is_by_our_previous, link_name
 from uavlinkd.log import DropSummary
 from uavlinkd.mavlink.frames import Frame, split_payload
 from uavlinkd.mavlink.policy import Policy, Refusal
@@ -187,7 +187,7 @@ class Daemon:
                 opened; the old one stays in force, whole.
         """
         async with self._reloading:
-            self.supervisor.reloading(monotonic())
+            self.supervisor.reloading()
             try:
                 await self._reload()
             except ConfigError:
@@ -208,15 +208,15 @@ class Daemon:
         self.config = config
         for name in changes.removed_peers:
             self._remove_peer(name)
+        for peer in changes.changed_peers:  # before any comes who may have a key that one of them gives up
+            self._change_peer(peer)
         for peer in changes.added_peers:
             self._add_peer(peer)
-        for peer in changes.changed_peers:
-            self._change_peer(peer)
         for name in changes.closed_endpoints:
             self._close_endpoint(name)
         if config.previous_private_key is None:
             for link in self.links.values():
-                link.give_up_previous(monotonic(), ours_only=True)
+                link.give_up_previous(monotonic(), is_by_our_previous)
         for endpoint, each in zip(opened, changes.opened_endpoints, strict=True):
             self.endpoints.append(endpoint)
             self._start_endpoint(endpoint, each)

@@ -43,6 +43,11 @@ def is_by_our_previous(core_name: str) -> bool:
     return core_name.endswith(_OURS)
 
 
+def is_by_their_previous(core_name: str) -> bool:
+    """Whether we know that peer of the core by its previous key."""
+    return f" {_THEIRS}" in core_name
+
+
 def link_name(core_name: str) -> str:
     """The peer as the configuration names it: names have no spaces."""
     return core_name.partition(" ")[0]

@@ -8,7 +8,7 @@ from uavlinkd.config import Peer as PeerConfig
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Output, Path, Transmit
 from uavlinkd.core.peer import NEVER, Peer
-from uavlinkd.key_change import is_by_our_previous, pairings
+from uavlinkd.key_change import is_by_their_previous, pairings
 from uavlinkd.mavlink.coalescing import Coalescer, make_egress
 from uavlinkd.mavlink.egress import Egress, EnvelopeShape
 from uavlinkd.mavlink.frames import Frame, SplitCounters
@@ -82,9 +82,9 @@ class PeerLink:
         for name in self._names:
             self._perform(self._node.remove_peer(name, now))
 
-    def give_up_previous(self, now: float, *, ours_only: bool = False) -> bool:
-        """Accept previous keys no longer; whether there were any."""
-        gone = [name for name in self._names[1:] if is_by_our_previous(name) or not ours_only]
+    def give_up_previous(self, now: float, which: Callable[[str], bool] = bool) -> bool:
+        """Accept previous keys no longer, all of them or those of ``which``; whether there were any."""
+        gone = [name for name in self._names[1:] if which(name)]
         self._names = [name for name in self._names if name not in gone]
         for name in gone:
             self._perform(self._node.remove_peer(name, now))
@@ -106,8 +106,8 @@ class PeerLink:
         if config.egress != self.config.egress:
             self.egress = make_egress(config.egress, now)
             self._charged = {name: self._sent(name) for name in self._names}
-        if config.previous_public_key != self.config.previous_public_key:
-            self.give_up_previous(now)
+        if config.previous_public_key is None:
+            self.give_up_previous(now, is_by_their_previous)
         self.config = config
         self.on_session()
 

@@ -16,6 +16,7 @@ _FIXED = {
     "routing": "routing",
     "metrics": "metrics",
     "recording": "recording",
+    "key_grace_s": "key_grace_s",
 }
 """Of the configuration, what is set for as long as the daemon runs; and the key that a person finds in the file."""
 _NEEDS_RESTART = "cannot change while the daemon runs: restart it, or put the old value back"
@@ -77,7 +78,7 @@ def compare(old: Config, new: Config) -> Changes:
     same_peers = {
         name
         for name, each in peers_now.items()
-        if name in peers_before and peers_before[name].settings == each.settings
+        if name in peers_before and _is_accepted_already(each, peers_before[name])
     }
     return Changes(
         removed_peers=tuple(name for name in peers_before if name not in same_peers),
@@ -89,3 +90,8 @@ def compare(old: Config, new: Config) -> Changes:
             endpoints_now[name] for name in same_endpoints if endpoints_now[name] != endpoints_before[name]
         ),
     )
+
+
+def _is_accepted_already(peer: Peer, before: Peer) -> bool:
+    """Whether a link made for ``before`` takes this peer by every key that it may have now."""
+    return peer.settings == before.settings and peer.previous_public_key in (None, before.previous_public_key)
