@@ -141,10 +141,10 @@ def test_the_version_is_told(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().out == f"uavlinkd {__version__}\n"
 
 
-@pytest.mark.parametrize("command", ["run", "check"])
+@pytest.mark.parametrize("command", ["run", "check", "status", "reload", "peer list"])
 def test_an_absent_file_gives_status_2(tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str) -> None:
     """One line with its name."""
-    assert main([command, "--config", str(tmp_path / "absent.toml")]) == WRONG
+    assert main([*command.split(), "--config", str(tmp_path / "absent.toml")]) == WRONG
     out, err = capsys.readouterr()
     assert out == ""
     assert "absent.toml" in err

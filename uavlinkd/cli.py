@@ -175,17 +175,15 @@ def _control_socket(options: argparse.Namespace) -> Path:
     """Where the daemon is asked.
 
     Raises:
-        ControlError: its configuration names no socket, or cannot be read.
+        ConfigError: its configuration is wrong.
+        ControlError: its configuration names no socket.
     """
-    from uavlinkd.config import ConfigError, load_config
+    from uavlinkd.config import load_config
     from uavlinkd.control import ControlError
 
     if options.socket is not None:
         return Path(options.socket)
-    try:
-        config = load_config(options.config, os.environ)
-    except ConfigError as error:
-        raise ControlError(str(error)) from None
+    config = load_config(options.config, os.environ)
     if config.control_socket is None:
         raise ControlError(f'{options.config} names no control_socket: add control_socket = "{config.name}.sock"')
     return config.control_socket
@@ -198,6 +196,7 @@ def _status(options: argparse.Namespace) -> int:
     from rich.console import Console
     from rich.live import Live
 
+    from uavlinkd.config.errors import ConfigError
     from uavlinkd.control import ControlError, ask
     from uavlinkd.status_screen import all_up, render_status
 
@@ -214,12 +213,15 @@ def _status(options: argparse.Namespace) -> int:
                     time.sleep(1.0)
                     status = ask(socket, "status")
                     live.update(render_status(status), refresh=True)
+    except ConfigError as error:
+        return _fail(error, WRONG)
     except ControlError as error:
         return _fail(error)
     return OK if all_up(status) else FAILED
 
 
 def _reload(options: argparse.Namespace) -> int:
+    from uavlinkd.config.errors import ConfigError
     from uavlinkd.control import ControlError, ask
 
     def say_so() -> None:
@@ -227,6 +229,8 @@ def _reload(options: argparse.Namespace) -> int:
 
     try:
         problems = ask(_control_socket(options), "reload", on_waiting=say_so)["problems"]
+    except ConfigError as error:
+        return _fail(error, WRONG)
     except ControlError as error:
         return _fail(error)
     return _fail("\n".join(problems), WRONG) if problems else OK
@@ -235,11 +239,14 @@ def _reload(options: argparse.Namespace) -> int:
 def _peer_list(options: argparse.Namespace) -> int:
     from rich.console import Console
 
+    from uavlinkd.config.errors import ConfigError
     from uavlinkd.control import ControlError, ask
     from uavlinkd.status_screen import render_peers
 
     try:
         Console().print(render_peers(ask(_control_socket(options), "status")))
+    except ConfigError as error:
+        return _fail(error, WRONG)
     except ControlError as error:
         return _fail(error)
     return OK
