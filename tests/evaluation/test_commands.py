@@ -63,7 +63,7 @@ def test_without_matplotlib_the_report_says_what_to_install(
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     options = parse("report", str(tmp_path))
     assert options.command(options) == 1
-    assert "uavlinkd[evaluation]" in capsys.readouterr().err
+    assert "'.[evaluation]'" in capsys.readouterr().err
 
 
 def test_the_parsers_and_the_measurements_import_nothing_of_the_figures() -> None:

@@ -38,4 +38,4 @@ def test_without_matplotlib_one_line_says_what_to_install(
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     assert main(["evaluate", "tampering", "--quick", "--out", str(tmp_path)]) == 1
-    assert "pip install 'uavlinkd[evaluation]'" in capsys.readouterr().err
+    assert "pip install '.[evaluation]'" in capsys.readouterr().err

@@ -374,6 +374,7 @@ async def suspended(stage: Stage) -> Outcome:
         assert not [n for n in old if speaker.frame(n) in hearer.heard_at], "what had waited came as if it were new"
     talk.check_no_copies()
     talk.stop()
+    await a.until_logged("daemon_stood_still")
     await a.until_logged("frames_dropped", reason="stale")
     dropped = sum(each["count"] for each in a.events("frames_dropped", reason="stale"))
     return Outcome(

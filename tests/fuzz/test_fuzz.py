@@ -96,7 +96,7 @@ def test_same_seed_is_the_same_hunt() -> None:
 
 def test_libfuzzer_finds_a_planted_bug(tmp_path: Path) -> None:
     """atheris runs a target in a process of its own, guided by its coverage; what escapes is kept, and reproduces."""
-    need(find_spec("atheris") is not None, "atheris: pip install 'uavlinkd[fuzz]'")
+    need(find_spec("atheris") is not None, "atheris: pip install '.[fuzz]'")
     found = fuzz(TARGETS["key"], runs=5000, escapes=tmp_path, plant="two spellings of a key")
     assert found.escape is not None, found.log
     assert "a key with two spellings" in found.log

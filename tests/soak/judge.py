@@ -82,6 +82,7 @@ def _frame_problems(last: Sample) -> list[str]:
                 problems.append(f"{way}: the taps saw {tap}, and by the radio {fates['sent']} and {by_radio} passed")
     if last["radio_troubles"]:
         problems.append(f"the radio had troubles: {last['radio_troubles']}")
+    problems += [f"{name}: lost a peer {times} times" for name, times in last["lost_peers"].items() if times]
     for name, peer in last["peers"].items():
         if not peer["generation"]:
             problems.append(f"{name}: no new keys were made")

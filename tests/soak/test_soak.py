@@ -24,7 +24,7 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 async def test_a_short_soak_loses_nothing_but_what_the_radio_dropped(tmp_path: Path) -> None:
     """Every frame that came out of the radio is delivered once, in the radio's order, over new keys and an outage."""
     samples = io.StringIO()
-    await record(Plan(SECONDS, every_s=2.0), samples, print)
+    await record(Plan(SECONDS, rekey_s=5.0, every_s=2.0), samples, print)
     (tmp_path / SAMPLES).write_text(samples.getvalue())
     assert report(tmp_path) == OK
     summary = json.loads((tmp_path / SUMMARY).read_text())
@@ -172,6 +172,7 @@ def _last(*path: str, value: object) -> Callable[[list[dict[str, Any]]], None]:
         (_last("flows", "drone0>ground", "invented", value=1), "nobody had sent"),
         (_last("flows", "drone0>ground", "delivered", value=0), "nothing was delivered"),
         (_last("taps", "drone0>ground", "left", value=8), "the taps saw"),
+        (_last("lost_peers", "drone0", value=1), "lost a peer"),
         (_last("radio_troubles", value={"Connection refused": 1}), "troubles"),
         (_last("peers", "drone0: ground", "generation", value=0), "no new keys"),
     ],

@@ -14,7 +14,7 @@ from pathlib import Path
 from uavlinkd.evaluation.energy import DEFAULT_WATTS_PER_CORE
 
 OK, FAILED = 0, 1
-_NEEDS_EXTRA = "the figures need matplotlib: pip install 'uavlinkd[evaluation]'"
+_NEEDS_EXTRA = "the figures need matplotlib: pip install '.[evaluation]'"
 
 
 def add_timing_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

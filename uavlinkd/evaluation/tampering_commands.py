@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from uavlinkd.evaluation.tampering_records import Trial
 
 OK, FAILED = 0, 1
-_NEEDS_EXTRA = "the figures need matplotlib: pip install 'uavlinkd[evaluation]'"
+_NEEDS_EXTRA = "the figures need matplotlib: pip install '.[evaluation]'"
 
 
 def add_tampering_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

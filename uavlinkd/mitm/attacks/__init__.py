@@ -144,10 +144,10 @@ def _problem(attack: type[Attack[Any]], location: tuple[int | str, ...], kind: s
 
 
 def list_attacks() -> str:
-    """Every attack with its numbers and parameters, as text for a terminal."""
+    """Every attack with its parameters, as text for a terminal."""
     lines: list[str] = []
     for attack in _ALL:
-        lines.append(f"{attack.name}  ({', '.join(attack.catalogue)})")
+        lines.append(attack.name)
         lines.append(f"    {attack.summary()}.")
         for name, default, meaning in describe_options(attack.options_model):
             if name not in Options.model_fields or default != Options.model_fields[name].default:
