@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import errno
+import select
 import socket
 from collections.abc import Callable
-from time import sleep
 from typing import Any
 
 import structlog
@@ -91,6 +91,11 @@ def udp_socket(address: Address, *, may_come_later: bool = False) -> socket.sock
     return sock
 
 
+def pause(seconds: float) -> None:
+    """Let time pass. Not by ``time.sleep``: that waits for a moment of a clock, which a faked one may never show."""
+    select.select((), (), (), seconds)
+
+
 Arrived = list[tuple[bytes, tuple[Any, ...]]]
 """Datagrams, each with where it came from."""
 
@@ -120,7 +125,7 @@ class Reader:
         now = monotonic()
         if now < self._busy_until and not has_gathered:
             has_gathered = True
-            sleep(PAUSE_S)
+            pause(PAUSE_S)
             now = monotonic()
         try:
             arrived = [self._sock.recvfrom(RECEIVE_BYTES)]
