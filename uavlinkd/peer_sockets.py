@@ -75,7 +75,6 @@ class PeerSockets:
     def _on_readable(self, number: int, reader: Reader) -> None:
         arrived, now = reader.read()
         self._on_arrived([(datagram, _path(number, source)) for datagram, source in arrived], now)
-        reader.done()
 
     def send(self, datagram: bytes, path: Path) -> None:
         """Hand a datagram to the kernel."""

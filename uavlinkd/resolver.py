@@ -78,6 +78,8 @@ async def keep_resolving(
                 )
                 if not answered:
                     continue
+                # Where it was an older question's end, the newest still counts its second.
+                rest_s = asked_at + LONGEST_WAIT_S - loop.time() if asking else wait_s
                 found, failed = answered.pop().result()
                 for name in set(failed) - failing:
                     log.warning("name_not_resolved", host=name)
@@ -89,9 +91,8 @@ async def keep_resolving(
                     _forget(asking)
                 wait_s = min(2 * wait_s, LONGEST_WAIT_S)
             else:
-                wait_s = FIRST_WAIT_S
-                asked_at = loop.time()
-            await asyncio.sleep(asked_at + wait_s - loop.time())
+                wait_s = rest_s = FIRST_WAIT_S
+            await asyncio.sleep(rest_s)
     finally:
         _forget(asking)
 

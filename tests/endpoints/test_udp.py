@@ -84,7 +84,7 @@ def name_of(sock: socket.socket) -> str:
 
 def read(server: UdpServer, now: float = 1.0) -> None:
     """What the loop does when the socket is readable."""
-    arrived, _ = Reader(server._sock, server._count_failure).read(has_gathered=True)
+    arrived, _ = Reader(server._sock, server._count_failure).read()
     server.take(arrived, now)
 
 

@@ -84,12 +84,11 @@ class UdpEndpoint(ABC):
             self._gathering = loop.call_later(self._gather_s, self._on_gathered, reader, self._gather_s)
         else:
             self.take(*reader.read())
-            reader.done()
 
     def _on_gathered(self, reader: Reader, waited_s: float) -> None:
         self._gathering = None
         self._watch(reader)
-        self.take(*reader.read(has_gathered=True), waited_s)
+        self.take(*reader.read(), waited_s)
 
     def take(self, datagrams: Arrived, now: float, waited_s: float = 0.0) -> None:
         """Hand over the frames of each sender in their order; the first of them has waited so long already."""
