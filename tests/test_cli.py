@@ -211,3 +211,64 @@ def test_a_demo_that_cannot_start_says_why(
     monkeypatch.setattr(demo, "run_demo", run_demo)
     assert main(["demo", "--json"]) == FAILED
     assert capsys.readouterr() == ("", "no room\n")
+
+
+def test_pubkey_of_bytes_is_refused(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """A key as raw bytes is no text: one line, no traceback."""
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(b"\xff\xfe" + bytes(30)), encoding="utf-8"))
+    assert main(["pubkey"]) == FAILED
+    assert capsys.readouterr().err.startswith("standard input: is no key")
+
+
+_SERVICE = """
+name = "drone0"
+private_key_file = "drone0.key"
+control_socket = "control.sock"
+
+[[endpoint]]
+name = "autopilot"
+url = "udpin:127.0.0.1:14550"
+
+[[peer]]
+name = "drone1"
+public_key = "eZPBKM+9Oztdms1v2yiR+byync+zZsR87etuOX4heHE="
+addresses = ["10.13.0.2:5790"]
+role = "swarm-member"
+system_ids = [2]
+"""
+
+
+def test_check_looks_for_a_services_keys_where_it_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The keys of a service lie in a folder of their own; without --keys the message says how to name it."""
+    (tmp_path / "keys").mkdir()
+    assert main(["keygen", "--out", str(tmp_path / "keys" / "drone0.key")]) == OK
+    path = tmp_path / "drone0.toml"
+    path.write_text(_SERVICE)
+    assert main(["check", "--config", str(path)]) == WRONG
+    assert f"uavlinkd check --keys {tmp_path / 'keys'}" in capsys.readouterr().err
+    assert main(["check", "--config", str(path), "--keys", str(tmp_path / "keys")]) == OK
+
+
+def test_a_daemon_is_asked_without_its_keys(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Of its configuration, status, reload and peer list need the socket alone; the rest may be wrong by now."""
+    path = tmp_path / "drone0.toml"
+    path.write_text(_SERVICE.replace("system_ids = [2]", "system_ids = [900]"))
+    assert main(["status", "--config", str(path)]) == FAILED
+    assert capsys.readouterr().err.startswith(f"no daemon answers at {tmp_path / 'control.sock'}")
+    path.write_text(_SERVICE.replace('"control.sock"', "7"))
+    assert main(["status", "--config", str(path)]) == WRONG
+    assert "control_socket" in capsys.readouterr().err
+
+
+def test_the_checker_imports_nothing_from_the_current_folder(tmp_path: Path) -> None:
+    """Where `uavlinkd run` is called, a file of a module's name is no module of it."""
+    (tmp_path / "tomllib.py").write_text("raise SystemExit('imported from the current folder')")
+    script = shutil.which("uavlinkd", path=str(Path(sys.executable).parent))
+    need(script is not None, "uavlinkd, installed beside this Python")
+    assert script is not None
+    (tmp_path / "empty.toml").write_text("")
+    command = [script, "run", "--config", "empty.toml"]
+    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert ended.returncode == WRONG
+    assert "private_key_file: is missing" in ended.stderr
+    assert "current folder" not in ended.stderr

@@ -401,7 +401,7 @@ _REFUSED = {
     "budget too large": (
         _GOOD + "budget_bits_s = 1_000_000_001\n",
         "peer[0].budget_bits_s (drone1)",
-        "or less",
+        "write 1000000000 or less",
     ),
     "budget broken": (_GOOD + "budget_bits_s = 4e3\n", "peer[0].budget_bits_s (drone1)", "whole number"),
     "coalescing for ever": (_GOOD + "coalesce_s = 0.51\n", "peer[0].coalesce_s (drone1)", "0.5 or less"),

@@ -15,7 +15,7 @@ from uavlinkd.config.changes import compare
 from uavlinkd.core.crypto import KeyPair, Secret
 from uavlinkd.core.node import Node
 from uavlinkd.core.settings import PeerSettings
-from uavlinkd.key_change import is_by_our_previous, is_by_their_previous, link_name, pairings
+from uavlinkd.key_change import Graces, is_by_our_previous, is_by_their_previous, link_name, pairings
 from uavlinkd.peer_link import PeerLink
 from uavlinkd.topology import print_topology
 
@@ -71,7 +71,7 @@ def test_the_end_of_their_change_leaves_ours() -> None:
     node = Node(Secret(keys.decode_key(OWN)), bytes, 0.0, Secret(keys.decode_key(PREVIOUS)))
     config = Peer(PeerSettings("b", now), (), previous_public_key=before)
     link = PeerLink(config, node, lambda _: None, 0.0)
-    link.join(0.0, has_previous_key=True, grace_s=10.0)
+    link.join(0.0, Graces(), 10.0, has_previous_key=True)
     assert len(node.peers) == 4
     link.change(replace(config, previous_public_key=None), 1.0)
     assert list(node.peers) == ["b", "b (our previous key)"]
@@ -177,3 +177,46 @@ def test_previous_key_may_go_while_the_daemon_runs_and_not_come(tmp_path: Path) 
     compare(having, without)
     with pytest.raises(ConfigError, match="previous_private_key_file"):
         compare(without, having)
+
+
+def test_a_link_made_anew_gets_no_second_grace() -> None:
+    """A reload that makes a link anew revives no key that was given up, and no time; only the operator does."""
+    now, before = (KeyPair(keys.decode_key(each)).public for each in (THEIRS, THEIRS_BEFORE))
+    node = Node(Secret(keys.decode_key(OWN)), bytes, 0.0, Secret(keys.decode_key(PREVIOUS)))
+    config = Peer(PeerSettings("b", now), (), previous_public_key=before)
+    graces = Graces()
+
+    def joined(at: float) -> PeerLink:
+        if "b" in node.peers:
+            for name in list(node.peers):
+                node.remove_peer(name, at)
+        link = PeerLink(config, node, lambda _: None, at)
+        link.join(at, graces, 10.0, has_previous_key=True)
+        return link
+
+    joined(0.0)
+    link = joined(6.0)
+    assert len(node.peers) == 4
+    assert not link.end_graces(9.9, graces)
+    assert link.end_graces(10.0, graces)
+    assert list(node.peers) == ["b"]
+    assert not joined(11.0).accepts_previous_keys
+
+    without = replace(config, previous_public_key=None)
+    graces.follow([config], [without])
+    graces.follow([without], [config])
+    link = joined(12.0)
+    assert list(node.peers) == ["b", "b (previous key)", "b (previous key) (our previous key)"]
+    assert link.confirm(13.0, graces)
+    assert not joined(14.0).accepts_previous_keys
+
+
+def test_the_key_that_was_ours_may_be_a_peers_later() -> None:
+    """Once it is out of the file it is no key of this daemon any more."""
+    node = Node(Secret(keys.decode_key(OWN)), bytes, 0.0, Secret(keys.decode_key(PREVIOUS)))
+    heir = PeerSettings("heir", KeyPair(keys.decode_key(PREVIOUS)).public)
+    with pytest.raises(ValueError, match="own key"):
+        node.add_peer(heir, 0.0)
+    node.forget_previous_key()
+    node.add_peer(heir, 1.0)
+    assert list(node.peers) == ["heir"]

@@ -216,11 +216,14 @@ def test_public_key_is_below_the_prime(number: int, canonical: bool) -> None:
 class TestFindSecretFile:
     """Where a key file is looked for."""
 
-    def test_file_beside_the_configuration_comes_first(self, tmp_path: Path) -> None:
-        """A credential of the same name does not replace it."""
+    def test_credential_comes_first(self, tmp_path: Path) -> None:
+        """It was given to this very service: a file of the same name beside the configuration does not replace it."""
         folder, credentials = self._folders(tmp_path)
         (folder / "drone0.key").touch()
         (credentials / "drone0.key").touch()
+        found = keys.find_secret_file("drone0.key", folder, {"CREDENTIALS_DIRECTORY": str(credentials)})
+        assert found == (credentials / "drone0.key", True)
+        (credentials / "drone0.key").unlink()
         found = keys.find_secret_file("drone0.key", folder, {"CREDENTIALS_DIRECTORY": str(credentials)})
         assert found == (folder / "drone0.key", False)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import itertools
 import socket
+import threading
 import time
 from collections.abc import Callable
 from typing import Any
@@ -165,3 +166,34 @@ async def test_a_silent_server_is_asked_each_second(monkeypatch: pytest.MonkeyPa
     put.sort()
     assert len(put) > 25
     assert max(after - before for before, after in itertools.pairwise(put)) < 0.25
+
+
+async def test_names_that_nobody_answers_for_leave_room_for_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ten peers that are not there, each question hanging: another's name is answered all the same."""
+    gate = threading.Event()
+    hanging = threading.Semaphore(0)
+    genuine = socket.getaddrinfo
+
+    def look_up(host: str, *arguments: Any, **options: Any) -> Any:
+        if host.startswith("gone"):
+            hanging.release()
+            gate.wait(30)
+            raise socket.gaierror(socket.EAI_AGAIN, "Temporary failure in name resolution")
+        return genuine("10.0.0.1" if host == "there.test" else host, *arguments, **options)
+
+    monkeypatch.setattr(socket, "getaddrinfo", look_up)
+    monkeypatch.setattr(resolver, "LONGEST_WAIT_S", 0.01)
+    gone = [Following([Address(f"gone{number}.test", 1)]) for number in range(10)]
+    try:
+        await asyncio.sleep(0.3)
+        asked = 0
+        while hanging.acquire(blocking=False):
+            asked += 1
+        assert 10 <= asked < resolver.MOST_THREADS
+        there = Following([Address("there.test", 1)])
+        await there.until(lambda: bool(there.told))
+        await there.stop()
+    finally:
+        gate.set()
+        for each in gone:
+            await each.stop()

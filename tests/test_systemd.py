@@ -89,7 +89,9 @@ def test_drone_is_never_given_up(name: str) -> None:
     watchdog = re.fullmatch(r"(\d+)s", unit["WatchdogSec"][0])
     assert watchdog is not None
     assert int(watchdog[1]) / 2 > 2 * HOUSEKEEPING_S  # it is told in time though the timer is coarse
-    assert not {"After", "Wants", "Requires", "BindsTo"} & set(unit)
+    assert not {"Requires", "BindsTo"} & set(unit)
+    drivers = ["modprobe@cdc_acm.service modprobe@usbserial.service"]  # of those in DeviceAllow that are modules
+    assert (unit["After"], unit["Wants"]) == (drivers, drivers)
     assert unit["ExecReload"] == ["/bin/sh -c 'kill -HUP $MAINPID'"]
 
 

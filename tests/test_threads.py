@@ -83,3 +83,19 @@ def test_the_process_does_not_wait_for_them() -> None:
         "asyncio.run(work())\n"
     )
     assert subprocess.run([sys.executable, "-c", code], timeout=60, check=False).returncode == 0
+
+
+async def test_where_no_thread_can_be_started_the_call_fails_and_a_later_one_does_not(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As with a system call: an OSError, and the place is free again."""
+    some = Threads(1, "test-none")
+
+    def refuse(_: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(threading.Thread, "start", refuse)
+        with pytest.raises(BlockingIOError):  # which is EAGAIN
+            await some.run(int)
+    assert await some.run(divmod, 7, 2) == (3, 1)

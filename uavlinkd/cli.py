@@ -13,6 +13,7 @@ import sys
 from collections.abc import Callable, Coroutine, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from uavlinkd import __version__
 from uavlinkd.evaluation.commands import add_report_parser, add_timing_parser
@@ -20,6 +21,7 @@ from uavlinkd.evaluation.tampering_commands import add_tampering_parser
 from uavlinkd.fleet.commands import add_parser as add_fleet
 
 OK, FAILED, WRONG = 0, 1, 2
+_LINE_LIMIT = 4096
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -28,6 +30,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     command: Callable[[argparse.Namespace], int] = options.command
     try:
         return command(options)
+    except _CommandError as error:
+        return _fail(*error.args)
     except KeyboardInterrupt:
         return OK
     except BrokenPipeError:  # the reader of our output left: `uavlinkd check | head`
@@ -55,8 +59,9 @@ def _parser() -> argparse.ArgumentParser:
 
     status = add("status", _status, "show how a running daemon is; exit status 0 only if every peer is up")
     _add_daemon(status)
-    status.add_argument("--watch", action="store_true", help="go on showing it, each second, until interrupted")
-    status.add_argument("--json", action="store_true", help="print all there is as JSON")
+    form = status.add_mutually_exclusive_group()
+    form.add_argument("--watch", action="store_true", help="go on showing it, each second, until interrupted")
+    form.add_argument("--json", action="store_true", help="print all there is as JSON")
 
     reload = add("reload", _reload, "have a running daemon read its configuration again")
     _add_daemon(reload)
@@ -67,6 +72,9 @@ def _parser() -> argparse.ArgumentParser:
 
     check = add("check", _check, "check a configuration and show what it amounts to")
     check.add_argument("--config", metavar="FILE", type=Path, required=True)
+    check.add_argument(
+        "--keys", metavar="DIR", type=Path, help="of a service: the folder of keys that systemd gives it"
+    )
 
     keygen = add("keygen", _keygen, "make a private key and print its public key")
     keygen.add_argument(
@@ -161,94 +169,111 @@ def _run_loop(work: Coroutine[None, None, None]) -> None:
 
 def _check(options: argparse.Namespace) -> int:
     from uavlinkd.config import ConfigError, load_config
+    from uavlinkd.keys import CREDENTIALS
     from uavlinkd.topology import print_topology
 
+    environ = os.environ if options.keys is None else {CREDENTIALS: str(options.keys.absolute())}
     try:
-        config = load_config(options.config, os.environ)
+        config = load_config(options.config, environ)
     except ConfigError as error:
         return _fail(error, WRONG)
     print_topology(config)
     return OK
 
 
+class _CommandError(Exception):
+    """A command could not be done. The first argument says why, the second is the exit status."""
+
+
 def _control_socket(options: argparse.Namespace) -> Path:
     """Where the daemon is asked.
 
     Raises:
-        ConfigError: its configuration is wrong.
-        ControlError: its configuration names no socket.
+        _CommandError: nowhere, by its configuration.
     """
-    from uavlinkd.config import load_config
-    from uavlinkd.control import ControlError
+    from uavlinkd.config.errors import ConfigError
+    from uavlinkd.config.load import load_control_socket
 
     if options.socket is not None:
         return Path(options.socket)
-    config = load_config(options.config, os.environ)
-    if config.control_socket is None:
-        raise ControlError(f'{options.config} names no control_socket: add control_socket = "{config.name}.sock"')
-    return config.control_socket
+    try:
+        path = load_control_socket(options.config)
+    except ConfigError as error:
+        raise _CommandError(error, WRONG) from None
+    if path is None:
+        raise _CommandError(f'{options.config} names no control_socket: add control_socket = "NAME.sock"', FAILED)
+    return path
+
+
+def _ask(options: argparse.Namespace, request: str, on_waiting: Callable[[], None] | None = None) -> dict[str, Any]:
+    """What a daemon answers; with ``on_waiting`` it may take long to.
+
+    Raises:
+        _CommandError: it cannot be asked, or gives no answer.
+    """
+    from uavlinkd.control import ControlError, ask
+
+    try:
+        return ask(_control_socket(options), request, on_waiting=on_waiting)
+    except ControlError as error:
+        raise _CommandError(error, FAILED) from None
 
 
 def _status(options: argparse.Namespace) -> int:
     import json
-    import time
 
     from rich.console import Console
-    from rich.live import Live
 
-    from uavlinkd.config.errors import ConfigError
-    from uavlinkd.control import ControlError, ask
     from uavlinkd.status_screen import all_up, render_status
 
-    try:
-        socket = _control_socket(options)
-        status = ask(socket, "status")
-        if options.json:
-            print(json.dumps(status))
-        elif not options.watch:
-            Console().print(render_status(status))
-        else:
-            with Live(render_status(status), auto_refresh=False, screen=True) as live:
-                while True:
-                    time.sleep(1.0)
-                    status = ask(socket, "status")
-                    live.update(render_status(status), refresh=True)
-    except ConfigError as error:
-        return _fail(error, WRONG)
-    except ControlError as error:
-        return _fail(error)
+    status = _ask(options, "status")
+    if options.json:
+        print(json.dumps(status))
+    elif options.watch:
+        return _watch(options)
+    else:
+        Console().print(render_status(status))
     return OK if all_up(status) else FAILED
 
 
-def _reload(options: argparse.Namespace) -> int:
-    from uavlinkd.config.errors import ConfigError
-    from uavlinkd.control import ControlError, ask
+def _watch(options: argparse.Namespace) -> int:
+    """Show it until interrupted. A daemon that is restarted meanwhile is waited for."""
+    import time
 
+    from rich.live import Live
+    from rich.text import Text
+
+    from uavlinkd.status_screen import all_up, render_status
+
+    is_good = False
+    with suppress(KeyboardInterrupt), Live(auto_refresh=False, screen=True) as live:
+        while True:
+            try:
+                status = _ask(options, "status")
+            except _CommandError as error:
+                is_good = False
+                live.update(Text(str(error.args[0]), style="bold red"), refresh=True)
+            else:
+                is_good = all_up(status)
+                live.update(render_status(status), refresh=True)
+            time.sleep(1.0)
+    return OK if is_good else FAILED
+
+
+def _reload(options: argparse.Namespace) -> int:
     def say_so() -> None:
         print("the daemon has not answered yet: it reads its file, or is busy. Waiting on", file=sys.stderr)
 
-    try:
-        problems = ask(_control_socket(options), "reload", on_waiting=say_so)["problems"]
-    except ConfigError as error:
-        return _fail(error, WRONG)
-    except ControlError as error:
-        return _fail(error)
+    problems = _ask(options, "reload", on_waiting=say_so)["problems"]
     return _fail("\n".join(problems), WRONG) if problems else OK
 
 
 def _peer_list(options: argparse.Namespace) -> int:
     from rich.console import Console
 
-    from uavlinkd.config.errors import ConfigError
-    from uavlinkd.control import ControlError, ask
     from uavlinkd.status_screen import render_peers
 
-    try:
-        Console().print(render_peers(ask(_control_socket(options), "status")))
-    except ConfigError as error:
-        return _fail(error, WRONG)
-    except ControlError as error:
-        return _fail(error)
+    Console().print(render_peers(_ask(options, "status")))
     return OK
 
 
@@ -275,11 +300,13 @@ def _pubkey(options: argparse.Namespace) -> int:
         except KeyFileError as error:
             return _fail(error)
     else:
-        private = sys.stdin.readline().strip()
+        private = ""
+        with suppress(UnicodeDecodeError):  # no text at all is no key either
+            private = sys.stdin.readline(_LINE_LIMIT).strip()
     try:
         return _print(public_key_text(private))
     except ValueError as error:
-        return _fail(error)
+        return _fail(f"{options.file or 'standard input'}: {error}")
 
 
 def _psk(options: argparse.Namespace) -> int:
@@ -305,12 +332,17 @@ def _write_secret(path: Path, text: str) -> int:
 def _sim(options: argparse.Namespace) -> int:
     from uavlinkd.sim.autopilot import AutopilotSettings
     from uavlinkd.sim.flight import fly
-    from uavlinkd.sim.links import LinkError
+    from uavlinkd.sim.links import LinkError, parse_url
     from uavlinkd.sim.replay import replay
     from uavlinkd.sim.tlog import TlogError
 
     if not (math.isfinite(options.speed) and options.speed >= 0):
         return _fail("--speed is a number from 0", WRONG)
+    _check_seconds(options)
+    try:
+        parse_url(options.url)
+    except LinkError as error:
+        return _fail(error, WRONG)
 
     async def work() -> None:
         if options.tlog is not None:
@@ -321,8 +353,10 @@ def _sim(options: argparse.Namespace) -> int:
 
     try:
         asyncio.run(work())
-    except (LinkError, TlogError, OSError, ValueError) as error:
+    except (LinkError, TlogError, OSError) as error:
         return _fail(error)
+    except ValueError as error:  # a setting that no autopilot has
+        return _fail(error, WRONG)
     return OK
 
 
@@ -330,8 +364,7 @@ def _demo(options: argparse.Namespace) -> int:
     from uavlinkd.mitm.attack import AttackError
     from uavlinkd.sim.demo import DemoError, run_demo
 
-    if options.seconds is not None and not (math.isfinite(options.seconds) and options.seconds > 0):
-        return _fail("--seconds is a number above 0", WRONG)
+    _check_seconds(options)
     try:
         summary = asyncio.run(run_demo(options.seconds, show=not options.json, attack=options.attack))
     except AttackError as error:
@@ -341,6 +374,11 @@ def _demo(options: argparse.Namespace) -> int:
     if options.json:
         print(summary.to_json())
     return OK if summary.is_good else FAILED
+
+
+def _check_seconds(options: argparse.Namespace) -> None:
+    if options.seconds is not None and not (math.isfinite(options.seconds) and options.seconds > 0):
+        raise _CommandError("--seconds is a number above 0", WRONG)
 
 
 def _print(text: str) -> int:

@@ -29,11 +29,11 @@ from uavlinkd.core.peer import NEVER
 from uavlinkd.endpoints.opening import open_endpoint, open_new
 from uavlinkd.endpoints.ports import Endpoint, LocalPort
 from uavlinkd.event_log import EventLog
-from uavlinkd.key_change import is_by_our_previous, link_name
+from uavlinkd.key_change import Graces, is_by_our_previous, link_name
 from uavlinkd.log import DropSummary
 from uavlinkd.mavlink.frames import Frame, split_payload
 from uavlinkd.mavlink.policy import Policy, Refusal
-from uavlinkd.mavlink.radio_status import RadioStatusSource, worst
+from uavlinkd.mavlink.radio_status import LinkFigures, RadioStatusSource, worst
 from uavlinkd.mavlink.routing import Router
 from uavlinkd.peer_link import PeerLink
 from uavlinkd.peer_sockets import Arrived, PeerSockets
@@ -69,6 +69,7 @@ class Daemon:
         self.endpoints: list[Endpoint] = []
         self.endpoint_policies: dict[str, Policy] = {}
         self.links: dict[str, PeerLink] = {}
+        self._graces = Graces()
         routing = config.routing
         router = Router[PeerLink | LocalPort](relays=routing.relay, floods_unknown=routing.unknown_targets == "flood")
         self.switch = Switch(router, self._on_refused)
@@ -190,7 +191,7 @@ class Daemon:
             self.supervisor.reloading()
             try:
                 await self._reload()
-            except ConfigError:
+            except BaseException:
                 self.supervisor.ready("the new configuration was refused")
                 raise
             self.supervisor.ready()
@@ -205,7 +206,12 @@ class Daemon:
         except ConfigError as error:
             self.log.error("configuration_refused", problems=str(error).splitlines())
             raise
+        self._graces.follow(self.config.peers, config.peers)
         self.config = config
+        if config.previous_private_key is None:
+            for link in self.links.values():
+                link.give_up_previous(monotonic(), is_by_our_previous)
+            self.node.forget_previous_key()
         for name in changes.removed_peers:
             self._remove_peer(name)
         for peer in changes.changed_peers:  # before any comes who may have a key that one of them gives up
@@ -214,9 +220,6 @@ class Daemon:
             self._add_peer(peer)
         for name in changes.closed_endpoints:
             self._close_endpoint(name)
-        if config.previous_private_key is None:
-            for link in self.links.values():
-                link.give_up_previous(monotonic(), is_by_our_previous)
         for endpoint, each in zip(opened, changes.opened_endpoints, strict=True):
             self.endpoints.append(endpoint)
             self._start_endpoint(endpoint, each)
@@ -237,10 +240,10 @@ class Daemon:
             await self.reload()
 
     def _add_peer(self, config: PeerConfig) -> None:
-        now = monotonic()
-        link = self.links[config.name] = PeerLink(config, self.node, self._perform, now, self.recorder)
-        has_previous_key = self.config.previous_private_key is not None
-        link.join(now, has_previous_key=has_previous_key, grace_s=self.config.key_grace_s)
+        now, has_previous = monotonic(), self.config.previous_private_key is not None
+        link = PeerLink(config, self.node, self._perform, now, self.recorder)
+        link.join(now, self._graces, self.config.key_grace_s, has_previous_key=has_previous)
+        self.links[config.name] = link
         self.switch.add(link, link.policy)
         self._note_who_waits()
         self.peer_sockets.follow(link, self._arm)
@@ -272,9 +275,7 @@ class Daemon:
             endpoint.gather(self._gather_s)
 
     def _start_endpoint(self, endpoint: Endpoint, config: EndpointConfig) -> None:
-        self.endpoint_policies[endpoint.name] = config.make_policy()
-        if config.radio_status:
-            self._radio_status[endpoint.name] = RadioStatusSource()
+        self._change_endpoint(config)
         endpoint.gather(self._gather_s)
         endpoint.start()
 
@@ -375,7 +376,7 @@ class Daemon:
         elif isinstance(event, o.PathChanged | o.SessionEstablished):
             link.on_session()
             is_current = isinstance(event, o.SessionEstablished) and event.peer == link.name
-            if is_current and link.give_up_previous(now):
+            if is_current and link.confirm(now, self._graces):
                 self.log.info("key_change_confirmed", peer=link.name)
 
     # Time.
@@ -392,25 +393,28 @@ class Daemon:
             self._timer = self._loop.call_later(max(0.0, deadline - monotonic()) + LOOP_TICK_S, self._on_timer)
 
     def _on_timer(self) -> None:
-        now = monotonic()
+        now, self._timer_at = monotonic(), NEVER
         self._stall.turn(now)
-        self._timer_at = NEVER
-        self._perform(self.node.handle_timeout(now))
-        for link in self.links.values():
-            link.send_waiting(now)
-        self._drops.flush(now)
-        if now >= self._housekeeping_at:
-            self._housekeeping_at = now + HOUSEKEEPING_S
-            self._do_housekeeping(now)
-        self._arm()
+        try:
+            self._perform(self.node.handle_timeout(now))
+            for link in self.links.values():
+                link.send_waiting(now)
+            self._drops.flush(now)
+            if now >= self._housekeeping_at:
+                self._housekeeping_at = now + HOUSEKEEPING_S
+                self._do_housekeeping(now)
+        finally:
+            self._arm()
 
     def _on_pause(self, pause_s: float) -> None:
         self.log.warning("daemon_stood_still", seconds=round(pause_s, 3))
 
     def _do_housekeeping(self, now: float) -> None:
-        self.supervisor.turn(self._headline(), now)
+        up = sum(link.peer.is_up for link in self.links.values())
+        self.supervisor.turn(f"{up} of {len(self.links)} peers up", now)
         if self.recorder is not None:
             self.recorder.do_housekeeping(now)
+        figures: list[LinkFigures] = []
         for link in self.links.values():
             if link.has_failed_to_answer(now):
                 self.log.warning(
@@ -419,10 +423,9 @@ class Daemon:
                     called_at=[str(each) for each in link.config.addresses],
                     meaning="it is not reachable there, or has another key for us, another PSK, or no common suite",
                 )
-        figures = [link.measure(now) for link in self.links.values()]
-        for link in self.links.values():
+            figures.append(link.measure(now))
             self._events.disturbed(link.name, link.disturbances(now), now)
-            if link.is_grace_over(now) and link.give_up_previous(now):
+            if link.end_graces(now, self._graces):
                 self.log.warning("previous_key_expired", peer=link.name)
         for endpoint in self.endpoints:
             endpoint.do_housekeeping(now)
@@ -431,9 +434,6 @@ class Daemon:
                 frame = source.frame(worst(figures))
                 for port in endpoint.ports:
                     endpoint.write(port, [frame], now)
-
-    def _headline(self) -> str:
-        return f"{sum(link.peer.is_up for link in self.links.values())} of {len(self.links)} peers up"
 
     # The control socket.
 

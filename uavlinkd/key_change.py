@@ -2,12 +2,15 @@
 
 The core then has the peer once for each pair of keys that may be right, by different names. Whichever pair both ends
 hold makes a session, so files with the new keys may arrive in any order. A session of the current pair is the proof
-that the other end has changed as well: the other pairs are given up then, for as long as the daemon runs.
+that the other end has changed as well: the other pairs are given up then, for as long as the daemon runs, whatever
+else is reloaded.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
+from math import inf
 from typing import NamedTuple
 
 from uavlinkd.config import Peer
@@ -33,6 +36,26 @@ def pairings(peer: Peer, has_previous_key: bool) -> list[KeyPairing]:
             for each in found
         ]
     return found
+
+
+class Graces:
+    """Until when pairs with a previous key are good: a link that is made anew does not get a second grace."""
+
+    def __init__(self) -> None:
+        self._until: dict[tuple[str, bytes], float] = {}
+
+    def until(self, settings: PeerSettings, now: float, grace_s: float) -> float:
+        """When a pair's grace ends, which begins at the first time that it is asked for."""
+        return self._until.setdefault((settings.name, settings.public_key), now + grace_s)
+
+    def end(self, settings: PeerSettings) -> None:
+        """The pair was given up."""
+        self._until[settings.name, settings.public_key] = -inf
+
+    def follow(self, before: Iterable[Peer], after: Iterable[Peer]) -> None:
+        """A new configuration. Previous keys that were taken out of it are good anew where they are put in again."""
+        keys = {each.previous_public_key for each in before} - {each.previous_public_key for each in after}
+        self._until = {each: until for each, until in self._until.items() if each[1] not in keys}
 
 
 _THEIRS, _OURS = "(previous key)", "(our previous key)"

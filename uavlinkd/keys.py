@@ -20,6 +20,8 @@ from uavlinkd.core.crypto import Secret, x25519_public_key
 
 KEY_TEXT_LENGTH = 44
 """Characters of a key in base64."""
+CREDENTIALS = "CREDENTIALS_DIRECTORY"
+"""The environment variable in which systemd names the folder with a service's keys."""
 _READ_LIMIT = 256
 """Bytes read of a key file: enough to see that there is more than a key."""
 _FIELD_PRIME = 2**255 - 19
@@ -132,13 +134,13 @@ def _sync_folder(folder: Path) -> None:
 def find_secret_file(name: str, folder: Path, environ: Mapping[str, str]) -> tuple[Path, bool]:
     """Where a key file is, and whether it is a systemd credential.
 
-    A name is relative to ``folder``. Where nothing is there, a credential of that name is taken (systemd.exec(5),
-    LoadCredential=), or one that systemd found in a folder handed over as ``keys``, which it calls ``keys_NAME``. A
-    credential's name has no folder in it.
+    A credential of that name is taken first (systemd.exec(5), LoadCredential=), or one that systemd found in a folder
+    handed over as ``keys``, which it calls ``keys_NAME``; its name has no folder in it. Else ``name`` is relative to
+    ``folder``.
     """
     path = folder / name
-    credentials = environ.get("CREDENTIALS_DIRECTORY", "")
-    if credentials and not os.path.lexists(path) and name not in (".", "..") and "/" not in name:
+    credentials = environ.get(CREDENTIALS, "")
+    if credentials and name not in (".", "..") and "/" not in name:
         for each in (name, f"keys_{name}"):
             credential = Path(credentials) / each
             if os.path.lexists(credential):

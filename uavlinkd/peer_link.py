@@ -8,7 +8,7 @@ from uavlinkd.config import Peer as PeerConfig
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Output, Path, Transmit
 from uavlinkd.core.peer import NEVER, Peer
-from uavlinkd.key_change import is_by_their_previous, pairings
+from uavlinkd.key_change import Graces, is_by_their_previous, pairings
 from uavlinkd.mavlink.coalescing import Coalescer, make_egress
 from uavlinkd.mavlink.egress import Egress, EnvelopeShape
 from uavlinkd.mavlink.frames import Frame, SplitCounters
@@ -42,7 +42,7 @@ class PeerLink:
         self._perform = perform
         self._recorder = recorder
         self._names = [config.name]  # in the core, the one of the current keys first
-        self._previous_until = NEVER
+        self._until: dict[str, float] = {}  # of those by a previous key
         self._charged: dict[str, tuple[int, int]] = {}  # datagrams and bytes that the budget has been told of
         self._called_since = now
         self._is_told = False
@@ -69,13 +69,16 @@ class PeerLink:
         """Whether a key is changing, and the new one not yet confirmed."""
         return len(self._names) > 1
 
-    def join(self, now: float, *, has_previous_key: bool, grace_s: float) -> None:
-        """Have the core accept the peer; by previous keys too, for ``grace_s`` at most."""
+    def join(self, now: float, graces: Graces, grace_s: float, *, has_previous_key: bool) -> None:
+        """Have the core accept the peer; by previous keys too, for what is left of ``grace_s``."""
         for settings, by_our_previous in pairings(self.config, has_previous_key):
-            self._node.add_peer(settings, now, by_previous_key=by_our_previous)
             if settings.name != self.name:
+                until = graces.until(settings, now, grace_s)
+                if now >= until:
+                    continue
                 self._names.append(settings.name)
-        self._previous_until = now + grace_s
+                self._until[settings.name] = until
+            self._node.add_peer(settings, now, by_previous_key=by_our_previous)
 
     def leave(self, now: float) -> None:
         """Cut the peer off at once."""
@@ -90,9 +93,16 @@ class PeerLink:
             self._perform(self._node.remove_peer(name, now))
         return bool(gone)
 
-    def is_grace_over(self, now: float) -> bool:
-        """Whether previous keys were accepted for long enough."""
-        return len(self._names) > 1 and now >= self._previous_until
+    def end_graces(self, now: float, graces: Graces) -> bool:
+        """Give up the previous keys that were accepted for long enough; whether there were any."""
+        over = [name for name in self._names[1:] if now >= self._until[name]]
+        return bool(over) and self.confirm(now, graces, over.__contains__)
+
+    def confirm(self, now: float, graces: Graces, which: Callable[[str], bool] = bool) -> bool:
+        """Give up previous keys, for as long as the daemon runs; whether there were any."""
+        for name in filter(which, self._names[1:]):
+            graces.end(self._node.peers[name].settings)
+        return self.give_up_previous(now, which)
 
     def set_paths(self, paths: Sequence[Path], now: float) -> None:
         """Where to call it."""
@@ -197,7 +207,7 @@ class PeerLink:
             loss_out=loss_out,
             round_trip_s=peer.round_trip_s,
             demand=0.0 if self.egress is None else self.egress.demand(now),
-            receive_errors=sum(peer.traffic.drops.values()),
+            receive_errors=peer.missing(now),
         )
         return self._figures
 

@@ -21,9 +21,16 @@ LONGEST_WAIT_S = 1.0
 QUESTIONS_AT_ONCE = 5
 """About the names of one peer. A question to a name server that is silent takes the system 5 s to repeat and 10 s to
 give up (resolv.conf(5)); with five of them, begun a second apart, one is put or repeated each second."""
+MOST_THREADS = 32
+"""No more than systemd's unit allows. Where more peers than six are looked up at once, each has its share of them, so
+that names which nobody answers for do not hold up the others."""
 
-_THREADS = Threads(8, "look-up")
-"""Names that nobody answers for can hold up so many others, and no more threads than systemd's unit allows."""
+_THREADS = Threads(MOST_THREADS, "look-up")
+_asking_now: set[object] = set()
+
+
+def _share() -> int:
+    return max(1, min(QUESTIONS_AT_ONCE, MOST_THREADS // max(1, len(_asking_now))))
 
 
 async def resolve(addresses: Sequence[Address]) -> tuple[Resolved, list[str]]:
@@ -67,10 +74,14 @@ async def keep_resolving(
     asking: set[asyncio.Task[tuple[Resolved, list[str]]]] = set()
     loop = asyncio.get_running_loop()
     asked_at = loop.time()
+    me = object()
+    takes_threads = any(each.ip is None for each in addresses)
     try:
         while True:
             if not known or failing or is_wanted():
-                if len(asking) < QUESTIONS_AT_ONCE:
+                if takes_threads:
+                    _asking_now.add(me)
+                if len(asking) < _share():
                     asked_at = loop.time()
                     asking.add(asyncio.ensure_future(resolve(addresses)))
                 answered, asking = await asyncio.wait(
@@ -91,9 +102,11 @@ async def keep_resolving(
                     _forget(asking)
                 wait_s = min(2 * wait_s, LONGEST_WAIT_S)
             else:
+                _asking_now.discard(me)
                 wait_s = rest_s = FIRST_WAIT_S
             await asyncio.sleep(rest_s)
     finally:
+        _asking_now.discard(me)
         _forget(asking)
 
 

@@ -48,14 +48,20 @@ def _headline(status: Status) -> Text:
 
 
 def _peers(status: Status) -> Group:
-    """How each does, the broken ones first; and below, in the same order, where it is and with which keys."""
+    """How each does, the broken ones first; below, in the same order, where it is and with which keys; and troubles.
+
+    It fits into 80 columns, names and IPv6 addresses folded where they are long.
+    """
     health = Table(box=SIMPLE_HEAD, pad_edge=False)
-    for name in ("peer", "state", "heard", "round trip", "loss in/out", "in", "out"):
+    health.add_column("peer", overflow="fold")
+    for name in ("state", "heard", "round trip", "loss in/out", "in", "out"):
         health.add_column(name, no_wrap=True)
-    health.add_column("dropped", overflow="fold")
     ways = Table(box=SIMPLE_HEAD, pad_edge=False)
-    for name in ("peer", "path", "suite", "mode", "keys are"):
+    for name in ("peer", "path"):
+        ways.add_column(name, overflow="fold")
+    for name in ("suite", "mode", "keys are"):
         ways.add_column(name, no_wrap=True)
+    troubles: list[RenderableType] = []
     for name, peer in sorted(status["peers"].items(), key=lambda item: (item[1]["state"] == "up", item[0])):
         health.add_row(
             Text(name, style="bold"),
@@ -65,12 +71,13 @@ def _peers(status: Status) -> Group:
             _loss(peer),
             _rate(peer["bytes_in_s"]),
             _rate(peer["bytes_out_s"]),
-            _counts(_troubles(peer)) or "-",
         )
+        if dropped := _counts(_troubles(peer)):
+            troubles.append(Text(f"{name} dropped: {dropped}"))
         session = peer["session"] or {}
         age = _age(peer["handshake_s"]) + " old" if session else "-"
         ways.add_row(name, peer["path"] or "-", session.get("suite", "-"), session.get("mode", "-"), age)
-    return Group(health, ways)
+    return Group(health, ways, *troubles)
 
 
 def _endpoints(status: Status) -> Table:

@@ -7,6 +7,8 @@ daemon that was told to stop.
 from __future__ import annotations
 
 import asyncio
+import errno
+import os
 from collections.abc import Callable
 from contextlib import suppress
 from queue import Empty, SimpleQueue
@@ -33,6 +35,7 @@ class Threads:
         """Call it in a thread, and give what it gives. Who is cancelled meanwhile leaves it to itself.
 
         Raises:
+            OSError: no thread can be started now.
             Exception: whatever it raises.
         """
         loop = asyncio.get_running_loop()
@@ -48,7 +51,12 @@ class Threads:
 
         self._work.put(work)
         if not self._idle.acquire(blocking=False) and self._slots.acquire(blocking=False):
-            Thread(target=self._serve, name=self._name, daemon=True).start()
+            try:
+                Thread(target=self._serve, name=self._name, daemon=True).start()
+            except RuntimeError:  # too many, or no memory
+                self._slots.release()
+                future.cancel()  # should another thread find the work after all
+                raise OSError(errno.EAGAIN, os.strerror(errno.EAGAIN)) from None
         return await future
 
     def _serve(self) -> None:

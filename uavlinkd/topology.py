@@ -76,7 +76,7 @@ def _grace(config: Config) -> str:
     """How long previous keys are good."""
     days, seconds = divmod(config.key_grace_s, 86400)
     most = f"{config.key_grace_s:g} s" if seconds or not days else f"{days:g} day{'s' if days > 1 else ''}"
-    return f"good too, until the new one is confirmed: {most} at most"
+    return f"good too, until the new one is confirmed: {most} at most from each start"
 
 
 def _routing(routing: Routing) -> str:

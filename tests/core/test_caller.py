@@ -180,8 +180,37 @@ def test_cookie_is_used_until_it_is_too_old() -> None:
     assert pair.a.peer.traffic.cookies_taken == 1
 
     caller = pair.a.peer.caller
-    assert caller.add_macs(b"message", c.COOKIE_HELD_S - 0.001)[-16:] != bytes(16)
-    assert caller.add_macs(b"message", c.COOKIE_HELD_S)[-16:] == bytes(16)
+    assert caller.add_macs(b"message", AT_B, c.COOKIE_HELD_S - 0.001)[-16:] != bytes(16)
+    assert caller.add_macs(b"message", AT_B, c.COOKIE_HELD_S)[-16:] == bytes(16)
+
+
+def test_cookies_of_two_paths_are_kept_apart() -> None:
+    """A peer that we reach on IPv4 and IPv6 sees two addresses of ours, each with its cookie: both calls count."""
+    pair = Pair()
+    six: Path = (1, "2001:db8::2", 5790)
+    from_six = (1, "2001:db8::1", 5790)
+    pair.a.node.set_addresses("bravo", [AT_B, six], 0.0)
+    jar = pair.b.node._cookies
+    for now, call in calls(pair, 2):
+        source = pair.a.at if call.path == AT_B else from_six
+        index = wire.parse_initiation(call.datagram).sender_index
+        assert not jar.has_valid_mac2(call.datagram, source, now)
+        assert pair.a.receive(jar.reply(call.datagram, index, source, now), now) == []
+    now = pair.a.node.next_deadline()
+    for later, call in calls(pair, 2, now):
+        assert jar.has_valid_mac2(call.datagram, pair.a.at if call.path == AT_B else from_six, later)
+
+
+def test_few_cookies_are_held() -> None:
+    """A name with many addresses, each of which gives one, costs no more than so many."""
+    pair = Pair()
+    many: list[Path] = [(0, f"198.51.100.{number}", 5790) for number in range(2 * c.COOKIES_PER_PEER)]
+    pair.a.node.set_addresses("bravo", many, 0.0)
+    jar = pair.b.node._cookies
+    for now, call in calls(pair, len(many)):
+        index = wire.parse_initiation(call.datagram).sender_index
+        pair.a.receive(jar.reply(call.datagram, index, pair.a.at, now), now)
+    assert len(pair.a.peer.caller._cookies) == c.COOKIES_PER_PEER
 
 
 def test_cookies_do_not_make_calls_come_faster_than_the_first_wait() -> None:

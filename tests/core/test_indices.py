@@ -10,7 +10,7 @@ import pytest
 from tests.core.harness import seeded
 from uavlinkd.core.constants import INDEX_QUARANTINE_S
 from uavlinkd.core.drops import Drop, DropReason
-from uavlinkd.core.indices import Indices
+from uavlinkd.core.indices import RESTING_PER_PEER, Indices
 
 OWNER = cast(Any, object())
 
@@ -40,7 +40,7 @@ def test_retired_index_rests_for_ten_minutes() -> None:
     """An index that carried a session is not picked again until just ten minutes later."""
     indices = Indices(drawing(5, 6, 5, 7, 5))
     indices.owners[5] = OWNER
-    indices.retire(5, 100.0)
+    indices.retire(5, "bravo", 100.0)
 
     assert 5 not in indices.owners
     assert indices.pick(100.0) == 6
@@ -55,7 +55,7 @@ def test_quarantine_is_released_in_order() -> None:
     """Each index is free when its own time is over, and is then forgotten: the quarantine does not grow."""
     indices = Indices(seeded(1))
     for index in (3, 7, 9):
-        indices.retire(index, float(index))
+        indices.retire(index, "bravo", float(index))
 
     indices.pick(INDEX_QUARANTINE_S + 7.0)
     assert list(indices._quarantine) == [9]
@@ -91,3 +91,17 @@ def test_indices_are_found_while_half_are_taken() -> None:
 
     for _ in range(1000):
         assert indices.pick(0.0) >= 2**15
+
+
+def test_a_peer_that_makes_many_sessions_uses_up_its_own_share() -> None:
+    """The oldest of its indices are free again before their time; those of another peer rest."""
+    indices = Indices(seeded(1))
+    indices.retire(60_000, "charlie", 0.0)
+    for index in range(1, RESTING_PER_PEER + 3):
+        indices.retire(index, "bravo", 1.0)
+
+    resting = [index for index in range(1, 2**16) if indices.is_quarantined(index, 2.0)]
+    assert resting == [*range(3, RESTING_PER_PEER + 3), 60_000]
+    indices.pick(INDEX_QUARANTINE_S + 1.0)
+    assert indices._quarantine == {}
+    assert indices._resting == {}

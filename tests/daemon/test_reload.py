@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import resource
 import signal
 import sys
 from pathlib import Path
@@ -11,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.daemon.harness import DaemonProcess, Program, Sockaddr, Stage, assert_same, frame, heartbeat, to_toml
+from uavlinkd import keys
 from uavlinkd.control import ask
 
 COUNT = 200
@@ -265,3 +267,35 @@ async def test_the_end_does_not_wait_for_a_name_server(stage: Stage, where: str)
     began = loop.time()
     assert await a.stop() == 0
     assert loop.time() - began < 5
+
+
+async def test_a_key_that_was_ours_may_become_a_peers(stage: Stage) -> None:
+    """The old identity moved to another machine: taken out here and put in as a peer, in one reload."""
+    a, b = stage.pair()
+    previous = keys.generate_private_key()
+    keys.write_secret_file(a.folder / "previous.key", previous)
+    a.config["previous_private_key_file"] = "previous.key"
+    into_a = a.add_endpoint("one")
+    await stage.start(a, b)
+    del a.config["previous_private_key_file"]
+    heir = {"name": "heir", "public_key": keys.public_key_text(previous), "role": "vehicle", "system_ids": [9]}
+    a.config["peer"].append(heir)
+    assert await reload(a) == []
+    assert set((await a.status())["peers"]) == {b.name, "heir"}
+    await program_at(stage, a, "one", into_a)
+
+
+async def test_a_reload_that_cannot_read_is_refused_and_a_later_one_is_not(stage: Stage) -> None:
+    """Without a process to read the file the old one stays in force, and the daemon says that it is ready again."""
+    a, b = stage.pair()
+    into_a = a.add_endpoint("one")
+    await stage.start(a, b)
+    limits = resource.prlimit(a.pid, resource.RLIMIT_NOFILE)
+    used = len(os.listdir(f"/proc/{a.pid}/fd"))
+    resource.prlimit(a.pid, resource.RLIMIT_NOFILE, (used + 1, limits[1]))  # the question itself takes one
+    problems = await reload(a)
+    assert len(problems) == 1
+    assert "cannot be read now" in problems[0]
+    resource.prlimit(a.pid, resource.RLIMIT_NOFILE, limits)
+    assert await reload(a) == []
+    await program_at(stage, a, "one", into_a)

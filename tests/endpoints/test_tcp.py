@@ -144,7 +144,10 @@ async def test_newcomer_takes_the_place_of_the_quietest(server: TcpServer, conne
     assert server.failures == {"displaced": 1}
 
 
-@pytest.mark.parametrize("request_line", [b"POST / HTTP/1.1\r\n", b"GET /?x HTTP/1.1\r\n", b"OPTIONS * HTTP/1.1\r\n"])
+@pytest.mark.parametrize(
+    "request_line",
+    [b"POST / HTTP/1.1\r\n", b"GET /?x HTTP/1.1\r\n", b"OPTIONS * HTTP/1.1\r\n", b"\x16\x03\x01\x02\x00\x01"],
+)
 async def test_browser_is_turned_away(server: TcpServer, connect: Connect, request_line: bytes) -> None:
     """A web page can make a browser post frames to a local port: they are not heard, wherever they stand."""
     server.start()

@@ -6,10 +6,12 @@ import tomllib
 from collections.abc import Callable
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from uavlinkd import keys
+from uavlinkd.addresses import parse_address
 from uavlinkd.config import Config, load_config
 from uavlinkd.fleet import work
 from uavlinkd.fleet.manifest import Fleet, Kind, Settings, read_manifest
@@ -245,26 +247,67 @@ ACTIONS: dict[str, Callable[[Path], object]] = {
 }
 
 
+@pytest.mark.parametrize("step", ["prepare", "replace"])
 @pytest.mark.parametrize("action", ACTIONS.values(), ids=ACTIONS)
 def test_failed_write_leaves_everything_as_it_was(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, action: Callable[[Path], object]
+    folder: Path, monkeypatch: pytest.MonkeyPatch, action: Callable[[Path], object], step: str
 ) -> None:
     """Where the last file cannot be written, those before it are as they were."""
-    genuine = work._write
-    failed: list[Path] = []
-
-    def fail_at_the_manifest(path: Path, content: bytes) -> None:
-        if path.name == "fleet.toml" and not failed:
-            failed.append(path)
-            raise OSError(28, "No space left on device", str(path))
-        genuine(path, content)
-
     before = snapshot(folder)
-    monkeypatch.setattr(work, "_write", fail_at_the_manifest)
+    genuine = getattr(work._Undo, step)
+    is_full = False
+
+    def fail_at_the_manifest(self: Any, path: Path, what: Any) -> Any:
+        nonlocal is_full
+        is_full = is_full or path.name == "fleet.toml"
+        if is_full:  # and so it stays: having things as they were takes no room
+            raise OSError(28, "No space left on device", str(path))
+        return genuine(self, path, what)
+
+    monkeypatch.setattr(work._Undo, step, fail_at_the_manifest)
     with pytest.raises(FleetError, match="No space left"):
         action(folder)
     assert snapshot(folder) == before
     assert not (folder / "scout").exists()
+
+
+def test_interrupted_command_leaves_everything_as_it_was(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C is no half either."""
+    before = snapshot(folder)
+
+    def interrupt(path: Path, text: str) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(keys, "write_secret_file", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        work.rotate(folder, "drone1", at_once=True)
+    assert snapshot(folder) == before
+
+
+def test_rotation_of_a_member_that_is_away_says_what_to_do_there(folder: Path, tmp_path: Path) -> None:
+    """Its old key is on the vehicle alone: done as it says, nothing is lost, and both keys are good."""
+    (folder / "drone1").rename(tmp_path / "drone1")
+    result = work.rotate(folder, "drone1")
+    assert any("mv drone1.key drone1.previous.key" in note for note in result.notes)
+    assert any("drone1.toml was not here" in note for note in result.notes)
+    (tmp_path / "drone1" / "drone1.key").rename(tmp_path / "drone1" / "drone1.previous.key")
+    for path in (folder / "drone1").iterdir():
+        path.replace(tmp_path / "drone1" / path.name)
+    (folder / "drone1").rmdir()
+    (tmp_path / "drone1").rename(folder / "drone1")
+    check_fleet(folder)
+    assert loaded(folder, "drone1").previous_private_key is not None
+
+
+@pytest.mark.parametrize("address", ["0.0.0.0:5790", "10.13.0.200:14550"])
+def test_member_that_no_daemon_would_take_is_not_added(folder: Path, address: str) -> None:
+    """What `uavlinkd check` refuses, anywhere in the fleet, is refused here, and nothing is changed."""
+    before = snapshot(folder)
+    with pytest.raises(FleetError, match="no good configuration"):
+        work.add(folder, "scout", Kind.DRONE, address=parse_address(address))
+    assert snapshot(folder) == before
+    with pytest.raises(FleetError, match="1 to 255"):
+        work.add(folder, "scout", Kind.DRONE, system_id=0)
 
 
 def test_key_changed_at_once_leaves_nothing_of_the_old(folder: Path) -> None:

@@ -74,3 +74,23 @@ def test_events_of_the_run_stand_in_both_logs(tmp_path: Path) -> None:
         journal.close()
     assert _lines(path) == [{"event": "mitm_paused", "at": 1.5}]
     assert [each["event"] for each in logs] == ["mitm_paused"]
+
+
+def test_a_run_after_another_adds_to_its_log(tmp_path: Path) -> None:
+    """A service that is started again does not erase what it saw."""
+    path = tmp_path / "run.jsonl"
+    for event in ("first", "second"):
+        journal = Journal(path, structlog.get_logger(), 0.0, detail=1)
+        journal.event(event, 1.0)
+        journal.close()
+    assert [each["event"] for each in _lines(path)] == ["first", "second"]
+
+
+def test_a_full_disk_is_told_once_and_ends_nothing() -> None:
+    """Lines are lost, and nothing is raised into the way of the datagrams."""
+    with capture_logs() as logs:
+        journal = Journal(Path("/dev/full"), structlog.get_logger(), 0.0, detail=100)
+        for number in range(3):
+            journal.add(_done(1.0, number))
+        journal.close()
+    assert [each["event"] for each in logs if each["log_level"] == "error"] == ["journal_not_written"]

@@ -28,7 +28,7 @@ from uavlinkd.config.schema import (
 )
 from uavlinkd.core.crypto import Secret, x25519_public_key
 from uavlinkd.core.settings import Link, PeerSettings, Timers
-from uavlinkd.keys import KeyFileError, find_secret_file, read_secret_file
+from uavlinkd.keys import CREDENTIALS, KeyFileError, find_secret_file, read_secret_file
 from uavlinkd.mavlink.egress import EgressSettings
 
 _MAX_FILE_BYTES = 1 << 20
@@ -99,6 +99,20 @@ def load_config(path: Path, environ: Mapping[str, str]) -> Config:
         key_grace_s=FileSection.model_construct(**top.good).key_grace_s,
         warnings=tuple(advice(listen, good_endpoints, good_peers, good_routing, metrics.good.get("listen"))),
     )
+
+
+def load_control_socket(path: Path) -> Path | None:
+    """Where the daemon of a configuration is asked, if anywhere; of the rest, nothing has to be good, or even here.
+
+    Raises:
+        ConfigError: the file cannot be read, or what it says of the socket is wrong.
+    """
+    table = _read_toml(path)
+    problems = Problems(str(path))
+    top = problems.read(FileSection, table, "")
+    if "control_socket" in top.bad:
+        problems.raise_any()
+    return _beside(path, top.good.get("control_socket"))
 
 
 def _public(private: Secret) -> bytes:
@@ -248,8 +262,15 @@ def _secret(problems: Problems, section: Values, key: str, folder: Path, environ
     if not os.path.lexists(path):
         where = shlex.quote(str(path))
         make = f"uavlinkd keygen --out {where}" if key == "private_key_file" else f"umask 077; uavlinkd psk >{where}"
-        credential = " and no systemd credential of that name" if environ.get("CREDENTIALS_DIRECTORY") else ""
-        problems.add(place, f"there is no file {path}{credential}: make it with `{make}`")
+        credential = " and no systemd credential of that name" if environ.get(CREDENTIALS) else ""
+        remedy = f"make it with `{make}`"
+        if key == "previous_private_key_file":
+            remedy = "it holds the key before this one; where that is lost, delete this line"
+        elif not credential and (folder / "keys").is_dir():
+            remedy += (
+                f", or look for those of a service by `uavlinkd check --keys {shlex.quote(str(folder / 'keys'))}`"
+            )
+        problems.add(place, f"there is no file {path}{credential}: {remedy}")
         return None
     try:
         return read_secret_file(path, credential=is_credential)

@@ -117,15 +117,20 @@ def _message(details: ErrorDetails, model: type[Section]) -> str:
         case "float_type":
             return f"must be a number, without quotes: write {key} = {_example(model, key)}"
         case "greater_than_equal":
-            return f"is too small: write {context['ge']:g} or more"
+            return f"is too small: write {_number(context['ge'])} or more"
         case "less_than_equal":
-            return f"is too large: write {context['le']:g} or less"
+            return f"is too large: write {_number(context['le'])} or less"
         case "literal_error":
             return f"must be {context['expected']}"
         case "list_type":
             return f"must be a list: write {key} = {_example(model, key)}"
         case _:  # a kind of error that the schema does not give today
             return f"cannot be used: write {key} = {_example(model, key)}"
+
+
+def _number(limit: float) -> str:
+    """As it can be written: a whole number stays one."""
+    return f"{limit:g}" if isinstance(limit, float) else str(limit)
 
 
 def _example(model: type[Section], key: str) -> str:

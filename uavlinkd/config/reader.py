@@ -8,6 +8,7 @@ the daemon imports what it needs itself.
 from __future__ import annotations
 
 import io
+import os
 import pickle
 import subprocess
 import sys
@@ -48,9 +49,12 @@ async def read_config(path: Path) -> Config:
     """
     import asyncio  # noqa: PLC0415  not in the process that reads: it ends the sooner
 
-    process = await asyncio.create_subprocess_exec(
-        *_command(path), stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.PIPE
-    )
+    try:
+        process = await asyncio.create_subprocess_exec(
+            *_command(path), stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.PIPE
+        )
+    except OSError as error:  # no descriptor, or no room for another process
+        raise ConfigError((Problem(str(path), "", f"cannot be read now: {error.strerror}: try again"),)) from None
     try:
         answer, _ = await process.communicate()
     finally:
@@ -70,15 +74,24 @@ def handed_over(result: Config | tuple[Problem, ...]) -> bytes:
 def _taken_over(answer: bytes, path: Path) -> Config:
     try:
         result = pickle.loads(answer)  # noqa: S301  from our own child, through a pipe that nobody else has
-    except (pickle.UnpicklingError, EOFError):
-        result = (Problem(str(path), "", "could not be read: the process that reads it ended early"),)
+    except Exception:  # cut short, or from another version: one was installed since this process began
+        why = "could not be read: the process that reads it ended early, or is of another version than this one"
+        result = (Problem(str(path), "", why),)
     if isinstance(result, Config):
         return result
     raise ConfigError(result)
 
 
 def _command(path: Path) -> tuple[str, ...]:
-    return sys.executable, "-m", "uavlinkd.config", str(path)
+    return *interpreter(), "-m", "uavlinkd.config", str(path)
+
+
+def interpreter() -> tuple[str, ...]:
+    """How to start this Python again for a module: it imports nothing from the current folder, unless we do too."""
+    here = {""}
+    with suppress(OSError):  # the current folder was deleted
+        here.add(os.getcwd())
+    return (sys.executable,) if sys.path[0] in here else (sys.executable, "-P")
 
 
 class _Pickler(pickle.Pickler):
@@ -99,8 +112,6 @@ def _view(contents: dict[str, object]) -> MappingProxyType[str, object]:
 
 def main() -> NoReturn:
     """``python -m uavlinkd.config FILE``: what :class:`ConfigReader` starts."""
-    import os  # noqa: PLC0415
-
     from uavlinkd.config.load import load_config  # noqa: PLC0415
 
     result: Config | tuple[Problem, ...]

@@ -59,7 +59,7 @@ class Caller:
         self._mac_keys = MacKeys(settings.public_key)
         self._attempt = 0
         self._called_at = -float("inf")
-        self._cookie: tuple[bytes, float] | None = None  # and until when
+        self._cookies: dict[Path, tuple[bytes, float]] = {}  # and until when; the oldest first
 
     def candidates(self, path: Path | None) -> list[Path]:
         """Where the peer may be: the path in use first, then its addresses."""
@@ -82,7 +82,7 @@ class Caller:
 
         index = self._indices.pick(now)
         initiated = handshake.initiate(self._identity, self._settings, index, generation, self._entropy)
-        datagram = self.add_macs(initiated.message, now)
+        datagram = self.add_macs(initiated.message, to, now)
         while len(self.pending) >= c.PENDING_PER_PEER:
             self._forget(next(iter(self.pending)))
         pending = Pending(self._peer, initiated, mac1_of(datagram), to, now + c.PENDING_LIFETIME_S)
@@ -99,22 +99,29 @@ class Caller:
         del self.pending[response.receiver_index]
         return keys
 
-    def receive_cookie(self, mac1: bytes, reply: wire.CookieReply, now: float) -> None:
-        """The peer is under load: keep its cookie, and try again with it soon.
+    def receive_cookie(self, mac1: bytes, path: Path, reply: wire.CookieReply, now: float) -> None:
+        """The peer is under load: keep its cookie, and try again soon.
+
+        A cookie proves one address of ours: where we have several, as towards IPv4 and IPv6, it is good on that
+        ``path`` alone.
 
         Raises:
             Drop: ``BAD_COOKIE``.
         """
-        self._cookie = self._mac_keys.open_cookie(reply, mac1), now + c.COOKIE_HELD_S
+        cookie = self._mac_keys.open_cookie(reply, mac1)
+        self._cookies.pop(path, None)
+        while len(self._cookies) >= c.COOKIES_PER_PEER:
+            del self._cookies[next(iter(self._cookies))]
+        self._cookies[path] = cookie, now + c.COOKIE_HELD_S
         self._peer.traffic.cookies_taken += 1
         # Anyone who sees our datagrams can make a cookie, so it may not make us send faster than the first retry.
         soon = max(now, self._called_at + self._settings.link.timers.retry_min_s)
         self.retry_at = min(self.retry_at, soon)
 
-    def add_macs(self, message: bytes, now: float) -> bytes:
-        """A handshake message to the peer with its macs, under the peer's cookie while there is one."""
-        cookie = self._cookie[0] if self._cookie is not None and now < self._cookie[1] else None
-        return self._mac_keys.add_macs(message, cookie)
+    def add_macs(self, message: bytes, path: Path, now: float) -> bytes:
+        """A handshake message to the peer with its macs, under the cookie for this path while there is one."""
+        cookie, held_until = self._cookies.get(path, (None, now))
+        return self._mac_keys.add_macs(message, cookie if now < held_until else None)
 
     def rest(self) -> None:
         """No new keys are wanted now: the next call begins with the shortest wait."""

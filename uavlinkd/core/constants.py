@@ -96,6 +96,8 @@ COOKIE_SECRET_LIFETIME_S = 120.0
 """The secret behind cookies changes this often; the one before it is honoured as long again."""
 COOKIE_HELD_S = 120.0
 """How long a received cookie is used."""
+COOKIES_PER_PEER = 8
+"""Received and held: one for each path to the peer."""
 HINTS_INTERVAL_S = 1.0
 """An unknown index from a peer's address makes us initiate at most this often."""
 INDEX_QUARANTINE_S = 600.0

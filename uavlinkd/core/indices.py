@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     from uavlinkd.core.caller import Pending
     from uavlinkd.core.session import Session
 
+RESTING_PER_PEER = 1024
+"""Indices of ended sessions of one peer: who makes more of them cannot use up those of all others."""
 _DRAWS = 64  # with half of all indices taken, all draws fail once in 2^64
 
 
@@ -20,7 +22,8 @@ class Indices:
 
     def __init__(self, entropy: Entropy) -> None:
         self._entropy = entropy
-        self._quarantine: dict[int, float] = {}  # free again at; a dict keeps order, so the oldest is first
+        self._quarantine: dict[int, tuple[float, str]] = {}  # free again at, and whose; the oldest is first
+        self._resting: dict[str, dict[int, None]] = {}  # the same by peer
         self.owners: dict[int, Pending | Session] = {}
 
     def pick(self, now: float) -> int:
@@ -36,10 +39,14 @@ class Indices:
                 return index
         raise Drop(DropReason.NO_FREE_INDEX)
 
-    def retire(self, index: int, now: float) -> None:
-        """The session at ``index`` has ended; what still arrives for it is late."""
+    def retire(self, index: int, peer: str, now: float) -> None:
+        """The session of ``peer`` at ``index`` has ended; what still arrives for it is late."""
         self.owners.pop(index, None)
-        self._quarantine[index] = now + INDEX_QUARANTINE_S
+        self._quarantine[index] = now + INDEX_QUARANTINE_S, peer
+        resting = self._resting.setdefault(peer, {})
+        resting[index] = None
+        if len(resting) > RESTING_PER_PEER:
+            self._free(next(iter(resting)))
 
     def forget(self, index: int) -> None:
         """Free an index that never carried a session."""
@@ -47,11 +54,17 @@ class Indices:
 
     def is_quarantined(self, index: int, now: float) -> bool:
         """Whether a session ended at ``index`` lately."""
-        return self._quarantine.get(index, now) > now
+        return index in self._quarantine and self._quarantine[index][0] > now
 
     def _release(self, now: float) -> None:
         while self._quarantine:
             oldest = next(iter(self._quarantine))
-            if self._quarantine[oldest] > now:
+            if self._quarantine[oldest][0] > now:
                 return
-            del self._quarantine[oldest]
+            self._free(oldest)
+
+    def _free(self, index: int) -> None:
+        _, peer = self._quarantine.pop(index)
+        del self._resting[peer][index]
+        if not self._resting[peer]:
+            del self._resting[peer]

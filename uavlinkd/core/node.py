@@ -89,6 +89,10 @@ class Node:
         self.peers[settings.name] = self._by_keys[keys] = peer
         self._deadline = min(self._deadline, now)
 
+    def forget_previous_key(self) -> None:
+        """Nothing is for our previous key any more: the peers by it are removed."""
+        self._previous = None
+
     def remove_peer(self, name: str, now: float) -> list[Output]:
         """Cut this peer off at once: its keys are forgotten, nothing of it is accepted any more."""
         out: list[Output] = []
@@ -238,12 +242,12 @@ class Node:
         reply = wire.parse_cookie_reply(datagram)
         owner = self._indices.owners.get(reply.receiver_index)
         if isinstance(owner, Pending):
-            peer, mac1 = owner.peer, owner.mac1
+            peer, mac1, path = owner.peer, owner.mac1, owner.path
         elif owner is not None and (unconfirmed := owner.peer.sessions.unconfirmed.get(reply.receiver_index)):
-            peer, mac1 = owner.peer, unconfirmed.mac1
+            peer, mac1, path = owner.peer, unconfirmed.mac1, unconfirmed.path
         else:
             raise Drop(DropReason.UNEXPECTED_COOKIE)
-        peer.receive_cookie(mac1, reply, now)
+        peer.receive_cookie(mac1, path, reply, now)
         self._deadline = min(self._deadline, peer.deadline)
 
     def _addressed(self, datagram: bytes) -> tuple[KeyPair, CookieJar]:

@@ -321,13 +321,13 @@ class Peer:
         # somebody relays it from elsewhere, and it gives the round trip at once.
         self._ask_for_echo(session, pending.path, now, out)
 
-    def receive_cookie(self, mac1: bytes, reply: wire.CookieReply, now: float) -> None:
+    def receive_cookie(self, mac1: bytes, path: Path, reply: wire.CookieReply, now: float) -> None:
         """The peer is under load and asks us to prove our address.
 
         Raises:
             Drop: ``BAD_COOKIE``.
         """
-        self.caller.receive_cookie(mac1, reply, now)
+        self.caller.receive_cookie(mac1, path, reply, now)
         self._wake_at(self.caller.retry_at)
 
     def hint(self, now: float, out: list[Output]) -> None:
@@ -349,7 +349,7 @@ class Peer:
             raise Drop(DropReason.SUITE_NOT_ACCEPTED, f"suite {suite.name}")
         index = self._indices.pick(now)
         message, keys = handshake.respond(received, self.settings, index, self.sessions.generation, self._entropy)
-        datagram = self.caller.add_macs(message, now)
+        datagram = self.caller.add_macs(message, path, now)
         session = Session(self, suite, keys, index, now, self.timers.reject_after_s, is_initiator=False)
         is_expected, expires_at = path in self.caller.candidates(self.path), now + c.UNCONFIRMED_LIFETIME_S
         self.sessions.wait(Unconfirmed(session, path, is_expected, mac1_of(datagram), expires_at))

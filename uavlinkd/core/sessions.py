@@ -112,7 +112,7 @@ class Sessions:
     def _end(self, sessions: list[Session], now: float) -> list[Session]:
         for session in sessions:
             self.confirmed.remove(session)
-            self._indices.retire(session.local_index, now)
+            self._indices.retire(session.local_index, session.peer.name, now)
         return sessions
 
     def _forget(self, index: int) -> None:

@@ -30,10 +30,12 @@ def open_new(
     for each in wanted:
         try:
             opened.append(open_endpoint(each, handler, leaving.get(each.url)))
-        except BindError as error:
+        except (BindError, OSError) as error:
             for endpoint in opened:
                 endpoint.close()
             remedy = "end what listens there, or write another port; if it is this daemon itself, restart it"
+            if isinstance(error, OSError):  # no descriptor is left to take a socket over
+                remedy = "it cannot be opened now, try again"
             problem = Problem(str(config.path), f"endpoint.url ({each.name})", f"{error}: {remedy}")
             raise ConfigError((problem,)) from None
     return opened

@@ -89,8 +89,8 @@ class SerialEndpoint(StreamEndpoint):
         while True:
             try:
                 device = await loop.run_in_executor(self._opener, self._open_device)
-            except OSError as error:
-                self.failures[failure_name(error)] += 1
+            except (OSError, RuntimeError) as error:  # RuntimeError: no thread can be started now
+                self.failures[failure_name(error) if isinstance(error, OSError) else "no_thread"] += 1
             else:
                 channel = SerialChannel(device, self._url.baud)
                 connection = self.open(channel, self._url.device, monotonic())

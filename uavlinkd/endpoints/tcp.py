@@ -40,8 +40,9 @@ _BACKLOG = 32
 _Sockaddr = tuple[str | int, ...]  # of either family, as the kernel takes it
 _Found = tuple[socket.AddressFamily, _Sockaddr]
 
-# A web page can make the browser of this machine send any bytes to any local port, but only after these.
-_HTTP_METHODS = (b"GET ", b"POST ", b"HEAD ", b"PUT ", b"OPTIONS ", b"PATCH ", b"DELETE ", b"CONNECT ")
+# A web page can make the browser of this machine send any bytes to any local port, but only after these: a method of
+# HTTP, or the beginning of TLS, whose session ticket may be any bytes.
+_BROWSER = (b"GET ", b"POST ", b"HEAD ", b"PUT ", b"OPTIONS ", b"PATCH ", b"DELETE ", b"CONNECT ", b"\x16\x03")
 
 
 def tcp_listener(address: Address) -> socket.socket:
@@ -131,7 +132,7 @@ class TcpServer(StreamEndpoint):
 
     def objection(self, first_bytes: bytes) -> str | None:
         """``http`` for what a browser begins with, whatever follows."""
-        return "http" if first_bytes.startswith(_HTTP_METHODS) else None
+        return "http" if first_bytes.startswith(_BROWSER) else None
 
     def close(self) -> None:
         """Stop listening, and close every connection."""

@@ -6,6 +6,7 @@ Nothing heavy is imported before a command runs.
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import math
 import sys
 from collections.abc import Callable
@@ -79,6 +80,8 @@ def _add(
 def _timing(options: argparse.Namespace) -> int:
     from uavlinkd.evaluation.timing import Settings, run_timing  # noqa: PLC0415
 
+    if importlib.util.find_spec("matplotlib") is None:
+        return _fail(_NEEDS_EXTRA)  # before hours of work whose figures could not be drawn
     settings = Settings(
         repeats=options.repeats,
         quick=options.quick,

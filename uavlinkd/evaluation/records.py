@@ -137,6 +137,8 @@ def read_records(path: Path) -> tuple[dict[str, Value], list[Record]]:
         lines = path.read_text(encoding="utf-8").splitlines()
     except OSError as error:
         raise RecordsError(f"{path}: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise RecordsError(f"{path}: is no text") from None
     if not lines:
         raise RecordsError(f"{path}: is empty")
     return _parse(path, 1, lines[0], _run_facts), [

@@ -178,6 +178,8 @@ def read_run(path: Path) -> Run:
         lines = path.read_text(encoding="utf-8").splitlines()
     except OSError as error:
         raise TamperingRecordsError(f"{path}: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise TamperingRecordsError(f"{path}: is no text") from None
     run = Run()
     for number, line in enumerate(lines, 1):
         try:

@@ -3,24 +3,25 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 
 from uavlinkd.addresses import AddressError, parse_address
 from uavlinkd.fleet import work
 from uavlinkd.fleet.manifest import Kind, Settings
-from uavlinkd.fleet.plan import FleetError
+from uavlinkd.fleet.plan import FleetError, FleetFileError
 from uavlinkd.fleet.work import Result
 
-OK, FAILED = 0, 1
+OK, FAILED, WRONG = 0, 1, 2
 
 
 def act(options: argparse.Namespace) -> int:
     """Do what ``options.action`` names, and tell what has to be carried where."""
     try:
         result = _ACTIONS[options.action](options)
-    except (FleetError, AddressError) as error:
+    except FleetError as error:
         print(error, file=sys.stderr)
-        return FAILED
+        return FAILED if isinstance(error, FleetFileError) else WRONG
     _tell(options, result)
     return OK
 
@@ -39,7 +40,10 @@ def _init(options: argparse.Namespace) -> Result:
 
 
 def _add(options: argparse.Namespace) -> Result:
-    address = None if options.address is None else parse_address(options.address, allow_names=True)
+    try:
+        address = None if options.address is None else parse_address(options.address, allow_names=True)
+    except AddressError as error:
+        raise FleetError(f"--address: {error}") from None
     return work.add(options.out, options.name, Kind(options.kind), address=address, system_id=options.system_id)
 
 
@@ -70,8 +74,15 @@ def _tell(options: argparse.Namespace, result: Result) -> None:
     changed = "every folder" if everybody else ", ".join(result.changed)
     if result.changed:
         print(f"\nChanged in {options.out}: {changed}. Carry each to its owner, by a way that nobody else reads.")
-        print("There: uavlinkd run --config NAME.toml; where a daemon runs already: uavlinkd reload, or SIGHUP.")
-    if options.action == "rotate" and not (options.finish or options.at_once):
+        print(
+            "There: uavlinkd run --config NAME.toml; where a daemon runs already: uavlinkd reload, or SIGHUP"
+            " (a restart, where systemd hands it new keys)."
+        )
+    for note in result.notes:
+        print(note)
+    if options.action == "rotate" and options.at_once:
+        print(f"{options.name} needs a restart.")
+    elif options.action == "rotate" and not options.finish:
         print(f"{options.name} needs a restart. In any order; then: uavlinkd fleet rotate {options.name} --finish")
-    if options.action == "remove" and (folder := options.out / options.name).exists():
+    if options.action == "remove" and os.path.exists(folder := options.out / options.name):
         print(f"{folder} was left: delete it when nothing in it is needed any more.")

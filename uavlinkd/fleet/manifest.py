@@ -16,7 +16,7 @@ from typing import Any
 
 from uavlinkd.addresses import Address, AddressError, parse_address
 from uavlinkd.core.suites import SUITES_BY_NAME
-from uavlinkd.fleet.plan import DEFAULT_PLAN, SYSTEM_IDS, AddressPlan, FleetError
+from uavlinkd.fleet.plan import DEFAULT_PLAN, SYSTEM_IDS, AddressPlan, FleetError, FleetFileError
 from uavlinkd.keys import decode_key
 
 FILE_NAME = "fleet.toml"
@@ -151,7 +151,7 @@ class Fleet:
             raise FleetError(f'there is a "{name}" in this fleet already')
         taken = {each.system_id for each in self.members}
         ids: Iterable[int] = SYSTEM_IDS if kind is Kind.DRONE else reversed(SYSTEM_IDS)
-        number = system_id or next((each for each in ids if each not in taken), None)
+        number = next((each for each in ids if each not in taken), None) if system_id is None else system_id
         if number is None or number not in SYSTEM_IDS:
             raise FleetError("a system id is a number from 1 to 255, and each member has its own")
         member = Member(name, kind, number, public_key, address)
@@ -201,7 +201,7 @@ def read_manifest(folder: Path) -> Fleet:
         ) from None
     except (OSError, ValueError, RecursionError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it is no TOML"
-        raise FleetError(f"{path} cannot be read: {reason}") from None
+        raise FleetFileError(f"{path} cannot be read: {reason}") from None
     try:
         fleet = Fleet(Settings(**table.pop("fleet")))
         check_settings(fleet.settings)

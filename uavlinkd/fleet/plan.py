@@ -19,6 +19,10 @@ class FleetError(Exception):
     """What was asked cannot be done. The message is for a person, and holds no secret."""
 
 
+class FleetFileError(FleetError):
+    """It could be done, were it not for a file or a folder."""
+
+
 class Numbered(Protocol):
     """Whom a plan gives an address to."""
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -28,7 +28,7 @@ from uavlinkd.fleet.manifest import (
     read_manifest,
     write_manifest,
 )
-from uavlinkd.fleet.plan import FleetError
+from uavlinkd.fleet.plan import FleetError, FleetFileError
 
 
 @dataclass(slots=True)
@@ -39,14 +39,20 @@ class Plan:
     texts: dict[Path, str] = field(default_factory=dict)
     moved: dict[Path, Path] = field(default_factory=dict)
     gone: list[Path] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    """What a person has to know of it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """What a command did: the fleet as it is now, and the folders whose files have to be carried to their owners."""
+    """What a command did: the fleet as it is now, and the folders whose files have to be carried to their owners.
+
+    ``notes`` are for the person who carries them.
+    """
 
     fleet: Fleet
     changed: tuple[str, ...]
+    notes: tuple[str, ...] = ()
 
 
 def init(folder: Path, settings: Settings, drones: int, ground_stations: int, observers: int) -> Result:
@@ -60,7 +66,11 @@ def init(folder: Path, settings: Settings, drones: int, ground_stations: int, ob
         raise FleetError("a fleet has at least one member")
     if drones + ground_stations + observers > 255:
         raise FleetError("a fleet has at most 255 members: MAVLink has no more system ids")
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+    try:
+        is_taken = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
+    except OSError as error:
+        raise FleetFileError(f"{folder} cannot be made: {error.strerror}") from None
+    if is_taken:
         raise FleetError(f"{folder} is there already: write the name of a new folder, or use `uavlinkd fleet add`")
     fleet = Fleet(settings)
     private_keys: dict[str, str] = {}
@@ -77,7 +87,7 @@ def init(folder: Path, settings: Settings, drones: int, ground_stations: int, ob
         folder.parent.mkdir(parents=True, exist_ok=True)
         building = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
     except OSError as error:
-        raise FleetError(f"{folder} cannot be made: {error.strerror}") from None
+        raise FleetFileError(f"{folder} cannot be made: {error.strerror}") from None
     try:
         plan = Plan()
         for member in fleet.members:
@@ -89,7 +99,7 @@ def init(folder: Path, settings: Settings, drones: int, ground_stations: int, ob
         building.chmod(0o755)
         building.rename(folder)
     except OSError as error:
-        raise FleetError(f"{folder} cannot be made: {error.strerror}") from None
+        raise FleetFileError(f"{folder} cannot be made: {error.strerror}") from None
     finally:
         shutil.rmtree(building, ignore_errors=True)
     return Result(fleet, tuple(each.name for each in fleet.members))
@@ -114,8 +124,8 @@ def add(
     _add_psks(plan, folder, fleet, [(member, peer) for peer in peers])
     for peer in peers:
         _edit(plan, folder, fleet, peer, lambda text, peer=peer: _with_peer(text, fleet, peer, member))  # type: ignore[misc]
-    _perform(plan, folder, fleet)
-    return Result(fleet, (name, *(each.name for each in peers)))
+    _perform(plan, folder, fleet, (member, *peers))
+    return Result(fleet, (name, *(each.name for each in peers)), tuple(plan.notes))
 
 
 def remove(folder: Path, name: str) -> Result:
@@ -133,7 +143,7 @@ def remove(folder: Path, name: str) -> Result:
         _edit(plan, folder, fleet, peer, lambda text: edit.remove_peer(text, name))
         plan.gone.append(folder / peer.name / files.psk_file(member))
     _perform(plan, folder, fleet)
-    return Result(fleet, tuple(each.name for each in peers))
+    return Result(fleet, tuple(each.name for each in peers), tuple(plan.notes))
 
 
 def rotate(folder: Path, name: str, *, at_once: bool = False) -> Result:
@@ -164,8 +174,13 @@ def rotate(folder: Path, name: str, *, at_once: bool = False) -> Result:
     plan.secrets[own / files.key_file(member)] = private
     if at_once:
         plan.gone += [own / files.key_file(member), own / files.previous_key_file(member)]
-    elif (own / files.key_file(member)).exists():
+    elif _is_there(own / files.key_file(member)):
         plan.moved[own / files.key_file(member)] = own / files.previous_key_file(member)
+    else:
+        plan.notes.append(
+            f"The old key of {name} is not here. Where it is, before the new files are put there:"
+            f" mv {files.key_file(member)} {files.previous_key_file(member)}"
+        )
     _edit(plan, folder, fleet, member, lambda text: edit.set_private_keys(text, member))
     peers = fleet.peers_of(member)
     for peer in peers:
@@ -175,7 +190,7 @@ def rotate(folder: Path, name: str, *, at_once: bool = False) -> Result:
             plan.gone += [folder / peer.name / files.psk_file(member), own / files.psk_file(peer)]
         _add_psks(plan, folder, fleet, [(member, peer) for peer in peers])
     _perform(plan, folder, fleet)
-    return Result(fleet, (name, *(each.name for each in peers)))
+    return Result(fleet, (name, *(each.name for each in peers)), tuple(plan.notes))
 
 
 def finish_rotation(folder: Path, name: str) -> Result:
@@ -197,7 +212,7 @@ def finish_rotation(folder: Path, name: str) -> Result:
     for peer in peers:
         _edit(plan, folder, fleet, peer, lambda text: edit.set_public_keys(text, member))
     _perform(plan, folder, fleet)
-    return Result(fleet, (name, *(each.name for each in peers)))
+    return Result(fleet, (name, *(each.name for each in peers)), tuple(plan.notes))
 
 
 # Files.
@@ -231,19 +246,34 @@ def _edit(plan: Plan, folder: Path, fleet: Fleet, member: Member, change: edit.C
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
         plan.texts[path] = files.write_config(fleet, member)
+        plan.notes.append(f"{path} was not here and was written anew: what was changed in it elsewhere is not in it.")
         return
     except (OSError, ValueError) as error:
-        raise FleetError(f"{path} cannot be read: {getattr(error, 'strerror', None) or 'it is no text'}") from None
+        reason = getattr(error, "strerror", None) or "it is no text"
+        raise FleetFileError(f"{path} cannot be read: {reason}") from None
     try:
         plan.texts[path] = change(text)
     except FleetError as error:
         raise FleetError(f"{path}: {error}") from None
 
 
-def _perform(plan: Plan, folder: Path, fleet: Fleet) -> None:
-    """Do it, or leave everything as it was. The manifest is last: what it says is so."""
-    undo = _Undo()
+def _is_there(path: Path) -> bool:
     try:
+        return path.exists()
+    except OSError as error:
+        raise FleetFileError(f"{path} cannot be looked at: {error.strerror}") from None
+
+
+def _perform(plan: Plan, folder: Path, fleet: Fleet, checked: Sequence[Member] = ()) -> None:
+    """Do it, or leave everything as it was. The manifest is last: what it says is so.
+
+    ``checked``: of these, the configurations whose keys are here have to be good then.
+    """
+    undo = _Undo()
+    texts: Mapping[Path, str] = {**plan.texts, folder / FILE_NAME: write_manifest(fleet)}
+    try:
+        # What may find no room on the disk comes before what changes anything.
+        prepared = {path: undo.prepare(path, text) for path, text in texts.items()}
         for path in plan.gone:
             undo.take_away(path)
         for path, to in plan.moved.items():
@@ -252,26 +282,26 @@ def _perform(plan: Plan, folder: Path, fleet: Fleet) -> None:
             undo.make_folder(path.parent)
             keys.write_secret_file(path, text)
             undo.made.append(path)
-        texts: Mapping[Path, str] = {**plan.texts, folder / FILE_NAME: write_manifest(fleet)}
-        for path, text in texts.items():
-            undo.make_folder(path.parent)
-            undo.replace(path, text)
-    except (OSError, keys.KeyFileError) as error:
+        for path, new in prepared.items():
+            undo.replace(path, new)
+        check(folder, [each for each in checked if (folder / each.name / files.key_file(each)).exists()])
+    except BaseException as error:
         undo.undo()
         if isinstance(error, OSError):
-            raise FleetError(f"{error.filename or folder} cannot be written: {error.strerror}") from None
-        raise FleetError(str(error)) from None
+            raise FleetFileError(f"{error.filename or folder} cannot be written: {error.strerror}") from None
+        if isinstance(error, keys.KeyFileError):
+            raise FleetFileError(str(error)) from None
+        raise
     undo.finish()
 
 
 class _Undo:
-    """How to have things as they were."""
+    """How to have things as they were: by renaming and deleting alone, as the disk may be full."""
 
     def __init__(self) -> None:
         self.made: list[Path] = []
         self._moved: list[tuple[Path, Path]] = []  # from, to
         self._taken: list[tuple[Path, Path]] = []
-        self._texts: list[tuple[Path, bytes]] = []
         self._folders: list[Path] = []
 
     def make_folder(self, folder: Path) -> None:
@@ -288,42 +318,65 @@ class _Undo:
     def take_away(self, path: Path) -> None:
         """Out of the way, and gone once all is done."""
         if path.exists():
-            aside = path.with_name(f".{path.name}.old")
+            aside = _aside(path)
             path.rename(aside)
             self._taken.append((path, aside))
 
-    def replace(self, path: Path, text: str) -> None:
-        """A text's new content: whole, or as it was."""
-        try:
-            self._texts.append((path, path.read_bytes()))
-        except FileNotFoundError:
+    def prepare(self, path: Path, text: str) -> Path:
+        """A text's new content, in a file beside it."""
+        self.make_folder(path.parent)
+        new = path.with_name(f".{path.name}.new")
+        self.made.append(new)
+        with new.open("wb") as file:
+            file.write(text.encode())
+            file.flush()
+            os.fsync(file.fileno())
+        return new
+
+    def replace(self, path: Path, new: Path) -> None:
+        """Put what was prepared in a text's place, at once: a reader sees the old or the new."""
+        if path.exists():
+            aside = _aside(path)
+            aside.unlink(missing_ok=True)
+            try:
+                aside.hardlink_to(path)
+            except OSError:  # a file system without links
+                path.rename(aside)
+            self._taken.append((path, aside))
+        else:
             self.made.append(path)
-        _write(path, text.encode())
+        new.rename(path)
 
     def finish(self) -> None:
+        """Delete what was taken away.
+
+        Raises:
+            FleetFileError: it cannot be, though all else is done.
+        """
         for _, aside in self._taken:
-            aside.unlink()
+            try:
+                aside.unlink()
+            except OSError as error:
+                raise FleetFileError(
+                    f"all is done, but {aside} is still there: delete it ({error.strerror})"
+                ) from None
 
     def undo(self) -> None:
-        with suppress(OSError):
-            for path, content in self._texts:
-                _write(path, content)
-            for path in self.made:
+        """Each step for itself: one that fails keeps no other from being done."""
+        for path in self.made:
+            with suppress(OSError):
                 path.unlink(missing_ok=True)
-            for path, other in reversed(self._moved + self._taken):
+        for path, other in reversed(self._moved + self._taken):
+            with suppress(OSError):
                 other.rename(path)
-            for folder in reversed(self._folders):
+                other.unlink(missing_ok=True)  # where both names were one file's still, the call did nothing
+        for folder in reversed(self._folders):
+            with suppress(OSError):
                 folder.rmdir()
 
 
-def _write(path: Path, content: bytes) -> None:
-    """Replace a file at once, so that a reader sees the old or the new."""
-    new = path.with_name(f".{path.name}.new")
-    with new.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    new.rename(path)
+def _aside(path: Path) -> Path:
+    return path.with_name(f".{path.name}.old")
 
 
 def check(folder: Path, members: Iterable[Member]) -> None:

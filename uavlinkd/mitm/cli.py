@@ -103,7 +103,7 @@ def _parser() -> argparse.ArgumentParser:
         help="an emulated radio behind the attacks: loss, delay_s, jitter_s, bits_per_s and so on",
     )
     parser.add_argument("--seed", type=int, metavar="N", help="the same seed, the same attack (default: 0)")
-    parser.add_argument("--log", metavar="FILE", type=Path, help="write every intervention there, in JSON lines")
+    parser.add_argument("--log", metavar="FILE", type=Path, help="add every intervention there, in JSON lines")
     parser.add_argument("--control-socket", metavar="PATH", type=Path, help="answer requests there")
     parser.add_argument("--seconds", type=float, metavar="N", help="end after N seconds")
     parser.add_argument(

@@ -7,12 +7,13 @@ summed up, so a flood fills no disk.
 from __future__ import annotations
 
 import json
+import os
 from collections import Counter
 from pathlib import Path
-from typing import TextIO
 
 from structlog.typing import FilteringBoundLogger
 
+from uavlinkd.log import LogFile
 from uavlinkd.mitm.attack import NEVER, Intervention
 
 SUM_INTERVAL_S = 10.0
@@ -20,7 +21,7 @@ SUM_INTERVAL_S = 10.0
 
 
 class Journal:
-    """Writes to a file, where there is one, and tells the operator's log what begins and how it goes on."""
+    """Adds to a file, where there is one, and tells the operator's log what begins and how it goes on."""
 
     def __init__(self, path: Path | None, log: FilteringBoundLogger, now: float, detail: int) -> None:
         self.counts: Counter[tuple[str, str]] = Counter()
@@ -31,7 +32,8 @@ class Journal:
         self._unsaid: Counter[tuple[str, str]] = Counter()
         self._told: Counter[tuple[str, str]] = Counter()
         self._sum_at = NEVER
-        self._file: TextIO | None = None if path is None else path.open("w", encoding="utf-8", buffering=1)
+        self._descriptor = None if path is None else os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
+        self._file = None if self._descriptor is None else LogFile(self._descriptor)
 
     def event(self, name: str, now: float, **facts: object) -> None:
         """A line about the run itself."""
@@ -75,10 +77,16 @@ class Journal:
         """Write what is left."""
         self._sum_at = min(self._sum_at, 0.0)
         self.flush(NEVER)
-        if self._file is not None:
-            self._file.close()
-            self._file = None
+        if self._descriptor is not None:
+            os.close(self._descriptor)
+            self._descriptor = self._file = None
 
     def _write(self, facts: dict[str, object]) -> None:
-        if self._file is not None:
-            self._file.write(json.dumps(facts) + "\n")
+        if self._file is None:
+            return
+        lost = self._file.lost
+        if lost:
+            facts = {**facts, "lines_lost_before": lost}
+        self._file.write(json.dumps(facts) + "\n")
+        if self._file.lost and not lost:  # the disk is full: the man in the middle goes on
+            self._log.error("journal_not_written")

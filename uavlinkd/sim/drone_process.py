@@ -6,12 +6,12 @@ import asyncio
 import json
 import signal
 import socket
-import sys
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
+from uavlinkd.config.reader import interpreter
 from uavlinkd.control import ControlError, ask
 from uavlinkd.keys import decode_key, generate_private_key, public_key_text, write_secret_file
 
@@ -91,7 +91,7 @@ class DroneProcess:
         """Start the process. Its log goes on where one before it ended."""
         with self.log.open("ab") as log:
             self._process = await asyncio.create_subprocess_exec(
-                *(sys.executable, "-m", "uavlinkd", "run", "--config", str(self.folder / "drone.toml")),
+                *(*interpreter(), "-m", "uavlinkd", "run", "--config", str(self.folder / "drone.toml")),
                 stdin=asyncio.subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,

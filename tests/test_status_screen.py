@@ -1,0 +1,76 @@
+"""`uavlinkd status` for people."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from uavlinkd.status_screen import all_up, render_status
+
+
+def peer(state: str, **facts: object) -> dict[str, Any]:
+    """What the daemon says of one."""
+    return {
+        "state": state,
+        "heard_s": 12.3,
+        "round_trip_s": 0.1234,
+        "loss_in": 0.12,
+        "loss_out": 1.0,
+        "bytes_in_s": 123456.0,
+        "bytes_out_s": 123456.0,
+        "path": "203.0.113.255:65535",
+        "session": {"suite": "x25519-mlkem768", "mode": "authenticated"},
+        "handshake_s": 99.9,
+        "drops": {},
+        "malformed": {},
+        "waiting_dropped": {},
+        "refused": {},
+        "envelopes_out_of_order": 0,
+        "challenges_unanswered": 0,
+        **facts,
+    }
+
+
+def shown(peers: dict[str, dict[str, Any]], width: int) -> str:
+    """The screen."""
+    status = {"name": "drone0", "peers": peers, "endpoints": {}, "drops": {}, "send_failures": {}}
+    file = io.StringIO()
+    Console(file=file, width=width).print(render_status(status))
+    return file.getvalue()
+
+
+@pytest.mark.parametrize("name", ["drone1", "ground-station"])
+def test_all_of_it_is_read_on_eighty_columns(name: str) -> None:
+    """On the narrowest terminal, and in a pipe, no figure and no reason is cut."""
+    drops = {"replayed": 1234567, "bad_tag": 12, "late": 1}
+    text = shown({name: peer("waiting", drops=drops)}, 80)
+    assert max(map(len, text.splitlines())) <= 80
+    assert "\u2026" not in text
+    path = "203.0.113.255:65535"
+    for part in (
+        name,
+        "waiting",
+        "12.3 s",
+        "123.4 ms",
+        "12/100 %",
+        "123.5 kB/s",
+        path,
+        "x25519-mlkem768",
+        "99.9 s old",
+    ):
+        assert part in text
+    assert f"{name} dropped: 1,234,567 replayed, 12 bad_tag, 1 late" in " ".join(text.split())
+
+
+def test_who_is_not_up_stands_first() -> None:
+    """What is broken is what is looked for."""
+    peers = {"alpha": peer("up"), "zulu": peer("lost")}
+    text = shown(peers, 100)
+    assert text.index("zulu") < text.index("alpha")
+    assert "1 of 2 peers up" in text
+    assert not all_up({"peers": peers})
+    assert all_up({"peers": {"alpha": peer("up")}})
+    assert not all_up({"peers": {}})
