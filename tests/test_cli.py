@@ -158,16 +158,19 @@ def test_sim_flies_and_ends(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "names"),
+    ("arguments", "names", "status"),
     [
-        (["--url", "nowhere"], "nowhere"),
-        (["--tlog", "absent.tlog"], "absent.tlog"),
-        (["--system-id", "256"], "256"),
+        (["--url", "nowhere"], "nowhere", WRONG),
+        (["--tlog", "absent.tlog"], "absent.tlog", FAILED),
+        (["--system-id", "256"], "256", WRONG),
+        (["--seconds", "nan"], "--seconds", WRONG),
     ],
 )
-def test_sim_that_cannot_fly_says_why(capsys: pytest.CaptureFixture[str], arguments: list[str], names: str) -> None:
-    """One line that names what is wrong, status 1."""
-    assert main(["sim", *arguments]) == FAILED
+def test_sim_that_cannot_fly_says_why(
+    capsys: pytest.CaptureFixture[str], arguments: list[str], names: str, status: int
+) -> None:
+    """One line that names what is wrong; status 2 where it is the command line."""
+    assert main(["sim", *arguments]) == status
     out, err = capsys.readouterr()
     assert out == ""
     assert names in err

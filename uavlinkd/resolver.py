@@ -17,7 +17,8 @@ Resolved = list[tuple[socket.AddressFamily, str, int]]
 
 FIRST_WAIT_S = 0.5
 LONGEST_WAIT_S = 1.0
-"""Between look-ups while an answer is wanted: a link is up within 2 s of the name server's return."""
+"""Between look-ups while an answer is wanted: a link is up within 2 s of the name server's return, with up to six
+peers that are given by name."""
 QUESTIONS_AT_ONCE = 5
 """About the names of one peer. A question to a name server that is silent takes the system 5 s to repeat and 10 s to
 give up (resolv.conf(5)); with five of them, begun a second apart, one is put or repeated each second."""

@@ -59,7 +59,7 @@ def _peers(status: Status) -> Group:
     ways = Table(box=SIMPLE_HEAD, pad_edge=False)
     for name in ("peer", "path"):
         ways.add_column(name, overflow="fold")
-    for name in ("suite", "mode", "keys are"):
+    for name in ("suite", "mode", "key age"):
         ways.add_column(name, no_wrap=True)
     troubles: list[RenderableType] = []
     for name, peer in sorted(status["peers"].items(), key=lambda item: (item[1]["state"] == "up", item[0])):
@@ -75,7 +75,7 @@ def _peers(status: Status) -> Group:
         if dropped := _counts(_troubles(peer)):
             troubles.append(Text(f"{name} dropped: {dropped}"))
         session = peer["session"] or {}
-        age = _age(peer["handshake_s"]) + " old" if session else "-"
+        age = _age(peer["handshake_s"]) if session else "-"
         ways.add_row(name, peer["path"] or "-", session.get("suite", "-"), session.get("mode", "-"), age)
     return Group(health, ways, *troubles)
 

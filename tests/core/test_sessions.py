@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
@@ -23,7 +24,7 @@ PATH = (0, "192.0.2.1", 1)
 def session(index: int, generation: int = 1, *, initiator: bool = True, now: float = 0.0) -> Session:
     """A session with this local index, rejected 180 s after ``now``."""
     keys = Keys((Secret(bytes(32)), Secret(bytes(32))), bytes(32), Parameters(generation, False, 16, 256, 1232), 1)
-    return Session(cast(Any, None), X25519, keys, index, now, 180.0, is_initiator=initiator)
+    return Session(cast(Any, SimpleNamespace(name="bravo")), X25519, keys, index, now, 180.0, is_initiator=initiator)
 
 
 def unconfirmed(index: int, expires_at: float = 10.0, *, is_expected: bool = False) -> Unconfirmed:

@@ -304,7 +304,7 @@ def test_member_that_no_daemon_would_take_is_not_added(folder: Path, address: st
     """What `uavlinkd check` refuses, anywhere in the fleet, is refused here, and nothing is changed."""
     before = snapshot(folder)
     with pytest.raises(FleetError, match="no good configuration"):
-        work.add(folder, "scout", Kind.DRONE, address=parse_address(address))
+        work.add(folder, "scout", Kind.DRONE, address=parse_address(address, allow_names=False))
     assert snapshot(folder) == before
     with pytest.raises(FleetError, match="1 to 255"):
         work.add(folder, "scout", Kind.DRONE, system_id=0)

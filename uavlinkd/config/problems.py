@@ -128,7 +128,7 @@ def _message(details: ErrorDetails, model: type[Section]) -> str:
             return f"cannot be used: write {key} = {_example(model, key)}"
 
 
-def _number(limit: float) -> str:
+def _number(limit: object) -> str:
     """As it can be written: a whole number stays one."""
     return f"{limit:g}" if isinstance(limit, float) else str(limit)
 
