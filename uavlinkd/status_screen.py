@@ -52,11 +52,11 @@ def _peers(status: Status) -> Group:
 
     It fits into 80 columns, names and IPv6 addresses folded where they are long.
     """
-    health = Table(box=SIMPLE_HEAD, pad_edge=False)
+    health = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
     health.add_column("peer", overflow="fold")
     for name in ("state", "heard", "round trip", "loss in/out", "in", "out"):
         health.add_column(name, no_wrap=True)
-    ways = Table(box=SIMPLE_HEAD, pad_edge=False)
+    ways = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
     for name in ("peer", "path"):
         ways.add_column(name, overflow="fold")
     for name in ("suite", "mode", "key age"):
@@ -81,7 +81,7 @@ def _peers(status: Status) -> Group:
 
 
 def _endpoints(status: Status) -> Table:
-    table = Table(box=SIMPLE_HEAD, pad_edge=False)
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
     for name in ("endpoint", "programs", "frames in", "frames out", "trouble"):
         table.add_column(name, overflow="fold")
     for name, endpoint in status["endpoints"].items():
