@@ -54,7 +54,7 @@ def _peers(status: Status) -> Group:
     """
     health = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
     health.add_column("peer", overflow="fold")
-    for name in ("state", "heard", "round trip", "loss in/out", "in", "out"):
+    for name in ("state", "heard", "rtt", "loss in/out", "in", "out"):
         health.add_column(name, no_wrap=True)
     ways = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
     for name in ("peer", "path"):
