@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import argparse
-import asyncio
 import math
 import os
 import sys
@@ -128,10 +127,12 @@ def _run(options: argparse.Namespace) -> int:
     from uavlinkd.core_dumps import forbid_core_dumps
 
     forbid_core_dumps()
-    from uavlinkd.config.errors import ConfigError
-    from uavlinkd.config.reader import ConfigReader
+    from uavlinkd.checker import start_checking
 
-    reader = ConfigReader(options.config)  # which works while the rest is imported
+    checker = start_checking(options.config)  # which works while the rest is imported
+    from uavlinkd.config.errors import ConfigError
+    from uavlinkd.config.reader import result_of
+
     if not sys.stderr.isatty():
         # structlog imports rich, for tracebacks on a terminal, wherever it finds it: 4 MB that JSON has no use for.
         sys.modules.setdefault("rich", None)  # type: ignore[arg-type]
@@ -141,7 +142,7 @@ def _run(options: argparse.Namespace) -> int:
     from uavlinkd.log import set_up_logging
 
     try:
-        config = reader.result()
+        config = result_of(checker, options.config)
     except ConfigError as error:
         return _fail(error, WRONG)
     set_up_logging(config.log.level, config.log.format)
@@ -158,6 +159,8 @@ def _run(options: argparse.Namespace) -> int:
 
 def _run_loop(work: Coroutine[None, None, None]) -> None:
     """On uvloop where it is installed, else on asyncio's own loop."""
+    import asyncio
+
     try:
         import uvloop
     except ImportError:
@@ -330,6 +333,8 @@ def _write_secret(path: Path, text: str) -> int:
 
 
 def _sim(options: argparse.Namespace) -> int:
+    import asyncio
+
     from uavlinkd.sim.autopilot import AutopilotSettings
     from uavlinkd.sim.flight import fly
     from uavlinkd.sim.links import LinkError, parse_url
@@ -361,6 +366,8 @@ def _sim(options: argparse.Namespace) -> int:
 
 
 def _demo(options: argparse.Namespace) -> int:
+    import asyncio
+
     from uavlinkd.mitm.attack import AttackError
     from uavlinkd.sim.demo import DemoError, run_demo
 

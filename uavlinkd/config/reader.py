@@ -17,28 +17,20 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NoReturn
 
+from uavlinkd.checker import checker_command
 from uavlinkd.config.errors import ConfigError, Problem
 from uavlinkd.config.model import Config
 from uavlinkd.core.crypto import Secret
 
 
-class ConfigReader:
-    """A process that reads one file. Made first, asked for the result later."""
+def result_of(process: subprocess.Popen[bytes], path: Path) -> Config:
+    """Wait for what a process of :func:`uavlinkd.checker.start_checking` finds.
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._process = subprocess.Popen(  # noqa: S603  this interpreter, and a path that is only an argument
-            _command(path), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE
-        )
-
-    def result(self) -> Config:
-        """Wait for it.
-
-        Raises:
-            ConfigError: every problem of the file.
-        """
-        answer, _ = self._process.communicate()
-        return _taken_over(answer, self._path)
+    Raises:
+        ConfigError: every problem of the file.
+    """
+    answer, _ = process.communicate()
+    return _taken_over(answer, path)
 
 
 async def read_config(path: Path) -> Config:
@@ -51,7 +43,7 @@ async def read_config(path: Path) -> Config:
 
     try:
         process = await asyncio.create_subprocess_exec(
-            *_command(path), stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.PIPE
+            *checker_command(path), stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.PIPE
         )
     except OSError as error:  # no descriptor, or no room for another process
         raise ConfigError((Problem(str(path), "", f"cannot be read now: {error.strerror}: try again"),)) from None
@@ -82,18 +74,6 @@ def _taken_over(answer: bytes, path: Path) -> Config:
     raise ConfigError(result)
 
 
-def _command(path: Path) -> tuple[str, ...]:
-    return *interpreter(), "-m", "uavlinkd.config", str(path)
-
-
-def interpreter() -> tuple[str, ...]:
-    """How to start this Python again for a module: it imports nothing from the current folder, unless we do too."""
-    here = {""}
-    with suppress(OSError):  # the current folder was deleted
-        here.add(os.getcwd())
-    return (sys.executable,) if sys.path[0] in here else (sys.executable, "-P")
-
-
 class _Pickler(pickle.Pickler):
     """Takes along what refuses to be pickled by accident: secrets, and views of dictionaries."""
 
@@ -111,7 +91,7 @@ def _view(contents: dict[str, object]) -> MappingProxyType[str, object]:
 
 
 def main() -> NoReturn:
-    """``python -m uavlinkd.config FILE``: what :class:`ConfigReader` starts."""
+    """``python -m uavlinkd.config FILE``: what :mod:`uavlinkd.checker` starts."""
     from uavlinkd.config.load import load_config  # noqa: PLC0415
 
     result: Config | tuple[Problem, ...]

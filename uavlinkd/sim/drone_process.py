@@ -11,7 +11,7 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
-from uavlinkd.config.reader import interpreter
+from uavlinkd.checker import interpreter
 from uavlinkd.control import ControlError, ask
 from uavlinkd.keys import decode_key, generate_private_key, public_key_text, write_secret_file
 
