@@ -210,7 +210,7 @@ def test_few_cookies_are_held() -> None:
     for now, call in calls(pair, len(many)):
         index = wire.parse_initiation(call.datagram).sender_index
         pair.a.receive(jar.reply(call.datagram, index, pair.a.at, now), now)
-    assert len(pair.a.peer.caller._cookies) == c.COOKIES_PER_PEER
+    assert len(pair.a.peer.caller._taken_cookies) == c.COOKIES_PER_PEER
 
 
 def test_cookies_do_not_make_calls_come_faster_than_the_first_wait() -> None:

@@ -59,7 +59,7 @@ class Caller:
         self._mac_keys = MacKeys(settings.public_key)
         self._attempt = 0
         self._called_at = -float("inf")
-        self._cookies: dict[Path, tuple[bytes, float]] = {}  # and until when; the oldest first
+        self._taken_cookies: dict[Path, tuple[bytes, float]] = {}  # and until when; the oldest first
 
     def candidates(self, path: Path | None) -> list[Path]:
         """Where the peer may be: the path in use first, then its addresses."""
@@ -109,10 +109,10 @@ class Caller:
             Drop: ``BAD_COOKIE``.
         """
         cookie = self._mac_keys.open_cookie(reply, mac1)
-        self._cookies.pop(path, None)
-        while len(self._cookies) >= c.COOKIES_PER_PEER:
-            del self._cookies[next(iter(self._cookies))]
-        self._cookies[path] = cookie, now + c.COOKIE_HELD_S
+        self._taken_cookies.pop(path, None)
+        while len(self._taken_cookies) >= c.COOKIES_PER_PEER:
+            del self._taken_cookies[next(iter(self._taken_cookies))]
+        self._taken_cookies[path] = cookie, now + c.COOKIE_HELD_S
         self._peer.traffic.cookies_taken += 1
         # Anyone who sees our datagrams can make a cookie, so it may not make us send faster than the first retry.
         soon = max(now, self._called_at + self._settings.link.timers.retry_min_s)
@@ -120,7 +120,7 @@ class Caller:
 
     def add_macs(self, message: bytes, path: Path, now: float) -> bytes:
         """A handshake message to the peer with its macs, under the cookie for this path while there is one."""
-        cookie, held_until = self._cookies.get(path, (None, now))
+        cookie, held_until = self._taken_cookies.get(path, (None, now))
         return self._mac_keys.add_macs(message, cookie if now < held_until else None)
 
     def rest(self) -> None:
