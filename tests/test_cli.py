@@ -248,7 +248,9 @@ def test_check_looks_for_a_services_keys_where_it_is_told(tmp_path: Path, capsys
     path = tmp_path / "drone0.toml"
     path.write_text(_SERVICE)
     assert main(["check", "--config", str(path)]) == WRONG
-    assert f"uavlinkd check --keys {tmp_path / 'keys'}" in capsys.readouterr().err
+    assert f"--keys {tmp_path / 'keys'}" in capsys.readouterr().err
+    assert main(["check", "--config", str(path), "--keys", str(tmp_path / "absent")]) == WRONG
+    assert "--keys" in capsys.readouterr().err
     assert main(["check", "--config", str(path), "--keys", str(tmp_path / "keys")]) == OK
 
 

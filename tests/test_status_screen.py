@@ -65,6 +65,12 @@ def test_all_of_it_is_read_on_eighty_columns(name: str) -> None:
     assert f"{name} dropped: 1,234,567 replayed, 12 bad_tag, 1 late" in " ".join(text.split())
 
 
+@pytest.mark.parametrize("path", ["[fd00::2]:5790", "[fe80::1%2]:5790", "[2001:db8:a::1]:5790"])
+def test_an_ipv6_address_is_no_markup(path: str) -> None:
+    """Brackets and colons are read as they are."""
+    assert path in shown({"drone1": peer("up", path=path)}, 80)
+
+
 def test_who_is_not_up_stands_first() -> None:
     """What is broken is what is looked for."""
     peers = {"alpha": peer("up"), "zulu": peer("lost")}

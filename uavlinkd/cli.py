@@ -32,7 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except _CommandError as error:
         return _fail(*error.args)
     except KeyboardInterrupt:
-        return OK
+        return OK if command in (_run, _sim, _demo) else FAILED
     except BrokenPipeError:  # the reader of our output left: `uavlinkd check | head`
         with suppress(OSError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -129,7 +129,10 @@ def _run(options: argparse.Namespace) -> int:
     forbid_core_dumps()
     from uavlinkd.checker import start_checking
 
-    checker = start_checking(options.config)  # which works while the rest is imported
+    try:
+        checker = start_checking(options.config)  # which works while the rest is imported
+    except OSError as error:
+        return _fail(f"cannot start a process: {error.strerror}")
     from uavlinkd.config.errors import ConfigError
     from uavlinkd.config.reader import result_of
 
@@ -175,6 +178,8 @@ def _check(options: argparse.Namespace) -> int:
     from uavlinkd.keys import CREDENTIALS
     from uavlinkd.topology import print_topology
 
+    if options.keys is not None and not (options.keys.is_dir() and os.access(options.keys, os.R_OK | os.X_OK)):
+        return _fail(f"--keys: {options.keys} is no folder, or not one that you may read", WRONG)
     environ = os.environ if options.keys is None else {CREDENTIALS: str(options.keys.absolute())}
     try:
         config = load_config(options.config, environ)

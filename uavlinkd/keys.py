@@ -115,11 +115,13 @@ def write_secret_file(path: Path, text: str) -> None:
             file.flush()
             os.fsync(file.fileno())
         _sync_folder(path.parent)
-    except OSError as error:
+    except BaseException as error:
         # Half a key is worse than none: the next try would find a file in its way.
         with suppress(OSError):
             path.unlink()
-        raise KeyFileError(f"{path}: cannot be written: {error.strerror}") from None
+        if isinstance(error, OSError):
+            raise KeyFileError(f"{path}: cannot be written: {error.strerror}") from None
+        raise
 
 
 def _sync_folder(folder: Path) -> None:

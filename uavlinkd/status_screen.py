@@ -76,7 +76,7 @@ def _peers(status: Status) -> Group:
             troubles.append(Text(f"{name} dropped: {dropped}"))
         session = peer["session"] or {}
         age = _age(peer["handshake_s"]) if session else "-"
-        ways.add_row(name, peer["path"] or "-", session.get("suite", "-"), session.get("mode", "-"), age)
+        ways.add_row(Text(name), Text(peer["path"] or "-"), session.get("suite", "-"), session.get("mode", "-"), age)
     return Group(health, ways, *troubles)
 
 

@@ -42,6 +42,8 @@ class Threads:
         future: asyncio.Future[T] = loop.create_future()
 
         def work() -> None:
+            if future.cancelled():
+                return
             try:
                 settle: tuple[Callable[[Any], None], object] = future.set_result, function(*arguments)
             except Exception as error:  # who waits is told

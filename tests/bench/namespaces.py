@@ -66,10 +66,15 @@ def remove_leftovers() -> None:
     for line in _ip("netns", "list").splitlines():
         found = _NAME.fullmatch(line.split()[0]) if line.split() else None
         if found and not Path("/proc", found[1]).exists():
-            for pid in _ip("netns", "pids", found[0], check=False).split():
-                with suppress(ProcessLookupError):
-                    os.kill(int(pid), signal.SIGKILL)
-            _ip("netns", "delete", found[0], check=False)
+            _remove(found[0])
+
+
+def _remove(name: str) -> None:
+    """A namespace, and what works in it: also what was being started when the run was interrupted."""
+    for pid in _ip("netns", "pids", name, check=False).split():
+        with suppress(ProcessLookupError):
+            os.kill(int(pid), signal.SIGKILL)
+    _ip("netns", "delete", name, check=False)
 
 
 class Host:
@@ -201,7 +206,7 @@ class Cable:
         for host in (self.left, self.right):
             host.end()
         for host in (self.left, self.right):
-            _ip("netns", "delete", host.name, check=False)
+            _remove(host.name)
 
     def counted(self) -> Counted:
         """What crossed so far."""

@@ -8,9 +8,9 @@ from typing import Any, cast
 import pytest
 
 from tests.core.harness import seeded
-from uavlinkd.core.constants import INDEX_QUARANTINE_S
+from uavlinkd.core.constants import INDEX_QUARANTINE_S, RESTING_PER_PEER
 from uavlinkd.core.drops import Drop, DropReason
-from uavlinkd.core.indices import RESTING_PER_PEER, Indices
+from uavlinkd.core.indices import Indices
 
 OWNER = cast(Any, object())
 

@@ -291,8 +291,8 @@ async def test_a_reload_that_cannot_read_is_refused_and_a_later_one_is_not(stage
     into_a = a.add_endpoint("one")
     await stage.start(a, b)
     limits = resource.prlimit(a.pid, resource.RLIMIT_NOFILE)
-    used = len(os.listdir(f"/proc/{a.pid}/fd"))
-    resource.prlimit(a.pid, resource.RLIMIT_NOFILE, (used + 1, limits[1]))  # the question itself takes one
+    highest = max(map(int, os.listdir(f"/proc/{a.pid}/fd")))
+    resource.prlimit(a.pid, resource.RLIMIT_NOFILE, (highest + 2, limits[1]))  # the question itself takes one
     problems = await reload(a)
     assert len(problems) == 1
     assert "cannot be read now" in problems[0]

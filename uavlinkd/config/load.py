@@ -267,9 +267,8 @@ def _secret(problems: Problems, section: Values, key: str, folder: Path, environ
         if key == "previous_private_key_file":
             remedy = "it holds the key before this one; where that is lost, delete this line"
         elif not credential and (folder / "keys").is_dir():
-            remedy += (
-                f", or look for those of a service by `uavlinkd check --keys {shlex.quote(str(folder / 'keys'))}`"
-            )
+            folder_of_keys = shlex.quote(str(folder / "keys"))
+            remedy += f"; or is it a service's? Then add `--keys {folder_of_keys}` to `uavlinkd check`"
         problems.add(place, f"there is no file {path}{credential}: {remedy}")
         return None
     try:

@@ -17,6 +17,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NoReturn
 
+from uavlinkd import __version__
 from uavlinkd.checker import checker_command
 from uavlinkd.config.errors import ConfigError, Problem
 from uavlinkd.config.model import Config
@@ -59,14 +60,16 @@ async def read_config(path: Path) -> Config:
 def handed_over(result: Config | tuple[Problem, ...]) -> bytes:
     """What goes through the pipe: the configuration with its secrets, or what is wrong with it."""
     stream = io.BytesIO()
-    _Pickler(stream).dump(result)
+    _Pickler(stream).dump((__version__, result))
     return stream.getvalue()
 
 
 def _taken_over(answer: bytes, path: Path) -> Config:
     try:
-        result = pickle.loads(answer)  # noqa: S301  from our own child, through a pipe that nobody else has
-    except Exception:  # cut short, or from another version: one was installed since this process began
+        version, result = pickle.loads(answer)  # noqa: S301  from our own child, by a pipe that nobody else has
+    except Exception:  # cut short, or of another version's classes
+        version = None
+    if version != __version__:  # one was installed since this process began
         why = "could not be read: the process that reads it ended early, or is of another version than this one"
         result = (Problem(str(path), "", why),)
     if isinstance(result, Config):

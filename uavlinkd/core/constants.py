@@ -102,6 +102,8 @@ HINTS_INTERVAL_S = 1.0
 """An unknown index from a peer's address makes us initiate at most this often."""
 INDEX_QUARANTINE_S = 600.0
 """An index that carried a session is not used again for this long: a late envelope is late, not forged."""
+RESTING_PER_PEER = 1024
+"""Indices that rest so of one peer: who makes more sessions cannot use up the indices of all others."""
 CHALLENGE_INTERVAL_S = 0.25
 """A new path is challenged at most this often."""
 CHALLENGE_LIFETIME_S = 5.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from uavlinkd.core.constants import INDEX_QUARANTINE_S
+from uavlinkd.core.constants import INDEX_QUARANTINE_S, RESTING_PER_PEER
 from uavlinkd.core.crypto import Entropy
 from uavlinkd.core.drops import Drop, DropReason
 
@@ -12,8 +12,6 @@ if TYPE_CHECKING:
     from uavlinkd.core.caller import Pending
     from uavlinkd.core.session import Session
 
-RESTING_PER_PEER = 1024
-"""Indices of ended sessions of one peer: who makes more of them cannot use up those of all others."""
 _DRAWS = 64  # with half of all indices taken, all draws fail once in 2^64
 
 

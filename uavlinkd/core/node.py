@@ -90,7 +90,7 @@ class Node:
         self._deadline = min(self._deadline, now)
 
     def forget_previous_key(self) -> None:
-        """Nothing is for our previous key any more: the peers by it are removed."""
+        """Nothing is for our previous key any more. Remove the peers by it first."""
         self._previous = None
 
     def remove_peer(self, name: str, now: float) -> list[Output]:

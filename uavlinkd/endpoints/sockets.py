@@ -138,6 +138,8 @@ class Reader:
         fcntl.ioctl(self._sock, termios.FIONREAD, self._waiting)
         if self._waiting[0]:
             arrived += self._drain()
+            if len(arrived) == DATAGRAMS_PER_WAKE_UP:
+                self._read_at = -BUSY_S  # more have gathered already
         return arrived, now
 
     def _drain(self) -> Arrived:

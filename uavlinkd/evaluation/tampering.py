@@ -100,11 +100,17 @@ class Evaluation:
     ) -> DaemonStage:
         folder = self._folder / label
         folder.mkdir()
-        log = self.out / f"mitm-{label}.jsonl"
+        log = self._log(label)
         seed = self.settings.seed
         is_here = here or self.settings.quick  # a process more takes a second to start
         middle = MiddleHere(names, log, seed) if is_here else MiddleProcess(names, folder, log, seed)
         return DaemonStage(names, folder, middle, link, rate_hz=rate_hz, silent=silent)
+
+    def _log(self, label: str) -> Path:
+        """Of a man in the middle, without what one of an earlier run wrote."""
+        path = self.out / f"mitm-{label}.jsonl"
+        path.unlink(missing_ok=True)
+        return path
 
     async def _try(
         self, label: str, stage: Stage, recorder: Recorder, work: Callable[[Bench], Awaitable[None]]
@@ -162,9 +168,7 @@ class Evaluation:
 
     async def _paper(self, recorder: Recorder) -> None:
         settings = self.settings
-        stage = PaperStage(
-            PAIR, MiddleHere(PAIR, self.out / "mitm-paper.jsonl", settings.seed), rate_hz=settings.paper_rate_hz
-        )
+        stage = PaperStage(PAIR, MiddleHere(PAIR, self._log("paper"), settings.seed), rate_hz=settings.paper_rate_hz)
         rows = (
             *plans.HANDSHAKE_PLANS,
             *plans.DATA_PLANS,

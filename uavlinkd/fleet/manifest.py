@@ -200,8 +200,9 @@ def read_manifest(folder: Path) -> Fleet:
             f"there is no fleet in {folder}: make one with `uavlinkd fleet init --out {folder}`"
         ) from None
     except (OSError, ValueError, RecursionError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is no TOML"
-        raise FleetFileError(f"{path} cannot be read: {reason}") from None
+        if isinstance(error, OSError):
+            raise FleetFileError(f"{path} cannot be read: {error.strerror}") from None
+        raise FleetError(f"{path} cannot be read: it is no TOML") from None
     try:
         fleet = Fleet(Settings(**table.pop("fleet")))
         check_settings(fleet.settings)

@@ -121,10 +121,11 @@ def add(
     plan.secrets[folder / name / files.key_file(member)] = private
     plan.texts[folder / name / files.config_file(member)] = files.write_config(fleet, member)
     peers = fleet.peers_of(member)
+    good = [peer for peer in peers if _is_good(folder, peer)]
     _add_psks(plan, folder, fleet, [(member, peer) for peer in peers])
     for peer in peers:
         _edit(plan, folder, fleet, peer, lambda text, peer=peer: _with_peer(text, fleet, peer, member))  # type: ignore[misc]
-    _perform(plan, folder, fleet, (member, *peers))
+    _perform(plan, folder, fleet, (member, *good))
     return Result(fleet, (name, *(each.name for each in peers)), tuple(plan.notes))
 
 
@@ -267,7 +268,7 @@ def _is_there(path: Path) -> bool:
 def _perform(plan: Plan, folder: Path, fleet: Fleet, checked: Sequence[Member] = ()) -> None:
     """Do it, or leave everything as it was. The manifest is last: what it says is so.
 
-    ``checked``: of these, the configurations whose keys are here have to be good then.
+    ``checked``: the configurations of these have to be good then.
     """
     undo = _Undo()
     texts: Mapping[Path, str] = {**plan.texts, folder / FILE_NAME: write_manifest(fleet)}
@@ -284,7 +285,7 @@ def _perform(plan: Plan, folder: Path, fleet: Fleet, checked: Sequence[Member] =
             undo.made.append(path)
         for path, new in prepared.items():
             undo.replace(path, new)
-        check(folder, [each for each in checked if (folder / each.name / files.key_file(each)).exists()])
+        check(folder, checked)
     except BaseException as error:
         undo.undo()
         if isinstance(error, OSError):
@@ -292,7 +293,7 @@ def _perform(plan: Plan, folder: Path, fleet: Fleet, checked: Sequence[Member] =
         if isinstance(error, keys.KeyFileError):
             raise FleetFileError(str(error)) from None
         raise
-    undo.finish()
+    plan.notes += undo.finish()
 
 
 class _Undo:
@@ -347,19 +348,15 @@ class _Undo:
             self.made.append(path)
         new.rename(path)
 
-    def finish(self) -> None:
-        """Delete what was taken away.
-
-        Raises:
-            FleetFileError: it cannot be, though all else is done.
-        """
+    def finish(self) -> list[str]:
+        """Delete what was taken away; what a person has to be told of what cannot be."""
+        left: list[str] = []
         for _, aside in self._taken:
             try:
                 aside.unlink()
             except OSError as error:
-                raise FleetFileError(
-                    f"all is done, but {aside} is still there: delete it ({error.strerror})"
-                ) from None
+                left.append(f"{aside} has what is good no longer and could not be deleted: {error.strerror}.")
+        return left
 
     def undo(self) -> None:
         """Each step for itself: one that fails keeps no other from being done."""
@@ -377,6 +374,15 @@ class _Undo:
 
 def _aside(path: Path) -> Path:
     return path.with_name(f".{path.name}.old")
+
+
+def _is_good(folder: Path, member: Member) -> bool:
+    """Whether a member's files are here, and as a daemon takes them: they may be with their vehicle in part."""
+    try:
+        load_config(folder / member.name / files.config_file(member), {})
+    except ConfigError:
+        return False
+    return True
 
 
 def check(folder: Path, members: Iterable[Member]) -> None:
