@@ -209,14 +209,3 @@ def test_a_link_made_anew_gets_no_second_grace() -> None:
     assert list(node.peers) == ["b", "b (previous key)", "b (previous key) (our previous key)"]
     assert link.confirm(13.0, graces)
     assert not joined(14.0).accepts_previous_keys
-
-
-def test_the_key_that_was_ours_may_be_a_peers_later() -> None:
-    """Once it is out of the file it is no key of this daemon any more."""
-    node = Node(Secret(keys.decode_key(OWN)), bytes, 0.0, Secret(keys.decode_key(PREVIOUS)))
-    heir = PeerSettings("heir", KeyPair(keys.decode_key(PREVIOUS)).public)
-    with pytest.raises(ValueError, match="own key"):
-        node.add_peer(heir, 0.0)
-    node.forget_previous_key()
-    node.add_peer(heir, 1.0)
-    assert list(node.peers) == ["heir"]

@@ -207,10 +207,16 @@ def test_few_cookies_are_held() -> None:
     many: list[Path] = [(0, f"198.51.100.{number}", 5790) for number in range(2 * c.COOKIES_PER_PEER)]
     pair.a.node.set_addresses("bravo", many, 0.0)
     jar = pair.b.node._cookies
-    for now, call in calls(pair, len(many)):
+    called: list[Path] = []
+    now = 0.0
+    for _ in many:
+        now, call = calls(pair, 1, now)[0]
         index = wire.parse_initiation(call.datagram).sender_index
-        pair.a.receive(jar.reply(call.datagram, index, pair.a.at, now), now)
-    assert len(pair.a.peer.caller._taken_cookies) == c.COOKIES_PER_PEER
+        assert pair.a.receive(jar.reply(call.datagram, index, pair.a.at, now), now) == []
+        called.append(call.path)
+        now = pair.a.node.next_deadline()
+    assert len(set(called)) == len(many)
+    assert list(pair.a.peer.caller._taken_cookies) == called[-c.COOKIES_PER_PEER :]
 
 
 def test_cookies_do_not_make_calls_come_faster_than_the_first_wait() -> None:

@@ -112,3 +112,14 @@ def test_peers_that_cannot_be_are_refused() -> None:
             node.add_peer(PeerSettings("self", PUBLIC[own]), 0.0)
     with pytest.raises(ValueError, match="there is none"):
         other(NEW).add_peer(PeerSettings("late", PUBLIC[OLD]), 0.0, by_previous_key=True)
+
+
+def test_forgotten_key_is_no_key_of_ours() -> None:
+    """Nothing is for it any more, and a peer may have it: the identity that was ours moved to another machine."""
+    node, caller = changing(), other(OLD)
+    node.remove_peer("other by old", 0.0)
+    with pytest.raises(ValueError, match="own key"):
+        node.add_peer(PeerSettings("heir", PUBLIC[OLD]), 0.0)
+    node.forget_previous_key()
+    node.add_peer(PeerSettings("heir", PUBLIC[OLD]), 0.0)
+    assert reasons(node.receive(only(datagrams(caller.handle_timeout(0.0))), AT_B, 0.0)) == [DropReason.BAD_MAC1]

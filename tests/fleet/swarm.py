@@ -23,7 +23,7 @@ from uavlinkd.control import ControlError, ask
 from uavlinkd.fleet import work
 from uavlinkd.fleet.manifest import Settings
 
-PATIENCE_S = 300.0
+PATIENCE_S = 120.0
 LINKED_S = 60.0
 """Every pair is linked so long after the first daemon was started."""
 POLL_S = 0.25
