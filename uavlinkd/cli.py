@@ -213,7 +213,7 @@ def _control_socket(options: argparse.Namespace) -> Path:
     return path
 
 
-def _ask(options: argparse.Namespace, request: str, on_waiting: Callable[[], None] | None = None) -> dict[str, Any]:
+def _ask(socket: Path, request: str, on_waiting: Callable[[], None] | None = None) -> dict[str, Any]:
     """What a daemon answers; with ``on_waiting`` it may take long to.
 
     Raises:
@@ -222,7 +222,7 @@ def _ask(options: argparse.Namespace, request: str, on_waiting: Callable[[], Non
     from uavlinkd.control import ControlError, ask
 
     try:
-        return ask(_control_socket(options), request, on_waiting=on_waiting)
+        return ask(socket, request, on_waiting=on_waiting)
     except ControlError as error:
         raise _CommandError(error, FAILED) from None
 
@@ -234,17 +234,18 @@ def _status(options: argparse.Namespace) -> int:
 
     from uavlinkd.status_screen import all_up, render_status
 
-    status = _ask(options, "status")
+    socket = _control_socket(options)
+    status = _ask(socket, "status")
     if options.json:
         print(json.dumps(status))
     elif options.watch:
-        return _watch(options)
+        return _watch(socket)
     else:
         Console().print(render_status(status))
     return OK if all_up(status) else FAILED
 
 
-def _watch(options: argparse.Namespace) -> int:
+def _watch(socket: Path) -> int:
     """Show it until interrupted. A daemon that is restarted meanwhile is waited for."""
     import time
 
@@ -257,7 +258,7 @@ def _watch(options: argparse.Namespace) -> int:
     with suppress(KeyboardInterrupt), Live(auto_refresh=False, screen=True) as live:
         while True:
             try:
-                status = _ask(options, "status")
+                status = _ask(socket, "status")
             except _CommandError as error:
                 is_good = False
                 live.update(Text(str(error.args[0]), style="bold red"), refresh=True)
@@ -272,7 +273,7 @@ def _reload(options: argparse.Namespace) -> int:
     def say_so() -> None:
         print("the daemon has not answered yet: it reads its file, or is busy. Waiting on", file=sys.stderr)
 
-    problems = _ask(options, "reload", on_waiting=say_so)["problems"]
+    problems = _ask(_control_socket(options), "reload", on_waiting=say_so)["problems"]
     return _fail("\n".join(problems), WRONG) if problems else OK
 
 
@@ -281,7 +282,7 @@ def _peer_list(options: argparse.Namespace) -> int:
 
     from uavlinkd.status_screen import render_peers
 
-    Console().print(render_peers(_ask(options, "status")))
+    Console().print(render_peers(_ask(_control_socket(options), "status")))
     return OK
 
 
