@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 from uavlinkd.config import Peer as PeerConfig
 from uavlinkd.core.node import Node
@@ -12,7 +12,7 @@ from uavlinkd.key_change import Graces, is_by_their_previous, pairings
 from uavlinkd.mavlink.coalescing import Coalescer, make_egress
 from uavlinkd.mavlink.egress import Egress, EnvelopeShape
 from uavlinkd.mavlink.frames import Frame, SplitCounters
-from uavlinkd.mavlink.radio_status import LinkFigures
+from uavlinkd.mavlink.radio_status import LinkFigures, worst
 from uavlinkd.recorder import TO_PEER, Recorder
 
 IPV4_UDP_BYTES = 20 + 8
@@ -116,6 +116,8 @@ class PeerLink:
         if config.egress != self.config.egress:
             self.egress = make_egress(config.egress, now)
             self._charged = {name: self._sent(name) for name in self._names}
+        if config.addresses != self.config.addresses:
+            self.set_paths((), now)  # its names may have no address now: it is not called at the old ones
         if config.previous_public_key is None:
             self.give_up_previous(now, is_by_their_previous)
         self.config = config
@@ -212,7 +214,10 @@ class PeerLink:
         return self._figures
 
     def disturbances(self, now: float) -> dict[str, int]:
-        """What went wrong between here and the peer, and no datagram that came was to blame for; it only grows."""
+        """What went wrong between here and the peer, and no datagram that came was to blame for.
+
+        It only grows for one peer of the core; by other keys it is another one, and begins anew.
+        """
         traffic = self.peer.traffic
         return {
             "envelopes_missing": self.peer.missing(now),
@@ -240,6 +245,16 @@ class PeerLink:
     def _sent(self, name: str) -> tuple[int, int]:
         traffic = self._node.peers[name].traffic
         return traffic.datagrams_sent, traffic.bytes_sent
+
+
+def radio_figures(links: Iterable[PeerLink]) -> LinkFigures | None:
+    """What an autopilot is told of its radio: the worst of the links to operators; of all, where no role says who is.
+
+    It slows down for those who watch and command it, not for a neighbour at the edge of its range.
+    """
+    by_role = [(each.config.policy.get("role"), each.figures) for each in links]
+    chosen = [figures for role, figures in by_role if role == "operator"] or [figures for _, figures in by_role]
+    return worst(chosen) if chosen else None
 
 
 class _Sample:

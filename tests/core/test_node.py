@@ -641,7 +641,7 @@ def test_sixteen_answers_wait_for_confirmation() -> None:
     pair = established()
     now = 1.0
     for _ in range(3 * c.UNCONFIRMED_PER_PEER):
-        now += 1 / c.ANSWERS_PER_S
+        now += 1 / c.ANSWERS_WHILE_UP_PER_S
         pair.b.peer.sessions.expire(1.0)
         assert datagrams(pair.b.receive(made_initiation(), now), wire.RESPONSE)
         assert len(pair.b.peer.sessions.unconfirmed) <= c.UNCONFIRMED_PER_PEER
@@ -651,31 +651,50 @@ def test_sixteen_answers_wait_for_confirmation() -> None:
     assert pair.carries(now)
 
 
-def test_answers_to_one_peer_are_bounded() -> None:
-    """A burst is answered at once; after that four a second without a cookie."""
-    pair = established()
+@pytest.mark.parametrize("is_up", [False, True])
+def test_answers_to_one_peer_are_bounded(is_up: bool) -> None:
+    """A burst is answered at once; after that four a second without a cookie, one while a link is up."""
+    pair = established() if is_up else Pair(link_a=QUIET, link_b=QUIET)
+    rate = c.ANSWERS_WHILE_UP_PER_S if is_up else c.ANSWERS_PER_S
+    assert rate == (1.0 if is_up else 4.0)
     now = 10.0
     for _ in range(c.ANSWERS_BURST):
         assert datagrams(pair.b.receive(made_initiation(), now), wire.RESPONSE)
 
-    for moment in (now, now + 1 / c.ANSWERS_PER_S - 0.001):
+    for moment in (now, now + 1 / rate - 0.001):
         outputs = pair.b.receive(made_initiation(), moment)
         assert reasons(outputs) == [DropReason.COOKIE_REQUIRED]
         assert datagrams(outputs, wire.RESPONSE) == []
-    assert datagrams(pair.b.receive(made_initiation(), now + 1 / c.ANSWERS_PER_S), wire.RESPONSE)
+    assert datagrams(pair.b.receive(made_initiation(), now + 1 / rate), wire.RESPONSE)
+
+
+def test_what_goes_elsewhere_is_no_part_of_what_the_peer_was_sent() -> None:
+    """Answers to replayed initiations, and challenges for envelopes from afar, take nothing from a link's budget."""
+    pair = established()
+    traffic = pair.b.peer.traffic
+    before, elsewhere = (traffic.datagrams_sent, traffic.bytes_sent), traffic.bytes_elsewhere
+
+    answer = only(datagrams(pair.b.receive(made_initiation(), 1.0, ELSEWHERE), wire.RESPONSE))
+    envelope = only(datagrams(pair.a.send(1.0, FRAME)))
+    challenge = only(datagrams(pair.b.receive(envelope, 1.0, ELSEWHERE)))
+    assert (traffic.datagrams_sent, traffic.bytes_sent) == before
+    assert traffic.bytes_elsewhere - elsewhere == len(answer) + len(challenge)
+
+    answer = only(datagrams(pair.b.receive(made_initiation(), 1.0), wire.RESPONSE))
+    assert (traffic.datagrams_sent, traffic.bytes_sent) == (before[0] + 1, before[1] + len(answer))
 
 
 def test_replays_do_not_take_the_answers_of_a_peer_at_its_address() -> None:
     """When recorded initiations used up the answers, the peer itself gets one with a cookie."""
     pair = established()
     now, initiation = retried(pair, c.REKEY_AFTER_S)
-    while pair.b.peer.answers.take(now):
+    while pair.b.peer.answers_while_up.take(now):
         pass
 
     reply = only(datagrams(pair.b.receive(initiation, now), wire.COOKIE))
     assert pair.a.receive(reply, now) == []
     now, initiation = retried(pair, now)
-    while pair.b.peer.answers.take(now):
+    while pair.b.peer.answers_while_up.take(now):
         pass
     assert completes(pair, initiation, now)
 
@@ -917,13 +936,17 @@ def test_one_peer_cannot_flush_another_ones_memory(monkeypatch: pytest.MonkeyPat
     assert len(node._remembered) == remembered - 3
 
 
-def test_all_sources_together_have_a_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("known_by", ["its path", "its configured address"])
+def test_all_sources_together_have_a_bound(monkeypatch: pytest.MonkeyPatch, known_by: str) -> None:
     """Whoever owns many addresses, and holds a cookie for each, still costs a bounded number of key exchanges.
 
-    A peer at its configured address does not queue with them.
+    A peer at its configured address, or where it was heard last, does not queue with them.
     """
     pair = established()
     node = pair.b.node
+    node.set_addresses("alpha", [], 0.5)
+    if known_by == "its configured address":
+        pair.b.peer.path = None
     monkeypatch.setattr(node._cookies, "has_valid_mac2", lambda *_: True)
     while node._initiations.take(1.0):
         pass
@@ -934,7 +957,10 @@ def test_all_sources_together_have_a_bound(monkeypatch: pytest.MonkeyPatch) -> N
 
     assert fates.count([DropReason.UNKNOWN_PEER]) == c.COOKIED_PER_S
     assert fates.count([DropReason.RATE_LIMITED]) == 5
-    node.set_addresses("alpha", [AT_A], 1.0)
+    assert reasons(pair.b.receive(made_initiation(), 1.0, ELSEWHERE)) == [DropReason.RATE_LIMITED]
+    if known_by == "its configured address":
+        assert reasons(pair.b.receive(made_initiation(), 1.0)) == [DropReason.RATE_LIMITED]
+        node.set_addresses("alpha", [AT_A], 1.0)
     assert datagrams(pair.b.receive(made_initiation(), 1.0), wire.RESPONSE)
 
 

@@ -109,7 +109,7 @@ def _refill(pair: Pair, now: float) -> None:
         node._initiations = TokenBucket(c.INITIATIONS_PER_S, c.INITIATIONS_BURST, now)
         node._responses = TokenBucket(c.INITIATIONS_PER_S, c.INITIATIONS_BURST, now)
         for peer in node.peers.values():
-            peer.answers = TokenBucket(c.ANSWERS_PER_S, c.ANSWERS_BURST, now)
+            peer.answers = peer.answers_while_up = TokenBucket(c.ANSWERS_PER_S, c.ANSWERS_BURST, now)
 
 
 def _refused(outputs: list[Output]) -> DropReason:

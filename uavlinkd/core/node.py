@@ -224,7 +224,8 @@ class Node:
         # Recorded initiations of this peer can be replayed from anywhere: they may use up the answers to everybody,
         # not those to the one who proves its address.
         index = received.initiation.sender_index
-        self._admit(peer.answers, peer.cookied_answers, cookies, datagram, index, path, now, out)
+        answers = peer.answers_while_up if peer.is_up else peer.answers
+        self._admit(answers, peer.cookied_answers, cookies, datagram, index, path, now, out)
         peer.answer(received, path, now, out)
         self._deadline = min(self._deadline, peer.deadline)
 
@@ -289,8 +290,14 @@ class Node:
         if not self._sources.take((ceiling, source_of(path[1])), now):
             raise Drop(DropReason.RATE_LIMITED)
         # The ceiling is for strangers with many addresses. Who proved an address of a peer does not queue with them.
-        if (path[1], path[2]) not in self._by_address and not ceiling.take(now):
+        if not self._is_known(path[1:]) and not ceiling.take(now):
             raise Drop(DropReason.RATE_LIMITED)
+
+    def _is_known(self, address: tuple[str, int]) -> bool:
+        """Whether a peer is said to be there, or was heard there last."""
+        return address in self._by_address or any(
+            peer.path is not None and peer.path[1:] == address for peer in self.peers.values()
+        )
 
     def _remember(self, peer: Peer, ephemeral: bytes) -> None:
         # A memory for each peer: none can make us forget what another sent.

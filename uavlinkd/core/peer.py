@@ -40,12 +40,7 @@ class Peer:
     """The state of the link with one peer. Methods append what the shell has to do to ``out``."""
 
     def __init__(
-        self,
-        settings: PeerSettings,
-        identity: KeyPair,
-        indices: Indices,
-        entropy: Entropy,
-        now: float,
+        self, settings: PeerSettings, identity: KeyPair, indices: Indices, entropy: Entropy, now: float
     ) -> None:
         self.settings = settings
         self.name = settings.name
@@ -55,6 +50,7 @@ class Peer:
         self.traffic = Traffic()
         self.answers = TokenBucket(c.ANSWERS_PER_S, c.ANSWERS_BURST, now)
         """Responses that it may get without a cookie."""
+        self.answers_while_up = TokenBucket(c.ANSWERS_WHILE_UP_PER_S, c.ANSWERS_BURST, now)
         self.cookied_answers = TokenBucket(c.COOKIED_ANSWERS_PER_S, c.COOKIED_ANSWERS_PER_S, now)
         """And with one, to all addresses together."""
         self.remembered: deque[bytes] = deque()
@@ -115,14 +111,7 @@ class Peer:
         self.deadline = NEVER
 
     def _seal(
-        self,
-        session: Session,
-        payload: bytes,
-        path: Path,
-        now: float,
-        out: list[Output],
-        *,
-        is_answer: bool = False,
+        self, session: Session, payload: bytes, path: Path, now: float, out: list[Output], *, is_answer: bool = False
     ) -> None:
         """Send an envelope. Silence after it is suspect, unless it is an answer: those would echo for ever."""
         if session.send_counter >= c.SESSION_ENVELOPE_LIMIT:
@@ -137,8 +126,11 @@ class Peer:
             self._wake_at(self._echo_at)
 
     def _transmit(self, transmit: Transmit, out: list[Output]) -> None:
-        self.traffic.datagrams_sent += 1
-        self.traffic.bytes_sent += len(transmit.datagram)
+        if transmit.path is self.path or transmit.path in self.caller.candidates(self.path):
+            self.traffic.datagrams_sent += 1
+            self.traffic.bytes_sent += len(transmit.datagram)
+        else:
+            self.traffic.bytes_elsewhere += len(transmit.datagram)
         out.append(transmit)
 
     def _drop(self, reason: DropReason, amount: int, out: list[Output]) -> None:

@@ -15,6 +15,9 @@ class Traffic:
     datagrams_sent: int = 0
     """Envelopes and handshake messages; ``bytes_sent`` are theirs."""
     bytes_sent: int = 0
+    bytes_elsewhere: int = 0
+    """Of answers and path challenges to places where the peer is not known to be. Whoever replays its handshakes or
+    its envelopes causes them: they are no part of the others, from which a link's budget is reckoned."""
     envelopes_sent: int = 0
     envelopes_received: int = 0
     bytes_received: int = 0
