@@ -76,7 +76,9 @@ def test_exceptions_are_told_once_too() -> None:
     data: dict[str, object] = {"role": "vehicle", "system_ids": [1], "deny_out": ["files"]}
     rows = {row.subject: row for row in table_rows(compile_policy(data), data)}
     assert rows["files"].outgoing == "none"
-    assert re.fullmatch(r"all but AUTOPILOT_VERSION, \d told in other rows", rows["answers"].outgoing)
+    assert re.fullmatch(
+        r"all but AUTOPILOT_VERSION, RESPONSE_EVENT_ERROR, \d told in other rows", rows["answers"].outgoing
+    )
 
 
 def test_rates_stand_as_they_were_written() -> None:

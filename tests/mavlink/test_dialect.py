@@ -6,8 +6,10 @@ import subprocess
 import sys
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import pytest
+from fastcrc.crc16 import mcrf4xx
 
 from uavlinkd.mavlink import dialect, dialect_generate, dialect_table
 
@@ -17,13 +19,97 @@ def test_table_equals_what_the_installed_pymavlink_says() -> None:
     assert Path(dialect_table.__file__).read_text(encoding="utf-8") == dialect_generate.source()
 
 
+def upstream() -> dict[int, ElementTree.Element]:
+    """The messages that are added to pymavlink's."""
+    found = ElementTree.parse(dialect_generate.UPSTREAM).iter("message")
+    return {int(message.attrib["id"]): message for message in found}
+
+
 def test_every_message_has_pymavlinks_name_crc_extra_and_length() -> None:
-    """Names, CRC_EXTRA and longest payloads agree with pymavlink's classes, id by id."""
+    """Names, CRC_EXTRA and longest payloads agree with pymavlink's classes; two messages are longer upstream."""
     from pymavlink.dialects.v20 import all as pymavlink
 
     theirs = {i: (m.msgname, m.crc_extra, m.unpacker.size) for i, m in pymavlink.mavlink_map.items()}
     ours = {i: (row[0], row[1], row[3]) for i, row in dialect_table.MESSAGES.items()}
-    assert ours == theirs
+    differing = {i: row for i, row in ours.items() if theirs.get(i) != row}
+    assert set(differing) == set(upstream())
+    assert {i: row for i, row in differing.items() if i in theirs} == {
+        111: ("TIMESYNC", 34, 18),
+        126: ("SERIAL_CONTROL", 220, 81),
+    }
+    assert set(theirs) <= set(ours)
+
+
+SIZES = {"int8_t": 1, "uint8_t": 1, "char": 1, "int16_t": 2, "uint16_t": 2, "int32_t": 4, "uint32_t": 4}
+SIZES |= {"float": 4, "double": 8, "int64_t": 8, "uint64_t": 8}
+
+
+@pytest.mark.parametrize("msgid", sorted(upstream()))
+def test_upstream_message_stands_in_the_table_as_mavlink_defines_it(msgid: int) -> None:
+    """Reckoned by https://mavlink.io/en/guide/serialization.html: CRC_EXTRA, lengths and offsets are the table's."""
+    message = upstream()[msgid]
+    parts = [part for part in message if part.tag in ("field", "extensions")]
+    start = next((n for n, part in enumerate(parts) if part.tag == "extensions"), len(parts))
+    fields: list[tuple[str, str, int]] = []
+    for part in parts[:start] + parts[start + 1 :]:
+        kind, _, length = part.attrib["type"].partition("[")
+        fields.append((kind, part.attrib["name"], int(length.rstrip("]") or 0)))
+    base = sorted(fields[:start], key=lambda field: -SIZES[field[0]])
+    checksum = mcrf4xx(f"{message.attrib['name']} ".encode())
+    offsets: dict[str, int] = {}
+    at = shortest = 0
+    for number, (kind, name, count) in enumerate(base + fields[start:]):
+        offsets[name] = at
+        at += SIZES[kind] * max(1, count)
+        if number < start:
+            checksum = mcrf4xx(f"{kind} {name} ".encode() + bytes([count] if count else []), checksum)
+            shortest = at
+    assert dialect_table.MESSAGES[msgid] == (
+        message.attrib["name"],
+        (checksum & 0xFF) ^ (checksum >> 8),
+        shortest,
+        at,
+        *(offsets.get(name) for name in ("target_system", "target_component", "command")),
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "msgid", "crc_extra"),
+    [
+        ("COMMAND_CANCEL", 80, 14),
+        ("ESC_STATUS", 291, 10),
+        ("BATTERY_INFO", 372, 26),
+        ("COMPONENT_INFORMATION", 395, 0),
+        ("COMPONENT_METADATA", 397, 182),
+        ("EVENT", 410, 160),
+    ],
+)
+def test_crc_extra_is_the_c_headers(name: str, msgid: int, crc_extra: int) -> None:
+    """The headers that autopilots are built with (MAVLINK_MSG_ID_410_CRC and so on) say the same."""
+    assert dialect_table.MESSAGES[msgid][:2] == (name, crc_extra)
+
+
+def test_pymavlinks_definition_goes_before_another_under_its_number(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of what is added, only a longer form of the same message takes the place of pymavlink's."""
+    fields = '<field type="uint8_t" name="target_system"/><field type="uint8_t" name="target_component"/>'
+    times = '<field type="int64_t" name="tc1"/><field type="int64_t" name="ts1"/>'
+    file = tmp_path / "more.xml"
+    file.write_text(
+        "<mavlink><messages>"
+        f'<message id="30" name="ATTITUDE"><description/>{fields}</message>'
+        f'<message id="33" name="ANOTHER"><description/>{fields}</message>'
+        f'<message id="111" name="TIMESYNC"><description/>{times}<extensions/>{fields}</message>'
+        f'<message id="54321" name="MORE"><description/>{fields}</message>'
+        "</messages></mavlink>",
+        encoding="utf-8",
+    )
+    monkeypatch.setattr(dialect_generate, "UPSTREAM", file)
+    made = dialect_generate.messages()
+    changed = {i for i, row in made.items() if dialect_table.MESSAGES.get(i) != row}
+    assert changed == {54321, 126}  # 126 without its extensions again
+    assert made[111] == ("TIMESYNC", 34, 16, 18, 16, 17, None)
 
 
 def test_offsets_find_the_fields_that_pymavlink_packs() -> None:
@@ -32,6 +118,8 @@ def test_offsets_find_the_fields_that_pymavlink_packs() -> None:
 
     checked = 0
     for msgid, message in pymavlink.mavlink_map.items():
+        if msgid in upstream():
+            continue  # longer than pymavlink packs it
         facts = dialect.facts(msgid)
         assert facts is not None
         marks = {"target_system": 201, "target_component": 202, "command": 0xABCD}
@@ -68,7 +156,7 @@ def test_messages_that_carry_commands_are_the_ones_known_to() -> None:
     carriers = {row[0] for row in dialect_table.MESSAGES.values() if row[6] is not None}
     assert carriers == {
         *("COMMAND_LONG", "COMMAND_INT", "COMMAND_LONG_STAMPED", "COMMAND_INT_STAMPED"),
-        *("MISSION_ITEM", "MISSION_ITEM_INT"),
+        *("MISSION_ITEM", "MISSION_ITEM_INT", "COMMAND_CANCEL"),
     }
 
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
+from operator import itemgetter
+from random import Random
 from typing import Any
 
 import pytest
@@ -23,9 +26,9 @@ OPERATOR = {"role": "operator", "system_ids": [255]}
 OPERATOR_WITHOUT_TERMINATION = OPERATOR | {"deny_in": ["MAV_CMD_DO_FLIGHTTERMINATION", "MAV_CMD_DO_SET_MODE"]}
 
 
-def sent(message: Any, *, system: int = 1, version: int = 2) -> Frame:
+def sent(message: Any, *, system: int = 1, component: int = 1, version: int = 2) -> Frame:
     """The message as pymavlink sends it and the splitter reads it."""
-    sender = mavlink.MAVLink(None, srcSystem=system, srcComponent=1)
+    sender = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
     (frame,) = split_payload(bytes(message.pack(sender, force_mavlink1=version == 1)), SplitCounters())
     return frame
 
@@ -156,7 +159,7 @@ def test_denied_command_is_kept_out_of_all_that_carries_it() -> None:
     """A denied command passes in no command message, mission item or stamped command; others do."""
     gate = incoming({"system_ids": "all", "deny_in": ["MAV_CMD_DO_FLIGHTTERMINATION"]})
     carriers = [msgid for msgid, row in MESSAGES.items() if row[6] is not None]
-    assert len(carriers) == 6
+    assert len(carriers) == 7
     for msgid in carriers:
         at = MESSAGES[msgid][6]
         assert at is not None
@@ -185,6 +188,49 @@ def test_denied_command_is_denied_in_its_other_form() -> None:
         gate = incoming({"system_ids": "all", "deny_in": [f"command:{number}"]})
         assert gate.check(blank(msgid), 0.0) is Refusal.COMMAND_NOT_ALLOWED
         assert gate.check(attitude(), 0.0) is None
+
+
+def mission_item_done_at_once(current: int, *, is_int: bool, version: int = 2) -> Frame:
+    """A mission item, float or integer; it ends in zeros, which MAVLink 2 cuts."""
+    name = f"MAVLink_mission_item{'_int' if is_int else ''}_message"
+    return sent(getattr(mavlink, name)(1, 1, 7, 3, 16, current, 0, 0, 0, 0, 0, 0, 0, 0), version=version)
+
+
+@pytest.mark.parametrize("is_int", [False, True])
+@pytest.mark.parametrize("version", [1, 2])
+@pytest.mark.parametrize(
+    ("denied", "refused"),
+    [
+        (["MAV_CMD_DO_REPOSITION"], {2}),
+        (["MAV_CMD_DO_CHANGE_ALTITUDE"], {3}),
+        (["MAV_CMD_DO_REPOSITION", "MAV_CMD_DO_CHANGE_ALTITUDE"], {2, 3}),
+        (["MAV_CMD_NAV_TAKEOFF"], set()),
+        ([], set()),
+    ],
+)
+def test_mission_item_that_is_done_at_once_is_the_command_it_stands_for(
+    is_int: bool, version: int, denied: list[str], refused: set[int]
+) -> None:
+    """ArduPilot flies at once to an item with `current` 2 and climbs for 3: denied with the commands for that."""
+    gate = incoming({"system_ids": "all", "deny_in": denied})
+    for current in (0, 1, 2, 3, 4, 255):
+        item = mission_item_done_at_once(current, is_int=is_int, version=version)
+        expected = Refusal.COMMAND_NOT_ALLOWED if current in refused else None
+        assert gate.check(item, 0.0) is expected, current
+
+
+def test_mission_item_is_read_where_its_sender_wrote() -> None:
+    """One that was cut before the field says 0, and no byte of the checksum is read for it; unreadable is refused."""
+    gate = incoming({"system_ids": "all", "deny_in": ["MAV_CMD_DO_REPOSITION", "MAV_CMD_DO_CHANGE_ALTITUDE"]})
+    for msgid in ids("MISSION_ITEM", "MISSION_ITEM_INT"):
+        for length in range(1, 36):
+            for fill in (1, 2, 3):
+                payload = bytes(length - 1) + bytes([fill])
+                assert gate.check(raw_frame(msgid, payload), 0.0) is None, length
+        whole = bytes(35) + b"\x02"
+        assert gate.check(raw_frame(msgid, whole), 0.0) is Refusal.COMMAND_NOT_ALLOWED
+        assert gate.check(raw_frame(msgid, whole + b"\x01\x01"), 0.0) is Refusal.COMMAND_NOT_ALLOWED
+        assert gate.check(raw_frame(msgid, bytes(36), crc_extra=1), 0.0) is Refusal.COMMAND_NOT_ALLOWED
 
 
 def test_commands_that_cannot_be_read_are_refused_where_any_is_denied() -> None:
@@ -276,6 +322,58 @@ def test_steady_sender_at_its_limit_loses_nothing() -> None:
     assert 60 <= passed <= 62
 
 
+def battery(which: int, **facts: Any) -> Frame:
+    message = mavlink.MAVLink_battery_status_message(which, 1, 1, 2500, [4000] * 10, 120, 1, 9, 77)
+    return sent(message, **facts)
+
+
+@pytest.mark.parametrize("way", ["in", "out"])
+def test_components_do_not_starve_one_another(way: str) -> None:
+    """Autopilot and gimbal beat once a second for five minutes: at a limit of one, each is heard nearly always."""
+    made = compile_policy({"system_ids": "all", f"rate_{way}": {"HEARTBEAT": 1}})
+    gate = made.incoming if way == "in" else made.outgoing
+    jitter = Random(1)
+    frames = [heartbeat(component=component) for component in (1, 154)]
+    beats = [(second + jitter.uniform(0, 0.003), frame) for second in range(300) for frame in frames]
+    beats.sort(key=itemgetter(0))
+    passed = Counter(frame.header.component for at, frame in beats if gate.check(frame, at) is None)
+    assert passed.keys() == {1, 154}
+    assert min(passed.values()) >= 298
+
+
+def test_what_goes_out_is_limited_by_instance() -> None:
+    """Two batteries of one component, told one after the other, are both told of."""
+    gate = compile_policy({"system_ids": "all", "rate_out": {"BATTERY_STATUS": 1}}).outgoing
+    passed = Counter(which for second in range(60) for which in (0, 1) if gate.check(battery(which), second) is None)
+    assert passed == {0: 60, 1: 60}
+    assert sum(gate.check(battery(0), 60.5) is None for _ in range(10)) == 2
+
+
+def test_flow_of_commands_is_limited_message_by_message() -> None:
+    """Commands and their answers are one flow to the link, and yet each message has its own rate."""
+    gate = compile_policy({"system_ids": "all", "rate_out": {"COMMAND_LONG": 1, "COMMAND_INT": 1}}).outgoing
+    assert [gate.check(command_long(TAKEOFF), 0.0) for _ in range(3)] == [None, None, Refusal.RATE_LIMITED]
+    assert [gate.check(command_int(TAKEOFF), 0.0) for _ in range(3)] == [None, None, Refusal.RATE_LIMITED]
+
+
+def test_invented_components_gain_little() -> None:
+    """Who speaks as another component in each frame gets four times the rate, however many there are."""
+    gate = incoming({"system_ids": "all", "rate_in": {"HEARTBEAT": 1}})
+    passed = sum(gate.check(heartbeat(component=n % 256), n / 100) is None for n in range(10_000))  # 100 s
+    assert policy.SYSTEM_SHARE * 100 <= passed <= policy.SYSTEM_SHARE * (100 + 2)
+    assert gate.check(heartbeat(system=2), 100.0) is None
+
+
+def test_frame_that_one_limit_refuses_uses_up_nothing_of_the_other() -> None:
+    """One component that floods takes its own share of the system's rate, and the others keep theirs."""
+    gate = incoming({"system_ids": "all", "rate_in": {"HEARTBEAT": 1}})
+    assert sum(gate.check(heartbeat(component=1), 0.0) is None for _ in range(1000)) == 2
+    others = [sum(gate.check(heartbeat(component=c), 0.0) is None for _ in range(9)) for c in (2, 3, 4, 5)]
+    assert others == [2, 2, 2, 0]
+    assert gate.check(heartbeat(component=5), 0.2) is Refusal.RATE_LIMITED
+    assert [gate.check(heartbeat(component=5), 0.5) for _ in range(3)] == [None, None, Refusal.RATE_LIMITED]
+
+
 def test_refused_frame_uses_up_no_rate() -> None:
     """Only frames that would pass count against a limit."""
     gate = incoming({"system_ids": [1], "allow_in": ["MAV_CMD_NAV_TAKEOFF"], "rate_in": {"COMMAND_LONG": 2}})
@@ -302,7 +400,7 @@ def test_rate_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     gate = incoming({"system_ids": "all", "rate_in": {"HEARTBEAT": 1}})
     for system in range(1, 256):
         assert gate.check(heartbeat(system=system), 0.0) is None
-    assert len(gate._buckets) == 8
+    assert len(gate._buckets) == len(gate._of_systems) == 8
 
 
 def test_every_refusal_is_counted_by_message_and_reason(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -406,6 +504,48 @@ def test_operator_may_take_off_but_not_terminate() -> None:
         assert gate.check(carry(TAKEOFF, system=255), 0.0) is None
         assert gate.check(carry(TERMINATE, system=255), 0.0) is Refusal.COMMAND_NOT_ALLOWED
     assert gate.check(blank(11, system=255), 0.0) is Refusal.COMMAND_NOT_ALLOWED
+
+
+FROM_PX4 = [
+    *("HEARTBEAT", "SYS_STATUS", "EXTENDED_SYS_STATE", "BATTERY_STATUS", "BATTERY_INFO", "ESC_INFO", "ESC_STATUS"),
+    *("EVENT", "CURRENT_EVENT_SEQUENCE", "RESPONSE_EVENT_ERROR", "COMPONENT_INFORMATION", "COMPONENT_METADATA"),
+    *("COMPONENT_INFORMATION_BASIC", "PROTOCOL_VERSION", "TIME_ESTIMATE_TO_TARGET", "FIGURE_EIGHT_EXECUTION_STATUS"),
+    *("ILLUMINATOR_STATUS", "FUEL_STATUS", "AVAILABLE_MODES", "CURRENT_MODE", "OPEN_DRONE_ID_ARM_STATUS"),
+]
+
+
+def test_px4_is_understood_both_ways() -> None:
+    """PX4's events and metadata reach operator and observer, who may ask for events again; members tell none."""
+    vehicle = {"role": "vehicle", "system_ids": [1]}
+    others = [compile_policy({"role": role, "system_ids": [1]}) for role in ("operator", "observer")]
+    told = [incoming(vehicle), *(other.outgoing for other in others)]
+    asked = [compile_policy(vehicle).outgoing, *(other.incoming for other in others)]
+    member = incoming({"role": "swarm-member", "system_ids": [1]})
+    for gate in told:
+        assert not [name for name in FROM_PX4 if gate.check(blank(*ids(name)), 0.0)]
+        assert gate.check(blank(*ids("REQUEST_EVENT")), 0.0) is Refusal.MESSAGE_NOT_ALLOWED
+    for gate in asked:
+        assert gate.check(blank(*ids("REQUEST_EVENT")), 0.0) is None
+        assert gate.check(blank(*ids("EVENT")), 0.0) is Refusal.MESSAGE_NOT_ALLOWED
+    operator, observer = asked[1:]
+    for name in ("COMMAND_CANCEL", "PLAY_TUNE_V2", "TIMESYNC"):
+        assert operator.check(blank(*ids(name)), 0.0) is None
+        assert observer.check(blank(*ids(name)), 0.0) is Refusal.MESSAGE_NOT_ALLOWED
+    passing = {name for name, msgid in dialect.ids_by_name().items() if member.check(blank(msgid), 0.0) is None}
+    assert passing == {
+        *("HEARTBEAT", "ATTITUDE", "ATTITUDE_QUATERNION", "GLOBAL_POSITION_INT", "LOCAL_POSITION_NED", "VFR_HUD"),
+        *("POSITION_TARGET_GLOBAL_INT", "HOME_POSITION", "EXTENDED_SYS_STATE"),
+    }
+
+
+def test_who_may_not_start_a_command_may_not_cancel_it() -> None:
+    """COMMAND_CANCEL is refused by the number in it, and is not allowed along with a command."""
+    number = TERMINATE.to_bytes(2, "little")
+    denied = incoming(OPERATOR_WITHOUT_TERMINATION)
+    assert denied.check(raw_frame(80, number + b"\x01\x01", system=255), 0.0) is Refusal.COMMAND_NOT_ALLOWED
+    assert denied.check(raw_frame(80, b"\x16\x00\x01\x01", system=255), 0.0) is None
+    named = incoming({"system_ids": "all", "allow_in": ["MAV_CMD_NAV_TAKEOFF"]})
+    assert named.check(raw_frame(80, b"\x16\x00\x01\x01"), 0.0) is Refusal.MESSAGE_NOT_ALLOWED
 
 
 def test_observer_reads() -> None:

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Sequence
 from math import inf
 
-from uavlinkd.mavlink.egress import Egress, EgressDrop, EgressSettings, EnvelopeShape, count_drop
+from uavlinkd.mavlink.egress import Egress, EgressDrop, EgressSettings, EnvelopeShape
 from uavlinkd.mavlink.egress_kinds import Lane, kind_of
 from uavlinkd.mavlink.frames import Frame
 
@@ -25,8 +25,6 @@ class Coalescer:
         self.shape = EnvelopeShape()
         """What an envelope to this peer holds now."""
         self.totals: Counter[EgressDrop] = Counter()
-        self.dropped: Counter[tuple[int, EgressDrop]] = Counter()
-        """By message id, or ANY_OTHER once there are many."""
         self._waiting: list[Frame] = []
         self._size = 0
         self._put_at = 0.0
@@ -93,9 +91,8 @@ class Coalescer:
         self._drop_all(EgressDrop.CLOSED)
 
     def _drop_all(self, reason: EgressDrop) -> None:
-        for frame in self._waiting:
-            self.totals[reason] += 1
-            count_drop(self.dropped, frame.header.msgid, reason)
+        if self._waiting:
+            self.totals[reason] += len(self._waiting)
         self._waiting.clear()
         self._size = 0
         self._due_at = inf

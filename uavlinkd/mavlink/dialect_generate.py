@@ -6,6 +6,9 @@ the pymavlink that is installed.
 
 Two sources are needed: the classes know the layout on the wire, and only the XML definitions beside them tell
 which fields are MAVLink 2 extensions (the shortest MAVLink 1 payload ends before those).
+
+``all`` follows ArduPilot's copy of MAVLink's definitions, which lacks messages that PX4 sends. Those, and what was
+added to the ends of others, are in `upstream_messages.xml`.
 """
 
 from __future__ import annotations
@@ -17,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 DIALECT = "pymavlink.dialects.v20.all"
+UPSTREAM = Path(__file__).with_name("upstream_messages.xml")
 
 # COMMAND_ACK has a field ``command`` too, but it reports on a command and carries none.
 REPORTS_A_COMMAND = frozenset({"COMMAND_ACK"})
@@ -26,25 +30,21 @@ Row = tuple[str, int, int, int, int | None, int | None, int | None]
 
 def messages() -> dict[int, Row]:
     """Each message id's row of `dialect_table.MESSAGES`, in order of id."""
-    dialect = importlib.import_module(DIALECT)
-    extensions_start = _lengths_without_extensions(Path(str(dialect.__file__)).with_suffix(".xml"))
-    rows: dict[int, Row] = {}
-    for msgid, message in sorted(dialect.mavlink_map.items()):
-        offsets = _field_offsets(message)
-        name = str(message.msgname)
-        # MANUAL_CONTROL alone calls the field "target": "the system to be controlled".
-        target = offsets.get("target" if name == "MANUAL_CONTROL" else "target_system")
-        command = None if name in REPORTS_A_COMMAND else offsets.get("command")
-        rows[msgid] = (
-            name,
-            int(message.crc_extra),
-            extensions_start[msgid],
-            int(message.unpacker.size),
-            target,
-            offsets.get("target_component"),
-            command,
+    rows = _pymavlinks_rows()
+    for message in upstream():
+        row = _row(
+            message.name, message.crc_extra, message.wire_min_length, message.wire_length, message.field_offsets
         )
-    return rows
+        known = rows.get(message.id)
+        # Another message under a number that pymavlink has gives way. The same message may only have grown.
+        if known is None or (known[:3] == row[:3] and known[3] < row[3]):
+            rows[message.id] = row
+    return dict(sorted(rows.items()))
+
+
+def upstream() -> list[Any]:
+    """The messages of `upstream_messages.xml`, as pymavlink's generator reads them."""
+    return list(_parsed(UPSTREAM).message)
 
 
 def commands() -> dict[str, int]:
@@ -76,6 +76,24 @@ def source() -> str:
     return "\n".join(lines)
 
 
+def _pymavlinks_rows() -> dict[int, Row]:
+    dialect = importlib.import_module(DIALECT)
+    shortest = _lengths_without_extensions(Path(str(dialect.__file__)).with_suffix(".xml"))
+    return {
+        msgid: _row(
+            message.msgname, message.crc_extra, shortest[msgid], message.unpacker.size, _field_offsets(message)
+        )
+        for msgid, message in dialect.mavlink_map.items()
+    }
+
+
+def _row(name: Any, crc_extra: Any, shortest: int, longest: Any, offsets: dict[str, int]) -> Row:
+    # MANUAL_CONTROL alone calls the field "target": "the system to be controlled".
+    target = offsets.get("target" if name == "MANUAL_CONTROL" else "target_system")
+    command = None if name in REPORTS_A_COMMAND else offsets.get("command")
+    return (str(name), int(crc_extra), shortest, int(longest), target, offsets.get("target_component"), command)
+
+
 def _field_offsets(message: Any) -> dict[str, int]:
     """Where each of a message's single-valued fields starts in the payload."""
     # unpacker.format has one code per field in wire order, an array's with its length in front ("<Q16sH").
@@ -95,7 +113,6 @@ def _field_offsets(message: Any) -> dict[str, int]:
 
 def _lengths_without_extensions(definition: Path) -> dict[int, int]:
     """Payload length without extension fields, by message id, of an XML definition and what it includes."""
-    mavparse = importlib.import_module("pymavlink.generator.mavparse")
     lengths: dict[int, int] = {}
     waiting, seen = [definition], set[Path]()
     while waiting:
@@ -103,11 +120,16 @@ def _lengths_without_extensions(definition: Path) -> dict[int, int]:
         if path in seen:
             continue
         seen.add(path)
-        with contextlib.redirect_stdout(None):  # it comments on enums, which are of no use here
-            parsed = mavparse.MAVXML(str(path), "2.0")
+        parsed = _parsed(path)
         lengths |= {int(message.id): int(message.wire_min_length) for message in parsed.message}
         waiting += [path.parent / str(include) for include in parsed.include]
     return lengths
+
+
+def _parsed(definition: Path) -> Any:
+    mavparse = importlib.import_module("pymavlink.generator.mavparse")
+    with contextlib.redirect_stdout(None):  # it comments on enums, which are of no use here
+        return mavparse.MAVXML(str(definition), "2.0")
 
 
 if __name__ == "__main__":

@@ -37,7 +37,6 @@ from typing import Final
 from uavlinkd.mavlink.egress_kinds import FlowKey, Lane, flow_key, kind_of
 from uavlinkd.mavlink.egress_queue import Flow, Queue, Waiting
 from uavlinkd.mavlink.frames import MAX_FRAME_BYTES, Frame
-from uavlinkd.mavlink.policy import ANY_OTHER
 
 BURST_S: Final = 0.25
 """The bucket holds this much of the budget: no more than this stands in a radio's own buffer before a command."""
@@ -57,8 +56,6 @@ FLOWS_PER_LANE: Final = 2
 """One flow has this part of its lane at most: who floods a lane pushes out himself, not another's heartbeat."""
 MAX_FLOWS: Final = 4096
 """Flows that are remembered while nothing of them waits."""
-MAX_COUNTED: Final = 1024
-"""Kinds of drops that are counted by themselves."""
 DEMAND_WINDOW_S: Final = 2.0
 _SLACK_BYTES: Final = 0.5  # a deadline computed in floating point must not come a hair early, over and over
 
@@ -119,8 +116,6 @@ class Egress:
     def __init__(self, settings: EgressSettings, now: float, shape: EnvelopeShape | None = None) -> None:
         self.settings = settings
         self.totals: Counter[EgressDrop] = Counter()
-        self.dropped: Counter[tuple[int, EgressDrop]] = Counter()
-        """By message id, or ANY_OTHER once there are many."""
         self._rate = settings.budget_bits_s / 8
         self._now = now
         self._number = 0
@@ -308,15 +303,6 @@ class Egress:
         if self._rate and reason is not EgressDrop.CLOSED:
             self._offered += len(waiting.raw)
         self.totals[reason] += 1
-        count_drop(self.dropped, waiting.msgid, reason)
-
-
-def count_drop(dropped: Counter[tuple[int, EgressDrop]], msgid: int, reason: EgressDrop) -> None:
-    """One more; under ANY_OTHER once :data:`MAX_COUNTED` kinds are counted by themselves."""
-    counted = (msgid, reason)
-    if len(dropped) >= MAX_COUNTED and counted not in dropped:
-        counted = (ANY_OTHER, reason)
-    dropped[counted] += 1
 
 
 def _by_number(waiting: Waiting) -> int:

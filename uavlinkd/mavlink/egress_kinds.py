@@ -56,12 +56,13 @@ def _names(text: str) -> frozenset[str]:
 _STATE_GROUPS = ("telemetry", "position", "traffic", "setpoints", "manual", "sensors")
 _MORE_STATES = _names(
     "RADIO RADIO_STATUS MLRS_RADIO_LINK_STATS GIMBAL_DEVICE_ATTITUDE_STATUS GIMBAL_MANAGER_STATUS GIMBAL_REPORT "
-    "AUTOPILOT_STATE_FOR_GIMBAL_DEVICE CAMERA_FOV_STATUS"
+    "AUTOPILOT_STATE_FOR_GIMBAL_DEVICE CAMERA_FOV_STATUS CELLULAR_STATUS LINK_NODE_STATUS"
 )
 # ... but for what is said once, in parts, or in answer to a question about one of many.
 _EVENTS_AMONG_THEM = _names(
     "STATUSTEXT AUTOPILOT_VERSION MISSION_ITEM_REACHED MESSAGE_INTERVAL DATA_STREAM MAG_CAL_REPORT BUTTON_CHANGE "
-    "MEMORY_VECT AVAILABLE_MODES UAVCAN_NODE_INFO SMART_BATTERY_INFO FLIGHT_INFORMATION OBSTACLE_DISTANCE_3D"
+    "MEMORY_VECT AVAILABLE_MODES UAVCAN_NODE_INFO SMART_BATTERY_INFO FLIGHT_INFORMATION OBSTACLE_DISTANCE_3D "
+    "PROTOCOL_VERSION COMPONENT_INFORMATION COMPONENT_INFORMATION_BASIC COMPONENT_METADATA EVENT"
 )
 
 INSTANCES: Final[dict[str, tuple[int, int]]] = {
@@ -71,14 +72,19 @@ INSTANCES: Final[dict[str, tuple[int, int]]] = {
     "ADSB_VEHICLE": (0, 4),  # ICAO_address
     "AIRSPEED": (10, 1),  # id
     "AIS_VESSEL": (0, 4),  # MMSI
+    "BATTERY_INFO": (44, 1),  # id
     "BATTERY_STATUS": (32, 1),  # id
     "CAMERA_FOV_STATUS": (52, 1),  # camera_device_id
+    "CELLULAR_STATUS": (10, 1),  # id
     "COLLISION": (0, 4),  # id
     "DEBUG": (8, 1),  # ind
     "DEBUG_FLOAT_ARRAY": (8, 12),  # array_id, name
     "DEBUG_VECT": (20, 10),  # name
     "DISTANCE_SENSOR": (10, 3),  # type, id, orientation
     "EFI_STATUS": (0, 4),  # ecu_index
+    "ESC_INFO": (42, 1),  # index
+    "ESC_STATUS": (56, 1),  # index
+    "FUEL_STATUS": (24, 1),  # id
     "GIMBAL_DEVICE_ATTITUDE_STATUS": (48, 1),  # gimbal_device_id
     "GIMBAL_MANAGER_STATUS": (8, 1),  # gimbal_device_id
     "GLOBAL_POSITION_SENSOR": (38, 1),  # id

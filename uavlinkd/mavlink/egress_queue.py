@@ -12,11 +12,10 @@ from uavlinkd.mavlink.frames import Frame
 class Waiting:
     """One frame that waits."""
 
-    __slots__ = ("flow", "is_waiting", "msgid", "number", "put_at", "raw")
+    __slots__ = ("flow", "is_waiting", "number", "put_at", "raw")
 
     def __init__(self, frame: Frame, flow: Flow, put_at: float, number: int) -> None:
         self.raw = frame.raw
-        self.msgid = frame.header.msgid
         self.flow = flow
         self.put_at = put_at
         self.number = number  # in the order of arrival

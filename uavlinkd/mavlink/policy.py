@@ -7,8 +7,8 @@
     allow_in  = ["telemetry", "PING"]    what passes; without a role and this list, everything does
     deny_in   = ["MAV_CMD_DO_FLIGHTTERMINATION"]            what does not, whatever allows it
     allow_out, deny_out                  the same for the other way
-    rate_in   = { ATTITUDE = 10 }        frames a second of each message and system; also of a group's messages
-    rate_out                             the same for the other way
+    rate_in   = { ATTITUDE = 10 }        frames a second of each message and component; also of a group's messages
+    rate_out                             the same for the other way; also of each target and instance (battery 0, 1)
     mavlink1 = true                      whether MAVLink 1 frames pass
     ground_station = true                whether its HEARTBEAT may claim to be a ground station's
 
@@ -19,7 +19,13 @@ A list's entries add up, a role's entries among them, and what is denied is deni
 ``30``                   a message by its number: the way to name one that the dialect does not know
 ``MAV_CMD_NAV_TAKEOFF``  a command by its name; ``command:22`` by its number. Allowing one lets it through in
                          COMMAND_LONG and COMMAND_INT. Denying one keeps it out of all that carries commands, mission
-                         items among them, and of messages that do the same (SET_MODE is MAV_CMD_DO_SET_MODE).
+                         items and cancellations among them, and of messages that do the same: SET_MODE is
+                         MAV_CMD_DO_SET_MODE, a mission item to fly to now is MAV_CMD_DO_REPOSITION.
+
+A rate is kept for each component by itself: an autopilot and its gimbal both send HEARTBEAT, and were the rate theirs
+together, whoever comes first in each second would silence the other for minutes. But what comes in may name any
+component, so all components of a system together have SYSTEM_SHARE times the rate: invented ones gain no more. What
+goes out has passed another's gate already, so there each flow has the rate, as where a link thins (`egress_kinds`).
 
 What a policy cannot see into passes or not as a whole: files, shells, tunnels, raw buses. A policy that denies a
 command and lets one of those through gets a warning, as the command may travel inside. A message that the dialect
@@ -37,7 +43,8 @@ from enum import StrEnum
 from typing import Final, NamedTuple
 
 from uavlinkd.mavlink import dialect
-from uavlinkd.mavlink.dialect_table import MESSAGES
+from uavlinkd.mavlink.dialect_table import COMMANDS, MESSAGES
+from uavlinkd.mavlink.egress_kinds import FlowKey, flow_key, kind_of
 from uavlinkd.mavlink.frames import Frame, Header
 from uavlinkd.mavlink.policy_settings import PolicyError, PolicyProblem, Rules, Settings, read_settings
 
@@ -54,9 +61,10 @@ __all__ = [
 
 ANY_OTHER: Final = -1  # stands for every message beyond those that are counted by themselves
 MAX_COUNTED: Final = 1024  # message ids and reasons counted by themselves, of one policy and way
-MAX_BUCKETS: Final = 4096  # messages and systems with a rate limit, likewise
+MAX_BUCKETS: Final = 4096  # flows, and messages of systems, with a rate limit, likewise
 MAX_DECISIONS: Final = 1024  # message ids whose decision is remembered, likewise
 BURST_S: Final = 0.5  # how much of a second's frames may come at once
+SYSTEM_SHARE: Final = 4  # what all components of a system may send of a message, in rates of one
 
 SETUP_SIGNING: Final = 256
 HEARTBEAT: Final = 0
@@ -91,6 +99,14 @@ SAME_AS_COMMAND: Final[Mapping[int, int]] = {
     if (number := dialect.command_number(command)) is not None
 }
 
+# ArduPilot does at once, whatever its command, what such a mission item says: by the value of `current`.
+MISSION_ITEMS: Final = frozenset(dialect.ids_by_name()[name] for name in ("MISSION_ITEM", "MISSION_ITEM_INT"))
+CURRENT_IN_MISSION_ITEM: Final = 35  # offset in the payload of both
+DONE_AT_ONCE: Final[Mapping[int, int]] = {
+    2: COMMANDS["MAV_CMD_DO_REPOSITION"],
+    3: COMMANDS["MAV_CMD_DO_CHANGE_ALTITUDE"],
+}
+
 # Carries five command numbers at once, which are not looked at: refused where any command is denied.
 CARRIES_MANY_COMMANDS: Final = frozenset({dialect.ids_by_name()["TRAJECTORY_REPRESENTATION_WAYPOINTS"]})
 
@@ -119,12 +135,17 @@ class PolicyRow(NamedTuple):
     outgoing: str
 
 
+_Buckets = dict[FlowKey, tuple[float, float]]
+"""Tokens, and when that was, by what shares them."""
+
+
 @dataclass(frozen=True, slots=True)
 class _Condition:
     """What a frame of one message must still meet."""
 
     only_commands: frozenset[int] | None = None  # None: any
     never_commands: frozenset[int] = frozenset()
+    never_current: frozenset[int] = frozenset()  # values of a mission item's field
     refuses_ground_station: bool = False
     per_second: float | None = None
 
@@ -132,24 +153,38 @@ class _Condition:
 class Gate:
     """One way of one policy."""
 
-    __slots__ = ("_buckets", "_decisions", "_ground_station", "_mavlink1", "_rates", "_rules", "_systems", "refused")
+    __slots__ = (
+        "_buckets",
+        "_decisions",
+        "_ground_station",
+        "_is_incoming",
+        "_mavlink1",
+        "_of_systems",
+        "_rates",
+        "_rules",
+        "_systems",
+        "refused",
+    )
 
     def __init__(
         self,
         rules: Rules,
         rates: Mapping[int, float],
         *,
+        is_incoming: bool,
         systems: frozenset[int] | None,
         mavlink1: bool,
         ground_station: bool,
     ) -> None:
         self._rules = rules
         self._rates = rates
+        self._is_incoming = is_incoming
         self._systems = systems
         self._mavlink1 = mavlink1
         self._ground_station = ground_station
         self._decisions: dict[int, Refusal | _Condition | None] = {}
-        self._buckets: dict[tuple[int, int], tuple[float, float]] = {}
+        self._buckets: _Buckets = {}
+        self._of_systems: _Buckets = {}
         self.refused: Counter[tuple[int, Refusal]] = Counter()  # by message id (or ANY_OTHER) and reason
 
     def check(self, frame: Frame, now: float) -> Refusal | None:
@@ -163,12 +198,16 @@ class Gate:
             self.refused[counted] += 1
         return refusal
 
+    def may_speak_as(self, system: int) -> bool:
+        """Whether frames of this system are let pass at all."""
+        return self._systems is None or system in self._systems
+
     def always_passes(self, header: Header) -> bool:
         """Whether every frame with this header passes, at any rate: `check` need not be asked."""
         return self._verdict(header) is None
 
     def _verdict(self, header: Header) -> Refusal | _Condition | None:
-        if self._systems is not None and header.system not in self._systems:
+        if not self.may_speak_as(header.system):
             return Refusal.FOREIGN_SYSTEM
         if not self._mavlink1 and header.is_mavlink1:
             return Refusal.MAVLINK1_NOT_ALLOWED
@@ -194,16 +233,20 @@ class Gate:
             if msgid not in DIRECT_COMMANDS or not rules.allowed_commands:
                 return Refusal.MESSAGE_NOT_ALLOWED
             only_commands = rules.allowed_commands
-        never_commands: frozenset[int] = frozenset()
+        never_commands = never_current = frozenset[int]()
         if rules.denied_commands:
             cannot_be_read = msgid in CARRIES_MANY_COMMANDS or (msgid in COMMAND_CARRIERS and not is_known)
             if cannot_be_read or SAME_AS_COMMAND.get(msgid) in rules.denied_commands:
                 return Refusal.COMMAND_NOT_ALLOWED
             if msgid in COMMAND_CARRIERS:
                 never_commands = rules.denied_commands
+            if msgid in MISSION_ITEMS:
+                at_once = {value for value, command in DONE_AT_ONCE.items() if command in rules.denied_commands}
+                never_current = frozenset(at_once)
         condition = _Condition(
             only_commands,
             never_commands,
+            never_current,
             refuses_ground_station=msgid == HEARTBEAT and not self._ground_station,
             per_second=self._rates.get(msgid),
         )
@@ -220,6 +263,8 @@ class Gate:
             return Refusal.COMMAND_NOT_ALLOWED
         if frame.header.command in condition.never_commands:
             return Refusal.COMMAND_NOT_ALLOWED
+        if condition.never_current and _payload_byte(frame, CURRENT_IN_MISSION_ITEM) in condition.never_current:
+            return Refusal.COMMAND_NOT_ALLOWED
         if condition.refuses_ground_station and _claims_to_be_ground_station(frame):
             return Refusal.GROUND_STATION_NOT_ALLOWED
         # Last, so that only frames which would pass use up the rate.
@@ -228,27 +273,46 @@ class Gate:
         return None
 
     def _takes_token(self, frame: Frame, per_second: float, now: float) -> bool:
-        # Not per component: a sender could choose another for each frame.
-        key = (frame.header.msgid, frame.header.system)
-        # Two at least: a frame a second that comes a moment early must not be lost to a limit of one a second.
-        most = max(2.0, per_second * BURST_S)
-        tokens, updated_at = self._buckets.get(key, (most, now))
-        tokens = min(most, tokens + max(0.0, now - updated_at) * per_second)
-        if key not in self._buckets and len(self._buckets) >= MAX_BUCKETS:
-            del self._buckets[next(iter(self._buckets))]
-        self._buckets[key] = (tokens - 1 if tokens >= 1 else tokens, now)
-        return tokens >= 1
+        header = frame.header
+        if not self._is_incoming:
+            return _take(((self._buckets, (header.msgid, *flow_key(frame, kind_of(frame))), 1),), per_second, now)
+        # A sender could choose another component for each frame, another target or instance too.
+        one = (self._buckets, (header.msgid, header.system, header.component), 1)
+        return _take((one, (self._of_systems, (header.msgid, header.system), SYSTEM_SHARE)), per_second, now)
 
 
 _UNCONDITIONAL = _Condition()
 
 
+def _take(limits: tuple[tuple[_Buckets, FlowKey, int], ...], per_second: float, now: float) -> bool:
+    """Whether each of the buckets has a token for a frame: then one is taken from each, else from none.
+
+    A bucket is given with its table, its key there, and how many times the rate it has.
+    """
+    levels = []
+    for buckets, key, share in limits:
+        # Two at least: a frame a second that comes a moment early must not be lost to a limit of one a second.
+        most = share * max(2.0, per_second * BURST_S)
+        tokens, updated_at = buckets.pop(key, (most, now))
+        levels.append(min(most, tokens + max(0.0, now - updated_at) * per_second * share))
+    passes = all(tokens >= 1 for tokens in levels)
+    for (buckets, key, _), tokens in zip(limits, levels, strict=True):
+        if len(buckets) >= MAX_BUCKETS:
+            del buckets[next(iter(buckets))]  # the longest unused, so the first to be full again
+        buckets[key] = (tokens - passes, now)
+    return passes
+
+
+def _payload_byte(frame: Frame, at: int) -> int:
+    """A byte of a frame's payload; 0 where a MAVLink 2 sender cut it off, as for every receiver."""
+    payload_at = 6 if frame.header.is_mavlink1 else 10
+    return frame.raw[payload_at + at] if at < frame.raw[1] else 0
+
+
 def _claims_to_be_ground_station(frame: Frame) -> bool:
     """Whether a HEARTBEAT has the type of a ground station: PX4 takes any for a sign that its own still lives."""
-    if not frame.header.is_known:
-        return True  # its type cannot be read
-    payload_at = 6 if frame.header.is_mavlink1 else 10
-    return frame.raw[1] > TYPE_IN_HEARTBEAT and frame.raw[payload_at + TYPE_IN_HEARTBEAT] == MAV_TYPE_GCS
+    # Of one in another definition the type cannot be read.
+    return not frame.header.is_known or _payload_byte(frame, TYPE_IN_HEARTBEAT) == MAV_TYPE_GCS
 
 
 class Policy:
@@ -261,6 +325,7 @@ class Policy:
         self.incoming = Gate(
             settings.rules_in,
             settings.rates_in,
+            is_incoming=True,
             systems=settings.systems,
             mavlink1=settings.mavlink1,
             ground_station=settings.ground_station,
@@ -268,6 +333,7 @@ class Policy:
         self.outgoing = Gate(
             settings.rules_out,
             settings.rates_out,
+            is_incoming=False,
             systems=None,
             mavlink1=settings.mavlink1,
             ground_station=True,

@@ -24,7 +24,7 @@ class Role(NamedTuple):
 # What a vehicle tells its operator.
 _FROM_VEHICLE: Final = (
     *("heartbeat", "telemetry", "position", "traffic", "identification", "answers", "payload-reports"),
-    *("time", "FILE_TRANSFER_PROTOCOL", "RADIO", "RADIO_STATUS"),
+    *("time", "FILE_TRANSFER_PROTOCOL", "RADIO", "RADIO_STATUS", "CELLULAR_STATUS", "LINK_NODE_STATUS"),
     *("UAVIONIX_ADSB_OUT_STATUS", "UAVIONIX_ADSB_TRANSCEIVER_HEALTH_REPORT"),
     "MAV_CMD_ACCELCAL_VEHICLE_POS",  # ArduPilot's "now put me on my left side", asked of the person
 )
@@ -36,12 +36,13 @@ _FROM_OPERATOR: Final = (
 )
 # Questions that change nothing in the vehicle. No HEARTBEAT: it would keep the failsafe for a lost operator quiet.
 _FROM_OBSERVER: Final = (
-    *("parameter-reads", "mission-reads", "PING"),
+    *("parameter-reads", "mission-reads", "PING", "REQUEST_EVENT"),
     *("MAV_CMD_REQUEST_MESSAGE", "MAV_CMD_REQUEST_PROTOCOL_VERSION", "MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES"),
     *("MAV_CMD_REQUEST_CAMERA_INFORMATION", "MAV_CMD_REQUEST_STORAGE_INFORMATION"),
 )
 _TO_OBSERVER: Final = (
     *("heartbeat", "telemetry", "position", "traffic", "identification", "answers", "payload-reports", "PING"),
+    *("CELLULAR_STATUS", "LINK_NODE_STATUS"),
 )
 # That it is there and where: enough to keep apart and to follow. No `traffic`: autopilots evade what it reports.
 _BETWEEN_MEMBERS: Final = ("heartbeat", "position")
