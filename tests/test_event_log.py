@@ -8,7 +8,8 @@ import pytest
 from structlog import get_logger
 from structlog.testing import capture_logs
 
-from uavlinkd.event_log import EventLog
+from uavlinkd.core.outputs import PeerUp
+from uavlinkd.event_log import LINES_BURST, LINES_PER_S, EventLog
 from uavlinkd.log import SUMMARY_INTERVAL_S
 
 
@@ -59,6 +60,45 @@ def test_what_waits_is_told_in_the_end(log: EventLog) -> None:
 
 
 def test_counters_that_begin_anew_are_no_news(log: EventLog) -> None:
-    """After a change of keys the other figures are told."""
+    """After a change of keys the figures are another's: what they have by then is not told, what is added is."""
     told(log, "b", 1.0, envelopes_missing=9)
     assert told(log, "b", 50.0, envelopes_missing=2) == []
+    (line,) = told(log, "b", 51.0, envelopes_missing=5)
+    assert line["envelopes_missing"] == 3
+
+
+def test_counters_that_begin_anew_in_the_quiet_after_a_line_are_told_after_it(log: EventLog) -> None:
+    """The quiet neither ends early nor hides what came in it."""
+    told(log, "b", 1.0, envelopes_missing=9)
+    assert told(log, "b", 2.0, envelopes_missing=0) == []
+    assert told(log, "b", 3.0, envelopes_missing=4) == []
+    (line,) = told(log, "b", 1.0 + SUMMARY_INTERVAL_S, envelopes_missing=4)
+    assert line["envelopes_missing"] == 4
+
+
+def test_programs_that_come_and_go_are_no_flood(log: EventLog) -> None:
+    """Whoever connects and leaves again for hours gets a bounded number of lines, and the others keep theirs."""
+    with capture_logs() as lines:
+        for number in range(10000):
+            log.program("program_found", "tcp", f"127.0.0.1:{number}", 0.36 * number)
+        log.program("program_found", "udp", "127.0.0.1:9", 3600.0)
+        log.write(PeerUp("tcp"), 3600.0)
+    assert LINES_BURST <= len(lines) - 2 <= LINES_BURST + LINES_PER_S * 3600 + 1
+    assert sum(1 + line.get("omitted_before", 0) for line in lines[:-2]) > 9990
+    assert lines[-2:] == [
+        {"event": "program_found", "log_level": "info", "endpoint": "udp", "program": "127.0.0.1:9"},
+        {"event": "peer_up", "log_level": "info", "peer": "tcp"},
+    ]
+
+
+@pytest.mark.parametrize("name", ["b", "b (previous key)", "b (previous key) (our previous key)"])
+def test_a_forgotten_peer_leaves_nothing_by_any_name(log: EventLog, name: str) -> None:
+    """While keys change the core has it by several; whoever comes back begins with every line, and owes none."""
+    for peer in ("c", name):
+        for _ in range(LINES_BURST + 1):
+            log.write(PeerUp(peer), 1.0)
+    log.forget("b")
+    with capture_logs() as lines:
+        log.write(PeerUp(name), 1.0)
+        log.write(PeerUp("c"), 1.0)
+    assert [dict(line) for line in lines] == [{"event": "peer_up", "log_level": "info", "peer": name}]

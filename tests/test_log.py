@@ -17,7 +17,9 @@ import structlog
 
 from uavlinkd.core.crypto import Secret
 from uavlinkd.core.drops import DropReason
-from uavlinkd.log import DISTURBANCES, MEANINGS, SUMMARY_INTERVAL_S, DropSummary, set_up_logging
+from uavlinkd.log import DISTURBANCES, MEANINGS, REFUSALS, SUMMARY_INTERVAL_S, DropSummary, set_up_logging
+from uavlinkd.mavlink.frames import Header
+from uavlinkd.mavlink.policy import Refusal
 
 
 class Terminal(io.StringIO):
@@ -107,7 +109,8 @@ def test_every_reason_has_a_meaning() -> None:
     """An operator reads a sentence, not a name."""
     assert set(MEANINGS) >= set(DISTURBANCES)
     assert set(MEANINGS) >= {reason.value for reason in DropReason}
-    assert all(len(meaning.split()) > 3 for meaning in MEANINGS.values())
+    assert set(REFUSALS) == set(Refusal)
+    assert all(len(meaning.split()) > 3 for meaning in [*MEANINGS.values(), *REFUSALS.values()])
 
 
 class Recorder:
@@ -119,6 +122,10 @@ class Recorder:
     def warning(self, event: str, **fields: Any) -> None:
         """As a logger."""
         self.lines.append((event, fields))
+
+    def info(self, event: str, **fields: Any) -> None:
+        """The same, of what is nobody's fault."""
+        self.lines.append((f"info: {event}", fields))
 
     def counts(self) -> list[int]:
         """The sums written."""
@@ -143,6 +150,16 @@ def test_the_first_drop_is_told_at_once(recorder: Recorder, summary: DropSummary
     meaning = MEANINGS[DropReason.BAD_TAG]
     facts = {"reason": "bad_tag", "who": "drone1", "count": 1, "meaning": meaning}
     assert recorder.lines == [("datagrams_dropped", facts)]
+
+
+def test_a_refused_frame_is_told_with_what_it_was(recorder: Recorder, summary: DropSummary) -> None:
+    """A limit of the policy is no flood of handshakes; what our own policy keeps from a peer is no warning."""
+    header = Header(30, 7, 1)
+    summary.add_refused("drone1", header, Refusal.RATE_LIMITED, 100.0, to_them=False)
+    summary.add_refused("drone1", header, Refusal.RATE_LIMITED, 100.0, to_them=True)
+    facts = {"reason": "rate_limited", "who": "drone1", "count": 1, "last": "ATTITUDE of system 7"}
+    facts["meaning"] = REFUSALS[Refusal.RATE_LIMITED]
+    assert recorder.lines == [("frames_refused", facts), ("info: frames_withheld", facts)]
 
 
 def test_who_is_left_out_where_nobody_is_known(recorder: Recorder, summary: DropSummary) -> None:

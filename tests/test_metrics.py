@@ -64,6 +64,7 @@ STATUS: dict[str, Any] = {
     "drops": {"malformed": 30},
     "unrouted": {"unknown_target": 31},
     "send_failures": {"ENETUNREACH": 32},
+    "stale": {"autopilot": 33},
     "recording": {"is_recording": True, "frames": 40, "bytes": 41, "frames_lost": 42, "failures": {"ENOSPC": 43}},
 }
 
@@ -137,6 +138,7 @@ def value(name: str, **labels: str) -> float:
         ),
         ("unrouted_frames_total", {"reason": "unknown_target"}, 31),
         ("send_failures_total", {"reason": "ENETUNREACH"}, 32),
+        ("stale_frames_total", {"source": "autopilot"}, 33),
         ("recording_up", {}, 1),
         ("recording_frames_total", {}, 40),
         ("recording_bytes_total", {}, 41),

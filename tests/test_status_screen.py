@@ -36,7 +36,7 @@ def peer(state: str, **facts: object) -> dict[str, Any]:
 
 def shown(peers: dict[str, dict[str, Any]], width: int) -> str:
     """The screen."""
-    status = {"name": "drone0", "peers": peers, "endpoints": {}, "drops": {}, "send_failures": {}}
+    status = {"name": "drone0", "peers": peers, "endpoints": {}, "drops": {}, "send_failures": {}, "stale": {}}
     file = io.StringIO()
     Console(file=file, width=width).print(render_status(status))
     return file.getvalue()

@@ -10,7 +10,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from uavlinkd import switch as switch_module
 from uavlinkd.endpoints.ports import LocalPort
-from uavlinkd.mavlink.frames import Frame, SplitCounters, split_datagram
+from uavlinkd.mavlink.frames import Frame, Header, SplitCounters, split_datagram
 from uavlinkd.mavlink.policy import Policy, Refusal, compile_policy
 from uavlinkd.mavlink.routing import ROUTE_LIFETIME_S, Router, Unrouted
 from uavlinkd.switch import Switch
@@ -55,10 +55,15 @@ class Stage:
     def __init__(self) -> None:
         self.refused: list[tuple[str, Refusal]] = []
         self.router = Router[switch_module.Port]()
-        self.switch = Switch(self.router, lambda who, why: self.refused.append((who, why)))
+        self.withheld: list[tuple[str, Refusal]] = []
+        self.switch = Switch(self.router, self.refuse)
         self.a, self.b, self.c = (Program(name) for name in "abc")
         for each in (self.a, self.b, self.c):
             self.switch.add(each.port, policy())
+
+    def refuse(self, who: str, header: Header, refusal: Refusal, now: float, *, to_them: bool) -> None:
+        """Keep it, by whether they said it or were not told."""
+        (self.withheld if to_them else self.refused).append((who, refusal))
 
     def told(self) -> tuple[int, int, int]:
         """How many frames each was told since the last call."""
@@ -120,12 +125,13 @@ def test_a_new_rule_holds_for_the_next_frame(stage: Stage) -> None:
     assert told() == (0, 1, 1)
     stage.switch.set_policy(stage.b.port, policy(deny_out=["ATTITUDE"]))
     assert (told(), told()) == ((0, 0, 1), (0, 0, 1))
-    assert stage.refused == [("b", Refusal.MESSAGE_NOT_ALLOWED)] * 2
+    assert stage.withheld == [("b", Refusal.MESSAGE_NOT_ALLOWED)] * 2
     stage.switch.set_policy(stage.b.port, policy())
     assert told() == (0, 1, 1)
     stage.switch.set_policy(stage.a.port, policy(system_ids=[7]))
     assert (told(), told()) == ((0, 0, 0), (0, 0, 0))
-    assert stage.refused[2:] == [("a", Refusal.FOREIGN_SYSTEM)] * 2
+    assert stage.refused == [("a", Refusal.FOREIGN_SYSTEM)] * 2
+    assert len(stage.withheld) == 2
 
 
 def test_what_depends_on_the_frame_is_asked_each_time(stage: Stage) -> None:
@@ -133,7 +139,7 @@ def test_what_depends_on_the_frame_is_asked_each_time(stage: Stage) -> None:
     stage.switch.set_policy(stage.c.port, policy(rate_out={"ATTITUDE": 4}))
     stage.switch.forward(stage.a.port, [attitude(number) for number in range(10)], 0.0)
     assert stage.told() == (0, 10, 2)
-    assert stage.refused == [("c", Refusal.RATE_LIMITED)] * 8
+    assert (stage.withheld, stage.refused) == ([("c", Refusal.RATE_LIMITED)] * 8, [])
 
 
 def test_a_target_is_followed_to_where_it_is_heard(stage: Stage) -> None:
@@ -153,6 +159,18 @@ def test_a_target_is_followed_to_where_it_is_heard(stage: Stage) -> None:
         stage.switch.forward(stage.b.port, [attitude(second, system=2)], 0.4 + second)
     stage.told()
     stage.switch.forward(stage.a.port, [request(4, target=2)], ROUTE_LIFETIME_S + 10)
+    assert stage.told() == (0, 1, 0)
+
+
+def test_whom_a_port_may_not_speak_for_any_more_is_not_looked_for_there(stage: Stage) -> None:
+    """A peer whose system was taken from it by a reload gets no copy of what is meant for that system."""
+    stage.switch.forward(stage.b.port, [attitude(1, system=2), attitude(2, system=3)], 0.0)
+    stage.switch.forward(stage.c.port, [attitude(3, system=2)], 0.0)
+    stage.told()
+    stage.switch.set_policy(stage.b.port, policy(system_ids=[3]))
+    stage.switch.forward(stage.a.port, [request(1, target=2)], 0.1)
+    assert stage.told() == (0, 0, 1)
+    stage.switch.forward(stage.a.port, [request(2, target=3)], 0.2)
     assert stage.told() == (0, 1, 0)
 
 

@@ -26,16 +26,16 @@ from uavlinkd.core import outputs as o
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Output
 from uavlinkd.core.peer import NEVER
-from uavlinkd.endpoints.opening import open_endpoint, open_new
+from uavlinkd.endpoints.opening import open_first, open_new
 from uavlinkd.endpoints.ports import Endpoint, LocalPort
 from uavlinkd.event_log import EventLog
 from uavlinkd.key_change import Graces, is_by_our_previous, link_name
 from uavlinkd.log import DropSummary
 from uavlinkd.mavlink.frames import Frame, split_payload
-from uavlinkd.mavlink.policy import Policy, Refusal
-from uavlinkd.mavlink.radio_status import LinkFigures, RadioStatusSource, worst
+from uavlinkd.mavlink.policy import Policy
+from uavlinkd.mavlink.radio_status import RadioStatusSource
 from uavlinkd.mavlink.routing import Router
-from uavlinkd.peer_link import PeerLink
+from uavlinkd.peer_link import PeerLink, radio_figures
 from uavlinkd.peer_sockets import Arrived, PeerSockets
 from uavlinkd.recorder import FROM_PEER, Recorder
 from uavlinkd.sdnotify import Supervisor
@@ -72,14 +72,14 @@ class Daemon:
         self._graces = Graces()
         routing = config.routing
         router = Router[PeerLink | LocalPort](relays=routing.relay, floods_unknown=routing.unknown_targets == "flood")
-        self.switch = Switch(router, self._on_refused)
         self._loop = asyncio.get_running_loop()
         self._drops = DropSummary(self.log)
+        self.switch = Switch(router, self._drops.add_refused)
         self._events = EventLog(self.log)
         self.peer_sockets = PeerSockets(self._on_arrived, self._drops, self.log)
         self._radio_status: dict[str, RadioStatusSource] = {}
         self._deliveries: dict[str, list[Frame]] = {}
-        self._stall = StallWatch(now, self._on_pause)
+        self.stall = StallWatch(now, self._on_pause)
         self._timer: asyncio.TimerHandle | None = None
         self._timer_at = NEVER
         self._housekeeping_at = now + HOUSEKEEPING_S
@@ -121,7 +121,8 @@ class Daemon:
         """
         try:
             self.peer_sockets.open(self.config.listen)
-            self.endpoints += [open_endpoint(each, self) for each in self.config.endpoints]
+            for each in self.config.endpoints:
+                self.endpoints.append(open_first(each, self))
             if self.config.metrics is not None:
                 from uavlinkd.metrics_server import serve_metrics  # noqa: PLC0415  where asked for
 
@@ -160,7 +161,7 @@ class Daemon:
             await self._control.stop()
         self._drops.flush(NEVER)
         for link in self.links.values():
-            self._events.disturbed(link.name, link.disturbances(monotonic()), NEVER)
+            self._events.disturbed(link.peer.name, link.disturbances(monotonic()), NEVER)
         if self.recorder is not None:
             self.recorder.stop(monotonic())
         self.log.info("daemon_stopped")
@@ -302,12 +303,12 @@ class Daemon:
 
     def on_port_opened(self, port: LocalPort) -> None:
         """A local program is there: frames may come from it and go to it."""
-        self.log.info("program_found", endpoint=port.endpoint.name, program=port.name)
+        self._events.program("program_found", port.endpoint.name, port.name, monotonic())
         self.switch.add(port, self.endpoint_policies[port.endpoint.name])
 
     def on_port_closed(self, port: LocalPort) -> None:
         """A local program is gone."""
-        self.log.info("program_gone", endpoint=port.endpoint.name, program=port.name)
+        self._events.program("program_gone", port.endpoint.name, port.name, monotonic())
         self.switch.remove(port)
 
     def on_frames(self, port: LocalPort, frames: list[Frame], now: float, waited_s: float = 0.0) -> None:
@@ -322,17 +323,18 @@ class Daemon:
         receive = self.node.receive
         for datagram, path in arrived:
             self._perform(receive(datagram, path, now))
-        for name, frames in self._deliveries.items():
+        deliveries, self._deliveries = self._deliveries, {}
+        for name, frames in deliveries.items():
             if self.recorder is not None:
                 self.recorder.add(name, [frame.raw for frame in frames], FROM_PEER, now)
             self._forward(self.links[name], frames, now)
-        self._deliveries.clear()
         if self._can_wait or self.node.next_deadline() < self._timer_at:
             self._arm()
 
     def _forward(self, source: PeerLink | LocalPort, frames: list[Frame], now: float, waited_s: float = 0.0) -> None:
-        if self._stall.turn(now):  # every way in passes here
+        if self.stall.turn(now):  # every way in passes here
             who = source.name if isinstance(source, PeerLink) else source.endpoint.name
+            self.stall.dropped[who] += len(frames)
             self._drops.add("frames_dropped", "stale", who, len(frames), now)
         else:
             self.switch.forward(source, frames, now, waited_s)
@@ -363,9 +365,6 @@ class Daemon:
             last = f"{detail} from {Address(*path[1:])}".strip()
             self._drops.add("datagrams_dropped", reason, peer or "", amount, monotonic(), last)
 
-    def _on_refused(self, who: str, refusal: Refusal) -> None:
-        self._drops.add("frames_refused", refusal, who, 1, monotonic())
-
     def _on_event(self, event: o.Event) -> None:
         now = monotonic()
         self._events.write(event, now)
@@ -394,7 +393,7 @@ class Daemon:
 
     def _on_timer(self) -> None:
         now, self._timer_at = monotonic(), NEVER
-        self._stall.turn(now)
+        self.stall.turn(now)
         try:
             self._perform(self.node.handle_timeout(now))
             for link in self.links.values():
@@ -414,7 +413,6 @@ class Daemon:
         self.supervisor.turn(f"{up} of {len(self.links)} peers up", now)
         if self.recorder is not None:
             self.recorder.do_housekeeping(now)
-        figures: list[LinkFigures] = []
         for link in self.links.values():
             if link.has_failed_to_answer(now):
                 self.log.warning(
@@ -423,15 +421,16 @@ class Daemon:
                     called_at=[str(each) for each in link.config.addresses],
                     meaning="it is not reachable there, or has another key for us, another PSK, or no common suite",
                 )
-            figures.append(link.measure(now))
-            self._events.disturbed(link.name, link.disturbances(now), now)
+            link.measure(now)
+            self._events.disturbed(link.peer.name, link.disturbances(now), now)
             if link.end_graces(now, self._graces):
                 self.log.warning("previous_key_expired", peer=link.name)
+        radio = radio_figures(self.links.values())
         for endpoint in self.endpoints:
             endpoint.do_housekeeping(now)
             source = self._radio_status.get(endpoint.name)
-            if source is not None and figures:
-                frame = source.frame(worst(figures))
+            if source is not None and radio is not None:
+                frame = source.frame(radio)
                 for port in endpoint.ports:
                     endpoint.write(port, [frame], now)
 

@@ -1,4 +1,4 @@
-"""What happens to the links, for the log: a line an event, and a bound on the lines that one peer can cause."""
+"""What happens to the links, for the log: a line an event, and a bound on the lines that anybody can cause."""
 
 from __future__ import annotations
 
@@ -10,30 +10,30 @@ from structlog.typing import FilteringBoundLogger
 from uavlinkd.addresses import Address
 from uavlinkd.core import outputs as o
 from uavlinkd.core.limits import TokenBucket
+from uavlinkd.key_change import link_name
 from uavlinkd.log import MEANINGS, SUMMARY_INTERVAL_S
 
 LINES_PER_S = 0.5
-"""Of one peer, on average: some 10 MB a day at worst. Whoever has its key can cause handshakes and new paths."""
+"""Of one peer or endpoint, on average: some 10 MB a day at worst. Whoever has a peer's key can cause handshakes and
+new paths, and whoever reaches a ``tcpin`` can connect and leave again."""
 LINES_BURST = 50
 
 
 class EventLog:
-    """Writes events of the core. What is left out is counted, and told with the next line of that peer."""
+    """Writes what happens. What is left out is counted, and told with the next line of that peer or endpoint."""
 
     def __init__(self, log: FilteringBoundLogger) -> None:
         self._log = log
-        self._budgets: dict[str, TokenBucket] = {}
-        self._omitted: Counter[str] = Counter()
+        self._budgets: dict[tuple[str, str], TokenBucket] = {}  # by peer or endpoint, which may share a name
+        self._omitted: Counter[tuple[str, str]] = Counter()
         self._disturbances: dict[str, tuple[Mapping[str, int], float]] = {}  # as told, and when to tell again
 
     def write(self, event: o.Event, now: float) -> None:
         """Write one, if its peer has a line left. ``now`` is monotonic seconds."""
-        budget = self._budgets.setdefault(event.peer, TokenBucket(LINES_PER_S, LINES_BURST, now))
-        if not budget.take(now):
-            self._omitted[event.peer] += 1
+        omitted = self._take_line("peer", event.peer, now)
+        if omitted is None:
             return
-        omitted = self._omitted.pop(event.peer, 0)
-        log = self._log.bind(peer=event.peer, **({"omitted_before": omitted} if omitted else {}))
+        log = self._log.bind(peer=event.peer, **omitted)
         match event:
             case o.PeerUp():
                 log.info("peer_up")
@@ -54,19 +54,39 @@ class EventLog:
                     rekey=made.rekey,
                 )
 
+    def program(self, event: str, endpoint: str, program: str, now: float) -> None:
+        """Write that a program came or went, if its endpoint has a line left."""
+        omitted = self._take_line("endpoint", endpoint, now)
+        if omitted is not None:
+            self._log.info(event, endpoint=endpoint, program=program, **omitted)
+
+    def _take_line(self, kind: str, name: str, now: float) -> dict[str, int] | None:
+        """What to say of lines that were left out before this one; None where this one is to be left out too."""
+        if not self._budgets.setdefault((kind, name), TokenBucket(LINES_PER_S, LINES_BURST, now)).take(now):
+            self._omitted[kind, name] += 1
+            return None
+        omitted = self._omitted.pop((kind, name), 0)
+        return {"omitted_before": omitted} if omitted else {}
+
     def disturbed(self, peer: str, totals: Mapping[str, int], now: float) -> None:
         """Write what grew of that for which no datagram was dropped, if it is time for a line again.
 
-        Call it about once a second: a line comes when it begins, then one each ``SUMMARY_INTERVAL_S`` a peer.
+        Call it about once a second: a line comes when it begins, then one each ``SUMMARY_INTERVAL_S`` a peer. Totals
+        that are smaller than those before began anew: what they have by then is not told, what comes on top is.
         """
-        told, quiet_until = self._disturbances.get(peer, ({}, now))
-        news = {what: total - told.get(what, 0) for what, total in totals.items() if total > told.get(what, 0)}
-        if news and now >= quiet_until:
+        before, quiet_until = self._disturbances.get(peer, ({}, now))
+        told = {what: min(before.get(what, 0), total) for what, total in totals.items()}
+        news = {what: total - told[what] for what, total in totals.items() if total > told[what]}
+        if not news or now < quiet_until:
+            self._disturbances[peer] = told, quiet_until
+        else:
             self._disturbances[peer] = dict(totals), now + SUMMARY_INTERVAL_S
             self._log.warning("link_disturbed", peer=peer, **news, meaning="; ".join(MEANINGS[each] for each in news))
 
     def forget(self, peer: str) -> None:
-        """The peer is no longer configured."""
-        self._disturbances.pop(peer, None)
-        self._budgets.pop(peer, None)
-        self._omitted.pop(peer, None)
+        """The peer is no longer configured. The core may have had it by previous keys too."""
+        for name in [each for each in self._disturbances if link_name(each) == peer]:
+            del self._disturbances[name]
+        for key in [each for each in self._budgets if each[0] == "peer" and link_name(each[1]) == peer]:
+            del self._budgets[key]
+            self._omitted.pop(key, None)

@@ -19,6 +19,9 @@ from structlog.typing import EventDict, FilteringBoundLogger, Processor
 from uavlinkd.clock import monotonic
 from uavlinkd.core.drops import DropReason
 from uavlinkd.endpoints.ports import failure_name
+from uavlinkd.mavlink.dialect import name_of
+from uavlinkd.mavlink.frames import Header
+from uavlinkd.mavlink.policy import Refusal
 
 SUMMARY_INTERVAL_S = 10.0
 """What repeats is logged at once when it begins, then summed up this often."""
@@ -62,6 +65,19 @@ MEANINGS: dict[str, str] = {
     "stale": "frames that waited in the system while this process stood still",
 }
 """What a person should understand by a reason."""
+
+REFUSALS: dict[str, str] = {
+    Refusal.FOREIGN_SYSTEM: "frames of a system that is not in its system_ids",
+    Refusal.MESSAGE_NOT_ALLOWED: "messages that its role, or its lists, do not let pass",
+    Refusal.UNKNOWN_MESSAGE: "messages that the dialect does not have, or not so; a list may allow their numbers",
+    Refusal.COMMAND_NOT_ALLOWED: "commands that its role, or its lists, do not let pass",
+    Refusal.SETUP_SIGNING: "MAVLink signing keys in clear, which never cross a link",
+    Refusal.MAVLINK1_NOT_ALLOWED: "MAVLink 1, which is switched off for it",
+    Refusal.GROUND_STATION_NOT_ALLOWED: "heartbeats as a ground station, which its role is not",
+    Refusal.RATE_LIMITED: "more of these messages than rate_in or rate_out lets pass",
+}
+"""The same of frames that a policy did not let pass: ``frames_refused``, which somebody sent, and
+``frames_withheld``, which somebody was not to be told."""
 
 
 DISTURBANCES = (
@@ -163,6 +179,11 @@ class DropSummary:
         else:
             self.next_flush = min(self.next_flush, self._quiet_until[key])
 
+    def add_refused(self, who: str, header: Header, refusal: Refusal, now: float, *, to_them: bool) -> None:
+        """Count a frame that a policy did not let pass: of ``who``, or ``to_them``."""
+        last = f"{name_of(header.msgid)} of system {header.system}"
+        self.add("frames_withheld" if to_them else "frames_refused", refusal, who, 1, now, last)
+
     def flush(self, now: float) -> None:
         """Write what has gathered since its last line, where that is long enough ago."""
         for key in [each for each in self._waiting if now >= self._quiet_until[each]]:
@@ -171,11 +192,14 @@ class DropSummary:
 
     def _write(self, key: tuple[str, str, str], now: float) -> None:
         event, reason, where = key
-        facts = {"count": self._waiting.pop(key), "meaning": MEANINGS.get(reason, reason.replace("_", " "))}
+        meanings = REFUSALS if event in ("frames_refused", "frames_withheld") else MEANINGS
+        facts = {"count": self._waiting.pop(key), "meaning": meanings.get(reason, reason.replace("_", " "))}
         self._quiet_until[key] = now + SUMMARY_INTERVAL_S
         last = self._last.pop(key, "")
         named = {"who": where} if where else {}
-        self._log.warning(event, reason=reason, **named, **facts, **({"last": last} if last else {}))
+        # What our own policy keeps from somebody is as it should be, and nobody's fault.
+        write = self._log.info if event == "frames_withheld" else self._log.warning
+        write(event, reason=reason, **named, **facts, **({"last": last} if last else {}))
 
     def on_loop_failure(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         """For an event loop: what it could not do, and nobody else could be told."""

@@ -144,6 +144,8 @@ def _drops(status: Status) -> Iterator[str]:
     )
     yield from _counts("send_failures_total", "Datagrams that the kernel did not take.", status["send_failures"])
     yield from _counts("unrouted_frames_total", "Frames that belong nowhere.", status["unrouted"])
+    stale = [(_labels(source=who), amount) for who, amount in status["stale"].items()]
+    yield from _family("stale_frames_total", "Frames that had waited while the daemon stood still.", stale)
 
 
 def _recording(recording: Status | None) -> Iterator[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 
 STALL_S = 2.5
@@ -18,6 +19,8 @@ class StallWatch:
 
     def __init__(self, now: float, on_pause: Callable[[float], None]) -> None:
         """``on_pause`` is told once how many seconds each pause was."""
+        self.dropped: Counter[str] = Counter()
+        """Frames that were stale, by the peer or endpoint that they came from: the daemon counts them here."""
         self._on_pause = on_pause
         self._turned_at = now
         self._stale_until = now

@@ -28,6 +28,7 @@ def daemon_status(daemon: Daemon, now: float) -> dict[str, object]:
             each.name: endpoint_status(each, daemon.endpoint_policies[each.name], now) for each in daemon.endpoints
         },
         "drops": {reason.value: amount for reason, amount in node.drops.items()},
+        "stale": dict(daemon.stall.dropped),
         "unrouted": {reason.value: amount for reason, amount in daemon.switch.router.unrouted.items()},
         "send_failures": dict(daemon.peer_sockets.failures),
         "recording": None if daemon.recorder is None else recording_status(daemon.recorder),

@@ -26,7 +26,11 @@ def all_up(status: Status) -> bool:
 def render_status(status: Status) -> RenderableType:
     """One screen: a headline, the peers with the broken ones first, the endpoints, and what came from strangers."""
     parts: list[RenderableType] = [_headline(status), _peers(status), _endpoints(status)]
-    for label, counts in (("from no known peer", status["drops"]), ("not sent", status["send_failures"])):
+    for label, counts in (
+        ("from no known peer", status["drops"]),
+        ("not sent", status["send_failures"]),
+        ("stale, as the daemon stood still", status["stale"]),
+    ):
         if counts:
             parts.append(Text(f"{label}: {_counts(counts)}", style="yellow"))
     return Group(*parts)

@@ -7,7 +7,8 @@ then a frame costs a look-up, and the question whether it came by another way al
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from typing import Protocol
 
 from uavlinkd.endpoints.ports import LocalPort
 from uavlinkd.mavlink.frames import Frame, Header
@@ -19,8 +20,13 @@ MAX_FLOWS = 2048
 """Headers of one source, of which the way is remembered."""
 
 Port = LocalPort | PeerLink
-Refused = Callable[[str, Refusal], None]
-"""Takes who was refused, the name of a peer or endpoint, and why."""
+
+
+class Refused(Protocol):
+    """Hears of each frame that a policy does not let pass."""
+
+    def __call__(self, who: str, header: Header, refusal: Refusal, now: float, *, to_them: bool) -> None:
+        """``who``: the peer or endpoint that said it, or that is not to be told (``to_them``)."""
 
 
 class Switch:
@@ -40,8 +46,9 @@ class Switch:
         self.router.add_port(port, is_peer=isinstance(port, PeerLink))
 
     def set_policy(self, port: Port, policy: Policy) -> None:
-        """Other rules for a port that is there."""
+        """Other rules for a port that is there. Whom it may not speak for any more is not looked for behind it."""
         self._policies[port] = policy
+        self.router.forget_systems(port, lambda system: not policy.incoming.may_speak_as(system))
         self._forget_flows()
 
     def remove(self, port: Port) -> None:
@@ -80,7 +87,7 @@ class Switch:
         incoming = self._policies[source].incoming
         refusal = incoming.check(frame, now)
         if refusal is not None:
-            self._refused(_owner(source), refusal)
+            self._refused(_owner(source), frame.header, refusal, now, to_them=False)
             return ()
         routed = self.router.route(frame, source, now)
         passed: list[Port] = []
@@ -89,7 +96,7 @@ class Switch:
             outgoing = self._policies[port].outgoing
             refusal = outgoing.check(frame, now)
             if refusal is not None:
-                self._refused(_owner(port), refusal)
+                self._refused(_owner(port), frame.header, refusal, now, to_them=True)
             else:
                 passed.append(port)
             always = always and outgoing.always_passes(frame.header)

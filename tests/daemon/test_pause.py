@@ -41,3 +41,4 @@ async def test_what_waited_while_a_daemon_was_stopped_is_not_delivered(paused: s
     late = [number for number in range(2, 40) if frame(number) in sink.received]
     assert late == [], "these had waited while the daemon was stopped"
     await stopped.until_logged("frames_dropped", reason="stale")
+    assert sum((await stopped.status())["stale"].values()) > 0

@@ -20,6 +20,7 @@ from uavlinkd.mavlink.frames import (
     MAVLINK1,
     MAX_FRAME_BYTES,
     Frame,
+    Header,
     SplitCounters,
     StreamSplitter,
     split_datagram,
@@ -214,7 +215,11 @@ def make_switch() -> Run:
         script = Script(data)
         refused: Counter[Refusal] = Counter()
         router = Router[Port]()
-        switch = Switch(router, lambda _, why: refused.update((why,)))
+
+        def count(who: str, header: Header, refusal: Refusal, now: float, *, to_them: bool) -> None:
+            refused[refusal] += 1
+
+        switch = Switch(router, count)
         programs = [Program(str(number)) for number in range(len(POLICIES))]
         policies = [policy(**each) for each in POLICIES]
         for program, each in zip(programs, policies, strict=True):

@@ -27,7 +27,7 @@ the policy may be given to `Router.route`: it learns from them.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
 from enum import StrEnum
 from typing import Final, Generic, TypeVar
 
@@ -93,6 +93,14 @@ class Router(Generic[P]):
         """Forgets the port and who was behind it."""
         self._is_peer.pop(port, None)
         for address in self._heard_at.pop(port, {}):
+            self._unlink(port, address)
+        self._forget_decisions()
+
+    def forget_systems(self, port: P, which: Callable[[int], bool]) -> None:
+        """Some of the systems that were heard behind a port are no longer looked for there."""
+        heard = self._heard_at.get(port, {})
+        for address in [each for each in heard if which(each[0])]:
+            del heard[address]
             self._unlink(port, address)
         self._forget_decisions()
 
