@@ -76,12 +76,24 @@ async def test_hostile_requests_get_an_error_and_nothing_more(server: ControlSer
 
 
 async def test_a_request_without_end_is_cut_off(server: ControlServer, path: Path) -> None:
-    """More bytes than a request has close the connection without an answer."""
+    """More bytes than a request has close the connection with an error."""
     reader, writer = await asyncio.open_unix_connection(path)
     writer.write(b"x" * (4 * MAX_REQUEST_BYTES))
+    answer = await asyncio.wait_for(reader.readline(), 5)
+    assert json.loads(answer) == {"error": f"the request is longer than {MAX_REQUEST_BYTES} bytes"}
     assert await read_to_end(reader) == b""
     await close(writer)
     assert await asyncio.to_thread(ask, path, "status") == {"name": "drone0"}
+
+
+async def test_how_long_a_request_may_be_is_the_servers_to_say(path: Path) -> None:
+    """To the byte; of a longer one the client says why it was refused, and does not repeat it."""
+    server = ControlServer(path, lambda request: {"length": len(request)}, max_request_bytes=4096)
+    await server.start()
+    assert await asyncio.to_thread(ask, path, "x" * 4096) == {"length": 4096}
+    with pytest.raises(ControlError, match="refuses the request: the request is longer than 4096 bytes"):
+        await asyncio.to_thread(ask, path, "x" * 4097)
+    await server.stop()
 
 
 async def test_mute_clients_do_not_keep_others_out_for_ever(

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+import selectors
 import socket
 import threading
-import time
+from collections import Counter
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NoReturn
 
 import pytest
 import structlog
 from structlog.testing import capture_logs
 
+from tests.waiting import until
 from uavlinkd import resolver
 from uavlinkd.addresses import Address
 from uavlinkd.resolver import Resolved, keep_resolving, resolve
@@ -72,23 +74,23 @@ class Following:
 
     def __init__(self, addresses: list[Address]) -> None:
         self.told: list[Resolved] = []
-        self.is_wanted = True
+        self.is_wanted = self.can_use = True
         self.asked = 0
-        self._task = asyncio.create_task(
-            keep_resolving(addresses, self._ask, self.told.append, structlog.get_logger())
-        )
+        self._task = asyncio.create_task(keep_resolving(addresses, self._ask, self._tell, structlog.get_logger()))
 
     async def until(self, condition: Callable[[], bool]) -> None:
         """Let it work until then."""
-        async with asyncio.timeout(5):
-            while not condition():  # noqa: ASYNC110  what is waited for is the task's own doing
-                await asyncio.sleep(0.001)
+        await until(condition)
 
     async def stop(self) -> None:
         """End it."""
         self._task.cancel()
         with pytest.raises(asyncio.CancelledError):
             await self._task
+
+    def _tell(self, found: Resolved) -> bool:
+        self.told.append(found)
+        return self.can_use
 
     def _ask(self) -> bool:
         self.asked += 1
@@ -104,6 +106,20 @@ async def test_only_what_is_new_is_told(names: Names) -> None:
     names["drone1.test"] = ["10.0.0.2"]
     await following.until(lambda: len(following.told) == 2)
     assert following.told[1] == [(V4, "10.0.0.2", 5790)]
+    await following.stop()
+
+
+async def test_what_could_not_be_used_is_told_again(names: Names) -> None:
+    """A socket that could not be had now may be had later: the same answer is then no old news."""
+    names["drone1.test"] = ["10.0.0.1"]
+    following = Following([Address("drone1.test", 5790)])
+    following.can_use = following.is_wanted = False
+    await following.until(lambda: len(following.told) >= 3)
+    following.can_use = True
+    told = len(following.told)
+    await following.until(lambda: len(following.told) == told + 1)
+    await asyncio.sleep(0.02)
+    assert following.told == [[(V4, "10.0.0.1", 5790)]] * (told + 1)
     await following.stop()
 
 
@@ -147,49 +163,72 @@ async def test_an_answer_that_vanishes_is_kept(names: Names) -> None:
         await following.stop()
 
 
-async def test_a_silent_server_is_asked_each_second(monkeypatch: pytest.MonkeyPatch) -> None:
-    """However long it is silent: the system repeats a question after 5 s and gives up after 10 (here tenths)."""
+class _NoWaiting(selectors.DefaultSelector):
+    """Where nothing comes, the time in which it could have come has passed."""
+
+    now = 0.0
+
+    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        found = super().select(0)
+        if not found:
+            assert timeout is not None, "nothing will ever happen"
+            self.now += timeout
+        return found
+
+
+def loop_of_no_time() -> asyncio.AbstractEventLoop:
+    """An event loop whose clock jumps to what is next."""
+    selector = _NoWaiting()
+    loop = asyncio.SelectorEventLoop(selector)
+    loop.time = lambda: selector.now  # type: ignore[method-assign]
+    return loop
+
+
+def test_a_silent_server_is_asked_each_second(monkeypatch: pytest.MonkeyPatch) -> None:
+    """However long it is silent: the system repeats a question after 5 s and gives up after 10."""
     put: list[float] = []
 
-    def look_up(*_: Any, **__: Any) -> Any:
-        for _again in (False, True):
-            put.append(time.monotonic())
-            time.sleep(0.5)
-        raise socket.gaierror(socket.EAI_AGAIN, "Temporary failure in name resolution")
+    class Silent:
+        async def run(self, *_: object) -> NoReturn:
+            for _again in (False, True):
+                put.append(asyncio.get_running_loop().time())
+                await asyncio.sleep(5.0)
+            raise socket.gaierror(socket.EAI_AGAIN, "Temporary failure in name resolution")
 
-    monkeypatch.setattr(socket, "getaddrinfo", look_up)
-    monkeypatch.setattr(resolver, "FIRST_WAIT_S", 0.05)
-    monkeypatch.setattr(resolver, "LONGEST_WAIT_S", 0.1)
-    following = Following([Address("drone1.test", 5790)])
-    await asyncio.sleep(3.0)
-    await following.stop()
-    put.sort()
-    assert len(put) > 25
-    assert max(after - before for before, after in itertools.pairwise(put)) < 0.25
+    async def follow() -> None:
+        following = Following([Address("drone1.test", 5790)])
+        await asyncio.sleep(60.0)
+        await following.stop()
+
+    monkeypatch.setattr(resolver, "_THREADS", Silent())
+    with asyncio.Runner(loop_factory=loop_of_no_time) as runner:
+        runner.run(follow())
+    gaps = [after - before for before, after in itertools.pairwise([*put, 60.0])]
+    assert max(gaps) == pytest.approx(1.0)
+    assert len(put) == pytest.approx(60, abs=2)
 
 
 async def test_names_that_nobody_answers_for_leave_room_for_others(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ten peers that are not there, each question hanging: another's name is answered all the same."""
     gate = threading.Event()
-    hanging = threading.Semaphore(0)
+    asked: list[str] = []
     genuine = socket.getaddrinfo
 
     def look_up(host: str, *arguments: Any, **options: Any) -> Any:
         if host.startswith("gone"):
-            hanging.release()
-            gate.wait(30)
+            asked.append(host)
+            gate.wait()
             raise socket.gaierror(socket.EAI_AGAIN, "Temporary failure in name resolution")
         return genuine("10.0.0.1" if host == "there.test" else host, *arguments, **options)
 
     monkeypatch.setattr(socket, "getaddrinfo", look_up)
     monkeypatch.setattr(resolver, "LONGEST_WAIT_S", 0.01)
     gone = [Following([Address(f"gone{number}.test", 1)]) for number in range(10)]
+    share = resolver.MOST_THREADS // 10
     try:
-        await asyncio.sleep(0.3)
-        asked = 0
-        while hanging.acquire(blocking=False):
-            asked += 1
-        assert 10 <= asked < resolver.MOST_THREADS
+        await until(lambda: len(asked) >= 10 * share)
+        await asyncio.sleep(0.1)  # in which each could ask ten times more
+        assert Counter(asked) == {f"gone{number}.test": share for number in range(10)}
         there = Following([Address("there.test", 1)])
         await there.until(lambda: bool(there.told))
         await there.stop()

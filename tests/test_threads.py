@@ -6,10 +6,12 @@ import asyncio
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
+from queue import Empty, SimpleQueue
 
 import pytest
 
-from tests.waiting import until
+from tests.waiting import PATIENCE_S, until
 from uavlinkd import threads
 from uavlinkd.threads import Threads
 
@@ -49,6 +51,35 @@ async def test_idle_threads_end(monkeypatch: pytest.MonkeyPatch) -> None:
     for _ in range(3):
         await some.run(int)
         await until(lambda: all(each.name != "test-idle" for each in threading.enumerate()))
+
+
+async def test_work_that_comes_as_a_thread_finds_none_is_done_and_so_is_what_comes_later(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A thread that has found no work counts as idle before more can come: nobody waits for one that has ended."""
+    monkeypatch.setattr(threads, "IDLE_S", 0.01)
+    found_none, has_come = threading.Event(), threading.Event()
+
+    class Queue(SimpleQueue[Callable[[], None]]):
+        def get_nowait(self) -> Callable[[], None]:
+            try:
+                return super().get_nowait()
+            except Empty:
+                found_none.set()
+                has_come.wait(0.2)  # it comes in this time, unless it has to wait as well
+                raise
+
+    monkeypatch.setattr(threads, "SimpleQueue", Queue)
+    some = Threads(1, "test-between")
+    await some.run(int)
+    await asyncio.to_thread(found_none.wait)
+    second = asyncio.create_task(some.run(int, "2"))
+    await asyncio.sleep(0)
+    has_come.set()
+    assert await second == 2
+    await until(lambda: all(each.name != "test-between" for each in threading.enumerate()))
+    async with asyncio.timeout(PATIENCE_S):
+        assert await some.run(int, "3") == 3
 
 
 async def test_a_hanging_call_leaves_its_place_to_nobody_but_its_caller_may_go() -> None:

@@ -32,7 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except _CommandError as error:
         return _fail(*error.args)
     except KeyboardInterrupt:
-        return OK if command in (_run, _sim, _demo) else FAILED
+        return OK if command in (_run, _sim) else FAILED  # which run until they are told to stop
     except BrokenPipeError:  # the reader of our output left: `uavlinkd check | head`
         with suppress(OSError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -155,8 +155,10 @@ def _run(options: argparse.Namespace) -> int:
 
     try:
         _run_loop(work())
-    except (BindError, ControlError) as error:
-        return _fail(error)
+    except BindError as error:
+        return _fail(f"{options.config}: {error}")
+    except ControlError as error:
+        return _fail(f"{options.config}: control_socket: {error}")
     return OK
 
 

@@ -16,6 +16,8 @@ from pathlib import Path
 from typing import Any
 
 MAX_REQUEST_BYTES = 256
+"""Unless the server is told otherwise: the longest request is a word."""
+UNKNOWN = "unknown request"
 REQUEST_TIMEOUT_S = 5.0
 """For the request to come, and for the answer to be taken. To find the answer takes as long as it takes."""
 MAX_CONNECTIONS = 8
@@ -32,9 +34,15 @@ class ControlError(Exception):
 class ControlServer:
     """Answers requests with what ``answer`` gives, at once or later; None for a request that it does not know."""
 
-    def __init__(self, path: Path, answer: Callable[[str], Answer | Awaitable[Answer]]) -> None:
+    def __init__(
+        self,
+        path: Path,
+        answer: Callable[[str], Answer | Awaitable[Answer]],
+        max_request_bytes: int = MAX_REQUEST_BYTES,
+    ) -> None:
         self._path = path
         self._answer = answer
+        self._max_request_bytes = max_request_bytes
         self._server: asyncio.Server | None = None
         self._connections = 0
 
@@ -45,7 +53,9 @@ class ControlServer:
             ControlError: where the path cannot be used.
         """
         if self._is_served():
-            raise ControlError(f"cannot listen on the control socket {self._path}: another daemon answers there")
+            raise ControlError(
+                f"cannot listen on the control socket {self._path}: another daemon answers there: name another"
+            )
         sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
             if self._path.is_socket():
@@ -55,11 +65,12 @@ class ControlServer:
                 sock.bind(str(self._path))
             finally:
                 os.umask(mask)
-            self._server = await asyncio.start_unix_server(self._serve, sock=sock, limit=MAX_REQUEST_BYTES)
+            self._server = await asyncio.start_unix_server(self._serve, sock=sock, limit=self._max_request_bytes)
         except OSError as error:
             sock.close()
             raise ControlError(
-                f"cannot listen on the control socket {self._path}: {error.strerror or error}"
+                f"cannot listen on the control socket {self._path}: {error.strerror or error}: "
+                "its folder must be there and writable, for a service /run/uavlinkd/control.sock"
             ) from None
 
     async def stop(self) -> None:
@@ -81,14 +92,18 @@ class ControlServer:
         self._connections += 1
         try:
             if self._connections <= MAX_CONNECTIONS:
-                async with asyncio.timeout(REQUEST_TIMEOUT_S):
-                    line = await reader.readline()
-                answer = await self._respond(line)  # which takes as long as it takes
+                try:
+                    async with asyncio.timeout(REQUEST_TIMEOUT_S):
+                        line = await reader.readline()
+                except ValueError:
+                    answer = _line({"error": f"the request is longer than {self._max_request_bytes} bytes"})
+                else:
+                    answer = await self._respond(line)  # which takes as long as it takes
                 async with asyncio.timeout(REQUEST_TIMEOUT_S):
                     writer.write(answer)
                     await writer.drain()
-        except (OSError, TimeoutError, ValueError):
-            pass  # the client went away, stalled, or sent more than a request: its loss
+        except (OSError, TimeoutError):
+            pass  # the client went away, or stalled: its loss
         finally:
             self._connections -= 1
             writer.close()
@@ -97,7 +112,11 @@ class ControlServer:
         answer = self._answer(line.decode("utf-8", "replace").strip())
         if isinstance(answer, Awaitable):
             answer = await answer
-        return json.dumps({"error": "unknown request"} if answer is None else answer).encode() + b"\n"
+        return _line({"error": UNKNOWN} if answer is None else answer)
+
+
+def _line(answer: dict[str, object]) -> bytes:
+    return json.dumps(answer).encode() + b"\n"
 
 
 def ask(
@@ -108,7 +127,7 @@ def ask(
     With ``on_waiting`` an answer may take longer: it is called after each ``timeout_s`` without one.
 
     Raises:
-        ControlError: where there is no daemon, or no permission, or no answer.
+        ControlError: where there is no daemon, or no permission, or no answer but an error.
     """
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as sock:
@@ -120,8 +139,10 @@ def ask(
         raise ControlError(f"no daemon answers at {path}: {error.strerror or error}") from None
     except ValueError:
         raise ControlError(f"the daemon at {path} gave no answer that can be read") from None
-    if not isinstance(answer, dict) or "error" in answer:
+    if not isinstance(answer, dict) or answer.get("error") == UNKNOWN:
         raise ControlError(f"the daemon at {path} does not know the request {request!r}")
+    if "error" in answer:
+        raise ControlError(f"the daemon at {path} refuses the request: {answer['error']}")
     return answer
 
 

@@ -14,6 +14,7 @@ from ipaddress import ip_address
 
 from uavlinkd.addresses import Address
 from uavlinkd.clock import monotonic
+from uavlinkd.endpoints.sockets import BindError
 from uavlinkd.endpoints.tcp import tcp_listener
 from uavlinkd.metrics import CONTENT_TYPE, Status, exposition
 
@@ -51,7 +52,10 @@ class MetricsServer:
         Raises:
             BindError: with the address and the reason.
         """
-        sock = tcp_listener(self._address)
+        try:
+            sock = tcp_listener(self._address)
+        except BindError as error:
+            raise BindError(f"metrics.listen: {error}") from None
         self._server = await asyncio.start_server(self._serve, sock=sock, limit=MAX_REQUEST_BYTES)
 
     def stop(self) -> None:

@@ -14,7 +14,7 @@ from uavlinkd.addresses import Address
 from uavlinkd.clock import monotonic
 from uavlinkd.core.outputs import Path
 from uavlinkd.endpoints.ports import failure_name
-from uavlinkd.endpoints.sockets import Reader, numeric_host, udp_socket
+from uavlinkd.endpoints.sockets import BindError, Reader, numeric_host, udp_socket
 from uavlinkd.log import DropSummary
 from uavlinkd.peer_link import PeerLink
 from uavlinkd.resolver import Resolved, keep_resolving
@@ -52,10 +52,13 @@ class PeerSockets:
         """Bind a socket to each address, or ephemeral ones without any.
 
         Raises:
-            BindError: where an address cannot be listened on.
+            BindError: where an address cannot be listened on, with the key that says so.
         """
         for address in addresses or _EPHEMERAL:
-            self._sockets.append(udp_socket(address, may_come_later=True))
+            try:
+                self._sockets.append(udp_socket(address, may_come_later=True))
+            except BindError as error:
+                raise BindError(f"listen: {error}") from None
 
     def start(self) -> None:
         """Read whenever something is there."""
@@ -99,7 +102,7 @@ class PeerSockets:
             link.set_paths((), monotonic())
             return
 
-        def on_resolved(found: Resolved) -> None:
+        def on_resolved(found: Resolved) -> bool:
             paths: list[Path] = [
                 (number, host, port)
                 for family, host, port in found
@@ -110,6 +113,7 @@ class PeerSockets:
                 self._log.warning("peer_unreachable", peer=link.name, reason="no listen address of its family")
             link.set_paths(paths, monotonic())
             on_found()
+            return True
 
         work = keep_resolving(link.config.addresses, lambda: not link.peer.is_up, on_resolved, self._log)
         self._following[link.name] = asyncio.get_running_loop().create_task(work)

@@ -61,13 +61,13 @@ def _look_up(address: Address, flags: int) -> list[tuple[Any, ...]]:
 async def keep_resolving(
     addresses: Sequence[Address],
     is_wanted: Callable[[], bool],
-    on_resolved: Callable[[Resolved], None],
+    on_resolved: Callable[[Resolved], bool],
     log: FilteringBoundLogger,
 ) -> None:
     """Look the names up now, and again while ``is_wanted`` says that what they gave does not answer.
 
-    Runs until cancelled. ``on_resolved`` is called with what is new. Names that fail are logged once each time
-    that they begin to fail.
+    Runs until cancelled. ``on_resolved`` is called with what is new, and again later where it gives False: it could
+    do nothing with that now. Names that fail are logged once each time that they begin to fail.
     """
     known: Resolved = []
     failing: set[str] = set()
@@ -96,9 +96,8 @@ async def keep_resolving(
                 for name in set(failed) - failing:
                     log.warning("name_not_resolved", host=name)
                 failing = set(failed)
-                if found and found != known:
+                if found and found != known and on_resolved(found):
                     known = found
-                    on_resolved(found)
                 if not failed:
                     _forget(asking)
                 wait_s = min(2 * wait_s, LONGEST_WAIT_S)

@@ -12,7 +12,7 @@ import os
 from collections.abc import Callable
 from contextlib import suppress
 from queue import Empty, SimpleQueue
-from threading import Semaphore, Thread
+from threading import Lock, Thread
 from typing import Any, TypeVar
 
 IDLE_S = 10.0
@@ -25,11 +25,12 @@ class Threads:
     """At most so many at a time; what comes beyond that waits for its turn."""
 
     def __init__(self, most: int, name: str) -> None:
-        self._most = most
         self._name = name
         self._work: SimpleQueue[Callable[[], None]] = SimpleQueue()
-        self._idle = Semaphore(0)
-        self._slots = Semaphore(most)
+        self._lock = Lock()
+        """Whoever puts work there, or finds none, counts himself in the same moment."""
+        self._idle = 0  # threads that wait, and that no work counts on yet
+        self._slots = most  # threads that may still be started
 
     async def run(self, function: Callable[..., T], *arguments: Any) -> T:
         """Call it in a thread, and give what it gives. Who is cancelled meanwhile leaves it to itself.
@@ -51,30 +52,57 @@ class Threads:
             with suppress(RuntimeError):  # the loop is closed: nobody waits any more
                 loop.call_soon_threadsafe(_settle, future, *settle)
 
-        self._work.put(work)
-        if not self._idle.acquire(blocking=False) and self._slots.acquire(blocking=False):
+        if self._put(work):
             try:
                 Thread(target=self._serve, name=self._name, daemon=True).start()
             except RuntimeError:  # too many, or no memory
-                self._slots.release()
+                with self._lock:
+                    self._slots += 1
                 future.cancel()  # should another thread find the work after all
                 raise OSError(errno.EAGAIN, os.strerror(errno.EAGAIN)) from None
         return await future
 
+    def _put(self, work: Callable[[], None]) -> bool:
+        """Leave it to the threads; whether one is to be started for it."""
+        with self._lock:
+            self._work.put(work)
+            if self._idle:
+                self._idle -= 1
+                return False
+            if not self._slots:
+                return False
+            self._slots -= 1
+            return True
+
     def _serve(self) -> None:
         while True:
-            try:
-                work = self._work.get_nowait()
-            except Empty:
-                self._idle.release()
+            work = self._take()
+            if work is None:
                 try:
                     work = self._work.get(timeout=IDLE_S)
                 except Empty:
-                    if self._idle.acquire(blocking=False):  # else somebody counts on this thread
-                        self._slots.release()
+                    if self._may_end():
                         return
                     continue
             work()
+
+    def _take(self) -> Callable[[], None] | None:
+        """Work; None where there is none, and the thread counts as idle."""
+        with self._lock:
+            try:
+                return self._work.get_nowait()
+            except Empty:
+                self._idle += 1
+                return None
+
+    def _may_end(self) -> bool:
+        """Whether no work counts on an idle thread; then it is no longer there."""
+        with self._lock:
+            if not self._idle:
+                return False
+            self._idle -= 1
+            self._slots += 1
+            return True
 
 
 def _settle(future: asyncio.Future[Any], settle: Callable[[Any], None], outcome: object) -> None:

@@ -156,4 +156,7 @@ async def test_a_taken_address_for_metrics_is_told(stage: Stage) -> None:
         await a.start()
         assert await a.ended() == 1
     await until(lambda: bool(a.lines))
-    assert a.lines == [f"cannot listen on {address}: Address already in use"]
+    (line,) = a.lines
+    assert line.startswith(
+        f"{a.config_file}: metrics.listen: cannot listen on {address}: Address already in use: end"
+    )

@@ -207,19 +207,25 @@ async def write_to(fifo: Path, text: str, before_the_end: DaemonProcess | None =
 
 
 async def test_many_hangups_are_no_more_than_two_reloads_at_a_time(stage: Stage) -> None:
-    """The last file wins however many signals came."""
+    """One that reads and one that waits, which reads the last file, however many signals came."""
     a, b = stage.pair()
     await stage.start(a, b)
-    peers, a.config["peer"] = a.config["peer"], []
-    a.write_config()
+    a.config_file.unlink()
+    os.mkfifo(a.config_file)  # who reads it waits
     for _ in range(20):
         await a.send_signal(signal.SIGHUP)
-    a.config["peer"] = peers
-    a.write_config()
-    await a.send_signal(signal.SIGHUP)
-    assert await reload(a) == []
+        await a.status()  # the signal was handled before
+    await write_to(a.config_file, to_toml({**a.config, "peer": []}))
+    await a.until_logged("configuration_reloaded")
+    writer = await asyncio.to_thread(os.open, a.config_file, os.O_WRONLY)
+    a.config_file.unlink()
+    a.write_config()  # should there be a third one
+    await asyncio.to_thread(os.write, writer, to_toml(a.config).encode())
+    os.close(writer)
+    assert await reload(a) == []  # its turn comes after all the others
     await a.until_linked()
-    assert len(a.events("configuration_reloaded")) <= 21
+    assert await a.stop() == 0  # every line has been read then
+    assert [each.get("peers_removed") for each in a.events("configuration_reloaded")] == [[b.name], None, None]
 
 
 async def test_the_end_may_come_during_a_reload(stage: Stage) -> None:
@@ -237,26 +243,30 @@ async def test_the_end_may_come_during_a_reload(stage: Stage) -> None:
 
 
 STUCK = """
-import socket, time
-genuine = socket.getaddrinfo
-def getaddrinfo(host, *arguments, **options):
-    if str(host).endswith(".test"):
+import os, socket, time
+genuine = {each: getattr(module, each) for module, each in ((socket, "getaddrinfo"), (os, "open"))}
+def hang(name, *arguments, **options):
+    if str(name).endswith("far.test"):
         open(__file__ + ".asked", "w").close()
         time.sleep(600)
-    return genuine(host, *arguments, **options)
-socket.getaddrinfo = getaddrinfo
+    return None
+def getaddrinfo(host, *arguments, **options):
+    return hang(host) or genuine["getaddrinfo"](host, *arguments, **options)
+def open_file(path, *arguments, **options):
+    return hang(path) or genuine["open"](path, *arguments, **options)
+socket.getaddrinfo, os.open = getaddrinfo, open_file
 """
 
 
-@pytest.mark.parametrize("where", ["peer", "udpout", "tcp"])
-async def test_the_end_does_not_wait_for_a_name_server(stage: Stage, where: str) -> None:
-    """A name that nobody answers for holds up neither the other peer nor the end."""
+@pytest.mark.parametrize("where", ["peer", "udpout", "tcp", "serial"])
+async def test_the_end_does_not_wait_for_a_name_server_or_a_device(stage: Stage, where: str) -> None:
+    """A name that nobody answers for, or a device that does not open, holds up neither the other peer nor the end."""
     a, b = stage.pair()
     if where == "peer":
         a.config["peer"].append({**a.config["peer"][0], "name": "far", "addresses": ["far.test:5790"]})
         a.config["peer"][-1]["public_key"] = stage.daemon("far").public_key
     else:
-        a.add_endpoint("far", f"{where}:far.test:14550")
+        a.add_endpoint("far", "serial:/dev/far.test:57600" if where == "serial" else f"{where}:far.test:14550")
     hook = stage.folder / "hook" / "sitecustomize.py"
     hook.parent.mkdir()
     hook.write_text(STUCK)

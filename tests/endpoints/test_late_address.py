@@ -11,6 +11,7 @@ from structlog.testing import capture_logs
 from tests.daemon.harness import free_port, has_ipv6, need
 from uavlinkd.addresses import Address
 from uavlinkd.endpoints.sockets import BindError, udp_socket
+from uavlinkd.endpoints.tcp import tcp_listener
 
 _IN_A_NETWORK_OF_ITS_OWN = """
 import socket, subprocess, sys
@@ -68,12 +69,20 @@ def test_it_is_said_once() -> None:
         assert logs == []
 
 
+def test_tcp_waits_for_its_address_too() -> None:
+    """Who serves programs or Prometheus at an address of another network does not keep the link from starting."""
+    address = Address("192.0.2.1", free_port())
+    with capture_logs() as logs, tcp_listener(address) as sock:
+        assert sock.getsockname() == address.sockaddr
+    assert [(each["event"], each["address"]) for each in logs] == [("address_not_here_yet", str(address))]
+
+
 def test_an_address_in_use_comes_to_nobody_else() -> None:
     """Waiting for an address is no way around who has it, there or not yet there."""
     for host in ("127.0.0.1", "192.0.2.1"):
         address = Address(host, free_port())
         with (
             udp_socket(address, may_come_later=True),
-            pytest.raises(BindError, match=rf"^cannot listen on {address}: Address already in use$"),
+            pytest.raises(BindError, match=rf"^cannot listen on {address}: Address already in use: "),
         ):
             udp_socket(address, may_come_later=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import socket
+import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import ExitStack
 
@@ -120,6 +121,53 @@ async def test_what_is_no_frame_makes_nobody_known(
     read(server)
     assert (list(server.ports), recorder.heard, recorder.opened) == ([], [], [])
     assert server.counters.garbage_bytes == len(datagram) == server.bytes_received
+
+
+async def test_a_bridge_may_cut_frames_apart(server: UdpServer, recorder: Recorder, program: Make) -> None:
+    """Bytes of a serial line, 24 a datagram: once a whole frame made the sender known, and one was lost, all come."""
+    bridge, other = program(), program()
+    sent = [heartbeat(), *(frame(number) for number in range(50))]
+    stream = b"".join(sent)
+    for position in range(0, len(stream), 24):
+        bridge.send(stream[position : position + 24])
+        other.send(frame(1000 + position))
+        read(server)
+    heard = [raw for name, frames in recorder.heard if name == name_of(bridge) for raw in frames]
+    assert heard == [sent[0], *sent[len(sent) + 1 - len(heard) :]]
+    assert len(heard) >= len(sent) - 1
+    whole = sum(len(frames) for name, frames in recorder.heard if name == name_of(other))
+    assert whole == -(-len(stream) // 24)
+    carried = sum(len(raw) for _, frames in recorder.heard for raw in frames)
+    assert carried + server.counters.garbage_bytes == server.bytes_received
+
+
+async def test_who_cuts_frames_apart_is_forgotten_too(server: UdpServer, program: Make) -> None:
+    """With the program goes what was held of its frames; what is no frame's beginning is not held at all."""
+    bridge = program()
+    for datagram in (heartbeat(), b"no frame", frame(1)[:20]):
+        bridge.send(datagram)
+        read(server)
+    assert list(server._cutters) == list(server._ports)
+    server.do_housekeeping(2.0 + CLIENT_IDLE_S)
+    assert (server._cutters, server._ports) == ({}, {})
+
+
+@pytest.mark.parametrize("start", [b"\xfd\x00\x00", b"\xfe\x00", b"\xfe\xff"])
+async def test_false_starts_in_what_a_bridge_sends_cost_a_bounded_time(
+    server: UdpServer, program: Make, start: bytes
+) -> None:
+    """Of a datagram full of them only the first are looked at, as of any other."""
+    bridge = program()
+    for datagram in (heartbeat(), frame(1)[:20], frame(1)[20:]):
+        bridge.send(datagram)
+        read(server)
+    assert server._cutters
+    began = time.monotonic()
+    for _ in range(20):
+        bridge.send(start * (60000 // len(start)))
+        read(server)
+    assert time.monotonic() - began < 1.0
+    assert server.counters.garbage_bytes > 20 * 59000
 
 
 async def test_frames_share_datagrams_up_to_a_size(server: UdpServer, program: Make) -> None:

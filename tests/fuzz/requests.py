@@ -71,7 +71,7 @@ def _reader(data: bytes, limit: int, loop: asyncio.AbstractEventLoop) -> asyncio
 
 
 def make_control() -> Run:
-    """One connection a script: it gets one line of JSON or nothing, and is closed; only what is known is asked."""
+    """One connection a script: it gets one line of JSON, and is closed; only what is known is asked."""
     loop = _loop()
     asked: list[str] = []
 
@@ -89,14 +89,14 @@ def make_control() -> Run:
         assert connection.is_closed, "the connection was left open"
         assert server._connections == 0, "a connection is counted that is gone"
         line = data.partition(b"\n")[0]
+        assert connection.written.endswith(b"\n")
+        reply = json.loads(connection.written)
         if not asked:
-            assert not connection.written, "an answer to nothing"
-            assert len(line) >= MAX_REQUEST_BYTES, "a request was not answered"
+            assert len(line) > MAX_REQUEST_BYTES, "a request was not answered"
+            assert "longer" in reply["error"]
             return
         (request,) = asked
         assert request == line.decode("utf-8", "replace").strip(), "another request than was sent"
-        assert connection.written.endswith(b"\n")
-        reply = json.loads(connection.written)
         assert reply == ({"asked": request} if request in KNOWN else {"error": "unknown request"})
 
     return run

@@ -33,12 +33,27 @@ def open_new(
         except (BindError, OSError) as error:
             for endpoint in opened:
                 endpoint.close()
-            remedy = "end what listens there, or write another port; if it is this daemon itself, restart it"
-            if isinstance(error, OSError):  # no descriptor is left to take a socket over
-                remedy = "it cannot be opened now, try again"
-            problem = Problem(str(config.path), f"endpoint.url ({each.name})", f"{error}: {remedy}")
+            # If not an address that is taken, it is that no descriptor is left.
+            remedy = "if this daemon itself has it, restart it" if isinstance(error, BindError) else "try again"
+            problem = Problem(str(config.path), _key(each), f"{error}; {remedy}")
             raise ConfigError((problem,)) from None
     return opened
+
+
+def open_first(config: EndpointConfig, handler: PortHandler) -> Endpoint:
+    """Make an endpoint of a daemon that starts.
+
+    Raises:
+        BindError: where its address cannot be listened on, with the key that says so.
+    """
+    try:
+        return open_endpoint(config, handler)
+    except BindError as error:
+        raise BindError(f"{_key(config)}: {error}") from None
+
+
+def _key(config: EndpointConfig) -> str:
+    return f"endpoint.url ({config.name})"
 
 
 def open_endpoint(config: EndpointConfig, handler: PortHandler, instead_of: Endpoint | None = None) -> Endpoint:
@@ -51,7 +66,11 @@ def open_endpoint(config: EndpointConfig, handler: PortHandler, instead_of: Endp
     """
     match config.url:
         case NetworkUrl(Kind.UDPIN, address):
-            sock = instead_of.share_socket() if isinstance(instead_of, UdpServer) else udp_socket(address)
+            sock = (
+                instead_of.share_socket()
+                if isinstance(instead_of, UdpServer)
+                else udp_socket(address, may_come_later=True)
+            )
             return UdpServer(config.name, sock, handler)
         case NetworkUrl(Kind.UDPOUT, address):
             return UdpClient(config.name, address, handler)

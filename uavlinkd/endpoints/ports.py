@@ -73,7 +73,7 @@ class Endpoint(Protocol):
         """Send whole frames to one port, or drop and count them. Returns at once."""
 
     def do_housekeeping(self, now: float) -> None:
-        """Called every few seconds: forget who is gone."""
+        """Called each second: forget who is gone."""
 
     def close(self) -> None:
         """Stop and close everything. Reports no port as closed any more."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import os
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
 
@@ -14,6 +13,7 @@ from uavlinkd.clock import monotonic
 from uavlinkd.endpoints.ports import PortHandler, failure_name
 from uavlinkd.endpoints.streams import MAX_AGE_S, Connection, StreamEndpoint
 from uavlinkd.endpoints.url import SerialUrl
+from uavlinkd.threads import Threads
 
 RETRY_S = 0.5
 """Between two attempts to open a device that is not there, or not ours to open."""
@@ -66,8 +66,8 @@ class SerialEndpoint(StreamEndpoint):
         self._url = url
         self._task: asyncio.Task[None] | None = None
         self._is_closed = False
-        # Opening and closing may wait for the device; one that hangs occupies this thread and no other.
-        self._opener = ThreadPoolExecutor(1, thread_name_prefix=f"serial-{name}")
+        # Opening and closing may wait for the device; one that hangs occupies this thread, and nobody waits for it.
+        self._thread = Threads(1, f"serial-{name}")
 
     def start(self) -> None:
         """Begin to look for the device."""
@@ -78,24 +78,23 @@ class SerialEndpoint(StreamEndpoint):
         self._is_closed = True
         if self._task is not None:
             self._task.cancel()
-        self._opener.shutdown(wait=False, cancel_futures=True)
         super().close()
 
     def dispose(self, connection: Connection) -> None:
         """Nothing yet: closing may wait for the device, and is done where that delays no one."""
 
     async def _keep_open(self) -> None:
-        loop = asyncio.get_running_loop()
         while True:
             try:
-                device = await loop.run_in_executor(self._opener, self._open_device)
-            except (OSError, RuntimeError) as error:  # RuntimeError: no thread can be started now
-                self.failures[failure_name(error) if isinstance(error, OSError) else "no_thread"] += 1
+                device = await self._thread.run(self._open_device)
+            except OSError as error:
+                self.could_not_open(failure_name(error))
             else:
                 channel = SerialChannel(device, self._url.baud)
                 connection = self.open(channel, self._url.device, monotonic())
                 await connection.lost.wait()
-                await loop.run_in_executor(self._opener, partial(channel.close, abort=True))
+                with suppress(OSError):  # no thread can be started now: it is closed when nobody holds it any more
+                    await self._thread.run(partial(channel.close, abort=True))
             await asyncio.sleep(RETRY_S)
 
     def _open_device(self) -> BaseSerial:

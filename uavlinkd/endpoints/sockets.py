@@ -68,11 +68,7 @@ def unbound_socket(address: Address, kind: socket.SocketKind) -> tuple[socket.so
 
 
 def udp_socket(address: Address, *, may_come_later: bool = False) -> socket.socket:
-    """A UDP socket bound to a numeric address.
-
-    ``may_come_later``: an address that this machine does not have is one that it does not have yet. The socket works
-    from the moment at which an interface gets it: a drone's network may come up after the daemon, one of several may
-    never, and the others must not wait for it. It is logged, as it may be a mistake too.
+    """A UDP socket bound to a numeric address, as :func:`bind` does it.
 
     Raises:
         BindError: with the address and the reason.
@@ -81,18 +77,43 @@ def udp_socket(address: Address, *, may_come_later: bool = False) -> socket.sock
     try:
         for option in (socket.SO_RCVBUF, socket.SO_SNDBUF):
             sock.setsockopt(socket.SOL_SOCKET, option, BUFFER_BYTES)
-        try:
-            sock.bind(sockaddr)
-        except OSError as error:
-            if error.errno != errno.EADDRNOTAVAIL or not may_come_later:
-                raise
-            sock.setsockopt(*_FREEBIND[sock.family], 1)
-            sock.bind(sockaddr)
-            structlog.get_logger().warning("address_not_here_yet", address=str(address))
+        bind(sock, sockaddr, may_come_later=may_come_later)
     except OSError as error:
         sock.close()
-        raise BindError(f"cannot listen on {address}: {error.strerror or error}") from None
+        raise cannot_listen(address, error) from None
     return sock
+
+
+def bind(sock: socket.socket, sockaddr: tuple[Any, ...], *, may_come_later: bool) -> None:
+    """Bind a socket.
+
+    ``may_come_later``: an address that this machine does not have is one that it does not have yet. The socket works
+    from the moment at which an interface gets it: a drone's network may come up after the daemon, one of several may
+    never, and the others must not wait for it. It is logged, as it may be a mistake too.
+
+    Raises:
+        OSError: what the kernel said.
+    """
+    try:
+        sock.bind(sockaddr)
+    except OSError as error:
+        if error.errno != errno.EADDRNOTAVAIL or not may_come_later:
+            raise
+        sock.setsockopt(*_FREEBIND[sock.family], 1)
+        sock.bind(sockaddr)
+        structlog.get_logger().warning("address_not_here_yet", address=str(Address(*sockaddr[:2])))
+
+
+_REMEDIES = {
+    errno.EADDRINUSE: "end the program that listens there (`ss -lntup` names it), or write another port",
+    errno.EACCES: "write a port of 1024 or more: those below are root's",
+}
+
+
+def cannot_listen(address: Address, error: OSError) -> BindError:
+    """What to tell the operator."""
+    remedy = _REMEDIES.get(error.errno or 0)
+    return BindError(f"cannot listen on {address}: {error.strerror or error}{f': {remedy}' if remedy else ''}")
 
 
 def pause(seconds: float) -> None:

@@ -13,9 +13,11 @@ from collections import Counter, deque
 from collections.abc import Sequence
 from typing import Protocol
 
+import structlog
+
 from uavlinkd.clock import monotonic
 from uavlinkd.endpoints.ports import LocalPort, PortHandler, failure_name
-from uavlinkd.mavlink.frames import SplitCounters, StreamSplitter
+from uavlinkd.mavlink.frames import MAX_GAP_S, SplitCounters, StreamSplitter
 
 MAX_AGE_S = 1.0
 """A frame that waited longer than this for its turn is not sent any more."""
@@ -29,6 +31,17 @@ ROOM_POLL_S = 0.01
 """How soon to look again where the kernel has room and it is we who leave it empty: it reports nothing then."""
 
 DISCONNECTED = "disconnected"
+
+_MEANINGS = {
+    "ENOENT": "there is no such device now",
+    "EACCES": "this user may not open it: add it to the device's group, often dialout",
+    "EPERM": "this service may not open it: see DeviceAllow in its unit",
+    "EBUSY": "another program has it open: end it (ModemManager takes new serial ports)",
+    "ECONNREFUSED": "nobody listens there now",
+    "connect_timeout": "nothing answers there now",
+    "not_resolved": "its name has no address now",
+}
+"""What a person should understand by the reason for which an endpoint is not open. It is tried again, for ever."""
 
 
 class Channel(Protocol):
@@ -137,7 +150,7 @@ class Connection:
         self.lost = asyncio.Event()
         """Set when the port has been reported as closed."""
         self._endpoint = endpoint
-        self._splitter = StreamSplitter(endpoint.counters)
+        self._splitter = StreamSplitter(endpoint.counters, endpoint.max_gap_s)
         self._loop = asyncio.get_running_loop()
         self._fd = channel.fileno()
         self._is_open = True
@@ -283,6 +296,9 @@ class StreamEndpoint(ABC):
     by the other side, ``stalled``, or under the kernel's error.
     """
 
+    max_gap_s = MAX_GAP_S
+    """A silence inside a frame, after which it is taken for broken."""
+
     def __init__(self, name: str, handler: PortHandler, max_age_s: float) -> None:
         self.name = name
         self.handler = handler
@@ -294,6 +310,7 @@ class StreamEndpoint(ABC):
         self.bytes_sent = 0
         self.frames_sent = 0
         self._connections: dict[LocalPort, Connection] = {}
+        self._told: set[str] = set()  # why it could not be opened, since it last was open
 
     @property
     def ports(self) -> Sequence[LocalPort]:
@@ -336,8 +353,17 @@ class StreamEndpoint(ABC):
         """Take a connection over, and report its port."""
         connection = Connection(self, channel, name, now)
         self._connections[connection.port] = connection
+        self._told.clear()
         self.handler.on_port_opened(connection.port)
         return connection
+
+    def could_not_open(self, reason: str) -> None:
+        """Count an attempt that failed. Each reason is logged once, until the endpoint has been open again."""
+        self.failures[reason] += 1
+        if reason not in self._told:
+            self._told.add(reason)
+            meaning = _MEANINGS.get(reason, "it is tried again, for ever")
+            structlog.get_logger().warning("endpoint_not_open", endpoint=self.name, reason=reason, meaning=meaning)
 
     def forget(self, connection: Connection) -> None:
         """Report the port of a lost connection as closed, once."""

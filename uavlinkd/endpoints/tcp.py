@@ -15,7 +15,7 @@ from secrets import SystemRandom
 from uavlinkd.addresses import Address
 from uavlinkd.clock import monotonic
 from uavlinkd.endpoints.ports import PortHandler, failure_name
-from uavlinkd.endpoints.sockets import BindError, unbound_socket
+from uavlinkd.endpoints.sockets import bind, cannot_listen, unbound_socket
 from uavlinkd.endpoints.streams import MAX_AGE_S, STALLED_S, StreamEndpoint
 from uavlinkd.threads import Threads
 
@@ -28,6 +28,8 @@ LONGEST_WAIT_S = 5.0
 """Between two attempts to connect. Each wait is twice the one before, and up to a quarter longer, by chance."""
 CONNECT_TIMEOUT_S = 5.0
 """For one address; a name may have several."""
+MAX_GAP_S = 2.0
+"""Inside a frame: TCP loses nothing, but what it has to repeat comes late; later than this a frame is old."""
 MAX_ADDRESSES = 8
 """Tried of one name in one attempt."""
 ACCEPT_PAUSE_S = 1.0
@@ -46,7 +48,7 @@ _BROWSER = (b"GET ", b"POST ", b"HEAD ", b"PUT ", b"OPTIONS ", b"PATCH ", b"DELE
 
 
 def tcp_listener(address: Address) -> socket.socket:
-    """A TCP socket that listens on a numeric address.
+    """A TCP socket that listens on a numeric address, which may come later.
 
     Raises:
         BindError: with the address and the reason.
@@ -54,11 +56,11 @@ def tcp_listener(address: Address) -> socket.socket:
     sock, sockaddr = unbound_socket(address, socket.SOCK_STREAM)
     try:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # connections of before may still be ending
-        sock.bind(sockaddr)
+        bind(sock, sockaddr, may_come_later=True)
         sock.listen(_BACKLOG)
     except OSError as error:
         sock.close()
-        raise BindError(f"cannot listen on {address}: {error.strerror or error}") from None
+        raise cannot_listen(address, error) from None
     return sock
 
 
@@ -88,6 +90,8 @@ class TcpServer(StreamEndpoint):
     In ``failures`` there are besides: ``too_many_clients``, who were not let in; ``displaced``, who had to give
     their place; ``http``, who turned out to be a browser.
     """
+
+    max_gap_s = MAX_GAP_S
 
     def __init__(
         self, name: str, listener: socket.socket, handler: PortHandler, *, max_age_s: float = MAX_AGE_S
@@ -167,6 +171,8 @@ class TcpClient(StreamEndpoint):
     ``connect_timeout`` or ``not_resolved``.
     """
 
+    max_gap_s = MAX_GAP_S
+
     def __init__(self, name: str, address: Address, handler: PortHandler, *, max_age_s: float = MAX_AGE_S) -> None:
         super().__init__(name, handler, max_age_s)
         self._address = address
@@ -204,14 +210,14 @@ class TcpClient(StreamEndpoint):
             try:
                 sock = socket.socket(family, socket.SOCK_STREAM)
             except OSError as error:
-                self.failures[failure_name(error)] += 1
+                self.could_not_open(failure_name(error))
                 continue
             try:
                 await self._connect_socket(sock, sockaddr)
             except TimeoutError:
-                self.failures["connect_timeout"] += 1
+                self.could_not_open("connect_timeout")
             except OSError as error:
-                self.failures[failure_name(error)] += 1
+                self.could_not_open(failure_name(error))
             except BaseException:
                 sock.close()
                 raise
@@ -235,7 +241,7 @@ class TcpClient(StreamEndpoint):
                 return _look_up(self._address, socket.AI_NUMERICHOST)
             return await self._threads.run(_look_up, self._address, 0)
         except (OSError, UnicodeError):
-            self.failures["not_resolved"] += 1
+            self.could_not_open("not_resolved")
             return []
 
 

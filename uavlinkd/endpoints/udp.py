@@ -17,7 +17,7 @@ from uavlinkd.addresses import Address
 from uavlinkd.clock import monotonic
 from uavlinkd.endpoints.ports import LocalPort, PortHandler, failure_name
 from uavlinkd.endpoints.sockets import Arrived, BindError, Reader, numeric_host, udp_socket
-from uavlinkd.mavlink.frames import Frame, SplitCounters, split_datagram
+from uavlinkd.mavlink.frames import Frame, SplitCounters, StreamSplitter, split_datagram
 from uavlinkd.resolver import Resolved, keep_resolving
 
 CLIENTS_PER_ENDPOINT = 32
@@ -28,8 +28,9 @@ CLIENT_QUIET_S = 5.0
 """When all places are taken, one that was quiet for this long gives its own to a newcomer; no other does."""
 REMOTE_SILENT_S = 5.0
 """A name whose address says nothing for this long is looked up again."""
-LOCAL_DATAGRAM_BYTES = 1000
-"""Frames for one program share a datagram up to this size; some autopilots read no more at once."""
+LOCAL_DATAGRAM_BYTES = 296
+"""Frames for one program share a datagram up to this size: MAVROS reads no more of one, and loses the rest
+(libmavconn, MsgBuffer::MAX_SIZE)."""
 
 _ANY = {socket.AF_INET: Address("0.0.0.0", 0), socket.AF_INET6: Address("::", 0)}
 
@@ -54,6 +55,7 @@ class UdpEndpoint(ABC):
         self._gathering: asyncio.TimerHandle | None = None
         self._ports: dict[Sockaddr, LocalPort] = {}  # the longest silent first
         self._addresses: dict[LocalPort, Sockaddr] = {}
+        self._cutters: dict[Sockaddr, StreamSplitter] = {}  # the programs that cut frames apart
 
     @property
     def ports(self) -> Sequence[LocalPort]:
@@ -93,11 +95,18 @@ class UdpEndpoint(ABC):
     def take(self, datagrams: Arrived, now: float, waited_s: float = 0.0) -> None:
         """Hand over the frames of each sender in their order; the first of them has waited so long already."""
         arrived: dict[Sockaddr, list[Frame]] = {}
+        counters = self.counters
         for datagram, source in datagrams:
             self.bytes_received += len(datagram)
-            frames = split_datagram(datagram, self.counters)
+            address = source if len(source) == 2 else (numeric_host(source), source[1])
+            if self._cutters and address in self._cutters:
+                frames = self._cutters[address].feed(datagram, now)
+            else:
+                garbage = counters.garbage_bytes
+                frames = split_datagram(datagram, counters)
+                if counters.garbage_bytes != garbage and address in self._ports:
+                    self._follow_cuts(address, datagram, now)
             if frames:
-                address = source if len(source) == 2 else (numeric_host(source), source[1])
                 if address in arrived:
                     arrived[address] += frames
                 else:
@@ -107,6 +116,18 @@ class UdpEndpoint(ABC):
             if port is not None:
                 port.heard_at = now
                 self._handler.on_frames(port, frames, now, waited_s)
+
+    def _follow_cuts(self, address: Sockaddr, datagram: bytes, now: float) -> None:
+        """A program that is known sent what is no frame. Where a frame ends amid its datagram, the rest is to come.
+
+        A bridge from a serial line may cut its bytes where it pleases. From then on they are taken as a stream.
+        """
+        splitter = StreamSplitter(SplitCounters(), gives_up=True)
+        splitter.feed(datagram, now)
+        if splitter.pending_bytes:
+            self.counters.garbage_bytes -= splitter.pending_bytes
+            splitter.counters = self.counters
+            self._cutters[address] = splitter
 
     def write(self, port: LocalPort, frames: Sequence[bytes], now: float) -> None:
         """Send frames to one program, together where they fit. What the kernel does not take is counted."""
@@ -149,7 +170,9 @@ class UdpEndpoint(ABC):
         return port
 
     def _forget(self, port: LocalPort) -> None:
-        del self._ports[self._addresses.pop(port)]
+        address = self._addresses.pop(port)
+        del self._ports[address]
+        self._cutters.pop(address, None)
         self._handler.on_port_closed(port)
 
     def _count_failure(self, error: OSError) -> None:
@@ -217,22 +240,23 @@ class UdpClient(UdpEndpoint):
         heard = [port.heard_at for port in self.ports if port.heard_at is not None]
         return self._remote.ip is None and (not heard or monotonic() - max(heard) >= REMOTE_SILENT_S)
 
-    def _on_resolved(self, found: Resolved) -> None:
+    def _on_resolved(self, found: Resolved) -> bool:
         family, host, port = found[0]
         if (host, port) in self._ports:
-            return
-        for gone in self.ports:
-            self._forget(gone)
+            return True
         if family != self._sock.family:
             try:
                 sock = udp_socket(_ANY[family])
             except BindError:
                 self.failures["family_unavailable"] += 1
-                return
+                return False
             super().close()
             self._sock = sock
             super().start()
+        for gone in self.ports:
+            self._forget(gone)
         self._open((host, port), None)
+        return True
 
     def _port_of(self, address: Sockaddr, now: float) -> LocalPort | None:
         port = self._ports.get(address)

@@ -114,7 +114,6 @@ _NOT_LINKS = frozenset({"ws", "wss", "wsserver", "zenoh", "raw", "file", "tlogre
 _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9_-]*):(//)?(.*)", re.DOTALL)
 _BARE_DEVICE = re.compile(r"(/dev/[\x21-\x2b\x2d-\x39\x3b-\x7e]+)(?:[,:](\d+))?")
 _BARE_ADDRESS = re.compile(r"[0-9.]+:\d+|\[[0-9A-Fa-f:.]+\]:\d+|\d+")
-_BAUD = re.compile(r"[0-9]{1,8}")
 _DEVICE = re.compile(r"/[\x21-\x7e]+")
 
 

@@ -133,7 +133,7 @@ def split_datagram(datagram: bytes, counters: SplitCounters) -> list[Frame]:
         counters.unknown += not first.header.is_known
         return [first]
     frames: list[Frame] = []
-    _scan(datagram, frames, counters, in_garbage=False, is_final=True)
+    _scan(datagram, frames, counters, in_garbage=False, is_final=True, gives_up=True)
     return frames
 
 
@@ -167,13 +167,18 @@ class StreamSplitter:
     A stray start byte makes what follows look like a frame of up to 280 bytes, and genuine frames would wait
     until that many have come: at one heartbeat a second, past every failsafe. But a sender writes a frame in
     one go, so after a silence of `max_gap_s` inside a frame it is taken for broken.
+
+    `gives_up`: of a chunk that is made of false starts the rest is garbage, as of a datagram: a bound on its cost.
     """
 
-    __slots__ = ("_fed_at", "_in_garbage", "_max_gap_s", "_rest", "counters")
+    __slots__ = ("_fed_at", "_gives_up", "_in_garbage", "_max_gap_s", "_rest", "counters")
 
-    def __init__(self, counters: SplitCounters | None = None, max_gap_s: float = MAX_GAP_S) -> None:
+    def __init__(
+        self, counters: SplitCounters | None = None, max_gap_s: float = MAX_GAP_S, *, gives_up: bool = False
+    ) -> None:
         self.counters = SplitCounters() if counters is None else counters
         self._max_gap_s = max_gap_s
+        self._gives_up = gives_up
         self._rest = b""
         self._in_garbage = False
         self._fed_at = 0.0
@@ -203,18 +208,24 @@ class StreamSplitter:
 
     def _scan(self, data: bytes, frames: list[Frame], *, is_final: bool) -> None:
         consumed, self._in_garbage = _scan(
-            data, frames, self.counters, in_garbage=self._in_garbage, is_final=is_final
+            data,
+            frames,
+            self.counters,
+            in_garbage=self._in_garbage,
+            is_final=is_final,
+            gives_up=is_final or self._gives_up,
         )
         self._rest = data[consumed:]
 
 
 def _scan(
-    data: bytes, frames: list[Frame], counters: SplitCounters, *, in_garbage: bool, is_final: bool
+    data: bytes, frames: list[Frame], counters: SplitCounters, *, in_garbage: bool, is_final: bool, gives_up: bool
 ) -> tuple[int, bool]:
     """Appends the frames in `data`; returns how many bytes are done with, and whether they end in garbage.
 
-    Unless `is_final`, an incomplete frame stays for the next call. Each decision depends on the bytes from
-    its position alone, never on how many more are there, so chunking cannot change what is found.
+    Unless `is_final`, an incomplete frame stays for the next call. Each decision depends on the bytes from its
+    position alone, never on how many more are there, so chunking cannot change what is found; but who `gives_up`
+    takes what follows MAX_FALSE_STARTS for garbage.
     """
     position, size, before = 0, len(data), len(frames)
     false_starts = 0
@@ -234,7 +245,7 @@ def _scan(
             in_garbage = True
         false_starts += 1
         start = None
-        if false_starts < MAX_FALSE_STARTS or not is_final:
+        if false_starts < MAX_FALSE_STARTS or not gives_up:
             start = _START.search(data, position + 1)
         skipped_to = start.start() if start else size
         counters.garbage_bytes += skipped_to - position

@@ -19,16 +19,15 @@ import structlog
 
 from uavlinkd.addresses import Address
 from uavlinkd.control import ControlServer
-from uavlinkd.endpoints.sockets import BindError, udp_socket
+from uavlinkd.endpoints.sockets import DATAGRAMS_PER_WAKE_UP, RECEIVE_BYTES, BindError, udp_socket
 from uavlinkd.mitm.attack import NEVER, Action, AttackError, AttackObject, Intervention, Surroundings, Way
 from uavlinkd.mitm.attacks import parse_attack
 from uavlinkd.mitm.channel import Channel
 from uavlinkd.mitm.journal import Journal
 from uavlinkd.mitm.settings import ProxySettings
 
-DATAGRAMS_PER_WAKE_UP = 128
-"""Read from one socket; then the others have their turn."""
-RECEIVE_BYTES = 65536
+MAX_REQUEST_BYTES = 4096
+"""To the control socket: several attacks, each with all that can be said of it."""
 LOOP_TICK_S = 0.001
 """A loop may fire a timer up to one tick of its clock early."""
 
@@ -88,7 +87,7 @@ class Proxy:
             await self._resolve()
             self._bind()
             if self.settings.control_socket is not None:
-                self._control = ControlServer(self.settings.control_socket, self._answer)
+                self._control = ControlServer(self.settings.control_socket, self._answer, MAX_REQUEST_BYTES)
                 await self._control.start()
             self.journal = Journal(self.settings.log, self.log, self._now, self.settings.log_detail)
         except BaseException:
