@@ -321,6 +321,33 @@ def test_keys_come_from_systemd_where_there_is_no_file(tmp_path: Path, in_a_fold
         load_config(path, {})
 
 
+def test_a_key_that_is_not_there_is_not_to_be_made_where_it_does_harm(tmp_path: Path) -> None:
+    """A PSK is the peer's; a service's key belongs to root and is handed over; a unit's folder is found."""
+    path = tmp_path / "drone0.toml"
+    path.write_text(f'{_GOOD}psk_file = "pair.psk"\n')
+
+    def told(environ: dict[str, str]) -> list[str]:
+        with pytest.raises(ConfigError) as caught:
+            load_config(path, environ)
+        return [str(each) for each in caught.value.problems]
+
+    private, psk = told({})
+    assert f"make it with `uavlinkd keygen --out {tmp_path}/drone0.key`" in private
+    assert "it is the same as the peer's: copy that, or, on one of the two, `uavlinkd psk --out" in psk
+    assert "--keys" not in private + psk
+    for folder in ("keys", "drone0"):
+        (tmp_path / folder).mkdir()
+        assert all(f"add `--keys {tmp_path}/{folder}` to `uavlinkd check`" in each for each in told({}))
+        (tmp_path / folder).rmdir()
+    credentials = tmp_path / "credentials"
+    credentials.mkdir()
+    for each in told({"CREDENTIALS_DIRECTORY": str(credentials)}):
+        assert "LoadCredential=" in each
+        assert "restart" in each
+        assert "keygen" not in each
+        assert "uavlinkd psk" not in each
+
+
 # Text in place of the ten lines -> the key that is named, and a part of what is said.
 _REFUSED = {
     "no name": (_GOOD.replace('name = "drone0"', ""), "name", 'is missing: write name = "drone0"'),
@@ -364,6 +391,23 @@ _REFUSED = {
         "endpoint[1].url (gcs)",
         "listens where endpoint[0] (autopilot) does",
     ),
+    "mavlink-router's port": (
+        _GOOD.replace("[[peer]]", "Port = 14550\n[[peer]]"),
+        "endpoint[0].Port (autopilot)",
+        'write url = "udpin:127.0.0.1:14550"',
+    ),
+    "mavlink-router's baud": (
+        _GOOD.replace("[[peer]]", "Baud = 57600\n[[peer]]"),
+        "endpoint[0].Baud (autopilot)",
+        'write url = "serial:/dev/ttyACM0:57600"',
+    ),
+    "mavlink-router's filter": (_GOOD + "BlockMsgIdIn = [76]\n", "peer[0].BlockMsgIdIn (drone1)", "write deny_in"),
+    "WireGuard's addresses": (
+        _GOOD + 'AllowedIPs = ["10.13.0.2/32"]\n',
+        "peer[0].AllowedIPs (drone1)",
+        "write role and system_ids",
+    ),
+    "log level at the top": ('log_level = "debug"\n' + _GOOD, "log_level", "write [log]"),
     "endpoint's age": (
         _GOOD.replace("[[peer]]", "max_age_s = 0.09\n[[peer]]"),
         "endpoint[0].max_age_s (autopilot)",

@@ -51,9 +51,9 @@ def load_config(path: Path, environ: Mapping[str, str]) -> Config:
     endpoints = _sections(problems, table, "endpoint", EndpointSection)
     peers = _sections(problems, table, "peer", PeerSection)
 
-    private = _secret(problems, top, "private_key_file", path.parent, environ)
-    previous = _secret(problems, top, "previous_private_key_file", path.parent, environ)
-    psks = [_secret(problems, peer, "psk_file", path.parent, environ) for peer in peers]
+    private = _secret(problems, top, "private_key_file", path, environ)
+    previous = _secret(problems, top, "previous_private_key_file", path, environ)
+    psks = [_secret(problems, peer, "psk_file", path, environ) for peer in peers]
     public = _public(private) if private else None
 
     checks.names(problems, endpoints)
@@ -252,27 +252,43 @@ def _sections(problems: Problems, table: Mapping[str, Any], key: str, model: typ
     ]
 
 
-def _secret(problems: Problems, section: Values, key: str, folder: Path, environ: Mapping[str, str]) -> Secret | None:
+def _secret(problems: Problems, section: Values, key: str, config: Path, environ: Mapping[str, str]) -> Secret | None:
     """The key in the file that a section names, if it names one."""
     name = section.good.get(key)
     if name is None:
         return None
-    path, is_credential = find_secret_file(name, folder, environ)
+    path, is_credential = find_secret_file(name, config.parent, environ)
     place = section.place.key(key)
+    is_service = bool(environ.get(CREDENTIALS))
     if not os.path.lexists(path):
-        where = shlex.quote(str(path))
-        make = f"uavlinkd keygen --out {where}" if key == "private_key_file" else f"umask 077; uavlinkd psk >{where}"
-        credential = " and no systemd credential of that name" if environ.get(CREDENTIALS) else ""
-        remedy = f"make it with `{make}`"
-        if key == "previous_private_key_file":
-            remedy = "it holds the key before this one; where that is lost, delete this line"
-        elif not credential and (folder / "keys").is_dir():
-            folder_of_keys = shlex.quote(str(folder / "keys"))
-            remedy += f"; or is it a service's? Then add `--keys {folder_of_keys}` to `uavlinkd check`"
+        credential = " and no systemd credential of that name" if is_service else ""
+        remedy = _FOR_A_SERVICE if is_service else _how_to_get(key, path, config)
         problems.add(place, f"there is no file {path}{credential}: {remedy}")
         return None
     try:
         return read_secret_file(path, credential=is_credential)
     except KeyFileError as error:
-        problems.add(place, str(error))
+        problems.add(place, f"{error}; {_FOR_A_SERVICE}" if is_service and not is_credential else str(error))
         return None
+
+
+_FOR_A_SERVICE = (
+    "a service's keys belong into the folder that LoadCredential= names in its unit, root's and of mode 0600, "
+    "and it has a new one after a restart"
+)
+
+
+def _how_to_get(key: str, path: Path, config: Path) -> str:
+    """The remedy for a key file that is not there."""
+    where = shlex.quote(str(path))
+    if key == "previous_private_key_file":
+        return "it holds the key before this one; where that is lost, delete this line"
+    if key == "psk_file":
+        remedy = f"it is the same as the peer's: copy that, or, on one of the two, `uavlinkd psk --out {where}`"
+    else:
+        remedy = f"make it with `uavlinkd keygen --out {where}`"
+    # Where the units have the keys of a configuration that names them as if they stood beside it.
+    for folder in (config.parent / "keys", config.with_suffix("")):
+        if folder.is_dir():
+            return f"{remedy}; or is it a service's? Then add `--keys {shlex.quote(str(folder))}` to `uavlinkd check`"
+    return remedy

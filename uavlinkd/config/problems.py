@@ -170,14 +170,36 @@ _OTHERS_CALL_IT = {
     "udp_endpoint": "[[endpoint]], with name and url",
     "uart_endpoint": "[[endpoint]], with name and url",
 }
-_OTHERS_CALL_IT_IN_A_PEER = {"endpoint": 'addresses, a list: addresses = ["10.13.0.2:5790"]'}
+_FILTERS = {
+    "block_msg_id_in": "deny_in, a list of messages by name",
+    "block_msg_id_out": "deny_out, a list of messages by name",
+    "allow_msg_id_in": "allow_in, a list of messages by name",
+    "allow_msg_id_out": "allow_out, a list of messages by name",
+    "allow_src_sys_in": "system_ids, a list",
+}
+_UDP, _SERIAL = 'url = "udpin:127.0.0.1:14550"', 'url = "serial:/dev/ttyACM0:57600"'
+_OTHERS_CALL_IT_IN: dict[type[Section], dict[str, str]] = {
+    FileSection: {"log_level": '[log] at the end of the file, and below it level = "info"'},
+    PeerSection: {
+        "endpoint": 'addresses, a list: addresses = ["10.13.0.2:5790"]',
+        "allowed_ips": "role and system_ids: they say what the peer may do",
+        **_FILTERS,
+    },
+    EndpointSection: {
+        **dict.fromkeys(("address", "port", "server"), _UDP),
+        "mode": f"{_UDP}, or udpout",
+        **dict.fromkeys(("device", "baud", "serial"), _SERIAL),
+        **_FILTERS,
+    },
+}
 
 
 def unknown_key(key: str, model: type[Section]) -> str:
     """What to write for a key that the section does not have."""
     plain = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|[ -]", "_", key).lower()
-    if model is PeerSection and plain in _OTHERS_CALL_IT_IN_A_PEER:
-        return f"is not known here: write {_OTHERS_CALL_IT_IN_A_PEER[plain]}"
+    here = _OTHERS_CALL_IT_IN.get(model, {})
+    if plain in here:
+        return f"is not known here: write {here[plain]}"
     if plain in _OTHERS_CALL_IT:
         return f"is not known: write {_OTHERS_CALL_IT[plain]}"
     for where, other in _SECTIONS.items():
