@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
 from typing import cast
@@ -263,7 +264,7 @@ def test_page_says_what_was_measured_reached_and_not(tmp_path: Path) -> None:
     assert "at most 1.3 times the uvloop relay | 55 µs | 28.6 µs | not reached: 1.92 times too much |" in text
     assert "- contender: contender nebula: not installed: nebula" in text
     assert "not measured" in text
-    pytest.importorskip("matplotlib", reason="the figure takes the evaluation extra")
+    need(find_spec("matplotlib") is not None, "matplotlib, for the figure")
     drawn = (tmp_path / "costs.svg").read_text()
     assert drawn.lstrip().startswith("<?xml")
     write_report(tmp_path, "records")

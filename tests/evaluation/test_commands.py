@@ -5,10 +5,12 @@ from __future__ import annotations
 import argparse
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 
+from tests.daemon.harness import need
 from uavlinkd.evaluation.commands import add_report_parser, add_timing_parser
 from uavlinkd.evaluation.timing import Settings
 
@@ -44,7 +46,7 @@ def test_senseless_numbers_are_refused(arguments: tuple[str, str], capsys: pytes
 
 def test_a_report_of_nothing_fails_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """No traceback."""
-    pytest.importorskip("matplotlib", reason="the figures need matplotlib")
+    need(find_spec("matplotlib") is not None, "matplotlib, for the figures")
     options = parse("report", str(tmp_path))
     assert options.command(options) == 1
     assert len(capsys.readouterr().err.splitlines()) == 1

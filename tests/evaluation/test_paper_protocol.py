@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import asyncio
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from tests.waiting import PATIENCE_S, until
 from uavlinkd.evaluation import paper_protocol as paper
 from uavlinkd.evaluation.ledger import Fault, numbered_frame
 from uavlinkd.evaluation.middle import MiddleHere
@@ -16,7 +18,6 @@ from uavlinkd.evaluation.stage import PaperStage
 from uavlinkd.mitm.attack import AttackObject
 
 NAMES = ("drone0", "drone1")
-PATIENCE_S = 20.0
 
 
 def test_two_keys_give_both_ends_the_same_hmac_key() -> None:
@@ -37,18 +38,28 @@ def test_data_is_opened_under_its_key_alone() -> None:
             assert paper.unseal(b"k" * 32, datagram[:at] + bytes((datagram[at] ^ 1,)) + datagram[at + 1 :]) is None
 
 
-async def attacked(tmp_path: Path, attack: AttackObject, seconds: float = 0.8) -> tuple[Counter[Fault], Counter[str]]:
-    """What comes out falsely, and what the ends notice, while this stands in the way."""
+Outcome = tuple[Counter[Fault], Counter[str]]
+"""What came out falsely, and what the ends noticed."""
+
+
+async def attacked(tmp_path: Path, attack: AttackObject, is_enough: Callable[[Outcome], bool]) -> Outcome:
+    """What this leads to while it stands in the way: for three exchanges at least, and until it is enough."""
     stage = PaperStage(NAMES, MiddleHere(NAMES, tmp_path / "mitm.jsonl", 1), rate_hz=100.0)
     async with stage:
         await stage.middle.attack([], [attack])
-        await asyncio.sleep(seconds)  # new keys come each quarter of a second
+        await asyncio.sleep(3.2 * paper.RENEW_S)
         async with asyncio.timeout(PATIENCE_S):
-            while not (await stage.middle.statistics()).counts:  # noqa: ASYNC110  sockets set no event
+            while not is_enough(await outcome(stage)):  # noqa: ASYNC110  sockets set no event
                 await asyncio.sleep(0.01)
-        noticed: Counter[str] = Counter()
-        for notice in (await stage.notices()).values():
-            noticed += notice.drops
+        assert (await stage.middle.statistics()).counts
+        return await outcome(stage)
+
+
+async def outcome(stage: PaperStage) -> Outcome:
+    """So far."""
+    noticed: Counter[str] = Counter()
+    for notice in (await stage.notices()).values():
+        noticed += notice.drops
     return stage.ledger.faults, noticed
 
 
@@ -57,20 +68,20 @@ async def test_the_papers_own_attacks_are_detected(tmp_path: Path, name: str) ->
     """A key that was tampered with or replaced gives the ends different keys, or is refused."""
     from random import Random
 
-    faults, noticed = await attacked(tmp_path, AlterKeys(name, Random(1)))
+    faults, noticed = await attacked(tmp_path, AlterKeys(name, Random(1)), lambda so_far: so_far[1].total() > 0)
     assert not faults
-    assert set(noticed) <= {"hmac_mismatch", "bad_public_key"}
-    assert noticed.total() > 0
+    assert noticed.keys() <= {"hmac_mismatch", "bad_public_key"}
 
 
 async def test_the_two_sided_relay_succeeds(tmp_path: Path) -> None:
     """An exchange with each side, and altered frames are accepted as genuine."""
     relay = PaperRelay()
-    faults, _ = await attacked(tmp_path, relay)
-    assert relay.exchanges >= 2
-    assert relay.read > relay.altered > 0
-    assert faults[Fault.FALSE] > 0
-    assert set(faults) == {Fault.FALSE}
+    faults, _ = await attacked(
+        tmp_path,
+        relay,
+        lambda so_far: relay.exchanges >= 2 and relay.read > relay.altered > 0 and so_far[0][Fault.FALSE] > 0,
+    )
+    assert faults.keys() == {Fault.FALSE}
 
 
 async def test_without_an_attack_everything_comes_out(tmp_path: Path) -> None:
@@ -78,12 +89,14 @@ async def test_without_an_attack_everything_comes_out(tmp_path: Path) -> None:
     stage = PaperStage(NAMES, MiddleHere(NAMES, tmp_path / "mitm.jsonl", 1), rate_hz=100.0)
     async with stage:
         begin = stage.ledger.mark()
-        await asyncio.sleep(0.8)  # three exchanges
+        before = [end.exchanges for end in stage.ends.values()]
+        await until(
+            lambda: (
+                stage.ledger.count(begin, stage.ledger.mark())[0] > 20
+                and all(end.exchanges >= each + 3 for end, each in zip(stage.ends.values(), before, strict=True))
+            )
+        )
         end = stage.ledger.mark()
-        async with asyncio.timeout(PATIENCE_S):
-            while len(set(stage.ledger.count(begin, end))) != 1:  # noqa: ASYNC110  likewise
-                await asyncio.sleep(0.01)
-        assert stage.ledger.count(begin, end)[0] > 20
+        await until(lambda: len(set(stage.ledger.count(begin, end))) == 1)
         assert all(not notice.drops for notice in (await stage.notices()).values())
-        assert all(notice.figures["exchanges"] >= 2 for notice in (await stage.notices()).values())
     assert not stage.ledger.faults

@@ -5,11 +5,13 @@ from __future__ import annotations
 import io
 import os
 from collections import Counter
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 from rich.console import Console
 
+from tests.daemon.harness import need
 from uavlinkd.core.suites import SUITES
 from uavlinkd.evaluation.records import Record, Status, read_records
 from uavlinkd.evaluation.timing import MAC_KEY_BITS, Settings, run_timing
@@ -85,8 +87,10 @@ def test_progress_is_shown(run: tuple[Path, list[Record], str]) -> None:
 
 def test_the_run_can_be_reported(run: tuple[Path, list[Record], str]) -> None:
     """Records of a real run, not of a sample, give every figure."""
-    report = pytest.importorskip("uavlinkd.evaluation.report", exc_type=ImportError)
-    html = report.write_report(run[0]).read_text(encoding="utf-8")
+    need(find_spec("matplotlib") is not None, "matplotlib, for the figures")
+    from uavlinkd.evaluation.report import write_report
+
+    html = write_report(run[0]).read_text(encoding="utf-8")
     assert html.count("data:image/svg+xml") == 5
 
 

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 
+from uavlinkd.evaluation import timing_paper
 from uavlinkd.evaluation.records import Status, Value
 from uavlinkd.evaluation.timing_paper import PaperEnds, paper_points
 
@@ -58,3 +62,38 @@ def test_an_end_that_fails_is_recorded_and_the_next_one_works(
     assert "ended with status 1" in failed.reason
     assert "KeyError" in capfd.readouterr().err
     assert ends.measure(point(2048, "standard"), limit_s=20).is_ok
+
+
+FAILURES = {
+    "ends": ("", "ended with status 0"),
+    "is silent": ("import time; time.sleep(600)", "not finished"),
+    "tells nonsense": ("print('{}', flush=True); import time; time.sleep(600)", "port"),
+}
+
+
+@pytest.mark.parametrize("role", ["initiator", "responder"])
+@pytest.mark.parametrize("failure", FAILURES)
+def test_an_end_that_does_not_begin_leaves_no_process(
+    ends: PaperEnds, monkeypatch: pytest.MonkeyPatch, role: str, failure: str
+) -> None:
+    """Neither its own nor the other end's, and the next exchange works."""
+    code, reason = FAILURES[failure]
+    genuine = subprocess.Popen
+    started: list[subprocess.Popen[bytes]] = []
+
+    def start(command: tuple[str, ...], **options: Any) -> subprocess.Popen[bytes]:
+        if command[-1] == role:
+            command = (sys.executable, "-c", code)
+            if reason == "not finished":
+                patch.setattr(timing_paper, "_ANSWER_S", 0.2)
+        started.append(genuine(command, **options))
+        return started[-1]
+
+    with monkeypatch.context() as patch:
+        patch.setattr(subprocess, "Popen", start)
+        failed = ends.measure(point(256), limit_s=60)
+    assert not failed.is_ok
+    assert reason in failed.reason
+    assert len(started) == (1 if role == "initiator" else 2)
+    assert all(each.returncode is not None for each in started)
+    assert ends.measure(point(256), limit_s=60).is_ok

@@ -232,7 +232,6 @@ def make_anatomy() -> Run:
                 assert parts.join() == datagram, "parts that are not the whole"
                 assert len(parts.ephemeral) == 32
             anatomy.has_cookie(datagram)
-            anatomy.suite_of(datagram)
             envelope = anatomy.envelope_of(datagram)
             assert (envelope is not None) <= (anatomy.kind_of(datagram) is anatomy.Kind.ENVELOPE)
             assert len(anatomy.message_ids(datagram)) * 8 <= len(datagram)

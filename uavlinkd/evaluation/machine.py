@@ -88,15 +88,10 @@ class EnergyMeter:
     """The processor packages' own energy counters, where they can be read. They count everything that runs."""
 
     def __init__(self, folder: Path = RAPL_FOLDER) -> None:
-        # intel-rapl:0 is a package; intel-rapl:0:1 a part of it, counted already.
-        zones = [each for each in sorted(folder.glob("*-rapl:*")) if each.name.count(":") == 1]
+        # intel-rapl:0 is a package; intel-rapl:0:1 a part of it, and psys the whole machine with all packages.
+        zones = [each for each in sorted(folder.glob("*-rapl:*")) if _name(each).startswith("package")]
         self._zones = [each for each in zones if _microjoules(each / "energy_uj") is not None]
         self._before: list[int | None] = []
-
-    @property
-    def is_there(self) -> bool:
-        """Whether the machine tells."""
-        return bool(self._zones)
 
     def start(self) -> None:
         """From now on."""
@@ -115,6 +110,13 @@ class EnergyMeter:
                 now += (_microjoules(zone / "max_energy_range_uj") or 0) + 1
             total += now - before
         return total / 1e6
+
+
+def _name(zone: Path) -> str:
+    try:
+        return (zone / "name").read_text(encoding="ascii")
+    except (OSError, ValueError):
+        return ""
 
 
 def _microjoules(path: Path) -> int | None:

@@ -26,6 +26,7 @@ from uavlinkd.evaluation.loop import Loop, Relay, Sink
 from uavlinkd.evaluation.machine import cpu_seconds
 from uavlinkd.keys import generate_private_key, generate_psk, public_key_text, write_secret_file
 from uavlinkd.mavlink import dialect
+from uavlinkd.sim.drone_process import free_udp_ports
 
 START_S = 20.0
 """How long a daemon may take to start: half a second, and much more on a busy or small machine."""
@@ -214,15 +215,6 @@ class Pair:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._stack.close()
-
-
-def free_udp_ports(count: int) -> list[int]:
-    """Ports of loopback that nobody uses now."""
-    with ExitStack() as stack:
-        sockets = [stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(count)]
-        for sock in sockets:
-            sock.bind(("127.0.0.1", 0))
-        return [sock.getsockname()[1] for sock in sockets]
 
 
 def numbered_frame(number: int) -> bytes:

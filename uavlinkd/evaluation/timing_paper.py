@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import ExitStack, closing
 from types import TracebackType
 from typing import Any, Self
 
@@ -44,7 +45,11 @@ class End:
         self._selector = selectors.DefaultSelector()
         assert self._process.stdout is not None
         self._selector.register(self._process.stdout, selectors.EVENT_READ)
-        self.port = int(self.answer(_ANSWER_S)["port"])
+        try:
+            self.port = int(self.answer(_ANSWER_S)["port"])
+        except BaseException:
+            self.close()
+            raise
 
     def ask(self, what: dict[str, Any]) -> None:
         """Send a line."""
@@ -113,7 +118,10 @@ class PaperEnds:
 
     def _exchange(self, point: dict[str, Value], limit_s: float, on_wait: Callable[[], None]) -> dict[str, Value]:
         if self._ends is None:
-            self._ends = End("initiator"), End("responder")
+            with ExitStack() as stack:  # where the second one fails, the first has to be ended too
+                ends = [stack.enter_context(closing(End(role))) for role in ("initiator", "responder")]
+                self._ends = ends[0], ends[1]
+                stack.pop_all()
         initiator, responder = self._ends
         responder.ask({})
         initiator.ask(

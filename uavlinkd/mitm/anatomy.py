@@ -16,7 +16,7 @@ import fastcrc
 from uavlinkd.core import constants as c
 from uavlinkd.core import wire
 from uavlinkd.core.drops import Drop
-from uavlinkd.core.suites import SUITES, Suite
+from uavlinkd.core.suites import Suite
 
 
 class Kind(StrEnum):
@@ -125,11 +125,6 @@ def initiation(suite: Suite, index: int, noise: bytes, public_key: bytes | None)
     room = wire.initiation_bytes(suite) - _HEADER_BYTES[Kind.INITIATION] - wire.MACS_BYTES
     body = wire.initiation_header(suite, index) + noise[:room].ljust(room, b"\0")
     return with_mac1(body + bytes(wire.MACS_BYTES), public_key)
-
-
-def suite_of(datagram: bytes) -> Suite | None:
-    """The suite that a handshake message names."""
-    return SUITES.get(datagram[1]) if len(datagram) > 1 else None
 
 
 # Envelopes.
