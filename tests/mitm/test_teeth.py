@@ -198,7 +198,7 @@ def test_receiver_without_memory_of_initiations_answers_replays(origin: str, mon
     initiations = [each for each in answered if kind_of(each) is Kind.INITIATION]
     responses = [each for each in answered if kind_of(each) is Kind.RESPONSE]
     assert stage.a.drops[Reason.REPLAYED_INITIATION] + stage.b.drops[Reason.REPLAYED_INITIATION] == 0
-    assert len(responses) >= len(initiations) + 10
+    assert len(responses) >= len(initiations) + 5  # a burst, then two a second while the link is up
 
 
 def test_receiver_that_follows_every_address_loses_its_traffic(monkeypatch: pytest.MonkeyPatch) -> None:
