@@ -40,6 +40,10 @@ _PEER_AGES = {
 _PEER_TOTALS = {
     "bytes_received": ("peer_receive_bytes_total", "Bytes of datagrams from the peer."),
     "bytes_sent": ("peer_transmit_bytes_total", "Bytes of datagrams to the peer."),
+    "bytes_elsewhere": (
+        "peer_elsewhere_bytes_total",
+        "Bytes of answers to places where the peer is not known to be: somebody replays what it said.",
+    ),
     "envelopes_received": ("peer_receive_envelopes_total", "Envelopes from the peer, authentic and new."),
     "envelopes_sent": ("peer_transmit_envelopes_total", "Envelopes to the peer."),
     "frames_received": ("peer_receive_frames_total", "MAVLink frames from the peer."),

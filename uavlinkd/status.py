@@ -69,6 +69,7 @@ def peer_status(link: PeerLink, now: float) -> dict[str, object]:
         "envelopes_sent": traffic.envelopes_sent,
         "envelopes_received": traffic.envelopes_received,
         "bytes_sent": traffic.bytes_sent,
+        "bytes_elsewhere": traffic.bytes_elsewhere,
         "bytes_received": traffic.bytes_received,
         **link.disturbances(now),
         "frames_received": link.counters.frames,

@@ -366,6 +366,28 @@ def test_stray_start_delays_a_stream_no_longer_than_the_gap() -> None:
     assert splitter.counters.garbage_bytes == 2
 
 
+def test_stray_start_delays_a_busy_stream_no_longer_than_it_may_be_held() -> None:
+    """Where chunks come too often for a silence, what is held is broken after a time of its own; nothing is lost."""
+    beat = SHAPES["v2 heartbeat"]
+    splitter = StreamSplitter(max_gap_s=2.0, max_hold_s=2.0)
+    assert splitter.feed(b"\xfe\xff" + beat, now=10.0) == []
+    came = [(second, raws(splitter.feed(beat, now=10.0 + second))) for second in range(1, 6)]
+    assert came == [(1, []), (2, []), (3, [beat] * 4), (4, [beat]), (5, [beat])]
+    halves = [splitter.feed(half, now=at) for half, at in ((beat[:9], 20.0), (beat[9:], 21.9))]
+    assert list(map(raws, halves)) == [[], [beat]]
+
+
+def test_what_is_broken_can_be_had_without_more() -> None:
+    """Frames behind a stray start need not wait until the sender speaks again: they would be old by then."""
+    beat = SHAPES["v2 heartbeat"]
+    splitter = StreamSplitter(max_gap_s=0.5)
+    assert splitter.give_up(9.0) == []
+    assert splitter.feed(b"\xfe\xff" + beat, now=10.0) == []
+    assert splitter.give_up(10.5) == []
+    assert raws(splitter.give_up(10.51)) == [beat]
+    assert splitter.give_up(11.0) == splitter.feed(b"", now=60.0) == []
+
+
 def test_slow_stream_keeps_its_frame_together() -> None:
     """Pauses up to the limit inside a frame do no harm, as long as the frame takes in total."""
     beat = SHAPES["v2 heartbeat"]

@@ -73,8 +73,8 @@ ANSWERS_PER_S = 4.0
 """Responses a second to one peer without a cookie. With 16 places, an honest handshake has two seconds at least to
 confirm before replayed initiations could push it out."""
 ANSWERS_WHILE_UP_PER_S = 2.0
-"""The same to one with which a link is up: on a slow radio they take room from its frames, with x25519 2 kbit/s. Enough
-for new keys every two seconds; who restarts and finds it used up by replays gets a cookie, a round trip more."""
+"""The same to one with which a link is up: on a slow radio they take room from its frames, with x25519 2 kbit/s.
+Enough for new keys every two seconds; who restarts and finds it used up by replays is given a cookie first."""
 ANSWERS_BURST = 8
 PENDING_PER_PEER = 8
 """Own initiations that may still be answered, so a slow path's response finds its initiation."""

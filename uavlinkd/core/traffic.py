@@ -17,7 +17,7 @@ class Traffic:
     bytes_sent: int = 0
     bytes_elsewhere: int = 0
     """Of answers and path challenges to places where the peer is not known to be. Whoever replays its handshakes or
-    its envelopes causes them: they are no part of the others, from which a link's budget is reckoned."""
+    its envelopes causes them: they are no part of ``bytes_sent``, from which a link's budget is reckoned."""
     envelopes_sent: int = 0
     envelopes_received: int = 0
     bytes_received: int = 0

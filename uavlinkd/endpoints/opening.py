@@ -33,9 +33,9 @@ def open_new(
         except (BindError, OSError) as error:
             for endpoint in opened:
                 endpoint.close()
-            # If not an address that is taken, it is that no descriptor is left.
-            remedy = "if this daemon itself has it, restart it" if isinstance(error, BindError) else "try again"
-            problem = Problem(str(config.path), _key(each), f"{error}; {remedy}")
+            is_taken = isinstance(error, BindError) and error.is_taken
+            remedy = "; if it is this daemon, restart it" if is_taken else ""
+            problem = Problem(str(config.path), _key(each), f"{error}{remedy}")
             raise ConfigError((problem,)) from None
     return opened
 

@@ -37,6 +37,9 @@ _FREEBIND = {
 class BindError(Exception):
     """An address that cannot be listened on. The message is for the operator."""
 
+    is_taken = False
+    """Whether it is because somebody listens there."""
+
 
 def numeric_host(sockaddr: tuple[Any, ...]) -> str:
     """The host of an Internet socket address, for sending back to it.
@@ -113,7 +116,9 @@ _REMEDIES = {
 def cannot_listen(address: Address, error: OSError) -> BindError:
     """What to tell the operator."""
     remedy = _REMEDIES.get(error.errno or 0)
-    return BindError(f"cannot listen on {address}: {error.strerror or error}{f': {remedy}' if remedy else ''}")
+    found = BindError(f"cannot listen on {address}: {error.strerror or error}{f': {remedy}' if remedy else ''}")
+    found.is_taken = error.errno == errno.EADDRINUSE
+    return found
 
 
 def pause(seconds: float) -> None:

@@ -11,6 +11,7 @@ import asyncio
 from abc import ABC, abstractmethod
 from collections import Counter, deque
 from collections.abc import Sequence
+from math import inf
 from typing import Protocol
 
 import structlog
@@ -27,6 +28,8 @@ READ_BYTES = 4096
 """Read of one connection in a wake-up; then the others have their turn. The costliest bytes take some 10 ms."""
 STALLED_S = 30.0
 """A connection that took no byte for this long is closed, so that what nobody reads is not held for ever."""
+LASTED_S = 60.0
+"""An endpoint that was open for so long and then is not is news; one that comes and goes fills no log."""
 ROOM_POLL_S = 0.01
 """How soon to look again where the kernel has room and it is we who leave it empty: it reports nothing then."""
 
@@ -150,7 +153,7 @@ class Connection:
         self.lost = asyncio.Event()
         """Set when the port has been reported as closed."""
         self._endpoint = endpoint
-        self._splitter = StreamSplitter(endpoint.counters, endpoint.max_gap_s)
+        self._splitter = StreamSplitter(endpoint.counters, endpoint.max_gap_s, endpoint.max_hold_s)
         self._loop = asyncio.get_running_loop()
         self._fd = channel.fileno()
         self._is_open = True
@@ -221,6 +224,8 @@ class Connection:
 
     def check(self, now: float) -> None:
         """Drop what got stale; close the connection if nothing of it has moved for long."""
+        if frames := self._splitter.give_up(now):
+            self._endpoint.handler.on_frames(self.port, frames, now)
         self.outgoing.drop_stale(now)
         if self._blocked_since is not None and now - self._blocked_since >= STALLED_S:
             self.lose("stalled")
@@ -298,6 +303,8 @@ class StreamEndpoint(ABC):
 
     max_gap_s = MAX_GAP_S
     """A silence inside a frame, after which it is taken for broken."""
+    max_hold_s = inf
+    """How long all of a frame may take: on a serial line as long as it does."""
 
     def __init__(self, name: str, handler: PortHandler, max_age_s: float) -> None:
         self.name = name
@@ -310,7 +317,7 @@ class StreamEndpoint(ABC):
         self.bytes_sent = 0
         self.frames_sent = 0
         self._connections: dict[LocalPort, Connection] = {}
-        self._told: set[str] = set()  # why it could not be opened, since it last was open
+        self._told: set[str] = set()  # why it could not be opened, since it last was for long
 
     @property
     def ports(self) -> Sequence[LocalPort]:
@@ -353,12 +360,11 @@ class StreamEndpoint(ABC):
         """Take a connection over, and report its port."""
         connection = Connection(self, channel, name, now)
         self._connections[connection.port] = connection
-        self._told.clear()
         self.handler.on_port_opened(connection.port)
         return connection
 
     def could_not_open(self, reason: str) -> None:
-        """Count an attempt that failed. Each reason is logged once, until the endpoint has been open again."""
+        """Count an attempt that failed. Each reason is logged once, until the endpoint has been open for long."""
         self.failures[reason] += 1
         if reason not in self._told:
             self._told.add(reason)
@@ -368,6 +374,8 @@ class StreamEndpoint(ABC):
     def forget(self, connection: Connection) -> None:
         """Report the port of a lost connection as closed, once."""
         if self._connections.pop(connection.port, None) is not None:
+            if monotonic() - connection.opened_at >= LASTED_S:
+                self._told.clear()
             self.handler.on_port_closed(connection.port)
             self.dispose(connection)
             connection.lost.set()

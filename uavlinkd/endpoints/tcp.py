@@ -29,7 +29,8 @@ LONGEST_WAIT_S = 5.0
 CONNECT_TIMEOUT_S = 5.0
 """For one address; a name may have several."""
 MAX_GAP_S = 2.0
-"""Inside a frame: TCP loses nothing, but what it has to repeat comes late; later than this a frame is old."""
+"""Inside a frame, and for all of it: TCP loses nothing, but what it has to repeat comes late; later than this a frame
+is old, or was none, from a serial line behind a server."""
 MAX_ADDRESSES = 8
 """Tried of one name in one attempt."""
 ACCEPT_PAUSE_S = 1.0
@@ -91,7 +92,7 @@ class TcpServer(StreamEndpoint):
     their place; ``http``, who turned out to be a browser.
     """
 
-    max_gap_s = MAX_GAP_S
+    max_gap_s = max_hold_s = MAX_GAP_S
 
     def __init__(
         self, name: str, listener: socket.socket, handler: PortHandler, *, max_age_s: float = MAX_AGE_S
@@ -171,7 +172,7 @@ class TcpClient(StreamEndpoint):
     ``connect_timeout`` or ``not_resolved``.
     """
 
-    max_gap_s = MAX_GAP_S
+    max_gap_s = max_hold_s = MAX_GAP_S
 
     def __init__(self, name: str, address: Address, handler: PortHandler, *, max_age_s: float = MAX_AGE_S) -> None:
         super().__init__(name, handler, max_age_s)

@@ -17,7 +17,7 @@ from uavlinkd.addresses import Address
 from uavlinkd.clock import monotonic
 from uavlinkd.endpoints.ports import LocalPort, PortHandler, failure_name
 from uavlinkd.endpoints.sockets import Arrived, BindError, Reader, numeric_host, udp_socket
-from uavlinkd.mavlink.frames import Frame, SplitCounters, StreamSplitter, split_datagram
+from uavlinkd.mavlink.frames import MAX_GAP_S, MIN_FRAME_BYTES, Frame, SplitCounters, StreamSplitter, split_datagram
 from uavlinkd.resolver import Resolved, keep_resolving
 
 CLIENTS_PER_ENDPOINT = 32
@@ -105,7 +105,7 @@ class UdpEndpoint(ABC):
                 garbage = counters.garbage_bytes
                 frames = split_datagram(datagram, counters)
                 if counters.garbage_bytes != garbage and address in self._ports:
-                    self._follow_cuts(address, datagram, now)
+                    self._follow_cuts(address, datagram, len(frames), now)
             if frames:
                 if address in arrived:
                     arrived[address] += frames
@@ -117,14 +117,15 @@ class UdpEndpoint(ABC):
                 port.heard_at = now
                 self._handler.on_frames(port, frames, now, waited_s)
 
-    def _follow_cuts(self, address: Sockaddr, datagram: bytes, now: float) -> None:
-        """A program that is known sent what is no frame. Where a frame ends amid its datagram, the rest is to come.
+    def _follow_cuts(self, address: Sockaddr, datagram: bytes, found: int, now: float) -> None:
+        """A program that is known sent what is no frame. Where its datagram ends amid one, the rest is to come.
 
         A bridge from a serial line may cut its bytes where it pleases. From then on they are taken as a stream.
+        ``found``: how many frames were. Where fewer come before that end, the others stand after it, and it is none.
+        A few bytes are a stray start rather; a bridge cuts elsewhere soon.
         """
-        splitter = StreamSplitter(SplitCounters(), gives_up=True)
-        splitter.feed(datagram, now)
-        if splitter.pending_bytes:
+        splitter = StreamSplitter(SplitCounters(), max_hold_s=MAX_GAP_S, gives_up=True)
+        if len(splitter.feed(datagram, now)) == found and splitter.pending_bytes >= MIN_FRAME_BYTES:
             self.counters.garbage_bytes -= splitter.pending_bytes
             splitter.counters = self.counters
             self._cutters[address] = splitter
@@ -148,8 +149,11 @@ class UdpEndpoint(ABC):
             size += len(frame)
         self._send(b"".join(batch), address, len(batch))
 
-    def do_housekeeping(self, now: float) -> None:  # noqa: B027  most have nothing to do
-        """Forget who is gone."""
+    def do_housekeeping(self, now: float) -> None:
+        """Forget who is gone, and what waits for an end that does not come."""
+        for address, splitter in self._cutters.items():
+            if frames := splitter.give_up(now):
+                self._handler.on_frames(self._ports[address], frames, now)
 
     def close(self) -> None:
         """Close the socket."""
@@ -197,6 +201,7 @@ class UdpServer(UdpEndpoint):
 
     def do_housekeeping(self, now: float) -> None:
         """Forget the programs that went silent."""
+        super().do_housekeeping(now)
         for port in self.ports:
             if port.heard_at is not None and now - port.heard_at >= CLIENT_IDLE_S:
                 self._forget(port)

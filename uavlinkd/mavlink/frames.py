@@ -27,6 +27,7 @@ import re
 from collections import Counter
 from dataclasses import dataclass, field
 from enum import StrEnum
+from math import inf
 from typing import Final, NamedTuple, final
 
 from fastcrc.crc16 import mcrf4xx
@@ -40,7 +41,7 @@ MIN_FRAME_BYTES: Final = 6 + 2
 MAX_FALSE_STARTS: Final = 64  # in a row, after which the rest of a datagram is not searched: each costs a checksum
 MAX_REMEMBERED: Final = 2048  # messages of one sender, of which the headers are kept
 MAX_REMEMBERED_TARGETS: Final = 32  # of each of them
-MAX_GAP_S: Final = 0.5  # longer than any link holds back the rest of a frame, shorter than any failsafe
+MAX_GAP_S: Final = 0.5  # longer than a serial line holds back the rest of a frame, shorter than any failsafe
 
 _START = re.compile(rb"[\xfd\xfe]")
 
@@ -162,22 +163,39 @@ def split_payload(payload: bytes, counters: SplitCounters) -> list[Frame]:
 
 
 class StreamSplitter:
-    """Frames out of a byte stream (serial, TCP), however it is cut into chunks. Holds less than one frame.
+    """Frames out of a byte stream (serial, TCP, a bridge on UDP), however it is cut into chunks. Holds less than one.
 
     A stray start byte makes what follows look like a frame of up to 280 bytes, and genuine frames would wait
     until that many have come: at one heartbeat a second, past every failsafe. But a sender writes a frame in
-    one go, so after a silence of `max_gap_s` inside a frame it is taken for broken.
+    one go. So after a silence of `max_gap_s` inside a frame, or where the rest of it has not come within
+    `max_hold_s`, it is taken for broken: when more comes, or when :meth:`give_up` is called.
 
     `gives_up`: of a chunk that is made of false starts the rest is garbage, as of a datagram: a bound on its cost.
     """
 
-    __slots__ = ("_fed_at", "_gives_up", "_in_garbage", "_max_gap_s", "_rest", "counters")
+    __slots__ = (
+        "_fed_at",
+        "_gives_up",
+        "_held_since",
+        "_in_garbage",
+        "_max_gap_s",
+        "_max_hold_s",
+        "_rest",
+        "counters",
+    )
 
     def __init__(
-        self, counters: SplitCounters | None = None, max_gap_s: float = MAX_GAP_S, *, gives_up: bool = False
+        self,
+        counters: SplitCounters | None = None,
+        max_gap_s: float = MAX_GAP_S,
+        max_hold_s: float = inf,
+        *,
+        gives_up: bool = False,
     ) -> None:
         self.counters = SplitCounters() if counters is None else counters
         self._max_gap_s = max_gap_s
+        self._max_hold_s = max_hold_s
+        self._held_since = 0.0
         self._gives_up = gives_up
         self._rest = b""
         self._in_garbage = False
@@ -190,13 +208,19 @@ class StreamSplitter:
 
     def feed(self, chunk: bytes, now: float) -> list[Frame]:
         """The frames that this chunk completes; `now` in seconds, monotonic. Total."""
-        frames: list[Frame] = []
-        if self._rest:
-            if now - self._fed_at > self._max_gap_s:
-                self._scan(self._rest, frames, is_final=True)
-            chunk = self._rest + chunk
+        frames = self.give_up(now)
+        held = len(self._rest)
         self._fed_at = now
-        self._scan(chunk, frames, is_final=False)
+        if self._scan(self._rest + chunk if held else chunk, frames, is_final=False) or not held:
+            self._held_since = now
+        return frames
+
+    def give_up(self, now: float) -> list[Frame]:
+        """The frames in what is held, if it is broken: whoever has waited for them waits no longer than need be."""
+        frames: list[Frame] = []
+        is_over = now - self._fed_at > self._max_gap_s or now - self._held_since > self._max_hold_s
+        if self._rest and is_over:
+            self._scan(self._rest, frames, is_final=True)
         return frames
 
     def end(self) -> list[Frame]:
@@ -206,7 +230,7 @@ class StreamSplitter:
         self._in_garbage = False
         return frames
 
-    def _scan(self, data: bytes, frames: list[Frame], *, is_final: bool) -> None:
+    def _scan(self, data: bytes, frames: list[Frame], *, is_final: bool) -> int:
         consumed, self._in_garbage = _scan(
             data,
             frames,
@@ -216,6 +240,7 @@ class StreamSplitter:
             gives_up=is_final or self._gives_up,
         )
         self._rest = data[consumed:]
+        return consumed
 
 
 def _scan(

@@ -64,7 +64,7 @@ MAX_COUNTED: Final = 1024  # message ids and reasons counted by themselves, of o
 MAX_BUCKETS: Final = 4096  # flows, and messages of systems, with a rate limit, likewise
 MAX_DECISIONS: Final = 1024  # message ids whose decision is remembered, likewise
 BURST_S: Final = 0.5  # how much of a second's frames may come at once
-SYSTEM_SHARE: Final = 4  # what all components of a system may send of a message, in rates of one
+SYSTEM_SHARE: Final = 16  # what all components of a system may send of a message, in rates of one
 
 SETUP_SIGNING: Final = 256
 HEARTBEAT: Final = 0
