@@ -395,6 +395,70 @@ def test_old_frame_of_the_session_before_is_refused() -> None:
     assert payloads([out for each in datagrams(answer) for out in pair.b.receive(each, 20.0)]) == [numbered(6)]
 
 
+def test_frames_of_the_session_before_end_with_the_first_on_the_next() -> None:
+    """Let go one by one, so that the old session is never silent, they are two seconds late at most, no minute."""
+    pair = Pair(link_a=quiet(), link_b=quiet()).establish()
+    talk(pair, 1.0, 10.0)
+    held = [frame(pair.a, 10.0 + number / 100, number) for number in range(40)]
+    called = pair.a.peer.caller.call(pair.a.peer.path, pair.a.peer.sessions.generation, 10.4)
+    assert called is not None
+    response = only(datagrams(pair.b.receive(called.datagram, 10.4)))
+    pair.b.receive(only(datagrams(pair.a.receive(response, 10.4))), 10.4)
+    came = []
+    for number, each in enumerate(held):
+        now = 10.5 + 1.9 * number
+        talk(pair, now, now + 1.8)  # on the new session all is well
+        if payloads(pair.b.receive(each, now)):
+            came.append(now)
+    assert came == [10.5]
+    assert pair.b.peer.traffic.drops[DropReason.DELAYED] + pair.b.peer.traffic.drops[DropReason.SESSION_EXPIRED] == 39
+    assert pair.b.peer.traffic.drops[DropReason.DELAYED] > 10
+
+
+def test_overtaken_by_the_next_session_frames_have_two_seconds() -> None:
+    """Reordered over a change of keys nothing is lost: it is from the peer's first envelope on the new session on."""
+    for late_s, comes in ((c.LATE_AFTER_S - 0.001, True), (c.LATE_AFTER_S, False)):
+        pair, old = rekeyed(10.0)
+        last = pair.a.peer.sessions.confirmed[1].seal(numbered(6), 9.9)
+        assert payloads(pair.b.receive(old, 11.0)) == [numbered(5)]
+        outputs = pair.b.receive(last, 10.0 + late_s)
+        assert (payloads(outputs) == [numbered(6)]) == comes
+        assert (reasons(outputs) == [DropReason.DELAYED]) != comes
+        assert pair.b.peer.missing(60.0) == 0
+
+
+def test_old_session_goes_on_until_the_peer_is_heard_on_the_new_one() -> None:
+    """The initiator has the new session first. Where its confirmation is lost, the peer sends on the old one on."""
+    pair = Pair(link_a=quiet(), link_b=quiet()).establish()
+    assert pair.carries(9.5)
+    called = pair.a.peer.caller.call(pair.a.peer.path, pair.a.peer.sessions.generation, 10.0)
+    assert called is not None
+    response = only(datagrams(pair.b.receive(called.datagram, 10.0)))
+    confirmation = only(datagrams(pair.a.receive(response, 10.0)))
+    for number in range(10):
+        now = 10.0 + number
+        assert payloads(exchange(pair.a, pair.b, pair.b.send(now), now)) == [FRAME]
+    pair.b.receive(confirmation, 19.5)
+    assert pair.carries(19.6)
+
+
+def test_late_control_records_of_the_session_before_are_no_sign_of_life() -> None:
+    """They are acted on, but who keeps them cannot make a peer look alive that is gone."""
+    pair = Pair(link_a=quiet(), link_b=quiet()).establish()
+    assert pair.carries(9.5)
+    kept = [pair.a.envelope(9.9, b"") for _ in range(8)]
+    question = pair.a.envelope(9.9, wire.Echo(False, 7, 0, 0).encode())
+    called = pair.a.peer.caller.call(pair.a.peer.path, pair.a.peer.sessions.generation, 10.0)
+    assert called is not None
+    response = only(datagrams(pair.b.receive(called.datagram, 10.0)))
+    pair.b.receive(only(datagrams(pair.a.receive(response, 10.0))), 10.0)
+    for number, each in enumerate(kept):
+        pair.b.receive(each, 10.5 + number)
+    assert pair.b.peer.heard_at == 11.5
+    assert len(datagrams(pair.b.receive(question, 20.0))) == 1
+    assert pair.b.peer.heard_at == 11.5
+
+
 def test_frames_on_a_session_that_ends_as_it_is_confirmed_are_counted() -> None:
     """Four newer ones came before the late confirmation of the first: what it carries can be asked about nowhere."""
     pair = Pair(link_a=quiet(), link_b=quiet())
@@ -414,6 +478,6 @@ def test_frames_on_a_session_that_ends_as_it_is_confirmed_are_counted() -> None:
     for number, each in enumerate(sessions[1:]):
         pair.b.peer.sessions.unconfirmed[each.remote_index].session.created_at = float(number + 1)
         pair.b.receive(each.seal(b"", 1.0), 1.0)
-    outputs = pair.b.receive(sessions[0].seal(FRAME, 9.0), 9.0)
+    outputs = pair.b.receive(sessions[0].seal(FRAME, 2.5), 2.5)
     assert reasons(outputs) == [DropReason.DOUBTFUL]
     assert payloads(outputs) == []

@@ -166,11 +166,12 @@ class Peer:
         unconfirmed = self.sessions.unconfirmed.pop(session.local_index, None)
         if unconfirmed is not None:
             self._adopt(session, unconfirmed.path, now, out)
-        is_new = now <= session.trusted_until
+        is_late = self.sessions.is_left_behind(session, now)
+        is_new = now <= session.trusted_until and not is_late
         if is_new:
             session.trusted_until = now + c.LATE_AFTER_S
             self._heard(now, out)
-        elif not self.is_up:
+        elif not self.is_up and not is_late:
             self._doubt(session, now, out)
         if counter != session.window.highest:
             self.traffic.out_of_order += 1
@@ -182,6 +183,8 @@ class Peer:
             self._receive_control(session, wire.parse_control(payload), path, now, out)
         elif is_new:
             out.append(Deliver(self.name, payload))
+        elif is_late:
+            self._drop(DropReason.DELAYED, 1, out)
         else:
             self._drop(DropReason.DOUBTFUL, session.doubt.hold(counter, payload), out)
             self._doubt(session, now, out)

@@ -8,7 +8,7 @@ from uavlinkd.core import constants as c
 from uavlinkd.core import wire
 from uavlinkd.core.crypto import AeadKey, MacKey, Secret, equal, hkdf_expand
 from uavlinkd.core.drops import Drop, DropReason
-from uavlinkd.core.freshness import Doubt, Lately
+from uavlinkd.core.freshness import NEVER, Doubt, Lately
 from uavlinkd.core.handshake import Keys
 from uavlinkd.core.replay import ReplayWindow
 from uavlinkd.core.suites import Suite
@@ -101,6 +101,7 @@ class Session:
         "_sent_lately",
         "created_at",
         "doubt",
+        "heard_first_at",
         "is_initiator",
         "local_index",
         "parameters",
@@ -142,6 +143,8 @@ class Session:
         self.window = ReplayWindow()
         self.trusted_until = now + c.LATE_AFTER_S
         """Until then what comes is new: the silence before it was short, or there was none since the handshake."""
+        self.heard_first_at = NEVER
+        """When the peer's first envelope came: from then on it sends on this session, or on one of higher rank."""
         self.doubt = Doubt()
         self._floor = -1  # the peer said that this counter, and those below, are of the past
         self._heard_lately = Lately(now)
@@ -214,6 +217,8 @@ class Session:
         payload = self._receive.open(datagram, header_bytes, counter)
         if payload is None:
             raise Drop(DropReason.BAD_TAG)
+        if not self.received:
+            self.heard_first_at = now
         if now >= self._heard_lately.next_at:
             self._heard_lately.note(window.highest, self.received, now)
         if is_overtaken:

@@ -91,6 +91,18 @@ class Sessions:
             self._forget(index)
         return self._end(list(self.confirmed), now)
 
+    def is_left_behind(self, session: Session, now: float) -> bool:
+        """Whether the peer has been sending on a session of higher rank since :data:`c.LATE_AFTER_S` ago.
+
+        Frames on this one were sent before that: who still lets them through has held them back.
+        """
+        for each in self.confirmed:
+            if each is session:
+                break
+            if now >= each.heard_first_at + c.LATE_AFTER_S:
+                return True
+        return False
+
     def asked(self, token: int) -> tuple[Session | None, float]:
         """On which session, and when, an echo was asked for by this token. It counts once."""
         for session in self.confirmed:
