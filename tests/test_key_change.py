@@ -206,6 +206,21 @@ def test_a_link_made_anew_gets_no_second_grace() -> None:
     graces.follow([config], [without])
     graces.follow([without], [config])
     link = joined(12.0)
-    assert list(node.peers) == ["b", "b (previous key)", "b (previous key) (our previous key)"]
+    assert list(node.peers) == ["b", "b (previous key)"]  # it is theirs that is good anew, not ours
     assert link.confirm(13.0, graces)
     assert not joined(14.0).accepts_previous_keys
+
+
+def test_our_previous_key_stays_given_up_when_their_key_changes() -> None:
+    """A peer that knows our new key does not bring the one before back by a new key of its own."""
+    first, second = (KeyPair(keys.decode_key(each)).public for each in (THEIRS_BEFORE, THEIRS))
+    graces = Graces()
+    node = Node(Secret(keys.decode_key(OWN)), bytes, 0.0, Secret(keys.decode_key(PREVIOUS)))
+    link = PeerLink(Peer(PeerSettings("b", first), ()), node, lambda _: None, 0.0)
+    link.join(0.0, graces, 10.0, has_previous_key=True)
+    assert list(node.peers) == ["b", "b (our previous key)"]
+    assert link.confirm(1.0, graces)
+    link.leave(2.0)
+    rotated = PeerLink(Peer(PeerSettings("b", second), (), previous_public_key=first), node, lambda _: None, 2.0)
+    rotated.join(2.0, graces, 10.0, has_previous_key=True)
+    assert list(node.peers) == ["b", "b (previous key)"]

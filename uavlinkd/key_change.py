@@ -39,18 +39,21 @@ def pairings(peer: Peer, has_previous_key: bool) -> list[KeyPairing]:
 
 
 class Graces:
-    """Until when pairs with a previous key are good: a link that is made anew does not get a second grace."""
+    """Until when pairs with a previous key are good: a link that is made anew does not get a second grace.
+
+    A peer's previous key has one, and so has ours with each peer, whichever key that peer has by then.
+    """
 
     def __init__(self) -> None:
-        self._until: dict[tuple[str, bytes], float] = {}
+        self._until: dict[tuple[str, bytes], float] = {}  # by peer, and its previous key, or nothing for ours
 
     def until(self, settings: PeerSettings, now: float, grace_s: float) -> float:
         """When a pair's grace ends, which begins at the first time that it is asked for."""
-        return self._until.setdefault((settings.name, settings.public_key), now + grace_s)
+        return self._until.setdefault(_whose(settings), now + grace_s)
 
     def end(self, settings: PeerSettings) -> None:
         """The pair was given up."""
-        self._until[settings.name, settings.public_key] = -inf
+        self._until[_whose(settings)] = -inf
 
     def follow(self, before: Iterable[Peer], after: Iterable[Peer]) -> None:
         """A new configuration. Previous keys that were taken out of it are good anew where they are put in again."""
@@ -69,6 +72,11 @@ def is_by_our_previous(core_name: str) -> bool:
 def is_by_their_previous(core_name: str) -> bool:
     """Whether we know that peer of the core by its previous key."""
     return f" {_THEIRS}" in core_name
+
+
+def _whose(settings: PeerSettings) -> tuple[str, bytes]:
+    """Which previous key a pair stands or falls with."""
+    return link_name(settings.name), b"" if is_by_our_previous(settings.name) else settings.public_key
 
 
 def link_name(core_name: str) -> str:

@@ -197,6 +197,34 @@ def test_removed_member_is_forgotten_by_the_others(folder: Path) -> None:
     assert not [path for path in left if path.endswith("drone2.psk")]
 
 
+def test_no_member_keeps_a_removed_one_by_another_name(folder: Path) -> None:
+    """A person renamed it in a file, or linked two that no role links: it is said where, and nothing is changed."""
+    path = folder / "drone2" / "drone2.toml"
+    path.write_text(path.read_text().replace('name = "drone1"', 'name = "scout"'))
+    before = snapshot(folder)
+    with pytest.raises(FleetError, match=r"drone2\.toml: peer\[0\] \(scout\) has a key of drone1"):
+        work.remove(folder, "drone1")
+    with pytest.raises(FleetError, match=r"drone2\.toml: it has no \[\[peer\]\] with the name .drone1."):
+        work.rotate(folder, "drone1", at_once=True)
+    assert snapshot(folder) == before
+    path.write_text(path.read_text().replace('name = "scout"', 'name = "drone1"'))
+    work.remove(folder, "drone1")
+    check_fleet(folder)
+
+
+def test_a_rotation_that_was_cut_short_can_be_made_again(folder: Path) -> None:
+    """The power went when the keys were on the disk and nothing else: the old one stays the one before."""
+    own = folder / "drone1"
+    old = (own / "drone1.key").read_text()
+    (own / "drone1.key").rename(own / "drone1.previous.key")
+    keys.write_secret_file(own / "drone1.key", keys.generate_private_key())
+    work.rotate(folder, "drone1")
+    assert (own / "drone1.previous.key").read_text() == old
+    fleet = check_fleet(folder)
+    assert fleet.member("drone1").previous_public_key == keys.public_key_text(old)
+    assert loaded(folder, "drone2").peers[0].previous_public_key == keys.decode_key(keys.public_key_text(old))
+
+
 def test_edits_of_a_person_are_kept(folder: Path) -> None:
     """What was changed or remarked by hand in the others' files is there after members came and went."""
     path = folder / "drone1" / "drone1.toml"

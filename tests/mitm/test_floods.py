@@ -86,10 +86,10 @@ def test_probe_tells_when_more_comes_back_than_was_sent() -> None:
 
 
 def test_probe_asks_in_every_way() -> None:
-    """Initiations of its own, recorded datagrams, and recorded datagrams cut short."""
+    """Initiations of its own, recorded datagrams, and recorded datagrams cut short; each of both peers."""
     attack = parse_attack("amplification-probe").make(CONVERSATION.surroundings)
-    details = {each.detail.split(", from")[0] for each in notes(play(attack, SAID))}
-    assert details == {"initiation", "recorded", "recorded, cut short"}
+    asked = {(each.way, each.detail.split(", from")[0]) for each in notes(play(attack, SAID))}
+    assert asked == {(way, what) for way in (AB, BA) for what in ("initiation", "recorded", "recorded, cut short")}
 
 
 def test_hints_are_envelopes_of_no_session_from_the_peers_address() -> None:

@@ -224,6 +224,8 @@ def test_message_intervals_are_heeded() -> None:
     assert here.command(mavlink.MAV_CMD_GET_MESSAGE_INTERVAL, attitude)[0].interval_us == -1
     assert here.result(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, attitude, 0) == ACCEPTED
     assert per_second() == pytest.approx(10, rel=0.1)
+    assert here.result(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, attitude, 1e12) == ACCEPTED
+    assert here.command(mavlink.MAV_CMD_GET_MESSAGE_INTERVAL, attitude)[0].interval_us == 2**31 - 1
 
 
 def test_data_streams_are_heeded() -> None:

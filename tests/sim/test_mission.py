@@ -141,6 +141,15 @@ def test_an_altitude_that_is_no_number_ends_the_upload(here: Station, altitude: 
     assert here.autopilot.missions.plan == []
 
 
+@pytest.mark.parametrize("x", [math.nan, math.inf])
+def test_a_repeated_last_item_that_is_no_number_is_not_it(here: Station, x: float) -> None:
+    """Nor does it end the flight: whatever comes is answered or not."""
+    upload(here)
+    last = item(len(PLAN) - 1)
+    odd = mavlink.MAVLink_mission_item_message(1, 1, last.seq, 3, last.command, 0, 1, 0, 0, 0, 0, x, 0, 0)
+    assert here.tell(odd) == []
+
+
 def test_clearing_one_kind_or_all(here: Station) -> None:
     """MISSION_CLEAR_ALL empties its kind, or with 255 every one."""
     for kind in (0, 1, 2):

@@ -22,6 +22,7 @@ from uavlinkd.checker import checker_command
 from uavlinkd.config.errors import ConfigError, Problem
 from uavlinkd.config.model import Config
 from uavlinkd.core.crypto import Secret
+from uavlinkd.core_dumps import forbid_core_dumps
 
 
 def result_of(process: subprocess.Popen[bytes], path: Path) -> Config:
@@ -95,6 +96,7 @@ def _view(contents: dict[str, object]) -> MappingProxyType[str, object]:
 
 def main() -> NoReturn:
     """``python -m uavlinkd.config FILE``: what :mod:`uavlinkd.checker` starts."""
+    forbid_core_dumps()
     from uavlinkd.config.load import load_config  # noqa: PLC0415
 
     result: Config | tuple[Problem, ...]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from uavlinkd.fleet.files import key_lines, public_key_lines
@@ -53,6 +53,19 @@ def remove_peer(text: str, name: str) -> str:
             table["peer"] = left
 
     return _checked(text, "".join(_without(_sections(text), name)).rstrip("\n") + "\n", change)
+
+
+def section_with_key(text: str, public_keys: Iterable[str]) -> str | None:
+    """Which ``[[peer]]`` of a configuration has one of these keys, present or previous; None for none."""
+    unwanted = set(public_keys)
+    try:
+        peers = tomllib.loads(text).get("peer", [])
+    except ValueError:  # no daemon takes it
+        return None
+    for number, each in enumerate(peers if isinstance(peers, list) else []):
+        if isinstance(each, dict) and unwanted & {each.get(key) for key in _PUBLIC if isinstance(each.get(key), str)}:
+            return f"peer[{number}] ({each.get('name')})"
+    return None
 
 
 def set_public_keys(text: str, peer: Member) -> str:

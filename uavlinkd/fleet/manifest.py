@@ -55,6 +55,11 @@ class Member:
     previous_public_key: str | None = None
 
     @property
+    def public_keys(self) -> tuple[str, ...]:
+        """By which others know it now."""
+        return (self.public_key,) if self.previous_public_key is None else (self.public_key, self.previous_public_key)
+
+    @property
     def is_drone(self) -> bool:
         """Whether it flies."""
         return self.kind is Kind.DRONE

@@ -17,6 +17,7 @@ from pathlib import Path
 from uavlinkd import keys
 from uavlinkd.addresses import Address
 from uavlinkd.config import ConfigError, load_config
+from uavlinkd.core.crypto import x25519_public_key
 from uavlinkd.fleet import edit, files
 from uavlinkd.fleet.manifest import (
     FILE_NAME,
@@ -143,6 +144,7 @@ def remove(folder: Path, name: str) -> Result:
     for peer in peers:
         _edit(plan, folder, fleet, peer, lambda text: edit.remove_peer(text, name))
         plan.gone.append(folder / peer.name / files.psk_file(member))
+    _check_is_gone(plan, folder, fleet, name, member.public_keys)
     _perform(plan, folder, fleet)
     return Result(fleet, tuple(each.name for each in peers), tuple(plan.notes))
 
@@ -175,6 +177,8 @@ def rotate(folder: Path, name: str, *, at_once: bool = False) -> Result:
     plan.secrets[own / files.key_file(member)] = private
     if at_once:
         plan.gone += [own / files.key_file(member), own / files.previous_key_file(member)]
+    elif _holds(own / files.previous_key_file(member), old.public_key):
+        plan.gone.append(own / files.key_file(member))  # of a rotation that was cut short: nobody was told of it
     elif _is_there(own / files.key_file(member)):
         plan.moved[own / files.key_file(member)] = own / files.previous_key_file(member)
     else:
@@ -190,6 +194,7 @@ def rotate(folder: Path, name: str, *, at_once: bool = False) -> Result:
         for peer in peers if fleet.settings.psk else ():
             plan.gone += [folder / peer.name / files.psk_file(member), own / files.psk_file(peer)]
         _add_psks(plan, folder, fleet, [(member, peer) for peer in peers])
+        _check_is_gone(plan, folder, fleet, name, old.public_keys)
     _perform(plan, folder, fleet)
     return Result(fleet, (name, *(each.name for each in peers)), tuple(plan.notes))
 
@@ -256,6 +261,32 @@ def _edit(plan: Plan, folder: Path, fleet: Fleet, member: Member, change: edit.C
         plan.texts[path] = change(text)
     except FleetError as error:
         raise FleetError(f"{path}: {error}") from None
+
+
+def _check_is_gone(plan: Plan, folder: Path, fleet: Fleet, name: str, public_keys: Iterable[str]) -> None:
+    """That no member's configuration has one of these keys any more, under whatever name somebody wrote it there.
+
+    Raises:
+        FleetError: one has; with the file and the section.
+    """
+    for member in fleet.members:
+        path = folder / member.name / files.config_file(member)
+        try:
+            text = plan.texts[path] if path in plan.texts else path.read_text(encoding="utf-8")
+        except (OSError, ValueError):  # with its vehicle, or nothing that a daemon would take
+            continue
+        if (section := edit.section_with_key(text, public_keys)) is not None:
+            raise FleetError(
+                f"{path}: {section} has a key of {name}, which would stay good there: take it out of that file first"
+            )
+
+
+def _holds(path: Path, public_key: str) -> bool:
+    """Whether a file has the private key of a public one."""
+    try:
+        return keys.encode_key(x25519_public_key(keys.read_secret_file(path).reveal())) == public_key
+    except keys.KeyFileError:
+        return False
 
 
 def _is_there(path: Path) -> bool:

@@ -155,7 +155,7 @@ class Commands:
         rate = self._autopilot.streams.rate_hz(message)
         if rate is None:
             return FAILED
-        interval_us = -1 if rate == 0 else round(1e6 / rate)
+        interval_us = -1 if rate == 0 else min(round(1e6 / rate), 2**31 - 1)
         self._autopilot.send(mavlink.MAVLink_message_interval_message(message, interval_us))
         return ACCEPTED
 

@@ -161,14 +161,16 @@ class Missions:
 
     def _take(self, partner: Partner, kind: int, message: Message, now: float) -> None:
         upload = self._upload
+        is_finite = all(map(math.isfinite, (message.x, message.y, message.z)))
         if upload is None or upload.partner != partner or upload.kind != kind:
             # The last acknowledgement was lost, or nobody asked: an answer ends the other side's waiting.
-            if message.seq + 1 == len(self._stored[kind]) and _item(message) == self._stored[kind][-1]:
+            is_last = is_finite and message.seq + 1 == len(self._stored[kind])
+            if is_last and _item(message) == self._stored[kind][-1]:
                 self._acknowledge(partner, kind, mavlink.MAV_MISSION_ACCEPTED)
             return
         if message.seq != len(upload.items):
             return  # a repetition, or one of those that overtook: the wanted one has been asked for
-        if not all(map(math.isfinite, (message.x, message.y, message.z))):
+        if not is_finite:
             self._upload = None
             self._acknowledge(partner, kind, mavlink.MAV_MISSION_INVALID)
             return

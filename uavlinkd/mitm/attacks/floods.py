@@ -202,9 +202,10 @@ class AmplificationProbe(Flood):
         """Now an initiation of ours, now something recorded, now something cut short."""
         recorded = self._recorded[way]
         key = self.surroundings.public_keys.get(way.receiver)
-        if recorded and self.shots % 4 == 1:
+        turn = self.shots // len(self.ways) % 4  # of this way: they are taken in turn too
+        if recorded and turn == 1:
             return self.chance.choice(recorded), "recorded"
-        if recorded and self.shots % 4 == 3:
+        if recorded and turn == 3:
             datagram = self.chance.choice(recorded)
             return datagram[: self.chance.randrange(len(datagram) + 1)], "recorded, cut short"
         return random_initiation(self.chance, X25519, key), "initiation"

@@ -305,7 +305,9 @@ class FromAnywhere(Timed[OriginOptions]):
 
     def origin(self) -> int | None:
         """A stranger, or None for the peer's address."""
-        is_stranger = self.options.origin == "stranger" or (self.options.origin == "both" and self.shots % 2 == 1)
+        # By turns along each way: these are taken in turn too, and there is an even number of them.
+        is_turn = self.shots // len(self.ways) % 2 == 1
+        is_stranger = self.options.origin == "stranger" or (self.options.origin == "both" and is_turn)
         return self.chance.randrange(self.options.sources) if is_stranger else None
 
 
@@ -317,7 +319,7 @@ class RawMavlink(FromAnywhere):
 
     def shoot(self, now: float) -> list[Action]:
         """The next frame, along the next way."""
-        name, frame = _COMMANDS[self.shots // 2 % len(_COMMANDS)]
+        name, frame = _COMMANDS[self.shots // (2 * len(self.ways)) % len(_COMMANDS)]
         return self.inject(frame, self.ways[self.shots % len(self.ways)], now, name, self.origin())
 
 
