@@ -33,7 +33,7 @@ class Refusing:
             raise OSError(self.error, "out of it")
         self.sent.append(datagram)
 
-    def recvfrom(self, size: int) -> tuple[bytes, tuple[str, int]]:
+    def recvfrom_into(self, buffer: memoryview) -> tuple[int, tuple[str, int]]:
         """As a socket's."""
         if self.is_out:
             self.is_out = False
