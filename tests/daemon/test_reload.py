@@ -171,7 +171,7 @@ async def test_an_endpoint_that_cannot_be_opened_refuses_the_whole_file(stage: S
     problems = await reload(a)
     assert len(problems) == 1
     assert problems[0].startswith(f"{a.config_file}: endpoint.url (three): cannot listen on {taken}: Address already")
-    assert "write another port" in problems[0]
+    assert "write another port; if it is this daemon, restart it" in problems[0]
     assert set((await a.status())["endpoints"]) == {"one"}
     await stage.program(*free)  # nobody listens there
     await program_at(stage, a, "one", into_a)

@@ -17,7 +17,7 @@ from uavlinkd.addresses import Address
 from uavlinkd.endpoints import tcp
 from uavlinkd.endpoints.sockets import BindError
 from uavlinkd.endpoints.streams import MAX_AGE_S, OUTGOING_BYTES, STALLED_S
-from uavlinkd.endpoints.tcp import CLIENT_QUIET_S, CLIENTS_PER_ENDPOINT, TcpClient, TcpServer, tcp_listener
+from uavlinkd.endpoints.tcp import CLIENT_QUIET_S, CLIENTS_PER_ENDPOINT, MAX_GAP_S, TcpClient, TcpServer, tcp_listener
 
 ANY_PORT = Address("127.0.0.1", 0)
 
@@ -104,6 +104,21 @@ async def test_each_client_is_a_port(server: TcpServer, connect: Connect) -> Non
     first.close()
     await eventually(lambda: len(server.ports) == 1)
     assert [port.name for port in server.ports] == [str(Address(*second.getsockname()))]
+
+
+async def test_a_stray_start_holds_frames_back_no_longer_than_two_seconds(
+    server: TcpServer, connect: Connect
+) -> None:
+    """Nor until the sender says more. From a serial line behind a server there may be one; what TCP repeats has time."""
+    program = connect()
+    server.on_acceptable(now=0.0)
+    server.start()
+    program.sendall(b"\xfe\xff" + frame(1))
+    await eventually(lambda: server.bytes_received == 2 + len(frame(1)))
+    server.do_housekeeping(monotonic() + MAX_GAP_S - 1.0)
+    assert recorder(server).heard == []
+    server.do_housekeeping(monotonic() + MAX_GAP_S)
+    assert recorder(server).heard == [frame(1)]
 
 
 async def test_newcomer_is_turned_away_while_all_places_are_in_use(server: TcpServer, connect: Connect) -> None:
@@ -289,8 +304,12 @@ async def test_client_waits_for_a_server_that_is_not_there_yet() -> None:
             "nobody listens there now",
         )
         assert list(client.ports) == []
-        with tcp_listener(address):
-            await eventually(lambda: len(client.ports) == 1)
+        with capture_logs() as logs:
+            with tcp_listener(address):
+                await eventually(lambda: len(client.ports) == 1)
+            tried = client.failures["ECONNREFUSED"]
+            await eventually(lambda: client.failures["ECONNREFUSED"] > tried)
+        assert logs == []  # it was open for a moment only
     finally:
         client.close()
 

@@ -112,7 +112,7 @@ CHALLENGE_INTERVAL_S = 0.25
 CHALLENGE_LIFETIME_S = 5.0
 """How long a path challenge may be answered."""
 LATE_STEP_S = 0.25
-"""Counters of the past are remembered in such steps: what is late is so by up to two of them more."""
+"""Counters of the past are remembered in such steps: what is late is so by up to one of them more."""
 DOUBT_S = 1.0
 """How long frames that came after a silence wait for the peer's word on their age, and how old that word may be."""
 DOUBT_ASK_S = 0.25

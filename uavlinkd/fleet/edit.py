@@ -63,7 +63,8 @@ def section_with_key(text: str, public_keys: Iterable[str]) -> str | None:
     except ValueError:  # no daemon takes it
         return None
     for number, each in enumerate(peers if isinstance(peers, list) else []):
-        if isinstance(each, dict) and unwanted & {each.get(key) for key in _PUBLIC if isinstance(each.get(key), str)}:
+        # As a daemon reads them: with spaces around a key it is the same key.
+        if isinstance(each, dict) and unwanted & {str(each.get(key)).strip() for key in _PUBLIC}:
             return f"peer[{number}] ({each.get('name')})"
     return None
 

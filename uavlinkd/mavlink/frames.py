@@ -168,7 +168,7 @@ class StreamSplitter:
     A stray start byte makes what follows look like a frame of up to 280 bytes, and genuine frames would wait
     until that many have come: at one heartbeat a second, past every failsafe. But a sender writes a frame in
     one go. So after a silence of `max_gap_s` inside a frame, or where the rest of it has not come within
-    `max_hold_s`, it is taken for broken: when more comes, or when :meth:`give_up` is called.
+    `max_hold_s` of the last progress, it is taken for broken: when more comes, or when :meth:`give_up` is called.
 
     `gives_up`: of a chunk that is made of false starts the rest is garbage, as of a datagram: a bound on its cost.
     """
