@@ -109,7 +109,7 @@ async def test_each_client_is_a_port(server: TcpServer, connect: Connect) -> Non
 async def test_a_stray_start_holds_frames_back_no_longer_than_two_seconds(
     server: TcpServer, connect: Connect
 ) -> None:
-    """Nor until the sender says more. From a serial line behind a server there may be one; what TCP repeats has time."""
+    """Not until the sender says more. A serial line behind a server may have one; what TCP has to repeat has time."""
     program = connect()
     server.on_acceptable(now=0.0)
     server.start()
