@@ -15,7 +15,7 @@ from uavlinkd.config.changes import compare
 from uavlinkd.core.crypto import KeyPair, Secret
 from uavlinkd.core.node import Node
 from uavlinkd.core.settings import PeerSettings
-from uavlinkd.key_change import Graces, is_by_our_previous, is_by_their_previous, link_name, pairings
+from uavlinkd.key_change import Graces, link_name, pairings
 from uavlinkd.peer_link import PeerLink
 from uavlinkd.topology import print_topology
 
@@ -60,8 +60,8 @@ def test_every_pair_of_keys_that_may_be_right_is_tried() -> None:
     assert names[0] == "b"
     assert len(set(names)) == 4
     assert {link_name(name) for name in names} == {"b"}
-    assert [is_by_our_previous(name) for name in names] == [False, False, True, True]
-    assert [is_by_their_previous(name) for name in names] == [False, True, False, True]
+    assert [each.by_our_previous for each in found] == [False, False, True, True]
+    assert [each.by_their_previous for each in found] == [False, True, False, True]
     assert len(pairings(Peer(PeerSettings("b", now), ()), has_previous_key=False)) == 1
 
 
@@ -76,7 +76,7 @@ def test_the_end_of_their_change_leaves_ours() -> None:
     link.change(replace(config, previous_public_key=None), 1.0)
     assert list(node.peers) == ["b", "b (our previous key)"]
     assert link.accepts_previous_keys
-    link.give_up_previous(2.0)
+    link.give_up_ours(2.0)
     assert list(node.peers) == ["b"]
 
 

@@ -8,7 +8,11 @@ from dataclasses import dataclass
 from ipaddress import IPv4Address, IPv6Address, ip_address
 
 DEFAULT_PORT = 5790
-"""The port that our examples listen on. A convention: the port is always written."""
+"""Where daemons listen for each other. A convention: in a configuration the port is always written."""
+IPV4_UDP_BYTES = 20 + 8
+"""Headers around a datagram on the wire (RFC 791, RFC 768)."""
+IPV6_UDP_BYTES = 40 + 8
+"""The same over IPv6 (RFC 8200)."""
 
 _MAX_PORT = 65535
 _PORT = re.compile(r"[0-9]{1,5}")

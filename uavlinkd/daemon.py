@@ -23,13 +23,13 @@ from uavlinkd.config.changes import compare
 from uavlinkd.config.reader import read_config
 from uavlinkd.control import ControlServer
 from uavlinkd.core import outputs as o
+from uavlinkd.core.constants import NEVER
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Output
-from uavlinkd.core.peer import NEVER
 from uavlinkd.endpoints.opening import open_first, open_new
 from uavlinkd.endpoints.ports import Endpoint, LocalPort
 from uavlinkd.event_log import EventLog
-from uavlinkd.key_change import Graces, is_by_our_previous, link_name
+from uavlinkd.key_change import Graces, link_name
 from uavlinkd.log import DropSummary
 from uavlinkd.mavlink.frames import Frame, split_payload
 from uavlinkd.mavlink.policy import Policy
@@ -211,7 +211,7 @@ class Daemon:
         self.config = config
         if config.previous_private_key is None:
             for link in self.links.values():
-                link.give_up_previous(monotonic(), is_by_our_previous)
+                link.give_up_ours(monotonic())
             self.node.forget_previous_key()
         for name in changes.removed_peers:
             self._remove_peer(name)

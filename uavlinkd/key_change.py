@@ -21,7 +21,13 @@ class KeyPairing(NamedTuple):
     """A peer of the core: with which key of theirs, and by which of ours it knows us."""
 
     settings: PeerSettings
+    by_their_previous: bool = False
     by_our_previous: bool = False
+
+    @property
+    def previous_key(self) -> tuple[str, bytes]:
+        """The peer and the previous key that this pair stands or falls with: nothing where that is ours."""
+        return link_name(self.settings.name), b"" if self.by_our_previous else self.settings.public_key
 
 
 def pairings(peer: Peer, has_previous_key: bool) -> list[KeyPairing]:
@@ -29,12 +35,12 @@ def pairings(peer: Peer, has_previous_key: bool) -> list[KeyPairing]:
     current = peer.settings
     found = [KeyPairing(current)]
     if peer.previous_public_key is not None:
-        found.append(KeyPairing(replace(current, name=f"{peer.name} {_THEIRS}", public_key=peer.previous_public_key)))
+        theirs = replace(current, name=f"{peer.name} (previous key)", public_key=peer.previous_public_key)
+        found.append(KeyPairing(theirs, by_their_previous=True))
     if has_previous_key:
-        found += [
-            KeyPairing(replace(each.settings, name=f"{each.settings.name} {_OURS}"), by_our_previous=True)
-            for each in found
-        ]
+        for settings, by_their_previous, _ in tuple(found):
+            ours = replace(settings, name=f"{settings.name} (our previous key)")
+            found.append(KeyPairing(ours, by_their_previous, by_our_previous=True))
     return found
 
 
@@ -45,15 +51,15 @@ class Graces:
     """
 
     def __init__(self) -> None:
-        self._until: dict[tuple[str, bytes], float] = {}  # by peer, and its previous key, or nothing for ours
+        self._until: dict[tuple[str, bytes], float] = {}  # by KeyPairing.previous_key
 
-    def until(self, settings: PeerSettings, now: float, grace_s: float) -> float:
+    def until(self, pairing: KeyPairing, now: float, grace_s: float) -> float:
         """When a pair's grace ends, which begins at the first time that it is asked for."""
-        return self._until.setdefault(_whose(settings), now + grace_s)
+        return self._until.setdefault(pairing.previous_key, now + grace_s)
 
-    def end(self, settings: PeerSettings) -> None:
+    def end(self, pairing: KeyPairing) -> None:
         """The pair was given up."""
-        self._until[_whose(settings)] = -inf
+        self._until[pairing.previous_key] = -inf
 
     def follow(self, before: Iterable[Peer], after: Iterable[Peer]) -> None:
         """A new configuration. Previous keys that were taken out of it are good anew where they are put in again."""
@@ -61,24 +67,6 @@ class Graces:
         self._until = {each: until for each, until in self._until.items() if each[1] not in keys}
 
 
-_THEIRS, _OURS = "(previous key)", "(our previous key)"
-
-
-def is_by_our_previous(core_name: str) -> bool:
-    """Whether that peer of the core knows us by our previous key."""
-    return core_name.endswith(_OURS)
-
-
-def is_by_their_previous(core_name: str) -> bool:
-    """Whether we know that peer of the core by its previous key."""
-    return f" {_THEIRS}" in core_name
-
-
-def _whose(settings: PeerSettings) -> tuple[str, bytes]:
-    """Which previous key a pair stands or falls with."""
-    return link_name(settings.name), b"" if is_by_our_previous(settings.name) else settings.public_key
-
-
 def link_name(core_name: str) -> str:
-    """The peer as the configuration names it: names have no spaces."""
+    """The peer as the configuration names it, of a pair's name: names in a configuration have no spaces."""
     return core_name.partition(" ")[0]

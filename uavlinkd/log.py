@@ -17,6 +17,7 @@ import structlog
 from structlog.typing import EventDict, FilteringBoundLogger, Processor
 
 from uavlinkd.clock import monotonic
+from uavlinkd.core.constants import NEVER
 from uavlinkd.core.drops import DropReason
 from uavlinkd.endpoints.ports import failure_name
 from uavlinkd.mavlink.dialect import name_of
@@ -32,8 +33,8 @@ MEANINGS: dict[str, str] = {
     DropReason.UNEXPECTED_RESPONSE: "responses to no handshake of ours",
     DropReason.BAD_MAC1: "handshake messages altered on the way, or from someone without our public key",
     DropReason.COOKIE_REQUIRED: "more handshakes than are answered at once: senders must prove their address",
-    DropReason.RATE_LIMITED: "more handshakes from one source than its share",
-    DropReason.REPLAYED_INITIATION: "initiations that were answered before: somebody replays them",
+    DropReason.RATE_LIMITED: "more handshakes than one source's share, or than all sources together are allowed",
+    DropReason.REPLAYED_INITIATION: "initiations that were read before: somebody replays them",
     DropReason.INVALID_KEY_SHARE: "handshakes with a public value that no honest peer sends",
     DropReason.BAD_HANDSHAKE: "handshakes altered on the way, or made with another key or PSK than configured here",
     DropReason.UNKNOWN_PEER: "initiations with a key that is not configured here",
@@ -163,7 +164,7 @@ class DropSummary:
         self._waiting: Counter[tuple[str, str, str]] = Counter()
         self._quiet_until: dict[tuple[str, str, str], float] = {}
         self._last: dict[tuple[str, str, str], str] = {}
-        self.next_flush = float("inf")
+        self.next_flush = NEVER
         """When :meth:`flush` has something to write; infinity for never."""
 
     def add(self, event: str, reason: str, where: str, amount: int, now: float, last: str = "") -> None:
@@ -188,7 +189,7 @@ class DropSummary:
         """Write what has gathered since its last line, where that is long enough ago."""
         for key in [each for each in self._waiting if now >= self._quiet_until[each]]:
             self._write(key, now)
-        self.next_flush = min((self._quiet_until[key] for key in self._waiting), default=float("inf"))
+        self.next_flush = min((self._quiet_until[key] for key in self._waiting), default=NEVER)
 
     def _write(self, key: tuple[str, str, str], now: float) -> None:
         event, reason, where = key

@@ -4,21 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 
+from uavlinkd.addresses import IPV4_UDP_BYTES, IPV6_UDP_BYTES
 from uavlinkd.config import Peer as PeerConfig
+from uavlinkd.core.constants import NEVER
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Output, Path, Transmit
-from uavlinkd.core.peer import NEVER, Peer
-from uavlinkd.key_change import Graces, is_by_their_previous, pairings
+from uavlinkd.core.peer import Peer
+from uavlinkd.key_change import Graces, KeyPairing, pairings
 from uavlinkd.mavlink.coalescing import Coalescer, make_egress
 from uavlinkd.mavlink.egress import Egress, EnvelopeShape
 from uavlinkd.mavlink.frames import Frame, SplitCounters
 from uavlinkd.mavlink.radio_status import LinkFigures, worst
 from uavlinkd.recorder import TO_PEER, Recorder
 
-IPV4_UDP_BYTES = 20 + 8
-"""Headers around a datagram on the wire (RFC 791, RFC 768)."""
-IPV6_UDP_BYTES = 40 + 8
-"""The same for IPv6 (RFC 8200)."""
 UNANSWERED_S = 5.0
 """A peer that is called in vain for this long is worth a line in the log."""
 
@@ -42,7 +40,7 @@ class PeerLink:
         self._perform = perform
         self._recorder = recorder
         self._names = [config.name]  # in the core, the one of the current keys first
-        self._until: dict[str, float] = {}  # of those by a previous key
+        self._previous: dict[str, tuple[KeyPairing, float]] = {}  # the others, and until when they are good
         self._charged: dict[str, tuple[int, int]] = {}  # datagrams and bytes that the budget has been told of
         self._called_since = now
         self._is_told = False
@@ -58,7 +56,7 @@ class PeerLink:
     @property
     def peer(self) -> Peer:
         """The core's side of it: by the current keys, or by those before while only they work."""
-        if len(self._names) > 1:
+        if self._previous:
             for name in self._names:
                 if self._node.peers[name].is_up:
                     return self._node.peers[name]
@@ -67,42 +65,53 @@ class PeerLink:
     @property
     def accepts_previous_keys(self) -> bool:
         """Whether a key is changing, and the new one not yet confirmed."""
-        return len(self._names) > 1
+        return bool(self._previous)
 
     def join(self, now: float, graces: Graces, grace_s: float, *, has_previous_key: bool) -> None:
         """Have the core accept the peer; by previous keys too, for what is left of ``grace_s``."""
-        for settings, by_our_previous in pairings(self.config, has_previous_key):
-            if settings.name != self.name:
-                until = graces.until(settings, now, grace_s)
+        for pairing in pairings(self.config, has_previous_key):
+            name = pairing.settings.name
+            if name != self.name:
+                until = graces.until(pairing, now, grace_s)
                 if now >= until:
                     continue
-                self._names.append(settings.name)
-                self._until[settings.name] = until
-            self._node.add_peer(settings, now, by_previous_key=by_our_previous)
+                self._names.append(name)
+                self._previous[name] = pairing, until
+            self._node.add_peer(pairing.settings, now, by_previous_key=pairing.by_our_previous)
 
     def leave(self, now: float) -> None:
         """Cut the peer off at once."""
         for name in self._names:
             self._perform(self._node.remove_peer(name, now))
 
-    def give_up_previous(self, now: float, which: Callable[[str], bool] = bool) -> bool:
-        """Accept previous keys no longer, all of them or those of ``which``; whether there were any."""
-        gone = [name for name in self._names[1:] if which(name)]
-        self._names = [name for name in self._names if name not in gone]
-        for name in gone:
-            self._perform(self._node.remove_peer(name, now))
-        return bool(gone)
+    def give_up_theirs(self, now: float) -> None:
+        """Accept the peer's previous key no longer."""
+        self._give_up([each for each, _ in self._previous.values() if each.by_their_previous], now)
+
+    def give_up_ours(self, now: float) -> None:
+        """Accept our own previous key no longer."""
+        self._give_up([each for each, _ in self._previous.values() if each.by_our_previous], now)
 
     def end_graces(self, now: float, graces: Graces) -> bool:
         """Give up the previous keys that were accepted for long enough; whether there were any."""
-        over = [name for name in self._names[1:] if now >= self._until[name]]
-        return bool(over) and self.confirm(now, graces, over.__contains__)
+        return self._end([each for each, until in self._previous.values() if now >= until], now, graces)
 
-    def confirm(self, now: float, graces: Graces, which: Callable[[str], bool] = bool) -> bool:
-        """Give up previous keys, for as long as the daemon runs; whether there were any."""
-        for name in filter(which, self._names[1:]):
-            graces.end(self._node.peers[name].settings)
-        return self.give_up_previous(now, which)
+    def confirm(self, now: float, graces: Graces) -> bool:
+        """The peer has the current keys: give up all previous ones; whether there were any."""
+        return self._end([each for each, _ in self._previous.values()], now, graces)
+
+    def _end(self, gone: Sequence[KeyPairing], now: float, graces: Graces) -> bool:
+        """Give these up for as long as the daemon runs: no reload brings them back."""
+        for pairing in gone:
+            graces.end(pairing)
+        self._give_up(gone, now)
+        return bool(gone)
+
+    def _give_up(self, gone: Sequence[KeyPairing], now: float) -> None:
+        for name in [each.settings.name for each in gone]:
+            self._names.remove(name)
+            del self._previous[name]
+            self._perform(self._node.remove_peer(name, now))
 
     def set_paths(self, paths: Sequence[Path], now: float) -> None:
         """Where to call it."""
@@ -119,7 +128,7 @@ class PeerLink:
         if config.addresses != self.config.addresses:
             self.set_paths((), now)  # its names may have no address now: it is not called at the old ones
         if config.previous_public_key is None:
-            self.give_up_previous(now, is_by_their_previous)
+            self.give_up_theirs(now)
         self.config = config
         self.on_session()
 

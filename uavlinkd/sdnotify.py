@@ -11,7 +11,8 @@ from collections import deque
 from collections.abc import Mapping
 from time import monotonic
 
-NEVER = float("inf")
+from uavlinkd.core.constants import NEVER
+
 UNSENT_MESSAGES = 16
 """Kept for a service manager that does not take them now; then the oldest are given up."""
 

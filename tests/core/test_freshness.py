@@ -6,7 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from uavlinkd.core import constants as c
-from uavlinkd.core.freshness import NEVER, Doubt, Lately
+from uavlinkd.core.constants import NEVER
+from uavlinkd.core.freshness import Doubt, Lately
 
 GAPS = st.lists(st.sampled_from((0.0, 0.01, 0.1, 0.24, 0.25, 0.3, 1.0, 1.9, 2.0, 2.3, 9.0)), max_size=60)
 

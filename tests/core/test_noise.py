@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from tests.core.harness import flipped, state_of
-from uavlinkd.core import noise
+from uavlinkd.core import noise, wire
 from uavlinkd.core.crypto import AeadKey, Entropy, KeyPair, Secret
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.noise import HandshakeState
@@ -150,8 +150,8 @@ def test_both_ends_agree_after_every_message(suite: Suite) -> None:
 
     share = suite.share_bytes + 16 if suite.has_group else 0
     ciphertext = suite.ciphertext_bytes + 16 if suite.has_group else 0
-    assert len(message_1) == noise.INITIATION_OVERHEAD + share + len(PAYLOAD_1)
-    assert len(message_2) == noise.RESPONSE_OVERHEAD + ciphertext + len(PAYLOAD_2)
+    assert len(message_1) == wire.NOISE_1_BYTES + share + len(PAYLOAD_1)
+    assert len(message_2) == wire.NOISE_2_BYTES + ciphertext + len(PAYLOAD_2)
 
 
 @pytest.mark.parametrize("suite", KINDS)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 
@@ -45,7 +46,9 @@ DOCUMENTED = {
     if re.fullmatch(r"`[A-Z_]+`", cells[0])
 }
 DEFINED = {
-    name: value for name, value in vars(constants).items() if name.isupper() and isinstance(value, int | float)
+    name: value
+    for name, value in vars(constants).items()
+    if name.isupper() and isinstance(value, int | float) and math.isfinite(value)
 }
 
 

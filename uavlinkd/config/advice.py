@@ -6,8 +6,9 @@ from collections.abc import Callable, Iterator, Sequence
 from itertools import combinations
 from math import ceil
 
-from uavlinkd.addresses import Address
+from uavlinkd.addresses import IPV4_UDP_BYTES, Address
 from uavlinkd.config.model import Endpoint, Peer, Routing
+from uavlinkd.core import constants as c
 from uavlinkd.core.settings import Link
 from uavlinkd.core.wire import initiation_bytes, response_bytes
 from uavlinkd.endpoints.url import Kind, NetworkUrl
@@ -20,8 +21,6 @@ ETHERNET_PAYLOAD = 1500 - 40 - 8
 """Over IPv6; IPv4 has 20 bytes more."""
 _SHORT_TAG_BYTES = 8
 _HASH_BLOCK_BITS = 512
-_UDP_BYTES = 28
-"""IPv4's and UDP's headers: a budget counts them too."""
 
 
 def advice(
@@ -171,7 +170,8 @@ def _lengths(peers: Sequence[Peer]) -> Iterator[str]:
     if split:
         yield (
             f"envelopes over {ETHERNET_PAYLOAD:,} bytes with {split}: most networks split them, and one lost part"
-            " loses all; unless the path is known to take them, write max_envelope_bytes = 1232"
+            f" loses all; unless the path is known to take them, write"
+            f" max_envelope_bytes = {c.DEFAULT_ENVELOPE_LIMIT}"
         )
     for suite in dict.fromkeys(suite for peer in peers for suite in peer.settings.link.suites):
         size = initiation_bytes(suite)
@@ -191,7 +191,7 @@ def _slow(peers: Sequence[Peer]) -> Iterator[str]:
         link, budget = peer.settings.link, peer.egress.budget_bits_s
         if not budget:
             continue
-        size = max(initiation_bytes(link.suites[0]), response_bytes(link.suites[0])) + _UDP_BYTES
+        size = max(initiation_bytes(link.suites[0]), response_bytes(link.suites[0])) + IPV4_UDP_BYTES
         if size * 8 / budget > link.timers.retry_max_s:
             yield (
                 f"a handshake with {link.suites[0].name} takes {size * 8 / budget:.1f} s at {budget:,} bits/s"

@@ -58,7 +58,7 @@ class Caller:
         self._entropy = entropy
         self._mac_keys = MacKeys(settings.public_key)
         self._attempt = 0
-        self._called_at = -float("inf")
+        self._called_at = -c.NEVER
         self._taken_cookies: dict[Path, tuple[bytes, float]] = {}  # and until when; the oldest first
 
     def candidates(self, path: Path | None) -> list[Path]:
@@ -139,7 +139,7 @@ class Caller:
 
     def next_expiry(self) -> float:
         """When :meth:`expire` has something to do."""
-        return min((each.expires_at for each in self.pending.values()), default=float("inf"))
+        return min((each.expires_at for each in self.pending.values()), default=c.NEVER)
 
     def _schedule(self, candidates: int, now: float) -> None:
         timers = self._settings.link.timers

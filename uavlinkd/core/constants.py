@@ -6,6 +6,11 @@ Durations are seconds on a monotonic clock. Timers that a configuration may chan
 
 from __future__ import annotations
 
+import math
+
+NEVER = math.inf
+"""A moment that does not come."""
+
 # Specification constants. Changing one makes another protocol.
 
 PROTOCOL_NAME = b"uavlink/1"
@@ -18,7 +23,9 @@ AEAD_TAG_BYTES = 16
 MAC_BYTES = 16
 """mac1, mac2 and a cookie."""
 COOKIE_NONCE_BYTES = 16
+"""Drawn anew for each cookie reply: its key is derived from it, so it must not repeat."""
 PATH_TOKEN_BYTES = 8
+"""Of a path challenge, which a guess hits once in 2^64."""
 
 SESSION_ENVELOPE_LIMIT = 2**32
 """Envelopes that one session's keys may seal, each way: the counter is 32 bits and never wraps."""
@@ -76,6 +83,7 @@ ANSWERS_WHILE_UP_PER_S = 2.0
 """The same to one with which a link is up: on a slow radio they take room from its frames, with x25519 2 kbit/s.
 Enough for new keys every two seconds; who restarts and finds it used up by replays is given a cookie first."""
 ANSWERS_BURST = 8
+"""So many at once, after a quiet while."""
 PENDING_PER_PEER = 8
 """Own initiations that may still be answered, so a slow path's response finds its initiation."""
 USABLE_PER_PEER = 3
@@ -88,9 +96,11 @@ each: with 200 peers 40 MB, and not before 34 hours of flight."""
 INITIATIONS_PER_S = 50.0
 """Messages a second that may reach a key exchange without a cookie. Beyond that we are under load."""
 INITIATIONS_BURST = 50
+"""So many at once, after a quiet while."""
 COOKIED_PER_SOURCE_PER_S = 10.0
 """Under load: initiations a second from one source that holds a cookie."""
 COOKIED_PER_SOURCE_BURST = 10
+"""So many at once, after a quiet while."""
 COOKIED_PER_S = 200
 """The same from all sources together: whoever owns many addresses still costs a bounded share of a core."""
 SOURCES_TRACKED = 1024

@@ -1,6 +1,7 @@
 """Primitives, typed: the only module that imports ``cryptography``. All of them are OpenSSL's underneath.
 
-A secret here does not print. What does not authenticate raises :class:`Drop` with its reason.
+A secret here does not print. A public value that is no good raises :class:`Drop`; where a tag does not verify there
+is no plaintext, and the caller names the reason.
 """
 
 from __future__ import annotations

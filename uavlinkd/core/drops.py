@@ -14,7 +14,7 @@ class DropReason(StrEnum):
     RAW_MAVLINK = "raw_mavlink"
     """A bare MAVLink frame at the peers' port."""
 
-    # Handshake, in the order of the checks.
+    # Handshake. The order of the checks is in README.md, section 13.
     UNEXPECTED_RESPONSE = "unexpected_response"
     """A response to no initiation of ours that still waits."""
     BAD_MAC1 = "bad_mac1"
@@ -22,9 +22,9 @@ class DropReason(StrEnum):
     COOKIE_REQUIRED = "cookie_required"
     """Under load, or one peer's initiations come too fast; without a valid cookie: one was sent back."""
     RATE_LIMITED = "rate_limited"
-    """The same with a cookie, from a source that sends more than its share."""
+    """The same with a cookie: this source has had its share, or all sources together have had theirs."""
     REPLAYED_INITIATION = "replayed_initiation"
-    """An initiation that was read before."""
+    """An initiation that was read before, whether it was answered or not."""
     INVALID_KEY_SHARE = "invalid_key_share"
     """A public value outside its group, or one that gives a secret anybody knows."""
     BAD_HANDSHAKE = "bad_handshake"
@@ -44,7 +44,7 @@ class DropReason(StrEnum):
     BAD_COOKIE = "bad_cookie"
     """A cookie that does not open."""
 
-    # Envelopes, in the order of the checks.
+    # Envelopes.
     UNKNOWN_INDEX = "unknown_index"
     """An envelope for a session that is not here: this side restarted, or it was never ours."""
     LATE = "late"
@@ -76,7 +76,7 @@ class DropReason(StrEnum):
 
 
 class Drop(Exception):  # noqa: N818  not an error of ours: the ordinary fate of a bad datagram
-    """Raised inside the core where a datagram turns out to be bad; caught in one place, in ``Node``."""
+    """Raised inside the core where a datagram turns out to be bad. ``Node.receive`` counts it and raises nothing."""
 
     def __init__(self, reason: DropReason, detail: str = "") -> None:
         super().__init__(reason)

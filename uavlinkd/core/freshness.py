@@ -10,8 +10,7 @@ from __future__ import annotations
 from collections import deque
 
 from uavlinkd.core import constants as c
-
-NEVER = float("inf")
+from uavlinkd.core.constants import NEVER
 
 
 class Lately:

@@ -1,7 +1,7 @@
 """The two handshake messages: the Noise messages, the headers in front of them and what is sealed inside.
 
 Functions without state: each takes what it needs and returns what follows. Who may do this when, and what it
-changes, is ``node.py`` and ``peer.py``.
+changes, is in ``node.py``, ``peer.py`` and ``caller.py``.
 """
 
 from __future__ import annotations

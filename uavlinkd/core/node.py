@@ -14,13 +14,14 @@ from collections.abc import Iterable, Sequence
 from uavlinkd.core import constants as c
 from uavlinkd.core import handshake, wire
 from uavlinkd.core.caller import Pending
+from uavlinkd.core.constants import NEVER
 from uavlinkd.core.cookie import CookieJar, MacKeys
 from uavlinkd.core.crypto import Entropy, KeyPair, Secret
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.indices import Indices
 from uavlinkd.core.limits import SourceLimiter, TokenBucket, source_of
 from uavlinkd.core.outputs import Dropped, Output, Path, Transmit
-from uavlinkd.core.peer import NEVER, Peer
+from uavlinkd.core.peer import Peer
 from uavlinkd.core.session import Session
 from uavlinkd.core.settings import PeerSettings
 
@@ -74,16 +75,18 @@ class Node:
         which, so a peer is added once for each pair of keys that may be right, by different names.
 
         Raises:
-            ValueError: for a name or pair of keys that is there already, a key of ours, or one that we do not have.
+            ValueError: the name or the pair of keys is there already, the peer's key is one of ours, or
+                ``by_previous_key`` without a previous key.
         """
-        own = [self._identity, *([self._previous.identity] if self._previous else [])]
-        identity = own[by_previous_key] if by_previous_key < len(own) else None
-        if identity is None:
-            raise ValueError(f"peer {settings.name} cannot know a previous key: there is none")
+        identity, previous = self._identity, None if self._previous is None else self._previous.identity
+        if by_previous_key:
+            if previous is None:
+                raise ValueError(f"peer {settings.name} cannot know a previous key: there is none")
+            identity = previous
         keys = identity.public, settings.public_key
         if settings.name in self.peers or keys in self._by_keys:
             raise ValueError(f"peer {settings.name} is there already")
-        if settings.public_key in [each.public for each in own]:
+        if settings.public_key in (self.public_key, None if previous is None else previous.public):
             raise ValueError(f"peer {settings.name} has this daemon's own key")
         peer = Peer(settings, identity, self._indices, self._entropy, now)
         self.peers[settings.name] = self._by_keys[keys] = peer

@@ -51,6 +51,7 @@ class Pattern:
         return _PSK in self.initiation + self.response
 
 
+# The protocol uses the last two. The others are in the published test vectors of Noise.
 IK = Pattern("IK", (_E, _ES, _S, _SS), (_E, _EE, _SE))
 IK_PSK1 = Pattern("IKpsk1", (_E, _ES, _S, _SS, _PSK), (_E, _EE, _SE))
 IK_PSK2 = Pattern("IKpsk2", (_E, _ES, _S, _SS), (_E, _EE, _SE, _PSK))
@@ -58,11 +59,6 @@ IK_HFS_PSK2 = Pattern("IKhfs+psk2", (_E, _ES, _E1, _S, _SS), (_E, _EE, _EKEM1, _
 
 NO_PSK = Secret(bytes(KEY_BYTES))
 """Where a pair shares no PSK."""
-
-INITIATION_OVERHEAD = KEY_BYTES + KEY_BYTES + AEAD_TAG_BYTES + AEAD_TAG_BYTES
-"""Bytes of message 1 beside its payload: e, sealed s, the payload's tag. A group adds its share and a tag."""
-RESPONSE_OVERHEAD = KEY_BYTES + AEAD_TAG_BYTES
-"""Bytes of message 2 beside its payload: e, the payload's tag. A group adds its ciphertext and a tag."""
 
 
 @dataclass(frozen=True, slots=True, repr=False)

@@ -6,11 +6,10 @@ from dataclasses import dataclass
 
 from uavlinkd.core import constants as c
 from uavlinkd.core import wire
+from uavlinkd.core.constants import NEVER
 from uavlinkd.core.crypto import Entropy, equal
 from uavlinkd.core.outputs import Path
 from uavlinkd.core.traffic import Traffic
-
-NEVER = float("inf")
 
 
 @dataclass(frozen=True, slots=True)

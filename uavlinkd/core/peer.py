@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from uavlinkd.core import constants as c
 from uavlinkd.core import handshake, wire
 from uavlinkd.core.caller import Caller, Pending
+from uavlinkd.core.constants import NEVER
 from uavlinkd.core.cookie import mac1_of
 from uavlinkd.core.crypto import Entropy, KeyPair
 from uavlinkd.core.drops import Drop, DropReason
@@ -32,7 +33,6 @@ from uavlinkd.core.sessions import Sessions, Unconfirmed
 from uavlinkd.core.settings import PeerSettings
 from uavlinkd.core.traffic import Traffic
 
-NEVER = float("inf")
 _CHALLENGED = bytes((wire.PATH_CHALLENGE,))  # gets an answer: with a question beside it, more would go back than came
 
 

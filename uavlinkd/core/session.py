@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING, Protocol
 
 from uavlinkd.core import constants as c
 from uavlinkd.core import wire
+from uavlinkd.core.constants import NEVER
 from uavlinkd.core.crypto import AeadKey, MacKey, Secret, equal, hkdf_expand
 from uavlinkd.core.drops import Drop, DropReason
-from uavlinkd.core.freshness import NEVER, Doubt, Lately
+from uavlinkd.core.freshness import Doubt, Lately
 from uavlinkd.core.handshake import Keys
 from uavlinkd.core.replay import ReplayWindow
 from uavlinkd.core.suites import Suite

@@ -114,7 +114,7 @@ class Sessions:
         """When :meth:`expire` has something to do."""
         moments = [each.reject_at for each in self.confirmed]
         moments += [each.expires_at for each in self.unconfirmed.values()]
-        return min(moments, default=float("inf"))
+        return min(moments, default=c.NEVER)
 
     def _rank(self, session: Session) -> tuple[int, bool, float]:
         # The age decides only where an end restarted before its session was known to count, or lies.

@@ -25,8 +25,10 @@ _LONG_HEADER = struct.Struct(">BHI")
 SHORT_HEADER_BYTES = _SHORT_HEADER.size
 LONG_HEADER_BYTES = _LONG_HEADER.size
 
-_NOISE_1_BYTES = c.KEY_BYTES + (c.KEY_BYTES + c.AEAD_TAG_BYTES) + c.AEAD_TAG_BYTES
-_NOISE_2_BYTES = c.KEY_BYTES + c.AEAD_TAG_BYTES
+NOISE_1_BYTES = c.KEY_BYTES + (c.KEY_BYTES + c.AEAD_TAG_BYTES) + c.AEAD_TAG_BYTES
+"""The first Noise message without payload: e, sealed s, the payload's tag. A group adds its share and a tag."""
+NOISE_2_BYTES = c.KEY_BYTES + c.AEAD_TAG_BYTES
+"""The second: e, the payload's tag. A group adds its ciphertext and a tag."""
 
 
 # Parameters and handshake payloads.
@@ -103,14 +105,14 @@ def initiation_bytes(suite: Suite) -> int:
     """Length of an initiation of this suite."""
     share = suite.share_bytes + c.AEAD_TAG_BYTES if suite.has_group else 0
     payload = _INITIATION_HEADER.size - 1 + Parameters.SIZE
-    return _INITIATION_HEADER.size + _NOISE_1_BYTES + share + payload + MACS_BYTES
+    return _INITIATION_HEADER.size + NOISE_1_BYTES + share + payload + MACS_BYTES
 
 
 def response_bytes(suite: Suite) -> int:
     """Length of a response of this suite: never more than its initiation's."""
     ciphertext = suite.ciphertext_bytes + c.AEAD_TAG_BYTES if suite.has_group else 0
     payload = _RESPONSE_HEADER.size - 1 + Parameters.SIZE
-    return _RESPONSE_HEADER.size + _NOISE_2_BYTES + ciphertext + payload + MACS_BYTES
+    return _RESPONSE_HEADER.size + NOISE_2_BYTES + ciphertext + payload + MACS_BYTES
 
 
 def initiation_header(suite: Suite, sender_index: int) -> bytes:
@@ -230,7 +232,8 @@ def parse_cookie_reply(datagram: bytes) -> CookieReply:
     if len(datagram) != COOKIE_BYTES or datagram[1] != 0:
         raise Drop(DropReason.MALFORMED)
     _, _, receiver_index = _INITIATION_HEADER.unpack_from(datagram)
-    return CookieReply(receiver_index, datagram[4:20], datagram[20:])
+    sealed_at = _INITIATION_HEADER.size + c.COOKIE_NONCE_BYTES
+    return CookieReply(receiver_index, datagram[_INITIATION_HEADER.size : sealed_at], datagram[sealed_at:])
 
 
 # Envelopes.
@@ -349,21 +352,20 @@ def parse_control(payload: bytes) -> Control:
     Raises:
         Drop: ``BAD_CONTROL``.
     """
-    match payload[0], len(payload):
-        case 1, 13:
-            _, token, received, expected = _ECHO_REQUEST.unpack(payload)
-            return Echo(False, token, received, expected)
-        case 2, 17:
-            _, token, received, expected, fresh = _ECHO_REPLY.unpack(payload)
-            return Echo(True, token, received, expected, fresh)
-        case 3, 11 if payload.endswith(_CHALLENGE_PADDING):
-            return PathChallenge(payload[1:9])
-        case 4, 9:
-            return PathResponse(payload[1:])
-        case 5, 1:
-            return Close()
-        case _:
-            raise Drop(DropReason.BAD_CONTROL)
+    kind, size = payload[0], len(payload)
+    if kind == ECHO_REQUEST and size == _ECHO_REQUEST.size:
+        _, token, received, expected = _ECHO_REQUEST.unpack(payload)
+        return Echo(False, token, received, expected)
+    if kind == ECHO_REPLY and size == _ECHO_REPLY.size:
+        _, token, received, expected, fresh = _ECHO_REPLY.unpack(payload)
+        return Echo(True, token, received, expected, fresh)
+    if kind == PATH_CHALLENGE and size == CHALLENGE_BYTES and payload.endswith(_CHALLENGE_PADDING):
+        return PathChallenge(payload[1 : 1 + c.PATH_TOKEN_BYTES])
+    if kind == PATH_RESPONSE and size == 1 + c.PATH_TOKEN_BYTES:
+        return PathResponse(payload[1:])
+    if kind == CLOSE and size == 1:
+        return Close()
+    raise Drop(DropReason.BAD_CONTROL)
 
 
 def claimed_receiver_index(datagram: bytes) -> int:

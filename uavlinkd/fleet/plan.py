@@ -6,10 +6,8 @@ from dataclasses import dataclass
 from ipaddress import IPv4Network, IPv6Network, ip_network
 from typing import Protocol
 
-from uavlinkd.addresses import Address, AddressError, parse_address
+from uavlinkd.addresses import DEFAULT_PORT, Address, AddressError, parse_address
 
-DEFAULT_PORT = 5790
-"""Where daemons listen for each other."""
 DEFAULT_PLAN = "10.13.0.0/24"
 SYSTEM_IDS = range(1, 256)
 """MAVLink's system ids."""
