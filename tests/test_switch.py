@@ -142,6 +142,20 @@ def test_what_depends_on_the_frame_is_asked_each_time(stage: Stage) -> None:
     assert (stage.withheld, stage.refused) == ([("c", Refusal.RATE_LIMITED)] * 8, [])
 
 
+def test_programs_of_an_endpoint_each_have_the_rate(stage: Stage) -> None:
+    """One policy for both: who is asked second, or connects again, is told as much as the first."""
+    shared = policy(rate_out={"ATTITUDE": 1})
+    for each in (stage.b, stage.c):
+        stage.switch.set_policy(each.port, shared)
+    for second in range(30):
+        stage.switch.forward(stage.a.port, [attitude(second)], float(second))
+    assert stage.told() == (0, 30, 30)
+    stage.switch.remove(stage.b.port)
+    stage.switch.add(stage.b.port, shared)
+    stage.switch.forward(stage.a.port, [attitude(number) for number in range(31, 41)], 29.0)
+    assert stage.told() == (0, 2, 1)
+
+
 def test_a_target_is_followed_to_where_it_is_heard(stage: Stage) -> None:
     """Flooded while unknown; then where it was heard; to both once heard at two; and no more where it is silent."""
     stage.switch.forward(stage.a.port, [request(1, target=2)], 0.0)

@@ -8,6 +8,7 @@ then a frame costs a look-up, and the question whether it came by another way al
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import count
 from typing import Protocol
 
 from uavlinkd.endpoints.ports import LocalPort
@@ -36,12 +37,15 @@ class Switch:
         self.router = router
         self._refused = refused
         self._policies: dict[Port, Policy] = {}
+        self._numbers: dict[Port, int] = {}  # never used again, for what a policy remembers of each
+        self._unused = count()
         self._flows: dict[Port, dict[Header, tuple[Port, ...]]] = {}
         self._edition = -1  # of the router's answers in the flows
 
     def add(self, port: Port, policy: Policy) -> None:
         """From now on frames may come from and go to this port, as far as the policy lets them."""
         self._policies[port] = policy
+        self._numbers[port] = next(self._unused)
         self._flows[port] = {}
         self.router.add_port(port, is_peer=isinstance(port, PeerLink))
 
@@ -54,6 +58,7 @@ class Switch:
     def remove(self, port: Port) -> None:
         """Forget the port."""
         del self._policies[port]
+        del self._numbers[port]
         del self._flows[port]
         self.router.remove_port(port)
 
@@ -94,7 +99,7 @@ class Switch:
         always = bool(routed) and incoming.always_passes(frame.header)
         for port in routed:
             outgoing = self._policies[port].outgoing
-            refusal = outgoing.check(frame, now)
+            refusal = outgoing.check(frame, now, self._numbers[port])
             if refusal is not None:
                 self._refused(_owner(port), frame.header, refusal, now, to_them=True)
             else:

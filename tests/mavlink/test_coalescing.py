@@ -86,6 +86,15 @@ def test_nothing_stale_is_sent(taken_at: float, sent: int) -> None:
     assert coalescer.totals == ({} if sent else {EgressDrop.STALE: 1})
 
 
+def test_what_is_fresh_is_not_dropped_with_what_is_stale() -> None:
+    """After a pause of the process a new command is put beside an old attitude: it leaves, the old one does not."""
+    coalescer = Coalescer(SETTINGS)
+    coalescer.put([attitude(1)], 0.0)
+    coalescer.put([heartbeat(2)], 1.5)
+    assert coalescer.take(1.5) == [heartbeat(2).raw]
+    assert coalescer.totals == {EgressDrop.STALE: 1}
+
+
 def test_clear_drops_all_that_waits() -> None:
     """Once a peer is gone nothing of it waits, and all is counted."""
     coalescer = Coalescer(SETTINGS)

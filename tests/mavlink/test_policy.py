@@ -350,6 +350,27 @@ def test_what_goes_out_is_limited_by_instance() -> None:
     assert sum(gate.check(battery(0), 60.5) is None for _ in range(10)) == 2
 
 
+def test_each_program_has_the_rate() -> None:
+    """Two programs at one endpoint: the first that is asked does not use up what the second is to be told."""
+    gate = compile_policy({"system_ids": "all", "rate_out": {"HEARTBEAT": 1}}).outgoing
+    passed = Counter(to for second in range(60) for to in (1, 2) if gate.check(heartbeat(), second, to) is None)
+    assert passed == {1: 60, 2: 60}
+    assert sum(gate.check(heartbeat(), 60.0, 3) is None for _ in range(10)) == 2
+
+
+def test_a_groups_rate_does_not_thin_out_what_is_said_once() -> None:
+    """The lines of a text all go out, whatever the rate of their group; named by itself it has one; and coming in."""
+    group = {"telemetry": 0.5}
+
+    def passed(gate: policy.Gate, msgid: int) -> int:
+        return sum(gate.check(blank(msgid), 0.0) is None for _ in range(10))
+
+    for rates, texts in ((group, 10), (group | {"STATUSTEXT": 1}, 2)):
+        gate = compile_policy({"system_ids": "all", "rate_out": rates}).outgoing
+        assert [passed(gate, dialect.ids_by_name()[name]) for name in ("ATTITUDE", "STATUSTEXT")] == [2, texts]
+    assert passed(incoming({"system_ids": "all", "rate_in": group}), dialect.ids_by_name()["STATUSTEXT"]) == 2
+
+
 def test_flow_of_commands_is_limited_message_by_message() -> None:
     """Commands and their answers are one flow to the link, and yet each message has its own rate."""
     gate = compile_policy({"system_ids": "all", "rate_out": {"COMMAND_LONG": 1, "COMMAND_INT": 1}}).outgoing

@@ -49,6 +49,8 @@ class Coalescer:
 
     def put(self, frames: Sequence[Frame], now: float) -> None:
         """Frames for the peer, in their order; ``now`` is when the first of them came."""
+        if self._waiting and now - self._put_at > self.settings.max_age_s:
+            self._drop_all(EgressDrop.STALE)  # nobody came to take them: what comes now is as fresh as ever
         if not self._waiting:
             self._put_at = now
             self._due_at = now + self.settings.coalesce_s

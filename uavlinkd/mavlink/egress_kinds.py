@@ -130,6 +130,8 @@ def _kinds() -> dict[int, Kind]:
     return kinds | {ids[name]: Kind(Lane.URGENT, False) for name in urgent - states}
 
 
+SAID_ONCE: Final = frozenset(ids_by_name()[name] for name in _EVENTS_AMONG_THEM)
+"""Message ids in groups of states that no later frame makes up for, such as a line of STATUSTEXT."""
 KINDS: Final = _kinds()
 """By message id. A message that is not here is an event."""
 EVENT: Final = Kind(Lane.EVENTS, False)

@@ -8,7 +8,8 @@
     deny_in   = ["MAV_CMD_DO_FLIGHTTERMINATION"]            what does not, whatever allows it
     allow_out, deny_out                  the same for the other way
     rate_in   = { ATTITUDE = 10 }        frames a second of each message and component; also of a group's messages
-    rate_out                             the same for the other way; also of each target and instance (battery 0, 1)
+    rate_out                             the same for the other way; also of each target and instance (battery 0, 1),
+                                         to each program; a group's does not hold for what is said once (STATUSTEXT)
     mavlink1 = true                      whether MAVLink 1 frames pass
     ground_station = true                whether its HEARTBEAT may claim to be a ground station's
 
@@ -25,7 +26,9 @@ A list's entries add up, a role's entries among them, and what is denied is deni
 A rate is kept for each component by itself: an autopilot and its gimbal both send HEARTBEAT, and were the rate theirs
 together, whoever comes first in each second would silence the other for minutes. But what comes in may name any
 component, so all components of a system together have SYSTEM_SHARE times the rate: invented ones gain no more. What
-goes out has passed another's gate already, so there each flow has the rate, as where a link thins (`egress_kinds`).
+goes out has passed another's gate already, so there each flow has the rate, as where a link thins (`egress_kinds`),
+to each of the programs at an endpoint. And what is said once, or in parts, is not thinned out of a group on its way
+out: a text whose line is missing never comes again. Named by itself it has the rate that is written.
 
 What a policy cannot see into passes or not as a whole: files, shells, tunnels, raw buses. A policy that denies a
 command and lets one of those through gets a warning, as the command may travel inside. A message that the dialect
@@ -187,10 +190,13 @@ class Gate:
         self._of_systems: _Buckets = {}
         self.refused: Counter[tuple[int, Refusal]] = Counter()  # by message id (or ANY_OTHER) and reason
 
-    def check(self, frame: Frame, now: float) -> Refusal | None:
-        """None if the frame may pass, else why not, which is counted. `now` in seconds, monotonic."""
+    def check(self, frame: Frame, now: float, to: int = 0) -> Refusal | None:
+        """None if the frame may pass, else why not, which is counted. `now` in seconds, monotonic.
+
+        `to`: which of several programs it goes out to. Each has the rate: a frame is another one for each of them.
+        """
         verdict = self._verdict(frame.header)
-        refusal = self._unmet(verdict, frame, now) if isinstance(verdict, _Condition) else verdict
+        refusal = self._unmet(verdict, frame, now, to) if isinstance(verdict, _Condition) else verdict
         if refusal is not None:
             counted = (frame.header.msgid, refusal)
             if len(self.refused) >= MAX_COUNTED and counted not in self.refused:
@@ -258,7 +264,7 @@ class Gate:
         self._decisions[key] = verdict
         return verdict
 
-    def _unmet(self, condition: _Condition, frame: Frame, now: float) -> Refusal | None:
+    def _unmet(self, condition: _Condition, frame: Frame, now: float, to: int) -> Refusal | None:
         if condition.only_commands is not None and frame.header.command not in condition.only_commands:
             return Refusal.COMMAND_NOT_ALLOWED
         if frame.header.command in condition.never_commands:
@@ -268,14 +274,15 @@ class Gate:
         if condition.refuses_ground_station and _claims_to_be_ground_station(frame):
             return Refusal.GROUND_STATION_NOT_ALLOWED
         # Last, so that only frames which would pass use up the rate.
-        if condition.per_second is not None and not self._takes_token(frame, condition.per_second, now):
+        if condition.per_second is not None and not self._takes_token(frame, condition.per_second, now, to):
             return Refusal.RATE_LIMITED
         return None
 
-    def _takes_token(self, frame: Frame, per_second: float, now: float) -> bool:
+    def _takes_token(self, frame: Frame, per_second: float, now: float, to: int) -> bool:
         header = frame.header
         if not self._is_incoming:
-            return _take(((self._buckets, (header.msgid, *flow_key(frame, kind_of(frame))), 1),), per_second, now)
+            flow = (to, header.msgid, *flow_key(frame, kind_of(frame)))
+            return _take(((self._buckets, flow, 1),), per_second, now)
         # A sender could choose another component for each frame, another target or instance too.
         one = (self._buckets, (header.msgid, header.system, header.component), 1)
         return _take((one, (self._of_systems, (header.msgid, header.system), SYSTEM_SHARE)), per_second, now)

@@ -11,6 +11,7 @@ from typing import Final, NamedTuple
 
 from uavlinkd.mavlink import dialect
 from uavlinkd.mavlink.dialect_table import COMMANDS
+from uavlinkd.mavlink.egress_kinds import SAID_ONCE
 from uavlinkd.mavlink.roles import ROLES
 
 MAX_MSGID: Final = 0xFFFFFF
@@ -224,7 +225,10 @@ def _systems(data: Mapping[str, object], report: Report, *, is_needed: bool) -> 
 
 
 def _rates(data: Mapping[str, object], key: str, report: Report) -> Mapping[int, float]:
-    """Frames a second by message id. A message's own rate goes before its groups', the lowest of those counts."""
+    """Frames a second by message id. A message's own rate goes before its groups', the lowest of those counts.
+
+    On the way out a group's rate thins what is said again and again, and leaves alone what is said once.
+    """
     value = data.get(key, {})
     if not isinstance(value, Mapping):
         report(key, f"{value!r} is no table", f"write {key} = {{ ATTITUDE = 10 }}")
@@ -247,7 +251,8 @@ def _rates(data: Mapping[str, object], key: str, report: Report) -> Mapping[int,
         if entry.number is not None or name in dialect.ids_by_name():
             of_messages[entry.messages[0] if entry.number is None else entry.number] = float(rate)
         else:
-            for msgid in entry.messages:
+            thinned = entry.messages if key == "rate_in" else set(entry.messages) - SAID_ONCE
+            for msgid in thinned:
                 of_groups[msgid] = min(float(rate), of_groups.get(msgid, math.inf))
     return of_groups | of_messages
 
