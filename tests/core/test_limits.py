@@ -77,16 +77,20 @@ def test_the_longest_silent_source_is_forgotten() -> None:
 
 
 @pytest.mark.parametrize(
-    ("host", "source"),
+    ("one", "other", "is_same"),
     [
-        ("10.0.0.1", "10.0.0.1"),
-        ("2001:db8:1:2::7", "2001:db8:1:2::/64"),
-        ("2001:db8:1:2:3:4:5:6", "2001:db8:1:2::/64"),
-        ("2001:db8::1", "2001:db8:0:0::/64"),
-        ("fe80::1%wlan0", "fe80:0:0:0::/64"),
-        ("::1", "0:0:0:0::/64"),
+        ("10.0.0.1", "10.0.0.1", True),
+        ("10.0.0.1", "10.0.0.2", False),
+        ("2001:db8:1:2::7", "2001:db8:1:2:3:4:5:6", True),
+        ("2001:db8:1:2::7", "2001:db8:1:3::7", False),
+        ("2001:db8::1", "2001:db8:0:0:ffff::", True),
+        ("fe80::1%wlan0", "fe80::2", True),
+        ("::1", "::2", True),
+        # The gap ends within the first four groups: not all that is left out is behind them.
+        ("fd00::5:aaaa:bbff:fecc:dddd", "fd00:0:0:5::7", True),
+        ("fd00::5:aaaa:bbff:fecc:dddd", "fd00::6:aaaa:bbff:fecc:dddd", False),
     ],
 )
-def test_source_is_what_one_machine_may_own(host: str, source: str) -> None:
+def test_source_is_what_one_machine_may_own(one: str, other: str, is_same: bool) -> None:
     """An IPv4 address stands for itself, an IPv6 address for its /64."""
-    assert source_of(host) == source
+    assert (source_of(one) == source_of(other)) is is_same

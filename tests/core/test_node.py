@@ -774,6 +774,22 @@ def test_forged_cookie_is_harmless() -> None:
         assert completes(pair, initiation, now)
 
 
+def test_forged_cookie_does_not_replace_the_genuine_one() -> None:
+    """Who sees an initiation sends a cookie of his own behind the peer's: it is not taken, and the link comes up."""
+    pair = Pair(link_a=QUIET, link_b=QUIET)
+    initiation = pair.initiation(0.0)
+    exhaust(pair.b, 0.0)
+    assert pair.a.receive(only(datagrams(pair.b.receive(initiation, 0.0))), 0.0) == []
+    index, pending = next(iter(pair.a.peer.caller.pending.items()))
+    sealed = pair.b.node._mac_keys.seal_cookie(b"forged cookie!!!", bytes(16), pending.mac1)
+    forged = wire.encode_cookie_reply(index, bytes(16), sealed)
+    assert reasons(pair.a.receive(forged, 0.01)) == [DropReason.UNEXPECTED_COOKIE]
+
+    now, again = retried(pair, 0.0)
+    exhaust(pair.b, now)
+    assert completes(pair, again, now)
+
+
 def test_response_under_load_is_repeated_with_a_cookie() -> None:
     """An initiator under load asks the responder for a cookie; its answer to the next initiation is taken."""
     pair = Pair(link_a=QUIET, link_b=QUIET)
@@ -821,6 +837,25 @@ def test_one_source_has_its_share_under_load() -> None:
     cookie = pair.b.node._mac_keys.open_cookie(wire.parse_cookie_reply(raw), initiation[-32:-16])
     with_cookie = with_macs(initiation[: -wire.MACS_BYTES], KEY_B.public, cookie)
     assert datagrams(pair.b.receive(with_cookie, 1.0, ELSEWHERE), wire.RESPONSE)
+
+
+def test_neighbours_do_not_use_up_a_peers_share() -> None:
+    """Others behind the router of a peer's network: it is answered where it is known to be, they have their own share."""
+    pair = established()
+    _, host, port = AT_A
+    rate_limited(pair, 1.0)  # at its own place: what is known there is one source, and its share is spent
+    pair.b.node.set_addresses("alpha", [(0, host, port + 1)], 1.0)
+    neighbour, peer = (0, host, port + 2), (0, host, port + 1)
+
+    def asked(place: Path, key: KeyPair) -> list[Output]:
+        initiation = made_initiation(key)
+        raw = pair.b.node._cookies.reply(initiation, 77, place, 1.0)
+        cookie = pair.b.node._mac_keys.open_cookie(wire.parse_cookie_reply(raw), initiation[-32:-16])
+        return pair.b.receive(with_macs(initiation[: -wire.MACS_BYTES], KEY_B.public, cookie), 1.0, place)
+
+    fates = [reasons(asked(neighbour, KEY_C)) for _ in range(c.COOKIED_PER_SOURCE_BURST + 1)]
+    assert fates == [[DropReason.UNKNOWN_PEER]] * c.COOKIED_PER_SOURCE_BURST + [[DropReason.RATE_LIMITED]]
+    assert datagrams(asked(peer, KEY_A), wire.RESPONSE)
 
 
 # Peers come and go.

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from uavlinkd.core.peer import Peer
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, eq=False)
 class Pending:
     """An initiation of ours that may still be answered."""
 
@@ -28,6 +28,8 @@ class Pending:
     """Of the initiation, which a cookie reply refers to."""
     path: Path
     expires_at: float
+    has_cookie: bool = False
+    """Whether one came for it: a second is not taken."""
 
 
 class Caller:

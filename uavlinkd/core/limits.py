@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Hashable
+from ipaddress import IPv6Address
 
 
 class TokenBucket:
@@ -26,14 +27,9 @@ class TokenBucket:
         return True
 
 
-def source_of(host: str) -> str:
+def source_of(host: str) -> Hashable:
     """Whom a numeric host stands for: itself, or its /64 in IPv6, of which a single machine has every address."""
-    if ":" not in host:
-        return host
-    head, gap, _ = host.partition("%")[0].partition("::")
-    groups = [group for group in head.split(":") if group][:4]
-    # Where the gap begins within the first four groups, zeros follow that are written nowhere.
-    return ":".join([*groups, *("0" for _ in range(4 - len(groups)) if gap)]) + "::/64"
+    return IPv6Address(host).packed[:8] if ":" in host else host
 
 
 class SourceLimiter:

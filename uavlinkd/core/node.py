@@ -245,13 +245,15 @@ class Node:
     def _receive_cookie(self, datagram: bytes, now: float) -> None:
         reply = wire.parse_cookie_reply(datagram)
         owner = self._indices.owners.get(reply.receiver_index)
-        if isinstance(owner, Pending):
-            peer, mac1, path = owner.peer, owner.mac1, owner.path
-        elif owner is not None and (unconfirmed := owner.peer.sessions.unconfirmed.get(reply.receiver_index)):
-            peer, mac1, path = owner.peer, unconfirmed.mac1, unconfirmed.path
-        else:
+        if owner is None:
             raise Drop(DropReason.UNEXPECTED_COOKIE)
-        peer.receive_cookie(mac1, path, reply, now)
+        peer = owner.peer
+        asked = owner if isinstance(owner, Pending) else peer.sessions.unconfirmed.get(reply.receiver_index)
+        # One for each message, as whoever saw it can make more: he has to be there before the peer, each time.
+        if asked is None or asked.has_cookie:
+            raise Drop(DropReason.UNEXPECTED_COOKIE)
+        peer.receive_cookie(asked.mac1, asked.path, reply, now)
+        asked.has_cookie = True
         self._deadline = min(self._deadline, peer.deadline)
 
     def _addressed(self, datagram: bytes) -> tuple[KeyPair, CookieJar]:
@@ -290,10 +292,13 @@ class Node:
         if not cookies.has_valid_mac2(datagram, path, now):
             out.append(Transmit(cookies.reply(datagram, sender_index, path, now), path))
             raise Drop(DropReason.COOKIE_REQUIRED)
-        if not self._sources.take((ceiling, source_of(path[1])), now):
+        # Who proved an address of a peer does not queue with strangers: neither with those of its host or network,
+        # such as others behind one router, nor with those of many addresses, for whom the ceiling is.
+        _, host, port = path
+        is_known = self._is_known((host, port))
+        if not self._sources.take((ceiling, (host, port) if is_known else source_of(host)), now):
             raise Drop(DropReason.RATE_LIMITED)
-        # The ceiling is for strangers with many addresses. Who proved an address of a peer does not queue with them.
-        if not self._is_known(path[1:]) and not ceiling.take(now):
+        if not is_known and not ceiling.take(now):
             raise Drop(DropReason.RATE_LIMITED)
 
     def _is_known(self, address: tuple[str, int]) -> bool:

@@ -310,11 +310,14 @@ class Peer:
         keys = self.caller.receive_response(pending, response)
         index, suite, lifetime_s = response.receiver_index, response.suite, self.timers.reject_after_s
         session = Session(self, suite, keys, index, now, lifetime_s, is_initiator=True)
-        self._adopt(session, pending.path, now, out)
-        self._heard(now, out)
+        events: list[Output] = []
+        self._adopt(session, pending.path, now, events)
+        self._heard(now, events)
         # The confirmation; any later envelope repeats it. It asks for an echo: long enough to be challenged where
-        # somebody relays it from elsewhere, and it gives the round trip at once.
+        # somebody relays it from elsewhere, and it gives the round trip at once. It goes out before anyone hears of
+        # the session: what that ends, such as a session by a previous key, must not end before the peer has this one.
         self._ask_for_echo(session, pending.path, now, out)
+        out += events
 
     def receive_cookie(self, mac1: bytes, path: Path, reply: wire.CookieReply, now: float) -> None:
         """The peer is under load and asks us to prove our address.

@@ -18,7 +18,7 @@ from uavlinkd.core.outputs import Path
 from uavlinkd.core.session import Session
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, eq=False)
 class Unconfirmed:
     """A session that answers an initiation; the first valid envelope on it confirms it."""
 
@@ -30,6 +30,8 @@ class Unconfirmed:
     mac1: bytes
     """Of the response, which a cookie reply refers to."""
     expires_at: float
+    has_cookie: bool = False
+    """Whether one came for it: a second is not taken."""
 
 
 class Sessions:

@@ -17,14 +17,15 @@ from uavlinkd.addresses import Address
 from uavlinkd.clock import monotonic
 
 BUFFER_BYTES = 1 << 20
-"""Asked of the kernel each way: some 500 of the largest envelopes. It may give less (net.core.rmem_max)."""
+"""Asked of the kernel each way: room for hundreds of envelopes of the default size. It may give less
+(net.core.rmem_max)."""
 
 DATAGRAMS_PER_WAKE_UP = 128
 """Read from one socket; then the others have their turn."""
 RECEIVE_BYTES = 65536
 _buffer = memoryview(bytearray(RECEIVE_BYTES))
-"""Where every datagram is read into, and copied from at once: memory of that size asked for with each of them, beside
-the little that is kept, would leave the heap in pieces and have it grow."""
+"""Every datagram is read into this, and copied at its own size. Asking for 64 KiB with each of them, of which little
+is kept, leaves holes between what lives long: the heap grows for hours (tests/soak/README.md)."""
 BUSY_S = 0.0005
 """A socket that becomes readable again so soon after it was read is busy: above 2,000 times a second."""
 PAUSE_S = 0.001
@@ -67,9 +68,13 @@ def unbound_socket(address: Address, kind: socket.SocketKind) -> tuple[socket.so
         sock = socket.socket(family, kind, proto)
     except OSError as error:
         raise BindError(f"cannot use {address}: {error.strerror or error}") from None
-    sock.setblocking(False)
-    if family == socket.AF_INET6:
-        sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+    try:
+        sock.setblocking(False)
+        if family == socket.AF_INET6:
+            sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+    except OSError as error:
+        sock.close()
+        raise BindError(f"cannot use {address}: {error.strerror or error}") from None
     return sock, sockaddr
 
 
@@ -154,7 +159,8 @@ class Reader:
     def read(self) -> tuple[Arrived, float]:
         """What is there, up to :data:`DATAGRAMS_PER_WAKE_UP` datagrams, and the monotonic time of it."""
         now = monotonic()
-        if now - self._read_at < BUSY_S:
+        is_busy = now - self._read_at < BUSY_S
+        if is_busy:
             pause(PAUSE_S)
             now = monotonic()
         self._read_at = now
@@ -164,9 +170,11 @@ class Reader:
         except OSError as error:
             return ([], now) if self._is_drained(error) else (self._drain(), now)
         # At most rates a datagram comes alone. Asking is then cheaper than reading in vain: that raises. An empty
-        # datagram may be missed by it; the loop wakes up for it again.
-        fcntl.ioctl(self._sock, termios.FIONREAD, self._waiting)
-        if self._waiting[0]:
+        # datagram is missed by it, and the loop wakes up for it again; were it missed after a pause too, empty ones,
+        # which anybody can send, would make each datagram cost one.
+        if not is_busy:
+            fcntl.ioctl(self._sock, termios.FIONREAD, self._waiting)
+        if is_busy or self._waiting[0]:
             arrived += self._drain()
             if len(arrived) == DATAGRAMS_PER_WAKE_UP:
                 self._read_at = -BUSY_S  # more have gathered already
