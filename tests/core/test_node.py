@@ -840,7 +840,7 @@ def test_one_source_has_its_share_under_load() -> None:
 
 
 def test_neighbours_do_not_use_up_a_peers_share() -> None:
-    """Others behind the router of a peer's network: it is answered where it is known to be, they have their own share."""
+    """Others behind the same router have a share of their own: a peer is answered where it is known to be."""
     pair = established()
     _, host, port = AT_A
     rate_limited(pair, 1.0)  # at its own place: what is known there is one source, and its share is spent
