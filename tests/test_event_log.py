@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Sequence
 from typing import Any
 
 import pytest
 from structlog import get_logger
 from structlog.testing import capture_logs
 
+from uavlinkd.addresses import Address
 from uavlinkd.core.outputs import PeerUp
+from uavlinkd.endpoints.ports import LocalPort
 from uavlinkd.event_log import LINES_BURST, LINES_PER_S, EventLog
 from uavlinkd.log import SUMMARY_INTERVAL_S
+from uavlinkd.mavlink.frames import SplitCounters
 
 
 def told(log: EventLog, peer: str, now: float, **totals: int) -> list[dict[str, Any]]:
@@ -50,6 +55,67 @@ def test_peers_are_told_apart(log: EventLog) -> None:
     assert not told(log, "b", 1.0, envelopes_out_of_order=2)
     log.forget("b")
     assert told(log, "b", 1.0, envelopes_out_of_order=2)
+
+
+class Silent:
+    """As much of an endpoint as is looked at: one with a program, that says so many frames."""
+
+    name = "autopilot"
+
+    def __init__(self) -> None:
+        self.counters = SplitCounters()
+        self.failures: Counter[str] = Counter()
+        self.bytes_received = self.bytes_sent = self.frames_sent = 0
+        self.ports: list[LocalPort] = [LocalPort(self, "/dev/ttyACM0", None)]
+
+    def gather(self, seconds: float) -> None:
+        """Nothing to read."""
+
+    def start(self) -> None:
+        """Nothing to start."""
+
+    def write(self, port: LocalPort, frames: Sequence[bytes], now: float) -> None:
+        """Nobody to write to."""
+
+    def do_housekeeping(self, now: float) -> None:
+        """Nothing to do."""
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+
+def test_a_silent_endpoint_is_told_once_each_time(log: EventLog) -> None:
+    """A wrong speed, an unpowered autopilot: after ten seconds one line; again when it spoke meanwhile."""
+    endpoint = Silent()
+
+    def lines(seconds: range) -> list[Any]:
+        with capture_logs() as told:
+            for second in seconds:
+                log.look_at(endpoint, float(second))
+        return told
+
+    endpoint.counters.garbage_bytes = 77
+    assert lines(range(10)) == []
+    (line,) = lines(range(10, 100))
+    assert (line["event"], line["endpoint"], line["programs"]) == ("endpoint_silent", "autopilot", ["/dev/ttyACM0"])
+    assert line["garbage_bytes"] == 77
+    endpoint.counters.frames += 1
+    assert lines(range(100, 110)) == []
+    assert len(lines(range(110, 200))) == 1
+    endpoint.counters.frames += 1
+    endpoint.ports.clear()  # nobody is there: that is told otherwise
+    assert lines(range(200, 300)) == []
+
+
+def test_an_unheard_peer_is_told_with_what_to_look_at(log: EventLog) -> None:
+    """One that is called, and one that has to call."""
+    with capture_logs() as told:
+        log.unheard("b", [Address("10.0.0.1", 5790)])
+        log.unheard("c", [])
+    events = [(each["event"], each["peer"]) for each in told]
+    assert events == [("peer_not_answering", "b"), ("peer_not_calling", "c")]
+    assert told[0]["called_at"] == ["10.0.0.1:5790"]
+    assert "has to call" in told[1]["meaning"]
 
 
 def test_what_waits_is_told_in_the_end(log: EventLog) -> None:

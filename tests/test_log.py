@@ -15,11 +15,16 @@ from typing import Any, cast
 import pytest
 import structlog
 
+from tests.core.harness import KEY_A, Pair
+from uavlinkd import metrics
+from uavlinkd.config import Peer
 from uavlinkd.core.crypto import Secret
 from uavlinkd.core.drops import DropReason
+from uavlinkd.core.settings import PeerSettings
 from uavlinkd.log import DISTURBANCES, MEANINGS, REFUSALS, SUMMARY_INTERVAL_S, DropSummary, set_up_logging
 from uavlinkd.mavlink.frames import Header
 from uavlinkd.mavlink.policy import Refusal
+from uavlinkd.peer_link import PeerLink
 
 
 class Terminal(io.StringIO):
@@ -108,6 +113,8 @@ def test_a_line_stays_a_line(fmt: str) -> None:
 def test_every_reason_has_a_meaning() -> None:
     """An operator reads a sentence, not a name."""
     assert set(MEANINGS) >= set(DISTURBANCES)
+    link = PeerLink(Peer(PeerSettings("alpha", KEY_A.public), ()), Pair().b.node, lambda _: None, 0.0)
+    assert set(link.disturbances(0.0)) == set(DISTURBANCES) <= set(metrics._PEER_TOTALS)
     assert set(MEANINGS) >= {reason.value for reason in DropReason}
     assert set(REFUSALS) == set(Refusal)
     assert all(len(meaning.split()) > 3 for meaning in [*MEANINGS.values(), *REFUSALS.values()])

@@ -94,6 +94,15 @@ CASES: dict[str, tuple[dict[str, str], list[tuple[str, bool]]]] = {
         {'uavlinkd_endpoint_programs{instance="a",endpoint="autopilot"}': "1x4 0x20"},
         [("1m", False), ("3m", True)],
     ),
+    "UavlinkdEndpointSilent": (
+        {
+            'uavlinkd_endpoint_programs{instance="a",endpoint="autopilot"}': "1x40",
+            'uavlinkd_endpoint_receive_frames_total{instance="a",endpoint="autopilot"}': "0+50x8 400x20",
+            'uavlinkd_endpoint_programs{instance="a",endpoint="spare"}': "0x40",
+            'uavlinkd_endpoint_receive_frames_total{instance="a",endpoint="spare"}': "0x40",
+        },
+        [("2m", False), ("3m", False), ("4m30s", True)],
+    ),
     "UavlinkdNotRecording": (
         {'uavlinkd_recording_up{instance="a"}': "1x4 0x20"},
         [("1m15s", False), ("4m", True)],

@@ -16,7 +16,7 @@ from uavlinkd.core.cookie import MacKeys
 from uavlinkd.core.outputs import Output, Path, Transmit
 from uavlinkd.core.settings import Link, PeerSettings
 from uavlinkd.mavlink.egress import EgressSettings
-from uavlinkd.mavlink.frames import SplitCounters, split_payload
+from uavlinkd.mavlink.frames import Frame, SplitCounters, split_payload
 from uavlinkd.mavlink.radio_status import LinkFigures
 from uavlinkd.peer_link import PeerLink, radio_figures
 
@@ -31,6 +31,12 @@ def recorded_initiation(entropy: random.Random) -> bytes:
     return MacKeys(KEY_B.public).add_macs(made.message, None)
 
 
+def heartbeat() -> list[Frame]:
+    """A vehicle's."""
+    raw = bytes(mavlink.MAVLink_heartbeat_message(2, 3, 81, 0, 4, 3).pack(mavlink.MAVLink(None)))
+    return split_payload(raw, SplitCounters())
+
+
 @pytest.mark.parametrize("source", [ELSEWHERE, AT_A], ids=["from elsewhere", "in the peer's name"])
 def test_replayed_handshakes_do_not_silence_a_link_with_a_budget(source: Path) -> None:
     """With 4 kbit/s, and four of the peer's recorded initiations answered or not each second, heartbeats pass."""
@@ -42,8 +48,7 @@ def test_replayed_handshakes_do_not_silence_a_link_with_a_budget(source: Path) -
     )
     peer_link = PeerLink(config, pair.b.node, outputs.extend, 0.0)
     peer_link.on_session()
-    heartbeat = bytes(mavlink.MAVLink_heartbeat_message(2, 3, 81, 0, 4, 3).pack(mavlink.MAVLink(None)))
-    heartbeats = split_payload(heartbeat, SplitCounters())
+    heartbeats = heartbeat()
     entropy, arrived = random.Random(7), 0
 
     for tick in range(SECONDS * REPLAYS_PER_S):
@@ -59,6 +64,23 @@ def test_replayed_handshakes_do_not_silence_a_link_with_a_budget(source: Path) -
     assert arrived >= SECONDS - (1 if source == ELSEWHERE else 2)  # those of the first burst go at once
 
 
+def test_a_budget_that_comes_with_a_reload_pays_for_nothing_before_it() -> None:
+    """A megabyte was sent without any: the first heartbeat under 4 kbit/s goes at once, in envelopes as before."""
+    link = Link(suites=PLAIN.suites, timers=QUIET)
+    pair = Pair(link_a=link, link_b=link).establish()
+    outputs: list[Output] = []
+    config = Peer(PeerSettings("alpha", KEY_A.public, None, link), ())
+    peer_link = PeerLink(config, pair.b.node, outputs.extend, 0.0)
+    while pair.b.peer.traffic.bytes_sent < 1_000_000:
+        peer_link.send(heartbeat() * 20, 1.0, 0.0)
+    peer_link.change(replace(config, egress=EgressSettings(budget_bits_s=BUDGET_BITS_S)), 2.0)
+    outputs.clear()
+    peer_link.send(heartbeat(), 2.0, 0.0)
+    assert len(of(outputs, Transmit)) == 1
+    assert peer_link.egress is not None
+    assert peer_link.egress.shape.payload_limit == pair.b.session.payload_limit
+
+
 def test_a_peer_whose_addresses_are_other_ones_is_not_called_at_those_before() -> None:
     """Its new names may have no address yet. The path that is in use goes on being so."""
     pair = Pair(link_a=Link(suites=PLAIN.suites, timers=QUIET), link_b=PLAIN).establish()
@@ -70,6 +92,17 @@ def test_a_peer_whose_addresses_are_other_ones_is_not_called_at_those_before() -
     link.change(replace(config, addresses=(Address("new.test", 14600),)), 2.0)
     assert list(pair.a.peer.caller.addresses) == []
     assert pair.a.peer.path == AT_B
+
+
+@pytest.mark.parametrize(("addresses", "told_at"), [((Address("192.0.2.2", 14600),), 5), ((), 30)])
+def test_a_peer_that_is_not_heard_is_told_of_once(addresses: tuple[Address, ...], told_at: int) -> None:
+    """Soon where it is called in vain, later where it has to call; and again only when it was up meanwhile."""
+    pair = Pair(link_a=Link(suites=PLAIN.suites, timers=QUIET), link_b=PLAIN)
+    config = Peer(PeerSettings("bravo", KEY_B.public, None, PLAIN), addresses)
+    link = PeerLink(config, pair.a.node, lambda _: None, 0.0)
+    assert [second for second in range(200) if link.is_unheard(float(second))] == [told_at]
+    pair.establish(200.0)
+    assert not link.is_unheard(200.0)
 
 
 def measured(config: Peer, figures: LinkFigures) -> PeerLink:

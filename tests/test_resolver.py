@@ -15,6 +15,7 @@ import pytest
 import structlog
 from structlog.testing import capture_logs
 
+from tests.daemon.harness import need
 from tests.waiting import until
 from uavlinkd import resolver
 from uavlinkd.addresses import Address
@@ -63,8 +64,7 @@ async def test_a_name_that_fails_does_not_hide_the_others(names: Names) -> None:
 async def test_a_link_local_address_keeps_its_zone() -> None:
     """Without the interface nothing could be sent there."""
     interface = next((name for number, name in socket.if_nameindex() if number == 1), None)
-    if interface is None:
-        pytest.skip("no interface has number 1")
+    need(interface is not None, "an interface with number 1, as a loopback has")
     found, failed = await resolve([Address(f"fe80::1%{interface}", 5790)])
     assert (found, failed) == ([(V6, "fe80::1%1", 5790)], [])
 

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
+from uavlinkd.log import DISTURBANCES
 from uavlinkd.status_screen import all_up, render_status
 
 
@@ -28,15 +29,15 @@ def peer(state: str, **facts: object) -> dict[str, Any]:
         "malformed": {},
         "waiting_dropped": {},
         "refused": {},
-        "envelopes_out_of_order": 0,
-        "challenges_unanswered": 0,
+        **dict.fromkeys(DISTURBANCES, 0),
         **facts,
     }
 
 
-def shown(peers: dict[str, dict[str, Any]], width: int) -> str:
+def shown(peers: dict[str, dict[str, Any]], width: int, recording: dict[str, Any] | None = None) -> str:
     """The screen."""
-    status = {"name": "drone0", "peers": peers, "endpoints": {}, "drops": {}, "send_failures": {}, "stale": {}}
+    nothing: dict[str, Any] = {"endpoints": {}, "drops": {}, "send_failures": {}, "stale": {}}
+    status = {"name": "drone0", "peers": peers, "recording": recording, **nothing}
     file = io.StringIO()
     Console(file=file, width=width).print(render_status(status))
     return file.getvalue()
@@ -69,6 +70,13 @@ def test_all_of_it_is_read_on_eighty_columns(name: str) -> None:
 def test_an_ipv6_address_is_no_markup(path: str) -> None:
     """Brackets and colons are read as they are."""
     assert path in shown({"drone1": peer("up", path=path)}, 80)
+
+
+def test_a_recording_that_failed_is_told() -> None:
+    """Where nothing is kept, who looks sees it."""
+    recording = {"is_recording": False, "failures": {"EROFS": 7}}
+    assert "nothing is recorded now: 7 EROFS" in shown({"drone1": peer("up")}, 80, recording)
+    assert "recorded" not in shown({"drone1": peer("up")}, 80, recording | {"is_recording": True})
 
 
 def test_who_is_not_up_stands_first() -> None:

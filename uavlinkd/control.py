@@ -70,7 +70,8 @@ class ControlServer:
             sock.close()
             raise ControlError(
                 f"cannot listen on the control socket {self._path}: {error.strerror or error}: "
-                "its folder must be there and writable, for a service /run/uavlinkd/control.sock"
+                f"its folder must be there and writable; of a service it is {_runtime_folder()}: write"
+                f' control_socket = "{_runtime_folder()}/control.sock"'
             ) from None
 
     async def stop(self) -> None:
@@ -135,6 +136,10 @@ def ask(
             sock.connect(str(path))
             sock.sendall(request.encode() + b"\n")
             answer = json.loads(_read_answer(sock, on_waiting))
+    except PermissionError:
+        raise ControlError(
+            f"not allowed to ask at {path}: only root and the daemon's own user may, use sudo"
+        ) from None
     except OSError as error:
         raise ControlError(f"no daemon answers at {path}: {error.strerror or error}") from None
     except ValueError:
@@ -144,6 +149,11 @@ def ask(
     if "error" in answer:
         raise ControlError(f"the daemon at {path} refuses the request: {answer['error']}")
     return answer
+
+
+def _runtime_folder() -> str:
+    """Where a service may put its socket: systemd says so (RuntimeDirectory= in systemd.exec(5))."""
+    return os.environ.get("RUNTIME_DIRECTORY", "/run/uavlinkd").partition(":")[0]
 
 
 def _read_answer(sock: socket.socket, on_waiting: Callable[[], None] | None) -> bytes:

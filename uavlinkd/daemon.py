@@ -33,7 +33,7 @@ from uavlinkd.key_change import Graces, link_name
 from uavlinkd.log import DropSummary
 from uavlinkd.mavlink.frames import Frame, split_payload
 from uavlinkd.mavlink.policy import Policy
-from uavlinkd.mavlink.radio_status import RadioStatusSource
+from uavlinkd.mavlink.radio_status import INTERVAL_S, RadioStatusSource
 from uavlinkd.mavlink.routing import Router
 from uavlinkd.peer_link import PeerLink, radio_figures
 from uavlinkd.peer_sockets import Arrived, PeerSockets
@@ -51,7 +51,7 @@ LOOP_TICK_S = 0.001
 GATHER_AT_MOST_S = 0.005
 """Where every peer's frames wait for company, but no longer than this, programs are read only so often: wake-ups are
 what costs. A longer wait is the queues', which know what is urgent."""
-HOUSEKEEPING_S = 1.0
+HOUSEKEEPING_S = INTERVAL_S
 """How often links are measured, and idle programs forgotten."""
 
 
@@ -414,13 +414,8 @@ class Daemon:
         if self.recorder is not None:
             self.recorder.do_housekeeping(now)
         for link in self.links.values():
-            if link.has_failed_to_answer(now):
-                self.log.warning(
-                    "peer_not_answering",
-                    peer=link.name,
-                    called_at=[str(each) for each in link.config.addresses],
-                    meaning="it is not reachable there, or has another key for us, another PSK, or no common suite",
-                )
+            if link.is_unheard(now):
+                self._events.unheard(link.name, link.config.addresses)
             link.measure(now)
             self._events.disturbed(link.peer.name, link.disturbances(now), now)
             if link.end_graces(now, self._graces):
@@ -428,6 +423,7 @@ class Daemon:
         radio = radio_figures(self.links.values())
         for endpoint in self.endpoints:
             endpoint.do_housekeeping(now)
+            self._events.look_at(endpoint, now)
             source = self._radio_status.get(endpoint.name)
             if source is not None and radio is not None:
                 frame = source.frame(radio)

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from structlog.typing import FilteringBoundLogger
 
 from uavlinkd.addresses import Address
 from uavlinkd.core import outputs as o
+from uavlinkd.core.constants import NEVER
 from uavlinkd.core.limits import TokenBucket
+from uavlinkd.endpoints.ports import Endpoint
 from uavlinkd.key_change import link_name
 from uavlinkd.log import MEANINGS, SUMMARY_INTERVAL_S
 
@@ -17,6 +19,8 @@ LINES_PER_S = 0.5
 """Of one peer or endpoint, on average: some 10 MB a day at worst. Whoever has a peer's key can cause handshakes and
 new paths, and whoever reaches a ``tcpin`` can connect and leave again."""
 LINES_BURST = 50
+ENDPOINT_SILENT_S = 10.0
+"""An endpoint whose programs say nothing for so long is worth a line: who speaks MAVLink beats each second."""
 
 
 class EventLog:
@@ -27,6 +31,7 @@ class EventLog:
         self._budgets: dict[tuple[str, str], TokenBucket] = {}  # by peer or endpoint, which may share a name
         self._omitted: Counter[tuple[str, str]] = Counter()
         self._disturbances: dict[str, tuple[Mapping[str, int], float]] = {}  # as told, and when to tell again
+        self._frames: dict[str, tuple[int, float]] = {}  # of an endpoint: how many, and when they last grew
 
     def write(self, event: o.Event, now: float) -> None:
         """Write one, if its peer has a line left. ``now`` is monotonic seconds."""
@@ -59,6 +64,31 @@ class EventLog:
         omitted = self._take_line("endpoint", endpoint, now)
         if omitted is not None:
             self._log.info(event, endpoint=endpoint, program=program, **omitted)
+
+    def unheard(self, peer: str, called_at: Sequence[Address]) -> None:
+        """Write that a peer has not been heard for long, and what a person may look at."""
+        if called_at:
+            meaning = "it is not reachable there, or has another key for us, another PSK, or no common suite"
+            self._log.warning("peer_not_answering", peer=peer, called_at=[*map(str, called_at)], meaning=meaning)
+        else:
+            meaning = "no addresses of it are known here, so it has to call: has its file this daemon's address?"
+            self._log.warning("peer_not_calling", peer=peer, meaning=meaning)
+
+    def look_at(self, endpoint: Endpoint, now: float) -> None:
+        """Write, once, that nothing comes from the programs of an endpoint. Call it about once a second."""
+        frames, since = self._frames.get(endpoint.name, (-1, now))
+        if not endpoint.ports or endpoint.counters.frames != frames:
+            self._frames[endpoint.name] = endpoint.counters.frames, now
+        elif now - since >= ENDPOINT_SILENT_S:
+            self._frames[endpoint.name] = frames, NEVER
+            self._log.warning(
+                "endpoint_silent",
+                endpoint=endpoint.name,
+                programs=[port.name for port in endpoint.ports],
+                garbage_bytes=endpoint.counters.garbage_bytes,
+                meaning="no MAVLink comes: is it on, is MAVLink on at that port, with that speed and wiring, and does"
+                " nothing else read it?",
+            )
 
     def _take_line(self, kind: str, name: str, now: float) -> dict[str, int] | None:
         """What to say of lines that were left out before this one; None where this one is to be left out too."""

@@ -19,6 +19,8 @@ from uavlinkd.recorder import TO_PEER, Recorder
 
 UNANSWERED_S = 5.0
 """A peer that is called in vain for this long is worth a line in the log."""
+UNCALLED_S = 30.0
+"""The same of one that has to call."""
 
 Perform = Callable[[list[Output]], None]
 
@@ -42,7 +44,7 @@ class PeerLink:
         self._names = [config.name]  # in the core, the one of the current keys first
         self._previous: dict[str, tuple[KeyPairing, float]] = {}  # the others, and until when they are good
         self._charged: dict[str, tuple[int, int]] = {}  # datagrams and bytes that the budget has been told of
-        self._called_since = now
+        self._unheard_since = now
         self._is_told = False
         self._sample: _Sample | None = None
         self._measured = now, config.name, 0, 0  # when, what, and the bytes received and sent then
@@ -181,13 +183,13 @@ class PeerLink:
         if self.egress is not None:
             self.egress.clear(now)
 
-    def has_failed_to_answer(self, now: float) -> bool:
-        """Once each time that the peer is called and not heard for :data:`UNANSWERED_S`."""
-        if self.peer.is_up or not self.config.addresses:
-            self._called_since = now
+    def is_unheard(self, now: float) -> bool:
+        """Once each time that the peer is not heard for long: :data:`UNANSWERED_S`, or :data:`UNCALLED_S`."""
+        if self.peer.is_up:
+            self._unheard_since = now
             self._is_told = False
             return False
-        if self._is_told or now - self._called_since < UNANSWERED_S:
+        if self._is_told or now - self._unheard_since < (UNANSWERED_S if self.config.addresses else UNCALLED_S):
             return False
         self._is_told = True
         return True

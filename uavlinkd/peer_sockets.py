@@ -18,6 +18,7 @@ from uavlinkd.endpoints.sockets import BindError, Reader, numeric_host, udp_sock
 from uavlinkd.log import DropSummary
 from uavlinkd.peer_link import PeerLink
 from uavlinkd.resolver import Resolved, keep_resolving
+from uavlinkd.tasks import keep_running
 
 _EPHEMERAL = (Address("0.0.0.0", 0), Address("::", 0))
 """Without a listen address the daemon only calls, from any port."""
@@ -116,7 +117,7 @@ class PeerSockets:
             return True
 
         work = keep_resolving(link.config.addresses, lambda: not link.peer.is_up, on_resolved, self._log)
-        self._following[link.name] = asyncio.get_running_loop().create_task(work)
+        self._following[link.name] = keep_running(work, f"the search for {link.name}")
 
     def stop_following(self, name: str) -> None:
         """Look this peer's names up no more."""

@@ -24,6 +24,7 @@ from structlog.typing import FilteringBoundLogger
 
 from uavlinkd.config.model import Recording
 from uavlinkd.endpoints.ports import failure_name
+from uavlinkd.mavlink.dialect import SETUP_SIGNING
 from uavlinkd.mavlink.frames import MAVLINK2
 from uavlinkd.tlog_files import STAMP_BYTES, FolderInUseError, TlogFolder
 
@@ -39,8 +40,7 @@ STOP_WAIT_S = 2.0
 
 FROM_PEER, TO_PEER = 0, 1
 _LINK_BITS = 3
-_SETUP_SIGNING = (256).to_bytes(3, "little")
-"""It carries the key of MAVLink's own signing. Of MAVLink 1 there is none: message 256 does not fit in there."""
+_SETUP_SIGNING = SETUP_SIGNING.to_bytes(3, "little")
 
 Batch = dict[tuple[str, int], list[bytes]]
 """Records by peer and epoch."""
@@ -69,6 +69,7 @@ class Recorder:
         """What the disk said, by the name of the error; and ``folder_in_use``."""
         self._log = log
         self._clock = clock
+        self._folder = str(settings.folder)
         self._loop = asyncio.get_running_loop()
         self._batch: Batch = {}
         self._buffered_bytes = 0
@@ -132,7 +133,10 @@ class Recorder:
             reason = "folder_in_use" if isinstance(written.error, FolderInUseError) else failure_name(written.error)
             self.failures[reason] += 1
             if self.is_recording:
-                self._log.warning("recording_stopped", reason=reason, retried_every_s=RETRY_S)
+                told = written.error.strerror or str(written.error)
+                self._log.warning(
+                    "recording_stopped", reason=reason, error=told, folder=self._folder, retried_every_s=RETRY_S
+                )
             self._paused_until = now + RETRY_S
         elif not self.is_recording:
             self._paused_until = 0.0

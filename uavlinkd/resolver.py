@@ -92,7 +92,8 @@ async def keep_resolving(
                     continue
                 # Where it was an older question's end, the newest still counts its second.
                 rest_s = asked_at + LONGEST_WAIT_S - loop.time() if asking else wait_s
-                found, failed = answered.pop().result()
+                # Several may come at once, from a server that is back: what counts is who found most.
+                found, failed = max((each.result() for each in answered), key=lambda told: len(told[0]))
                 for name in set(failed) - failing:
                     log.warning("name_not_resolved", host=name)
                 failing = set(failed)

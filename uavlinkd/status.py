@@ -73,6 +73,7 @@ def peer_status(link: PeerLink, now: float) -> dict[str, object]:
         "bytes_received": traffic.bytes_received,
         **link.disturbances(now),
         "frames_received": link.counters.frames,
+        "frames_unknown": link.counters.unknown,
         "malformed": {fault.value: amount for fault, amount in link.counters.faults.items()},
         "refused": policy_status(link.policy),
         "waiting_dropped": {}
@@ -89,6 +90,7 @@ def endpoint_status(endpoint: Endpoint, policy: Policy, now: float) -> dict[str,
             port.name: {"heard_s": None if port.heard_at is None else now - port.heard_at} for port in endpoint.ports
         },
         "frames_received": endpoint.counters.frames,
+        "frames_unknown": endpoint.counters.unknown,
         "frames_sent": endpoint.frames_sent,
         "bytes_received": endpoint.bytes_received,
         "bytes_sent": endpoint.bytes_sent,

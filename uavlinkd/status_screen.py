@@ -9,12 +9,14 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from uavlinkd.log import DISTURBANCES
+
 Status = dict[str, Any]
 
 _STYLES = {"up": "green", "lost": "bold red", "waiting": "bold yellow"}
 _SHOWN_DROPS = 3
-_SIGNS = {"envelopes_out_of_order": "out_of_order", "challenges_unanswered": "unanswered_challenges"}
-"""What is told with the drops. What is missing has a column of its own."""
+_SIGNS = tuple(each for each in DISTURBANCES if each != "envelopes_missing")
+"""What is told with the drops. What is missing shows in the column of losses."""
 
 
 def all_up(status: Status) -> bool:
@@ -33,6 +35,9 @@ def render_status(status: Status) -> RenderableType:
     ):
         if counts:
             parts.append(Text(f"{label}: {_counts(counts)}", style="yellow"))
+    recording = status["recording"]
+    if recording is not None and not recording["is_recording"]:
+        parts.append(Text(f"nothing is recorded now: {_counts(recording['failures'])}", style="bold red"))
     return Group(*parts)
 
 
@@ -90,10 +95,11 @@ def _endpoints(status: Status) -> Table:
         table.add_column(name, overflow="fold")
     for name, endpoint in status["endpoints"].items():
         programs = ", ".join(f"{at} ({_age(each['heard_s'])})" for at, each in endpoint["programs"].items())
+        is_heard = bool(endpoint["programs"]) and endpoint["frames_received"] > 0
         trouble = _counts({**endpoint["faults"], **endpoint["failures"], **_refused(endpoint)})
         table.add_row(
             Text(name, style="bold"),
-            Text(programs or "nobody", style="" if programs else "bold yellow"),
+            Text(programs or "nobody", style="" if is_heard else "bold yellow"),
             f"{endpoint['frames_received']:,}",
             f"{endpoint['frames_sent']:,}",
             trouble or "-",
@@ -102,7 +108,7 @@ def _endpoints(status: Status) -> Table:
 
 
 def _troubles(peer: Status) -> dict[str, int]:
-    signs = {name: peer[key] for key, name in _SIGNS.items() if peer[key]}
+    signs = {name: peer[name] for name in _SIGNS if peer[name]}
     return {**peer["drops"], **peer["malformed"], **peer["waiting_dropped"], **_refused(peer), **signs}
 
 

@@ -28,7 +28,7 @@ class Threads:
         self._name = name
         self._work: SimpleQueue[Callable[[], None]] = SimpleQueue()
         self._lock = Lock()
-        """Whoever puts work there, or finds none, counts himself in the same moment."""
+        """Held while the queue and the two counts below change together."""
         self._idle = 0  # threads that wait, and that no work counts on yet
         self._slots = most  # threads that may still be started
 

@@ -121,7 +121,7 @@ class TlogFolder:
         """
         while self._free_bytes() < self._settings.min_free_bytes + amount:
             if not self._closed:
-                raise OSError(errno.ENOSPC, "the disk is as full as it may become")
+                raise OSError(errno.ENOSPC, "the disk is as full as it may become: min_free_bytes are left to others")
             self._delete(next(iter(self._closed)))
 
     def _free_bytes(self) -> int:

@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from tests.daemon.harness import PATIENCE_S, POLL_S
+from tests.daemon.harness import PATIENCE_S, POLL_S, need
 from uavlinkd.control import ControlError, ask
 
 
@@ -112,8 +112,7 @@ def linked(folder: Path) -> bool:
 def daemon_pid(parent: int, name: str) -> int:
     """The process of one daemon of the demo."""
     children = Path(f"/proc/{parent}/task/{parent}/children")
-    if not children.exists():
-        pytest.skip("needs Linux's /proc/PID/task/PID/children")
+    need(children.exists(), "Linux's /proc/PID/task/PID/children")
     return next(
         int(pid)
         for pid in children.read_text().split()

@@ -295,6 +295,23 @@ async def test_a_key_that_was_ours_may_become_a_peers(stage: Stage) -> None:
     await program_at(stage, a, "one", into_a)
 
 
+async def test_a_previous_key_that_is_taken_out_ends_what_stands_by_it(stage: Stage) -> None:
+    """A peer that knows only our key before is linked by it, and cut off when the operator ends the change."""
+    a, b = stage.pair()
+    previous = keys.generate_private_key()
+    keys.write_secret_file(a.folder / "previous.key", previous)
+    a.config["previous_private_key_file"] = "previous.key"
+    b.config["peer"][0]["public_key"] = keys.public_key_text(previous)
+    await stage.start(a, b)
+    del a.config["previous_private_key_file"]
+    assert await reload(a) == []
+    peer = (await a.status())["peers"][b.name]
+    assert (peer["state"], peer["session"], peer["accepts_previous_key"]) == ("waiting", None, False)
+    # It calls on, by a key that nobody here has any more.
+    status = await a.until(lambda status: bool(status["drops"].get("bad_mac1")))
+    assert status["peers"][b.name]["state"] == "waiting"
+
+
 async def test_a_reload_that_cannot_read_is_refused_and_a_later_one_is_not(stage: Stage) -> None:
     """Without a process to read the file the old one stays in force, and the daemon says that it is ready again."""
     a, b = stage.pair()

@@ -12,13 +12,13 @@ import argparse
 import asyncio
 import json
 import os
-import signal
 import sys
 import tempfile
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from tests.daemon.harness import free_port
 from uavlinkd.control import ControlError, ask
 from uavlinkd.fleet import work
 from uavlinkd.fleet.manifest import Settings
@@ -27,6 +27,8 @@ PATIENCE_S = 120.0
 LINKED_S = 60.0
 """Every pair is linked so long after the first daemon was started."""
 POLL_S = 0.25
+END_S = 20.0
+"""A daemon that was told to end does so within a fraction of this."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +58,7 @@ async def measure(drones: int, folder: Path, idle_s: float = 5.0) -> Figures:
     Raises:
         TimeoutError: some pair was not linked in time.
     """
-    settings = Settings(address_plan="127.0.13.{n}:5790", drone_url="udpin:127.0.13.{n}:14550")
+    settings = Settings(address_plan=f"127.0.13.{{n}}:{free_port()}", drone_url=f"udpin:127.0.13.{{n}}:{free_port()}")
     began = time.monotonic()
     fleet = work.init(folder / "fleet", settings, drones, 0, 0).fleet
     made_s = time.monotonic() - began
@@ -90,11 +92,22 @@ async def measure(drones: int, folder: Path, idle_s: float = 5.0) -> Figures:
             resident_bytes=max(_memory(each.pid, "Rss") for each in processes),
             idle_cpu_share=round(idle, 5),
         )
+    except TimeoutError:
+        print((folder / "swarm.log").read_text(errors="replace"))
+        raise
     finally:
-        for process in processes:
-            process.send_signal(signal.SIGTERM)
-        for process in processes:
-            await process.wait()
+        await asyncio.gather(*map(end, processes))
+
+
+async def end(process: asyncio.subprocess.Process) -> int:
+    """End a daemon, whether it still runs or not; its exit status. One that does not listen is killed."""
+    if process.returncode is None:
+        process.terminate()
+    try:
+        return await asyncio.wait_for(process.wait(), END_S)
+    except TimeoutError:
+        process.kill()
+        return await process.wait()
 
 
 async def _until_answering(socket: Path) -> None:

@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 
 from tests.daemon.harness import free_port
+from tests.fleet.swarm import end
 from uavlinkd import keys
 from uavlinkd.control import ControlError, ask
 from uavlinkd.fleet import work
@@ -59,9 +60,7 @@ class Vehicles:
 
     async def stop(self, name: str) -> None:
         """End it."""
-        process = self._processes.pop(name)
-        process.send_signal(signal.SIGTERM)
-        assert await process.wait() == 0
+        assert await end(self._processes.pop(name)) == 0
 
     async def renew(self, name: str, *, restart: bool) -> None:
         """Carry the files there, and have the daemon read them."""
@@ -103,12 +102,12 @@ class Vehicles:
 
     async def close(self) -> None:
         """End all."""
-        for name in list(self._processes):
-            await self.stop(name)
-        for path in self._folder.glob("*.log"):
-            text = path.read_text()
-            print(f"--- {path.stem}\n{text}")
-            assert "Traceback" not in text
+        statuses = await asyncio.gather(*map(end, self._processes.values()))
+        logs = {path.stem: path.read_text() for path in self._folder.glob("*.log")}
+        for name, text in logs.items():
+            print(f"--- {name}\n{text}")
+        assert set(statuses) <= {0}
+        assert not [name for name, text in logs.items() if "Traceback" in text]
 
 
 async def _until(condition: Callable[[], bool]) -> None:

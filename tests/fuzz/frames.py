@@ -15,6 +15,7 @@ from uavlinkd import switch as switching
 from uavlinkd.mavlink import frames as splitting
 from uavlinkd.mavlink import policy as policing
 from uavlinkd.mavlink import routing
+from uavlinkd.mavlink.dialect import SETUP_SIGNING
 from uavlinkd.mavlink.dialect_table import MESSAGES
 from uavlinkd.mavlink.frames import (
     MAVLINK1,
@@ -253,7 +254,7 @@ def _check_told(programs: list[Program], source: int, frames: list[Frame]) -> No
             header = by_raw[raw]
             claims = _CLAIMS[source]
             assert claims is None or header.system in claims, "somebody spoke as another system"
-            assert header.msgid != policing.SETUP_SIGNING, "a signing key was passed on"
+            assert header.msgid != SETUP_SIGNING, "a signing key was passed on"
         program.told.clear()
 
 
@@ -291,7 +292,7 @@ def make_gate() -> Run:
                 assert not (always and refusal), "what always passes was refused"
                 claims = _CLAIMS[number]
                 assert refusal or claims is None or frame.header.system in claims, "spoke as another system"
-                assert refusal or frame.header.msgid != policing.SETUP_SIGNING, "a signing key may pass"
+                assert refusal or frame.header.msgid != SETUP_SIGNING, "a signing key may pass"
         assert len(gate.refused) <= policing.MAX_COUNTED + len(Refusal)
         assert len(gate._decisions) <= policing.MAX_DECISIONS
         assert len(gate._buckets) <= policing.MAX_BUCKETS

@@ -188,16 +188,8 @@ def test_reports_ask_for_nothing(asking: str) -> None:
     assert not set(dialect.GROUPS[asking]) & doing
 
 
-def test_all_is_every_message() -> None:
-    """The group `all` holds the whole dialect."""
-    everything = dialect.group("all")
-    assert everything is not None
-    assert set(everything) == set(dialect.ids_by_name())
-
-
 def test_unknown_names_are_told_from_known_ones() -> None:
     """Lookups answer None, or the number itself, for what the dialect does not have."""
-    assert dialect.group("nonsense") is None
     assert dialect.facts(0xABCDEF) is None
     assert dialect.name_of(0xABCDEF) == "11259375"
     assert dialect.name_of(0) == "HEARTBEAT"

@@ -77,6 +77,7 @@ def test_receiver_without_tag_check_accepts_a_false_tag(monkeypatch: pytest.Monk
     stage = _stage()
     stage.begin("tamper-tag,tag=zero")
     stage.network.run(3)
+    assert [each for each in stage.middle.interventions if each.attack == "tamper-tag"]
     assert stage.a.drops[Reason.BAD_TAG] == stage.b.drops[Reason.BAD_TAG] == 0
     assert not stage.flows[0].lost(1.0, stage.network.now - 0.1)
 

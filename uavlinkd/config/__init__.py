@@ -1,7 +1,7 @@
 """The configuration: from a TOML file to values that cannot change, or every problem that the file has.
 
-``load_config`` reads a file in this process; ``read_config`` in another one, which spares the daemon the memory and
-the time of the checker.
+``load_config`` reads a file in this process; ``uavlinkd.config.reader.read_config`` in another one, which spares the
+daemon the memory and the time of the checker.
 """
 
 from typing import TYPE_CHECKING, Any

@@ -13,6 +13,7 @@ from uavlinkd.clock import monotonic
 from uavlinkd.endpoints.ports import PortHandler, failure_name
 from uavlinkd.endpoints.streams import MAX_AGE_S, Connection, StreamEndpoint
 from uavlinkd.endpoints.url import SerialUrl
+from uavlinkd.tasks import keep_running
 from uavlinkd.threads import Threads
 
 RETRY_S = 0.5
@@ -71,7 +72,7 @@ class SerialEndpoint(StreamEndpoint):
 
     def start(self) -> None:
         """Begin to look for the device."""
-        self._task = asyncio.get_running_loop().create_task(self._keep_open())
+        self._task = keep_running(self._keep_open(), f"the endpoint {self.name}")
 
     def close(self) -> None:
         """Stop looking, and close the device."""

@@ -17,6 +17,7 @@ from uavlinkd.clock import monotonic
 from uavlinkd.endpoints.ports import PortHandler, failure_name
 from uavlinkd.endpoints.sockets import bind, cannot_listen, unbound_socket
 from uavlinkd.endpoints.streams import MAX_AGE_S, STALLED_S, StreamEndpoint
+from uavlinkd.tasks import keep_running
 from uavlinkd.threads import Threads
 
 CLIENTS_PER_ENDPOINT = 32
@@ -183,7 +184,7 @@ class TcpClient(StreamEndpoint):
 
     def start(self) -> None:
         """Begin to connect."""
-        self._task = asyncio.get_running_loop().create_task(self._keep_connected())
+        self._task = keep_running(self._keep_connected(), f"the endpoint {self.name}")
 
     def close(self) -> None:
         """Stop connecting, and close the connection."""

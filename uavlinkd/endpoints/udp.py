@@ -19,6 +19,7 @@ from uavlinkd.endpoints.ports import LocalPort, PortHandler, failure_name
 from uavlinkd.endpoints.sockets import Arrived, BindError, Reader, numeric_host, udp_socket
 from uavlinkd.mavlink.frames import MAX_GAP_S, MIN_FRAME_BYTES, Frame, SplitCounters, StreamSplitter, split_datagram
 from uavlinkd.resolver import Resolved, keep_resolving
+from uavlinkd.tasks import keep_running
 
 CLIENTS_PER_ENDPOINT = 32
 """Programs that one ``udpin`` endpoint serves."""
@@ -233,7 +234,7 @@ class UdpClient(UdpEndpoint):
         super().start()
         log = structlog.get_logger().bind(endpoint=self.name)
         following = keep_resolving((self._remote,), self._is_silent, self._on_resolved, log)
-        self._task = asyncio.get_running_loop().create_task(following)
+        self._task = keep_running(following, f"the search for {self._remote}")
 
     def close(self) -> None:
         """Close the socket."""

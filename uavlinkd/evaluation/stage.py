@@ -63,8 +63,8 @@ class Stage(ABC):
     Args:
         names: of the drones.
         middle: between them.
+        ledger: the books; a drone's program speaks if it has an audience there.
         rate_hz: frames a second from each program that speaks.
-        speakers: the drones whose programs speak; all by default.
     """
 
     system = ""

@@ -75,6 +75,10 @@ def _tell(options: argparse.Namespace, result: Result) -> None:
     if result.changed:
         print(f"\nChanged in {options.out}: {changed}. Carry each to its owner, by a way that nobody else reads.")
         print(
+            "Set SYSID_THISMAV or MAV_SYS_ID of each autopilot, and the id of each ground program, to its id above:"
+            " as any other it is refused."
+        )
+        print(
             "There: uavlinkd run --config NAME.toml; where a daemon runs already: uavlinkd reload, or SIGHUP"
             " (a restart, where systemd hands it new keys)."
         )

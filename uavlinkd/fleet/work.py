@@ -6,6 +6,7 @@ is not needed again: a folder may be moved to its vehicle, and the commands then
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import tempfile
@@ -343,7 +344,7 @@ class _Undo:
 
     def move(self, path: Path, to: Path) -> None:
         if to.exists():
-            raise FileExistsError(17, "it exists: move it away", str(to))
+            raise FileExistsError(errno.EEXIST, "it exists: move it away", str(to))
         path.rename(to)
         self._moved.append((path, to))
 

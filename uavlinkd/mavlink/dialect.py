@@ -49,6 +49,10 @@ def ids_by_name() -> Mapping[str, int]:
     return {row[0]: msgid for msgid, row in MESSAGES.items()}
 
 
+SETUP_SIGNING: Final = ids_by_name()["SETUP_SIGNING"]
+"""Carries the key of MAVLink's own signing, in clear. MAVLink 1 has no room for its number."""
+
+
 def command_number(name: str) -> int | None:
     """The number of a command, with or without ``MAV_CMD_`` in front; None if no dialect has it."""
     name = name.upper()
@@ -58,11 +62,6 @@ def command_number(name: str) -> int | None:
 def command_name(number: int) -> str:
     """The command's name; of an unknown one, its number."""
     return _command_names().get(number, str(number))
-
-
-def group(name: str) -> tuple[str, ...] | None:
-    """The names of the messages in a group, or None if there is no such group."""
-    return tuple(ids_by_name()) if name == ALL else GROUPS.get(name)
 
 
 @cache

@@ -93,7 +93,10 @@ class EgressSettings:
 
 @dataclass(frozen=True, slots=True)
 class EnvelopeShape:
-    """What an envelope holds and costs, in bytes: header and tag, and around it IP and UDP (48 over IPv6)."""
+    """What an envelope holds and costs, in bytes: header and tag, and around it IP and UDP (48 over IPv6).
+
+    What stands here holds before the first session: a little less than envelopes of the default size over IPv4.
+    """
 
     payload_limit: int = 1200
     seal_bytes: int = 23

@@ -55,6 +55,7 @@ class Queue:
         self.size = 0  # bytes that wait
 
     def add(self, frame: Waiting) -> None:
+        """Put a frame at the end of its flow, and the flow in line."""
         flow = frame.flow
         flow.frames.append(frame)
         self.arrivals.append(frame)

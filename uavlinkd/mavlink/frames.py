@@ -107,11 +107,6 @@ class Frame(NamedTuple):
     raw: bytes  # as it was on the wire, signature included
     header: Header
 
-    @property
-    def is_signed(self) -> bool:
-        """Whether a signature is at its end."""
-        return self.raw[0] == MAVLINK2 and self.raw[2] != 0
-
 
 @dataclass(slots=True)
 class SplitCounters:

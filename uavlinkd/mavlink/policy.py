@@ -69,7 +69,6 @@ MAX_DECISIONS: Final = 1024  # message ids whose decision is remembered, likewis
 BURST_S: Final = 0.5  # how much of a second's frames may come at once
 SYSTEM_SHARE: Final = 16  # what all components of a system may send of a message, in rates of one
 
-SETUP_SIGNING: Final = 256
 HEARTBEAT: Final = 0
 TYPE_IN_HEARTBEAT: Final = 4  # offset in its payload
 MAV_TYPE_GCS: Final = 6
@@ -227,7 +226,7 @@ class Gate:
     def decide(self, msgid: int, *, is_known: bool) -> Refusal | _Condition | None:
         """What holds for every frame of a message: it passes, is refused, or has conditions to meet."""
         rules = self._rules
-        if msgid == SETUP_SIGNING:
+        if msgid == dialect.SETUP_SIGNING:
             return Refusal.SETUP_SIGNING
         if rules.denies_all or msgid in rules.denied:
             return Refusal.MESSAGE_NOT_ALLOWED

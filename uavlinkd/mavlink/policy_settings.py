@@ -181,11 +181,12 @@ def _command_entry(item: str) -> _Entry | PolicyProblem:
 
 
 def _check_entries(key: str, items: tuple[str | int, ...], report: Report) -> None:
+    signing = dialect.SETUP_SIGNING
     for place, item in enumerate(items):
         entry = _entry(item)
         if isinstance(entry, PolicyProblem):
             report(f"{key}[{place}]", entry.problem, entry.remedy)
-        elif key.startswith("allow") and (entry.number == 256 or entry.messages == (256,)):
+        elif key.startswith("allow") and (entry.number or entry.messages) in (signing, (signing,)):
             report(f"{key}[{place}]", "SETUP_SIGNING never crosses", "leave it out")
 
 

@@ -86,7 +86,7 @@ _BASE_CREEP: Final = 0.01
 
 @dataclass(frozen=True, slots=True)
 class LinkFigures:
-    """The link, over the last few seconds. Losses are shares of envelopes, 0 to 1; others are clipped to that."""
+    """The link, since it was last measured. Losses are shares of envelopes, 0 to 1; others are clipped to that."""
 
     is_up: bool
     loss_in: float
