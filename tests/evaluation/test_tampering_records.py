@@ -54,6 +54,12 @@ TRIAL = Trial(
         ({"attempts": 0}, Verdict.BROKEN),
         ({"noticed": {"drone0": {"bad_tag": 1}, "drone1": {}}}, Verdict.DETECTED),
         ({"events": {"drone0": {"peer_lost": 1}}}, Verdict.DETECTED),
+        ({"events": {"drone0": {"path_changed": 1}}}, Verdict.DETECTED),
+        ({"events": {"drone0": {"session_established": 1}}}, Verdict.HARMLESS),
+        # As many as come in two seconds without an attack, and then more.
+        ({"noticed": {"drone0": {"late": 4}, "drone1": {"late": 2}}, "control": {"late": 1.0}}, Verdict.HARMLESS),
+        ({"noticed": {"drone0": {"late": 4}, "drone1": {"late": 3}}, "control": {"late": 1.0}}, Verdict.DETECTED),
+        ({"noticed": {"drone0": {"bad_tag": 1}}, "control": {"late": 1.0}}, Verdict.DETECTED),
         ({"frames_delivered": 199}, Verdict.BLOCKED),
         ({"faults": {"replayed": 1}}, Verdict.SUCCEEDED),
         ({"faults": {"replayed": 1}, "noticed": {"drone0": {"bad_tag": 99}}}, Verdict.SUCCEEDED),

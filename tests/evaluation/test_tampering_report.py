@@ -37,13 +37,41 @@ FLOOD = Flood(
 )
 
 
-def report(folder: Path, *trials: Trial) -> str:
+def report(folder: Path, *trials: Trial, **facts: object) -> str:
     """The HTML of these."""
-    lines = [json.dumps({"run": {"seed": 1}}), *(trial.to_json() for trial in trials), FLOOD.to_json()]
+    lines = [json.dumps({"run": {"seed": 1, **facts}}), *(trial.to_json() for trial in trials), FLOOD.to_json()]
     (folder / "tampering.jsonl").write_text("\n".join(lines))
     html = write_tampering_report(folder)
     assert html == folder / "tampering.html"
     return html.read_text()
+
+
+def test_what_was_sent_is_told_from_what_was_kept_back(tmp_path: Path) -> None:
+    """Of a dropped datagram nothing could be accepted: it is no attempt that was refused."""
+    drops = replace(
+        TRIAL, attack="drop, half", attempts=40, interventions={"drop: dropped": 40}, frames_delivered=160
+    )
+    html = report(tmp_path, TRIAL, drops, RELAY)
+    assert "made 140 attempts: 100 datagrams were forged" in html
+    assert "and 40 genuine ones were dropped or held back" in html
+
+
+def test_recovery_is_that_of_attacks_that_cost_something(tmp_path: Path) -> None:
+    """After the others the next frame comes when it was to come anyway."""
+    slow = replace(TRIAL, attack="drop, half", frames_delivered=150, recovery_s=0.5)
+    html = report(tmp_path, TRIAL, slow, RELAY)
+    assert "of the 1 attacks that cost genuine frames median 500 ms" in html
+    assert "After the other 1 the next frame" in html
+
+
+def test_quiet_times_and_timers_of_each_stage_are_shown(tmp_path: Path) -> None:
+    """What a reader needs to weigh "detected" and the times."""
+    control = {"data": {"late": 0.3}, "paper": {}}
+    html = report(tmp_path, TRIAL, RELAY, control=control, links={"data": {"rekey_after_s": 2.0}})
+    assert "rekey_after_s = 2.0" in html
+    assert "0.3 late" in html
+    assert "the defaults" in html
+    assert "Where nothing is attacked" not in report(tmp_path, TRIAL, RELAY)
 
 
 def test_it_says_what_came_of_it(tmp_path: Path) -> None:

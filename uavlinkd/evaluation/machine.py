@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import subprocess
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -24,6 +25,7 @@ def machine_facts() -> dict[str, Value]:
         "system": f"{platform.system()} {platform.release()} {platform.machine()}",
         "python": platform.python_version(),
         "uavlinkd": __version__,
+        "commit": _commit(),
         "cryptography": _version_of("cryptography"),
         "openssl": _openssl_version(),
         "uvloop": _version_of("uvloop"),
@@ -42,6 +44,25 @@ def _cpu_name() -> str:
             if name.strip() in ("model name", "Model", "Hardware"):  # x86; boards such as a Raspberry Pi
                 return value.strip()
     return platform.processor() or platform.machine()
+
+
+def _commit() -> str | None:
+    """Which code was measured: git's name for it, with "changed" where files differ; None outside of a checkout."""
+    questions = (
+        ("ls-files", "--error-unmatch", __file__),  # a checkout of this project, and not one around an installation
+        ("rev-parse", "--short", "HEAD"),
+        ("status", "--porcelain", "--", ".."),
+    )
+    answers = []
+    for question in questions:
+        git = ("git", "-C", str(Path(__file__).parent), *question)
+        try:
+            done = subprocess.run(git, capture_output=True, text=True, check=True, timeout=10)  # noqa: S603  our words
+        except (OSError, subprocess.SubprocessError):
+            return None
+        answers.append(done.stdout.strip())
+    _, commit, changes = answers
+    return f"{commit}, changed" if changes else commit
 
 
 def _version_of(package: str) -> str | None:

@@ -44,7 +44,8 @@ class Interventions:
     """By "attack: what"."""
     bytes_to_strangers: int = 0
     """What was sent back to addresses of the attacker's own."""
-    amplified: frozenset[str] = frozenset()
+    amplified: Mapping[str, int] = field(default_factory=dict)
+    """By "peer to address of the attacker's own": bytes that came back beyond what lately went there."""
 
     def of(self, names: Sequence[str]) -> dict[str, int]:
         """Of these attacks."""
@@ -55,7 +56,7 @@ def interventions(statistics: Mapping[str, Any]) -> Interventions:
     """From the statistics of a :class:`Proxy`."""
     strangers = statistics["strangers"]
     return Interventions(
-        dict(statistics["interventions"]), int(strangers["bytes_back"]), frozenset(strangers["amplified"])
+        dict(statistics["interventions"]), int(strangers["bytes_back"]), dict(strangers["amplified"])
     )
 
 

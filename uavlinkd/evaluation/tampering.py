@@ -18,7 +18,7 @@ from typing import Any
 
 from uavlinkd.evaluation import tampering_plan as plans
 from uavlinkd.evaluation.flood import run_floods
-from uavlinkd.evaluation.machine import machine_facts
+from uavlinkd.evaluation.machine import load, machine_facts
 from uavlinkd.evaluation.middle import MiddleHere, MiddleProcess
 from uavlinkd.evaluation.paper_attacks import CHANGES, AlterKeys
 from uavlinkd.evaluation.stage import DaemonStage, PaperStage, Stage
@@ -41,6 +41,8 @@ FAST_LINK = {
 DATA_LINK = {"rekey_after_s": 2.0, "reject_after_s": 20.0}
 KEYS_LINK = {"rekey_after_s": 1.0, "reject_after_s": 10.0}
 PLAIN_LINK: dict[str, object] = {}
+LINKS = {"handshake-0": FAST_LINK, "handshake-1": FAST_LINK, "data": DATA_LINK, "keys": KEYS_LINK}
+"""Of each stage: what differs from the defaults of `[link]`."""
 
 
 class Evaluation:
@@ -82,7 +84,13 @@ class Evaluation:
                 recorder.run.floods = await run_floods(stage, rates, phase_s)
             for flood in recorder.run.floods:
                 recorder.write(flood.to_json())
-            facts |= {"seconds": round(monotonic() - recorder.began_at, 1), "unlogged": self._unlogged}
+            facts |= {
+                "seconds": round(monotonic() - recorder.began_at, 1),
+                "load_after": load(),
+                "unlogged": self._unlogged,
+                "control": {label: bench.control for label, bench in self._benches},
+                "links": {label: settings for label, settings in LINKS.items() if label in dict(self._benches)},
+            }
             recorder.run.facts = facts
             recorder.write(json.dumps({"run": facts}))
             write_logs(self.out, self._benches)
@@ -118,6 +126,7 @@ class Evaluation:
         bench = Bench(stage, recorder, self.settings)
         self._benches.append((label, bench))
         async with stage:
+            await bench.run_control()
             await work(bench)
             counted = {name: set(+notice.drops) for name, notice in (await stage.notices()).items()}
         for name, lines in stage.logs().items():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from time import monotonic
@@ -20,6 +20,8 @@ GIVE_UP_S = 5.0
 """How long frames are waited for after an attack."""
 QUICK_AFTER_S = 1.2
 """The longest that a quick run goes on after the last attempt: it has few to wait for."""
+CONTROL_S, QUICK_CONTROL_S = 10.0, 1.0
+"""How long nothing is attacked, for comparison, before the first attack."""
 _LOOK_S = 0.02
 _SETTLE_S = 0.08
 """After the recovery: what is on its way arrives."""
@@ -98,6 +100,8 @@ class Bench:
     def __init__(self, stage: Stage, recorder: Recorder, settings: Settings) -> None:
         self.stage = stage
         self.markers: list[Marker] = []
+        self.control: dict[str, float] = {}
+        """What the drones count a second where nothing is attacked, as :meth:`run_control` found."""
         self._recorder = recorder
         self._settings = settings
 
@@ -176,16 +180,26 @@ class Bench:
             achieved=result,
             bytes_to_strangers=after_stats.bytes_to_strangers - stats.bytes_to_strangers,
             must_be_silent=plan.is_silent,
-            amplified=() if plan.validates else tuple(sorted(after_stats.amplified - stats.amplified)),
+            amplified=() if plan.validates else tuple(sorted(_difference(after_stats.amplified, stats.amplified))),
             frames_sent=sent,
             frames_delivered=delivered,
             noticed={name: dict(after[name].since(notices[name]).drops) for name in after},
             events=_events(stage, lines),
             recovery_s=None if recovery_s is None else round(recovery_s, 4),
             notes=plan.notes,
+            control=self.control,
         )
         self._recorder.add(trial)
         return trial
+
+    async def run_control(self) -> None:
+        """See what the drones count while the man in the middle lets everything pass."""
+        duration_s = QUICK_CONTROL_S if self._settings.quick else CONTROL_S
+        before = await self.stage.notices()
+        await asyncio.sleep(duration_s)
+        after = await self.stage.notices()
+        counts = sum((after[name].since(before[name]).drops for name in after), Counter[str]())
+        self.control = {reason: round(count / duration_s, 3) for reason, count in counts.items()}
 
     def _mark(self, text: str) -> None:
         self.markers.append(Marker(datetime.now(UTC), text))
@@ -194,11 +208,11 @@ class Bench:
 _NO_ATTEMPTS = ("answered", "released")
 
 
-def _attempts(now: dict[str, int], before: dict[str, int]) -> int:
+def _attempts(now: Mapping[str, int], before: Mapping[str, int]) -> int:
     return sum(n for key, n in _difference(now, before).items() if not key.endswith(_NO_ATTEMPTS))
 
 
-def _difference(now: dict[str, int], before: dict[str, int]) -> dict[str, int]:
+def _difference(now: Mapping[str, int], before: Mapping[str, int]) -> dict[str, int]:
     return {key: n - before.get(key, 0) for key, n in now.items() if n > before.get(key, 0)}
 
 

@@ -13,12 +13,17 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
+from uavlinkd.mitm.attack import What
+
 PAPER, OURS = "paper", "uavlinkd"
 """The systems."""
 RELAY = "two-sided-relay"
 """The attack that must succeed against the one, and not against the other."""
 RECOVERY_LIMIT_S = 2.0
 """A link that does not carry frames again by then, without help, was broken by the attack."""
+
+
+_WITHHELD = (What.DROPPED, What.HELD, What.REORDERED)
 
 
 class Verdict(StrEnum):
@@ -28,7 +33,8 @@ class Verdict(StrEnum):
     """Something forged, altered, replayed, reflected or misrouted came out at a local program; or the attacker shares
     keys with a drone; or a drone answered where it must be silent, or amplified; or the link stayed down."""
     DETECTED = "detected"
-    """Nothing of that, and the drones noticed: counters with a name, and a line in the log."""
+    """Nothing of that, and the drones noticed: counters with a name, beyond what they count where nothing is
+    attacked, and a line in the log."""
     BLOCKED = "blocked"
     """Nothing of that, but frames were missing or late while it lasted, for which no datagram is to blame: an
     attacker who drops and delays is not refused, he is outlasted."""
@@ -53,6 +59,7 @@ class Trial:
     """Since the run began."""
     duration_s: float
     attempts: int
+    """Datagrams forged, altered, replayed, held back and so on. While a drone was down some met nobody."""
     interventions: Mapping[str, int]
     """By "attack: what"."""
     target: int
@@ -76,6 +83,13 @@ class Trial:
     recovery_s: float | None
     """From the attack's end until frames sent after it had come out everywhere; None: not within five seconds."""
     notes: str = ""
+    control: Mapping[str, float] = field(default_factory=dict)
+    """What the drones of this stage count a second, all together, where nothing is attacked."""
+
+    @property
+    def withheld(self) -> int:
+        """Of the attempts: genuine datagrams that were dropped or held, of which nothing could be accepted."""
+        return sum(n for key, n in self.interventions.items() if key.rpartition(" ")[2] in _WITHHELD)
 
     @property
     def frames_lost(self) -> int:
@@ -84,9 +98,14 @@ class Trial:
 
     @property
     def is_noticed(self) -> bool:
-        """Whether a person can find out."""
-        lost = any(events.get("peer_lost") for events in self.events.values())
-        return lost or any(counts for counts in self.noticed.values())
+        """Whether a person can find out: an event that attacks cause, or counts beyond those of quiet times."""
+        told = any(events.get(each) for events in self.events.values() for each in ("peer_lost", "path_changed"))
+        return told or any(count > self._usual(reason) for reason, count in self.reasons.items())
+
+    def _usual(self, reason: str) -> float:
+        """As many as may well be counted in that time without an attack."""
+        rate = self.control.get(reason, 0.0)
+        return 2 + 2 * rate * self.duration_s if rate else 0.0
 
     @property
     def reasons(self) -> dict[str, int]:

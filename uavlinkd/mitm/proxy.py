@@ -20,6 +20,7 @@ import structlog
 from uavlinkd.addresses import Address
 from uavlinkd.control import ControlServer
 from uavlinkd.endpoints.sockets import DATAGRAMS_PER_WAKE_UP, RECEIVE_BYTES, BindError, udp_socket
+from uavlinkd.mitm.amplification import Amplification
 from uavlinkd.mitm.attack import NEVER, Action, AttackError, AttackObject, Intervention, Surroundings, Way
 from uavlinkd.mitm.attacks import parse_attack
 from uavlinkd.mitm.channel import Channel
@@ -53,6 +54,7 @@ class Proxy:
         self.stranger_bytes_sent: Counter[tuple[str, int]] = Counter()
         self.stranger_bytes_back: Counter[tuple[str, int]] = Counter()
         """By peer and stranger: what went there, what came from there. Each stranger is an unvalidated address."""
+        self.amplification = Amplification()
         self.troubles: Counter[str] = Counter()
         """Datagrams that went nowhere, by the reason."""
         self._given = attacks
@@ -181,9 +183,9 @@ class Proxy:
             "strangers": {
                 "bytes_sent": sent.total(),
                 "bytes_back": back.total(),
-                "amplified": sorted(
-                    f"{peer} to {number}" for peer, number in back if back[peer, number] > sent[peer, number]
-                ),
+                "amplified": {
+                    f"{peer} to {number}": excess for (peer, number), excess in self.amplification.excess.items()
+                },
             },
             "radios": {str(way): dict(radio.fates) for way, radio in self.channel.radios.items()},
             "troubles": dict(self.troubles),
@@ -255,6 +257,7 @@ class Proxy:
                 self.troubles["from nobody we know"] += 1
                 continue
             self.stranger_bytes_back[peer, stranger] += len(datagram)
+            self.amplification.came_back(peer, stranger, len(datagram), now)
             self._perform(self.channel.on_answer(datagram, peer, stranger, now))
         self._arm()
 
@@ -280,6 +283,7 @@ class Proxy:
                 self.sent[way] += 1
             else:
                 self.stranger_bytes_sent[way.receiver, stranger] += len(datagram)
+                self.amplification.sent(way.receiver, stranger, len(datagram), monotonic())
 
     def _stranger(self, number: int, to: Sockaddr) -> socket.socket:
         """The socket of a stranger. On loopback each has an address of its own, elsewhere a port of its own."""
