@@ -13,6 +13,7 @@ from uavlinkd.evaluation.spread import Spread, duration, spread
 
 _TAGS_IN_AN_EXCHANGE = 10
 """More than there are: those of one frame, one confirmation and one answer, made and checked."""
+_ENOUGH_FOR_QUARTILES = 5
 _OWN_LOAD = 2
 _MOST = 0.5
 _LEVEL = 0.05
@@ -31,7 +32,8 @@ def on_the_machine(findings: Findings) -> list[str]:
         return []
     return [
         f"Other work was in the way: the load was up to {max(loads):g} on {cores} cores. Times between events are "
-        "longer than on an idle machine, and their spread wider; processor times suffer less."
+        "longer than on an idle machine, and their spread wider; processor times suffer less. The limit on an "
+        "exchange is of time passed: where the paper's method reached it, a factor is one of this machine on that day."
     ]
 
 
@@ -78,7 +80,9 @@ def on_the_cause(findings: Findings) -> list[str]:
                 if each.is_ok
             ]
             medians.append(spread(shares).median)
-            said.append(f"{100 * medians[-1]:.0f} % at {bits} bits (longest {_ratio(made)} times the shortest)")
+            few = "once" if made.count == 1 else f"n = {made.count}"
+            range_ = f"longest {_ratio(made)} times the shortest" if made.count >= _ENOUGH_FOR_QUARTILES else few
+            said.append(f"{100 * medians[-1]:.0f} % at {bits} bits ({range_})")
     if not said:
         return []
     if max(medians) > _MOST:
@@ -318,6 +322,8 @@ def with_spread(each: Spread) -> str:
     """A median with what stands around it."""
     if each.count == 1:
         return f"{duration(each.median)} (once)"
+    if each.count < _ENOUGH_FOR_QUARTILES:
+        return f"{duration(each.median)} (all {duration(each.least)} to {duration(each.most)}, n = {each.count})"
     return (
         f"{duration(each.median)} (middle half {duration(each.low)} to {duration(each.high)}, all "
         f"{duration(each.least)} to {duration(each.most)}, n = {each.count})"

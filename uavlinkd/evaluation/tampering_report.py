@@ -92,6 +92,8 @@ def make_sections(run: Run, figures: Sequence[str]) -> list[Section]:
         Section("Attackers with keys", "", _ON_KEYS, _keys(run)),
         Section("What the drones noticed", "", _ON_NOTICED, _noticed(run)),
         *([Section("Where nothing is attacked", "", _ON_CONTROL, _control(run))] if "control" in run.facts else []),
+        Section("The paper's protocol", "", _ON_PAPER),
+        Section("What is tried elsewhere", "", [], Table(["attack", "where"], _ELSEWHERE)),
         Section("Where and how", "", _ON_RUN, _facts(run)),
     ]
 
@@ -117,6 +119,25 @@ _ON_CONTROL = [
     "What the drones of each stage count a second, all together, while the man in the middle lets everything pass: "
     "new keys each second or two leave some too. An attack is detected where more than twice that came, or something "
     "else."
+]
+_ON_PAPER = [
+    "The paper: Ouadah and Merazka, Securing UAV Communication: Authentication and Integrity, 2024 (arXiv "
+    "2410.09085). Two drones exchange bare Diffie-Hellman public keys over UDP and authenticate data by an HMAC under "
+    "the shared secret. What it leaves open was settled here, and some rows follow from that: new keys are made each "
+    "0.25 s, so that attacks on the exchange have something to attack, and the key before the newest is taken on, so "
+    "that what was held longer is refused; each datagram has the header of our envelopes, under the HMAC, whose "
+    "number is not looked at, so that what is replayed or doubled is accepted; an address is not looked at either."
+]
+_ELSEWHERE = [
+    ["a clock set to 1970 or 2106, or that jumps", "tests/daemon/test_reboot.py, tests/faults, tests/network"],
+    ["a network gone for 60 s between containers", "tests/compose"],
+    [
+        "a peer's frames beyond its policy: other systems, commands, SETUP_SIGNING, MAVLink 1",
+        "tests/mavlink, tests/daemon",
+    ],
+    ["a hostile program at the local port", "tests/daemon/test_hostile_local.py"],
+    ["recordings, and later a stolen key; a quantum computer", "tests/formal"],
+    ["a copy of a running daemon's memory that runs on", "out of scope: uavlinkd/core/README.md, section 1"],
 ]
 _ON_RUN = [
     "Reproduce with `uavlinkd evaluate tampering --out DIR`. The seed fixes what the man in the middle chooses, not "
