@@ -33,7 +33,8 @@ def on_the_machine(findings: Findings) -> list[str]:
     return [
         f"Other work was in the way: the load was up to {max(loads):g} on {cores} cores. Times between events are "
         "longer than on an idle machine, and their spread wider; processor times suffer less. The limit on an "
-        "exchange is of time passed: where the paper's method reached it, a factor is one of this machine on that day."
+        "exchange is of time passed: where the paper's method reached it, a factor is one of this machine on that "
+        "day."
     ]
 
 
