@@ -242,7 +242,8 @@ def test_policy_tells_what_passes_and_what_does_not(folder: Path) -> None:
     assert {"parameters", "mission-reads", "shell", "signing", "MAVLink 1"} <= set(neither.split(", "))
     assert "commands" not in neither.split(", ")
     assert "commands all (by command: COMMAND_LONG," in rest
-    assert "denied: MAV_CMD_DO_FLIGHTTERMINATION -" in rest.replace("commands by number ", "")
+    assert "denied: MAV_CMD_DO_FLIGHTTERMINATION, -" in rest.replace("commands by number ", "")
+    assert "MAV_CMD_DO_AUX_FUNCTION" in rest
     assert "rates - position 2.5/s" in rest
 
 

@@ -350,6 +350,25 @@ def test_what_goes_out_is_limited_by_instance() -> None:
     assert sum(gate.check(battery(0), 60.5) is None for _ in range(10)) == 2
 
 
+@pytest.mark.parametrize(
+    ("denied", "others"),
+    [
+        ("MAV_CMD_COMPONENT_ARM_DISARM", ["MAV_CMD_DO_AUX_FUNCTION"]),
+        ("MAV_CMD_DO_SET_MODE", ["MAV_CMD_DO_AUX_FUNCTION", "MAV_CMD_DO_SET_STANDARD_MODE"]),
+        ("MAV_CMD_DO_CHANGE_ALTITUDE", ["MAV_CMD_GUIDED_CHANGE_ALTITUDE"]),
+        ("MAV_CMD_GUIDED_CHANGE_ALTITUDE", ["MAV_CMD_DO_CHANGE_ALTITUDE"]),
+        ("MAV_CMD_NAV_TAKEOFF", []),
+    ],
+)
+def test_what_does_the_same_is_denied_with_a_command(denied: str, others: list[str]) -> None:
+    """Who may not arm may not do so by the number of a switch either; what has no twin takes nothing along."""
+    made = compile_policy({"system_ids": "all", "role": "operator", "deny_in": [denied]})
+    refused = {name for name in COMMANDS if made.incoming.check(command_long(COMMANDS[name]), 0.0) is not None}
+    assert refused == {denied, *others}
+    text = {row.subject: row.incoming for row in made.describe()}["commands by number"]
+    assert all(name in text for name in refused), "what is denied is shown"
+
+
 def test_each_program_has_the_rate() -> None:
     """Two programs at one endpoint: the first that is asked does not use up what the second is to be told."""
     gate = compile_policy({"system_ids": "all", "rate_out": {"HEARTBEAT": 1}}).outgoing
@@ -620,7 +639,7 @@ def test_table_says_what_the_gate_does() -> None:
     assert "by command: MISSION_ITEM, MISSION_ITEM_INT" in rows["mission"].incoming
     assert rows["commands"].incoming == "only COMMAND_LONG, COMMAND_INT (by command: COMMAND_LONG, COMMAND_INT)"
     assert rows["commands by number"].incoming == (
-        "allowed: MAV_CMD_NAV_TAKEOFF; denied: MAV_CMD_DO_FLIGHTTERMINATION"
+        "allowed: MAV_CMD_NAV_TAKEOFF; denied: MAV_CMD_DO_FLIGHTTERMINATION, MAV_CMD_DO_AUX_FUNCTION"
     )
     assert rows["messages by number"].incoming == "allowed: 99999; denied: 88888"
     assert rows["messages unknown to the dialect"][1:] == ("refused", "passes")

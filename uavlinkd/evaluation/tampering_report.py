@@ -123,10 +123,11 @@ _ON_CONTROL = [
 _ON_PAPER = [
     "The paper: Ouadah and Merazka, Securing UAV Communication: Authentication and Integrity, 2024 (arXiv "
     "2410.09085). Two drones exchange bare Diffie-Hellman public keys over UDP and authenticate data by an HMAC "
-    "under the shared secret. What it leaves open was settled here, and some rows follow from that: new keys are made each "
-    "0.25 s, so that attacks on the exchange have something to attack, and the key before the newest is taken on, so "
-    "that what was held longer is refused; each datagram has the header of our envelopes, under the HMAC, whose "
-    "number is not looked at, so that what is replayed or doubled is accepted; an address is not looked at either."
+    "under the shared secret. What it leaves open was settled here, and some rows follow from that: new keys are "
+    "made each 0.25 s, so that attacks on the exchange have something to attack, and the key before the newest is "
+    "taken on, so that what was held longer is refused; each datagram has the header of our envelopes, under the "
+    "HMAC, whose number is not looked at, so that what is replayed or doubled is accepted; an address is not looked "
+    "at either."
 ]
 _ELSEWHERE = [
     ["a clock set to 1970 or 2106, or that jumps", "tests/daemon/test_reboot.py, tests/faults, tests/network"],

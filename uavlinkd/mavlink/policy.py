@@ -20,8 +20,9 @@ A list's entries add up, a role's entries among them, and what is denied is deni
 ``30``                   a message by its number: the way to name one that the dialect does not know
 ``MAV_CMD_NAV_TAKEOFF``  a command by its name; ``command:22`` by its number. Allowing one lets it through in
                          COMMAND_LONG and COMMAND_INT. Denying one keeps it out of all that carries commands, mission
-                         items and cancellations among them, and of messages that do the same: SET_MODE is
-                         MAV_CMD_DO_SET_MODE, a mission item to fly to now is MAV_CMD_DO_REPOSITION.
+                         items and cancellations among them, and with it what does the same: SET_MODE is
+                         MAV_CMD_DO_SET_MODE, a mission item to fly to now is MAV_CMD_DO_REPOSITION, and
+                         MAV_CMD_DO_AUX_FUNCTION can arm (`policy_settings.DONE_BY`).
 
 A rate is kept for each component by itself: an autopilot and its gimbal both send HEARTBEAT, and were the rate theirs
 together, whoever comes first in each second would silence the other for minutes. But what comes in may name any

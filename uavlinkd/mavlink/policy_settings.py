@@ -23,6 +23,25 @@ KEYS: Final = (
     *("mavlink1", "ground_station"),
 )
 
+# Commands by which an autopilot can be made to do what another says: whoever denies the one means the others too.
+# DO_AUX_FUNCTION does what a switch of the remote control would (ArduPilot's RCx_OPTION): modes, arming, a stop.
+_DONE_BY: Final[Mapping[str, tuple[str, ...]]] = {
+    "COMPONENT_ARM_DISARM": ("DO_AUX_FUNCTION",),
+    "DO_FLIGHTTERMINATION": ("DO_AUX_FUNCTION",),
+    "DO_PARACHUTE": ("DO_AUX_FUNCTION",),
+    "DO_FENCE_ENABLE": ("DO_AUX_FUNCTION",),
+    "DO_SET_MODE": ("DO_AUX_FUNCTION", "DO_SET_STANDARD_MODE"),
+    "DO_SET_STANDARD_MODE": ("DO_AUX_FUNCTION", "DO_SET_MODE"),
+    "NAV_RETURN_TO_LAUNCH": ("DO_AUX_FUNCTION",),
+    "NAV_LAND": ("DO_AUX_FUNCTION",),
+    "DO_CHANGE_ALTITUDE": ("GUIDED_CHANGE_ALTITUDE",),
+    "GUIDED_CHANGE_ALTITUDE": ("DO_CHANGE_ALTITUDE",),
+}
+DONE_BY: Final[Mapping[int, frozenset[int]]] = {
+    COMMANDS[f"MAV_CMD_{name}"]: frozenset(COMMANDS[f"MAV_CMD_{other}"] for other in others)
+    for name, others in _DONE_BY.items()
+}
+
 
 class PolicyProblem(NamedTuple):
     """One thing wrong in a policy's data."""
@@ -135,6 +154,7 @@ def _rules(allow: tuple[str | int, ...], deny: tuple[str | int, ...], *, allows_
     allowed = [entry for entry in map(_entry, allow) if isinstance(entry, _Entry)]
     denied = [entry for entry in map(_entry, deny) if isinstance(entry, _Entry)]
     denied_messages = {msgid for entry in denied for msgid in entry.messages}
+    denied_commands = {entry.command for entry in denied if entry.command is not None}
     return Rules(
         allows_all=allows_all or any(entry.is_all for entry in allowed),
         allowed=frozenset(msgid for entry in allowed for msgid in entry.messages),
@@ -142,7 +162,7 @@ def _rules(allow: tuple[str | int, ...], deny: tuple[str | int, ...], *, allows_
         allowed_commands=frozenset(entry.command for entry in allowed if entry.command is not None),
         denies_all=any(entry.is_all for entry in denied),
         denied=frozenset(denied_messages | {entry.number for entry in denied if entry.number is not None}),
-        denied_commands=frozenset(entry.command for entry in denied if entry.command is not None),
+        denied_commands=frozenset(denied_commands.union(*(DONE_BY.get(each, ()) for each in denied_commands))),
     )
 
 
