@@ -230,6 +230,19 @@ def test_policy_is_told_once_for_all_who_have_it(folder: Path) -> None:
     assert list(_policies(_printed(_load(folder, different)))) == ["drone1", "observer", "autopilot"]
 
 
+def test_where_metrics_are_and_recordings_go_is_told(folder: Path) -> None:
+    """A folder that a service cannot write to is seen here first."""
+    printed = _printed(
+        _load(folder, _FILE + '[metrics]\nlisten = "127.0.0.1:9790"\n[recording]\nfolder = "flights"\n')
+    )
+    told = "".join(printed.split())  # long lines are folded
+    assert "metricshttp://127.0.0.1:9790/metrics" in told
+    assert f"recordsin{folder / 'flights'}(1GBofitsdisk" in told
+    plain = _printed(_load(folder, _FILE))
+    assert "records in" not in plain
+    assert "metrics" not in plain
+
+
 def test_policy_tells_what_passes_and_what_does_not(folder: Path) -> None:
     """Whole groups in a line each way, then what differs; a rate as it was written."""
     text = _FILE.replace(

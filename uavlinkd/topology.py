@@ -69,6 +69,11 @@ def _identity(config: Config) -> Table:
         table.add_row("before", Text(f"{before}\n{_grace(config)}"))
     table.add_row("listens on", Text(_listening(config)))
     table.add_row("routing", Text(_routing(config.routing)))
+    if config.metrics is not None:
+        table.add_row("metrics", Text(f"http://{config.metrics}/metrics"))
+    if config.recording is not None:
+        left = f"{config.recording.min_free_bytes / 1e9:g} GB of its disk are left to others"
+        table.add_row("records in", Text(f"{config.recording.folder} ({left})"))
     return table
 
 

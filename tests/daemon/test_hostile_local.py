@@ -266,7 +266,7 @@ async def test_who_comes_back_from_another_port_is_followed_at_once(stage: Stage
             await pilot.until(lambda: bool(pilot.arrivals))
             question = mavlink.MAVLink_param_request_read_message(1, 1, parameter, -1)
             pilot.send(pack(question, GROUND_SYSTEM, seq=life), ("127.0.0.1", pilot.sources[-1][1]))
-            await flight.until(lambda flight=flight: flight.report().frames_received == 1, 1.0)  # type: ignore[misc]
-            await pilot.until(lambda parameter=parameter: parameter in pilot.received, 1.0)  # type: ignore[misc]
+            await flight.until(lambda flight=flight: flight.report().frames_received == 1, 2.5)  # type: ignore[misc]
+            await pilot.until(lambda parameter=parameter: parameter in pilot.received, 2.5)  # type: ignore[misc]
     programs = (await a.status())["endpoints"]["autopilot"]["programs"]
     assert len(programs) == 3, "each life spoke from a port of its own"
