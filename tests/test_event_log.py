@@ -102,9 +102,11 @@ def test_a_silent_endpoint_is_told_once_each_time(log: EventLog) -> None:
     endpoint.counters.frames += 1
     assert lines(range(100, 110)) == []
     assert len(lines(range(110, 200))) == 1
+    log.forget_endpoint("autopilot")  # closed and opened anew
+    assert len(lines(range(200, 220))) == 1
     endpoint.counters.frames += 1
     endpoint.ports.clear()  # nobody is there: that is told otherwise
-    assert lines(range(200, 300)) == []
+    assert lines(range(220, 300)) == []
 
 
 def test_an_unheard_peer_is_told_with_what_to_look_at(log: EventLog) -> None:

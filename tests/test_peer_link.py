@@ -101,8 +101,11 @@ def test_a_peer_that_is_not_heard_is_told_of_once(addresses: tuple[Address, ...]
     config = Peer(PeerSettings("bravo", KEY_B.public, None, PLAIN), addresses)
     link = PeerLink(config, pair.a.node, lambda _: None, 0.0)
     assert [second for second in range(200) if link.is_unheard(float(second))] == [told_at]
-    pair.establish(200.0)
-    assert not link.is_unheard(200.0)
+    link.change(replace(config, addresses=(Address("192.0.2.3", 14600),)), 200.0)  # told anew, of the new address
+    assert [second for second in range(200, 300) if link.is_unheard(float(second))] == [205]
+    link.set_paths([AT_B], 300.0)
+    pair.establish(300.0)
+    assert not link.is_unheard(300.0)
 
 
 def measured(config: Peer, figures: LinkFigures) -> PeerLink:

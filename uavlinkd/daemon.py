@@ -287,6 +287,7 @@ class Daemon:
             self.switch.remove(port)
         endpoint.close()
         del self.endpoint_policies[name]
+        self._events.forget_endpoint(name)
         self._radio_status.pop(name, None)
 
     def _change_endpoint(self, config: EndpointConfig) -> None:

@@ -87,8 +87,12 @@ class EventLog:
                 programs=[port.name for port in endpoint.ports],
                 garbage_bytes=endpoint.counters.garbage_bytes,
                 meaning="no MAVLink comes: is it on, is MAVLink on at that port, with that speed and wiring, and does"
-                " nothing else read it?",
+                " nothing else read it? Or the program is closed, or only listens",
             )
+
+    def forget_endpoint(self, name: str) -> None:
+        """The endpoint was closed: another one of its name begins anew."""
+        self._frames.pop(name, None)
 
     def _take_line(self, kind: str, name: str, now: float) -> dict[str, int] | None:
         """What to say of lines that were left out before this one; None where this one is to be left out too."""

@@ -110,9 +110,11 @@ class PeerLink:
         return bool(gone)
 
     def _give_up(self, gone: Sequence[KeyPairing], now: float) -> None:
-        for name in [each.settings.name for each in gone]:
-            self._names.remove(name)
+        names = [each.settings.name for each in gone]
+        self._names = [name for name in self._names if name not in names]
+        for name in names:
             del self._previous[name]
+        for name in names:  # what comes of it sees none of them any more
             self._perform(self._node.remove_peer(name, now))
 
     def set_paths(self, paths: Sequence[Path], now: float) -> None:
@@ -128,6 +130,7 @@ class PeerLink:
             self.egress = make_egress(config.egress, now)
             self._charged = {name: self._sent(name) for name in self._names}
         if config.addresses != self.config.addresses:
+            self._unheard_since, self._is_told = now, False
             self.set_paths((), now)  # its names may have no address now: it is not called at the old ones
         if config.previous_public_key is None:
             self.give_up_theirs(now)

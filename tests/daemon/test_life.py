@@ -76,11 +76,15 @@ async def test_signals_during_a_flood_still_end_it(stage: Stage) -> None:
             await asyncio.sleep(0)
 
     flooding = asyncio.create_task(flood())
-    await a.until(lambda status: bool(status["drops"]))
-    before = sent
-    assert await a.stop() == 0
-    assert sent > before, "nothing was sent after the signal"
-    flooding.cancel()
+    try:
+        await a.until(lambda status: bool(status["drops"]))
+        before = sent
+        assert await a.stop() == 0
+        assert sent > before, "nothing was sent after the signal"
+        assert not flooding.done()
+    finally:
+        flooding.cancel()
+        await asyncio.gather(flooding, return_exceptions=True)
 
 
 @pytest.mark.parametrize("taken", ["listen", "endpoint"])

@@ -44,6 +44,7 @@ TRIAL = Trial(
     noticed={"drone0": {}, "drone1": {}},
     events={"drone0": {}, "drone1": {}},
     recovery_s=0.01,
+    observed_s=2.0,
 )
 
 

@@ -119,7 +119,7 @@ class Bench:
         target = settings.target(plan.group, stage.system) if plan.targeted else 0
         told = tuple(with_target(phase, target) for phase in (plan.phases if phases is None else phases))
         names = [phase.split()[0].split(",")[0] for phase in told]
-        notices = await stage.notices()
+        notices, noticed_at = await stage.notices(), monotonic()
         lines = {name: len(log) for name, log in stage.logs().items()}
         stats = await stage.middle.statistics()
         faults, begin, begin_at = Counter(ledger.faults), ledger.mark(), monotonic()
@@ -187,6 +187,7 @@ class Bench:
             events=_events(stage, lines),
             recovery_s=None if recovery_s is None else round(recovery_s, 4),
             notes=plan.notes,
+            observed_s=round(monotonic() - noticed_at, 3),
             control=self.control,
         )
         self._recorder.add(trial)

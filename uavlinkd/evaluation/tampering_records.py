@@ -83,6 +83,8 @@ class Trial:
     recovery_s: float | None
     """From the attack's end until frames sent after it had come out everywhere; None: not within five seconds."""
     notes: str = ""
+    observed_s: float = 0.0
+    """How long the drones' counters were watched: longer than the attack lasted."""
     control: Mapping[str, float] = field(default_factory=dict)
     """What the drones of this stage count a second, all together, where nothing is attacked."""
 
@@ -105,7 +107,7 @@ class Trial:
     def _usual(self, reason: str) -> float:
         """As many as may well be counted in that time without an attack."""
         rate = self.control.get(reason, 0.0)
-        return 2 + 2 * rate * self.duration_s if rate else 0.0
+        return 2 + 2 * rate * self.observed_s if rate else 0.0
 
     @property
     def reasons(self) -> dict[str, int]:

@@ -117,8 +117,8 @@ _ON_NOTICED = [
 ]
 _ON_CONTROL = [
     "What the drones of each stage count a second, all together, while the man in the middle lets everything pass: "
-    "new keys each second or two leave some too. An attack is detected where more than twice that came, or something "
-    "else."
+    "new keys each second or two leave some too. An attack is detected where more than twice that came, and two, or "
+    "something else."
 ]
 _ON_PAPER = [
     "The paper: Ouadah and Merazka, Securing UAV Communication: Authentication and Integrity, 2024 (arXiv "

@@ -9,7 +9,7 @@
     allow_out, deny_out                  the same for the other way
     rate_in   = { ATTITUDE = 10 }        frames a second of each message and component; also of a group's messages
     rate_out                             the same for the other way; also of each target and instance (battery 0, 1),
-                                         to each program; a group's does not hold for what is said once (STATUSTEXT)
+                                         to each program; telemetry's not of what is said once (STATUSTEXT)
     mavlink1 = true                      whether MAVLink 1 frames pass
     ground_station = true                whether its HEARTBEAT may claim to be a ground station's
 
@@ -28,8 +28,8 @@ A rate is kept for each component by itself: an autopilot and its gimbal both se
 together, whoever comes first in each second would silence the other for minutes. But what comes in may name any
 component, so all components of a system together have SYSTEM_SHARE times the rate: invented ones gain no more. What
 goes out has passed another's gate already, so there each flow has the rate, as where a link thins (`egress_kinds`),
-to each of the programs at an endpoint. And what is said once, or in parts, is not thinned out of a group on its way
-out: a text whose line is missing never comes again. Named by itself it has the rate that is written.
+to each of the programs at an endpoint. And from groups of what is reported again and again, as `telemetry`, what is
+said once or in parts is not thinned out: a line of a text that is missing never comes again. Named by itself it is.
 
 What a policy cannot see into passes or not as a whole: files, shells, tunnels, raw buses. A policy that denies a
 command and lets one of those through gets a warning, as the command may travel inside. A message that the dialect

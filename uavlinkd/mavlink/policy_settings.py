@@ -248,7 +248,7 @@ def _systems(data: Mapping[str, object], report: Report, *, is_needed: bool) -> 
 def _rates(data: Mapping[str, object], key: str, report: Report) -> Mapping[int, float]:
     """Frames a second by message id. A message's own rate goes before its groups', the lowest of those counts.
 
-    On the way out a group's rate thins what is said again and again, and leaves alone what is said once.
+    On the way out the rate of a group of reports, as telemetry, leaves alone what is said once among them.
     """
     value = data.get(key, {})
     if not isinstance(value, Mapping):

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections import Counter, deque
 
-CREDIT_S = 2.0
+CREDIT_S = 10.0
 """How long a datagram may be answered. Were it for ever, a thousand unanswered ones would hide a thousand answers of
-twice the size of what they answer."""
+twice the size of what they answer. Long enough for a busy machine."""
 
 
 class Amplification:
