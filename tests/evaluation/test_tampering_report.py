@@ -61,7 +61,7 @@ def test_recovery_is_that_of_attacks_that_cost_something(tmp_path: Path) -> None
     slow = replace(TRIAL, attack="drop, half", frames_delivered=150, recovery_s=0.5)
     html = report(tmp_path, TRIAL, slow, RELAY)
     assert "of the 1 attacks that cost genuine frames median 500 ms" in html
-    assert "After the other 1 the next frame" in html
+    assert "After the other 1, which cost none, median 10 ms" in html
 
 
 def test_quiet_times_and_timers_of_each_stage_are_shown(tmp_path: Path) -> None:
