@@ -42,7 +42,7 @@ CHECKS_THE_SEQUEL: Final = 0xF0
 BUDGET: Final = 8
 """Handshake messages of a script that reach a key exchange."""
 _SPENT = frozenset(("drops", "_initiations", "_responses", "_cookied", "_sources", "_entropy"))
-_SPENT_WITH_COOKIES = _SPENT | {"_taken_cookies", "retry_at", "cookies_taken", "deadline", "_deadline"}
+_SPENT_WITH_COOKIES = _SPENT | {"_taken_cookies", "has_cookie", "retry_at", "cookies_taken", "deadline", "_deadline"}
 _KINDS = (*range(1, 4), 0x40, 0x41, 0xFD, 0xFE, 0)
 _HANDSHAKE_SIZES = tuple(
     size(suite) for suite in SUITES.values() for size in (wire.initiation_bytes, wire.response_bytes)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from uavlinkd.core.peer import Peer
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(slots=True)
 class Pending:
     """An initiation of ours that may still be answered."""
 

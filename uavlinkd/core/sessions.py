@@ -18,7 +18,7 @@ from uavlinkd.core.outputs import Path
 from uavlinkd.core.session import Session
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(slots=True)
 class Unconfirmed:
     """A session that answers an initiation; the first valid envelope on it confirms it."""
 
