@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Sequence
 from typing import Any
 
 import pytest
 from structlog import get_logger
 from structlog.testing import capture_logs
 
+from tests.test_switch import Program
 from uavlinkd.addresses import Address
 from uavlinkd.core.outputs import PeerUp
-from uavlinkd.endpoints.ports import LocalPort
 from uavlinkd.event_log import LINES_BURST, LINES_PER_S, EventLog
 from uavlinkd.log import SUMMARY_INTERVAL_S
-from uavlinkd.mavlink.frames import SplitCounters
 
 
 def told(log: EventLog, peer: str, now: float, **totals: int) -> list[dict[str, Any]]:
@@ -57,36 +54,10 @@ def test_peers_are_told_apart(log: EventLog) -> None:
     assert told(log, "b", 1.0, envelopes_out_of_order=2)
 
 
-class Silent:
-    """As much of an endpoint as is looked at: one with a program, that says so many frames."""
-
-    name = "autopilot"
-
-    def __init__(self) -> None:
-        self.counters = SplitCounters()
-        self.failures: Counter[str] = Counter()
-        self.bytes_received = self.bytes_sent = self.frames_sent = 0
-        self.ports: list[LocalPort] = [LocalPort(self, "/dev/ttyACM0", None)]
-
-    def gather(self, seconds: float) -> None:
-        """Nothing to read."""
-
-    def start(self) -> None:
-        """Nothing to start."""
-
-    def write(self, port: LocalPort, frames: Sequence[bytes], now: float) -> None:
-        """Nobody to write to."""
-
-    def do_housekeeping(self, now: float) -> None:
-        """Nothing to do."""
-
-    def close(self) -> None:
-        """Nothing to close."""
-
-
 def test_a_silent_endpoint_is_told_once_each_time(log: EventLog) -> None:
     """A wrong speed, an unpowered autopilot: after ten seconds one line; again when it spoke meanwhile."""
-    endpoint = Silent()
+    endpoint = Program("autopilot")
+    endpoint.port.name = "/dev/ttyACM0"
 
     def lines(seconds: range) -> list[Any]:
         with capture_logs() as told:

@@ -26,11 +26,7 @@ class Program:
         self.bytes_received = self.bytes_sent = self.frames_sent = 0
         self.told: list[bytes] = []
         self.port = LocalPort(self, name, None)
-
-    @property
-    def ports(self) -> Sequence[LocalPort]:
-        """The one."""
-        return [self.port]
+        self.ports = [self.port]
 
     def gather(self, seconds: float) -> None:
         """Nothing to read."""

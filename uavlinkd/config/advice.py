@@ -170,7 +170,7 @@ def _lengths(peers: Sequence[Peer]) -> Iterator[str]:
     if split:
         yield (
             f"envelopes over {ETHERNET_PAYLOAD:,} bytes with {split}: most networks split them, and one lost part"
-            f" loses all; unless the path is known to take them, write"
+            " loses all; unless the path is known to take them, write"
             f" max_envelope_bytes = {c.DEFAULT_ENVELOPE_LIMIT}"
         )
     for suite in dict.fromkeys(suite for peer in peers for suite in peer.settings.link.suites):

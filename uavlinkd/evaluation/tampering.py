@@ -41,8 +41,6 @@ FAST_LINK = {
 DATA_LINK = {"rekey_after_s": 2.0, "reject_after_s": 20.0}
 KEYS_LINK = {"rekey_after_s": 1.0, "reject_after_s": 10.0}
 PLAIN_LINK: dict[str, object] = {}
-LINKS = {"handshake-0": FAST_LINK, "handshake-1": FAST_LINK, "data": DATA_LINK, "keys": KEYS_LINK}
-"""Of each stage: what differs from the defaults of `[link]`."""
 
 
 class Evaluation:
@@ -54,6 +52,7 @@ class Evaluation:
         self._show = show
         self._benches: list[tuple[str, Bench]] = []
         self._unlogged: list[str] = []
+        self._links: dict[str, Mapping[str, object]] = {}  # of each stage: what differs from the defaults of [link]
 
     async def run(self) -> Run:
         """Try everything, and write records and logs.
@@ -89,7 +88,7 @@ class Evaluation:
                 "load_after": load(),
                 "unlogged": self._unlogged,
                 "control": {label: bench.control for label, bench in self._benches},
-                "links": {label: settings for label, settings in LINKS.items() if label in dict(self._benches)},
+                "links": self._links,
             }
             recorder.run.facts = facts
             recorder.write(json.dumps({"run": facts}))
@@ -106,6 +105,7 @@ class Evaluation:
         silent: Sequence[str] = (),
         here: bool = False,
     ) -> DaemonStage:
+        self._links[label] = link
         folder = self._folder / label
         folder.mkdir()
         log = self._log(label)

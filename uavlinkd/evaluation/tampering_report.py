@@ -229,9 +229,11 @@ def _recovery(trial: Trial) -> str:
 
 
 def _on_recovery(run: Run) -> list[str]:
-    trials = [trial for trial in run.of("uavlinkd") if trial.recovery_s is not None]
-    costly = [trial.recovery_s for trial in trials if trial.frames_lost and trial.recovery_s is not None]
-    others = [trial.recovery_s for trial in trials if not trial.frames_lost and trial.recovery_s is not None]
+    costly: list[float] = []
+    others: list[float] = []
+    for trial in run.of("uavlinkd"):
+        if trial.recovery_s is not None:
+            (costly if trial.frames_lost else others).append(trial.recovery_s)
     if not costly:
         return []
     text = (

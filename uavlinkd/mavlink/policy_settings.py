@@ -201,12 +201,11 @@ def _command_entry(item: str) -> _Entry | PolicyProblem:
 
 
 def _check_entries(key: str, items: tuple[str | int, ...], report: Report) -> None:
-    signing = dialect.SETUP_SIGNING
     for place, item in enumerate(items):
         entry = _entry(item)
         if isinstance(entry, PolicyProblem):
             report(f"{key}[{place}]", entry.problem, entry.remedy)
-        elif key.startswith("allow") and (entry.number or entry.messages) in (signing, (signing,)):
+        elif key.startswith("allow") and dialect.SETUP_SIGNING in (entry.number, *entry.messages):
             report(f"{key}[{place}]", "SETUP_SIGNING never crosses", "leave it out")
 
 

@@ -11,6 +11,7 @@ from pydantic import Field
 from uavlinkd.core import wire
 from uavlinkd.core.constants import MAC_BYTES
 from uavlinkd.core.suites import SUITES, X25519, Suite
+from uavlinkd.mitm.amplification import Amplification
 from uavlinkd.mitm.anatomy import Kind, initiation, kind_of
 from uavlinkd.mitm.attack import (
     STRANGERS,
@@ -190,9 +191,7 @@ class AmplificationProbe(Flood):
     def __init__(self, options: ProbeOptions, surroundings: Surroundings, chance: Random, now: float) -> None:
         super().__init__(options, surroundings, chance, now)
         self._recorded: dict[Way, deque[bytes]] = {way: deque(maxlen=64) for way in self.ways}
-        self.bytes_sent: Counter[tuple[str, int]] = Counter()
-        self.bytes_back: Counter[tuple[str, int]] = Counter()
-        """By peer and stranger: what it got from there, what it sent there."""
+        self._amplification = Amplification()
 
     def observe(self, datagram: bytes, way: Way, now: float) -> None:
         """Keep a few of everything."""
@@ -215,12 +214,12 @@ class AmplificationProbe(Flood):
     ) -> list[Action]:
         """And count."""
         if stranger is not None:
-            self.bytes_sent[way.receiver, stranger] += len(datagram)
+            self._amplification.sent(way.receiver, stranger, len(datagram), now)
         return super().inject(datagram, way, now, detail, stranger)
 
     def on_answer(self, datagram: bytes, peer: str, stranger: int, now: float) -> list[Action]:
         """Count, and tell where more came back than went there."""
-        self.bytes_back[peer, stranger] += len(datagram)
+        self._amplification.came_back(peer, stranger, len(datagram), now)
         actions = super().on_answer(datagram, peer, stranger, now)
         if (peer, stranger) in self.amplified:
             way = next((each for each in self.ways if each.receiver == peer), self.ways[0]).back
@@ -230,7 +229,7 @@ class AmplificationProbe(Flood):
     @property
     def amplified(self) -> list[tuple[str, int]]:
         """Peers and strangers between whom more came back than went there."""
-        return [key for key, size in self.bytes_back.items() if size > self.bytes_sent[key]]
+        return list(self._amplification.excess)
 
 
 class HintsOptions(FloodOptions):
