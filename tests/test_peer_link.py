@@ -9,6 +9,7 @@ import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
 from tests.core.harness import AT_A, AT_B, ELSEWHERE, KEY_A, KEY_B, PLAIN, QUIET, Pair, exchange, of, payloads
+from tests.endpoints.programs import PASSES
 from uavlinkd.addresses import Address
 from uavlinkd.config import Peer
 from uavlinkd.core import handshake
@@ -55,7 +56,7 @@ def test_replayed_handshakes_do_not_silence_a_link_with_a_budget(source: Path) -
         now = 1.0 + tick / REPLAYS_PER_S
         pair.b.receive(recorded_initiation(entropy), now, source)
         if tick % REPLAYS_PER_S == 0:
-            peer_link.send(heartbeats, now, 0.0)
+            peer_link.send(heartbeats, PASSES, now, 0.0)
         peer_link.send_waiting(now)
         assert all(sent.path == AT_A for sent in of(outputs, Transmit))
         arrived += len(payloads(exchange(pair.a, pair.b, outputs, now)))
@@ -72,10 +73,10 @@ def test_a_budget_that_comes_with_a_reload_pays_for_nothing_before_it() -> None:
     config = Peer(PeerSettings("alpha", KEY_A.public, None, link), ())
     peer_link = PeerLink(config, pair.b.node, outputs.extend, 0.0)
     while pair.b.peer.traffic.bytes_sent < 1_000_000:
-        peer_link.send(heartbeat() * 20, 1.0, 0.0)
+        peer_link.send(heartbeat() * 20, PASSES, 1.0, 0.0)
     peer_link.change(replace(config, egress=EgressSettings(budget_bits_s=BUDGET_BITS_S)), 2.0)
     outputs.clear()
-    peer_link.send(heartbeat(), 2.0, 0.0)
+    peer_link.send(heartbeat(), PASSES, 2.0, 0.0)
     assert len(of(outputs, Transmit)) == 1
     assert peer_link.egress is not None
     assert peer_link.egress.shape.payload_limit == pair.b.session.payload_limit

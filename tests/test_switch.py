@@ -10,6 +10,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from uavlinkd import switch as switch_module
 from uavlinkd.endpoints.ports import LocalPort
+from uavlinkd.mavlink.delivery import Source
 from uavlinkd.mavlink.frames import Frame, Header, SplitCounters, split_datagram
 from uavlinkd.mavlink.policy import Policy, Refusal, compile_policy
 from uavlinkd.mavlink.routing import ROUTE_LIFETIME_S, Router, Unrouted
@@ -34,9 +35,9 @@ class Program:
     def start(self) -> None:
         """Nothing to start."""
 
-    def write(self, port: LocalPort, frames: Sequence[bytes], now: float) -> None:
+    def write(self, port: LocalPort, frames: Sequence[Frame], source: Source, now: float) -> None:
         """Keep them."""
-        self.told += frames
+        self.told += [raw for raw, _ in frames]
 
     def do_housekeeping(self, now: float) -> None:
         """Nothing to do."""

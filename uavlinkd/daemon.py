@@ -31,8 +31,9 @@ from uavlinkd.endpoints.ports import Endpoint, LocalPort
 from uavlinkd.event_log import EventLog
 from uavlinkd.key_change import Graces, link_name
 from uavlinkd.log import DropSummary
-from uavlinkd.mavlink.frames import Frame, split_payload
-from uavlinkd.mavlink.policy import Policy
+from uavlinkd.mavlink.delivery import Source
+from uavlinkd.mavlink.frames import Frame, SplitCounters, split_payload
+from uavlinkd.mavlink.policy import Policy, compile_policy
 from uavlinkd.mavlink.radio_status import INTERVAL_S, RadioStatusSource
 from uavlinkd.mavlink.routing import Router
 from uavlinkd.peer_link import PeerLink, radio_figures
@@ -78,6 +79,7 @@ class Daemon:
         self._events = EventLog(self.log)
         self.peer_sockets = PeerSockets(self._on_arrived, self._drops, self.log)
         self._radio_status: dict[str, RadioStatusSource] = {}
+        self._own = Source(config.name, compile_policy({}).incoming)  # of the frames that this daemon makes itself
         self._deliveries: dict[str, list[Frame]] = {}
         self.stall = StallWatch(now, self._on_pause)
         self._timer: asyncio.TimerHandle | None = None
@@ -427,9 +429,9 @@ class Daemon:
             self._events.look_at(endpoint, now)
             source = self._radio_status.get(endpoint.name)
             if source is not None and radio is not None:
-                frame = source.frame(radio)
+                frames = split_payload(source.frame(radio), SplitCounters())
                 for port in endpoint.ports:
-                    endpoint.write(port, [frame], now)
+                    endpoint.write(port, frames, self._own, now)
 
     # The control socket.
 

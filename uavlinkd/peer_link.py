@@ -12,6 +12,7 @@ from uavlinkd.core.outputs import Output, Path, Transmit
 from uavlinkd.core.peer import Peer
 from uavlinkd.key_change import Graces, KeyPairing, pairings
 from uavlinkd.mavlink.coalescing import Coalescer, make_egress
+from uavlinkd.mavlink.delivery import Source
 from uavlinkd.mavlink.egress import Egress, EnvelopeShape
 from uavlinkd.mavlink.frames import Frame, SplitCounters
 from uavlinkd.mavlink.radio_status import LinkFigures, worst
@@ -137,10 +138,10 @@ class PeerLink:
         self.config = config
         self.on_session()
 
-    def send(self, frames: Sequence[Frame], now: float, waited_s: float) -> None:
+    def send(self, frames: Sequence[Frame], source: Source, now: float, waited_s: float) -> None:
         """Send frames that are here together: at once, or when the budget lets them.
 
-        ``waited_s``: how long the first of them has waited already.
+        ``source``: where they came from. ``waited_s``: how long the first of them has waited already.
         """
         if self.egress is None:
             self._give([raw for raw, _ in frames], now)

@@ -12,6 +12,7 @@ from itertools import count
 from typing import Protocol
 
 from uavlinkd.endpoints.ports import LocalPort
+from uavlinkd.mavlink.delivery import Source
 from uavlinkd.mavlink.frames import Frame, Header
 from uavlinkd.mavlink.policy import Policy, Refusal
 from uavlinkd.mavlink.routing import Router
@@ -37,6 +38,7 @@ class Switch:
         self.router = router
         self._refused = refused
         self._policies: dict[Port, Policy] = {}
+        self._sources: dict[Port, Source] = {}
         self._numbers: dict[Port, int] = {}  # never used again, for what a policy remembers of each
         self._unused = count()
         self._flows: dict[Port, dict[Header, tuple[Port, ...]]] = {}
@@ -45,6 +47,7 @@ class Switch:
     def add(self, port: Port, policy: Policy) -> None:
         """From now on frames may come from and go to this port, as far as the policy lets them."""
         self._policies[port] = policy
+        self._sources[port] = Source(_owner(port), policy.incoming)
         self._numbers[port] = next(self._unused)
         self._flows[port] = {}
         self.router.add_port(port, is_peer=isinstance(port, PeerLink))
@@ -52,12 +55,14 @@ class Switch:
     def set_policy(self, port: Port, policy: Policy) -> None:
         """Other rules for a port that is there. Whom it may not speak for any more is not looked for behind it."""
         self._policies[port] = policy
+        self._sources[port].gate = policy.incoming
         self.router.forget_systems(port, lambda system: not policy.incoming.may_speak_as(system))
         self._forget_flows()
 
     def remove(self, port: Port) -> None:
         """Forget the port."""
         del self._policies[port]
+        del self._sources[port]
         del self._numbers[port]
         del self._flows[port]
         self.router.remove_port(port)
@@ -85,7 +90,7 @@ class Switch:
                 else:
                     batches[port] = [frame]
         for port, batch in batches.items():
-            port.send(batch, now, waited_s)
+            port.send(batch, self._sources[source], now, waited_s)
 
     def _way_of(self, frame: Frame, source: Port, now: float) -> tuple[Port, ...]:
         """Where this one frame goes. Remembered for all of its header, if nothing about it depends on the frame."""

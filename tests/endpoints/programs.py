@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from time import monotonic
 
@@ -13,7 +13,9 @@ from pymavlink.dialects.v20 import common as mavlink
 from uavlinkd.addresses import Address
 from uavlinkd.endpoints.ports import Endpoint, LocalPort
 from uavlinkd.endpoints.udp import UdpClient
-from uavlinkd.mavlink.frames import Frame
+from uavlinkd.mavlink.delivery import Source
+from uavlinkd.mavlink.frames import Frame, SplitCounters, split_payload
+from uavlinkd.mavlink.policy import compile_policy
 
 PATIENCE_S = 10.0
 """After which what was to happen has not."""
@@ -29,6 +31,15 @@ def large_frame(number: int) -> bytes:
     """A genuine frame of 263 bytes."""
     message = mavlink.MAVLink_file_transfer_protocol_message(0, 1, 1, [number % 256] * 250 + [1])
     return bytes(message.pack(mavlink.MAVLink(None, srcSystem=1, srcComponent=1)))
+
+
+PASSES = Source("peer", compile_policy({}).incoming)
+"""A peer that may send everything."""
+
+
+def write(endpoint: Endpoint, port: LocalPort, raws: Sequence[bytes], now: float, source: Source = PASSES) -> None:
+    """Send these frames of one source to a port, as the switch does."""
+    endpoint.write(port, split_payload(b"".join(raws), SplitCounters()), source, now)
 
 
 async def eventually(condition: Callable[[], bool]) -> None:
@@ -96,8 +107,8 @@ async def measure_udp_delivery(*others: Endpoint, batches: int = 200, frames_per
             began = now = monotonic()
             for other in others:
                 for port in other.ports:
-                    other.write(port, frames, now)
-            endpoint.write(endpoint.ports[0], frames, now)
+                    write(other, port, frames, now)
+            write(endpoint, endpoint.ports[0], frames, now)
             sent += sum(map(len, frames))
             async with asyncio.timeout(PATIENCE_S):
                 while len(got) < sent:

@@ -17,7 +17,7 @@ from typing import Any, cast
 import pytest
 from serialx import BaseSerial
 
-from tests.endpoints.programs import PATIENCE_S, Recorder, eventually, frame, large_frame, measure_udp_delivery
+from tests.endpoints.programs import PATIENCE_S, Recorder, eventually, frame, large_frame, measure_udp_delivery, write
 from uavlinkd.addresses import Address
 from uavlinkd.endpoints import serial
 from uavlinkd.endpoints.serial import SerialChannel, SerialEndpoint
@@ -93,7 +93,7 @@ async def test_frames_go_both_ways(autopilot: Autopilot, endpoint: SerialEndpoin
     await eventually(lambda: recorder(endpoint).heard == from_autopilot)
     assert endpoint.ports[0].heard_at is not None
     assert autopilot.read() == b""
-    endpoint.write(endpoint.ports[0], from_autopilot, monotonic())
+    write(endpoint, endpoint.ports[0], from_autopilot, monotonic())
     await eventually(lambda: bool(select.select([autopilot.master], [], [], 0)[0]))
     assert autopilot.read() == b"".join(from_autopilot)
 
@@ -118,7 +118,7 @@ async def test_unplugged_device_is_gone_and_comes_back(autopilot: Autopilot, end
         autopilot.unplug()
         await eventually(lambda: recorder(endpoint).open == [])
         assert recorder(endpoint).closed[-1] is port
-        endpoint.write(port, [frame(99)], monotonic())
+        write(endpoint, port, [frame(99)], monotonic())
         assert list(endpoint.ports) == []
     assert recorder(endpoint).heard == [frame(0), frame(1), frame(2)]
     assert endpoint.failures["unsent"] == 3
@@ -130,7 +130,7 @@ async def test_unplugged_device_is_noticed_by_writing(autopilot: Autopilot, endp
     await opened(endpoint)
     (port,) = endpoint.ports
     autopilot.unplug()
-    endpoint.write(port, [frame(1)], monotonic())
+    write(endpoint, port, [frame(1)], monotonic())
     assert recorder(endpoint).closed == []
     await eventually(lambda: recorder(endpoint).closed == [port])
     assert (endpoint.failures["EIO"], endpoint.failures["unsent"]) == (1, 1)
@@ -212,10 +212,10 @@ async def test_device_that_takes_nothing_gets_stale_frames_never(
     before = monotonic() - 60
     count = 0
     while not connection._awaits_writable:
-        endpoint.write(port, [large_frame(count)], before)
+        write(endpoint, port, [large_frame(count)], before)
         count += 1
-    endpoint.write(port, [large_frame(200)] * 50, before)
-    endpoint.write(port, [frame(1), frame(2)], monotonic())
+    write(endpoint, port, [large_frame(200)] * 50, before)
+    write(endpoint, port, [frame(1), frame(2)], monotonic())
     got = b""
     while connection.outgoing:
         got += autopilot.read()
@@ -239,7 +239,7 @@ async def test_device_that_takes_nothing_for_long_is_opened_anew(
     (connection,) = endpoint._connections.values()
     began = monotonic()
     while not connection._awaits_writable:
-        endpoint.write(port, [large_frame(0)], began)
+        write(endpoint, port, [large_frame(0)], began)
     endpoint.do_housekeeping(began + STALLED_S - 0.01)
     assert endpoint.failures["stalled"] == 0
     endpoint.do_housekeeping(began + STALLED_S)

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.endpoints.programs import Recorder, eventually, frame, large_frame
+from tests.endpoints.programs import Recorder, eventually, frame, large_frame, write
 from uavlinkd.endpoints.streams import (
     OUTGOING_BYTES,
     READ_BYTES,
@@ -204,7 +204,7 @@ def fill(pair: Pair, now: float) -> int:
     """Write until something has to wait; how many frames that took."""
     count = 0
     while not pair.connection.outgoing:
-        pair.write(pair.connection.port, [large_frame(count)], now)
+        write(pair, pair.connection.port, [large_frame(count)], now)
         count += 1
     return count
 
@@ -221,7 +221,7 @@ def read_all(sock: socket.socket) -> bytes:
 
 async def test_frames_are_sent_at_once(pair: Pair) -> None:
     """Where the kernel has room ``write`` itself sends: nothing waits for the event loop."""
-    pair.write(pair.connection.port, [frame(1), frame(2)], now=0.0)
+    write(pair, pair.connection.port, [frame(1), frame(2)], now=0.0)
     assert pair.other.recv(4096) == frame(1) + frame(2)
     assert (pair.frames_sent, pair.bytes_sent) == (2, len(frame(1) + frame(2)))
 
@@ -268,11 +268,11 @@ async def test_frame_behind_a_false_start_is_heard_at_the_end(pair: Pair) -> Non
 async def test_other_side_that_is_gone_is_not_reported_from_within_write(pair: Pair) -> None:
     """The daemon may be in the middle of a batch: it hears of it in the next round."""
     pair.other.close()
-    pair.write(pair.connection.port, [frame(1)], now=0.0)
-    pair.write(pair.connection.port, [frame(2)], now=0.0)
+    write(pair, pair.connection.port, [frame(1)], now=0.0)
+    write(pair, pair.connection.port, [frame(2)], now=0.0)
     assert recorder(pair).closed == []
     await pair.connection.lost.wait()
-    pair.write(pair.connection.port, [frame(3)], now=0.0)
+    write(pair, pair.connection.port, [frame(3)], now=0.0)
     assert recorder(pair).closed == [pair.connection.port]
     assert pair.failures == {"EPIPE": 1, "unsent": 3}
     assert pair.channel.aborted is True
@@ -283,7 +283,7 @@ async def test_slow_reader_gets_whole_frames_and_the_newest(pair: Pair) -> None:
     """What a slow reader misses is missed in whole frames, and all of it is counted."""
     count = 1000
     for number in range(count):
-        pair.write(pair.connection.port, [large_frame(number)], monotonic())
+        write(pair, pair.connection.port, [large_frame(number)], monotonic())
     assert pair.failures["outgoing_full"] > 0
     got = bytearray()
     while pair.connection.outgoing:
@@ -302,7 +302,7 @@ async def test_slow_reader_gets_whole_frames_and_the_newest(pair: Pair) -> None:
 async def test_bytes_held_back_are_bounded(pair: Pair) -> None:
     """However much is written to who does not read, no more than the buffer's size waits."""
     for number in range(0, 4000, 40):
-        pair.write(pair.connection.port, [large_frame(each) for each in range(number, number + 40)], now=0.0)
+        write(pair, pair.connection.port, [large_frame(each) for each in range(number, number + 40)], now=0.0)
     held = len(pair.connection.outgoing.next_bytes(1 << 30, now=0.0))
     assert OUTGOING_BYTES - 300 < held < OUTGOING_BYTES + 300
     assert pair.frames_sent + len(pair.connection.outgoing) + pair.failures["outgoing_full"] == 4000
@@ -312,8 +312,8 @@ async def test_stale_frames_do_not_follow_an_outage(pair: Pair) -> None:
     """When the other side reads again, it gets the frame half sent and what is new, and nothing between."""
     began = monotonic()
     count = fill(pair, began - 60)
-    pair.write(pair.connection.port, [large_frame(number) for number in range(count, count + 50)], began - 60)
-    pair.write(pair.connection.port, [frame(1), frame(2)], monotonic())
+    write(pair, pair.connection.port, [large_frame(number) for number in range(count, count + 50)], began - 60)
+    write(pair, pair.connection.port, [frame(1), frame(2)], monotonic())
     got = bytearray()
     while pair.connection.outgoing:
         got += read_all(pair.other)
@@ -347,7 +347,7 @@ async def test_kernel_is_given_no_more_than_the_channel_has_room_for(pair: Pair)
     """Frames wait here, where they can get stale, and go as soon as there is room again."""
     size = len(large_frame(0))
     pair.channel.left = 2 * size
-    pair.write(pair.connection.port, [large_frame(number) for number in range(5)], monotonic())
+    write(pair, pair.connection.port, [large_frame(number) for number in range(5)], monotonic())
     assert read_all(pair.other) == large_frame(0) + large_frame(1)
     assert len(pair.connection.outgoing) == 3
     pair.channel.left = size
@@ -358,7 +358,7 @@ async def test_kernel_is_given_no_more_than_the_channel_has_room_for(pair: Pair)
 async def test_channel_that_never_gets_room_has_stalled(pair: Pair) -> None:
     """A stall is known as one even where all that waited got stale."""
     pair.channel.left = 0
-    pair.write(pair.connection.port, [frame(1)], now := monotonic())
+    write(pair, pair.connection.port, [frame(1)], now := monotonic())
     pair.do_housekeeping(now + STALLED_S - 0.01)
     assert pair.failures == {"stale": 1}
     pair.do_housekeeping(now + STALLED_S)
@@ -368,7 +368,7 @@ async def test_channel_that_never_gets_room_has_stalled(pair: Pair) -> None:
 async def test_channel_that_got_room_with_nothing_to_send_has_not_stalled(pair: Pair) -> None:
     """Nothing moved because nothing was there to move."""
     pair.channel.left = 0
-    pair.write(pair.connection.port, [frame(1)], now := monotonic())
+    write(pair, pair.connection.port, [frame(1)], now := monotonic())
     pair.do_housekeeping(now + 5)
     pair.channel.left = 100
     await eventually(lambda: pair.connection._room_timer is None)
@@ -381,12 +381,12 @@ async def test_error_of_the_kernel_ends_the_connection(pair: Pair, noticed_by: s
     """Whatever is tried first: the error is counted by its name, once, and the port is reported as closed."""
     if noticed_by == "waiting for room":
         pair.channel.left = 0
-        pair.write(pair.connection.port, [frame(1)], monotonic())
+        write(pair, pair.connection.port, [frame(1)], monotonic())
     pair.channel.error = OSError(errno.EIO, "unplugged")
     if noticed_by == "reading":
         pair.other.send(frame(2))
     elif noticed_by == "writing":
-        pair.write(pair.connection.port, [frame(1)], monotonic())
+        write(pair, pair.connection.port, [frame(1)], monotonic())
     await eventually(lambda: recorder(pair).closed == [pair.connection.port])
     assert pair.failures == {"EIO": 1} | ({} if noticed_by == "reading" else {"unsent": 1})
     assert pair.channel.sock.fileno() == -1
@@ -427,10 +427,10 @@ async def test_endpoint_may_be_closed_while_it_reports(pair: Pair) -> None:
 async def test_closed_endpoint_reports_nothing_more(pair: Pair) -> None:
     """Neither a port lost just before nor one still there is reported as closed."""
     pair.other.close()
-    pair.write(pair.connection.port, [frame(1)], now=0.0)
+    write(pair, pair.connection.port, [frame(1)], now=0.0)
     pair.close()
     await asyncio.sleep(0)
     assert recorder(pair).closed == []
     assert pair.channel.sock.fileno() == -1
-    pair.write(pair.connection.port, [frame(2)], now=0.0)
+    write(pair, pair.connection.port, [frame(2)], now=0.0)
     assert pair.failures == {"EPIPE": 1, "unsent": 2}

@@ -12,7 +12,7 @@ from time import monotonic
 import pytest
 from structlog.testing import capture_logs
 
-from tests.endpoints.programs import Recorder, eventually, frame, large_frame, measure_udp_delivery
+from tests.endpoints.programs import Recorder, eventually, frame, large_frame, measure_udp_delivery, write
 from uavlinkd.addresses import Address
 from uavlinkd.endpoints import tcp
 from uavlinkd.endpoints.sockets import BindError
@@ -99,7 +99,7 @@ async def test_each_client_is_a_port(server: TcpServer, connect: Connect) -> Non
     for number, program in enumerate((first, second)):
         port = ports[str(Address(*program.getsockname()))]
         assert (port.heard_at is not None) == (program is second)
-        server.write(port, [frame(10 + number)], monotonic())
+        write(server, port, [frame(10 + number)], monotonic())
         assert program.recv(100) == frame(10 + number)
     first.close()
     await eventually(lambda: len(server.ports) == 1)
@@ -230,7 +230,7 @@ async def test_kernel_holds_little_for_a_client_that_never_reads(server: TcpServ
     server.on_acceptable(0.0)
     (port,) = server.ports
     for number in range(2000):
-        server.write(port, [large_frame(number)], monotonic())
+        write(server, port, [large_frame(number)], monotonic())
         await asyncio.sleep(0)
     on_our_side = server.bytes_sent - len(program.recv(1 << 20, socket.MSG_PEEK))
     assert on_our_side < 65536
@@ -244,9 +244,9 @@ async def test_client_that_never_reads_is_closed_in_the_end(server: TcpServer, c
     program = never_read(connect)
     server.on_acceptable(now=100.0)
     (port,) = server.ports
-    server.write(port, [large_frame(number) for number in range(200)], now=100.0)
+    write(server, port, [large_frame(number) for number in range(200)], now=100.0)
     while not server._connections[port]._awaits_writable:
-        server.write(port, [large_frame(0)], now=100.0)
+        write(server, port, [large_frame(0)], now=100.0)
     waiting = len(server._connections[port].outgoing)
     server.do_housekeeping(now=100.0 + MAX_AGE_S)
     assert server.failures["stale"] == 0
@@ -283,8 +283,8 @@ async def test_frames_go_both_ways(server: TcpServer, client: TcpClient) -> None
     client.start()
     await eventually(lambda: len(server.ports) == len(client.ports) == 1)
     assert client.ports[0].name == str(Address(*server.address))
-    client.write(client.ports[0], [frame(1), frame(2)], monotonic())
-    server.write(server.ports[0], [frame(3)], monotonic())
+    write(client, client.ports[0], [frame(1), frame(2)], monotonic())
+    write(server, server.ports[0], [frame(3)], monotonic())
     await eventually(lambda: recorder(server).heard == [frame(1), frame(2)] and recorder(client).heard == [frame(3)])
 
 
@@ -319,7 +319,7 @@ async def test_client_follows_a_server_that_restarts(server: TcpServer, client: 
     server.start()
     client.start()
     await eventually(lambda: len(server.ports) == 1)
-    server.write(server.ports[0], [frame(1)], monotonic())
+    write(server, server.ports[0], [frame(1)], monotonic())
     await eventually(lambda: recorder(client).heard == [frame(1)])
     (before,) = client.ports
     address = Address(*server.address)
@@ -331,7 +331,7 @@ async def test_client_follows_a_server_that_restarts(server: TcpServer, client: 
     try:
         await eventually(lambda: len(again.ports) == 1)
         assert monotonic() - began < 1.0
-        again.write(again.ports[0], [frame(2)], monotonic())
+        write(again, again.ports[0], [frame(2)], monotonic())
         await eventually(lambda: recorder(client).heard == [frame(1), frame(2)])
         assert client.ports[0] is not before
     finally:

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from tests.daemon.harness import frame, heartbeat, open_socket
+from tests.endpoints.programs import write
 from tests.waiting import until
 from uavlinkd.addresses import Address
 from uavlinkd.endpoints.ports import LocalPort
@@ -212,7 +213,7 @@ async def test_frames_share_datagrams_up_to_a_size(server: UdpServer, program: M
     one.send(heartbeat())
     read(server)
     frames = [frame(number) for number in range(100)]
-    server.write(server.ports[0], frames, 1.0)
+    write(server, server.ports[0], frames, 1.0)
     received: list[bytes] = []
     while sum(map(len, received)) < sum(map(len, frames)):
         received.append(one.recv(65536))
@@ -244,7 +245,7 @@ async def test_a_forgotten_program_is_not_sent_to(server: UdpServer, program: Ma
     read(server, 100.0)
     (port,) = server.ports
     server.do_housekeeping(1000.0)
-    server.write(port, [frame(1)], 1000.0)
+    write(server, port, [frame(1)], 1000.0)
     with pytest.raises(BlockingIOError):
         one.recv(1000)
     one.send(heartbeat())

@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Protocol
 
+from uavlinkd.mavlink.delivery import Source
 from uavlinkd.mavlink.frames import Frame, SplitCounters
 
 
@@ -29,9 +30,9 @@ class LocalPort:
     def __repr__(self) -> str:
         return f"LocalPort({self.endpoint.name}, {self.name})"
 
-    def send(self, frames: Sequence[Frame], now: float, waited_s: float) -> None:
-        """Hand frames that are here together to the program."""
-        self.endpoint.write(self, [raw for raw, _ in frames], now)
+    def send(self, frames: Sequence[Frame], source: Source, now: float, waited_s: float) -> None:
+        """Hand frames that are here together, all from one source, to the program."""
+        self.endpoint.write(self, frames, source, now)
 
 
 class PortHandler(Protocol):
@@ -69,8 +70,8 @@ class Endpoint(Protocol):
     def start(self) -> None:
         """Begin to work, in the running event loop. The daemon has bound what listens already."""
 
-    def write(self, port: LocalPort, frames: Sequence[bytes], now: float) -> None:
-        """Send whole frames to one port, or drop and count them. Returns at once."""
+    def write(self, port: LocalPort, frames: Sequence[Frame], source: Source, now: float) -> None:
+        """Send frames of one source to one port, or drop and count them. Returns at once."""
 
     def do_housekeeping(self, now: float) -> None:
         """Called each second: forget who is gone."""

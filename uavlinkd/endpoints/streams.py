@@ -18,7 +18,8 @@ import structlog
 
 from uavlinkd.clock import monotonic
 from uavlinkd.endpoints.ports import LocalPort, PortHandler, failure_name
-from uavlinkd.mavlink.frames import MAX_GAP_S, SplitCounters, StreamSplitter
+from uavlinkd.mavlink.delivery import Source
+from uavlinkd.mavlink.frames import MAX_GAP_S, Frame, SplitCounters, StreamSplitter
 
 MAX_AGE_S = 1.0
 """A frame that waited longer than this for its turn is not sent any more."""
@@ -331,13 +332,13 @@ class StreamEndpoint(ABC):
     def gather(self, seconds: float) -> None:  # noqa: B027
         """Nothing: a stream's bytes gather in the kernel, and in its splitter, as they are."""
 
-    def write(self, port: LocalPort, frames: Sequence[bytes], now: float) -> None:
-        """Send whole frames to one program, now or when it has room. Returns at once; reports nothing."""
+    def write(self, port: LocalPort, frames: Sequence[Frame], source: Source, now: float) -> None:
+        """Send frames to one program, now or when it has room. Returns at once; reports nothing."""
         connection = self._connections.get(port)
         if connection is None:
             self.failures["unsent"] += len(frames)
         else:
-            connection.write(frames, now)
+            connection.write([raw for raw, _ in frames], now)
 
     def do_housekeeping(self, now: float) -> None:
         """Close what has stalled."""

@@ -17,6 +17,7 @@ from uavlinkd.addresses import Address
 from uavlinkd.clock import monotonic
 from uavlinkd.endpoints.ports import LocalPort, PortHandler, failure_name
 from uavlinkd.endpoints.sockets import Arrived, BindError, Reader, numeric_host, udp_socket
+from uavlinkd.mavlink.delivery import Source
 from uavlinkd.mavlink.frames import MAX_GAP_S, MIN_FRAME_BYTES, Frame, SplitCounters, StreamSplitter, split_datagram
 from uavlinkd.resolver import Resolved, keep_resolving
 from uavlinkd.tasks import keep_running
@@ -131,18 +132,19 @@ class UdpEndpoint(ABC):
             splitter.counters = self.counters
             self._cutters[address] = splitter
 
-    def write(self, port: LocalPort, frames: Sequence[bytes], now: float) -> None:
+    def write(self, port: LocalPort, frames: Sequence[Frame], source: Source, now: float) -> None:
         """Send frames to one program, together where they fit. What the kernel does not take is counted."""
         address = self._addresses.get(port)
         if address is None:
             return
-        datagram = b"".join(frames)
+        raws = [raw for raw, _ in frames]
+        datagram = b"".join(raws)
         if len(datagram) <= LOCAL_DATAGRAM_BYTES:
-            self._send(datagram, address, len(frames))
+            self._send(datagram, address, len(raws))
             return
         batch: list[bytes] = []
         size = 0
-        for frame in frames:
+        for frame in raws:
             if batch and size + len(frame) > LOCAL_DATAGRAM_BYTES:
                 self._send(b"".join(batch), address, len(batch))
                 batch, size = [], 0
