@@ -47,7 +47,8 @@ class Switch:
     def add(self, port: Port, policy: Policy) -> None:
         """From now on frames may come from and go to this port, as far as the policy lets them."""
         self._policies[port] = policy
-        self._sources[port] = Source(_owner(port), policy.incoming)
+        self._sources[port] = Source(_owner(port), policy.incoming, self._report)
+        _set_outgoing(port, policy)
         self._numbers[port] = next(self._unused)
         self._flows[port] = {}
         self.router.add_port(port, is_peer=isinstance(port, PeerLink))
@@ -56,6 +57,7 @@ class Switch:
         """Other rules for a port that is there. Whom it may not speak for any more is not looked for behind it."""
         self._policies[port] = policy
         self._sources[port].gate = policy.incoming
+        _set_outgoing(port, policy)
         self.router.forget_systems(port, lambda system: not policy.incoming.may_speak_as(system))
         self._forget_flows()
 
@@ -120,10 +122,18 @@ class Switch:
             flows[frame.header] = ways
         return ways
 
+    def _report(self, who: str, header: Header, refusal: Refusal, now: float) -> None:
+        self._refused(who, header, refusal, now, to_them=False)
+
     def _forget_flows(self) -> None:
         for flows in self._flows.values():
             flows.clear()
         self._edition = self.router.edition
+
+
+def _set_outgoing(port: Port, policy: Policy) -> None:
+    if isinstance(port, LocalPort):
+        port.delivered.outgoing = policy.outgoing
 
 
 def _owner(port: Port) -> str:

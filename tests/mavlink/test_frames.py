@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import all as mavlink
 
 from uavlinkd.mavlink import frames as frames_module
+from uavlinkd.mavlink.dialect_table import MESSAGES
 from uavlinkd.mavlink.frames import (
     MAX_FALSE_STARTS,
     MAX_FRAME_BYTES,
@@ -184,13 +185,15 @@ def test_fields_cut_from_the_payloads_end_are_zero(kept: int) -> None:
     assert frame.header.is_known
 
 
-def test_extension_fields_that_the_dialect_lacks_are_passed() -> None:
-    """A MAVLink 2 payload may be longer than the dialect knows: the checksum decides, the target is found."""
-    raw = with_id(76, bytes(30) + b"\x07\x09\x00" + b"later extension", crc_extra=152)
-    frame = split_datagram(raw, SplitCounters())[0]
+@pytest.mark.parametrize("more", [0, 1, 200])
+def test_payload_longer_than_its_definition_is_unknown(more: int) -> None:
+    """A MAVLink 2 frame may be as long as the definition with its extensions; beyond that it passes unread."""
+    longest = MESSAGES[76][3]
+    raw = with_id(76, bytes(30) + b"\x07\x09\x00" + bytes(longest - 33 + more), crc_extra=152)
+    (frame,) = split_datagram(raw, SplitCounters())
     assert frame.raw == raw
-    assert frame.header.is_known
-    assert frame.header.target_system == 7
+    assert frame.header.is_known == (more == 0)
+    assert frame.header.target_system == (7 if more == 0 else 0)
 
 
 @shapes

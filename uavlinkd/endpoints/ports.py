@@ -11,14 +11,14 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Protocol
 
-from uavlinkd.mavlink.delivery import Source
+from uavlinkd.mavlink.delivery import DeliveredStream, Source
 from uavlinkd.mavlink.frames import Frame, SplitCounters
 
 
 class LocalPort:
     """One program behind an endpoint. Compared by identity."""
 
-    __slots__ = ("endpoint", "heard_at", "name")
+    __slots__ = ("delivered", "endpoint", "heard_at", "name")
 
     def __init__(self, endpoint: Endpoint, name: str, heard_at: float | None) -> None:
         self.endpoint = endpoint
@@ -26,6 +26,8 @@ class LocalPort:
         """Where it is, for people: ``127.0.0.1:14550``, ``/dev/ttyACM0``."""
         self.heard_at = heard_at
         """Monotonic seconds; None for one that is there by configuration and has not been heard."""
+        self.delivered = DeliveredStream()
+        """The stream that it reads. Its endpoint asks it for the bytes of each frame, in the order of delivery."""
 
     def __repr__(self) -> str:
         return f"LocalPort({self.endpoint.name}, {self.name})"

@@ -338,7 +338,8 @@ class StreamEndpoint(ABC):
         if connection is None:
             self.failures["unsent"] += len(frames)
         else:
-            connection.write([raw for raw, _ in frames], now)
+            admitted = (port.delivered.admit(frame, source, now) for frame in frames)
+            connection.write([data for data in admitted if data], now)
 
     def do_housekeeping(self, now: float) -> None:
         """Close what has stalled."""

@@ -137,20 +137,25 @@ class UdpEndpoint(ABC):
         address = self._addresses.get(port)
         if address is None:
             return
-        raws = [raw for raw, _ in frames]
-        datagram = b"".join(raws)
-        if len(datagram) <= LOCAL_DATAGRAM_BYTES:
-            self._send(datagram, address, len(raws))
-            return
+        admit = port.delivered.admit
         batch: list[bytes] = []
         size = 0
-        for frame in raws:
-            if batch and size + len(frame) > LOCAL_DATAGRAM_BYTES:
-                self._send(b"".join(batch), address, len(batch))
-                batch, size = [], 0
-            batch.append(frame)
-            size += len(frame)
-        self._send(b"".join(batch), address, len(batch))
+        for frame in frames:
+            data = admit(frame, source, now)
+            if not data:
+                continue
+            if size + len(data) > LOCAL_DATAGRAM_BYTES:
+                if batch:
+                    self._send(b"".join(batch), address, len(batch))
+                    batch, size = [], 0
+                if len(data) > LOCAL_DATAGRAM_BYTES:  # a separator and the frame
+                    cut = len(data) - len(frame.raw)
+                    self._send(data[:cut], address, 0)
+                    data = data[cut:]
+            batch.append(data)
+            size += len(data)
+        if batch:
+            self._send(b"".join(batch), address, len(batch))
 
     def do_housekeeping(self, now: float) -> None:
         """Forget who is gone, and what waits for an end that does not come."""

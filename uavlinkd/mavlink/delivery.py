@@ -1,23 +1,149 @@
-"""Delivery of frames to one local client: who they came from, and the byte stream that the client reads."""
+"""Delivery of frames to one local client: who they came from, and the byte stream that the client reads.
+
+The invariant: *in the byte stream delivered to a client, no byte offset other than the start of a frame that policy
+passed begins a valid MAVLink frame that policy would not pass from the same source.* What is valid is in
+:mod:`.hidden`. The stream counts, not the datagram: a parser keeps its state from one datagram to the next.
+
+Without it a captured peer gets past its role. It puts a forbidden frame into the payload of an allowed one. A parser
+that reads bytes differently than this daemon (another dialect, MAVLink 1 only, a byte lost) then accepts the
+forbidden frame. Every filter that reads frames with one dialect and feeds a parser with another has this hole.
+
+A frame is refused (:attr:`Refusal.HIDDEN_FRAME`) where it
+
+* contains a hidden frame, or
+* completes one that began in an earlier frame of the same source.
+
+A frame that completes one which began in a frame of *another* source is delivered behind separator bytes, which end
+the hidden frame before it is complete. So a source cannot cause the refusal of another's frame. It cannot swallow
+another's urgent frames either: wherever a header of another source is still open, separator bytes end it first.
+
+A hidden frame that every source of its bytes may send is harmless: the download of a recorded flight carries whole
+frames of the vehicle itself. Rates do not apply to hidden frames. Dialects that the daemon does not know are a limit:
+a receiver with a private definition may accept what is no frame here, unless a policy lets unknown messages pass.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import final
 
-from uavlinkd.mavlink.policy import Gate
+from uavlinkd.mavlink import hidden
+from uavlinkd.mavlink.egress_kinds import Lane, kind_of
+from uavlinkd.mavlink.frames import Frame, Header
+from uavlinkd.mavlink.policy import Gate, Refusal
+
+Report = Callable[[str, Header, Refusal, float], None]
+"""Receives each refusal: the source's name, the header of the frame that was not delivered, why, and when."""
+
+
+def _report_nothing(name: str, header: Header, refusal: Refusal, now: float) -> None:
+    """The source's gate has counted it."""
 
 
 @final
 class Source:
     """One port that frames come from, as the ports that they go to know it. Compared by identity."""
 
-    __slots__ = ("gate", "name")
+    __slots__ = ("_report", "gate", "name")
 
-    def __init__(self, name: str, gate: Gate) -> None:
+    def __init__(self, name: str, gate: Gate, report: Report = _report_nothing) -> None:
         self.name = name
         """The peer or endpoint, as the configuration names it."""
         self.gate = gate
         """The incoming rules that its frames passed."""
+        self._report = report
 
     def __repr__(self) -> str:
         return f"Source({self.name})"
+
+    def refuse(self, frame: Frame, now: float) -> None:
+        """Count and report a frame that carries hidden ones."""
+        self.gate.count(frame.header, Refusal.HIDDEN_FRAME)
+        self._report(self.name, frame.header, Refusal.HIDDEN_FRAME, now)
+
+
+class DeliveredStream:
+    """The bytes that one client has been sent, as far as a hidden frame may still begin in them.
+
+    Call :meth:`admit` once for each frame, in the order of delivery, and deliver all of what it returns.
+    """
+
+    __slots__ = ("_authors", "_starts", "_tail", "outgoing", "separators")
+
+    def __init__(self, outgoing: Gate | None = None) -> None:
+        self.outgoing = outgoing
+        """The rules for what goes to this client; None where nothing is withheld."""
+        self.separators = 0
+        """How often bytes had to be put between frames of different sources."""
+        self._tail = b""  # the stream from the first start that is still open
+        self._starts: list[int] = []  # where in it frames may have begun that are not complete
+        self._authors: list[tuple[int, Source | None]] = []  # up to where in it whose bytes go; None: a separator
+
+    def admit(self, frame: Frame, source: Source, now: float) -> bytes:
+        """The bytes to deliver for a frame: itself, perhaps behind separator bytes. None of them: it is refused."""
+        raw = frame.raw
+        if not self._starts and not hidden.has_start(raw):
+            return raw
+        return self._examine(frame, source, now)
+
+    def _examine(self, frame: Frame, source: Source, now: float) -> bytes:
+        raw = frame.raw
+        gap: bytes | None = b""
+        if any(self._author(start) is not source for start in self._starts) and _is_urgent(frame):
+            gap = self._gap() or b""
+        while gap is not None:
+            begun_at = len(self._tail) + len(gap)
+            data = self._tail + gap + raw
+            authors = [*self._authors, *([(begun_at, None)] if gap else []), (len(data), source)]
+            still_open: list[int] = []
+            is_hidden_elsewhere = False
+            starts = [] if gap else self._starts  # all of them end within the gap
+            for start in (*starts, *hidden.starts_in(data, begun_at + 1)):
+                end = hidden.end_of_checksum(data, start)
+                if end is None or end > len(data):
+                    still_open.append(start)
+                elif end != hidden.PAST and self._is_forbidden(data, start, end, authors):
+                    if start > begun_at or self._author(start) is source:
+                        source.refuse(frame, now)
+                        return b""
+                    is_hidden_elsewhere = True
+            if not is_hidden_elsewhere:
+                self._keep(data, still_open, authors)
+                self.separators += bool(gap)
+                return gap + raw
+            gap = self._gap()
+        source.refuse(frame, now)  # no separator was found: see hidden.separator
+        return b""
+
+    def _gap(self) -> bytes | None:
+        return hidden.separator(self._tail, self._starts)
+
+    def _is_forbidden(self, data: bytes, start: int, end: int, authors: list[tuple[int, Source | None]]) -> bool:
+        """Whether a valid frame is there that one of the sources of its bytes may not send, or the client not get."""
+        gates = []
+        begins_at = 0
+        for ends_at, source in authors:
+            if source is not None and begins_at < end and start < ends_at:
+                gates.append(source.gate)
+            begins_at = ends_at
+        if not hidden.has_checksum(data, start, end, any_extra=any(gate.passes_unknown for gate in gates)):
+            return False
+        frame = hidden.frame_at(data, start, end)
+        if self.outgoing is not None:
+            gates.append(self.outgoing)
+        return not all(gate.permits(frame) for gate in gates)
+
+    def _keep(self, data: bytes, starts: list[int], authors: list[tuple[int, Source | None]]) -> None:
+        """Remember the stream from the first of these starts."""
+        first = starts[0] if starts else len(data)
+        self._tail = data[first:]
+        self._starts = [start - first for start in starts]
+        self._authors = [(ends_at - first, source) for ends_at, source in authors if ends_at > first]
+
+    def _author(self, at: int) -> Source | None:
+        """Whose byte is at this place of the tail."""
+        return next(source for ends_at, source in self._authors if at < ends_at)
+
+
+def _is_urgent(frame: Frame) -> bool:
+    return kind_of(frame).lane is Lane.URGENT

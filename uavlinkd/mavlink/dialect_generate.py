@@ -7,6 +7,9 @@ the pymavlink that is installed.
 Two sources are needed: the classes know the layout on the wire, and only the XML definitions beside them tell
 which fields are MAVLink 2 extensions (the shortest MAVLink 1 payload ends before those).
 
+Other dialects of pymavlink define some of the same numbers otherwise. A parser that was built with one of those
+accepts frames by its CRC_EXTRA, so these are in the table too (``OTHER_EXTRAS``).
+
 ``all`` follows ArduPilot's copy of MAVLink's definitions, which lacks messages that PX4 sends. Those, and what was
 added to the ends of others, are in `upstream_messages.xml`.
 """
@@ -15,11 +18,13 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import pkgutil
 import sys
 from pathlib import Path
 from typing import Any
 
 DIALECT = "pymavlink.dialects.v20.all"
+DIALECT_PACKAGES = ("pymavlink.dialects.v10", "pymavlink.dialects.v20")
 UPSTREAM = Path(__file__).with_name("upstream_messages.xml")
 
 # COMMAND_ACK has a field ``command`` too, but it reports on a command and carries none.
@@ -47,6 +52,22 @@ def upstream() -> list[Any]:
     return list(_parsed(UPSTREAM).message)
 
 
+def other_extras() -> dict[int, tuple[int, ...]]:
+    """The CRC_EXTRAs by which other dialects, old ones among them, know a message's number."""
+    found: dict[int, set[int]] = {}
+    for package_name in DIALECT_PACKAGES:
+        package = importlib.import_module(package_name)
+        for module in pkgutil.iter_modules(package.__path__):
+            dialect = importlib.import_module(f"{package_name}.{module.name}")
+            for msgid, message in dialect.mavlink_map.items():
+                found.setdefault(msgid, set()).add(int(message.crc_extra))
+    for message in upstream():
+        found.setdefault(message.id, set()).add(int(message.crc_extra))
+    table = messages()
+    others = {msgid: extras - ({table[msgid][1]} if msgid in table else set()) for msgid, extras in found.items()}
+    return {msgid: tuple(sorted(extras)) for msgid, extras in sorted(others.items()) if extras}
+
+
 def commands() -> dict[str, int]:
     """Each MAV_CMD's number, in order of number."""
     dialect = importlib.import_module(DIALECT)
@@ -66,6 +87,11 @@ def source() -> str:
         "# in bytes of the payload. The shortest is MAVLink 1's: all fields but the extensions.",
         "MESSAGES: dict[int, tuple[str, int, int, int, int | None, int | None, int | None]] = {",
         *(f'    {msgid}: ("{row[0]}", {", ".join(map(str, row[1:]))}),' for msgid, row in messages().items()),
+        "}",
+        "",
+        "# CRC_EXTRAs that other dialects have for the same number, or for one that MESSAGES lacks.",
+        "OTHER_EXTRAS: dict[int, tuple[int, ...]] = {",
+        *(f"    {msgid}: {extras}," for msgid, extras in other_extras().items()),
         "}",
         "",
         "COMMANDS: dict[str, int] = {",

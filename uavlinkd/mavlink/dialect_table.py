@@ -382,6 +382,37 @@ MESSAGES: dict[int, tuple[str, int, int, int, int | None, int | None, int | None
     60053: ("AVSS_DRONE_OPERATION_MODE", 45, 6, 6, None, None, None),
 }
 
+# CRC_EXTRAs that other dialects have for the same number, or for one that MESSAGES lacks.
+OTHER_EXTRAS: dict[int, tuple[int, ...]] = {
+    150: (181,),
+    151: (26,),
+    152: (101,),
+    153: (109,),
+    155: (12,),
+    156: (218,),
+    157: (133,),
+    158: (208,),
+    170: (103,),
+    171: (245,),
+    172: (191,),
+    173: (54,),
+    174: (54,),
+    175: (171,),
+    176: (142,),
+    177: (249,),
+    178: (123,),
+    179: (7,),
+    180: (222, 231),
+    181: (55, 129),
+    182: (115, 154),
+    183: (175, 186),
+    184: (40, 41),
+    185: (87,),
+    186: (144,),
+    187: (134,),
+    188: (91,),
+}
+
 COMMANDS: dict[str, int] = {
     "MAV_CMD_NAV_WAYPOINT": 16,
     "MAV_CMD_NAV_LOITER_UNLIM": 17,

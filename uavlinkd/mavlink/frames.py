@@ -15,7 +15,8 @@ are not in the table, or other versions of what is. Their CRC_EXTRA cannot be kn
 in 256 of a checksum fits any CRC_EXTRA at all, and hardly ever after a few flipped bits. So where a
 frame is expected (at the start, and right after a frame) one that fits some CRC_EXTRA passes, unread, as
 unknown. Elsewhere it does not: stray bytes must not pass for a frame and swallow the next. The receiver,
-who knows the dialect, checks it again.
+who knows the dialect, checks it again. A frame whose payload is longer than its message's definition, extensions
+included, is unknown too: what the receiver would make of the rest cannot be known.
 
 Bytes that are no frame are skipped to the next byte that could start one, as MAVLink's own parsers do.
 Each run of such bytes is one fault, under the reason of its first byte.
@@ -38,6 +39,7 @@ MAVLINK1: Final = 0xFE
 MAVLINK2: Final = 0xFD
 MAX_FRAME_BYTES: Final = 10 + 255 + 2 + 13
 MIN_FRAME_BYTES: Final = 6 + 2
+SIGNATURE_BYTES: Final = 13
 MAX_FALSE_STARTS: Final = 64  # in a row, after which the rest of a datagram is not searched: each costs a checksum
 MAX_REMEMBERED: Final = 2048  # messages of one sender, of which the headers are kept
 MAX_REMEMBERED_TARGETS: Final = 32  # of each of them
@@ -45,9 +47,9 @@ MAX_GAP_S: Final = 0.5  # longer than a serial line holds back the rest of a fra
 
 _START = re.compile(rb"[\xfd\xfe]")
 
-# What one more byte does to a checksum: new = (old >> 8) ^ _STEP[(old ^ byte) & 0xFF].
-_STEP = tuple(mcrf4xx(bytes([byte]), 0) for byte in range(256))
-_STEPS = frozenset(_STEP)
+CHECKSUM_STEP: Final = tuple(mcrf4xx(bytes([byte]), 0) for byte in range(256))
+"""What one more byte does to a checksum: new = (old >> 8) ^ CHECKSUM_STEP[(old ^ byte) & 0xFF]."""
+_STEPS = frozenset(CHECKSUM_STEP)
 
 
 class FrameFault(StrEnum):
@@ -131,6 +133,12 @@ def split_datagram(datagram: bytes, counters: SplitCounters) -> list[Frame]:
     frames: list[Frame] = []
     _scan(datagram, frames, counters, in_garbage=False, is_final=True, gives_up=True)
     return frames
+
+
+def parse_frame(raw: bytes) -> Frame | None:
+    """The frame that these bytes are, with any CRC_EXTRA; None where they are not exactly one."""
+    frame = _frame_at(raw, 0, len(raw), is_expected=True)
+    return frame if type(frame) is Frame and len(frame.raw) == len(raw) else None
 
 
 def split_payload(payload: bytes, counters: SplitCounters) -> list[Frame]:
@@ -312,9 +320,11 @@ def _frame_at(data: bytes, position: int, size: int, *, is_expected: bool) -> Fr
         return FrameFault.NOT_MAVLINK
 
     message = _messages.get(key) or _remember_message(key)
+    if start == MAVLINK2 and data[position + 1] > message.longest:
+        message = _messages.get(key + _OTHER_DEFINITION) or _remember_message(key + _OTHER_DEFINITION)
     checksum = mcrf4xx(data[position + 1 : checksum_at])
     step = (data[checksum_at] | data[checksum_at + 1] << 8) ^ (checksum >> 8)
-    if message.definition is None or step != _STEP[(checksum ^ message.definition[1]) & 0xFF]:
+    if message.definition is None or step != CHECKSUM_STEP[(checksum ^ message.definition[1]) & 0xFF]:
         if is_expected and step in _STEPS:
             return Frame(data[position:end], message.unknown)
         return FrameFault.BAD_CRC
@@ -325,6 +335,7 @@ class _Message(NamedTuple):
     """What sender and message id alone tell about a frame."""
 
     definition: tuple[str, int, int, int, int | None, int | None, int | None] | None
+    longest: int  # payload of a frame by this definition, in bytes; 255 without one
     known: Header | None  # None where the payload has a say: it holds a target or a command
     unknown: Header
     targeted: dict[tuple[int, int, int | None], Header]
@@ -332,21 +343,23 @@ class _Message(NamedTuple):
 
 _OTHER_DEFINITION = b"?"
 _messages: dict[bytes, _Message] = {}
-"""By the header's bytes from system to message id: 5 in MAVLink 2, 3 in MAVLink 1, or 4: see above."""
+"""By the header's bytes from system to message id, 5 in MAVLink 2 and 3 in MAVLink 1, and _OTHER_DEFINITION behind
+them where the payload's length fits no frame by the table's definition."""
 
 
 def _remember_message(key: bytes) -> _Message:
     is_mavlink1 = len(key) < 5
     system, component = key[0], key[1]
-    msgid = key[2] if is_mavlink1 else int.from_bytes(key[2:], "little")
-    definition = None if len(key) == 4 else MESSAGES.get(msgid)
+    msgid = key[2] if is_mavlink1 else int.from_bytes(key[2:5], "little")
+    definition = None if len(key) in (4, 6) else MESSAGES.get(msgid)
+    longest = 255 if definition is None else definition[3]
     known = None
     if definition is not None and definition[4] is None and definition[6] is None:
         known = Header(msgid, system, component, is_mavlink1=is_mavlink1)
     unknown = Header(msgid, system, component, is_known=False, is_mavlink1=is_mavlink1)
     if len(_messages) >= MAX_REMEMBERED:
         _messages.clear()  # only someone who makes up headers gets here
-    _messages[key] = message = _Message(definition, known, unknown, {})
+    _messages[key] = message = _Message(definition, longest, known, unknown, {})
     return message
 
 

@@ -128,6 +128,7 @@ class Refusal(StrEnum):
     MAVLINK1_NOT_ALLOWED = "mavlink1_not_allowed"
     GROUND_STATION_NOT_ALLOWED = "ground_station_not_allowed"
     RATE_LIMITED = "rate_limited"
+    HIDDEN_FRAME = "hidden_frame"  # its bytes hold, or complete, another frame that may not pass: see `delivery`
 
 
 class PolicyRow(NamedTuple):
@@ -163,6 +164,7 @@ class Gate:
         "_is_incoming",
         "_mavlink1",
         "_of_systems",
+        "_passes_unknown",
         "_rates",
         "_rules",
         "_systems",
@@ -185,6 +187,11 @@ class Gate:
         self._systems = systems
         self._mavlink1 = mavlink1
         self._ground_station = ground_station
+        rules_pass_unknown = (rules.allows_all or bool(rules.allowed_numbers)) and not rules.denies_all
+        passes_everything = (
+            rules.allows_all and not rules.denied and not rules.denied_commands and mavlink1 and ground_station
+        )
+        self._passes_unknown = rules_pass_unknown and not (passes_everything and systems is None)
         self._decisions: dict[int, Refusal | _Condition | None] = {}
         self._buckets: _Buckets = {}
         self._of_systems: _Buckets = {}
@@ -198,11 +205,30 @@ class Gate:
         verdict = self._verdict(frame.header)
         refusal = self._unmet(verdict, frame, now, to) if isinstance(verdict, _Condition) else verdict
         if refusal is not None:
-            counted = (frame.header.msgid, refusal)
-            if len(self.refused) >= MAX_COUNTED and counted not in self.refused:
-                counted = (ANY_OTHER, refusal)
-            self.refused[counted] += 1
+            self.count(frame.header, refusal)
         return refusal
+
+    def count(self, header: Header, refusal: Refusal) -> None:
+        """Count a frame that did not pass."""
+        counted = (header.msgid, refusal)
+        if len(self.refused) >= MAX_COUNTED and counted not in self.refused:
+            counted = (ANY_OTHER, refusal)
+        self.refused[counted] += 1
+
+    def permits(self, frame: Frame) -> bool:
+        """Whether the frame may pass, at any rate. Counts nothing and uses up no rate."""
+        verdict = self._verdict(frame.header)
+        if isinstance(verdict, _Condition):
+            return self._breach(verdict, frame) is None
+        return verdict is None
+
+    @property
+    def passes_unknown(self) -> bool:
+        """Whether a message that the dialect does not know may pass: of some systems, but not of every one.
+
+        Then a frame is valid by any CRC_EXTRA. Where all that there is may pass, nothing needs to be told apart.
+        """
+        return self._passes_unknown
 
     def may_speak_as(self, system: int) -> bool:
         """Whether frames of this system are let pass at all."""
@@ -265,6 +291,17 @@ class Gate:
         return verdict
 
     def _unmet(self, condition: _Condition, frame: Frame, now: float, to: int) -> Refusal | None:
+        breach = self._breach(condition, frame)
+        # The rate comes last, so that only frames which would pass use it up.
+        if (
+            breach is not None
+            or condition.per_second is None
+            or self._takes_token(frame, condition.per_second, now, to)
+        ):
+            return breach
+        return Refusal.RATE_LIMITED
+
+    def _breach(self, condition: _Condition, frame: Frame) -> Refusal | None:
         if condition.only_commands is not None and frame.header.command not in condition.only_commands:
             return Refusal.COMMAND_NOT_ALLOWED
         if frame.header.command in condition.never_commands:
@@ -273,9 +310,6 @@ class Gate:
             return Refusal.COMMAND_NOT_ALLOWED
         if condition.refuses_ground_station and _claims_to_be_ground_station(frame):
             return Refusal.GROUND_STATION_NOT_ALLOWED
-        # Last, so that only frames which would pass use up the rate.
-        if condition.per_second is not None and not self._takes_token(frame, condition.per_second, now, to):
-            return Refusal.RATE_LIMITED
         return None
 
     def _takes_token(self, frame: Frame, per_second: float, now: float, to: int) -> bool:

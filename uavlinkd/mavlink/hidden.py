@@ -1,0 +1,113 @@
+"""Hidden frames: bytes inside or across delivered frames that a parser would accept as a frame of their own.
+
+A parser that meets a frame which its dialect lacks rejects the checksum and resumes inside that frame. So does a
+parser that lost bytes, one that speaks MAVLink 1 only, and one that starts in the middle of a stream. What it reads
+then begins at a start byte in a payload, a checksum or a signature. :mod:`.delivery` keeps such bytes from clients;
+this module finds them. It knows no policy and keeps no state.
+
+What the parsers of the reference C library accept, and so what counts as a frame here:
+
+* MAVLink 1 and 2, of any payload length. ``mavlink_parse_char`` compares no length with the definition.
+* incompat_flags of 0 or 1. Any other value makes a parser give up at that byte.
+* a checksum that fits a CRC_EXTRA of any definition of the message's number, or 0, which the library uses for each
+  message that the receiver's dialect lacks. Where a policy lets unknown messages pass, any CRC_EXTRA at all.
+* a signature of any content, also before its 13 bytes are complete: without a key a receiver does not check it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from functools import lru_cache
+from typing import Final
+
+from fastcrc.crc16 import mcrf4xx
+
+from uavlinkd.mavlink.dialect_table import MESSAGES, OTHER_EXTRAS
+from uavlinkd.mavlink.frames import CHECKSUM_STEP, MAVLINK1, MAX_FRAME_BYTES, SIGNATURE_BYTES, Frame, parse_frame
+
+PAST: Final = -1
+"""Of a start: no frame can begin there."""
+
+_PLAUSIBLE = re.compile(rb"\xfe|\xfd(?=.?\Z|.[\x00\x01])", re.DOTALL)
+"""A start byte whose flags, as far as the bytes go, are ones that parsers accept."""
+_STEPS = frozenset(CHECKSUM_STEP)
+_FILLERS: Final = (*range(2, MAVLINK1 - 1), 0xFF)
+"""Values of separator bytes: no start byte, and as incompat_flags each of them ends a header at once."""
+
+
+def has_start(raw: bytes) -> bool:
+    """Whether a frame has a start byte anywhere but at its start."""
+    return raw.count(b"\xfd") + raw.count(b"\xfe") != 1
+
+
+def starts_in(data: bytes, begin: int) -> list[int]:
+    """Where frames may begin, from `begin` on."""
+    return [match.start() for match in _PLAUSIBLE.finditer(data, begin)]
+
+
+def end_of_checksum(data: bytes, start: int) -> int | None:
+    """Where the checksum of the frame at `start` ends; None if its header is incomplete, :data:`PAST` if it is none.
+
+    `start` must be a start byte.
+    """
+    left = len(data) - start
+    if data[start] == MAVLINK1:
+        return start + 8 + data[start + 1] if left >= 2 else None
+    if left >= 3 and data[start + 2] > 1:
+        return PAST
+    return start + 12 + data[start + 1] if left >= 2 else None
+
+
+def has_checksum(data: bytes, start: int, end: int, *, any_extra: bool) -> bool:
+    """Whether the checksum that ends at `end` fits the frame at `start`, by the rules at the head of this module."""
+    checksum = mcrf4xx(data[start + 1 : end - 2])
+    step = (data[end - 2] | data[end - 1] << 8) ^ (checksum >> 8)
+    if step not in _STEPS:
+        return False
+    if any_extra:
+        return True
+    is_mavlink1 = data[start] == MAVLINK1
+    msgid = data[start + 5] if is_mavlink1 else int.from_bytes(data[start + 7 : start + 10], "little")
+    return any(step == CHECKSUM_STEP[(checksum ^ extra) & 0xFF] for extra in _extras(msgid))
+
+
+def frame_at(data: bytes, start: int, end: int) -> Frame:
+    """The hidden frame at `start`, whose checksum ends at `end`, as a policy reads it. Its signature is left out."""
+    raw = data[start:end]
+    if raw[0] != MAVLINK1 and raw[2]:
+        raw += bytes(SIGNATURE_BYTES)  # whatever it will be
+    frame = parse_frame(raw)
+    assert frame is not None, "its checksum fits some CRC_EXTRA"
+    return frame
+
+
+def separator(tail: bytes, starts: Iterable[int]) -> bytes | None:
+    """Bytes to put behind `tail` after which no frame that begins at `starts` is open, or has become valid.
+
+    None where no such bytes were found. One filler value fails for a start only if the checksum up to here is one
+    particular of 65,536 values, so some 250 starts would each have to be made for it. 280 bytes hold fewer.
+    """
+    starts = list(starts)
+    for filler in _FILLERS:
+        data = tail + bytes((filler,)) * MAX_FRAME_BYTES
+        ends = [(start, end_of_checksum(data, start)) for start in starts]
+        closed = [(start, end) for start, end in ends if end is not None and end != PAST]
+        if any(has_checksum(data, start, end, any_extra=True) for start, end in closed):
+            continue
+        longest = max((_reach(data, start, end) for start, end in closed), default=0)
+        shortest = max((start + 3 for start in starts), default=0)  # flags that end a header have to be there
+        return data[len(tail) : max(longest, shortest, len(tail) + 1)]
+    return None
+
+
+def _reach(data: bytes, start: int, end: int) -> int:
+    """Where a parser that took `start` for a frame is done with it."""
+    is_signed = data[start] != MAVLINK1 and data[start + 2] == 1
+    return end + SIGNATURE_BYTES if is_signed else end
+
+
+@lru_cache(maxsize=4096)
+def _extras(msgid: int) -> tuple[int, ...]:
+    known = MESSAGES.get(msgid)
+    return (0, *(() if known is None else (known[1],)), *OTHER_EXTRAS.get(msgid, ()))
