@@ -22,6 +22,7 @@ from tests.mavlink.smuggling import (
     v2,
     valid_frames,
 )
+from uavlinkd.mavlink import hidden
 from uavlinkd.mavlink.delivery import DeliveredStream, Source
 from uavlinkd.mavlink.dialect_table import MESSAGES
 from uavlinkd.mavlink.frames import Frame, Header
@@ -151,6 +152,18 @@ def test_frame_of_two_sources_has_to_be_allowed_for_both() -> None:
     assert {at for at, _ in valid_frames(client.stream)} == client.passed
 
 
+def test_member_cannot_complete_a_command_with_the_operators_next_frame() -> None:
+    """Its bytes stand in the middle of a frame that begins and ends with the operator's: separator bytes end it."""
+    client, member, operator = Client(), source(), source("operator", [255])
+    between = v2(ATTITUDE, bytes(27) + b"\2")
+    opening, closing = split_over(between, system=255)
+    assert client.send(opening, operator)
+    assert client.send(between, member)
+    assert client.send(closing, operator)
+    assert client.delivered.separators == 1
+    assert {at for at, _ in valid_frames(client.stream)} == client.passed
+
+
 def test_frame_that_the_source_may_send_passes_inside_another() -> None:
     """A vehicle's recorded flight holds its own frames. Commands of a ground station in it do not pass."""
     vehicle = source("vehicle")
@@ -249,3 +262,39 @@ def an_observer_frame(rng: random.Random) -> bytes:
 def an_operator_frame(rng: random.Random) -> bytes:
     """An honest command or heartbeat."""
     return ARM if rng.random() < 0.5 else v2(HEARTBEAT, bytes((rng.randrange(256), 0, 0, 0, 6, 8, 0, 0, 3)), 255)
+
+
+def test_frame_is_refused_where_no_separator_restores_the_invariant(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fail closed: a frame that must not follow what was delivered does not. An urgent one that may, does."""
+    monkeypatch.setattr(hidden, "_FILLERS", ())
+    client, member, operator = Client(), source(), source("operator", [255])
+    opening, closing = split_over(system=255)
+    assert client.send(opening, member)
+    assert not client.send(closing, operator)
+    assert client.send(ARM, operator)
+
+
+@pytest.mark.parametrize("tail", [b"\xfe", b"\xfd", b"\xfd\x09", b"\xfd\x09\x01", hidden_header(COMMAND_LONG, 33)])
+def test_separator_ends_every_header(tail: bytes) -> None:
+    """Complete or not, signed or not: behind it a parser looks for the next frame."""
+    gap = hidden.separator(tail, [0])
+    assert gap is not None
+    assert not set(gap) & {0xFD, 0xFE}
+    end = hidden.end_of_checksum(tail + gap, 0)
+    assert end is not None
+    assert end <= len(tail + gap)
+    assert end == hidden.PAST or not hidden.has_checksum(tail + gap, 0, end, any_extra=True)
+
+
+def test_separator_completes_no_frame() -> None:
+    """A tail made for the first filler gets another one."""
+    first = hidden.separator(hidden_header(COMMAND_LONG, 33), [0])
+    assert first is not None
+    for number in range(1 << 16):
+        header = bytes((0xFD, 33, 0, 0, number & 0xFF, 255, number >> 8)) + COMMAND_LONG.to_bytes(3, "little")
+        data = header + bytes((first[0],)) * 35
+        if hidden.has_checksum(data, 0, len(data), any_extra=True):
+            break
+    gap = hidden.separator(header, [0])
+    assert gap is not None
+    assert gap[0] != first[0]

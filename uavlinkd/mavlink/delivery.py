@@ -11,11 +11,11 @@ forbidden frame. Every filter that reads frames with one dialect and feeds a par
 A frame is refused (:attr:`Refusal.HIDDEN_FRAME`) where it
 
 * contains a hidden frame, or
-* completes one that began in an earlier frame of the same source.
+* completes one that began in an earlier frame, with no bytes between but those of the same source.
 
-A frame that completes one which began in a frame of *another* source is delivered behind separator bytes, which end
-the hidden frame before it is complete. So a source cannot cause the refusal of another's frame. It cannot swallow
-another's urgent frames either: wherever a header of another source is still open, separator bytes end it first.
+A frame that completes one to which *another* source contributed is delivered behind separator bytes, which end the
+hidden frame before it is complete. So a source cannot cause the refusal of another's frame. It cannot have a parser
+swallow another's urgent frame either: where another source's header is still open, separator bytes end it first.
 
 A hidden frame that every source of its bytes may send is harmless: the download of a recorded flight carries whole
 frames of the vehicle itself. Rates do not apply to hidden frames. Dialects that the daemon does not know are a limit:
@@ -29,7 +29,7 @@ from typing import final
 
 from uavlinkd.mavlink import hidden
 from uavlinkd.mavlink.egress_kinds import Lane, kind_of
-from uavlinkd.mavlink.frames import Frame, Header
+from uavlinkd.mavlink.frames import MAX_FRAME_BYTES, Frame, Header
 from uavlinkd.mavlink.policy import Gate, Refusal
 
 Report = Callable[[str, Header, Refusal, float], None]
@@ -68,7 +68,7 @@ class DeliveredStream:
     Call :meth:`admit` once for each frame, in the order of delivery, and deliver all of what it returns.
     """
 
-    __slots__ = ("_authors", "_starts", "_tail", "outgoing", "separators")
+    __slots__ = ("_authors", "_due_at", "_starts", "_tail", "outgoing", "separators")
 
     def __init__(self, outgoing: Gate | None = None) -> None:
         self.outgoing = outgoing
@@ -77,38 +77,49 @@ class DeliveredStream:
         """How often bytes had to be put between frames of different sources."""
         self._tail = b""  # the stream from the first start that is still open
         self._starts: list[int] = []  # where in it frames may have begun that are not complete
+        self._due_at = 0  # the tail's length at which the first of them may be complete
         self._authors: list[tuple[int, Source | None]] = []  # up to where in it whose bytes go; None: a separator
 
     def admit(self, frame: Frame, source: Source, now: float) -> bytes:
         """The bytes to deliver for a frame: itself, perhaps behind separator bytes. None of them: it is refused."""
         raw = frame.raw
-        if not self._starts and not hidden.has_start(raw):
-            return raw
+        if not hidden.has_start(raw):
+            if not self._starts:
+                return raw
+            authors = self._authors
+            if len(authors) == 1 and authors[0][1] is source and len(self._tail) + len(raw) < self._due_at:
+                self._tail += raw
+                self._authors = [(len(self._tail), source)]
+                return raw
         return self._examine(frame, source, now)
 
     def _examine(self, frame: Frame, source: Source, now: float) -> bytes:
         raw = frame.raw
         gap: bytes | None = b""
-        if any(self._author(start) is not source for start in self._starts) and _is_urgent(frame):
+        if self._starts and not self._is_only(source) and _is_urgent(frame):
             gap = self._gap() or b""
         while gap is not None:
             begun_at = len(self._tail) + len(gap)
             data = self._tail + gap + raw
             authors = [*self._authors, *([(begun_at, None)] if gap else []), (len(data), source)]
+            if self._is_only(source) and not gap:
+                authors = authors[-1:]
             still_open: list[int] = []
+            due_at = MAX_FRAME_BYTES + len(data)
             is_hidden_elsewhere = False
             starts = [] if gap else self._starts  # all of them end within the gap
             for start in (*starts, *hidden.starts_in(data, begun_at + 1)):
                 end = hidden.end_of_checksum(data, start)
                 if end is None or end > len(data):
                     still_open.append(start)
+                    due_at = min(due_at, end or 0)
                 elif end != hidden.PAST and self._is_forbidden(data, start, end, authors):
-                    if start > begun_at or self._author(start) is source:
+                    if start > begun_at or self._is_only(source, start):
                         source.refuse(frame, now)
                         return b""
                     is_hidden_elsewhere = True
             if not is_hidden_elsewhere:
-                self._keep(data, still_open, authors)
+                self._keep(data, still_open, due_at, authors)
                 self.separators += bool(gap)
                 return gap + raw
             gap = self._gap()
@@ -133,16 +144,20 @@ class DeliveredStream:
             gates.append(self.outgoing)
         return not all(gate.permits(frame) for gate in gates)
 
-    def _keep(self, data: bytes, starts: list[int], authors: list[tuple[int, Source | None]]) -> None:
+    def _keep(self, data: bytes, starts: list[int], due_at: int, authors: list[tuple[int, Source | None]]) -> None:
         """Remember the stream from the first of these starts."""
-        first = starts[0] if starts else len(data)
+        if not starts:
+            self._tail, self._starts, self._authors = b"", starts, []
+            return
+        first = starts[0]
         self._tail = data[first:]
         self._starts = [start - first for start in starts]
+        self._due_at = due_at - first
         self._authors = [(ends_at - first, source) for ends_at, source in authors if ends_at > first]
 
-    def _author(self, at: int) -> Source | None:
-        """Whose byte is at this place of the tail."""
-        return next(source for ends_at, source in self._authors if at < ends_at)
+    def _is_only(self, source: Source, start: int = 0) -> bool:
+        """Whether all bytes of the tail from `start` on are of this source."""
+        return all(author is source for ends_at, author in self._authors if ends_at > start)
 
 
 def _is_urgent(frame: Frame) -> bool:
