@@ -46,6 +46,10 @@ class LimitedCpu:
         """Limit a process that runs already, with the children that it starts from now on."""
         (self.folder / "cgroup.procs").write_text(str(pid))
 
+    def release(self, pid: int) -> None:
+        """Give a process all of the machine again."""
+        (self.folder.parent / "cgroup.procs").write_text(str(pid))
+
     def throttled_s(self) -> float:
         """For how many seconds the kernel has kept the group from running."""
         facts = dict(line.split() for line in (self.folder / "cpu.stat").read_text().splitlines())

@@ -14,9 +14,11 @@ import pytest
 import structlog
 
 from uavlinkd.addresses import Address
+from uavlinkd.clock import monotonic
 from uavlinkd.endpoints.sockets import Reader
 from uavlinkd.log import DropSummary
 from uavlinkd.peer_sockets import PeerSockets
+from uavlinkd.stall import StallWatch
 
 
 class Refusing:
@@ -26,6 +28,10 @@ class Refusing:
         self.error = error
         self.is_out = True
         self.sent: list[bytes] = []
+
+    def fileno(self) -> int:
+        """As that of a closed socket."""
+        return -1
 
     def sendto(self, datagram: bytes, address: object) -> None:
         """As a socket's."""
@@ -51,7 +57,8 @@ def test_what_is_not_taken_is_counted_and_the_next_is_sent(name: str) -> None:
             lines.append((event, fields))
 
     log = cast(Any, Log())
-    sockets = PeerSockets(lambda arrived, now: None, DropSummary(log), structlog.get_logger())
+    stall = StallWatch(0.0, lambda seconds: None)
+    sockets = PeerSockets(lambda arrived, now, epoch: None, stall, DropSummary(log), structlog.get_logger())
     sockets.open([Address("127.0.0.1", 0)])
     sock = Refusing(getattr(errno, name))
     sockets._sockets[0].close()
@@ -68,6 +75,7 @@ def test_what_is_not_taken_is_counted_and_the_next_is_sent(name: str) -> None:
 def test_a_read_that_fails_for_want_of_memory_is_told_and_the_next_tried() -> None:
     """Nothing is raised into the loop."""
     failures: list[OSError] = []
-    reader = Reader(cast(socket.socket, Refusing(errno.ENOBUFS)), failures.append)
+    stall = StallWatch(monotonic(), lambda seconds: None)
+    reader = Reader(cast(socket.socket, Refusing(errno.ENOBUFS)), failures.append, stall)
     assert reader.read()[0] == []
     assert [each.errno for each in failures] == [errno.ENOBUFS]

@@ -77,11 +77,11 @@ class Daemon:
         self._drops = DropSummary(self.log)
         self.switch = Switch(router, self._drops.add_refused)
         self._events = EventLog(self.log)
-        self.peer_sockets = PeerSockets(self._on_arrived, self._drops, self.log)
+        self.stall = StallWatch(now, self._on_pause)
+        self.peer_sockets = PeerSockets(self._on_arrived, self.stall, self._drops, self.log)
         self._radio_status: dict[str, RadioStatusSource] = {}
         self._own = Source(config.name, compile_policy({}).incoming)  # of the frames that this daemon makes itself
         self._deliveries: dict[str, list[Frame]] = {}
-        self.stall = StallWatch(now, self._on_pause)
         self._timer: asyncio.TimerHandle | None = None
         self._timer_at = NEVER
         self._housekeeping_at = now + HOUSEKEEPING_S
@@ -314,28 +314,33 @@ class Daemon:
         self._events.program("program_gone", port.endpoint.name, port.name, monotonic())
         self.switch.remove(port)
 
-    def on_frames(self, port: LocalPort, frames: list[Frame], now: float, waited_s: float = 0.0) -> None:
+    def on_frames(self, port: LocalPort, frames: list[Frame], now: float, epoch: int, waited_s: float = 0.0) -> None:
         """What a local program sent in one wake-up."""
-        self._forward(port, frames, now, waited_s)
+        self._forward(port, frames, now, epoch, waited_s)
         if self._can_wait or self.node.next_deadline() < self._timer_at:
             self._arm()
 
     # What the peers send.
 
-    def _on_arrived(self, arrived: Arrived, now: float) -> None:
+    def _on_arrived(self, arrived: Arrived, now: float, epoch: int) -> None:
+        # Stale datagrams are opened too: their counters must be used up, or an attacker could replay them as new.
         receive = self.node.receive
         for datagram, path in arrived:
             self._perform(receive(datagram, path, now))
+        if epoch != self.stall.epoch:
+            self._perform(self.node.take_held())  # stale as well, even if the peer calls them new later
         deliveries, self._deliveries = self._deliveries, {}
         for name, frames in deliveries.items():
             if self.recorder is not None:
                 self.recorder.add(name, [frame.raw for frame in frames], FROM_PEER, now)
-            self._forward(self.links[name], frames, now)
+            self._forward(self.links[name], frames, now, epoch)
         if self._can_wait or self.node.next_deadline() < self._timer_at:
             self._arm()
 
-    def _forward(self, source: PeerLink | LocalPort, frames: list[Frame], now: float, waited_s: float = 0.0) -> None:
-        if self.stall.turn(now):  # every way in passes here
+    def _forward(
+        self, source: PeerLink | LocalPort, frames: list[Frame], now: float, epoch: int, waited_s: float = 0.0
+    ) -> None:
+        if epoch != self.stall.turn(monotonic()):  # every frame passes here; a pause may have been since its read
             who = source.name if isinstance(source, PeerLink) else source.endpoint.name
             self.stall.dropped[who] += len(frames)
             self._drops.add("frames_dropped", "stale", who, len(frames), now)

@@ -18,6 +18,7 @@ from uavlinkd.endpoints.sockets import BindError, Reader, numeric_host, udp_sock
 from uavlinkd.log import DropSummary
 from uavlinkd.peer_link import PeerLink
 from uavlinkd.resolver import Resolved, keep_resolving
+from uavlinkd.stall import StallWatch
 from uavlinkd.tasks import keep_running
 
 _EPHEMERAL = (Address("0.0.0.0", 0), Address("::", 0))
@@ -30,15 +31,20 @@ Arrived = Sequence[tuple[bytes, Path]]
 class PeerSockets:
     """Reads and sends the peers' datagrams. A path's first number is the place of its socket here.
 
-    ``on_arrived`` gets what came in one wake-up, with the monotonic time of it.
+    ``on_arrived`` gets what came in one wake-up, with the monotonic time and the epoch of it.
     """
 
     def __init__(
-        self, on_arrived: Callable[[Arrived, float], None], drops: DropSummary, log: FilteringBoundLogger
+        self,
+        on_arrived: Callable[[Arrived, float, int], None],
+        stall: StallWatch,
+        drops: DropSummary,
+        log: FilteringBoundLogger,
     ) -> None:
         self.failures: Counter[str] = Counter()
         """What the kernel did not take towards the peers, by the name of the error."""
         self._on_arrived = on_arrived
+        self._stall = stall
         self._drops = drops
         self._log = log
         self._sockets: list[socket.socket] = []
@@ -65,7 +71,7 @@ class PeerSockets:
         """Read whenever something is there."""
         loop = asyncio.get_running_loop()
         for number, sock in enumerate(self._sockets):
-            loop.add_reader(sock, self._on_readable, number, Reader(sock, self._count_failure))
+            loop.add_reader(sock, self._on_readable, number, Reader(sock, self._count_failure, self._stall))
 
     def close(self) -> None:
         """Close the sockets, and follow no name any more."""
@@ -77,8 +83,8 @@ class PeerSockets:
             sock.close()
 
     def _on_readable(self, number: int, reader: Reader) -> None:
-        arrived, now = reader.read()
-        self._on_arrived([(datagram, _path(number, source)) for datagram, source in arrived], now)
+        arrived, now, epoch = reader.read()
+        self._on_arrived([(datagram, _path(number, source)) for datagram, source in arrived], now, epoch)
 
     def send(self, datagram: bytes, path: Path) -> None:
         """Hand a datagram to the kernel."""

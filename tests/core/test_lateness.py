@@ -234,6 +234,17 @@ def test_what_is_held_is_bounded_and_counted(pair: Pair) -> None:
     assert sum(map(len, delivered)) <= c.HELD_BYTES
 
 
+def test_what_is_held_can_be_taken_while_the_question_stays_open(pair: Pair) -> None:
+    """After a pause of this process the shell drops held frames. The core delivers the frames after the answer."""
+    question = only(datagrams(pair.b.receive(frame(pair.a, SILENT, 1), SILENT)))
+    assert payloads(pair.b.node.take_held()) == [numbered(1)]
+    assert pair.b.node.take_held() == []
+
+    answer = only(datagrams(pair.a.receive(question, SILENT + 0.1)))
+    assert payloads(pair.b.receive(answer, SILENT + 0.2)) == []
+    assert payloads(pair.b.receive(frame(pair.a, SILENT + 0.2, 2), SILENT + 0.3)) == [numbered(2)]
+
+
 def test_stretched_time_is_betrayed_by_the_round_trip() -> None:
     """Each envelope is let through in order, a little later than the last: the first slow answer ends the trust."""
     pair = Pair(link_a=quiet(), link_b=lively(keepalive_s=1e6, handshake_after_s=1e6, lost_after_s=1e6)).establish()

@@ -1,20 +1,52 @@
-"""A daemon that stood still gives nobody what had gathered meanwhile as if it were new."""
+"""A daemon that stood still delivers nothing that gathered meanwhile as if it were new."""
 
 from __future__ import annotations
 
 import asyncio
+import os
 import signal
+import socket
+import tty
+from collections.abc import Callable
+from contextlib import suppress
 
 import pytest
 
-from tests.daemon.harness import Stage, frame
+from tests.daemon.harness import PATIENCE_S, DaemonProcess, Program, Stage, frame, free_port
+from tests.limited_cpu import limited_cpu
+from uavlinkd.stall import STALL_S
 
-PAUSED_S = 4.0
+PAUSED_S = STALL_S + 0.5
+FRESH = 10_000
+"""Frames from this number on are sent after the pause."""
+
+
+async def until_fresh(send: Callable[[bytes], object], sink: Program, system: int = 1) -> None:
+    """Send new frames until one arrives."""
+    number = FRESH
+    async with asyncio.timeout(PATIENCE_S):
+        while not any(frame(each, system) in sink.received for each in range(FRESH, number)):
+            send(frame(number, system))
+            number += 1
+            await asyncio.sleep(0.05)
+
+
+async def stop(daemon: DaemonProcess) -> None:
+    """Stop the process, and wait until the kernel has."""
+    await daemon.send_signal(signal.SIGSTOP)
+    while (state := _state(daemon.pid)) != "T":
+        assert state in "RSD"
+        await asyncio.sleep(0.001)
+
+
+def _state(pid: int) -> str:
+    with open(f"/proc/{pid}/stat") as file:
+        return file.read().rpartition(")")[2].split()[0]
 
 
 @pytest.mark.parametrize("paused", ["sender", "receiver"])
 async def test_what_waited_while_a_daemon_was_stopped_is_not_delivered(paused: str, stage: Stage) -> None:
-    """After a SIGSTOP of some seconds only what is sent from then on arrives, and the rest is told as stale."""
+    """After a SIGSTOP of some seconds only what is sent from then on arrives. The rest is counted as stale."""
     a, b = stage.pair()
     into = a.add_endpoint("autopilot")
     sink = await stage.program()
@@ -25,20 +57,90 @@ async def test_what_waited_while_a_daemon_was_stopped_is_not_delivered(paused: s
     await sink.until_heard(frame(1))
 
     stopped = a if paused == "sender" else b
-    await stopped.send_signal(signal.SIGSTOP)
+    await stop(stopped)
     for number in range(2, 42):
         source.send(frame(number), into)
         await asyncio.sleep(PAUSED_S / 40)
     await stopped.send_signal(signal.SIGCONT)
     await stopped.until_logged("daemon_stood_still")
-    fresh = 100
-    while not any(frame(number) in sink.received for number in range(100, fresh)):
-        source.send(frame(fresh), into)
-        fresh += 1
-        await asyncio.sleep(0.05)
-        assert fresh < 200
+    await until_fresh(lambda data: source.send(data, into), sink)
 
-    late = [number for number in range(2, 40) if frame(number) in sink.received]
+    late = [number for number in range(2, 42) if frame(number) in sink.received]
     assert late == [], "these had waited while the daemon was stopped"
     await stopped.until_logged("frames_dropped", reason="stale")
     assert sum((await stopped.status())["stale"].values()) > 0
+
+
+async def test_slow_computer_does_not_deliver_a_long_backlog() -> None:
+    """At a fortieth of a core it takes a second to read a full socket: the last datagram is as old as the first."""
+    backlog = range(2, 2000)
+    with limited_cpu(0.025) as limit:
+        async with Stage() as stage:
+            a, b = stage.pair()
+            into = a.add_endpoint("autopilot")
+            sink = await stage.program()
+            b.add_endpoint("ground", f"udpout:{sink}")
+            await stage.start(a, b)
+            source = await stage.program()
+            source.send(frame(1), into)
+            await sink.until_heard(frame(1))
+
+            await stop(a)
+            for number in backlog:
+                source.send(frame(number), into)
+            await asyncio.sleep(PAUSED_S)
+            limit.add(a.pid)
+            await a.send_signal(signal.SIGCONT)
+            await a.until_logged("daemon_stood_still")
+            await until_fresh(lambda data: source.send(data, into), sink)
+            limit.release(a.pid)
+
+            assert [number for number in backlog if frame(number) in sink.received] == []
+            assert limit.throttled_s() > 0.25
+
+
+async def test_each_kind_of_endpoint_drops_what_waited(stage: Stage) -> None:
+    """UDP, TCP and serial clients speak during the pause; a frame that one of them was amid is not cut in two."""
+    a, b = stage.pair()
+    udp = a.add_endpoint("udp")
+    tcp = a.add_endpoint("tcp", f"tcpin:127.0.0.1:{free_port()}")
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    device = a.folder / "ttyACM0"
+    device.symlink_to(os.ttyname(slave))
+    a.add_endpoint("serial", f"serial:{device}:57600")
+    sink = await stage.program()
+    b.add_endpoint("ground", f"udpout:{sink}")
+    await stage.start(a, b)
+    source = await stage.program()
+    client = socket.create_connection(tcp)
+    await a.until(lambda status: all(status["endpoints"][name]["programs"] for name in ("tcp", "serial")))
+    send: dict[int, Callable[[bytes], object]] = {
+        1: lambda data: source.send(data, udp),
+        2: client.send,
+        3: lambda data: os.write(master, data),
+    }
+    for system, write in send.items():
+        await until_fresh(write, sink, system)
+    sink.clear()
+
+    await stop(a)
+    for system, write in send.items():
+        write(frame(1, system) + frame(2, system))
+        if system != 1:
+            write(frame(3, system)[:9])
+    await asyncio.sleep(PAUSED_S)
+    await a.send_signal(signal.SIGCONT)
+    await a.until(lambda status: status["stale"] == {"udp": 2, "tcp": 2, "serial": 2})
+    for system, write in send.items():
+        if system != 1:
+            write(frame(3, system)[9:])
+        await until_fresh(write, sink, system)
+    late = [(system, number) for system in send for number in (1, 2, 3) if frame(number, system) in sink.received]
+    assert late == []
+    status = await a.until(lambda status: all(status["stale"][name] >= 3 for name in ("tcp", "serial")))
+    assert [status["endpoints"][name]["garbage_bytes"] for name in ("tcp", "serial")] == [0, 0]
+    client.close()
+    with suppress(OSError):
+        os.close(slave)
+    os.close(master)

@@ -11,11 +11,13 @@ from time import monotonic
 from pymavlink.dialects.v20 import common as mavlink
 
 from uavlinkd.addresses import Address
+from uavlinkd.clock import monotonic as boot_time
 from uavlinkd.endpoints.ports import Endpoint, LocalPort
 from uavlinkd.endpoints.udp import UdpClient
 from uavlinkd.mavlink.delivery import Source
 from uavlinkd.mavlink.frames import Frame, SplitCounters, split_payload
 from uavlinkd.mavlink.policy import compile_policy
+from uavlinkd.stall import StallWatch
 
 PATIENCE_S = 10.0
 """After which what was to happen has not."""
@@ -61,6 +63,9 @@ class Recorder:
         self.closed: list[LocalPort] = []
         self.batches: list[list[bytes]] = []
         """One for each call."""
+        self.epochs: list[int] = []
+        """Of each."""
+        self.stall = StallWatch(boot_time(), lambda seconds: None)
         self.on_batch: Callable[[], None] = lambda: None
 
     @property
@@ -74,9 +79,10 @@ class Recorder:
         self.open.remove(port)
         self.closed.append(port)
 
-    def on_frames(self, port: LocalPort, frames: list[Frame], now: float, waited_s: float = 0.0) -> None:
+    def on_frames(self, port: LocalPort, frames: list[Frame], now: float, epoch: int, waited_s: float = 0.0) -> None:
         assert port in self.open, "a port speaks after it is opened and before it is closed"
         self.batches.append([each.raw for each in frames])
+        self.epochs.append(epoch)
         self.on_batch()
 
 

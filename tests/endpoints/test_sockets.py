@@ -10,9 +10,11 @@ import pytest
 
 from tests.daemon.harness import free_port, has_ipv6, need
 from uavlinkd.addresses import Address
+from uavlinkd.clock import monotonic
 from uavlinkd.endpoints.sockets import (
     BUFFER_BYTES,
     BUSY_S,
+    DATAGRAM_OVERHEAD_BYTES,
     DATAGRAMS_PER_WAKE_UP,
     PAUSE_S,
     BindError,
@@ -20,6 +22,7 @@ from uavlinkd.endpoints.sockets import (
     numeric_host,
     udp_socket,
 )
+from uavlinkd.stall import STALE, STALL_S, StallWatch
 
 
 def test_it_is_bound_and_does_not_block() -> None:
@@ -91,7 +94,8 @@ class Pair:
         self.sender = udp_socket(Address("127.0.0.1", 0))
         self.sender.connect(self.receiver.getsockname())
         self.failures: list[OSError] = []
-        self.reader = Reader(self.receiver, self.failures.append)
+        self.stall = StallWatch(monotonic(), lambda seconds: None)
+        self.reader = Reader(self.receiver, self.failures.append, self.stall)
 
     def send(self, *datagrams: bytes) -> None:
         for datagram in datagrams:
@@ -99,7 +103,7 @@ class Pair:
 
     def read(self) -> list[bytes]:
         """What one wake-up reads."""
-        arrived, _ = self.reader.read()
+        arrived = self.reader.read().arrived
         assert all(source == self.sender.getsockname() for _, source in arrived)
         return [datagram for datagram, _ in arrived]
 
@@ -143,7 +147,7 @@ def test_empty_datagrams_are_read_in_batches_too(monkeypatch: pytest.MonkeyPatch
 def test_a_failure_is_told_and_reading_goes_on(pair: Pair) -> None:
     """A connected socket hears of a refused datagram at the next read; what arrived is read all the same."""
     failures: list[OSError] = []
-    reader = Reader(pair.sender, failures.append)
+    reader = Reader(pair.sender, failures.append, pair.stall)
     pair.receiver.close()
     pair.sender.send(b"into the void")
     assert reader.read()[0] == []
@@ -175,3 +179,61 @@ def test_a_busy_socket_is_read_after_a_pause(monkeypatch: pytest.MonkeyPatch, pa
     assert len(pair.read()) == DATAGRAMS_PER_WAKE_UP
     assert pair.read() == [b"full"]  # more had gathered already: there is nothing to wait for
     assert pauses == [PAUSE_S]
+
+
+def pause_process(pair: Pair) -> None:
+    """This process stood still until now."""
+    pair.stall.turn(monotonic() + 2 * STALL_S)
+
+
+def test_datagrams_that_waited_during_a_pause_are_stale_however_slowly_they_are_read(
+    monkeypatch: pytest.MonkeyPatch, pair: Pair
+) -> None:
+    """A second between two batches makes none of them new; what comes once the socket was empty is."""
+    now = monotonic()
+    monkeypatch.setattr("uavlinkd.endpoints.sockets.monotonic", lambda: now)
+    pair.send(*[b"old"] * (3 * DATAGRAMS_PER_WAKE_UP + 1))
+    now += 2 * STALL_S
+    epochs = []
+    for _ in range(4):
+        epochs.append(pair.reader.read().epoch)
+        now += 1.0
+    assert epochs == [STALE] * 4
+    pair.send(b"new")
+    assert pair.reader.read()[::2] == ([(b"new", pair.sender.getsockname())], 1)
+
+
+def test_empty_datagrams_do_not_pass_for_an_empty_socket(pair: Pair) -> None:
+    """FIONREAD reports 0 for them too, and an old frame may be behind them."""
+    pair.send(b"old", *[b""] * DATAGRAMS_PER_WAKE_UP, b"old")
+    pause_process(pair)
+    assert [pair.reader.read().epoch for _ in range(2)] == [STALE, STALE]
+
+
+def test_socket_that_never_becomes_empty_is_stale_for_a_receive_buffer(pair: Pair) -> None:
+    """A flood does not keep frames from being delivered for long after a pause."""
+    pair.send(b"old")
+    pause_process(pair)
+    buffer_bytes = pair.receiver.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
+    batches = 0
+    while pair.reader.backlog.is_stale:
+        pair.send(*[bytes(1000)] * (DATAGRAMS_PER_WAKE_UP + 1))
+        pair.read()
+        batches += 1
+    assert batches == -(-buffer_bytes // (DATAGRAMS_PER_WAKE_UP * (1000 + DATAGRAM_OVERHEAD_BYTES)))
+
+
+@pytest.mark.parametrize("size", [0, 1, 60, 300, 1200, 9000, 60000])
+def test_a_full_socket_counts_as_no_more_than_its_receive_buffer(pair: Pair, size: int) -> None:
+    """Otherwise the bound would end before the old datagrams do."""
+    buffer_bytes = pair.receiver.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
+    one = size + DATAGRAM_OVERHEAD_BYTES
+    for _ in range(buffer_bytes // one + 2):
+        pair.send(bytes(size))
+    pause_process(pair)
+    amount = 0
+    while pair.reader.backlog.is_stale:
+        amount += sum(len(each) + DATAGRAM_OVERHEAD_BYTES for each in pair.read())
+    with pytest.raises(BlockingIOError):
+        pair.receiver.recv(1)
+    assert 0 < amount <= buffer_bytes + one

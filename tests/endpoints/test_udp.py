@@ -14,6 +14,7 @@ from tests.daemon.harness import frame, heartbeat, open_socket
 from tests.endpoints.programs import write
 from tests.waiting import until
 from uavlinkd.addresses import Address
+from uavlinkd.clock import monotonic
 from uavlinkd.endpoints.ports import LocalPort
 from uavlinkd.endpoints.sockets import DATAGRAMS_PER_WAKE_UP, Reader, udp_socket
 from uavlinkd.endpoints.udp import (
@@ -25,6 +26,7 @@ from uavlinkd.endpoints.udp import (
 )
 from uavlinkd.mavlink import frames
 from uavlinkd.mavlink.frames import Frame
+from uavlinkd.stall import STALE, STALL_S, StallWatch
 
 
 class Recorder:
@@ -35,6 +37,8 @@ class Recorder:
         self.closed: list[str] = []
         self.heard: list[tuple[str, list[bytes]]] = []
         self.waited: list[float] = []
+        self.epochs: list[int] = []
+        self.stall = StallWatch(monotonic(), lambda seconds: None)
 
     def on_port_opened(self, port: LocalPort) -> None:
         """A program is there."""
@@ -44,10 +48,11 @@ class Recorder:
         """It is gone."""
         self.closed.append(port.name)
 
-    def on_frames(self, port: LocalPort, frames: list[Frame], now: float, waited_s: float = 0.0) -> None:
+    def on_frames(self, port: LocalPort, frames: list[Frame], now: float, epoch: int, waited_s: float = 0.0) -> None:
         """What it sent."""
         self.heard.append((port.name, [each.raw for each in frames]))
         self.waited.append(waited_s)
+        self.epochs.append(epoch)
 
 
 @pytest.fixture
@@ -87,8 +92,8 @@ def name_of(sock: socket.socket) -> str:
 
 def read(server: UdpServer, now: float = 1.0) -> None:
     """What the loop does when the socket is readable."""
-    arrived, _ = Reader(server._sock, server._count_failure).read()
-    server.take(arrived, now)
+    batch = Reader(server._sock, server._count_failure, server._handler.stall).read()
+    server.take(batch._replace(now=now))
 
 
 async def test_what_is_there_is_handed_over_at_once(server: UdpServer, recorder: Recorder, program: Make) -> None:
@@ -310,3 +315,36 @@ async def test_closed_while_frames_gather_nothing_is_read(recorder: Recorder) ->
     server.close()
     await asyncio.sleep(0.05)
     assert recorder.heard == []
+
+
+async def test_frames_that_waited_during_a_pause_are_stale(
+    server: UdpServer, recorder: Recorder, program: Make
+) -> None:
+    """They are handed over as such, so that they are counted."""
+    one = program()
+    reader = Reader(server._sock, server._count_failure, recorder.stall)
+    one.send(frame(1))
+    recorder.stall.turn(monotonic() + 2 * STALL_S)
+    server.take(reader.read())
+    one.send(frame(2))
+    server.take(reader.read())
+    assert recorder.heard == [(name_of(one), [frame(1)]), (name_of(one), [frame(2)])]
+    assert recorder.epochs == [STALE, 1]
+
+
+async def test_frame_that_a_bridge_began_before_a_pause_is_stale(
+    server: UdpServer, recorder: Recorder, program: Make
+) -> None:
+    """The rest of it comes after the pause; the next frame is new."""
+    one = program()
+    reader = Reader(server._sock, server._count_failure, recorder.stall)
+    cut = frame(2)
+    for datagram in (frame(1), frame(1) + cut[:10]):
+        one.send(datagram)
+        server.take(reader.read())
+    recorder.stall.turn(monotonic() + 2 * STALL_S)
+    for datagram in (cut[10:], frame(3)):
+        one.send(datagram)
+        server.take(reader.read())
+    assert [frames for _, frames in recorder.heard] == [[frame(1)], [frame(1)], [cut], [frame(3)]]
+    assert recorder.epochs == [0, 0, STALE, 1]

@@ -103,11 +103,16 @@ class Doubt:
             pushed_out += 1
         return pushed_out
 
+    def take_held(self) -> list[bytes]:
+        """Hold the frames no more, and go on asking."""
+        held = [payload for _, payload in self._held]
+        self._held.clear()
+        self._held_bytes = 0
+        return held
+
     def end(self, fresh: int) -> tuple[list[bytes], int]:
         """The doubt is over: what is new, in the order of arrival, and how many envelopes are not."""
         new = [payload for counter, payload in self._held if counter >= fresh]
-        old = len(self._held) - len(new)
-        self._held.clear()
-        self._held_bytes = 0
+        old = len(self.take_held()) - len(new)
         self.due_at = self._give_up_at = NEVER
         return new, old

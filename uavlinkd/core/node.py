@@ -137,6 +137,16 @@ class Node:
             out.append(Dropped(drop.reason, peer.name if peer else None, path, 1, drop.detail))
         return out
 
+    def take_held(self) -> list[Output]:
+        """Hold the frames no more that wait for a peer's word.
+
+        Only for a shell that drops them: this process stood still, and they may be from before that.
+        """
+        out: list[Output] = []
+        for peer in self.peers.values():
+            peer.take_held(out)
+        return out
+
     def handle_timeout(self, now: float) -> list[Output]:
         """Do what is due. Call it at :meth:`next_deadline`, or at any time."""
         out: list[Output] = []

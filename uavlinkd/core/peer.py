@@ -263,6 +263,11 @@ class Peer:
         _, held = session.doubt.end(c.SESSION_ENVELOPE_LIMIT)
         self._drop(DropReason.DOUBTFUL, held, out)
 
+    def take_held(self, out: list[Output]) -> None:
+        """Hold no frames any more."""
+        for session in self.sessions.confirmed:
+            out += [Deliver(self.name, payload) for payload in session.doubt.take_held()]
+
     def _count_ended(self, sessions: list[Session], out: list[Output]) -> None:
         """What ends with a session: frames that waited, and the hope for envelopes that did not come."""
         for session in sessions:

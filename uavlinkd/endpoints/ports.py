@@ -13,6 +13,7 @@ from typing import Protocol
 
 from uavlinkd.mavlink.delivery import DeliveredStream, Source
 from uavlinkd.mavlink.frames import Frame, SplitCounters
+from uavlinkd.stall import StallWatch
 
 
 class LocalPort:
@@ -40,14 +41,20 @@ class LocalPort:
 class PortHandler(Protocol):
     """What an endpoint reports to. ``now`` is monotonic seconds."""
 
+    stall: StallWatch
+    """Endpoints report their reads to it."""
+
     def on_port_opened(self, port: LocalPort) -> None:
         """A program is there."""
 
     def on_port_closed(self, port: LocalPort) -> None:
         """It is gone."""
 
-    def on_frames(self, port: LocalPort, frames: list[Frame], now: float, waited_s: float = 0.0) -> None:
-        """What it sent, all that was there at once, in order; the first of it has waited so long already."""
+    def on_frames(self, port: LocalPort, frames: list[Frame], now: float, epoch: int, waited_s: float = 0.0) -> None:
+        """What it sent, all that was there at once, in order; the first of it has waited so long already.
+
+        ``epoch``: when it was read (:mod:`uavlinkd.stall`). The handler drops frames of any but the present one.
+        """
 
 
 class Endpoint(Protocol):

@@ -20,6 +20,8 @@ RETRY_S = 0.5
 """Between two attempts to open a device that is not there, or not ours to open."""
 IN_FLIGHT_S = 0.1
 """The kernel is given no more than the wire carries in this time: what it has can get stale, but not be dropped."""
+TERMINAL_BYTES = 4096 + 640 * 1024
+"""The kernel holds no more received bytes of a terminal (Linux: N_TTY_BUF_SIZE, TTYB_DEFAULT_MEM_LIMIT)."""
 _BITS_PER_BYTE = 10  # with start and stop bit
 
 
@@ -42,6 +44,10 @@ class SerialChannel:
     def write(self, data: bytes) -> int:
         """Hand bytes to the kernel."""
         return os.write(self._fd, data)
+
+    def capacity(self) -> int:
+        """What the kernel's queue for a terminal can hold, at any rate."""
+        return TERMINAL_BYTES
 
     def room(self) -> int:
         """How much less than it may hold the kernel has to send."""
@@ -86,13 +92,14 @@ class SerialEndpoint(StreamEndpoint):
 
     async def _keep_open(self) -> None:
         while True:
+            epoch = self.handler.stall.epoch
             try:
                 device = await self._thread.run(self._open_device)
             except OSError as error:
                 self.could_not_open(failure_name(error))
             else:
                 channel = SerialChannel(device, self._url.baud)
-                connection = self.open(channel, self._url.device, monotonic())
+                connection = self.open(channel, self._url.device, monotonic(), epoch)
                 await connection.lost.wait()
                 with suppress(OSError):  # no thread can be started now: it is closed when nobody holds it any more
                     await self._thread.run(partial(channel.close, abort=True))

@@ -20,6 +20,7 @@ from uavlinkd.clock import monotonic
 from uavlinkd.endpoints.ports import LocalPort, PortHandler, failure_name
 from uavlinkd.mavlink.delivery import Source
 from uavlinkd.mavlink.frames import MAX_GAP_S, Frame, SplitCounters, StreamSplitter
+from uavlinkd.stall import STALE, Backlog
 
 MAX_AGE_S = 1.0
 """A frame that waited longer than this for its turn is not sent any more."""
@@ -59,6 +60,9 @@ class Channel(Protocol):
 
     def write(self, data: bytes) -> int:
         """Hand bytes over; how many were taken. ``BlockingIOError`` for none."""
+
+    def capacity(self) -> int:
+        """How many received bytes the kernel can hold now."""
 
     def room(self) -> int:
         """How many bytes may be handed over now, so that the kernel does not hold what gets stale there."""
@@ -146,7 +150,9 @@ class OutgoingFrames:
 class Connection:
     """One open byte stream and the program at its other end."""
 
-    def __init__(self, endpoint: StreamEndpoint, channel: Channel, name: str, opened_at: float) -> None:
+    def __init__(
+        self, endpoint: StreamEndpoint, channel: Channel, name: str, opened_at: float, opened_in: int
+    ) -> None:
         self.port = LocalPort(endpoint, name, None)
         self.channel = channel
         self.opened_at = opened_at
@@ -157,6 +163,9 @@ class Connection:
         self._splitter = StreamSplitter(endpoint.counters, endpoint.max_gap_s, endpoint.max_hold_s)
         self._loop = asyncio.get_running_loop()
         self._fd = channel.fileno()
+        self._stall = endpoint.handler.stall
+        self._backlog = Backlog(self._stall, self._fd, channel.capacity, opened_in)
+        self._epoch = opened_in  # of the last read
         self._is_open = True
         self._lost_by = ""
         self._has_read = False
@@ -177,6 +186,8 @@ class Connection:
 
     def on_readable(self, now: float) -> None:
         """Read what is there, and hand over its frames at once."""
+        epoch = self._backlog.begin(now)
+        is_empty = False
         chunks: list[bytes] = []
         left = READ_BYTES
         ended: str | None = None
@@ -184,6 +195,7 @@ class Connection:
             try:
                 chunk = self.channel.read(left)
             except BlockingIOError:
+                is_empty = True
                 break
             except OSError as error:
                 ended = failure_name(error)
@@ -192,18 +204,22 @@ class Connection:
                 left -= len(chunk)
                 ended = None if chunk else DISCONNECTED
         data = b"".join(chunks)
+        self._backlog.end(len(data), is_empty=is_empty)
         if data and not self._has_read:
             self._has_read = True
             if (reason := self._endpoint.objection(data)) is not None:
                 self.lose(reason)
                 return
         self._endpoint.bytes_received += len(data)
+        self._age(epoch)
+        # Stale bytes are split too: a stream that is cut amid a frame begins with any bytes of that.
+        is_fresh = self._splitter.is_fresh
         frames = self._splitter.feed(data, now)
         if ended is not None:
             frames += self._splitter.end()
         if frames:
             self.port.heard_at = now
-            self._endpoint.handler.on_frames(self.port, frames, now)
+            self._endpoint.handler.on_frames(self.port, frames, now, epoch if is_fresh else STALE)
         if ended is not None:
             self.lose(ended)
 
@@ -225,11 +241,19 @@ class Connection:
 
     def check(self, now: float) -> None:
         """Drop what got stale; close the connection if nothing of it has moved for long."""
+        self._age(self._stall.epoch)
+        epoch = self._epoch if self._splitter.is_fresh else STALE
         if frames := self._splitter.give_up(now):
-            self._endpoint.handler.on_frames(self.port, frames, now)
+            self._endpoint.handler.on_frames(self.port, frames, now, epoch)
         self.outgoing.drop_stale(now)
         if self._blocked_since is not None and now - self._blocked_since >= STALLED_S:
             self.lose("stalled")
+
+    def _age(self, epoch: int) -> None:
+        """What is held of a frame came before a pause: then the frame is not new."""
+        if epoch != self._epoch:
+            self._epoch = epoch
+            self._splitter.age()
 
     def lose(self, reason: str) -> None:
         """Stop, count why, and report the port as closed soon: never from within ``write``."""
@@ -358,9 +382,9 @@ class StreamEndpoint(ABC):
         """Why a connection that begins with these bytes is to be closed at once; None to keep it."""
         return None
 
-    def open(self, channel: Channel, name: str, now: float) -> Connection:
-        """Take a connection over, and report its port."""
-        connection = Connection(self, channel, name, now)
+    def open(self, channel: Channel, name: str, now: float, opened_in: int) -> Connection:
+        """Take a connection over, and report its port. ``opened_in``: the epoch in which opening it began."""
+        connection = Connection(self, channel, name, now, opened_in)
         self._connections[connection.port] = connection
         self.handler.on_port_opened(connection.port)
         return connection

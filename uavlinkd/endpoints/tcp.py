@@ -17,6 +17,7 @@ from uavlinkd.clock import monotonic
 from uavlinkd.endpoints.ports import PortHandler, failure_name
 from uavlinkd.endpoints.sockets import bind, cannot_listen, unbound_socket
 from uavlinkd.endpoints.streams import MAX_AGE_S, STALLED_S, StreamEndpoint
+from uavlinkd.stall import Backlog
 from uavlinkd.tasks import keep_running
 from uavlinkd.threads import Threads
 
@@ -75,6 +76,10 @@ class SocketChannel:
         self.read = sock.recv
         self.write = sock.send
 
+    def capacity(self) -> int:
+        """The receive buffer, as large as it is now."""
+        return self._sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
+
     def room(self) -> int:
         """As much as the kernel will take: it says itself when it has room again."""
         return _ROOM_BYTES
@@ -101,6 +106,7 @@ class TcpServer(StreamEndpoint):
         super().__init__(name, handler, max_age_s)
         self._listener = listener
         self._resume: asyncio.TimerHandle | None = None
+        self._backlog = Backlog(handler.stall, listener.fileno(), lambda: _BACKLOG + 1)
 
     @property
     def address(self) -> tuple[str, int]:
@@ -118,10 +124,13 @@ class TcpServer(StreamEndpoint):
 
     def on_acceptable(self, now: float) -> None:
         """Let in who waits, as far as there are places."""
+        # A client that connected during a pause may have sent something. Its connection is stale as this queue is.
+        epoch = self._backlog.begin(now)
         for _ in range(_BACKLOG):
             try:
                 sock, sockaddr = self._listener.accept()
             except BlockingIOError:
+                self._backlog.end(0, is_empty=True)
                 return
             except OSError as error:
                 self.failures[failure_name(error)] += 1
@@ -129,12 +138,13 @@ class TcpServer(StreamEndpoint):
                     self._pause()
                     return
                 continue
+            self._backlog.end(1, is_empty=False)
             if not self._has_place(now):
                 self.failures["too_many_clients"] += 1
                 sock.close()
                 continue
             _prepare(sock)
-            self.open(SocketChannel(sock), str(Address(*sockaddr[:2])), now)
+            self.open(SocketChannel(sock), str(Address(*sockaddr[:2])), now, epoch)
 
     def objection(self, first_bytes: bytes) -> str | None:
         """``http`` for what a browser begins with, whatever follows."""
@@ -196,9 +206,10 @@ class TcpClient(StreamEndpoint):
         chance = SystemRandom()
         wait_s = FIRST_WAIT_S
         while True:
+            epoch = self.handler.stall.epoch
             sock = await self._connect()
             if sock is not None:
-                connection = self.open(SocketChannel(sock), str(self._address), monotonic())
+                connection = self.open(SocketChannel(sock), str(self._address), monotonic(), epoch)
                 await connection.lost.wait()
                 # A server that only accepts and closes is not asked at once again.
                 if connection.port.heard_at is not None or monotonic() - connection.opened_at >= LONGEST_WAIT_S:

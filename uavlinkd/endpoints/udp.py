@@ -16,10 +16,11 @@ import structlog
 from uavlinkd.addresses import Address
 from uavlinkd.clock import monotonic
 from uavlinkd.endpoints.ports import LocalPort, PortHandler, failure_name
-from uavlinkd.endpoints.sockets import Arrived, BindError, Reader, numeric_host, udp_socket
+from uavlinkd.endpoints.sockets import Batch, BindError, Reader, numeric_host, udp_socket
 from uavlinkd.mavlink.delivery import Source
 from uavlinkd.mavlink.frames import MAX_GAP_S, MIN_FRAME_BYTES, Frame, SplitCounters, StreamSplitter, split_datagram
 from uavlinkd.resolver import Resolved, keep_resolving
+from uavlinkd.stall import STALE
 from uavlinkd.tasks import keep_running
 
 CLIENTS_PER_ENDPOINT = 32
@@ -53,6 +54,7 @@ class UdpEndpoint(ABC):
         self.frames_sent = 0
         self._sock = sock
         self._handler = handler
+        self._epoch = handler.stall.epoch  # of the last read
         self._gather_s = 0.0
         self._gathering: asyncio.TimerHandle | None = None
         self._ports: dict[Sockaddr, LocalPort] = {}  # the longest silent first
@@ -72,7 +74,7 @@ class UdpEndpoint(ABC):
 
     def start(self) -> None:
         """Read whenever something is there."""
-        self._watch(Reader(self._sock, self._count_failure))
+        self._watch(Reader(self._sock, self._count_failure, self._handler.stall))
 
     def gather(self, seconds: float) -> None:
         """One wake-up for all that comes within ``seconds``, rather than one for each datagram."""
@@ -87,22 +89,28 @@ class UdpEndpoint(ABC):
             loop.remove_reader(self._sock)
             self._gathering = loop.call_later(self._gather_s, self._on_gathered, reader, self._gather_s)
         else:
-            self.take(*reader.read())
+            self.take(reader.read())
 
     def _on_gathered(self, reader: Reader, waited_s: float) -> None:
         self._gathering = None
         self._watch(reader)
-        self.take(*reader.read(), waited_s)
+        self.take(reader.read(), waited_s)
 
-    def take(self, datagrams: Arrived, now: float, waited_s: float = 0.0) -> None:
+    def take(self, batch: Batch, waited_s: float = 0.0) -> None:
         """Hand over the frames of each sender in their order; the first of them has waited so long already."""
+        datagrams, now, epoch = batch
         arrived: dict[Sockaddr, list[Frame]] = {}
+        stale: set[Sockaddr] = set()
         counters = self.counters
+        self._age(epoch)
         for datagram, source in datagrams:
             self.bytes_received += len(datagram)
             address = source if len(source) == 2 else (numeric_host(source), source[1])
             if self._cutters and address in self._cutters:
-                frames = self._cutters[address].feed(datagram, now)
+                splitter = self._cutters[address]
+                if not splitter.is_fresh:
+                    stale.add(address)
+                frames = splitter.feed(datagram, now)
             else:
                 garbage = counters.garbage_bytes
                 frames = split_datagram(datagram, counters)
@@ -117,7 +125,7 @@ class UdpEndpoint(ABC):
             port = self._port_of(address, now)
             if port is not None:
                 port.heard_at = now
-                self._handler.on_frames(port, frames, now, waited_s)
+                self._handler.on_frames(port, frames, now, STALE if address in stale else epoch, waited_s)
 
     def _follow_cuts(self, address: Sockaddr, datagram: bytes, found: int, now: float) -> None:
         """A program that is known sent what is no frame. Where its datagram ends amid one, the rest is to come.
@@ -131,6 +139,13 @@ class UdpEndpoint(ABC):
             self.counters.garbage_bytes -= splitter.pending_bytes
             splitter.counters = self.counters
             self._cutters[address] = splitter
+
+    def _age(self, epoch: int) -> None:
+        """What programs cut apart began before a pause: then none of it is new."""
+        if epoch != self._epoch:
+            self._epoch = epoch
+            for splitter in self._cutters.values():
+                splitter.age()
 
     def write(self, port: LocalPort, frames: Sequence[Frame], source: Source, now: float) -> None:
         """Send frames to one program, together where they fit. What the kernel does not take is counted."""
@@ -159,9 +174,11 @@ class UdpEndpoint(ABC):
 
     def do_housekeeping(self, now: float) -> None:
         """Forget who is gone, and what waits for an end that does not come."""
+        self._age(self._handler.stall.epoch)
         for address, splitter in self._cutters.items():
+            epoch = self._epoch if splitter.is_fresh else STALE
             if frames := splitter.give_up(now):
-                self._handler.on_frames(self._ports[address], frames, now)
+                self._handler.on_frames(self._ports[address], frames, now, epoch)
 
     def close(self) -> None:
         """Close the socket."""

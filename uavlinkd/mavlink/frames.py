@@ -178,6 +178,7 @@ class StreamSplitter:
 
     __slots__ = (
         "_fed_at",
+        "_fresh_bytes",
         "_gives_up",
         "_held_since",
         "_in_garbage",
@@ -203,6 +204,16 @@ class StreamSplitter:
         self._rest = b""
         self._in_garbage = False
         self._fed_at = 0.0
+        self._fresh_bytes = 0
+
+    @property
+    def is_fresh(self) -> bool:
+        """Whether all that is held came after the last :meth:`age`."""
+        return len(self._rest) <= self._fresh_bytes
+
+    def age(self) -> None:
+        """What is held now is old, and so is a frame that begins in it."""
+        self._fresh_bytes = 0
 
     @property
     def pending_bytes(self) -> int:
@@ -214,6 +225,7 @@ class StreamSplitter:
         frames = self.give_up(now)
         held = len(self._rest)
         self._fed_at = now
+        self._fresh_bytes += len(chunk)
         if self._scan(self._rest + chunk if held else chunk, frames, is_final=False) or not held:
             self._held_since = now
         return frames
