@@ -21,7 +21,6 @@ from tests.daemon.test_reboot import faked_clock
 from tests.faults.network import FAULT_S
 from tests.faults.talk import NOBODY, Log, Outcome, Talk, grew, prepare, told
 from tests.waiting import until
-from uavlinkd.core.constants import LATE_AFTER_S, LATE_STEP_S
 
 SUSPENDED_S = float(os.environ.get("UAVLINKD_SIGSTOP_S", FAULT_S))
 """How long a process is stopped; 30 in CI."""
@@ -369,8 +368,7 @@ async def suspended(stage: Stage) -> Outcome:
     await a.send_signal(signal.SIGCONT)
     recovered_s = await talk.back(ended)
     for speaker, hearer in (talk.voices, talk.voices[::-1]):
-        # What is younger is not late by the protocol: the core may hold it until the peer has vouched for it.
-        old = {n for n, at in speaker.sent_at.items() if began + 0.1 < at < ended - LATE_AFTER_S - 2 * LATE_STEP_S}
+        old = {n for n, at in speaker.sent_at.items() if began + 0.1 < at < ended}
         assert not [n for n in old if speaker.frame(n) in hearer.heard_at], "what had waited came as if it were new"
     talk.check_no_copies()
     talk.stop()
