@@ -14,6 +14,7 @@ from pathlib import Path
 from types import FrameType
 
 from tests.bench.contenders import Contender, all_contenders
+from tests.bench.daemons import Uavlinkd
 from tests.bench.frames import FrameSet, load_frames
 from tests.bench.measure import NO_LOSS
 from tests.bench.namespaces import CableKind, NamespaceError, why_not
@@ -56,6 +57,12 @@ def _measure(arguments: Sequence[str]) -> int:
     parser.add_argument("--out", type=Path, default=Path("bench-results"), help="where records, table and figure go")
     parser.add_argument("--rounds", type=int, help=f"how often each is measured, in turn ({Plan().rounds})")
     parser.add_argument("--only", nargs="+", choices=names, metavar="NAME", help=f"of {', '.join(names)}")
+    parser.add_argument(
+        "--against",
+        type=Path,
+        metavar="CHECKOUT",
+        help="measure uavlinkd with the code there as well, in turn with this one: before and after in one run",
+    )
     parser.add_argument("--quick", action="store_true", help="one short round, without the highest rates")
     parser.add_argument(
         "--cable",
@@ -77,6 +84,15 @@ def _measure(arguments: Sequence[str]) -> int:
         return FAILED
     wanted = options.only or names
     chosen = [each for name, each in contenders.items() if name in wanted]
+    if options.against is not None:
+        others = {each.name: each.of(options.against) for each in chosen if isinstance(each, Uavlinkd)}
+        if not others:
+            parser.error("--against compares uavlinkd, which --only leaves out")
+        reasons = {reason for each in others.values() if (reason := each.why_not())}
+        if reasons:
+            print(f"cannot measure: {'; '.join(sorted(reasons))}", file=sys.stderr)
+            return FAILED
+        chosen = [one for each in chosen for one in (each, others.get(each.name)) if one is not None]
     scales = [name for name in SCALES if name in wanted]
     return _run(plan, options.out, chosen, scales, _command(options))
 
@@ -86,6 +102,7 @@ def _command(options: argparse.Namespace) -> str:
     words = ["python -m tests.bench", "--out DIR"]
     words += [f"--rounds {options.rounds}"] if options.rounds else []
     words += ["--only", *options.only] if options.only else []
+    words += ["--against CHECKOUT"] if options.against else []
     words += ["--quick"] if options.quick else []
     words += [f"--cable {options.cable}"] if options.cable is not CableKind.PLAIN else []
     return " ".join(words)

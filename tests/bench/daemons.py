@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from copy import copy
 from pathlib import Path
 from typing import Final
 
@@ -17,17 +18,56 @@ from tests.daemon.harness import WITHOUT_UVLOOP
 from uavlinkd import keys
 from uavlinkd.control import ControlError, ask
 
+OF_OTHER: Final = "-against"
+"""How the name of a contender ends that runs the code of another checkout."""
+
 
 class Uavlinkd(Contender):
-    """Two daemons that are linked, each with the role of the other in its file, as in flight."""
+    """Two daemons that are linked, each with the role of the other in its file, as in flight.
 
-    def __init__(self, name: str, about: str, *, uvloop: bool = True, **link: str) -> None:
+    Without ``has_roles`` policy lets everything pass: the difference is what policy costs.
+    """
+
+    def __init__(self, name: str, about: str, *, uvloop: bool = True, has_roles: bool = True, **link: str) -> None:
         super().__init__(name, about)
         self._uvloop = uvloop
+        self._has_roles = has_roles
         self._link = link
+        self._python = Path(sys.executable)
+        self._checkout: Path | None = None
+
+    def of(self, checkout: Path) -> Uavlinkd:
+        """The same, with the code of another checkout, in that one's environment ``.venv``."""
+        other = copy(self)
+        other.name = f"{self.name}{OF_OTHER}"
+        other._checkout = checkout.resolve()
+        other._python = other._checkout / ".venv" / "bin" / "python"
+        return other
 
     def why_not(self) -> str | None:
-        return needs_module("uvloop") if self._uvloop else None
+        if self._checkout is None:
+            return needs_module("uvloop") if self._uvloop else None
+        if not self._python.exists():
+            return f"{self._checkout} has no environment: python3 -m venv .venv && .venv/bin/pip install -e '.[test]'"
+        modules = "uavlinkd, uvloop" if self._uvloop else "uavlinkd"
+        asked = subprocess.run(
+            [self._python, "-c", f"import {modules}; print(uavlinkd.__file__)"],
+            cwd=self._checkout,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        if asked.returncode:
+            return f"{self._python} cannot import {modules}"
+        where = Path(asked.stdout.strip())
+        # Otherwise a PYTHONPATH, or an environment that was copied, would compare this code with itself.
+        return None if self._checkout in where.parents else f"{self._python} runs {where}"
+
+    def version(self) -> str | None:
+        if self._checkout is None:
+            return None
+        git = ["git", "-C", str(self._checkout), "describe", "--always", "--dirty"]
+        return subprocess.run(git, capture_output=True, text=True, check=False).stdout.strip() or None
 
     def start(self, cable: Cable, folder: Path) -> Running:
         private = {side: keys.generate_private_key() for side in ("left", "right")}
@@ -37,30 +77,44 @@ class Uavlinkd(Contender):
         link = "".join(f"{key} = {value}\n" for key, value in self._link.items())
         left = configuration(
             "left",
-            peers=[peer("right", public["right"], "operator", [255], f"{cable.right.address}:{LINK_PORT}")],
+            peers=[
+                peer("right", public["right"], *self._rules("operator", 255), f"{cable.right.address}:{LINK_PORT}")
+            ],
             endpoint=f"udpin:127.0.0.1:{INTO_PORT}",
             link=link,
         )
         right = configuration(
             "right",
-            peers=[peer("left", public["left"], "vehicle", [SYSTEM])],
+            peers=[peer("left", public["left"], *self._rules("vehicle", SYSTEM))],
             endpoint=f"udpout:{LOCAL_SINK}",
             link=link,
         )
         (folder / "left.toml").write_text(left)
         (folder / "right.toml").write_text(right)
         processes = {
-            host: start_daemon(host, folder / f"{side}.toml", uvloop=self._uvloop)
+            host: start_daemon(host, folder / f"{side}.toml", python=self._python, uvloop=self._uvloop)
             for host, side in ((cable.right, "right"), (cable.left, "left"))
         }
         until(lambda: all(peers_up(folder / f"{side}.sock") == 1 for side in private), "the daemons are linked")
         return Running([processes[cable.left]], [processes[cable.right]])
 
+    def _rules(self, role: str, system: int) -> tuple[str | None, list[int]]:
+        """Role and systems of a peer."""
+        if self._has_roles:
+            return role, [system]
+        return ("all" if self._knows_role("all") else None), []
 
-def peer(name: str, public: str, role: str, systems: Sequence[int], address: str = "") -> str:
+    def _knows_role(self, role: str) -> bool:
+        """Whether there is one. A checkout from before a word was needed passes everything without one."""
+        asks = f"from uavlinkd.mavlink.policy import compile_policy; compile_policy({{'role': {role!r}}})"
+        return subprocess.run([self._python, "-c", asks], capture_output=True, check=False).returncode == 0
+
+
+def peer(name: str, public: str, role: str | None, systems: Sequence[int], address: str = "") -> str:
     """A ``[[peer]]``."""
-    called = f'addresses = ["{address}"]\n' if address else ""
-    said = f'role = "{role}"\nsystem_ids = {list(systems)}\n{called}'
+    said = f'role = "{role}"\n' if role else ""
+    said += f"system_ids = {list(systems)}\n" if systems else ""
+    said += f'addresses = ["{address}"]\n' if address else ""
     return f'\n[[peer]]\nname = "{name}"\npublic_key = "{public}"\n{said}'
 
 
@@ -73,19 +127,23 @@ def configuration(name: str, *, peers: Sequence[str], endpoint: str, link: str =
     )
 
 
-def daemon_command(config: Path, *, uvloop: bool = True) -> list[str]:
+def daemon_command(config: Path, *, python: Path = Path(sys.executable), uvloop: bool = True) -> list[str]:
     """How a daemon is run."""
     program = ["-m", "uavlinkd"] if uvloop else ["-c", WITHOUT_UVLOOP]
-    return [sys.executable, *program, "run", "--config", str(config)]
+    return [str(python), *program, "run", "--config", str(config)]
 
 
 def start_daemon(
-    host: Host, config: Path, *, uvloop: bool = True, environ: Mapping[str, str] | None = None
+    host: Host,
+    config: Path,
+    *,
+    python: Path = Path(sys.executable),
+    uvloop: bool = True,
+    environ: Mapping[str, str] | None = None,
 ) -> subprocess.Popen[bytes]:
     """Start a daemon on a host; its log is beside its file."""
-    return host.start(
-        daemon_command(config, uvloop=uvloop), folder=config.parent, log=config.with_suffix(".log"), environ=environ
-    )
+    command = daemon_command(config, python=python, uvloop=uvloop)
+    return host.start(command, folder=config.parent, log=config.with_suffix(".log"), environ=environ)
 
 
 def peers_up(control_socket: Path) -> int:
@@ -101,5 +159,6 @@ DAEMONS: Final = (
     Uavlinkd("uavlinkd", "authenticated"),
     Uavlinkd("uavlinkd-confidential", "encrypted too", confidential="true"),
     Uavlinkd("uavlinkd-coalesced", "authenticated, coalesce_s = 0.002", coalesce_s="0.002"),
+    Uavlinkd("uavlinkd-all", "authenticated, without roles: policy passes everything", has_roles=False),
     Uavlinkd("uavlinkd-asyncio", "authenticated, without uvloop", uvloop=False),
 )

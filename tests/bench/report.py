@@ -8,6 +8,7 @@ from statistics import median
 from typing import Final
 
 from tests.bench.checks import all_checks
+from tests.bench.daemons import OF_OTHER
 from tests.bench.findings import LOSES, SIDES, Findings
 from tests.bench.measure import DISTURBED_MOST, EVEN_S
 
@@ -73,6 +74,8 @@ def page_text(findings: Findings, figure: str | None) -> str:
     parts += ["## What has to be reached", _checks(findings)]
     if findings.contenders:
         parts += ["## CPU and highest rate", _costs(findings), "## Latency, memory, bytes", _rest(findings)]
+    if against := [name for name in findings.contenders if name.endswith(OF_OTHER)]:
+        parts += ["## Against the other checkout", _against(findings, against)]
     parts += ["## uavlinkd alone", _alone(findings)]
     missing = findings.not_measured()
     if missing:
@@ -107,6 +110,20 @@ def _costs(findings: Findings) -> str:
         cells += [_count(findings.highest(name, each)) for each in (1, 8)]
         rows.append(cells)
     return _table((*heads, "loss", "highest", "highest, 8 a datagram"), rows)
+
+
+def _against(findings: Findings, others: Sequence[str]) -> str:
+    heads = ["", *(f"CPU {rate:,}/s, {side}" for rate in RATES for side in ("sending", "receiving"))]
+    rows = []
+    for other in others:
+        cells = [other.removesuffix(OF_OTHER)]
+        for rate in RATES:
+            for side in SIDES:
+                before, after = (findings.cpu_us(name, rate, side) for name in (other, cells[0]))
+                cells.append(f"{before:.1f} → {after:.1f} µs ({after / before:.2f})" if before and after else "-")
+        rows.append(cells)
+    said = f"There → here, and the ratio. There: `{findings.facts.get(f'version_{others[0]}', 'not known')}`."
+    return f"{said}\n\n{_table(heads, rows)}"
 
 
 def _rest(findings: Findings) -> str:

@@ -20,6 +20,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from tests.bench import scale
 from tests.bench.checks import Check
 from tests.bench.contenders import Contender, NotMeasuredError, Running, all_contenders
+from tests.bench.daemons import Uavlinkd
 from tests.bench.findings import Findings
 from tests.bench.frames import PROBE_EVERY, SYSTEM, is_probe, load_frames, probe, said_by
 from tests.bench.generator import pack, send_evenly
@@ -269,6 +270,34 @@ def test_page_says_what_was_measured_reached_and_not(tmp_path: Path) -> None:
     assert drawn.lstrip().startswith("<?xml")
     write_report(tmp_path, "records")
     assert (tmp_path / "costs.svg").read_text() == drawn
+
+
+def test_page_compares_two_checkouts(tmp_path: Path) -> None:
+    """The medians of both, their ratio, and which code the other one is."""
+    with RecordWriter(tmp_path, "records", {"version_uavlinkd-against": "296bd4d"}) as writer:
+        for each in (*records_of("uavlinkd", 60.0, 1e-4), *records_of("uavlinkd-against", 50.0, 1e-4)):
+            writer.add(each)
+    text = write_report(tmp_path, "records")
+    assert "There: `296bd4d`" in text
+    assert "| uavlinkd | 55.0 → 66.0 µs (1.20) | 55.0 → 66.0 µs (1.20) | - | - |" in text
+
+
+def test_checkout_that_cannot_be_measured_is_reported(tmp_path: Path) -> None:
+    """Without an environment, or where the environment runs other code than the checkout's."""
+    ours = CONTENDERS["uavlinkd"]
+    assert isinstance(ours, Uavlinkd)
+    assert "has no environment" in str(ours.of(tmp_path).why_not())
+    python = tmp_path / ".venv" / "bin" / "python"
+    python.parent.mkdir(parents=True)
+    python.write_text(f'#!/bin/sh\nexec {sys.executable} "$@"\n')
+    python.chmod(0o755)
+    assert f"{python} runs {REPOSITORY / 'uavlinkd'}" in str(ours.of(tmp_path).why_not())
+
+
+def test_daemons_without_roles_carry_frames(bench: Bench) -> None:
+    """Their configuration passes everything, however this checkout wants that written."""
+    with at_work(CONTENDERS["uavlinkd-all"], bench) as running:
+        assert at_rate(bench, running, 1_000, 0.5)["received"] == pytest.approx(500, abs=20)
 
 
 def test_page_of_nothing_can_be_read() -> None:
