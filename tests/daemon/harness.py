@@ -87,19 +87,30 @@ _given_ports: set[int] = set()
 
 
 def free_port() -> int:
-    """A UDP port that nobody uses, below those that the system gives out by itself."""
+    """A port that nobody uses for UDP or TCP, below those that the system gives out by itself."""
     while True:
         port = random.SystemRandom().randrange(10240, 32768)
         if port in _given_ports:
             continue
-        with suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-            sock.bind(("0.0.0.0", port))
-            if has_ipv6():
-                with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as other:
-                    other.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
-                    other.bind(("::", port))
+        with suppress(OSError):
+            for kind in (socket.SOCK_DGRAM, socket.SOCK_STREAM):
+                _try_port(port, kind)
             _given_ports.add(port)
             return port
+
+
+def _try_port(port: int, kind: socket.SocketKind) -> None:
+    """Bind it for a moment.
+
+    Raises:
+        OSError: it is in use.
+    """
+    with socket.socket(socket.AF_INET, kind) as sock:
+        sock.bind(("0.0.0.0", port))
+    if has_ipv6():
+        with socket.socket(socket.AF_INET6, kind) as sock:
+            sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+            sock.bind(("::", port))
 
 
 def shown(address: Sockaddr) -> str:

@@ -31,7 +31,7 @@ async def test_a_signal_ends_it_cleanly_and_the_peer_is_told(stage: Stage, numbe
     a, b = stage.pair()
     await stage.start(a, b)
     assert await a.stop(number) == 0
-    told = await b.until_logged("peer_closed", timeout_s=2.5)
+    told = await b.until_logged("peer_closed")
     assert told["peer"] == a.name
     status = await b.status()
     assert status["peers"][a.name]["state"] == "lost"

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import io
 import json
+import socket
+from pathlib import Path
 
 import pytest
 from rich.console import Console
 
 from uavlinkd.sim.demo import Direction, Summary
 from uavlinkd.sim.demo_screen import render_summary
+from uavlinkd.sim.drone_process import free_udp_ports
 
 FRAMES = [bytes((0xFD, number)) for number in range(10)]
 
@@ -122,3 +125,14 @@ def test_no_round_trip_is_no_number() -> None:
     file = io.StringIO()
     Console(file=file, width=80).print(render_summary(Summary(0.0, 0, 0, 0, 0, {}, None)))
     assert "round trip not measured" in file.getvalue()
+
+
+def test_ports_are_free_and_never_assigned_by_the_system() -> None:
+    """Another process cannot be assigned one of them before the daemon binds it."""
+    ports = free_udp_ports(20)
+    assert len(set(ports)) == 20
+    first = int(Path("/proc/sys/net/ipv4/ip_local_port_range").read_text().split()[0])
+    assert max(ports) < first
+    for port in ports:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+            sock.bind(("127.0.0.1", port))

@@ -26,9 +26,9 @@ from uavlinkd.sim.flight import Flight
 DemoError = DroneError
 """The demo could not be shown. The message is for a person."""
 
-LINK_UP_S = 10.0
+LINK_UP_S = 30.0
 """How long the daemons may take to start and link. They take about half a second."""
-DRAIN_S = 3.0
+DRAIN_S = 15.0
 """How long the last frames may be on their way."""
 ATTITUDE_HZ = 50.0
 REKEY_AFTER_S = 4.0

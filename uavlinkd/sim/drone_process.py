@@ -9,6 +9,7 @@ import socket
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
+from random import SystemRandom
 from typing import Any
 
 from uavlinkd.checker import interpreter
@@ -17,6 +18,10 @@ from uavlinkd.keys import decode_key, generate_private_key, public_key_text, wri
 
 STOP_S = 5.0
 """How long a daemon may take to end when it is asked to."""
+
+
+_UNASSIGNED = 10240, 32768
+"""The ports below Linux's default for net.ipv4.ip_local_port_range."""
 
 
 class DroneError(Exception):
@@ -137,9 +142,16 @@ class DroneProcess:
 
 
 def free_udp_ports(count: int) -> list[int]:
-    """Ports of loopback that nobody uses now."""
+    """Unused ports of loopback, outside the range from which the system assigns ports.
+
+    A daemon binds its port some time after this choice. Until then the system could assign it to another process.
+    """
+    ports: list[int] = []
+    rng = SystemRandom()
     with ExitStack() as stack:
-        sockets = [stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(count)]
-        for sock in sockets:
-            sock.bind(("127.0.0.1", 0))
-        return [sock.getsockname()[1] for sock in sockets]
+        while len(ports) < count:
+            sock = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+            with suppress(OSError):
+                sock.bind(("127.0.0.1", rng.randrange(*_UNASSIGNED)))
+                ports.append(sock.getsockname()[1])
+    return ports
