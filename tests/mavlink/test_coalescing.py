@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from tests.mavlink.test_egress import MAKERS, attitude, heartbeat, parameter
 from uavlinkd.mavlink.coalescing import Coalescer, make_egress
-from uavlinkd.mavlink.egress import Egress, EgressDrop, EgressSettings, EnvelopeShape
+from uavlinkd.mavlink.egress import Egress, EgressSettings, EnvelopeShape
+from uavlinkd.mavlink.egress_lanes import EgressDrop
 from uavlinkd.mavlink.frames import Frame
 
 SETTINGS = EgressSettings(coalesce_s=0.1, max_age_s=1.0)

@@ -24,11 +24,11 @@ from uavlinkd.mavlink.egress import (
     MAX_FLOWS,
     MIN_LANE_BYTES,
     Egress,
-    EgressDrop,
     EgressSettings,
     EnvelopeShape,
 )
 from uavlinkd.mavlink.egress_kinds import Lane, flow_key, kind_of
+from uavlinkd.mavlink.egress_lanes import EgressDrop
 from uavlinkd.mavlink.frames import Frame, Header, SplitCounters, split_datagram
 
 SHAPE = EnvelopeShape(payload_limit=1200, seal_bytes=23, carrier_bytes=28)
@@ -540,12 +540,12 @@ def test_memory_is_bounded_under_a_flood_of_replaceable_frames() -> None:
     egress = Egress(SLOW, 0.0)
     egress.spend(4000, 0.0)
     egress.put([attitude(n) for n in range(5000)], 0.0)
-    assert len(egress._queues[Lane.STATES].arrivals) <= 100
+    assert len(egress._lanes.queues[Lane.STATES].arrivals) <= 100
     for start in range(0, 3 * MAX_FLOWS, 1024):
         names = (f"{n}".encode() for n in range(start, start + 1024))
         egress.put([frame(mavlink.MAVLink_named_value_float_message(1, name, 1.5)) for name in names], 0.0)
-    assert len(egress._flows) <= MAX_FLOWS
-    assert len(egress._queues[Lane.STATES].line) <= 2 * egress.queued_frames + 65
+    assert len(egress._lanes._flows) <= MAX_FLOWS
+    assert len(egress._lanes.queues[Lane.STATES].line) <= 2 * egress.queued_frames + 65
 
 
 def test_clear_drops_all_that_waits() -> None:

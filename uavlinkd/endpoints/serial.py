@@ -6,6 +6,7 @@ import asyncio
 import os
 from contextlib import suppress
 from functools import partial
+from math import inf
 
 from serialx import BaseSerial, serial_for_url
 
@@ -18,19 +19,43 @@ from uavlinkd.threads import Threads
 
 RETRY_S = 0.5
 """Between two attempts to open a device that is not there, or not ours to open."""
-IN_FLIGHT_S = 0.1
-"""The kernel is given no more than the wire carries in this time: what it has can get stale, but not be dropped."""
+IN_FLIGHT_S = 0.02
+"""The kernel is given no more than the line carries in this time, or one frame: frames there cannot be overtaken."""
+REFILL = 0.75
+"""The kernel is given more when it holds no more than this part of that, so that several frames share a wake-up."""
+IN_FLIGHT_BYTES = 4096
+"""... or no more than this, as its driver counts it, where the device has no line rate."""
+POLL_S = 0.005
+"""How soon to look again where there is no line rate."""
+LATE_S = 0.001
+"""A timer should not come before the line has carried what it waits for: event loops round to milliseconds."""
 TERMINAL_BYTES = 4096 + 640 * 1024
 """The kernel holds no more received bytes of a terminal (Linux: N_TTY_BUF_SIZE, TTYB_DEFAULT_MEM_LIMIT)."""
 _BITS_PER_BYTE = 10  # with start and stop bit
+_WITHOUT_RATE = ("ttyACM", "ttyGS", "rfcomm", "cu.usbmodem", "tty.usbmodem")
+_PSEUDO_TERMINALS = "/dev/pts/"
+
+
+def has_line_rate(device: str) -> bool:
+    """Whether the device is a real UART, so that its baud rate says how fast it sends.
+
+    USB CDC devices (``ttyACM``), Bluetooth and pseudo-terminals take any baud rate and ignore it.
+    """
+    path = os.path.realpath(device)
+    return not path.startswith(_PSEUDO_TERMINALS) and not os.path.basename(path).startswith(_WITHOUT_RATE)
 
 
 class SerialChannel:
-    """An open serial device. Reads and writes go past the library, whose own wait for the device."""
+    """An open serial device. Reads and writes go past the library, whose own wait for the device.
 
-    def __init__(self, device: BaseSerial, baud: int) -> None:
+    ``baud``: None where the device has no line rate.
+    """
+
+    def __init__(self, device: BaseSerial, baud: int | None) -> None:
         self.device = device
-        self.in_flight_bytes = max(1, int(IN_FLIGHT_S * baud / _BITS_PER_BYTE))
+        self._bytes_per_s = baud / _BITS_PER_BYTE if baud is not None else None
+        self.limit_bytes = IN_FLIGHT_BYTES if self._bytes_per_s is None else max(1, int(IN_FLIGHT_S * self._bytes_per_s))
+        self._sent_by = -inf  # when the line will have carried what was written, at its rate
         self._fd = device.fileno()
 
     def fileno(self) -> int:
@@ -43,15 +68,35 @@ class SerialChannel:
 
     def write(self, data: bytes) -> int:
         """Hand bytes to the kernel."""
+        count = self.hand_over(data)
+        if self._bytes_per_s is not None:
+            self._sent_by = max(self._sent_by, monotonic()) + count / self._bytes_per_s
+        return count
+
+    def hand_over(self, data: bytes) -> int:
+        """The system call of :meth:`write`."""
         return os.write(self._fd, data)
 
     def capacity(self) -> int:
         """What the kernel's queue for a terminal can hold, at any rate."""
         return TERMINAL_BYTES
 
-    def room(self) -> int:
-        """How much less than it may hold the kernel has to send."""
-        return self.in_flight_bytes - self.device.num_unwritten_bytes()
+    def held(self, now: float) -> int:
+        """What the kernel has to send, or what the line cannot have carried yet where that is more.
+
+        The kernel does not count what a UART's FIFO or a USB adapter's buffer holds: some tens to hundreds of bytes.
+        """
+        in_kernel = self.device.num_unwritten_bytes()
+        if self._bytes_per_s is None:
+            return in_kernel
+        return max(in_kernel, int((self._sent_by - now) * self._bytes_per_s)) if self._sent_by > now else in_kernel
+
+    def drain_s(self, to_bytes: int, now: float) -> float:
+        """By the line's rate."""
+        if self._bytes_per_s is None:
+            return POLL_S
+        to_bytes = min(to_bytes, int(REFILL * self.limit_bytes))
+        return max(0.0, self.held(now) - to_bytes) / self._bytes_per_s + LATE_S
 
     def close(self, *, abort: bool) -> None:
         """Close the device, and forget what was not sent: the kernel would wait half a minute for it to go."""
@@ -98,7 +143,8 @@ class SerialEndpoint(StreamEndpoint):
             except OSError as error:
                 self.could_not_open(failure_name(error))
             else:
-                channel = SerialChannel(device, self._url.baud)
+                baud = self._url.baud if has_line_rate(self._url.device) else None
+                channel = SerialChannel(device, baud)
                 connection = self.open(channel, self._url.device, monotonic(), epoch)
                 await connection.lost.wait()
                 with suppress(OSError):  # no thread can be started now: it is closed when nobody holds it any more

@@ -1,15 +1,15 @@
 """What TCP and serial ports share: frames into and out of byte streams, and a bounded wait for a slow other side.
 
-What the kernel does not take at once waits in a buffer of its connection's own. When that is full the oldest frame
-is dropped; a frame that waited too long is dropped whatever room there is, because what it says is no longer so. A
-frame of which some bytes have gone is finished first: the other side could not find the next one's start.
+What the kernel does not take at once waits in its connection's own queue (:mod:`.outgoing`): urgent frames first, each
+source its fair share, the newest state. The kernel holds little, because frames there can be neither dropped nor
+overtaken.
 """
 
 from __future__ import annotations
 
 import asyncio
 from abc import ABC, abstractmethod
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Sequence
 from math import inf
 from typing import Protocol
@@ -17,6 +17,7 @@ from typing import Protocol
 import structlog
 
 from uavlinkd.clock import monotonic
+from uavlinkd.endpoints.outgoing import OutgoingFrames
 from uavlinkd.endpoints.ports import LocalPort, PortHandler, failure_name
 from uavlinkd.mavlink.delivery import Source
 from uavlinkd.mavlink.frames import MAX_GAP_S, Frame, SplitCounters, StreamSplitter
@@ -24,16 +25,12 @@ from uavlinkd.stall import STALE, Backlog
 
 MAX_AGE_S = 1.0
 """A frame that waited longer than this for its turn is not sent any more."""
-OUTGOING_BYTES = 65536
-"""Held back for one connection: a second of the fastest telemetry, several seconds of the usual."""
 READ_BYTES = 4096
 """Read of one connection in a wake-up; then the others have their turn. The costliest bytes take some 10 ms."""
 STALLED_S = 30.0
 """A connection that took no byte for this long is closed, so that what nobody reads is not held for ever."""
 LASTED_S = 60.0
 """An endpoint that was open for so long and then is not is news; one that comes and goes fills no log."""
-ROOM_POLL_S = 0.01
-"""How soon to look again where the kernel has room and it is we who leave it empty: it reports nothing then."""
 
 DISCONNECTED = "disconnected"
 
@@ -64,87 +61,18 @@ class Channel(Protocol):
     def capacity(self) -> int:
         """How many received bytes the kernel can hold now."""
 
-    def room(self) -> int:
-        """How many bytes may be handed over now, so that the kernel does not hold what gets stale there."""
+    @property
+    def limit_bytes(self) -> int:
+        """The kernel is handed no more than this, except for a single larger frame while it holds nothing."""
+
+    def held(self, now: float) -> int:
+        """How many bytes the kernel holds that count towards the limit."""
+
+    def drain_s(self, to_bytes: int, now: float) -> float:
+        """In how many seconds the kernel should hold no more than ``to_bytes``."""
 
     def close(self, *, abort: bool) -> None:
         """Close it; ``abort`` forgets what the kernel has not sent."""
-
-
-class OutgoingFrames:
-    """The frames that wait for one connection, and the rest of the one that is half written."""
-
-    def __init__(self, max_age_s: float, dropped: Counter[str], capacity_bytes: int = OUTGOING_BYTES) -> None:
-        self._max_age_s = max_age_s
-        self._dropped = dropped
-        self._capacity_bytes = capacity_bytes
-        self._waiting: deque[tuple[float, bytes]] = deque()
-        self._waiting_bytes = 0
-        self._begun = b""  # what is left of a frame whose start has been written
-
-    def __len__(self) -> int:
-        """How many frames are not wholly written."""
-        return len(self._waiting) + bool(self._begun)
-
-    def add(self, frames: Sequence[bytes], now: float) -> None:
-        """Have frames wait. Where there is too little room the oldest are dropped, as ``outgoing_full``."""
-        self.drop_stale(now)
-        for frame in frames:
-            self._waiting.append((now, frame))
-            self._waiting_bytes += len(frame)
-        while self._waiting_bytes > self._capacity_bytes:
-            self._take_oldest()
-            self._dropped["outgoing_full"] += 1
-
-    def drop_stale(self, now: float) -> None:
-        """Drop what waited too long, counted as ``stale``. A frame that is half written has no age."""
-        while self._waiting and now - self._waiting[0][0] > self._max_age_s:
-            self._take_oldest()
-            self._dropped["stale"] += 1
-
-    def next_bytes(self, room: int, now: float) -> bytes:
-        """What to write next: whole frames, as many as begin within ``room`` bytes. Changes only what is stale."""
-        self.drop_stale(now)
-        if room <= 0:
-            return b""
-        parts = [self._begun] if self._begun else []
-        size = len(self._begun)
-        for _, frame in self._waiting:
-            if size >= room:
-                break
-            parts.append(frame)
-            size += len(frame)
-        return b"".join(parts)
-
-    def mark_written(self, count: int) -> int:
-        """Take out the first ``count`` of the next bytes. Returns how many frames are now complete."""
-        if count < len(self._begun):
-            self._begun = self._begun[count:]
-            return 0
-        completed = 1 if self._begun else 0
-        count -= len(self._begun)
-        self._begun = b""
-        while count:
-            frame = self._take_oldest()
-            if count < len(frame):
-                self._begun = frame[count:]
-                break
-            count -= len(frame)
-            completed += 1
-        return completed
-
-    def drop_all(self) -> None:
-        """The connection is gone: count what waits for it as ``unsent``."""
-        if self:
-            self._dropped["unsent"] += len(self)
-        self._waiting.clear()
-        self._waiting_bytes = 0
-        self._begun = b""
-
-    def _take_oldest(self) -> bytes:
-        _, frame = self._waiting.popleft()
-        self._waiting_bytes -= len(frame)
-        return frame
 
 
 class Connection:
@@ -223,14 +151,14 @@ class Connection:
         if ended is not None:
             self.lose(ended)
 
-    def write(self, frames: Sequence[bytes], now: float) -> None:
+    def write(self, frames: Sequence[Frame], source: Source, now: float) -> None:
         """Send frames, or have them wait for those that wait already."""
         if not self._is_open:
             self._endpoint.failures["unsent"] += len(frames)
-            return
-        self.outgoing.add(frames, now)
-        if not self._awaits_writable and self._room_timer is None:
-            self._flush(now)
+        elif self._awaits_writable or self._room_timer is not None:
+            self.outgoing.put(frames, source, now)
+        else:
+            self._write_at_once(frames, source, now)
 
     def on_writable(self, now: float) -> None:
         """The kernel has room again."""
@@ -273,25 +201,74 @@ class Connection:
             self._room_timer.cancel()
         self.outgoing.drop_all()
 
-    def _flush(self, now: float) -> None:
-        """Write what waits until the kernel takes no more."""
-        endpoint = self._endpoint
+    def _write_at_once(self, frames: Sequence[Frame], source: Source, now: float) -> None:
+        """Write what the kernel has room for, while no other frame waits. The rest waits for its turn."""
+        count = 0
         try:
-            while data := self.outgoing.next_bytes(self.channel.room(), now):
-                count = self.channel.write(data)
-                endpoint.bytes_sent += count
-                endpoint.frames_sent += self.outgoing.mark_written(count)
-                self._blocked_since = None
-                if count < len(data):
-                    self._await_writable(now)
+            while count < len(frames) and not self._awaits_writable:
+                fitting = self._count_fitting(frames, count, now)
+                if fitting == count:
+                    break
+                self.outgoing.commit(frames[count:fitting], source)
+                count = fitting
+                self._write_committed(now)
+        except OSError as error:
+            self.outgoing.put(frames[count:], source, now)
+            self.lose(failure_name(error))
+            return
+        if count < len(frames):
+            self.outgoing.put(frames[count:], source, now)
+            if not self._awaits_writable:
+                self._flush(now)
+
+    def _count_fitting(self, frames: Sequence[Frame], first: int, now: float) -> int:
+        """How far the frames from ``first`` on fit into the kernel's room; at least one does where it holds nothing."""
+        held = self.channel.held(now)
+        limit = self.channel.limit_bytes
+        count = first
+        for frame in frames[first:]:
+            size = len(frame.raw)
+            if held and held + size > limit:
+                break
+            held += size
+            count += 1
+        return count
+
+    def _flush(self, now: float) -> None:
+        """Write what waits until the kernel has no room for more."""
+        channel = self.channel
+        outgoing = self.outgoing
+        try:
+            while True:
+                outgoing.commit_next(channel.held(now), channel.limit_bytes, now)
+                if not outgoing.committed:
+                    break
+                if not self._write_committed(now):
                     return
-        except BlockingIOError:
-            self._await_writable(now)
+            if outgoing.waiting:
+                self._await_room(now)
         except OSError as error:
             self.lose(failure_name(error))
-        else:
-            if self.outgoing:
-                self._await_room(now)
+
+    def _write_committed(self, now: float) -> bool:
+        """Hand committed bytes to the kernel. Returns whether it took them all; else wait until it takes more.
+
+        Raises:
+            OSError: the connection is gone.
+        """
+        data = self.outgoing.committed
+        try:
+            count = self.channel.write(data)
+        except BlockingIOError:
+            self._await_writable(now)
+            return False
+        self._endpoint.bytes_sent += count
+        self._endpoint.frames_sent += self.outgoing.mark_written(count)
+        self._blocked_since = None
+        if count < len(data):
+            self._await_writable(now)
+            return False
+        return True
 
     def _await_writable(self, now: float) -> None:
         self._blocked_since = self._blocked_since if self._blocked_since is not None else now
@@ -299,31 +276,38 @@ class Connection:
         self._loop.add_writer(self._fd, lambda: self.on_writable(monotonic()))
 
     def _await_room(self, now: float) -> None:
+        """Look again when the next frame should fit. The kernel reports nothing where it is we who leave it empty.
+
+        Raises:
+            OSError: the connection is gone.
+        """
         self._blocked_since = self._blocked_since if self._blocked_since is not None else now
-        self._room_timer = self._loop.call_later(ROOM_POLL_S, self._on_room_timer)
+        size = self.outgoing.next_bytes(now)
+        to_bytes = max(0, self.channel.limit_bytes - size) if size else 0
+        self._room_timer = self._loop.call_later(self.channel.drain_s(to_bytes, now), self._on_room_timer)
 
     def _on_room_timer(self) -> None:
-        # Goes on while there is no room even if all that waited got stale, so that a stall is known as one.
+        # Goes on while the kernel holds bytes even if all that waited got stale, so that a stall is known as one.
         now = monotonic()
         self._room_timer = None
         try:
-            room = self.channel.room()
+            if self.channel.held(now) == 0:
+                self._blocked_since = None
+            elif not self.outgoing.waiting:
+                self._await_room(now)
+                return
         except OSError as error:
             self.lose(failure_name(error))
             return
-        if room <= 0:
-            self._await_room(now)
-        else:
-            self._blocked_since = None
-            self._flush(now)
+        self._flush(now)
 
 
 class StreamEndpoint(ABC):
     """An endpoint whose programs are at the other end of byte streams.
 
     Every frame given to ``write`` is in ``frames_sent``, or waits, or is in ``failures``: as ``outgoing_full``,
-    ``stale``, or ``unsent`` where its connection ended. Connections that ended are counted there as ``disconnected``
-    by the other side, ``stalled``, or under the kernel's error.
+    ``stale``, ``thinned`` (a newer state replaced it), or ``unsent`` where its connection ended. Connections that
+    ended are counted there as ``disconnected`` by the other side, ``stalled``, or under the kernel's error.
     """
 
     max_gap_s = MAX_GAP_S
@@ -362,8 +346,7 @@ class StreamEndpoint(ABC):
         if connection is None:
             self.failures["unsent"] += len(frames)
         else:
-            admitted = (port.delivered.admit(frame, source, now) for frame in frames)
-            connection.write([data for data in admitted if data], now)
+            connection.write(frames, source, now)
 
     def do_housekeeping(self, now: float) -> None:
         """Close what has stalled."""

@@ -1,6 +1,6 @@
 """Local MAVLink ports on TCP: ``tcp`` connects, again and again; ``tcpin`` listens, for many clients.
 
-The kernel is told to hold little of what it cannot send: there a frame can be neither dropped nor overtaken.
+The kernel holds little of what it cannot send (TCP_NOTSENT_LOWAT): there a frame can be neither dropped nor overtaken.
 """
 
 from __future__ import annotations
@@ -39,8 +39,10 @@ ACCEPT_PAUSE_S = 1.0
 """Without a file descriptor or memory for a client there is nothing to do but wait."""
 
 _SEND_BUFFER_BYTES = 16384
-_NOT_SENT_BYTES = 4096  # beyond what is on its way, where the kernel knows this option
-_ROOM_BYTES = 16384
+_NOT_SENT_BYTES = 1024
+"""The kernel takes a write while it holds fewer bytes than this beyond those on their way."""
+_WRITE_BYTES = 1400
+"""One write. The kernel takes all of a write that it begins to take, so it may hold so much more."""
 _BACKLOG = 32
 _Sockaddr = tuple[str | int, ...]  # of either family, as the kernel takes it
 _Found = tuple[socket.AddressFamily, _Sockaddr]
@@ -80,9 +82,15 @@ class SocketChannel:
         """The receive buffer, as large as it is now."""
         return self._sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
 
-    def room(self) -> int:
-        """As much as the kernel will take: it says itself when it has room again."""
-        return _ROOM_BYTES
+    limit_bytes = _WRITE_BYTES
+
+    def held(self, now: float) -> int:
+        """The kernel has its own limit, and reports when it has room again."""
+        return 0
+
+    def drain_s(self, to_bytes: int, now: float) -> float:
+        """Nothing is held."""
+        return 0.0
 
     def close(self, *, abort: bool) -> None:
         """Close it; ``abort`` resets the connection."""

@@ -30,12 +30,12 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 from math import exp, inf
 from typing import Final
 
-from uavlinkd.mavlink.egress_kinds import FlowKey, Lane, flow_key, kind_of
-from uavlinkd.mavlink.egress_queue import Flow, Queue, Waiting
+from uavlinkd.mavlink.egress_kinds import Lane
+from uavlinkd.mavlink.egress_lanes import EgressDrop, Lanes, by_number
+from uavlinkd.mavlink.egress_queue import Waiting
 from uavlinkd.mavlink.frames import MAX_FRAME_BYTES, Frame
 
 BURST_S: Final = 0.25
@@ -52,21 +52,10 @@ outage's handshakes must not silence the link once it is back."""
 MIN_LANE_BYTES: Final = 8 * 1024
 MAX_LANE_BYTES: Final = 80 * 1024
 """Bounds on what waits in each of the three lanes; in between, as much as the budget carries in ``max_age_s``."""
-FLOWS_PER_LANE: Final = 2
-"""One flow has this part of its lane at most: who floods a lane pushes out himself, not another's heartbeat."""
 MAX_FLOWS: Final = 4096
 """Flows that are remembered while nothing of them waits."""
 DEMAND_WINDOW_S: Final = 2.0
 _SLACK_BYTES: Final = 0.5  # a deadline computed in floating point must not come a hair early, over and over
-
-
-class EgressDrop(StrEnum):
-    """Why a frame was not sent."""
-
-    STALE = "stale"  # waited longer than max_age_s
-    THINNED = "thinned"  # a newer one of the same state came
-    OVERFLOW = "overflow"  # the oldest of too much
-    CLOSED = "closed"  # the peer is gone
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,14 +110,9 @@ class Egress:
         self.totals: Counter[EgressDrop] = Counter()
         self._rate = settings.budget_bits_s / 8
         self._now = now
-        self._number = 0
-        self._flows: dict[FlowKey, Flow] = {}
-        self._flows_limit = MAX_FLOWS
-        self._queues = (Queue(), Queue(), Queue())
         in_time = self._rate * settings.max_age_s if self._rate else inf
-        self._lane_bytes = min(max(in_time, MIN_LANE_BYTES), MAX_LANE_BYTES)
-        self._flow_bytes = self._lane_bytes / FLOWS_PER_LANE
-        self._lead = 0  # bytes of events sent beyond those of states, while both wait
+        lane_bytes = min(max(in_time, MIN_LANE_BYTES), MAX_LANE_BYTES)
+        self._lanes = Lanes(lane_bytes, MAX_FLOWS, self._is_superseded, self._on_drop)
         self._offered = 0.0  # bytes sent and dropped, fading over the window
         self.shape = shape or EnvelopeShape()
         self._bytes = self._burst if self._rate else inf  # what may be spent now
@@ -147,12 +131,12 @@ class Egress:
     @property
     def queued_frames(self) -> int:
         """How many frames wait."""
-        return sum(queue.count for queue in self._queues)
+        return self._lanes.count
 
     @property
     def queued_bytes(self) -> int:
         """How many bytes of frames wait."""
-        return sum(queue.size for queue in self._queues)
+        return self._lanes.size
 
     def demand(self, now: float) -> float:
         """What was sent and what had to be dropped over the last seconds, as a share of the budget; 0 without one."""
@@ -163,27 +147,14 @@ class Egress:
         """Frames for the peer, in their order."""
         self._advance(now)
         for frame in frames:
-            flow = self._flow_of(frame, now)
-            queue = self._queues[flow.lane]
-            if not flow.frames:
-                flow.since = now
-            elif flow.is_state and self._is_short(len(frame.raw)):
-                while flow.frames:
-                    self._drop(flow.frames[0], EgressDrop.THINNED)
-            self._number += 1
-            queue.add(Waiting(frame, flow, now, self._number))
-            if flow.size > self._flow_bytes:
-                self._drop(flow.frames[0], EgressDrop.OVERFLOW)
-            elif queue.size > self._lane_bytes:
-                oldest = queue.oldest()
-                assert oldest is not None
-                self._drop(oldest, EgressDrop.OVERFLOW)
+            self._lanes.put(frame, now)
 
     def take(self, now: float) -> list[bytes]:
         """The frames of the next envelope, in order; none if there is nothing to be sent now."""
         self._advance(now)
-        self._drop_stale(now)
-        next_one = self._next if self._is_short(0) else self._first
+        lanes = self._lanes
+        lanes.drop_stale(now, self.settings.max_age_s)
+        next_one = lanes.next if self._is_short(0) else lanes.first
         first = next_one()
         if first is None or now < self._due_at() or self._bytes + _SLACK_BYTES < self._price(first):
             return []
@@ -191,14 +162,14 @@ class Egress:
         batch: list[Waiting] = []
         size = 0
         waiting: Waiting | None = first
-        while waiting is not None and (size + len(waiting.raw) <= room or not batch):
-            size += len(waiting.raw)
-            self._serve(waiting, now)
+        while waiting is not None and (size + len(waiting.frame.raw) <= room or not batch):
+            size += len(waiting.frame.raw)
+            lanes.serve(waiting, now)
             batch.append(waiting)
             waiting = next_one()
         # By turns it was decided which frames go; within the envelope they are in the order in which they came.
-        batch.sort(key=_by_number)
-        return [each.raw for each in batch]
+        batch.sort(key=by_number)
+        return [each.frame.raw for each in batch]
 
     def spend(self, datagram_bytes: int, now: float, datagrams: int = 1) -> None:
         """Datagrams that have gone to the peer, of so many bytes together: envelopes, handshakes, all there is."""
@@ -212,7 +183,7 @@ class Egress:
 
     def next_deadline(self) -> float:
         """When :meth:`take` is to be called next; infinity while nothing waits."""
-        first = self._next()
+        first = self._lanes.next()
         if first is None:
             return inf
         missing = self._price(first) - self._bytes
@@ -221,9 +192,7 @@ class Egress:
     def clear(self, now: float) -> None:
         """Drop all that waits: the peer is gone."""
         self._advance(now)
-        for queue in self._queues:
-            while (oldest := queue.oldest()) is not None:
-                self._drop(oldest, EgressDrop.CLOSED)
+        self._lanes.clear()
 
     # The budget.
 
@@ -250,63 +219,22 @@ class Egress:
             worth = min(URGENT_SHARING * overhead, URGENT_SHARING_S * self._rate)
         else:
             worth = min(self._burst, SHARING_OF_AGE * self.settings.max_age_s * self._rate)
-        return max(overhead + len(first.raw), min(all_of_it, worth))
+        return max(overhead + len(first.frame.raw), min(all_of_it, worth))
 
     def _due_at(self) -> float:
         """When coalescing ends for what waits; there must be something."""
-        urgent, *rest = self._queues
+        urgent, *rest = self._lanes.queues
         if urgent.count or self.queued_bytes >= self._shape.payload_limit:
             return -inf
         return min(oldest.put_at for queue in rest if (oldest := queue.oldest())) + self.settings.coalesce_s
 
-    # Whose turn it is.
+    # What the lanes ask and report.
 
-    def _first(self) -> Waiting | None:
-        """What came first: there is room for everything."""
-        heads = [oldest for queue in self._queues if (oldest := queue.oldest())]
-        return min(heads, key=_by_number) if heads else None
+    def _is_superseded(self, waiting: Waiting, newer: Frame, now: float) -> bool:
+        """A newer state replaces an older one while the budget is short."""
+        return self._is_short(len(newer.raw))
 
-    def _next(self) -> Waiting | None:
-        """What matters most."""
-        urgent, events, states = self._queues
-        if urgent.count:
-            return urgent.head()
-        if events.count and not (states.count and self._lead > 0):
-            return events.head()
-        return states.head() if states.count else None
-
-    def _serve(self, waiting: Waiting, now: float) -> None:
-        _, events, states = self._queues
-        lane = waiting.flow.lane
-        if lane is not Lane.URGENT:
-            size = len(waiting.raw) if lane is Lane.EVENTS else -len(waiting.raw)
-            self._lead = self._lead + size if events.count and states.count else 0
-        self._queues[lane].serve(waiting, now)
-
-    def _flow_of(self, frame: Frame, now: float) -> Flow:
-        kind = kind_of(frame)
-        key = flow_key(frame, kind)
-        flow = self._flows.get(key)
-        if flow is None:
-            if len(self._flows) >= self._flows_limit:
-                self._flows = {at: each for at, each in self._flows.items() if each.frames}
-                self._flows_limit = max(MAX_FLOWS, 2 * len(self._flows))
-            flow = self._flows[key] = Flow(kind, now)
-        return flow
-
-    # Drops.
-
-    def _drop_stale(self, now: float) -> None:
-        for queue in self._queues:
-            while (oldest := queue.oldest()) is not None and now - oldest.put_at > self.settings.max_age_s:
-                self._drop(oldest, EgressDrop.STALE)
-
-    def _drop(self, waiting: Waiting, reason: EgressDrop) -> None:
-        self._queues[waiting.flow.lane].remove(waiting)
+    def _on_drop(self, waiting: Waiting, reason: EgressDrop) -> None:
         if self._rate and reason is not EgressDrop.CLOSED:
-            self._offered += len(waiting.raw)
+            self._offered += len(waiting.frame.raw)
         self.totals[reason] += 1
-
-
-def _by_number(waiting: Waiting) -> int:
-    return waiting.number

@@ -12,10 +12,10 @@ from uavlinkd.mavlink.frames import Frame
 class Waiting:
     """One frame that waits."""
 
-    __slots__ = ("flow", "is_waiting", "number", "put_at", "raw")
+    __slots__ = ("flow", "frame", "is_waiting", "number", "put_at")
 
     def __init__(self, frame: Frame, flow: Flow, put_at: float, number: int) -> None:
-        self.raw = frame.raw
+        self.frame = frame
         self.flow = flow
         self.put_at = put_at
         self.number = number  # in the order of arrival
@@ -60,8 +60,8 @@ class Queue:
         flow.frames.append(frame)
         self.arrivals.append(frame)
         self.count += 1
-        flow.size += len(frame.raw)
-        self.size += len(frame.raw)
+        flow.size += len(frame.frame.raw)
+        self.size += len(frame.frame.raw)
         if len(self.arrivals) > 2 * self.count + 64:
             self.arrivals = deque(each for each in self.arrivals if each.is_waiting)
         if not flow.stands:
@@ -98,10 +98,10 @@ class Queue:
     def remove(self, frame: Waiting) -> None:
         """Take out the first frame of a flow."""
         frame.flow.frames.popleft()
-        frame.flow.size -= len(frame.raw)
+        frame.flow.size -= len(frame.frame.raw)
         frame.is_waiting = False
         self.count -= 1
-        self.size -= len(frame.raw)
+        self.size -= len(frame.frame.raw)
 
     def serve(self, frame: Waiting, now: float) -> None:
         """Take out the first frame of a flow to be sent, which is the flow's turn."""

@@ -1,0 +1,160 @@
+"""Measures what an operator gets through a serial line while a captured swarm member floods it.
+
+::
+
+    python -m tests.endpoints.starvation
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from statistics import median
+from typing import Any, NamedTuple
+from unittest.mock import patch
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from tests.endpoints.line import Line, LineChannel, VirtualTimeLoop
+from tests.endpoints.programs import Recorder
+from uavlinkd.endpoints import serial, streams
+from uavlinkd.endpoints.streams import StreamEndpoint
+from uavlinkd.mavlink.delivery import Source
+from uavlinkd.mavlink.frames import Frame, SplitCounters, StreamSplitter, split_payload
+from uavlinkd.mavlink.policy import compile_policy
+
+BAUD = 57600
+RATES_KBIT_S = (0, 64, 192, 512, 2000)
+DURATION_S = 10.0
+COMMANDS = 50
+HEARTBEATS = 10
+OPERATOR, CAPTURED = 255, 2
+
+Make = Callable[[int], bytes]
+
+
+def pack(message: Any, system: int, component: int = 1, seq: int = 0) -> bytes:
+    """A frame of this system."""
+    codec = mavlink.MAVLink(None, system, component)
+    codec.seq = seq % 256
+    return bytes(message.pack(codec))
+
+
+def command(number: int) -> bytes:
+    """A command of the operator that says its number."""
+    return pack(mavlink.MAVLink_command_long_message(1, 1, 176, 0, number, 1, 1, 1, 1, 1, 1), OPERATOR, seq=number)
+
+
+def heartbeat(number: int) -> bytes:
+    """A heartbeat of the operator."""
+    return pack(mavlink.MAVLink_heartbeat_message(6, 8, 0, number, 4, 3), OPERATOR, seq=number)
+
+
+def position(number: int) -> bytes:
+    """The flood: where the captured member is."""
+    message = mavlink.MAVLink_global_position_int_message(number, 1, 2, 3, 4, 5, 6, 7, 8)
+    return pack(message, CAPTURED, seq=number)
+
+
+def member_heartbeat(number: int) -> bytes:
+    """The flood in the lane of urgent frames, of another component each time."""
+    return pack(mavlink.MAVLink_heartbeat_message(2, 3, 0, number, 4, 3), CAPTURED, number % 250 + 1, number)
+
+
+class Result(NamedTuple):
+    """What came through one flood."""
+
+    commands: int
+    heartbeats: int
+    median_added_s: float
+    worst_added_s: float
+    flood_frames: int
+    most_held: int
+
+
+class LineEndpoint(StreamEndpoint):
+    """An endpoint with one connection, to a simulated line."""
+
+    def start(self) -> None:
+        """Nothing."""
+
+
+def source(name: str) -> Source:
+    """A source whose policy lets everything pass."""
+    return Source(name, compile_policy({}).incoming)
+
+
+def frames_of(raw: bytes) -> list[Frame]:
+    """Frames as the daemon reads them."""
+    return split_payload(raw, SplitCounters())
+
+
+def starve(kbit_s: float, flood: Make = position) -> Result:
+    """Flood a serial endpoint for DURATION_S of virtual time, beside an operator."""
+    with asyncio.Runner(loop_factory=VirtualTimeLoop) as runner:
+        loop = runner.get_loop()
+        with patch.object(streams, "monotonic", loop.time), patch.object(serial, "monotonic", loop.time):
+            return runner.run(_starve(kbit_s, flood))
+
+
+async def _starve(kbit_s: float, flood: Make) -> Result:
+    loop = asyncio.get_running_loop()
+    line = Line(BAUD / 10, loop.time)
+    endpoint = LineEndpoint("serial", Recorder(), 1.0)
+    port = endpoint.open(LineChannel(line), "line", loop.time()).port
+    operator, captured = source("operator"), source("captured")
+    sent_at: dict[bytes, float] = {}
+
+    def say(raw: bytes) -> None:
+        sent_at[raw] = loop.time()
+        endpoint.write(port, frames_of(raw), operator, loop.time())
+
+    for number in range(COMMANDS):
+        loop.call_at((number + 0.37) * DURATION_S / COMMANDS, say, command(number))
+    for number in range(HEARTBEATS):
+        loop.call_at((number + 0.51) * DURATION_S / HEARTBEATS, say, heartbeat(number))
+    size = len(flood(0))
+    number = 0
+    while kbit_s and loop.time() < DURATION_S:
+        endpoint.write(port, frames_of(flood(number)), captured, loop.time())
+        number += 1
+        await asyncio.sleep(size * 8 / (kbit_s * 1000))
+    await asyncio.sleep(max(0.0, DURATION_S + 2.0 - loop.time()))
+    endpoint.close()
+    return _result(line, sent_at)
+
+
+def _result(line: Line, sent_at: dict[bytes, float]) -> Result:
+    added: dict[bytes, float] = {}
+    flooded = 0
+    splitter = StreamSplitter()
+    for at, data in line.arrivals:
+        for raw, header in splitter.feed(data, at):
+            if raw in sent_at:
+                added[raw] = at - sent_at[raw] - len(raw) / line.bytes_per_s
+            flooded += header.system == CAPTURED
+    of_commands = [each for raw, each in added.items() if raw in {command(number) for number in range(COMMANDS)}]
+    return Result(
+        len(of_commands),
+        len(added) - len(of_commands),
+        median(of_commands) if of_commands else 0.0,
+        max(of_commands, default=0.0),
+        flooded,
+        line.most_held,
+    )
+
+
+def main() -> None:
+    """Print a table."""
+    for name, flood in (("GLOBAL_POSITION_INT", position), ("HEARTBEAT", member_heartbeat)):
+        print(f"{name}: kbit/s, commands of {COMMANDS}, heartbeats of {HEARTBEATS}, added ms median and worst, ...")
+        for kbit_s in RATES_KBIT_S:
+            result = starve(kbit_s, flood)
+            print(
+                f"{kbit_s:6} {result.commands:4} {result.heartbeats:4} {result.median_added_s * 1000:8.1f} "
+                f"{result.worst_added_s * 1000:8.1f} {result.flood_frames:6} {result.most_held:6}"
+            )
+
+
+if __name__ == "__main__":
+    main()
