@@ -35,13 +35,29 @@ def large_frame(number: int) -> bytes:
     return bytes(message.pack(mavlink.MAVLink(None, srcSystem=1, srcComponent=1)))
 
 
-PASSES = Source("peer", compile_policy({}).incoming)
+def heartbeat() -> bytes:
+    """A frame that goes before others."""
+    message = mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)
+    return bytes(message.pack(mavlink.MAVLink(None, srcSystem=255, srcComponent=1)))
+
+
+def source(name: str) -> Source:
+    """A peer that may send everything."""
+    return Source(name, compile_policy({}).incoming)
+
+
+PASSES = source("peer")
 """A peer that may send everything."""
+
+
+def frames_of(raws: Sequence[bytes]) -> list[Frame]:
+    """Frames as the daemon reads them."""
+    return split_payload(b"".join(raws), SplitCounters())
 
 
 def write(endpoint: Endpoint, port: LocalPort, raws: Sequence[bytes], now: float, source: Source = PASSES) -> None:
     """Send these frames of one source to a port, as the switch does."""
-    endpoint.write(port, split_payload(b"".join(raws), SplitCounters()), source, now)
+    endpoint.write(port, frames_of(raws), source, now)
 
 
 async def eventually(condition: Callable[[], bool]) -> None:

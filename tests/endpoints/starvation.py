@@ -16,12 +16,10 @@ from unittest.mock import patch
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from tests.endpoints.line import Line, LineChannel, VirtualTimeLoop
-from tests.endpoints.programs import Recorder
+from tests.endpoints.programs import Recorder, frames_of, source
 from uavlinkd.endpoints import serial, streams
 from uavlinkd.endpoints.streams import StreamEndpoint
-from uavlinkd.mavlink.delivery import Source
-from uavlinkd.mavlink.frames import Frame, SplitCounters, StreamSplitter, split_payload
-from uavlinkd.mavlink.policy import compile_policy
+from uavlinkd.mavlink.frames import StreamSplitter
 
 BAUD = 57600
 RATES_KBIT_S = (0, 64, 192, 512, 2000)
@@ -79,16 +77,6 @@ class LineEndpoint(StreamEndpoint):
         """Nothing."""
 
 
-def source(name: str) -> Source:
-    """A source whose policy lets everything pass."""
-    return Source(name, compile_policy({}).incoming)
-
-
-def frames_of(raw: bytes) -> list[Frame]:
-    """Frames as the daemon reads them."""
-    return split_payload(raw, SplitCounters())
-
-
 def starve(kbit_s: float, flood: Make = position) -> Result:
     """Flood a serial endpoint for DURATION_S of virtual time, beside an operator."""
     with asyncio.Runner(loop_factory=VirtualTimeLoop) as runner:
@@ -107,7 +95,7 @@ async def _starve(kbit_s: float, flood: Make) -> Result:
 
     def say(raw: bytes) -> None:
         sent_at[raw] = loop.time()
-        endpoint.write(port, frames_of(raw), operator, loop.time())
+        endpoint.write(port, frames_of([raw]), operator, loop.time())
 
     for number in range(COMMANDS):
         loop.call_at((number + 0.37) * DURATION_S / COMMANDS, say, command(number))
@@ -116,7 +104,7 @@ async def _starve(kbit_s: float, flood: Make) -> Result:
     size = len(flood(0))
     number = 0
     while kbit_s and loop.time() < DURATION_S:
-        endpoint.write(port, frames_of(flood(number)), captured, loop.time())
+        endpoint.write(port, frames_of([flood(number)]), captured, loop.time())
         number += 1
         await asyncio.sleep(size * 8 / (kbit_s * 1000))
     await asyncio.sleep(max(0.0, DURATION_S + 2.0 - loop.time()))

@@ -247,12 +247,82 @@ async def test_device_that_takes_nothing_for_long_is_opened_anew(
     await eventually(lambda: recorder(endpoint).closed == [port] and len(endpoint.ports) == 1)
 
 
-@pytest.mark.parametrize(("baud", "may_hold"), [(57600, 576), (921600, 9216), (300, 3)])
-def test_kernel_holds_no_more_than_a_tenth_of_a_second(baud: int, may_hold: int) -> None:
-    """A byte is ten bits on the wire; what the kernel holds already is taken off."""
-    device = SimpleNamespace(fileno=lambda: 0, num_unwritten_bytes=lambda: 100)
-    channel = SerialChannel(cast(BaseSerial, device), baud)
-    assert channel.room() == may_hold - 100
+# How much the kernel is given.
+
+
+def device_with(in_kernel: int) -> BaseSerial:
+    """A device whose kernel queue holds so many bytes."""
+    return cast(BaseSerial, SimpleNamespace(fileno=lambda: -1, num_unwritten_bytes=lambda: in_kernel))
+
+
+@pytest.mark.parametrize(("baud", "limit"), [(57600, 115), (921600, 1843), (300, 1)])
+def test_kernel_holds_no_more_than_20_ms_of_line_time(baud: int, limit: int) -> None:
+    """A byte is ten bits on the line; what the kernel reports counts at once."""
+    channel = SerialChannel(device_with(100), baud)
+    assert channel.limit_bytes == limit
+    assert channel.held(now=0.0) == 100
+
+
+class HiddenBuffer(SerialChannel):
+    """A USB adapter that takes all bytes into a buffer of its own: the kernel counts none of them."""
+
+    def hand_over(self, data: bytes) -> int:
+        return len(data)
+
+
+def test_bytes_that_the_line_cannot_have_carried_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An adapter's own buffer is bounded too: the baud rate says when the line has carried what was written."""
+    now = 50.0
+    monkeypatch.setattr(serial, "monotonic", lambda: now)
+    channel = HiddenBuffer(device_with(0), 57600)
+    assert (channel.held(now), channel.drain_s(0, now)) == (0, serial.LATE_S)
+    channel.write(bytes(115))
+    assert channel.held(now) in {114, 115}
+    assert channel.held(now + 0.010) in {57, 58}
+    assert channel.drain_s(0, now) == pytest.approx(115 / 5760 + serial.LATE_S, abs=0.0003)
+    now += 0.010
+    channel.write(bytes(40))
+    assert channel.held(now) in {97, 98}
+    assert channel.held(now + 98 / 5760) == 0
+
+
+def test_timer_waits_until_a_quarter_of_the_limit_is_free() -> None:
+    """At a high rate the next small frame would fit in less than a millisecond."""
+    channel = SerialChannel(device_with(1843), 921600)
+    assert channel.drain_s(1843 - 21, now=0.0) == pytest.approx(0.005 + serial.LATE_S, abs=0.0003)
+
+
+def test_device_without_line_rate_is_bounded_in_bytes() -> None:
+    """Its baud rate says nothing: only the kernel's own count does."""
+    channel = SerialChannel(device_with(4000), None)
+    assert (channel.held(now=0.0), channel.limit_bytes) == (4000, serial.IN_FLIGHT_BYTES)
+    assert channel.drain_s(0, now=0.0) == serial.POLL_S
+
+
+@pytest.mark.parametrize(
+    ("device", "is_uart"),
+    [
+        ("ttyS0", True),
+        ("ttyAMA0", True),
+        ("ttyUSB0", True),
+        ("ttyTHS1", True),
+        ("ttyACM0", False),
+        ("rfcomm0", False),
+    ],
+)
+def test_line_rate_is_that_of_the_device_behind_a_link(tmp_path: Path, device: str, is_uart: bool) -> None:
+    """Names under /dev/serial/by-id are links, and say nothing about the kind."""
+    link = tmp_path / "usb-Autopilot"
+    link.symlink_to(tmp_path / device)
+    assert serial.has_line_rate(str(link)) is serial.has_line_rate(str(tmp_path / device)) is is_uart
+
+
+async def test_pseudo_terminal_is_not_paced(autopilot: Autopilot, endpoint: SerialEndpoint) -> None:
+    """It has no line: a second of line time at 57,600 baud goes at once."""
+    autopilot.plug_in()
+    await opened(endpoint)
+    write(endpoint, endpoint.ports[0], [frame(number) for number in range(100)], monotonic())
+    assert endpoint.frames_sent == 100
 
 
 async def test_dead_endpoints_hold_nobody_up(autopilot: Autopilot, endpoint: SerialEndpoint, tmp_path: Path) -> None:

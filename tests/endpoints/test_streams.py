@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import errno
 import socket
-from collections import Counter
 from collections.abc import AsyncIterator
 from time import monotonic
 
@@ -13,131 +12,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.endpoints.programs import Recorder, eventually, frame, large_frame, write
+from tests.endpoints.programs import Recorder, eventually, frame, heartbeat, large_frame, source, write
 from uavlinkd.clock import monotonic as boot_time
 from uavlinkd.endpoints.streams import (
-    OUTGOING_BYTES,
     READ_BYTES,
     STALLED_S,
     Connection,
-    OutgoingFrames,
     StreamEndpoint,
 )
+from uavlinkd.mavlink.egress_lanes import FLOWS_PER_LANE
+from uavlinkd.mavlink.fair_queue import LANE_BYTES
 from uavlinkd.mavlink.frames import SplitCounters, StreamSplitter
 from uavlinkd.stall import STALE, STALL_S
 
 CAPACITY = 5000
-A, B, C = b"aaaa", b"bbbb", b"cccc"
-
-
-def outgoing(capacity_bytes: int = 12) -> tuple[OutgoingFrames, Counter[str]]:
-    dropped: Counter[str] = Counter()
-    return OutgoingFrames(1.0, dropped, capacity_bytes), dropped
-
-
-def test_frames_leave_whole_and_in_order() -> None:
-    """What fits is given out together, and again until it is marked as written."""
-    waiting, dropped = outgoing()
-    waiting.add([A, B], now=0.0)
-    waiting.add([C], now=0.5)
-    assert waiting.next_bytes(100, now=0.5) == waiting.next_bytes(100, now=0.5) == A + B + C
-    assert waiting.mark_written(12) == 3
-    assert (len(waiting), waiting.next_bytes(100, now=0.5), +dropped) == (0, b"", Counter())
-
-
-def test_oldest_frame_makes_room_for_the_newest() -> None:
-    """Where there is too little room it is the oldest that go, each counted, and not one more than must."""
-    waiting, dropped = outgoing(capacity_bytes=8)
-    waiting.add([A, B], now=0.0)
-    assert not dropped
-    waiting.add([C], now=0.1)
-    assert waiting.next_bytes(100, now=0.1) == B + C
-    assert dropped == {"outgoing_full": 1}
-
-
-@pytest.mark.parametrize(("now", "left"), [(1.0, A + B), (1.01, B), (1.5, B), (1.51, b"")])
-def test_frame_that_waited_too_long_is_dropped(now: float, left: bytes) -> None:
-    """At the greatest age a frame still goes; beyond it, it is counted as stale and not sent."""
-    waiting, dropped = outgoing()
-    waiting.add([A], now=0.0)
-    waiting.add([B], now=0.5)
-    assert waiting.next_bytes(100, now) == left
-    assert dropped["stale"] == 2 - len(left) // 4
-
-
-def test_stale_frames_are_not_counted_as_overflow() -> None:
-    """What makes room because of its age is counted under its age."""
-    waiting, dropped = outgoing(capacity_bytes=8)
-    waiting.add([A, B], now=0.0)
-    waiting.add([C], now=2.0)
-    assert dropped == {"stale": 2}
-    assert waiting.next_bytes(100, now=2.0) == C
-
-
-@pytest.mark.parametrize("written", [1, 2, 3])
-def test_half_written_frame_is_finished_first(written: int) -> None:
-    """Neither age nor a full buffer takes the rest of a frame away whose start has gone."""
-    waiting, dropped = outgoing(capacity_bytes=4)
-    waiting.add([A], now=0.0)
-    assert waiting.mark_written(written) == 0
-    waiting.add([B], now=50.0)
-    waiting.add([C], now=50.0)
-    assert waiting.next_bytes(1, now=50.0) == A[written:]
-    assert waiting.next_bytes(100, now=50.0) == A[written:] + C
-    assert dropped == {"outgoing_full": 1}
-    assert waiting.mark_written(4 - written + 4) == 2
-
-
-@pytest.mark.parametrize(("room", "given_out"), [(-1, b""), (0, b""), (1, A), (4, A), (5, A + B), (100, A + B + C)])
-def test_frame_begins_where_there_is_room_for_its_start(room: int, given_out: bytes) -> None:
-    """A frame larger than the room goes whole, or the narrowest wire would carry none."""
-    waiting, _ = outgoing()
-    waiting.add([A, B, C], now=0.0)
-    assert waiting.next_bytes(room, now=0.0) == given_out
-
-
-def test_what_waits_at_the_end_is_counted() -> None:
-    """A half-written frame is one that has not been sent."""
-    waiting, dropped = outgoing()
-    waiting.add([A, B, C], now=0.0)
-    assert waiting.mark_written(6) == 1
-    waiting.drop_all()
-    assert dropped == {"unsent": 2}
-    assert (len(waiting), waiting.next_bytes(100, now=0.0)) == (0, b"")
-
-
-STEPS = st.lists(
-    st.tuples(st.just("add"), st.integers(0, 6), st.sampled_from([0.0, 0.4, 1.1]))
-    | st.tuples(st.just("write"), st.integers(0, 90), st.integers(-1, 90)),
-    max_size=30,
-)
-
-
-@given(STEPS)
-def test_stream_is_whole_frames_in_order_whatever_the_kernel_takes(steps: list[tuple[str, int, float]]) -> None:
-    """Every frame is either on the wire whole and in its turn, or waits, or is in a counter."""
-    dropped: Counter[str] = Counter()
-    waiting = OutgoingFrames(1.0, dropped, capacity_bytes=100)
-    now, number, completed = 0.0, 0, 0
-    wire = bytearray()
-    for step, amount, detail in steps:
-        if step == "add":
-            now += detail
-            waiting.add([frame(number + each) for each in range(amount)], now)
-            number += amount
-        else:
-            taken = waiting.next_bytes(int(detail), now)[:amount]
-            wire += taken
-            completed += waiting.mark_written(len(taken))
-        assert number == completed + len(waiting) + dropped.total()
-    wire += (rest := waiting.next_bytes(10_000, now))
-    completed += waiting.mark_written(len(rest))
-    counters = SplitCounters()
-    sent = [each.raw for each in StreamSplitter(counters).feed(bytes(wire), now)]
-    assert b"".join(sent) == wire
-    assert len(sent) == completed
-    everything = iter([frame(each) for each in range(number)])
-    assert all(each in everything for each in sent)  # in order, none twice
 
 
 class Pair(StreamEndpoint):
@@ -163,7 +51,7 @@ class RationedChannel:
 
     def __init__(self, sock: socket.socket) -> None:
         self.sock = sock
-        self.left = 1 << 30
+        self.left = self.limit_bytes
         self.fileno = sock.fileno
         self.aborted: bool | None = None
         self.error: OSError | None = None
@@ -181,10 +69,15 @@ class RationedChannel:
     def capacity(self) -> int:
         return CAPACITY
 
-    def room(self) -> int:
+    limit_bytes = 1 << 30
+
+    def held(self, now: float) -> int:
         if self.error is not None:
             raise self.error
-        return self.left
+        return self.limit_bytes - self.left
+
+    def drain_s(self, to_bytes: int, now: float) -> float:
+        return 0.01
 
     def close(self, *, abort: bool) -> None:
         self.aborted = abort
@@ -306,11 +199,11 @@ async def test_slow_reader_gets_whole_frames_and_the_newest(pair: Pair) -> None:
 
 
 async def test_bytes_held_back_are_bounded(pair: Pair) -> None:
-    """However much is written to who does not read, no more than the buffer's size waits."""
+    """However much is written to a client that does not read, no more than the bound of one flow waits."""
     for number in range(0, 4000, 40):
         write(pair, pair.connection.port, [large_frame(each) for each in range(number, number + 40)], now=0.0)
-    held = len(pair.connection.outgoing.next_bytes(1 << 30, now=0.0))
-    assert OUTGOING_BYTES - 300 < held < OUTGOING_BYTES + 300
+    held = pair.connection.outgoing.waiting * len(large_frame(0))
+    assert LANE_BYTES // FLOWS_PER_LANE - 300 < held <= LANE_BYTES // FLOWS_PER_LANE
     assert pair.frames_sent + len(pair.connection.outgoing) + pair.failures["outgoing_full"] == 4000
 
 
@@ -376,10 +269,45 @@ async def test_channel_that_got_room_with_nothing_to_send_has_not_stalled(pair: 
     pair.channel.left = 0
     write(pair, pair.connection.port, [frame(1)], now := monotonic())
     pair.do_housekeeping(now + 5)
-    pair.channel.left = 100
+    pair.channel.left = pair.channel.limit_bytes
     await eventually(lambda: pair.connection._room_timer is None)
     pair.do_housekeeping(now + 10 * STALLED_S)
     assert pair.failures == {"stale": 1}
+
+
+async def test_stuck_channel_that_holds_less_than_its_limit_has_stalled(pair: Pair) -> None:
+    """Flow control may stop a line that holds a part of its limit: frames that no longer wait do not hide that."""
+    pair.channel.left = 10
+    write(pair, pair.connection.port, [frame(1)], now := monotonic())
+    pair.do_housekeeping(now + 5)
+    rounds = 0
+    while rounds < 3:
+        before = pair.connection._room_timer
+        await eventually(lambda before=before: pair.connection._room_timer is not before)  # type: ignore[misc]
+        rounds += 1
+    pair.do_housekeeping(now + STALLED_S)
+    assert pair.failures == {"stale": 1, "stalled": 1}
+
+
+async def test_frame_that_does_not_fit_waits_for_an_empty_kernel(pair: Pair) -> None:
+    """A frame larger than the room goes only where the kernel holds nothing, and then goes whole."""
+    pair.channel.left = len(large_frame(0)) - 1
+    write(pair, pair.connection.port, [large_frame(0)], monotonic())
+    assert read_all(pair.other) == b""
+    pair.channel.left = pair.channel.limit_bytes
+    await eventually(lambda: pair.frames_sent == 1)
+    assert read_all(pair.other) == large_frame(0)
+
+
+async def test_command_overtakes_what_waits(pair: Pair) -> None:
+    """An urgent frame of one source goes before frames of another that came earlier."""
+    pair.channel.left = len(large_frame(0))
+    write(pair, pair.connection.port, [large_frame(number) for number in range(3)], now := monotonic())
+    write(pair, pair.connection.port, [heartbeat()], now, source("operator"))
+    assert read_all(pair.other) == large_frame(0)
+    pair.channel.left = pair.channel.limit_bytes
+    await eventually(lambda: pair.frames_sent == 4)
+    assert read_all(pair.other) == heartbeat() + large_frame(1) + large_frame(2)
 
 
 @pytest.mark.parametrize("noticed_by", ["reading", "writing", "waiting for room"])

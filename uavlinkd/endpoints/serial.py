@@ -54,7 +54,9 @@ class SerialChannel:
     def __init__(self, device: BaseSerial, baud: int | None) -> None:
         self.device = device
         self._bytes_per_s = baud / _BITS_PER_BYTE if baud is not None else None
-        self.limit_bytes = IN_FLIGHT_BYTES if self._bytes_per_s is None else max(1, int(IN_FLIGHT_S * self._bytes_per_s))
+        self.limit_bytes = (
+            IN_FLIGHT_BYTES if self._bytes_per_s is None else max(1, int(IN_FLIGHT_S * self._bytes_per_s))
+        )
         self._sent_by = -inf  # when the line will have carried what was written, at its rate
         self._fd = device.fileno()
 

@@ -77,10 +77,11 @@ def _is_superseded(waiting: Waiting, newer: Frame, now: float) -> bool:
 class _Line:
     """Whose turn it is in one class of frames. The clock counts the bytes that each waiting source was sent."""
 
-    __slots__ = ("_clock", "_heap", "_number")
+    __slots__ = ("_clock", "_heap", "_most_paid", "_number")
 
     def __init__(self) -> None:
         self._clock = 0.0
+        self._most_paid = 0.0
         self._heap: list[tuple[float, int, _Place]] = []
         self._number = 0
 
@@ -99,12 +100,14 @@ class _Line:
                 return place, waiting
             heappop(self._heap)
             place.is_in_line = False
+        self._clock = self._most_paid  # none waits: all are quits
         return None
 
     def charge(self, size: int) -> None:
         """The frame that :meth:`next` returned is sent."""
         self._clock, _, place = self._heap[0]
         place.paid = self._clock + size
+        self._most_paid = max(self._most_paid, place.paid)
         self._number += 1
         heapreplace(self._heap, (place.paid, self._number, place))
 
@@ -144,7 +147,7 @@ class FairQueue:
                 self._urgent.join(waiting.urgent)
             else:
                 self._rest.join(waiting.rest)
-            if self.size > QUEUE_BYTES:
+            while self.size > QUEUE_BYTES:
                 max(self._sources.values(), key=_size_of).lanes.drop_from_largest()
 
     def next_bytes(self, now: float) -> int:
