@@ -1,8 +1,8 @@
 """What TCP and serial ports share: frames into and out of byte streams, and a bounded wait for a slow other side.
 
-What the kernel does not take at once waits in its connection's own queue (:mod:`.outgoing`): urgent frames first, each
-source its fair share, the newest state. The kernel holds little, because frames there can be neither dropped nor
-overtaken.
+What the kernel does not take at once waits in its connection's own queue (:mod:`.outgoing`): urgent frames first,
+each source its fair share, the newest state. The kernel holds little, because frames there can be neither dropped
+nor overtaken.
 """
 
 from __future__ import annotations
@@ -222,7 +222,7 @@ class Connection:
                 self._flush(now)
 
     def _count_fitting(self, frames: Sequence[Frame], first: int, now: float) -> int:
-        """How far the frames from ``first`` on fit into the kernel's room; at least one does where it holds nothing."""
+        """How far the frames from ``first`` on fit into the kernel's room. One always fits where it holds nothing."""
         held = self.channel.held(now)
         limit = self.channel.limit_bytes
         count = first

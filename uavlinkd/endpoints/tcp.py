@@ -1,6 +1,7 @@
 """Local MAVLink ports on TCP: ``tcp`` connects, again and again; ``tcpin`` listens, for many clients.
 
-The kernel holds little of what it cannot send (TCP_NOTSENT_LOWAT): there a frame can be neither dropped nor overtaken.
+The kernel holds little of what it cannot send (TCP_NOTSENT_LOWAT): there a frame can be neither dropped nor
+overtaken.
 """
 
 from __future__ import annotations

@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from math import inf
 
 from uavlinkd.mavlink.egress import Egress, EgressSettings, EnvelopeShape
-from uavlinkd.mavlink.egress_lanes import EgressDrop
 from uavlinkd.mavlink.egress_kinds import Lane, kind_of
+from uavlinkd.mavlink.egress_lanes import EgressDrop
 from uavlinkd.mavlink.frames import Frame
 
 

@@ -15,7 +15,7 @@ from uavlinkd.mavlink.egress_queue import Flow, Queue, Waiting
 from uavlinkd.mavlink.frames import Frame
 
 FLOWS_PER_LANE: Final = 2
-"""One flow has this part of its lane at most: a flow that floods a lane drops its own frames, not another's heartbeat."""
+"""One flow has this part of its lane at most. A flow that floods a lane drops its own frames, not another's."""
 
 
 class EgressDrop(StrEnum):
@@ -74,7 +74,11 @@ class Lanes:
         return urgent.size + events.size + states.size
 
     def put(self, frame: Frame, now: float) -> Lane:
-        """Have a frame wait; its lane. A state replaces older ones that are superseded; the oldest of too much is dropped."""
+        """Have a frame wait. A state replaces older ones that are superseded. The oldest of too much is dropped.
+
+        Returns:
+            The frame's lane.
+        """
         flow = self._flow_of(frame, now)
         queue = self.queues[flow.lane]
         if not flow.frames:
