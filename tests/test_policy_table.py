@@ -86,3 +86,16 @@ def test_rates_stand_as_they_were_written() -> None:
     data: dict[str, object] = {"system_ids": [1], "rate_out": {"telemetry": 0.5, "ATTITUDE": 2}}
     (rates,) = (row for row in table_rows(compile_policy(data), data) if row.subject == "rates")
     assert (rates.incoming, rates.outgoing) == ("-", "telemetry 0.5/s, ATTITUDE 2/s")
+
+
+def test_rates_of_the_role_are_shown() -> None:
+    """A role's rate is shown where no rate of the configuration replaces it."""
+    data: dict[str, object] = {"role": "swarm-member", "system_ids": [1]}
+
+    def shown(**own: object) -> str:
+        (rates,) = (row for row in table_rows(compile_policy(data | own), data | own) if row.subject == "rates")
+        return rates.incoming
+
+    assert shown() == "HEARTBEAT 5/s, position 50/s, VFR_HUD 250/s"
+    assert shown(rate_in={"ATTITUDE": 2}) == "ATTITUDE 2/s, HEARTBEAT 5/s, position 50/s, VFR_HUD 250/s"
+    assert shown(rate_in={"position": 2}) == "position 2/s, HEARTBEAT 5/s"

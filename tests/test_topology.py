@@ -257,7 +257,7 @@ def test_policy_tells_what_passes_and_what_does_not(folder: Path) -> None:
     assert "commands all (by command: COMMAND_LONG," in rest
     assert "denied: MAV_CMD_DO_FLIGHTTERMINATION, -" in rest.replace("commands by number ", "")
     assert "MAV_CMD_DO_AUX_FUNCTION" in rest
-    assert "rates - position 2.5/s" in rest
+    assert "rates HEARTBEAT 5/s, position 50/s, VFR_HUD position 2.5/s 250/s" in rest
 
 
 @pytest.mark.parametrize("role", ROLES)

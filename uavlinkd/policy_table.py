@@ -13,6 +13,7 @@ from rich.text import Text
 from uavlinkd.config import Config, PolicyData
 from uavlinkd.mavlink import dialect
 from uavlinkd.mavlink.policy import Gate, Policy, PolicyRow, Refusal
+from uavlinkd.mavlink.roles import ROLES
 
 _IN_THE_SUMMARY: Final = frozenset({"role", "may speak as"})
 _SAID_BY_OTHER_ROWS: Final = frozenset({"urgent"})  # says what goes first; each of its messages is in another group
@@ -83,15 +84,23 @@ def table_rows(policy: Policy, data: PolicyData) -> tuple[PolicyRow, ...]:
             sides = _short(sides[0], members, policy.incoming), _short(sides[1], members, policy.outgoing)
         elif row.subject == "rates":
             # As they were written: a group's rate is that of a hundred messages.
-            sides = _rates(data.get("rate_in")), _rates(data.get("rate_out"))
+            role = ROLES.get(str(data.get("role")))
+            sides = _rates(data.get("rate_in"), role.rate_in if role else {}), _rates(data.get("rate_out"), {})
         found.append(PolicyRow(row.subject, *sides))
     return tuple(found)
 
 
-def _rates(written: object) -> str:
-    if not isinstance(written, Mapping):
-        return "-"
-    return ", ".join(f"{name} {rate:g}/s" for name, rate in written.items()) or "-"
+def _rates(written: object, by_role: Mapping[str, float]) -> str:
+    """The rates as they were written, and the role's where they still hold."""
+    own = written if isinstance(written, Mapping) else {}
+    replaced = {name for each in own for name in _members(str(each))}
+    left = {each: rate for each, rate in by_role.items() if not replaced.issuperset(_members(each))}
+    return ", ".join(f"{name} {rate:g}/s" for name, rate in {**own, **left}.items()) or "-"
+
+
+def _members(name: str) -> tuple[str, ...]:
+    """The messages that a rate is for."""
+    return dialect.GROUPS.get(name, (name,))
 
 
 def _short(text: str, members: Sequence[str], gate: Gate) -> str:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from itertools import count
 from statistics import median
 from typing import Any, NamedTuple
 from unittest.mock import patch
@@ -57,6 +58,13 @@ def position(number: int) -> bytes:
 def member_heartbeat(number: int) -> bytes:
     """The flood in the lane of urgent frames, of another component each time."""
     return pack(mavlink.MAVLink_heartbeat_message(2, 3, 0, number, 4, 3), CAPTURED, number % 250 + 1, number)
+
+
+def without_starts(make: Make) -> Make:
+    """Such frames without a start byte inside, so that no separator bytes are needed behind them."""
+    raws = (make(number) for number in count())
+    calm = (raw for raw in raws if raw.count(0xFD) + raw.count(0xFE) == 1)
+    return lambda number: next(calm)
 
 
 class Result(NamedTuple):

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from tests.endpoints.programs import PASSES, frame, frames_of, heartbeat, large_frame, source
 from uavlinkd.endpoints.outgoing import OutgoingFrames
+from uavlinkd.mavlink.delivery import DeliveredStream
 from uavlinkd.mavlink.frames import SplitCounters, StreamSplitter
 
 A, B, C = large_frame(1), large_frame(2), large_frame(3)
@@ -18,7 +19,7 @@ SIZE = len(A)
 
 def outgoing() -> tuple[OutgoingFrames, Counter[str]]:
     dropped: Counter[str] = Counter()
-    return OutgoingFrames(1.0, dropped), dropped
+    return OutgoingFrames(1.0, dropped, DeliveredStream()), dropped
 
 
 def test_frames_leave_whole_and_in_order() -> None:
@@ -37,7 +38,7 @@ def test_frames_leave_whole_and_in_order() -> None:
 def test_committed_frame_is_finished_first(written: int) -> None:
     """Neither age nor an urgent frame comes between the bytes of a committed frame."""
     waiting, dropped = outgoing()
-    waiting.commit(frames_of([A, B]), PASSES)
+    waiting.commit(frames_of([A, B]), PASSES, 0.0)
     assert waiting.mark_written(written) == written // SIZE
     waiting.put(frames_of([heartbeat()]), source("operator"), now=50.0)
     waiting.drop_stale(now=50.0)
@@ -64,7 +65,7 @@ def test_frame_is_committed_where_it_fits_or_the_kernel_holds_nothing(
 def test_what_waits_at_the_end_is_counted() -> None:
     """A half-written frame is one that has not been sent."""
     waiting, dropped = outgoing()
-    waiting.commit(frames_of([A, B]), PASSES)
+    waiting.commit(frames_of([A, B]), PASSES, 0.0)
     waiting.put(frames_of([C]), PASSES, now=0.0)
     assert waiting.mark_written(SIZE + 6) == 1
     waiting.drop_all()

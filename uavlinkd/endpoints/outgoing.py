@@ -2,7 +2,8 @@
 
 A frame leaves the queue once, at the moment its bytes are committed: the stream carries committed bytes next, in the
 order in which they were committed. What the kernel did not take of them is kept, because the client could not find
-the start of the next frame behind half a frame.
+the start of the next frame behind half a frame. The delivered stream (:mod:`uavlinkd.mavlink.delivery`) decides at
+that moment which bytes a frame becomes: it sees the frames in the order in which the client reads them.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from collections import Counter, deque
 from collections.abc import Sequence
 from math import inf
 
-from uavlinkd.mavlink.delivery import Source
+from uavlinkd.mavlink.delivery import DeliveredStream, Source
 from uavlinkd.mavlink.egress_lanes import EgressDrop
 from uavlinkd.mavlink.fair_queue import FairQueue
 from uavlinkd.mavlink.frames import Frame
@@ -20,10 +21,14 @@ _REASONS = {EgressDrop.OVERFLOW: "outgoing_full", EgressDrop.CLOSED: "unsent"}
 
 
 class OutgoingFrames:
-    """The frames for one connection. ``dropped`` counts ``stale``, ``thinned``, ``outgoing_full`` and ``unsent``."""
+    """The frames for one connection. ``dropped`` counts ``stale``, ``thinned``, ``outgoing_full`` and ``unsent``.
 
-    def __init__(self, max_age_s: float, dropped: Counter[str]) -> None:
+    A frame that the delivered stream refuses is counted by its source.
+    """
+
+    def __init__(self, max_age_s: float, dropped: Counter[str], delivered: DeliveredStream) -> None:
         self._dropped = dropped
+        self._admit = delivered.admit
         self._queue = FairQueue(max_age_s, self._on_drop)
         self._committed = b""
         self._ends: deque[int] = deque()  # sizes of the committed frames; of the first, what is left of it
@@ -50,11 +55,12 @@ class OutgoingFrames:
         """How large the frame is whose turn it is; 0 if none waits."""
         return self._queue.next_bytes(now)
 
-    def commit(self, frames: Sequence[Frame], source: Source) -> None:
+    def commit(self, frames: Sequence[Frame], source: Source, now: float) -> None:
         """Write these frames next: they need not wait. Call it only while none waits."""
-        raws = [frame.raw for frame in frames]
-        self._ends.extend(map(len, raws))
-        self._committed += b"".join(raws)
+        admit = self._admit
+        parts = [data for frame in frames if (data := admit(frame, source, now))]
+        self._ends.extend(map(len, parts))
+        self._committed += b"".join(parts)
 
     def commit_next(self, held: int, limit: int, now: float) -> None:
         """Commit frames in turn while the kernel's ``held`` bytes and they are at most ``limit``: at least one frame
@@ -62,10 +68,10 @@ class OutgoingFrames:
         held += len(self._committed)
         parts = []
         while (popped := self._queue.pop(limit - held if held else inf, now)) is not None:
-            raw = popped[0].raw
-            parts.append(raw)
-            self._ends.append(len(raw))
-            held += len(raw)
+            if data := self._admit(*popped, now):
+                parts.append(data)
+                self._ends.append(len(data))
+                held += len(data)
         self._committed += b"".join(parts)
 
     def mark_written(self, count: int) -> int:

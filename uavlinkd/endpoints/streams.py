@@ -84,7 +84,7 @@ class Connection:
         self.port = LocalPort(endpoint, name, None)
         self.channel = channel
         self.opened_at = opened_at
-        self.outgoing = OutgoingFrames(endpoint.max_age_s, endpoint.failures)
+        self.outgoing = OutgoingFrames(endpoint.max_age_s, endpoint.failures, self.port.delivered)
         self.lost = asyncio.Event()
         """Set when the port has been reported as closed."""
         self._endpoint = endpoint
@@ -209,7 +209,7 @@ class Connection:
                 fitting = self._count_fitting(frames, count, now)
                 if fitting == count:
                     break
-                self.outgoing.commit(frames[count:fitting], source)
+                self.outgoing.commit(frames[count:fitting], source, now)
                 count = fitting
                 self._write_committed(now)
         except OSError as error:
@@ -305,9 +305,10 @@ class Connection:
 class StreamEndpoint(ABC):
     """An endpoint whose programs are at the other end of byte streams.
 
-    Every frame given to ``write`` is in ``frames_sent``, or waits, or is in ``failures``: as ``outgoing_full``,
-    ``stale``, ``thinned`` (a newer state replaced it), or ``unsent`` where its connection ended. Connections that
-    ended are counted there as ``disconnected`` by the other side, ``stalled``, or under the kernel's error.
+    Every frame given to ``write`` is in ``frames_sent``, or waits, or was refused (:mod:`uavlinkd.mavlink.delivery`),
+    or is in ``failures``: as ``outgoing_full``, ``stale``, ``thinned`` (a newer state replaced it), or ``unsent``
+    where its connection ended. Connections that ended are counted there as ``disconnected`` by the other side,
+    ``stalled``, or under the kernel's error.
     """
 
     max_gap_s = MAX_GAP_S

@@ -7,7 +7,8 @@
     allow_in  = ["telemetry", "PING"]    what passes; without a role and this list, everything does
     deny_in   = ["MAV_CMD_DO_FLIGHTTERMINATION"]            what does not, whatever allows it
     allow_out, deny_out                  the same for the other way
-    rate_in   = { ATTITUDE = 10 }        frames a second of each message and component; also of a group's messages
+    rate_in   = { ATTITUDE = 10 }        frames a second of each message and component; also of a group's messages;
+                                         swarm-member and observer have rates of their own, which these go before
     rate_out                             the same for the other way; also of each target and instance (battery 0, 1),
                                          to each program; telemetry's not of what is said once (STATUSTEXT)
     mavlink1 = true                      whether MAVLink 1 frames pass

@@ -132,6 +132,8 @@ def read_settings(data: Mapping[str, object], *, needs_system_ids: bool) -> Sett
         allows_all = preset is None and f"allow_{way}" not in data
         rules[way] = _rules((*(preset or ()), *allow), deny, allows_all=allows_all)
         rates[way] = _rates(data, f"rate_{way}", report)
+    if role is not None:
+        rates["in"] = {**_rates({"rate_in": role.rate_in}, "rate_in", report), **rates["in"]}
     settings = Settings(
         is_empty=not data,
         role=role_name if isinstance(role_name, str) else None,

@@ -4,11 +4,16 @@ The roles are seen from the daemon whose configuration names them: ``role = "veh
 means that this peer is a vehicle. `vehicle` and `operator` are each other's mirror image. Between two vehicles only
 `swarm-member` is right: a vehicle's answers to a ground station (file transfer, mission items) are writes to another
 autopilot.
+
+A role that does not operate comes with incoming rates, in frames a second of each message and
+component. All components of a system together have `policy.SYSTEM_SHARE` times the rate. The configuration's own
+`rate_in` for a message goes before the role's.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Final, NamedTuple
 
 
@@ -19,6 +24,7 @@ class Role(NamedTuple):
     allow_in: tuple[str, ...]
     allow_out: tuple[str, ...]
     ground_station: bool  # whether its HEARTBEAT may claim to be a ground station's
+    rate_in: Mapping[str, float] = MappingProxyType({})  # frames a second by group or message, as in a configuration
 
 
 # What a vehicle tells its operator.
@@ -46,6 +52,20 @@ _TO_OBSERVER: Final = (
 )
 # That it is there and where: enough to keep apart and to follow. No `traffic`: autopilots evade what it reports.
 _BETWEEN_MEMBERS: Final = ("heartbeat", "position")
+# An autopilot sends HEARTBEAT at 1/s, and positions at 50/s at most by its defaults; following needs some 10/s. A
+# recorded dive has bursts of 127 VFR_HUD in 0.1 s.
+_MEMBER_RATES: Final = MappingProxyType({"HEARTBEAT": 5.0, "position": 50.0, "VFR_HUD": 250.0})
+# A client asks again for parameters that it missed: a recorded one for 10 at once.
+_OBSERVER_RATES: Final = MappingProxyType(
+    {
+        "parameter-reads": 50.0,
+        "mission-reads": 50.0,
+        "REQUEST_EVENT": 50.0,
+        "PING": 10.0,
+        "COMMAND_LONG": 10.0,
+        "COMMAND_INT": 10.0,
+    }
+)
 
 ROLES: Final[Mapping[str, Role]] = {
     "vehicle": Role(
@@ -65,11 +85,13 @@ ROLES: Final[Mapping[str, Role]] = {
         allow_in=_FROM_OBSERVER,
         allow_out=_TO_OBSERVER,
         ground_station=False,
+        rate_in=_OBSERVER_RATES,
     ),
     "swarm-member": Role(
         "a vehicle that flies along: each tells the other that it is there and where, and no more",
         allow_in=_BETWEEN_MEMBERS,
         allow_out=_BETWEEN_MEMBERS,
         ground_station=False,
+        rate_in=_MEMBER_RATES,
     ),
 }
