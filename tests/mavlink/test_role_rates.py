@@ -6,8 +6,9 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+from pymavlink.dialects.v20 import all as mavlink
 
-from tests.mavlink.test_egress import attitude, frame, heartbeat, mavlink
+from tests.mavlink.test_egress import attitude, frame, heartbeat
 from uavlinkd.mavlink.dialect import ids_by_name
 from uavlinkd.mavlink.frames import Frame, SplitCounters, split_payload
 from uavlinkd.mavlink.policy import SYSTEM_SHARE, Gate, Refusal, compile_policy
