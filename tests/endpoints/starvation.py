@@ -8,7 +8,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from itertools import count
 from statistics import median
 from typing import Any, NamedTuple
@@ -20,7 +20,7 @@ from tests.endpoints.line import Line, LineChannel, VirtualTimeLoop
 from tests.endpoints.programs import Recorder, frames_of, source
 from uavlinkd.endpoints import serial, streams
 from uavlinkd.endpoints.streams import StreamEndpoint
-from uavlinkd.mavlink.frames import StreamSplitter
+from uavlinkd.mavlink.frames import Frame, StreamSplitter
 
 BAUD = 57600
 RATES_KBIT_S = (0, 64, 192, 512, 2000)
@@ -121,35 +121,55 @@ async def _starve(kbit_s: float, flood: Make) -> Result:
 
 
 def _result(line: Line, sent_at: dict[bytes, float]) -> Result:
+    splitter = StreamSplitter()
+    arrivals = ((at, each) for at, data in line.arrivals for each in splitter.feed(data, at))
+    return summary(arrivals, sent_at, line.bytes_per_s, line.most_held)
+
+
+def summary(
+    arrivals: Iterable[tuple[float, Frame]], sent_at: dict[bytes, float], bytes_per_s: float, most_held: int
+) -> Result:
+    """What came of the operator's frames, which were sent at these times."""
     added: dict[bytes, float] = {}
     flooded = 0
-    splitter = StreamSplitter()
-    for at, data in line.arrivals:
-        for raw, header in splitter.feed(data, at):
-            if raw in sent_at:
-                added[raw] = at - sent_at[raw] - len(raw) / line.bytes_per_s
-            flooded += header.system == CAPTURED
-    of_commands = [each for raw, each in added.items() if raw in {command(number) for number in range(COMMANDS)}]
+    for at, (raw, header) in arrivals:
+        if raw in sent_at:
+            added[raw] = at - sent_at[raw] - len(raw) / bytes_per_s
+        flooded += header.system == CAPTURED
+    commands = {command(number) for number in range(COMMANDS)}
+    of_commands = [each for raw, each in added.items() if raw in commands]
     return Result(
         len(of_commands),
         len(added) - len(of_commands),
         median(of_commands) if of_commands else 0.0,
         max(of_commands, default=0.0),
         flooded,
-        line.most_held,
+        most_held,
     )
 
 
+def row(label: object, result: Result) -> str:
+    """A line of the table."""
+    return (
+        f"{label:>8} {result.commands:4} of {COMMANDS} {result.heartbeats:4} of {HEARTBEATS} "
+        f"{result.median_added_s * 1000:8.1f} {result.worst_added_s * 1000:8.1f} {result.flood_frames:8}"
+    )
+
+
+HEADING = "  kbit/s  commands heartbeats  added ms median, worst  frames of the flood"
+
+
 def main() -> None:
-    """Print a table."""
-    for name, flood in (("GLOBAL_POSITION_INT", position), ("HEARTBEAT", member_heartbeat)):
-        print(f"{name}: kbit/s, commands of {COMMANDS}, heartbeats of {HEARTBEATS}, added ms median and worst, ...")
+    """Print a table for each flood, in virtual time."""
+    floods = {
+        "GLOBAL_POSITION_INT": position,
+        "GLOBAL_POSITION_INT without start bytes inside": without_starts(position),
+        "HEARTBEAT of many components": member_heartbeat,
+    }
+    for name, flood in floods.items():
+        print(name, HEADING, sep="\n")
         for kbit_s in RATES_KBIT_S:
-            result = starve(kbit_s, flood)
-            print(
-                f"{kbit_s:6} {result.commands:4} {result.heartbeats:4} {result.median_added_s * 1000:8.1f} "
-                f"{result.worst_added_s * 1000:8.1f} {result.flood_frames:6} {result.most_held:6}"
-            )
+            print(row(kbit_s, starve(kbit_s, flood)))
 
 
 if __name__ == "__main__":
