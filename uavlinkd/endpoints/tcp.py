@@ -10,6 +10,7 @@ import asyncio
 import errno
 import socket
 import struct
+import sys
 from contextlib import suppress
 from secrets import SystemRandom
 
@@ -43,7 +44,8 @@ _SEND_BUFFER_BYTES = 16384
 _NOT_SENT_BYTES = 1024
 """The kernel takes a write while it holds fewer bytes than this beyond those on their way."""
 _WRITE_BYTES = 1400
-"""One write. The kernel takes all of a write that it begins to take, so it may hold so much more."""
+"""One write: a segment at most. The kernel takes all of a write that it begins to take."""
+_OWN_SEGMENT = socket.MSG_EOR if sys.platform == "linux" else 0
 _BACKLOG = 32
 _Sockaddr = tuple[str | int, ...]  # of either family, as the kernel takes it
 _Found = tuple[socket.AddressFamily, _Sockaddr]
@@ -77,7 +79,11 @@ class SocketChannel:
         self._sock = sock
         self.fileno = sock.fileno
         self.read = sock.recv
-        self.write = sock.send
+
+    def write(self, data: bytes) -> int:
+        """Hand bytes to the kernel. Each write is a segment of its own: the kernel would add to the last one that it
+        has not sent, up to 64 kB, whatever TCP_NOTSENT_LOWAT says."""
+        return self._sock.send(data, _OWN_SEGMENT)
 
     def capacity(self) -> int:
         """The receive buffer, as large as it is now."""
