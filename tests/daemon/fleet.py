@@ -38,6 +38,10 @@ def a_member(system: int) -> dict[str, object]:
     return {"role": "swarm-member", "system_ids": [system]}
 
 
+FAST: dict[str, object] = {"rate_in": {"heartbeat": 1000, "position": 1000, "PING": 1000}}
+"""In place of a role's own rates, where a test sends faster than they allow."""
+
+
 def introduce(
     stage: Stage,
     a: DaemonProcess,

@@ -15,6 +15,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from tests.daemon.fleet import (
+    FAST,
     GROUND_SYSTEM,
     Rogue,
     Station,
@@ -327,10 +328,10 @@ class Table(NamedTuple):
 
 
 TABLES = {
-    "member": Table(a_member(CAPTURED), as_a_member, lambda n: heartbeat(CAPTURED, seq=n, kind=13)),
+    "member": Table(a_member(CAPTURED) | FAST, as_a_member, lambda n: heartbeat(CAPTURED, seq=n, kind=13)),
     "vehicle": Table(a_vehicle(CAPTURED), as_a_vehicle, lambda n: heartbeat(CAPTURED, seq=n, kind=13)),
     "observer": Table(
-        {"role": "observer", "system_ids": [TABLET]},
+        {"role": "observer", "system_ids": [TABLET], **FAST},
         as_an_observer,
         lambda n: pack(mavlink.MAVLink_ping_message(1000 + n, n, 0, 0), TABLET),
     ),

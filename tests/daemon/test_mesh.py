@@ -12,6 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from tests.daemon.fleet import (
     AN_OPERATOR,
+    FAST,
     GROUND_SYSTEM,
     Station,
     a_member,
@@ -55,7 +56,11 @@ async def mesh(stage: Stage, *, relaying: tuple[int, ...] = (), trusting: bool =
     daemons = {system: stage.daemon(f"drone{system}") for system in DRONES}
     daemons[GROUND_SYSTEM] = stage.daemon("ground")
     for one, other in combinations(daemons, 2):
-        seen, sees = (AN_OPERATOR, a_vehicle(one)) if other == GROUND_SYSTEM else (a_member(other), a_member(one))
+        seen, sees = (
+            (AN_OPERATOR, a_vehicle(one))
+            if other == GROUND_SYSTEM
+            else (a_member(other) | FAST, a_member(one) | FAST)
+        )
         if trusting:
             seen = sees = TRUSTED
         introduce(stage, daemons[one], daemons[other], a_sees_b=seen, b_sees_a=sees)

@@ -97,7 +97,7 @@ async def _starve(kbit_s: float, flood: Make) -> Result:
     loop = asyncio.get_running_loop()
     line = Line(BAUD / 10, loop.time)
     endpoint = LineEndpoint("serial", Recorder(), 1.0)
-    port = endpoint.open(LineChannel(line), "line", loop.time()).port
+    port = endpoint.open(LineChannel(line), "line", loop.time(), endpoint.handler.stall.epoch).port
     operator, captured = source("operator"), source("captured")
     sent_at: dict[bytes, float] = {}
 
