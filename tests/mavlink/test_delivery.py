@@ -22,6 +22,7 @@ from tests.mavlink.smuggling import (
     v2,
     valid_frames,
 )
+from uavlinkd.evaluation.captured_member import restart_in_mavlink1
 from uavlinkd.mavlink import hidden
 from uavlinkd.mavlink.delivery import DeliveredStream, Source
 from uavlinkd.mavlink.dialect_table import MESSAGES
@@ -30,6 +31,7 @@ from uavlinkd.mavlink.policy import Gate, Refusal, compile_policy
 
 ARM = v2(COMMAND_LONG, bytes(28) + (400).to_bytes(2, "little") + b"\x02\x01\x00", 255)
 MODE_V1 = v1(SET_MODE, b"\x04\x00\x00\x00\x02\x51", 255)
+MISSION_CHECKSUM = 53
 FILE_BYTES = MESSAGES[110][3]  # of FILE_TRANSFER_PROTOCOL
 
 
@@ -274,27 +276,57 @@ def test_frame_is_refused_where_no_separator_restores_the_invariant(monkeypatch:
     assert client.send(ARM, operator)
 
 
+def read_as_v1(extra: int) -> bytes:
+    """A MAVLink 2 ATTITUDE of system 1 that is a MAVLink 1 frame as well, of message 1, by this CRC_EXTRA."""
+    raw = v2(ATTITUDE, bytes(28))
+    crc = mcrf4xx(raw[1 : 6 + 28] + bytes((extra,))).to_bytes(2, "little")
+    return v2(ATTITUDE, raw[10:34] + crc + bytes(2))
+
+
+def test_parser_goes_on_in_mavlink1_at_the_end_of_a_rejected_frame() -> None:
+    """A hidden MAVLink 1 frame may begin with 0xFD: the checksum's last byte of a frame that the receiver lacks."""
+    client, vehicle = Client(), source("vehicle", [2])
+    *first, last = (raw for _, raw in restart_in_mavlink1(MISSION_CHECKSUM).frames)
+    assert all(client.send(raw, vehicle) for raw in first)
+    assert not client.send(last, vehicle)
+    assert vehicle.gate.refused == {(110, Refusal.HIDDEN_FRAME): 1}
+
+
+def test_frame_may_be_read_as_mavlink1_from_its_own_start() -> None:
+    """Only behind a MAVLink 1 frame that ends with this byte: elsewhere no parser reads it so."""
+    twofold = read_as_v1(MESSAGES[1][1])
+    client, member = Client(), source()
+    assert client.send(twofold, member)
+    opening = v2(ATTITUDE, bytes(27) + b"\1", signature=bytes(6) + b"\xfe\0\0\0\0\0\0")  # ends with the next byte
+    assert client.send(opening, member)
+    assert not client.send(twofold, member)
+    other = source("operator", [1])
+    assert client.send(opening, member)
+    assert client.send(twofold, other), "behind separator bytes: the cause is the member's"
+    assert client.delivered.separators == 1
+
+
 @pytest.mark.parametrize("tail", [b"\xfe", b"\xfd", b"\xfd\x09", b"\xfd\x09\x01", hidden_header(COMMAND_LONG, 33)])
 def test_separator_ends_every_header(tail: bytes) -> None:
     """Complete or not, signed or not: behind it a parser looks for the next frame."""
-    gap = hidden.separator(tail, [0])
+    gap = hidden.separator(tail, [(0, tail[0] == 0xFE)])
     assert gap is not None
     assert not set(gap) & {0xFD, 0xFE}
-    end = hidden.end_of_checksum(tail + gap, 0)
+    end = hidden.end_of_checksum(tail + gap, (0, tail[0] == 0xFE))
     assert end is not None
     assert end <= len(tail + gap)
-    assert end == hidden.PAST or not hidden.has_checksum(tail + gap, 0, end, any_extra=True)
+    assert end == hidden.PAST or not hidden.has_checksum(tail + gap, (0, tail[0] == 0xFE), end, any_extra=True)
 
 
 def test_separator_completes_no_frame() -> None:
     """A tail made for the first filler gets another one."""
-    first = hidden.separator(hidden_header(COMMAND_LONG, 33), [0])
+    first = hidden.separator(hidden_header(COMMAND_LONG, 33), [(0, False)])
     assert first is not None
     for number in range(1 << 16):
         header = bytes((0xFD, 33, 0, 0, number & 0xFF, 255, number >> 8)) + COMMAND_LONG.to_bytes(3, "little")
         data = header + bytes((first[0],)) * 35
-        if hidden.has_checksum(data, 0, len(data), any_extra=True):
+        if hidden.has_checksum(data, (0, False), len(data), any_extra=True):
             break
-    gap = hidden.separator(header, [0])
+    gap = hidden.separator(header, [(0, False)])
     assert gap is not None
     assert gap[0] != first[0]

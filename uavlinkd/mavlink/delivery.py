@@ -29,7 +29,7 @@ from typing import final
 
 from uavlinkd.mavlink import hidden
 from uavlinkd.mavlink.egress_kinds import Lane, kind_of
-from uavlinkd.mavlink.frames import MAX_FRAME_BYTES, Frame, Header
+from uavlinkd.mavlink.frames import MAVLINK1, MAX_FRAME_BYTES, Frame, Header
 from uavlinkd.mavlink.policy import Gate, Refusal
 
 Report = Callable[[str, Header, Refusal, float], None]
@@ -76,7 +76,7 @@ class DeliveredStream:
         self.separators = 0
         """How often bytes had to be put between frames of different sources."""
         self._tail = b""  # the stream from the first start that is still open
-        self._starts: list[int] = []  # where in it frames may have begun that are not complete
+        self._starts: list[hidden.Start] = []  # where in it frames may have begun that are not complete
         self._due_at = 0  # the tail's length at which the first of them may be complete
         self._authors: list[tuple[int, Source | None]] = []  # up to where in it whose bytes go; None: a separator
 
@@ -104,20 +104,33 @@ class DeliveredStream:
             authors = [*self._authors, *([(begun_at, None)] if gap else []), (len(data), source)]
             if self._is_only(source) and not gap:
                 authors = authors[-1:]
-            still_open: list[int] = []
+            still_open: list[hidden.Start] = []
             due_at = MAX_FRAME_BYTES + len(data)
             is_hidden_elsewhere = False
-            starts = [] if gap else self._starts  # all of them end within the gap
-            for start in (*starts, *hidden.starts_in(data, begun_at + 1)):
+            starts = [] if gap else list(self._starts)  # all of them end within the gap
+            starts += hidden.starts_in(data, begun_at + 1)
+            itself = (begun_at, True) if raw[0] == MAVLINK1 else None
+            if itself is not None:
+                starts.append(itself)  # for a receiver that rejects it
+            causes: dict[hidden.Start, hidden.Start] = {}  # of a restart: what the receiver rejected
+            for start in starts:
                 end = hidden.end_of_checksum(data, start)
                 if end is None or end > len(data):
                     still_open.append(start)
                     due_at = min(due_at, end or 0)
-                elif end != hidden.PAST and self._is_forbidden(data, start, end, authors):
-                    if start > begun_at or self._is_only(source, start):
+                    continue
+                if end == hidden.PAST:
+                    continue
+                cause = causes.get(start, start)
+                if start != itself and self._is_forbidden(data, start, end, authors):
+                    if cause[0] >= begun_at or self._is_only(source, cause[0]):
                         source.refuse(frame, now)
                         return b""
                     is_hidden_elsewhere = True
+                again = hidden.restart(data, start, end)
+                if again is not None and again not in causes:
+                    causes[again] = cause
+                    starts.append(again)
             if not is_hidden_elsewhere:
                 self._keep(data, still_open, due_at, authors)
                 self.separators += bool(gap)
@@ -129,12 +142,14 @@ class DeliveredStream:
     def _gap(self) -> bytes | None:
         return hidden.separator(self._tail, self._starts)
 
-    def _is_forbidden(self, data: bytes, start: int, end: int, authors: list[tuple[int, Source | None]]) -> bool:
+    def _is_forbidden(
+        self, data: bytes, start: hidden.Start, end: int, authors: list[tuple[int, Source | None]]
+    ) -> bool:
         """Whether a valid frame is there that one of the sources of its bytes may not send, or the client not get."""
         gates = []
         begins_at = 0
         for ends_at, source in authors:
-            if source is not None and begins_at < end and start < ends_at:
+            if source is not None and begins_at < end and start[0] < ends_at:
                 gates.append(source.gate)
             begins_at = ends_at
         if not hidden.has_checksum(data, start, end, any_extra=any(gate.passes_unknown for gate in gates)):
@@ -144,14 +159,16 @@ class DeliveredStream:
             gates.append(self.outgoing)
         return not all(gate.permits(frame) for gate in gates)
 
-    def _keep(self, data: bytes, starts: list[int], due_at: int, authors: list[tuple[int, Source | None]]) -> None:
+    def _keep(
+        self, data: bytes, starts: list[hidden.Start], due_at: int, authors: list[tuple[int, Source | None]]
+    ) -> None:
         """Remember the stream from the first of these starts."""
         if not starts:
             self._tail, self._starts, self._authors = b"", starts, []
             return
-        first = starts[0]
+        first = min(at for at, _ in starts)
         self._tail = data[first:]
-        self._starts = [start - first for start in starts]
+        self._starts = [(at - first, is_mavlink1) for at, is_mavlink1 in starts]
         self._due_at = due_at - first
         self._authors = [(ends_at - first, source) for ends_at, source in authors if ends_at > first]
 

@@ -8,6 +8,8 @@ this module finds them. It knows no policy and keeps no state.
 What the parsers of the reference C library accept, and so what counts as a frame here:
 
 * MAVLink 1 and 2, of any payload length. ``mavlink_parse_char`` compares no length with the definition.
+* MAVLink 1 from 0xFD on. Where ``mavlink_parse_char`` rejects a MAVLink 1 frame whose last byte is 0xFD, it takes
+  this byte for a start and reads on in MAVLink 1. The byte may be a delivered frame's own start.
 * incompat_flags of 0 or 1. Any other value makes a parser give up at that byte.
 * a checksum that fits a CRC_EXTRA of any definition of the message's number, or 0, which the library uses for each
   message that the receiver's dialect lacks. Where a policy lets unknown messages pass, any CRC_EXTRA at all.
@@ -24,14 +26,26 @@ from typing import Final
 from fastcrc.crc16 import mcrf4xx
 
 from uavlinkd.mavlink.dialect_table import MESSAGES, OTHER_EXTRAS
-from uavlinkd.mavlink.frames import CHECKSUM_STEP, MAVLINK1, MAX_FRAME_BYTES, SIGNATURE_BYTES, Frame, parse_frame
+from uavlinkd.mavlink.frames import (
+    CHECKSUM_STEP,
+    MAVLINK1,
+    MAVLINK2,
+    MAX_FRAME_BYTES,
+    SIGNATURE_BYTES,
+    Frame,
+    parse_frame,
+)
 
 PAST: Final = -1
 """Of a start: no frame can begin there."""
 
+Start = tuple[int, bool]
+"""Where a frame may begin, and whether it is read in MAVLink 1."""
+
 _PLAUSIBLE = re.compile(rb"\xfe|\xfd(?=.?\Z|.[\x00\x01])", re.DOTALL)
 """A start byte whose flags, as far as the bytes go, are ones that parsers accept."""
 _STEPS = frozenset(CHECKSUM_STEP)
+_MAVLINK1 = bytes((MAVLINK1,))
 _FILLERS: Final = (*range(2, MAVLINK1 - 1), 0xFF)
 """Values of separator bytes: no start byte, and as incompat_flags each of them ends a header at once."""
 
@@ -41,48 +55,57 @@ def has_start(raw: bytes) -> bool:
     return raw.count(b"\xfd") + raw.count(b"\xfe") != 1
 
 
-def starts_in(data: bytes, begin: int) -> list[int]:
+def starts_in(data: bytes, begin: int) -> list[Start]:
     """Where frames may begin, from `begin` on."""
-    return [match.start() for match in _PLAUSIBLE.finditer(data, begin)]
+    return [(match.start(), match[0] == _MAVLINK1) for match in _PLAUSIBLE.finditer(data, begin)]
 
 
-def end_of_checksum(data: bytes, start: int) -> int | None:
+def restart(data: bytes, start: Start, end: int) -> Start | None:
+    """Where a parser begins anew that rejects the frame from `start` to `end`, if it does so in MAVLink 1."""
+    return (end - 1, True) if start[1] and data[end - 1] == MAVLINK2 else None
+
+
+def end_of_checksum(data: bytes, start: Start) -> int | None:
     """Where the checksum of the frame at `start` ends; None if its header is incomplete, :data:`PAST` if it is none.
 
-    `start` must be a start byte.
+    `start` must be at a start byte.
     """
-    left = len(data) - start
-    if data[start] == MAVLINK1:
-        return start + 8 + data[start + 1] if left >= 2 else None
-    if left >= 3 and data[start + 2] > 1:
+    at, is_mavlink1 = start
+    left = len(data) - at
+    if is_mavlink1:
+        return at + 8 + data[at + 1] if left >= 2 else None
+    if left >= 3 and data[at + 2] > 1:
         return PAST
-    return start + 12 + data[start + 1] if left >= 2 else None
+    return at + 12 + data[at + 1] if left >= 2 else None
 
 
-def has_checksum(data: bytes, start: int, end: int, *, any_extra: bool) -> bool:
+def has_checksum(data: bytes, start: Start, end: int, *, any_extra: bool) -> bool:
     """Whether the checksum that ends at `end` fits the frame at `start`, by the rules at the head of this module."""
-    checksum = mcrf4xx(data[start + 1 : end - 2])
+    at, is_mavlink1 = start
+    checksum = mcrf4xx(data[at + 1 : end - 2])
     step = (data[end - 2] | data[end - 1] << 8) ^ (checksum >> 8)
     if step not in _STEPS:
         return False
     if any_extra:
         return True
-    is_mavlink1 = data[start] == MAVLINK1
-    msgid = data[start + 5] if is_mavlink1 else int.from_bytes(data[start + 7 : start + 10], "little")
+    msgid = data[at + 5] if is_mavlink1 else int.from_bytes(data[at + 7 : at + 10], "little")
     return any(step == CHECKSUM_STEP[(checksum ^ extra) & 0xFF] for extra in _extras(msgid))
 
 
-def frame_at(data: bytes, start: int, end: int) -> Frame:
+def frame_at(data: bytes, start: Start, end: int) -> Frame:
     """The hidden frame at `start`, whose checksum ends at `end`, as a policy reads it. Its signature is left out."""
-    raw = data[start:end]
-    if raw[0] != MAVLINK1 and raw[2]:
+    at, is_mavlink1 = start
+    raw = data[at:end]
+    if is_mavlink1:
+        raw = _MAVLINK1 + raw[1:]
+    elif raw[2]:
         raw += bytes(SIGNATURE_BYTES)  # whatever it will be
     frame = parse_frame(raw)
     assert frame is not None, "its checksum fits some CRC_EXTRA"
     return frame
 
 
-def separator(tail: bytes, starts: Iterable[int]) -> bytes | None:
+def separator(tail: bytes, starts: Iterable[Start]) -> bytes | None:
     """Bytes to put behind `tail` after which no frame that begins at `starts` is open, or has become valid.
 
     None where no such bytes were found. One filler value fails for a start only if the checksum up to here is one
@@ -96,14 +119,15 @@ def separator(tail: bytes, starts: Iterable[int]) -> bytes | None:
         if any(has_checksum(data, start, end, any_extra=True) for start, end in closed):
             continue
         longest = max((_reach(data, start, end) for start, end in closed), default=0)
-        shortest = max((start + 3 for start in starts), default=0)  # flags that end a header have to be there
+        shortest = max((at + 3 for at, _ in starts), default=0)  # flags that end a header have to be there
         return data[len(tail) : max(longest, shortest, len(tail) + 1)]
     return None
 
 
-def _reach(data: bytes, start: int, end: int) -> int:
+def _reach(data: bytes, start: Start, end: int) -> int:
     """Where a parser that took `start` for a frame is done with it."""
-    is_signed = data[start] != MAVLINK1 and data[start + 2] == 1
+    at, is_mavlink1 = start
+    is_signed = not is_mavlink1 and data[at + 2] == 1
     return end + SIGNATURE_BYTES if is_signed else end
 
 
