@@ -1,0 +1,199 @@
+"""The judge: whether what a receiver accepted is what policy lets pass, whatever the daemon's filter thinks.
+
+It knows policies, who sent which bytes, and nothing of hidden frames.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from fastcrc.crc16 import mcrf4xx
+
+from tests.mavlink.parsers.generate import CAST, CLIENTS, LETS_UNKNOWN_PASS, Recipe
+from tests.mavlink.parsers.receivers import Accepted, Batch, Delivery, Receiver
+from uavlinkd.evaluation.hidden_frames import SIGNATURE_BYTES, crc_extra, msgid_of
+from uavlinkd.mavlink.delivery import DeliveredStream, Source
+from uavlinkd.mavlink.dialect_table import OTHER_EXTRAS
+from uavlinkd.mavlink.frames import MAVLINK2, Frame, SplitCounters, parse_frame, split_payload
+from uavlinkd.mavlink.policy import Gate, compile_policy
+
+_LONG_S = 1e6  # between two frames: rates are not looked at
+
+
+class Stream(NamedTuple):
+    """What one client read, and whose bytes those are."""
+
+    delivery: Delivery
+    authors: Sequence[tuple[int, str | None]]  # up to which offset whose; None: separator bytes
+    client: int
+
+
+Admit = Callable[[Frame, Source, float], bytes]
+"""``DeliveredStream.admit``."""
+MakeStream = Callable[[Gate], Admit]
+
+
+def filtered(outgoing: Gate) -> Admit:
+    """The daemon's own filter."""
+    return DeliveredStream(outgoing).admit
+
+
+def unfiltered(outgoing: Gate) -> Admit:
+    """Policy alone."""
+    return lambda frame, source, now: frame.raw
+
+
+@dataclass
+class Deliverer:
+    """Passes recipes through policy and filter."""
+
+    make: MakeStream = filtered
+    cast: Mapping[str, Mapping[str, object]] = field(default_factory=lambda: CAST)
+    refused: int = 0
+    admitted: int = 0
+    _now: float = 0.0
+
+    def __post_init__(self) -> None:
+        self._gates = {name: compile_policy(data).incoming for name, data in self.cast.items()}
+        self._outgoing = [compile_policy(data, needs_system_ids=False).outgoing for data in CLIENTS]
+
+    def deliver(self, recipe: Recipe) -> Stream:
+        """What the client reads."""
+        outgoing = self._outgoing[recipe.client]
+        admit = self.make(outgoing)
+        sources = {part.sender: Source(part.sender, self._gates[part.sender]) for part in recipe.parts}
+        stream = bytearray()
+        authors: list[tuple[int, str | None]] = []
+        frames = []
+        for part in recipe.parts:
+            frame = parse_frame(part.raw)
+            self._now += _LONG_S
+            if frame is None or self._gates[part.sender].check(frame, self._now) is not None:
+                continue
+            if outgoing.check(frame, self._now) is not None:
+                continue
+            data = admit(frame, sources[part.sender], self._now)
+            if not data:
+                self.refused += 1
+                continue
+            assert data.endswith(part.raw), "a frame is delivered whole, or not at all"
+            self.admitted += 1
+            begin = len(stream) + len(data) - len(part.raw)
+            if begin > len(stream):
+                authors.append((begin, None))
+            stream += data
+            authors.append((len(stream), part.sender))
+            frames.append((begin, len(stream)))
+        return Stream(Delivery(bytes(stream), frames), authors, recipe.client)
+
+
+class Breach(NamedTuple):
+    """A forbidden frame that a receiver accepted."""
+
+    receiver: str
+    raw: bytes
+    senders: tuple[str, ...]
+    accepted: Accepted
+    stream: bytes
+
+
+@dataclass
+class Verdicts:
+    """What became of the frames that receivers accepted beyond the delivered ones."""
+
+    harmless: int = 0
+    spanning: int = 0
+    spanning_forbidden: int = 0
+    private: int = 0
+    """Forbidden frames by a private definition, from sources without unknown messages in their lists: the limit."""
+    breaches: list[Breach] = field(default_factory=list)
+    truncated: int = 0
+    """Accepted frames that were not looked at, because there were too many."""
+
+
+def is_private(raw: bytes) -> bool:
+    """Whether a frame's checksum fits no CRC_EXTRA of a public definition, and not the 0 of receivers without one."""
+    msgid = msgid_of(raw)
+    extras = {0, crc_extra(msgid), *OTHER_EXTRAS.get(msgid, ())}
+    end = len(raw) - (SIGNATURE_BYTES if raw[0] == MAVLINK2 and raw[2] else 0)
+    fitting = {mcrf4xx(raw[1 : end - 2] + bytes((extra,))).to_bytes(2, "little") for extra in extras}
+    return raw[end - 2 : end] not in fitting
+
+
+class Judge:
+    """Knows policies of its own, compiled from the same data."""
+
+    def __init__(
+        self, cast: Mapping[str, Mapping[str, object]] = CAST, clients: Sequence[Mapping[str, object]] = CLIENTS
+    ) -> None:
+        self._gates = {name: compile_policy(data).incoming for name, data in cast.items()}
+        self._outgoing = [compile_policy(data, needs_system_ids=False).outgoing for data in clients]
+        self._now = 0.0
+
+    def is_forbidden(self, raw: bytes, senders: Iterable[str], client: int = 0) -> bool:
+        """Whether policy refuses this frame from any of those who sent its bytes, or keeps it from the client."""
+        counters = SplitCounters()
+        frames = split_payload(raw, counters)
+        if len(frames) != 1:
+            return True
+        self._now += _LONG_S
+        frame = frames[0]
+        refusals = [self._gates[sender].check(frame, self._now) for sender in senders]
+        refusals.append(self._outgoing[client].check(frame, self._now))
+        return any(refusal is not None for refusal in refusals)
+
+    def examine(
+        self, receiver: Receiver, streams: Sequence[Stream], found: Sequence[Accepted], into: Verdicts
+    ) -> None:
+        """Sort what a receiver accepted into verdicts."""
+        for accepted in found:
+            stream = streams[accepted.stream]
+            end = accepted.start + len(accepted.raw) + (accepted.lost if accepted.spans else 0)
+            senders = _authors(stream.authors, accepted.start, end)
+            is_forbidden = self.is_forbidden(accepted.raw, senders, stream.client)
+            if accepted.spans:
+                into.spanning += 1
+                into.spanning_forbidden += is_forbidden
+            elif is_forbidden and is_private(accepted.raw) and not LETS_UNKNOWN_PASS.intersection(senders):
+                into.private += 1
+            elif is_forbidden:
+                into.breaches.append(Breach(receiver.name, accepted.raw, senders, accepted, stream.delivery.stream))
+            else:
+                into.harmless += 1
+
+
+def _authors(authors: Sequence[tuple[int, str | None]], start: int, end: int) -> tuple[str, ...]:
+    found = []
+    begin = 0
+    for until, sender in authors:
+        if sender is not None and begin < end and start < until:
+            found.append(sender)
+        begin = until
+    return tuple(dict.fromkeys(found))
+
+
+def judge_all(
+    streams: Sequence[Stream],
+    receivers: Iterable[Receiver],
+    judge: Judge,
+    *,
+    every_offset: bool = True,
+    losses: int = 1,
+    seed: int = 1,
+) -> Verdicts:
+    """Give the streams to every receiver, from every offset and after losses."""
+    verdicts = Verdicts()
+    batch = Batch([stream.delivery for stream in streams])
+    for receiver in receivers:
+        total, found = receiver.judge(batch, every_offset=every_offset, losses=losses, seed=seed)
+        verdicts.truncated += total - len(found)
+        judge.examine(receiver, streams, found, verdicts)
+    return verdicts
+
+
+def by_message(breaches: Iterable[Breach]) -> Counter[str]:
+    """How many of them each receiver accepted."""
+    return Counter(breach.receiver for breach in breaches)

@@ -1,0 +1,197 @@
+"""Receivers made of MAVLink's C library: which frames each accepts in a stream, from where it may begin or resume."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from typing import NamedTuple
+
+from tests.mavlink.parsers.build import DIALECTS, build
+
+KEY = bytes(range(32))
+"""The signing key of receivers that check signatures."""
+LONGEST_LOSS = 300
+EVERY_LOSS = -1
+_ROOM = 4096
+_STATES = 32
+
+# The parser's states, by the library's numbers.
+STATES_2 = (
+    *("UNINIT", "IDLE", "GOT_STX", "GOT_LENGTH", "GOT_INCOMPAT_FLAGS", "GOT_COMPAT_FLAGS", "GOT_SEQ", "GOT_SYSID"),
+    *("GOT_COMPID", "GOT_MSGID1", "GOT_MSGID2", "GOT_MSGID3", "GOT_PAYLOAD", "GOT_CRC1", "GOT_BAD_CRC1"),
+    *("SIGNATURE_WAIT", "SIGNATURE_WAIT_BAD_CRC"),
+)
+STATES_1 = (
+    *("UNINIT", "IDLE", "GOT_STX", "GOT_SEQ", "GOT_LENGTH", "GOT_SYSID", "GOT_COMPID", "GOT_MSGID", "GOT_PAYLOAD"),
+    *("GOT_CRC1", "GOT_BAD_CRC1"),
+)
+
+
+class Options(NamedTuple):
+    """How a receiver uses the library."""
+
+    resumes: bool = True
+    """``mavlink_parse_char``, which resumes at the last byte of a rejected frame; else ``mavlink_frame_char``."""
+    mavlink1: bool = True
+    """Whether 0xFE starts a frame."""
+    signs: bool = False
+    """Whether it checks signatures, by :data:`KEY`; of unsigned frames it then takes RADIO_STATUS alone."""
+    takes_unsigned: bool = False
+    """With ``signs``: takes every unsigned frame."""
+
+    @property
+    def bits(self) -> int:
+        """As receiver.c wants them."""
+        return self.resumes | (not self.mavlink1) << 1 | self.signs << 2 | self.takes_unsigned << 3
+
+
+_PLAIN = Options()
+
+
+class Accepted(NamedTuple):
+    """A frame that a receiver accepted and that was not delivered as such."""
+
+    stream: int  # which of the streams
+    start: int  # offset in it, before anything was lost
+    raw: bytes  # as the receiver read it, from its own start byte
+    lost_at: int  # -1: nothing was lost
+    lost: int
+    spans: bool  # whether the loss is inside it, or inside the rejected frame whose last byte it begins with
+
+
+class _Accepted(ctypes.Structure):
+    _fields_ = [
+        (name, ctypes.c_int32) for name in ("stream", "start", "length", "lost_at", "lost", "mavlink1", "spans")
+    ]
+
+
+class _Counts(ctypes.Structure):
+    _fields_ = [
+        ("parses", ctypes.c_int64),
+        ("accepted", ctypes.c_int64),
+        ("spanning", ctypes.c_int64),
+        ("losses", ctypes.c_int64),
+        ("steps", ctypes.c_int64 * _STATES * _STATES),
+        ("framing", ctypes.c_int64 * 4),
+    ]
+
+
+class Delivery(NamedTuple):
+    """The bytes that a client read, and the frames in them: the offsets of each one's first byte and of its end."""
+
+    stream: bytes
+    frames: Sequence[tuple[int, int]]
+
+
+class Batch:
+    """Deliveries, in the form that receiver.c wants."""
+
+    def __init__(self, deliveries: Sequence[Delivery]) -> None:
+        self.count = len(deliveries)
+        self.data = b"".join(delivery.stream for delivery in deliveries)
+        begins = [0]
+        for delivery in deliveries:
+            begins.append(begins[-1] + len(delivery.stream))
+        self.begins = (ctypes.c_int32 * len(begins))(*begins)
+        self.frame_end = (ctypes.c_int32 * (len(self.data) + 1))()
+        for begin, delivery in zip(begins, deliveries, strict=False):
+            for start, end in delivery.frames:
+                self.frame_end[begin + start] = end
+
+
+@dataclass
+class Receiver:
+    """One dialect, one version of the library, one way to use it."""
+
+    dialect: str
+    library: str
+    options: Options = _PLAIN
+    counts: _Counts = field(default_factory=_Counts, repr=False)
+
+    @property
+    def name(self) -> str:
+        """For people: ``common parse_char``, with what else is special."""
+        parts = [self.dialect, "parse_char" if self.options.resumes else "frame_char_buffer"]
+        parts += ["library of MAVLink 1"] if self.library == "1.0" else []
+        parts += ["CRC_EXTRA 0 for unknown messages"] if self.library == "2.0-unknown" else []
+        parts += ["other definitions"] if self.library == "2.0-other" else []
+        parts += [] if self.options.mavlink1 else ["MAVLink 2 only"]
+        parts += (
+            (["signing, unsigned too"] if self.options.takes_unsigned else ["signing"]) if self.options.signs else []
+        )
+        return ", ".join(parts)
+
+    def judge(
+        self, batch: Batch, *, every_offset: bool = False, losses: int = 0, seed: int = 1
+    ) -> tuple[int, list[Accepted]]:
+        """How many frames beyond the delivered ones it accepts, and the first few thousand of them.
+
+        ``losses``: random losses for each stream; EVERY_LOSS: every loss at every offset; ``-1 - n``: every loss of
+        ``n`` bytes.
+        """
+        found = (_Accepted * _ROOM)()
+        total = _load(self.dialect, self.library).judge(
+            batch.data,
+            batch.begins,
+            batch.count,
+            batch.frame_end,
+            self.options.bits,
+            int(every_offset),
+            losses,
+            ctypes.c_uint64(seed or 1),
+            found,
+            _ROOM,
+            ctypes.byref(self.counts),
+        )
+        return total, [self._read(batch, found[k]) for k in range(min(total, _ROOM))]
+
+    def accepts(self, stream: bytes, frames: Sequence[tuple[int, int]] = ()) -> list[bytes]:
+        """The frames that it accepts when it reads a stream from its start, without those that were delivered."""
+        return [each.raw for each in self.judge(Batch([Delivery(stream, frames)]))[1]]
+
+    def _read(self, batch: Batch, found: _Accepted) -> Accepted:
+        begin = batch.begins[found.stream] + found.start
+        raw = batch.data[begin : begin + found.length]
+        if found.start < found.lost_at < found.start + found.length:
+            lost_at = batch.begins[found.stream] + found.lost_at
+            raw = batch.data[begin:lost_at] + batch.data[lost_at + found.lost :]
+            raw = raw[: found.length]
+        if found.mavlink1 and raw[0] == 0xFD:
+            raw = b"\xfe" + raw[1:]
+        return Accepted(found.stream, found.start, raw, found.lost_at, found.lost, bool(found.spans))
+
+    @property
+    def steps(self) -> dict[tuple[str, str], int]:
+        """How often the parser went from one state to another."""
+        names = STATES_1 if self.library == "1.0" else STATES_2
+        rows = self.counts.steps
+        return {
+            (before, after): int(rows[i][k])
+            for i, before in enumerate(names)
+            for k, after in enumerate(names)
+            if rows[i][k]
+        }
+
+
+@cache
+def _load(dialect: str, library: str) -> ctypes.CDLL:
+    loaded = ctypes.CDLL(str(build(dialect, library)))
+    loaded.judge.restype = ctypes.c_int32
+    return loaded
+
+
+def all_receivers(dialects: Sequence[str] = DIALECTS) -> list[Receiver]:
+    """Every receiver: each dialect, parser and version, with and without MAVLink 1 and signing."""
+    signing = (Options(), Options(signs=True), Options(signs=True, takes_unsigned=True))
+    of_library_2 = [
+        kind._replace(resumes=resumes, mavlink1=mavlink1)
+        for kind in signing
+        for resumes in (True, False)
+        for mavlink1 in (True, False)
+    ]
+    either = [Options(resumes=True), Options(resumes=False)]
+    kinds = [("2.0", each) for each in of_library_2]
+    kinds += [(library, each) for library in ("2.0-unknown", "2.0-other", "1.0") for each in either]
+    return [Receiver(dialect, library, options) for dialect in dialects for library, options in kinds]

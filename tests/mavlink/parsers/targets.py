@@ -1,0 +1,70 @@
+"""The attacks of a captured member, aimed at receivers of one dialect."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from functools import cache
+
+from tests.mavlink.parsers.generate import Part, Recipe
+from tests.mavlink.parsers.judge import Deliverer, Judge, MakeStream, Stream, filtered
+from tests.mavlink.parsers.receivers import Delivery
+from uavlinkd.evaluation.captured_member import Attack, attacks
+from uavlinkd.mavlink.dialect_table import MESSAGES
+from uavlinkd.mavlink.policy import Refusal, compile_policy
+
+
+@cache
+def lacking(dialect: str, role: str, *, numbered: bool = False) -> int:
+    """A message that this role may send and the dialect lacks; with ``numbered`` one that MAVLink 1 can number."""
+    known = importlib.import_module(f"pymavlink.dialects.v20.{dialect}").mavlink_map
+    gate = compile_policy({"role": role, "system_ids": [2]}).incoming
+    return next(
+        msgid
+        for msgid in sorted(MESSAGES, reverse=True)
+        if msgid not in known
+        and not isinstance(gate.decide(msgid, is_known=True), Refusal)
+        and not (numbered and msgid > 0xFF)
+    )
+
+
+@cache
+def attacks_on(dialect: str) -> tuple[Attack, ...]:
+    """Every attack against receivers of this dialect."""
+    return tuple(
+        attacks(
+            lacking(dialect, "observer"),
+            lacking(dialect, "vehicle"),
+            lacking(dialect, "operator"),
+            lacking(dialect, "vehicle", numbered=True),
+        )
+    )
+
+
+def deliver(attack: Attack, make: MakeStream = filtered, times: int = 1) -> tuple[Stream, Deliverer]:
+    """What a client reads of an attack that is repeated so many times."""
+    deliverer = Deliverer(make, cast=cast_of(attack))
+    parts = tuple(Part(f"member {member}", raw) for member, raw in attack.frames) * times
+    return deliverer.deliver(Recipe(0, parts)), deliverer
+
+
+def concatenated(attack: Attack, times: int = 1) -> Stream:
+    """What a client reads where the frames are delivered as they are, as before there was a filter."""
+    stream = bytearray()
+    authors: list[tuple[int, str | None]] = []
+    frames = []
+    for member, raw in attack.frames * times:
+        frames.append((len(stream), len(stream) + len(raw)))
+        stream += raw
+        authors.append((len(stream), f"member {member}"))
+    return Stream(Delivery(bytes(stream), frames), authors, 0)
+
+
+def cast_of(attack: Attack) -> dict[str, Mapping[str, object]]:
+    """Its members' policies, by the names that :func:`deliver` gives them."""
+    return {f"member {number}": policy for number, policy in enumerate(attack.members)}
+
+
+def judge_of(attack: Attack) -> Judge:
+    """A judge who knows its members' policies."""
+    return Judge(cast_of(attack))

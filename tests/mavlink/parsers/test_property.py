@@ -1,0 +1,48 @@
+"""Whatever is delivered: what a real parser accepts is what policy passes from those who sent its bytes."""
+
+from __future__ import annotations
+
+from tests.mavlink.parsers.generate import Generator
+from tests.mavlink.parsers.judge import Deliverer, unfiltered
+from tests.mavlink.parsers.receivers import Batch, Delivery, Options, Receiver
+from tests.mavlink.parsers.run import run
+
+STREAMS = 6000
+
+
+def test_no_receiver_accepts_what_policy_forbids() -> None:
+    """From any offset and after a random loss; the streams take every step of the parsers."""
+    result = run(STREAMS, seed=15, share=4)
+    assert not result.breaches_by_receiver, "\n".join(result.lines())
+    assert not any(result.missing_steps.values()), result.missing_steps
+    assert result.verdicts.truncated == 0
+    assert result.refused > STREAMS // 100
+    assert result.separators > STREAMS // 100
+    assert result.verdicts.harmless > 0
+
+
+def test_streams_are_dangerous() -> None:
+    """Without the filter the same streams make receivers accept forbidden frames."""
+    result = run(500, seed=15, make=unfiltered, share=4)
+    assert sum(result.breaches_by_receiver.values()) > 100
+
+
+def test_every_offset_finds_what_reading_from_each_offset_finds() -> None:
+    """The short way, one attempt at each start byte, is the same as reading the rest of the stream from everywhere."""
+    generator, deliverer = Generator(4), Deliverer(unfiltered)
+    receiver = Receiver("common", "2.0", Options(resumes=False))
+    for _ in range(60):
+        delivery = deliverer.deliver(generator.recipe()).delivery
+        _, short = receiver.judge(Batch([delivery]), every_offset=True)
+        plain: set[tuple[int, bytes]] = set()
+        for offset in range(len(delivery.stream)):
+            later = [(a - offset, b - offset) for a, b in delivery.frames if a >= offset]
+            _, found = receiver.judge(Batch([Delivery(delivery.stream[offset:], later)]))
+            plain |= {(each.start + offset, each.raw) for each in found}
+        assert {(each.start, each.raw) for each in short} == plain
+
+
+def test_same_seed_makes_the_same_streams() -> None:
+    """A run can be repeated."""
+    first, second = Generator(9), Generator(9)
+    assert [first.recipe() for _ in range(50)] == [second.recipe() for _ in range(50)]
