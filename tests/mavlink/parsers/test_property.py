@@ -28,7 +28,7 @@ def test_streams_are_dangerous() -> None:
 
 
 def test_every_offset_finds_what_reading_from_each_offset_finds() -> None:
-    """The short way, one attempt at each start byte, is the same as reading the rest of the stream from everywhere."""
+    """The short way, one attempt at each start byte, is the same as reading the stream's rest from everywhere."""
     generator, deliverer = Generator(4), Deliverer(unfiltered)
     receiver = Receiver("common", "2.0", Options(resumes=False))
     for _ in range(60):

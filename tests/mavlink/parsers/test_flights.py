@@ -1,0 +1,62 @@
+"""Honest traffic passes: recorded flights under the roles that carry them, and random telemetry."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from tests.mavlink.parsers.noise import false_refusals
+from uavlinkd.mavlink.delivery import DeliveredStream, Source
+from uavlinkd.mavlink.dialect import name_of
+from uavlinkd.mavlink.frames import Frame, SplitCounters, split_payload
+from uavlinkd.mavlink.policy import compile_policy
+from uavlinkd.sim.tlog import Record, read_tlog
+
+FLIGHTS = ("arducopter_sitl_flight.tlog", "ardusub_dive.tlog", "copter_flight_mavlink1.tlog")
+GROUND = 255
+# What the roles leave out on purpose: a companion's positions for its own autopilot, and a message that the dialect
+# defines otherwise.
+LEFT_OUT: dict[str, dict[tuple[str, str], int]] = {
+    "ardusub_dive.tlog": {("GPS_INPUT", "message_not_allowed"): 1011},
+    "copter_flight_mavlink1.tlog": {("RESOURCE_REQUEST", "unknown_message"): 1314},
+}
+
+
+def parsed(records: Sequence[Record]) -> list[tuple[float, Frame]]:
+    """When each frame was logged, in seconds, and the frame. Broken ones are left out."""
+    found = []
+    for record in records:
+        found += [(record.time_us / 1e6, frame) for frame in split_payload(record.frame, SplitCounters())]
+    return found
+
+
+@pytest.mark.parametrize("name", FLIGHTS)
+def test_recorded_flight_passes(shared_data: Path, name: str) -> None:
+    """Every frame of vehicle and ground station, by policy, rates and invariant, in both directions, unchanged."""
+    flight = parsed(read_tlog(shared_data / name).records)
+    systems = sorted({frame.header.system for _, frame in flight} - {0, GROUND})
+    vehicle = compile_policy({"role": "vehicle", "system_ids": systems})
+    operator = compile_policy({"role": "operator", "system_ids": [GROUND]})
+    sources = {True: Source("operator", operator.incoming), False: Source("vehicle", vehicle.incoming)}
+    streams = {True: DeliveredStream(), False: DeliveredStream()}
+    refused: Counter[tuple[str, str]] = Counter()
+    first = flight[0][0]
+    for at_s, frame in flight:
+        is_ground = frame.header.system == GROUND
+        source = sources[is_ground]
+        refusal = source.gate.check(frame, max(0.0, at_s - first))
+        if refusal is not None:
+            refused[name_of(frame.header.msgid), refusal] += 1
+        elif streams[is_ground].admit(frame, source, at_s) != frame.raw:
+            refused[name_of(frame.header.msgid), "hidden_frame"] += 1
+    assert refused == LEFT_OUT.get(name, {})
+
+
+def test_random_telemetry_passes() -> None:
+    """A frame of random floats is refused by chance, less than once in a million."""
+    result = false_refusals(300_000, seed=1)
+    assert result.refused <= 1
+    assert result.frame_bytes >= 300_000
