@@ -16,7 +16,7 @@ from typing import Any
 
 from uavlinkd import __version__
 from uavlinkd.evaluation.commands import add_report_parser, add_timing_parser
-from uavlinkd.evaluation.tampering_commands import add_tampering_parser
+from uavlinkd.evaluation.tampering_commands import add_member_parser, add_tampering_parser
 from uavlinkd.fleet.commands import add_parser as add_fleet
 
 OK, FAILED, WRONG = 0, 1, 2
@@ -110,6 +110,7 @@ def _parser() -> argparse.ArgumentParser:
     evaluations = evaluate.add_subparsers(title="evaluations", metavar="WHAT", required=True)
     add_timing_parser(evaluations)
     add_tampering_parser(evaluations)
+    add_member_parser(evaluations)
     add_report_parser(evaluations)
     return parser
 

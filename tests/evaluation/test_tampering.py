@@ -99,7 +99,7 @@ async def test_quick_run(tmp_path: Path) -> None:
     ours, paper = run.of(OURS), run.of(PAPER)
     chosen = [plan for plan in ALL_PLANS if not plan.is_variant]
     assert {trial.attack for trial in ours} >= {plan.attack for plan in chosen}
-    assert len({trial.attack for trial in ours if trial.group == "keys"}) == 6
+    assert len({trial.attack for trial in ours if trial.group == "keys"}) == 7
     for trial in ours:
         assert trial.verdict is Verdict.DETECTED, trial
         assert trial.attempts > 0
@@ -131,6 +131,7 @@ async def test_quick_run(tmp_path: Path) -> None:
         ("block-rekey", "handshakes_unanswered"),
         ("sealed-cookies", "cookies_taken"),
         ("captured drone, as itself", "refused_foreign_system"),
+        ("captured member", "refused_hidden_frame"),
     ):
         assert by_name[name].reasons[reason] > 0
     (flood,) = run.floods

@@ -213,7 +213,7 @@ def attacks(
         signed_unknown(
             "no policy: SETUP_SIGNING",
             _ANYTHING,
-            GROUND,
+            GROUND - 1,
             lacking_operator,
             _ID["FILE_TRANSFER_PROTOCOL"],
             setup_signing(GROUND),

@@ -19,6 +19,7 @@ from typing import Any
 from uavlinkd.evaluation import tampering_plan as plans
 from uavlinkd.evaluation.flood import run_floods
 from uavlinkd.evaluation.machine import load, machine_facts
+from uavlinkd.evaluation.member_trial import as_trial, run_attacks
 from uavlinkd.evaluation.middle import MiddleHere, MiddleProcess
 from uavlinkd.evaluation.paper_attacks import CHANGES, AlterKeys
 from uavlinkd.evaluation.stage import DaemonStage, PaperStage, Stage
@@ -72,7 +73,7 @@ class Evaluation:
             recorder.run.facts = dict(facts)
             try:
                 async with asyncio.TaskGroup() as group:
-                    for lane in (self._handshakes, self._data, self._with_keys, self._paper):
+                    for lane in (self._handshakes, self._data, self._with_keys, self._captured_member, self._paper):
                         group.create_task(lane(recorder))
             except ExceptionGroup as failed:  # the first says it all: the others were ended because of it
                 raise failed.exceptions[0] from None
@@ -174,6 +175,13 @@ class Evaluation:
                 await bench.run(plan)
 
         await self._try("keys", stage, recorder, work)
+
+    async def _captured_member(self, recorder: Recorder) -> None:
+        begin_s, began = monotonic() - recorder.began_at, monotonic()
+        folder = self._folder / "member"
+        folder.mkdir()
+        results = await run_attacks(folder)
+        recorder.add(as_trial(results, begin_s, monotonic() - began, self.settings.seed))
 
     async def _paper(self, recorder: Recorder) -> None:
         settings = self.settings

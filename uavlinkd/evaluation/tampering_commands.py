@@ -44,6 +44,36 @@ def add_tampering_parser(commands: argparse._SubParsersAction[argparse.ArgumentP
     )
 
 
+def add_member_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """``captured-member``, to the subcommands of ``evaluate``."""
+    text = "try the attacks of a captured member on a real daemon: forbidden frames hidden in allowed ones"
+    parser = commands.add_parser("captured-member", help=text, description=text[0].upper() + text[1:] + ".")
+    parser.set_defaults(command=_captured_member)
+
+
+def _captured_member(options: argparse.Namespace) -> int:
+    import asyncio  # noqa: PLC0415  nothing heavy is imported before the command runs
+    import tempfile  # noqa: PLC0415
+
+    from uavlinkd.evaluation.member_trial import run_attacks  # noqa: PLC0415
+    from uavlinkd.evaluation.stage import StageError  # noqa: PLC0415
+    from uavlinkd.sim.drone_process import DroneError  # noqa: PLC0415
+
+    del options
+    try:
+        with tempfile.TemporaryDirectory(prefix="uavlinkd-") as folder:
+            results = asyncio.run(run_attacks(Path(folder)))
+    except (StageError, DroneError, OSError) as error:
+        return _fail(error)
+    for outcome in results.outcomes:
+        print(
+            f"{outcome.attack:58} {outcome.delivered} of {outcome.sent} frames delivered, {outcome.separators:3} "
+            f"separator bytes, forbidden frames {len(outcome.forbidden)}"
+        )
+    print("refused: " + ", ".join(f"{count} {reason}" for reason, count in sorted(results.refused.items())))
+    return FAILED if any(outcome.forbidden for outcome in results.outcomes) else OK
+
+
 def _tampering(options: argparse.Namespace) -> int:
     import asyncio  # noqa: PLC0415  nothing heavy is imported before the command runs
 

@@ -106,7 +106,9 @@ _ON_KEYS = [
     "The man in the middle proper holds no key. These attackers do: keys of their own, or stolen ones. Each runs the "
     "protocol's own code, so it makes no mistakes. Answers of a drone are responses to initiations; a session is "
     "what "
-    "would let the attacker speak. The captured drone has a session as itself, and says on it what only another may "
+    "would let the attacker speak. The captured member sends frames that its role allows and that hide forbidden "
+    "ones; a search at every offset of what the client was sent judges, by every CRC_EXTRA that the daemon knows. "
+    "The captured drone has a session as itself, and says on it what only another may "
     "say."
 ]
 _ON_NOTICED = [
@@ -132,6 +134,10 @@ _ON_PAPER = [
 _ELSEWHERE = [
     ["a clock set to 1970 or 2106, or that jumps", "tests/daemon/test_reboot.py, tests/faults, tests/network"],
     ["a network gone for 60 s between containers", "tests/compose"],
+    [
+        "a captured member's hidden frames against MAVLink's own parsers, 10,000,000 generated streams",
+        "tests/mavlink/parsers",
+    ],
     [
         "a peer's frames beyond its policy: other systems, commands, SETUP_SIGNING, MAVLink 1",
         "tests/mavlink, tests/daemon",
