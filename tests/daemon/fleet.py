@@ -119,10 +119,17 @@ def number_in(frame: bytes) -> int | None:
     return int.from_bytes(frame[10:14], "little") if is_one else None
 
 
+SEPARATOR = 2
+"""The first filler that `uavlinkd.mavlink.hidden` puts between frames."""
+
+
 def frames_in(data: bytes | bytearray) -> Iterator[bytes]:
-    """The frames in bytes that are whole frames, by their lengths alone."""
+    """The frames in bytes that are whole frames, by their lengths alone, and separator bytes before them."""
     at = 0
     while at < len(data):
+        if data[at] == SEPARATOR:
+            at += 1
+            continue
         assert data[at] in (0xFD, 0xFE), f"no frame starts at byte {at} of {bytes(data).hex(' ')}"
         size = data[at + 1] + (8 if data[at] == 0xFE else 25 if data[at + 2] else 12)
         yield bytes(data[at : at + size])

@@ -11,7 +11,8 @@ from uavlinkd.mavlink.dialect_table import MESSAGES, OTHER_EXTRAS
 from uavlinkd.mavlink.frames import Frame, SplitCounters, split_payload
 from uavlinkd.mavlink.policy import compile_policy
 
-ATTITUDE, PARAM_REQUEST_READ, SET_MODE, COMMAND_LONG, HEARTBEAT, SETUP_SIGNING = 30, 20, 11, 76, 0, 256
+ATTITUDE, PARAM_REQUEST_READ, SET_MODE, COMMAND_LONG, HEARTBEAT = 30, 20, 11, 76, 0
+HOME_POSITION, SETUP_SIGNING = 242, 256
 SIGNATURE = bytes(range(13))
 
 

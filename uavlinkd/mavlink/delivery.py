@@ -15,7 +15,8 @@ A frame is refused (:attr:`Refusal.HIDDEN_FRAME`) where it
 
 A frame that completes one to which *another* source contributed is delivered behind separator bytes, which end the
 hidden frame before it is complete. So a source cannot cause the refusal of another's frame. It cannot have a parser
-swallow another's urgent frame either: where another source's header is still open, separator bytes end it first.
+swallow another's urgent frame either: where the receiver may have rejected another source's frame, and resumed at a
+start byte in it, separator bytes end what it reads there.
 
 A hidden frame that every source of its bytes may send is harmless: the download of a recorded flight carries whole
 frames of the vehicle itself. Rates do not apply to hidden frames. Dialects that the daemon does not know are a limit:
@@ -25,12 +26,15 @@ a receiver with a private definition may accept what is no frame here, unless a 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import final
+from typing import Final, final
 
 from uavlinkd.mavlink import hidden
 from uavlinkd.mavlink.egress_kinds import Lane, kind_of
 from uavlinkd.mavlink.frames import MAVLINK1, MAX_FRAME_BYTES, Frame, Header
 from uavlinkd.mavlink.policy import Gate, Refusal
+
+LAST_COMMON_ID: Final = 149
+"""Receivers of any dialect but ``minimal`` have the messages up to this number, and reject none of them."""
 
 Report = Callable[[str, Header, Refusal, float], None]
 """Receives each refusal: the source's name, the header of the frame that was not delivered, why, and when."""
@@ -68,7 +72,7 @@ class DeliveredStream:
     Call :meth:`admit` once for each frame, in the order of delivery, and deliver all of what it returns.
     """
 
-    __slots__ = ("_authors", "_due_at", "_starts", "_tail", "outgoing", "separators")
+    __slots__ = ("_authors", "_due_at", "_has_mavlink2", "_has_rare", "_starts", "_tail", "outgoing", "separators")
 
     def __init__(self, outgoing: Gate | None = None) -> None:
         self.outgoing = outgoing
@@ -77,6 +81,7 @@ class DeliveredStream:
         """How often bytes had to be put between frames of different sources."""
         self._tail = b""  # the stream from the first start that is still open
         self._starts: list[hidden.Start] = []  # where in it frames may have begun that are not complete
+        self._has_mavlink2 = self._has_rare = False  # whether the tail has such frames: some receivers reject them
         self._due_at = 0  # the tail's length at which the first of them may be complete
         self._authors: list[tuple[int, Source | None]] = []  # up to where in it whose bytes go; None: a separator
 
@@ -96,7 +101,7 @@ class DeliveredStream:
     def _examine(self, frame: Frame, source: Source, now: float) -> bytes:
         raw = frame.raw
         gap: bytes | None = b""
-        if self._starts and not self._is_only(source) and _is_urgent(frame):
+        if self._starts and not self._is_only(source) and _is_urgent(frame) and self._may_be_rejected(frame):
             gap = self._gap() or b""
         while gap is not None:
             begun_at = len(self._tail) + len(gap)
@@ -133,11 +138,24 @@ class DeliveredStream:
                     starts.append(again)
             if not is_hidden_elsewhere:
                 self._keep(data, still_open, due_at, authors)
+                self._note(frame, is_alone=bool(gap))
                 self.separators += bool(gap)
                 return gap + raw
             gap = self._gap()
         source.refuse(frame, now)  # no separator was found: see hidden.separator
         return b""
+
+    def _may_be_rejected(self, frame: Frame) -> bool:
+        """Whether a receiver of this frame may have rejected one before it, in which a header is open."""
+        return self._has_rare or (self._has_mavlink2 and frame.header.is_mavlink1)
+
+    def _note(self, frame: Frame, *, is_alone: bool) -> None:
+        """Remember what kind of frame joined the tail."""
+        is_alone = is_alone or len(self._tail) <= len(frame.raw)
+        header = frame.header
+        is_rare = not header.is_known or header.msgid > LAST_COMMON_ID
+        self._has_rare = is_rare or (self._has_rare and not is_alone)
+        self._has_mavlink2 = not header.is_mavlink1 or (self._has_mavlink2 and not is_alone)
 
     def _gap(self) -> bytes | None:
         return hidden.separator(self._tail, self._starts)
