@@ -226,14 +226,18 @@ def quiet(**changes: Any) -> Link:
     return replace(PLAIN, timers=QUIET, **changes)
 
 
-_ONLY_COUNTED = frozenset(("drops", "_initiations", "_responses", "_entropy"))
+ONLY_COUNTED = frozenset(
+    ("drops", "_initiations", "_responses", "_read", "_known_read", "_cookie_replies", "_prefixes", "_known")
+) | {"_computed", "_entropy"}
+"""What a forgery may change."""
 _OPAQUE = (KeyPair, AeadKey, MacKey)
 
 
-def state_of(thing: Any, *, ignoring: frozenset[str] = _ONLY_COUNTED) -> Any:
+def state_of(thing: Any, *, ignoring: frozenset[str] = ONLY_COUNTED) -> Any:
     """All that an object remembers, comparable: what a forgery must leave as it was.
 
-    Left out are the counters of drops, the budgets that forgeries may spend and the generator.
+    Left out are the counters of drops, the budgets that forgeries may spend, the generator, and the secret of a
+    genuine ciphertext, which an altered copy of its response has computed early.
     """
     return _picture(thing, ignoring, {})
 

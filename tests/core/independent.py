@@ -155,6 +155,7 @@ class Session:
         kind, index, counter = struct.unpack(">BHH" if size == 5 else ">BHI", header)
         assert (kind == 0x41) == (counter >= 2**16)
         assert index == self.index
+        assert len(datagram) <= self.parameters.largest_envelope
         if self.parameters.confidential:
             return ChaCha20Poly1305(self.receive_key).decrypt(_aead_nonce(counter), body, header)
         payload, tag = body[: -self.parameters.tag_bytes], body[-self.parameters.tag_bytes :]

@@ -262,6 +262,19 @@ def test_nothing_is_sent_before_confirmation() -> None:
     assert pair.node.send(NAME, [FRAME], 1.0) == [Dropped(DropReason.NO_SESSION, NAME)]
 
 
+def test_no_envelope_is_longer_than_agreed() -> None:
+    """Section 11: one of the agreed length is read, one byte more is refused."""
+    pair = Pair()
+    linked = pair.link()
+    longest = linked.parameters.largest_envelope - len(linked.seal(b""))
+    assert pair.node.receive(linked.seal(FRAME.ljust(longest, b"\0")), HERE, 1.0)[-1] == Deliver(
+        NAME, FRAME.ljust(longest, b"\0")
+    )
+    assert pair.node.receive(linked.seal(FRAME.ljust(longest + 1, b"\0")), HERE, 1.0) == [
+        Dropped(DropReason.TOO_LONG, NAME, HERE)
+    ]
+
+
 def test_cookie_lets_an_initiation_through() -> None:
     """Under load the Node answers with a cookie, and then takes the initiation that proves to have it."""
     pair = Pair()

@@ -175,3 +175,28 @@ def test_private_parts_do_not_show(suite: Suite) -> None:
 
     assert seen
     assert not any(repr(value)[2:20] in shown or value.hex()[:16] in shown for value in seen)
+
+
+@pytest.mark.parametrize("suite", GROUPS)
+def test_one_ciphertext_is_computed_and_no_other(suite: Suite) -> None:
+    """The first ciphertext gives its secret as often as it comes; any other is refused before any work."""
+    group = group_of(suite)
+    key = kem.OneCiphertext(group.generate(seeded(1)))
+    ciphertext, secret = group.encapsulate(key.share, seeded(2))
+    other, _ = group.encapsulate(key.share, seeded(3))
+
+    assert [key.decapsulate(ciphertext), key.decapsulate(ciphertext)] == [secret, secret]
+    with pytest.raises(Drop) as caught:
+        key.decapsulate(other)
+    assert caught.value.reason is DropReason.GROUP_BUDGET_SPENT
+
+
+def test_a_value_outside_the_group_is_not_the_one_ciphertext() -> None:
+    """It costs no work, and the genuine ciphertext still counts."""
+    group = FfdheGroup(2048)
+    key = kem.OneCiphertext(group.generate(seeded(1)))
+    with pytest.raises(Drop):
+        key.decapsulate(bytes(256))
+    ciphertext, secret = group.encapsulate(key.share, seeded(2))
+
+    assert key.decapsulate(ciphertext) == secret

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from uavlinkd.core.limits import SourceLimiter, TokenBucket, source_of
+from uavlinkd.core.limits import SourceLimiter, TokenBucket, prefix_of, source_of
 
 
 def taken(bucket: TokenBucket, attempts: int, now: float) -> int:
@@ -46,6 +46,23 @@ def test_bucket_never_exceeds_burst_and_rate(steps: list[float], rate: float, bu
         now += step
         passed += bucket.take(now)
         assert passed <= burst + rate * now + 1e-6
+
+
+def test_bucket_gives_all_that_is_asked_or_nothing() -> None:
+    """Too few tokens stay where they are, for one that asks for less."""
+    bucket = TokenBucket(2.0, 5, 0.0)
+
+    assert not bucket.take(0.0, 5.5)
+    assert bucket.has(0.0, 5)
+    assert bucket.take(0.0, 4.5)
+    assert not bucket.has(0.0)
+    assert bucket.take(0.0, 0.5)
+
+
+def test_prefix_is_the_network_of_a_host() -> None:
+    """A /24 in IPv4, a /64 in IPv6."""
+    assert prefix_of("192.0.2.1") == prefix_of("192.0.2.254") != prefix_of("192.0.3.1")
+    assert prefix_of("2001:db8::1") == prefix_of("2001:db8::ffff:0:0:1") != prefix_of("2001:db8:0:1::1")
 
 
 def test_sources_have_their_own_buckets() -> None:

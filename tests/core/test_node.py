@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 from base64 import b64encode
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import pytest
@@ -173,6 +174,30 @@ def no_free_index(pair: Pair, now: float) -> list[Output]:
     return outputs
 
 
+def group_budget_spent(pair: Pair, now: float) -> list[Output]:
+    """An initiation with a group from somewhere new, after the peer's share is spent."""
+    peer, costly = pair.b.peer, SUITES_BY_NAME["ffdhe2048"]
+    while peer.group_share.anywhere.take(now):
+        pass
+    settings = peer.settings
+    peer.settings = replace(settings, link=replace(settings.link, suites=(costly, *settings.link.suites)))
+    outputs = pair.b.receive(made_initiation(link=Link(suites=(costly,))), now, ELSEWHERE)
+    peer.settings = settings
+    return outputs
+
+
+def over_share(pair: Pair, now: float) -> list[Output]:
+    """A genuine envelope that a busy shell does not hand over."""
+    return [pair.b.node.refuse(pair.a.envelope(now), AT_A)]
+
+
+def too_long(pair: Pair, now: float) -> list[Output]:
+    """An authentic envelope one byte longer than agreed."""
+    session = pair.a.session
+    padding = bytes(session.max_envelope + 1 - session.envelope_bytes(len(FRAME)))
+    return pair.b.receive(pair.a.envelope(now, FRAME + padding), now)
+
+
 def unexpected_cookie(pair: Pair, now: float) -> list[Output]:
     """A cookie for a session in use, which asked for none."""
     return pair.b.receive(wire.encode_cookie_reply(pair.b.session.local_index, bytes(16), bytes(32)), now)
@@ -292,11 +317,14 @@ PROVOKED: dict[DropReason, Callable[[Pair, float], list[Output]]] = {
     DropReason.SUITE_NOT_ACCEPTED: suite_not_accepted,
     DropReason.HEADER_MISMATCH: header_mismatch,
     DropReason.BAD_PARAMETERS: bad_parameters,
+    DropReason.GROUP_BUDGET_SPENT: group_budget_spent,
     DropReason.NO_FREE_INDEX: no_free_index,
     DropReason.UNEXPECTED_COOKIE: unexpected_cookie,
     DropReason.BAD_COOKIE: bad_cookie,
     DropReason.UNKNOWN_INDEX: unknown_index,
     DropReason.LATE: late,
+    DropReason.OVER_SHARE: over_share,
+    DropReason.TOO_LONG: too_long,
     DropReason.SESSION_EXPIRED: session_expired,
     DropReason.LONG_COUNTER: long_counter,
     DropReason.REPLAYED: replayed,
@@ -982,6 +1010,7 @@ def test_all_sources_together_have_a_bound(monkeypatch: pytest.MonkeyPatch, know
     node.set_addresses("alpha", [], 0.5)
     if known_by == "its configured address":
         pair.b.peer.path = None
+        node._note_places()
     monkeypatch.setattr(node._cookies, "has_valid_mac2", lambda *_: True)
     while node._initiations.take(1.0):
         pass

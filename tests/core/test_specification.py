@@ -89,6 +89,12 @@ def test_sizes_of_every_suite() -> None:
         assert sizes[3] <= sizes[2]
 
 
+def test_work_of_every_suite() -> None:
+    """The units of group work are those that the budget charges."""
+    table = {cells[0].strip("`"): cells[1] for cells in rows(section("Group work")) if cells[1].isdigit()}
+    assert table == {suite.name: str(suite.work) for suite in SUITES.values()}
+
+
 def test_messages_that_cross_an_mtu() -> None:
     """The table names each message over 1,280 bytes, with what it is over IPv6 and IPv4, and none else crosses."""
     table = {tuple(cells[0].split()): cells[1:] for cells in rows(section("5 Suites")) if len(cells) == 5}

@@ -17,6 +17,7 @@ from uavlinkd.core import constants as c
 from uavlinkd.core import handshake, noise, wire
 from uavlinkd.core.crypto import KeyPair
 from uavlinkd.core.drops import DropReason
+from uavlinkd.core.group_budget import GroupBudget, GroupShare
 from uavlinkd.core.limits import TokenBucket
 from uavlinkd.core.noise import HandshakeState, Token
 from uavlinkd.core.outputs import Dropped, Output, SessionEstablished, Transmit
@@ -105,10 +106,14 @@ def expected(payload: bytes, header: bytes) -> DropReason | None:
 
 def _refill(pair: Pair, now: float) -> None:
     """A budget that does not run out: what is behind it is looked for here."""
+    for pending in pair.a.peer.caller.pending.values():
+        pending.__post_init__()
     for node in (pair.a.node, pair.b.node):
+        node._group = GroupBudget(now)
         node._initiations = TokenBucket(c.INITIATIONS_PER_S, c.INITIATIONS_BURST, now)
         node._responses = TokenBucket(c.INITIATIONS_PER_S, c.INITIATIONS_BURST, now)
         for peer in node.peers.values():
+            peer.group_share = GroupShare(now)
             peer.answers = peer.answers_while_up = TokenBucket(c.ANSWERS_PER_S, c.ANSWERS_BURST, now)
 
 

@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Final
 
-from tests.core.harness import exchange, of, state_of
+from tests.core.harness import ONLY_COUNTED, exchange, of, state_of
 from tests.fuzz.engine import TALLY, Run, Script
 from tests.fuzz.stages import (
     LINKS,
@@ -41,7 +41,7 @@ CHECKS_THE_SEQUEL: Final = 0xF0
 """In a script's first byte, all of them: afterwards the genuine datagram comes, and the link must work."""
 BUDGET: Final = 8
 """Handshake messages of a script that reach a key exchange."""
-_SPENT = frozenset(("drops", "_initiations", "_responses", "_cookied", "_sources", "_entropy"))
+_SPENT = ONLY_COUNTED | {"_cookied", "_sources"}
 _SPENT_WITH_COOKIES = _SPENT | {"_taken_cookies", "has_cookie", "retry_at", "cookies_taken", "deadline", "_deadline"}
 _KINDS = (*range(1, 4), 0x40, 0x41, 0xFD, 0xFE, 0)
 _HANDSHAKE_SIZES = tuple(

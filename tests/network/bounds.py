@@ -16,6 +16,9 @@ LIMITS: dict[str, int] = {
     "confirmed sessions of a peer": c.USABLE_PER_PEER,
     "remembered initiations of a peer": c.REMEMBERED_INITIATIONS,
     "sources under load": c.SOURCES_TRACKED,
+    "networks that get cookies": c.SOURCES_TRACKED,
+    "sources of group work": c.SOURCES_TRACKED,
+    "known addresses with shares": c.SOURCES_TRACKED,
     "echoes asked on a session": c.ECHOES_REMEMBERED,
     "bytes held on a session": c.HELD_BYTES,
     "steps of the past of a session": int(c.LATE_AFTER_S / c.LATE_STEP_S) + 3,
@@ -36,6 +39,9 @@ def measure(node: Node) -> Sizes:
             "confirmed sessions of a peer": max((len(peer.sessions.confirmed) for peer in peers), default=0),
             "remembered initiations of a peer": max((len(peer.remembered) for peer in peers), default=0),
             "sources under load": len(node._sources._buckets),
+            "networks that get cookies": len(node._prefixes._buckets),
+            "sources of group work": len(node._group._sources._buckets),
+            "known addresses with shares": max(len(node._known._buckets), len(node._known_read._buckets)),
             "echoes asked on a session": max((len(session.doubt.asked) for session in sessions), default=0),
             "bytes held on a session": max((session.doubt._held_bytes for session in sessions), default=0),
             "steps of the past of a session": max((len(each._steps) for each in lately), default=0),
@@ -63,5 +69,6 @@ def check(node: Node) -> Sizes:
     assert len(node._remembered) == sum(len(peer.remembered) for peer in peers)
     assert len(node._by_keys) == len(node.peers)
     assert all(node.peers.get(peer.name) is peer for peer in node._by_address.values())
+    assert node._last_seen == {peer.path[1:] for peer in peers if peer.path is not None}
     assert len(node._by_address) <= sum(len(peer.caller.addresses) for peer in peers)
     return sizes

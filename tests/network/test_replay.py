@@ -140,7 +140,8 @@ def test_link_comes_up_amid_a_storm_that_uses_up_all_answers() -> None:
             for number, datagram in enumerate(old):
                 network.at(begin + number / 50, partial(network.inject, datagram, MISCHIEF, a.addresses[0]))
             network.run(3)
-            assert a.drops["cookie_required"] > 50
+            # Asked for a cookie, or, in more of them than one network is sent, not even that.
+            assert a.drops["cookie_required"] + a.drops["rate_limited"] > 50
             b.start(0.0)
             network.run_until(partial(share_a_session, a, b), within_s=3)
             network.run(2)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from uavlinkd.core import constants as c
@@ -11,6 +11,7 @@ from uavlinkd.core.cookie import MacKeys, mac1_of
 from uavlinkd.core.crypto import Entropy, KeyPair
 from uavlinkd.core.handshake import Initiated, Keys
 from uavlinkd.core.indices import Indices
+from uavlinkd.core.kem import OneCiphertext
 from uavlinkd.core.outputs import Path, Transmit
 from uavlinkd.core.settings import PeerSettings
 
@@ -30,6 +31,12 @@ class Pending:
     expires_at: float
     has_cookie: bool = False
     """Whether one came for it: a second is not taken."""
+    once: OneCiphertext | None = field(init=False, default=None)
+    """The secret for its suite's group, which a response may use; None without a group."""
+
+    def __post_init__(self) -> None:
+        if (key := self.initiated.state.e1) is not None:
+            self.once = OneCiphertext(key)
 
 
 class Caller:
@@ -97,7 +104,8 @@ class Caller:
         Raises:
             Drop: as :func:`handshake.receive_response`; then the genuine response can still come.
         """
-        keys = handshake.receive_response(pending.initiated, response)
+        state = replace(pending.initiated.state, e1=pending.once)
+        keys = handshake.receive_response(pending.initiated._replace(state=state), response)
         del self.pending[response.receiver_index]
         return keys
 

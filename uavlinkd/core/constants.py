@@ -103,6 +103,38 @@ COOKIED_PER_SOURCE_BURST = 10
 """So many at once, after a quiet while."""
 COOKIED_PER_S = 200
 """The same from all sources together: whoever owns many addresses still costs a bounded share of a core."""
+INITIATIONS_READ_PER_S = 2000
+"""Initiations a second of which mac1 is checked. What is beyond costs a third, so a flood leaves time for frames."""
+INITIATIONS_READ_BURST = 1000
+"""So many at once, after a quiet while."""
+INITIATIONS_READ_PER_KNOWN_PER_S = 50
+"""The same from each address where a peer is known to be: twelve times what an honest initiator sends."""
+INITIATIONS_READ_PER_KNOWN_BURST = 50
+"""So many at once, after a quiet while."""
+COOKIE_REPLIES_PER_PREFIX_PER_S = 10
+"""Cookie replies a second to one network: an IPv4 /24 or an IPv6 /64. A forger of addresses may choose any of its
+hosts, and one radio often leads to all of them. With IPv4 and UDP headers 6.4 kbit/s."""
+COOKIE_REPLIES_PER_PREFIX_BURST = 10
+"""So many at once, after a quiet while."""
+COOKIE_REPLIES_PER_S = 200
+"""The same to all networks together: 0.4 % of a desktop's core."""
+COOKIE_REPLIES_PER_KNOWN_PER_S = 20
+"""Cookie replies a second to an address where a peer is known to be; others cannot use them up. 13 kbit/s."""
+COOKIE_REPLIES_PER_KNOWN_BURST = 20
+"""So many at once, after a quiet while."""
+GROUP_WORK_PER_S = 40
+"""Encapsulations for all peers, in hundredths of one of ``ffdhe8192``: that takes 16 to 35 ms of a desktop's core and
+five times as long on a small computer. One in 2.5 s makes at most 5 % of the frames wait for more than 50 ms."""
+GROUP_WORK_BURST = 2000
+"""So much at once, after a quiet while: twenty peers that start together."""
+GROUP_WORK_PER_SOURCE_PER_S = 20
+"""The same for one source: half."""
+GROUP_WORK_PER_SOURCE_BURST = 1000
+"""So much at once, after a quiet while."""
+GROUP_WORK_PER_PEER_PER_S = 20
+"""The same for one peer, and once more for one that proves by a cookie that it is where it is known to be."""
+GROUP_WORK_PER_PEER_BURST = 200
+"""So much at once, after a quiet while: a handshake of the dearest suite and a repeat of it."""
 SOURCES_TRACKED = 1024
 """Sources whose rate is remembered under load; the longest silent one is forgotten first."""
 COOKIE_SECRET_LIFETIME_S = 120.0

@@ -73,8 +73,10 @@ class CookieJar:
 
     def has_valid_mac2(self, datagram: bytes, path: Path, now: float) -> bool:
         """Whether mac2 was made with a cookie that we gave to this source, at most four minutes ago."""
-        self._change_secret(now)
         covered, mac2 = datagram[: -c.MAC_BYTES], datagram[-c.MAC_BYTES :]
+        if mac2 == _NO_COOKIE:
+            return False
+        self._change_secret(now)
         # Both are computed always: which secret fits is nobody's business.
         fits = [
             equal(hmac_sha256(_cookie(secret, path), covered)[: c.MAC_BYTES], mac2)

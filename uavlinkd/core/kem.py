@@ -10,7 +10,7 @@ from functools import cache
 from typing import Protocol
 
 from uavlinkd.core import crypto
-from uavlinkd.core.crypto import Entropy, MlkemPrivateKey
+from uavlinkd.core.crypto import Entropy, MlkemPrivateKey, Secret
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.suites import Suite
 
@@ -35,6 +35,38 @@ class KemPrivateKey(Protocol):
         Raises:
             Drop: ``INVALID_KEY_SHARE``.
         """
+
+
+class OneCiphertext:
+    """An ephemeral secret that computes for one ciphertext only, the first that the responder sealed.
+
+    An honest responder answers an initiation once. Without this, one that holds the keys could answer it many times
+    and cause as much work each time. The same ciphertext in an altered copy of the response costs nothing again.
+    """
+
+    __slots__ = ("_computed", "_key")
+
+    def __init__(self, key: KemPrivateKey) -> None:
+        self._key = key
+        self._computed: tuple[bytes, Secret] | None = None
+
+    @property
+    def share(self) -> bytes:
+        """What goes to the responder."""
+        return self._key.share
+
+    def decapsulate(self, ciphertext: bytes) -> bytes:
+        """The shared secret.
+
+        Raises:
+            Drop: ``INVALID_KEY_SHARE``, or ``GROUP_BUDGET_SPENT`` for another ciphertext than the first.
+        """
+        if self._computed is None:
+            self._computed = ciphertext, Secret(self._key.decapsulate(ciphertext))
+        first, secret = self._computed
+        if ciphertext != first:
+            raise Drop(DropReason.GROUP_BUDGET_SPENT)
+        return secret.reveal()
 
 
 class Kem(Protocol):

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from base64 import b64encode
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Hashable, Iterable, Sequence
+from typing import NoReturn
 
 from uavlinkd.core import constants as c
 from uavlinkd.core import handshake, wire
@@ -18,13 +19,16 @@ from uavlinkd.core.constants import NEVER
 from uavlinkd.core.cookie import CookieJar, MacKeys
 from uavlinkd.core.crypto import Entropy, KeyPair, Secret
 from uavlinkd.core.drops import Drop, DropReason
+from uavlinkd.core.group_budget import GroupBudget
 from uavlinkd.core.indices import Indices
-from uavlinkd.core.limits import SourceLimiter, TokenBucket, source_of
+from uavlinkd.core.limits import SourceLimiter, TokenBucket, prefix_of, source_of
 from uavlinkd.core.outputs import Dropped, Output, Path, Transmit
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.session import Session
 from uavlinkd.core.settings import PeerSettings
+from uavlinkd.core.suites import Suite
 
+_ENVELOPE_STARTS = frozenset((bytes((wire.SHORT_ENVELOPE,)), bytes((wire.LONG_ENVELOPE,))))
 _MAVLINK_STARTS = frozenset((0xFD, 0xFE))
 
 
@@ -55,6 +59,19 @@ class Node:
         self._responses = TokenBucket(c.INITIATIONS_PER_S, c.INITIATIONS_BURST, now)
         self._cookied = TokenBucket(c.COOKIED_PER_S, c.COOKIED_PER_S, now)
         self._sources = SourceLimiter(c.COOKIED_PER_SOURCE_PER_S, c.COOKIED_PER_SOURCE_BURST, c.SOURCES_TRACKED)
+        self._read = TokenBucket(c.INITIATIONS_READ_PER_S, c.INITIATIONS_READ_BURST, now)
+        self._known_read = SourceLimiter(
+            c.INITIATIONS_READ_PER_KNOWN_PER_S, c.INITIATIONS_READ_PER_KNOWN_BURST, c.SOURCES_TRACKED
+        )
+        self._cookie_replies = TokenBucket(c.COOKIE_REPLIES_PER_S, c.COOKIE_REPLIES_PER_S, now)
+        self._prefixes = SourceLimiter(
+            c.COOKIE_REPLIES_PER_PREFIX_PER_S, c.COOKIE_REPLIES_PER_PREFIX_BURST, c.SOURCES_TRACKED
+        )
+        self._known = SourceLimiter(
+            c.COOKIE_REPLIES_PER_KNOWN_PER_S, c.COOKIE_REPLIES_PER_KNOWN_BURST, c.SOURCES_TRACKED
+        )
+        self._group = GroupBudget(now)
+        self._last_seen: set[tuple[str, int]] = set()  # where peers are, as far as they proved
         self._deadline = NEVER
         self.peers: dict[str, Peer] = {}
         """By name."""
@@ -103,6 +120,7 @@ class Node:
         self._by_keys = {keys: each for keys, each in self._by_keys.items() if each is not peer}
         self._by_address = {at: each for at, each in self._by_address.items() if each is not peer}
         self._remembered.difference_update(peer.remembered)
+        self._note_places()
         peer.close(now, out)
         return out
 
@@ -132,9 +150,7 @@ class Node:
         try:
             self._receive(datagram, path, now, out)
         except Drop as drop:  # the one place where a datagram is dropped
-            peer = self.peers.get(drop.peer) or self._claimed_peer(datagram)
-            (peer.traffic.drops if peer else self.drops)[drop.reason] += 1
-            out.append(Dropped(drop.reason, peer.name if peer else None, path, 1, drop.detail))
+            out.append(self._count(datagram, drop, path))
         return out
 
     def take_held(self) -> list[Output]:
@@ -146,6 +162,27 @@ class Node:
         for peer in self.peers.values():
             peer.take_held(out)
         return out
+
+    def _count(self, datagram: bytes, drop: Drop, path: Path) -> Dropped:
+        peer = self.peers.get(drop.peer) or self._claimed_peer(datagram)
+        (peer.traffic.drops if peer else self.drops)[drop.reason] += 1
+        return Dropped(drop.reason, peer.name if peer else None, path, 1, drop.detail)
+
+    def sender_of(self, datagram: bytes, path: Path) -> Hashable:
+        """Whose datagram it claims to be. A busy shell lets senders take turns; nothing is authenticated yet.
+
+        Of each peer the datagrams from where it is, and those from elsewhere, are two senders: a forger of its
+        envelopes has to forge its address too. So is each address where a peer is known to be, for handshakes. All
+        others are one.
+        """
+        if datagram[:1] in _ENVELOPE_STARTS and (peer := self._claimed_peer(datagram)) is not None:
+            return peer.name, path == peer.path
+        address = path[1:]
+        return address if self._is_known(address) else None
+
+    def refuse(self, datagram: bytes, path: Path) -> Dropped:
+        """Count a datagram that a busy shell does not hand over: its sender has more waiting than its share."""
+        return self._count(datagram, Drop(DropReason.OVER_SHARE), path)
 
     def handle_timeout(self, now: float) -> list[Output]:
         """Do what is due. Call it at :meth:`next_deadline`, or at any time."""
@@ -194,10 +231,13 @@ class Node:
             self._hint(path, now, out)
             raise Drop(DropReason.UNKNOWN_INDEX)
         peer = session.peer
+        before = peer.path
         try:
             peer.receive_envelope(session, datagram, header_bytes, counter, path, now, out)
         finally:
             self._deadline = min(self._deadline, peer.deadline)
+            if peer.path is not before:
+                self._note_places()
 
     def _hint(self, path: Path, now: float, out: list[Output]) -> None:
         _, host, port = path
@@ -208,6 +248,10 @@ class Node:
 
     def _receive_initiation(self, datagram: bytes, path: Path, now: float, out: list[Output]) -> None:
         initiation = wire.parse_initiation(datagram)
+        address = path[1:]
+        # Where a peer is known to be, a flood from elsewhere does not count.
+        if not (self._is_known(address) and self._known_read.take(address, now)) and not self._read.take(now):
+            raise Drop(DropReason.RATE_LIMITED)
         identity, cookies = self._addressed(datagram)
         index = initiation.sender_index
         if initiation.ephemeral in self._remembered:  # before the budget: one recording must not use it up
@@ -236,9 +280,13 @@ class Node:
     ) -> None:
         # Recorded initiations of this peer can be replayed from anywhere: they may use up the answers to everybody,
         # not those to the one who proves its address.
-        index = received.initiation.sender_index
+        index, suite = received.initiation.sender_index, received.initiation.suite
         answers = peer.answers_while_up if peer.is_up else peer.answers
         self._admit(answers, peer.cookied_answers, cookies, datagram, index, path, now, out)
+        if suite not in peer.settings.link.suites:
+            raise Drop(DropReason.SUITE_NOT_ACCEPTED, f"suite {suite.name}")
+        if suite.has_group:
+            self._admit_group(peer, suite, cookies, datagram, index, path, now, out)
         peer.answer(received, path, now, out)
         self._deadline = min(self._deadline, peer.deadline)
 
@@ -250,6 +298,7 @@ class Node:
         _, cookies = self._addressed(datagram)
         self._admit(self._responses, self._cookied, cookies, datagram, response.sender_index, path, now, out)
         pending.peer.receive_response(pending, response, now, out)
+        self._note_places()
         self._deadline = min(self._deadline, pending.peer.deadline)
 
     def _receive_cookie(self, datagram: bytes, now: float) -> None:
@@ -300,8 +349,7 @@ class Node:
         if budget.take(now):
             return
         if not cookies.has_valid_mac2(datagram, path, now):
-            out.append(Transmit(cookies.reply(datagram, sender_index, path, now), path))
-            raise Drop(DropReason.COOKIE_REQUIRED)
+            self._require_cookie(cookies, datagram, sender_index, path, now, out)
         # Who proved an address of a peer does not queue with strangers: neither with those of its host or network,
         # such as others behind one router, nor with those of many addresses, for whom the ceiling is.
         _, host, port = path
@@ -311,11 +359,58 @@ class Node:
         if not is_known and not ceiling.take(now):
             raise Drop(DropReason.RATE_LIMITED)
 
+    def _require_cookie(
+        self, cookies: CookieJar, datagram: bytes, sender_index: int, path: Path, now: float, out: list[Output]
+    ) -> NoReturn:
+        """Refuse a message without a cookie, and send one back unless too many were sent there.
+
+        Raises:
+            Drop: ``COOKIE_REQUIRED``, or ``RATE_LIMITED`` without a reply.
+        """
+        _, host, port = path
+        is_due = self._is_known((host, port)) and self._known.take((host, port), now)
+        # The total is looked at first: a flood from many prefixes then costs no more than this.
+        if not is_due and self._cookie_replies.has(now):
+            is_due = self._prefixes.take(prefix_of(host), now) and self._cookie_replies.take(now)
+        if not is_due:
+            raise Drop(DropReason.RATE_LIMITED)
+        out.append(Transmit(cookies.reply(datagram, sender_index, path, now), path))
+        raise Drop(DropReason.COOKIE_REQUIRED)
+
+    def _admit_group(
+        self,
+        peer: Peer,
+        suite: Suite,
+        cookies: CookieJar,
+        datagram: bytes,
+        sender_index: int,
+        path: Path,
+        now: float,
+        out: list[Output],
+    ) -> None:
+        """Whether an authentic initiation may cost the arithmetic of its group.
+
+        Raises:
+            Drop: ``GROUP_BUDGET_SPENT``; ``COOKIE_REQUIRED`` or ``RATE_LIMITED`` where a cookie would help.
+        """
+        # An attacker can send a recorded initiation under the peer's own address: only a cookie proves an address.
+        is_there = path in peer.caller.candidates(peer.path)
+        is_proven = is_there and cookies.has_valid_mac2(datagram, path, now)
+        if is_proven and peer.group_share.proven.take(now, suite.work):
+            return
+        if self._group.take(peer.group_share, source_of(path[1]), suite.work, now):
+            return
+        if is_there and not is_proven:
+            self._require_cookie(cookies, datagram, sender_index, path, now, out)
+        raise Drop(DropReason.GROUP_BUDGET_SPENT)
+
     def _is_known(self, address: tuple[str, int]) -> bool:
         """Whether a peer is said to be there, or was heard there last."""
-        return address in self._by_address or any(
-            peer.path is not None and peer.path[1:] == address for peer in self.peers.values()
-        )
+        return address in self._by_address or address in self._last_seen
+
+    def _note_places(self) -> None:
+        """A peer may be elsewhere than before."""
+        self._last_seen = {peer.path[1:] for peer in self.peers.values() if peer.path is not None}
 
     def _remember(self, peer: Peer, ephemeral: bytes) -> None:
         # A memory for each peer: none can make us forget what another sent.

@@ -12,6 +12,7 @@ from uavlinkd.core.constants import NEVER
 from uavlinkd.core.cookie import mac1_of
 from uavlinkd.core.crypto import Entropy, KeyPair
 from uavlinkd.core.drops import Drop, DropReason
+from uavlinkd.core.group_budget import GroupShare
 from uavlinkd.core.handshake import Received
 from uavlinkd.core.indices import Indices
 from uavlinkd.core.limits import TokenBucket
@@ -53,6 +54,8 @@ class Peer:
         self.answers_while_up = TokenBucket(c.ANSWERS_WHILE_UP_PER_S, c.ANSWERS_BURST, now)
         self.cookied_answers = TokenBucket(c.COOKIED_ANSWERS_PER_S, c.COOKIED_ANSWERS_PER_S, now)
         """And with one, to all addresses together."""
+        self.group_share = GroupShare(now)
+        """Of the CPU time for the groups of its suites."""
         self.remembered: deque[bytes] = deque()
         """Ephemerals of its initiations, the oldest first."""
         self.path: Path | None = None
@@ -345,11 +348,9 @@ class Peer:
         """Answer an authentic initiation. The session waits, beside what is there, until it is confirmed.
 
         Raises:
-            Drop: ``SUITE_NOT_ACCEPTED``, ``NO_FREE_INDEX`` or ``INVALID_KEY_SHARE``.
+            Drop: ``NO_FREE_INDEX`` or ``INVALID_KEY_SHARE``.
         """
         suite = received.initiation.suite
-        if suite not in self.settings.link.suites:
-            raise Drop(DropReason.SUITE_NOT_ACCEPTED, f"suite {suite.name}")
         index = self._indices.pick(now)
         message, keys = handshake.respond(received, self.settings, index, self.sessions.generation, self._entropy)
         datagram = self.caller.add_macs(message, path, now)

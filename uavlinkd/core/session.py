@@ -105,6 +105,7 @@ class Session:
         "heard_first_at",
         "is_initiator",
         "local_index",
+        "max_envelope",
         "parameters",
         "payload_limit",
         "peer",
@@ -150,6 +151,7 @@ class Session:
         self._floor = -1  # the peer said that this counter, and those below, are of the past
         self._heard_lately = Lately(now)
         self._sent_lately = Lately(now)
+        self.max_envelope = keys.parameters.max_envelope
         self.payload_limit = keys.parameters.max_envelope - wire.LONG_HEADER_BYTES - first.tag_bytes
         """Longest payload that fits into an envelope to the peer."""
 
@@ -206,8 +208,10 @@ class Session:
         """The payload of an envelope whose header says it is for this session.
 
         Raises:
-            Drop: ``SESSION_EXPIRED``, ``TOO_OLD``, ``REPLAYED``, ``DELAYED`` or ``BAD_TAG``.
+            Drop: ``TOO_LONG``, ``SESSION_EXPIRED``, ``TOO_OLD``, ``REPLAYED``, ``DELAYED`` or ``BAD_TAG``.
         """
+        if len(datagram) > self.max_envelope:
+            raise Drop(DropReason.TOO_LONG)
         if now >= self.reject_at:
             raise Drop(DropReason.SESSION_EXPIRED)
         window = self.window
