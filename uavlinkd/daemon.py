@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
+from collections.abc import Iterator
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
@@ -25,7 +26,7 @@ from uavlinkd.control import ControlServer
 from uavlinkd.core import outputs as o
 from uavlinkd.core.constants import NEVER
 from uavlinkd.core.node import Node
-from uavlinkd.core.outputs import Output
+from uavlinkd.core.outputs import Output, Path
 from uavlinkd.endpoints.opening import open_first, open_new
 from uavlinkd.endpoints.ports import Endpoint, LocalPort
 from uavlinkd.event_log import EventLog
@@ -43,6 +44,7 @@ from uavlinkd.sdnotify import Supervisor
 from uavlinkd.stall import StallWatch
 from uavlinkd.status import daemon_status
 from uavlinkd.switch import Switch
+from uavlinkd.turns import TURN_FRAMES, TURN_S, Turns
 
 if TYPE_CHECKING:
     from uavlinkd.metrics_server import MetricsServer
@@ -82,6 +84,8 @@ class Daemon:
         self._radio_status: dict[str, RadioStatusSource] = {}
         self._own = Source(config.name, compile_policy({}).incoming)  # of the frames that this daemon makes itself
         self._deliveries: dict[str, list[Frame]] = {}
+        self._turns = Turns()
+        self._frames_in_turn = 0
         self._timer: asyncio.TimerHandle | None = None
         self._timer_at = NEVER
         self._housekeeping_at = now + HOUSEKEEPING_S
@@ -157,6 +161,7 @@ class Daemon:
         self.supervisor.stopping()
         if self._timer is not None:
             self._timer.cancel()
+        self._turns = Turns()
         self._perform(self.node.close(monotonic()))
         self._close_sockets()
         if self._control is not None:
@@ -323,10 +328,50 @@ class Daemon:
     # What the peers send.
 
     def _on_arrived(self, arrived: Arrived, now: float, epoch: int) -> None:
-        # Stale datagrams are opened too: their counters must be used up, or an attacker could replay them as new.
-        receive = self.node.receive
+        if self._turns:
+            self._have_wait(arrived, epoch)
+            return
+        if len(arrived) == 1:  # a turn of one needs no clock
+            self._perform(self.node.receive(*arrived[0], now))
+            self._deliver(now, epoch)
+        else:
+            arriving = iter(arrived)
+            self._take_turn(arriving, now, epoch)
+            if rest := list(arriving):
+                self._have_wait(rest, epoch)
+                self._loop.call_soon(self._take_turns)
+        if self._can_wait or self.node.next_deadline() < self._timer_at:
+            self._arm()
+
+    def _have_wait(self, arrived: Arrived, epoch: int) -> None:
+        sender_of = self.node.sender_of
         for datagram, path in arrived:
+            for each in self._turns.put(sender_of(datagram, path), datagram, path, epoch):
+                self._perform([self.node.refuse(*each)])
+
+    def _take_turns(self) -> None:
+        """Let each sender have one turn; then the sockets, the timer and the control socket have theirs."""
+        self.stall.turn(monotonic())
+        try:
+            for turn, epoch in self._turns.round():
+                self._take_turn(turn, monotonic(), epoch)
+        finally:
+            if self._turns:
+                self._loop.call_soon(self._take_turns)
+            if self._can_wait or self.node.next_deadline() < self._timer_at:
+                self._arm()
+
+    def _take_turn(self, arriving: Iterator[tuple[bytes, Path]], now: float, epoch: int) -> None:
+        """Receive until there is no more, or the turn is over; deliver the frames."""
+        # Stale datagrams are opened too: their counters must be used up, or an attacker could replay them as new.
+        receive, self._frames_in_turn, ends_at = self.node.receive, 0, now + TURN_S
+        for datagram, path in arriving:
             self._perform(receive(datagram, path, now))
+            if self._frames_in_turn >= TURN_FRAMES or monotonic() >= ends_at:
+                break
+        self._deliver(now, epoch)
+
+    def _deliver(self, now: float, epoch: int) -> None:
         if epoch != self.stall.epoch:
             self._perform(self.node.take_held())  # stale as well, even if the peer calls them new later
         deliveries, self._deliveries = self._deliveries, {}
@@ -334,8 +379,6 @@ class Daemon:
             if self.recorder is not None:
                 self.recorder.add(name, [frame.raw for frame in frames], FROM_PEER, now)
             self._forward(self.links[name], frames, now, epoch)
-        if self._can_wait or self.node.next_deadline() < self._timer_at:
-            self._arm()
 
     def _forward(
         self, source: PeerLink | LocalPort, frames: list[Frame], now: float, epoch: int, waited_s: float = 0.0
@@ -356,6 +399,7 @@ class Daemon:
             elif isinstance(output, o.Deliver):
                 name = link_name(output.peer)
                 frames = split_payload(output.payload, self.links[name].counters)
+                self._frames_in_turn += len(frames)
                 if name in self._deliveries:
                     self._deliveries[name] += frames
                 else:
