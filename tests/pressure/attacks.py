@@ -1,0 +1,179 @@
+"""The attackers: each is a process of its own, that sends datagrams to one daemon until its standard input ends.
+
+``python -m tests.pressure.attacks NAME`` reads a :class:`Target` as JSON from the first line of its standard input.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import socket
+import sys
+from base64 import b64decode
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from time import monotonic
+from unittest.mock import patch
+
+from uavlinkd.core import constants as c
+from uavlinkd.core import handshake, wire
+from uavlinkd.core.cookie import MacKeys, mac1_of
+from uavlinkd.core.crypto import KeyPair, Secret
+from uavlinkd.core.drops import Drop
+from uavlinkd.core.kem import FfdheGroup
+from uavlinkd.core.node import Node
+from uavlinkd.core.outputs import Transmit
+from uavlinkd.core.session import Session
+from uavlinkd.core.settings import Link, PeerSettings
+from uavlinkd.core.suites import SUITES_BY_NAME, X25519
+
+HOSTS = tuple(f"127.0.0.{number}" for number in range(2, 6))
+SPOOFED_SOCKETS = 500
+FRAME_BYTES = 8
+_TICK_S = 0.002
+
+
+@dataclass(frozen=True)
+class Target:
+    """Where the daemon is, what the attacker holds, and how fast it sends."""
+
+    port: int
+    public_key: str
+    captured_key: str
+    """Private key of the captured peer."""
+    psk: str
+    per_s: float
+    suite: str = "x25519"
+    envelope_bytes: int = c.DEFAULT_ENVELOPE_LIMIT
+
+    def to_json(self) -> str:
+        """One line."""
+        return json.dumps(asdict(self))
+
+    @property
+    def address(self) -> tuple[str, int]:
+        """Of the daemon."""
+        return "127.0.0.1", self.port
+
+    def settings(self) -> PeerSettings:
+        """The daemon as the captured peer knows it."""
+        link = Link(suites=(SUITES_BY_NAME[self.suite],))
+        return PeerSettings("victim", b64decode(self.public_key), Secret(b64decode(self.psk)), link)
+
+
+def _ticks(per_s: float) -> Iterator[int]:
+    """How many datagrams are due, each time that some are; until standard input ends."""
+    began, sent = monotonic(), 0
+    while not select.select([sys.stdin], [], [], _TICK_S)[0]:
+        due = int((monotonic() - began) * per_s) - sent
+        sent += due
+        if due:
+            yield due
+
+
+def _socket(host: str) -> socket.socket:
+    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    sock.bind((host, 0))
+    sock.setblocking(False)
+    return sock
+
+
+def initiations(target: Target) -> None:
+    """Sound initiations of the captured peer, all different, from four hosts that answer with their cookies.
+
+    The daemon cannot tell them from recorded ones that it reads for the first time.
+    """
+    socks = [_socket(host) for host in HOSTS]
+    cookies: dict[socket.socket, bytes] = {}
+    macs = MacKeys(b64decode(target.public_key))
+    captured, settings = KeyPair(b64decode(target.captured_key)), target.settings()
+    sent: dict[tuple[socket.socket, int], bytes] = {}
+    number = 0
+    share = FfdheGroup(int(target.suite.removeprefix("ffdhe"))).generate(os.urandom)
+    with patch.object(FfdheGroup, "generate", lambda *_: share):  # the attacker does not pay for what it never uses
+        for due in _ticks(target.per_s):
+            for _ in range(due):
+                number += 1
+                sock, index = socks[number % len(socks)], 1 + number % 65535
+                message = handshake.initiate(captured, settings, index, 0, os.urandom).message
+                datagram = macs.add_macs(message, cookies.get(sock))
+                sent[sock, index] = mac1_of(datagram)
+                _send(sock, datagram, target)
+            for sock in socks:
+                for answer in _received(sock):
+                    with suppress(Drop, KeyError):
+                        reply = wire.parse_cookie_reply(answer)
+                        cookies[sock] = macs.open_cookie(reply, sent[sock, reply.receiver_index])
+
+
+def spoofed(target: Target) -> None:
+    """Initiations with a valid mac1 from many prefixes, which no cookie reply reaches."""
+    socks = [_socket(f"127.{1 + number // 250}.{number % 250}.9") for number in range(SPOOFED_SOCKETS)]
+    macs = MacKeys(b64decode(target.public_key))
+    size = wire.initiation_bytes(X25519) - wire.MACS_BYTES
+    datagrams = []
+    for number in range(20_000):
+        header = wire.initiation_header(X25519, 1 + number % 65535)
+        datagrams.append(macs.add_macs(header + os.urandom(size - len(header)), None))
+    number = 0
+    for due in _ticks(target.per_s):
+        for _ in range(due):
+            number += 1
+            _send(socks[number % len(socks)], datagrams[number % len(datagrams)], target)
+
+
+def envelopes(target: Target) -> None:
+    """Genuine envelopes of ``envelope_bytes`` bytes, whatever was agreed, filled with the shortest frames."""
+    sock = _socket("127.0.0.1")
+    node = Node(Secret(b64decode(target.captured_key)), os.urandom, monotonic())
+    node.add_peer(target.settings(), monotonic())
+    node.set_addresses("victim", [(0, *target.address)], monotonic())
+    filling = _shortest_frames(target.envelope_bytes)
+    for due in _ticks(target.per_s):
+        outputs = node.handle_timeout(monotonic()) if monotonic() >= node.next_deadline() else []
+        for answer in _received(sock):
+            outputs += node.receive(answer, (0, *target.address), monotonic())
+        for output in outputs:
+            if isinstance(output, Transmit):
+                _send(sock, output.datagram, target)
+        session = node.peers["victim"].sessions.current
+        if session is not None:
+            for _ in range(due):
+                _send(sock, _fill(session, filling, target.envelope_bytes), target)
+
+
+def _fill(session: Session, filling: bytes, size: int) -> bytes:
+    room = size - session.envelope_bytes(0)
+    return session.seal(filling[: room - room % FRAME_BYTES], monotonic())
+
+
+def _shortest_frames(size: int) -> bytes:
+    """MAVLink 1 frames without a payload, one for each sequence number: 8 bytes each."""
+    from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+    frames = []
+    for seq in range(size // FRAME_BYTES):
+        head = bytes((0xFE, 0, seq % 256, 2, 1, seq // 256))
+        crc = mavlink.x25crc(head[1:])
+        crc.accumulate(bytes((50,)))
+        frames.append(head + int(crc.crc).to_bytes(2, "little"))
+    return b"".join(frames)
+
+
+def _send(sock: socket.socket, datagram: bytes, target: Target) -> None:
+    with suppress(OSError):  # no room: as if the network had lost it
+        sock.sendto(datagram, target.address)
+
+
+def _received(sock: socket.socket) -> Iterator[bytes]:
+    with suppress(OSError):
+        while True:
+            yield sock.recv(65536)
+
+
+ATTACKS = {each.__name__: each for each in (initiations, spoofed, envelopes)}
+
+if __name__ == "__main__":
+    ATTACKS[sys.argv[1]](Target(**json.loads(sys.stdin.readline())))

@@ -1,0 +1,43 @@
+"""``python -m tests.pressure``: attacks real daemons on loopback and prints what their other peers notice."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+from collections.abc import Sequence
+from contextlib import nullcontext
+
+from tests.daemon.harness import Stage
+from tests.limited_cpu import limited_cpu
+from tests.pressure.scene import HEADER, Plan, Seen, watch
+
+PLANS = {
+    each.name: each
+    for each in (
+        Plan("insider initiations", "initiations", 80, suite="ffdhe8192", with_latecomer=True),
+        Plan("spoofed initiations", "spoofed", 10_000, with_latecomer=True),
+        Plan("64 kB envelopes", "envelopes", 40, envelope_bytes=64_000),
+        Plan("agreed envelopes", "envelopes", 2_000),
+    )
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the attacks that were named, or all of them."""
+    parser = argparse.ArgumentParser(prog="python -m tests.pressure", description=__doc__)
+    parser.add_argument("plans", nargs="*", metavar="PLAN", help=f"of: {', '.join(PLANS)}")
+    parser.add_argument("--seconds", type=float, default=4.0, help="of frames both ways during each attack")
+    parser.add_argument("--share", type=float, help="the part of one core that the daemon gets")
+    options = parser.parse_args(arguments)
+    if unknown := set(options.plans) - set(PLANS):
+        parser.error(f"no such plan: {', '.join(unknown)}")
+    print(HEADER)
+    for name in options.plans or PLANS:
+        print(asyncio.run(_run(PLANS[name], options.seconds, options.share)).line(), flush=True)
+    return 0
+
+
+async def _run(plan: Plan, seconds: float, share: float | None) -> Seen:
+    with nullcontext() if share is None else limited_cpu(share) as limit:
+        async with Stage() as stage:
+            return await watch(stage, plan, seconds, () if limit is None else limit.launcher)
