@@ -30,6 +30,8 @@ KEY_C = KeyPair(bytes([3]) * 32)
 AT_A: Path = (0, "192.0.2.1", 14600)
 AT_B: Path = (0, "192.0.2.2", 14600)
 ELSEWHERE: Path = (0, "198.51.100.9", 4000)
+UNUSED_INDEX = 0xFFFF
+"""An index that no session of these tests draws."""
 
 FRAME = bytes((0xFD, 9, 0, 0, 1, 1, 1, 0, 0, 0)) + bytes(9) + b"\x12\x34"
 QUIET = Timers(keepalive_s=1e6, echo_after_s=1e6, handshake_after_s=1e6, lost_after_s=1e6, probe_interval_s=0.0)

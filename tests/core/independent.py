@@ -228,6 +228,7 @@ class Initiator:
         """Message 2."""
         kind, suite, remote_index, index = struct.unpack(">BBHH", response[:6])
         assert (kind, suite, index) == (2, self.suite, self.index)
+        assert remote_index != 0
         own_public = self.static.public_key().public_bytes_raw()
         assert response[-32:-16] == _hmac(_sha256(VERSION + b" mac1" + own_public), response[:-32])[:16]
         noise, body = self.noise, response[6:-32]

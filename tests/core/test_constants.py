@@ -12,7 +12,7 @@ def test_rekeying_leaves_time_and_room_for_retries_before_the_keys_end() -> None
 
     assert c.REKEY_AFTER_S < responder_at < c.REJECT_AFTER_S
     assert c.REJECT_AFTER_S - responder_at > 20 * c.RETRY_MAX_S * (1 + c.RETRY_JITTER)
-    assert c.REKEY_AFTER_ENVELOPES <= c.SESSION_ENVELOPE_LIMIT // 2
+    assert 2 * c.REKEY_AFTER_ENVELOPES <= c.SESSION_ENVELOPE_LIMIT + 1
 
 
 def test_a_link_that_comes_back_is_called_within_two_seconds() -> None:
@@ -37,9 +37,9 @@ def test_the_smallest_envelope_holds_the_largest_frame() -> None:
     assert c.MIN_ENVELOPE_LIMIT <= c.DEFAULT_ENVELOPE_LIMIT <= c.MAX_ENVELOPE_LIMIT <= 65507
 
 
-def test_the_counter_fits_into_its_long_form() -> None:
-    """The last counter of a session is the largest that four bytes hold: it never wraps."""
-    assert c.SESSION_ENVELOPE_LIMIT == 2**32
+def test_every_count_of_envelopes_fits_into_four_bytes() -> None:
+    """The counter after the last one, and the count of all envelopes, fit the fields of an echo."""
+    assert c.SESSION_ENVELOPE_LIMIT == 2**32 - 1
     assert c.SHORT_COUNTER_LIMIT == 2**16
 
 

@@ -205,6 +205,23 @@ def test_wrong_mac1_is_not_answered() -> None:
     assert pair.node.receive(initiation, HERE, 1.0) == dropped(DropReason.BAD_MAC1, peer=None)
 
 
+def test_index_zero_gets_no_answer() -> None:
+    """Section 6: a sound initiation with sender index 0 is dropped before any key exchange."""
+    pair = Pair()
+    initiator = pair.initiator()
+    initiator.index = 0
+    assert pair.node.receive(initiator.initiation(), HERE, 1.0) == dropped(DropReason.MALFORMED, peer=None)
+
+
+def test_counter_beyond_the_limit_is_not_opened() -> None:
+    """Section 11: the last counter is 2^32 - 2; an authentic envelope under 2^32 - 1 is dropped."""
+    pair = Pair()
+    linked = pair.link()
+    linked.counter = 2**32 - 2
+    assert pair.node.receive(linked.seal(FRAME), HERE, 1.0) == [Deliver(NAME, FRAME)]
+    assert pair.node.receive(linked.seal(FRAME), HERE, 1.0) == dropped(DropReason.MALFORMED)
+
+
 def test_psk_is_needed() -> None:
     """With another PSK the response does not open."""
     pair = Pair(psk=PSK)

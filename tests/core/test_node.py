@@ -21,6 +21,7 @@ from tests.core.harness import (
     KEY_B,
     KEY_C,
     PLAIN,
+    UNUSED_INDEX,
     Pair,
     datagrams,
     exhaust,
@@ -94,7 +95,7 @@ def raw_mavlink(pair: Pair, now: float) -> list[Output]:
 
 def unexpected_response(pair: Pair, now: float) -> list[Output]:
     """A response to a call that nobody made."""
-    header = wire.response_header(SUITES[0], 5, 0)
+    header = wire.response_header(SUITES[0], 5, UNUSED_INDEX)
     message = header + bytes(wire.response_bytes(SUITES[0]) - len(header) - wire.MACS_BYTES)
     return pair.b.receive(with_macs(message, pair.b.node.public_key), now)
 
@@ -212,7 +213,7 @@ def bad_cookie(pair: Pair, now: float) -> list[Output]:
 
 def unknown_index(pair: Pair, now: float) -> list[Output]:
     """An envelope for nobody."""
-    return pair.b.receive(wire.envelope_header(0, 1) + bytes(20), now)
+    return pair.b.receive(wire.envelope_header(UNUSED_INDEX, 1) + bytes(20), now)
 
 
 def late(pair: Pair, now: float) -> list[Output]:
@@ -900,7 +901,7 @@ def test_removed_peer_is_cut_off_at_once() -> None:
     assert reasons(pair.b.receive(before, 1.0)) == [DropReason.LATE]
     told = Dropped(DropReason.UNKNOWN_PEER, None, AT_A, 1, f"key {b64encode(KEY_A.public).decode()}")
     assert pair.b.receive(made_initiation(), 1.0) == [told]
-    assert datagrams(pair.b.receive(wire.envelope_header(0, 5) + bytes(20), 1.0)) == []
+    assert datagrams(pair.b.receive(wire.envelope_header(UNUSED_INDEX, 5) + bytes(20), 1.0)) == []
     assert pair.b.node._indices.owners == {}
     assert pair.b.node.handle_timeout(500.0) == []
     assert pair.b.node.next_deadline() == float("inf")
@@ -950,7 +951,7 @@ def test_addresses_can_change() -> None:
     """A name that resolves to another place is called and believed there, and no longer at the old one."""
     pair = Pair(link_a=QUIET, link_b=QUIET)
     pair.a.node.set_addresses("bravo", [ELSEWHERE], 0.0)
-    stray = wire.envelope_header(0, 5) + bytes(20)
+    stray = wire.envelope_header(UNUSED_INDEX, 5) + bytes(20)
 
     assert only(of(pair.a.timeout(0.0), Transmit)).path == ELSEWHERE
     assert datagrams(pair.a.receive(stray, 5.0, AT_B)) == []

@@ -12,6 +12,7 @@ from tests.core.harness import (
     ELSEWHERE,
     FRAME,
     PLAIN,
+    UNUSED_INDEX,
     Pair,
     Side,
     datagrams,
@@ -531,7 +532,7 @@ def test_hint_about_a_peer_without_an_address_is_nothing_to_act_on() -> None:
 
 def stray() -> bytes:
     """An envelope for a session that nobody has."""
-    return wire.envelope_header(0, 5) + bytes(24)
+    return wire.envelope_header(UNUSED_INDEX, 5) + bytes(24)
 
 
 def test_unknown_envelope_from_the_peers_place_is_a_hint() -> None:

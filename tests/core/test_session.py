@@ -204,7 +204,7 @@ def test_forged_high_counter_does_not_move_the_window() -> None:
     """A forgery with the highest counter leaves the window where it is."""
     initiator, responder = pair()
     genuine = initiator.seal(FRAME, 0.0)
-    forged = wire.envelope_header(9, 2**32 - 1) + FRAME + bytes(16)
+    forged = wire.envelope_header(9, c.SESSION_ENVELOPE_LIMIT - 1) + FRAME + bytes(16)
 
     assert reason_of(responder, forged) is DropReason.BAD_TAG
     assert opened(responder, genuine) == FRAME
@@ -227,7 +227,7 @@ def test_header_changes_form_with_the_counter(
 
 
 def test_last_counter_is_used_and_no_more() -> None:
-    """A session seals exactly 2^32 envelopes; after that its keys only open."""
+    """A session seals exactly `SESSION_ENVELOPE_LIMIT` envelopes; after that its keys only open."""
     initiator, responder = pair()
     initiator.send_counter = c.SESSION_ENVELOPE_LIMIT - 1
     assert not initiator.is_used_up
@@ -244,13 +244,13 @@ def test_last_counter_is_used_and_no_more() -> None:
 
 
 def test_report_of_a_used_up_session_still_fits_its_record() -> None:
-    """A peer that uses the last counter cannot make the count of expected envelopes outgrow four bytes."""
+    """The counter after the last one fits the fields of an echo reply, at either end."""
     initiator, responder = pair()
     initiator.send_counter = c.SESSION_ENVELOPE_LIMIT - 1
     opened(responder, initiator.seal(FRAME, 0.0))
 
-    assert responder.expected == 2**32 - 1
-    assert wire.parse_control(wire.Echo(False, 1, responder.received, responder.expected).encode())
+    assert responder.expected == initiator.fresh(1000.0) == 2**32 - 1
+    assert wire.parse_control(wire.Echo(True, 1, 1, responder.expected, initiator.fresh(1000.0)).encode())
 
 
 def test_keys_end_at_their_time() -> None:

@@ -31,10 +31,10 @@ def rows(text: str) -> list[list[str]]:
 
 
 def number(cell: str) -> float:
-    """``120 s``, ``2^31``, ``1.5 s``."""
-    value = cell.split(maxsplit=1)[0]
-    base, _, power = value.partition("^")
-    return float(int(base) ** int(power)) if power else float(value)
+    """``120 s``, ``2^31``, ``2^32 - 1`` with a true minus sign, ``1.5 s``."""
+    value, _, less = cell.partition(" \N{MINUS SIGN} ")
+    base, _, power = value.split(maxsplit=1)[0].partition("^")
+    return (float(int(base) ** int(power)) if power else float(base)) - float(less or 0)
 
 
 DOCUMENTED = {

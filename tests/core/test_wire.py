@@ -17,7 +17,8 @@ from uavlinkd.core.suites import SUITES, SUITES_BY_NAME, Suite
 from uavlinkd.core.wire import Parameters
 
 ALL_SUITES = [pytest.param(suite, id=suite.name) for suite in SUITES.values()]
-INDEX = st.integers(0, 2**16 - 1)
+INDEX = st.integers(1, 2**16 - 1)
+COUNTER = st.integers(0, c.SESSION_ENVELOPE_LIMIT - 1)
 U32 = st.integers(0, 2**32 - 1)
 SUITE = st.sampled_from(list(SUITES.values()))
 PARAMETERS = st.builds(
@@ -146,6 +147,24 @@ def test_unknown_suite_is_malformed(suite: Suite) -> None:
             assert reason_of(parse, altered) is DropReason.MALFORMED
 
 
+@pytest.mark.parametrize(
+    ("parse", "message", "at"),
+    [
+        (wire.parse_initiation, initiation(SUITES[0]), 2),
+        (wire.parse_response, response(SUITES[0]), 2),
+        (wire.parse_response, response(SUITES[0]), 4),
+        (wire.parse_cookie_reply, COOKIE_REPLY, 2),
+        (wire.parse_envelope_header, wire.envelope_header(0x1234, 5) + bytes(8), 1),
+        (wire.parse_envelope_header, wire.envelope_header(0x1234, 2**20) + bytes(8), 1),
+    ],
+    ids=["initiation", "response sender", "response receiver", "cookie reply", "short envelope", "long envelope"],
+)
+def test_index_zero_is_malformed(parse: Callable[[bytes], object], message: bytes, at: int) -> None:
+    """Index 0 names no session, so a message with it in any of its index fields is no message."""
+    parse(message)
+    assert reason_of(parse, message[:at] + bytes(2) + message[at + 2 :]) is DropReason.MALFORMED
+
+
 def test_cookie_reply_of_another_shape_is_malformed() -> None:
     """Every truncation, every trailing byte and every value of the reserved byte but zero is refused."""
     for length in range(len(COOKIE_REPLY)):
@@ -156,7 +175,7 @@ def test_cookie_reply_of_another_shape_is_malformed() -> None:
         assert reason_of(wire.parse_cookie_reply, altered) is DropReason.MALFORMED
 
 
-@given(receiver=INDEX, counter=U32, rest=st.binary(min_size=8, max_size=64))
+@given(receiver=INDEX, counter=COUNTER, rest=st.binary(min_size=8, max_size=64))
 def test_envelope_header_round_trip(receiver: int, counter: int, rest: bytes) -> None:
     """Index and counter come back; the header is five bytes for a small counter and seven for others."""
     header = wire.envelope_header(receiver, counter)
@@ -171,7 +190,7 @@ def test_envelope_header_round_trip(receiver: int, counter: int, rest: bytes) ->
         (0, "40 abcd 0000"),
         (65535, "40 abcd ffff"),
         (65536, "41 abcd 00010000"),
-        (2**32 - 1, "41 abcd ffffffff"),
+        (2**32 - 2, "41 abcd fffffffe"),
     ],
 )
 def test_envelope_header_at_the_edges(counter: int, header: str) -> None:
@@ -185,6 +204,11 @@ def test_small_counter_in_the_long_form_is_refused(counter: int) -> None:
     header = b"\x41\xab\xcd" + counter.to_bytes(4, "big")
 
     assert reason_of(wire.parse_envelope_header, header + bytes(8)) is DropReason.LONG_COUNTER
+
+
+def test_counter_at_the_limit_is_malformed() -> None:
+    """No session seals an envelope under counter 2^32 - 1."""
+    assert reason_of(wire.parse_envelope_header, b"\x41\xab\xcd\xff\xff\xff\xff" + bytes(8)) is DropReason.MALFORMED
 
 
 @pytest.mark.parametrize("counter", [3, 65536])

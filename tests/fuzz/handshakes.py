@@ -27,7 +27,7 @@ KEY_D: Final = KeyPair(bytes((4,)) * 32)
 CALLERS: Final = (KEY_A, KEY_A, KEY_C, KEY_D)
 """Two whom bravo knows, and one whom it does not."""
 OFTEN: Final = (GROUPS[0], GROUPS[0], GROUPS[0], GROUPS[1])
-_REFUSALS = (DropReason.HEADER_MISMATCH, DropReason.BAD_PARAMETERS)
+_REFUSALS = (DropReason.MALFORMED, DropReason.HEADER_MISMATCH, DropReason.BAD_PARAMETERS)
 
 
 def write(
@@ -94,6 +94,8 @@ def _share(script: Script, size: int) -> bytes | None:
 
 def expected(payload: bytes, header: bytes) -> DropReason | None:
     """Why an authentic payload behind this header must be refused, by its bytes alone."""
+    if header[2:4] == bytes(2):
+        return DropReason.MALFORMED  # sender index 0
     if payload[: len(header) - 1] != header[1:]:
         return DropReason.HEADER_MISMATCH
     *_, tag_bytes = payload[: len(header) + 7]
@@ -254,4 +256,6 @@ def seeds() -> list[bytes]:
         b"\x08" + answers,
         b"\x0d" + answers,
         b"\x08" + calls[:300],
+        b"\0" + bytes((0x10, 0, 0, 0, 1, 0, 0, 0, 3, 9, 9)),  # index 0, in an initiation and in a response
+        b"\x08" + bytes((0, 0, 0, 0, 1, 3)),
     ]

@@ -18,6 +18,7 @@ from tests.core.harness import (
     KEY_C,
     PLAIN,
     PRIVATE_B,
+    UNUSED_INDEX,
     Pair,
     Side,
     datagrams,
@@ -105,7 +106,7 @@ class Stage:
     def __post_init__(self) -> None:
         """An envelope of no session comes from the peer's address: the victim calls, and not again for a second."""
         self.public_keys = self.public_keys or (self.victim.node.public_key,)
-        self.victim.receive(bytes((wire.SHORT_ENVELOPE,)) + bytes(40), self.now)
+        self.victim.receive(wire.envelope_header(UNUSED_INDEX, 0) + bytes(36), self.now)
 
     @property
     def victim(self) -> Side:

@@ -27,8 +27,8 @@ COOKIE_NONCE_BYTES = 16
 PATH_TOKEN_BYTES = 8
 """Of a path challenge, which a guess hits once in 2^64."""
 
-SESSION_ENVELOPE_LIMIT = 2**32
-"""Envelopes that one session's keys may seal, each way: the counter is 32 bits and never wraps."""
+SESSION_ENVELOPE_LIMIT = 2**32 - 1
+"""Envelopes that one session's keys may seal, each way. The counter after the last one fits an echo's 32 bits."""
 SHORT_COUNTER_LIMIT = 2**16
 """Counters below this travel in two bytes, others in four; either in the other's form is refused."""
 LATE_AFTER_S = 2.0

@@ -170,8 +170,8 @@ class Session:
 
     @property
     def expected(self) -> int:
-        """Envelopes that the peer has sent, as far as is known here; capped at what a report can say."""
-        return min(self.window.highest + 1, c.SESSION_ENVELOPE_LIMIT - 1)
+        """Envelopes that the peer has sent, as far as is known here."""
+        return self.window.highest + 1
 
     @property
     def is_used_up(self) -> bool:

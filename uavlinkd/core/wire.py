@@ -200,6 +200,8 @@ def parse_initiation(datagram: bytes) -> Initiation:
     if suite is None or len(datagram) != initiation_bytes(suite):
         raise Drop(DropReason.MALFORMED)
     _, _, sender_index = _INITIATION_HEADER.unpack_from(datagram)
+    if not sender_index:
+        raise Drop(DropReason.MALFORMED)
     size = _INITIATION_HEADER.size
     return Initiation(suite, sender_index, datagram[:size], datagram[size:-MACS_BYTES])
 
@@ -214,6 +216,8 @@ def parse_response(datagram: bytes) -> Response:
     if suite is None or len(datagram) != response_bytes(suite):
         raise Drop(DropReason.MALFORMED)
     _, _, sender_index, receiver_index = _RESPONSE_HEADER.unpack_from(datagram)
+    if not (sender_index and receiver_index):
+        raise Drop(DropReason.MALFORMED)
     size = _RESPONSE_HEADER.size
     return Response(suite, sender_index, receiver_index, datagram[:size], datagram[size:-MACS_BYTES])
 
@@ -232,6 +236,8 @@ def parse_cookie_reply(datagram: bytes) -> CookieReply:
     if len(datagram) != COOKIE_BYTES or datagram[1] != 0:
         raise Drop(DropReason.MALFORMED)
     _, _, receiver_index = _INITIATION_HEADER.unpack_from(datagram)
+    if not receiver_index:
+        raise Drop(DropReason.MALFORMED)
     sealed_at = _INITIATION_HEADER.size + c.COOKIE_NONCE_BYTES
     return CookieReply(receiver_index, datagram[_INITIATION_HEADER.size : sealed_at], datagram[sealed_at:])
 
@@ -259,16 +265,21 @@ def parse_envelope_header(datagram: bytes) -> tuple[int, int, int]:
         5/7+n  t    tag
 
     Raises:
-        Drop: ``MALFORMED`` when shorter than a header and the shortest tag, ``LONG_COUNTER``.
+        Drop: ``MALFORMED`` for index 0, for a counter at the limit, and for less than a header and the
+            shortest tag; ``LONG_COUNTER``.
     """
     if datagram[0] == SHORT_ENVELOPE:
         if len(datagram) < SHORT_HEADER_BYTES + TAG_LENGTHS[0]:
             raise Drop(DropReason.MALFORMED)
         _, receiver_index, counter = _SHORT_HEADER.unpack_from(datagram)
+        if not receiver_index:
+            raise Drop(DropReason.MALFORMED)
         return receiver_index, counter, SHORT_HEADER_BYTES
     if len(datagram) < LONG_HEADER_BYTES + TAG_LENGTHS[0]:
         raise Drop(DropReason.MALFORMED)
     _, receiver_index, counter = _LONG_HEADER.unpack_from(datagram)
+    if not receiver_index or counter >= c.SESSION_ENVELOPE_LIMIT:
+        raise Drop(DropReason.MALFORMED)
     if counter < c.SHORT_COUNTER_LIMIT:
         raise Drop(DropReason.LONG_COUNTER)
     return receiver_index, counter, LONG_HEADER_BYTES

@@ -176,7 +176,7 @@ class CounterOptions(ForgeryOptions):
 
     beside: bool = Field(True, description="let the genuine datagram pass too, behind the altered one")
     to: Literal["random", "last", "ahead", "back"] = Field(
-        "random", description="any counter, the last there is (2^32-1), a little ahead, or one that was used"
+        "random", description="any counter, the last there is (2^32-2), a little ahead, or one that was used"
     )
 
 
