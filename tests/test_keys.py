@@ -159,6 +159,36 @@ def test_key_of_its_owner_alone_is_read(tmp_path: Path, mode: int) -> None:
     assert keys.encode_key(keys.read_secret_file(path).reveal()) == path.read_text().strip()
 
 
+@pytest.mark.parametrize("credential", [False, True])
+def test_key_of_another_owner_is_refused_with_the_remedy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, credential: bool
+) -> None:
+    """Its owner can replace it at any time, whatever its mode says; a credential has no exception."""
+    path = _key_file(tmp_path / "drone 0.key")
+    owner = path.stat().st_uid
+    monkeypatch.setattr(os, "geteuid", lambda: owner + 1)
+    fstat = os.fstat
+    monkeypatch.setattr(os, "fstat", lambda descriptor: _owned(fstat(descriptor), 4242))
+    with pytest.raises(KeyFileError, match="uid 4242") as caught:
+        keys.read_secret_file(path, credential=credential)
+    assert f"chown {owner + 1} '{path}'" in str(caught.value)
+    assert path.read_text().strip() not in str(caught.value)
+
+
+@pytest.mark.parametrize("owner", [0, 1000])
+def test_key_of_root_or_of_the_user_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, owner: int) -> None:
+    """Root can read every file anyway, and systemd's credentials belong to root."""
+    path = _key_file(tmp_path / "drone0.key")
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    fstat = os.fstat
+    monkeypatch.setattr(os, "fstat", lambda descriptor: _owned(fstat(descriptor), owner))
+    assert keys.encode_key(keys.read_secret_file(path).reveal()) == path.read_text().strip()
+
+
+def _owned(status: os.stat_result, owner: int) -> os.stat_result:
+    return os.stat_result((*status[:4], owner, *status[5:10]))
+
+
 def test_credential_may_show_the_groups_right_to_read(tmp_path: Path) -> None:
     """systemd's access list shows as mode 0440; no other right of others is let pass."""
     path = _key_file(tmp_path / "a", 0o440)

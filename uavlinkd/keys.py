@@ -151,7 +151,9 @@ def find_secret_file(name: str, folder: Path, environ: Mapping[str, str]) -> tup
 
 
 def read_secret_file(path: Path, *, credential: bool = False) -> Secret:
-    """The key in a file, which must be a regular file that nobody but its owner may touch.
+    """The key in a regular file of this process's user or of root, to which no other user has a right.
+
+    A file's owner can always change it and its mode, so a key file of another user is refused (as by sshd).
 
     ``credential``: systemd grants a service its credentials through an access list, whose mask shows as the
     group's right to read. In the service's own folder that is no exposure, so it is let pass there.
@@ -171,6 +173,8 @@ def read_secret_file(path: Path, *, credential: bool = False) -> Secret:
         status = os.fstat(descriptor)
         if not stat.S_ISREG(status.st_mode):
             raise KeyFileError(f"{path}: is not a regular file")
+        if status.st_uid not in (0, os.geteuid()):
+            raise KeyFileError(f"{path}: {_owned_by_another(path, status.st_uid)}")
         allowed = 0o740 if credential else 0o700
         if excess := stat.S_IMODE(status.st_mode) & 0o777 & ~allowed:
             raise KeyFileError(f"{path}: {_who(excess)}: run `chmod 600 {shlex.quote(str(path))}`")
@@ -186,6 +190,14 @@ def read_secret_file(path: Path, *, credential: bool = False) -> Secret:
     if not any(key):
         raise KeyFileError(f"{path}: is all zeros, a key that everybody knows: make another")
     return Secret(key)
+
+
+def _owned_by_another(path: Path, owner: int) -> str:
+    quoted = shlex.quote(str(path))
+    return (
+        f"belongs to another user (uid {owner}), who can read and replace it: if the key is known to be yours, run"
+        f" `chown {os.geteuid()} {quoted}` as root"
+    )
 
 
 def _who(excess: int) -> str:
