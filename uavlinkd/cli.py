@@ -18,6 +18,7 @@ from uavlinkd import __version__
 from uavlinkd.evaluation.commands import add_report_parser, add_timing_parser
 from uavlinkd.evaluation.tampering_commands import add_member_parser, add_tampering_parser
 from uavlinkd.fleet.commands import add_parser as add_fleet
+from uavlinkd.terminal import printable
 
 OK, FAILED, WRONG = 0, 1, 2
 _LINE_LIMIT = 4096
@@ -398,10 +399,10 @@ def _check_seconds(options: argparse.Namespace) -> None:
 
 
 def _print(text: str) -> int:
-    print(text)
+    print(printable(text, keep="\n"))
     return OK
 
 
 def _fail(problem: object, status: int = FAILED) -> int:
-    print(problem, file=sys.stderr)
+    print(printable(str(problem), keep="\n"), file=sys.stderr)
     return status

@@ -11,6 +11,7 @@ from uavlinkd.fleet import work
 from uavlinkd.fleet.manifest import Kind, Settings
 from uavlinkd.fleet.plan import FleetError, FleetFileError
 from uavlinkd.fleet.work import Result
+from uavlinkd.terminal import printable
 
 OK, FAILED, WRONG = 0, 1, 2
 
@@ -20,7 +21,7 @@ def act(options: argparse.Namespace) -> int:
     try:
         result = _ACTIONS[options.action](options)
     except FleetError as error:
-        print(error, file=sys.stderr)
+        print(printable(str(error), keep="\n"), file=sys.stderr)
         return FAILED if isinstance(error, FleetFileError) else WRONG
     _tell(options, result)
     return OK
@@ -69,24 +70,28 @@ def _tell(options: argparse.Namespace, result: Result) -> None:
         rows.append((member.name, member.kind.value, str(member.system_id), address, key))
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
-        print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+        _print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
     everybody = {each.name for each in result.fleet.members} <= set(result.changed)
     changed = "every folder" if everybody else ", ".join(result.changed)
     if result.changed:
-        print(f"\nChanged in {options.out}: {changed}. Carry each to its owner, by a way that nobody else reads.")
-        print(
+        _print(f"\nChanged in {options.out}: {changed}. Carry each to its owner, by a way that nobody else reads.")
+        _print(
             "Set SYSID_THISMAV or MAV_SYS_ID of each autopilot, and the id of each ground program, to its id above:"
             " as any other it is refused."
         )
-        print(
+        _print(
             "There: uavlinkd run --config NAME.toml; where a daemon runs already: uavlinkd reload, or SIGHUP"
             " (a restart, where systemd hands it new keys)."
         )
     for note in result.notes:
-        print(note)
+        _print(note)
     if options.action == "rotate" and options.at_once:
-        print(f"{options.name} needs a restart.")
+        _print(f"{options.name} needs a restart.")
     elif options.action == "rotate" and not options.finish:
-        print(f"{options.name} needs a restart. In any order; then: uavlinkd fleet rotate {options.name} --finish")
+        _print(f"{options.name} needs a restart. In any order; then: uavlinkd fleet rotate {options.name} --finish")
     if options.action == "remove" and os.path.exists(folder := options.out / options.name):
-        print(f"{folder} was left: delete it when nothing in it is needed any more.")
+        _print(f"{folder} was left: delete it when nothing in it is needed any more.")
+
+
+def _print(text: str) -> None:
+    print(printable(text, keep="\n"))

@@ -34,7 +34,10 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     init.add_argument("--psk", action="store_true", help="a pre-shared key for each pair")
     init.add_argument("--suite", default="x25519", metavar="NAME", help="key exchange (default: %(default)s)")
     init.add_argument(
-        "--control-socket", default="{name}.sock", metavar="FILE", help="may have {name} in it (default: %(default)s)"
+        "--control-socket",
+        default="{name}.sock",
+        metavar="FILE",
+        help="may have {n} or {name} in it (default: %(default)s)",
     )
     init.add_argument(
         "--drone-url",

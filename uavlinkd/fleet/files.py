@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from uavlinkd.addresses import Address
-from uavlinkd.fleet.manifest import ROLES, Fleet, Kind, Member, fill, literal
+from uavlinkd.fleet.manifest import ROLES, Fleet, Kind, Member, literal
 from uavlinkd.fleet.plan import listen_address
 
 _ENDPOINT_NAMES = {
@@ -44,7 +44,7 @@ def write_config(fleet: Fleet, member: Member) -> str:
         f"name = {literal(member.name)}",
         *key_lines(member),
         f"listen = {literal(listen)}",
-        f"control_socket = {literal(fill(settings.control_socket, member))}",
+        f"control_socket = {literal(settings.control_socket_of(member))}",
         "",
         "[link]",
         f"suites = {literal([settings.suite])}",

@@ -17,9 +17,12 @@ from typing import Any
 from uavlinkd.addresses import Address, AddressError, parse_address
 from uavlinkd.core.suites import SUITES_BY_NAME
 from uavlinkd.fleet.plan import DEFAULT_PLAN, SYSTEM_IDS, AddressPlan, FleetError, FleetFileError
+from uavlinkd.fleet.template import TemplateError, fill
 from uavlinkd.keys import decode_key
+from uavlinkd.terminal import printable
 
 FILE_NAME = "fleet.toml"
+_TEMPLATES = ("control_socket", "drone_url", "ground_station_url", "observer_url")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}")
 
 
@@ -81,19 +84,11 @@ class Settings:
     def url_of(self, member: Member) -> str:
         """Its local endpoint."""
         template: str = getattr(self, f"{member.kind.value.replace('-', '_')}_url")
-        return fill(template, member)
+        return fill(template, member.system_id, member.name)
 
-
-def fill(template: str, member: Member) -> str:
-    """A template with this member's number and name in it.
-
-    Raises:
-        FleetError: there is something else in braces.
-    """
-    try:
-        return template.format(n=member.system_id, name=member.name)
-    except (LookupError, ValueError, AttributeError):
-        raise FleetError(f'"{template}" may have {{n}} and {{name}} in it, and nothing else in braces') from None
+    def control_socket_of(self, member: Member) -> str:
+        """Where its daemon is asked."""
+        return fill(self.control_socket, member.system_id, member.name)
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +108,7 @@ class Fleet:
             if member.name == name:
                 return member
         there = ", ".join(each.name for each in self.members)
-        raise FleetError(f'there is no "{name}" in this fleet: it has {there or "no members"}')
+        raise FleetError(f'there is no "{printable(name)}" in this fleet: it has {there or "no members"}')
 
     def peers_of(self, member: Member) -> list[Member]:
         """With whom it is linked."""
@@ -151,7 +146,9 @@ class Fleet:
             FleetError: for a name that is none or taken, or a plan without room.
         """
         if not _NAME.fullmatch(name):
-            raise FleetError(f'"{name}" is no name: write up to 63 letters, digits, dots, hyphens and underscores')
+            raise FleetError(
+                f'"{printable(name)}" is no name: write up to 63 letters, digits, dots, hyphens and underscores'
+            )
         if any(each.name == name for each in self.members):
             raise FleetError(f'there is a "{name}" in this fleet already')
         taken = {each.system_id for each in self.members}
@@ -234,6 +231,13 @@ def check_settings(settings: Settings) -> None:
     if settings.suite not in SUITES_BY_NAME:
         raise FleetError(f'there is no suite "{settings.suite}": take one of {", ".join(SUITES_BY_NAME)}')
     AddressPlan.parse(settings.address_plan)
+    for key in _TEMPLATES:
+        template = getattr(settings, key)
+        try:
+            fill(template, 1, "drone1")
+        except TemplateError as error:
+            option = f"--{key.replace('_', '-')}"
+            raise FleetError(f'{option}: "{printable(template)}": {error}') from None
 
 
 def _member(section: dict[str, Any]) -> Member:

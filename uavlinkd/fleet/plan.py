@@ -7,6 +7,7 @@ from ipaddress import IPv4Network, IPv6Network, ip_network
 from typing import Protocol
 
 from uavlinkd.addresses import DEFAULT_PORT, Address, AddressError, parse_address
+from uavlinkd.fleet.template import TemplateError, fill
 
 DEFAULT_PLAN = "10.13.0.0/24"
 SYSTEM_IDS = range(1, 256)
@@ -53,7 +54,7 @@ class AddressPlan:
         Raises:
             FleetError: the text is none.
         """
-        if "{" in text:
+        if "{" in text or "}" in text:
             plan = cls(text, None)
             plan._fill(1, "drone1")
             if "{n}" not in text and "{name}" not in text:
@@ -83,8 +84,8 @@ class AddressPlan:
 
     def _fill(self, number: int, name: str) -> Address:
         try:
-            return parse_address(self.text.format(n=number, name=name), allow_names=True)
-        except (AddressError, LookupError, ValueError, AttributeError) as error:
+            return parse_address(fill(self.text, number, name), allow_names=True)
+        except (AddressError, TemplateError) as error:
             raise FleetError(f'the address plan "{self.text}" gives no address for {name}: {error}') from None
 
 

@@ -33,6 +33,7 @@ from uavlinkd.mitm.settings import (
     parse_peer,
     parse_radio,
 )
+from uavlinkd.terminal import printable
 
 OK, FAILED, WRONG = 0, 1, 2
 _EPILOG = """\
@@ -192,5 +193,5 @@ def _ask(path: Path | None, request: str) -> int:
 
 
 def _fail(problem: object, status: int = FAILED) -> int:
-    print(problem, file=sys.stderr)
+    print(printable(str(problem), keep="\n"), file=sys.stderr)
     return status
