@@ -1,7 +1,8 @@
-"""A second implementation of the initiator, written from ``uavlinkd/core/README.md`` alone.
+"""A second implementation of the handshake and the envelopes, written from ``uavlinkd/core/README.md`` alone.
 
 It shares no code with the core: what the two agree on, the document says. It is the shortest program that links, and
-no more: no timers, no replay window, no paths; how old its envelopes are the caller says.
+no more: no timers, no replay window, no paths; how old its envelopes are the caller says. `handshake_vectors` makes
+whole handshakes with both of its roles.
 """
 
 from __future__ import annotations
@@ -10,29 +11,51 @@ import hashlib
 import hmac
 import secrets
 import struct
+from collections.abc import Callable
+from functools import cache
 from typing import NamedTuple
 
-from cryptography.hazmat.primitives.asymmetric.mlkem import MLKEM768PrivateKey, MLKEM1024PrivateKey
+from cryptography.hazmat.primitives.asymmetric.mlkem import (
+    MLKEM768PrivateKey,
+    MLKEM768PublicKey,
+    MLKEM1024PrivateKey,
+    MLKEM1024PublicKey,
+)
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X25519PublicKey
 from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 
 VERSION = b"uavlink/1"
 
-X25519, FFDHE2048, MLKEM768, MLKEM1024 = 0, 1, 16, 17
-GROUPS = {FFDHE2048: "FFDHE2048", MLKEM768: "MLKEM768", MLKEM1024: "MLKEM1024"}
-CIPHERTEXT_BYTES = {FFDHE2048: 256, MLKEM768: 1088, MLKEM1024: 1568}
+Draw = Callable[[int], bytes]
+"""So many random bytes."""
+
+X25519, FFDHE2048, FFDHE3072, FFDHE4096, FFDHE6144, FFDHE8192, MLKEM768, MLKEM1024 = 0, 1, 2, 3, 4, 5, 16, 17
+# Suite: bits of the group, and the number that RFC 7919, appendix A, adds to make its prime safe.
+FFDHE = {
+    FFDHE2048: (2048, 560316),
+    FFDHE3072: (3072, 2625351),
+    FFDHE4096: (4096, 5736041),
+    FFDHE6144: (6144, 15705020),
+    FFDHE8192: (8192, 10965728),
+}
+GROUPS = {suite: f"FFDHE{bits}" for suite, (bits, _) in FFDHE.items()} | {
+    MLKEM768: "MLKEM768",
+    MLKEM1024: "MLKEM1024",
+}
+CIPHERTEXT_BYTES = {suite: bits // 8 for suite, (bits, _) in FFDHE.items()} | {MLKEM768: 1088, MLKEM1024: 1568}
+SHARE_BYTES = CIPHERTEXT_BYTES | {MLKEM768: 1184}
 
 
-def _ffdhe2048() -> int:
-    """RFC 7919, appendix A.1: 2^2048 - 2^1984 + (floor(2^1918 e) + 560316) 2^64 - 1."""
-    numerator, denominator, k = 1, 1, 0  # e as one fraction: the sum of 1/k! far beyond 2048 bits
-    while denominator.bit_length() < 2200:
+@cache
+def ffdhe_prime(suite: int) -> int:
+    """RFC 7919, appendix A: 2^b - 2^(b-64) + (floor(2^(b-130) e) + X) 2^64 - 1."""
+    bits, addition = FFDHE[suite]
+    numerator, denominator, k = 1, 1, 0  # e as one fraction: the sum of 1/k! far beyond b bits
+    while denominator.bit_length() < bits + 152:
         k += 1
         numerator, denominator = numerator * k + 1, denominator * k
-    return 2**2048 - 2**1984 + ((2**1918 * numerator // denominator) + 560316) * 2**64 - 1
-
-
-FFDHE2048_PRIME = _ffdhe2048()
+    middle = ((1 << (bits - 130)) * numerator // denominator) + addition
+    return (1 << bits) - (1 << (bits - 64)) + (middle << 64) - 1
 
 
 def _sha256(data: bytes) -> bytes:
@@ -126,15 +149,19 @@ def _agree(ours: Parameters, encoded: bytes) -> Parameters:
 class Session:
     """Section 11, both directions."""
 
-    def __init__(self, noise: Noise, agreed: Parameters, index: int, remote_index: int) -> None:
+    def __init__(
+        self, noise: Noise, agreed: Parameters, index: int, remote_index: int, *, is_initiator: bool = True
+    ) -> None:
+        self.handshake_hash, self.transport_keys = noise.h, noise.split()
         self.parameters = agreed
         self.index, self.remote_index = index, remote_index
         self.counter = 0
         purpose = b" confidential" if agreed.confidential else b" authenticated"
         length = 32 if agreed.confidential else agreed.mac_key_bits // 8
-        first, second = noise.split()
-        self.send_key = _expand(first, VERSION + purpose + b" initiator to responder" + noise.h, length)
-        self.receive_key = _expand(second, VERSION + purpose + b" responder to initiator" + noise.h, length)
+        first, second = self.transport_keys
+        ours = _expand(first, VERSION + purpose + b" initiator to responder" + noise.h, length)
+        theirs = _expand(second, VERSION + purpose + b" responder to initiator" + noise.h, length)
+        self.send_key, self.receive_key = (ours, theirs) if is_initiator else (theirs, ours)
 
     def seal(self, payload: bytes, *, long_form: bool = False) -> bytes:
         """The next envelope. ``long_form`` writes the counter long where the protocol wants it short."""
@@ -186,18 +213,18 @@ class Initiator:
         suite: int = X25519,
         psk: bytes = bytes(32),
         parameters: Parameters | None = None,
+        draw: Draw = secrets.token_bytes,
     ) -> None:
         self.static, self.responder_public = static, responder_public
         self.suite, self.psk = suite, psk
         self.parameters = Parameters() if parameters is None else parameters
-        self.index = 1 + secrets.randbelow(65535)
-        group = GROUPS.get(suite)
-        pattern = f"IKhfs+psk2_25519+{group}" if group else "IKpsk2_25519"
-        name = f"Noise_{pattern}_ChaChaPoly_SHA256".encode()
-        self.noise = Noise(name, VERSION + bytes([suite]), responder_public)
-        self.ephemeral = X25519PrivateKey.generate()
-        self.exponent = secrets.randbits(512)
-        self.mlkem = MLKEM768PrivateKey.generate() if suite == MLKEM768 else MLKEM1024PrivateKey.generate()
+        self.index = int.from_bytes(draw(2), "big") or 1
+        self.noise = _start(suite, responder_public)
+        self.ephemeral = X25519PrivateKey.from_private_bytes(draw(32))
+        seed = draw(64) if suite in GROUPS else bytes(64)
+        self.exponent = int.from_bytes(seed, "big")
+        mlkem = MLKEM768PrivateKey if suite == MLKEM768 else MLKEM1024PrivateKey
+        self.mlkem = mlkem.from_seed_bytes(seed)
         self.mac1 = b""
 
     def initiation(self, cookie: bytes | None = None) -> bytes:
@@ -247,16 +274,93 @@ class Initiator:
         return Session(noise, _agree(self.parameters, payload[5:]), self.index, remote_index)
 
     def _share(self) -> bytes:
-        if self.suite == FFDHE2048:
-            return pow(2, self.exponent, FFDHE2048_PRIME).to_bytes(256, "big")
+        if self.suite in FFDHE:
+            return _power(self.suite, 2, self.exponent)
         return self.mlkem.public_key().public_bytes_raw()
 
     def _decapsulate(self, ciphertext: bytes) -> bytes:
-        if self.suite == FFDHE2048:
-            value = int.from_bytes(ciphertext, "big")
-            assert 2 <= value <= FFDHE2048_PRIME - 2
-            return pow(value, self.exponent, FFDHE2048_PRIME).to_bytes(256, "big")
+        if self.suite in FFDHE:
+            return _power(self.suite, int.from_bytes(ciphertext, "big"), self.exponent)
         return self.mlkem.decapsulate(ciphertext)
+
+
+class Responder:
+    """Sections 6 and 7: one handshake as B, which knows its initiator."""
+
+    def __init__(
+        self,
+        static: X25519PrivateKey,
+        initiator_public: bytes,
+        *,
+        psk: bytes = bytes(32),
+        parameters: Parameters | None = None,
+        draw: Draw = secrets.token_bytes,
+    ) -> None:
+        self.static, self.initiator_public, self.psk, self.draw = static, initiator_public, psk, draw
+        self.parameters = Parameters() if parameters is None else parameters
+        self.encapsulated = (b"", b"")
+        """The group's ciphertext and secret."""
+
+    def answer(self, initiation: bytes) -> tuple[bytes, Session]:
+        """Message 2, and the session that it makes."""
+        kind, suite, remote_index = struct.unpack(">BBH", initiation[:4])
+        own_public = self.static.public_key().public_bytes_raw()
+        assert kind == 1
+        assert remote_index != 0
+        assert initiation[-32:-16] == _hmac(_sha256(VERSION + b" mac1" + own_public), initiation[:-32])[:16]
+        noise, body = _start(suite, own_public), initiation[4:-32]
+        remote, body = body[:32], body[32:]
+        noise.mix_hash(remote)
+        noise.mix_key(remote)
+        noise.mix_key(_x25519(self.static, remote))
+        share = b""
+        if suite in GROUPS:
+            size = SHARE_BYTES[suite] + 16
+            share, body = noise.open(body[:size]), body[size:]
+        assert noise.open(body[:48]) == self.initiator_public
+        noise.mix_key(_x25519(self.static, self.initiator_public))
+        payload = noise.open(body[48:])
+        assert payload[:3] == initiation[1:4]
+
+        index = int.from_bytes(self.draw(2), "big") or 1
+        ephemeral = X25519PrivateKey.from_private_bytes(self.draw(32))
+        public = ephemeral.public_key().public_bytes_raw()
+        header = struct.pack(">BBHH", 2, suite, index, remote_index)
+        noise.mix_hash(public)
+        noise.mix_key(public)
+        noise.mix_key(_x25519(ephemeral, remote))
+        message = header + public
+        if suite in GROUPS:
+            self.encapsulated = self._encapsulate(suite, share)
+            ciphertext, secret = self.encapsulated
+            message += noise.seal(ciphertext)
+            noise.mix_key(secret)
+        noise.mix_key(_x25519(ephemeral, self.initiator_public))
+        noise.mix_key_and_hash(self.psk)
+        message += noise.seal(header[1:] + self.parameters.encode())
+        message += _hmac(_sha256(VERSION + b" mac1" + self.initiator_public), message)[:16] + bytes(16)
+        agreed = _agree(self.parameters, payload[3:])
+        return message, Session(noise, agreed, index, remote_index, is_initiator=False)
+
+    def _encapsulate(self, suite: int, share: bytes) -> tuple[bytes, bytes]:
+        if suite in FFDHE:
+            exponent = int.from_bytes(self.draw(64), "big")
+            return _power(suite, 2, exponent), _power(suite, int.from_bytes(share, "big"), exponent)
+        mlkem = MLKEM768PublicKey if suite == MLKEM768 else MLKEM1024PublicKey
+        secret, ciphertext = mlkem.from_public_bytes(share).encapsulate()
+        return ciphertext, secret
+
+
+def _start(suite: int, responder_public: bytes) -> Noise:
+    group = GROUPS.get(suite)
+    pattern = f"IKhfs+psk2_25519+{group}" if group else "IKpsk2_25519"
+    return Noise(f"Noise_{pattern}_ChaChaPoly_SHA256".encode(), VERSION + bytes([suite]), responder_public)
+
+
+def _power(suite: int, base: int, exponent: int) -> bytes:
+    prime = ffdhe_prime(suite)
+    assert 2 <= base <= prime - 2
+    return pow(base, exponent, prime).to_bytes(FFDHE[suite][0] // 8, "big")
 
 
 def _x25519(private: X25519PrivateKey, public: bytes) -> bytes:
