@@ -115,7 +115,7 @@ def test_peer_inherits_key_by_key(load: Load) -> None:
         f"{_ENDPOINT}{_PEER}"
         f"tag_bits = 256\nconfidential = true\nkeepalive_s = 20\npsk_file = 'pair.psk'\n"
         f"[[peer]]\nname = 'observer'\npublic_key = '{_TWO}'\nsuites = ['mlkem768']\nmac_key_bits = 512\n"
-        "max_envelope_bytes = 320\n"
+        "max_envelope_bytes = 320\nrole = 'observer'\nsystem_ids = [254]\n"
     )
     first, second = (peer.settings for peer in config.peers)
     assert first.link == Link(
@@ -779,10 +779,14 @@ def test_every_problem_is_listed_at_once(refused: Refused) -> None:
         "endpoint[1].url (a)",
         "peer[0].public_key (b)",
         "peer[0].retry_max_s (b)",
+        "peer[0].role (b)",
+        "peer[0].system_ids (b)",
         "peer[1].name (b)",
         "peer[1].public_key (b)",
         "peer[1].addresses[0] (b)",
         "peer[1].psk_file (b)",
+        "peer[1].role (b)",
+        "peer[1].system_ids (b)",
     }
 
 
@@ -972,22 +976,26 @@ _WARNED = {
         _GOOD.replace("udpin:127.0.0.1", "tcp:10.0.0.9"),
         r"connects beyond this machine.*speak to every peer with any message",
     ),
-    "peer without a policy": (
-        _GOOD.replace("role", "#").replace("system_ids", "#"),
-        r'^peer "drone1": no policy.*role = "vehicle" and system_ids',
+    "peer trusted with everything": (
+        _GOOD.replace("swarm-member", "all"),
+        r'^peer "drone1": role = "all": it may send every message',
     ),
-    "two peers without a policy": (
-        (_GOOD + _OTHER_PEER).replace("role", "#").replace("system_ids", "#"),
-        r'^peer "drone1", peer "drone2": no policy',
+    "two peers trusted with everything": (
+        (_GOOD + _OTHER_PEER).replace("swarm-member", "all"),
+        r'^peer "drone1", peer "drone2": role = "all"',
     ),
     "peer trusted with every system": (_GOOD.replace("[2]", '["all"]'), r'^peer "drone1": system_ids is "all"'),
     "command denied that may travel unseen": (
-        _GOOD + 'allow_in = ["commands", "files"]\ndeny_in = ["MAV_CMD_DO_FLIGHTTERMINATION"]\n',
+        _GOOD + 'allow_in = ["commands", "files"]\ndeny_in = ["MAV_CMD_NAV_PATHPLANNING"]\n',
         r'^peer "drone1": deny_in.*FILE_TRANSFER_PROTOCOL',
     ),
     "the same at an endpoint": (
-        _GOOD.replace("[[peer]]", 'deny_in = ["MAV_CMD_DO_FLIGHTTERMINATION"]\n[[peer]]'),
+        _GOOD.replace("[[peer]]", 'deny_in = ["MAV_CMD_NAV_PATHPLANNING"]\n[[peer]]'),
         r'^endpoint "autopilot": deny_in',
+    ),
+    "command denied whose effect stays possible": (
+        _GOOD + 'allow_in = ["manual", "MAV_CMD_COMPONENT_ARM_DISARM"]\ndeny_in = ["MAV_CMD_COMPONENT_ARM_DISARM"]\n',
+        r"arming and disarming stays possible by RC_CHANNELS_OVERRIDE, MANUAL_CONTROL: denial is best effort",
     ),
     "endpoint trusted with every system in so many words": (
         _GOOD.replace("[[peer]]", 'system_ids = "all"\n[[peer]]'),
@@ -1028,7 +1036,7 @@ def test_what_a_person_should_know_is_said_once(load: Load, case: str) -> None:
         "max_envelope_bytes = 1452",
         "suites = ['ffdhe8192']",
         "budget_bits_s = 1000",
-        'allow_in = ["commands"]\ndeny_in = ["MAV_CMD_DO_FLIGHTTERMINATION"]',
+        'allow_in = ["commands"]\ndeny_in = ["MAV_CMD_NAV_PATHPLANNING"]',
         '[routing]\nrelay = true\nunknown_targets = "drop"',
         '[[endpoint]]\nname = "companion"\nurl = "tcp:127.0.0.1:5760"\nsystem_ids = [1]\nrole = "vehicle"',
     ],

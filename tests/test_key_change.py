@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from tests.policies import TRUSTED
 from uavlinkd import keys
 from uavlinkd.config import Config, ConfigError, Peer, load_config
 from uavlinkd.config.changes import compare
@@ -21,6 +22,8 @@ from uavlinkd.topology import print_topology
 
 OWN, PREVIOUS, THEIRS, THEIRS_BEFORE, OTHER = (keys.generate_private_key() for _ in range(5))
 
+OPEN = 'role = "all"\nsystem_ids = "all"\n'
+
 
 def load(folder: Path, own: str = "", theirs: str = "") -> Config:
     """A configuration with these lines at the top, and in its one peer."""
@@ -30,8 +33,8 @@ def load(folder: Path, own: str = "", theirs: str = "") -> Config:
     path = folder / "a.toml"
     path.write_text(
         f'name = "a"\nprivate_key_file = "a.key"\nlisten = ["0.0.0.0:5790"]\n{own}\n'
-        f'[[peer]]\nname = "b"\npublic_key = "{keys.public_key_text(THEIRS)}"\n{theirs}\n'
-        f'[[peer]]\nname = "c"\npublic_key = "{keys.public_key_text(OTHER)}"\n'
+        f'[[peer]]\nname = "b"\npublic_key = "{keys.public_key_text(THEIRS)}"\n{OPEN}{theirs}\n'
+        f'[[peer]]\nname = "c"\npublic_key = "{keys.public_key_text(OTHER)}"\n{OPEN}'
     )
     return load_config(path, {})
 
@@ -47,7 +50,7 @@ OUR_LINE = 'previous_private_key_file = "a.previous.key"'
 def test_every_pair_of_keys_that_may_be_right_is_tried() -> None:
     """Two keys of ours and two of theirs make four, the current ones first; each has a name that leads back."""
     now, before = bytes([1]) * 32, bytes([2]) * 32
-    peer = Peer(PeerSettings("b", now), (), previous_public_key=before)
+    peer = Peer(PeerSettings("b", now), (), TRUSTED, previous_public_key=before)
     found = pairings(peer, has_previous_key=True)
 
     assert [(each.settings.public_key, each.by_our_previous) for each in found] == [
@@ -62,14 +65,14 @@ def test_every_pair_of_keys_that_may_be_right_is_tried() -> None:
     assert {link_name(name) for name in names} == {"b"}
     assert [each.by_our_previous for each in found] == [False, False, True, True]
     assert [each.by_their_previous for each in found] == [False, True, False, True]
-    assert len(pairings(Peer(PeerSettings("b", now), ()), has_previous_key=False)) == 1
+    assert len(pairings(Peer(PeerSettings("b", now), (), TRUSTED), has_previous_key=False)) == 1
 
 
 def test_the_end_of_their_change_leaves_ours() -> None:
     """Their previous key is out of the file: the peer is still accepted where it knows us by our previous one."""
     now, before = (KeyPair(keys.decode_key(each)).public for each in (THEIRS, THEIRS_BEFORE))
     node = Node(Secret(keys.decode_key(OWN)), bytes, 0.0, Secret(keys.decode_key(PREVIOUS)))
-    config = Peer(PeerSettings("b", now), (), previous_public_key=before)
+    config = Peer(PeerSettings("b", now), (), TRUSTED, previous_public_key=before)
     link = PeerLink(config, node, lambda _: None, 0.0)
     link.join(0.0, Graces(), 10.0, has_previous_key=True)
     assert len(node.peers) == 4
@@ -142,7 +145,7 @@ def test_previous_keys_of_two_peers_differ(tmp_path: Path) -> None:
     top = f'name = "a"\nprivate_key_file = "a.key"\nlisten = ["0.0.0.0:5790"]\n{OUR_LINE}\n'
 
     def peer(name: str, private: str, before: str) -> str:
-        return f'[[peer]]\nname = "{name}"\npublic_key = "{keys.public_key_text(private)}"\n{before}\n'
+        return f'[[peer]]\nname = "{name}"\npublic_key = "{keys.public_key_text(private)}"\n{OPEN}{before}\n'
 
     for b, c, place in (
         (peer("b", first, was(second)), peer("c", second, ""), "peer[0].previous_public_key (b)"),
@@ -183,7 +186,7 @@ def test_a_link_made_anew_gets_no_second_grace() -> None:
     """A reload that makes a link anew revives no key that was given up, and no time; only the operator does."""
     now, before = (KeyPair(keys.decode_key(each)).public for each in (THEIRS, THEIRS_BEFORE))
     node = Node(Secret(keys.decode_key(OWN)), bytes, 0.0, Secret(keys.decode_key(PREVIOUS)))
-    config = Peer(PeerSettings("b", now), (), previous_public_key=before)
+    config = Peer(PeerSettings("b", now), (), TRUSTED, previous_public_key=before)
     graces = Graces()
 
     def joined(at: float) -> PeerLink:
@@ -216,11 +219,13 @@ def test_our_previous_key_stays_given_up_when_their_key_changes() -> None:
     first, second = (KeyPair(keys.decode_key(each)).public for each in (THEIRS_BEFORE, THEIRS))
     graces = Graces()
     node = Node(Secret(keys.decode_key(OWN)), bytes, 0.0, Secret(keys.decode_key(PREVIOUS)))
-    link = PeerLink(Peer(PeerSettings("b", first), ()), node, lambda _: None, 0.0)
+    link = PeerLink(Peer(PeerSettings("b", first), (), TRUSTED), node, lambda _: None, 0.0)
     link.join(0.0, graces, 10.0, has_previous_key=True)
     assert list(node.peers) == ["b", "b (our previous key)"]
     assert link.confirm(1.0, graces)
     link.leave(2.0)
-    rotated = PeerLink(Peer(PeerSettings("b", second), (), previous_public_key=first), node, lambda _: None, 2.0)
+    rotated = PeerLink(
+        Peer(PeerSettings("b", second), (), TRUSTED, previous_public_key=first), node, lambda _: None, 2.0
+    )
     rotated.join(2.0, graces, 10.0, has_previous_key=True)
     assert list(node.peers) == ["b", "b (previous key)"]

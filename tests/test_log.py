@@ -16,6 +16,7 @@ import pytest
 import structlog
 
 from tests.core.harness import KEY_A, Pair
+from tests.policies import TRUSTED
 from uavlinkd import metrics
 from uavlinkd.config import Peer
 from uavlinkd.core.crypto import Secret
@@ -113,7 +114,7 @@ def test_a_line_stays_a_line(fmt: str) -> None:
 def test_every_reason_has_a_meaning() -> None:
     """An operator reads a sentence, not a name."""
     assert set(MEANINGS) >= set(DISTURBANCES)
-    link = PeerLink(Peer(PeerSettings("alpha", KEY_A.public), ()), Pair().b.node, lambda _: None, 0.0)
+    link = PeerLink(Peer(PeerSettings("alpha", KEY_A.public), (), TRUSTED), Pair().b.node, lambda _: None, 0.0)
     assert set(link.disturbances(0.0)) == set(DISTURBANCES) <= set(metrics._PEER_TOTALS)
     assert set(MEANINGS) >= {reason.value for reason in DropReason}
     assert set(REFUSALS) == set(Refusal)

@@ -10,6 +10,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from tests.core.harness import AT_A, AT_B, ELSEWHERE, KEY_A, KEY_B, PLAIN, QUIET, Pair, exchange, of, payloads
 from tests.endpoints.programs import PASSES
+from tests.policies import TRUSTED
 from uavlinkd.addresses import Address
 from uavlinkd.config import Peer
 from uavlinkd.core import handshake
@@ -45,7 +46,10 @@ def test_replayed_handshakes_do_not_silence_a_link_with_a_budget(source: Path) -
     pair = Pair(link_a=link, link_b=link).establish()
     outputs: list[Output] = []
     config = Peer(
-        PeerSettings("alpha", KEY_A.public, None, link), (), egress=EgressSettings(budget_bits_s=BUDGET_BITS_S)
+        PeerSettings("alpha", KEY_A.public, None, link),
+        (),
+        TRUSTED,
+        egress=EgressSettings(budget_bits_s=BUDGET_BITS_S),
     )
     peer_link = PeerLink(config, pair.b.node, outputs.extend, 0.0)
     peer_link.on_session()
@@ -70,7 +74,7 @@ def test_a_budget_that_comes_with_a_reload_pays_for_nothing_before_it() -> None:
     link = Link(suites=PLAIN.suites, timers=QUIET)
     pair = Pair(link_a=link, link_b=link).establish()
     outputs: list[Output] = []
-    config = Peer(PeerSettings("alpha", KEY_A.public, None, link), ())
+    config = Peer(PeerSettings("alpha", KEY_A.public, None, link), (), TRUSTED)
     peer_link = PeerLink(config, pair.b.node, outputs.extend, 0.0)
     while pair.b.peer.traffic.bytes_sent < 1_000_000:
         peer_link.send(heartbeat() * 20, PASSES, 1.0, 0.0)
@@ -85,7 +89,7 @@ def test_a_budget_that_comes_with_a_reload_pays_for_nothing_before_it() -> None:
 def test_a_peer_whose_addresses_are_other_ones_is_not_called_at_those_before() -> None:
     """Its new names may have no address yet. The path that is in use goes on being so."""
     pair = Pair(link_a=Link(suites=PLAIN.suites, timers=QUIET), link_b=PLAIN).establish()
-    config = Peer(PeerSettings("bravo", KEY_B.public, None, PLAIN), (Address("192.0.2.2", 14600),))
+    config = Peer(PeerSettings("bravo", KEY_B.public, None, PLAIN), (Address("192.0.2.2", 14600),), TRUSTED)
     link = PeerLink(config, pair.a.node, lambda _: None, 0.0)
     assert list(pair.a.peer.caller.addresses) == [AT_B]
     link.change(replace(config, egress=EgressSettings(coalesce_s=0.01)), 1.0)
@@ -99,7 +103,7 @@ def test_a_peer_whose_addresses_are_other_ones_is_not_called_at_those_before() -
 def test_a_peer_that_is_not_heard_is_told_of_once(addresses: tuple[Address, ...], told_at: int) -> None:
     """Soon where it is called in vain, later where it has to call; and again only when it was up meanwhile."""
     pair = Pair(link_a=Link(suites=PLAIN.suites, timers=QUIET), link_b=PLAIN)
-    config = Peer(PeerSettings("bravo", KEY_B.public, None, PLAIN), addresses)
+    config = Peer(PeerSettings("bravo", KEY_B.public, None, PLAIN), addresses, TRUSTED)
     link = PeerLink(config, pair.a.node, lambda _: None, 0.0)
     assert [second for second in range(200) if link.is_unheard(float(second))] == [told_at]
     link.change(replace(config, addresses=(Address("192.0.2.3", 14600),)), 200.0)  # told anew, of the new address

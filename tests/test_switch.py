@@ -72,7 +72,7 @@ class Stage:
 
 def policy(**data: object) -> Policy:
     """As a configuration describes it; nothing: everything passes."""
-    return compile_policy(data, needs_system_ids=False)
+    return compile_policy(data, is_local=True)
 
 
 def attitude(number: int, system: int = 1) -> Frame:

@@ -200,25 +200,27 @@ def test_coalescing_alone_is_told(folder: Path) -> None:
 
 def test_policy_without_exceptions_has_no_table(folder: Path) -> None:
     """Where everything but signing passes both ways, two lines say so."""
-    text = _FILE.replace('role = "swarm-member"\nsystem_ids = [2]', "system_ids = [2]")
+    text = _FILE.replace('role = "swarm-member"', 'role = "all"')
     policy = _policies(_printed(_load(folder, text)))["drone1"]
     assert policy.startswith("both ways heartbeat, position, telemetry, ")
     assert policy.endswith("HEARTBEAT neither way signing")
 
 
 def test_each_peer_and_endpoint_is_told_with_its_role(folder: Path) -> None:
-    """Who it is and as which systems it speaks; who has no policy stands out by what that means."""
-    printed = _printed(_load(folder, _FILE.replace('role = "observer"\nsystem_ids = [254]\n', "")))
+    """Who it is and as which systems it speaks; a peer that may say everything stands out by what that means."""
+    printed = _printed(
+        _load(folder, _FILE.replace('role = "observer"\nsystem_ids = [254]', 'role = "all"\nsystem_ids = "all"'))
+    )
     summary = printed.split("Who may say what\n")[1].split("\n\n")[0]
     rows = [line.split() for line in summary.splitlines()[2:]]
     nothing_said = ["may", "say", "anything", "but", "SETUP_SIGNING", "any", "system"]
     assert rows == [
         ["peer", "drone1", "swarm-member", "2"],
-        ["peer", "observer", *nothing_said],
+        ["peer", "observer", "all:", *nothing_said[2:]],
         ["endpoint", "autopilot", *nothing_said],
         ["endpoint", "tablet", *nothing_said],
     ]
-    assert list(_policies(printed)) == ["drone1"]
+    assert list(_policies(printed)) == ["drone1", "observer"]
 
 
 def test_policy_is_told_once_for_all_who_have_it(folder: Path) -> None:

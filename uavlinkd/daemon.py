@@ -82,7 +82,8 @@ class Daemon:
         self.stall = StallWatch(now, self._on_pause)
         self.peer_sockets = PeerSockets(self._on_arrived, self.stall, self._drops, self.log)
         self._radio_status: dict[str, RadioStatusSource] = {}
-        self._own = Source(config.name, compile_policy({}).incoming)  # of the frames that this daemon makes itself
+        # Of the frames that this daemon makes itself.
+        self._own = Source(config.name, compile_policy({}, is_local=True).incoming)
         self._deliveries: dict[str, list[Frame]] = {}
         self._turns = Turns()
         self._frames_in_turn = 0

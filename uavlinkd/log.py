@@ -77,6 +77,7 @@ REFUSALS: dict[str, str] = {
     Refusal.COMMAND_NOT_ALLOWED: "commands that its role, or its lists, do not let pass",
     Refusal.SETUP_SIGNING: "MAVLink signing keys in clear, which never cross a link",
     Refusal.MAVLINK1_NOT_ALLOWED: "MAVLink 1, which is switched off for it",
+    Refusal.FILE_WRITE_NOT_ALLOWED: "file transfers that write, where only reading is allowed",
     Refusal.GROUND_STATION_NOT_ALLOWED: "heartbeats as a ground station, which its role is not",
     Refusal.HIDDEN_FRAME: "frames with another frame hidden in their bytes, which it may not send",
     Refusal.RATE_LIMITED: "more of these messages than rate_in or rate_out lets pass",

@@ -37,11 +37,12 @@ def review(config: Config) -> list[RenderableType]:
     having: dict[_Rows, list[str]] = {}
     for kind, name, data, policy in speakers:
         if not data:
-            style = "bold yellow" if kind == "peer" else ""
-            summary.add_row(kind, Text(name), Text("may say anything but SETUP_SIGNING", style=style), "any system")
+            summary.add_row(kind, Text(name), Text("may say anything but SETUP_SIGNING"), "any system")
             continue
         said = {row.subject: row.incoming for row in policy.describe()}
-        summary.add_row(kind, Text(name), Text(said["role"]), Text(said["may speak as"]))
+        trusts_all = kind == "peer" and said["role"] == dialect.ALL
+        role = Text("all: anything but SETUP_SIGNING", style="bold yellow") if trusts_all else Text(said["role"])
+        summary.add_row(kind, Text(name), role, Text(said["may speak as"]))
         having.setdefault(table_rows(policy, data), []).append(name)
     parts: list[RenderableType] = [Text("\nWho may say what", style="bold"), summary]
     for rows, names in having.items():

@@ -83,6 +83,15 @@ def drops(status: Status) -> dict[str, int]:
     return {reason: amount for reason, amount in counts.items() if reason != "unexpected_response"}
 
 
+def _open_policy(settings: Mapping[str, object]) -> dict[str, object]:
+    """A peer's settings, with all that they do not name allowed in so many words."""
+    lists = {"allow_in", "allow_out"}
+    allowed: dict[str, object] = {"system_ids": "all"}
+    if "role" not in settings:
+        allowed |= {key: ["all"] for key in lists} if lists & set(settings) else {"role": "all"}
+    return allowed | dict(settings)
+
+
 _given_ports: set[int] = set()
 
 
@@ -334,12 +343,12 @@ class DaemonProcess:
     def add_peer(
         self, peer: DaemonProcess, addresses: Sequence[str], psk: str | None = None, **settings: object
     ) -> None:
-        """Add a peer, with a key shared with it where there is one."""
+        """Add a peer, with a key shared with it where there is one. It may say what ``settings`` do not refuse."""
         section: dict[str, object] = {"name": peer.name, "public_key": peer.public_key, "addresses": list(addresses)}
         if psk is not None:
             section["psk_file"] = f"{peer.name}.psk"
             keys.write_secret_file(self.folder / f"{peer.name}.psk", psk)
-        self.config["peer"].append({**section, **settings})
+        self.config["peer"].append({**section, **_open_policy(settings)})
 
     def write_config(self) -> Path:
         """Write the configuration file."""

@@ -30,7 +30,7 @@ from tests.daemon.harness import DaemonProcess, Sockaddr, Stage
 
 DRONES = (1, 2, 3)
 FRAMES = 200
-TRUSTED: dict[str, object] = {"system_ids": "all"}
+TRUSTED: dict[str, object] = {"role": "all", "system_ids": "all"}
 
 
 class Vehicle(NamedTuple):

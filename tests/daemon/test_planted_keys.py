@@ -83,6 +83,8 @@ name = "drone1"
 public_key = "PUBLIC"
 addresses = ["127.0.0.1:5791"]
 psk_file = "drone1.psk"
+role = "all"
+system_ids = "all"
 """
 MISTAKES = {
     "as the name": ('name = "drone0"', f'name = "{KEY}"'),

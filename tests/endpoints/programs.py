@@ -10,6 +10,7 @@ from time import monotonic
 
 from pymavlink.dialects.v20 import common as mavlink
 
+from tests.policies import TRUSTED
 from uavlinkd.addresses import Address
 from uavlinkd.clock import monotonic as boot_time
 from uavlinkd.endpoints.ports import Endpoint, LocalPort
@@ -43,7 +44,7 @@ def heartbeat() -> bytes:
 
 def source(name: str) -> Source:
     """A peer that may send everything."""
-    return Source(name, compile_policy({}).incoming)
+    return Source(name, compile_policy(TRUSTED).incoming)
 
 
 PASSES = source("peer")

@@ -209,7 +209,7 @@ def test_no_member_keeps_a_removed_one_by_another_name(folder: Path) -> None:
     assert snapshot(folder) == before
     text = path.read_text().replace('name = "scout"', 'name = "drone1"')
     key = read_manifest(folder).member("drone1").public_key
-    path.write_text(f'{text}\n[[peer]]\nname = "second"\npublic_key = " {key}"\nsystem_ids = [9]\n')
+    path.write_text(f'{text}\n[[peer]]\nname = "second"\npublic_key = " {key}"\nrole = "all"\nsystem_ids = [9]\n')
     with pytest.raises(FleetError, match=r"peer\[4\] \(second\) has a key of drone1"):
         work.rotate(folder, "drone1", at_once=True)
     path.write_text(text)

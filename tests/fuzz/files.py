@@ -246,7 +246,7 @@ def config_seeds() -> list[bytes]:
     """Every configuration that comes with the package."""
     small = [
         'name = "a"\nprivate_key_file = "drone0.key"\nlisten = ["0.0.0.0:1"]\n',
-        f'[[peer]]\nname = "b"\npublic_key = "{PUBLIC}"\nsystem_ids = [1]\n',
+        f'[[peer]]\nname = "b"\npublic_key = "{PUBLIC}"\nrole = "all"\nsystem_ids = [1]\n',
         f'psk_file = "{SECRET}"\n',
         '[[endpoint]]\nname = "e"\nurl = "tcpin:127.0.0.1:2"\n',
     ]

@@ -196,7 +196,7 @@ def file_part(content: bytes, system: int = 1) -> bytes:
 
 def test_setup_signing_never_passes_hidden() -> None:
     """Also from a source that may send everything."""
-    everything = Source("local", compile_policy({}).incoming)
+    everything = Source("local", compile_policy({}, is_local=True).incoming)
     assert not Client().send(file_part(v2(SETUP_SIGNING, bytes(41) + b"\1")), everything)
     assert Client().send(file_part(ARM), everything)
 

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import all as mavlink
 
 from tests.mavlink.test_egress import attitude, battery, command, frame, heartbeat, parameter
+from tests.policies import TRUSTED
 from uavlinkd.mavlink.delivery import Source
 from uavlinkd.mavlink.egress_kinds import flow_key, kind_of
 from uavlinkd.mavlink.egress_lanes import EgressDrop
@@ -26,7 +27,7 @@ from uavlinkd.mavlink.fair_queue import (
 from uavlinkd.mavlink.frames import Frame
 from uavlinkd.mavlink.policy import compile_policy
 
-GATE = compile_policy({}).incoming
+GATE = compile_policy(TRUSTED).incoming
 HONEST, CAPTURED = Source("honest", GATE), Source("captured", GATE)
 
 

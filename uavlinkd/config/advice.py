@@ -49,8 +49,7 @@ def _policies(endpoints: Sequence[Endpoint], peers: Sequence[Peer]) -> Iterator[
     about: dict[str, list[str]] = {}
     for peer in peers:
         for warning in peer.make_policy().warnings:
-            remedy = "" if peer.policy else '; say what it is: role = "vehicle" and system_ids = [1], for example'
-            about.setdefault(warning + remedy, []).append(f'peer "{peer.name}"')
+            about.setdefault(warning, []).append(f'peer "{peer.name}"')
     for endpoint in endpoints:
         for warning in endpoint.make_policy().warnings if endpoint.policy else ():
             # A program on this machine may be any system, unless the file says which.
@@ -65,10 +64,10 @@ def _shared_systems(endpoints: Sequence[Endpoint], peers: Sequence[Peer]) -> Ite
     """Programs on this machine may be components of one system; systems far from one another are not."""
     speakers: dict[int, list[str]] = {}
     for peer in peers:
-        for system in read_settings(peer.policy, needs_system_ids=True).systems or ():
+        for system in read_settings(peer.policy, is_local=False).systems or ():
             speakers.setdefault(system, []).append(f'peer "{peer.name}"')
     for endpoint in endpoints:
-        for system in read_settings(endpoint.policy, needs_system_ids=False).systems or ():
+        for system in read_settings(endpoint.policy, is_local=True).systems or ():
             if system in speakers:
                 speakers[system].append(f'endpoint "{endpoint.name}"')
     shared: dict[tuple[str, ...], list[int]] = {}

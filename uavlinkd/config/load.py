@@ -66,10 +66,10 @@ def load_config(path: Path, environ: Mapping[str, str]) -> Config:
     checks.recording(problems, recording, peers)
     checks.timers(problems, link)
     for endpoint in endpoints:
-        policies.check(problems, endpoint, needs_system_ids=False)
+        policies.check(problems, endpoint, is_local=True)
     for peer, psk in zip(peers, psks, strict=True):
         checks.timers(problems, peer, link)
-        policies.check(problems, peer, needs_system_ids=True)
+        policies.check(problems, peer, is_local=False)
         if psk is not None and psk == private:
             problems.add(
                 peer.place.key("psk_file"),

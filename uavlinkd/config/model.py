@@ -39,7 +39,7 @@ class Endpoint:
 
     def make_policy(self) -> Policy:
         """A new policy: its counters at zero, its rates unused."""
-        return compile_policy(self.policy, needs_system_ids=False)
+        return compile_policy(self.policy, is_local=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +51,7 @@ class Peer:
 
     settings: PeerSettings
     addresses: tuple[Address, ...]
-    policy: PolicyData = field(default_factory=_trust_all)
+    policy: PolicyData
     egress: EgressSettings = field(default_factory=EgressSettings)
     previous_public_key: bytes | None = None
 

@@ -25,10 +25,10 @@ def data(section: Values) -> PolicyData:
     )
 
 
-def check(problems: Problems, section: Values, *, needs_system_ids: bool) -> None:
+def check(problems: Problems, section: Values, *, is_local: bool) -> None:
     """Note whatever is wrong in the section's policy."""
     try:
-        compile_policy(data(section), needs_system_ids=needs_system_ids)
+        compile_policy(data(section), is_local=is_local)
     except PolicyError as error:
         for found in error.problems:
             problems.add(section.place.key(found.key), f"{found.problem}; {found.remedy}")

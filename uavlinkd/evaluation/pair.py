@@ -86,6 +86,8 @@ name = "{peer.name}"
 public_key = "{peer.public_key}"
 addresses = [{f'"{calls}"' if calls else ""}]
 psk_file = "pair.psk"
+role = "all"
+system_ids = "all"
 """,
             encoding="utf-8",
         )

@@ -235,6 +235,11 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
         "LOG_REQUEST_END LOGGING_DATA LOGGING_DATA_ACKED LOGGING_ACK REMOTE_LOG_DATA_BLOCK "
         "REMOTE_LOG_BLOCK_STATUS DATA_TRANSMISSION_HANDSHAKE ENCAPSULATED_DATA RESOURCE_REQUEST"
     ),
+    # Only reading files and logs: of FILE_TRANSFER_PROTOCOL the requests that read and their answers
+    # (`policy_settings.READING_OPCODES`).
+    "files-read": _names(
+        "FILE_TRANSFER_PROTOCOL LOG_REQUEST_LIST LOG_ENTRY LOG_REQUEST_DATA LOG_DATA LOG_REQUEST_END"
+    ),
     # Bytes for a shell, a serial port, a bus or a program: no policy can see what they do.
     "shell": _names(
         "SERIAL_CONTROL TUNNEL V2_EXTENSION CAN_FRAME CANFD_FRAME CAN_FILTER_MODIFY DEVICE_OP_READ "

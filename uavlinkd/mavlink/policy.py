@@ -1,10 +1,10 @@
 """Who may say what: a policy for one peer or one local endpoint, each way.
 
-*In* is what comes from the peer or endpoint, *out* what goes to it. The keys, all optional unless said otherwise::
+*In* is what comes from the peer or endpoint, *out* what goes to it. The keys::
 
-    role = "operator"                    a preset to start from, see `roles`
+    role = "operator"                    a preset to start from, see `roles`; "all" lets everything through
     system_ids = [1, "10-20"]            MAVLink systems it may speak as; "all" trusts it with every one
-    allow_in  = ["telemetry", "PING"]    what passes; without a role and this list, everything does
+    allow_in  = ["telemetry", "PING"]    what passes
     deny_in   = ["MAV_CMD_DO_FLIGHTTERMINATION"]            what does not, whatever allows it
     allow_out, deny_out                  the same for the other way
     rate_in   = { ATTITUDE = 10 }        frames a second of each message and component; also of a group's messages;
@@ -14,10 +14,17 @@
     mavlink1 = true                      whether MAVLink 1 frames pass
     ground_station = true                whether its HEARTBEAT may claim to be a ground station's
 
+A peer's policy fails closed: it needs `system_ids`, and a role or both `allow_in` and `allow_out` ([] lets nothing
+pass). All keys are optional for a local endpoint, whose wire is trusted: without a role and a list everything passes.
+
+Denial is best effort. An autopilot does most things in several ways (`alternatives` lists those that are known), and
+its next release may add one. To keep an effect out, allow what is needed and nothing else.
+
 A list's entries add up, a role's entries among them, and what is denied is denied whatever allows it. An entry is
 
 ``telemetry``            a group of `dialect.GROUPS` (small letters), or ``all``
 ``ATTITUDE``             a message by its name (capitals)
+``files-read``           a group that allows only what reads of FILE_TRANSFER_PROTOCOL (READING_OPCODES)
 ``30``                   a message by its number: the way to name one that the dialect does not know
 ``MAV_CMD_NAV_TAKEOFF``  a command by its name; ``command:22`` by its number. Allowing one lets it through in
                          COMMAND_LONG and COMMAND_INT. Denying one keeps it out of all that carries commands, mission
@@ -48,10 +55,19 @@ from enum import StrEnum
 from typing import Final, NamedTuple
 
 from uavlinkd.mavlink import dialect
+from uavlinkd.mavlink.alternatives import open_effects
 from uavlinkd.mavlink.dialect_table import COMMANDS, MESSAGES
 from uavlinkd.mavlink.egress_kinds import FlowKey, flow_key, kind_of
 from uavlinkd.mavlink.frames import Frame, Header
-from uavlinkd.mavlink.policy_settings import PolicyError, PolicyProblem, Rules, Settings, read_settings
+from uavlinkd.mavlink.policy_settings import (
+    FILE_TRANSFER,
+    READING_OPCODES,
+    PolicyError,
+    PolicyProblem,
+    Rules,
+    Settings,
+    read_settings,
+)
 
 __all__ = [
     "ANY_OTHER",
@@ -111,6 +127,9 @@ DONE_AT_ONCE: Final[Mapping[int, int]] = {
     3: COMMANDS["MAV_CMD_DO_CHANGE_ALTITUDE"],
 }
 
+# Behind three bytes of target: sequence 2, session 1, opcode 1.
+OPCODE_IN_FILE_TRANSFER: Final = 6
+
 # Carries five command numbers at once, which are not looked at: refused where any command is denied.
 CARRIES_MANY_COMMANDS: Final = frozenset({dialect.ids_by_name()["TRAJECTORY_REPRESENTATION_WAYPOINTS"]})
 
@@ -125,6 +144,7 @@ class Refusal(StrEnum):
     MESSAGE_NOT_ALLOWED = "message_not_allowed"
     UNKNOWN_MESSAGE = "unknown_message"  # not in the dialect, or not as the dialect defines it
     COMMAND_NOT_ALLOWED = "command_not_allowed"
+    FILE_WRITE_NOT_ALLOWED = "file_write_not_allowed"  # FILE_TRANSFER_PROTOCOL, and not what reads
     SETUP_SIGNING = "setup_signing"
     MAVLINK1_NOT_ALLOWED = "mavlink1_not_allowed"
     GROUND_STATION_NOT_ALLOWED = "ground_station_not_allowed"
@@ -151,8 +171,13 @@ class _Condition:
     only_commands: frozenset[int] | None = None  # None: any
     never_commands: frozenset[int] = frozenset()
     never_current: frozenset[int] = frozenset()  # values of a mission item's field
+    only_reads_files: bool = False
     refuses_ground_station: bool = False
     per_second: float | None = None
+
+    def takes_command(self, number: int | None) -> bool:
+        """Whether a frame with this command meets it."""
+        return (self.only_commands is None or number in self.only_commands) and number not in self.never_commands
 
 
 class Gate:
@@ -260,9 +285,12 @@ class Gate:
             return Refusal.MESSAGE_NOT_ALLOWED
         is_allowed = rules.allows_all or msgid in rules.allowed_numbers or (is_known and msgid in rules.allowed)
         only_commands = None
+        only_reads_files = False
         if not is_allowed:
             if not is_known:
                 return Refusal.UNKNOWN_MESSAGE
+            only_reads_files = rules.reads_files and msgid == FILE_TRANSFER
+        if not is_allowed and not only_reads_files:
             if msgid not in DIRECT_COMMANDS or not rules.allowed_commands:
                 return Refusal.MESSAGE_NOT_ALLOWED
             only_commands = rules.allowed_commands
@@ -280,10 +308,22 @@ class Gate:
             only_commands,
             never_commands,
             never_current,
+            only_reads_files=only_reads_files,
             refuses_ground_station=msgid == HEARTBEAT and not self._ground_station,
             per_second=self._rates.get(msgid),
         )
         return None if condition == _UNCONDITIONAL else condition
+
+    def lets_act(self, name: str) -> bool:
+        """Whether a frame of this message passes that changes something; with MAV_CMD_ in front, of this command."""
+        if not name.startswith("MAV_CMD_"):
+            verdict = self.decide(dialect.ids_by_name()[name], is_known=True)
+            return verdict is None or (isinstance(verdict, _Condition) and not verdict.only_reads_files)
+        verdicts = (self.decide(msgid, is_known=True) for msgid in DIRECT_COMMANDS)
+        return any(
+            verdict is None or (isinstance(verdict, _Condition) and verdict.takes_command(COMMANDS[name]))
+            for verdict in verdicts
+        )
 
     def _remember(self, key: int, verdict: Refusal | _Condition | None) -> Refusal | _Condition | None:
         if len(self._decisions) >= MAX_DECISIONS:
@@ -303,12 +343,12 @@ class Gate:
         return Refusal.RATE_LIMITED
 
     def _breach(self, condition: _Condition, frame: Frame) -> Refusal | None:
-        if condition.only_commands is not None and frame.header.command not in condition.only_commands:
-            return Refusal.COMMAND_NOT_ALLOWED
-        if frame.header.command in condition.never_commands:
+        if not condition.takes_command(frame.header.command):
             return Refusal.COMMAND_NOT_ALLOWED
         if condition.never_current and _payload_byte(frame, CURRENT_IN_MISSION_ITEM) in condition.never_current:
             return Refusal.COMMAND_NOT_ALLOWED
+        if condition.only_reads_files and _payload_byte(frame, OPCODE_IN_FILE_TRANSFER) not in READING_OPCODES:
+            return Refusal.FILE_WRITE_NOT_ALLOWED
         if condition.refuses_ground_station and _claims_to_be_ground_station(frame):
             return Refusal.GROUND_STATION_NOT_ALLOWED
         return None
@@ -380,7 +420,8 @@ class Policy:
             mavlink1=settings.mavlink1,
             ground_station=True,
         )
-        self.warnings = tuple(_warnings(settings))  # sentences for the operator, the gravest first
+        # Sentences for the operator, the gravest first.
+        self.warnings = tuple(_warnings(settings, self.incoming, self.outgoing))
 
     def describe(self) -> list[PolicyRow]:
         """The policy as a table: each group of messages, and what holds beside them."""
@@ -408,26 +449,37 @@ class Policy:
         return rows
 
 
-def compile_policy(data: Mapping[str, object], *, needs_system_ids: bool = True) -> Policy:
-    """The policy that plain data (see this module's head) describes. No data at all: everything passes.
+def compile_policy(data: Mapping[str, object], *, is_local: bool = False) -> Policy:
+    """The policy that plain data (see this module's head) describes.
 
-    `needs_system_ids`: a policy that says anything must say which systems the peer may speak as. Right for
-    peers; a local endpoint without `system_ids` may speak as any.
+    `is_local`: of a local endpoint, where every key is optional and no data lets everything pass. A peer's policy
+    must say what passes each way and which systems the peer may speak as.
 
     Raises:
         PolicyError: with every problem in the data, each with its key and its remedy.
     """
-    return Policy(read_settings(data, needs_system_ids=needs_system_ids))
+    return Policy(read_settings(data, is_local=is_local))
 
 
-def _warnings(settings: Settings) -> list[str]:
+def _warnings(settings: Settings, incoming: Gate, outgoing: Gate) -> list[str]:
     if settings.is_empty:
         return ["no policy: it may speak as any system and send anything but SETUP_SIGNING"]
     found = []
+    if settings.role == dialect.ALL:
+        found.append('role = "all": it may send every message and command that no list denies')
     if settings.systems is None:
         found.append('system_ids is "all": it may speak as any system, the ground station\'s among them')
-    for way, rules in (("in", settings.rules_in), ("out", settings.rules_out)):
-        if not rules.denied_commands or rules.denies_all:
+    for way, rules, gate in (("in", settings.rules_in, incoming), ("out", settings.rules_out, outgoing)):
+        if rules.denies_all:
+            continue
+        # A denied message that does what a command does stands for that command.
+        same = {SAME_AS_COMMAND[msgid] for msgid in rules.denied if msgid in SAME_AS_COMMAND}
+        for name, denied, still_open in open_effects(rules.denied_commands | same, gate.lets_act):
+            found.append(
+                f"deny_{way} keeps out {', '.join(denied)}, but {name} stays possible by {', '.join(still_open)}:"
+                f" denial is best effort; to keep the effect out, write no role and allow_{way} = what is needed"
+            )
+        if not rules.denied_commands:
             continue
         ids = dialect.ids_by_name()
         through = [
@@ -446,12 +498,9 @@ def _group_text(gate: Gate, members: tuple[str, ...]) -> str:
     ids = dialect.ids_by_name()
     verdicts = {name: gate.decide(ids[name], is_known=True) for name in members}
     passing = [name for name, verdict in verdicts.items() if not isinstance(verdict, Refusal)]
-    limited = [
-        name
-        for name in passing
-        if isinstance(verdict := verdicts[name], _Condition)
-        and (verdict.only_commands is not None or verdict.never_commands)
-    ]
+    conditions = {name: verdict for name in passing if isinstance(verdict := verdicts[name], _Condition)}
+    limited = [name for name, each in conditions.items() if each.only_commands is not None or each.never_commands]
+    reading = [name for name, each in conditions.items() if each.only_reads_files]
     if not passing:
         return "none" if members != ("SETUP_SIGNING",) else "never"
     if len(passing) == len(members):
@@ -460,7 +509,8 @@ def _group_text(gate: Gate, members: tuple[str, ...]) -> str:
         text = f"all but {', '.join(name for name in members if name not in passing)}"
     else:
         text = f"only {', '.join(passing)}"
-    return text + (f" (by command: {', '.join(limited)})" if limited else "")
+    text += f" (by command: {', '.join(limited)})" if limited else ""
+    return text + (f" (only reading: {', '.join(reading)})" if reading else "")
 
 
 def _commands_text(rules: Rules) -> str:

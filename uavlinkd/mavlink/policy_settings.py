@@ -43,6 +43,25 @@ DONE_BY: Final[Mapping[int, frozenset[int]]] = {
 }
 
 
+FILES_READ: Final = "files-read"
+FILE_TRANSFER: Final = dialect.ids_by_name()["FILE_TRANSFER_PROTOCOL"]
+# MAVLink's MAV_FTP_OPCODE (https://mavlink.io/en/services/ftp.html). The others create, write, truncate, rename or
+# remove; a number that the definition does not have may do anything.
+READING_OPCODES: Final = frozenset(
+    {
+        1,  # TerminateSession
+        2,  # ResetSessions
+        3,  # ListDirectory
+        4,  # OpenFileRO
+        5,  # ReadFile
+        14,  # CalcFileCRC32
+        15,  # BurstReadFile
+        128,  # ACK, of either kind of request
+        129,  # NAK
+    }
+)
+
+
 class PolicyProblem(NamedTuple):
     """One thing wrong in a policy's data."""
 
@@ -70,6 +89,7 @@ class Rules:
     allowed: frozenset[int]  # by name or group: the message as the dialect defines it
     allowed_numbers: frozenset[int]  # by number: in whatever definition
     allowed_commands: frozenset[int]
+    reads_files: bool  # of FILE_TRANSFER_PROTOCOL, READING_OPCODES pass
     denies_all: bool
     denied: frozenset[int]  # in whatever definition
     denied_commands: frozenset[int]
@@ -79,7 +99,7 @@ class Rules:
 class Settings:
     """A policy's data, read."""
 
-    is_empty: bool  # there was none
+    is_empty: bool  # there was none: only a local endpoint may have none
     role: str | None
     systems: frozenset[int] | None  # that it may speak as; None: any
     systems_text: str
@@ -101,10 +121,11 @@ class _Entry(NamedTuple):
     messages: tuple[int, ...] = ()
     number: int | None = None
     command: int | None = None
+    reads_files: bool = False
 
 
-def read_settings(data: Mapping[str, object], *, needs_system_ids: bool) -> Settings:
-    """What plain data says.
+def read_settings(data: Mapping[str, object], *, is_local: bool) -> Settings:
+    """Read a policy's plain data. ``is_local``: of an endpoint, where a missing list lets everything through.
 
     Raises:
         PolicyError: with every problem in it.
@@ -121,7 +142,9 @@ def read_settings(data: Mapping[str, object], *, needs_system_ids: bool) -> Sett
     role = ROLES.get(role_name) if isinstance(role_name, str) else None
     if role_name is not None and role is None:
         report("role", f"no such role: {role_name!r}", f"the roles are {', '.join(ROLES)}")
-    systems, systems_text = _systems(data, report, is_needed=needs_system_ids and bool(data))
+    if not is_local:
+        _check_is_complete(data, report)
+    systems, systems_text = _systems(data, report, is_needed=not is_local)
     rules = {}
     rates = {}
     for way, preset in (("in", role and role.allow_in), ("out", role and role.allow_out)):
@@ -129,7 +152,7 @@ def read_settings(data: Mapping[str, object], *, needs_system_ids: bool) -> Sett
         deny = _list(data, f"deny_{way}", report)
         _check_entries(f"allow_{way}", allow, report)
         _check_entries(f"deny_{way}", deny, report)
-        allows_all = preset is None and f"allow_{way}" not in data
+        allows_all = is_local and preset is None and f"allow_{way}" not in data
         rules[way] = _rules((*(preset or ()), *allow), deny, allows_all=allows_all)
         rates[way] = _rates(data, f"rate_{way}", report)
     if role is not None:
@@ -151,9 +174,27 @@ def read_settings(data: Mapping[str, object], *, needs_system_ids: bool) -> Sett
     return settings
 
 
+def _check_is_complete(data: Mapping[str, object], report: Report) -> None:
+    """A peer's policy says what passes each way: nothing is allowed because a key is missing."""
+    if "role" in data:
+        return
+    missing = [key for key in ("allow_in", "allow_out") if key not in data]
+    if len(missing) == 2:
+        names = ", ".join(f'"{name}"' for name in ROLES if name != dialect.ALL)
+        remedy = f'write role = one of {names}, or both lists; role = "{dialect.ALL}" lets everything through'
+        report("role", "missing, and there is no allow_in and no allow_out: nothing says what may pass", remedy)
+    for key in missing if len(missing) == 1 else ():
+        direction = "come from" if key == "allow_in" else "go to"
+        report(
+            key,
+            f"missing: without a role, nothing says what may {direction} this peer",
+            f'write {key} = ["telemetry"] or what else may pass; [] is nothing, ["{dialect.ALL}"] everything',
+        )
+
+
 @lru_cache(maxsize=256)  # a fleet's peers mostly have the same lists, and may then share what these became
 def _rules(allow: tuple[str | int, ...], deny: tuple[str | int, ...], *, allows_all: bool) -> Rules:
-    allowed = [entry for entry in map(_entry, allow) if isinstance(entry, _Entry)]
+    allowed = [_as_allowed(entry) for entry in map(_entry, allow) if isinstance(entry, _Entry)]
     denied = [entry for entry in map(_entry, deny) if isinstance(entry, _Entry)]
     denied_messages = {msgid for entry in denied for msgid in entry.messages}
     denied_commands = {entry.command for entry in denied if entry.command is not None}
@@ -162,10 +203,18 @@ def _rules(allow: tuple[str | int, ...], deny: tuple[str | int, ...], *, allows_
         allowed=frozenset(msgid for entry in allowed for msgid in entry.messages),
         allowed_numbers=frozenset(entry.number for entry in allowed if entry.number is not None),
         allowed_commands=frozenset(entry.command for entry in allowed if entry.command is not None),
+        reads_files=any(entry.reads_files for entry in allowed),
         denies_all=any(entry.is_all for entry in denied),
         denied=frozenset(denied_messages | {entry.number for entry in denied if entry.number is not None}),
         denied_commands=frozenset(denied_commands.union(*(DONE_BY.get(each, ()) for each in denied_commands))),
     )
+
+
+def _as_allowed(entry: _Entry) -> _Entry:
+    """Reading files allows a part of FILE_TRANSFER_PROTOCOL; a list that denies reading denies the whole message."""
+    if not entry.reads_files:
+        return entry
+    return entry._replace(messages=tuple(msgid for msgid in entry.messages if msgid != FILE_TRANSFER))
 
 
 def _entry(item: str | int) -> _Entry | PolicyProblem:
@@ -185,7 +234,8 @@ def _entry(item: str | int) -> _Entry | PolicyProblem:
         return _Entry(messages=(msgid,))
     members = dialect.GROUPS.get(item)
     if members is not None:
-        return _Entry(messages=tuple(dialect.ids_by_name()[name] for name in members))
+        ids = tuple(dialect.ids_by_name()[name] for name in members)
+        return _Entry(messages=ids, reads_files=item == FILES_READ)
     known = (*dialect.GROUPS, *dialect.ids_by_name())
     remedy = "groups are in small letters, messages in capitals, an unknown message goes by its number"
     return PolicyProblem("", f"no such group or message: {item!r}", _did_you_mean(item, known, remedy))

@@ -16,6 +16,8 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Final, NamedTuple
 
+from uavlinkd.mavlink.dialect import ALL
+
 
 class Role(NamedTuple):
     """The lists that a policy starts from."""
@@ -93,5 +95,11 @@ ROLES: Final[Mapping[str, Role]] = {
         allow_out=_BETWEEN_MEMBERS,
         ground_station=False,
         rate_in=_MEMBER_RATES,
+    ),
+    ALL: Role(
+        "trusted with everything: any message and command both ways, except SETUP_SIGNING",
+        allow_in=(ALL,),
+        allow_out=(ALL,),
+        ground_station=True,
     ),
 }

@@ -79,12 +79,14 @@ class DroneProcess:
         (self.folder / "drone.toml").write_text("\n".join(lines).lstrip(), encoding="utf-8")
 
     def as_peer(self, address: str, psk_file: str, **settings: object) -> dict[str, object]:
-        """What another drone's configuration says of this one."""
+        """What another drone's configuration says of this one: it is trusted, unless ``settings`` say otherwise."""
         return {
             "name": self.name,
             "public_key": self.public_key,
             "addresses": [address],
             "psk_file": psk_file,
+            "role": "all",
+            "system_ids": "all",
             **settings,
         }
 

@@ -58,7 +58,7 @@ class Deliverer:
 
     def __post_init__(self) -> None:
         self._gates = {name: compile_policy(data).incoming for name, data in self.cast.items()}
-        self._outgoing = [compile_policy(data, needs_system_ids=False).outgoing for data in CLIENTS]
+        self._outgoing = [compile_policy(data, is_local=True).outgoing for data in CLIENTS]
 
     def deliver(self, recipe: Recipe) -> Stream:
         """What the client reads."""
@@ -130,7 +130,7 @@ class Judge:
         self, cast: Mapping[str, Mapping[str, object]] = CAST, clients: Sequence[Mapping[str, object]] = CLIENTS
     ) -> None:
         self._gates = {name: compile_policy(data).incoming for name, data in cast.items()}
-        self._outgoing = [compile_policy(data, needs_system_ids=False).outgoing for data in clients]
+        self._outgoing = [compile_policy(data, is_local=True).outgoing for data in clients]
         self._now = 0.0
 
     def is_forbidden(self, raw: bytes, senders: Iterable[str], client: int = 0) -> bool:
