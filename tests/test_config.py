@@ -189,6 +189,21 @@ def test_pace_is_inherited_key_by_key(load: Load) -> None:
     assert load(f"{_TOP}[link]\nbudget_bits_s = 0\n{_ENDPOINT}{_PEER}").peers[0].egress == EgressSettings()
 
 
+def test_freshness_is_verified_within_a_share_of_the_budget(load: Load) -> None:
+    """Each second, or as often as a twentieth of the budget carries a request and its reply over IPv6."""
+    config = load(f"{_TOP}{_LISTEN}{_ENDPOINT}{_PEER}budget_bits_s = 4000\n{_OTHER_PEER}budget_bits_s = 1_000_000\n")
+    slow, fast = (peer.settings.link.verify_interval_s for peer in config.peers)
+    assert slow == 8 * (13 + 17 + 2 * (7 + 16 + 48)) / (0.05 * 4000)
+    assert fast == Link().verify_interval_s == load(_GOOD).peers[0].settings.link.verify_interval_s == 1.0
+
+
+def test_other_budget_is_no_other_link(load: Load) -> None:
+    """The interval follows from it, and a session goes on while it changes."""
+    before, after = (load(f"{_GOOD}budget_bits_s = {budget}\n").peers[0] for budget in (4000, 8000))
+    assert before.settings.link.verify_interval_s != after.settings.link.verify_interval_s
+    assert before.settings == after.settings
+
+
 def test_metrics_are_off_unless_an_address_is_named(load: Load) -> None:
     """An address is the switch, and loopback gives no warning."""
     assert load(_GOOD).metrics is None

@@ -10,7 +10,7 @@ from structlog.testing import capture_logs
 
 from tests.test_switch import Program
 from uavlinkd.addresses import Address
-from uavlinkd.core.outputs import PeerUp
+from uavlinkd.core.outputs import FreshnessUnverified, FreshnessVerified, PeerUp
 from uavlinkd.event_log import LINES_BURST, LINES_PER_S, EventLog
 from uavlinkd.log import SUMMARY_INTERVAL_S
 
@@ -52,6 +52,19 @@ def test_peers_are_told_apart(log: EventLog) -> None:
     assert not told(log, "b", 1.0, envelopes_out_of_order=2)
     log.forget("b")
     assert told(log, "b", 1.0, envelopes_out_of_order=2)
+
+
+def test_unverified_freshness_is_logged_when_it_begins_and_ends(log: EventLog) -> None:
+    """The first as a warning with its meaning, the second with its duration."""
+    with capture_logs() as lines:
+        log.write(FreshnessUnverified("b"), 1.0)
+        log.write(FreshnessVerified("b", 12.3456), 13.0)
+    assert [(line["event"], line["log_level"], line["peer"]) for line in lines] == [
+        ("freshness_unverified", "warning", "b"),
+        ("freshness_verified", "info", "b"),
+    ]
+    assert "held and dropped" in lines[0]["meaning"]
+    assert lines[1]["unverified_s"] == 12.346
 
 
 def test_a_silent_endpoint_is_told_once_each_time(log: EventLog) -> None:

@@ -22,6 +22,7 @@ PEER: dict[str, Any] = {
     "handshake_s": 12.5,
     "heard_s": 0.25,
     "round_trip_s": 0.003,
+    "freshness_unverified_s": None,
     "loss_in": 0.125,
     "loss_out": 0.5,
     "handshakes": 3,
@@ -106,6 +107,7 @@ def value(name: str, **labels: str) -> float:
         ("peer_last_handshake_age_seconds", {"peer": "drone1"}, 12.5),
         ("peer_last_heard_age_seconds", {"peer": "drone1"}, 0.25),
         ("round_trip_seconds", {"peer": "drone1"}, 0.003),
+        ("peer_freshness_unverified", {"peer": "drone1"}, 0),
         ("peer_handshakes_total", {"peer": "drone1"}, 3),
         ("peer_transmit_envelopes_total", {"peer": "drone1"}, 10),
         ("peer_receive_envelopes_total", {"peer": "drone1"}, 11),
@@ -201,6 +203,12 @@ def test_nothing_is_made_up() -> None:
     }
     status = copy.deepcopy(STATUS) | {"recording": None}
     assert b"recording" not in exposition(status, 0.0)
+
+
+def test_unverified_freshness_is_one() -> None:
+    """However long it has lasted."""
+    status = STATUS | {"peers": {"drone1": PEER | {"freshness_unverified_s": 12.5}}}
+    assert b'uavlinkd_peer_freshness_unverified{peer="drone1"} 1\n' in exposition(status, 0.0)
 
 
 def test_strange_names_stay_inside_their_quotes() -> None:

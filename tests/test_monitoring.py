@@ -67,6 +67,10 @@ CASES: dict[str, tuple[dict[str, str], list[tuple[str, bool]]]] = {
         {'uavlinkd_round_trip_seconds{instance="a",peer="b"}': "1x4 1.1x20"},
         [("1m", False), ("2m30s", True)],
     ),
+    "UavlinkdFreshnessUnverified": (
+        {'uavlinkd_peer_freshness_unverified{instance="a",peer="b"}': "0 0 1x20"},
+        [("15s", False), ("30s", False), ("1m", True)],
+    ),
     "UavlinkdForgeries": (
         {
             'uavlinkd_rx_dropped_total{instance="a",peer="b",reason="bad_tag"}': "0x4 1x40",

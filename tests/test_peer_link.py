@@ -13,6 +13,7 @@ from tests.endpoints.programs import PASSES
 from tests.policies import TRUSTED
 from uavlinkd.addresses import Address
 from uavlinkd.config import Peer
+from uavlinkd.config.pace import verify_interval_s
 from uavlinkd.core import handshake
 from uavlinkd.core.cookie import MacKeys
 from uavlinkd.core.outputs import Output, Path, Transmit
@@ -21,6 +22,7 @@ from uavlinkd.mavlink.egress import EgressSettings
 from uavlinkd.mavlink.frames import Frame, SplitCounters, split_payload
 from uavlinkd.mavlink.radio_status import LinkFigures
 from uavlinkd.peer_link import PeerLink, radio_figures
+from uavlinkd.status import peer_status
 
 BUDGET_BITS_S = 4000
 REPLAYS_PER_S = 4
@@ -42,7 +44,8 @@ def heartbeat() -> list[Frame]:
 @pytest.mark.parametrize("source", [ELSEWHERE, AT_A], ids=["from elsewhere", "in the peer's name"])
 def test_replayed_handshakes_do_not_silence_a_link_with_a_budget(source: Path) -> None:
     """With 4 kbit/s, and four of the peer's recorded initiations answered or not each second, heartbeats pass."""
-    link = Link(suites=PLAIN.suites, timers=QUIET)
+    interval_s = verify_interval_s(BUDGET_BITS_S, PLAIN.tag_bytes)
+    link = Link(suites=PLAIN.suites, timers=QUIET, verify_interval_s=interval_s)
     pair = Pair(link_a=link, link_b=link).establish()
     outputs: list[Output] = []
     config = Peer(
@@ -84,6 +87,27 @@ def test_a_budget_that_comes_with_a_reload_pays_for_nothing_before_it() -> None:
     assert len(of(outputs, Transmit)) == 1
     assert peer_link.egress is not None
     assert peer_link.egress.shape.payload_limit == pair.b.session.payload_limit
+
+
+def test_new_budget_changes_the_interval_of_the_next_session() -> None:
+    """The session in use goes on with the one that it began with."""
+    link = Link(suites=PLAIN.suites, timers=QUIET)
+    pair = Pair(link_a=link, link_b=link).establish()
+    config = Peer(PeerSettings("alpha", KEY_A.public, None, link), ())
+    peer_link = PeerLink(config, pair.b.node, lambda _: None, 0.0)
+    slower = replace(config.settings, link=replace(link, verify_interval_s=5.0))
+    peer_link.change(replace(config, settings=slower), 1.0)
+    assert pair.b.peer.verify_interval_s == 5.0
+    assert pair.b.peer.sessions.current is pair.b.session
+
+
+@pytest.mark.parametrize(("since", "shown"), [(None, None), (10.0, 2.5)])
+def test_status_has_the_time_of_unverified_freshness(since: float | None, shown: float | None) -> None:
+    """In seconds until now; nothing while freshness is verified."""
+    pair = Pair().establish()
+    pair.b.peer._age.unverified_since = since
+    peer_link = PeerLink(Peer(PeerSettings("alpha", KEY_A.public), ()), pair.b.node, lambda _: None, 0.0)
+    assert peer_status(peer_link, 12.5)["freshness_unverified_s"] == shown
 
 
 def test_a_peer_whose_addresses_are_other_ones_is_not_called_at_those_before() -> None:

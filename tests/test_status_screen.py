@@ -18,6 +18,7 @@ def peer(state: str, **facts: object) -> dict[str, Any]:
         "state": state,
         "heard_s": 12.3,
         "round_trip_s": 0.1234,
+        "freshness_unverified_s": None,
         "loss_in": 0.12,
         "loss_out": 1.0,
         "bytes_in_s": 123456.0,
@@ -70,6 +71,14 @@ def test_all_of_it_is_read_on_eighty_columns(name: str) -> None:
 def test_an_ipv6_address_is_no_markup(path: str) -> None:
     """Brackets and colons are read as they are."""
     assert path in shown({"drone1": peer("up", path=path)}, 80)
+
+
+def test_unverified_freshness_is_shown_with_its_meaning() -> None:
+    """The time, and what happens to commands; nothing of it while freshness is verified."""
+    text = " ".join(shown({"drone1": peer("up", freshness_unverified_s=12.5)}, 80).split())
+    assert "drone1 freshness unverified for 12.5 s" in text
+    assert "held and dropped" in text
+    assert "freshness" not in shown({"drone1": peer("up")}, 80)
 
 
 def test_a_recording_that_failed_is_told() -> None:

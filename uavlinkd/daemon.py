@@ -32,6 +32,7 @@ from uavlinkd.endpoints.ports import Endpoint, LocalPort
 from uavlinkd.event_log import EventLog
 from uavlinkd.key_change import Graces, link_name
 from uavlinkd.log import DropSummary
+from uavlinkd.mavlink.classes import screen
 from uavlinkd.mavlink.delivery import Source
 from uavlinkd.mavlink.frames import Frame, SplitCounters, split_payload
 from uavlinkd.mavlink.policy import Policy, compile_policy
@@ -68,7 +69,7 @@ class Daemon:
         self.config = config
         self.log = structlog.get_logger().bind(daemon=config.name)
         now = monotonic()
-        self.node = Node(config.private_key, os.urandom, now, config.previous_private_key)
+        self.node = Node(config.private_key, os.urandom, now, config.previous_private_key, screen=screen)
         self.endpoints: list[Endpoint] = []
         self.endpoint_policies: dict[str, Policy] = {}
         self.links: dict[str, PeerLink] = {}

@@ -13,7 +13,7 @@ from uavlinkd.core.constants import NEVER
 from uavlinkd.core.limits import TokenBucket
 from uavlinkd.endpoints.ports import Endpoint
 from uavlinkd.key_change import link_name
-from uavlinkd.log import MEANINGS, SUMMARY_INTERVAL_S
+from uavlinkd.log import MEANINGS, SUMMARY_INTERVAL_S, UNVERIFIED
 
 LINES_PER_S = 0.5
 """Of one peer or endpoint, on average: some 10 MB a day at worst. Whoever has a peer's key can cause handshakes and
@@ -48,6 +48,10 @@ class EventLog:
                 log.info("peer_closed")
             case o.PathChanged(_, (_, host, port)):
                 log.info("path_changed", path=str(Address(host, port)))
+            case o.FreshnessUnverified():
+                log.warning("freshness_unverified", meaning=UNVERIFIED)
+            case o.FreshnessVerified(_, unverified_s):
+                log.info("freshness_verified", unverified_s=round(unverified_s, 3))
             case o.SessionEstablished() as made:
                 log.info(
                     "session_established",

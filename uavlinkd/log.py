@@ -54,7 +54,7 @@ MEANINGS: dict[str, str] = {
     DropReason.REPLAYED: "replayed envelopes, or copies that the network made",
     DropReason.TOO_OLD: "envelopes far behind the newest: replayed, or held back",
     DropReason.DELAYED: "envelopes held back on the way for seconds",
-    DropReason.DOUBTFUL: "frames after a silence, which the peer did not confirm to be new",
+    DropReason.DOUBTFUL: "frames after a silence, or commands while echoes stay unanswered: not confirmed to be new",
     DropReason.BAD_TAG: "envelopes altered or forged on the way",
     DropReason.BAD_CONTROL: "control records of an authentic peer that are none",
     DropReason.BAD_PATH_RESPONSE: "answers to no path challenge",
@@ -85,6 +85,12 @@ REFUSALS: dict[str, str] = {
 """The same of frames that a policy did not let pass: ``frames_refused``, which somebody sent, and
 ``frames_withheld``, which somebody was not to be told."""
 
+
+UNVERIFIED = (
+    "the peer's frames arrive, its echo replies do not: the direction back is blocked, or an attacker delays frames."
+    " Commands, missions, parameters and manual control are held and dropped; reports pass and may be old"
+)
+"""What a person should understand by unverified freshness."""
 
 DISTURBANCES = (
     "envelopes_missing",

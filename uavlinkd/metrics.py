@@ -112,6 +112,9 @@ def _daemon(status: Status, uptime_s: float) -> Iterator[str]:
 def _links(peers: Mapping[str, Status]) -> Iterator[str]:
     up = [(_labels(peer=name), peer["state"] == "up") for name, peer in peers.items()]
     yield from _family("peer_up", "Whether the peer is linked.", up)
+    unverified = [(_labels(peer=name), peer["freshness_unverified_s"] is not None) for name, peer in peers.items()]
+    text = "Whether frames arrive that the peer does not confirm to be new: commands are dropped."
+    yield from _family("peer_freshness_unverified", text, unverified)
     linked = {name: peer for name, peer in peers.items() if peer["session"] is not None}
     yield from _family(
         "peer_info",

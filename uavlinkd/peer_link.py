@@ -135,6 +135,8 @@ class PeerLink:
             self.set_paths((), now)  # its names may have no address now: it is not called at the old ones
         if config.previous_public_key is None:
             self.give_up_theirs(now)
+        for name in self._names:
+            self._node.peers[name].verify_interval_s = config.settings.link.verify_interval_s
         self.config = config
         self.on_session()
 

@@ -49,6 +49,7 @@ def peer_status(link: PeerLink, now: float) -> dict[str, object]:
         "heard_s": None if peer.heard_at is None else now - peer.heard_at,
         "handshake_s": None if peer.established_at is None else now - peer.established_at,
         "round_trip_s": peer.round_trip_s,
+        "freshness_unverified_s": None if peer.unverified_since is None else now - peer.unverified_since,
         "loss_in": figures.loss_in,
         "loss_out": figures.loss_out,
         "bytes_in_s": link.bytes_s[0],

@@ -9,7 +9,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from uavlinkd.log import DISTURBANCES
+from uavlinkd.log import DISTURBANCES, UNVERIFIED
 
 Status = dict[str, Any]
 
@@ -81,6 +81,9 @@ def _peers(status: Status) -> Group:
             _rate(peer["bytes_in_s"]),
             _rate(peer["bytes_out_s"]),
         )
+        if peer["freshness_unverified_s"] is not None:
+            since = _age(peer["freshness_unverified_s"])
+            troubles.append(Text(f"{name} freshness unverified for {since}: {UNVERIFIED}", style="bold red"))
         if dropped := _counts(_troubles(peer)):
             troubles.append(Text(f"{name} dropped: {dropped}"))
         session = peer["session"] or {}

@@ -37,7 +37,8 @@ FRAME = bytes((0xFD, 9, 0, 0, 1, 1, 1, 0, 0, 0)) + bytes(9) + b"\x12\x34"
 QUIET = Timers(keepalive_s=1e6, echo_after_s=1e6, handshake_after_s=1e6, lost_after_s=1e6, probe_interval_s=0.0)
 """No timer but those of handshakes and keys."""
 
-PLAIN = Link(suites=(SUITES_BY_NAME["x25519"],))
+PLAIN = Link(suites=(SUITES_BY_NAME["x25519"],), verify_interval_s=1e6)
+"""Freshness stays verified."""
 
 
 def seeded(seed: int) -> Callable[[int], bytes]:

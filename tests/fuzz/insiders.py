@@ -199,9 +199,9 @@ class Insider:
         owned = len(sessions.confirmed) + len(sessions.unconfirmed) + len(peer.caller.pending)
         assert len(self.node._indices.owners) == owned, "an index that nobody owns"
         assert len(peer.remembered) == len(self.node._remembered) <= c.REMEMBERED_INITIATIONS
+        assert len(peer._age._questions) <= 64, "too many echo requests"
         for session in sessions.confirmed:
             doubt = session.doubt
-            assert len(doubt.asked) <= c.ECHOES_REMEMBERED, "too many echoes"
             assert doubt._held_bytes <= c.HELD_BYTES or len(doubt._held) == 1, "too much is held"
             assert len(session._heard_lately._steps) <= 16, "too many steps"
 

@@ -14,6 +14,7 @@ from tests.network.network import Drone, Flow, Network
 from uavlinkd.core import handshake, session, wire
 from uavlinkd.core.cookie import CookieJar, MacKeys
 from uavlinkd.core.drops import DropReason as Reason
+from uavlinkd.core.freshness import Questions, Verification
 from uavlinkd.core.indices import Indices
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Path
@@ -127,6 +128,25 @@ def test_receiver_without_a_sense_of_time_delivers_what_was_held(
     stage.begin(attack)
     stage.network.run(12)
     assert max(at - flow.sent_at[n] for flow in stage.flows for n, at in flow.delivered.items()) > 4.9
+
+
+@pytest.mark.parametrize("attack", ["stretch", "stretch-one-way"])
+def test_receiver_that_needs_no_answers_delivers_stretched_frames(
+    attack: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without verification and without late answers, each frame is older than the one before."""
+    genuine = Verification.__init__
+
+    def lasts(self: Verification, now: float, interval_s: float) -> None:
+        genuine(self, now, interval_s)
+        self.until = self.look_at = float("inf")
+
+    monkeypatch.setattr(Verification, "__init__", lasts)
+    monkeypatch.setattr(Questions, "is_issued", lambda _self, _token: False)
+    stage = _stage()
+    stage.begin(f"{attack},way=a>b")
+    stage.network.run(30)
+    assert stage.flows[0].oldest_s > 25.0
 
 
 def test_receiver_with_one_key_for_both_directions_takes_its_own_frames(monkeypatch: pytest.MonkeyPatch) -> None:

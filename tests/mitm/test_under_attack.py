@@ -62,6 +62,8 @@ EXPECTED: dict[str, set[Reason]] = {
     "forge-cookie": {Reason.BAD_COOKIE},
     "roam": {Reason.REPLAYED},
     "hold": {Reason.DELAYED},
+    "stretch": {Reason.DOUBTFUL},
+    "stretch-one-way": {Reason.DOUBTFUL},
     "cross-initiations": {Reason.UNEXPECTED_RESPONSE},
 }
 DISTURBS: dict[str, str] = {
@@ -69,6 +71,8 @@ DISTURBS: dict[str, str] = {
     "drop-heartbeats": "missing",
     "blackout": "handshakes_unanswered",
     "hold": "missing",
+    "stretch": "echoes_unanswered",
+    "stretch-one-way": "echoes_unanswered",
     "reorder": "out_of_order",
     "roam": "challenges_unanswered",
     "drop-message": "handshakes_unanswered",

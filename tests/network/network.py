@@ -25,7 +25,7 @@ from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Deliver, Dropped, Output, Path, SessionEstablished, Transmit
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.session import Session
-from uavlinkd.core.settings import Link, PeerSettings
+from uavlinkd.core.settings import Link, PeerSettings, Screen, hold_all
 from uavlinkd.mitm.radio import Radio, RadioSettings
 
 Address = tuple[str, int]
@@ -151,7 +151,7 @@ class Drone:
             self.clock = clock - self._network.now
         now = self.local_now
         entropy = Random(self._network.chance.randbytes(16))
-        self.node = Node(Secret(self.private_key), entropy.randbytes, now)
+        self.node = Node(Secret(self.private_key), entropy.randbytes, now, screen=self._network.screen)
         for settings, paths in self.acquaintances.values():
             self.node.add_peer(settings, now)
             self.node.set_addresses(settings.name, paths, now)
@@ -230,6 +230,8 @@ class Network:
         self.steps = 0
         self.datagrams = 0
         """Put on their way, by whomever."""
+        self.screen: Screen = hold_all
+        """Which frames may be delivered while freshness is unverified; of the nodes that are started from now on."""
         self.checks_bounds = True
         """Whether the tables of the nodes are looked at; not where a check was taken out of them on purpose."""
         self._radios: dict[tuple[Address, Address], Radio] = {}
@@ -457,6 +459,12 @@ class Network:
                 sessions = peer.sessions
                 lines.append(f"{drone.name}: {peer.name} {sessions.confirmed} {sessions.unconfirmed} {peer.path}")
         return "\n".join(lines)
+
+
+def every_second_may_be_old(payload: bytes) -> tuple[bytes, bytes]:
+    """A screen: frames with an odd number are reports, the others must be new."""
+    frames = [payload[at : at + FRAME_BYTES] for at in range(0, len(payload), FRAME_BYTES)]
+    return tuple(b"".join(each for each in frames if each[-1] % 2 == parity) for parity in (1, 0))  # type: ignore[return-value]
 
 
 def share_a_session(a: Drone, b: Drone) -> bool:

@@ -14,6 +14,7 @@ from uavlinkd.config import checks, policies
 from uavlinkd.config.advice import advice
 from uavlinkd.config.errors import ConfigError, Problem
 from uavlinkd.config.model import Config, Endpoint, Log, Peer, Recording, Routing
+from uavlinkd.config.pace import verify_interval_s
 from uavlinkd.config.problems import Problems, Values
 from uavlinkd.config.schema import (
     EndpointSection,
@@ -145,6 +146,7 @@ def _endpoint(section: Values) -> Endpoint:
 
 def _peer(peer: Values, psk: Secret | None, link: Values) -> Peer:
     keys = LinkSection.model_construct(**checks.inherited(link, peer))
+    tag_bytes = keys.tag_bits // 8
     return Peer(
         settings=PeerSettings(
             name=peer.good["name"],
@@ -153,7 +155,7 @@ def _peer(peer: Values, psk: Secret | None, link: Values) -> Peer:
             link=Link(
                 suites=tuple(keys.suites),
                 confidential=keys.confidential,
-                tag_bytes=keys.tag_bits // 8,
+                tag_bytes=tag_bytes,
                 mac_key_bits=keys.mac_key_bits,
                 max_envelope=keys.max_envelope_bytes,
                 timers=Timers(
@@ -167,6 +169,7 @@ def _peer(peer: Values, psk: Secret | None, link: Values) -> Peer:
                     lost_after_s=keys.lost_after_s,
                     probe_interval_s=keys.probe_interval_s,
                 ),
+                verify_interval_s=verify_interval_s(keys.budget_bits_s, tag_bytes),
             ),
         ),
         addresses=tuple(peer.good.get("addresses", ())),

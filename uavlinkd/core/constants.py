@@ -159,12 +159,16 @@ DOUBT_S = 1.0
 """How long frames that came after a silence wait for the peer's word on their age, and how old that word may be."""
 DOUBT_ASK_S = 0.25
 """How often the peer is asked meanwhile: as often as for a handshake."""
+VERIFY_INTERVAL_S = 1.0
+"""While frames arrive, the peer is asked for an echo this often. A link with a budget has a longer interval."""
+VERIFY_REPEAT_SHARE = 0.25
+"""After one interval without an answer the request is repeated each time this share of an interval has passed."""
+VERIFIED_INTERVALS = 2
+"""Freshness stays verified for so many intervals after an answer, at least for `LATE_AFTER_S`."""
 HELD_BYTES = 65536
 """Of frames that wait so, on one session: the largest envelope fits; a second of a fast link does too."""
 HELD_OVERHEAD_BYTES = 64
 """Counted with each of them, so that many small ones are bounded too."""
-ECHOES_REMEMBERED = 8
-"""Own echo requests on a session that may still be answered: more than one doubt asks."""
 
 REPLAY_WINDOW = 2048
 """Envelopes that may overtake one another: four seconds of PX4's busiest mode, one frame each."""

@@ -72,7 +72,7 @@ class DropReason(StrEnum):
     BAD_PATH_RESPONSE = "bad_path_response"
     """An answer to no path challenge, or from another path than the challenged."""
     DOUBTFUL = "doubtful"
-    """Frames after a silence, and the peer did not say in time that they are new."""
+    """Frames after a silence, or such as must be new, and the peer did not say in time that they are."""
 
     # On the way out.
     NO_SESSION = "no_session"

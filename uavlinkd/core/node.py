@@ -25,7 +25,7 @@ from uavlinkd.core.limits import SourceLimiter, TokenBucket, prefix_of, source_o
 from uavlinkd.core.outputs import Dropped, Output, Path, Transmit
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.session import Session
-from uavlinkd.core.settings import PeerSettings
+from uavlinkd.core.settings import PeerSettings, Screen, hold_all
 from uavlinkd.core.suites import Suite
 
 _ENVELOPE_STARTS = frozenset((bytes((wire.SHORT_ENVELOPE,)), bytes((wire.LONG_ENVELOPE,))))
@@ -40,11 +40,19 @@ class Node:
         entropy: gives unpredictable bytes.
         now: monotonic seconds.
         previous_private_key: the one before, while it is being changed: peers can be added that know us by it.
+        screen: splits a payload into frames that may be old and frames that must be new. By default all must be new.
     """
 
     def __init__(
-        self, private_key: Secret, entropy: Entropy, now: float, previous_private_key: Secret | None = None
+        self,
+        private_key: Secret,
+        entropy: Entropy,
+        now: float,
+        previous_private_key: Secret | None = None,
+        *,
+        screen: Screen = hold_all,
     ) -> None:
+        self._screen = screen
         self._identity = KeyPair(private_key.reveal())
         self._entropy = entropy
         self._mac_keys = MacKeys(self._identity.public)
@@ -105,7 +113,7 @@ class Node:
             raise ValueError(f"peer {settings.name} is there already")
         if settings.public_key in (self.public_key, None if previous is None else previous.public):
             raise ValueError(f"peer {settings.name} has this daemon's own key")
-        peer = Peer(settings, identity, self._indices, self._entropy, now)
+        peer = Peer(settings, identity, self._indices, self._entropy, now, self._screen)
         self.peers[settings.name] = self._by_keys[keys] = peer
         self._deadline = min(self._deadline, now)
 

@@ -72,5 +72,18 @@ class PathChanged(NamedTuple):
     path: Path
 
 
-Event = PeerUp | PeerLost | PeerClosed | SessionEstablished | PathChanged
+class FreshnessUnverified(NamedTuple):
+    """Frames of the peer arrive, and it does not answer: those that must be new are held back, the others pass."""
+
+    peer: str
+
+
+class FreshnessVerified(NamedTuple):
+    """The peer answers again, ``unverified_s`` after it stopped."""
+
+    peer: str
+    unverified_s: float
+
+
+Event = PeerUp | PeerLost | PeerClosed | SessionEstablished | PathChanged | FreshnessUnverified | FreshnessVerified
 Output = Transmit | Deliver | Dropped | Event

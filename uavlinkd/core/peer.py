@@ -7,13 +7,14 @@ from collections.abc import Sequence
 
 from uavlinkd.core import constants as c
 from uavlinkd.core import handshake, wire
+from uavlinkd.core.age import Age
 from uavlinkd.core.caller import Caller, Pending
 from uavlinkd.core.constants import NEVER
 from uavlinkd.core.cookie import mac1_of
 from uavlinkd.core.crypto import Entropy, KeyPair
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.group_budget import GroupShare
-from uavlinkd.core.handshake import Received
+from uavlinkd.core.handshake import Keys, Received
 from uavlinkd.core.indices import Indices
 from uavlinkd.core.limits import TokenBucket
 from uavlinkd.core.outputs import (
@@ -31,7 +32,8 @@ from uavlinkd.core.outputs import (
 from uavlinkd.core.paths import Challenger
 from uavlinkd.core.session import Session
 from uavlinkd.core.sessions import Sessions, Unconfirmed
-from uavlinkd.core.settings import PeerSettings
+from uavlinkd.core.settings import PeerSettings, Screen
+from uavlinkd.core.suites import Suite
 from uavlinkd.core.traffic import Traffic
 
 _CHALLENGED = bytes((wire.PATH_CHALLENGE,))  # gets an answer: with a question beside it, more would go back than came
@@ -41,11 +43,19 @@ class Peer:
     """The state of the link with one peer. Methods append what the shell has to do to ``out``."""
 
     def __init__(
-        self, settings: PeerSettings, identity: KeyPair, indices: Indices, entropy: Entropy, now: float
+        self,
+        settings: PeerSettings,
+        identity: KeyPair,
+        indices: Indices,
+        entropy: Entropy,
+        now: float,
+        screen: Screen,
     ) -> None:
         self.settings = settings
         self.name = settings.name
         self.timers = settings.link.timers
+        self.verify_interval_s = settings.link.verify_interval_s
+        """Of the sessions that are made from now on."""
         self.caller = Caller(self, settings, identity, indices, entropy, now)
         self.sessions = Sessions(indices, has_smaller_key=identity.public < settings.public_key)
         self.traffic = Traffic()
@@ -74,7 +84,7 @@ class Peer:
         self._unanswered_since: float | None = None
         self._echo_at = NEVER  # ask for an echo then, if still nothing is heard
         self._probe_at = NEVER  # measure the round trip then
-        self._echo_token = 0
+        self._age = Age(self, screen)
 
     # Sending.
 
@@ -82,11 +92,11 @@ class Peer:
         """Put frames that are here together into as few envelopes as hold them, in their order."""
         session = self.sessions.current
         if session is None or self.path is None or not session.is_usable(now):
-            self._drop(DropReason.NO_SESSION, len(frames), out)
+            self.drop(DropReason.NO_SESSION, len(frames), out)
             return
         if self._probe_at == NEVER and self.timers.probe_interval_s:
             self._probe_at = now + self.timers.probe_interval_s
-            self._wake_at(self._probe_at)
+            self.wake_at(self._probe_at)
         limit = session.payload_limit
         batch: list[bytes] = []
         size = 0
@@ -96,7 +106,7 @@ class Peer:
                     self._seal(session, b"".join(batch), self.path, now, out)
                     batch, size = [], 0
                 if len(frame) > limit:
-                    self._drop(DropReason.TOO_LARGE, 1, out)
+                    self.drop(DropReason.TOO_LARGE, 1, out)
                     continue
             batch.append(frame)
             size += len(frame)
@@ -108,7 +118,7 @@ class Peer:
         session = self.sessions.current
         if session is not None and self.path is not None and now < session.reject_at:
             self._seal(session, wire.Close().encode(), self.path, now, out)
-        self._count_ended(self.sessions.clear(now), out)
+        self._age.end(self.sessions.clear(now), out)
         self.caller.cancel()
         self.is_up = False
         self.deadline = NEVER
@@ -118,7 +128,7 @@ class Peer:
     ) -> None:
         """Send an envelope. Silence after it is suspect, unless it is an answer: those would echo for ever."""
         if session.send_counter >= c.SESSION_ENVELOPE_LIMIT:
-            self._drop(DropReason.NO_SESSION, 1, out)
+            self.drop(DropReason.NO_SESSION, 1, out)
             return
         self.traffic.envelopes_sent += 1
         self._transmit(Transmit(session.seal(payload, now), path), out)
@@ -126,7 +136,7 @@ class Peer:
         if self._unanswered_since is None and not is_answer:
             self._unanswered_since = now
             self._echo_at = now + self.timers.echo_after_s
-            self._wake_at(self._echo_at)
+            self.wake_at(self._echo_at)
 
     def _transmit(self, transmit: Transmit, out: list[Output]) -> None:
         if transmit.path is self.path or transmit.path in self.caller.candidates(self.path):
@@ -136,13 +146,13 @@ class Peer:
             self.traffic.bytes_elsewhere += len(transmit.datagram)
         out.append(transmit)
 
-    def _drop(self, reason: DropReason, amount: int, out: list[Output]) -> None:
+    def drop(self, reason: DropReason, amount: int, out: list[Output]) -> None:
         """Of frames on their way out, or of envelopes that waited to be delivered."""
         if amount:
             self.traffic.drops[reason] += amount
             out.append(Dropped(reason, self.name, None, amount))
 
-    def _wake_at(self, moment: float) -> None:
+    def wake_at(self, moment: float) -> None:
         self.deadline = min(self.deadline, moment)
 
     # Receiving on a session.
@@ -173,9 +183,9 @@ class Peer:
         is_new = now <= session.trusted_until and not is_late
         if is_new:
             session.trusted_until = now + c.LATE_AFTER_S
-            self._heard(now, out)
+            self.heard(now, out)
         elif not self.is_up and not is_late:
-            self._doubt(session, now, out)
+            self._age.doubt(session, now, out)
         if counter != session.window.highest:
             self.traffic.out_of_order += 1
         elif path != self.path and session is self.sessions.current and payload[:1] != _CHALLENGED:
@@ -185,12 +195,14 @@ class Peer:
         if payload[0] < wire.FRAMES_FROM:
             self._receive_control(session, wire.parse_control(payload), path, now, out)
         elif is_new:
-            out.append(Deliver(self.name, payload))
+            if now < session.verification.look_at:
+                out.append(Deliver(self.name, payload))
+            else:
+                self._age.deliver(session, counter, payload, now, out)
         elif is_late:
-            self._drop(DropReason.DELAYED, 1, out)
+            self.drop(DropReason.DELAYED, 1, out)
         else:
-            self._drop(DropReason.DOUBTFUL, session.doubt.hold(counter, payload), out)
-            self._doubt(session, now, out)
+            self._age.hold(session, counter, payload, now, out)
 
     def _receive_control(
         self, session: Session, control: wire.Control, path: Path, now: float, out: list[Output]
@@ -208,10 +220,13 @@ class Peer:
 
     def _receive_echo(self, session: Session, echo: wire.Echo, now: float, out: list[Output]) -> None:
         # A report of more than was sent, or than was expected, is a lie.
-        if session is self.sessions.current and echo.received <= echo.expected <= session.send_counter:
-            self.traffic.reported = (echo.expected, echo.received)
+        if echo.received <= echo.expected <= session.send_counter:
+            if session is self.sessions.current:
+                self.traffic.reported = (echo.expected, echo.received)
+            if echo.expected > session.fresh(now, c.DOUBT_S):
+                session.verification.extend(now)
         if echo.is_reply:
-            self._receive_answer(echo, now, out)
+            self._age.receive_answer(echo, now, out)
             return
         assert self.path is not None, "a session came along a path"
         # On the session that sends, whichever asked: else a peer that never had our newest session
@@ -220,7 +235,7 @@ class Peer:
         reply = wire.Echo(True, echo.token, current.received, current.expected, session.fresh(now))
         self._seal(current, reply.encode(), self.path, now, out, is_answer=True)
 
-    def _heard(self, now: float, out: list[Output]) -> None:
+    def heard(self, now: float, out: list[Output]) -> None:
         """Something authentic and new came from the peer."""
         self.heard_at = now
         self._unanswered_since = None
@@ -228,67 +243,29 @@ class Peer:
             self.is_up = True
             out.append(PeerUp(self.name))
 
-    # The age of what arrives.
-
-    def _doubt(self, session: Session, now: float, out: list[Output]) -> None:
-        """Something came after a silence: ask how old it may be."""
-        if session not in self.sessions.confirmed:  # it ended as soon as it was confirmed
-            self._give_up(session, out)
-        elif session.doubt.begin(now):
-            self._pursue(session, now, out)
-            self._wake_at(session.doubt.due_at)
-
-    def _pursue(self, session: Session, now: float, out: list[Output]) -> None:
-        """Ask again, or give up what is held."""
-        assert self.path is not None, "a session came along a path"
-        if session.doubt.is_over(now):
-            self._give_up(session, out)
-        else:
-            self._ask_for_echo(session, self.path, now, out)
-
-    def _receive_answer(self, echo: wire.Echo, now: float, out: list[Output]) -> None:
-        """The peer says which counters are new, on the session on which it was asked."""
-        session, asked_at = self.sessions.asked(echo.token)
-        if session is None:
-            return
-        self.round_trip_s = now - asked_at
-        session.refuse_below(echo.fresh)
-        if self.round_trip_s > c.LATE_AFTER_S:
-            session.trusted_until = -NEVER  # so slow a path, or somebody who stretches time: nothing is new
-        elif self.round_trip_s <= c.DOUBT_S:
-            session.trusted_until = now + c.LATE_AFTER_S
-            self._heard(now, out)
-            new, late = session.doubt.end(echo.fresh)
-            out += [Deliver(self.name, payload) for payload in new]
-            self._drop(DropReason.DELAYED, late, out)
-
-    def _give_up(self, session: Session, out: list[Output]) -> None:
-        _, held = session.doubt.end(c.SESSION_ENVELOPE_LIMIT)
-        self._drop(DropReason.DOUBTFUL, held, out)
-
     def take_held(self, out: list[Output]) -> None:
         """Hold no frames any more."""
         for session in self.sessions.confirmed:
             out += [Deliver(self.name, payload) for payload in session.doubt.take_held()]
 
-    def _count_ended(self, sessions: list[Session], out: list[Output]) -> None:
-        """What ends with a session: frames that waited, and the hope for envelopes that did not come."""
-        for session in sessions:
-            self._give_up(session, out)
-            self.traffic.missing += session.missing(NEVER)
+    @property
+    def unverified_since(self) -> float | None:
+        """Since when frames arrive and none of them is known to be new; None while freshness is verified."""
+        return self._age.unverified_since
 
     def missing(self, now: float) -> int:
         """Envelopes that the peer sent and that were not accepted, on all sessions so far; it only grows."""
         return self.traffic.missing + sum(each.missing(now) for each in self.sessions.confirmed)
 
     def _receive_close(self, session: Session, now: float, out: list[Output]) -> None:
-        self._count_ended(self.sessions.end_up_to(session, now), out)
+        self._age.end(self.sessions.end_up_to(session, now), out)
         if self.sessions.current is None:
             self.is_up = False
+            self._age.unverified_since = None
             self._unanswered_since = None
             self.caller.rest()
             self.caller.retry_at = now + c.CLOSE_HOLDOFF_S
-            self._wake_at(self.caller.retry_at)
+            self.wake_at(self.caller.retry_at)
             out.append(PeerClosed(self.name))
 
     # Paths.
@@ -298,7 +275,7 @@ class Peer:
         if session.envelope_bytes(wire.CHALLENGE_BYTES) > size:
             return
         if (question := self._challenger.question(path, now)) is not None:
-            self._wake_at(self._challenger.next_expiry())
+            self.wake_at(self._challenger.next_expiry())
             self._seal(session, question.encode(), path, now, out)
 
     def _receive_path_response(self, token: bytes, path: Path, now: float, out: list[Output]) -> None:
@@ -316,15 +293,14 @@ class Peer:
             Drop: as :meth:`Caller.receive_response`; then nothing was changed.
         """
         keys = self.caller.receive_response(pending, response)
-        index, suite, lifetime_s = response.receiver_index, response.suite, self.timers.reject_after_s
-        session = Session(self, suite, keys, index, now, lifetime_s, is_initiator=True)
+        session = self._session(response.suite, keys, response.receiver_index, now, is_initiator=True)
         events: list[Output] = []
         self._adopt(session, pending.path, now, events)
-        self._heard(now, events)
+        self.heard(now, events)
         # The confirmation; any later envelope repeats it. It asks for an echo: long enough to be challenged where
         # somebody relays it from elsewhere, and it gives the round trip at once. It goes out before anyone hears of
         # the session: what that ends, such as a session by a previous key, must not end before the peer has this one.
-        self._ask_for_echo(session, pending.path, now, out)
+        self.ask_for_echo(session, pending.path, now, out)
         out += events
 
     def receive_cookie(self, mac1: bytes, path: Path, reply: wire.CookieReply, now: float) -> None:
@@ -334,7 +310,7 @@ class Peer:
             Drop: ``BAD_COOKIE``.
         """
         self.caller.receive_cookie(mac1, path, reply, now)
-        self._wake_at(self.caller.retry_at)
+        self.wake_at(self.caller.retry_at)
 
     def hint(self, now: float, out: list[Output]) -> None:
         """An envelope for a session unknown here came from the peer's address: perhaps we restarted."""
@@ -354,20 +330,26 @@ class Peer:
         index = self._indices.pick(now)
         message, keys = handshake.respond(received, self.settings, index, self.sessions.generation, self._entropy)
         datagram = self.caller.add_macs(message, path, now)
-        session = Session(self, suite, keys, index, now, self.timers.reject_after_s, is_initiator=False)
+        session = self._session(suite, keys, index, now, is_initiator=False)
         is_expected, expires_at = path in self.caller.candidates(self.path), now + c.UNCONFIRMED_LIFETIME_S
         self.sessions.wait(Unconfirmed(session, path, is_expected, mac1_of(datagram), expires_at))
-        self._wake_at(expires_at)
+        self.wake_at(expires_at)
         self._transmit(Transmit(datagram, path), out)
+
+    def _session(self, suite: Suite, keys: Keys, index: int, now: float, *, is_initiator: bool) -> Session:
+        lifetime_s, interval_s = self.timers.reject_after_s, self.verify_interval_s
+        return Session(
+            self, suite, keys, index, now, lifetime_s, is_initiator=is_initiator, verify_interval_s=interval_s
+        )
 
     def _adopt(self, session: Session, path: Path, now: float, out: list[Output]) -> None:
         """A session is confirmed. Where it is the highest, traffic goes on it now, along the path that made it."""
         is_rekey = self.sessions.current is not None
-        self._count_ended(self.sessions.confirm(session, now), out)
+        self._age.end(self.sessions.confirm(session, now), out)
         self.caller.cancel()
         self.caller.rest()
         self.traffic.handshakes += 1
-        self._wake_at(now)
+        self.wake_at(now)
         if self.sessions.current is not session:
             return
         self.path = path
@@ -382,25 +364,25 @@ class Peer:
         try:
             initiation = self.caller.call(self.path, self.sessions.generation, now)
         except Drop as drop:  # every index is taken: as if the initiation had been lost
-            self._drop(drop.reason, 1, out)
+            self.drop(drop.reason, 1, out)
             return
         if initiation is not None:
             self._transmit(initiation, out)
-            self._wake_at(self.caller.retry_at)
+            self.wake_at(self.caller.retry_at)
 
     # Time.
 
     def handle_timeout(self, now: float, out: list[Output]) -> None:
         """Do what is due at ``now``."""
-        self._count_ended(self.sessions.expire(now), out)
+        self._age.end(self.sessions.expire(now), out)
         for each in self.sessions.confirmed:
-            if now >= each.doubt.due_at:
-                self._pursue(each, now, out)
+            self._age.handle_timeout(each, now, out)
         self.caller.expire(now)
         self._challenger.expire(now)
         session = self.sessions.current
         if self.is_up and (session is None or now >= self._silent_for(self.timers.lost_after_s)):
             self.is_up = False
+            self._age.unverified_since = None
             assert self.heard_at is not None, "a peer is up because it was heard"
             out.append(PeerLost(self.name, now - self.heard_at))
         if now < self._call_due_at():
@@ -409,16 +391,14 @@ class Peer:
             self._call(now, out)
         if session is not None and self.path is not None and not session.is_used_up:
             if now >= min(self._echo_due_at(), self._probe_at):
-                self._ask_for_echo(session, self.path, now, out)
+                self.ask_for_echo(session, self.path, now, out)
             if now >= self._sent_at + self.timers.keepalive_s:
                 self._seal(session, b"", self.path, now, out)
         self.deadline = self._next_deadline()
 
-    def _ask_for_echo(self, session: Session, path: Path, now: float, out: list[Output]) -> None:
+    def ask_for_echo(self, session: Session, path: Path, now: float, out: list[Output]) -> None:
         self._probe_at = NEVER  # until traffic asks for another
-        self._echo_token = (self._echo_token + 1) % 2**32
-        self.traffic.echoes_unanswered += session.doubt.ask(self._echo_token, now)
-        echo = wire.Echo(False, self._echo_token, session.received, session.expected)
+        echo = wire.Echo(False, self._age.ask(session, now), session.received, session.expected)
         self._seal(session, echo.encode(), path, now, out)
         self._echo_at = now + self.timers.echo_after_s
 
@@ -445,7 +425,7 @@ class Peer:
     def _next_deadline(self) -> float:
         moments = [max(self.caller.retry_at, self._call_due_at())]
         moments += [self.sessions.next_expiry(), self.caller.next_expiry(), self._challenger.next_expiry()]
-        moments += [each.doubt.due_at for each in self.sessions.confirmed]
+        moments += [min(each.doubt.due_at, each.verification.due_at) for each in self.sessions.confirmed]
         session = self.sessions.current
         if session is not None and self.path is not None and not session.is_used_up:
             moments += [self._sent_at + self.timers.keepalive_s, self._echo_due_at(), self._probe_at]

@@ -9,7 +9,7 @@ from uavlinkd.core import wire
 from uavlinkd.core.constants import NEVER
 from uavlinkd.core.crypto import AeadKey, MacKey, Secret, equal, hkdf_expand
 from uavlinkd.core.drops import Drop, DropReason
-from uavlinkd.core.freshness import Doubt, Lately
+from uavlinkd.core.freshness import Doubt, Lately, Verification
 from uavlinkd.core.handshake import Keys
 from uavlinkd.core.replay import ReplayWindow
 from uavlinkd.core.suites import Suite
@@ -115,6 +115,7 @@ class Session:
         "send_counter",
         "suite",
         "trusted_until",
+        "verification",
         "window",
     )
 
@@ -128,6 +129,7 @@ class Session:
         lifetime_s: float,
         *,
         is_initiator: bool,
+        verify_interval_s: float = c.VERIFY_INTERVAL_S,
     ) -> None:
         first = derive(keys.parameters, keys.transport[0], keys.handshake_hash, from_initiator=True)
         second = derive(keys.parameters, keys.transport[1], keys.handshake_hash, from_initiator=False)
@@ -148,6 +150,7 @@ class Session:
         self.heard_first_at = NEVER
         """When the peer's first envelope came: from then on it sends on this session, or on one of higher rank."""
         self.doubt = Doubt()
+        self.verification = Verification(now, verify_interval_s)
         self._floor = -1  # the peer said that this counter, and those below, are of the past
         self._heard_lately = Lately(now)
         self._sent_lately = Lately(now)
@@ -182,9 +185,12 @@ class Session:
         """Whether the keys may still seal."""
         return now < self.reject_at and self.send_counter < c.SESSION_ENVELOPE_LIMIT
 
-    def fresh(self, now: float) -> int:
-        """The lowest counter that was sealed in the last :data:`c.LATE_AFTER_S`; the next one if none was."""
-        return self._sent_lately.past(self.send_counter - 1, self.send_counter, now)[0] + 1
+    def fresh(self, now: float, age_s: float | None = None) -> int:
+        """The lowest counter that was sealed in the last ``age_s``, or a step before; the next one if none was.
+
+        ``age_s`` is :data:`c.LATE_AFTER_S`, or less.
+        """
+        return self._sent_lately.past(self.send_counter - 1, self.send_counter, now, age_s)[0] + 1
 
     def refuse_below(self, fresh: int) -> None:
         """The peer says that it sealed what has a lower counter than this too long ago."""

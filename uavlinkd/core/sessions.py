@@ -105,12 +105,12 @@ class Sessions:
                 return True
         return False
 
-    def asked(self, token: int) -> tuple[Session | None, float]:
-        """On which session, and when, an echo was asked for by this token. It counts once."""
-        for session in self.confirmed:
-            if token in session.doubt.asked:
-                return session, session.doubt.asked.pop(token)
-        return None, 0.0
+    def is_in_use(self, session: Session) -> bool:
+        """Whether the peer may go on sending on this session: nothing came yet on one of higher rank."""
+        for each in self.confirmed:
+            if each is session or each.heard_first_at != c.NEVER:
+                return each is session
+        return False
 
     def next_expiry(self) -> float:
         """When :meth:`expire` has something to do."""

@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from uavlinkd.core import constants as c
 from uavlinkd.core.crypto import Secret
 from uavlinkd.core.suites import X25519, Suite
+
+Screen = Callable[[bytes], tuple[bytes, bytes]]
+"""Splits an authentic payload into the frames that may pass while freshness is unverified, and those that wait."""
+
+
+def hold_all(payload: bytes) -> tuple[bytes, bytes]:
+    """The screen of a node that knows nothing about frames: all of them wait."""
+    return b"", payload
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +46,8 @@ class Link:
     mac_key_bits: int = 256
     max_envelope: int = c.DEFAULT_ENVELOPE_LIMIT
     timers: Timers = field(default_factory=Timers)
+    verify_interval_s: float = field(default=c.VERIFY_INTERVAL_S, compare=False)
+    """How often freshness is verified while frames arrive. A session keeps the interval that it began with."""
 
 
 @dataclass(frozen=True, slots=True)

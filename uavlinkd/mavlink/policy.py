@@ -349,7 +349,7 @@ class Gate:
             return Refusal.COMMAND_NOT_ALLOWED
         if condition.only_reads_files and _payload_byte(frame, OPCODE_IN_FILE_TRANSFER) not in READING_OPCODES:
             return Refusal.FILE_WRITE_NOT_ALLOWED
-        if condition.refuses_ground_station and _claims_to_be_ground_station(frame):
+        if condition.refuses_ground_station and claims_to_be_ground_station(frame):
             return Refusal.GROUND_STATION_NOT_ALLOWED
         return None
 
@@ -391,7 +391,7 @@ def _payload_byte(frame: Frame, at: int) -> int:
     return frame.raw[payload_at + at] if at < frame.raw[1] else 0
 
 
-def _claims_to_be_ground_station(frame: Frame) -> bool:
+def claims_to_be_ground_station(frame: Frame) -> bool:
     """Whether a HEARTBEAT has the type of a ground station: PX4 takes any for a sign that its own still lives."""
     # Of one in another definition the type cannot be read.
     return not frame.header.is_known or _payload_byte(frame, TYPE_IN_HEARTBEAT) == MAV_TYPE_GCS

@@ -12,7 +12,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from uavlinkd.mitm.attack import Attack, AttackError, Options, Surroundings, describe_options
-from uavlinkd.mitm.attacks import floods, forgery, handshake, replay, roaming, traffic
+from uavlinkd.mitm.attacks import floods, forgery, handshake, replay, roaming, stretch, traffic
 
 _ALL: tuple[type[Attack[Any]], ...] = (
     handshake.TamperKey,
@@ -59,6 +59,8 @@ _ALL: tuple[type[Attack[Any]], ...] = (
     traffic.Hold,
     traffic.Cross,
     traffic.Reorder,
+    stretch.Stretch,
+    stretch.StretchOneWay,
 )
 
 ATTACKS: Mapping[str, type[Attack[Any]]] = MappingProxyType({each.name: each for each in _ALL})
