@@ -153,6 +153,7 @@ class Peer:
             out.append(Dropped(reason, self.name, None, amount))
 
     def wake_at(self, moment: float) -> None:
+        """Have :meth:`handle_timeout` called by then."""
         self.deadline = min(self.deadline, moment)
 
     # Receiving on a session.
@@ -397,6 +398,7 @@ class Peer:
         self.deadline = self._next_deadline()
 
     def ask_for_echo(self, session: Session, path: Path, now: float, out: list[Output]) -> None:
+        """Send an echo request about a session on it."""
         self._probe_at = NEVER  # until traffic asks for another
         echo = wire.Echo(False, self._age.ask(session, now), session.received, session.expected)
         self._seal(session, echo.encode(), path, now, out)
