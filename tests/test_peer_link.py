@@ -93,7 +93,7 @@ def test_new_budget_changes_the_interval_of_the_next_session() -> None:
     """The session in use goes on with the one that it began with."""
     link = Link(suites=PLAIN.suites, timers=QUIET)
     pair = Pair(link_a=link, link_b=link).establish()
-    config = Peer(PeerSettings("alpha", KEY_A.public, None, link), ())
+    config = Peer(PeerSettings("alpha", KEY_A.public, None, link), (), TRUSTED)
     peer_link = PeerLink(config, pair.b.node, lambda _: None, 0.0)
     slower = replace(config.settings, link=replace(link, verify_interval_s=5.0))
     peer_link.change(replace(config, settings=slower), 1.0)
@@ -106,7 +106,7 @@ def test_status_has_the_time_of_unverified_freshness(since: float | None, shown:
     """In seconds until now; nothing while freshness is verified."""
     pair = Pair().establish()
     pair.b.peer._age.unverified_since = since
-    peer_link = PeerLink(Peer(PeerSettings("alpha", KEY_A.public), ()), pair.b.node, lambda _: None, 0.0)
+    peer_link = PeerLink(Peer(PeerSettings("alpha", KEY_A.public), (), TRUSTED), pair.b.node, lambda _: None, 0.0)
     assert peer_status(peer_link, 12.5)["freshness_unverified_s"] == shown
 
 
