@@ -28,7 +28,7 @@ _OTHER: Final = {"role": "swarm-member", "system_ids": [OTHER_MEMBER]}
 _VEHICLE: Final = {"role": "vehicle", "system_ids": [MEMBER]}
 _OBSERVER: Final = {"role": "observer", "system_ids": [TABLET]}
 _OPERATOR: Final = {"role": "operator", "system_ids": [GROUND], "deny_in": ["MAV_CMD_DO_FLIGHTTERMINATION"]}
-_ANYTHING: Final[Mapping[str, object]] = {"system_ids": "all", "allow_in": ["all"]}
+_ANYTHING: Final[Mapping[str, object]] = {"role": "all", "system_ids": "all"}
 
 
 class Attack(NamedTuple):

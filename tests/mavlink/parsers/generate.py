@@ -13,7 +13,7 @@ from uavlinkd.evaluation.hidden_frames import SIGNATURE_BYTES, Carrier, crc_extr
 from uavlinkd.mavlink.dialect_table import COMMANDS, MESSAGES, OTHER_EXTRAS
 from uavlinkd.mavlink.policy import Refusal, compile_policy
 
-EVERYTHING: Final[Mapping[str, object]] = {"allow_in": ["all"], "system_ids": "all"}
+EVERYTHING: Final[Mapping[str, object]] = {"role": "all", "system_ids": "all"}
 CAST: Final[Mapping[str, Mapping[str, object]]] = {
     "member": {"role": "swarm-member", "system_ids": [2]},
     "other member": {"role": "swarm-member", "system_ids": [3]},
