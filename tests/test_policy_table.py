@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import io
 import re
 
 import pytest
+from rich.console import Console
 
 from uavlinkd.mavlink import dialect
 from uavlinkd.mavlink.policy import Gate, Refusal, compile_policy
 from uavlinkd.mavlink.roles import ROLES
-from uavlinkd.policy_table import table_rows
+from uavlinkd.policy_table import table_rows, tables
 
 _POLICIES: dict[str, dict[str, object]] = {
     **{role: {"role": role} for role in ROLES},
@@ -74,9 +76,22 @@ def test_long_cell_is_shorter_than_the_policys_own() -> None:
     """Telemetry to a vehicle is 15 messages, of which other rows tell all but one; the commands in it stay told."""
     data: dict[str, object] = {"role": "operator", "system_ids": [255], "deny_in": ["MAV_CMD_DO_FLIGHTTERMINATION"]}
     rows = {row.subject: row for row in table_rows(compile_policy(data), data)}
-    assert rows["telemetry"].incoming == "only STATUSTEXT, 14 told in other rows"
+    assert rows["telemetry"].incoming == "only STATUSTEXT, 14 listed in other rows"
     assert rows["mission"].incoming == "all (by command: MISSION_ITEM, MISSION_ITEM_INT)"
     assert rows["commands"].incoming.startswith("all (by command: COMMAND_LONG, COMMAND_INT,")
+
+
+def test_names_of_groups_are_whole_on_eighty_columns() -> None:
+    """The first column is as wide as its longest word."""
+    data = {"role": "operator", "system_ids": [255], "deny_in": ["MAV_CMD_NAV_LAND", "files"]}
+    policy = compile_policy(data)
+    rows = table_rows(policy, data)
+    file = io.StringIO()
+    Console(file=file, width=80).print(*tables(rows))
+    lines = file.getvalue().splitlines()
+    assert max(map(len, lines)) <= 80
+    words = {line.split()[0].rstrip(",") for line in lines if line[:1].strip()}
+    assert {"parameter-reads", "mission-reads", "control-access"} <= words
 
 
 def test_exceptions_are_told_once_too() -> None:
@@ -85,7 +100,7 @@ def test_exceptions_are_told_once_too() -> None:
     rows = {row.subject: row for row in table_rows(compile_policy(data), data)}
     assert rows["files"].outgoing == "none"
     assert re.fullmatch(
-        r"all but AUTOPILOT_VERSION, RESPONSE_EVENT_ERROR, \d told in other rows", rows["answers"].outgoing
+        r"all but AUTOPILOT_VERSION, RESPONSE_EVENT_ERROR, \d listed in other rows", rows["answers"].outgoing
     )
 
 

@@ -81,6 +81,14 @@ def test_unverified_freshness_is_shown_with_its_meaning() -> None:
     assert "freshness" not in shown({"drone1": peer("up")}, 80)
 
 
+def test_a_hidden_frame_is_shown_before_reasons_with_greater_counts() -> None:
+    """A captured member cannot push it off the screen by other refused frames."""
+    loud = {"foreign_system": 900, "message_not_allowed": 800, "rate_limited": 700}
+    refused = {"in": {"HEARTBEAT": loud, "HOME_POSITION": {"hidden_frame": 1}}}
+    text = " ".join(shown({"drone1": peer("up", refused=refused)}, 80).split())
+    assert "drone1 dropped: 1 hidden_frame, 900 foreign_system, 800 message_not_allowed, \u2026" in text
+
+
 def test_a_recording_that_failed_is_told() -> None:
     """Where nothing is kept, who looks sees it."""
     recording = {"is_recording": False, "failures": {"EROFS": 7}}

@@ -46,11 +46,11 @@ def review(config: Config) -> list[RenderableType]:
         having.setdefault(table_rows(policy, data), []).append(name)
     parts: list[RenderableType] = [Text("\nWho may say what", style="bold"), summary]
     for rows, names in having.items():
-        parts += [Text(f"\nPolicy of {', '.join(names)}", style="bold"), *_tables(rows)]
+        parts += [Text(f"\nPolicy of {', '.join(names)}", style="bold"), *tables(rows)]
     return parts
 
 
-def _tables(rows: _Rows) -> list[RenderableType]:
+def tables(rows: _Rows) -> list[RenderableType]:
     """What passes both ways, what passes neither way, and the rest: rows with the same on both sides together."""
     alike: dict[tuple[str, str], list[str]] = {}
     for row in rows:
@@ -63,8 +63,10 @@ def _tables(rows: _Rows) -> list[RenderableType]:
     if not alike:
         return [whole]
     table = Table(box=SIMPLE_HEAD, pad_edge=False, show_edge=False, expand=True)
-    for column, ratio in (("otherwise", 2), ("from there", 5), ("to there", 5)):
-        table.add_column(column, ratio=ratio, overflow="fold")
+    widest = max(len(f"{word},") for subjects in alike.values() for subject in subjects for word in subject.split())
+    table.add_column("otherwise", width=widest, overflow="fold")
+    for column in ("from there", "to there"):
+        table.add_column(column, ratio=1, overflow="fold")
     for sides, subjects in alike.items():
         table.add_row(*map(Text, (", ".join(subjects), *sides)))
     return [whole, table]
@@ -119,7 +121,7 @@ def _short(text: str, members: Sequence[str], gate: Gate) -> str:
     rest = [name for name in listed if name not in told]
     if len(listed) - len(rest) < _MANY:
         return text
-    rest.append(f"{len(listed) - len(rest)} told in other rows")
+    rest.append(f"{len(listed) - len(rest)} listed in other rows")
     by_command = text[text.index(" (by command") :] if " (by command" in text else ""
     return f"{'only' if names_passing else 'all but'} {', '.join(rest)}{by_command}"
 

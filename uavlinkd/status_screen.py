@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Final
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Group, RenderableType
@@ -10,11 +10,14 @@ from rich.table import Table
 from rich.text import Text
 
 from uavlinkd.log import DISTURBANCES, UNVERIFIED
+from uavlinkd.mavlink.policy import Refusal
 
 Status = dict[str, Any]
 
 _STYLES = {"up": "green", "lost": "bold red", "waiting": "bold yellow"}
 _SHOWN_DROPS = 3
+_SHOWN_FIRST: Final = (Refusal.HIDDEN_FRAME.value,)
+"""Reasons that no count of others may push out: a captured member could choose those counts."""
 _SIGNS = tuple(each for each in DISTURBANCES if each != "envelopes_missing")
 """What is told with the drops. What is missing shows in the column of losses."""
 
@@ -126,8 +129,8 @@ def _refused(part: Status) -> dict[str, int]:
 
 
 def _counts(counts: dict[str, int]) -> str:
-    """The most frequent first; a few are enough to know where to look."""
-    ranked = sorted(counts.items(), key=lambda item: -item[1])
+    """The most frequent first, after `_SHOWN_FIRST`; a few are enough to know where to look."""
+    ranked = sorted(counts.items(), key=lambda item: (item[0] not in _SHOWN_FIRST, -item[1]))
     text = ", ".join(f"{amount:,} {reason}" for reason, amount in ranked[:_SHOWN_DROPS])
     return text + (", …" if len(ranked) > _SHOWN_DROPS else "")
 
