@@ -83,7 +83,11 @@ CASES: dict[str, tuple[dict[str, str], list[tuple[str, bool]]]] = {
         [("4m", False), ("8m", True)],
     ),
     "UavlinkdFlood": (
-        {'uavlinkd_rx_dropped_total{instance="a",peer="",reason="rate_limited"}': "0+100x20 2000+3000x20"},
+        {  # Only all of them together are above 50 a second.
+            'uavlinkd_rx_dropped_total{instance="a",peer="",reason="rate_limited"}': "0+100x20 2000+400x20",
+            'uavlinkd_rx_dropped_total{instance="a",peer="b",reason="over_share"}': "0+0x20 0+300x20",
+            'uavlinkd_rx_dropped_total{instance="a",peer="b",reason="group_budget_spent"}': "0+0x20 0+300x20",
+        },
         [("4m", False), ("8m", True)],
     ),
     "UavlinkdPeerOversteps": (
