@@ -102,7 +102,7 @@ def test_the_read_that_notices_the_pause_is_stale(queue: Queue) -> None:
 
 
 def test_a_closed_socket_is_passed_over(watch: StallWatch, queue: Queue) -> None:
-    """Its number stays known until nobody holds it any more."""
+    """Its number stays known while anything refers to it."""
     other = Queue(watch)
     other.close()
     queue.sender.send(b"old")

@@ -207,7 +207,7 @@ def test_policy_without_exceptions_has_no_table(folder: Path) -> None:
 
 
 def test_each_peer_and_endpoint_is_told_with_its_role(folder: Path) -> None:
-    """Who it is and as which systems it speaks; a peer that may say everything stands out by what that means."""
+    """Its name and its systems; a peer that may say everything is highlighted, with what that means."""
     printed = _printed(
         _load(folder, _FILE.replace('role = "observer"\nsystem_ids = [254]', 'role = "all"\nsystem_ids = "all"'))
     )

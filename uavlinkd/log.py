@@ -73,17 +73,17 @@ MEANINGS: dict[str, str] = {
 REFUSALS: dict[str, str] = {
     Refusal.FOREIGN_SYSTEM: "frames of a system that is not in its system_ids",
     Refusal.MESSAGE_NOT_ALLOWED: "messages that its role, or its lists, do not let pass",
-    Refusal.UNKNOWN_MESSAGE: "messages that the dialect does not have, or longer ones than it has; a list may allow their numbers",
+    Refusal.UNKNOWN_MESSAGE: "messages unknown to the dialect, or too long for it; a list may allow their numbers",
     Refusal.COMMAND_NOT_ALLOWED: "commands that its role, or its lists, do not let pass",
     Refusal.SETUP_SIGNING: "MAVLink signing keys in clear, which never cross a link",
     Refusal.MAVLINK1_NOT_ALLOWED: "MAVLink 1, which is switched off for it",
     Refusal.FILE_WRITE_NOT_ALLOWED: "file transfers that write, where only reading is allowed",
     Refusal.GROUND_STATION_NOT_ALLOWED: "heartbeats as a ground station, which its role is not",
-    Refusal.HIDDEN_FRAME: "frames that hide a frame which it may not send: an attack, or a file that holds such frames",
+    Refusal.HIDDEN_FRAME: "frames that hide one which it may not send: an attack, or a file with such frames",
     Refusal.RATE_LIMITED: "more of these messages than rate_in or rate_out lets pass",
 }
-"""The same of frames that a policy did not let pass: ``frames_refused``, which somebody sent, and
-``frames_withheld``, which somebody was not to be told."""
+"""The same for frames that a policy did not let pass: ``frames_refused`` came from a peer or endpoint, and
+``frames_withheld`` would have gone to one."""
 
 
 UNVERIFIED = (

@@ -185,7 +185,7 @@ def test_a_removed_peer_is_known_nowhere() -> None:
     assert pair.b.node.sender_of(flooding(1), AT_A) is None
 
 
-# Who is who, for a busy shell.
+# Which sender a datagram belongs to, for a busy shell.
 
 
 def test_senders_are_told_apart() -> None:

@@ -96,7 +96,7 @@ _given_ports: set[int] = set()
 
 
 def free_port() -> int:
-    """A port that nobody uses for UDP or TCP, below those that the system gives out by itself."""
+    """A port that is free for UDP and TCP, below the range that the kernel assigns."""
     while True:
         port = random.SystemRandom().randrange(10240, 32768)
         if port in _given_ports:

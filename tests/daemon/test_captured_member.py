@@ -138,7 +138,7 @@ async def test_its_hidden_frames_reach_no_parser(stage: Stage, family: str) -> N
 
 
 def look(received: bytes, attack: Attack) -> None:
-    """Give what a client read to every receiver. The honest peer's frames count as nobody's."""
+    """Let every receiver parse what a client read. The honest peer's frames have no author."""
     at = 0
     delivered: list[tuple[int, int]] = []
     authors: list[tuple[int, str | None]] = []

@@ -39,7 +39,7 @@ def hidden_header(msgid: int, payload_bytes: int, system: int = 255) -> bytes:
 def split_over(middle: bytes = b"", msgid: int = COMMAND_LONG, system: int = 1) -> tuple[bytes, bytes]:
     """Two ATTITUDE frames. A frame of system 255 begins in the signature of one and ends in the payload of the next.
 
-    `middle` stands between them.
+    `middle` is between them.
     """
     header = hidden_header(msgid, len(middle) + 10 + 26)
     opening = v2(ATTITUDE, bytes(27) + b"\1", system, signature=bytes(3) + header)

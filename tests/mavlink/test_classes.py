@@ -94,5 +94,5 @@ def test_unknown_message_must_be_new() -> None:
 
 @pytest.mark.parametrize("garbage", [b"\x00", ATTITUDE[:-1], b"\xfd" + bytes(20)])
 def test_payload_with_garbage_waits_as_a_whole(garbage: bytes) -> None:
-    """It is not taken apart here: who delivers it counts what is wrong."""
+    """It is not split here: the code that delivers it counts what is wrong."""
     assert screen(ATTITUDE + garbage) == (b"", ATTITUDE + garbage)

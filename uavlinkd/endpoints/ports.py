@@ -34,7 +34,7 @@ class LocalPort:
         return f"LocalPort({self.endpoint.name}, {self.name})"
 
     def send(self, frames: Sequence[Frame], source: Source, now: float, waited_s: float) -> None:
-        """Hand frames that are here together, all from one source, to the program."""
+        """Send frames that arrived together, all from one source, to the client."""
         self.endpoint.write(self, frames, source, now)
 
 

@@ -276,7 +276,7 @@ class Connection:
         self._loop.add_writer(self._fd, lambda: self.on_writable(monotonic()))
 
     def _await_room(self, now: float) -> None:
-        """Look again when the next frame should fit. The kernel reports nothing where it is we who leave it empty.
+        """Look again when the next frame should fit. The kernel sends no event while this side leaves it empty.
 
         Raises:
             OSError: the connection is gone.
@@ -342,7 +342,7 @@ class StreamEndpoint(ABC):
         """Nothing: a stream's bytes gather in the kernel, and in its splitter, as they are."""
 
     def write(self, port: LocalPort, frames: Sequence[Frame], source: Source, now: float) -> None:
-        """Send frames to one program, now or when it has room. Returns at once; reports nothing."""
+        """Send frames to one client, now or when it has room. Returns at once; reports nothing."""
         connection = self._connections.get(port)
         if connection is None:
             self.failures["unsent"] += len(frames)

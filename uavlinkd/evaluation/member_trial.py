@@ -128,7 +128,7 @@ class _Member(asyncio.DatagramProtocol):
 
 
 class _Client:
-    """A program at the daemon's endpoint that keeps every byte."""
+    """A client at the daemon's endpoint that keeps every byte."""
 
     def __init__(self, endpoint_port: int) -> None:
         self.received = bytearray()

@@ -74,7 +74,7 @@ def _tell(options: argparse.Namespace, result: Result) -> None:
     everybody = {each.name for each in result.fleet.members} <= set(result.changed)
     changed = "every folder" if everybody else ", ".join(result.changed)
     if result.changed:
-        _print(f"\nChanged in {options.out}: {changed}. Carry each to its owner, by a way that nobody else reads.")
+        _print(f"\nChanged in {options.out}: {changed}. Carry each to its owner so that no other person can read it.")
         _print(
             "Set SYSID_THISMAV or MAV_SYS_ID of each autopilot, and the id of each ground program, to its id above:"
             " as any other it is refused."

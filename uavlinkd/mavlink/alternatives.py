@@ -18,7 +18,7 @@ class Effect(NamedTuple):
 
     name: str
     commands: tuple[str, ...]
-    """The commands for this effect: whoever denies one of them wants to keep the effect out."""
+    """The commands for this effect: a policy that denies one of them is meant to keep the effect out."""
     alternatives: tuple[str, ...]
     """Messages, and commands that start with MAV_CMD_, that can cause the effect too."""
 

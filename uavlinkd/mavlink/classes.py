@@ -6,7 +6,7 @@
 *Age*: after a silence, or without an answer from the peer, a frame may be old (specification, section 11). Only a
 report may be delivered then: a message that asks its receiver for nothing and by which no autopilot steers. Any
 other message must be known to be new. That includes a ground station's HEARTBEAT, which silences the failsafe, and a
-message that the dialect does not have, or not in this form: nobody knows what an old one does.
+message that the dialect does not have, or not in this form: the effect of an old one is unknown.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Delivery of frames to one local client: who they came from, and the byte stream that the client reads.
+"""Delivery of frames to one local client: their sources, and the byte stream that the client reads.
 
 The invariant: *in the byte stream delivered to a client, no byte offset other than the start of a frame that policy
 passed begins a valid MAVLink frame that policy would not pass from the same source.* What is valid is in

@@ -97,7 +97,7 @@ class Lanes:
         return flow.lane
 
     def first(self) -> Waiting | None:
-        """What came first: there is room for everything."""
+        """The oldest frame first: there is room for everything."""
         heads = [oldest for queue in self.queues if (oldest := queue.oldest())]
         return min(heads, key=by_number) if heads else None
 

@@ -14,8 +14,8 @@ A frame is genuine when its checksum fits its message's CRC_EXTRA. Autopilots al
 are not in the table, or other versions of what is. Their CRC_EXTRA cannot be known, but only one value
 in 256 of a checksum fits any CRC_EXTRA at all, and hardly ever after a few flipped bits. So where a
 frame is expected (at the start, and right after a frame) one that fits some CRC_EXTRA passes, unread, as
-unknown. Elsewhere it does not: stray bytes must not pass for a frame and swallow the next. The receiver,
-who knows the dialect, checks it again. A frame whose payload is longer than its message's definition, extensions
+unknown. Elsewhere it does not: stray bytes must not pass for a frame and swallow the next. The receiver
+knows the dialect and checks it again. A frame whose payload is longer than its message's definition, extensions
 included, is unknown too: what the receiver would make of the rest cannot be known.
 
 Bytes that are no frame are skipped to the next byte that could start one, as MAVLink's own parsers do.

@@ -472,7 +472,7 @@ def _warnings(settings: Settings, incoming: Gate, outgoing: Gate) -> list[str]:
     for way, rules, gate in (("in", settings.rules_in, incoming), ("out", settings.rules_out, outgoing)):
         if rules.denies_all:
             continue
-        # A denied message that does what a command does stands for that command.
+        # A denied message with the effect of a command counts as that command.
         same = {SAME_AS_COMMAND[msgid] for msgid in rules.denied if msgid in SAME_AS_COMMAND}
         for name, denied, still_open in open_effects(rules.denied_commands | same, gate.lets_act):
             found.append(

@@ -39,7 +39,7 @@ _ALLOWED_COMMAND: Final = COMMANDS["MAV_CMD_REQUEST_MESSAGE"].to_bytes(2, "littl
 
 
 class Part(NamedTuple):
-    """One frame, and who sends it."""
+    """One frame and its sender."""
 
     sender: str
     raw: bytes

@@ -1,6 +1,6 @@
 """The judge: whether what a receiver accepted is what policy lets pass, whatever the daemon's filter thinks.
 
-It knows policies, who sent which bytes, and nothing of hidden frames.
+It knows the policies and the sender of each byte, and nothing of hidden frames.
 """
 
 from __future__ import annotations
@@ -134,7 +134,7 @@ class Judge:
         self._now = 0.0
 
     def is_forbidden(self, raw: bytes, senders: Iterable[str], client: int = 0) -> bool:
-        """Whether policy refuses this frame from any of those who sent its bytes, or keeps it from the client."""
+        """Whether policy refuses this frame from any sender of its bytes, or keeps it from the client."""
         counters = SplitCounters()
         frames = split_payload(raw, counters)
         if len(frames) != 1:

@@ -5,7 +5,7 @@ for a captured swarm member that knows the length of the loss, and not where it 
 
 The attacker fills its payloads with the second to last byte of a forbidden frame, so many bytes behind the start of
 each of its frames as will be lost. Bytes lost right behind a start byte then join it to the rest. Without the loss no
-start byte stands before that rest, so it is no hidden frame.
+start byte is before that rest, so it is not a hidden frame.
 """
 
 from __future__ import annotations

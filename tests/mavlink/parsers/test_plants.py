@@ -106,7 +106,7 @@ class Unseparated(DeliveredStream):
     """Delivers frames of different sources without separator bytes."""
 
     def admit(self, frame: Frame, source: Source, now: float) -> bytes:
-        """Refuse as always; leave out what stands before the frame."""
+        """Refuse as always; leave out the bytes before the frame."""
         return super().admit(frame, source, now)[-len(frame.raw) :]
 
 

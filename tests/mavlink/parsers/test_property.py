@@ -1,4 +1,4 @@
-"""Whatever is delivered: what a real parser accepts is what policy passes from those who sent its bytes."""
+"""For any delivered stream: policy passes each frame that a real parser accepts, from the senders of its bytes."""
 
 from __future__ import annotations
 
