@@ -195,8 +195,8 @@ def read_secret_file(path: Path, *, credential: bool = False) -> Secret:
 def _owned_by_another(path: Path, owner: int) -> str:
     quoted = shlex.quote(str(path))
     return (
-        f"belongs to another user (uid {owner}), which can read and replace it: if the key is known to be yours, run"
-        f" `chown {os.geteuid()} {quoted}` as root"
+        f"belongs to another user (uid {owner}), who can read and replace it: if the key is known to be yours, run"
+        f" `chown {os.geteuid()} {quoted}` as root, or this command as that user"
     )
 
 

@@ -52,6 +52,12 @@ def test_alternatives_of_a_denied_command_are_named(denied: str, named: list[str
     assert f" {denied}," not in stays
 
 
+def test_a_denied_message_is_named_as_it_was_denied() -> None:
+    """Denying SET_MODE leaves the command with its effect open: only the message is said to be kept out."""
+    assert "deny_in keeps out SET_MODE, but changing the mode" in warnings(deny_in=["SET_MODE"])
+    assert "keeps out MAV_CMD_DO_SET_MODE" in warnings(deny_in=["SET_MODE", "MAV_CMD_DO_SET_MODE"])
+
+
 def test_what_the_role_refuses_is_not_named() -> None:
     """A shell could restart an autopilot, and an operator has none."""
     assert "SERIAL_CONTROL" not in warnings(deny_in=["MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN"])

@@ -163,12 +163,17 @@ EFFECTS: Final = (
 )
 
 
+def full_command_name(number: int) -> str:
+    """A command's name with MAV_CMD_ before it."""
+    return f"MAV_CMD_{dialect.command_name(number).removeprefix('MAV_CMD_')}"
+
+
 def open_effects(denied: Iterable[int], passes: Callable[[str], bool]) -> Iterator[OpenEffect]:
     """The effects of denied commands that a policy leaves open.
 
     ``denied``: numbers of commands. ``passes``: whether the policy lets a message or command of this name through.
     """
-    names = {f"MAV_CMD_{dialect.command_name(number).removeprefix('MAV_CMD_')}" for number in denied}
+    names = {full_command_name(number) for number in denied}
     for effect in EFFECTS:
         asked = tuple(name for name in effect.commands if name in names)
         if not asked:

@@ -55,7 +55,7 @@ from enum import StrEnum
 from typing import Final, NamedTuple
 
 from uavlinkd.mavlink import dialect
-from uavlinkd.mavlink.alternatives import open_effects
+from uavlinkd.mavlink.alternatives import full_command_name, open_effects
 from uavlinkd.mavlink.dialect_table import COMMANDS, MESSAGES
 from uavlinkd.mavlink.egress_kinds import FlowKey, flow_key, kind_of
 from uavlinkd.mavlink.frames import Frame, Header
@@ -473,10 +473,18 @@ def _warnings(settings: Settings, incoming: Gate, outgoing: Gate) -> list[str]:
         if rules.denies_all:
             continue
         # A denied message with the effect of a command counts as that command.
-        same = {SAME_AS_COMMAND[msgid] for msgid in rules.denied if msgid in SAME_AS_COMMAND}
-        for name, denied, still_open in open_effects(rules.denied_commands | same, gate.lets_act):
+        same = {
+            SAME_AS_COMMAND[msgid]: dialect.name_of(msgid)
+            for msgid in sorted(rules.denied)
+            if msgid in SAME_AS_COMMAND
+        }
+        by_message = {
+            full_command_name(number): name for number, name in same.items() if number not in rules.denied_commands
+        }
+        for name, denied, still_open in open_effects(rules.denied_commands | set(same), gate.lets_act):
+            asked = ", ".join(by_message.get(command, command) for command in denied)
             found.append(
-                f"deny_{way} keeps out {', '.join(denied)}, but {name} stays possible by {', '.join(still_open)}:"
+                f"deny_{way} keeps out {asked}, but {name} stays possible by {', '.join(still_open)}:"
                 f" denial is best effort; to keep the effect out, write no role and allow_{way} = what is needed"
             )
         if not rules.denied_commands:
