@@ -34,7 +34,9 @@ from uavlinkd.mavlink.frames import MAVLINK1, MAX_FRAME_BYTES, Frame, Header
 from uavlinkd.mavlink.policy import Gate, Refusal
 
 LAST_COMMON_ID: Final = 149
-"""Receivers of any dialect but ``minimal`` have the messages up to this number, and reject none of them."""
+"""Receivers of any dialect but ``minimal`` have the messages up to this number, and reject none of them but these."""
+NOT_COMMON_IDS: Final = frozenset((8, 53, 80))
+"""LINK_NODE_STATUS, MISSION_CHECKSUM and COMMAND_CANCEL: ArduPilot lacks them."""
 
 Report = Callable[[str, Header, Refusal, float], None]
 """Receives each refusal: the source's name, the header of the frame that was not delivered, why, and when."""
@@ -100,10 +102,10 @@ class DeliveredStream:
 
     def _examine(self, frame: Frame, source: Source, now: float) -> bytes:
         raw = frame.raw
-        gap: bytes | None = b""
+        gap = b""
         if self._starts and not self._is_only(source) and _is_urgent(frame) and self._may_be_rejected(frame):
-            gap = self._gap() or b""
-        while gap is not None:
+            gap = self._gap()
+        while True:
             begun_at = len(self._tail) + len(gap)
             data = self._tail + gap + raw
             authors = [*self._authors, *([(begun_at, None)] if gap else []), (len(data), source)]
@@ -132,6 +134,11 @@ class DeliveredStream:
                         source.refuse(frame, now)
                         return b""
                     is_hidden_elsewhere = True
+                if (reach := hidden.reach(data, start, end)) > len(data) and hidden.has_checksum(
+                    data, start, end, any_extra=True
+                ):  # a parser that accepts it waits for its signature
+                    still_open.append(start)
+                    due_at = min(due_at, reach)
                 again = hidden.restart(data, start, end)
                 if again is not None and again not in causes:
                     causes[again] = cause
@@ -141,9 +148,7 @@ class DeliveredStream:
                 self._note(frame, is_alone=bool(gap))
                 self.separators += bool(gap)
                 return gap + raw
-            gap = self._gap()
-        source.refuse(frame, now)  # no separator was found: see hidden.separator
-        return b""
+            gap = self._gap()  # nothing that began before it goes on behind it: this happens once
 
     def _may_be_rejected(self, frame: Frame) -> bool:
         """Whether a receiver of this frame may have rejected one before it, in which a header is open."""
@@ -153,11 +158,12 @@ class DeliveredStream:
         """Remember what kind of frame joined the tail."""
         is_alone = is_alone or len(self._tail) <= len(frame.raw)
         header = frame.header
-        is_rare = not header.is_known or header.msgid > LAST_COMMON_ID
+        msgid = header.msgid
+        is_rare = not header.is_known or msgid > LAST_COMMON_ID or msgid in NOT_COMMON_IDS
         self._has_rare = is_rare or (self._has_rare and not is_alone)
         self._has_mavlink2 = not header.is_mavlink1 or (self._has_mavlink2 and not is_alone)
 
-    def _gap(self) -> bytes | None:
+    def _gap(self) -> bytes:
         return hidden.separator(self._tail, self._starts)
 
     def _is_forbidden(

@@ -45,6 +45,8 @@ Start = tuple[int, bool]
 _PLAUSIBLE = re.compile(rb"\xfe|\xfd(?=.?\Z|.[\x00\x01])", re.DOTALL)
 """A start byte whose flags, as far as the bytes go, are ones that parsers accept."""
 _STEPS = frozenset(CHECKSUM_STEP)
+_HIGH_BYTES: Final = tuple(frozenset(step >> 8 for step in _STEPS if step & 0xFF == low) for low in range(256))
+"""Of the steps with this low byte: at most two."""
 _MAVLINK1 = bytes((MAVLINK1,))
 _FILLERS: Final = (*range(2, MAVLINK1 - 1), 0xFF)
 """Values of separator bytes: no start byte, and as incompat_flags each of them ends a header at once."""
@@ -105,26 +107,41 @@ def frame_at(data: bytes, start: Start, end: int) -> Frame:
     return frame
 
 
-def separator(tail: bytes, starts: Iterable[Start]) -> bytes | None:
+def separator(tail: bytes, starts: Iterable[Start]) -> bytes:
     """Bytes to put behind `tail` after which no frame that begins at `starts` is open, or has become valid.
 
-    None where no such bytes were found. One filler value fails for a start only if the checksum up to here is one
-    particular of 65,536 values, so some 250 starts would each have to be made for it. 280 bytes hold fewer.
+    Where a frame that began before them would end, its checksum's last byte is chosen so that it fits none that ends
+    there. Of 252 values each start rules out two, or none. 126 starts whose length leads to the same place fill all
+    the bytes that can be open, so that nothing is left by which to choose what their checksums rule out.
     """
     starts = list(starts)
-    for filler in _FILLERS:
-        data = tail + bytes((filler,)) * MAX_FRAME_BYTES
-        ends = [(start, end_of_checksum(data, start)) for start in starts]
-        closed = [(start, end) for start, end in ends if end is not None and end != PAST]
-        if any(has_checksum(data, start, end, any_extra=True) for start, end in closed):
-            continue
-        longest = max((_reach(data, start, end) for start, end in closed), default=0)
-        shortest = max((at + 3 for at, _ in starts), default=0)  # flags that end a header have to be there
-        return data[len(tail) : max(longest, shortest, len(tail) + 1)]
-    return None
+    size = len(tail)
+    data = tail + bytes((_FILLERS[0],)) * MAX_FRAME_BYTES
+    # The first byte may be the length of the last start, so it is settled before the others.
+    for is_first in (True, False):
+        by_end: dict[int, list[Start]] = {}
+        for start in starts:
+            end = end_of_checksum(data, start)
+            if end is not None and end > size and (end == size + 1) == is_first:
+                by_end.setdefault(end, []).append(start)
+        for end in sorted(by_end):
+            data = _without_checksum(data, by_end[end], end)
+    closed = [(start, end) for start in starts if (end := end_of_checksum(data, start)) is not None and end != PAST]
+    longest = max((reach(data, start, end) for start, end in closed), default=0)
+    shortest = max((at + 3 for at, _ in starts), default=0)  # flags that end a header have to be there
+    return data[size : max(longest, shortest, size + 1)]
 
 
-def _reach(data: bytes, start: Start, end: int) -> int:
+def _without_checksum(data: bytes, starts: Iterable[Start], end: int) -> bytes:
+    """The same data, but at `end` stands a checksum that fits none of the frames at `starts`."""
+    fitting: set[int] = set()
+    for at, _ in starts:
+        fitting |= _HIGH_BYTES[data[end - 2] ^ (mcrf4xx(data[at + 1 : end - 2]) >> 8)]
+    last = next((value for value in _FILLERS if value not in fitting), _FILLERS[0])
+    return data if last == data[end - 1] else data[: end - 1] + bytes((last,)) + data[end:]
+
+
+def reach(data: bytes, start: Start, end: int) -> int:
     """Where a parser that took `start` for a frame is done with it."""
     at, is_mavlink1 = start
     is_signed = not is_mavlink1 and data[at + 2] == 1
