@@ -45,7 +45,7 @@ from uavlinkd.sdnotify import Supervisor
 from uavlinkd.stall import StallWatch
 from uavlinkd.status import daemon_status
 from uavlinkd.switch import Switch
-from uavlinkd.turns import TURN_FRAMES, TURN_S, Turns
+from uavlinkd.turns import TURN_FRAMES, TURN_S, Turns, cost_of
 
 if TYPE_CHECKING:
     from uavlinkd.metrics_server import MetricsServer
@@ -401,7 +401,7 @@ class Daemon:
             elif isinstance(output, o.Deliver):
                 name = link_name(output.peer)
                 frames = split_payload(output.payload, self.links[name].counters)
-                self._frames_in_turn += len(frames)
+                self._frames_in_turn += cost_of(output.payload, len(frames))
                 if name in self._deliveries:
                     self._deliveries[name] += frames
                 else:

@@ -14,9 +14,13 @@ TURN_S = 0.003
 """How long one sender's turn takes at most, by the clock, without the delivery of its frames. Another sender's frames
 then wait for some such turns, which is far below a radio's delay."""
 TURN_FRAMES = 300
-"""Frames that end a turn too: to deliver one costs as much as to read it."""
+"""Frames that end a turn too, by :func:`cost_of`: to deliver one costs as much as to read it."""
+STARTS_OF_A_FRAME = 4
+"""So many start bytes in payloads cost as much as a frame: each may begin a hidden one (:mod:`.mavlink.hidden`)."""
 WAITING_BYTES = 65536
 """Of one sender's datagrams: the largest one fits, and a burst of fifty of the default size."""
+WAITING_OVERHEAD_BYTES = 64
+"""Counted with each of them, so that many small ones, and empty ones, are bounded too."""
 
 Waiting = tuple[bytes, Path]
 """A datagram, and the path that it came along."""
@@ -41,12 +45,12 @@ class Turns:
         ``epoch``: that of its reading, as :class:`uavlinkd.stall.StallWatch` counts them.
         """
         queue = self._queues.setdefault(sender, deque())
-        size = self._bytes.get(sender, 0) + len(datagram)
+        size = self._bytes.get(sender, 0) + _size(datagram)
         queue.append(((datagram, path), epoch))
         pushed_out: list[Waiting] = []
-        while size > WAITING_BYTES:
+        while size > WAITING_BYTES and len(queue) > 1:
             pushed_out.append(queue.popleft()[0])
-            size -= len(pushed_out[-1][0])
+            size -= _size(pushed_out[-1][0])
         self._bytes[sender] = size
         return pushed_out
 
@@ -62,5 +66,15 @@ class Turns:
         queue = self._queues[sender]
         while queue and queue[0][1] == epoch:
             waiting, _ = queue.popleft()
-            self._bytes[sender] -= len(waiting[0])
+            self._bytes[sender] -= _size(waiting[0])
             yield waiting
+
+
+def cost_of(payload: bytes, frames: int) -> int:
+    """What it costs to deliver a payload of so many frames, in frames of the usual kind."""
+    starts = payload.count(b"\xfd") + payload.count(b"\xfe")
+    return frames + max(0, starts - frames) // STARTS_OF_A_FRAME
+
+
+def _size(datagram: bytes) -> int:
+    return len(datagram) + WAITING_OVERHEAD_BYTES

@@ -32,6 +32,7 @@ from uavlinkd.core.suites import SUITES_BY_NAME, X25519
 HOSTS = tuple(f"127.0.0.{number}" for number in range(2, 6))
 SPOOFED_SOCKETS = 500
 FRAME_BYTES = 8
+STARTS_FRAME_BYTES = 266
 _TICK_S = 0.002
 
 
@@ -126,11 +127,19 @@ def spoofed(target: Target) -> None:
 
 def envelopes(target: Target) -> None:
     """Genuine envelopes of ``envelope_bytes`` bytes, whatever was agreed, filled with the shortest frames."""
+    _insider(target, _shortest_frames(target.envelope_bytes), FRAME_BYTES)
+
+
+def starts(target: Target) -> None:
+    """Genuine envelopes of file transfer whose bytes are all start bytes: the dearest to search for hidden frames."""
+    _insider(target, _frames_of_starts(target.envelope_bytes), STARTS_FRAME_BYTES)
+
+
+def _insider(target: Target, filling: bytes, frame_bytes: int) -> None:
     sock = _socket("127.0.0.1")
     node = Node(Secret(b64decode(target.captured_key)), os.urandom, monotonic())
     node.add_peer(target.settings(), monotonic())
     node.set_addresses("victim", [(0, *target.address)], monotonic())
-    filling = _shortest_frames(target.envelope_bytes)
     for due in _ticks(target.per_s):
         outputs = node.handle_timeout(monotonic()) if monotonic() >= node.next_deadline() else []
         for answer in _received(sock):
@@ -141,12 +150,24 @@ def envelopes(target: Target) -> None:
         session = node.peers["victim"].sessions.current
         if session is not None:
             for _ in range(due):
-                _send(sock, _fill(session, filling, target.envelope_bytes), target)
+                _send(sock, _fill(session, filling, frame_bytes, target.envelope_bytes), target)
 
 
-def _fill(session: Session, filling: bytes, size: int) -> bytes:
+def _fill(session: Session, filling: bytes, frame_bytes: int, size: int) -> bytes:
     room = size - session.envelope_bytes(0)
-    return session.seal(filling[: room - room % FRAME_BYTES], monotonic())
+    return session.seal(filling[: room - room % frame_bytes], monotonic())
+
+
+def _frames_of_starts(size: int) -> bytes:
+    """FILE_TRANSFER_PROTOCOL of system 2, one for each sequence number."""
+    from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+    codec = mavlink.MAVLink(None, 2, 1)
+    frames = []
+    for seq in range(size // STARTS_FRAME_BYTES):
+        codec.seq = seq % 256
+        frames.append(bytes(mavlink.MAVLink_file_transfer_protocol_message(254, 254, 254, [254] * 251).pack(codec)))
+    return b"".join(frames)
 
 
 def _shortest_frames(size: int) -> bytes:
@@ -173,7 +194,7 @@ def _received(sock: socket.socket) -> Iterator[bytes]:
             yield sock.recv(65536)
 
 
-ATTACKS = {each.__name__: each for each in (initiations, spoofed, envelopes)}
+ATTACKS = {each.__name__: each for each in (initiations, spoofed, envelopes, starts)}
 
 if __name__ == "__main__":
     ATTACKS[sys.argv[1]](Target(**json.loads(sys.stdin.readline())))

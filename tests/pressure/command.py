@@ -18,6 +18,7 @@ PLANS = {
         Plan("spoofed initiations", "spoofed", 10_000, with_latecomer=True),
         Plan("64 kB envelopes", "envelopes", 40, envelope_bytes=64_000),
         Plan("agreed envelopes", "envelopes", 2_000),
+        Plan("start bytes", "starts", 2_000, role="vehicle"),
     )
 }
 

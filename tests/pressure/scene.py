@@ -33,6 +33,8 @@ class Plan:
     per_s: float
     suite: str = "x25519"
     envelope_bytes: int = 1232
+    role: str = "swarm-member"
+    """Of the captured peer."""
     with_latecomer: bool = False
     """Whether another peer, at its configured address, starts during the attack."""
 
@@ -94,7 +96,7 @@ async def watch(stage: Stage, plan: Plan, seconds: float, launcher: tuple[str, .
     victim.launcher = launcher
     stage.introduce(victim, honest)
     psk, late_psk = stage.psk(), stage.psk()
-    victim.add_peer(captured, [], psk, suites=[plan.suite], role="swarm-member", system_ids=[2])
+    victim.add_peer(captured, [], psk, suites=[plan.suite], role=plan.role, system_ids=[2])
     # The daemon offers what costs it nothing: the answer to the peer's own initiation is what this is about.
     victim.add_peer(late, [late.address], late_psk, suites=list(dict.fromkeys(["x25519", plan.suite])))
     late.add_peer(victim, [victim.address], late_psk, suites=[plan.suite])

@@ -19,6 +19,7 @@ EXPECTED: dict[str, tuple[set[str], float | None]] = {
     "spoofed initiations": ({"rate_limited", "cookie_required"}, 0.5),
     "64 kB envelopes": ({"too_long"}, 0.5),
     "agreed envelopes": (set(), None),
+    "start bytes": (set(), None),
 }
 
 
