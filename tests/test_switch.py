@@ -6,8 +6,10 @@ from collections import Counter
 from collections.abc import Sequence
 
 import pytest
+from fastcrc.crc16 import mcrf4xx
 from pymavlink.dialects.v20 import all as mavlink
 
+from tests.mavlink.smuggling import v2
 from uavlinkd import switch as switch_module
 from uavlinkd.endpoints.ports import LocalPort
 from uavlinkd.mavlink.delivery import Source
@@ -203,3 +205,35 @@ def test_memory_is_bounded(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> Non
         stage.switch.forward(stage.a.port, [attitude(1, system)], 0.0)
         assert len(stage.switch._flows[stage.a.port]) <= 16
     assert stage.told() == (0, 199, 199)
+
+
+class Reader(Program):
+    """A program that is sent what a real endpoint would send it."""
+
+    def write(self, port: LocalPort, frames: Sequence[Frame], source: Source, now: float) -> None:
+        """Keep the frames that are delivered."""
+        self.told += [frame.raw for frame in frames if port.delivered.admit(frame, source, now)]
+
+
+def test_frame_that_was_refused_is_no_reason_to_drop_the_same_from_another() -> None:
+    """A captured operator sends the other's next heartbeat first, made to complete a hidden command of its own."""
+    scene = Stage()
+    scene.switch.remove(scene.a.port)
+    scene.a = Reader("a")
+    scene.switch.add(scene.a.port, policy())
+    scene.switch.set_policy(scene.b.port, policy(role="operator", system_ids=[255], deny_in=["SET_MODE"]))
+    beat = made(mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3), 255)
+    (opening,) = split_datagram(opening_before(beat.raw), SplitCounters())
+    scene.switch.forward(scene.b.port, [opening, beat], 1.0)
+    assert scene.refused == [("b", Refusal.HIDDEN_FRAME)]
+    scene.switch.forward(scene.c.port, [beat], 1.1)
+    assert scene.a.told == [opening.raw, beat.raw]
+
+
+def opening_before(victim: bytes) -> bytes:
+    """A PING whose signature begins a MAVLink 1 SET_MODE. Its checksum is the first two bytes of the other frame."""
+    for number in range(1 << 20):
+        covered = bytes((6, number & 255, 255, number >> 8 & 255, 11, number >> 16, 0, 0, 0, 1, 81))
+        if mcrf4xx(covered + bytes((89,))).to_bytes(2, "little") == victim[:2]:
+            return v2(4, bytes(13) + b"\1", 255, signature=b"\0\xfe" + covered)
+    raise AssertionError("one in 65,536 fits")

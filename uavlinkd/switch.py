@@ -47,7 +47,7 @@ class Switch:
     def add(self, port: Port, policy: Policy) -> None:
         """From now on frames may come from and go to this port, as far as the policy lets them."""
         self._policies[port] = policy
-        self._sources[port] = Source(_owner(port), policy.incoming, self._report)
+        self._sources[port] = Source(_owner(port), policy.incoming, self._report, self.router.forget_frame)
         _set_outgoing(port, policy)
         self._numbers[port] = next(self._unused)
         self._flows[port] = {}

@@ -42,6 +42,14 @@ Report = Callable[[str, Header, Refusal, float], None]
 """Receives each refusal: the source's name, the header of the frame that was not delivered, why, and when."""
 
 
+Forget = Callable[[bytes], None]
+"""Receives the bytes of a frame that was not delivered: the same from another source is no duplicate of it."""
+
+
+def _forget_nothing(raw: bytes) -> None:
+    """No other source sends the same."""
+
+
 def _report_nothing(name: str, header: Header, refusal: Refusal, now: float) -> None:
     """The source's gate has counted it."""
 
@@ -50,14 +58,17 @@ def _report_nothing(name: str, header: Header, refusal: Refusal, now: float) -> 
 class Source:
     """One port that frames come from, as the ports that they go to know it. Compared by identity."""
 
-    __slots__ = ("_report", "gate", "name")
+    __slots__ = ("_forget", "_report", "gate", "name")
 
-    def __init__(self, name: str, gate: Gate, report: Report = _report_nothing) -> None:
+    def __init__(
+        self, name: str, gate: Gate, report: Report = _report_nothing, forget: Forget = _forget_nothing
+    ) -> None:
         self.name = name
         """The peer or endpoint, as the configuration names it."""
         self.gate = gate
         """The incoming rules that its frames passed."""
         self._report = report
+        self._forget = forget
 
     def __repr__(self) -> str:
         return f"Source({self.name})"
@@ -65,6 +76,7 @@ class Source:
     def refuse(self, frame: Frame, now: float) -> None:
         """Count and report a frame that carries hidden ones."""
         self.gate.count(frame.header, Refusal.HIDDEN_FRAME)
+        self._forget(frame.raw)
         self._report(self.name, frame.header, Refusal.HIDDEN_FRAME, now)
 
 

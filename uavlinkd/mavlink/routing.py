@@ -162,6 +162,11 @@ class Router(Generic[P]):
         self.unrouted[Unrouted.DUPLICATE] += 1
         return False
 
+    def forget_frame(self, raw: bytes) -> None:
+        """These bytes were not delivered: should another port send the same, it is the first to do so."""
+        self._seen.pop(raw, None)
+        self._seen_before.pop(raw, None)
+
     def addresses(self, port: P) -> list[Address]:
         """The systems and components heard behind a port lately, sorted."""
         return sorted(self._heard_at.get(port, ()))
