@@ -441,3 +441,11 @@ async def test_connection_that_was_being_opened_during_a_pause_is_stale(pair: Pa
     pair.other.send(frame(1))
     connection.on_readable(now=0.0)
     assert recorder(pair).epochs == [STALE]
+
+
+async def test_device_that_is_opened_again_has_the_same_stream(pair: Pair) -> None:
+    """The parser behind it may have kept its state."""
+    before = pair.connection.port.delivered
+    pair.connection.lose("unplugged")
+    await pair.connection.lost.wait()
+    assert pair.open_now().port.delivered is before

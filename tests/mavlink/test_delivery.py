@@ -25,7 +25,7 @@ from tests.mavlink.smuggling import (
 )
 from uavlinkd.evaluation.captured_member import restart_in_mavlink1
 from uavlinkd.mavlink import hidden
-from uavlinkd.mavlink.delivery import DeliveredStream, Source
+from uavlinkd.mavlink.delivery import MAX_STREAMS, DeliveredStream, DeliveredStreams, Source
 from uavlinkd.mavlink.dialect_table import MESSAGES
 from uavlinkd.mavlink.frames import Frame, Header
 from uavlinkd.mavlink.policy import Gate, Refusal, compile_policy
@@ -359,3 +359,17 @@ def test_separator_completes_no_frame(seed: int) -> None:
         assert end is not None
         assert hidden.reach(data, start, end) <= len(data)
         assert end == hidden.PAST or not hidden.has_checksum(data, start, end, any_extra=True)
+
+
+def test_client_that_comes_back_has_the_stream_that_it_had() -> None:
+    """Its parser may have kept the first half of a hidden frame. The client away longest is forgotten."""
+    streams, member = DeliveredStreams(), source()
+    opening, closing = split_over()
+    assert streams.of("/dev/ttyACM0").admit(parsed(opening), member, 1.0) == opening
+    for number in range(MAX_STREAMS - 1):
+        streams.of(f"127.0.0.1:{number}")
+    assert streams.of("/dev/ttyACM0").admit(parsed(closing), member, 2.0) == b""
+    first = streams.of("127.0.0.1:0")
+    streams.of("[::1]:14550")
+    assert streams.of("127.0.0.1:0") is first
+    assert streams.of("127.0.0.1:1") is not streams.of("127.0.0.1:2")

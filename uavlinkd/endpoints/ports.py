@@ -21,13 +21,15 @@ class LocalPort:
 
     __slots__ = ("delivered", "endpoint", "heard_at", "name")
 
-    def __init__(self, endpoint: Endpoint, name: str, heard_at: float | None) -> None:
+    def __init__(
+        self, endpoint: Endpoint, name: str, heard_at: float | None, delivered: DeliveredStream | None = None
+    ) -> None:
         self.endpoint = endpoint
         self.name = name
         """Where it is, for people: ``127.0.0.1:14550``, ``/dev/ttyACM0``."""
         self.heard_at = heard_at
         """Monotonic seconds; None for one that is there by configuration and has not been heard."""
-        self.delivered = DeliveredStream()
+        self.delivered = delivered or DeliveredStream()
         """The stream that it reads. Its endpoint asks it for the bytes of each frame, in the order of delivery."""
 
     def __repr__(self) -> str:

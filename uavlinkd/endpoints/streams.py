@@ -19,7 +19,7 @@ import structlog
 from uavlinkd.clock import monotonic
 from uavlinkd.endpoints.outgoing import OutgoingFrames
 from uavlinkd.endpoints.ports import LocalPort, PortHandler, failure_name
-from uavlinkd.mavlink.delivery import Source
+from uavlinkd.mavlink.delivery import DeliveredStreams, Source
 from uavlinkd.mavlink.frames import MAX_GAP_S, Frame, SplitCounters, StreamSplitter
 from uavlinkd.stall import STALE, Backlog
 
@@ -81,7 +81,7 @@ class Connection:
     def __init__(
         self, endpoint: StreamEndpoint, channel: Channel, name: str, opened_at: float, opened_in: int
     ) -> None:
-        self.port = LocalPort(endpoint, name, None)
+        self.port = LocalPort(endpoint, name, None, endpoint.delivered.of(name))
         self.channel = channel
         self.opened_at = opened_at
         self.outgoing = OutgoingFrames(endpoint.max_age_s, endpoint.failures, self.port.delivered)
@@ -326,6 +326,7 @@ class StreamEndpoint(ABC):
         self.bytes_received = 0
         self.bytes_sent = 0
         self.frames_sent = 0
+        self.delivered = DeliveredStreams()
         self._connections: dict[LocalPort, Connection] = {}
         self._told: set[str] = set()  # why it could not be opened, since it last was for long
 

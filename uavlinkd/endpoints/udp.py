@@ -17,7 +17,7 @@ from uavlinkd.addresses import Address
 from uavlinkd.clock import monotonic
 from uavlinkd.endpoints.ports import LocalPort, PortHandler, failure_name
 from uavlinkd.endpoints.sockets import Batch, BindError, Reader, numeric_host, udp_socket
-from uavlinkd.mavlink.delivery import Source
+from uavlinkd.mavlink.delivery import DeliveredStreams, Source
 from uavlinkd.mavlink.frames import MAX_GAP_S, MIN_FRAME_BYTES, Frame, SplitCounters, StreamSplitter, split_datagram
 from uavlinkd.resolver import Resolved, keep_resolving
 from uavlinkd.stall import STALE
@@ -57,6 +57,7 @@ class UdpEndpoint(ABC):
         self._epoch = handler.stall.epoch  # of the last read
         self._gather_s = 0.0
         self._gathering: asyncio.TimerHandle | None = None
+        self._delivered = DeliveredStreams()
         self._ports: dict[Sockaddr, LocalPort] = {}  # the longest silent first
         self._addresses: dict[LocalPort, Sockaddr] = {}
         self._cutters: dict[Sockaddr, StreamSplitter] = {}  # the programs that cut frames apart
@@ -192,7 +193,8 @@ class UdpEndpoint(ABC):
         """The program at ``address``, which just sent a genuine frame; None where it is not listened to."""
 
     def _open(self, address: Sockaddr, heard_at: float | None) -> LocalPort:
-        port = LocalPort(self, str(Address(*address)), heard_at)
+        name = str(Address(*address))
+        port = LocalPort(self, name, heard_at, self._delivered.of(name))
         self._ports[address] = port
         self._addresses[port] = address
         self._handler.on_port_opened(port)

@@ -4,7 +4,8 @@
 `urgent` of :mod:`.egress_kinds` is the part of `critical` that a slow link sends first.
 
 *Age*: after a silence, or without an answer from the peer, a frame may be old (specification, section 11). Only a
-report may be delivered then: a message that asks its receiver for nothing and by which no autopilot steers. Any
+report may be delivered then: a message that asks its receiver for nothing. Positions of other vehicles are reports.
+A vehicle that follows or avoids by them has to judge their age itself: see section 11 for how old they may be. Any
 other message must be known to be new. That includes a ground station's HEARTBEAT, which silences the failsafe, and a
 message that the dialect does not have, or not in this form: the effect of an old one is unknown.
 """

@@ -38,6 +38,9 @@ LAST_COMMON_ID: Final = 149
 NOT_COMMON_IDS: Final = frozenset((8, 53, 80))
 """LINK_NODE_STATUS, MISSION_CHECKSUM and COMMAND_CANCEL: ArduPilot lacks them."""
 
+MAX_STREAMS: Final = 64
+"""Clients of one endpoint whose streams are remembered: twice as many as it serves."""
+
 Report = Callable[[str, Header, Refusal, float], None]
 """Receives each refusal: the source's name, the header of the frame that was not delivered, why, and when."""
 
@@ -211,6 +214,25 @@ class DeliveredStream:
     def _is_only(self, source: Source, start: int = 0) -> bool:
         """Whether all bytes of the tail from `start` on are of this source."""
         return all(author is source for ends_at, author in self._authors if ends_at > start)
+
+
+class DeliveredStreams:
+    """The streams of one endpoint's clients. A client that comes back has the parser that it had.
+
+    A serial device that is plugged in again, a TCP target or a UDP client may go on in the middle of what it read
+    before. So its stream is kept by name. Bounded: the client that came back longest ago is forgotten first.
+    """
+
+    def __init__(self) -> None:
+        self._by_name: dict[str, DeliveredStream] = {}
+
+    def of(self, name: str) -> DeliveredStream:
+        """The stream of the client of this name, which is opened now."""
+        stream = self._by_name.pop(name, None) or DeliveredStream()
+        if len(self._by_name) >= MAX_STREAMS:
+            del self._by_name[next(iter(self._by_name))]
+        self._by_name[name] = stream
+        return stream
 
 
 def _is_urgent(frame: Frame) -> bool:
