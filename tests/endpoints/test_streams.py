@@ -448,4 +448,10 @@ async def test_device_that_is_opened_again_has_the_same_stream(pair: Pair) -> No
     before = pair.connection.port.delivered
     pair.connection.lose("unplugged")
     await pair.connection.lost.wait()
-    assert pair.open_now().port.delivered is before
+    ours, other = socket.socketpair()
+    pair.channel = RationedChannel(ours)
+    with other:
+        again = pair.open_now()
+        assert again.port.delivered is before
+        again.lose("unplugged")
+        await again.lost.wait()
