@@ -25,7 +25,7 @@ from tests.daemon.harness import BUFFER_BYTES, Program
 from uavlinkd.control import ControlError, ask
 from uavlinkd.mavlink.frames import SplitCounters, split_datagram
 
-PATIENCE_S = 30.0
+PATIENCE_S = 60.0
 """How long anything may take that has to happen and is not what a test measures."""
 POLL_S = 0.02
 LINKED_S = 5.0

@@ -42,7 +42,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from uavlinkd import keys
 from uavlinkd.sim.links import Changes
 
-PATIENCE_S = 15.0
+PATIENCE_S = 60.0
 """How long anything may take that has to happen: much more than it does take, for busy machines."""
 POLL_S = 0.01
 BUFFER_BYTES = 1 << 21

@@ -20,7 +20,7 @@ from uavlinkd.mavlink.frames import Frame, SplitCounters, split_payload
 from uavlinkd.mavlink.policy import compile_policy
 from uavlinkd.stall import StallWatch
 
-PATIENCE_S = 10.0
+PATIENCE_S = 60.0
 """After which what was to happen has not."""
 
 

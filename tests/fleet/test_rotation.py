@@ -21,7 +21,7 @@ from uavlinkd.control import ControlError, ask
 from uavlinkd.fleet import work
 from uavlinkd.fleet.manifest import Kind, Settings, read_manifest
 
-PATIENCE_S = 30.0
+PATIENCE_S = 60.0
 POLL_S = 0.02
 NAMES = ("drone1", "drone2", "drone3")
 
