@@ -214,7 +214,7 @@ def repaired(datagram: bytes, receiver_public_key: bytes) -> bytes:
 
 def exhaust(side: Side, now: float) -> None:
     """Bring a node under load: its budget of initiations and of responses is spent."""
-    for bucket in (side.node._initiations, side.node._responses):
+    for bucket in (side.node._admission._initiations, side.node._admission._responses):
         while bucket.take(now):
             pass
 

@@ -93,7 +93,7 @@ def test_a_flood_from_ten_thousand_networks_leaves_a_known_peer_its_cookie(known
     assert fates.count([DropReason.COOKIE_REQUIRED]) <= 2 * c.COOKIE_REPLIES_PER_S
     assert fates.count([DropReason.BAD_HANDSHAKE]) <= c.INITIATIONS_PER_S
     exhaust(pair.b, 2.0)
-    while pair.b.node._cookie_replies.take(2.0):
+    while pair.b.node._admission._cookie_replies.take(2.0):
         pass
     assert reasons(initiation(pair, (0, "10.99.0.1", 9), 2.0)) == [DropReason.RATE_LIMITED]
     asked = initiation(pair, at, 2.0)

@@ -838,7 +838,7 @@ def test_initiations_do_not_spend_the_budget_of_responses() -> None:
     """A flood of initiations leaves our own handshakes alone."""
     pair = Pair(link_a=QUIET, link_b=QUIET)
     response = only(datagrams(pair.b.receive(pair.initiation(0.0), 0.0)))
-    while pair.a.node._initiations.take(0.0):
+    while pair.a.node._admission._initiations.take(0.0):
         pass
 
     assert of(pair.a.receive(response, 0.0), SessionEstablished)
@@ -1013,7 +1013,7 @@ def test_all_sources_together_have_a_bound(monkeypatch: pytest.MonkeyPatch, know
         pair.b.peer.path = None
         node._note_places()
     monkeypatch.setattr(node._cookies, "has_valid_mac2", lambda *_: True)
-    while node._initiations.take(1.0):
+    while node._admission._initiations.take(1.0):
         pass
     fates = [
         reasons(node.receive(made_initiation(KEY_C), (0, f"10.0.{number // 200}.{number % 200}", 1), 1.0))

@@ -15,9 +15,10 @@ from tests.fuzz.engine import TALLY, Run, Script
 from tests.fuzz.stages import GROUPS, LINKS, NOW, Chance, copier, pair_of
 from uavlinkd.core import constants as c
 from uavlinkd.core import handshake, noise, wire
+from uavlinkd.core.admission import Admission
 from uavlinkd.core.crypto import KeyPair
 from uavlinkd.core.drops import DropReason
-from uavlinkd.core.group_budget import GroupBudget, GroupShare
+from uavlinkd.core.group_budget import GroupShare
 from uavlinkd.core.limits import TokenBucket
 from uavlinkd.core.noise import HandshakeState, Token
 from uavlinkd.core.outputs import Dropped, Output, SessionEstablished, Transmit
@@ -111,9 +112,7 @@ def _refill(pair: Pair, now: float) -> None:
     for pending in pair.a.peer.caller.pending.values():
         pending.__post_init__()
     for node in (pair.a.node, pair.b.node):
-        node._group = GroupBudget(now)
-        node._initiations = TokenBucket(c.INITIATIONS_PER_S, c.INITIATIONS_BURST, now)
-        node._responses = TokenBucket(c.INITIATIONS_PER_S, c.INITIATIONS_BURST, now)
+        node._admission = Admission(node._is_known, now)
         for peer in node.peers.values():
             peer.group_share = GroupShare(now)
             peer.answers = peer.answers_while_up = TokenBucket(c.ANSWERS_PER_S, c.ANSWERS_BURST, now)

@@ -204,8 +204,8 @@ class Outsider:
 
 def _refill(node: Node, now: float) -> None:
     """Budgets as at the beginning, and no drops. Small ones, so that scripts come to where cookies are asked for."""
-    node._initiations = TokenBucket(1.0, BUDGET, now)
-    node._responses = TokenBucket(1.0, BUDGET, now)
+    node._admission._initiations = TokenBucket(1.0, BUDGET, now)
+    node._admission._responses = TokenBucket(1.0, BUDGET, now)
     node.drops.clear()
     for peer in node.peers.values():
         peer.traffic.drops.clear()

@@ -31,17 +31,17 @@ def measure(node: Node) -> Sizes:
     peers = node.peers.values()
     sessions = [session for peer in peers for session in peer.sessions.confirmed]
     lately = [each for session in sessions for each in (session._heard_lately, session._sent_lately)]
-    indices = node._indices
+    indices, admission = node._indices, node._admission
     return Counter(
         {
             "pending initiations of a peer": max((len(peer.caller.pending) for peer in peers), default=0),
             "unconfirmed sessions of a peer": max((len(peer.sessions.unconfirmed) for peer in peers), default=0),
             "confirmed sessions of a peer": max((len(peer.sessions.confirmed) for peer in peers), default=0),
             "remembered initiations of a peer": max((len(peer.remembered) for peer in peers), default=0),
-            "sources under load": len(node._sources._buckets),
-            "networks that get cookies": len(node._prefixes._buckets),
-            "sources of group work": len(node._group._sources._buckets),
-            "known addresses with shares": max(len(node._known._buckets), len(node._known_read._buckets)),
+            "sources under load": len(admission._sources._buckets),
+            "networks that get cookies": len(admission._prefixes._buckets),
+            "sources of group work": len(admission._group._sources._buckets),
+            "known addresses with shares": max(len(admission._known._buckets), len(admission._known_read._buckets)),
             "echo requests that wait for an answer": max((len(peer._age._questions) for peer in peers), default=0),
             "bytes held on a session": max((session.doubt._held_bytes for session in sessions), default=0),
             "steps of the past of a session": max((len(each._steps) for each in lately), default=0),

@@ -10,23 +10,20 @@ from __future__ import annotations
 from base64 import b64encode
 from collections import Counter
 from collections.abc import Hashable, Iterable, Sequence
-from typing import NoReturn
 
 from uavlinkd.core import constants as c
 from uavlinkd.core import handshake, wire
+from uavlinkd.core.admission import Admission, Message
 from uavlinkd.core.caller import Pending
 from uavlinkd.core.constants import NEVER
 from uavlinkd.core.cookie import CookieJar, MacKeys
 from uavlinkd.core.crypto import Entropy, KeyPair, Secret
 from uavlinkd.core.drops import Drop, DropReason
-from uavlinkd.core.group_budget import GroupBudget
 from uavlinkd.core.indices import Indices
-from uavlinkd.core.limits import SourceLimiter, TokenBucket, prefix_of, source_of
-from uavlinkd.core.outputs import Dropped, Output, Path, Transmit
+from uavlinkd.core.outputs import Dropped, Output, Path
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.session import Session
 from uavlinkd.core.settings import PeerSettings, Screen, hold_all
-from uavlinkd.core.suites import Suite
 
 _ENVELOPE_STARTS = frozenset((bytes((wire.SHORT_ENVELOPE,)), bytes((wire.LONG_ENVELOPE,))))
 _MAVLINK_STARTS = frozenset((0xFD, 0xFE))
@@ -62,24 +59,8 @@ class Node:
         self._by_keys: dict[tuple[bytes, bytes], Peer] = {}  # ours, theirs
         self._by_address: dict[tuple[str, int], Peer] = {}
         self._remembered: set[bytes] = set()  # ephemerals of authentic initiations, of every peer
-        # Two budgets: a flood of initiations must not keep our own handshakes from finishing.
-        self._initiations = TokenBucket(c.INITIATIONS_PER_S, c.INITIATIONS_BURST, now)
-        self._responses = TokenBucket(c.INITIATIONS_PER_S, c.INITIATIONS_BURST, now)
-        self._cookied = TokenBucket(c.COOKIED_PER_S, c.COOKIED_PER_S, now)
-        self._sources = SourceLimiter(c.COOKIED_PER_SOURCE_PER_S, c.COOKIED_PER_SOURCE_BURST, c.SOURCES_TRACKED)
-        self._read = TokenBucket(c.INITIATIONS_READ_PER_S, c.INITIATIONS_READ_BURST, now)
-        self._known_read = SourceLimiter(
-            c.INITIATIONS_READ_PER_KNOWN_PER_S, c.INITIATIONS_READ_PER_KNOWN_BURST, c.SOURCES_TRACKED
-        )
-        self._cookie_replies = TokenBucket(c.COOKIE_REPLIES_PER_S, c.COOKIE_REPLIES_PER_S, now)
-        self._prefixes = SourceLimiter(
-            c.COOKIE_REPLIES_PER_PREFIX_PER_S, c.COOKIE_REPLIES_PER_PREFIX_BURST, c.SOURCES_TRACKED
-        )
-        self._known = SourceLimiter(
-            c.COOKIE_REPLIES_PER_KNOWN_PER_S, c.COOKIE_REPLIES_PER_KNOWN_BURST, c.SOURCES_TRACKED
-        )
-        self._group = GroupBudget(now)
         self._last_seen: set[tuple[str, int]] = set()  # where peers are, as far as they proved
+        self._admission = Admission(self._is_known, now)
         self._deadline = NEVER
         self.peers: dict[str, Peer] = {}
         """By name."""
@@ -256,46 +237,33 @@ class Node:
 
     def _receive_initiation(self, datagram: bytes, path: Path, now: float, out: list[Output]) -> None:
         initiation = wire.parse_initiation(datagram)
-        address = path[1:]
-        # Where a peer is known to be, a flood from elsewhere does not count.
-        if not (self._is_known(address) and self._known_read.take(address, now)) and not self._read.take(now):
-            raise Drop(DropReason.RATE_LIMITED)
+        self._admission.read(path, now)
         identity, cookies = self._addressed(datagram)
-        index = initiation.sender_index
         if initiation.ephemeral in self._remembered:  # before the budget: one recording must not use it up
             raise Drop(DropReason.REPLAYED_INITIATION)
-        self._admit(self._initiations, self._cookied, cookies, datagram, index, path, now, out)
+        message = Message(datagram, initiation.sender_index, path, cookies)
+        self._admission.admit_initiation(message, now, out)
         received = handshake.receive_initiation(identity, initiation)
         peer = self._by_keys.get((identity.public, received.public_key))
         if peer is None:
             raise Drop(DropReason.UNKNOWN_PEER, f"key {b64encode(received.public_key).decode()}")
         self._remember(peer, initiation.ephemeral)
         try:
-            self._answer(peer, received, cookies, datagram, path, now, out)
+            self._answer(peer, received, message, now, out)
         except Drop as drop:
             drop.peer = peer.name
             raise
 
     def _answer(
-        self,
-        peer: Peer,
-        received: handshake.Received,
-        cookies: CookieJar,
-        datagram: bytes,
-        path: Path,
-        now: float,
-        out: list[Output],
+        self, peer: Peer, received: handshake.Received, message: Message, now: float, out: list[Output]
     ) -> None:
-        # Recorded initiations of this peer can be replayed from anywhere: they may use up the answers to everybody,
-        # not those to the one who proves its address.
-        index, suite = received.initiation.sender_index, received.initiation.suite
-        answers = peer.answers_while_up if peer.is_up else peer.answers
-        self._admit(answers, peer.cookied_answers, cookies, datagram, index, path, now, out)
+        suite = received.initiation.suite
+        self._admission.admit_answer(peer, message, now, out)
         if suite not in peer.settings.link.suites:
             raise Drop(DropReason.SUITE_NOT_ACCEPTED, f"suite {suite.name}")
         if suite.has_group:
-            self._admit_group(peer, suite, cookies, datagram, index, path, now, out)
-        peer.answer(received, path, now, out)
+            self._admission.admit_group(peer, suite, message, now, out)
+        peer.answer(received, message.path, now, out)
         self._deadline = min(self._deadline, peer.deadline)
 
     def _receive_response(self, datagram: bytes, path: Path, now: float, out: list[Output]) -> None:
@@ -304,7 +272,7 @@ class Node:
         if not isinstance(pending, Pending):
             raise Drop(DropReason.UNEXPECTED_RESPONSE)
         _, cookies = self._addressed(datagram)
-        self._admit(self._responses, self._cookied, cookies, datagram, response.sender_index, path, now, out)
+        self._admission.admit_response(Message(datagram, response.sender_index, path, cookies), now, out)
         pending.peer.receive_response(pending, response, now, out)
         self._note_places()
         self._deadline = min(self._deadline, pending.peer.deadline)
@@ -337,80 +305,6 @@ class Node:
             self._previous.mac_keys.check_mac1(datagram)
             return self._previous.identity, self._previous.cookies
         return self._identity, self._cookies
-
-    def _admit(
-        self,
-        budget: TokenBucket,
-        ceiling: TokenBucket,
-        cookies: CookieJar,
-        datagram: bytes,
-        sender_index: int,
-        path: Path,
-        now: float,
-        out: list[Output],
-    ) -> None:
-        """Whether this message may cost work: until the budget is spent, then with a cookie, by its source's share.
-
-        Raises:
-            Drop: ``COOKIE_REQUIRED`` (a cookie is on its way) or ``RATE_LIMITED``.
-        """
-        if budget.take(now):
-            return
-        if not cookies.has_valid_mac2(datagram, path, now):
-            self._require_cookie(cookies, datagram, sender_index, path, now, out)
-        # Who proved an address of a peer does not queue with strangers: neither with those of its host or network,
-        # such as others behind one router, nor with those of many addresses, for whom the ceiling is.
-        _, host, port = path
-        is_known = self._is_known((host, port))
-        if not self._sources.take((ceiling, (host, port) if is_known else source_of(host)), now):
-            raise Drop(DropReason.RATE_LIMITED)
-        if not is_known and not ceiling.take(now):
-            raise Drop(DropReason.RATE_LIMITED)
-
-    def _require_cookie(
-        self, cookies: CookieJar, datagram: bytes, sender_index: int, path: Path, now: float, out: list[Output]
-    ) -> NoReturn:
-        """Refuse a message without a cookie, and send one back unless too many were sent there.
-
-        Raises:
-            Drop: ``COOKIE_REQUIRED``, or ``RATE_LIMITED`` without a reply.
-        """
-        _, host, port = path
-        is_due = self._is_known((host, port)) and self._known.take((host, port), now)
-        # The total is looked at first: a flood from many prefixes then costs no more than this.
-        if not is_due and self._cookie_replies.has(now):
-            is_due = self._prefixes.take(prefix_of(host), now) and self._cookie_replies.take(now)
-        if not is_due:
-            raise Drop(DropReason.RATE_LIMITED)
-        out.append(Transmit(cookies.reply(datagram, sender_index, path, now), path))
-        raise Drop(DropReason.COOKIE_REQUIRED)
-
-    def _admit_group(
-        self,
-        peer: Peer,
-        suite: Suite,
-        cookies: CookieJar,
-        datagram: bytes,
-        sender_index: int,
-        path: Path,
-        now: float,
-        out: list[Output],
-    ) -> None:
-        """Whether an authentic initiation may cost the arithmetic of its group.
-
-        Raises:
-            Drop: ``GROUP_BUDGET_SPENT``; ``COOKIE_REQUIRED`` or ``RATE_LIMITED`` where a cookie would help.
-        """
-        # An attacker can send a recorded initiation under the peer's own address: only a cookie proves an address.
-        is_there = path in peer.caller.candidates(peer.path)
-        is_proven = is_there and cookies.has_valid_mac2(datagram, path, now)
-        if is_proven and peer.group_share.proven.take(now, suite.work):
-            return
-        if self._group.take(peer.group_share, source_of(path[1]), suite.work, now):
-            return
-        if is_there and not is_proven:
-            self._require_cookie(cookies, datagram, sender_index, path, now, out)
-        raise Drop(DropReason.GROUP_BUDGET_SPENT)
 
     def _is_known(self, address: tuple[str, int]) -> bool:
         """Whether a peer is said to be there, or was heard there last."""
