@@ -31,7 +31,7 @@ from uavlinkd.core.settings import Link, Timers
 from uavlinkd.core.suites import SUITES_BY_NAME
 from uavlinkd.mavlink.egress import EgressSettings
 from uavlinkd.mavlink.frames import Frame, SplitCounters, split_payload
-from uavlinkd.mavlink.policy import Refusal
+from uavlinkd.mavlink.gate import Refusal
 from uavlinkd.mavlink.policy_settings import KEYS
 from uavlinkd.mavlink.roles import ROLES
 

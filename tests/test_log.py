@@ -24,7 +24,7 @@ from uavlinkd.core.drops import DropReason
 from uavlinkd.core.settings import PeerSettings
 from uavlinkd.log import DISTURBANCES, MEANINGS, REFUSALS, SUMMARY_INTERVAL_S, DropSummary, set_up_logging
 from uavlinkd.mavlink.frames import Header
-from uavlinkd.mavlink.policy import Refusal
+from uavlinkd.mavlink.gate import Refusal
 from uavlinkd.peer_link import PeerLink
 
 

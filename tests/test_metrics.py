@@ -13,7 +13,7 @@ import pytest
 from tests.daemon.harness import need
 from uavlinkd import __version__
 from uavlinkd.core.drops import DropReason
-from uavlinkd.mavlink.policy import Refusal
+from uavlinkd.mavlink.gate import Refusal
 from uavlinkd.metrics import exposition
 
 PEER: dict[str, Any] = {

@@ -9,7 +9,8 @@ import pytest
 from rich.console import Console
 
 from uavlinkd.mavlink import dialect
-from uavlinkd.mavlink.policy import Gate, Refusal, compile_policy
+from uavlinkd.mavlink.gate import Gate, Refusal
+from uavlinkd.mavlink.policy import compile_policy
 from uavlinkd.mavlink.roles import ROLES
 from uavlinkd.policy_table import table_rows, tables
 

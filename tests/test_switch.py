@@ -14,7 +14,8 @@ from uavlinkd import switch as switch_module
 from uavlinkd.endpoints.ports import LocalPort
 from uavlinkd.mavlink.delivery import Source
 from uavlinkd.mavlink.frames import Frame, Header, SplitCounters, split_datagram
-from uavlinkd.mavlink.policy import Policy, Refusal, compile_policy
+from uavlinkd.mavlink.gate import Refusal
+from uavlinkd.mavlink.policy import Policy, compile_policy
 from uavlinkd.mavlink.routing import ROUTE_LIFETIME_S, Router, Unrouted
 from uavlinkd.switch import Switch
 

@@ -22,7 +22,7 @@ from uavlinkd.core.drops import DropReason
 from uavlinkd.endpoints.ports import failure_name
 from uavlinkd.mavlink.dialect import name_of
 from uavlinkd.mavlink.frames import Header
-from uavlinkd.mavlink.policy import Refusal
+from uavlinkd.mavlink.gate import Refusal
 
 SUMMARY_INTERVAL_S = 10.0
 """What repeats is logged at once when it begins, then summed up this often."""

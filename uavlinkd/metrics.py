@@ -22,7 +22,7 @@ from typing import Any
 
 from uavlinkd import __version__
 from uavlinkd.core.drops import DropReason
-from uavlinkd.mavlink.policy import Refusal
+from uavlinkd.mavlink.gate import Refusal
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 

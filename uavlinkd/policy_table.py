@@ -12,7 +12,8 @@ from rich.text import Text
 
 from uavlinkd.config import Config, PolicyData
 from uavlinkd.mavlink import dialect
-from uavlinkd.mavlink.policy import Gate, Policy, PolicyRow, Refusal
+from uavlinkd.mavlink.gate import Gate, Refusal
+from uavlinkd.mavlink.policy import Policy, PolicyRow
 from uavlinkd.mavlink.roles import ROLES
 
 _IN_THE_SUMMARY: Final = frozenset({"role", "may speak as"})

@@ -8,7 +8,8 @@ from uavlinkd.addresses import Address
 from uavlinkd.endpoints.ports import Endpoint
 from uavlinkd.keys import encode_key
 from uavlinkd.mavlink.dialect import name_of
-from uavlinkd.mavlink.policy import ANY_OTHER, Policy
+from uavlinkd.mavlink.gate import ANY_OTHER
+from uavlinkd.mavlink.policy import Policy
 
 if TYPE_CHECKING:
     from uavlinkd.daemon import Daemon

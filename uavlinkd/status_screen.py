@@ -10,7 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from uavlinkd.log import DISTURBANCES, UNVERIFIED
-from uavlinkd.mavlink.policy import Refusal
+from uavlinkd.mavlink.gate import Refusal
 
 Status = dict[str, Any]
 

@@ -14,7 +14,8 @@ from typing import Protocol
 from uavlinkd.endpoints.ports import LocalPort
 from uavlinkd.mavlink.delivery import Source
 from uavlinkd.mavlink.frames import Frame, Header
-from uavlinkd.mavlink.policy import Policy, Refusal
+from uavlinkd.mavlink.gate import Refusal
+from uavlinkd.mavlink.policy import Policy
 from uavlinkd.mavlink.routing import Router
 from uavlinkd.peer_link import PeerLink
 

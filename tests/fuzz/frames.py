@@ -13,7 +13,7 @@ from tests.fuzz.engine import TALLY, Run, Script
 from tests.test_switch import Program, policy
 from uavlinkd import switch as switching
 from uavlinkd.mavlink import frames as splitting
-from uavlinkd.mavlink import policy as policing
+from uavlinkd.mavlink import gate as gates
 from uavlinkd.mavlink import routing
 from uavlinkd.mavlink.dialect import SETUP_SIGNING
 from uavlinkd.mavlink.dialect_table import MESSAGES
@@ -27,7 +27,8 @@ from uavlinkd.mavlink.frames import (
     split_datagram,
     split_payload,
 )
-from uavlinkd.mavlink.policy import Refusal
+from uavlinkd.mavlink.gate import Refusal
+from uavlinkd.mavlink.policy import Policy
 from uavlinkd.mavlink.routing import Router
 from uavlinkd.switch import Port, Switch
 
@@ -190,7 +191,7 @@ _CLAIMS: Final = (None, {1, 2, 4, 5}, {1, 2, 3}, None, {6}, {7})
 
 _BOUNDS = (
     (routing, ("MAX_ADDRESSES_PER_PORT", "MAX_FRAMES_REMEMBERED", "MAX_DECISIONS")),
-    (policing, ("MAX_COUNTED", "MAX_BUCKETS", "MAX_DECISIONS")),
+    (gates, ("MAX_COUNTED", "MAX_BUCKETS", "MAX_DECISIONS")),
     (switching, ("MAX_FLOWS",)),
 )
 
@@ -258,7 +259,7 @@ def _check_told(programs: list[Program], source: int, frames: list[Frame]) -> No
         program.told.clear()
 
 
-def _check_tables(router: Router[Port], switch: Switch, policies: list[policing.Policy]) -> None:
+def _check_tables(router: Router[Port], switch: Switch, policies: list[Policy]) -> None:
     for heard in router._heard_at.values():
         assert len(heard) <= routing.MAX_ADDRESSES_PER_PORT, "too many addresses"
     assert len(router._seen) <= routing.MAX_FRAMES_REMEMBERED
@@ -267,9 +268,9 @@ def _check_tables(router: Router[Port], switch: Switch, policies: list[policing.
         assert len(flows) <= switching.MAX_FLOWS
     for each in policies:
         for gate in (each.incoming, each.outgoing):
-            assert len(gate.refused) <= policing.MAX_COUNTED + len(Refusal), "too much is counted by itself"
-            assert len(gate._decisions) <= policing.MAX_DECISIONS
-            assert len(gate._buckets) <= policing.MAX_BUCKETS
+            assert len(gate.refused) <= gates.MAX_COUNTED + len(Refusal), "too much is counted by itself"
+            assert len(gate._decisions) <= gates.MAX_DECISIONS
+            assert len(gate._buckets) <= gates.MAX_BUCKETS
 
 
 def make_gate() -> Run:
@@ -293,9 +294,9 @@ def make_gate() -> Run:
                 claims = _CLAIMS[number]
                 assert refusal or claims is None or frame.header.system in claims, "spoke as another system"
                 assert refusal or frame.header.msgid != SETUP_SIGNING, "a signing key may pass"
-        assert len(gate.refused) <= policing.MAX_COUNTED + len(Refusal)
-        assert len(gate._decisions) <= policing.MAX_DECISIONS
-        assert len(gate._buckets) <= policing.MAX_BUCKETS
+        assert len(gate.refused) <= gates.MAX_COUNTED + len(Refusal)
+        assert len(gate._decisions) <= gates.MAX_DECISIONS
+        assert len(gate._buckets) <= gates.MAX_BUCKETS
 
     return run
 

@@ -20,7 +20,7 @@ from uavlinkd.core import caller, cookie, freshness, handshake, peer, replay, se
 from uavlinkd.core import node as core_node
 from uavlinkd.core.drops import Drop
 from uavlinkd.core.outputs import Deliver, Transmit
-from uavlinkd.mavlink import frames, policy, routing
+from uavlinkd.mavlink import frames, gate, routing
 from uavlinkd.mitm import anatomy
 from uavlinkd.mitm import settings as mitm_settings
 from uavlinkd.sim import tlog
@@ -276,13 +276,13 @@ PLANTS: Final = {
     "foreign system": Plant(
         "gate",
         "system 3 may be spoken as by all",
-        policy.Gate,
+        gate.Gate,
         "_verdict",
         lambda right: lambda self, header: None if header.system == 3 else right(self, header),
     ),
     "back to its sender": Plant("switch", "a frame comes back", routing.Router, "_decide", _back_to_sender),
     "unbounded routes": Plant("switch", "addresses pile up", routing.Router, "_learn", _learns_for_ever),
-    "unbounded counts": Plant("gate", "message ids pile up", policy.Gate, "_remember", _remembers_for_ever),
+    "unbounded counts": Plant("gate", "message ids pile up", gate.Gate, "_remember", _remembers_for_ever),
     "control escapes": Plant(
         "control",
         "text that is not ASCII ends it",

@@ -28,7 +28,8 @@ from uavlinkd.mavlink import hidden
 from uavlinkd.mavlink.delivery import MAX_STREAMS, DeliveredStream, DeliveredStreams, Source
 from uavlinkd.mavlink.dialect_table import MESSAGES
 from uavlinkd.mavlink.frames import Frame, Header
-from uavlinkd.mavlink.policy import Gate, Refusal, compile_policy
+from uavlinkd.mavlink.gate import Gate, Refusal
+from uavlinkd.mavlink.policy import compile_policy
 
 ARM = v2(COMMAND_LONG, bytes(28) + (400).to_bytes(2, "little") + b"\x02\x01\x00", 255)
 MODE_V1 = v1(SET_MODE, b"\x04\x00\x00\x00\x02\x51", 255)

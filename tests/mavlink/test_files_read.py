@@ -8,7 +8,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from tests.mavlink.test_policy import blank, compiled, ids, incoming, raw_frame, sent
 from uavlinkd.mavlink import dialect
 from uavlinkd.mavlink.frames import Frame
-from uavlinkd.mavlink.policy import Gate, Refusal
+from uavlinkd.mavlink.gate import Gate, Refusal
 
 FTP = dialect.ids_by_name()["FILE_TRANSFER_PROTOCOL"]
 READING = {

@@ -14,10 +14,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import all as mavlink
 
-from uavlinkd.mavlink import dialect, policy
+from uavlinkd.mavlink import dialect
+from uavlinkd.mavlink import gate as gates
 from uavlinkd.mavlink.dialect_table import COMMANDS, MESSAGES
 from uavlinkd.mavlink.frames import Frame, SplitCounters, split_payload
-from uavlinkd.mavlink.policy import ANY_OTHER, Gate, Policy, PolicyError, Refusal, compile_policy
+from uavlinkd.mavlink.gate import ANY_OTHER, Gate, Refusal
+from uavlinkd.mavlink.policy import Policy, PolicyError, compile_policy
 from uavlinkd.mavlink.roles import ROLES
 
 TERMINATE = COMMANDS["MAV_CMD_DO_FLIGHTTERMINATION"]
@@ -189,8 +191,8 @@ def test_command_that_was_cut_short_is_the_one_that_receivers_read() -> None:
 
 def test_denied_command_is_denied_in_its_other_form() -> None:
     """Messages that do what a command does are denied with it: SET_MODE is DO_SET_MODE."""
-    assert len(policy.SAME_AS_COMMAND) == 17  # all that are listed: the dialect has them
-    for msgid, number in policy.SAME_AS_COMMAND.items():
+    assert len(gates.SAME_AS_COMMAND) == 17  # all that are listed: the dialect has them
+    for msgid, number in gates.SAME_AS_COMMAND.items():
         gate = incoming({"system_ids": "all", "deny_in": [f"command:{number}"]})
         assert gate.check(blank(msgid), 0.0) is Refusal.COMMAND_NOT_ALLOWED
         assert gate.check(attitude(), 0.0) is None
@@ -334,7 +336,7 @@ def battery(which: int, **facts: Any) -> Frame:
 
 
 @pytest.mark.parametrize("way", ["in", "out"])
-@pytest.mark.parametrize("components", [2, policy.SYSTEM_SHARE])
+@pytest.mark.parametrize("components", [2, gates.SYSTEM_SHARE])
 def test_components_do_not_starve_one_another(way: str, components: int) -> None:
     """Autopilot, gimbals and more beat once a second for minutes: at a limit of one, each is heard nearly always."""
     made = compiled({"system_ids": "all", f"rate_{way}": {"HEARTBEAT": 1}})
@@ -387,7 +389,7 @@ def test_a_groups_rate_does_not_thin_out_what_is_said_once() -> None:
     """The lines of a text all go out, whatever the rate of their group; named by itself it has one; and coming in."""
     group = {"telemetry": 0.5}
 
-    def passed(gate: policy.Gate, msgid: int) -> int:
+    def passed(gate: Gate, msgid: int) -> int:
         return sum(gate.check(blank(msgid), 0.0) is None for _ in range(10))
 
     for rates, texts in ((group, 10), (group | {"STATUSTEXT": 1}, 2)):
@@ -407,7 +409,7 @@ def test_invented_components_gain_little() -> None:
     """Who speaks as another component in each frame gets sixteen times the rate, however many there are."""
     gate = incoming({"system_ids": "all", "rate_in": {"HEARTBEAT": 1}})
     passed = sum(gate.check(heartbeat(component=n % 256), n / 100) is None for n in range(10_000))  # 100 s
-    assert policy.SYSTEM_SHARE * 100 <= passed <= policy.SYSTEM_SHARE * (100 + 2)
+    assert gates.SYSTEM_SHARE * 100 <= passed <= gates.SYSTEM_SHARE * (100 + 2)
     assert gate.check(heartbeat(system=2), 100.0) is None
 
 
@@ -415,7 +417,7 @@ def test_frame_that_one_limit_refuses_uses_up_nothing_of_the_other() -> None:
     """One component that floods takes its own share of the system's rate, and the others keep theirs."""
     gate = incoming({"system_ids": "all", "rate_in": {"HEARTBEAT": 1}})
     assert sum(gate.check(heartbeat(component=1), 0.0) is None for _ in range(1000)) == 2
-    share = policy.SYSTEM_SHARE
+    share = gates.SYSTEM_SHARE
     others = [sum(gate.check(heartbeat(component=2 + n), 0.0) is None for _ in range(9)) for n in range(share)]
     assert others == [2] * (share - 1) + [0]
     late = heartbeat(component=1 + share)
@@ -445,7 +447,7 @@ def test_own_rate_goes_before_the_groups() -> None:
 
 def test_rate_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     """Made-up systems do not grow the table of rates."""
-    monkeypatch.setattr(policy, "MAX_BUCKETS", 8)
+    monkeypatch.setattr(gates, "MAX_BUCKETS", 8)
     gate = incoming({"system_ids": "all", "rate_in": {"HEARTBEAT": 1}})
     for system in range(1, 256):
         assert gate.check(heartbeat(system=system), 0.0) is None
@@ -454,8 +456,8 @@ def test_rate_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_every_refusal_is_counted_by_message_and_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     """Counts are exact per message until too many kinds have come; from then the rest is counted together."""
-    monkeypatch.setattr(policy, "MAX_COUNTED", 4)
-    monkeypatch.setattr(policy, "MAX_DECISIONS", 4)
+    monkeypatch.setattr(gates, "MAX_COUNTED", 4)
+    monkeypatch.setattr(gates, "MAX_DECISIONS", 4)
     gate = incoming({"role": "swarm-member", "system_ids": "all"})
     for msgid in range(0xA0000, 0xA0010):
         for _ in range(2):

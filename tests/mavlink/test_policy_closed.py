@@ -8,7 +8,8 @@ import pytest
 
 from tests.mavlink.test_policy import blank, heartbeat
 from uavlinkd.mavlink.dialect_table import MESSAGES
-from uavlinkd.mavlink.policy import PolicyError, Refusal, compile_policy
+from uavlinkd.mavlink.gate import Refusal
+from uavlinkd.mavlink.policy import PolicyError, compile_policy
 from uavlinkd.mavlink.roles import ROLES
 
 OPEN = (["all"], ["all"])

@@ -11,7 +11,8 @@ from pymavlink.dialects.v20 import all as mavlink
 from tests.mavlink.test_egress import attitude, frame, heartbeat
 from uavlinkd.mavlink.dialect import ids_by_name
 from uavlinkd.mavlink.frames import Frame, SplitCounters, split_payload
-from uavlinkd.mavlink.policy import SYSTEM_SHARE, Gate, Refusal, compile_policy
+from uavlinkd.mavlink.gate import SYSTEM_SHARE, Gate, Refusal
+from uavlinkd.mavlink.policy import compile_policy
 from uavlinkd.mavlink.roles import ROLES
 from uavlinkd.sim.tlog import read_tlog
 

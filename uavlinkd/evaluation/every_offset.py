@@ -13,7 +13,7 @@ from fastcrc.crc16 import mcrf4xx
 from uavlinkd.evaluation.hidden_frames import SIGNATURE_BYTES, crc_extra
 from uavlinkd.mavlink.dialect_table import OTHER_EXTRAS
 from uavlinkd.mavlink.frames import MAVLINK1, MAVLINK2, parse_frame
-from uavlinkd.mavlink.policy import Gate
+from uavlinkd.mavlink.gate import Gate
 
 
 def frames_at_every_offset(stream: bytes) -> Iterator[tuple[int, bytes]]:

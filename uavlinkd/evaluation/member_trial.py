@@ -30,7 +30,8 @@ from uavlinkd.evaluation.tampering_plan import KEYS
 from uavlinkd.evaluation.tampering_records import OURS, Trial
 from uavlinkd.keys import decode_key, generate_private_key, generate_psk, public_key_text
 from uavlinkd.mavlink.dialect import ids_by_name
-from uavlinkd.mavlink.policy import Gate, compile_policy
+from uavlinkd.mavlink.gate import Gate
+from uavlinkd.mavlink.policy import compile_policy
 from uavlinkd.sim.drone_process import DroneProcess, free_udp_ports
 
 NAME: Final = "captured member"

@@ -31,7 +31,7 @@ from typing import Final, final
 from uavlinkd.mavlink import hidden
 from uavlinkd.mavlink.egress_kinds import Lane, kind_of
 from uavlinkd.mavlink.frames import MAVLINK1, MAX_FRAME_BYTES, Frame, Header
-from uavlinkd.mavlink.policy import Gate, Refusal
+from uavlinkd.mavlink.gate import Gate, Refusal
 
 LAST_COMMON_ID: Final = 149
 """Receivers of any dialect but ``minimal`` have the messages up to this number, and reject none of them but these."""

@@ -18,7 +18,8 @@ from uavlinkd.evaluation.hidden_frames import SIGNATURE_BYTES, crc_extra, msgid_
 from uavlinkd.mavlink.delivery import DeliveredStream, Source
 from uavlinkd.mavlink.dialect_table import OTHER_EXTRAS
 from uavlinkd.mavlink.frames import MAVLINK2, Frame, SplitCounters, parse_frame, split_payload
-from uavlinkd.mavlink.policy import Gate, compile_policy
+from uavlinkd.mavlink.gate import Gate
+from uavlinkd.mavlink.policy import compile_policy
 
 _LONG_S = 1e6  # between two frames: rates are not looked at
 

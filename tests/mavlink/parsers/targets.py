@@ -11,7 +11,8 @@ from tests.mavlink.parsers.judge import Deliverer, Judge, MakeStream, Stream, fi
 from tests.mavlink.parsers.receivers import Delivery
 from uavlinkd.evaluation.captured_member import Attack, attacks
 from uavlinkd.mavlink.dialect_table import MESSAGES
-from uavlinkd.mavlink.policy import Refusal, compile_policy
+from uavlinkd.mavlink.gate import Refusal
+from uavlinkd.mavlink.policy import compile_policy
 
 
 @cache

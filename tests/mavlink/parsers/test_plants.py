@@ -13,7 +13,8 @@ from uavlinkd.mavlink import hidden
 from uavlinkd.mavlink.delivery import DeliveredStream, Source
 from uavlinkd.mavlink.dialect_table import MESSAGES, OTHER_EXTRAS
 from uavlinkd.mavlink.frames import MAVLINK1, MAVLINK2, Frame
-from uavlinkd.mavlink.policy import Gate, compile_policy
+from uavlinkd.mavlink.gate import Gate
+from uavlinkd.mavlink.policy import compile_policy
 
 MOST_STREAMS = 60_000
 SEED = 15
