@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
-from collections.abc import Iterator
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
@@ -26,10 +25,11 @@ from uavlinkd.control import ControlServer
 from uavlinkd.core import outputs as o
 from uavlinkd.core.constants import NEVER
 from uavlinkd.core.node import Node
-from uavlinkd.core.outputs import Output, Path
+from uavlinkd.core.outputs import Output
 from uavlinkd.endpoints.opening import open_first, open_new
 from uavlinkd.endpoints.ports import Endpoint, LocalPort
 from uavlinkd.event_log import EventLog
+from uavlinkd.intake import Intake
 from uavlinkd.key_change import Graces, link_name
 from uavlinkd.log import DropSummary
 from uavlinkd.mavlink.classes import screen
@@ -39,13 +39,13 @@ from uavlinkd.mavlink.policy import Policy, compile_policy
 from uavlinkd.mavlink.radio_status import INTERVAL_S, RadioStatusSource
 from uavlinkd.mavlink.routing import Router
 from uavlinkd.peer_link import PeerLink, radio_figures
-from uavlinkd.peer_sockets import Arrived, PeerSockets
+from uavlinkd.peer_sockets import PeerSockets
 from uavlinkd.recorder import FROM_PEER, Recorder
 from uavlinkd.sdnotify import Supervisor
 from uavlinkd.stall import StallWatch
 from uavlinkd.status import daemon_status
 from uavlinkd.switch import Switch
-from uavlinkd.turns import TURN_FRAMES, TURN_S, Turns, cost_of
+from uavlinkd.turns import cost_of
 
 if TYPE_CHECKING:
     from uavlinkd.metrics_server import MetricsServer
@@ -81,13 +81,11 @@ class Daemon:
         self.switch = Switch(router, self._drops.add_refused)
         self._events = EventLog(self.log)
         self.stall = StallWatch(now, self._on_pause)
-        self.peer_sockets = PeerSockets(self._on_arrived, self.stall, self._drops, self.log)
+        self._intake = Intake(self.node, self.stall, self._perform, self._on_peer_frames, self._settle)
+        self.peer_sockets = PeerSockets(self._intake.on_arrived, self.stall, self._drops, self.log)
         self._radio_status: dict[str, RadioStatusSource] = {}
         # Of the frames that this daemon makes itself.
         self._own = Source(config.name, compile_policy({}, is_local=True).incoming)
-        self._deliveries: dict[str, list[Frame]] = {}
-        self._turns = Turns()
-        self._frames_in_turn = 0
         self._timer: asyncio.TimerHandle | None = None
         self._timer_at = NEVER
         self._housekeeping_at = now + HOUSEKEEPING_S
@@ -163,7 +161,7 @@ class Daemon:
         self.supervisor.stopping()
         if self._timer is not None:
             self._timer.cancel()
-        self._turns = Turns()
+        self._intake.clear()
         self._perform(self.node.close(monotonic()))
         self._close_sockets()
         if self._control is not None:
@@ -324,63 +322,14 @@ class Daemon:
     def on_frames(self, port: LocalPort, frames: list[Frame], now: float, epoch: int, waited_s: float = 0.0) -> None:
         """What a local program sent in one wake-up."""
         self._forward(port, frames, now, epoch, waited_s)
-        if self._can_wait or self.node.next_deadline() < self._timer_at:
-            self._arm()
+        self._settle()
 
     # What the peers send.
 
-    def _on_arrived(self, arrived: Arrived, now: float, epoch: int) -> None:
-        if self._turns:
-            self._have_wait(arrived, epoch)
-            return
-        if len(arrived) == 1:  # a turn of one needs no clock
-            self._perform(self.node.receive(*arrived[0], now))
-            self._deliver(now, epoch)
-        else:
-            arriving = iter(arrived)
-            self._take_turn(arriving, now, epoch)
-            if rest := list(arriving):
-                self._have_wait(rest, epoch)
-                self._loop.call_soon(self._take_turns)
-        if self._can_wait or self.node.next_deadline() < self._timer_at:
-            self._arm()
-
-    def _have_wait(self, arrived: Arrived, epoch: int) -> None:
-        sender_of = self.node.sender_of
-        for datagram, path in arrived:
-            for each in self._turns.put(sender_of(datagram, path), datagram, path, epoch):
-                self._perform([self.node.refuse(*each)])
-
-    def _take_turns(self) -> None:
-        """Let each sender have one turn; then the sockets, the timer and the control socket have theirs."""
-        self.stall.turn(monotonic())
-        try:
-            for turn, epoch in self._turns.round():
-                self._take_turn(turn, monotonic(), epoch)
-        finally:
-            if self._turns:
-                self._loop.call_soon(self._take_turns)
-            if self._can_wait or self.node.next_deadline() < self._timer_at:
-                self._arm()
-
-    def _take_turn(self, arriving: Iterator[tuple[bytes, Path]], now: float, epoch: int) -> None:
-        """Receive until there is no more, or the turn is over; deliver the frames."""
-        # Stale datagrams are opened too: their counters must be used up, or an attacker could replay them as new.
-        receive, self._frames_in_turn, ends_at = self.node.receive, 0, now + TURN_S
-        for datagram, path in arriving:
-            self._perform(receive(datagram, path, now))
-            if self._frames_in_turn >= TURN_FRAMES or monotonic() >= ends_at:
-                break
-        self._deliver(now, epoch)
-
-    def _deliver(self, now: float, epoch: int) -> None:
-        if epoch != self.stall.epoch:
-            self._perform(self.node.take_held())  # stale as well, even if the peer calls them new later
-        deliveries, self._deliveries = self._deliveries, {}
-        for name, frames in deliveries.items():
-            if self.recorder is not None:
-                self.recorder.add(name, [frame.raw for frame in frames], FROM_PEER, now)
-            self._forward(self.links[name], frames, now, epoch)
+    def _on_peer_frames(self, name: str, frames: list[Frame], now: float, epoch: int) -> None:
+        if self.recorder is not None:
+            self.recorder.add(name, [frame.raw for frame in frames], FROM_PEER, now)
+        self._forward(self.links[name], frames, now, epoch)
 
     def _forward(
         self, source: PeerLink | LocalPort, frames: list[Frame], now: float, epoch: int, waited_s: float = 0.0
@@ -401,11 +350,7 @@ class Daemon:
             elif isinstance(output, o.Deliver):
                 name = link_name(output.peer)
                 frames = split_payload(output.payload, self.links[name].counters)
-                self._frames_in_turn += cost_of(output.payload, len(frames))
-                if name in self._deliveries:
-                    self._deliveries[name] += frames
-                else:
-                    self._deliveries[name] = frames
+                self._intake.add(name, frames, cost_of(output.payload, len(frames)))
             elif isinstance(output, o.Dropped):
                 self._on_dropped(output)
             else:
@@ -433,6 +378,11 @@ class Daemon:
                 self.log.info("key_change_confirmed", peer=link.name)
 
     # Time.
+
+    def _settle(self) -> None:
+        """Something came: what it made due may be earlier than the timer."""
+        if self._can_wait or self.node.next_deadline() < self._timer_at:
+            self._arm()
 
     def _arm(self) -> None:
         """Have the one timer fire at the next deadline. A later one is cheap: it is moved only to be earlier."""
