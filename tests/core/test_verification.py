@@ -226,6 +226,16 @@ def test_recent_record_of_the_peer_extends_verification(pair: Pair) -> None:
     assert payloads(pair.b.receive(only(datagrams(pair.a.send(3.7, COMMAND))), 3.7)) == []
 
 
+def test_recent_record_does_not_end_unverified_freshness(pair: Pair) -> None:
+    """Only an answer ends it: the record tells nothing of the frames before it."""
+    reports(pair, 0.0, 2.1)
+    pair.a.receive(only(datagrams(pair.b.send(2.1))), 2.1)
+    proof = wire.Echo(False, 7, pair.a.session.received, pair.a.session.expected)
+    assert proof.expected > pair.b.session.fresh(2.2, c.DOUBT_S)
+    pair.b.receive(pair.a.envelope(2.2, proof.encode()), 2.2)
+    assert payloads(pair.b.receive(only(datagrams(pair.a.send(2.3, COMMAND))), 2.3)) == []
+
+
 @pytest.mark.parametrize("expected_above", [0, 50])
 def test_record_that_proves_nothing_recent_extends_nothing(pair: Pair, expected_above: int) -> None:
     """Neither one that tells of old envelopes, nor one that tells of more than were sent."""
