@@ -145,6 +145,19 @@ def test_source_that_empties_its_queue_again_and_again_gains_nothing() -> None:
     assert abs(sums[HONEST] - sums[CAPTURED]) <= 300
 
 
+def test_source_that_left_the_line_pays_for_what_it_was_sent() -> None:
+    """A stream that waits for room looks whose turn it is: an idle source leaves the line, and keeps its debt."""
+    queue, _ = make()
+    queue.put([part(number) for number in range(40)], HONEST, 0.0)
+    sums: Counter[Source] = Counter()
+    for number in range(200):
+        queue.next_bytes(0.0)
+        if CAPTURED not in waiting_sources(queue):
+            queue.put([parameter(number)], CAPTURED, 0.0)
+        sums += bytes_by_source(popped(queue, 1))
+    assert abs(sums[HONEST] - sums[CAPTURED]) <= 300
+
+
 def waiting_sources(queue: FairQueue) -> set[Source]:
     return {source for source, each in queue._sources.items() if each.lanes.count}
 
