@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -15,6 +16,7 @@ from tests.bench.contenders import INTO_PORT, LINK_PORT, LOCAL_SINK, Contender, 
 from tests.bench.frames import SYSTEM
 from tests.bench.namespaces import Cable, Host
 from tests.daemon.harness import WITHOUT_UVLOOP
+from tests.policies import TRUSTED
 from uavlinkd import keys
 from uavlinkd.control import ControlError, ask
 
@@ -78,14 +80,14 @@ class Uavlinkd(Contender):
         left = configuration(
             "left",
             peers=[
-                peer("right", public["right"], *self._rules("operator", 255), f"{cable.right.address}:{LINK_PORT}")
+                peer("right", public["right"], self._rules("operator", 255), f"{cable.right.address}:{LINK_PORT}")
             ],
             endpoint=f"udpin:127.0.0.1:{INTO_PORT}",
             link=link,
         )
         right = configuration(
             "right",
-            peers=[peer("left", public["left"], *self._rules("vehicle", SYSTEM))],
+            peers=[peer("left", public["left"], self._rules("vehicle", SYSTEM))],
             endpoint=f"udpout:{LOCAL_SINK}",
             link=link,
         )
@@ -98,22 +100,22 @@ class Uavlinkd(Contender):
         until(lambda: all(peers_up(folder / f"{side}.sock") == 1 for side in private), "the daemons are linked")
         return Running([processes[cable.left]], [processes[cable.right]])
 
-    def _rules(self, role: str, system: int) -> tuple[str | None, list[int]]:
+    def _rules(self, role: str, system: int) -> dict[str, object]:
         """Role and systems of a peer."""
         if self._has_roles:
-            return role, [system]
-        return ("all" if self._knows_role("all") else None), []
+            return {"role": role, "system_ids": [system]}
+        trusted = dict(TRUSTED)
+        return trusted if self._knows(trusted) else {}
 
-    def _knows_role(self, role: str) -> bool:
-        """Whether there is one. A checkout from before a word was needed passes everything without one."""
-        asks = f"from uavlinkd.mavlink.policy import compile_policy; compile_policy({{'role': {role!r}}})"
+    def _knows(self, policy: Mapping[str, object]) -> bool:
+        """Whether there is such a policy. A checkout from before a word was needed passes everything without one."""
+        asks = f"from uavlinkd.mavlink.policy import compile_policy; compile_policy({policy!r})"
         return subprocess.run([self._python, "-c", asks], capture_output=True, check=False).returncode == 0
 
 
-def peer(name: str, public: str, role: str | None, systems: Sequence[int], address: str = "") -> str:
+def peer(name: str, public: str, rules: Mapping[str, object], address: str = "") -> str:
     """A ``[[peer]]``."""
-    said = f'role = "{role}"\n' if role else ""
-    said += f"system_ids = {list(systems)}\n" if systems else ""
+    said = "".join(f"{key} = {json.dumps(value)}\n" for key, value in rules.items())
     said += f'addresses = ["{address}"]\n' if address else ""
     return f'\n[[peer]]\nname = "{name}"\npublic_key = "{public}"\n{said}'
 

@@ -47,7 +47,7 @@ def hub(bench: Bench, peers: int) -> Iterator[tuple[Bench, Running]]:
         own = keys.generate_private_key()
         keys.write_secret_file(folder / "hub.key", own + "\n")
         sections = [
-            peer(f"drone{system}", keys.public_key_text(each), "vehicle", [system])
+            peer(f"drone{system}", keys.public_key_text(each), {"role": "vehicle", "system_ids": [system]})
             for system, each in enumerate(private, 1)
         ]
         (folder / "hub.toml").write_text(
@@ -107,7 +107,7 @@ def start() -> dict[str, Value]:
         config = folder / "drone.toml"
         text = configuration(
             "drone",
-            peers=[peer("ground", keys.public_key_text(other), "operator", [255], NOBODY)],
+            peers=[peer("ground", keys.public_key_text(other), {"role": "operator", "system_ids": [255]}, NOBODY)],
             endpoint=f"udpout:{NOBODY}",
         )
         config.write_text(text.replace(f'listen = ["0.0.0.0:{LINK_PORT}"]\n', ""))
