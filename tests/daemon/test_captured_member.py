@@ -25,6 +25,8 @@ from uavlinkd.keys import generate_psk
 from uavlinkd.mavlink.frames import SplitCounters, split_datagram
 from uavlinkd.sim.links import Changes
 
+pytestmark = pytest.mark.long
+
 DIALECT = "common"
 MARKER_SYSTEM = 77
 

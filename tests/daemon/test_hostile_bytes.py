@@ -78,6 +78,7 @@ async def test_what_is_no_mavlink_stays_out_and_is_counted(stage: Stage, case: s
     assert counted["faults"] == faults
 
 
+@pytest.mark.long
 async def test_a_flood_of_noise_at_an_endpoint_does_not_reach_the_peer(stage: Stage) -> None:
     """Thousands of random datagrams between frames: frames alone cross."""
     a, _, autopilot, ground = await linked_with_programs(stage)

@@ -34,6 +34,7 @@ def test_search_finds_what_is_there() -> None:
     assert not told(b"nothing of it", [KEY])
 
 
+@pytest.mark.long
 async def test_nothing_that_a_daemon_gives_away_holds_a_key(stage: Stage) -> None:
     """Log at its most talkative, status, metrics, recordings, what /proc shows, and what its commands print."""
     a, b = stage.pair(confidential=True)
@@ -115,6 +116,7 @@ MISTAKES = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("command", ["check", "run"])
 def test_a_key_in_the_wrong_place_is_not_repeated(command: str, tmp_path: Path) -> None:
     """Whatever is wrong is told, and the key that was put there is not, in either command."""

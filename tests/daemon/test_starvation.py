@@ -11,6 +11,8 @@ from tests.daemon.harness import Stage
 from tests.daemon.starvation import POLICIES, SHARE, starve
 from tests.endpoints.starvation import COMMANDS, HEARTBEATS
 
+pytestmark = pytest.mark.long
+
 KBIT_S = 2000
 QUEUED_S = 0.25
 """Half of the commands are faster than this on any machine. Behind the flood each of them would wait for a second."""

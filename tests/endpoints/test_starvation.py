@@ -25,7 +25,7 @@ LINE_BYTES_S = BAUD / 10
 FLOODS = pytest.mark.parametrize("flood", [position, member_heartbeat])
 
 
-@pytest.mark.parametrize("kbit_s", RATES_KBIT_S)
+@pytest.mark.parametrize("kbit_s", [*RATES_KBIT_S[:-1], pytest.param(RATES_KBIT_S[-1], marks=pytest.mark.long)])
 @FLOODS
 def test_flood_on_a_serial_line_delays_no_command(kbit_s: float, flood: Make) -> None:
     """At every rate of the flood each command and heartbeat arrives, in less than 50 ms more than on an idle line."""

@@ -67,6 +67,7 @@ def test_a_full_run_asks_for_as_many_attempts_as_promised() -> None:
     assert settings.target("data", PAPER) == 1000
 
 
+@pytest.mark.long
 async def test_quick_run(tmp_path: Path) -> None:
     """Nothing succeeds against the daemons, every attack reaches the wire, the relay succeeds against the paper's."""
     begin = time.monotonic()

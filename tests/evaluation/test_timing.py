@@ -17,6 +17,8 @@ from uavlinkd.evaluation.records import Record, Status, read_records
 from uavlinkd.evaluation.timing import MAC_KEY_BITS, Settings, run_timing
 from uavlinkd.evaluation.timing_paper import paper_points
 
+pytestmark = pytest.mark.long
+
 QUICK_S = 60.0
 
 

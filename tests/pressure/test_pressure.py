@@ -10,6 +10,8 @@ from tests.daemon.harness import Stage
 from tests.pressure.command import PLANS
 from tests.pressure.scene import watch
 
+pytestmark = pytest.mark.long
+
 SECONDS = 2.0
 AT_MOST_PER_S = 2_500.0
 

@@ -54,7 +54,9 @@ AFTER_LOSSES = {
     "two members, MAVLink 2": 60,
 }
 REPEATED = 20
-LARGE = ("common", "ardupilotmega", "all")
+SHORT = "common"
+EACH_DIALECT = {each: pytest.param(each, marks=() if each == SHORT else pytest.mark.long) for each in DIALECTS}
+LARGE = [EACH_DIALECT[each] for each in ("common", "ardupilotmega", "all")]
 
 
 def named(dialect: str, name: str) -> Attack:
@@ -101,7 +103,7 @@ def test_concatenated_frames_let_it_through_after_a_loss(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", BEFORE)
-@pytest.mark.parametrize("dialect", DIALECTS)
+@pytest.mark.parametrize("dialect", EACH_DIALECT.values())
 def test_filter_stops_it(dialect: str, name: str) -> None:
     """No receiver accepts a forbidden frame: from any offset, after any loss of up to 300 bytes."""
     attack = named(dialect, name)

@@ -16,6 +16,8 @@ from uavlinkd.mavlink.frames import MAVLINK1, MAVLINK2, Frame
 from uavlinkd.mavlink.gate import Gate
 from uavlinkd.mavlink.policy import compile_policy
 
+pytestmark = pytest.mark.long
+
 MOST_STREAMS = 60_000
 SEED = 15
 Plant = Callable[[pytest.MonkeyPatch], MakeStream]
