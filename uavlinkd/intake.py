@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Iterator
+from time import thread_time
 
 from uavlinkd.clock import monotonic
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Output, Path
+from uavlinkd.core.wire import ENVELOPE_STARTS
 from uavlinkd.mavlink.frames import Frame
 from uavlinkd.peer_sockets import Arrived
 from uavlinkd.stall import StallWatch
@@ -41,19 +43,34 @@ class Intake:
 
     def on_arrived(self, arrived: Arrived, now: float, epoch: int) -> None:
         """Receive what came in one wake-up, or have it wait for its senders' turns."""
-        if self._turns:
-            self._have_wait(arrived, epoch)
-            return
-        if len(arrived) == 1:  # a turn of one needs no clock
+        if len(arrived) == 1 and not self._turns:  # a turn of one needs no clock
             self._perform(self._node.receive(*arrived[0], now))
             self._deliver(now, epoch)
         else:
-            arriving = iter(arrived)
-            self._take_turn(arriving, now, epoch)
-            if rest := list(arriving):
-                self._have_wait(rest, epoch)
-                self._loop.call_soon(self._take_turns)
+            envelopes = self._receive_handshakes(arrived, now)
+            if self._turns:
+                self._have_wait(envelopes, epoch)
+            else:
+                arriving = iter(envelopes)
+                self._take_turn(arriving, now, epoch)
+                if rest := list(arriving):
+                    self._have_wait(rest, epoch)
+                    self._loop.call_soon(self._take_turns)
         self._settle()
+
+    def _receive_handshakes(self, arrived: Arrived, now: float) -> Arrived:
+        """Receive all but envelopes, which are returned.
+
+        Handshake messages have budgets of their own in the core. If they waited for turns, their senders would repeat
+        them meanwhile, and a busy daemon would be busier.
+        """
+        envelopes = []
+        for datagram, path in arrived:
+            if datagram[:1] in ENVELOPE_STARTS:
+                envelopes.append((datagram, path))
+            else:
+                self._perform(self._node.receive(datagram, path, now))
+        return envelopes
 
     def add(self, peer: str, frames: list[Frame], cost: int) -> None:
         """Frames of a peer came out of the core. They go on when the turn is over; ``cost`` is charged to it."""
@@ -87,10 +104,10 @@ class Intake:
     def _take_turn(self, arriving: Iterator[tuple[bytes, Path]], now: float, epoch: int) -> None:
         """Receive until there is no more, or the turn is over; deliver the frames."""
         # Stale datagrams are opened too: their counters must be used up, or an attacker could replay them as new.
-        receive, self._cost, ends_at = self._node.receive, 0, now + TURN_S
+        receive, self._cost, ends_at = self._node.receive, 0, thread_time() + TURN_S
         for datagram, path in arriving:
             self._perform(receive(datagram, path, now))
-            if self._cost >= TURN_FRAMES or monotonic() >= ends_at:
+            if self._cost >= TURN_FRAMES or thread_time() >= ends_at:
                 break
         self._deliver(now, epoch)
 

@@ -11,8 +11,9 @@ from collections.abc import Hashable, Iterator
 from uavlinkd.core.outputs import Path
 
 TURN_S = 0.003
-"""How long one sender's turn takes at most, by the clock, without the delivery of its frames. Another sender's frames
-then wait for some such turns, which is far below a radio's delay."""
+"""How much of the processor's time one sender's turn takes at most, without the delivery of its frames. Another
+sender's frames then wait for some such turns, which is far below a radio's delay. Not time by the clock: where other
+programs have the processor meanwhile, each turn would end after one datagram."""
 TURN_FRAMES = 300
 """Frames that end a turn too, by :func:`cost_of`: to deliver one costs as much as to read it."""
 STARTS_OF_A_FRAME = 4

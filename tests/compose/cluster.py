@@ -34,7 +34,7 @@ ENDPOINT = ("127.0.0.1", 14550)
 """Where each daemon listens for its autopilot or ground control program."""
 COMPONENT = 191
 """Of the frames that the tests send: an onboard computer's, which no autopilot uses."""
-HELLO = 0xFFFF_FFFF
+HELLO = 0x7FFF_FFFF
 """The number of the frame by which a program makes itself known."""
 _CLONE_NEWNET = 0x4000_0000
 _LOSSES = ("drops", "refused", "waiting_dropped", "malformed", "envelopes_missing", "faults", "failures")
@@ -150,7 +150,7 @@ class Cluster(ABC):
         _, program = await loop.create_datagram_endpoint(lambda: Program(sock), sock=sock)
 
         def is_known() -> bool:
-            program.send(heartbeat(SYSTEM_IDS[name], HELLO), ENDPOINT)
+            program.send(numbered(SYSTEM_IDS[name], HELLO), ENDPOINT)
             status = self.status(name)
             endpoints = () if status is None else status["endpoints"].values()
             return any(f"127.0.0.1:{program.address[1]}" in each for each in map(_programs, endpoints))
@@ -203,11 +203,16 @@ def socket_in(namespace: Path) -> socket.socket:
     return there(namespace, opened)
 
 
-def heartbeat(system: int, number: int) -> bytes:
-    """A HEARTBEAT that differs from that of every other number: every role may say and hear it."""
+def numbered(system: int, number: int) -> bytes:
+    """A frame that differs from that of every other number, of a message that its sender may send often.
+
+    Drones send VFR_HUD: `swarm-member` passes 250 a second by default. A ground station may send its HEARTBEAT.
+    """
     codec = mavlink.MAVLink(None, system, COMPONENT)
     codec.seq = number % 256
-    return bytes(mavlink.MAVLink_heartbeat_message(18, 8, 0, number, 4, 3).pack(codec))
+    if system == SYSTEM_IDS["ground-station"]:
+        return bytes(mavlink.MAVLink_heartbeat_message(18, 8, 0, number, 4, 3).pack(codec))
+    return bytes(mavlink.MAVLink_vfr_hud_message(0, 0, number >> 16, number & 0xFFFF, 1, 0).pack(codec))
 
 
 class Conversation:
@@ -222,7 +227,7 @@ class Conversation:
         self._programs: dict[str, Program] = {}
         self._first = self.said = self._numbers_used
         """The numbers of the first frame that counts, and of the next; each says one of every number."""
-        self._forgotten = {heartbeat(system, HELLO) for system in SYSTEM_IDS.values()}
+        self._forgotten = {numbered(system, HELLO) for system in SYSTEM_IDS.values()}
 
     async def open(self) -> None:
         """Make the programs known, and see that all hear each other: a daemon that stood still drops at first."""
@@ -234,7 +239,7 @@ class Conversation:
     def _does_latest_arrive(self) -> bool:
         """Whether what was said last is heard by all; if not, more is said."""
         if self.said > self._first:
-            latest = {name: heartbeat(SYSTEM_IDS[name], self.said - 1) for name in self._names}
+            latest = {name: numbered(SYSTEM_IDS[name], self.said - 1) for name in self._names}
             if all(self.heard(name).keys() >= set(latest.values()) - {latest[name]} for name in self._names):
                 return True
         self.say()
@@ -249,7 +254,7 @@ class Conversation:
     def say(self) -> None:
         """One frame by each."""
         for name, program in self._programs.items():
-            program.send(heartbeat(SYSTEM_IDS[name], self.said), ENDPOINT)
+            program.send(numbered(SYSTEM_IDS[name], self.said), ENDPOINT)
         self.said += 1
 
     async def say_many(self, amount: int, interval_s: float = 0.005) -> None:
@@ -285,7 +290,7 @@ class Conversation:
     def expected(self, name: str) -> Counter[bytes]:
         """What each other said, once."""
         return Counter(
-            heartbeat(SYSTEM_IDS[other], number)
+            numbered(SYSTEM_IDS[other], number)
             for other in self._names
             if other != name
             for number in range(self._first, self.said)
@@ -294,7 +299,7 @@ class Conversation:
     def forget(self) -> None:
         """Begin anew: what was said so far does not count, whether it was heard or is still on its way."""
         self._forgotten |= {
-            heartbeat(SYSTEM_IDS[name], number) for name in self._names for number in range(self._first, self.said)
+            numbered(SYSTEM_IDS[name], number) for name in self._names for number in range(self._first, self.said)
         }
         self._first = self.said
 
@@ -329,7 +334,7 @@ class Conversation:
         told: dict[str, list[int]] = {}
         for other in self._names:
             for number in range(self._first, self.said):
-                if heartbeat(SYSTEM_IDS[other], number) in frames:
+                if numbered(SYSTEM_IDS[other], number) in frames:
                     told.setdefault(other, []).append(number - self._first)
         return str(told)
 

@@ -25,7 +25,6 @@ from uavlinkd.core.peer import Peer
 from uavlinkd.core.session import Session
 from uavlinkd.core.settings import PeerSettings, Screen, hold_all
 
-_ENVELOPE_STARTS = frozenset((bytes((wire.SHORT_ENVELOPE,)), bytes((wire.LONG_ENVELOPE,))))
 _MAVLINK_STARTS = frozenset((0xFD, 0xFE))
 
 
@@ -161,10 +160,10 @@ class Node:
         """Whose datagram it claims to be. A busy shell lets senders take turns; nothing is authenticated yet.
 
         Of each peer the datagrams from where it is, and those from elsewhere, are two senders: a forger of its
-        envelopes has to forge its address too. So is each address where a peer is known to be, for handshakes. All
-        others are one.
+        envelopes has to forge its address too. So is each address where a peer is known to be, for datagrams that
+        name no session. All others are one.
         """
-        if datagram[:1] in _ENVELOPE_STARTS and (peer := self._claimed_peer(datagram)) is not None:
+        if datagram[:1] in wire.ENVELOPE_STARTS and (peer := self._claimed_peer(datagram)) is not None:
             return peer.name, path == peer.path
         address = path[1:]
         return address if self._is_known(address) else None
