@@ -104,7 +104,7 @@ def laboratory(name: str, source: str) -> set[str]:
     """Wall 2: what the daemon and its rooms import of the evaluation, beside the commands that run it."""
     if name.startswith(("evaluation/", "cli", "commands")):
         return set()
-    return {each for each in imports(name, source) if belongs(each, "uavlinkd.evaluation")}
+    return {each for each in imports(name, source) if belongs(each, "uavlinkd.lab.evaluation")}
 
 
 def decoding(name: str, source: str) -> set[str]:
@@ -174,8 +174,8 @@ PLANTED: list[tuple[Wall, str, str]] = [
     (keys_of_the_attacker, "mitm/attacks.py", "from ..core.node import Node"),
     (keys_of_the_attacker, "mitm/attacks.py", "import uavlinkd.core.session"),
     (keys_of_the_attacker, "mitm/proxy.py", "from cryptography.hazmat.primitives import hashes"),
-    (laboratory, "daemon.py", "from uavlinkd.evaluation import lab"),
-    (laboratory, "core/node.py", "import uavlinkd.evaluation.bare_dh"),
+    (laboratory, "daemon.py", "from uavlinkd.lab.evaluation import lab"),
+    (laboratory, "core/node.py", "import uavlinkd.lab.evaluation.bare_dh"),
     (laboratory, "mitm/proxy.py", "from ..evaluation.lab import relay"),
     (decoding, "mavlink/frames.py", "from pymavlink import mavutil"),
     (decoding, "daemon.py", "def f():\n    import pymavlink.mavutil"),
@@ -195,7 +195,7 @@ def test_planted_hole_is_seen(wall: Wall, name: str, source: str) -> None:
         (stray_cryptography, "core/crypto.py", "import hashlib, cryptography"),
         (keys_of_the_attacker, "mitm/attacks.py", "from uavlinkd.core import wire, constants\nimport random"),
         (keys_of_the_attacker, "mitm/attacks.py", "from uavlinkd.core.wire import parse_initiation"),
-        (laboratory, "evaluation/report.py", "from uavlinkd.evaluation import lab"),
+        (laboratory, "evaluation/report.py", "from uavlinkd.lab.evaluation import lab"),
         (decoding, "sim/autopilot.py", "from pymavlink import mavutil"),
         (decoding, "mavlink/dialect_generate.py", "from pymavlink.dialects.v20 import all"),
     ],

@@ -12,9 +12,10 @@ from pathlib import Path
 import pytest
 
 from tests.daemon.harness import need
-from uavlinkd import __version__, keys
+from uavlinkd import __version__
+from uavlinkd.config import keys
 from uavlinkd.cli import FAILED, OK, WRONG, main
-from uavlinkd.sim import demo
+from uavlinkd.lab.sim import demo
 
 
 def test_keygen_writes_a_key_that_only_its_owner_reads(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

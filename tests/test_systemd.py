@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.daemon.harness import need
-from uavlinkd.daemon import HOUSEKEEPING_S
+from uavlinkd.link.daemon import HOUSEKEEPING_S
 
 UNITS = Path(__file__).parents[1] / "systemd"
 NAMES = sorted(path.name for path in UNITS.glob("*.service"))

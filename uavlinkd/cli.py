@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import Any
 
 from uavlinkd import __version__
-from uavlinkd.evaluation.commands import add_report_parser, add_timing_parser
-from uavlinkd.evaluation.tampering_commands import add_member_parser, add_tampering_parser
+from uavlinkd.lab.evaluation.commands import add_report_parser, add_timing_parser
+from uavlinkd.lab.evaluation.tampering_commands import add_member_parser, add_tampering_parser
 from uavlinkd.fleet.commands import add_parser as add_fleet
-from uavlinkd.terminal import printable
+from uavlinkd.system.terminal import printable
 
 OK, FAILED, WRONG = 0, 1, 2
 _LINE_LIMIT = 4096
@@ -126,7 +126,7 @@ def _add_daemon(command: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from uavlinkd.core_dumps import forbid_core_dumps
+    from uavlinkd.system.core_dumps import forbid_core_dumps
 
     forbid_core_dumps()
     from uavlinkd.checker import start_checking
@@ -141,10 +141,10 @@ def _run(options: argparse.Namespace) -> int:
     if not sys.stderr.isatty():
         # structlog imports rich, for tracebacks on a terminal, wherever it finds it: 4 MB that JSON has no use for.
         sys.modules.setdefault("rich", None)  # type: ignore[arg-type]
-    from uavlinkd.control import ControlError
-    from uavlinkd.daemon import Daemon
+    from uavlinkd.ops.control import ControlError
+    from uavlinkd.link.daemon import Daemon
     from uavlinkd.endpoints.sockets import BindError
-    from uavlinkd.log import set_up_logging
+    from uavlinkd.ops.log import set_up_logging
 
     try:
         config = result_of(checker, options.config)
@@ -179,8 +179,8 @@ def _run_loop(work: Coroutine[None, None, None]) -> None:
 
 def _check(options: argparse.Namespace) -> int:
     from uavlinkd.config import ConfigError, load_config
-    from uavlinkd.keys import CREDENTIALS
-    from uavlinkd.topology import print_topology
+    from uavlinkd.config.keys import CREDENTIALS
+    from uavlinkd.ops.topology import print_topology
 
     if options.keys is not None and not (options.keys.is_dir() and os.access(options.keys, os.R_OK | os.X_OK)):
         return _fail(f"--keys: {options.keys} is no folder, or not one that you may read", WRONG)
@@ -223,7 +223,7 @@ def _ask(socket: Path, request: str, on_waiting: Callable[[], None] | None = Non
     Raises:
         _CommandError: it cannot be asked, or gives no answer.
     """
-    from uavlinkd.control import ControlError, ask
+    from uavlinkd.ops.control import ControlError, ask
 
     try:
         return ask(socket, request, on_waiting=on_waiting)
@@ -236,7 +236,7 @@ def _status(options: argparse.Namespace) -> int:
 
     from rich.console import Console
 
-    from uavlinkd.status_screen import all_up, render_status
+    from uavlinkd.ops.status_screen import all_up, render_status
 
     socket = _control_socket(options)
     status = _ask(socket, "status")
@@ -256,7 +256,7 @@ def _watch(socket: Path) -> int:
     from rich.live import Live
     from rich.text import Text
 
-    from uavlinkd.status_screen import all_up, render_status
+    from uavlinkd.ops.status_screen import all_up, render_status
 
     is_good = False
     with suppress(KeyboardInterrupt), Live(auto_refresh=False, screen=True) as live:
@@ -284,7 +284,7 @@ def _reload(options: argparse.Namespace) -> int:
 def _peer_list(options: argparse.Namespace) -> int:
     from rich.console import Console
 
-    from uavlinkd.status_screen import render_peers
+    from uavlinkd.ops.status_screen import render_peers
 
     Console().print(render_peers(_ask(_control_socket(options), "status")))
     return OK
@@ -294,7 +294,7 @@ def _peer_list(options: argparse.Namespace) -> int:
 
 
 def _keygen(options: argparse.Namespace) -> int:
-    from uavlinkd.keys import generate_private_key, public_key_text
+    from uavlinkd.config.keys import generate_private_key, public_key_text
 
     private = generate_private_key()
     if options.out is None:
@@ -305,7 +305,7 @@ def _keygen(options: argparse.Namespace) -> int:
 
 
 def _pubkey(options: argparse.Namespace) -> int:
-    from uavlinkd.keys import KeyFileError, encode_key, public_key_text, read_secret_file
+    from uavlinkd.config.keys import KeyFileError, encode_key, public_key_text, read_secret_file
 
     if options.file is not None:
         try:
@@ -323,14 +323,14 @@ def _pubkey(options: argparse.Namespace) -> int:
 
 
 def _psk(options: argparse.Namespace) -> int:
-    from uavlinkd.keys import generate_psk
+    from uavlinkd.config.keys import generate_psk
 
     psk = generate_psk()
     return _print(psk) if options.out is None else _write_secret(options.out, psk)
 
 
 def _write_secret(path: Path, text: str) -> int:
-    from uavlinkd.keys import KeyFileError, write_secret_file
+    from uavlinkd.config.keys import KeyFileError, write_secret_file
 
     try:
         write_secret_file(path, text)
@@ -345,11 +345,11 @@ def _write_secret(path: Path, text: str) -> int:
 def _sim(options: argparse.Namespace) -> int:
     import asyncio
 
-    from uavlinkd.sim.autopilot import AutopilotSettings
-    from uavlinkd.sim.flight import fly
-    from uavlinkd.sim.links import LinkError, parse_url
-    from uavlinkd.sim.replay import replay
-    from uavlinkd.sim.tlog import TlogError
+    from uavlinkd.lab.sim.autopilot import AutopilotSettings
+    from uavlinkd.lab.sim.flight import fly
+    from uavlinkd.lab.sim.links import LinkError, parse_url
+    from uavlinkd.lab.sim.tlog_player import replay
+    from uavlinkd.lab.sim.tlog import TlogError
 
     if not (math.isfinite(options.speed) and options.speed >= 0):
         return _fail("--speed is a number from 0", WRONG)
@@ -378,8 +378,8 @@ def _sim(options: argparse.Namespace) -> int:
 def _demo(options: argparse.Namespace) -> int:
     import asyncio
 
-    from uavlinkd.mitm.attack import AttackError
-    from uavlinkd.sim.demo import DemoError, run_demo
+    from uavlinkd.lab.mitm.attack import AttackError
+    from uavlinkd.lab.sim.demo import DemoError, run_demo
 
     _check_seconds(options)
     try:

@@ -21,8 +21,8 @@ from tests.bench.namespaces import CableKind, NamespaceError, why_not
 from tests.bench.report import write_report
 from tests.bench.run import QUICK, SCALES, Plan, Run, laboratory
 from tests.bench.traffic import TrafficError
-from uavlinkd.evaluation.machine import machine_facts
-from uavlinkd.evaluation.records import RecordsError, RecordWriter, Value
+from uavlinkd.lab.evaluation.machine import machine_facts
+from uavlinkd.lab.evaluation.records import RecordsError, RecordWriter, Value
 
 OK, FAILED = 0, 1
 RECORDS = "records"

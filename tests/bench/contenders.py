@@ -132,7 +132,7 @@ def until(condition: Callable[[], bool], what: str, timeout_s: float = 20.0) -> 
 def all_contenders() -> Sequence[Contender]:
     """Every one that is known, the baselines first."""
     from tests.bench.daemons import DAEMONS
-    from tests.bench.programs import PROGRAMS
+    from tests.bench.routers import PROGRAMS
     from tests.bench.tunnels import TUNNELS
 
     return (

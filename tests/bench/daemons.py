@@ -17,8 +17,8 @@ from tests.bench.frames import SYSTEM
 from tests.bench.namespaces import Cable, Host
 from tests.daemon.harness import WITHOUT_UVLOOP
 from tests.policies import TRUSTED
-from uavlinkd import keys
-from uavlinkd.control import ControlError, ask
+from uavlinkd.config import keys
+from uavlinkd.ops.control import ControlError, ask
 
 OF_OTHER: Final = "-against"
 """How the name of a contender ends that runs the code of another checkout."""
@@ -109,7 +109,7 @@ class Uavlinkd(Contender):
 
     def _knows(self, policy: Mapping[str, object]) -> bool:
         """Whether there is such a policy. A checkout from before a word was needed passes everything without one."""
-        asks = f"from uavlinkd.mavlink.policy import compile_policy; compile_policy({policy!r})"
+        asks = f"from uavlinkd.mavlink.policy.compilation import compile_policy; compile_policy({policy!r})"
         return subprocess.run([self._python, "-c", asks], capture_output=True, check=False).returncode == 0
 
 

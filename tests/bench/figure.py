@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from tests.bench.findings import BASELINE, LOSES, Findings
-from uavlinkd.evaluation.spread import duration
+from uavlinkd.lab.evaluation.spread import duration
 
 _COLOURS = ("#0072b2", "#d55e00", "#009e73")
 _MARKERS = "osD"

@@ -8,8 +8,8 @@ from pathlib import Path
 from statistics import median
 from typing import Final
 
-from uavlinkd.evaluation.findings import percentile
-from uavlinkd.evaluation.records import Record, Value, read_records
+from uavlinkd.lab.evaluation.timing_queries import percentile
+from uavlinkd.lab.evaluation.records import Record, Value, read_records
 
 BASELINE: Final = "relay-uvloop"
 """What the others are compared with."""

@@ -17,8 +17,8 @@ from typing import Final
 from fastcrc.crc16 import mcrf4xx
 
 from uavlinkd.mavlink.dialect_table import MESSAGES
-from uavlinkd.mavlink.policy import compile_policy
-from uavlinkd.sim.tlog import parse_tlog
+from uavlinkd.mavlink.policy.compilation import compile_policy
+from uavlinkd.lab.sim.tlog import parse_tlog
 
 MAVLINK2: Final = 0xFD
 PROBE_EVERY: Final = 20
@@ -95,7 +95,7 @@ def message_of(raw: bytes) -> int:
 
 
 def _simulated() -> Iterable[bytes]:
-    from uavlinkd.sim.autopilot import Autopilot, AutopilotSettings
+    from uavlinkd.lab.sim.autopilot import Autopilot, AutopilotSettings
 
     autopilot = Autopilot(AutopilotSettings(system_id=SYSTEM))
     for tick in range(100_000):

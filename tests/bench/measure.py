@@ -10,8 +10,8 @@ from typing import Final
 from tests.bench.contenders import NotMeasuredError, Running
 from tests.bench.namespaces import Cable
 from tests.bench.traffic import Flow, Traffic
-from uavlinkd.evaluation.machine import CpuTimeError, cpu_seconds
-from uavlinkd.evaluation.records import Value
+from uavlinkd.lab.evaluation.machine import CpuTimeError, cpu_seconds
+from uavlinkd.lab.evaluation.records import Value
 
 NO_LOSS: Final = 0.001
 """Up to this part lost, a rate counts as come through: one hiccup of the machine is not the contender's limit."""

@@ -15,7 +15,7 @@ from tests.bench.frames import FrameSet, write_frames
 from tests.bench.measure import Bench, at_rate, highest_rate, rotated, until_carried
 from tests.bench.namespaces import Cable, CableKind, NamespaceError
 from tests.bench.traffic import SINK_PORT, Traffic, Worker
-from uavlinkd.evaluation.records import Record, RecordWriter, Status, Value
+from uavlinkd.lab.evaluation.records import Record, RecordWriter, Status, Value
 
 Say = Callable[[str], None]
 

@@ -19,9 +19,9 @@ from tests.bench.daemons import configuration, daemon_command, peer, peers_up, s
 from tests.bench.measure import Bench, at_rate, resident_bytes
 from tests.bench.namespaces import END_S
 from tests.bench.traffic import Traffic, TrafficError, Worker
-from uavlinkd import keys
-from uavlinkd.evaluation.machine import cpu_seconds
-from uavlinkd.evaluation.records import Value
+from uavlinkd.config import keys
+from uavlinkd.lab.evaluation.machine import cpu_seconds
+from uavlinkd.lab.evaluation.records import Value
 
 SINK_PORT: Final = 14601
 """Of the sink that counts the frames of all systems."""

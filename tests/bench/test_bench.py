@@ -31,7 +31,7 @@ from tests.bench.run import at_work, laboratory
 from tests.bench.sink import Count
 from tests.bench.traffic import REPOSITORY, Flow, Traffic
 from tests.daemon.harness import need
-from uavlinkd.evaluation.records import Record, RecordWriter, Status, Value
+from uavlinkd.lab.evaluation.records import Record, RecordWriter, Status, Value
 
 PLAIN_HEADERS = 28
 """Of IPv4 and UDP."""

@@ -22,7 +22,7 @@ from typing import Any, TypeVar
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from tests.daemon.harness import BUFFER_BYTES, Program
-from uavlinkd.control import ControlError, ask
+from uavlinkd.ops.control import ControlError, ask
 from uavlinkd.mavlink.frames import SplitCounters, split_datagram
 
 PATIENCE_S = 60.0

@@ -15,8 +15,8 @@ import pytest_asyncio
 from tests.compose import images, outages
 from tests.compose.cluster import PATIENCE_S, Cluster, Conversation, run, until
 from tests.daemon.harness import need
-from uavlinkd.control import ControlError, ask
-from uavlinkd.fleet import work
+from uavlinkd.ops.control import ControlError, ask
+from uavlinkd.fleet import operations as work
 from uavlinkd.fleet.manifest import Settings
 
 pytestmark = pytest.mark.asyncio(loop_scope="module")

@@ -17,7 +17,7 @@ import pytest_asyncio
 from tests.compose import images, outages
 from tests.compose.cluster import SYSTEM_IDS, Cluster, run, until
 from tests.daemon.harness import need
-from uavlinkd.fleet import work
+from uavlinkd.fleet import operations as work
 from uavlinkd.fleet.manifest import Settings
 
 pytestmark = pytest.mark.asyncio(loop_scope="module")

@@ -8,7 +8,7 @@ import pytest
 
 from tests.core.harness import Pair, quiet
 from uavlinkd.core import constants as c
-from uavlinkd.core.caller import Pending
+from uavlinkd.core.initiator import Pending
 from uavlinkd.core.noise import HandshakeState, SymmetricState
 from uavlinkd.core.session import Authenticated, Confidential, Session
 from uavlinkd.core.settings import Link

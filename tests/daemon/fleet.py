@@ -19,8 +19,8 @@ from uavlinkd.core.crypto import Secret
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Deliver, Dropped, Output, Transmit
 from uavlinkd.core.settings import PeerSettings
-from uavlinkd.keys import decode_key
-from uavlinkd.sim.links import Changes
+from uavlinkd.config.keys import decode_key
+from uavlinkd.lab.sim.links import Changes
 
 GROUND_SYSTEM = 255
 
@@ -120,7 +120,7 @@ def number_in(frame: bytes) -> int | None:
 
 
 SEPARATOR = 2
-"""The first filler that `uavlinkd.mavlink.hidden` puts between frames."""
+"""The first filler that `uavlinkd.mavlink.policy.hidden` puts between frames."""
 
 
 def frames_in(data: bytes | bytearray) -> Iterator[bytes]:

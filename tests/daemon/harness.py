@@ -39,8 +39,8 @@ from typing import Any, Self
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from uavlinkd import keys
-from uavlinkd.sim.links import Changes
+from uavlinkd.config import keys
+from uavlinkd.lab.sim.links import Changes
 
 PATIENCE_S = 60.0
 """How long anything may take that has to happen: much more than it does take, for busy machines."""

@@ -20,10 +20,10 @@ from tests.mavlink.parsers.build import compiler
 from tests.mavlink.parsers.judge import Stream, judge_all
 from tests.mavlink.parsers.receivers import Delivery, all_receivers
 from tests.mavlink.parsers.targets import attacks_on, judge_of
-from uavlinkd.evaluation.captured_member import Attack
-from uavlinkd.keys import generate_psk
+from uavlinkd.lab.evaluation.captured_member import Attack
+from uavlinkd.config.keys import generate_psk
 from uavlinkd.mavlink.frames import SplitCounters, split_datagram
-from uavlinkd.sim.links import Changes
+from uavlinkd.lab.sim.links import Changes
 
 pytestmark = pytest.mark.long
 

@@ -29,7 +29,7 @@ from tests.daemon.fleet import (
     station,
 )
 from tests.daemon.harness import DaemonProcess, Stage
-from uavlinkd.keys import generate_psk
+from uavlinkd.config.keys import generate_psk
 
 CAPTURED = 2
 TABLET = 200

@@ -11,10 +11,10 @@ from pathlib import Path
 
 from tests.daemon.fleet import Cable, drone_and_ground, held_back
 from tests.daemon.harness import DaemonProcess, Stage, free_port
-from tests.sim import scenarios
-from tests.sim.scenarios import Seen
-from uavlinkd.sim.autopilot import AutopilotSettings
-from uavlinkd.sim.flight import Flight
+from tests.lab.sim import scenarios
+from tests.lab.sim.scenarios import Seen
+from uavlinkd.lab.sim.autopilot import AutopilotSettings
+from uavlinkd.lab.sim.flight import Flight
 
 SYSTEM = 3
 

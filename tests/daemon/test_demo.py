@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from tests.daemon.harness import PATIENCE_S, POLL_S, need
-from uavlinkd.control import ControlError, ask
+from uavlinkd.ops.control import ControlError, ask
 
 ENDED_S = 120.0
 """How long a demo may take: much more than it does take, for busy machines."""

@@ -10,7 +10,7 @@ import pytest
 
 from tests.daemon.harness import Stage, drops, pour
 from uavlinkd.core.suites import SUITES_BY_NAME
-from uavlinkd.sim.tlog import read_tlog
+from uavlinkd.lab.sim.tlog import read_tlog
 
 SOME_FRAMES = 3000
 

@@ -10,7 +10,7 @@ import pytest
 from tests.daemon.harness import DaemonProcess, End, Relay, Stage, frame
 from uavlinkd.core import wire
 from uavlinkd.core.cookie import MacKeys
-from uavlinkd.keys import decode_key
+from uavlinkd.config.keys import decode_key
 
 Forge = Callable[[bytes, random.Random, MacKeys], list[bytes]]
 

@@ -11,7 +11,7 @@ from uavlinkd.core.crypto import Secret
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Transmit
 from uavlinkd.core.settings import PeerSettings
-from uavlinkd.keys import decode_key, generate_private_key, generate_psk
+from uavlinkd.config.keys import decode_key, generate_private_key, generate_psk
 
 LARGEST_DATAGRAM = 65507
 BOOT_TEXT = b"\r\n\r\nInit ArduCopter V4.5.7 (2a3dc4b7)\n\nFree RAM: 190392\nload_all took 6480us\n"

@@ -22,7 +22,7 @@ from tests.daemon.fleet import (
     station,
 )
 from tests.daemon.harness import DaemonProcess, Sockaddr, Stage
-from uavlinkd.sim.flight import Flight
+from uavlinkd.lab.sim.flight import Flight
 
 CAMERA = 100  # MAV_COMP_ID_CAMERA
 CAMERA_POLICY: dict[str, Any] = {

@@ -22,7 +22,7 @@ from tests.daemon.fleet import (
     station,
 )
 from tests.daemon.harness import DaemonProcess, End, Relay, Sockaddr, Stage
-from uavlinkd.sim.flight import Flight
+from uavlinkd.lab.sim.flight import Flight
 
 FAILSAFE_S = 5.0
 """The simulated autopilot's, and ArduPilot's, FS_GCS_TIMEOUT."""

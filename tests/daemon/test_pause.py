@@ -14,7 +14,7 @@ import pytest
 
 from tests.daemon.harness import PATIENCE_S, DaemonProcess, Program, Stage, frame, free_port
 from tests.limited_cpu import limited_cpu
-from uavlinkd.stall import STALL_S
+from uavlinkd.system.stall import STALL_S
 
 PAUSED_S = STALL_S + 0.5
 FRESH = 10_000

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.daemon.harness import DaemonProcess, Stage, frame, free_port, secret_forms
-from uavlinkd import keys
+from uavlinkd.config import keys
 
 KEY = b64encode(bytes(range(130, 162))).decode()
 """With + and / in it; so the other spelling of base64 differs."""

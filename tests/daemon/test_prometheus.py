@@ -17,7 +17,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from tests.daemon.fleet import command_long
 from tests.daemon.harness import Program, Sockaddr, Stage, free_port, heartbeat, need
-from tests.test_monitoring import ALERTS, DASHBOARD, expressions
+from tests.ops.test_monitoring import ALERTS, DASHBOARD, expressions
 
 PATIENCE_S = 60.0
 WINDOW = "5s"

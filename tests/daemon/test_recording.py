@@ -11,9 +11,9 @@ from pathlib import Path
 from pymavlink import mavutil
 
 from tests.daemon.harness import DaemonProcess, Stage, frame, free_port
-from tests.test_metrics import samples
+from tests.ops.test_metrics import samples
 from tests.waiting import until
-from uavlinkd.sim.tlog import read_tlog
+from uavlinkd.lab.sim.tlog import read_tlog
 
 FROM_PEER, TO_PEER = 0, 1
 

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from tests.daemon.harness import DaemonProcess, Program, Sockaddr, Stage, assert_same, frame, heartbeat, to_toml
-from uavlinkd import keys
-from uavlinkd.control import ask
+from uavlinkd.config import keys
+from uavlinkd.ops.control import ask
 
 COUNT = 200
 """Frames each way between two reloads, and during each."""

@@ -17,9 +17,9 @@ from unittest.mock import patch
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from tests.endpoints.line import Line, LineChannel, VirtualTimeLoop
-from tests.endpoints.programs import Recorder, frames_of, source
-from uavlinkd.endpoints import serial, streams
-from uavlinkd.endpoints.streams import StreamEndpoint
+from tests.endpoints.clients import Recorder, frames_of, source
+from uavlinkd.endpoints import serial, stream_endpoint as streams
+from uavlinkd.endpoints.stream_endpoint import StreamEndpoint
 from uavlinkd.mavlink.frames import Frame, StreamSplitter
 
 BAUD = 57600

@@ -9,13 +9,13 @@ import pytest
 from structlog.testing import capture_logs
 
 from tests.daemon.harness import free_port, has_ipv6, need
-from uavlinkd.addresses import Address
+from uavlinkd.system.addresses import Address
 from uavlinkd.endpoints.sockets import BindError, udp_socket
 from uavlinkd.endpoints.tcp import tcp_listener
 
 _IN_A_NETWORK_OF_ITS_OWN = """
 import socket, subprocess, sys
-from uavlinkd.addresses import Address
+from uavlinkd.system.addresses import Address
 from uavlinkd.endpoints.sockets import udp_socket
 
 host, bits = sys.argv[1].split("/")

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.endpoints.programs import PASSES, frame, frames_of, heartbeat, large_frame, source
+from tests.endpoints.clients import PASSES, frame, frames_of, heartbeat, large_frame, source
 from uavlinkd.endpoints.outgoing import OutgoingFrames
-from uavlinkd.mavlink.delivery import DeliveredStream
+from uavlinkd.mavlink.policy.delivery import DeliveredStream
 from uavlinkd.mavlink.frames import SplitCounters, StreamSplitter
 
 A, B, C = large_frame(1), large_frame(2), large_frame(3)

@@ -17,11 +17,11 @@ from typing import Any, cast
 import pytest
 from serialx import BaseSerial
 
-from tests.endpoints.programs import PATIENCE_S, Recorder, eventually, frame, large_frame, measure_udp_delivery, write
-from uavlinkd.addresses import Address
+from tests.endpoints.clients import PATIENCE_S, Recorder, eventually, frame, large_frame, measure_udp_delivery, write
+from uavlinkd.system.addresses import Address
 from uavlinkd.endpoints import serial
 from uavlinkd.endpoints.serial import SerialChannel, SerialEndpoint
-from uavlinkd.endpoints.streams import STALLED_S
+from uavlinkd.endpoints.stream_endpoint import STALLED_S
 from uavlinkd.endpoints.tcp import TcpServer, tcp_listener
 from uavlinkd.endpoints.url import SerialUrl
 from uavlinkd.mavlink.frames import StreamSplitter

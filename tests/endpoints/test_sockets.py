@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from tests.daemon.harness import free_port, has_ipv6, need
-from uavlinkd.addresses import Address
-from uavlinkd.clock import monotonic
+from uavlinkd.system.addresses import Address
+from uavlinkd.system.clock import monotonic
 from uavlinkd.endpoints.sockets import (
     BUFFER_BYTES,
     BUSY_S,
@@ -22,7 +22,7 @@ from uavlinkd.endpoints.sockets import (
     numeric_host,
     udp_socket,
 )
-from uavlinkd.stall import STALE, STALL_S, StallWatch
+from uavlinkd.system.stall import STALE, STALL_S, StallWatch
 
 
 def test_it_is_bound_and_does_not_block() -> None:

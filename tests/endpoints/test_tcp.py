@@ -14,11 +14,11 @@ from time import monotonic
 import pytest
 from structlog.testing import capture_logs
 
-from tests.endpoints.programs import Recorder, eventually, frame, large_frame, measure_udp_delivery, write
-from uavlinkd.addresses import Address
+from tests.endpoints.clients import Recorder, eventually, frame, large_frame, measure_udp_delivery, write
+from uavlinkd.system.addresses import Address
 from uavlinkd.endpoints import tcp
 from uavlinkd.endpoints.sockets import BindError
-from uavlinkd.endpoints.streams import MAX_AGE_S, STALLED_S
+from uavlinkd.endpoints.stream_endpoint import MAX_AGE_S, STALLED_S
 from uavlinkd.endpoints.tcp import CLIENT_QUIET_S, CLIENTS_PER_ENDPOINT, MAX_GAP_S, TcpClient, TcpServer, tcp_listener
 
 SIOCOUTQNSD = 0x894B

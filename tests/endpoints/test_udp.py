@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 
 from tests.daemon.harness import frame, heartbeat, open_socket
-from tests.endpoints.programs import write
+from tests.endpoints.clients import write
 from tests.waiting import until
-from uavlinkd.addresses import Address
-from uavlinkd.clock import monotonic
+from uavlinkd.system.addresses import Address
+from uavlinkd.system.clock import monotonic
 from uavlinkd.endpoints.ports import LocalPort
 from uavlinkd.endpoints.sockets import DATAGRAMS_PER_WAKE_UP, Reader, udp_socket
 from uavlinkd.endpoints.udp import (
@@ -26,7 +26,7 @@ from uavlinkd.endpoints.udp import (
 )
 from uavlinkd.mavlink import frames
 from uavlinkd.mavlink.frames import Frame
-from uavlinkd.stall import STALE, STALL_S, StallWatch
+from uavlinkd.system.stall import STALE, STALL_S, StallWatch
 
 
 class Recorder:

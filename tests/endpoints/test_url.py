@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from uavlinkd.addresses import Address
+from uavlinkd.system.addresses import Address
 from uavlinkd.endpoints.url import Kind, NetworkUrl, SerialUrl, UrlError, parse_url
 
 

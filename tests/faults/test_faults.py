@@ -11,7 +11,7 @@ from tests.faults.machine import LINES_AT_MOST
 from tests.faults.network import FAULT_S
 from tests.faults.run import BACK_S, FAULTS, happen, markdown, why_not
 from tests.faults.talk import Outcome
-from uavlinkd.event_log import LINES_BURST, LINES_PER_S
+from uavlinkd.link.event_log import LINES_BURST, LINES_PER_S
 
 Outcomes = dict[str, Outcome | BaseException]
 

@@ -19,8 +19,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from tests.daemon.harness import free_port
-from uavlinkd.control import ControlError, ask
-from uavlinkd.fleet import work
+from uavlinkd.ops.control import ControlError, ask
+from uavlinkd.fleet import operations as work
 from uavlinkd.fleet.manifest import Settings
 
 PATIENCE_S = 120.0

@@ -16,9 +16,9 @@ import pytest
 
 from tests.daemon.harness import free_port
 from tests.fleet.swarm import end
-from uavlinkd import keys
-from uavlinkd.control import ControlError, ask
-from uavlinkd.fleet import work
+from uavlinkd.config import keys
+from uavlinkd.ops.control import ControlError, ask
+from uavlinkd.fleet import operations as work
 from uavlinkd.fleet.manifest import Kind, Settings, read_manifest
 
 PATIENCE_S = 60.0

@@ -19,10 +19,10 @@ from uavlinkd.core import wire
 from uavlinkd.core.suites import SUITES
 from uavlinkd.fleet.manifest import FILE_NAME, read_manifest, write_manifest
 from uavlinkd.fleet.plan import FleetError
-from uavlinkd.keys import KeyFileError, decode_key, encode_key, read_secret_file
-from uavlinkd.mitm import anatomy
-from uavlinkd.mitm.settings import ProxySettings, SettingsError, load_proxy_settings
-from uavlinkd.sim.tlog import TlogError, parse_tlog
+from uavlinkd.config.keys import KeyFileError, decode_key, encode_key, read_secret_file
+from uavlinkd.lab.mitm import anatomy
+from uavlinkd.lab.mitm.proxy_settings import ProxySettings, SettingsError, load_proxy_settings
+from uavlinkd.lab.sim.tlog import TlogError, parse_tlog
 
 SECRET: Final = encode_key(bytes(range(7, 39)))
 """A private key; a person may paste it where it does not belong."""

@@ -10,10 +10,10 @@ from typing import Final
 from fastcrc.crc16 import mcrf4xx
 
 from tests.fuzz.engine import TALLY, Run, Script
-from tests.test_switch import Program, policy
-from uavlinkd import switch as switching
+from tests.link.test_switch import Program, policy
+from uavlinkd.link import switch as switching
 from uavlinkd.mavlink import frames as splitting
-from uavlinkd.mavlink import gate as gates
+from uavlinkd.mavlink.policy import gate as gates
 from uavlinkd.mavlink import routing
 from uavlinkd.mavlink.dialect import SETUP_SIGNING
 from uavlinkd.mavlink.dialect_table import MESSAGES
@@ -27,10 +27,10 @@ from uavlinkd.mavlink.frames import (
     split_datagram,
     split_payload,
 )
-from uavlinkd.mavlink.gate import Refusal
-from uavlinkd.mavlink.policy import Policy
+from uavlinkd.mavlink.policy.gate import Refusal
+from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.routing import Router
-from uavlinkd.switch import Port, Switch
+from uavlinkd.link.switch import Port, Switch
 
 KNOWN: Final = (0, 4, 11, 20, 23, 30, 33, 39, 44, 73, 75, 76, 77, 110, 253, 256)
 """Messages that frames are made of: telemetry, parameters, missions, commands, files, SETUP_SIGNING."""

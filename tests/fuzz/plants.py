@@ -13,17 +13,19 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
-from uavlinkd import control, keys, metrics_server
+from uavlinkd.config import keys
+from uavlinkd.ops import control, metrics_server
 from uavlinkd.config import checks as config_checks
 from uavlinkd.config import load as config_load
-from uavlinkd.core import caller, cookie, freshness, handshake, peer, replay, session, sessions, wire
+from uavlinkd.core import initiator as caller, cookie, freshness, handshake, peer, replay, session, sessions, wire
 from uavlinkd.core import node as core_node
 from uavlinkd.core.drops import Drop
 from uavlinkd.core.outputs import Deliver, Transmit
-from uavlinkd.mavlink import frames, gate, routing
-from uavlinkd.mitm import anatomy
-from uavlinkd.mitm import settings as mitm_settings
-from uavlinkd.sim import tlog
+from uavlinkd.mavlink import frames, routing
+from uavlinkd.mavlink.policy import gate
+from uavlinkd.lab.mitm import anatomy
+from uavlinkd.lab.mitm import proxy_settings as mitm_settings
+from uavlinkd.lab.sim import tlog
 
 Undo = Callable[[], None]
 

@@ -9,9 +9,9 @@ from functools import cache
 from pathlib import Path
 
 from tests.fuzz.engine import TALLY, Run
-from uavlinkd.addresses import Address
-from uavlinkd.control import MAX_REQUEST_BYTES, ControlServer
-from uavlinkd.metrics_server import MetricsServer
+from uavlinkd.system.addresses import Address
+from uavlinkd.ops.control import MAX_REQUEST_BYTES, ControlServer
+from uavlinkd.ops.metrics_server import MetricsServer
 
 KNOWN = ("status", "reload")
 _STATUSES = {200, 400, 404, 405, 421, 431}

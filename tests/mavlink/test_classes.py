@@ -7,7 +7,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from uavlinkd.mavlink.classes import CLASSES, Class, MessageClass, screen
 from uavlinkd.mavlink.dialect import GROUPS, ids_by_name
-from uavlinkd.mavlink.egress_kinds import KINDS, Lane
+from uavlinkd.mavlink.egress.kinds import KINDS, Lane
 
 _SENDER = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 
 from tests.network.network import Network, share_a_session
-from uavlinkd.mitm.radio import RadioSettings
+from uavlinkd.lab.mitm.radio import RadioSettings
 
 MODES = ("both know", "one knows")
 """Who has a configured address of the other, and so calls."""

@@ -21,7 +21,7 @@ from tests.network.bounds import Sizes
 from tests.network.network import Drone, Flow, Network, share_a_session
 from uavlinkd.core.outputs import SessionEstablished
 from uavlinkd.core.settings import Link, Timers
-from uavlinkd.mitm.radio import Bursts, RadioSettings
+from uavlinkd.lab.mitm.radio import Bursts, RadioSettings
 
 UP_WITHIN_S = 3.0
 """After the last misfortune: frames both ways between every two drones that know each other, on one session."""

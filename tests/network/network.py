@@ -26,7 +26,7 @@ from uavlinkd.core.outputs import Deliver, Dropped, Output, Path, SessionEstabli
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.session import Session
 from uavlinkd.core.settings import Link, PeerSettings, Screen, hold_all
-from uavlinkd.mitm.radio import Radio, RadioSettings
+from uavlinkd.lab.mitm.radio import Radio, RadioSettings
 
 Address = tuple[str, int]
 

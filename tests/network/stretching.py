@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from tests.mitm.middle import Middle
+from tests.lab.mitm.middle import Middle
 from tests.network.network import Drone, Flow, Network, every_second_may_be_old
-from uavlinkd.mitm.attacks import parse_attack
-from uavlinkd.mitm.radio import RadioSettings
+from uavlinkd.lab.mitm.attacks import parse_attack
+from uavlinkd.lab.mitm.radio import RadioSettings
 
 ONE_EVERY_1_8_S = "way=a>b,interval_s=1.8"
 ATTACKS = {

@@ -9,7 +9,7 @@ import pytest
 
 from tests.network.network import Address, Network, share_a_session
 from uavlinkd.core.outputs import PeerLost
-from uavlinkd.mitm.radio import Bursts, RadioSettings
+from uavlinkd.lab.mitm.radio import Bursts, RadioSettings
 
 BACK_WITHIN_S = 2.0
 STALE: tuple[Address, ...] = (("192.0.2.1", 5790), ("192.0.2.2", 5790), ("192.0.2.3", 5790))

@@ -13,7 +13,7 @@ import pytest
 
 from tests.network.command import main
 from tests.network.histories import BUSY, HOURS, LARGE, Plan, Played, play
-from uavlinkd.core.caller import Caller
+from uavlinkd.core.initiator import Caller
 from uavlinkd.core.indices import Indices
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Output

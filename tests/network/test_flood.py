@@ -11,7 +11,7 @@ from tests.network.network import Network, share_a_session
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.settings import Link
 from uavlinkd.core.suites import SUITES_BY_NAME
-from uavlinkd.mitm.radio import RadioSettings
+from uavlinkd.lab.mitm.radio import RadioSettings
 
 SOURCES = 10_000
 PER_S = 2000.0

@@ -7,12 +7,12 @@ from functools import partial
 
 import pytest
 
-from tests.mitm.middle import Middle
+from tests.lab.mitm.middle import Middle
 from tests.network.network import Drone, Flow, Network, every_second_may_be_old, share_a_session
 from uavlinkd.core import constants as c
 from uavlinkd.core.settings import Link, Timers
-from uavlinkd.mitm.attacks import parse_attack
-from uavlinkd.mitm.radio import RadioSettings
+from uavlinkd.lab.mitm.attacks import parse_attack
+from uavlinkd.lab.mitm.radio import RadioSettings
 
 OVERTAKEN_S = c.LATE_AFTER_S + 2 * c.LATE_STEP_S
 """No frame comes out this long after it was sent where others came through all the time,"""

@@ -8,7 +8,7 @@ import pytest
 
 from tests.network.network import Drone, Network, share_a_session
 from uavlinkd.core.settings import Link, Timers
-from uavlinkd.mitm.radio import RadioSettings
+from uavlinkd.lab.mitm.radio import RadioSettings
 
 EVERY_2_S = Link(timers=Timers(rekey_after_s=2.0, reject_after_s=6.0))
 

@@ -9,7 +9,7 @@ import pytest
 from tests.network.attackers import Recorder
 from tests.network.network import Address, Drone, Network, share_a_session
 from uavlinkd.core.settings import Link, Timers
-from uavlinkd.mitm.radio import RadioSettings
+from uavlinkd.lab.mitm.radio import RadioSettings
 
 MISCHIEF: Address = ("198.51.100.66", 6666)
 FAST_REKEY = Link(timers=Timers(rekey_after_s=1.0, reject_after_s=6.0))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tests.network.network import Drone, Network, share_a_session
-from uavlinkd.mitm.radio import RadioSettings
+from uavlinkd.lab.mitm.radio import RadioSettings
 
 BACK_WITHIN_S = 2.0
 CLOCKS = {"zero": 0.0, "1970": 1.0, "2106": 2.0**32 + 0.25}

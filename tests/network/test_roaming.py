@@ -7,7 +7,7 @@ import pytest
 from tests.network.attackers import Racer
 from tests.network.network import Address, Drone, Flow, Network, share_a_session
 from uavlinkd.core.outputs import PathChanged
-from uavlinkd.mitm.radio import RadioSettings
+from uavlinkd.lab.mitm.radio import RadioSettings
 
 BACK_WITHIN_S = 3.0
 MISCHIEF: Address = ("198.51.100.66", 6666)

@@ -10,7 +10,7 @@ import pytest
 
 from tests.network.handshakes import MODES, broken, distribution, handshake_time
 from tests.network.network import Address, Drone, Network, session_name, share_a_session
-from uavlinkd.mitm.radio import RadioSettings
+from uavlinkd.lab.mitm.radio import RadioSettings
 
 NOBODY: tuple[Address, ...] = (("192.0.2.1", 5790), ("192.0.2.2", 14550))
 """Stale addresses: nobody answers there."""

@@ -7,14 +7,14 @@ from functools import partial
 
 import pytest
 
-from tests.mitm.middle import Middle
+from tests.lab.mitm.middle import Middle
 from tests.network.network import Network, every_second_may_be_old, share_a_session
 from tests.network.stretching import ATTACKS, oldest, stretched
 from uavlinkd.core import constants as c
 from uavlinkd.core.outputs import FreshnessUnverified
 from uavlinkd.core.settings import Link
-from uavlinkd.mitm.attacks import parse_attack
-from uavlinkd.mitm.radio import Bursts, RadioSettings
+from uavlinkd.lab.mitm.attacks import parse_attack
+from uavlinkd.lab.mitm.radio import Bursts, RadioSettings
 
 VERIFIED_S = c.LATE_AFTER_S + c.DOUBT_S
 """No frame that must be new comes in order this long after it was sent,"""

@@ -36,7 +36,7 @@ from tests.daemon.harness import (
     to_toml,
 )
 from tests.soak.flows import SETTLED_S, Flow, frame, numbers_in
-from uavlinkd.control import ControlError, ask
+from uavlinkd.ops.control import ControlError, ask
 
 DRONES = ("drone0", "drone1")
 GROUND = "ground"
@@ -213,7 +213,7 @@ class Soak:
         path = self.stage.folder / "radio.toml"
         path.write_text(to_toml(config))
         self._radio = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-m", "uavlinkd.mitm", "--config", str(path)),
+            *(sys.executable, "-m", "uavlinkd.lab.mitm", "--config", str(path)),
             stdin=asyncio.subprocess.DEVNULL,
             stdout=asyncio.subprocess.DEVNULL,
             stderr=asyncio.subprocess.DEVNULL,

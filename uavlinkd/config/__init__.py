@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from uavlinkd.config.errors import ConfigError, Problem
 from uavlinkd.config.model import Config, Endpoint, Log, Peer, PolicyData, Recording, Routing
-from uavlinkd.mavlink.egress import EgressSettings
+from uavlinkd.mavlink.egress.budgeted import EgressSettings
 
 if TYPE_CHECKING:
     from uavlinkd.config.load import load_config

@@ -6,13 +6,13 @@ from collections.abc import Callable, Iterator, Sequence
 from itertools import combinations
 from math import ceil
 
-from uavlinkd.addresses import IPV4_UDP_BYTES, Address
+from uavlinkd.system.addresses import IPV4_UDP_BYTES, Address
 from uavlinkd.config.model import Endpoint, Peer, Routing
 from uavlinkd.core import constants as c
 from uavlinkd.core.settings import Link
 from uavlinkd.core.wire import initiation_bytes, response_bytes
 from uavlinkd.endpoints.url import Kind, NetworkUrl
-from uavlinkd.mavlink.policy_settings import read_settings
+from uavlinkd.mavlink.policy.settings import read_settings
 
 # UDP payloads that pass in one piece.
 IPV6_LEAST_PAYLOAD = 1280 - 40 - 8

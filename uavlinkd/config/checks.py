@@ -6,7 +6,7 @@ from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Seq
 from itertools import combinations
 from typing import Any
 
-from uavlinkd.addresses import Address, overlaps
+from uavlinkd.system.addresses import Address, overlaps
 from uavlinkd.config.problems import Problems, Values
 from uavlinkd.config.schema import LinkSection, RecordingSection
 from uavlinkd.endpoints.url import EndpointUrl, Kind, NetworkUrl, SerialUrl

@@ -29,8 +29,8 @@ from uavlinkd.config.schema import (
 )
 from uavlinkd.core.crypto import Secret, x25519_public_key
 from uavlinkd.core.settings import Link, PeerSettings, Timers
-from uavlinkd.keys import CREDENTIALS, KeyFileError, find_secret_file, read_secret_file
-from uavlinkd.mavlink.egress import EgressSettings
+from uavlinkd.config.keys import CREDENTIALS, KeyFileError, find_secret_file, read_secret_file
+from uavlinkd.mavlink.egress.budgeted import EgressSettings
 
 _MAX_FILE_BYTES = 1 << 20
 

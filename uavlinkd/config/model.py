@@ -8,15 +8,15 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Literal
 
-from uavlinkd.addresses import Address
+from uavlinkd.system.addresses import Address
 from uavlinkd.core.crypto import Secret
 from uavlinkd.core.settings import PeerSettings
 from uavlinkd.endpoints.url import EndpointUrl
-from uavlinkd.mavlink.egress import EgressSettings
-from uavlinkd.mavlink.policy import Policy, compile_policy
+from uavlinkd.mavlink.egress.budgeted import EgressSettings
+from uavlinkd.mavlink.policy.compilation import Policy, compile_policy
 
 PolicyData = Mapping[str, object]
-"""A policy as plain data, which cannot change: :mod:`uavlinkd.mavlink.policy` says what the keys mean."""
+"""A policy as plain data, which cannot change: :mod:`uavlinkd.mavlink.policy.compilation` says what the keys mean."""
 
 
 def _trust_all() -> PolicyData:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from uavlinkd.addresses import IPV6_UDP_BYTES
+from uavlinkd.system.addresses import IPV6_UDP_BYTES
 from uavlinkd.core import constants as c
 from uavlinkd.core import wire
 

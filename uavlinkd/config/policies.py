@@ -9,7 +9,7 @@ from typing import Any
 from uavlinkd.config.model import PolicyData
 from uavlinkd.config.problems import Problems, Values
 from uavlinkd.config.schema import PolicySection
-from uavlinkd.mavlink.policy import PolicyError, compile_policy
+from uavlinkd.mavlink.policy.compilation import PolicyError, compile_policy
 
 # A policy's messages repeat what was written, so that a person finds it: a group, a message, a command, a number.
 # Whatever else stands there may be a secret, or control a terminal, or have a million digits.

@@ -22,7 +22,7 @@ from uavlinkd.checker import checker_command
 from uavlinkd.config.errors import ConfigError, Problem
 from uavlinkd.config.model import Config
 from uavlinkd.core.crypto import Secret
-from uavlinkd.core_dumps import forbid_core_dumps
+from uavlinkd.system.core_dumps import forbid_core_dumps
 
 
 def result_of(process: subprocess.Popen[bytes], path: Path) -> Config:

@@ -18,13 +18,13 @@ from pydantic import (
     field_validator,
 )
 
-from uavlinkd.addresses import Address, parse_address
+from uavlinkd.system.addresses import Address, parse_address
 from uavlinkd.core import constants as c
 from uavlinkd.core.crypto import is_usable_public_key
 from uavlinkd.core.suites import SUITES_BY_NAME, X25519, Suite
 from uavlinkd.endpoints.url import EndpointUrl, parse_url
-from uavlinkd.keys import decode_key, is_canonical_public_key
-from uavlinkd.mavlink.egress import EgressSettings
+from uavlinkd.config.keys import decode_key, is_canonical_public_key
+from uavlinkd.mavlink.egress.budgeted import EgressSettings
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}")
 # A key in base64 or hex, whole or nearly: such a thing is never repeated in a message.
@@ -192,7 +192,7 @@ class LinkSection(Section):
 class PolicySection(Section):
     """The keys in ``[[peer]]`` and ``[[endpoint]]`` which say what may be said there.
 
-    They are checked together, by :func:`uavlinkd.mavlink.policy.compile_policy`, which knows what they mean.
+    They are checked together, by :func:`uavlinkd.mavlink.policy.compilation.compile_policy`, which knows what they mean.
     """
 
     role: Any = None

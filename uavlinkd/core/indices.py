@@ -9,7 +9,7 @@ from uavlinkd.core.crypto import Entropy
 from uavlinkd.core.drops import Drop, DropReason
 
 if TYPE_CHECKING:
-    from uavlinkd.core.caller import Pending
+    from uavlinkd.core.initiator import Pending
     from uavlinkd.core.session import Session
 
 _DRAWS = 64  # with half of all indices taken, all draws fail once in 2^64

@@ -14,7 +14,7 @@ from collections.abc import Hashable, Iterable, Sequence
 from uavlinkd.core import constants as c
 from uavlinkd.core import handshake, wire
 from uavlinkd.core.admission import Admission, Message
-from uavlinkd.core.caller import Pending
+from uavlinkd.core.initiator import Pending
 from uavlinkd.core.constants import NEVER
 from uavlinkd.core.cookie import CookieJar, MacKeys
 from uavlinkd.core.crypto import Entropy, KeyPair, Secret

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from uavlinkd.core import constants as c
 from uavlinkd.core import handshake, wire
 from uavlinkd.core.age import Age
-from uavlinkd.core.caller import Caller, Pending
+from uavlinkd.core.initiator import Caller, Pending
 from uavlinkd.core.constants import NEVER
 from uavlinkd.core.cookie import mac1_of
 from uavlinkd.core.crypto import Entropy, KeyPair
@@ -29,7 +29,7 @@ from uavlinkd.core.outputs import (
     SessionEstablished,
     Transmit,
 )
-from uavlinkd.core.paths import Challenger
+from uavlinkd.core.path import Challenger
 from uavlinkd.core.session import Session
 from uavlinkd.core.sessions import Sessions, Unconfirmed
 from uavlinkd.core.settings import PeerSettings, Screen

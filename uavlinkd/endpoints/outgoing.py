@@ -2,7 +2,7 @@
 
 A frame leaves the queue once, at the moment its bytes are committed: the stream carries committed bytes next, in the
 order in which they were committed. What the kernel did not take of them is kept, because the client could not find
-the start of the next frame behind half a frame. The delivered stream (:mod:`uavlinkd.mavlink.delivery`) decides at
+the start of the next frame behind half a frame. The delivered stream (:mod:`uavlinkd.mavlink.policy.delivery`) decides at
 that moment which bytes a frame becomes: it sees the frames in the order in which the client reads them.
 """
 
@@ -12,9 +12,9 @@ from collections import Counter, deque
 from collections.abc import Sequence
 from math import inf
 
-from uavlinkd.mavlink.delivery import DeliveredStream, Source
-from uavlinkd.mavlink.egress_lanes import EgressDrop
-from uavlinkd.mavlink.fair_queue import FairQueue
+from uavlinkd.mavlink.policy.delivery import DeliveredStream, Source
+from uavlinkd.mavlink.egress.lanes import EgressDrop
+from uavlinkd.mavlink.egress.fair_queue import FairQueue
 from uavlinkd.mavlink.frames import Frame
 
 _REASONS = {EgressDrop.OVERFLOW: "outgoing_full", EgressDrop.CLOSED: "unsent"}

@@ -11,9 +11,9 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Protocol
 
-from uavlinkd.mavlink.delivery import DeliveredStream, Source
+from uavlinkd.mavlink.policy.delivery import DeliveredStream, Source
 from uavlinkd.mavlink.frames import Frame, SplitCounters
-from uavlinkd.stall import StallWatch
+from uavlinkd.system.stall import StallWatch
 
 
 class LocalPort:
@@ -55,7 +55,7 @@ class PortHandler(Protocol):
     def on_frames(self, port: LocalPort, frames: list[Frame], now: float, epoch: int, waited_s: float = 0.0) -> None:
         """What it sent, all that was there at once, in order; the first of it has waited so long already.
 
-        ``epoch``: when it was read (:mod:`uavlinkd.stall`). The handler drops frames of any but the present one.
+        ``epoch``: when it was read (:mod:`uavlinkd.system.stall`). The handler drops frames of any but the present one.
         """
 
 

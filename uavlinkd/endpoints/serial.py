@@ -10,12 +10,12 @@ from math import inf
 
 from serialx import BaseSerial, serial_for_url
 
-from uavlinkd.clock import monotonic
+from uavlinkd.system.clock import monotonic
 from uavlinkd.endpoints.ports import PortHandler, failure_name
-from uavlinkd.endpoints.streams import MAX_AGE_S, Connection, StreamEndpoint
+from uavlinkd.endpoints.stream_endpoint import MAX_AGE_S, Connection, StreamEndpoint
 from uavlinkd.endpoints.url import SerialUrl
-from uavlinkd.tasks import keep_running
-from uavlinkd.threads import Threads
+from uavlinkd.system.tasks import keep_running
+from uavlinkd.system.threads import Threads
 
 RETRY_S = 0.5
 """Between two attempts to open a device that is not there, or not ours to open."""

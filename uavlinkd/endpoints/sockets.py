@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 
 import structlog
 
-from uavlinkd.addresses import Address
-from uavlinkd.clock import monotonic
-from uavlinkd.stall import Backlog, StallWatch
+from uavlinkd.system.addresses import Address
+from uavlinkd.system.clock import monotonic
+from uavlinkd.system.stall import Backlog, StallWatch
 
 BUFFER_BYTES = 1 << 20
 """Asked of the kernel each way: room for hundreds of envelopes of the default size. It may give less
@@ -149,7 +149,7 @@ class Batch(NamedTuple):
     now: float
     """Monotonic seconds."""
     epoch: int
-    """In which it was read (:mod:`uavlinkd.stall`)."""
+    """In which it was read (:mod:`uavlinkd.system.stall`)."""
 
 
 class Reader:

@@ -14,14 +14,14 @@ import sys
 from contextlib import suppress
 from secrets import SystemRandom
 
-from uavlinkd.addresses import Address
-from uavlinkd.clock import monotonic
+from uavlinkd.system.addresses import Address
+from uavlinkd.system.clock import monotonic
 from uavlinkd.endpoints.ports import PortHandler, failure_name
 from uavlinkd.endpoints.sockets import bind, cannot_listen, unbound_socket
-from uavlinkd.endpoints.streams import MAX_AGE_S, STALLED_S, StreamEndpoint
-from uavlinkd.stall import Backlog
-from uavlinkd.tasks import keep_running
-from uavlinkd.threads import Threads
+from uavlinkd.endpoints.stream_endpoint import MAX_AGE_S, STALLED_S, StreamEndpoint
+from uavlinkd.system.stall import Backlog
+from uavlinkd.system.tasks import keep_running
+from uavlinkd.system.threads import Threads
 
 CLIENTS_PER_ENDPOINT = 32
 """Programs that one ``tcpin`` endpoint serves."""

@@ -13,15 +13,15 @@ from collections.abc import Sequence
 
 import structlog
 
-from uavlinkd.addresses import Address
-from uavlinkd.clock import monotonic
+from uavlinkd.system.addresses import Address
+from uavlinkd.system.clock import monotonic
 from uavlinkd.endpoints.ports import LocalPort, PortHandler, failure_name
 from uavlinkd.endpoints.sockets import Batch, BindError, Reader, numeric_host, udp_socket
-from uavlinkd.mavlink.delivery import DeliveredStreams, Source
+from uavlinkd.mavlink.policy.delivery import DeliveredStreams, Source
 from uavlinkd.mavlink.frames import MAX_GAP_S, MIN_FRAME_BYTES, Frame, SplitCounters, StreamSplitter, split_datagram
-from uavlinkd.resolver import Resolved, keep_resolving
-from uavlinkd.stall import STALE
-from uavlinkd.tasks import keep_running
+from uavlinkd.system.resolver import Resolved, keep_resolving
+from uavlinkd.system.stall import STALE
+from uavlinkd.system.tasks import keep_running
 
 CLIENTS_PER_ENDPOINT = 32
 """Programs that one ``udpin`` endpoint serves."""

@@ -18,7 +18,7 @@ import re
 from dataclasses import dataclass
 from enum import StrEnum
 
-from uavlinkd.addresses import Address, AddressError, parse_address
+from uavlinkd.system.addresses import Address, AddressError, parse_address
 
 
 class UrlError(ValueError):

@@ -6,12 +6,12 @@ import argparse
 import os
 import sys
 
-from uavlinkd.addresses import AddressError, parse_address
-from uavlinkd.fleet import work
+from uavlinkd.system.addresses import AddressError, parse_address
+from uavlinkd.fleet import operations as work
 from uavlinkd.fleet.manifest import Kind, Settings
 from uavlinkd.fleet.plan import FleetError, FleetFileError
-from uavlinkd.fleet.work import Result
-from uavlinkd.terminal import printable
+from uavlinkd.fleet.operations import Result
+from uavlinkd.system.terminal import printable
 
 OK, FAILED, WRONG = 0, 1, 2
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from uavlinkd.addresses import Address
+from uavlinkd.system.addresses import Address
 from uavlinkd.fleet.manifest import ROLES, Fleet, Kind, Member, literal
 from uavlinkd.fleet.plan import listen_address
 

@@ -14,12 +14,12 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-from uavlinkd.addresses import Address, AddressError, parse_address
+from uavlinkd.system.addresses import Address, AddressError, parse_address
 from uavlinkd.core.suites import SUITES_BY_NAME
 from uavlinkd.fleet.plan import DEFAULT_PLAN, SYSTEM_IDS, AddressPlan, FleetError, FleetFileError
 from uavlinkd.fleet.template import TemplateError, fill
-from uavlinkd.keys import decode_key
-from uavlinkd.terminal import printable
+from uavlinkd.config.keys import decode_key
+from uavlinkd.system.terminal import printable
 
 FILE_NAME = "fleet.toml"
 _TEMPLATES = ("control_socket", "drone_url", "ground_station_url", "observer_url")

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from ipaddress import IPv4Network, IPv6Network, ip_network
 from typing import Protocol
 
-from uavlinkd.addresses import DEFAULT_PORT, Address, AddressError, parse_address
+from uavlinkd.system.addresses import DEFAULT_PORT, Address, AddressError, parse_address
 from uavlinkd.fleet.template import TemplateError, fill
 
 DEFAULT_PLAN = "10.13.0.0/24"

@@ -18,7 +18,7 @@ from typing import Final, NamedTuple
 
 from uavlinkd.mavlink.dialect import GROUPS, ids_by_name
 from uavlinkd.mavlink.frames import Frame, SplitCounters, split_payload
-from uavlinkd.mavlink.gate import HEARTBEAT, claims_to_be_ground_station
+from uavlinkd.mavlink.policy.gate import HEARTBEAT, claims_to_be_ground_station
 
 
 class Class(StrEnum):

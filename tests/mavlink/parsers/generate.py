@@ -8,11 +8,11 @@ from functools import cache
 from typing import Final, NamedTuple
 
 from tests.mavlink.parsers.build import PRIVATE_EXTRAS
-from uavlinkd.evaluation.captured_member import GOALS, command_long, heartbeat_of, set_mode
-from uavlinkd.evaluation.hidden_frames import SIGNATURE_BYTES, Carrier, crc_extra, frame, hide, msgid_of
+from uavlinkd.lab.evaluation.captured_member import GOALS, command_long, heartbeat_of, set_mode
+from uavlinkd.lab.evaluation.hidden_frames import SIGNATURE_BYTES, Carrier, crc_extra, frame, hide, msgid_of
 from uavlinkd.mavlink.dialect_table import COMMANDS, MESSAGES, OTHER_EXTRAS
-from uavlinkd.mavlink.gate import Refusal
-from uavlinkd.mavlink.policy import compile_policy
+from uavlinkd.mavlink.policy.gate import Refusal
+from uavlinkd.mavlink.policy.compilation import compile_policy
 
 EVERYTHING: Final[Mapping[str, object]] = {"role": "all", "system_ids": "all"}
 CAST: Final[Mapping[str, Mapping[str, object]]] = {

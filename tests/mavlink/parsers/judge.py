@@ -14,12 +14,12 @@ from fastcrc.crc16 import mcrf4xx
 
 from tests.mavlink.parsers.generate import CAST, CLIENTS, LETS_UNKNOWN_PASS, Recipe
 from tests.mavlink.parsers.receivers import Accepted, Batch, Delivery, Receiver
-from uavlinkd.evaluation.hidden_frames import SIGNATURE_BYTES, crc_extra, msgid_of
-from uavlinkd.mavlink.delivery import DeliveredStream, Source
+from uavlinkd.lab.evaluation.hidden_frames import SIGNATURE_BYTES, crc_extra, msgid_of
+from uavlinkd.mavlink.policy.delivery import DeliveredStream, Source
 from uavlinkd.mavlink.dialect_table import OTHER_EXTRAS
 from uavlinkd.mavlink.frames import MAVLINK2, Frame, SplitCounters, parse_frame, split_payload
-from uavlinkd.mavlink.gate import Gate
-from uavlinkd.mavlink.policy import compile_policy
+from uavlinkd.mavlink.policy.gate import Gate
+from uavlinkd.mavlink.policy.compilation import compile_policy
 
 _LONG_S = 1e6  # between two frames: rates are not looked at
 

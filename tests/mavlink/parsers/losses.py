@@ -21,8 +21,8 @@ from tests.mavlink.parsers.generate import Part, Recipe
 from tests.mavlink.parsers.judge import Deliverer, Judge, Stream, judge_all
 from tests.mavlink.parsers.noise import TELEMETRY
 from tests.mavlink.parsers.receivers import LONGEST_LOSS, Options, Receiver
-from uavlinkd.evaluation.hidden_frames import Carrier, hide
-from uavlinkd.evaluation.hidden_frames import frame as build
+from uavlinkd.lab.evaluation.hidden_frames import Carrier, hide
+from uavlinkd.lab.evaluation.hidden_frames import frame as build
 from uavlinkd.mavlink.dialect import ids_by_name
 from uavlinkd.mavlink.dialect_table import MESSAGES
 

@@ -12,12 +12,12 @@ from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from typing import NamedTuple
 
-from uavlinkd.evaluation.hidden_frames import frame as build
-from uavlinkd.mavlink.delivery import DeliveredStream, Source
+from uavlinkd.lab.evaluation.hidden_frames import frame as build
+from uavlinkd.mavlink.policy.delivery import DeliveredStream, Source
 from uavlinkd.mavlink.dialect import ids_by_name
 from uavlinkd.mavlink.dialect_table import MESSAGES
 from uavlinkd.mavlink.frames import parse_frame
-from uavlinkd.mavlink.policy import compile_policy
+from uavlinkd.mavlink.policy.compilation import compile_policy
 
 TELEMETRY = (
     "ATTITUDE",

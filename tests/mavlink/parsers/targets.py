@@ -9,10 +9,10 @@ from functools import cache
 from tests.mavlink.parsers.generate import Part, Recipe
 from tests.mavlink.parsers.judge import Deliverer, Judge, MakeStream, Stream, filtered
 from tests.mavlink.parsers.receivers import Delivery
-from uavlinkd.evaluation.captured_member import Attack, attacks
+from uavlinkd.lab.evaluation.captured_member import Attack, attacks
 from uavlinkd.mavlink.dialect_table import MESSAGES
-from uavlinkd.mavlink.gate import Refusal
-from uavlinkd.mavlink.policy import compile_policy
+from uavlinkd.mavlink.policy.gate import Refusal
+from uavlinkd.mavlink.policy.compilation import compile_policy
 
 
 @cache

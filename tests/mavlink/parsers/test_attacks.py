@@ -8,7 +8,7 @@ from tests.mavlink.parsers.build import DIALECTS
 from tests.mavlink.parsers.judge import judge_all
 from tests.mavlink.parsers.receivers import EVERY_LOSS, Batch, Receiver, all_receivers
 from tests.mavlink.parsers.targets import attacks_on, concatenated, deliver, judge_of
-from uavlinkd.evaluation.captured_member import Attack
+from uavlinkd.lab.evaluation.captured_member import Attack
 
 # Receivers that accept the hidden frame where the frames are simply concatenated, from the stream's first byte on.
 _RESUMES = frozenset(

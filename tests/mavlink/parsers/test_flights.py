@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 
 from tests.mavlink.parsers.noise import false_refusals
-from uavlinkd.mavlink.delivery import DeliveredStream, Source
+from uavlinkd.mavlink.policy.delivery import DeliveredStream, Source
 from uavlinkd.mavlink.dialect import name_of
 from uavlinkd.mavlink.frames import Frame, SplitCounters, split_payload
-from uavlinkd.mavlink.policy import compile_policy
-from uavlinkd.sim.tlog import Record, read_tlog
+from uavlinkd.mavlink.policy.compilation import compile_policy
+from uavlinkd.lab.sim.tlog import Record, read_tlog
 
 FLIGHTS = ("arducopter_sitl_flight.tlog", "ardusub_dive.tlog", "copter_flight_mavlink1.tlog")
 GROUND = 255

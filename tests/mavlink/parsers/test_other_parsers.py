@@ -14,10 +14,10 @@ from tests.mavlink.parsers.build import DIALECTS
 from tests.mavlink.parsers.generate import CAST, Generator
 from tests.mavlink.parsers.judge import Deliverer, Judge, Stream, unfiltered
 from tests.mavlink.parsers.targets import attacks_on, concatenated, deliver, lacking
-from tests.sim import scenarios
+from tests.lab.sim import scenarios
 from tests.waiting import PATIENCE_S
-from uavlinkd.evaluation.captured_member import Attack, signed_unknown, within
-from uavlinkd.evaluation.hidden_frames import Carrier, frame, msgid_of
+from uavlinkd.lab.evaluation.captured_member import Attack, signed_unknown, within
+from uavlinkd.lab.evaluation.hidden_frames import Carrier, frame, msgid_of
 from uavlinkd.mavlink.dialect import ids_by_name, name_of
 
 STREAMS = 400

@@ -9,12 +9,12 @@ import pytest
 from tests.mavlink.parsers.generate import EVERYTHING
 from tests.mavlink.parsers.judge import Admit, MakeStream, filtered
 from tests.mavlink.parsers.run import Result, run
-from uavlinkd.mavlink import hidden
-from uavlinkd.mavlink.delivery import DeliveredStream, Source
+from uavlinkd.mavlink.policy import hidden
+from uavlinkd.mavlink.policy.delivery import DeliveredStream, Source
 from uavlinkd.mavlink.dialect_table import MESSAGES, OTHER_EXTRAS
 from uavlinkd.mavlink.frames import MAVLINK1, MAVLINK2, Frame
-from uavlinkd.mavlink.gate import Gate
-from uavlinkd.mavlink.policy import compile_policy
+from uavlinkd.mavlink.policy.gate import Gate
+from uavlinkd.mavlink.policy.compilation import compile_policy
 
 pytestmark = pytest.mark.long
 

@@ -1,0 +1,288 @@
+"""Key files: WireGuard's form, nobody else's eyes."""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+import shutil
+import stat
+import subprocess
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.daemon.harness import need
+from uavlinkd.config import keys
+from uavlinkd.config.keys import KeyFileError
+
+_VECTORS = Path(__file__).parents[1] / "vectors" / "noise.json"
+
+
+@given(st.binary(min_size=32, max_size=32))
+def test_key_survives_its_text(key: bytes) -> None:
+    """Any 32 bytes come back from the 44 characters that stand for them, with or without a newline."""
+    text = keys.encode_key(key)
+    assert len(text) == keys.KEY_TEXT_LENGTH
+    assert keys.decode_key(text) == keys.decode_key(f"{text}\n") == key
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "=",
+        base64.b64encode(bytes(31)).decode(),
+        base64.b64encode(bytes(33)).decode(),
+        base64.b64encode(bytes(32)).decode().rstrip("="),
+        "AAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAB=",  # loose bits set in the last character
+        "AAAAAAAAAAAAAAAAAAAAA\nAAAAAAAAAAAAAAAAAAAAAA=",
+        "-_AAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAA=",  # the URL alphabet
+        "é" * 44,
+        bytes(32).hex(),
+    ],
+)
+def test_other_text_is_no_key_and_is_not_repeated(text: str) -> None:
+    """Only the one spelling of a key is one, and the message holds nothing of the text."""
+    with pytest.raises(ValueError, match="is no key") as caught:
+        keys.decode_key(text)
+    assert len(text) < 2 or text not in str(caught.value)
+
+
+def test_generated_keys_differ() -> None:
+    """Two keys in a row are two keys."""
+    assert len({make() for make in (keys.generate_private_key, keys.generate_psk) for _ in range(4)}) == 8
+
+
+def test_private_key_has_the_bits_that_x25519_sets() -> None:
+    """As ``wg genkey`` writes them, so both tools show one key alike (RFC 7748, section 5)."""
+    for _ in range(64):
+        key = keys.decode_key(keys.generate_private_key())
+        assert (key[0] & 7, key[31] & 192) == (0, 64)
+
+
+def test_public_key_is_the_one_of_published_vectors() -> None:
+    """The Noise vectors give responders' key pairs: each initiator knows the other half."""
+    pairs = {
+        (vector["resp_static"], vector["init_remote_static"])
+        for vector in json.loads(_VECTORS.read_text())["vectors"]
+        if "init_remote_static" in vector
+    }
+    assert pairs
+    for private, public in pairs:
+        text = keys.encode_key(bytes.fromhex(private))
+        assert keys.public_key_text(f"{text}\n") == keys.encode_key(bytes.fromhex(public))
+
+
+def test_public_key_is_the_one_that_wireguard_gives() -> None:
+    """``wg pubkey`` and ours answer the same."""
+    need(shutil.which("wg") is not None, "wg, of wireguard-tools")
+    private = keys.generate_private_key()
+    theirs = subprocess.run(["wg", "pubkey"], input=private, capture_output=True, text=True, check=True).stdout
+    assert keys.public_key_text(private) == theirs.strip()
+
+
+def test_short_form_is_the_start_of_the_key() -> None:
+    """What logs show of a public key can be found in the file it stands in."""
+    public = keys.public_key_text(keys.generate_private_key())
+    assert public.startswith(keys.short_form(keys.decode_key(public)).removesuffix("..."))
+
+
+def test_written_key_is_its_owners_alone(tmp_path: Path) -> None:
+    """A new file has mode 0600 whatever the umask, ends in a newline, and is read back."""
+    path = tmp_path / "drone0.key"
+    text = keys.generate_private_key()
+    before = os.umask(0)
+    try:
+        keys.write_secret_file(path, text)
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    assert path.read_text() == f"{text}\n"
+    assert keys.read_secret_file(path).reveal() == keys.decode_key(text)
+
+
+def test_key_is_never_overwritten(tmp_path: Path) -> None:
+    """Neither a file nor a dangling link gives way to a new key."""
+    path = tmp_path / "drone0.key"
+    path.write_text("precious")
+    link = tmp_path / "link.key"
+    link.symlink_to(tmp_path / "elsewhere")
+    for taken in (path, link):
+        with pytest.raises(KeyFileError, match="never overwritten"):
+            keys.write_secret_file(taken, keys.generate_psk())
+    assert path.read_text() == "precious"
+    assert not (tmp_path / "elsewhere").exists()
+
+
+def test_key_for_a_missing_folder_is_not_written(tmp_path: Path) -> None:
+    """The reason is the operating system's."""
+    with pytest.raises(KeyFileError, match="No such file"):
+        keys.write_secret_file(tmp_path / "none" / "drone0.key", keys.generate_psk())
+
+
+def test_failed_write_leaves_no_half_key(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A disk that fills up leaves nothing that would be in the way of the next try."""
+
+    def full(descriptor: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    path = tmp_path / "drone0.key"
+    with pytest.raises(KeyFileError, match="No space left"):
+        keys.write_secret_file(path, keys.generate_psk())
+    assert not path.exists()
+
+
+def _key_file(path: Path, mode: int = 0o600) -> Path:
+    path.write_text(keys.generate_private_key() + "\n")
+    path.chmod(mode)
+    return path
+
+
+@pytest.mark.parametrize("mode", [0o640, 0o604, 0o620, 0o602, 0o644, 0o660, 0o666, 0o610, 0o601])
+def test_key_that_others_may_touch_is_refused_with_the_remedy(tmp_path: Path, mode: int) -> None:
+    """Any right of the group or of others is one too many, and the message says what to run."""
+    path = _key_file(tmp_path / "drone 0.key", mode)
+    with pytest.raises(KeyFileError) as caught:
+        keys.read_secret_file(path)
+    assert f"chmod 600 '{path}'" in str(caught.value)
+    assert path.read_text().strip() not in str(caught.value)
+
+
+@pytest.mark.parametrize("mode", [0o400, 0o600, 0o700])
+def test_key_of_its_owner_alone_is_read(tmp_path: Path, mode: int) -> None:
+    """Whatever the owner's own rights are beyond reading."""
+    path = _key_file(tmp_path / "drone0.key", mode)
+    assert keys.encode_key(keys.read_secret_file(path).reveal()) == path.read_text().strip()
+
+
+@pytest.mark.parametrize("credential", [False, True])
+def test_key_of_another_owner_is_refused_with_the_remedy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, credential: bool
+) -> None:
+    """Its owner can replace it at any time, whatever its mode says; a credential has no exception."""
+    path = _key_file(tmp_path / "drone 0.key")
+    owner = path.stat().st_uid
+    monkeypatch.setattr(os, "geteuid", lambda: owner + 1)
+    fstat = os.fstat
+    monkeypatch.setattr(os, "fstat", lambda descriptor: _owned(fstat(descriptor), 4242))
+    with pytest.raises(KeyFileError, match="uid 4242") as caught:
+        keys.read_secret_file(path, credential=credential)
+    assert f"chown {owner + 1} '{path}'" in str(caught.value)
+    assert path.read_text().strip() not in str(caught.value)
+
+
+@pytest.mark.parametrize("owner", [0, 1000])
+def test_key_of_root_or_of_the_user_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, owner: int) -> None:
+    """Root can read every file anyway, and systemd's credentials belong to root."""
+    path = _key_file(tmp_path / "drone0.key")
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    fstat = os.fstat
+    monkeypatch.setattr(os, "fstat", lambda descriptor: _owned(fstat(descriptor), owner))
+    assert keys.encode_key(keys.read_secret_file(path).reveal()) == path.read_text().strip()
+
+
+def _owned(status: os.stat_result, owner: int) -> os.stat_result:
+    return os.stat_result((*status[:4], owner, *status[5:10]))
+
+
+def test_credential_may_show_the_groups_right_to_read(tmp_path: Path) -> None:
+    """systemd's access list shows as mode 0440; no other right of others is let pass."""
+    path = _key_file(tmp_path / "a", 0o440)
+    secret = keys.read_secret_file(path, credential=True)
+    assert keys.encode_key(secret.reveal()) == path.read_text().strip()
+    for mode in (0o444, 0o460):
+        with pytest.raises(KeyFileError, match="chmod"):
+            keys.read_secret_file(_key_file(tmp_path / f"b{mode}", mode), credential=True)
+
+
+def test_what_is_no_regular_file_is_refused_at_once(tmp_path: Path) -> None:
+    """A pipe without a writer does not stop the daemon, a folder or a device is no key."""
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe, 0o600)
+    for path in (pipe, tmp_path, Path(os.devnull)):
+        with pytest.raises(KeyFileError, match="not a regular file"):
+            keys.read_secret_file(path)
+
+
+def test_missing_file_and_impossible_name_are_named(tmp_path: Path) -> None:
+    """What cannot be opened is told, whatever the reason."""
+    with pytest.raises(KeyFileError, match="no such file"):
+        keys.read_secret_file(tmp_path / "drone0.key")
+    with pytest.raises(KeyFileError, match="not a file name"):
+        keys.read_secret_file(tmp_path / "a\0b")
+
+
+@pytest.mark.parametrize("content", [b"", b"secret words", b"\xff" * 44, bytes(32), b"A" * 10_000])
+def test_content_that_is_no_key_is_refused_and_not_repeated(tmp_path: Path, content: bytes) -> None:
+    """The message tells the form of a key and nothing of what was there."""
+    path = tmp_path / "drone0.key"
+    path.write_bytes(content)
+    path.chmod(0o600)
+    with pytest.raises(KeyFileError, match="44 characters") as caught:
+        keys.read_secret_file(path)
+    assert "secret words" not in str(caught.value)
+
+
+def test_zero_key_is_refused(tmp_path: Path) -> None:
+    """A PSK of zeros is the same as none, and a private key of zeros is everybody's."""
+    path = tmp_path / "zero.psk"
+    keys.write_secret_file(path, keys.encode_key(bytes(32)))
+    with pytest.raises(KeyFileError, match="all zeros"):
+        keys.read_secret_file(path)
+
+
+@pytest.mark.parametrize(
+    ("number", "canonical"), [(0, True), (9, True), (2**255 - 20, True), (2**255 - 19, False), (2**256 - 1, False)]
+)
+def test_public_key_is_below_the_prime(number: int, canonical: bool) -> None:
+    """Numbers from the field's prime on are second names of other points."""
+    assert keys.is_canonical_public_key(number.to_bytes(32, "little")) is canonical
+
+
+class TestFindSecretFile:
+    """Where a key file is looked for."""
+
+    def test_credential_comes_first(self, tmp_path: Path) -> None:
+        """It was given to this very service: a file of the same name beside the configuration does not replace it."""
+        folder, credentials = self._folders(tmp_path)
+        (folder / "drone0.key").touch()
+        (credentials / "drone0.key").touch()
+        found = keys.find_secret_file("drone0.key", folder, {"CREDENTIALS_DIRECTORY": str(credentials)})
+        assert found == (credentials / "drone0.key", True)
+        (credentials / "drone0.key").unlink()
+        found = keys.find_secret_file("drone0.key", folder, {"CREDENTIALS_DIRECTORY": str(credentials)})
+        assert found == (folder / "drone0.key", False)
+
+    def test_credential_serves_where_there_is_no_file(self, tmp_path: Path) -> None:
+        """With systemd's variable set and a credential of that name."""
+        folder, credentials = self._folders(tmp_path)
+        (credentials / "drone0.key").touch()
+        environ = {"CREDENTIALS_DIRECTORY": str(credentials)}
+        assert keys.find_secret_file("drone0.key", folder, environ) == (credentials / "drone0.key", True)
+        assert keys.find_secret_file("drone0.key", folder, {}) == (folder / "drone0.key", False)
+        assert keys.find_secret_file("other.key", folder, environ) == (folder / "other.key", False)
+
+    def test_credential_name_leads_nowhere_else(self, tmp_path: Path) -> None:
+        """The laxer check of a credential is for files in that folder alone."""
+        folder, credentials = self._folders(tmp_path)
+        (tmp_path / "outside").touch()
+        (credentials / "sub").mkdir()
+        (credentials / "sub" / "key").touch()
+        environ = {"CREDENTIALS_DIRECTORY": str(credentials)}
+        for name in ("../outside/x", "sub/key", "..", "."):
+            assert keys.find_secret_file(name, folder, environ)[1] is False
+
+    def test_absolute_path_is_taken_as_it_is(self, tmp_path: Path) -> None:
+        """The folder matters to relative names only."""
+        assert keys.find_secret_file("/etc/uavlinkd/a.key", tmp_path, {}) == (Path("/etc/uavlinkd/a.key"), False)
+
+    @staticmethod
+    def _folders(tmp_path: Path) -> tuple[Path, Path]:
+        folder, credentials = tmp_path / "etc", tmp_path / "credentials"
+        folder.mkdir()
+        credentials.mkdir()
+        return folder, credentials

@@ -1,0 +1,169 @@
+"""Attackers with keys against the core: what each achieves, and that with the right keys it would achieve all."""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+
+from uavlinkd.core.cookie import MacKeys
+from uavlinkd.core.crypto import KeyPair, Secret
+from uavlinkd.core.drops import DropReason
+from uavlinkd.core.node import Node
+from uavlinkd.core.outputs import Deliver, Transmit
+from uavlinkd.core.peer import Peer
+from uavlinkd.core.settings import PeerSettings
+from uavlinkd.core.suites import X25519
+from uavlinkd.lab.evaluation.impostors import Achieved, Disguise, Impostor, SealedCookies, StolenIdentity
+from uavlinkd.lab.evaluation.ledger import numbered_frame
+from uavlinkd.lab.mitm.attack import Action, Send, Way
+
+A, B, C = (KeyPair(bytes((number,)) * 32) for number in (1, 2, 3))
+PRIVATE_A = Secret(b"\1" * 32)
+PSK, PSK_C = b"p" * 32, b"c" * 32
+OWN = KeyPair(b"\x66" * 32)
+FACE = (0, "10.0.0.9", 5790)
+FRAME = numbered_frame(2, 0)
+STEP_S = 0.01
+
+
+class Victim:
+    """Drone a, which knows b and c."""
+
+    def __init__(self) -> None:
+        self.node = Node(PRIVATE_A, os.urandom, 0.0)
+        for name, key, psk in (("b", B.public, PSK), ("c", C.public, PSK_C)):
+            self.node.add_peer(PeerSettings(name, key, Secret(psk)), 0.0)
+        self.delivered: list[Deliver] = []
+
+    def suffer(self, impostor: Impostor, seconds: float) -> Achieved:
+        """Let the impostor try for so long."""
+        now, waiting = 0.0, list[Action]()
+        while now < seconds:
+            now += STEP_S
+            waiting += impostor.due(now)
+            while waiting:
+                action = waiting.pop(0)
+                if not isinstance(action, Send):
+                    continue
+                assert action.way == Way("b", "a")
+                for output in self.node.receive(action.datagram, FACE, now):
+                    match output:
+                        case Transmit(datagram, path):
+                            assert path == FACE
+                            met = impostor.on_datagram(datagram, Way("a", "b"), now)
+                            waiting += [each for each in met if not (isinstance(each, Send) and each.way[0] == "a")]
+                        case Deliver():
+                            self.delivered.append(output)
+        return impostor.achieved["a"]
+
+    @property
+    def drops(self) -> set[DropReason]:
+        """All reasons counted."""
+        found = set(self.node.drops)
+        for peer in self.node.peers.values():
+            found |= set(peer.traffic.drops)
+        return found
+
+
+def impostor(identity: KeyPair, psk: bytes | None) -> Impostor:
+    """Goes to a as b."""
+    return Impostor("impostor", [Disguise("a", A.public, "b", identity, psk)], (X25519,), 0.0, frames=(FRAME,))
+
+
+@pytest.mark.parametrize(
+    ("identity", "psk", "reason"),
+    [
+        (OWN, None, DropReason.UNKNOWN_PEER),
+        (OWN, PSK, DropReason.UNKNOWN_PEER),
+        (StolenIdentity(B.public, OWN, None), PSK, DropReason.BAD_HANDSHAKE),
+        (StolenIdentity(B.public, C, None), PSK_C, DropReason.BAD_HANDSHAKE),
+    ],
+)
+def test_wrong_keys_get_no_answer(identity: KeyPair, psk: bytes | None, reason: DropReason) -> None:
+    """An own key, with or without the PSK, or a public key whose private one is another's."""
+    victim = Victim()
+    achieved = victim.suffer(impostor(identity, psk), 1.0)
+    assert achieved.initiations >= 20
+    assert (achieved.answers, achieved.sessions, achieved.frames_sent) == (0, 0, 0)
+    assert reason in victim.drops
+    assert victim.delivered == []
+
+
+def test_the_victims_own_key_gives_answers_and_no_session() -> None:
+    """Key compromise impersonation: with a's static key one can ask as b, and cannot use what a answers."""
+    victim = Victim()
+    achieved = victim.suffer(impostor(StolenIdentity(B.public, OWN, A), PSK), 1.0)
+    assert achieved.answers > 0
+    assert achieved.drops["bad_handshake"] == achieved.answers
+    assert achieved.sessions == 0
+    assert victim.delivered == []
+    assert not victim.node.peers["b"].is_up
+
+
+def test_a_captured_drone_is_itself() -> None:
+    """With all keys of c there is a session, as c: what comes over it is c's, and judged as that."""
+    victim = Victim()
+    achieved = victim.suffer(impostor(C, PSK_C), 1.0)
+    assert achieved.sessions == 1
+    assert achieved.frames_sent > 0
+    assert {each.peer for each in victim.delivered} == {"c"}
+
+
+def test_the_right_keys_succeed() -> None:
+    """The impostor is no straw man: with b's own keys it is b."""
+    victim = Victim()
+    achieved = victim.suffer(impostor(B, PSK), 1.0)
+    assert achieved.sessions == 1
+    assert {each.peer for each in victim.delivered} == {"b"}
+    assert not victim.node.drops
+
+
+class TakesAnyKey(dict[tuple[bytes, bytes], Peer]):
+    """A table of peers that leaves out the check of the static key: whoever shakes hands is the first of them."""
+
+    def get(self, keys: tuple[bytes, bytes], _default: object = None) -> Peer:
+        """Not by the key. The answer is made out to who asked."""
+        peer = next(iter(self.values()))
+        peer.caller._mac_keys = MacKeys(keys[1])
+        return peer
+
+
+def test_a_victim_without_the_static_key_check_takes_an_impostor_for_its_peer() -> None:
+    """The same keys of its own that got no answer above get a session, and frames in as b: the check is what held."""
+    victim = Victim()
+    victim.node._by_keys = TakesAnyKey(victim.node._by_keys)
+    achieved = victim.suffer(impostor(OWN, PSK), 1.0)
+    assert achieved.sessions == 1
+    assert achieved.frames_sent > 0
+    assert {(each.peer, each.payload[:10]) for each in victim.delivered} == {("b", FRAME[:10])}
+    assert DropReason.UNKNOWN_PEER not in victim.drops
+
+
+def test_the_relay_lets_nothing_genuine_pass() -> None:
+    """In full it stands for the other side; beside the traffic it does not."""
+    genuine = b"\x40" + bytes(40)
+    for relays in (True, False):
+        middle = Impostor("x", [Disguise("a", A.public, "b", OWN)], (X25519,), 0.0, relays=relays)
+        passes = Send(genuine, Way("a", "b")) in middle.on_datagram(genuine, Way("a", "b"), 0.0)
+        assert passes is not relays
+        # What concerns others goes its way.
+        assert middle.on_datagram(genuine, Way("b", "c"), 0.0) == [Send(genuine, Way("b", "c"))]
+
+
+def test_sealed_cookies_open_and_change_nothing() -> None:
+    """A peer takes such a cookie, initiates with it, and is answered as without."""
+    victim = Victim()
+    victim.node.set_addresses("b", [FACE], 0.0)
+    cookies = SealedCookies({"b": B.public}, 0.0)
+    (sent,) = [each for each in victim.node.handle_timeout(0.0) if isinstance(each, Transmit)]
+    actions = [each for each in cookies.on_datagram(sent.datagram, Way("a", "b"), 0.0) if isinstance(each, Send)]
+    assert actions[0] == Send(sent.datagram, Way("a", "b"))
+    assert actions[1].way == Way("b", "a")
+    victim.node.receive(actions[1].datagram, FACE, 0.01)
+    assert victim.drops == set()
+    (again,) = [each for each in victim.node.handle_timeout(1.0) if isinstance(each, Transmit)]
+    assert again.datagram[-16:] != bytes(16)
+    other = Node(Secret(b"\2" * 32), os.urandom, 0.0)
+    other.add_peer(PeerSettings("a", A.public, Secret(PSK)), 0.0)
+    assert [type(each) for each in other.receive(again.datagram, FACE, 1.0)] == [Transmit]

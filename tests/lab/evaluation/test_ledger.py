@@ -1,0 +1,95 @@
+"""The books: every frame that may not come out is seen, and of what kind it is."""
+
+from __future__ import annotations
+
+import pytest
+
+from uavlinkd.lab.evaluation.ledger import STALE_S, Fault, Ledger, numbered_frame
+from uavlinkd.mavlink.frames import SplitCounters, split_datagram
+
+
+@pytest.fixture
+def ledger() -> Ledger:
+    """Two drones; one frame of each has been sent."""
+    ledger = Ledger(("a", "b"))
+    ledger.next_frame("a", 1.0)
+    ledger.next_frame("b", 1.0)
+    return ledger
+
+
+def test_frames_are_genuine_and_all_different() -> None:
+    """Any MAVLink parser takes them, and no two are the same."""
+    frames = [numbered_frame(system, number) for system in (1, 2) for number in range(300)]
+    assert len(set(frames)) == 600
+    assert [frame.raw for frame in split_datagram(b"".join(frames), SplitCounters())] == frames
+
+
+def test_what_comes_as_sent_is_no_fault(ledger: Ledger) -> None:
+    """And counts as delivered."""
+    ledger.on_received("b", numbered_frame(1, 0), 1.5)
+    assert not ledger.faults
+    assert ledger.delivered_total() == 1
+    assert ledger.count({"a": 0, "b": 0}, ledger.mark()) == (2, 1)
+
+
+def test_what_comes_long_after_it_was_sent_is_stale(ledger: Ledger) -> None:
+    """As it was sent, and yet an attack that succeeded: somebody kept it."""
+    ledger.on_received("b", numbered_frame(1, 0), 1.0 + STALE_S)
+    assert not ledger.faults
+    ledger.on_received("a", numbered_frame(2, 0), 1.1 + STALE_S)
+    assert ledger.faults == {Fault.STALE: 1}
+
+
+@pytest.mark.parametrize(
+    ("receiver", "frame", "fault"),
+    [
+        ("b", numbered_frame(1, 1), Fault.FALSE),  # never sent
+        ("b", numbered_frame(7, 0), Fault.FALSE),  # nobody's
+        ("b", numbered_frame(1, 0)[:-3] + b"\x00\x00\x00", Fault.FALSE),
+        ("b", b"\xfd", Fault.FALSE),
+        ("b", b"", None),
+        ("a", numbered_frame(1, 0), Fault.REFLECTED),
+    ],
+)
+def test_what_may_not_come_out_is_a_fault(ledger: Ledger, receiver: str, frame: bytes, fault: Fault | None) -> None:
+    """Forged, altered, cut short, or one's own."""
+    ledger.on_received(receiver, frame, 1.5)
+    assert set(ledger.faults) == ({fault} if fault else set())
+    assert ledger.delivered_total() == 0
+
+
+def test_every_altered_byte_is_seen(ledger: Ledger) -> None:
+    """Wherever it is."""
+    frame = numbered_frame(1, 0)
+    for at in range(len(frame)):
+        before = ledger.faults.total()
+        ledger.on_received("b", frame[:at] + bytes((frame[at] ^ 1,)) + frame[at + 1 :], 1.5)
+        assert ledger.faults.total() > before
+    assert ledger.delivered_total() == 0
+
+
+def test_the_second_copy_is_a_replay(ledger: Ledger) -> None:
+    """The first is not."""
+    for _ in range(2):
+        ledger.on_received("b", numbered_frame(1, 0), 1.5)
+    assert dict(ledger.faults) == {Fault.REPLAYED: 1}
+
+
+def test_whom_it_was_not_for_gets_it_misrouted() -> None:
+    """A frame that is genuine, at a drone that should not have it."""
+    ledger = Ledger(("a", "b", "c"), {"a": {"b"}, "b": {"a"}, "c": set()})
+    ledger.next_frame("a", 1.0)
+    ledger.on_received("c", numbered_frame(1, 0), 1.5)
+    assert dict(ledger.faults) == {Fault.MISROUTED: 1}
+
+
+def test_recovery_counts_frames_sent_after_the_moment_alone(ledger: Ledger) -> None:
+    """And waits for every direction."""
+    ledger.await_recovery(2.0)
+    ledger.on_received("b", numbered_frame(1, 0), 2.5)
+    ledger.next_frame("a", 3.0)
+    ledger.next_frame("b", 3.0)
+    ledger.on_received("b", numbered_frame(1, 1), 3.25)
+    assert ledger.recovery_s is None
+    ledger.on_received("a", numbered_frame(2, 1), 3.5)
+    assert ledger.recovery_s == 1.5

@@ -1,0 +1,150 @@
+"""``uavlinkd evaluate tampering --quick``: every attack against real daemons and against the paper's protocol."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from uavlinkd.lab.evaluation import tampering_plan as plans
+from uavlinkd.lab.evaluation.paper_attacks import CHANGES
+from uavlinkd.lab.evaluation.tampering_bench import Settings
+from uavlinkd.lab.evaluation.tampering_plan import HANDSHAKE, Plan
+from uavlinkd.lab.evaluation.tampering_records import OURS, PAPER, RECOVERY_LIMIT_S, RELAY, Verdict, read_run
+from uavlinkd.lab.mitm.attack import Surroundings
+from uavlinkd.lab.mitm.attacks import ATTACKS, parse_attack
+
+ALL_PLANS: tuple[Plan, ...] = (
+    *plans.HANDSHAKE_PLANS,
+    *plans.STALE_PLANS,
+    *plans.DATA_PLANS,
+    *plans.FLOOD_PLANS,
+    *plans.TRAFFIC_PLANS,
+    *plans.LONG_PLANS,
+    *plans.LAST_PLANS,
+    *plans.MISROUTE_PLANS,
+)
+LIMIT_S = 500.0
+"""A machine that does much else at the same time takes longer."""
+
+
+def test_every_attack_of_the_registry_is_tried_also_in_a_quick_run() -> None:
+    """None is forgotten when one is added."""
+    tried = {
+        spec.partition(",")[0]
+        for plan in ALL_PLANS
+        if not plan.is_variant
+        for text in plan.phases
+        for spec in text.split()
+    }
+    assert tried == set(ATTACKS)
+
+
+@pytest.mark.parametrize("plan", ALL_PLANS, ids=lambda plan: plan.attack)
+def test_plans_can_be_made(plan: Plan) -> None:
+    """Each line is understood by the man in the middle, and fits into a request to it."""
+    around = Surroundings.between(
+        "drone0", "drone1", "drone2", public_keys=dict.fromkeys(("drone0", "drone1", "drone2"), bytes(32))
+    )
+    texts = [*plan.phases, *([plan.paper] if plan.paper and plan.paper not in CHANGES else [])]
+    for text in texts:
+        told = plans.with_target(text, 10_000)
+        assert len(f"attack {told}") < 200
+        for spec in told.split():
+            parse_attack(spec).make(around)
+    assert not [name for name in plan.names if name not in ATTACKS]
+
+
+def test_a_full_run_asks_for_as_many_attempts_as_promised() -> None:
+    """10,000 of each attack on data, 200 of each on the handshake; a tenth of it on the paper's protocol."""
+    settings = Settings()
+    assert (settings.target("data", OURS), settings.target("flood", OURS)) == (10_000, 10_000)
+    assert (settings.target(HANDSHAKE, OURS), settings.target("keys", OURS)) == (200, 200)
+    assert settings.target("data", PAPER) == 1000
+
+
+@pytest.mark.long
+async def test_quick_run(tmp_path: Path) -> None:
+    """Nothing succeeds against the daemons, every attack reaches the wire, the relay succeeds against the paper's."""
+    begin = time.monotonic()
+    process = await asyncio.create_subprocess_exec(
+        *(
+            sys.executable,
+            "-m",
+            "uavlinkd",
+            "evaluate",
+            "tampering",
+            "--quick",
+            "--seed",
+            "3",
+            "--out",
+            str(tmp_path),
+        ),
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.PIPE,
+    )
+    try:
+        out, err = await asyncio.wait_for(process.communicate(), LIMIT_S)
+    finally:
+        if process.returncode is None:
+            process.terminate()
+            await process.wait()
+    print(out.decode(), f"{time.monotonic() - begin:.1f} s")
+    assert (process.returncode, err.decode()) == (0, "")
+
+    run = read_run(tmp_path / "tampering.jsonl")
+    ours, paper = run.of(OURS), run.of(PAPER)
+    chosen = [plan for plan in ALL_PLANS if not plan.is_variant]
+    assert {trial.attack for trial in ours} >= {plan.attack for plan in chosen}
+    assert len({trial.attack for trial in ours if trial.group == "keys"}) == 7
+    for trial in ours:
+        assert trial.verdict is Verdict.DETECTED, trial
+        assert trial.attempts > 0
+        assert not trial.faults
+        assert trial.recovery_s is not None
+        assert trial.recovery_s <= RECOVERY_LIMIT_S
+    assert {trial.attack for trial in paper} >= {RELAY, *(plan.attack for plan in chosen if plan.paper)}
+    relay = next(trial for trial in paper if trial.attack == RELAY)
+    assert relay.faults["forged or altered"] > 0
+    assert relay.sessions >= 2
+    assert {trial.attack for trial in paper if trial.verdict is Verdict.SUCCEEDED} >= {
+        RELAY,
+        "replay-data",
+        "reflect",
+    }
+    by_name = {trial.attack: trial for trial in (*ours,)}
+    for name, reason in (
+        ("tamper-key", "bad_handshake"),
+        ("invalid-element", "invalid_key_share"),
+        ("bit-flip", "bad_tag"),
+        ("replay-data", "replayed"),
+        ("raw-mavlink", "raw_mavlink"),
+        (RELAY, "unknown_peer"),
+        ("hold", "delayed"),
+        ("reorder", "envelopes_out_of_order"),
+        ("roam, then gone", "challenges_unanswered"),
+        ("drop-heartbeats", "envelopes_missing"),
+        ("blackout, 1 s", "envelopes_missing"),
+        ("block-rekey", "handshakes_unanswered"),
+        ("sealed-cookies", "cookies_taken"),
+        ("captured drone, as itself", "refused_foreign_system"),
+        ("captured member", "refused_hidden_frame"),
+    ):
+        assert by_name[name].reasons[reason] > 0
+    (flood,) = run.floods
+    assert flood.initiations > 100
+    assert min(flood.delivered_hz[1:]) > 0
+
+    html = (tmp_path / "tampering.html").read_text()
+    assert html.count("data:image/svg+xml;base64,") == 3
+    assert all(trial.attack in html for trial in ours)
+    for log in ("uavlinkd-drone0.log", "uavlinkd-drone1.log", "paper-drone0.log", "paper-drone1.log"):
+        text = (tmp_path / log).read_text()
+        assert "attack begins: tamper-key" in text
+        assert "bad_handshake" in text or "hmac_mismatch" in text
+    interventions = [json.loads(line) for line in (tmp_path / "mitm-data.jsonl").read_text().splitlines()]
+    assert any(line["event"] == "intervention" and line["attack"] == "bit-flip" for line in interventions)

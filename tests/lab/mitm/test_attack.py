@@ -1,0 +1,129 @@
+"""What all attacks share: when they are on, which way, how often, and that they follow from their seed."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.lab.mitm.samples import AB, BA, converse, notes, play, sends
+from uavlinkd.lab.mitm.attack import NEVER, SHOTS_AT_ONCE, AttackError, Send, Surroundings, What
+from uavlinkd.lab.mitm.attacks import ATTACKS, parse_attack
+
+CONVERSATION = converse()
+AMONG_THREE = Surroundings.between("a", "b", "c", public_keys={name: bytes([9]) + bytes(31) for name in "abc"})
+
+
+@pytest.mark.parametrize("name", ATTACKS)
+def test_same_seed_gives_the_same_actions(name: str) -> None:
+    """Twice the same attack against the same datagrams does the same, to the byte and to the moment."""
+    runs = [play(parse_attack(name).make(AMONG_THREE, 7), CONVERSATION.said) for _ in range(2)]
+    assert runs[0] == runs[1]
+
+
+@pytest.mark.parametrize("text", ["bit-flip,share=0.5", "replay-data,origin=stranger", "flood-garbage", "forge-data"])
+def test_another_seed_gives_another_attack(text: str) -> None:
+    """Where chance plays a part, it follows from the seed."""
+    one, other = (play(parse_attack(text).make(AMONG_THREE, seed), CONVERSATION.said) for seed in (1, 2))
+    assert one != other
+
+
+@pytest.mark.parametrize("name", ATTACKS)
+def test_attack_that_has_ended_lets_everything_pass(name: str) -> None:
+    """After its seconds the datagrams go on as they came, and nothing is sent beside them."""
+    attack = parse_attack(f"{name},seconds=0.001,begin_s=0").make(AMONG_THREE, 1)
+    attack.due(0.0)
+    for datagram, way in CONVERSATION.said:
+        assert attack.on_datagram(datagram, way, 10.0) == [Send(datagram, way)]
+    assert not sends(attack.due(10.0))
+    assert attack.next_deadline() == NEVER
+
+
+@pytest.mark.parametrize("name", ATTACKS)
+def test_attack_that_has_not_begun_lets_everything_pass(name: str) -> None:
+    """Before begin_s it only watches."""
+    attack = parse_attack(f"{name},begin_s=100").make(AMONG_THREE, 1)
+    for datagram, way in CONVERSATION.said:
+        assert attack.on_datagram(datagram, way, 1.0) == [Send(datagram, way)]
+    assert attack.due(1.0) == []
+    assert attack.strikes == 0
+
+
+def test_way_leaves_the_other_direction_alone() -> None:
+    """One direction is attacked, the other passes untouched."""
+    attack = parse_attack("drop,way=b>a").make(CONVERSATION.surroundings)
+    passed = [(each.datagram, each.way) for each in sends(play(attack, CONVERSATION.said))]
+    assert passed == [each for each in CONVERSATION.said if each[1] == AB]
+
+
+def test_way_that_is_not_there_is_refused() -> None:
+    """The message names those that are."""
+    with pytest.raises(AttackError, match="a>b, b>a"):
+        parse_attack("drop,way=a>c").make(CONVERSATION.surroundings)
+
+
+def test_skip_and_limit_choose_exactly() -> None:
+    """skip=3,limit=2: the fourth and the fifth of those that could be attacked, no other."""
+    attack = parse_attack("drop,kinds=envelope,skip=3,limit=2").make(CONVERSATION.surroundings)
+    actions = play(attack, CONVERSATION.said)
+    passed = {each.datagram for each in sends(actions)}
+    envelopes = [datagram for datagram, _ in CONVERSATION.said if datagram[0] == 0x40]
+    assert [each for each in envelopes if each not in passed] == envelopes[3:5]
+    assert [each.number for each in notes(actions)] == [6, 7]  # behind the two messages of the handshake
+
+
+def test_share_attacks_that_share() -> None:
+    """Of 2,000 datagrams about a quarter, within five standard deviations."""
+    attack = parse_attack("drop,share=0.25").make(CONVERSATION.surroundings, 3)
+    for number in range(2000):
+        attack.on_datagram(b"\x40" + number.to_bytes(20, "big"), AB, 0.0)
+    assert abs(attack.strikes - 500) < 5 * math.sqrt(2000 * 0.25 * 0.75)
+
+
+def test_intervention_names_the_datagram() -> None:
+    """Number, kind, length and moment are those of what was attacked."""
+    attack = parse_attack("tamper-key,message=response").make(CONVERSATION.surroundings)
+    (told,) = notes(play(attack, CONVERSATION.said))
+    assert (told.attack, told.what, told.way, told.number, told.kind, told.length, told.at) == (
+        "tamper-key",
+        What.ALTERED,
+        BA,
+        2,
+        "response",
+        103,
+        0.01,
+    )
+    assert told.to_dict()["way"] == "b>a"
+
+
+def test_flood_keeps_its_rate_and_makes_up_for_little() -> None:
+    """100 a second for a second are 100; after a pause of an hour no more than a handful comes at once."""
+    attack = parse_attack("raw-mavlink,rate_per_s=100,seconds=1").make(CONVERSATION.surroundings)
+    play(attack, [], after_s=2.0)
+    assert attack.strikes == 100
+    asleep = parse_attack("raw-mavlink,rate_per_s=100").make(CONVERSATION.surroundings)
+    assert len(sends(asleep.due(3600.0))) == SHOTS_AT_ONCE
+    assert len(sends(asleep.due(3600.0))) <= 1
+    assert asleep.next_deadline() == pytest.approx(3600.0, abs=0.011)
+
+
+@pytest.mark.parametrize("name", ATTACKS)
+@settings(max_examples=15, deadline=None)
+@given(data=st.data())
+def test_no_datagram_raises(name: str, data: st.DataObject) -> None:
+    """Whatever comes by or comes back, an attack goes on."""
+    attack = parse_attack(name).make(AMONG_THREE, 1)
+    starts = st.sampled_from([b"", b"\x01\x00", b"\x02\x00", b"\x03\x00", b"\x40", b"\x41", b"\xfd"])
+    ways = st.sampled_from(AMONG_THREE.ways)
+    now = 0.0
+    for _ in range(data.draw(st.integers(1, 12))):
+        datagram = data.draw(starts) + data.draw(
+            st.one_of(st.binary(max_size=64), st.just(bytes(145)), st.just(bytes(101)))
+        )
+        attack.on_datagram(datagram, data.draw(ways), now)
+        attack.on_answer(datagram, "b", data.draw(st.integers(0, 255)), now)
+        now += data.draw(st.floats(0, 1))
+        attack.due(now)
+        assert attack.next_deadline() >= 0

@@ -1,0 +1,328 @@
+"""The emulated radio: each impairment by itself, within exact bounds, and all of them together."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from itertools import pairwise
+from random import Random
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from uavlinkd.lab.mitm.radio import Bursts, Fate, Outage, Radio, RadioSettings
+
+N = 20_000
+
+
+def _numbered(count: int, size: int = 8) -> list[bytes]:
+    return [number.to_bytes(size, "big") for number in range(count)]
+
+
+def _play(radio: Radio, datagrams: list[bytes], interval_s: float = 0.01) -> list[tuple[float, bytes]]:
+    """Send one datagram each interval from 0 on, and take each out when it is due: (when, datagram)."""
+    arrivals: list[tuple[float, bytes]] = []
+
+    def drain(until: float) -> None:
+        while radio.next_deadline() <= until:
+            moment = radio.next_deadline()
+            arrivals.extend((moment, each) for each in radio.due(moment))
+
+    for number, datagram in enumerate(datagrams):
+        drain(number * interval_s)
+        radio.send(datagram, number * interval_s)
+    drain(1e12)
+    return arrivals
+
+
+def _is_accounted_for(radio: Radio) -> bool:
+    fates = radio.fates
+    ends = (
+        Fate.DELIVERED,
+        Fate.LOST,
+        Fate.LOST_IN_BURST,
+        Fate.LOST_IN_OUTAGE,
+        Fate.QUEUE_FULL,
+        Fate.TOO_MANY_IN_FLIGHT,
+    )
+    return fates[Fate.SENT] + fates[Fate.DUPLICATED] == sum(fates[end] for end in ends) + radio.in_flight
+
+
+def test_default_radio_changes_nothing() -> None:
+    """Without settings every datagram is due at once, unaltered and in order."""
+    radio = Radio(RadioSettings(), Random(1))
+    datagrams = _numbered(100)
+    assert _play(radio, datagrams) == [(number * 0.01, each) for number, each in enumerate(datagrams)]
+    assert radio.fates == {Fate.SENT: 100, Fate.DELIVERED: 100, Fate.HELD_BACK: 0}
+
+
+def test_nothing_is_due_before_its_time() -> None:
+    """A datagram comes out at its delivery time and not a moment before; then never again."""
+    radio = Radio(RadioSettings(delay_s=0.5), Random(1))
+    radio.send(b"a", 1.0)
+    assert radio.next_deadline() == 1.5
+    assert radio.due(math.nextafter(1.5, 0)) == []
+    assert radio.due(1.5) == [b"a"]
+    assert radio.due(2.0) == []
+    assert radio.next_deadline() == math.inf
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.01, 0.3, 0.6, 1.0])
+def test_independent_loss_has_its_share(loss: float) -> None:
+    """The share lost is the share asked for, within four standard deviations."""
+    radio = Radio(RadioSettings(loss=loss), Random(2))
+    arrivals = _play(radio, _numbered(N))
+    deviation = math.sqrt(loss * (1 - loss) / N)
+    assert abs(radio.fates[Fate.LOST] / N - loss) <= 4 * deviation
+    assert len(arrivals) == N - radio.fates[Fate.LOST]
+
+
+def test_independent_loss_has_no_memory() -> None:
+    """After a loss the next datagram is lost as often as after none."""
+    radio = Radio(RadioSettings(loss=0.3), Random(3))
+    arrived = {each for _, each in _play(radio, _numbered(N))}
+    is_lost = [each not in arrived for each in _numbered(N)]
+    after_loss = [later for earlier, later in pairwise(is_lost) if earlier]
+    assert abs(sum(after_loss) / len(after_loss) - 0.3) < 4 * math.sqrt(0.3 * 0.7 / len(after_loss))
+
+
+def test_bursts_have_their_length_and_share() -> None:
+    """Bursts last 1 / to_good datagrams in the mean, and swallow to_bad / (to_bad + to_good) of all."""
+    radio = Radio(RadioSettings(bursts=Bursts(to_bad=0.02, to_good=0.1)), Random(4))
+    arrived = {each for _, each in _play(radio, _numbered(N))}
+    lost = "".join(" " if each in arrived else "x" for each in _numbered(N)).split()
+    lengths = [len(burst) for burst in lost]
+    assert 9 < sum(lengths) / len(lengths) < 11
+    assert 0.14 < sum(lengths) / N < 0.19  # 1/6; the bursts are few, so it scatters more than single losses
+    assert radio.fates[Fate.LOST_IN_BURST] == sum(lengths)
+
+
+def test_losses_inside_and_outside_bursts_have_their_shares() -> None:
+    """Both states have a loss of their own."""
+    bursts = Bursts(to_bad=0.1, to_good=0.1, loss_in_bad=0.8, loss_in_good=0.1)
+    radio = Radio(RadioSettings(bursts=bursts), Random(5))
+    _play(radio, _numbered(N))
+    assert abs(radio.fates[Fate.LOST_IN_BURST] / N - 0.45) < 0.02
+
+
+def test_delay_is_exact_and_jitter_even() -> None:
+    """Each datagram takes the delay and up to the jitter more, in the mean half of it."""
+    radio = Radio(RadioSettings(delay_s=0.2, jitter_s=0.1), Random(6))
+    took = {each: moment for moment, each in _play(radio, _numbered(N))}
+    times = [took[each] - number * 0.01 for number, each in enumerate(_numbered(N))]
+    assert len(times) == N
+    assert min(times) >= 0.2 - 1e-9
+    assert max(times) <= 0.3 + 1e-9
+    assert abs(sum(times) / N - 0.25) < 4 * (0.1 / math.sqrt(12)) / math.sqrt(N)
+    quarters = Counter(int((each - 0.2) / 0.025) for each in times)
+    assert all(abs(quarters[quarter] - N / 4) < 4 * math.sqrt(N * 3 / 16) for quarter in range(4))
+
+
+@pytest.mark.parametrize("keeps_order", [False, True])
+def test_jitter_lets_datagrams_overtake_unless_order_is_kept(keeps_order: bool) -> None:
+    """Jitter longer than the interval reorders; as a queue it does not."""
+    radio = Radio(RadioSettings(jitter_s=0.1, keeps_order=keeps_order), Random(7))
+    order = [each for _, each in _play(radio, _numbered(1000))]
+    assert sorted(order) == _numbered(1000)
+    assert (order == _numbered(1000)) is keeps_order
+
+
+def test_reordering_holds_its_share_back() -> None:
+    """The share asked for comes later by the time asked for, and nothing else does."""
+    settings = RadioSettings(delay_s=0.1, keeps_order=True, reordering=0.05, held_back_s=0.035)
+    radio = Radio(settings, Random(8))
+    arrivals = _play(radio, _numbered(N))
+    took = Counter(round(moment - int.from_bytes(each, "big") * 0.01, 6) for moment, each in arrivals)
+    assert set(took) == {0.1, 0.135}
+    assert took[0.135] == radio.fates[Fate.HELD_BACK]
+    assert abs(took[0.135] / N - 0.05) < 4 * math.sqrt(0.05 * 0.95 / N)
+    assert [each for _, each in arrivals] != _numbered(N)
+
+
+def test_duplication_makes_its_share_of_copies() -> None:
+    """The share asked for arrives twice, nothing three times, and copies have a jitter of their own."""
+    radio = Radio(RadioSettings(duplication=0.2, jitter_s=0.05), Random(9))
+    arrivals = _play(radio, _numbered(N))
+    times = Counter(each for _, each in arrivals)
+    twice = sum(1 for count in times.values() if count == 2)
+    assert max(times.values()) == 2
+    assert twice == radio.fates[Fate.DUPLICATED]
+    assert abs(twice / N - 0.2) < 4 * math.sqrt(0.16 / N)
+    assert len(set(arrivals)) == len(arrivals)
+
+
+def test_bandwidth_spaces_datagrams_and_the_queue_drops_its_tail() -> None:
+    """A datagram takes its bits' time; what finds no room in the queue is dropped, what was queued is not."""
+    settings = RadioSettings(bits_per_s=8000, overhead_bytes=28, queue_bytes=300, delay_s=0.5)
+    radio = Radio(settings, Random(10))
+    for datagram in _numbered(5, size=72):  # 100 bytes with overhead: 0.1 s each
+        radio.send(datagram, 0.0)
+    moments = []
+    while radio.in_flight:
+        moments.append(round(radio.next_deadline(), 9))
+        radio.due(radio.next_deadline())
+    assert moments == [0.6, 0.7, 0.8]
+    assert radio.fates[Fate.QUEUE_FULL] == 2
+    radio.send(b"later", 0.31)
+    assert radio.next_deadline() == pytest.approx(0.31 + 0.033 + 0.5)
+
+
+def test_room_in_the_queue_to_the_byte() -> None:
+    """A datagram that fills the queue to its last byte is taken, one byte more is not."""
+    for size, fits in ((172, True), (173, False)):
+        radio = Radio(RadioSettings(bits_per_s=8000, queue_bytes=300), Random(11))
+        radio.send(bytes(72), 0.0)
+        radio.send(bytes(size), 0.0)
+        assert (radio.in_flight == 2) is fits
+
+
+def test_throughput_is_the_bandwidth() -> None:
+    """Offered twice what it carries, the link carries what it can, and the delay is that of a full queue."""
+    radio = Radio(RadioSettings(bits_per_s=80_000, queue_bytes=1000), Random(12))
+    arrivals = _play(radio, _numbered(2000, size=72), interval_s=0.005)
+    begun, ended = arrivals[0][0], arrivals[-1][0]
+    assert (len(arrivals) - 1) / (ended - begun) == pytest.approx(100, rel=0.01)
+    number = int.from_bytes(arrivals[-1][1], "big")
+    assert 0.08 < ended - number * 0.005 <= 0.1 + 1e-9
+
+
+@pytest.mark.parametrize(
+    ("moment", "is_carried"), [(0.99, True), (1.0, False), (2.99, False), (3.0, True), (11.5, True), (1e9, True)]
+)
+def test_outage_has_sharp_ends(moment: float, is_carried: bool) -> None:
+    """The link is down from the first moment of an outage to just before its end, and once only."""
+    radio = Radio(RadioSettings(outages=(Outage(1, 3),)), Random(13))
+    radio.send(b"a", moment)
+    assert (radio.in_flight == 1) is is_carried
+    assert radio.fates[Fate.LOST_IN_OUTAGE] == (not is_carried)
+
+
+@pytest.mark.parametrize(
+    ("moment", "is_carried"), [(0.5, True), (1.5, False), (3.0, True), (10.9, True), (11.0, False), (12.9, False)]
+)
+def test_outage_comes_again(moment: float, is_carried: bool) -> None:
+    """With a period the outage returns, counted from when the radio was made."""
+    radio = Radio(RadioSettings(outages=(Outage(1, 3, every_s=10),)), Random(14), now=1000.0)
+    radio.send(b"a", 1000.0 + moment + 70)
+    assert (radio.in_flight == 1) is is_carried
+
+
+def test_outage_takes_what_is_on_the_air_and_leaves_what_has_left() -> None:
+    """A datagram is lost when any part of its sending falls into an outage; one that was sent before arrives."""
+    settings = RadioSettings(bits_per_s=8000, overhead_bytes=0, outages=(Outage(0.95, 2),), delay_s=1.0)
+    radio = Radio(settings, Random(15))
+    for _ in range(11):
+        radio.send(bytes(100), 0.0)  # 0.1 s each, one behind the other
+    assert radio.fates[Fate.LOST_IN_OUTAGE] == 2
+    assert len(radio.due(3.0)) == 9
+
+
+def test_in_flight_is_bounded() -> None:
+    """A radio never holds more datagrams than its limit, however long its delay."""
+    radio = Radio(RadioSettings(delay_s=3600, duplication=1.0, in_flight_limit=100), Random(16))
+    for datagram in _numbered(1000):
+        radio.send(datagram, 0.0)
+        assert radio.in_flight <= 100
+    assert radio.fates[Fate.TOO_MANY_IN_FLIGHT] == 1900
+    assert _is_accounted_for(radio)
+
+
+def test_same_seed_gives_the_same_and_another_seed_something_else() -> None:
+    """All that a radio does follows from its settings, its generator and the calls."""
+    settings = RadioSettings(
+        loss=0.1, bursts=Bursts(0.05, 0.3), duplication=0.1, jitter_s=0.05, reordering=0.1, bits_per_s=50_000
+    )
+    plays = [_play(Radio(settings, Random(seed)), _numbered(500)) for seed in (1, 1, 2)]
+    assert plays[0] == plays[1] != plays[2]
+
+
+def test_changing_one_setting_leaves_the_luck_of_the_others() -> None:
+    """The same datagrams are lost whether or not there is a jitter, duplication or burst beside."""
+    losses = []
+    for more in ({}, {"jitter_s": 0.5}, {"duplication": 0.5}, {"reordering": 0.5}):
+        radio = Radio(RadioSettings(loss=0.3, **more), Random(17))  # type: ignore[arg-type]
+        arrived = {each for _, each in _play(radio, _numbered(500))}
+        losses.append(set(_numbered(500)) - arrived)
+    assert len(losses[0]) > 100
+    assert all(each == losses[0] for each in losses)
+
+
+def test_settings_may_change_on_the_way() -> None:
+    """New settings count for what is sent from then on; what is on its way stays there."""
+    radio = Radio(RadioSettings(delay_s=1.0), Random(18))
+    radio.send(b"slow", 0.0)
+    radio.settings = RadioSettings()
+    radio.send(b"fast", 0.5)
+    assert radio.due(0.5) == [b"fast"]
+    assert radio.due(1.0) == [b"slow"]
+
+
+_SHARES = st.floats(0, 1)
+_TIMES = st.floats(0, 0.5)
+_BURSTS = st.none() | st.builds(Bursts, to_bad=_SHARES, to_good=_SHARES, loss_in_bad=_SHARES, loss_in_good=_SHARES)
+_SETTINGS = st.builds(
+    RadioSettings,
+    loss=_SHARES,
+    bursts=_BURSTS,
+    duplication=_SHARES,
+    delay_s=_TIMES,
+    jitter_s=_TIMES,
+    keeps_order=st.booleans(),
+    reordering=_SHARES,
+    held_back_s=_TIMES,
+    bits_per_s=st.none() | st.floats(1000, 1e6),
+    queue_bytes=st.integers(0, 2000),
+    outages=st.lists(st.builds(Outage, _TIMES, st.floats(0.6, 1), st.none() | st.floats(1, 2)), max_size=3).map(
+        tuple
+    ),
+    in_flight_limit=st.integers(1, 50),
+)
+
+
+@given(settings=_SETTINGS, seed=st.integers(0, 2**32), gaps=st.lists(st.floats(0, 0.2), max_size=60))
+def test_every_datagram_is_accounted_for(settings: RadioSettings, seed: int, gaps: list[float]) -> None:
+    """Whatever is combined: nothing is invented or altered, nothing is early, and every fate is counted."""
+    radio, now = Radio(settings, Random(seed)), 0.0
+    sent_at: dict[bytes, float] = {}
+    arrived: Counter[bytes] = Counter()
+    for number, gap in enumerate(gaps):
+        now += gap
+        datagram = number.to_bytes(4, "big")
+        sent_at[datagram] = now
+        radio.send(datagram, now)
+        for each in radio.due(now):
+            assert now >= sent_at[each] + settings.delay_s
+            arrived[each] += 1
+        assert radio.in_flight <= settings.in_flight_limit
+        assert radio.next_deadline() > now
+        assert _is_accounted_for(radio)
+    arrived.update(radio.due(math.inf))
+    assert set(arrived) <= set(sent_at)
+    assert all(count <= 2 for count in arrived.values())
+    assert radio.fates[Fate.DELIVERED] == arrived.total()
+    assert _is_accounted_for(radio)
+
+
+@pytest.mark.parametrize(
+    ("make", "named"),
+    [
+        (lambda: RadioSettings(loss=1.01), "loss"),
+        (lambda: RadioSettings(duplication=-0.1), "duplication"),
+        (lambda: RadioSettings(reordering=math.nan), "reordering"),
+        (lambda: RadioSettings(delay_s=-1), "delay_s"),
+        (lambda: RadioSettings(jitter_s=math.inf), "jitter_s"),
+        (lambda: RadioSettings(bits_per_s=0), "bits_per_s"),
+        (lambda: RadioSettings(queue_bytes=-1), "queue_bytes"),
+        (lambda: RadioSettings(in_flight_limit=0), "in_flight_limit"),
+        (lambda: Bursts(to_bad=2, to_good=0.1), "to_bad"),
+        (lambda: Outage(3, 3), "ends after it begins"),
+        (lambda: Outage(-1, 3), "ends after it begins"),
+        (lambda: Outage(1, 3, every_s=1.5), "over before the next"),
+    ],
+)
+def test_settings_that_no_radio_has_are_refused(make: object, named: str) -> None:
+    """A value outside its range is an error that names the setting."""
+    assert callable(make)
+    with pytest.raises(ValueError, match=named):
+        make()

@@ -1,0 +1,139 @@
+"""The simulator's own links: URLs, and real sockets on loopback."""
+
+from __future__ import annotations
+
+import asyncio
+import random
+import socket
+
+import pytest
+
+from tests.lab.sim.recorded import frames
+from uavlinkd.lab.sim.links import MAX_CORRESPONDENTS, Collector, LinkError, LinkURL, open_link, parse_url
+
+
+@pytest.mark.parametrize(
+    ("text", "url"),
+    [
+        ("udpin:127.0.0.1:14550", LinkURL("udpin", "127.0.0.1", 14550)),
+        ("udpin://127.0.0.1:14550", LinkURL("udpin", "127.0.0.1", 14550)),
+        ("udpout:drone.local:14550", LinkURL("udpout", "drone.local", 14550)),
+        ("udpin::14550", LinkURL("udpin", "0.0.0.0", 14550)),
+        ("udp://:14550", LinkURL("udpin", "0.0.0.0", 14550)),
+        ("udpin:127.0.0.1:0", LinkURL("udpin", "127.0.0.1", 0)),
+        ("tcp:10.0.0.1:5760", LinkURL("tcp", "10.0.0.1", 5760)),
+        ("tcpout://10.0.0.1:5760/", LinkURL("tcp", "10.0.0.1", 5760)),
+        ("tcpin:[::1]:5760", LinkURL("tcpin", "::1", 5760)),
+    ],
+)
+def test_a_url_is_read(text: str, url: LinkURL) -> None:
+    """Both spellings of every kind, and what is written back is read alike."""
+    assert parse_url(text) == url
+    assert parse_url(str(url)) == url
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "udpin",
+        "udpin:127.0.0.1",
+        "udpin:127.0.0.1:",
+        "udpin:127.0.0.1:x",
+        "udpin:127.0.0.1:65536",
+        "udpin:::1:14550",
+        "udpout::14550",
+        "udpout:127.0.0.1:0",
+        "tcp::5760",
+        "serial:/dev/ttyS0:57600",
+        "/dev/ttyACM0",
+    ],
+)
+def test_what_is_no_url_is_refused_in_one_line(text: str) -> None:
+    """The error quotes what was given, on one line."""
+    with pytest.raises(LinkError) as failure:
+        parse_url(text)
+    assert repr(text) in str(failure.value)
+    assert "\n" not in str(failure.value)
+
+
+@pytest.mark.parametrize(("listening", "calling"), [("udpin", "udpout"), ("tcpin", "tcp")])
+async def test_frames_go_both_ways_unchanged(listening: str, calling: str) -> None:
+    """What one end sends, the other collects byte for byte; a listener answers who called."""
+    sent, answers = frames(20), frames(20, system_id=255)
+    async with Collector(f"{listening}:127.0.0.1:0") as ground:
+        assert not ground.send(answers[0])
+        async with Collector(f"{calling}:127.0.0.1:{ground.address[1]}") as air:
+            for frame in sent:
+                assert air.send(frame)
+            await ground.until(lambda: len(ground.frames) == len(sent))
+            for frame in answers:
+                assert ground.send(frame)
+            await air.until(lambda: len(air.frames) == len(answers))
+            assert (ground.frames, air.frames) == (sent, answers)
+
+
+async def test_several_correspondents_hear_the_same() -> None:
+    """A listener sends to everyone who was heard."""
+    async with Collector("udpin:127.0.0.1:0") as ground:
+        url = f"udpout:127.0.0.1:{ground.address[1]}"
+        async with Collector(url) as one, Collector(url) as two:
+            one.send(frames(1)[0])
+            two.send(frames(1)[0])
+            await ground.until(lambda: ground.link.correspondents == 2)
+            ground.send(frames(2)[1])
+            await one.until(lambda: len(one.frames) == 1)
+            await two.until(lambda: len(two.frames) == 1)
+
+
+async def test_whoever_sends_no_mavlink_is_sent_none() -> None:
+    """Noise makes nobody a correspondent, and a flood of callers pushes out the oldest only."""
+    async with Collector("udpin:127.0.0.1:0") as ground:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+            stranger.sendto(random.Random(1).randbytes(400), ground.address)
+            await ground.until(lambda: ground.link.correspondents == 0)
+            callers = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(MAX_CORRESPONDENTS + 5)]
+            for caller in callers:
+                caller.sendto(frames(1)[0], ground.address)
+            await ground.until(lambda: len(ground.frames) == len(callers))
+            assert ground.link.correspondents == MAX_CORRESPONDENTS
+            assert ground.link.split.garbage_bytes == 400
+            for caller in callers:
+                caller.close()
+
+
+async def test_an_address_in_use_is_told_in_one_line() -> None:
+    """The error names the URL."""
+    async with Collector("udpin:127.0.0.1:0") as ground:
+        with pytest.raises(LinkError, match=f"udpin:127.0.0.1:{ground.address[1]}: "):
+            await open_link(ground.url, lambda _frame: None)
+
+
+async def test_nobody_listening_is_no_error_on_udp_and_one_on_tcp() -> None:
+    """A datagram may be sent before the other end is up; a connection cannot."""
+    with socket.socket() as bound:
+        bound.bind(("127.0.0.1", 0))
+        port = bound.getsockname()[1]
+        async with Collector(f"udpout:127.0.0.1:{port}") as air:
+            assert air.send(frames(1)[0])
+            await asyncio.wait_for(air.link.refused.wait(), 5)
+            assert air.send(frames(1)[0])
+        with pytest.raises(LinkError, match=r"tcp:127\.0\.0\.1"):
+            await open_link(f"tcp:127.0.0.1:{port}", lambda _frame: None)
+
+
+async def test_a_closed_connection_is_noticed() -> None:
+    """The calling end of TCP learns that the other has gone."""
+    async with Collector("tcpin:127.0.0.1:0") as ground:
+        air = await open_link(f"tcp:127.0.0.1:{ground.address[1]}", lambda _frame: None)
+        air.send(frames(1)[0])
+        await ground.until(lambda: len(ground.frames) == 1)
+    await asyncio.wait_for(air.lost.wait(), 5)
+    await air.close()
+
+
+async def test_waiting_for_what_does_not_come_ends() -> None:
+    """A condition that never holds is a TimeoutError after its time."""
+    async with Collector("udpin:127.0.0.1:0") as ground:
+        with pytest.raises(TimeoutError):
+            await ground.until(lambda: bool(ground.frames), timeout_s=0.01)

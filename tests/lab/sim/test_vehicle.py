@@ -1,0 +1,130 @@
+"""How the simulated copter moves: where it ends, how fast it gets there, what it never does."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from uavlinkd.lab.sim.vehicle import MAX_CATCH_UP_S, Axes, Landed, Mode, Place, Vehicle
+
+HOME = Place(47.4, 8.5, 488.0)
+
+
+def in_the_air(altitude_m: float = 10.0) -> Vehicle:
+    """A copter that hovers."""
+    vehicle = Vehicle(HOME, mode=Mode.GUIDED)
+    vehicle.arm()
+    vehicle.take_off(altitude_m)
+    for _ in range(200):
+        vehicle.step(0.1)
+    assert vehicle.landed is Landed.IN_AIR
+    return vehicle
+
+
+@settings(deadline=None, max_examples=30)  # each example is a flight of minutes
+@given(
+    north=st.floats(-300, 300),
+    east=st.floats(-300, 300),
+    up=st.floats(0.5, 50),
+    step_s=st.sampled_from([0.05, 0.1, 1.0]),
+)
+def test_it_arrives_and_stays(north: float, east: float, up: float, step_s: float) -> None:
+    """Any target is reached without passing the speeds allowed, and held."""
+    vehicle = in_the_air()
+    vehicle.go_to(Axes(north, east, up))
+    # The slowest way there: along at 8 m/s and down at 1.5 m/s, with time to speed up, brake and settle.
+    needed_s = math.hypot(north, east) / 8 + abs(up - 10) / 1.5 + 20
+    for _ in range(int(needed_s / step_s) + 1):
+        vehicle.step(step_s)
+        assert vehicle.ground_speed_m_s <= vehicle.speeds.travel_m_s + 0.01
+        assert -vehicle.speeds.descend_m_s - 0.01 <= vehicle.velocity.up <= vehicle.speeds.climb_m_s + 0.01
+    assert vehicle.has_arrived(within_m=0.5)
+    assert vehicle.ground_speed_m_s < 0.5
+
+
+def test_it_does_not_move_unarmed() -> None:
+    """Without motors nothing lifts it, whatever the target."""
+    vehicle = Vehicle(HOME)
+    vehicle.go_to(Axes(100, 100, 100))
+    vehicle.step(5)
+    assert vehicle.position == Axes()
+
+
+def test_a_landing_ends_on_the_ground_with_the_motors_off() -> None:
+    """It touches down at the place it was above, never below the ground."""
+    vehicle = in_the_air()
+    vehicle.go_to(Axes(30, 0, 12))
+    for _ in range(200):
+        vehicle.step(0.1)
+    vehicle.set_mode(Mode.LAND)
+    for _ in range(200):
+        vehicle.step(0.1)
+        assert vehicle.altitude_m >= 0
+    assert (vehicle.landed, vehicle.armed) == (Landed.ON_GROUND, False)
+    at = vehicle.position
+    assert (at.north, at.east) == pytest.approx((30, 0), abs=0.5)
+    assert at.up == 0
+
+
+def test_a_return_climbs_first_and_lands_at_home() -> None:
+    """RTL goes up to its altitude, home, and down."""
+    vehicle = in_the_air(4)
+    vehicle.go_to(Axes(40, -20, 4))
+    for _ in range(200):
+        vehicle.step(0.1)
+    vehicle.set_mode(Mode.RTL)
+    highest = 0.0
+    for _ in range(600):
+        vehicle.step(0.1)
+        highest = max(highest, vehicle.altitude_m)
+    assert highest == pytest.approx(vehicle.return_altitude_m, abs=0.5)
+    assert (vehicle.landed, vehicle.armed) == (Landed.ON_GROUND, False)
+    assert math.hypot(vehicle.position.north, vehicle.position.east) < 1
+
+
+def test_a_change_of_mode_holds_the_position() -> None:
+    """On the way to a far target, LOITER stops where it is."""
+    vehicle = in_the_air()
+    vehicle.go_to(Axes(500, 0, 10))
+    vehicle.step(4)
+    at = vehicle.position.north
+    vehicle.set_mode(Mode.LOITER)
+    for _ in range(200):
+        vehicle.step(0.1)
+    assert vehicle.position.north == pytest.approx(at, abs=0.5)
+
+
+def test_a_long_pause_is_not_made_up_for() -> None:
+    """A process that was suspended for an hour goes on from there; so does a clock that went back."""
+    vehicle = in_the_air()
+    vehicle.go_to(Axes(100_000, 0, 10))
+    vehicle.step(3600)
+    assert vehicle.position.north <= vehicle.speeds.travel_m_s * MAX_CATCH_UP_S
+    before = vehicle.position.north
+    vehicle.step(-5)
+    assert vehicle.position.north == before
+
+
+@settings(deadline=None)
+@given(st.floats(-85, 85), st.floats(-180, 179.9), st.floats(-3000, 3000), st.floats(-3000, 3000))
+def test_a_place_and_its_point_belong_together(latitude: float, longitude: float, north: float, east: float) -> None:
+    """From metres to degrees and back is the same point, also over the 180th meridian."""
+    vehicle = Vehicle(Place(latitude, longitude, 100.0))
+    point = vehicle.point_of(vehicle.place_of(Axes(north, east, 25.0)))
+    assert (point.north, point.east, point.up) == pytest.approx((north, east, 25.0), abs=1e-3)
+
+
+def test_the_battery_drains_faster_in_flight_and_not_below_nothing() -> None:
+    """Hovering costs more than standing, and an empty battery stays at 0 percent."""
+    flying, standing = in_the_air(), Vehicle(HOME)
+    for vehicle in (flying, standing):
+        before = vehicle.used_mah
+        vehicle.step(5)
+        vehicle.used_mah -= before
+    assert flying.used_mah > 10 * standing.used_mah > 0
+    flying.used_mah = 5199.999
+    flying.step(5)
+    assert (flying.battery_percent, flying.battery_v) == (0, 14.0)

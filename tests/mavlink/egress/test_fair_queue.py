@@ -1,0 +1,278 @@
+"""What waits for one slow client: each source its share, urgent frames first, the newest state, all of it bounded."""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Callable
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pymavlink.dialects.v20 import all as mavlink
+
+from tests.mavlink.egress.test_egress import attitude, battery, command, frame, heartbeat, parameter
+from tests.policies import TRUSTED
+from uavlinkd.mavlink.policy.delivery import Source
+from uavlinkd.mavlink.egress.kinds import flow_key, kind_of
+from uavlinkd.mavlink.egress.lanes import EgressDrop
+from uavlinkd.mavlink.egress.fair_queue import (
+    LANE_BYTES,
+    MAX_SOURCES,
+    QUEUE_BYTES,
+    SUPERSEDED_S,
+    URGENT_LEAD_BYTES,
+    URGENT_PART,
+    FairQueue,
+)
+from uavlinkd.mavlink.frames import Frame
+from uavlinkd.mavlink.policy.compilation import compile_policy
+
+GATE = compile_policy(TRUSTED).incoming
+HONEST, CAPTURED = Source("honest", GATE), Source("captured", GATE)
+
+
+def make() -> tuple[FairQueue, Counter[EgressDrop]]:
+    dropped: Counter[EgressDrop] = Counter()
+
+    def on_drop(reason: EgressDrop) -> None:
+        dropped[reason] += 1
+
+    return FairQueue(1.0, on_drop), dropped
+
+
+def part(number: int, size: int = 239) -> Frame:
+    """A part of a file: an event of this size."""
+    return frame(
+        mavlink.MAVLink_file_transfer_protocol_message(0, 255, 1, [number % 256] * (size - 1) + [1] * (252 - size))
+    )
+
+
+def popped(queue: FairQueue, byte_count: float = 1e9, now: float = 0.0) -> list[tuple[Frame, Source]]:
+    """What leaves until so many bytes have gone."""
+    gone = []
+    while byte_count > 0 and (one := queue.pop(1e9, now)) is not None:
+        gone.append(one)
+        byte_count -= len(one[0].raw)
+    return gone
+
+
+def bytes_by_source(gone: list[tuple[Frame, Source]]) -> Counter[Source]:
+    sums: Counter[Source] = Counter()
+    for each, source in gone:
+        sums[source] += len(each.raw)
+    return sums
+
+
+def test_urgent_frames_of_all_sources_go_first() -> None:
+    """A command goes before what came earlier, from whichever source."""
+    queue, dropped = make()
+    queue.put([attitude(0), parameter(0)], CAPTURED, 0.0)
+    queue.put([attitude(1, 3), command(1), heartbeat(1, 255)], HONEST, 0.0)
+    first = popped(queue)[:2]
+    assert first == [(command(1), HONEST), (heartbeat(1, 255), HONEST)]
+    assert not dropped
+
+
+def test_frame_that_does_not_fit_stays() -> None:
+    """The frame whose turn it is goes next, or none does."""
+    queue, _ = make()
+    queue.put([parameter(0)], HONEST, 0.0)
+    size = len(parameter(0).raw)
+    assert queue.next_bytes(0.0) == size
+    assert queue.pop(size - 1, 0.0) is None
+    assert queue.pop(size, 0.0) == (parameter(0), HONEST)
+    assert (queue.next_bytes(0.0), queue.count, queue.size) == (0, 0, 0)
+
+
+@pytest.mark.parametrize(
+    "flood", [lambda n: attitude(n, n % 200 + 1), lambda n: battery(n, n % 250), parameter, part]
+)
+def test_sources_share_by_bytes(flood: Callable[[int], Frame]) -> None:
+    """Half of the bytes each, however large the frames are, and however many flows one of the sources invents."""
+    queue, _ = make()
+    queue.put([flood(number) for number in range(400)], CAPTURED, 0.0)
+    queue.put([parameter(number) for number in range(400)], HONEST, 0.0)
+    sums = bytes_by_source(popped(queue, 8000))
+    assert abs(sums[HONEST] - sums[CAPTURED]) <= 300
+
+
+def test_flood_of_urgent_frames_shares_with_urgent_frames() -> None:
+    """Heartbeats of invented components take turns with the commands of another source."""
+    queue, _ = make()
+    queue.put([heartbeat(number, 2, number % 250 + 1) for number in range(500)], CAPTURED, 0.0)
+    queue.put([command(number) for number in range(50)], HONEST, 0.0)
+    sums = bytes_by_source(popped(queue, 2000))
+    assert abs(sums[HONEST] - sums[CAPTURED]) <= 100
+
+
+def test_flood_of_urgent_frames_leaves_a_part_to_the_rest() -> None:
+    """A mission upload or a position of another source goes on during a flood of heartbeats."""
+    queue, _ = make()
+    queue.put([heartbeat(number, 2, number % 250 + 1) for number in range(2000)], CAPTURED, 0.0)
+    queue.put([parameter(number) for number in range(100)], HONEST, 0.0)
+    sums = bytes_by_source(popped(queue, 8000))
+    assert sums[HONEST] == pytest.approx((8000 - URGENT_LEAD_BYTES) / (URGENT_PART + 1), abs=100)
+
+
+def test_burst_of_commands_is_not_interrupted() -> None:
+    """The rest gets its part only after the urgent frames' head start."""
+    queue, _ = make()
+    queue.put([parameter(number) for number in range(100)], HONEST, 0.0)
+    commands = [command(number) for number in range(URGENT_LEAD_BYTES // len(command(0).raw))]
+    queue.put(commands, CAPTURED, 0.0)
+    assert [each for each, _ in popped(queue)[: len(commands)]] == commands
+
+
+def test_source_that_was_idle_has_saved_nothing_up() -> None:
+    """After a pause a source gets its share, not what it did not ask for before."""
+    queue, _ = make()
+    queue.put([parameter(number) for number in range(500)], CAPTURED, 0.0)
+    popped(queue, 8000)
+    queue.put([parameter(number) for number in range(200)], HONEST, 0.0)
+    sums = bytes_by_source(popped(queue, 4000))
+    assert abs(sums[HONEST] - sums[CAPTURED]) <= 100
+
+
+def test_source_that_empties_its_queue_again_and_again_gains_nothing() -> None:
+    """A source with one frame at a time pays for each: it does not rejoin in front."""
+    queue, _ = make()
+    queue.put([parameter(number) for number in range(400)], HONEST, 0.0)
+    sums: Counter[Source] = Counter()
+    for number in range(100):
+        if CAPTURED not in waiting_sources(queue):
+            queue.put([part(number)], CAPTURED, 0.0)
+        sums += bytes_by_source(popped(queue, 1))
+    assert abs(sums[HONEST] - sums[CAPTURED]) <= 300
+
+
+def test_source_that_left_the_line_pays_for_what_it_was_sent() -> None:
+    """A stream that waits for room looks whose turn it is: an idle source leaves the line, and keeps its debt."""
+    queue, _ = make()
+    queue.put([part(number) for number in range(40)], HONEST, 0.0)
+    sums: Counter[Source] = Counter()
+    for number in range(200):
+        queue.next_bytes(0.0)
+        if CAPTURED not in waiting_sources(queue):
+            queue.put([parameter(number)], CAPTURED, 0.0)
+        sums += bytes_by_source(popped(queue, 1))
+    assert abs(sums[HONEST] - sums[CAPTURED]) <= 300
+
+
+def waiting_sources(queue: FairQueue) -> set[Source]:
+    return {source for source, each in queue._sources.items() if each.lanes.count}
+
+
+def test_newest_state_wins() -> None:
+    """A state that has waited is replaced by a newer one, which keeps its turn; other flows are not touched."""
+    queue, dropped = make()
+    queue.put([attitude(0), attitude(0, 3), command(0)], HONEST, 0.0)
+    queue.put([attitude(1)], HONEST, SUPERSEDED_S + 0.01)
+    queue.put([attitude(2)], HONEST, SUPERSEDED_S + 0.02)
+    gone = popped(queue, now=SUPERSEDED_S + 0.02)
+    assert [each for each, _ in gone] == [command(0), attitude(1), attitude(0, 3), attitude(2)]
+    assert dropped == {EgressDrop.THINNED: 1}
+
+
+def test_states_that_came_together_are_not_thinned() -> None:
+    """One envelope may carry several of a flow: they go where there is room for all."""
+    queue, dropped = make()
+    queue.put([attitude(number) for number in range(5)], HONEST, 0.0)
+    assert [each for each, _ in popped(queue)] == [attitude(number) for number in range(5)]
+    assert not dropped
+
+
+def test_flood_drops_its_own_oldest_frames() -> None:
+    """A source that floods loses its oldest; what another source has waiting stays, to the last frame."""
+    queue, dropped = make()
+    honest = [parameter(number) for number in range(50)]
+    queue.put(honest, HONEST, 0.0)
+    flood = [attitude(number, number % 250 + 1) for number in range(5000)]
+    queue.put(flood, CAPTURED, 0.0)
+    assert queue.size <= LANE_BYTES + sum(len(each.raw) for each in honest)
+    gone = popped(queue)
+    assert [each for each, source in gone if source is HONEST] == honest
+    left = [each for each, source in gone if source is CAPTURED]
+    assert sorted(map(flood.index, left)) == list(range(5000 - len(left), 5000))
+    assert dropped == {EgressDrop.OVERFLOW: 5000 - len(left)}
+
+
+def test_queue_is_bounded_over_all_sources() -> None:
+    """Many sources that flood together are bounded too, and the one that asks for little loses nothing."""
+    queue, _ = make()
+    honest = [parameter(number) for number in range(50)]
+    queue.put(honest, HONEST, 0.0)
+    for each in range(10):
+        flooding = Source(f"captured{each}", GATE)
+        for lane in (lambda n: heartbeat(n, 2, n % 250 + 1), part, lambda n: attitude(n, n % 250 + 1)):
+            queue.put([lane(number) for number in range(1500)], flooding, 0.0)
+            assert queue.size <= QUEUE_BYTES
+    assert [each for each, source in popped(queue) if source is HONEST] == honest
+
+
+def test_stale_frames_are_dropped_when_their_turn_comes() -> None:
+    """They are counted as stale, not as overflow, and take no turn."""
+    queue, dropped = make()
+    queue.put([part(number) for number in range(100)], CAPTURED, 0.0)
+    queue.put([part(number) for number in range(100)], CAPTURED, 1.5)
+    assert dropped == {EgressDrop.STALE: 100}
+    queue.put([parameter(0)], HONEST, 2.6)
+    assert queue.pop(1e9, 2.6) == (parameter(0), HONEST)
+    assert queue.next_bytes(2.6) == 0
+    assert dropped == {EgressDrop.STALE: 200}
+
+
+def test_sources_that_are_gone_are_forgotten() -> None:
+    """Clients of a listening endpoint come and go, each a source."""
+    queue, _ = make()
+    for number in range(5 * MAX_SOURCES):
+        queue.put([heartbeat(number), attitude(number)], Source(str(number), GATE), 0.0)
+        assert len(popped(queue)) == 2
+    assert len(queue._sources) <= 2 * MAX_SOURCES
+
+
+SOURCES = [HONEST, CAPTURED, Source("third", GATE)]
+FRAMES: list[Callable[[int], Frame]] = [
+    lambda n: attitude(n, n % 3 + 1),
+    lambda n: heartbeat(n, 1, n % 4 + 1),
+    lambda n: command(n, 255 - n % 2),
+    lambda n: battery(n, n % 5),
+    parameter,
+    part,
+]
+STEPS = st.lists(
+    st.tuples(st.just("put"), st.integers(0, 2), st.integers(0, 5), st.integers(1, 40))
+    | st.tuples(st.just("pop"), st.just(0), st.just(0), st.integers(1, 60))
+    | st.tuples(st.just("wait"), st.just(0), st.just(0), st.sampled_from([1, 50, 150, 600, 1200])),
+    max_size=40,
+)
+
+
+@given(STEPS)
+def test_each_frame_leaves_once_and_flows_keep_their_order(steps: list[tuple[str, int, int, int]]) -> None:
+    """Whatever comes and goes: popped, dropped and waiting frames are all there are, and no flow is reordered."""
+    queue, dropped = make()
+    now, put_count = 0.0, 0
+    put_order: dict[int, int] = {}
+    gone: list[tuple[Frame, Source]] = []
+    kept: list[Frame] = []  # so that no id is used twice
+    for step, which, kind, amount in steps:
+        if step == "put":
+            frames = [FRAMES[kind](put_count + each) for each in range(amount)]
+            for each in frames:
+                put_order[id(each)] = len(put_order)
+            put_count += amount
+            queue.put(frames, SOURCES[which], now)
+            kept.extend(frames)
+        elif step == "pop":
+            gone += popped(queue, amount * 10, now)
+        else:
+            now += amount / 1000
+        assert put_count == len(gone) + dropped.total() + queue.count
+        assert queue.size == sum(each.lanes.size for each in queue._sources.values())
+    gone += popped(queue, now=now)
+    assert put_count == len(gone) + dropped.total()
+    last: dict[object, int] = defaultdict(lambda: -1)
+    for each, source in gone:
+        flow = (source, flow_key(each, kind_of(each)))
+        assert put_order[id(each)] > last[flow]
+        last[flow] = put_order[id(each)]

@@ -1,0 +1,189 @@
+"""Recording beside the frame path: what crossed the link, both ways, and nothing that holds the link up."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import json
+import shutil
+import sys
+import threading
+from asyncio.subprocess import PIPE
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+import structlog
+from pymavlink import mavutil
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from structlog.testing import capture_logs
+from structlog.typing import FilteringBoundLogger
+
+from tests.daemon.harness import frame, heartbeat, need
+from tests.waiting import until
+from uavlinkd.config import Recording
+from uavlinkd.ops.recorder import CLOCK_STEP_S, FROM_PEER, MAX_BUFFERED_BYTES, RETRY_S, TO_PEER, Recorder
+from uavlinkd.lab.sim.tlog import read_tlog
+from uavlinkd.ops.tlog_files import TlogFolder
+
+NOW_S = 1_700_000_000.0
+SETTINGS = Recording(Path("flights"), 1 << 20, 100, 0)
+
+
+def log() -> FilteringBoundLogger:
+    """A log that capture_logs sees."""
+    logger: FilteringBoundLogger = structlog.get_logger()
+    return logger
+
+
+def setup_signing() -> bytes:
+    """A frame with a secret."""
+    message = mavlink.MAVLink_setup_signing_message(1, 1, b"secret-secret-secret-secret-secr", 1)
+    return bytes(message.pack(mavlink.MAVLink(None, 1, 1)))
+
+
+def recorded(path: Path) -> list[list[tuple[int, bytes]]]:
+    """Times and frames, file by file."""
+    files = sorted((path / "flights").iterdir())
+    return [[(each.time_us, each.frame) for each in read_tlog(file).records] for file in files]
+
+
+async def test_pymavlink_reads_what_was_recorded(tmp_path: Path) -> None:
+    """Frames, times, and which way each went: its link number."""
+    recorder = Recorder(Recording(tmp_path / "flights", 1 << 20, 9, 0), log(), lambda: NOW_S)
+    recorder.add("drone1", [frame(1), frame(2)], FROM_PEER, 0.0)
+    recorder.add("drone1", [frame(3)], TO_PEER, 1.5)
+    recorder.stop(2.0)
+    (path,) = (tmp_path / "flights").iterdir()
+    reader = mavutil.mavlink_connection(str(path))
+    seen = [(each.value, each._link, each._timestamp) for each in iter(reader.recv_msg, None)]
+    reader.close()
+    assert [one[:2] for one in seen] == [(1, FROM_PEER), (2, FROM_PEER), (3, TO_PEER)]
+    assert [one[2] for one in seen] == pytest.approx([NOW_S, NOW_S, NOW_S + 1.5], abs=1e-5)
+
+
+async def test_tools_read_what_was_recorded(tmp_path: Path) -> None:
+    """mavlogdump prints it, with the reader that MAVProxy's MAVExplorer has too."""
+    tool = shutil.which("mavlogdump.py", path=str(Path(sys.executable).parent))
+    need(tool is not None, "mavlogdump.py, which pymavlink brings")
+    recorder = Recorder(Recording(tmp_path / "flights", 1 << 20, 9, 0), log(), lambda: NOW_S)
+    text = mavlink.MAVLink_statustext_message(6, b"found in the recording").pack(mavlink.MAVLink(None, 1, 1))
+    recorder.add("drone1", [heartbeat(), frame(1), bytes(text)], FROM_PEER, 0.0)
+    recorder.add("drone1", [heartbeat(2)], TO_PEER, 1.0)
+    recorder.stop(2.0)
+    (path,) = (tmp_path / "flights").iterdir()
+    done = await asyncio.create_subprocess_exec(sys.executable, str(tool), "--format=json", path, stdout=PIPE)
+    output, _ = await done.communicate()
+    seen = [json.loads(line) for line in output.splitlines()]
+    assert [each["meta"]["type"] for each in seen] == ["HEARTBEAT", "NAMED_VALUE_INT", "STATUSTEXT", "HEARTBEAT"]
+    assert seen[2]["data"]["text"] == "found in the recording"
+    assert [each["meta"]["timestamp"] - NOW_S for each in seen] == pytest.approx([0, 0, 0, 1], abs=1e-4)
+
+
+async def test_secrets_are_left_out(tmp_path: Path) -> None:
+    """SETUP_SIGNING is not recorded, and what is beside it is."""
+    recorder = Recorder(Recording(tmp_path / "flights", 1 << 20, 9, 0), log())
+    recorder.add("drone1", [frame(1), setup_signing(), frame(2)], FROM_PEER, 0.0)
+    recorder.add("drone1", [setup_signing()], TO_PEER, 0.0)
+    recorder.stop(0.0)
+    (path,) = (tmp_path / "flights").iterdir()
+    assert b"secret" not in path.read_bytes()
+    assert [each.frame for each in read_tlog(path).records] == [frame(1), frame(2)]
+
+
+async def test_what_came_is_written_at_housekeeping(tmp_path: Path) -> None:
+    """Once a second at most, and counted; nothing new, nothing written."""
+    recorder = Recorder(Recording(tmp_path / "flights", 1 << 20, 9, 0), log())
+    recorder.do_housekeeping(0.0)
+    assert not (tmp_path / "flights").exists()
+    recorder.add("drone1", [frame(1)], FROM_PEER, 0.5)
+    recorder.do_housekeeping(1.0)
+    await until(lambda: recorder.frames == 1)
+    assert (recorder.bytes, recorder.frames_lost, recorder.is_recording) == (8 + len(frame(1)), 0, True)
+    recorder.stop(2.0)
+
+
+async def test_a_clock_that_is_set_begins_a_file_and_drift_does_not(tmp_path: Path) -> None:
+    """Within a file, times differ by what passed."""
+    clock = [0.0]
+    recorder = Recorder(Recording(tmp_path / "flights", 1 << 20, 9, 0), log(), lambda: clock[0])
+    for now, time_s in ((0.0, 5.0), (10.0, 15.0 + CLOCK_STEP_S - 0.01), (20.0, NOW_S), (30.0, NOW_S + 10)):
+        clock[0] = time_s
+        recorder.do_housekeeping(now)
+        recorder.add("drone1", [frame(1)], FROM_PEER, now)
+    recorder.stop(31.0)
+    times = [[time // 4 * 4 / 1e6 for time, _ in file] for file in recorded(tmp_path)]
+    assert times == [pytest.approx([5.0, 15.0], abs=1e-5), pytest.approx([NOW_S, NOW_S + 10], abs=1e-5)]
+
+
+async def test_times_before_1970_are_none(tmp_path: Path) -> None:
+    """A clock below zero gives zero."""
+    recorder = Recorder(Recording(tmp_path / "flights", 1 << 20, 9, 0), log(), lambda: -5.0)
+    recorder.add("drone1", [frame(1)], TO_PEER, 0.0)
+    recorder.stop(0.0)
+    assert recorded(tmp_path) == [[(TO_PEER, frame(1))]]
+
+
+async def test_full_disk_stops_recording_and_room_resumes_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Said once each; what came in between is counted, and nothing is tried before its time."""
+    tries: list[float] = []
+    is_full = [True]
+    append = TlogFolder.append
+
+    def appending(self: TlogFolder, peer: str, records: Sequence[bytes], epoch: int, now: float) -> int:
+        tries.append(now)
+        if is_full[0]:
+            raise OSError(errno.ENOSPC, "full")
+        return append(self, peer, records, epoch, now)
+
+    monkeypatch.setattr(TlogFolder, "append", appending)
+    with capture_logs() as logs:
+        recorder = Recorder(Recording(tmp_path / "flights", 1 << 20, 9, 0), log())
+        lost = 0
+        for now in (0.0, RETRY_S - 0.01, RETRY_S, 2 * RETRY_S):
+            is_full[0] = now < 2 * RETRY_S
+            recorder.add("drone1", [frame(1), frame(2)], FROM_PEER, now)
+            recorder.do_housekeeping(now)
+            lost += 2 * is_full[0]
+            await until(lambda lost=lost: recorder.frames_lost == lost and not recorder._is_writing)  # type: ignore[misc]
+        assert recorder.is_recording
+        recorder.stop(3 * RETRY_S)
+    assert tries == [0.0, RETRY_S, 2 * RETRY_S]
+    assert (recorder.frames, recorder.frames_lost, recorder.failures) == (2, 6, {"ENOSPC": 2})
+    assert [each["event"] for each in logs] == ["recording_stopped", "recording_resumed"]
+
+
+async def test_a_disk_that_hangs_holds_nothing_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Frames go on being taken, up to the bound; then they are counted; and the end does not wait for ever."""
+    answer = threading.Event()
+    monkeypatch.setattr(TlogFolder, "append", lambda *_: answer.wait(30) and 0)
+    monkeypatch.setattr("uavlinkd.ops.recorder.STOP_WAIT_S", 0.05)
+    recorder = Recorder(Recording(tmp_path / "flights", 1 << 20, 9, 0), log())
+    recorder.add("drone1", [frame(1)], FROM_PEER, 0.0)
+    recorder.do_housekeeping(0.0)
+    batch = [frame(1)] * 1000
+    while not recorder.frames_lost:
+        recorder.add("drone1", batch, FROM_PEER, 1.0)
+        recorder.do_housekeeping(1.0)
+    assert recorder._buffered_bytes < MAX_BUFFERED_BYTES + sum(8 + len(each) for each in batch)
+    assert recorder.frames_lost == len(batch)
+    recorder.stop(2.0)
+    answer.set()
+    await until(lambda: not recorder._thread.is_alive())
+
+
+async def test_a_folder_of_another_daemon_is_left_to_it(tmp_path: Path) -> None:
+    """Under a reason of its own."""
+    settings = Recording(tmp_path / "flights", 1 << 20, 9, 0)
+    first, second = Recorder(settings, log()), Recorder(settings, log())
+    first.add("drone1", [frame(1)], FROM_PEER, 0.0)
+    first.do_housekeeping(0.0)
+    await until(lambda: first.frames == 1)
+    with capture_logs() as logs:
+        second.add("drone1", [frame(2)], FROM_PEER, 0.0)
+        second.do_housekeeping(0.0)
+        await until(lambda: bool(second.failures))
+    assert second.failures == {"folder_in_use": 1}
+    assert [each["reason"] for each in logs] == ["folder_in_use"]
+    first.stop(1.0)
+    second.stop(1.0)

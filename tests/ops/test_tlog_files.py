@@ -1,0 +1,281 @@
+"""The folder of recordings: whole records, bounded files, the oldest deleted, and nobody else's."""
+
+from __future__ import annotations
+
+import errno
+import os
+import subprocess
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.daemon.harness import frame, need
+from uavlinkd.config import Recording
+from uavlinkd.lab.sim.tlog import read_tlog
+from uavlinkd.ops.tlog_files import SYNC_INTERVAL_S, FolderInUseError, TlogFolder
+
+DAY_S = 1_700_000_000
+
+
+def record(number: int) -> bytes:
+    """A genuine record of 34 bytes, a second after the one before."""
+    return ((DAY_S + number) * 1_000_000).to_bytes(8) + frame(number)
+
+
+SIZE = len(record(1))
+
+
+def folder_at(
+    path: Path, max_file_bytes: int = 10 * SIZE, max_files: int = 100, min_free_bytes: int = 0
+) -> TlogFolder:
+    """A folder there."""
+    return TlogFolder(Recording(path / "flights", max_file_bytes, max_files, min_free_bytes))
+
+
+def kept(path: Path) -> dict[str, list[bytes]]:
+    """What the files hold, by name, in the order of their names."""
+    return {
+        each.name: [one.time_us.to_bytes(8) + one.frame for one in read_tlog(each).records]
+        for each in sorted((path / "flights").iterdir())
+    }
+
+
+def test_each_peer_has_a_file_for_its_owner_alone(tmp_path: Path) -> None:
+    """Named by number, time and peer; the folder is made."""
+    folder = folder_at(tmp_path)
+    assert folder.append("drone1", [record(1), record(2)], 0, 0.0) == 2 * SIZE
+    folder.append("drone2", [record(3)], 0, 0.0)
+    folder.append("drone1", [record(4)], 0, 1.0)
+    folder.close()
+    assert kept(tmp_path) == {
+        "00000001-20231114T221321Z-drone1.tlog": [record(1), record(2), record(4)],
+        "00000002-20231114T221323Z-drone2.tlog": [record(3)],
+    }
+    assert {each.stat().st_mode & 0o777 for each in (tmp_path / "flights").iterdir()} == {0o600}
+    assert (tmp_path / "flights").stat().st_mode & 0o777 == 0o700
+
+
+def test_file_ends_where_the_next_record_does_not_fit(tmp_path: Path) -> None:
+    """At the limit it still does; one byte less, and it goes into the next file."""
+    for limit, files in ((10 * SIZE, [10, 1]), (10 * SIZE - 1, [9, 2])):
+        path = tmp_path / str(limit)
+        path.mkdir()
+        folder = folder_at(path, limit)
+        for number in range(11):
+            folder.append("drone1", [record(number)], 0, 0.0)
+        folder.close()
+        assert [len(each) for each in kept(path).values()] == files
+
+
+@given(batches=st.lists(st.integers(0, 40), min_size=1, max_size=12), limit=st.integers(SIZE, 30 * SIZE))
+@settings(max_examples=30, deadline=None)
+def test_what_comes_in_any_batches_is_kept_in_order(
+    tmp_path_factory: pytest.TempPathFactory, batches: list[int], limit: int
+) -> None:
+    """Every record once, no file over its limit."""
+    path = tmp_path_factory.mktemp("any")
+    folder = folder_at(path, limit, max_files=1000)
+    records = [record(number) for number in range(sum(batches))]
+    at = 0
+    for amount in batches:
+        folder.append("drone1", records[at : at + amount], 0, 0.0)
+        at += amount
+    folder.close()
+    found = kept(path)
+    assert [each for one in found.values() for each in one] == records
+    assert all((path / "flights" / name).stat().st_size <= limit for name in found)
+
+
+def test_oldest_are_deleted_for_the_newest_by_number(tmp_path: Path) -> None:
+    """Not by time: a drone that boots in 1970 keeps the flight of today."""
+    folder = folder_at(tmp_path, max_file_bytes=SIZE, max_files=3)
+    for number in range(5):
+        folder.append("drone1", [bytes(8) + frame(number)], 0, 0.0)
+    folder.close()
+    assert [name[:17] for name in kept(tmp_path)] == [f"0000000{each}-19700101" for each in (3, 4, 5)]
+
+
+def test_numbers_go_on_after_a_restart(tmp_path: Path) -> None:
+    """And the recordings of before count as ours."""
+    for number in range(3):
+        folder = folder_at(tmp_path, max_files=2)
+        folder.append("drone1", [record(number)], 0, 0.0)
+        folder.close()
+    assert [name[:8] for name in kept(tmp_path)] == ["00000002", "00000003"]
+
+
+def test_what_is_not_ours_stays(tmp_path: Path) -> None:
+    """However full it gets."""
+    (tmp_path / "flights").mkdir()
+    others = [
+        "flight.tlog",
+        "00000000-notes.txt",
+        "1-20231114T221321Z-drone1.tlog",
+        "x00000001-20231114T221321Z-a.tlog",
+    ]
+    for name in others:
+        (tmp_path / "flights" / name).write_text("precious")
+    folder = folder_at(tmp_path, max_file_bytes=SIZE, max_files=2)
+    for number in range(9):
+        folder.append("drone1", [record(number)], 0, 0.0)
+    folder.close()
+    assert all((tmp_path / "flights" / name).read_text() == "precious" for name in others)
+    assert len(list((tmp_path / "flights").iterdir())) == len(others) + 2
+
+
+def test_no_file_is_deleted_that_is_written_to(tmp_path: Path) -> None:
+    """More peers than files: each keeps the one that it has."""
+    folder = folder_at(tmp_path, max_files=2)
+    for number in range(4):
+        folder.append(f"drone{number}", [record(number)], 0, 0.0)
+    folder.append("drone0", [record(9)], 0, 0.0)
+    folder.close()
+    assert [len(each) for each in kept(tmp_path).values()] == [2, 1, 1, 1]
+
+
+def test_a_clock_that_was_set_begins_a_file(tmp_path: Path) -> None:
+    """Time runs evenly in each."""
+    folder = folder_at(tmp_path)
+    folder.append("drone1", [bytes(8) + frame(1)], 0, 0.0)
+    folder.append("drone1", [record(2)], 1, 0.0)
+    folder.append("drone1", [record(3)], 1, 0.0)
+    folder.close()
+    assert [len(each) for each in kept(tmp_path).values()] == [1, 2]
+
+
+def test_disk_keeps_what_is_of_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The oldest go first, then nothing more is written; when there is room again, it goes on."""
+    folder = folder_at(tmp_path, max_file_bytes=SIZE, min_free_bytes=1000)
+    for number in range(3):
+        folder.append("drone1", [record(number)], 0, 0.0)
+    extra = [0]  # what the disk has left beside the files that were deleted
+
+    def disk(_: int) -> SimpleNamespace:
+        there = len(list((tmp_path / "flights").iterdir()))
+        return SimpleNamespace(f_bavail=1001 + SIZE - SIZE * there + extra[0], f_frsize=1)
+
+    monkeypatch.setattr(os, "fstatvfs", disk)
+    extra[0] = SIZE
+    folder.append("drone1", [record(3)], 0, 0.0)
+    assert [name[:8] for name in kept(tmp_path)] == ["00000003", "00000004"]
+    extra[0] = -1
+    with pytest.raises(OSError) as caught:  # noqa: PT011  the number is looked at
+        folder.append("drone1", [record(4)], 0, 0.0)
+    assert caught.value.errno == errno.ENOSPC
+    folder.close()
+    assert kept(tmp_path) == {}
+    extra[0] = SIZE
+    folder.append("drone1", [record(5)], 0, 0.0)
+    folder.close()
+    assert list(kept(tmp_path).values()) == [[record(5)]]
+
+
+@pytest.mark.parametrize("fault", ["error", "short"])
+def test_half_a_record_is_taken_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: str) -> None:
+    """A disk that takes a part, or fails: the file ends with a whole record, and an empty one is no file."""
+    folder = folder_at(tmp_path)
+    folder.append("drone1", [record(1)], 0, 0.0)
+    write = os.write
+
+    def failing(descriptor: int, data: bytes) -> int:
+        write(descriptor, data[:5])
+        if fault == "error":
+            raise OSError(errno.EIO, "broken")
+        return 5
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "write", failing)
+        for peer in ("drone1", "drone2"):
+            with pytest.raises(OSError):  # noqa: PT011
+                folder.append(peer, [record(2)], 0, 0.0)
+    folder.append("drone1", [record(3)], 0, 0.0)
+    folder.close()
+    assert list(kept(tmp_path).values()) == [[record(1)], [record(3)]]
+
+
+def test_two_daemons_do_not_share_a_folder(tmp_path: Path) -> None:
+    """The second is told; once the first is done, it has it."""
+    first, second = folder_at(tmp_path), folder_at(tmp_path)
+    first.append("drone1", [record(1)], 0, 0.0)
+    with pytest.raises(FolderInUseError):
+        second.append("drone1", [record(2)], 0, 0.0)
+    first.close()
+    second.append("drone1", [record(2)], 0, 0.0)
+    second.close()
+    assert len(kept(tmp_path)) == 2
+
+
+def test_a_file_that_was_taken_away_is_not_written_to(tmp_path: Path) -> None:
+    """What comes after is in a new one."""
+    folder = folder_at(tmp_path)
+    folder.append("drone1", [record(1)], 0, 0.0)
+    next((tmp_path / "flights").iterdir()).unlink()
+    folder.append("drone1", [record(2)], 0, 0.0)
+    folder.close()
+    assert list(kept(tmp_path).values()) == [[record(2)]]
+
+
+def test_a_link_in_the_way_is_not_followed(tmp_path: Path) -> None:
+    """Nobody makes the daemon write elsewhere by foreseeing a name."""
+    (tmp_path / "flights").mkdir()
+    (tmp_path / "elsewhere").write_text("precious")
+    folder = folder_at(tmp_path)
+    folder.append("drone1", [record(0)], 0, 0.0)
+    (tmp_path / "flights" / "00000002-20231114T221321Z-drone2.tlog").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(FileExistsError):
+        folder.append("drone2", [record(1)], 0, 0.0)
+    folder.close()
+    assert (tmp_path / "elsewhere").read_text() == "precious"
+
+
+def test_power_may_fail(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every few seconds, what was written is brought to the disk."""
+    folder = folder_at(tmp_path)
+    synced: list[int] = []
+    monkeypatch.setattr(os, "fdatasync", synced.append)
+    folder.append("drone1", [record(1)], 0, 100.0)
+    folder.append("drone1", [record(2)], 0, 100.0 + SYNC_INTERVAL_S - 0.001)
+    assert len(synced) == 1
+    folder.append("drone1", [record(3)], 0, 100.0 + SYNC_INTERVAL_S)
+    assert len(synced) == 2
+    folder.close()
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A real file system of one megabyte."""
+    where = tmp_path / "disk"
+    where.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(where)]
+    can = os.geteuid() == 0 and subprocess.run(command, capture_output=True, check=False).returncode == 0
+    need(can, "root, and leave to mount a file system")
+    yield where
+    subprocess.run(["umount", "--lazy", str(where)], check=True)
+
+
+@pytest.mark.parametrize("min_free_bytes", [0, 300_000])
+def test_a_real_disk_is_never_filled(small_disk: Path, min_free_bytes: int) -> None:
+    """Five times what it holds: as much stays free as was asked for, the newest is kept, in whole records."""
+    other = small_disk / "of-somebody-else"
+    other.write_bytes(bytes(200_000))
+    folder = folder_at(small_disk, max_file_bytes=50_000, min_free_bytes=min_free_bytes)
+    batch, number = 200, 0
+    for _ in range(5_000_000 // (batch * SIZE)):
+        records = [record(number + each) for each in range(batch)]
+        with suppress(OSError):
+            folder.append("drone1", records, 0, float(number))
+            number += batch
+        found = os.statvfs(small_disk)
+        assert found.f_bavail * found.f_frsize >= min_free_bytes
+    folder.close()
+    assert other.stat().st_size == 200_000
+    files = kept(small_disk)
+    assert len(files) > 2
+    last = [each for file in files.values() for each in file]
+    assert last == [record(each) for each in range(number - len(last), number)]
+    assert number * SIZE > 4_000_000

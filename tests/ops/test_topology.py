@@ -1,0 +1,308 @@
+"""What ``uavlinkd check`` prints: everything a person must see, and no secret."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from uavlinkd.config import keys
+from uavlinkd.config import Config, Endpoint, load_config
+from uavlinkd.config.advice import exposure
+from uavlinkd.endpoints.url import SerialUrl
+from uavlinkd.mavlink.policy.roles import ROLES
+from uavlinkd.ops.topology import describe, print_topology
+
+_PUBLIC = [keys.public_key_text(keys.generate_private_key()) for _ in range(2)]
+_FILE = f"""
+name = "drone0"
+private_key_file = "drone0.key"
+listen = ["0.0.0.0:5790"]
+[[endpoint]]
+name = "autopilot"
+url = "udpin:127.0.0.1:14550"
+[[endpoint]]
+name = "tablet"
+url = "udpin:0.0.0.0:14551"
+[[peer]]
+name = "drone1"
+public_key = "{_PUBLIC[0]}"
+addresses = ["10.13.0.2:5790", "drone1.local:5790"]
+psk_file = "pair.psk"
+role = "swarm-member"
+system_ids = [2]
+[[peer]]
+name = "observer"
+public_key = "{_PUBLIC[1]}"
+role = "observer"
+system_ids = [254]
+suites = ["mlkem768", "x25519"]
+confidential = true
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A folder with the key files."""
+    keys.write_secret_file(tmp_path / "drone0.key", keys.generate_private_key())
+    keys.write_secret_file(tmp_path / "pair.psk", keys.generate_psk())
+    return tmp_path
+
+
+def _load(folder: Path, text: str) -> Config:
+    (folder / "drone0.toml").write_text(text)
+    return load_config(folder / "drone0.toml", {})
+
+
+def _printed(config: Config) -> str:
+    file = io.StringIO()
+    print_topology(config, Console(file=file))
+    return file.getvalue()
+
+
+def _line(printed: str, start: str) -> str:
+    return next(line for line in printed.splitlines() if line.startswith(start))
+
+
+def test_who_and_where(folder: Path) -> None:
+    """Our name, our whole public key, and where we listen."""
+    config = _load(folder, _FILE)
+    printed = _printed(config)
+    assert _line(printed, "name").split() == ["name", "drone0"]
+    assert _line(printed, "public key").endswith(keys.encode_key(config.public_key))
+    assert "0.0.0.0:5790" in _line(printed, "listens on")
+    assert "open to the network" in _line(printed, "listens on")
+
+
+@pytest.mark.parametrize(
+    ("listen", "says"), [('["127.0.0.1:5790"]', "this machine only"), ("[]", "it calls its peers")]
+)
+def test_listening_less_is_said(folder: Path, listen: str, says: str) -> None:
+    """A daemon on loopback, or one that only calls, is not called open."""
+    text = _FILE.split('[[peer]]\nname = "observer"', maxsplit=1)[0].replace('["0.0.0.0:5790"]', listen)
+    line = _line(_printed(_load(folder, text)), "listens on")
+    assert says in line
+    assert "open" not in line
+
+
+def test_each_peer_has_a_line(folder: Path) -> None:
+    """Name, start of the key, addresses, suites, mode and PSK."""
+    printed = _printed(_load(folder, _FILE))
+    first, second = _line(printed, "drone1 "), _line(printed, "observer ")
+    assert "(it calls)" not in first
+    for part in (_PUBLIC[0][:8], "10.13.0.2:5790", "x25519", "authentic, 128-bit tag", "yes"):
+        assert part in first
+    assert "drone1.local:5790" in printed
+    for part in (_PUBLIC[1][:8], "(it calls)", "mlkem768 x25519", "encrypted", "no"):
+        assert part in second
+
+
+def test_sizes_are_those_of_the_wire(folder: Path) -> None:
+    """Five to seven bytes of header and the tag; peers with equal sizes share a line."""
+    printed = _printed(_load(folder, _FILE + "max_envelope_bytes = 500\n"))
+    sizes = printed.split("Bytes in a datagram\n")[1].split("\n\n")[0].splitlines()
+    assert len(sizes) == 2
+    assert "envelopes up to 1,232, adding 21-23" in sizes[0]
+    assert "envelopes up to 500, adding 21-23" in sizes[1]
+    shorter = _printed(_load(folder, _FILE.replace("confidential = true", "").replace('"mlkem768", ', "")))
+    assert "every peer  envelopes up to 1,232, adding 21-23" in shorter
+    short_tag = _printed(_load(folder, _FILE.replace("[[endpoint]]", "[link]\ntag_bits = 64\n[[endpoint]]", 1)))
+    assert "adding 13-15" in short_tag
+
+
+def test_mac_key_length_is_told_where_it_was_chosen(folder: Path) -> None:
+    """The default is not worth a word."""
+    chosen = _printed(_load(folder, _FILE.replace("psk_file", "mac_key_bits = 512\npsk_file")))
+    assert "512-bit" in _line(chosen, "drone1 ")
+    assert "512-bit" not in _printed(_load(folder, _FILE))
+
+
+def test_open_endpoint_stands_out(folder: Path) -> None:
+    """The one that the network reaches is told from the one it does not, in the table and in the warnings."""
+    printed = _printed(_load(folder, _FILE))
+    assert _line(printed, "autopilot").endswith("this machine")
+    assert _line(printed, "tablet").endswith("THE NETWORK")
+    assert 'warning: endpoint "tablet" listens beyond loopback' in printed
+    assert "No warnings" not in printed
+
+
+def test_wire_is_open_to_nobody() -> None:
+    """A serial port is reached with hands."""
+    assert exposure(Endpoint("autopilot", SerialUrl("/dev/ttyACM0", 57600))) == "wire"
+
+
+def test_every_warning_is_printed_whole(folder: Path) -> None:
+    """Folded, not cut."""
+    config = _load(folder, _FILE)
+    printed = " ".join(_printed(config).split())
+    assert len(config.warnings) == 2
+    for warning in config.warnings:
+        assert f"warning: {' '.join(warning.split())}" in printed
+
+
+def test_quiet_configuration_says_so(folder: Path) -> None:
+    """No warning is a statement too."""
+    text = _FILE.replace("0.0.0.0:14551", "127.0.0.1:14551").replace('"mlkem768", ', "")
+    assert _printed(_load(folder, text)).endswith("No warnings.\n")
+
+
+def test_empty_sections_are_left_out(folder: Path) -> None:
+    """A daemon without peers and endpoints has two warnings and no empty table."""
+    printed = _printed(_load(folder, _FILE.split("[[endpoint]]", maxsplit=1)[0]))
+    assert "Peers" not in printed
+    assert "Local endpoints" not in printed
+    assert printed.count("warning:") == 2
+
+
+def test_routing_is_told(folder: Path) -> None:
+    """What may pass between peers, and where a frame for nobody known goes: the default and the other."""
+    told = " ".join(_printed(_load(folder, _FILE)).split())
+    assert "routing between peers and endpoints, from no peer to another; a frame for a system not heard yet" in told
+    assert "goes to all others" in told
+    changed = '[routing]\nrelay = true\nunknown_targets = "drop"\n[[endpoint]]'
+    told = " ".join(_printed(_load(folder, _FILE.replace("[[endpoint]]", changed, 1))).split())
+    assert "routing from peers to other peers too; a frame for a system not heard yet goes nowhere" in told
+
+
+def test_pace_is_told_for_those_who_share_it(folder: Path) -> None:
+    """Budget, delay and age; one line where every peer has the same."""
+    assert "every peer  each frame at once" in _printed(_load(folder, _FILE))
+    slow = "budget_bits_s = 64000\ncoalesce_s = 0.25\nmax_age_s = 2.5\npsk_file"
+    printed = _printed(_load(folder, _FILE.replace("psk_file", slow)))
+    on_the_way = printed.split("On the way to a peer\n")[1].split("\n\n")[0].splitlines()
+    assert on_the_way == [
+        "drone1    up to 64,000 bits/s; up to 0.25 s to share an envelope; what waited 2.5 s is dropped",
+        "observer  each frame at once",
+    ]
+
+
+def test_endpoint_is_told_with_its_age_and_radio_status(folder: Path) -> None:
+    """Each endpoint's own."""
+    text = _FILE.replace(':14550"', ':14550"\nmax_age_s = 0.5\nradio_status = true')
+    printed = _printed(_load(folder, text))
+    assert _line(printed, "autopilot").split()[2:5] == ["0.5", "s", "yes"]
+    assert _line(printed, "tablet").split()[2:5] == ["1", "s", "no"]
+
+
+def _policies(printed: str) -> dict[str, str]:
+    """The printed policies by the names of those who have them, spaces made one."""
+    parts = printed.split("\nPolicy of ")[1:]
+    return {part.split("\n")[0]: " ".join(part.split("\n\n")[0].split()[1:]) for part in parts}
+
+
+def test_coalescing_alone_is_told(folder: Path) -> None:
+    """Frames wait without a budget too."""
+    printed = _printed(_load(folder, _FILE.replace("psk_file", "coalesce_s = 0.1\npsk_file")))
+    assert "drone1    no budget; up to 0.1 s to share an envelope; what waited 1 s is dropped" in printed
+
+
+def test_policy_without_exceptions_has_no_table(folder: Path) -> None:
+    """Where everything but signing passes both ways, two lines say so."""
+    text = _FILE.replace('role = "swarm-member"', 'role = "all"')
+    policy = _policies(_printed(_load(folder, text)))["drone1"]
+    assert policy.startswith("both ways heartbeat, position, telemetry, ")
+    assert policy.endswith("HEARTBEAT neither way signing")
+
+
+def test_each_peer_and_endpoint_is_told_with_its_role(folder: Path) -> None:
+    """Its name and its systems; a peer that may say everything is highlighted, with what that means."""
+    printed = _printed(
+        _load(folder, _FILE.replace('role = "observer"\nsystem_ids = [254]', 'role = "all"\nsystem_ids = "all"'))
+    )
+    summary = printed.split("Who may say what\n")[1].split("\n\n")[0]
+    rows = [line.split() for line in summary.splitlines()[2:]]
+    nothing_said = ["may", "say", "anything", "but", "SETUP_SIGNING", "any", "system"]
+    assert rows == [
+        ["peer", "drone1", "swarm-member", "2"],
+        ["peer", "observer", "all:", *nothing_said[2:]],
+        ["endpoint", "autopilot", *nothing_said],
+        ["endpoint", "tablet", *nothing_said],
+    ]
+    assert list(_policies(printed)) == ["drone1", "observer"]
+
+
+def test_policy_is_told_once_for_all_who_have_it(folder: Path) -> None:
+    """Peers and endpoints with other system ids, but the same rules, share a table."""
+    same = _FILE.replace('role = "observer"', 'role = "swarm-member"')
+    same = same.replace(':14550"', ':14550"\nrole = "observer"\nsystem_ids = [1]')
+    assert list(_policies(_printed(_load(folder, same)))) == ["drone1, observer", "autopilot"]
+    different = same.replace("system_ids = [254]", 'system_ids = [254]\ndeny_in = ["HOME_POSITION"]')
+    assert list(_policies(_printed(_load(folder, different)))) == ["drone1", "observer", "autopilot"]
+
+
+def test_where_metrics_are_and_recordings_go_is_told(folder: Path) -> None:
+    """A folder that a service cannot write to is seen here first."""
+    printed = _printed(
+        _load(folder, _FILE + '[metrics]\nlisten = "127.0.0.1:9790"\n[recording]\nfolder = "flights"\n')
+    )
+    told = "".join(printed.split())  # long lines are folded
+    assert "metricshttp://127.0.0.1:9790/metrics" in told
+    assert f"recordsin{folder / 'flights'}(1GBofitsdisk" in told
+    plain = _printed(_load(folder, _FILE))
+    assert "records in" not in plain
+    assert "metrics" not in plain
+
+
+def test_policy_tells_what_passes_and_what_does_not(folder: Path) -> None:
+    """Whole groups in a line each way, then what differs; a rate as it was written."""
+    text = _FILE.replace(
+        'role = "swarm-member"', 'role = "swarm-member"\nallow_in = ["commands"]\nrate_out = { position = 2.5 }'
+    ).replace("[2]", '[2]\ndeny_in = ["MAV_CMD_DO_FLIGHTTERMINATION"]\nmavlink1 = false')
+    policy = _policies(_printed(_load(folder, text)))["drone1"]
+    both, rest = policy.split(" neither way ")
+    assert both == "both ways heartbeat, position"
+    neither, rest = rest.split(" otherwise ")
+    assert {"parameters", "mission-reads", "shell", "signing", "MAVLink 1"} <= set(neither.split(", "))
+    assert "commands" not in neither.split(", ")
+    assert "commands all (by command: COMMAND_LONG," in rest
+    assert "denied: MAV_CMD_DO_FLIGHTTERMINATION, -" in rest.replace("commands by number ", "")
+    assert "MAV_CMD_DO_AUX_FUNCTION" in rest
+    assert "rates HEARTBEAT 5/s, position 50/s, VFR_HUD position 2.5/s 250/s" in rest
+
+
+@pytest.mark.parametrize("role", ROLES)
+def test_plain_output_has_a_hundred_columns(folder: Path, role: str) -> None:
+    """Every role's table can be read without scrolling sideways."""
+    printed = _printed(_load(folder, _FILE.replace('role = "observer"', f'role = "{role}"')))
+    assert max(map(len, printed.splitlines())) <= 100
+    assert "…" not in printed
+
+
+def test_plain_output_is_plain(folder: Path) -> None:
+    """Where there is no terminal: no control sequences, no spaces at line ends, nothing folded early."""
+    printed = _printed(_load(folder, _FILE))
+    assert "\x1b" not in printed
+    assert all(line == line.rstrip() for line in printed.splitlines())
+    assert "10.13.0.2:5790" in printed
+
+
+def test_terminal_output_fits_the_terminal(folder: Path) -> None:
+    """On 80 columns with colours nothing is cut off: cells are folded."""
+    console = Console(file=io.StringIO(), width=80, force_terminal=True, color_system="standard")
+    with console.capture() as captured:
+        print_topology(_load(folder, _FILE), console)
+    plain = Console(file=io.StringIO(), width=80)
+    with plain.capture() as uncoloured:
+        plain.print(describe(_load(folder, _FILE)))
+    assert "\x1b[" in captured.get()
+    assert max(map(len, uncoloured.get().splitlines())) <= 80
+    assert "…" not in uncoloured.get()
+
+
+def test_no_secret_is_printed(folder: Path) -> None:
+    """Neither the private key nor a PSK, in no form."""
+    printed = _printed(_load(folder, _FILE))
+    for name in ("drone0.key", "pair.psk"):
+        text = (folder / name).read_text().strip()
+        assert text not in printed
+        assert text[:8] not in printed
+        assert keys.decode_key(text).hex() not in printed
+
+
+def test_standard_output_is_the_default(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Without a console it goes where the command's output goes, the same as into a file."""
+    config = _load(folder, _FILE)
+    print_topology(config)
+    assert capsys.readouterr().out == _printed(config)

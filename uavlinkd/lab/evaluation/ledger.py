@@ -1,0 +1,139 @@
+"""Every frame of the local programs, numbered: what was sent, what came out, and what came out that may not.
+
+A frame is made from its sender and its number alone, so nothing has to be kept to know whether one that arrives is
+as it was sent: it is made again and compared.
+"""
+
+from __future__ import annotations
+
+import struct
+from array import array
+from collections import Counter
+from collections.abc import Iterable
+from enum import StrEnum
+
+from uavlinkd.mavlink.frames import SplitCounters, split_datagram
+from uavlinkd.lab.mitm.anatomy import mavlink_frame
+
+_ATTITUDE, _ATTITUDE_CRC_EXTRA = 30, 39
+_HEARTBEAT, _HEARTBEAT_CRC_EXTRA = 0, 50
+_HEARTBEAT_EVERY = 20
+STALE_S = 8.0
+"""Older than that nothing may come out; far beyond what a busy machine makes of a second."""
+_NUMBER = struct.Struct("<I")
+_HEADER_BYTES = 10
+# Roll, pitch and yaw in radians, and their rates; type, autopilot, base mode, status, version.
+_ANGLES = struct.pack("<6f", 0.1, -0.05, 1.5, 0.01, 0.02, -0.01)
+_COPTER = bytes((2, 3, 81, 4, 3))
+
+
+class Fault(StrEnum):
+    """What must not come out at a local program."""
+
+    FALSE = "forged or altered"
+    REPLAYED = "replayed"
+    REFLECTED = "reflected"
+    MISROUTED = "misrouted"
+    STALE = "stale"
+    """As it was sent, long after it was sent."""
+
+
+def numbered_frame(system: int, number: int) -> bytes:
+    """An ATTITUDE, now and then a HEARTBEAT: no two of a system are the same."""
+    payload = _NUMBER.pack(number)
+    if number % _HEARTBEAT_EVERY == 0:
+        return mavlink_frame(_HEARTBEAT, payload + _COPTER, _HEARTBEAT_CRC_EXTRA, system, number)
+    return mavlink_frame(_ATTITUDE, payload + _ANGLES, _ATTITUDE_CRC_EXTRA, system, number)
+
+
+class Ledger:
+    """The books of one link or more. Systems are numbered as the names stand, from 1.
+
+    Args:
+        names: the drones.
+        audience: whose frames come out at whom; every other's by default.
+    """
+
+    def __init__(self, names: Iterable[str], audience: dict[str, set[str]] | None = None) -> None:
+        self.names = tuple(names)
+        self.audience = audience or {name: set(self.names) - {name} for name in self.names}
+        self.faults: Counter[Fault] = Counter()
+        self.split = SplitCounters()
+        self.sent_at = {name: array("d") for name in self.names}
+        """When each frame of a drone was sent, by its number."""
+        self._ways = [(sender, to) for sender in self.names for to in sorted(self.audience[sender])]
+        self._delivered = {way: bytearray() for way in self._ways}
+        self._newest: dict[tuple[str, str], tuple[float, float]] = {}
+
+    def next_frame(self, sender: str, now: float) -> bytes:
+        """The next frame of a drone, sent at ``now``."""
+        times = self.sent_at[sender]
+        times.append(now)
+        for to in self.audience[sender]:
+            self._delivered[sender, to].append(0)
+        return numbered_frame(self.names.index(sender) + 1, len(times) - 1)
+
+    def on_received(self, receiver: str, datagram: bytes, now: float) -> None:
+        """What came out at a drone's local program."""
+        frames = split_datagram(datagram, self.split)
+        if sum(len(frame.raw) for frame in frames) != len(datagram):
+            self.faults[Fault.FALSE] += 1
+        for frame in frames:
+            self._on_frame(receiver, frame.raw, now)
+
+    def _on_frame(self, receiver: str, raw: bytes, now: float) -> None:
+        system = raw[5] if raw[0] == 0xFD and len(raw) >= _HEADER_BYTES + _NUMBER.size else 0
+        sender = self.names[system - 1] if 0 < system <= len(self.names) else None
+        number = _NUMBER.unpack_from(raw, _HEADER_BYTES)[0] if sender else 0
+        if sender is None or number >= len(self.sent_at[sender]) or raw != numbered_frame(system, number):
+            self.faults[Fault.FALSE] += 1
+        elif sender == receiver:
+            self.faults[Fault.REFLECTED] += 1
+        elif (sender, receiver) not in self._delivered:
+            self.faults[Fault.MISROUTED] += 1
+        elif self._delivered[sender, receiver][number]:
+            self.faults[Fault.REPLAYED] += 1
+        else:
+            self._delivered[sender, receiver][number] = 1
+            sent_at = self.sent_at[sender][number]
+            if now - sent_at > STALE_S:
+                self.faults[Fault.STALE] += 1
+            if sent_at >= self._newest.get((sender, receiver), (-1.0, 0.0))[0]:
+                self._newest[sender, receiver] = (sent_at, now)
+                self._note_recovery(sender, receiver, sent_at, now)
+
+    # The time between two marks, and what became of it.
+
+    def mark(self) -> dict[str, int]:
+        """How many frames each drone has sent by now."""
+        return {name: len(times) for name, times in self.sent_at.items()}
+
+    def count(self, begin: dict[str, int], end: dict[str, int]) -> tuple[int, int]:
+        """Frames sent between two marks, for each who should get them, and how many of these came out."""
+        sent = delivered = 0
+        for sender, to in self._ways:
+            part = self._delivered[sender, to][begin[sender] : end[sender]]
+            sent += len(part)
+            delivered += sum(part)
+        return sent, delivered
+
+    def delivered_total(self) -> int:
+        """All that came out as they should."""
+        return sum(sum(each) for each in self._delivered.values())
+
+    def await_recovery(self, since: float) -> None:
+        """From now on, note when frames sent after ``since`` come out."""
+        self._since = since
+        self._recovered: dict[tuple[str, str], float] = {}
+
+    _since = float("inf")
+    _recovered: dict[tuple[str, str], float]
+
+    def _note_recovery(self, sender: str, receiver: str, sent_at: float, now: float) -> None:
+        if sent_at > self._since and (sender, receiver) not in self._recovered:
+            self._recovered[sender, receiver] = now - self._since
+
+    @property
+    def recovery_s(self) -> float | None:
+        """Seconds until frames came out again everywhere; None as long as they do not."""
+        return max(self._recovered.values()) if len(self._recovered) == len(self._ways) else None

@@ -1,0 +1,147 @@
+"""The machine under the measurement: what it is, what a process used of it, what the processor says it drew."""
+
+from __future__ import annotations
+
+import os
+import platform
+import subprocess
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from uavlinkd import __version__
+from uavlinkd.lab.evaluation.records import Value
+
+RAPL_FOLDER = Path("/sys/class/powercap")
+"""Where Linux shows the energy counters of the processor (Intel's and AMD's RAPL), if it lets us see them."""
+
+
+def machine_facts() -> dict[str, Value]:
+    """What a reader needs to compare numbers: processor, cores, system, versions, and how busy it was before."""
+    return {
+        "cpu": _cpu_name(),
+        "cores": os.cpu_count(),
+        "load_before": load(),
+        "system": f"{platform.system()} {platform.release()} {platform.machine()}",
+        "python": platform.python_version(),
+        "uavlinkd": __version__,
+        "commit": _commit(),
+        "cryptography": _version_of("cryptography"),
+        "openssl": _openssl_version(),
+        "uvloop": _version_of("uvloop"),
+    }
+
+
+def load() -> float | None:
+    """Processes that wanted a core in the last minute, on average; None where the system does not count."""
+    return round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None
+
+
+def _cpu_name() -> str:
+    with suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            name, _, value = line.partition(":")
+            if name.strip() in ("model name", "Model", "Hardware"):  # x86; boards such as a Raspberry Pi
+                return value.strip()
+    return platform.processor() or platform.machine()
+
+
+def _commit() -> str | None:
+    """Which code was measured: git's name for it, with "changed" where files differ; None outside of a checkout."""
+    questions = (
+        ("ls-files", "--error-unmatch", __file__),  # a checkout of this project, and not one around an installation
+        ("rev-parse", "--short", "HEAD"),
+        ("status", "--porcelain", "--", ".."),
+    )
+    answers = []
+    for question in questions:
+        git = ("git", "-C", str(Path(__file__).parent), *question)
+        try:
+            done = subprocess.run(git, capture_output=True, text=True, check=True, timeout=10)  # noqa: S603  our words
+        except (OSError, subprocess.SubprocessError):
+            return None
+        answers.append(done.stdout.strip())
+    _, commit, changes = answers
+    return f"{commit}, changed" if changes else commit
+
+
+def _version_of(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def _openssl_version() -> str:
+    """The OpenSSL that ``cryptography`` brings, which does the arithmetic; not that of Python's ``ssl``."""
+    from uavlinkd.lab.evaluation.paper import openssl_version  # noqa: PLC0415  where the library may be imported
+
+    return openssl_version()
+
+
+class CpuTimeError(Exception):
+    """The time that a process used cannot be read: it has ended, or this is no Linux."""
+
+
+def cpu_seconds(pid: int) -> float:
+    """Processor time that a process used so far, all its threads.
+
+    From the scheduler's accounts in nanoseconds (``/proc/PID/task/*/schedstat``); where the kernel keeps none, from
+    ``/proc/PID/stat``, whose steps are 10 ms.
+
+    Raises:
+        CpuTimeError: it cannot be read.
+    """
+    threads = Path(f"/proc/{pid}/task")
+    try:
+        return sum(int((each / "schedstat").read_bytes().split()[0]) for each in threads.iterdir()) / 1e9
+    except (OSError, IndexError, ValueError):
+        pass
+    try:
+        # Behind the name, which may hold anything: fields 14 and 15 of proc(5).
+        fields = Path(f"/proc/{pid}/stat").read_bytes().rpartition(b")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    except (OSError, IndexError, ValueError) as error:
+        raise CpuTimeError(f"the processor time of process {pid} cannot be read") from error
+
+
+class EnergyMeter:
+    """The processor packages' own energy counters, where they can be read. They count everything that runs."""
+
+    def __init__(self, folder: Path = RAPL_FOLDER) -> None:
+        # intel-rapl:0 is a package; intel-rapl:0:1 a part of it, and psys the whole machine with all packages.
+        zones = [each for each in sorted(folder.glob("*-rapl:*")) if _name(each).startswith("package")]
+        self._zones = [each for each in zones if _microjoules(each / "energy_uj") is not None]
+        self._before: list[int | None] = []
+
+    def start(self) -> None:
+        """From now on."""
+        self._before = [_microjoules(each / "energy_uj") for each in self._zones]
+
+    def joules(self) -> float | None:
+        """Since :meth:`start`; None where the machine does not tell."""
+        if not self._zones:
+            return None
+        total = 0
+        for zone, before in zip(self._zones, self._before, strict=True):
+            now = _microjoules(zone / "energy_uj")
+            if now is None or before is None:
+                return None
+            if now < before:  # the counter went round
+                now += (_microjoules(zone / "max_energy_range_uj") or 0) + 1
+            total += now - before
+        return total / 1e6
+
+
+def _name(zone: Path) -> str:
+    try:
+        return (zone / "name").read_text(encoding="ascii")
+    except (OSError, ValueError):
+        return ""
+
+
+def _microjoules(path: Path) -> int | None:
+    try:
+        return int(path.read_text(encoding="ascii"))
+    except (OSError, ValueError):
+        return None

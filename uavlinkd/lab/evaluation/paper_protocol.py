@@ -1,0 +1,237 @@
+"""The paper's protocol, two ends that speak it over UDP: for comparison alone, it protects nobody.
+
+As the paper describes it: each end makes a Diffie-Hellman key pair, the public keys are exchanged over UDP as they
+are, the key of an HMAC is derived from the shared secret, and data travel with their HMAC, which the receiver
+computes again and compares. There are no identities, no counters, and one key for both directions.
+
+::
+
+    1 | public key 256                          from the initiator
+    2 | public key 256                          the answer
+    0x40 or 0x41 | 1 u16 | number u16/u32 | frame | HMAC-SHA256 over all before it 32
+
+The header of a datagram with data is that of our envelopes, so that the same attacks can be run against both. It
+stands under the HMAC too; its number is not looked at.
+
+New keys are made each :data:`RENEW_S`, so that attacks on the exchange have something to attack. The receiver goes on
+taking the key before the newest, so that an exchange loses no frame.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hmac
+import socket
+import warnings
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from uavlinkd.core import wire
+from uavlinkd.core.crypto import hmac_sha256
+from uavlinkd.lab.evaluation.paper import LibraryKey, Parameters, mac_key, make_key, make_parameters
+
+HELLO, ANSWER = 1, 2
+GROUP_BITS = 2048
+KEY_BYTES = GROUP_BITS // 8
+MAC_KEY_BITS = 256
+TAG_BYTES = 32
+RENEW_S = 0.25
+_DATAGRAM_BYTES = 65536
+_DATAGRAMS_PER_WAKE_UP = 128
+
+Tell = Callable[[str, str], None]
+"""What happened, and the explanation for a person."""
+
+VERIFIED = "hmac_verified"
+MEANINGS = {
+    VERIFIED: "data whose HMAC fits",
+    "hmac_mismatch": "data whose HMAC does not fit: altered on the way, or made with another key",
+    "bad_public_key": "a public key that no honest end sends",
+    "unexpected_key": "a public key in answer to nothing",
+    "malformed": "a datagram that is no message of this protocol",
+}
+
+
+class PaperKey:
+    """A key pair in RFC 7919's ffdhe2048, and what follows from another's public key."""
+
+    def __init__(self) -> None:
+        with _ffdh():
+            made = make_key(parameters())
+        assert isinstance(made, LibraryKey)
+        self._key = made
+
+    @property
+    def public(self) -> bytes:
+        """As it travels."""
+        return self._key.public.to_bytes(KEY_BYTES, "big")
+
+    def mac_key(self, public: bytes) -> bytes:
+        """The key of the HMAC shared with the holder of ``public``.
+
+        Raises:
+            ValueError: the library refuses the key.
+        """
+        with _ffdh():
+            return mac_key(self._key.secret(int.from_bytes(public, "big")), MAC_KEY_BITS)
+
+
+@contextmanager
+def _ffdh() -> Iterator[None]:
+    """cryptography 50 announces that FFDH goes away some day; pyproject.toml bounds the version."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Diffie-Hellman over finite fields")
+        yield
+
+
+_group: list[Parameters] = []
+
+
+def parameters() -> Parameters:
+    """The group, loaded once."""
+    if not _group:
+        _group.append(make_parameters(GROUP_BITS, standard=True))
+    return _group[0]
+
+
+def seal(key: bytes, number: int, frame: bytes) -> bytes:
+    """A datagram with data."""
+    signed = wire.envelope_header(1, number) + frame
+    return signed + hmac_sha256(key, signed)
+
+
+def unseal(key: bytes, datagram: bytes) -> bytes | None:
+    """The frame in a datagram with data; None where the HMAC does not fit."""
+    signed, tag = datagram[:-TAG_BYTES], datagram[-TAG_BYTES:]
+    if not hmac.compare_digest(hmac_sha256(key, signed), tag):
+        return None
+    return signed[header_bytes(datagram) :]
+
+
+def header_bytes(datagram: bytes) -> int:
+    """Of a datagram with data."""
+    return wire.SHORT_HEADER_BYTES if datagram[0] == wire.SHORT_ENVELOPE else wire.LONG_HEADER_BYTES
+
+
+def is_key(datagram: bytes) -> bool:
+    """Whether a datagram has the form of a message with a public key."""
+    return len(datagram) == 1 + KEY_BYTES and datagram[0] in (HELLO, ANSWER)
+
+
+def is_data(datagram: bytes) -> bool:
+    """Whether a datagram has the form of one with data."""
+    return len(datagram) > wire.LONG_HEADER_BYTES + TAG_BYTES and datagram[0] in (
+        wire.SHORT_ENVELOPE,
+        wire.LONG_ENVELOPE,
+    )
+
+
+class PaperEnd:
+    """One end, on a socket of its own in the running event loop.
+
+    Args:
+        on_frame: called with each frame whose HMAC fits.
+        tell: called when something happens that a person would want to see.
+    """
+
+    def __init__(self, name: str, *, is_initiator: bool, on_frame: Callable[[bytes], None], tell: Tell) -> None:
+        self.name = name
+        self.counters: Counter[str] = Counter()
+        self.exchanges = 0
+        self._is_initiator = is_initiator
+        self._on_frame = on_frame
+        self._tell = tell
+        self._keys: list[bytes] = []  # of the HMAC, the newest first
+        self._waiting: PaperKey | None = None
+        self._number = 0
+        self._to: tuple[str, int] | None = None
+        self._loop = asyncio.get_running_loop()
+        self._timer: asyncio.TimerHandle | None = None
+        self._sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._sock.setblocking(False)
+        self._sock.bind(("127.0.0.1", 0))
+        self._loop.add_reader(self._sock, self._on_readable)
+
+    @property
+    def port(self) -> int:
+        """Where the other end reaches it."""
+        return int(self._sock.getsockname()[1])
+
+    def start(self, to: tuple[str, int]) -> None:
+        """Speak with whoever is there."""
+        self._to = to
+        if self._is_initiator:
+            self._renew()
+
+    def close(self) -> None:
+        """Stop."""
+        if self._timer is not None:
+            self._timer.cancel()
+        self._loop.remove_reader(self._sock)
+        self._sock.close()
+
+    def send(self, frame: bytes) -> None:
+        """Send a frame with its HMAC; before there is a key it is lost."""
+        if self._keys:
+            self._send(seal(self._keys[0], self._number, frame))
+            self._number += 1
+
+    def _send(self, datagram: bytes) -> None:
+        assert self._to is not None
+        try:
+            self._sock.sendto(datagram, self._to)
+        except OSError as error:
+            self._count("send_failed", error.strerror or str(error))
+
+    def _renew(self) -> None:
+        self._waiting = PaperKey()
+        self._send(bytes((HELLO,)) + self._waiting.public)
+        self._timer = self._loop.call_at(self._loop.time() + RENEW_S, self._renew)
+
+    def _on_readable(self) -> None:
+        for _ in range(_DATAGRAMS_PER_WAKE_UP):
+            try:
+                datagram = self._sock.recv(_DATAGRAM_BYTES)
+            except BlockingIOError:
+                return
+            except OSError:  # an earlier datagram found nobody
+                continue
+            self._receive(datagram)
+
+    def _receive(self, datagram: bytes) -> None:
+        if is_data(datagram):
+            self._receive_data(datagram)
+        elif is_key(datagram):
+            self._receive_key(datagram[0], datagram[1:])
+        else:
+            self._count("malformed")
+
+    def _receive_key(self, kind: int, public: bytes) -> None:
+        ours = PaperKey() if kind == HELLO else self._waiting
+        if ours is None or (kind == HELLO) is self._is_initiator:
+            self._count("unexpected_key")
+            return
+        try:
+            key = ours.mac_key(public)
+        except ValueError:
+            self._count("bad_public_key")
+            return
+        if kind == HELLO:
+            self._send(bytes((ANSWER,)) + ours.public)
+        self._waiting = None
+        self._keys = [key, *self._keys[:1]]
+        self.exchanges += 1
+
+    def _receive_data(self, datagram: bytes) -> None:
+        for key in self._keys:
+            frame = unseal(key, datagram)
+            if frame is not None:
+                self._tell(VERIFIED, MEANINGS[VERIFIED])
+                self._on_frame(frame)
+                return
+        self._count("hmac_mismatch")
+
+    def _count(self, reason: str, meaning: str = "") -> None:
+        self.counters[reason] += 1
+        self._tell(reason, meaning or MEANINGS[reason])

@@ -1,0 +1,363 @@
+"""Where attacks are tried: drones with their local programs, the man in the middle between them, and the books.
+
+:class:`DaemonStage` has real daemons, each a process; :class:`PaperStage` two ends of the paper's protocol. Both
+carry numbered frames all the time, each way.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import signal
+import socket
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from time import monotonic
+from typing import Any, Self
+
+from uavlinkd.lab.evaluation.ledger import Ledger
+from uavlinkd.lab.evaluation.middle import Middle, MiddleHere, MiddleProcess
+from uavlinkd.lab.evaluation.paper_protocol import VERIFIED, PaperEnd
+from uavlinkd.config.keys import decode_key, generate_psk
+from uavlinkd.ops.log import DISTURBANCES
+from uavlinkd.lab.sim.drone_process import DroneProcess, free_udp_ports
+
+LINK_UP_S = 60.0
+"""Half a second on a quiet machine."""
+_LOOK_S = 0.01
+_DATAGRAM_BYTES = 65536
+_TELL_EVERY_S = 1.0
+_TICK_S = 0.001
+_MOST_A_TICK = 20
+"""Frames that are made up for after a pause of this process; the rest is never sent."""
+
+
+class StageError(Exception):
+    """The drones did not link. The message is for a person."""
+
+
+@dataclass(frozen=True, slots=True)
+class Notice:
+    """What one drone noticed, so far or in a while: counters by reason, and figures of its link."""
+
+    drops: Counter[str] = field(default_factory=Counter)
+    figures: Counter[str] = field(default_factory=Counter)
+
+    def since(self, before: Notice) -> Notice:
+        """What came since then. Counters that began anew count from zero."""
+        return Notice(self.drops - before.drops, self.figures - before.figures)
+
+    def plus(self, other: Notice) -> Notice:
+        """Both together."""
+        return Notice(self.drops + other.drops, self.figures + other.figures)
+
+
+class Stage(ABC):
+    """What both have in common: traffic, the middle, the drones' logs.
+
+    Args:
+        names: of the drones.
+        middle: between them.
+        ledger: the books; a drone's program speaks if it has an audience there.
+        rate_hz: frames a second from each program that speaks.
+    """
+
+    system = ""
+
+    def __init__(self, names: Sequence[str], middle: Middle, ledger: Ledger, rate_hz: float) -> None:
+        self.names = tuple(names)
+        self.middle = middle
+        self.ledger = ledger
+        self.rate_hz = rate_hz
+        self.speakers = tuple(name for name in names if ledger.audience[name])
+        self._traffic: asyncio.Task[None] | None = None
+
+    async def __aenter__(self) -> Self:
+        try:
+            await self.open()
+            self._traffic = asyncio.create_task(self._talk())
+            await self._until_linked()
+        except BaseException:
+            await self._end()
+            raise
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self._end()
+
+    async def _end(self) -> None:
+        if self._traffic is not None:
+            self._traffic.cancel()
+            await asyncio.gather(self._traffic, return_exceptions=True)
+        await self.close()
+
+    async def _until_linked(self) -> None:
+        begin = monotonic()
+        self.ledger.await_recovery(begin)
+        while self.ledger.recovery_s is None:
+            if monotonic() > begin + LINK_UP_S:
+                raise StageError(f"no link within {LINK_UP_S:g} s: {await self.notices()}")
+            await asyncio.sleep(_LOOK_S)
+
+    async def _talk(self) -> None:
+        begin, sent = monotonic(), 0
+        while True:
+            due = int((monotonic() - begin) * self.rate_hz)
+            if due - sent > _MOST_A_TICK:
+                sent = due - _MOST_A_TICK
+            for _ in range(due - sent):
+                for name in self.speakers:
+                    self.send(name, self.ledger.next_frame(name, monotonic()))
+            sent = due
+            await asyncio.sleep(max(_TICK_S, 0.5 / self.rate_hz))
+
+    @abstractmethod
+    async def open(self) -> None:
+        """Start everything but the traffic."""
+
+    @abstractmethod
+    async def close(self) -> None:
+        """End everything but the traffic."""
+
+    @abstractmethod
+    def send(self, name: str, frame: bytes) -> None:
+        """A drone's local program says something."""
+
+    @abstractmethod
+    async def notices(self) -> dict[str, Notice]:
+        """What each drone noticed so far."""
+
+    @abstractmethod
+    async def restart(self, name: str) -> None:
+        """A power failure of one drone, and its start; when it answers again."""
+
+    @abstractmethod
+    def logs(self) -> dict[str, list[dict[str, Any]]]:
+        """Each drone's log so far: its lines, parsed."""
+
+
+class DaemonStage(Stage):
+    """Real daemons. Each pair is linked through the middle, with a PSK.
+
+    Args:
+        link: the ``[link]`` section of every daemon.
+        silent: drones whose program says nothing and is told nothing, and who may speak as themselves alone.
+    """
+
+    system = "uavlinkd"
+
+    def __init__(
+        self,
+        names: Sequence[str],
+        folder: Path,
+        middle: MiddleProcess | MiddleHere,
+        link: Mapping[str, object],
+        *,
+        rate_hz: float,
+        silent: Sequence[str] = (),
+    ) -> None:
+        speakers = [name for name in names if name not in silent]
+        audience = {name: set(speakers) - {name} if name in speakers else set() for name in names}
+        super().__init__(names, middle, Ledger(names, audience), rate_hz)
+        ports = free_udp_ports(2 * len(names))
+        self.drones = {
+            name: DroneProcess(name, folder / name, ports[2 * number], ports[2 * number + 1])
+            for number, name in enumerate(names)
+        }
+        self.psks: dict[frozenset[str], str] = {}
+        self._link = link
+        self._silent = frozenset(silent)
+        self._programs: dict[str, socket.socket] = {}
+        self._before: dict[str, Notice] = {name: Notice() for name in names}
+
+    @property
+    def public_keys(self) -> dict[str, bytes]:
+        """Of the drones."""
+        return {name: decode_key(drone.public_key) for name, drone in self.drones.items()}
+
+    async def open(self) -> None:
+        """Configure and start the daemons, the middle, and a program at each."""
+        self._configure()
+        await self.middle.start({name: drone.port for name, drone in self.drones.items()}, self.public_keys)
+        loop = asyncio.get_running_loop()
+        for name in self.names:
+            sock = self._programs[name] = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            sock.setblocking(False)
+            sock.bind(("127.0.0.1", 0))
+            loop.add_reader(sock, self._on_readable, name, sock)
+        for drone in self.drones.values():
+            await drone.start()
+        await self._until_up(*self.names)
+
+    def _configure(self) -> None:
+        for one in self.names:
+            peers = []
+            for other in self.names:
+                if one == other:
+                    continue
+                pair = frozenset((one, other))
+                psk = self.psks.setdefault(pair, generate_psk())
+                file = f"{other}.psk"
+                self.drones[one].share_psk(psk, file)
+                rules: dict[str, object] = {}
+                if self._silent:
+                    rules["system_ids"] = [self.names.index(other) + 1]
+                if pair & self._silent:
+                    rules["deny_out"] = ["ATTITUDE", "HEARTBEAT"]
+                address = f"127.0.0.1:{self.middle.ports[one, other]}"
+                peers.append(self.drones[other].as_peer(address, file, **rules))
+            self.drones[one].configure(self._link, peers)
+
+    async def _until_up(self, *names: str) -> None:
+        begin = monotonic()
+        waiting = [self.drones[name] for name in names]
+        while waiting:
+            for drone in list(waiting):
+                await drone.ask()
+                if drone.peer_statuses and all(each["state"] == "up" for each in drone.peer_statuses):
+                    waiting.remove(drone)
+            if monotonic() > begin + LINK_UP_S:
+                said = "\n".join(line for drone in waiting for line in drone.last_lines(3))
+                raise StageError(f"the daemons did not link within {LINK_UP_S:g} s; they said:\n{said}")
+            await asyncio.sleep(_LOOK_S)
+
+    async def close(self) -> None:
+        """End all processes."""
+        await asyncio.gather(*(drone.stop() for drone in self.drones.values()))
+        await self.middle.stop()
+        loop = asyncio.get_running_loop()
+        for sock in self._programs.values():
+            loop.remove_reader(sock)
+            sock.close()
+
+    def send(self, name: str, frame: bytes) -> None:
+        """To the daemon's endpoint."""
+        with suppress(OSError):  # its daemon is being restarted
+            self._programs[name].sendto(frame, ("127.0.0.1", self.drones[name].endpoint_port))
+
+    def _on_readable(self, name: str, sock: socket.socket) -> None:
+        now = monotonic()
+        for _ in range(64):
+            try:
+                datagram = sock.recv(_DATAGRAM_BYTES)
+            except BlockingIOError:
+                return
+            except OSError:
+                continue
+            self.ledger.on_received(name, datagram, now)
+
+    async def notices(self) -> dict[str, Notice]:
+        """From each daemon's status; what it said before a restart counts too."""
+        told = {}
+        for name, drone in self.drones.items():
+            told[name] = self._before[name].plus(_notice(await drone.ask()))
+        return told
+
+    async def restart(self, name: str) -> None:
+        """Kill the daemon and start it again."""
+        drone = self.drones[name]
+        self._before[name] = self._before[name].plus(_notice(await drone.ask()))
+        await drone.stop(signal.SIGKILL)
+        await asyncio.sleep(0.4)  # as long as replays take for a restart
+        drone.status = {}
+        await drone.start()
+        begin = monotonic()
+        while not await drone.ask():
+            if monotonic() > begin + LINK_UP_S:
+                raise StageError(f"{name} did not start again within {LINK_UP_S:g} s")
+            await asyncio.sleep(_LOOK_S)
+
+    def logs(self) -> dict[str, list[dict[str, Any]]]:
+        """Their JSON lines; what is none is a line too."""
+        return {
+            name: [_parsed(line) for line in drone.last_lines(1 << 20)] if drone.log.exists() else []
+            for name, drone in self.drones.items()
+        }
+
+
+def _parsed(line: str) -> dict[str, Any]:
+    try:
+        found = json.loads(line)
+    except ValueError:
+        return {"event": line}
+    return found if isinstance(found, dict) else {"event": line}
+
+
+def _notice(status: Mapping[str, Any]) -> Notice:
+    drops: Counter[str] = Counter(status.get("drops", {}))
+    figures: Counter[str] = Counter()
+    for peer in status.get("peers", {}).values():
+        drops.update(peer["drops"])
+        figures["handshakes"] += peer["handshakes"]
+        figures["envelopes_received"] += peer["envelopes_received"]
+        drops.update({sign: peer[sign] for sign in DISTURBANCES if peer[sign]})
+        for reasons in peer["refused"]["in"].values():
+            for reason, count in reasons.items():
+                drops[f"refused_{reason}"] += count
+    return Notice(drops, figures)
+
+
+class PaperStage(Stage):
+    """Two ends of the paper's protocol."""
+
+    system = "paper"
+
+    def __init__(self, names: Sequence[str], middle: MiddleHere, *, rate_hz: float) -> None:
+        super().__init__(names, middle, Ledger(names), rate_hz)
+        self.ends: dict[str, PaperEnd] = {}
+        self._lines: dict[str, list[dict[str, Any]]] = {name: [] for name in names}
+        self._told: Counter[tuple[str, str]] = Counter()
+        self._quiet_until: dict[tuple[str, str], float] = {}
+
+    async def open(self) -> None:
+        """Both ends, and the middle."""
+        for number, name in enumerate(self.names):
+            self.ends[name] = PaperEnd(
+                name,
+                is_initiator=number == 0,
+                on_frame=lambda frame, name=name: self.ledger.on_received(name, frame, monotonic()),  # type: ignore[misc]
+                tell=lambda reason, meaning, name=name: self._tell(name, reason, meaning),  # type: ignore[misc]
+            )
+        await self.middle.start({name: end.port for name, end in self.ends.items()}, {})
+        for one, other in (self.names, self.names[::-1]):
+            self.ends[one].start(("127.0.0.1", self.middle.ports[one, other]))
+
+    async def close(self) -> None:
+        """End."""
+        for end in self.ends.values():
+            end.close()
+        await self.middle.stop()
+
+    def send(self, name: str, frame: bytes) -> None:
+        """The end sends it."""
+        self.ends[name].send(frame)
+
+    async def notices(self) -> dict[str, Notice]:
+        """Its counters."""
+        return {
+            name: Notice(Counter(end.counters), Counter(exchanges=end.exchanges)) for name, end in self.ends.items()
+        }
+
+    async def restart(self, name: str) -> None:
+        """Nothing of it is kept anyway: new keys come each moment."""
+
+    def logs(self) -> dict[str, list[dict[str, Any]]]:
+        """What they told."""
+        return self._lines
+
+    def _tell(self, name: str, reason: str, meaning: str) -> None:
+        # As few lines as the daemon's: one when it begins, then one a second.
+        self._told[name, reason] += 1
+        now = monotonic()
+        if now < self._quiet_until.get((name, reason), now):
+            return
+        self._quiet_until[name, reason] = now + _TELL_EVERY_S
+        event = "data_verified" if reason == VERIFIED else "tampering_detected"
+        stamp = datetime.now(UTC).isoformat().replace("+00:00", "Z")
+        facts = {"reason": reason, "count": self._told[name, reason], "meaning": meaning, "timestamp": stamp}
+        self._lines[name].append({"event": event, **facts})

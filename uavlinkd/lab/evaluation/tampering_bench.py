@@ -1,0 +1,231 @@
+"""One attack at a time: told to the man in the middle, watched from both ends, and written down."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from time import monotonic
+from typing import Any, TextIO
+
+from uavlinkd.core.constants import LATE_AFTER_S, LATE_STEP_S
+from uavlinkd.lab.evaluation.stage import Stage
+from uavlinkd.lab.evaluation.tampering_plan import HANDSHAKE, KEYS, Plan, with_target
+from uavlinkd.lab.evaluation.tampering_records import PAPER, Run, Trial
+from uavlinkd.lab.mitm.attack import AttackObject
+
+GIVE_UP_S = 5.0
+"""How long frames are waited for after an attack."""
+QUICK_AFTER_S = 1.2
+"""The longest that a quick run goes on after the last attempt: it has few to wait for."""
+CONTROL_S, QUICK_CONTROL_S = 10.0, 1.0
+"""How long nothing is attacked, for comparison, before the first attack."""
+_LOOK_S = 0.02
+_SETTLE_S = 0.08
+"""After the recovery: what is on its way arrives."""
+_TOLD_S = LATE_AFTER_S + 2 * LATE_STEP_S + 0.1
+"""The same where envelopes may be missing: a daemon calls them so when they can come no more."""
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """How much of everything."""
+
+    quick: bool = False
+    attempts_data: int = 10_000
+    attempts_handshake: int = 200
+    seed: int = 0
+
+    @property
+    def rate_hz(self) -> float:
+        """Frames a second of each program on a stage for attacks on data."""
+        return 100.0 if self.quick else 500.0
+
+    @property
+    def paper_rate_hz(self) -> float:
+        """The same on the stage of the paper's protocol, whose ends share a process with everything here."""
+        return 100.0 if self.quick else 250.0
+
+    def target(self, group: str, system: str) -> int:
+        """Attempts of an attack: on the paper's protocol fewer will do, which shows its faults at once."""
+        if self.quick:
+            return 5 if group in (HANDSHAKE, KEYS) else 60
+        wanted = self.attempts_handshake if group in (HANDSHAKE, KEYS) else self.attempts_data
+        return max(1, wanted // 10) if system == PAPER else wanted
+
+    def most_s(self, group: str) -> float:
+        """How long an attack may take for that."""
+        if self.quick:
+            return 8.0
+        return 300.0 if group in (HANDSHAKE, KEYS) else 60.0
+
+
+Show = Callable[[Trial], None]
+
+
+class Recorder:
+    """Writes each trial as it ends."""
+
+    def __init__(self, file: TextIO, show: Show) -> None:
+        self.run = Run()
+        self.began_at = monotonic()
+        self._file = file
+        self._show = show
+
+    def add(self, trial: Trial) -> None:
+        """One more."""
+        self.run.trials.append(trial)
+        self.write(trial.to_json())
+        self._show(trial)
+
+    def write(self, line: str) -> None:
+        """A line of the records."""
+        self._file.write(line + "\n")
+        self._file.flush()
+
+
+@dataclass(slots=True)
+class Marker:
+    """A moment for the readable logs."""
+
+    at: datetime
+    text: str
+
+
+class Bench:
+    """Tries attacks on one stage, one after the other."""
+
+    def __init__(self, stage: Stage, recorder: Recorder, settings: Settings) -> None:
+        self.stage = stage
+        self.markers: list[Marker] = []
+        self.control: dict[str, float] = {}
+        """What the drones count a second where nothing is attacked, as :meth:`run_control` found."""
+        self._recorder = recorder
+        self._settings = settings
+
+    async def run(
+        self,
+        plan: Plan,
+        *,
+        phases: Sequence[str] | None = None,
+        objects: Callable[[], Sequence[AttackObject]] | None = None,
+        sessions: Callable[[], int] = lambda: 0,
+        achieved: Callable[[], dict[str, Any]] = dict,
+    ) -> Trial:
+        """Try one. ``phases`` in place of the plan's, or attackers with keys."""
+        stage, ledger, settings = self.stage, self.stage.ledger, self._settings
+        target = settings.target(plan.group, stage.system) if plan.targeted else 0
+        told = tuple(with_target(phase, target) for phase in (plan.phases if phases is None else phases))
+        names = [phase.split()[0].split(",")[0] for phase in told]
+        notices, noticed_at = await stage.notices(), monotonic()
+        lines = {name: len(log) for name, log in stage.logs().items()}
+        stats = await stage.middle.statistics()
+        faults, begin, begin_at = Counter(ledger.faults), ledger.mark(), monotonic()
+        self._mark(f"attack begins: {plan.attack} {'; then '.join(told)}")
+        most_s = max(settings.most_s(plan.group), plan.least_s)
+        for position in range(max(1, len(told))):
+            if objects is not None:
+                made = objects()
+                names = [each.name for each in made]
+                await stage.middle.attack([], made)
+            else:
+                await stage.middle.attack(told[position].split())
+            wanted = target * (position + 1) // max(1, len(told))
+            restart_at = begin_at + 0.3 * plan.least_s if plan.restarts else None
+            phase_at, least_at = monotonic(), begin_at + plan.least_s
+            while True:
+                await asyncio.sleep(_LOOK_S)
+                now = monotonic()
+                if restart_at is not None:
+                    if now >= restart_at:
+                        await stage.restart(stage.names[1])
+                        restart_at, phase_at = None, monotonic()
+                        least_at = phase_at + 0.7 * plan.least_s
+                    continue
+                done = _attempts((await stage.middle.statistics()).of(names), stats.of(names))
+                enough = done >= wanted if plan.targeted else done > 0
+                if (enough and now >= least_at) or now - phase_at > most_s:
+                    break
+        is_cut = settings.quick and not plan.takes_away
+        await asyncio.sleep(min(plan.after_s, QUICK_AFTER_S) if is_cut else plan.after_s)
+        result, got = achieved(), sessions()
+        end = ledger.mark()
+        await stage.middle.attack([])
+        ended_at = monotonic()
+        self._mark(f"attack ended: {plan.attack}")
+        ledger.await_recovery(ended_at)
+        while ledger.recovery_s is None and monotonic() < ended_at + GIVE_UP_S:  # noqa: ASYNC110  sockets, not tasks
+            await asyncio.sleep(_LOOK_S / 4)
+        recovery_s = ledger.recovery_s
+        tells_late = plan.takes_away and stage.system != PAPER  # the paper's drones tell at once, or never
+        await asyncio.sleep(_TOLD_S if tells_late or not settings.quick else _SETTLE_S)
+        after_stats, after = await stage.middle.statistics(), await stage.notices()
+        done_counts = _difference(after_stats.of(names), stats.of(names))
+        sent, delivered = ledger.count(begin, end)
+        trial = Trial(
+            system=stage.system,
+            attack=plan.attack,
+            group=plan.group,
+            seed=settings.seed,
+            parameters=told or tuple(names),
+            begin_s=round(begin_at - self._recorder.began_at, 3),
+            duration_s=round(ended_at - begin_at, 3),
+            attempts=_attempts(after_stats.of(names), stats.of(names)),
+            interventions=done_counts,
+            target=target,
+            faults={kind.value: count for kind, count in (ledger.faults - faults).items()},
+            sessions=got,
+            achieved=result,
+            bytes_to_strangers=after_stats.bytes_to_strangers - stats.bytes_to_strangers,
+            must_be_silent=plan.is_silent,
+            amplified=() if plan.validates else tuple(sorted(_difference(after_stats.amplified, stats.amplified))),
+            frames_sent=sent,
+            frames_delivered=delivered,
+            noticed={name: dict(after[name].since(notices[name]).drops) for name in after},
+            events=_events(stage, lines),
+            recovery_s=None if recovery_s is None else round(recovery_s, 4),
+            notes=plan.notes,
+            observed_s=round(monotonic() - noticed_at, 3),
+            control=self.control,
+        )
+        self._recorder.add(trial)
+        return trial
+
+    async def run_control(self) -> None:
+        """See what the drones count while the man in the middle lets everything pass."""
+        duration_s = QUICK_CONTROL_S if self._settings.quick else CONTROL_S
+        before = await self.stage.notices()
+        await asyncio.sleep(duration_s)
+        after = await self.stage.notices()
+        counts = sum((after[name].since(before[name]).drops for name in after), Counter[str]())
+        self.control = {reason: round(count / duration_s, 3) for reason, count in counts.items()}
+
+    def _mark(self, text: str) -> None:
+        self.markers.append(Marker(datetime.now(UTC), text))
+
+
+_NO_ATTEMPTS = ("answered", "released")
+
+
+def _attempts(now: Mapping[str, int], before: Mapping[str, int]) -> int:
+    return sum(n for key, n in _difference(now, before).items() if not key.endswith(_NO_ATTEMPTS))
+
+
+def _difference(now: Mapping[str, int], before: Mapping[str, int]) -> dict[str, int]:
+    return {key: n - before.get(key, 0) for key, n in now.items() if n > before.get(key, 0)}
+
+
+def _events(stage: Stage, seen: dict[str, int]) -> dict[str, dict[str, int]]:
+    """Lines of each drone's log since then, by event and reason."""
+    found = {}
+    for name, lines in stage.logs().items():
+        counts = Counter(_event_name(line) for line in lines[seen.get(name, 0) :])
+        found[name] = dict(counts)
+    return found
+
+
+def _event_name(line: dict[str, Any]) -> str:
+    event = str(line.get("event", ""))
+    return f"{event}: {line['reason']}" if "reason" in line else event

@@ -1,0 +1,371 @@
+"""A simulated autopilot without I/O: what comes in and the time are arguments, what goes out is returned.
+
+It speaks as ArduCopter does towards ground stations, well enough that QGroundControl, MAVSDK and MAVProxy take it for
+one. It is a tool to try a link with: the full decoder of pymavlink is used here, and nowhere on a frame's way through
+the daemon.
+
+All that it sends is meant for everyone who is heard: the stations share one link and one sequence of frames, as over
+a radio.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, OrderedDict, deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from uavlinkd.mavlink.frames import SplitCounters, split_datagram
+from uavlinkd.lab.sim.mav_commands import Command, Commands
+from uavlinkd.lab.sim.mission import PLAN, Missions
+from uavlinkd.lab.sim.parameters import Parameters
+from uavlinkd.lab.sim.pilot import MissionPilot, point_of
+from uavlinkd.lab.sim.message_rates import MAX_RATE_HZ, Streams, default_rates
+from uavlinkd.lab.sim.telemetry import Telemetry
+from uavlinkd.lab.sim.vehicle import Landed, Mode, Place, Vehicle
+
+MOVE_EVERY_S: Final = 0.05
+# A whole list at once would overrun a radio; ArduPilot spreads it too.
+PARAMETERS_PER_S: Final = 200.0
+MAX_STATIONS: Final = 32
+HOME: Final = Place(47.397742, 8.545594, 488.0)
+
+FTP_NAK: Final = 129
+FTP_FILE_NOT_FOUND: Final = 10
+
+Event = Callable[[str, dict[str, object]], None]
+Message = Any  # a pymavlink message: pymavlink has no types
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AutopilotSettings:
+    """What one simulated copter is like. Rates are messages a second, until a ground station asks for others."""
+
+    system_id: int = 1
+    component_id: int = 1
+    attitude_rate_hz: float = 10.0
+    position_rate_hz: float = 5.0
+    home: Place = HOME
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, value in (("system_id", self.system_id), ("component_id", self.component_id)):
+            if not 1 <= value <= 255:
+                raise ValueError(f"{name} is {value}: it must be 1 to 255")
+        for name, rate in (("attitude_rate_hz", self.attitude_rate_hz), ("position_rate_hz", self.position_rate_hz)):
+            if not 0 <= rate <= MAX_RATE_HZ:
+                raise ValueError(f"{name} is {rate}: it must be 0 to {MAX_RATE_HZ:g}")
+
+
+@dataclass(slots=True)
+class Counters:
+    """What the autopilot has done so far."""
+
+    frames_sent: int = 0
+    bytes_sent: int = 0
+    frames_received: int = 0
+    undecodable: int = 0
+    for_others: int = 0
+    commands: Counter[int] = field(default_factory=Counter)
+    events: Counter[str] = field(default_factory=Counter)
+
+
+class Autopilot:
+    """One simulated copter. Times are seconds on a clock of the caller's.
+
+    Equal input at equal times gives equal frames.
+    """
+
+    def __init__(
+        self,
+        settings: AutopilotSettings | None = None,
+        *,
+        started_at: float = 0.0,
+        unix_epoch_us: int = 0,
+        on_event: Event | None = None,
+    ) -> None:
+        self.settings = settings or AutopilotSettings()
+        self.counters = Counters()
+        self.split = SplitCounters()
+        self.vehicle = Vehicle(self.settings.home)
+        self.parameters = Parameters(self.settings.system_id)
+        self.missions = Missions(self.send, self._missions_changed)
+        self.pilot = MissionPilot(self.vehicle, self.missions)
+        self.streams = Streams(
+            default_rates(self.settings.attitude_rate_hz, self.settings.position_rate_hz), started_at
+        )
+        self.commands = Commands(self)
+        self._telemetry = Telemetry(
+            self.vehicle,
+            self.missions,
+            seed=self.settings.seed,
+            identity=(self.settings.seed & 0xFFFF_FFFF) << 8 | self.settings.system_id,
+            unix_epoch_us=unix_epoch_us,
+        )
+        self._codec = mavlink.MAVLink(None, self.settings.system_id, self.settings.component_id)
+        self._on_event = on_event
+        self._started_at = started_at
+        self._moved_at = started_at
+        self._out: list[bytes] = []
+        self._parameters_to_send: deque[int] = deque()
+        self._parameter_due_at = started_at
+        # By (system, component), the latest last: when a ground station's heartbeat was heard.
+        self._stations: OrderedDict[tuple[int, int], float] = OrderedDict()
+        self._gcs_lost = False
+        self._handlers: dict[str, Callable[[Message, float], None]] = {
+            "HEARTBEAT": self._on_heartbeat,
+            "PING": self._on_ping,
+            "TIMESYNC": self._on_timesync,
+            "PARAM_REQUEST_LIST": self._on_param_request_list,
+            "PARAM_REQUEST_READ": self._on_param_request_read,
+            "PARAM_SET": self._on_param_set,
+            "COMMAND_LONG": self._on_command_long,
+            "COMMAND_INT": self._on_command_int,
+            "SET_MODE": self._on_set_mode,
+            "REQUEST_DATA_STREAM": self._on_request_data_stream,
+            "MISSION_SET_CURRENT": self._on_mission_set_current,
+            "SET_POSITION_TARGET_GLOBAL_INT": self._on_position_target,
+            "FILE_TRANSFER_PROTOCOL": self._on_file_transfer,
+            **dict.fromkeys(
+                (
+                    "MISSION_REQUEST_LIST",
+                    "MISSION_REQUEST_INT",
+                    "MISSION_REQUEST",
+                    "MISSION_COUNT",
+                    "MISSION_ITEM_INT",
+                    "MISSION_ITEM",
+                    "MISSION_CLEAR_ALL",
+                    "MISSION_ACK",
+                ),
+                self.missions.receive,
+            ),
+        }
+
+    @property
+    def next_due_at(self) -> float:
+        """When to call ``advance`` next."""
+        parameters = self._parameter_due_at if self._parameters_to_send else math.inf
+        moving = self._moved_at + MOVE_EVERY_S
+        return min(self.streams.next_due_at, self.missions.next_due_at, parameters, moving)
+
+    @property
+    def stations(self) -> list[tuple[int, int]]:
+        """The ground stations heard: system and component ids."""
+        return list(self._stations)
+
+    def advance(self, now: float) -> list[bytes]:
+        """Let time pass: fly on, and say what is due."""
+        was_armed, was = self.vehicle.armed, self.vehicle.landed
+        self.vehicle.step(now - self._moved_at)
+        self._moved_at = now
+        if was is not Landed.ON_GROUND and self.vehicle.landed is Landed.ON_GROUND:
+            self.tell("landed")
+        if was_armed and not self.vehicle.armed:
+            self.tell("disarmed")
+        mode = self.vehicle.mode
+        for sequence in self.pilot.advance():
+            self.tell("mission_item_reached", sequence=sequence)
+            self.send(mavlink.MAVLink_mission_item_reached_message(sequence))
+        if self.vehicle.mode is not mode:
+            self.tell("mode_changed", mode=self.vehicle.mode.name)
+        self._watch_stations(now)
+        self.missions.advance(now)
+        while self._parameters_to_send and self._parameter_due_at <= now:
+            self._send_parameter(self._parameters_to_send.popleft())
+            self._parameter_due_at += 1 / PARAMETERS_PER_S
+        for number in self.streams.take_due(now):
+            self.send_by_number(number, now)
+        return self._take()
+
+    def receive(self, data: bytes, now: float) -> list[bytes]:
+        """Answer a datagram, or whole frames of a stream. Total: any bytes give a list of frames to send."""
+        for frame in split_datagram(data, self.split):
+            self._receive(frame.raw, now)
+        return self._take()
+
+    def send(self, message: Message) -> None:
+        """Put a message among what is to go out."""
+        frame = bytes(message.pack(self._codec))
+        self._codec.seq = (self._codec.seq + 1) % 256
+        self.counters.frames_sent += 1
+        self.counters.bytes_sent += len(frame)
+        self._out.append(frame)
+
+    def send_by_number(self, number: int, now: float) -> bool:
+        """Say something of itself, by message id; False if there is nothing such to say."""
+        message = self._telemetry.message(number, now - self._started_at)
+        if message is not None:
+            self.send(message)
+        return message is not None
+
+    def tell(self, event: str, **fields: object) -> None:
+        """Report what happened to the vehicle."""
+        self.counters.events[event] += 1
+        if self._on_event:
+            self._on_event(event, fields)
+
+    def _take(self) -> list[bytes]:
+        out, self._out = self._out, []
+        return out
+
+    def _receive(self, frame: bytes, now: float) -> None:
+        self.counters.frames_received += 1
+        try:
+            message = self._codec.decode(bytearray(frame))
+        except Exception:  # pymavlink raises MAVError, and whatever its constructors raise
+            self.counters.undecodable += 1
+            return
+        ours = (self.settings.system_id, self.settings.component_id)
+        source = (message.get_srcSystem(), message.get_srcComponent())
+        target = getattr(message, "target_system", 0), getattr(message, "target_component", 0)
+        if source == ours or target[0] not in (0, ours[0]) or target[1] not in (0, ours[1]):
+            self.counters.for_others += 1
+            return
+        handle = self._handlers.get(message.get_type())
+        if handle is not None:
+            handle(message, now)
+
+    def _watch_stations(self, now: float) -> None:
+        """ArduPilot's ground station failsafe: silence for FS_GCS_TIMEOUT brings the copter home."""
+        if not self._stations or self._gcs_lost:
+            return
+        last_heard = next(reversed(self._stations.values()))
+        if now - last_heard < self.parameters["FS_GCS_TIMEOUT"]:
+            return
+        self._gcs_lost = True
+        self.tell("gcs_lost", after_s=round(now - last_heard, 3))
+        flying = self.vehicle.armed and self.vehicle.landed is not Landed.ON_GROUND
+        if flying and self.parameters["FS_GCS_ENABLE"] and self.vehicle.mode not in (Mode.RTL, Mode.LAND):
+            self.tell("gcs_failsafe")
+            self.send(mavlink.MAVLink_statustext_message(mavlink.MAV_SEVERITY_WARNING, b"GCS Failsafe"))
+            self.commands.set_mode(Mode.RTL)
+
+    def _on_heartbeat(self, message: Message, now: float) -> None:
+        if message.type != mavlink.MAV_TYPE_GCS:
+            return
+        station = (message.get_srcSystem(), message.get_srcComponent())
+        if station not in self._stations or self._gcs_lost:
+            self._gcs_lost = False
+            self.tell("gcs_heard", system_id=station[0], component_id=station[1])
+        self._stations[station] = now
+        self._stations.move_to_end(station)
+        if len(self._stations) > MAX_STATIONS:
+            self._stations.popitem(last=False)
+
+    def _on_ping(self, message: Message, _now: float) -> None:
+        # A ping with a target is the answer to one.
+        if message.target_system == 0 and message.target_component == 0:
+            source = message.get_srcSystem(), message.get_srcComponent()
+            self.send(mavlink.MAVLink_ping_message(message.time_usec, message.seq, *source))
+
+    def _on_timesync(self, message: Message, now: float) -> None:
+        if message.tc1 == 0:
+            self.send(mavlink.MAVLink_timesync_message(round((now - self._started_at) * 1e9), message.ts1))
+
+    def _on_param_request_list(self, _message: Message, now: float) -> None:
+        if not self._parameters_to_send:
+            self._parameter_due_at = now
+        self._parameters_to_send = deque(range(len(self.parameters)))
+
+    def _on_param_request_read(self, message: Message, _now: float) -> None:
+        index = message.param_index if message.param_index >= 0 else self.parameters.index_of(message.param_id)
+        if index is not None and self.parameters.at(index):
+            self._send_parameter(index)
+
+    def _on_param_set(self, message: Message, _now: float) -> None:
+        index = self.parameters.index_of(message.param_id)
+        if index is None:
+            return
+        if self.parameters.set(message.param_id, message.param_value):
+            self._apply_parameters()
+            self.tell("parameter_set", name=message.param_id, value=self.parameters[message.param_id])
+        # Refused or not, the answer is the value in force.
+        self._send_parameter(index)
+
+    def _send_parameter(self, index: int) -> None:
+        parameter = self.parameters.table[index]
+        self.send(
+            mavlink.MAVLink_param_value_message(
+                parameter.name.encode(), parameter.value, int(parameter.kind), len(self.parameters), index
+            )
+        )
+
+    def _apply_parameters(self) -> None:
+        """Those that the model heeds; ArduPilot has centimetres here."""
+        speeds, parameters = self.vehicle.speeds, self.parameters
+        speeds.travel_m_s = _between(parameters["WPNAV_SPEED"] / 100, 0.2, 20)
+        speeds.climb_m_s = _between(parameters["WPNAV_SPEED_UP"] / 100, 0.1, 10)
+        speeds.descend_m_s = _between(parameters["WPNAV_SPEED_DN"] / 100, 0.1, 5)
+        speeds.land_m_s = _between(parameters["LAND_SPEED"] / 100, 0.3, 2)
+        self.vehicle.return_altitude_m = _between(parameters["RTL_ALT"] / 100, 2, 300)
+
+    def _on_command_long(self, message: Message, now: float) -> None:
+        four = (message.param1, message.param2, message.param3, message.param4)
+        x, y = (_degrees_e7(value) for value in (message.param5, message.param6))
+        frame = mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT
+        self._run(message, Command(message.command, four, frame, x, y, message.param7), now)
+
+    def _on_command_int(self, message: Message, now: float) -> None:
+        four = (message.param1, message.param2, message.param3, message.param4)
+        self._run(message, Command(message.command, four, message.frame, message.x, message.y, message.z), now)
+
+    def _run(self, message: Message, command: Command, now: float) -> None:
+        self.counters.commands[command.number] += 1
+        result = self.commands.run(command, now)
+        self._acknowledge(message, command.number, result)
+
+    def _acknowledge(self, message: Message, command: int, result: int) -> None:
+        source = message.get_srcSystem(), message.get_srcComponent()
+        self.send(mavlink.MAVLink_command_ack_message(command, result, 0, 0, *source))
+
+    def _on_set_mode(self, message: Message, _now: float) -> None:
+        result = self.commands.set_mode(message.custom_mode)
+        self._acknowledge(message, mavlink.MAVLINK_MSG_ID_SET_MODE, result)  # so does ArduPilot
+
+    def _on_request_data_stream(self, message: Message, now: float) -> None:
+        rate = message.req_message_rate if message.start_stop else 0
+        self.streams.set_group(message.req_stream_id, rate, now)
+
+    def _on_mission_set_current(self, message: Message, now: float) -> None:
+        if self.missions.set_current(message.seq):
+            self.pilot.restart()
+        self.send_by_number(mavlink.MAVLINK_MSG_ID_MISSION_CURRENT, now)
+
+    def _on_position_target(self, message: Message, _now: float) -> None:
+        ignores_position = message.type_mask & 0b111
+        guided = self.vehicle.mode is Mode.GUIDED and self.vehicle.landed is not Landed.ON_GROUND
+        if guided and not ignores_position and math.isfinite(message.alt):
+            frame = message.coordinate_frame
+            self.vehicle.go_to(point_of(self.vehicle, frame, message.lat_int, message.lon_int, message.alt))
+
+    def _on_file_transfer(self, message: Message, _now: float) -> None:
+        """There are no files: the refusal makes a ground station turn to the parameter protocol at once."""
+        request = bytes(message.payload)
+        if request[3] >= 128:
+            return  # an answer, not a request
+        sequence = (int.from_bytes(request[:2], "little") + 1) & 0xFFFF
+        answer = bytearray(251)
+        answer[:2] = sequence.to_bytes(2, "little")
+        answer[2] = request[2]
+        answer[3], answer[4], answer[5], answer[12] = FTP_NAK, 1, request[3], FTP_FILE_NOT_FOUND
+        source = message.get_srcSystem(), message.get_srcComponent()
+        self.send(mavlink.MAVLink_file_transfer_protocol_message(0, *source, list(answer)))
+
+    def _missions_changed(self, kind: int, partner: tuple[int, int]) -> None:
+        items = len(self.missions.items(kind))
+        if kind == PLAN:
+            self.parameters.preset("MIS_TOTAL", items)
+            self.pilot.restart()
+        self.tell("mission_received", kind=kind, items=items, system_id=partner[0])
+
+
+def _between(value: float, lowest: float, highest: float) -> float:
+    return max(lowest, min(highest, value))
+
+
+def _degrees_e7(degrees: float) -> int:
+    """Degrees of a COMMAND_LONG in 1e-7 degrees; 0 (here) for what is no place."""
+    return round(degrees * 1e7) if abs(degrees) <= 180 else 0

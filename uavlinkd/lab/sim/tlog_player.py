@@ -1,0 +1,130 @@
+"""Plays a recorded flight to a MAVLink URL: each frame byte for byte, at the pace of the log or another."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections import Counter
+from collections.abc import Collection
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+from uavlinkd.lab.sim.links import Link, LinkError, OnFrame, open_link
+from uavlinkd.lab.sim.tlog import Record, Tlog, TlogError, parse_tlog, read_tlog
+
+__all__ = ["Record", "ReplayReport", "Tlog", "TlogError", "parse_tlog", "read_tlog", "replay"]
+
+# Within what a local socket takes without loss.
+MAX_FRAMES_PER_S: Final = 5000.0
+# Frames nearer than this to their time go out at once: a sleep of the loop is no finer.
+TICK_S: Final = 0.002
+
+
+@dataclass(slots=True)
+class ReplayReport:
+    """What a replay came to."""
+
+    frames_sent: int = 0
+    bytes_sent: int = 0
+    frames_left_out: int = 0  # of systems that were not asked for
+    frames_unsent: int = 0  # nobody was there any more
+    skipped_bytes: int = 0  # of the log, in no record
+    frames_received: int = 0
+    log_seconds: float = 0.0  # from the first record sent to the last one
+    seconds: float = 0.0
+    is_complete: bool = False  # the log was played to its end
+    by_system: Counter[int] = field(default_factory=Counter)
+
+
+async def replay(
+    source: str | Path | Tlog,
+    url: str,
+    *,
+    speed: float = 1.0,
+    max_frames_per_s: float = MAX_FRAMES_PER_S,
+    system_ids: Collection[int] | None = None,
+    seconds: float | None = None,
+    stop: asyncio.Event | None = None,
+    on_sent: OnFrame | None = None,
+    on_received: OnFrame | None = None,
+) -> ReplayReport:
+    """Play a log, ``speed`` times as fast as it was recorded, but never faster than ``max_frames_per_s``.
+
+    At speed 0 or infinity that limit alone is the pace. Only frames of ``system_ids``, if any are given. It ends with
+    the log, after ``seconds``, or when ``stop`` is set. A listening URL waits for its first correspondent before it
+    starts. A stamp that goes back, as where logs were joined, makes no pause.
+
+    Raises:
+        OSError, TlogError: The log cannot be read.
+        LinkError: The link cannot be opened, or the other end closed it.
+        ValueError: A speed or a limit that is none.
+    """
+    if not speed >= 0 or not max_frames_per_s > 0:
+        raise ValueError(f"speed {speed} and frames a second {max_frames_per_s} must be positive")
+    log = source if isinstance(source, Tlog) else await asyncio.to_thread(read_tlog, source)
+    report = ReplayReport(skipped_bytes=log.skipped_bytes)
+
+    def receive(frame: bytes) -> None:
+        report.frames_received += 1
+        if on_received:
+            on_received(frame)
+
+    link = await open_link(url, receive)
+    try:
+        ends = [asyncio.ensure_future(event.wait()) for event in (stop or asyncio.Event(), link.lost)]
+        playing = asyncio.ensure_future(
+            _play(log, link, report, 0.0 if math.isinf(speed) else speed, max_frames_per_s, system_ids, on_sent)
+        )
+        try:
+            await asyncio.wait({playing, *ends}, timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
+            if playing.done():
+                playing.result()
+            elif link.lost.is_set():
+                raise LinkError(f"{link.url}: the other end closed the connection")
+        finally:
+            for task in (playing, *ends):
+                task.cancel()
+            await asyncio.gather(playing, *ends, return_exceptions=True)
+    finally:
+        await link.close()
+    return report
+
+
+async def _play(
+    log: Tlog,
+    link: Link,
+    report: ReplayReport,
+    speed: float,
+    max_frames_per_s: float,
+    system_ids: Collection[int] | None,
+    on_sent: OnFrame | None,
+) -> None:
+    loop = asyncio.get_running_loop()
+    await link.joined.wait()
+    started_at = due_at = loop.time()
+    first_us = latest_us = None
+    for record in log.records:
+        if system_ids is not None and record.system_id not in system_ids:
+            report.frames_left_out += 1
+            continue
+        if first_us is None or latest_us is None:
+            first_us = latest_us = record.time_us
+        latest_us = max(latest_us, record.time_us)
+        by_log = started_at + (latest_us - first_us) / 1e6 / speed if speed else started_at
+        due_at = max(by_log, due_at)
+        if due_at - loop.time() > TICK_S:
+            await asyncio.sleep(due_at - loop.time())
+        # A pace that cannot be kept is not made up for in a burst beyond the limit.
+        due_at = max(due_at, loop.time() - TICK_S) + 1 / max_frames_per_s
+        if link.send(record.frame):
+            report.frames_sent += 1
+            report.bytes_sent += len(record.frame)
+            report.by_system[record.system_id] += 1
+            if on_sent:
+                on_sent(record.frame)
+        else:
+            report.frames_unsent += 1
+        report.log_seconds = (latest_us - first_us) / 1e6
+        report.seconds = loop.time() - started_at
+    report.is_complete = True

@@ -1,0 +1,1 @@
+"""Which waiting frame is sent next, and when."""

@@ -1,0 +1,217 @@
+"""What waits for one slow local client: urgent frames first, and each source its fair share of the bytes.
+
+A captured member may send what its policy allows, as fast as its link carries it. It can invent component ids and
+instances, so fairness between flows alone would let it take almost everything. Therefore a frame's turn depends on
+its *source* first, and on lane and flow within the source after that:
+
+* Urgent frames (:mod:`.egress_kinds`) of all sources go first. While other frames wait too, urgent ones get three of
+  four bytes, so a flood of HEARTBEAT stops neither a mission upload nor positions.
+* In both classes the source that was sent the fewest bytes is next, counted from when it began to wait (start-time
+  fair queueing). A source that asks for less than its share waits for at most one frame of each other source.
+* Within a source the lanes and flows take turns (:mod:`.egress_lanes`).
+* A newer state replaces an older one that has waited for ``SUPERSEDED_S``: counted as THINNED. Up to then both are
+  delivered, since one envelope may carry several of a flow and the client may have room for all.
+* A frame that waited longer than ``max_age_s`` is dropped as STALE. Bytes are bounded for each source, and together:
+  the source that holds most loses its own oldest frame, as OVERFLOW.
+
+Within a flow the order is never reversed. Sans-IO: `now` is monotonic seconds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from heapq import heappop, heappush, heapreplace
+from typing import Final
+
+from uavlinkd.mavlink.policy.delivery import Source
+from uavlinkd.mavlink.egress.kinds import Lane
+from uavlinkd.mavlink.egress.lanes import EgressDrop, Lanes, OnDrop
+from uavlinkd.mavlink.egress.queue import Waiting
+from uavlinkd.mavlink.frames import Frame
+
+SUPERSEDED_S: Final = 0.1
+"""A state that waited so long is replaced by a newer one of its flow."""
+LANE_BYTES: Final = 64 * 1024
+"""Bounds what waits in each of the three lanes of one source: a second of the fastest telemetry."""
+QUEUE_BYTES: Final = 256 * 1024
+"""Bounds what waits for the client."""
+MAX_FLOWS: Final = 256
+"""Flows of one source that are remembered while none of their frames waits."""
+MAX_SOURCES: Final = 64
+"""Sources that are remembered while none of their frames waits."""
+URGENT_PART: Final = 3
+"""Bytes of urgent frames for each byte of others, while both wait."""
+URGENT_LEAD_BYTES: Final = 1024
+"""So many bytes of urgent frames go first before that ratio holds: a burst of commands is not interrupted."""
+
+
+class _Place:
+    """Where one source is in the line of one class of frames."""
+
+    __slots__ = ("frames", "is_in_line", "next_frame", "paid")
+
+    def __init__(self, frames: _SourceFrames, next_frame: Callable[[], Waiting | None]) -> None:
+        self.frames = frames
+        self.next_frame = next_frame
+        """The source's next frame of this class."""
+        self.paid = 0.0  # on the line's clock, in bytes
+        self.is_in_line = False
+
+
+class _SourceFrames:
+    """What waits of one source."""
+
+    __slots__ = ("lanes", "rest", "source", "urgent")
+
+    def __init__(self, source: Source, on_drop: OnDrop) -> None:
+        self.source = source
+        self.lanes = Lanes(LANE_BYTES, MAX_FLOWS, _is_superseded, on_drop)
+        self.urgent = _Place(self, self.lanes.next_urgent)
+        self.rest = _Place(self, self.lanes.next_of_the_rest)
+
+
+def _is_superseded(waiting: Waiting, newer: Frame, now: float) -> bool:
+    return now - waiting.put_at > SUPERSEDED_S
+
+
+class _Line:
+    """Whose turn it is in one class of frames. The clock counts the bytes that each waiting source was sent."""
+
+    __slots__ = ("_clock", "_heap", "_most_paid", "_number")
+
+    def __init__(self) -> None:
+        self._clock = 0.0
+        self._most_paid = 0.0
+        self._heap: list[tuple[float, int, _Place]] = []
+        self._number = 0
+
+    def join(self, place: _Place) -> None:
+        """A frame of this source waits. A source that was idle has saved nothing up, and owes what it was sent."""
+        if not place.is_in_line:
+            place.is_in_line = True
+            self._number += 1
+            heappush(self._heap, (max(self._clock, place.paid), self._number, place))
+
+    def next(self) -> tuple[_Place, Waiting] | None:
+        """The frame whose turn it is."""
+        while self._heap:
+            place = self._heap[0][2]
+            if (waiting := place.next_frame()) is not None:
+                return place, waiting
+            heappop(self._heap)
+            place.is_in_line = False
+        self._clock = self._most_paid  # none waits: all are quits
+        return None
+
+    def charge(self, size: int) -> None:
+        """The frame that :meth:`next` returned is sent."""
+        self._clock, _, place = self._heap[0]
+        place.paid = self._clock + size
+        self._most_paid = max(self._most_paid, place.paid)
+        self._number += 1
+        heapreplace(self._heap, (place.paid, self._number, place))
+
+    def owes(self, place: _Place) -> bool:
+        """Whether the source is ahead of others, or waits."""
+        return place.is_in_line or place.paid > self._clock
+
+
+class FairQueue:
+    """The frames that wait for one client.
+
+    Each frame leaves once: by :meth:`pop`, or reported to ``on_drop``.
+    """
+
+    def __init__(self, max_age_s: float, on_drop: Callable[[EgressDrop], None]) -> None:
+        self.count = 0
+        """Frames that wait."""
+        self.size = 0
+        """Their bytes."""
+        self._max_age_s = max_age_s
+        self._report = on_drop
+        self._sources: dict[Source, _SourceFrames] = {}
+        self._sources_limit = MAX_SOURCES
+        self._urgent = _Line()
+        self._rest = _Line()
+        self._lead = 0  # bytes of urgent frames beyond their part, while others wait
+
+    def put(self, frames: Sequence[Frame], source: Source, now: float) -> None:
+        """Have frames of one source wait, in their order."""
+        waiting = self._sources.get(source) or self._add(source)
+        lanes = waiting.lanes
+        lanes.drop_stale(now, self._max_age_s)
+        for frame in frames:
+            self.count += 1
+            self.size += len(frame.raw)
+            if lanes.put(frame, now) is Lane.URGENT:
+                self._urgent.join(waiting.urgent)
+            else:
+                self._rest.join(waiting.rest)
+            while self.size > QUEUE_BYTES:
+                max(self._sources.values(), key=_size_of).lanes.drop_from_largest()
+
+    def next_bytes(self, now: float) -> int:
+        """How large the frame is whose turn it is; 0 if none waits."""
+        turn = self._turn(now)
+        return len(turn[1].frame.raw) if turn is not None else 0
+
+    def pop(self, room: float, now: float) -> tuple[Frame, Source] | None:
+        """Take out the frame whose turn it is; None if none waits or it has more than ``room`` bytes."""
+        turn = self._turn(now)
+        if turn is None:
+            return None
+        place, waiting = turn
+        frame = waiting.frame
+        size = len(frame.raw)
+        if size > room:
+            return None
+        if waiting.flow.lane is Lane.URGENT:
+            self._lead = self._lead + size if self._rest.next() is not None else 0
+            self._urgent.charge(size)
+        else:
+            others_wait = self._urgent.next() is not None
+            self._lead = max(0, self._lead - URGENT_PART * size) if others_wait else 0
+            self._rest.charge(size)
+        place.frames.lanes.serve(waiting, now)
+        self.count -= 1
+        self.size -= size
+        return frame, place.frames.source
+
+    def drop_stale(self, now: float) -> None:
+        """Drop what has waited too long."""
+        for each in self._sources.values():
+            each.lanes.drop_stale(now, self._max_age_s)
+
+    def clear(self) -> None:
+        """Drop all that waits: the client is gone."""
+        for each in self._sources.values():
+            each.lanes.clear()
+
+    def _turn(self, now: float) -> tuple[_Place, Waiting] | None:
+        """The frame that goes next, and its source's place. It is not stale."""
+        while True:
+            turn = self._rest.next() if self._lead >= URGENT_LEAD_BYTES else None
+            turn = turn or self._urgent.next() or self._rest.next()
+            if turn is None or now - turn[1].put_at <= self._max_age_s:
+                return turn
+            turn[0].frames.lanes.drop_stale(now, self._max_age_s)
+
+    def _add(self, source: Source) -> _SourceFrames:
+        if len(self._sources) >= self._sources_limit:
+            self._sources = {at: each for at, each in self._sources.items() if self._is_needed(each)}
+            self._sources_limit = max(MAX_SOURCES, 2 * len(self._sources))
+        added = self._sources[source] = _SourceFrames(source, self._on_drop)
+        return added
+
+    def _is_needed(self, frames: _SourceFrames) -> bool:
+        """Whether a source must be remembered."""
+        return bool(frames.lanes.count) or self._urgent.owes(frames.urgent) or self._rest.owes(frames.rest)
+
+    def _on_drop(self, waiting: Waiting, reason: EgressDrop) -> None:
+        self.count -= 1
+        self.size -= len(waiting.frame.raw)
+        self._report(reason)
+
+
+def _size_of(frames: _SourceFrames) -> int:
+    return frames.lanes.size

@@ -1,0 +1,320 @@
+"""One direction of one policy: judges each frame, and counts what it refuses. The rules are explained in `policy`."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final
+
+from uavlinkd.mavlink import dialect
+from uavlinkd.mavlink.dialect_table import COMMANDS, MESSAGES
+from uavlinkd.mavlink.egress.kinds import FlowKey, flow_key, kind_of
+from uavlinkd.mavlink.frames import Frame, Header
+from uavlinkd.mavlink.policy.settings import FILE_TRANSFER, READING_OPCODES, Rules
+
+ANY_OTHER: Final = -1  # stands for every message beyond those that are counted by themselves
+MAX_COUNTED: Final = 1024  # message ids and reasons counted by themselves, of one policy and way
+MAX_BUCKETS: Final = 4096  # flows, and messages of systems, with a rate limit, likewise
+MAX_DECISIONS: Final = 1024  # message ids whose decision is remembered, likewise
+BURST_S: Final = 0.5  # how much of a second's frames may come at once
+SYSTEM_SHARE: Final = 16  # what all components of a system may send of a message, in rates of one
+
+HEARTBEAT: Final = 0
+TYPE_IN_HEARTBEAT: Final = 4  # offset in its payload
+MAV_TYPE_GCS: Final = 6
+
+COMMAND_CARRIERS: Final = frozenset(msgid for msgid, row in MESSAGES.items() if row[6] is not None)
+DIRECT_COMMANDS: Final = frozenset(dialect.ids_by_name()[name] for name in ("COMMAND_LONG", "COMMAND_INT"))
+
+# Messages that do what a command does.
+SAME_AS_COMMAND: Final[Mapping[int, int]] = {
+    dialect.ids_by_name()[message]: number
+    for message, command in (
+        ("SET_MODE", "DO_SET_MODE"),
+        ("MISSION_SET_CURRENT", "DO_SET_MISSION_CURRENT"),
+        ("SET_HOME_POSITION", "DO_SET_HOME"),
+        ("REQUEST_DATA_STREAM", "SET_MESSAGE_INTERVAL"),
+        ("MOUNT_CONFIGURE", "DO_MOUNT_CONFIGURE"),
+        ("MOUNT_CONTROL", "DO_MOUNT_CONTROL"),
+        ("DIGICAM_CONFIGURE", "DO_DIGICAM_CONFIGURE"),
+        ("DIGICAM_CONTROL", "DO_DIGICAM_CONTROL"),
+        ("GIMBAL_MANAGER_SET_PITCHYAW", "DO_GIMBAL_MANAGER_PITCHYAW"),
+        ("GIMBAL_MANAGER_SET_ATTITUDE", "DO_GIMBAL_MANAGER_PITCHYAW"),
+        ("GIMBAL_MANAGER_SET_MANUAL_CONTROL", "DO_GIMBAL_MANAGER_PITCHYAW"),
+        ("STORM32_GIMBAL_MANAGER_CONTROL_PITCHYAW", "STORM32_DO_GIMBAL_MANAGER_CONTROL_PITCHYAW"),
+        ("AUTOPILOT_VERSION_REQUEST", "REQUEST_AUTOPILOT_CAPABILITIES"),
+        ("SET_GPS_GLOBAL_ORIGIN", "DO_SET_GLOBAL_ORIGIN"),
+        ("PARAM_SET", "DO_SET_PARAMETER"),
+        ("SET_MAG_OFFSETS", "PREFLIGHT_SET_SENSOR_OFFSETS"),
+        ("UAVIONIX_ADSB_OUT_CONTROL", "DO_ADSB_OUT_IDENT"),
+    )
+    if (number := dialect.command_number(command)) is not None
+}
+
+# ArduPilot does at once, whatever its command, what such a mission item says: by the value of `current`.
+MISSION_ITEMS: Final = frozenset(dialect.ids_by_name()[name] for name in ("MISSION_ITEM", "MISSION_ITEM_INT"))
+CURRENT_IN_MISSION_ITEM: Final = 35  # offset in the payload of both
+DONE_AT_ONCE: Final[Mapping[int, int]] = {
+    2: COMMANDS["MAV_CMD_DO_REPOSITION"],
+    3: COMMANDS["MAV_CMD_DO_CHANGE_ALTITUDE"],
+}
+
+# Behind three bytes of target: sequence 2, session 1, opcode 1.
+OPCODE_IN_FILE_TRANSFER: Final = 6
+
+# Carries five command numbers at once, which are not looked at: refused where any command is denied.
+CARRIES_MANY_COMMANDS: Final = frozenset({dialect.ids_by_name()["TRAJECTORY_REPRESENTATION_WAYPOINTS"]})
+
+
+class Refusal(StrEnum):
+    """Why a frame may not pass."""
+
+    FOREIGN_SYSTEM = "foreign_system"  # speaks as a system that it is not
+    MESSAGE_NOT_ALLOWED = "message_not_allowed"
+    UNKNOWN_MESSAGE = "unknown_message"  # not in the dialect, or not as the dialect defines it
+    COMMAND_NOT_ALLOWED = "command_not_allowed"
+    FILE_WRITE_NOT_ALLOWED = "file_write_not_allowed"  # FILE_TRANSFER_PROTOCOL, and not what reads
+    SETUP_SIGNING = "setup_signing"
+    MAVLINK1_NOT_ALLOWED = "mavlink1_not_allowed"
+    GROUND_STATION_NOT_ALLOWED = "ground_station_not_allowed"
+    RATE_LIMITED = "rate_limited"
+    HIDDEN_FRAME = "hidden_frame"  # its bytes hold, or complete, another frame that may not pass: see `delivery`
+
+
+_Buckets = dict[FlowKey, tuple[float, float]]
+"""Tokens, and when that was, by what shares them."""
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """What a frame of one message must still meet."""
+
+    only_commands: frozenset[int] | None = None  # None: any
+    never_commands: frozenset[int] = frozenset()
+    never_current: frozenset[int] = frozenset()  # values of a mission item's field
+    only_reads_files: bool = False
+    refuses_ground_station: bool = False
+    per_second: float | None = None
+
+    def takes_command(self, number: int | None) -> bool:
+        """Whether a frame with this command meets it."""
+        return (self.only_commands is None or number in self.only_commands) and number not in self.never_commands
+
+
+class Gate:
+    """One way of one policy."""
+
+    __slots__ = (
+        "_buckets",
+        "_decisions",
+        "_ground_station",
+        "_is_incoming",
+        "_mavlink1",
+        "_of_systems",
+        "_passes_unknown",
+        "_rates",
+        "_rules",
+        "_systems",
+        "refused",
+    )
+
+    def __init__(
+        self,
+        rules: Rules,
+        rates: Mapping[int, float],
+        *,
+        is_incoming: bool,
+        systems: frozenset[int] | None,
+        mavlink1: bool,
+        ground_station: bool,
+    ) -> None:
+        self._rules = rules
+        self._rates = rates
+        self._is_incoming = is_incoming
+        self._systems = systems
+        self._mavlink1 = mavlink1
+        self._ground_station = ground_station
+        rules_pass_unknown = (rules.allows_all or bool(rules.allowed_numbers)) and not rules.denies_all
+        passes_everything = (
+            rules.allows_all and not rules.denied and not rules.denied_commands and mavlink1 and ground_station
+        )
+        self._passes_unknown = rules_pass_unknown and not (passes_everything and systems is None)
+        self._decisions: dict[int, Refusal | Condition | None] = {}
+        self._buckets: _Buckets = {}
+        self._of_systems: _Buckets = {}
+        self.refused: Counter[tuple[int, Refusal]] = Counter()  # by message id (or ANY_OTHER) and reason
+
+    def check(self, frame: Frame, now: float, to: int = 0) -> Refusal | None:
+        """None if the frame may pass, else why not, which is counted. `now` in seconds, monotonic.
+
+        `to`: which of several programs it goes out to. Each has the rate: a frame is another one for each of them.
+        """
+        verdict = self._verdict(frame.header)
+        refusal = self._unmet(verdict, frame, now, to) if isinstance(verdict, Condition) else verdict
+        if refusal is not None:
+            self.count(frame.header, refusal)
+        return refusal
+
+    def count(self, header: Header, refusal: Refusal) -> None:
+        """Count a frame that did not pass."""
+        counted = (header.msgid, refusal)
+        if len(self.refused) >= MAX_COUNTED and counted not in self.refused:
+            counted = (ANY_OTHER, refusal)
+        self.refused[counted] += 1
+
+    def permits(self, frame: Frame) -> bool:
+        """Whether the frame may pass, at any rate. Counts nothing and uses up no rate."""
+        verdict = self._verdict(frame.header)
+        if isinstance(verdict, Condition):
+            return self._breach(verdict, frame) is None
+        return verdict is None
+
+    @property
+    def passes_unknown(self) -> bool:
+        """Whether a message that the dialect does not know may pass: of some systems, but not of every one.
+
+        Then a frame is valid by any CRC_EXTRA. Where all that there is may pass, nothing needs to be told apart.
+        """
+        return self._passes_unknown
+
+    def may_speak_as(self, system: int) -> bool:
+        """Whether frames of this system are let pass at all."""
+        return self._systems is None or system in self._systems
+
+    def always_passes(self, header: Header) -> bool:
+        """Whether every frame with this header passes, at any rate: `check` need not be asked."""
+        return self._verdict(header) is None
+
+    def _verdict(self, header: Header) -> Refusal | Condition | None:
+        if not self.may_speak_as(header.system):
+            return Refusal.FOREIGN_SYSTEM
+        if not self._mavlink1 and header.is_mavlink1:
+            return Refusal.MAVLINK1_NOT_ALLOWED
+        # A message in another definition than the dialect's is another message under the same number.
+        key = header.msgid if header.is_known else ~header.msgid
+        try:
+            return self._decisions[key]
+        except KeyError:
+            return self._remember(key, self.decide(header.msgid, is_known=header.is_known))
+
+    def decide(self, msgid: int, *, is_known: bool) -> Refusal | Condition | None:
+        """What holds for every frame of a message: it passes, is refused, or has conditions to meet."""
+        rules = self._rules
+        if msgid == dialect.SETUP_SIGNING:
+            return Refusal.SETUP_SIGNING
+        if rules.denies_all or msgid in rules.denied:
+            return Refusal.MESSAGE_NOT_ALLOWED
+        is_allowed = rules.allows_all or msgid in rules.allowed_numbers or (is_known and msgid in rules.allowed)
+        only_commands = None
+        only_reads_files = False
+        if not is_allowed:
+            if not is_known:
+                return Refusal.UNKNOWN_MESSAGE
+            only_reads_files = rules.reads_files and msgid == FILE_TRANSFER
+        if not is_allowed and not only_reads_files:
+            if msgid not in DIRECT_COMMANDS or not rules.allowed_commands:
+                return Refusal.MESSAGE_NOT_ALLOWED
+            only_commands = rules.allowed_commands
+        never_commands = never_current = frozenset[int]()
+        if rules.denied_commands:
+            cannot_be_read = msgid in CARRIES_MANY_COMMANDS or (msgid in COMMAND_CARRIERS and not is_known)
+            if cannot_be_read or SAME_AS_COMMAND.get(msgid) in rules.denied_commands:
+                return Refusal.COMMAND_NOT_ALLOWED
+            if msgid in COMMAND_CARRIERS:
+                never_commands = rules.denied_commands
+            if msgid in MISSION_ITEMS:
+                at_once = {value for value, command in DONE_AT_ONCE.items() if command in rules.denied_commands}
+                never_current = frozenset(at_once)
+        condition = Condition(
+            only_commands,
+            never_commands,
+            never_current,
+            only_reads_files=only_reads_files,
+            refuses_ground_station=msgid == HEARTBEAT and not self._ground_station,
+            per_second=self._rates.get(msgid),
+        )
+        return None if condition == _UNCONDITIONAL else condition
+
+    def lets_act(self, name: str) -> bool:
+        """Whether a frame of this message passes that changes something; with MAV_CMD_ in front, of this command."""
+        if not name.startswith("MAV_CMD_"):
+            verdict = self.decide(dialect.ids_by_name()[name], is_known=True)
+            return verdict is None or (isinstance(verdict, Condition) and not verdict.only_reads_files)
+        verdicts = (self.decide(msgid, is_known=True) for msgid in DIRECT_COMMANDS)
+        return any(
+            verdict is None or (isinstance(verdict, Condition) and verdict.takes_command(COMMANDS[name]))
+            for verdict in verdicts
+        )
+
+    def _remember(self, key: int, verdict: Refusal | Condition | None) -> Refusal | Condition | None:
+        if len(self._decisions) >= MAX_DECISIONS:
+            self._decisions.clear()  # only someone who sends random message ids gets here
+        self._decisions[key] = verdict
+        return verdict
+
+    def _unmet(self, condition: Condition, frame: Frame, now: float, to: int) -> Refusal | None:
+        breach = self._breach(condition, frame)
+        # The rate comes last, so that only frames which would pass use it up.
+        if (
+            breach is not None
+            or condition.per_second is None
+            or self._takes_token(frame, condition.per_second, now, to)
+        ):
+            return breach
+        return Refusal.RATE_LIMITED
+
+    def _breach(self, condition: Condition, frame: Frame) -> Refusal | None:
+        if not condition.takes_command(frame.header.command):
+            return Refusal.COMMAND_NOT_ALLOWED
+        if condition.never_current and _payload_byte(frame, CURRENT_IN_MISSION_ITEM) in condition.never_current:
+            return Refusal.COMMAND_NOT_ALLOWED
+        if condition.only_reads_files and _payload_byte(frame, OPCODE_IN_FILE_TRANSFER) not in READING_OPCODES:
+            return Refusal.FILE_WRITE_NOT_ALLOWED
+        if condition.refuses_ground_station and claims_to_be_ground_station(frame):
+            return Refusal.GROUND_STATION_NOT_ALLOWED
+        return None
+
+    def _takes_token(self, frame: Frame, per_second: float, now: float, to: int) -> bool:
+        header = frame.header
+        if not self._is_incoming:
+            flow = (to, header.msgid, *flow_key(frame, kind_of(frame)))
+            return _take(((self._buckets, flow, 1),), per_second, now)
+        # A sender could choose another component for each frame, another target or instance too.
+        one = (self._buckets, (header.msgid, header.system, header.component), 1)
+        return _take((one, (self._of_systems, (header.msgid, header.system), SYSTEM_SHARE)), per_second, now)
+
+
+_UNCONDITIONAL = Condition()
+
+
+def _take(limits: tuple[tuple[_Buckets, FlowKey, int], ...], per_second: float, now: float) -> bool:
+    """Whether each of the buckets has a token for a frame: then one is taken from each, else from none.
+
+    A bucket is given with its table, its key there, and how many times the rate it has.
+    """
+    levels = []
+    for buckets, key, share in limits:
+        # Two at least: a frame a second that comes a moment early must not be lost to a limit of one a second.
+        most = share * max(2.0, per_second * BURST_S)
+        tokens, updated_at = buckets.pop(key, (most, now))
+        levels.append(min(most, tokens + max(0.0, now - updated_at) * per_second * share))
+    passes = all(tokens >= 1 for tokens in levels)
+    for (buckets, key, _), tokens in zip(limits, levels, strict=True):
+        if len(buckets) >= MAX_BUCKETS:
+            del buckets[next(iter(buckets))]  # the longest unused, so the first to be full again
+        buckets[key] = (tokens - passes, now)
+    return passes
+
+
+def _payload_byte(frame: Frame, at: int) -> int:
+    """A byte of a frame's payload; 0 where a MAVLink 2 sender cut it off, as for every receiver."""
+    payload_at = 6 if frame.header.is_mavlink1 else 10
+    return frame.raw[payload_at + at] if at < frame.raw[1] else 0
+
+
+def claims_to_be_ground_station(frame: Frame) -> bool:
+    """Whether a HEARTBEAT has the type of a ground station: PX4 takes any for a sign that its own still lives."""
+    # Of one in another definition the type cannot be read.
+    return not frame.header.is_known or _payload_byte(frame, TYPE_IN_HEARTBEAT) == MAV_TYPE_GCS

@@ -1,0 +1,344 @@
+"""Reads a policy's plain data into sets of numbers, or names every problem in it. The syntax is in `policy`."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final, NamedTuple
+
+from uavlinkd.mavlink import dialect
+from uavlinkd.mavlink.dialect_table import COMMANDS
+from uavlinkd.mavlink.egress.kinds import SAID_ONCE
+from uavlinkd.mavlink.policy.roles import ROLES
+
+MAX_MSGID: Final = 0xFFFFFF
+MAX_COMMAND: Final = 0xFFFF
+MAX_SYSTEM: Final = 255
+
+KEYS: Final = (
+    *("role", "system_ids", "allow_in", "deny_in", "allow_out", "deny_out", "rate_in", "rate_out"),
+    *("mavlink1", "ground_station"),
+)
+
+# Commands by which an autopilot can be made to do what another says: whoever denies the one means the others too.
+# DO_AUX_FUNCTION does what a switch of the remote control would (ArduPilot's RCx_OPTION): modes, arming, a stop.
+_DONE_BY: Final[Mapping[str, tuple[str, ...]]] = {
+    "COMPONENT_ARM_DISARM": ("DO_AUX_FUNCTION",),
+    "DO_FLIGHTTERMINATION": ("DO_AUX_FUNCTION",),
+    "DO_PARACHUTE": ("DO_AUX_FUNCTION",),
+    "DO_FENCE_ENABLE": ("DO_AUX_FUNCTION",),
+    "DO_SET_MODE": ("DO_AUX_FUNCTION", "DO_SET_STANDARD_MODE"),
+    "DO_SET_STANDARD_MODE": ("DO_AUX_FUNCTION", "DO_SET_MODE"),
+    "NAV_RETURN_TO_LAUNCH": ("DO_AUX_FUNCTION",),
+    "NAV_LAND": ("DO_AUX_FUNCTION",),
+    "DO_CHANGE_ALTITUDE": ("GUIDED_CHANGE_ALTITUDE",),
+    "GUIDED_CHANGE_ALTITUDE": ("DO_CHANGE_ALTITUDE",),
+}
+DONE_BY: Final[Mapping[int, frozenset[int]]] = {
+    COMMANDS[f"MAV_CMD_{name}"]: frozenset(COMMANDS[f"MAV_CMD_{other}"] for other in others)
+    for name, others in _DONE_BY.items()
+}
+
+
+FILES_READ: Final = "files-read"
+FILE_TRANSFER: Final = dialect.ids_by_name()["FILE_TRANSFER_PROTOCOL"]
+# MAVLink's MAV_FTP_OPCODE (https://mavlink.io/en/services/ftp.html). The others create, write, truncate, rename or
+# remove; a number that the definition does not have may do anything.
+READING_OPCODES: Final = frozenset(
+    {
+        1,  # TerminateSession
+        2,  # ResetSessions
+        3,  # ListDirectory
+        4,  # OpenFileRO
+        5,  # ReadFile
+        14,  # CalcFileCRC32
+        15,  # BurstReadFile
+        128,  # ACK, of either kind of request
+        129,  # NAK
+    }
+)
+
+
+class PolicyProblem(NamedTuple):
+    """One thing wrong in a policy's data."""
+
+    key: str  # with the place in a list: "allow_in[2]"
+    problem: str
+    remedy: str
+
+    def __str__(self) -> str:
+        return f"{self.key}: {self.problem}; {self.remedy}"
+
+
+class PolicyError(ValueError):
+    """A policy's data does not say what it should. Lists every problem."""
+
+    def __init__(self, problems: Iterable[PolicyProblem]) -> None:
+        self.problems = tuple(problems)
+        super().__init__("\n".join(map(str, self.problems)))
+
+
+@dataclass(frozen=True, slots=True)
+class Rules:
+    """What passes one way. Numbers are message ids, or commands where the name says so."""
+
+    allows_all: bool
+    allowed: frozenset[int]  # by name or group: the message as the dialect defines it
+    allowed_numbers: frozenset[int]  # by number: in whatever definition
+    allowed_commands: frozenset[int]
+    reads_files: bool  # of FILE_TRANSFER_PROTOCOL, READING_OPCODES pass
+    denies_all: bool
+    denied: frozenset[int]  # in whatever definition
+    denied_commands: frozenset[int]
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """A policy's data, read."""
+
+    is_empty: bool  # there was none: only a local endpoint may have none
+    role: str | None
+    systems: frozenset[int] | None  # that it may speak as; None: any
+    systems_text: str
+    rules_in: Rules
+    rules_out: Rules
+    rates_in: Mapping[int, float]  # frames a second, by message id
+    rates_out: Mapping[int, float]
+    mavlink1: bool
+    ground_station: bool
+
+
+Report = Callable[[str, str, str], None]  # key, problem, remedy
+
+
+class _Entry(NamedTuple):
+    """What one entry of a list stands for."""
+
+    is_all: bool = False
+    messages: tuple[int, ...] = ()
+    number: int | None = None
+    command: int | None = None
+    reads_files: bool = False
+
+
+def read_settings(data: Mapping[str, object], *, is_local: bool) -> Settings:
+    """Read a policy's plain data. ``is_local``: of an endpoint, where a missing list lets everything through.
+
+    Raises:
+        PolicyError: with every problem in it.
+    """
+    problems: list[PolicyProblem] = []
+
+    def report(key: str, problem: str, remedy: str) -> None:
+        problems.append(PolicyProblem(key, problem, remedy))
+
+    for key in data:
+        if key not in KEYS:
+            report(str(key), "no such key", _did_you_mean(str(key), KEYS, f"the keys are {', '.join(KEYS)}"))
+    role_name = data.get("role")
+    role = ROLES.get(role_name) if isinstance(role_name, str) else None
+    if role_name is not None and role is None:
+        report("role", f"no such role: {role_name!r}", f"the roles are {', '.join(ROLES)}")
+    if not is_local:
+        _check_is_complete(data, report)
+    systems, systems_text = _systems(data, report, is_needed=not is_local)
+    rules = {}
+    rates = {}
+    for way, preset in (("in", role and role.allow_in), ("out", role and role.allow_out)):
+        allow = _list(data, f"allow_{way}", report)
+        deny = _list(data, f"deny_{way}", report)
+        _check_entries(f"allow_{way}", allow, report)
+        _check_entries(f"deny_{way}", deny, report)
+        allows_all = is_local and preset is None and f"allow_{way}" not in data
+        rules[way] = _rules((*(preset or ()), *allow), deny, allows_all=allows_all)
+        rates[way] = _rates(data, f"rate_{way}", report)
+    if role is not None:
+        rates["in"] = {**_rates({"rate_in": role.rate_in}, "rate_in", report), **rates["in"]}
+    settings = Settings(
+        is_empty=not data,
+        role=role_name if isinstance(role_name, str) else None,
+        systems=systems,
+        systems_text=systems_text,
+        rules_in=rules["in"],
+        rules_out=rules["out"],
+        rates_in=rates["in"],
+        rates_out=rates["out"],
+        mavlink1=_flag(data, "mavlink1", True, report),
+        ground_station=_flag(data, "ground_station", role is None or role.ground_station, report),
+    )
+    if problems:
+        raise PolicyError(problems)
+    return settings
+
+
+def _check_is_complete(data: Mapping[str, object], report: Report) -> None:
+    """A peer's policy says what passes each way: nothing is allowed because a key is missing."""
+    if "role" in data:
+        return
+    missing = [key for key in ("allow_in", "allow_out") if key not in data]
+    if len(missing) == 2:
+        names = ", ".join(f'"{name}"' for name in ROLES if name != dialect.ALL)
+        remedy = f'write role = one of {names}, or both lists; role = "{dialect.ALL}" lets everything through'
+        report("role", "missing, and there is no allow_in and no allow_out: nothing says what may pass", remedy)
+    for key in missing if len(missing) == 1 else ():
+        direction = "come from" if key == "allow_in" else "go to"
+        report(
+            key,
+            f"missing: without a role, nothing says what may {direction} this peer",
+            f'write {key} = ["telemetry"] or what else may pass; [] is nothing, ["{dialect.ALL}"] everything',
+        )
+
+
+@lru_cache(maxsize=256)  # a fleet's peers mostly have the same lists, and may then share what these became
+def _rules(allow: tuple[str | int, ...], deny: tuple[str | int, ...], *, allows_all: bool) -> Rules:
+    allowed = [_as_allowed(entry) for entry in map(_entry, allow) if isinstance(entry, _Entry)]
+    denied = [entry for entry in map(_entry, deny) if isinstance(entry, _Entry)]
+    denied_messages = {msgid for entry in denied for msgid in entry.messages}
+    denied_commands = {entry.command for entry in denied if entry.command is not None}
+    return Rules(
+        allows_all=allows_all or any(entry.is_all for entry in allowed),
+        allowed=frozenset(msgid for entry in allowed for msgid in entry.messages),
+        allowed_numbers=frozenset(entry.number for entry in allowed if entry.number is not None),
+        allowed_commands=frozenset(entry.command for entry in allowed if entry.command is not None),
+        reads_files=any(entry.reads_files for entry in allowed),
+        denies_all=any(entry.is_all for entry in denied),
+        denied=frozenset(denied_messages | {entry.number for entry in denied if entry.number is not None}),
+        denied_commands=frozenset(denied_commands.union(*(DONE_BY.get(each, ()) for each in denied_commands))),
+    )
+
+
+def _as_allowed(entry: _Entry) -> _Entry:
+    """Reading files allows a part of FILE_TRANSFER_PROTOCOL; a list that denies reading denies the whole message."""
+    if not entry.reads_files:
+        return entry
+    return entry._replace(messages=tuple(msgid for msgid in entry.messages if msgid != FILE_TRANSFER))
+
+
+def _entry(item: str | int) -> _Entry | PolicyProblem:
+    """What a list's entry stands for, or what is wrong with it (without its key)."""
+    if isinstance(item, str) and item.isdecimal():
+        item = int(item)
+    if isinstance(item, int):
+        if 0 <= item <= MAX_MSGID:
+            return _Entry(number=item)
+        return PolicyProblem("", f"no message can have the number {item}", f"write 0 to {MAX_MSGID}")
+    if item == dialect.ALL:
+        return _Entry(is_all=True)
+    if item.startswith(("MAV_CMD_", "command:")):
+        return _command_entry(item)
+    msgid = dialect.ids_by_name().get(item)
+    if msgid is not None:
+        return _Entry(messages=(msgid,))
+    members = dialect.GROUPS.get(item)
+    if members is not None:
+        ids = tuple(dialect.ids_by_name()[name] for name in members)
+        return _Entry(messages=ids, reads_files=item == FILES_READ)
+    known = (*dialect.GROUPS, *dialect.ids_by_name())
+    remedy = "groups are in small letters, messages in capitals, an unknown message goes by its number"
+    return PolicyProblem("", f"no such group or message: {item!r}", _did_you_mean(item, known, remedy))
+
+
+def _command_entry(item: str) -> _Entry | PolicyProblem:
+    name = item.removeprefix("command:")
+    number = int(name) if name.isdecimal() else dialect.command_number(name)
+    if number is None:
+        remedy = "write its name as in the MAVLink definitions, or command:NUMBER"
+        return PolicyProblem("", f"no such command: {name!r}", _did_you_mean(name, COMMANDS, remedy))
+    if number > MAX_COMMAND:
+        return PolicyProblem("", f"no command can have the number {number}", f"write 0 to {MAX_COMMAND}")
+    return _Entry(command=number)
+
+
+def _check_entries(key: str, items: tuple[str | int, ...], report: Report) -> None:
+    for place, item in enumerate(items):
+        entry = _entry(item)
+        if isinstance(entry, PolicyProblem):
+            report(f"{key}[{place}]", entry.problem, entry.remedy)
+        elif key.startswith("allow") and dialect.SETUP_SIGNING in (entry.number, *entry.messages):
+            report(f"{key}[{place}]", "SETUP_SIGNING never crosses", "leave it out")
+
+
+def _list(data: Mapping[str, object], key: str, report: Report) -> tuple[str | int, ...]:
+    value = data.get(key, ())
+    if isinstance(value, (list, tuple)):
+        # No True in there: it equals 1, also as a key of the cache of `_rules`.
+        return tuple(item if isinstance(item, str) or type(item) is int else repr(item) for item in value)
+    report(key, f"{value!r} is no list", f'write {key} = ["telemetry", "PING"]')
+    return ()
+
+
+def _systems(data: Mapping[str, object], report: Report, *, is_needed: bool) -> tuple[frozenset[int] | None, str]:
+    """The systems it may speak as, and the same for people."""
+    remedy = 'write the systems it is, such as system_ids = [1] or [1, "10-20"], or "all" to trust it with every one'
+    value = data.get("system_ids")
+    if value is None:
+        if is_needed:
+            report("system_ids", "missing: which systems may it speak as?", remedy)
+        return None, "any system"
+    if value in (dialect.ALL, [dialect.ALL]):
+        return None, "any system"
+    if not isinstance(value, (list, tuple)) or not value:
+        report("system_ids", f"{value!r} names no systems", remedy)
+        return frozenset(), "none"
+    systems: set[int] = set()
+    for place, item in enumerate(value):
+        first, _, last = str(item).partition("-")
+        numbers = (first, last or first)
+        if isinstance(item, bool) or not all(n.isdecimal() and 1 <= int(n) <= MAX_SYSTEM for n in numbers):
+            report(f"system_ids[{place}]", f"{item!r} is no system from 1 to {MAX_SYSTEM}", remedy)
+        elif int(numbers[0]) > int(numbers[1]):
+            report(f"system_ids[{place}]", f"{item!r} runs backwards", f'write "{last}-{first}"')
+        else:
+            systems.update(range(int(numbers[0]), int(numbers[1]) + 1))
+    return frozenset(systems), ", ".join(map(str, value))
+
+
+def _rates(data: Mapping[str, object], key: str, report: Report) -> Mapping[int, float]:
+    """Frames a second by message id. A message's own rate goes before its groups', the lowest of those counts.
+
+    On the way out the rate of a group of reports, as telemetry, leaves alone what is said once among them.
+    """
+    value = data.get(key, {})
+    if not isinstance(value, Mapping):
+        report(key, f"{value!r} is no table", f"write {key} = {{ ATTITUDE = 10 }}")
+        return {}
+    of_groups: dict[int, float] = {}
+    of_messages: dict[int, float] = {}
+    for item, rate in value.items():
+        name = str(item)
+        entry = _entry(name)
+        if isinstance(entry, PolicyProblem):
+            report(f"{key}.{name}", entry.problem, entry.remedy)
+            continue
+        if entry.command is not None or entry.is_all:
+            report(f"{key}.{name}", "a rate is for messages", "name a message or a group")
+        if isinstance(rate, bool) or not isinstance(rate, (int, float)) or not math.isfinite(rate) or rate <= 0:
+            report(
+                f"{key}.{name}", f"{rate!r} is no rate", "write frames a second, above 0; to stop a message deny it"
+            )
+            continue
+        if entry.number is not None or name in dialect.ids_by_name():
+            of_messages[entry.messages[0] if entry.number is None else entry.number] = float(rate)
+        else:
+            thinned = entry.messages if key == "rate_in" else set(entry.messages) - SAID_ONCE
+            for msgid in thinned:
+                of_groups[msgid] = min(float(rate), of_groups.get(msgid, math.inf))
+    return of_groups | of_messages
+
+
+def _flag(data: Mapping[str, object], key: str, default: bool, report: Report) -> bool:
+    value = data.get(key, default)
+    if isinstance(value, bool):
+        return value
+    report(key, f"{value!r} is neither true nor false", f"write {key} = true or {key} = false")
+    return default
+
+
+def _did_you_mean(word: str, known: Iterable[str], otherwise: str) -> str:
+    """The known word most like this one, whatever its letters' size."""
+    by_small = {name.lower(): name for name in known}
+    close = difflib.get_close_matches(word.lower(), by_small, n=1)
+    return f"did you mean {by_small[close[0]]!r}?" if close else otherwise

@@ -1,0 +1,1 @@
+"""What an operator sees: control socket, status, metrics, logs and recordings."""
