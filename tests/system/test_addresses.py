@@ -1,4 +1,4 @@
-"""``HOST:PORT``: what is an address, and what is said of what is none."""
+"""``HOST:PORT``: which text is an address, and the errors for other text."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from tests.daemon.harness import need
-from uavlinkd.system.addresses import Address, AddressError, overlaps, parse_address
+from tests.needs import need
+from uavlinkd.system.addresses import Address, AddressError, numeric_host, overlaps, parse_address
 
 
 @pytest.mark.parametrize(
@@ -26,8 +26,8 @@ from uavlinkd.system.addresses import Address, AddressError, overlaps, parse_add
         ("relay.example.org.:5790", "relay.example.org.", 5790, socket.AF_UNSPEC),
     ],
 )
-def test_address_is_read(text: str, host: str, port: int, family: socket.AddressFamily) -> None:
-    """Numeric addresses come out in their one usual form, names in small letters, localhost as loopback."""
+def test_address_is_parsed(text: str, host: str, port: int, family: socket.AddressFamily) -> None:
+    """Numeric addresses have their canonical form, names lower case, and localhost is loopback."""
     address = parse_address(text, allow_names=True)
     assert (address.host, address.port, address.family) == (host, port, family)
     assert address.sockaddr == (host, port)
@@ -56,8 +56,9 @@ def test_address_is_read(text: str, host: str, port: int, family: socket.Address
         ("[::1]5790", "has no port"),
         ("[drone1]:5790", "names without brackets"),
         ("[localhost]:5790", "names without brackets"),
-        ("[fe80::1%w lan]:5790", "no network interface"),
-        ("[fe80::1%\x1b[2J]:5790", "no network interface"),
+        ("[fe80::1%w lan]:5790", "not a network interface"),
+        ("[fe80::1]:5790", "[fe80::1%wlan0]:5790"),
+        ("[fe80::1%\x1b[2J]:5790", "not a network interface"),
         ("[::1:5790", "no closing bracket"),
         ("[10.13.0.2]:5790", "write 10.13.0.2:5790"),
         ("[::ffff:10.13.0.2]:5790", "10.13.0.2:5790"),
@@ -73,21 +74,21 @@ def test_address_is_read(text: str, host: str, port: int, family: socket.Address
         (f"{'a' * 64}:5790", "neither an IP address nor a host name"),
     ],
 )
-def test_what_is_no_address_is_refused_with_what_to_write(text: str, says: str) -> None:
-    """The message names the mistake, and repeats an address only where one was recognised."""
+def test_invalid_address_is_refused_with_advice(text: str, says: str) -> None:
+    """The message names the mistake, and repeats only a recognised address."""
     with pytest.raises(AddressError) as caught:
         parse_address(text, allow_names=True)
     assert says in str(caught.value)
 
 
-def test_name_is_refused_where_only_numbers_serve() -> None:
-    """A listening address that a resolver chooses could be any."""
+def test_name_is_refused_as_a_listening_address() -> None:
+    """A resolver could map it to any address."""
     with pytest.raises(AddressError, match=r"numeric.*0\.0\.0\.0:5790"):
         parse_address("drone1.local:5790", allow_names=False)
 
 
 def test_unrecognised_text_is_not_repeated() -> None:
-    """A key that was pasted into the wrong place does not reach a log."""
+    """A key in the wrong place does not reach a log."""
     key = "cHJpdmF0ZSBrZXkgdGhhdCBub2JvZHkgbWF5IHNlZSE="
     for text in (key, f"{key}:5790", f"[{key}]:5790", f"[{key}", f"10.13.0.2:{key}"):
         with pytest.raises(AddressError) as caught:
@@ -107,8 +108,8 @@ def test_unrecognised_text_is_not_repeated() -> None:
         ("[::]:1", "[::1]:1", True),
     ],
 )
-def test_overlap_is_what_one_machine_cannot_bind_twice(a: str, b: str, clash: bool) -> None:
-    """The table agrees with the operating system, asked with real sockets where it has both addresses."""
+def test_overlapping_addresses_cannot_both_be_bound(a: str, b: str, clash: bool) -> None:
+    """The table agrees with real sockets, where the machine has both addresses."""
     first, second = parse_address(a, allow_names=False), parse_address(b, allow_names=False)
     assert overlaps(first, second) is clash
     if first.port == second.port:
@@ -117,9 +118,9 @@ def test_overlap_is_what_one_machine_cannot_bind_twice(a: str, b: str, clash: bo
 
 def _cannot_bind_both(first: Address, second: Address) -> bool:
     with socket.socket(first.family, socket.SOCK_DGRAM) as a, socket.socket(second.family, socket.SOCK_DGRAM) as b:
-        for each in (a, b):
-            if each.family == socket.AF_INET6:
-                each.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+        for sock in (a, b):
+            if sock.family == socket.AF_INET6:
+                sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
         try:
             a.bind((first.host, 0))
         except OSError as error:
@@ -133,7 +134,7 @@ def _cannot_bind_both(first: Address, second: Address) -> bool:
 
 @given(st.text(max_size=60))
 def test_any_text_is_an_address_or_an_address_error(text: str) -> None:
-    """No text makes the parser raise anything else, and what it takes it writes back the same."""
+    """No text causes another exception, and a parsed address survives a round trip."""
     try:
         address = parse_address(text, allow_names=True)
     except AddressError:
@@ -142,10 +143,23 @@ def test_any_text_is_an_address_or_an_address_error(text: str) -> None:
 
 
 @given(st.ip_addresses(), st.integers(1, 65535))
-def test_every_unicast_address_is_read(ip: IPv4Address | IPv6Address, port: int) -> None:
-    """What the standard library calls a unicast address is one, except IPv4 in IPv6's clothes."""
-    mapped = isinstance(ip, IPv6Address) and ip.ipv4_mapped is not None
-    assume(not ip.is_multicast and not mapped and str(ip) != "255.255.255.255")
+def test_every_unicast_address_is_parsed(ip: IPv4Address | IPv6Address, port: int) -> None:
+    """Every unicast address of the standard library is valid, except IPv4-mapped and link-local IPv6."""
+    refused = isinstance(ip, IPv6Address) and (ip.ipv4_mapped is not None or ip.is_link_local)
+    assume(not ip.is_multicast and not refused and str(ip) != "255.255.255.255")
     text = f"[{ip}]:{port}" if ip.version == 6 else f"{ip}:{port}"
     address = parse_address(text, allow_names=False)
     assert (address.ip, address.port) == (ip, port)
+
+
+@pytest.mark.parametrize(
+    ("sockaddr", "host"),
+    [
+        (("127.0.0.1", 5790), "127.0.0.1"),
+        (("2001:db8::1", 5790, 0, 0), "2001:db8::1"),
+        (("fe80::1", 5790, 0, 2), "fe80::1%2"),
+    ],
+)
+def test_numeric_host_keeps_the_zone(sockaddr: tuple[str | int, ...], host: str) -> None:
+    """A link-local address is valid on one interface only."""
+    assert numeric_host(sockaddr) == host

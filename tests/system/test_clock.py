@@ -10,8 +10,8 @@ import pytest
 from uavlinkd.system import clock
 
 
-def test_it_goes_on_while_the_machine_sleeps(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is the clock that counts the sleep, where the system has one; else the one that at least never goes back."""
+def test_clock_counts_sleep(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is CLOCK_BOOTTIME where the system has it, and otherwise the monotonic clock."""
     if not hasattr(time, "CLOCK_BOOTTIME"):
         assert clock.monotonic is time.monotonic
         return

@@ -1,11 +1,11 @@
-"""No core dump holds a key, wherever the system would send it."""
+"""No core dump contains a key, wherever the system sends it."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
 
-from tests.daemon.harness import need
+from tests.needs import need
 
 _ASK = """
 import ctypes, resource
@@ -17,8 +17,8 @@ print(before, dumpable(), *resource.getrlimit(resource.RLIMIT_CORE))
 """
 
 
-def test_a_process_with_keys_is_not_dumpable() -> None:
-    """By the limit, and by the flag that counts also where dumps are piped to a program."""
+def test_process_with_keys_is_not_dumpable() -> None:
+    """It has the limit, and the flag that also applies to dumps in a pipe."""
     need(sys.platform == "linux", "Linux")
     done = subprocess.run([sys.executable, "-c", _ASK], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["1", "0", "0", "0"]

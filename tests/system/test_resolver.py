@@ -1,4 +1,4 @@
-"""Host names to addresses, again and again."""
+"""Repeated resolution of host names."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import pytest
 import structlog
 from structlog.testing import capture_logs
 
-from tests.daemon.harness import need
+from tests.needs import need
 from tests.waiting import until
 from uavlinkd.system import resolver
 from uavlinkd.system.addresses import Address
@@ -27,7 +27,7 @@ Names = dict[str, list[str]]
 
 @pytest.fixture
 def names(monkeypatch: pytest.MonkeyPatch) -> Names:
-    """A name service that a test fills; numeric hosts are asked of the real one. No wait is longer than a moment."""
+    """A fake name service; numeric hosts use the real one. Every wait is short."""
     known: Names = {}
     genuine = socket.getaddrinfo
 
@@ -35,7 +35,7 @@ def names(monkeypatch: pytest.MonkeyPatch) -> Names:
         if host.endswith(".test"):
             if host not in known:
                 raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
-            return [each for ip in known[host] for each in genuine(ip, port, *arguments, **options)]
+            return [answer for ip in known[host] for answer in genuine(ip, port, *arguments, **options)]
         return genuine(host, port, *arguments, **options)
 
     monkeypatch.setattr(socket, "getaddrinfo", look_up)
@@ -44,52 +44,59 @@ def names(monkeypatch: pytest.MonkeyPatch) -> Names:
     return known
 
 
-async def test_order_is_kept_and_doubles_are_left_out(names: Names) -> None:
-    """All addresses of all names, in the order of the file, each once."""
+async def test_order_is_kept_and_duplicates_are_removed(names: Names) -> None:
+    """The result has all addresses of all names, in the order of the file, each once."""
     names["drone1.test"] = ["10.0.0.9", "::1"]
     names["alias.test"] = ["10.0.0.9"]
-    found, failed = await resolve(
+    resolved, failed = await resolve(
         [Address("10.0.0.1", 5790), Address("drone1.test", 5790), Address("alias.test", 5790), Address("::1", 5791)]
     )
-    assert found == [(V4, "10.0.0.1", 5790), (V4, "10.0.0.9", 5790), (V6, "::1", 5790), (V6, "::1", 5791)]
+    assert resolved == [
+        (V4, ("10.0.0.1", 5790)),
+        (V4, ("10.0.0.9", 5790)),
+        (V6, ("::1", 5790, 0, 0)),
+        (V6, ("::1", 5791, 0, 0)),
+    ]
     assert failed == []
 
 
-async def test_a_name_that_fails_does_not_hide_the_others(names: Names) -> None:
-    """It is returned as failed, beside what was found."""
-    found, failed = await resolve([Address("gone.test", 1), Address("10.0.0.1", 2)])
-    assert (found, failed) == ([(V4, "10.0.0.1", 2)], ["gone.test"])
+async def test_failed_name_does_not_hide_others(names: Names) -> None:
+    """It is returned as failed, beside the addresses of the other names."""
+    resolved, failed = await resolve([Address("gone.test", 1), Address("10.0.0.1", 2)])
+    assert (resolved, failed) == ([(V4, ("10.0.0.1", 2))], ["gone.test"])
 
 
-async def test_a_link_local_address_keeps_its_zone() -> None:
-    """Without the interface nothing could be sent there."""
+async def test_link_local_address_keeps_its_zone() -> None:
+    """Sending to it needs the interface."""
     interface = next((name for number, name in socket.if_nameindex() if number == 1), None)
     need(interface is not None, "an interface with number 1, as a loopback has")
-    found, failed = await resolve([Address(f"fe80::1%{interface}", 5790)])
-    assert (found, failed) == ([(V6, "fe80::1%1", 5790)], [])
+    resolved, failed = await resolve([Address(f"fe80::1%{interface}", 5790)])
+    assert (resolved, failed) == ([(V6, ("fe80::1", 5790, 0, 1))], [])
 
 
 class Following:
-    """One task that keeps resolving, and what it told."""
+    """A task that keeps resolving, and its results."""
 
     def __init__(self, addresses: list[Address]) -> None:
-        self.told: list[Resolved] = []
+        self.results: list[Resolved] = []
         self.is_wanted = self.can_use = True
         self.asked = 0
-        self._task = asyncio.create_task(keep_resolving(addresses, self._ask, self._tell, structlog.get_logger()))
+        self._task = asyncio.create_task(
+            keep_resolving(addresses, self._ask, self._on_resolved, structlog.get_logger())
+        )
 
     async def until(self, condition: Callable[[], bool]) -> None:
-        """Let it work until then."""
+        """Run the task until a condition holds."""
         await until(condition)
 
     async def stop(self) -> None:
-        """End it."""
+        """Cancel the task."""
         self._task.cancel()
         with pytest.raises(asyncio.CancelledError):
             await self._task
 
-    def _tell(self, found: Resolved) -> bool:
-        self.told.append(found)
+    def _on_resolved(self, resolved: Resolved) -> bool:
+        self.results.append(resolved)
         return self.can_use
 
     def _ask(self) -> bool:
@@ -97,95 +104,95 @@ class Following:
         return self.is_wanted
 
 
-async def test_only_what_is_new_is_told(names: Names) -> None:
-    """The same answer again is no news; another one is."""
+async def test_only_new_results_are_reported(names: Names) -> None:
+    """The same result is not reported twice; a different one is."""
     names["drone1.test"] = ["10.0.0.1"]
     following = Following([Address("drone1.test", 5790)])
     await following.until(lambda: following.asked > 3)
-    assert following.told == [[(V4, "10.0.0.1", 5790)]]
+    assert following.results == [[(V4, ("10.0.0.1", 5790))]]
     names["drone1.test"] = ["10.0.0.2"]
-    await following.until(lambda: len(following.told) == 2)
-    assert following.told[1] == [(V4, "10.0.0.2", 5790)]
+    await following.until(lambda: len(following.results) == 2)
+    assert following.results[1] == [(V4, ("10.0.0.2", 5790))]
     await following.stop()
 
 
-async def test_what_could_not_be_used_is_told_again(names: Names) -> None:
-    """A socket that could not be had now may be had later: the same answer is then no old news."""
+async def test_unused_result_is_reported_again(names: Names) -> None:
+    """A socket that cannot be opened now may open later, so the same result is reported again."""
     names["drone1.test"] = ["10.0.0.1"]
     following = Following([Address("drone1.test", 5790)])
     following.can_use = following.is_wanted = False
-    await following.until(lambda: len(following.told) >= 3)
+    await following.until(lambda: len(following.results) >= 3)
     following.can_use = True
-    told = len(following.told)
-    await following.until(lambda: len(following.told) == told + 1)
+    count = len(following.results)
+    await following.until(lambda: len(following.results) == count + 1)
     await asyncio.sleep(0.02)
-    assert following.told == [[(V4, "10.0.0.1", 5790)]] * (told + 1)
+    assert following.results == [[(V4, ("10.0.0.1", 5790))]] * (count + 1)
     await following.stop()
 
 
-async def test_a_peer_that_answers_is_not_looked_up(names: Names) -> None:
-    """While the address in use works, names may change without harm; when it does not, they are asked again."""
+async def test_names_of_an_answering_peer_are_not_resolved(names: Names) -> None:
+    """While the address in use works, its name is not looked up; when it stops working, it is."""
     names["drone1.test"] = ["10.0.0.1"]
     following = Following([Address("drone1.test", 5790)])
     following.is_wanted = False
-    await following.until(lambda: len(following.told) == 1)
+    await following.until(lambda: len(following.results) == 1)
     names["drone1.test"] = ["10.0.0.2"]
     asked = following.asked
     await following.until(lambda: following.asked > asked + 3)
-    assert len(following.told) == 1
+    assert len(following.results) == 1
     following.is_wanted = True
-    await following.until(lambda: len(following.told) == 2)
+    await following.until(lambda: len(following.results) == 2)
     await following.stop()
 
 
-async def test_a_name_that_comes_late_is_found(names: Names) -> None:
-    """Before the network is there names fail: told once each time they begin to fail, and asked until they do not."""
+async def test_name_that_appears_late_is_resolved(names: Names) -> None:
+    """Names fail before the network is up. Each begin of a failure is logged once, and look-ups go on."""
     with capture_logs() as logs:
         following = Following([Address("drone1.test", 5790)])
         following.is_wanted = False
         await following.until(lambda: bool(logs))
         await asyncio.sleep(0.02)
         names["drone1.test"] = ["10.0.0.1"]
-        await following.until(lambda: len(following.told) == 1)
+        await following.until(lambda: len(following.results) == 1)
         await following.stop()
     assert [(line["event"], line["host"]) for line in logs] == [("name_not_resolved", "drone1.test")]
 
 
-async def test_an_answer_that_vanishes_is_kept(names: Names) -> None:
-    """When the name service goes away, what it said before goes on being used."""
+async def test_last_result_is_kept_while_names_fail(names: Names) -> None:
+    """Without the name service, the peer keeps its last addresses."""
     names["drone1.test"] = ["10.0.0.1"]
     with capture_logs() as logs:
         following = Following([Address("drone1.test", 5790)])
-        await following.until(lambda: len(following.told) == 1)
+        await following.until(lambda: len(following.results) == 1)
         del names["drone1.test"]
         await following.until(lambda: bool(logs))
-        assert len(following.told) == 1
+        assert len(following.results) == 1
         await following.stop()
 
 
 class _NoWaiting(selectors.DefaultSelector):
-    """Where nothing comes, the time in which it could have come has passed."""
+    """Without an event, the whole timeout has passed."""
 
     now = 0.0
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        found = super().select(0)
-        if not found:
+        resolved = super().select(0)
+        if not resolved:
             assert timeout is not None, "nothing will ever happen"
             self.now += timeout
-        return found
+        return resolved
 
 
 def loop_of_no_time() -> asyncio.AbstractEventLoop:
-    """An event loop whose clock jumps to what is next."""
+    """An event loop whose clock jumps to the next timer."""
     selector = _NoWaiting()
     loop = asyncio.SelectorEventLoop(selector)
     loop.time = lambda: selector.now  # type: ignore[method-assign]
     return loop
 
 
-def test_a_silent_server_is_asked_each_second(monkeypatch: pytest.MonkeyPatch) -> None:
-    """However long it is silent: the system repeats a question after 5 s and gives up after 10."""
+def test_silent_server_gets_a_query_every_second(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The rate holds for any silence: the system repeats a query after 5 s and gives up after 10 s."""
     put: list[float] = []
 
     class Silent:
@@ -208,8 +215,8 @@ def test_a_silent_server_is_asked_each_second(monkeypatch: pytest.MonkeyPatch) -
     assert len(put) == pytest.approx(60, abs=2)
 
 
-async def test_names_that_nobody_answers_for_leave_room_for_others(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ten peers that are not there, each question hanging: another's name is answered all the same."""
+async def test_names_without_answer_do_not_delay_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The queries of ten absent peers hang, and another name still resolves."""
     gate = threading.Event()
     asked: list[str] = []
     genuine = socket.getaddrinfo
@@ -224,15 +231,15 @@ async def test_names_that_nobody_answers_for_leave_room_for_others(monkeypatch: 
     monkeypatch.setattr(socket, "getaddrinfo", look_up)
     monkeypatch.setattr(resolver, "LONGEST_WAIT_S", 0.01)
     gone = [Following([Address(f"gone{number}.test", 1)]) for number in range(10)]
-    share = resolver.MOST_THREADS // 10
+    share = resolver.MAX_THREADS // 10
     try:
         await until(lambda: len(asked) >= 10 * share)
-        await asyncio.sleep(0.1)  # in which each could ask ten times more
+        await asyncio.sleep(0.1)  # enough time for ten times more queries
         assert Counter(asked) == {f"gone{number}.test": share for number in range(10)}
         there = Following([Address("there.test", 1)])
-        await there.until(lambda: bool(there.told))
+        await there.until(lambda: bool(there.results))
         await there.stop()
     finally:
         gate.set()
-        for each in gone:
-            await each.stop()
+        for following in gone:
+            await following.stop()

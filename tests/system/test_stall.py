@@ -1,4 +1,4 @@
-"""The first turn after a pause of the process notices it. Each queue is stale until nothing old can be in it."""
+"""The first turn after a pause detects it. Each queue is stale until it cannot hold old frames."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PAUSED_UNTIL = STALL_S + 0.001
 
 
 class Queue:
-    """One socket, and what a reader knows of it."""
+    """One socket and its backlog."""
 
     def __init__(self, watch: StallWatch, opened_in: int | None = None) -> None:
         self.sender, self.receiver = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -37,8 +37,8 @@ def queue(watch: StallWatch) -> Iterator[Queue]:
     queue.close()
 
 
-def test_an_ordinary_turn_is_no_pause(watch: StallWatch, queue: Queue) -> None:
-    """Up to the bound nothing is stale, and each turn begins the count again."""
+def test_short_turn_is_not_a_pause(watch: StallWatch, queue: Queue) -> None:
+    """Up to the limit no queue is stale, and each turn restarts the count."""
     queue.sender.send(b"new")
     assert watch.turn(STALL_S) == 0
     assert queue.backlog.begin(2 * STALL_S) == 0
@@ -46,7 +46,7 @@ def test_an_ordinary_turn_is_no_pause(watch: StallWatch, queue: Queue) -> None:
 
 
 def test_each_pause_is_reported_once_and_begins_an_epoch() -> None:
-    """Just beyond the bound."""
+    """A pause is just longer than the limit."""
     pauses: list[float] = []
     watch = StallWatch(10.0, pauses.append)
     ends = 10.0 + PAUSED_UNTIL, 10.0 + 2 * PAUSED_UNTIL
@@ -54,10 +54,8 @@ def test_each_pause_is_reported_once_and_begins_an_epoch() -> None:
     assert pauses == pytest.approx([PAUSED_UNTIL] * 2)
 
 
-def test_what_waited_is_stale_until_the_queue_was_empty_however_long_that_takes(
-    watch: StallWatch, queue: Queue
-) -> None:
-    """Time alone makes nothing new."""
+def test_queue_is_stale_until_it_was_empty(watch: StallWatch, queue: Queue) -> None:
+    """Time alone does not end staleness."""
     queue.sender.send(b"old")
     assert watch.turn(PAUSED_UNTIL) == 1
     for seconds in range(60):
@@ -68,8 +66,8 @@ def test_what_waited_is_stale_until_the_queue_was_empty_however_long_that_takes(
     assert queue.backlog.begin(PAUSED_UNTIL + 60) == 1
 
 
-def test_what_waited_is_stale_until_a_full_queue_was_read(watch: StallWatch, queue: Queue) -> None:
-    """A sender that never lets the queue become empty does not keep it stale."""
+def test_queue_is_stale_until_its_capacity_was_read(watch: StallWatch, queue: Queue) -> None:
+    """A sender that always fills the queue does not keep it stale."""
     queue.sender.send(b"old")
     watch.turn(PAUSED_UNTIL)
     queue.backlog.end(CAPACITY - 1, is_empty=False)
@@ -78,8 +76,8 @@ def test_what_waited_is_stale_until_a_full_queue_was_read(watch: StallWatch, que
     assert queue.backlog.begin(PAUSED_UNTIL) == 1
 
 
-def test_a_second_pause_begins_again(watch: StallWatch, queue: Queue) -> None:
-    """What gathered in it is as old."""
+def test_second_pause_makes_the_queue_stale_again(watch: StallWatch, queue: Queue) -> None:
+    """The whole queue must be read again."""
     queue.sender.send(b"old")
     watch.turn(PAUSED_UNTIL)
     queue.backlog.end(CAPACITY - 1, is_empty=False)
@@ -88,21 +86,21 @@ def test_a_second_pause_begins_again(watch: StallWatch, queue: Queue) -> None:
     assert queue.backlog.begin(2 * PAUSED_UNTIL) == STALE
 
 
-def test_a_queue_that_was_empty_at_the_end_of_a_pause_is_not_stale(watch: StallWatch, queue: Queue) -> None:
+def test_queue_that_is_empty_after_a_pause_is_not_stale(watch: StallWatch, queue: Queue) -> None:
     """The first command after the pause is delivered."""
     assert watch.turn(PAUSED_UNTIL) == 1
     queue.sender.send(b"new")
     assert queue.backlog.begin(PAUSED_UNTIL) == 1
 
 
-def test_the_read_that_notices_the_pause_is_stale(queue: Queue) -> None:
-    """No other turn of the loop has to come first."""
+def test_read_that_detects_the_pause_is_stale(queue: Queue) -> None:
+    """The read needs no earlier turn of the loop."""
     queue.sender.send(b"old")
     assert queue.backlog.begin(PAUSED_UNTIL) == STALE
 
 
-def test_a_closed_socket_is_passed_over(watch: StallWatch, queue: Queue) -> None:
-    """Its number stays known while anything refers to it."""
+def test_closed_socket_is_ignored(watch: StallWatch, queue: Queue) -> None:
+    """Its backlog exists while a reader refers to it."""
     other = Queue(watch)
     other.close()
     queue.sender.send(b"old")
@@ -110,24 +108,22 @@ def test_a_closed_socket_is_passed_over(watch: StallWatch, queue: Queue) -> None
     assert (queue.backlog.is_stale, other.backlog.is_stale) == (True, False)
 
 
-def test_a_queue_that_came_from_a_stale_one_is_stale(watch: StallWatch, queue: Queue) -> None:
-    """A reload may share a socket before it was read; once all are read a new one is new."""
+def test_new_queue_is_stale_while_another_is(watch: StallWatch, queue: Queue) -> None:
+    """A reload may share a socket before it is read. After all are read, a new one is not stale."""
     queue.sender.send(b"old")
     watch.turn(PAUSED_UNTIL)
     heir = Queue(watch)
     assert heir.backlog.is_stale
-    for each in (queue, heir):
-        each.backlog.end(0, is_empty=True)
+    for stale in (queue, heir):
+        stale.backlog.end(0, is_empty=True)
     late = Queue(watch)
     assert not late.backlog.is_stale
     heir.close()
     late.close()
 
 
-def test_a_device_whose_opening_began_before_a_pause_is_stale(
-    monkeypatch: pytest.MonkeyPatch, watch: StallWatch
-) -> None:
-    """It may have said something meanwhile."""
+def test_device_opened_before_a_pause_is_stale(monkeypatch: pytest.MonkeyPatch, watch: StallWatch) -> None:
+    """It may have sent bytes meanwhile."""
     monkeypatch.setattr("uavlinkd.system.stall.monotonic", lambda: PAUSED_UNTIL)
     before = Queue(watch, opened_in=0)
     assert before.backlog.is_stale

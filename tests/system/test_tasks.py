@@ -1,4 +1,4 @@
-"""Tasks that nobody waits for."""
+"""Background tasks."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import Any
 from uavlinkd.system.tasks import keep_running
 
 
-async def test_a_failure_is_told_at_once() -> None:
-    """Not at the end of the process, when nobody can do anything about it."""
-    told: list[dict[str, Any]] = []
-    asyncio.get_running_loop().set_exception_handler(lambda _, context: told.append(context))
+async def test_failure_is_reported_at_once() -> None:
+    """The report does not wait for the end of the process."""
+    reports: list[dict[str, Any]] = []
+    asyncio.get_running_loop().set_exception_handler(lambda _, context: reports.append(context))
 
     async def fail() -> None:
         raise ZeroDivisionError
@@ -19,15 +19,15 @@ async def test_a_failure_is_told_at_once() -> None:
     task = keep_running(fail(), "the search for drone1")
     await asyncio.wait([task])
     await asyncio.sleep(0)
-    assert told[0]["message"] == "the search for drone1 has failed"
-    assert isinstance(told[0]["exception"], ZeroDivisionError)
-    assert told[0]["task"] is task
+    assert reports[0]["message"] == "the search for drone1 has failed"
+    assert isinstance(reports[0]["exception"], ZeroDivisionError)
+    assert reports[0]["task"] is task
 
 
-async def test_an_end_on_purpose_is_not_told() -> None:
-    """It is cancelled, or has done what it was for."""
-    told: list[dict[str, Any]] = []
-    asyncio.get_running_loop().set_exception_handler(lambda _, context: told.append(context))
+async def test_intended_end_is_not_reported() -> None:
+    """A task that was cancelled or finished causes no report."""
+    reports: list[dict[str, Any]] = []
+    asyncio.get_running_loop().set_exception_handler(lambda _, context: reports.append(context))
     waiting = keep_running(asyncio.sleep(60), "one that waits")
     done = keep_running(asyncio.sleep(0), "one that ends")
     await asyncio.sleep(0)
@@ -35,4 +35,4 @@ async def test_an_end_on_purpose_is_not_told() -> None:
     await asyncio.wait([waiting, done])
     await asyncio.sleep(0)
     assert waiting.cancelled()
-    assert told == []
+    assert reports == []

@@ -1,4 +1,4 @@
-"""What the commands print cannot control a terminal."""
+"""The output of the commands cannot control a terminal."""
 
 from __future__ import annotations
 
@@ -13,10 +13,13 @@ from uavlinkd.system.terminal import printable
 
 
 @given(st.text())
-def test_nothing_invisible_remains(text: str) -> None:
-    """Neither a control character nor one that reverses or hides text, nor half of a surrogate pair."""
+def test_invisible_characters_are_escaped(text: str) -> None:
+    """The output has no control character, no character that reverses or hides text, and no half surrogate pair."""
     shown = printable(text)
-    assert all(unicodedata.category(each)[0] not in "C" and (each == " " or not each.isspace()) for each in shown)
+    assert all(
+        unicodedata.category(character)[0] not in "C" and (character == " " or not character.isspace())
+        for character in shown
+    )
     shown.encode()
 
 
@@ -29,13 +32,13 @@ def test_nothing_invisible_remains(text: str) -> None:
         ("\x9b2J\u202e\u200b\udcff", r"\x9b2J\u202e\u200b\udcff"),
     ],
 )
-def test_control_characters_are_spelt_out(text: str, shown: str) -> None:
-    """As Python spells them; text stays."""
+def test_control_characters_have_an_escape_sequence(text: str, shown: str) -> None:
+    """The sequences are those of Python; other text is unchanged."""
     assert printable(text) == shown
 
 
-def test_lines_stay_where_a_message_has_several() -> None:
-    """Kept characters stay as they are."""
+def test_kept_characters_are_unchanged() -> None:
+    """A message of several lines keeps its line breaks."""
     assert printable("a\nb\x1b", keep="\n") == "a\nb\\x1b"
 
 
@@ -58,7 +61,7 @@ def test_commands_do_not_echo_control_characters(
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    """Names, addresses and paths of the command line appear in errors with their control characters spelt out."""
+    """Names, addresses and paths of the command line appear in errors with escaped control characters."""
     folder = tmp_path_factory.mktemp("fleet")
     monkeypatch.chdir(folder)
     assert main(["fleet", "init", "--drones", "1", "--out", "new"]) == 0

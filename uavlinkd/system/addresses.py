@@ -1,4 +1,4 @@
-"""``HOST:PORT`` and ``[IPv6]:PORT``, as they stand in a configuration."""
+"""``HOST:PORT`` and ``[IPv6]:PORT``, as they are written in a configuration."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ import re
 import socket
 from dataclasses import dataclass
 from ipaddress import IPv4Address, IPv6Address, ip_address
+from typing import Any
 
 DEFAULT_PORT = 5790
-"""Where daemons listen for each other. A convention: in a configuration the port is always written."""
+"""The usual port of a daemon. It is a convention: a configuration always names the port."""
 IPV4_UDP_BYTES = 20 + 8
-"""Headers around a datagram on the wire (RFC 791, RFC 768)."""
+"""Header bytes of a datagram over IPv4 (RFC 791, RFC 768)."""
 IPV6_UDP_BYTES = 40 + 8
-"""The same over IPv6 (RFC 8200)."""
+"""Header bytes of a datagram over IPv6 (RFC 8200, RFC 768)."""
 
 _MAX_PORT = 65535
 _PORT = re.compile(r"[0-9]{1,5}")
@@ -22,9 +23,9 @@ _MAX_NAME = 253
 
 
 class AddressError(ValueError):
-    """Text that is no address. The message says what to write.
+    """The text is not an address. The message says what to write.
 
-    It repeats only what was recognised in the text, because what stands in the wrong place may be a key.
+    It repeats only recognised parts of the text, because a text in the wrong place may be a key.
     """
 
 
@@ -34,6 +35,11 @@ class Address:
 
     host: str
     port: int
+
+    @classmethod
+    def of(cls, sockaddr: tuple[Any, ...]) -> Address:
+        """The address of an Internet socket address."""
+        return cls(numeric_host(sockaddr), sockaddr[1])
 
     def __str__(self) -> str:
         return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
@@ -45,7 +51,7 @@ class Address:
 
     @property
     def ip(self) -> IPv4Address | IPv6Address | None:
-        """The numeric host; none where it is a name."""
+        """The numeric host; None for a name."""
         try:
             return ip_address(self.host)
         except ValueError:
@@ -53,7 +59,7 @@ class Address:
 
     @property
     def family(self) -> socket.AddressFamily:
-        """``AF_UNSPEC`` for a name: it may have addresses of both."""
+        """The address family; ``AF_UNSPEC`` for a name, which may have addresses of both families."""
         match self.ip:
             case IPv4Address():
                 return socket.AF_INET
@@ -69,24 +75,24 @@ class Address:
 
     @property
     def is_wildcard(self) -> bool:
-        """Whether it stands for every address of the machine."""
+        """Whether it means every address of the machine."""
         return self.ip is not None and self.ip.is_unspecified
 
 
 def overlaps(a: Address, b: Address) -> bool:
-    """Whether two sockets cannot listen on both: same port, and same host or one of them every host."""
+    """Whether two sockets cannot listen on both: same port, and same host or a wildcard."""
     if a.port != b.port or a.family != b.family:
         return False
     return a.ip == b.ip or a.is_wildcard or b.is_wildcard
 
 
 def parse_address(text: str, *, allow_names: bool) -> Address:
-    """An address.
+    """Parse ``HOST:PORT``.
 
-    ``localhost`` is 127.0.0.1 here: a name that resolves elsewhere must not widen who can connect.
+    ``localhost`` is always 127.0.0.1: a resolver that maps it elsewhere must not open the port to other machines.
 
     Raises:
-        AddressError: with what to write instead.
+        AddressError: the text is not an address; the message says what to write.
     """
     host, port = _split(text)
     if host in ("", "*"):
@@ -98,20 +104,25 @@ def parse_address(text: str, *, allow_names: bool) -> Address:
             raise AddressError("has no IPv6 address in its brackets: write names without brackets") from None
         return Address("127.0.0.1", port) if host == "localhost" else _named(host, port, allow_names)
     if isinstance(ip, IPv6Address) and ip.scope_id is not None and not _ZONE.fullmatch(ip.scope_id):
-        raise AddressError("has a zone that is no network interface: write one, such as [fe80::1%wlan0]:5790")
+        raise AddressError("has a zone that is not a network interface: write one, such as [fe80::1%wlan0]:5790")
     if isinstance(ip, IPv6Address) and not text.startswith("["):
-        raise AddressError(f"an IPv6 address stands in brackets: write [{ip}]:{port}")
+        raise AddressError(f"an IPv6 address needs brackets: write [{ip}]:{port}")
+    if isinstance(ip, IPv6Address) and ip.is_link_local and ip.scope_id is None:
+        raise AddressError(
+            "is link-local, valid on one network interface only, and does not name that: write"
+            f" [{ip}%wlan0]:{port} with yours (`ip -brief link` lists them)"
+        )
     if isinstance(ip, IPv4Address) and text.startswith("["):
-        raise AddressError(f"only IPv6 addresses stand in brackets: write {ip}:{port}")
+        raise AddressError(f"only IPv6 addresses have brackets: write {ip}:{port}")
     if isinstance(ip, IPv6Address) and ip.ipv4_mapped is not None:
-        raise AddressError(f"an IPv4 address is written as one: {ip.ipv4_mapped}:{port}")
+        raise AddressError(f"is an IPv4 address in IPv6 form: write {ip.ipv4_mapped}:{port}")
     if ip.is_multicast or host == "255.255.255.255":
         raise AddressError("is a multicast or broadcast address: write the address of one machine")
     return Address(str(ip), port)
 
 
 def _split(text: str) -> tuple[str, int]:
-    """The host without brackets, and a valid port."""
+    """Split into the host, without brackets, and a valid port."""
     if text.startswith("["):
         host, bracket, rest = text[1:].partition("]")
         if not bracket:
@@ -129,7 +140,7 @@ def _split(text: str) -> tuple[str, int]:
 
 
 def _is_ip(text: str) -> bool:
-    """Whether all of the text is an address: ``::1:5790`` is one, and was not meant so."""
+    """Whether the whole text is an IP address: ``::1:5790`` is one, although the author meant a port."""
     try:
         ip_address(text)
     except ValueError:
@@ -142,7 +153,7 @@ def _without_port(text: str) -> str:
     if not _is_ip(host):
         return f'has no port: write "HOST:PORT"; uavlinkd\'s usual port is {DEFAULT_PORT}'
     if ":" in host:
-        # Whether ::1:5790 was meant to end in a port cannot be told.
+        # In ::1:5790, the end may be a port or a part of the address.
         return f'is IPv6 without brackets, or without a port: write "[ADDRESS]:PORT", as in [::1]:{DEFAULT_PORT}'
     return f"has no port: write {host}:{DEFAULT_PORT}"
 
@@ -158,3 +169,12 @@ def _named(host: str, port: int, allowed: bool) -> Address:
     if len(host) > _MAX_NAME or not all(map(_LABEL.fullmatch, labels)) or labels[-1].isdigit():
         raise AddressError('is neither an IP address nor a host name: write one, such as "10.13.0.2:5790"')
     return Address(host.lower(), port)
+
+
+def numeric_host(sockaddr: tuple[Any, ...]) -> str:
+    """The host of an Internet socket address, in a form that can be sent to.
+
+    A link-local IPv6 address keeps its zone (``fe80::1%2``), because it is valid on that interface only.
+    """
+    host, zone = str(sockaddr[0]), sockaddr[3] if len(sockaddr) > 3 else 0  # (host, port, flow, zone)
+    return f"{host}%{zone}" if zone else host

@@ -1,4 +1,8 @@
-"""Host names to addresses, again and again: networks come and go, and so do the addresses behind names."""
+"""Resolves host names to addresses, repeatedly, because networks and their addresses change during a flight.
+
+It uses the system's resolver and not a DNS library, so that names mean the same here as for every other tool:
+hosts file, mDNS and search domains included.
+"""
 
 from __future__ import annotations
 
@@ -10,47 +14,47 @@ from typing import Any
 from structlog.typing import FilteringBoundLogger
 
 from uavlinkd.system.addresses import Address
-from uavlinkd.endpoints.sockets import numeric_host
+from uavlinkd.system.error_meanings import NAME_NOT_RESOLVED, meaning_of
 from uavlinkd.system.threads import Threads
 
-Resolved = list[tuple[socket.AddressFamily, str, int]]
+Resolved = list[tuple[socket.AddressFamily, Any]]
+"""Family and socket address of each address, as the kernel takes them."""
+Query = asyncio.Task[tuple[Resolved, list[str]]]
 
 FIRST_WAIT_S = 0.5
 LONGEST_WAIT_S = 1.0
-"""Between look-ups while an answer is wanted: a link is up within 2 s of the name server's return, with up to six
-peers that are given by name."""
-QUESTIONS_AT_ONCE = 5
-"""About the names of one peer. A question to a name server that is silent takes the system 5 s to repeat and 10 s to
-give up (resolv.conf(5)); with five of them, begun a second apart, one is put or repeated each second."""
-MOST_THREADS = 32
-"""No more than systemd's unit allows. Where more peers than six are looked up at once, each has its share of them, so
-that names which nobody answers for do not hold up the others."""
+"""Longest wait between look-ups. With up to six named peers, a link is up within 2 s of the name server's return."""
+MAX_QUERIES = 5
+"""Concurrent look-ups of one peer's names. The system repeats a query to a silent name server after 5 s and gives up
+after 10 s (resolv.conf(5)). Five look-ups, started 1 s apart, send one query per second."""
+MAX_THREADS = 32
+"""At most what systemd's unit allows. More than six peers share them equally, so that names without an answer do not
+delay others."""
 
-_THREADS = Threads(MOST_THREADS, "look-up")
-_asking_now: set[object] = set()
+_THREADS = Threads(MAX_THREADS, "look-up")
+_active: set[object] = set()
 
 
 def _share() -> int:
-    return max(1, min(QUESTIONS_AT_ONCE, MOST_THREADS // max(1, len(_asking_now))))
+    return max(1, min(MAX_QUERIES, MAX_THREADS // max(1, len(_active))))
 
 
 async def resolve(addresses: Sequence[Address]) -> tuple[Resolved, list[str]]:
-    """Every numeric address behind ``addresses``, in their order; and the names that have none now."""
+    """Return every numeric address of ``addresses``, in their order, and the names that do not resolve now."""
     resolved: Resolved = []
     failed: list[str] = []
     for address in addresses:
         try:
             if address.ip is None:
-                found = await _THREADS.run(_look_up, address, 0)
+                answers = await _THREADS.run(_look_up, address, 0)
             else:
-                found = _look_up(address, socket.AI_NUMERICHOST)  # which asks nobody
+                answers = _look_up(address, socket.AI_NUMERICHOST)  # sends no query
         except (OSError, UnicodeError):
             failed.append(address.host)
             continue
-        for family, _, _, _, sockaddr in found:
-            each = (family, numeric_host(sockaddr), int(sockaddr[1]))
-            if each not in resolved:
-                resolved.append(each)
+        for family, _, _, _, sockaddr in answers:
+            if (family, sockaddr) not in resolved:
+                resolved.append((family, sockaddr))
     return resolved, failed
 
 
@@ -63,56 +67,58 @@ async def keep_resolving(
     is_wanted: Callable[[], bool],
     on_resolved: Callable[[Resolved], bool],
     log: FilteringBoundLogger,
+    unresolved: set[str] | None = None,
 ) -> None:
-    """Look the names up now, and again while ``is_wanted`` says that what they gave does not answer.
+    """Resolve the names now, and again while ``is_wanted()``: the addresses so far do not answer.
 
-    Runs until cancelled. ``on_resolved`` is called with what is new, and again later where it gives False: it could
-    do nothing with that now. Names that fail are logged once each time that they begin to fail.
+    Runs until cancelled. ``on_resolved`` is called with each new result. If it returns False, it could not use the
+    result, and is called with it again later. A name is logged once each time that it begins to fail. ``unresolved``
+    always has the names that did not resolve at the last attempt.
     """
     known: Resolved = []
-    failing: set[str] = set()
+    failing = set[str]() if unresolved is None else unresolved
     wait_s = FIRST_WAIT_S
-    asking: set[asyncio.Task[tuple[Resolved, list[str]]]] = set()
+    queries: set[Query] = set()
     loop = asyncio.get_running_loop()
-    asked_at = loop.time()
+    queried_at = loop.time()
     me = object()
-    takes_threads = any(each.ip is None for each in addresses)
+    needs_threads = any(address.ip is None for address in addresses)
     try:
         while True:
             if not known or failing or is_wanted():
-                if takes_threads:
-                    _asking_now.add(me)
-                if len(asking) < _share():
-                    asked_at = loop.time()
-                    asking.add(asyncio.ensure_future(resolve(addresses)))
-                answered, asking = await asyncio.wait(
-                    asking, timeout=LONGEST_WAIT_S, return_when=asyncio.FIRST_COMPLETED
+                if needs_threads:
+                    _active.add(me)
+                if len(queries) < _share():
+                    queried_at = loop.time()
+                    queries.add(asyncio.ensure_future(resolve(addresses)))
+                answered, queries = await asyncio.wait(
+                    queries, timeout=LONGEST_WAIT_S, return_when=asyncio.FIRST_COMPLETED
                 )
                 if not answered:
                     continue
-                # Where it was an older question's end, the newest still counts its second.
-                rest_s = asked_at + LONGEST_WAIT_S - loop.time() if asking else wait_s
-                # Several may come at once, from a server that is back: what counts is who found most.
-                found, failed = max((each.result() for each in answered), key=lambda told: len(told[0]))
+                # While other queries are open, the next one starts a second after the newest of them.
+                rest_s = queried_at + LONGEST_WAIT_S - loop.time() if queries else wait_s
+                # A server that is back may answer several at once: use the result with the most addresses.
+                resolved, failed = max((query.result() for query in answered), key=lambda result: len(result[0]))
                 for name in set(failed) - failing:
-                    log.warning("name_not_resolved", host=name)
-                failing = set(failed)
-                if found and found != known and on_resolved(found):
-                    known = found
+                    log.warning("name_not_resolved", host=name, meaning=meaning_of(NAME_NOT_RESOLVED))
+                failing.clear()
+                failing.update(failed)
+                if resolved and resolved != known and on_resolved(resolved):
+                    known = resolved
                 if not failed:
-                    _forget(asking)
+                    _cancel(queries)
                 wait_s = min(2 * wait_s, LONGEST_WAIT_S)
             else:
-                _asking_now.discard(me)
+                _active.discard(me)
                 wait_s = rest_s = FIRST_WAIT_S
             await asyncio.sleep(rest_s)
     finally:
-        _asking_now.discard(me)
-        _forget(asking)
+        _active.discard(me)
+        _cancel(queries)
 
 
-def _forget(asking: set[asyncio.Task[tuple[Resolved, list[str]]]]) -> None:
-    """What these answer would be old when it is looked at."""
-    for task in asking:
-        task.cancel()
-    asking.clear()
+def _cancel(queries: set[Query]) -> None:
+    for query in queries:
+        query.cancel()
+    queries.clear()

@@ -1,4 +1,4 @@
-"""Tasks that nobody waits for, and that must not end unseen."""
+"""Background tasks whose failure must be reported at once."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from collections.abc import Coroutine
 
 
 def keep_running(work: Coroutine[object, object, None], name: str) -> asyncio.Task[None]:
-    """A task of the running loop, for work that ends only where it is cancelled.
+    """Start a task in the running loop for work that ends only by cancellation.
 
-    Should it fail, the loop's exception handler is told at once; else nobody would be before the end of the process,
-    and what it kept up, such as an endpoint, would just be gone.
+    The task reports a failure to the loop's exception handler at once. Otherwise asyncio would report it at the end
+    of the process, and an endpoint that depends on the task would stop silently.
     """
     loop = asyncio.get_running_loop()
 

@@ -1,4 +1,4 @@
-"""Text for a terminal, in which nothing that others wrote can act as a control sequence."""
+"""Text for a terminal: text from a file or an attacker must not act as a control sequence."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from __future__ import annotations
 def printable(text: str, *, keep: str = "") -> str:
     r"""Write each control or invisible character as an escape sequence such as ``\x1b``, except those in ``keep``.
 
-    Names, paths and key texts in messages may come from a file or an argument that someone else wrote.
+    Names, paths and keys in messages may come from a file or an argument that an attacker wrote.
     """
     return "".join(
         character

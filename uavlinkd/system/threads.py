@@ -1,7 +1,7 @@
-"""Threads for calls that may hang, such as look-ups of names: the end of the process does not wait for them.
+"""Worker threads for calls that may hang, such as name look-ups.
 
-The executors of asyncio and ``concurrent.futures`` are joined at the end: a silent name server would then hold up a
-daemon that was told to stop.
+They are our own because Python joins the threads of ``concurrent.futures``, which asyncio uses, at exit: a silent
+name server would delay the stop of the daemon.
 """
 
 from __future__ import annotations
@@ -16,28 +16,28 @@ from threading import Lock, Thread
 from typing import Any, TypeVar
 
 IDLE_S = 10.0
-"""A thread without work ends after so long."""
+"""A thread without work ends after this time."""
 
 T = TypeVar("T")
 
 
 class Threads:
-    """At most so many at a time; what comes beyond that waits for its turn."""
+    """At most ``limit`` worker threads, called ``name``. Further calls wait in a queue."""
 
-    def __init__(self, most: int, name: str) -> None:
+    def __init__(self, limit: int, name: str) -> None:
         self._name = name
         self._work: SimpleQueue[Callable[[], None]] = SimpleQueue()
         self._lock = Lock()
-        """Held while the queue and the two counts below change together."""
-        self._idle = 0  # threads that wait, and that no work counts on yet
-        self._slots = most  # threads that may still be started
+        """Protects the queue and the two counts below, which change together."""
+        self._idle = 0  # waiting threads that no queued call has claimed
+        self._slots = limit  # threads that may still be started
 
     async def run(self, function: Callable[..., T], *arguments: Any) -> T:
-        """Call it in a thread, and give what it gives. Who is cancelled meanwhile leaves it to itself.
+        """Run ``function`` in a worker thread and return its result. Cancelling does not stop the thread.
 
         Raises:
-            OSError: no thread can be started now.
-            Exception: whatever it raises.
+            OSError: the system cannot start a thread now.
+            Exception: any exception of ``function``.
         """
         loop = asyncio.get_running_loop()
         future: asyncio.Future[T] = loop.create_future()
@@ -47,23 +47,23 @@ class Threads:
                 return
             try:
                 settle: tuple[Callable[[Any], None], object] = future.set_result, function(*arguments)
-            except Exception as error:  # who waits is told
+            except Exception as error:  # raised again in `run`
                 settle = future.set_exception, error
-            with suppress(RuntimeError):  # the loop is closed: nobody waits any more
+            with suppress(RuntimeError):  # the loop is closed: no coroutine waits
                 loop.call_soon_threadsafe(_settle, future, *settle)
 
         if self._put(work):
             try:
                 Thread(target=self._serve, name=self._name, daemon=True).start()
-            except RuntimeError:  # too many, or no memory
+            except RuntimeError:  # the limit of threads, or no memory
                 with self._lock:
                     self._slots += 1
-                future.cancel()  # should another thread find the work after all
+                future.cancel()  # another thread may still take the work from the queue
                 raise OSError(errno.EAGAIN, os.strerror(errno.EAGAIN)) from None
         return await future
 
     def _put(self, work: Callable[[], None]) -> bool:
-        """Leave it to the threads; whether one is to be started for it."""
+        """Queue work. Returns whether a new thread is needed for it."""
         with self._lock:
             self._work.put(work)
             if self._idle:
@@ -76,7 +76,7 @@ class Threads:
 
     def _serve(self) -> None:
         while True:
-            work = self._take()
+            work = self._next()
             if work is None:
                 try:
                     work = self._work.get(timeout=IDLE_S)
@@ -86,8 +86,8 @@ class Threads:
                     continue
             work()
 
-    def _take(self) -> Callable[[], None] | None:
-        """Work; None where there is none, and the thread counts as idle."""
+    def _next(self) -> Callable[[], None] | None:
+        """The next work; None if the queue is empty, and then the thread counts as idle."""
         with self._lock:
             try:
                 return self._work.get_nowait()
@@ -96,7 +96,7 @@ class Threads:
                 return None
 
     def _may_end(self) -> bool:
-        """Whether no work counts on an idle thread; then it is no longer there."""
+        """Whether the idle thread may end, because no queued call has claimed it. Then its slot is free again."""
         with self._lock:
             if not self._idle:
                 return False
@@ -105,6 +105,6 @@ class Threads:
             return True
 
 
-def _settle(future: asyncio.Future[Any], settle: Callable[[Any], None], outcome: object) -> None:
+def _settle(future: asyncio.Future[Any], settle: Callable[[Any], None], result: object) -> None:
     if not future.done():
-        settle(outcome)
+        settle(result)

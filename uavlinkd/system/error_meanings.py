@@ -1,0 +1,64 @@
+"""What the names of errors mean for an operator: one table for the status, the log and ``check``.
+
+The names are the kernel's (``ECONNREFUSED``), and the daemon's own for failures without such a name.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Mapping
+from typing import Final
+
+NAME_NOT_RESOLVED: Final = "name_not_resolved"
+ADDRESS_NOT_HERE_YET: Final = "address_not_here_yet"
+
+ERROR_MEANINGS: Final[Mapping[str, str]] = {
+    # The network.
+    "EPERM": "this machine's firewall, or the service's unit, does not permit it: see `sudo nft list ruleset`",
+    "ENETUNREACH": "this machine has no route to the address: bring the network up, and see `ip route get ADDRESS`",
+    "EHOSTUNREACH": "no machine answers at the address: it is off, or its address is wrong; or a firewall rejects",
+    "ENETDOWN": "the network interface is down: see `ip -brief link`",
+    "ECONNREFUSED": "no process listens there now: start it, or correct the port",
+    "ECONNRESET": "the other end closed the connection",
+    "EPIPE": "the other end closed the connection",
+    "ETIMEDOUT": "the other end does not answer",
+    "EADDRNOTAVAIL": "this machine does not have the address: see `ip -brief address`",
+    "EADDRINUSE": "another process has the port: end it (`ss -lntup` names it), or write another port",
+    "EAFNOSUPPORT": "this machine cannot use addresses of this family (IPv4 or IPv6)",
+    "EINVAL": "the address cannot be used from here: a link-local address (fe80::) needs its interface, as in %wlan0,"
+    " and a daemon that listens on loopback reaches only this machine",
+    "EMSGSIZE": "the datagram is larger than the path permits: reduce max_envelope_bytes",
+    "EAGAIN": "the network card or its driver accepts no more data now: the machine sends more than it can carry",
+    "ENOBUFS": "the network card or its driver accepts no more data now: the machine sends more than it can carry",
+    NAME_NOT_RESOLVED: "the name has no address now: see `getent hosts NAME`, or write an IP address."
+    " The daemon tries again each second",
+    ADDRESS_NOT_HERE_YET: "no interface has the address: write it correctly, or wait."
+    ' The socket works as soon as an interface has it. "0.0.0.0" stands for every address',
+    # Files and devices.
+    "ENOENT": "there is no such file or device now: plug it in, or correct its name",
+    "ENXIO": "the device has gone: plug it in again",
+    "ENODEV": "the device has gone: plug it in again",
+    "EIO": "the device does not work: it was unplugged, or is broken",
+    "EACCES": "this user has no permission: for a serial device, add the user to its group, often dialout",
+    "EBUSY": "another process has the device: end it (`fuser -v DEVICE` names it), often ModemManager",
+    "ENOSPC": "no space is left on the disk: delete files, or set min_free_bytes lower",
+    "EDQUOT": "the user's quota on the disk is used up",
+    "EROFS": "the file system is mounted read-only: after an error, check it with fsck",
+    "ENOTDIR": "a part of the path is a file: correct the path",
+    "EISDIR": "the path is a folder: name a file",
+    "folder_in_use": "another daemon records there: give each daemon a folder of its own",
+    # Limits of the process.
+    "EMFILE": "the daemon has no file descriptor left: raise LimitNOFILE in its unit",
+    "ENFILE": "the machine has no file descriptor left",
+    "ENOMEM": "the machine has no memory left",
+}
+"""The meaning of each name: a short statement, often with a remedy, without a full stop at the end."""
+
+
+def meaning_of(name: str) -> str:
+    """What an error means and what an operator can do. Without a line in the table: the system's own text."""
+    if name in ERROR_MEANINGS:
+        return ERROR_MEANINGS[name]
+    number = getattr(errno, name, None) if name in errno.errorcode.values() else None
+    return "" if number is None else os.strerror(number)
