@@ -1,6 +1,6 @@
 """Whole handshakes as test vectors, made by the second implementation (`independent`) in both roles.
 
-    python -m tests.core.handshake_vectors          writes tests/vectors/handshake.json anew
+    python -m tests.core.handshake_vectors          writes tests/vectors/handshake.json again
 
 All randomness is drawn from SHA-256 of the vector's name, so a vector without ML-KEM is the same each time. ML-KEM's
 encapsulation draws inside the library: a vector records its ciphertext and its secret, and is another one each time.
@@ -31,8 +31,8 @@ PATH = Path(__file__).parents[1] / "vectors" / "handshake.json"
 ABOUT = (
     "Whole handshakes of the protocol in uavlinkd/core/README.md, made by tests/core/independent.py:"
     " `python -m tests.core.handshake_vectors`. Byte strings in hex. Parameters: generation, confidential, tag bytes,"
-    " MAC key bits, largest envelope. `entropy` lists what each side draws, in order: its index, its ephemeral X25519"
-    " key, and with a group the initiator's exponent or ML-KEM seed, the responder's exponent."
+    " MAC key bits, largest envelope, features. `entropy` lists what each side draws, in order: its index, its"
+    " ephemeral X25519 key, and with a group the initiator's exponent or ML-KEM seed, the responder's exponent."
 )
 FRAME = bytes.fromhex("fd09000001010100000000000000020303040303") + b"\x9a\x2e"
 
@@ -58,7 +58,7 @@ class Case(NamedTuple):
 def cases() -> Iterator[Case]:
     """Each suite in both modes, with and without a PSK; the smallest suite in all four combinations."""
     plain = Parameters(), Parameters()
-    unlike = Parameters(7, False, 8, 256, 1452), Parameters(3, False, 32, 1024, 1232)
+    unlike = Parameters(7, False, 8, 256, 1452, 1), Parameters(3, False, 32, 1024, 1232, 1)
     confidential = Parameters(confidential=True), Parameters(2, False, 32, 512, 320)
     yield Case(X25519, True, *unlike)
     yield Case(X25519, False, *confidential)
@@ -73,7 +73,7 @@ def is_reproducible(case: Case) -> bool:
 
 
 def make(case: Case) -> Vector:
-    """One handshake, its keys, and the first envelope each way."""
+    """One handshake, its keys, and the first envelope in each direction."""
     drawn: dict[str, list[str]] = {"initiator": [], "responder": []}
 
     def draw(side: str) -> Draw:
@@ -137,8 +137,8 @@ def make(case: Case) -> Vector:
 
 def main() -> None:
     """Write the file."""
-    found = {"about": ABOUT, "vectors": [make(case) for case in cases()]}
-    PATH.write_text(json.dumps(found, indent=1) + "\n")
+    content = {"about": ABOUT, "vectors": [make(case) for case in cases()]}
+    PATH.write_text(json.dumps(content, indent=1) + "\n")
 
 
 if __name__ == "__main__":

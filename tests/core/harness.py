@@ -6,16 +6,17 @@ import random
 from array import array
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from uavlinkd.core import wire
 from uavlinkd.core.cookie import MacKeys
 from uavlinkd.core.crypto import AeadKey, KeyPair, MacKey, Secret
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.node import Node
-from uavlinkd.core.outputs import Deliver, Dropped, Output, Path, Transmit
+from uavlinkd.core.outputs import Deliver, Dropped, Output, Transmit
+from uavlinkd.core.path import Path
 from uavlinkd.core.peer import Peer
-from uavlinkd.core.session import Session
+from uavlinkd.core.session import EnvelopeKey, Session
 from uavlinkd.core.settings import Link, PeerSettings, Timers
 from uavlinkd.core.suites import SUITES_BY_NAME
 
@@ -27,9 +28,9 @@ KEY_A, KEY_B = (KeyPair(private) for private in _KEYS)
 """Alpha's public key is the smaller one."""
 KEY_C = KeyPair(bytes([3]) * 32)
 
-AT_A: Path = (0, "192.0.2.1", 14600)
-AT_B: Path = (0, "192.0.2.2", 14600)
-ELSEWHERE: Path = (0, "198.51.100.9", 4000)
+AT_A = Path(0, ("192.0.2.1", 14600))
+AT_B = Path(0, ("192.0.2.2", 14600))
+ELSEWHERE = Path(0, ("198.51.100.9", 4000))
 UNUSED_INDEX = 0xFFFF
 """An index that no session of these tests draws."""
 
@@ -44,6 +45,12 @@ PLAIN = Link(suites=(SUITES_BY_NAME["x25519"],), verify_interval_s=1e6)
 def seeded(seed: int) -> Callable[[int], bytes]:
     """Entropy that is the same each time."""
     return random.Random(seed).randbytes
+
+
+class Named(NamedTuple):
+    """A peer of which only the name counts."""
+
+    name: str
 
 
 @dataclass
@@ -68,20 +75,20 @@ class Side:
         return session
 
     def receive(self, datagram: bytes, now: float, source: Path | None = None) -> list[Output]:
-        """Hand a datagram over; it comes from the other side's place unless told otherwise."""
+        """Hand a datagram over; it comes from the other side's address by default."""
         return self.node.receive(datagram, source or self.peer_at, now)
 
     def send(self, now: float, *frames: bytes) -> list[Output]:
-        """Send frames (one, unless told otherwise) to the other side."""
-        return self.node.send(self.peer_name, frames or (FRAME,), now)
+        """Send frames (one by default) to the other side."""
+        return self.node.send(self.peer, frames or (FRAME,), now)
 
     def timeout(self, now: float) -> list[Output]:
         """Let the timers run."""
         return self.node.handle_timeout(now)
 
-    def knows_the_way(self, now: float) -> None:
-        """From now on this side has the other's address, and so calls it."""
-        self.node.set_addresses(self.peer_name, [self.peer_at], now)
+    def configure_path(self, now: float) -> None:
+        """Configure the other side's address, so that this side initiates."""
+        self.node.set_paths(self.peer, [self.peer_at], now)
 
     def envelope(self, now: float, payload: bytes = FRAME) -> bytes:
         """Any payload sealed on the current session: what only the holder of the keys can make."""
@@ -90,7 +97,7 @@ class Side:
 
 @dataclass
 class Pair:
-    """Alpha and bravo. Alpha calls; bravo only knows alpha's key, until :meth:`Side.knows_the_way`."""
+    """Alpha and bravo. Alpha initiates; bravo only knows alpha's key, until :meth:`Side.configure_path`."""
 
     link_a: Link = PLAIN
     link_b: Link = PLAIN
@@ -112,7 +119,7 @@ class Pair:
         node_b.add_peer(PeerSettings("alpha", public_a, self.psk_b, self.link_b), self.now)
         self.a = Side(node_a, AT_A, "bravo", AT_B)
         self.b = Side(node_b, AT_B, "alpha", AT_A)
-        self.a.knows_the_way(self.now)
+        self.a.configure_path(self.now)
 
     def initiation(self, now: float) -> bytes:
         """Alpha's next initiation."""
@@ -128,7 +135,7 @@ class Pair:
         return self
 
     def carries(self, now: float) -> bool:
-        """Whether a frame gets through each way."""
+        """Whether a frame gets through in both directions."""
         return self.crosses(self.a, self.b, now) and self.crosses(self.b, self.a, now)
 
     @staticmethod
@@ -163,9 +170,9 @@ def exchange(one: Side, other: Side, outputs: list[Output], now: float) -> list[
     """Hand over what ``other`` sends, and what either answers, until both are quiet. All outputs of ``one``."""
     seen: list[Output] = []
     while sent := datagrams(outputs):
-        answers = [out for each in sent for out in one.receive(each, now)]
+        answers = [out for datagram in sent for out in one.receive(datagram, now)]
         seen += answers
-        outputs = [out for each in datagrams(answers) for out in other.receive(each, now)]
+        outputs = [out for datagram in datagrams(answers) for out in other.receive(datagram, now)]
     return seen
 
 
@@ -210,6 +217,20 @@ def with_macs(message: bytes, receiver_public_key: bytes, cookie: bytes | None =
 def repaired(datagram: bytes, receiver_public_key: bytes) -> bytes:
     """An altered handshake message with its mac1 made right again."""
     return with_macs(datagram[: -wire.MACS_BYTES], receiver_public_key)
+
+
+def unsealed(session: Session, datagram: bytes) -> bytes | None:
+    """The payload of an envelope by a session's key alone: nothing else is checked, and nothing changes."""
+    _, counter, size = wire.parse_envelope_header(datagram)
+    return unprotected(session._receive, session.tag_bytes, datagram, size, counter)
+
+
+def unprotected(key: EnvelopeKey, tag_bytes: int, datagram: bytes, header_bytes: int, counter: int) -> bytes | None:
+    """The payload of an envelope; None if the tag does not verify."""
+    if isinstance(key, AeadKey):
+        return key.open(counter, datagram[header_bytes:], datagram[:header_bytes])
+    covered = datagram[:-tag_bytes]
+    return covered[header_bytes:] if key.tag(covered)[:tag_bytes] == datagram[-tag_bytes:] else None
 
 
 def exhaust(side: Side, now: float) -> None:
@@ -260,7 +281,7 @@ def _picture(thing: Any, ignoring: frozenset[str], seen: dict[int, int]) -> Any:
     if isinstance(thing, dict):
         return [(_picture(k, ignoring, seen), _picture(v, ignoring, seen)) for k, v in thing.items()]
     if isinstance(thing, list | tuple | set | frozenset):
-        return [_picture(each, ignoring, seen) for each in thing]
+        return [_picture(item, ignoring, seen) for item in thing]
     slots = [name for kind in type(thing).__mro__ for name in getattr(kind, "__slots__", ())]
     names = [name for name in [*slots, *getattr(thing, "__dict__", {})] if name not in ignoring]
     if not names:

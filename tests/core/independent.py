@@ -1,8 +1,8 @@
 """A second implementation of the handshake and the envelopes, written from ``uavlinkd/core/README.md`` alone.
 
-It shares no code with the core: what the two agree on, the document says. It is the shortest program that links, and
-no more: no timers, no replay window, no paths; how old its envelopes are the caller says. `handshake_vectors` makes
-whole handshakes with both of its roles.
+It shares no code with the core: what the two agree on, the document says. It is as short as possible: it has no
+timers, no replay window and no paths, and the test sets the age of its envelopes. `handshake_vectors` makes whole
+handshakes with both of its roles.
 """
 
 from __future__ import annotations
@@ -128,14 +128,15 @@ class Parameters(NamedTuple):
     tag_bytes: int = 16
     mac_key_bits: int = 256
     largest_envelope: int = 1232
+    features: int = 0
 
     def encode(self) -> bytes:
-        generation, confidential, *rest = self
-        return struct.pack(">IHBBHH", generation, 0, int(confidential), *rest)
+        generation, confidential, *rest, features = self
+        return struct.pack(">IHBBHH", generation, features, int(confidential), *rest)
 
 
 def _agree(ours: Parameters, encoded: bytes) -> Parameters:
-    generation, _, flags, tag_bytes, mac_key_bits, largest = struct.unpack(">IHBBHH", encoded)
+    generation, features, flags, tag_bytes, mac_key_bits, largest = struct.unpack(">IHBBHH", encoded)
     confidential = ours.confidential or bool(flags & 1)
     return Parameters(
         max(ours.generation, generation) + 1,
@@ -143,6 +144,7 @@ def _agree(ours: Parameters, encoded: bytes) -> Parameters:
         16 if confidential else max(ours.tag_bytes, tag_bytes),
         max(ours.mac_key_bits, mac_key_bits),
         min(ours.largest_envelope, largest),
+        ours.features & features,
     )
 
 
@@ -200,6 +202,12 @@ def echo_reply(request: bytes, fresh: int, received: int = 0, expected: int = 0)
     kind, token, _, _ = struct.unpack(">BIII", request)
     assert kind == 1
     return struct.pack(">BIIII", 2, token, received, expected, fresh)
+
+
+def refusal_report(*entries: tuple[int, int, int, int]) -> bytes:
+    """Section 12: each entry is message id, command, reason and total."""
+    rows = (m.to_bytes(3, "big") + struct.pack(">HBI", *rest) for m, *rest in entries)
+    return b"\x06" + b"".join(rows)
 
 
 class Initiator:

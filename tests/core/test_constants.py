@@ -15,7 +15,7 @@ def test_rekeying_leaves_time_and_room_for_retries_before_the_keys_end() -> None
     assert 2 * c.REKEY_AFTER_ENVELOPES <= c.SESSION_ENVELOPE_LIMIT + 1
 
 
-def test_a_link_that_comes_back_is_called_within_two_seconds() -> None:
+def test_returning_link_gets_an_initiation_within_two_seconds() -> None:
     """The longest wait with all of its jitter stays under the 2 s that the protocol promises."""
     assert c.RETRY_MIN_S < c.RETRY_MAX_S
     assert c.RETRY_MAX_S * (1 + c.RETRY_JITTER) < 2.0
@@ -49,5 +49,5 @@ def test_a_cookie_is_honoured_as_long_as_it_is_used() -> None:
 
 
 def test_indices_outlive_the_envelopes_that_name_them() -> None:
-    """An index rests for longer than any session lives, so no envelope of the last owner meets the next."""
+    """An index is quarantined longer than any session lives: the next owner gets no envelope of the last one."""
     assert c.INDEX_QUARANTINE_S > c.REJECT_AFTER_S

@@ -9,6 +9,7 @@ from uavlinkd.core import constants as c
 from uavlinkd.core import wire
 from uavlinkd.core.cookie import CookieJar, MacKeys, mac1_of
 from uavlinkd.core.drops import Drop, DropReason
+from uavlinkd.core.path import Path
 
 KEYS = MacKeys(KEY_B.public)
 MESSAGE = b"\1\0\0\7" + bytes(range(100))
@@ -55,7 +56,7 @@ def test_without_a_cookie_mac2_is_zero() -> None:
 
 
 def test_cookie_admits_its_source(jar: CookieJar) -> None:
-    """Who got the cookie makes a valid mac2 with it, over any message."""
+    """The holder of a cookie can make a valid mac2 with it, over any message."""
     cookie = cookie_from(jar, KEYS.add_macs(MESSAGE, None), 1000.0)
 
     assert jar.has_valid_mac2(KEYS.add_macs(MESSAGE, cookie), AT_A, 1000.0)
@@ -72,8 +73,10 @@ def test_mac2_covers_everything_before_it(jar: CookieJar) -> None:
     assert not jar.has_valid_mac2(KEYS.add_macs(MESSAGE, None), AT_A, 1000.0)
 
 
-@pytest.mark.parametrize("path", [ELSEWHERE, (0, AT_A[1], AT_A[2] + 1), (0, "192.0.2.11", 4600)])
-def test_cookie_is_bound_to_its_source(jar: CookieJar, path: tuple[int, str, int]) -> None:
+@pytest.mark.parametrize(
+    "path", [ELSEWHERE, Path(0, (AT_A.host, AT_A.address[1] + 1)), Path(0, ("192.0.2.11", 4600))]
+)
+def test_cookie_is_bound_to_its_source(jar: CookieJar, path: Path) -> None:
     """From another host or port the same cookie is worth nothing."""
     cookie = cookie_from(jar, KEYS.add_macs(MESSAGE, None), 1000.0)
 
@@ -94,7 +97,7 @@ def test_cookie_lives_between_one_and_two_lifetimes(jar: CookieJar, given: float
     assert not jar.has_valid_mac2(datagram, AT_A, end)
 
 
-def test_late_question_does_not_lengthen_a_cookies_life(jar: CookieJar) -> None:
+def test_late_check_does_not_extend_a_cookies_life(jar: CookieJar) -> None:
     """A secret changes when it is due, not when the next message happens to come."""
     cookie = cookie_from(jar, KEYS.add_macs(MESSAGE, None), 1000.0)
     datagram = KEYS.add_macs(MESSAGE, cookie)

@@ -36,7 +36,7 @@ def test_x25519_published(vector: dict[str, str]) -> None:
     assert pair.exchange(bytes.fromhex(vector["public"])).hex() == vector["shared"]
 
 
-def test_x25519_agrees_both_ways() -> None:
+def test_x25519_agrees_in_both_directions() -> None:
     """Both holders reach the same secret, and the public key is what the other needs."""
     a, b = KeyPair(bytes(range(32))), KeyPair(bytes(range(32, 64)))
 
@@ -46,7 +46,7 @@ def test_x25519_agrees_both_ways() -> None:
 
 @pytest.mark.parametrize("vector", vectors("x25519_low_order.json"))
 def test_point_of_low_order_is_refused(vector: dict[str, Any]) -> None:
-    """A public key that gives everybody the same secret is no key, in an exchange or in a configuration."""
+    """A public key that gives the same secret with every key is refused, in an exchange or in a configuration."""
     public = bytes.fromhex(vector["public"])
 
     with pytest.raises(Drop) as caught:
@@ -56,8 +56,8 @@ def test_point_of_low_order_is_refused(vector: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("size", [0, 1, 31, 33, 64])
-def test_key_of_another_length_is_no_key(size: int) -> None:
-    """A private key of another length is our caller's mistake; a public one is unusable."""
+def test_key_of_another_length_is_invalid(size: int) -> None:
+    """A private key of another length raises ValueError; a public one is unusable."""
     with pytest.raises(ValueError, match=f"32 bytes, not {size}"):
         KeyPair(bytes(range(100, 100 + size)))
     assert not crypto.is_usable_public_key(b"\x09" * size)
@@ -148,7 +148,7 @@ def test_equal_compares_values(a: bytes, b: bytes) -> None:
 
 
 def test_secret_does_not_show() -> None:
-    """No way of printing, formatting, hashing or pickling a secret tells of its value."""
+    """No way of printing, formatting, hashing or pickling a secret reveals its value."""
     secret = Secret(b"hunter2-hunter2-hunter2-hunter2-")
 
     shown = [repr(secret), str(secret), f"{secret}", f"{secret!r}", f"{[secret]}", str(hash(secret))]

@@ -15,7 +15,7 @@ def test_reason_names_are_fit_for_metrics() -> None:
 
 
 def test_a_drop_carries_its_reason() -> None:
-    """Whoever catches a drop learns why, from the attribute and from the text."""
+    """A drop has its reason as an attribute and in its text."""
     drop = Drop(DropReason.BAD_TAG)
 
     assert drop.reason is DropReason.BAD_TAG

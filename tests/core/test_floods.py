@@ -20,7 +20,8 @@ from tests.core.harness import (
 from uavlinkd.core import constants as c
 from uavlinkd.core import handshake, wire
 from uavlinkd.core.drops import DropReason
-from uavlinkd.core.outputs import Output, Path
+from uavlinkd.core.outputs import Output
+from uavlinkd.core.path import Path
 from uavlinkd.core.settings import Link, PeerSettings
 from uavlinkd.core.suites import SUITES_BY_NAME
 
@@ -38,7 +39,7 @@ def flooding(number: int) -> bytes:
 
 def prefix(number: int) -> Path:
     """A host in a network of its own."""
-    return 0, f"10.{number // 256}.{number % 256}.7", 4000
+    return Path(0, (f"10.{number // 256}.{number % 256}.7", 4000))
 
 
 def initiation(pair: Pair, at: Path, now: float, link: Link = COSTLY, *, with_cookie: bool = False) -> list[Output]:
@@ -71,11 +72,11 @@ def test_a_network_gets_so_many_cookies() -> None:
     """All hosts of a /24 share them; another network has its own."""
     pair = established()
     exhaust(pair.b, 1.0)
-    sent = [reasons(pair.b.receive(flooding(n), 1.0, (0, f"10.0.0.{n}", 9))) for n in range(30)]
+    sent = [reasons(pair.b.receive(flooding(n), 1.0, Path(0, (f"10.0.0.{n}", 9)))) for n in range(30)]
 
     assert sent.count([DropReason.COOKIE_REQUIRED]) == c.COOKIE_REPLIES_PER_PREFIX_BURST
     assert sent.count([DropReason.RATE_LIMITED]) == 30 - c.COOKIE_REPLIES_PER_PREFIX_BURST
-    assert reasons(pair.b.receive(flooding(99), 1.0, (0, "10.0.1.1", 9))) == [DropReason.COOKIE_REQUIRED]
+    assert reasons(pair.b.receive(flooding(99), 1.0, Path(0, ("10.0.1.1", 9)))) == [DropReason.COOKIE_REQUIRED]
 
 
 @pytest.mark.parametrize("known_by", ["where it was last seen", "its configured address"])
@@ -84,8 +85,8 @@ def test_a_flood_from_ten_thousand_networks_leaves_a_known_peer_its_cookie(known
     pair = established()
     at = AT_A
     if known_by == "its configured address":
-        at = 0, "192.0.2.77", 5790
-        pair.b.node.set_addresses("alpha", [at], 0.5)
+        at = Path(0, ("192.0.2.77", 5790))
+        pair.b.node.set_paths(pair.b.peer, [at], 0.5)
     exhaust(pair.b, 1.0)
     fates = [reasons(pair.b.receive(flooding(n), 1.0 + n / 10_000, prefix(n))) for n in range(10_000)]
 
@@ -95,7 +96,7 @@ def test_a_flood_from_ten_thousand_networks_leaves_a_known_peer_its_cookie(known
     exhaust(pair.b, 2.0)
     while pair.b.node._admission._cookie_replies.take(2.0):
         pass
-    assert reasons(initiation(pair, (0, "10.99.0.1", 9), 2.0)) == [DropReason.RATE_LIMITED]
+    assert reasons(initiation(pair, Path(0, ("10.99.0.1", 9)), 2.0)) == [DropReason.RATE_LIMITED]
     asked = initiation(pair, at, 2.0)
     assert reasons(asked) == [DropReason.COOKIE_REQUIRED]
     assert len(datagrams(asked, wire.COOKIE)) == 1
@@ -109,7 +110,7 @@ def test_cookies_to_a_known_address_are_bounded_too() -> None:
     sent = [pair.b.receive(flooding(n), 1.0, AT_A) for n in range(80)]
 
     expected = c.COOKIE_REPLIES_PER_KNOWN_BURST + c.COOKIE_REPLIES_PER_PREFIX_BURST
-    assert sum(len(datagrams(each, wire.COOKIE)) for each in sent) == expected
+    assert sum(len(datagrams(outputs, wire.COOKIE)) for outputs in sent) == expected
 
 
 def test_only_so_many_initiations_are_read() -> None:
@@ -179,22 +180,22 @@ def test_the_reserve_is_bounded() -> None:
 def test_a_removed_peer_is_known_nowhere() -> None:
     """Its address has no share of its own any more."""
     pair = established()
-    assert pair.b.node.sender_of(flooding(1), AT_A) == AT_A[1:]
-    pair.b.node.remove_peer("alpha", 1.0)
+    assert pair.b.node.claimed_sender(flooding(1), AT_A) == AT_A.address
+    pair.b.node.remove_peer(pair.b.peer, 1.0)
 
-    assert pair.b.node.sender_of(flooding(1), AT_A) is None
+    assert pair.b.node.claimed_sender(flooding(1), AT_A) is None
 
 
 # Which sender a datagram belongs to, for a busy shell.
 
 
-def test_senders_are_told_apart() -> None:
+def test_senders_are_distinguished() -> None:
     """A peer where it is, the same peer elsewhere, a known address, and all others."""
     pair = established()
     node, envelope = pair.b.node, pair.a.envelope(1.0)
 
-    assert node.sender_of(envelope, AT_A) == ("alpha", True)
-    assert node.sender_of(envelope, ELSEWHERE) == ("alpha", False)
-    assert node.sender_of(flooding(1), AT_A) == AT_A[1:]
+    assert node.claimed_sender(envelope, AT_A) == (pair.b.peer, True)
+    assert node.claimed_sender(envelope, ELSEWHERE) == (pair.b.peer, False)
+    assert node.claimed_sender(flooding(1), AT_A) == AT_A.address
     strangers = [flooding(1), b"", b"\x40", wire.envelope_header(0, 1) + bytes(20)]
-    assert {node.sender_of(each, ELSEWHERE) for each in strangers} == {None}
+    assert {node.claimed_sender(datagram, ELSEWHERE) for datagram in strangers} == {None}

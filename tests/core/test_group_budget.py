@@ -54,6 +54,6 @@ def test_what_is_refused_spends_nothing() -> None:
 
     for _ in range(10):
         spent(budget, GroupShare(0.0), "a")
-    rested, total = GroupShare(0.0), budget._total._tokens
-    assert not budget.take(rested, "a", DEAREST, 0.0)
-    assert (budget._total._tokens, rested.anywhere._tokens) == (total, c.GROUP_WORK_PER_PEER_BURST)
+    unused, total = GroupShare(0.0), budget._total._tokens
+    assert not budget.take(unused, "a", DEAREST, 0.0)
+    assert (budget._total._tokens, unused.anywhere._tokens) == (total, c.GROUP_WORK_PER_PEER_BURST)

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import pytest
 
 from tests.core.harness import KEY_A, KEY_B, KEY_C, seeded, state_of
+from uavlinkd.core import constants as c
 from uavlinkd.core import handshake, noise, wire
 from uavlinkd.core.crypto import Secret
 from uavlinkd.core.drops import Drop, DropReason
@@ -126,7 +127,7 @@ def test_response_of_another_suite_is_noticed() -> None:
 
 
 @pytest.mark.parametrize("claimed", ALL_SUITES)
-def test_altered_suite_is_no_downgrade(claimed: Suite) -> None:
+def test_altered_suite_does_not_downgrade(claimed: Suite) -> None:
     """An initiation under the name of another suite is not read: the suite is in prologue and protocol name."""
     offered = SUITES_BY_NAME["ffdhe3072"]
     if claimed == offered:
@@ -164,7 +165,7 @@ def test_parameters_outside_the_protocol_are_refused(tag_bytes: int, mac_key_bit
 
 
 def test_initiation_for_another_key_is_refused() -> None:
-    """Message 1 is read by the holder of the key it was made for, and by nobody else."""
+    """Message 1 is read by the holder of the key it was made for, and by no other."""
     one = exchange()
 
     with pytest.raises(Drop) as caught:
@@ -183,4 +184,4 @@ def test_parameters_are_those_of_the_link() -> None:
     """A side asks for what its configuration says."""
     link = Link(confidential=True, tag_bytes=32, mac_key_bits=512, max_envelope=700)
 
-    assert handshake.parameters_of(link, 5) == wire.Parameters(5, True, 32, 512, 700)
+    assert handshake.parameters_of(link, 5) == wire.Parameters(5, True, 32, 512, 700, c.FEATURE_REFUSALS)

@@ -9,18 +9,19 @@ from typing import Any
 import pytest
 
 from tests.core import handshake_vectors
+from tests.core.harness import unprotected
 from tests.core.test_noise import fixed
 from uavlinkd.core import crypto, handshake, wire
 from uavlinkd.core.cookie import MacKeys
 from uavlinkd.core.crypto import KeyPair, MacKey, Secret
 from uavlinkd.core.handshake import Keys
-from uavlinkd.core.session import derive
+from uavlinkd.core.session import Session, derive
 from uavlinkd.core.settings import Link, PeerSettings
-from uavlinkd.core.suites import SUITES
+from uavlinkd.core.suites import SUITES, X25519
 from uavlinkd.core.wire import Parameters
 
 VECTORS: list[dict[str, Any]] = json.loads(handshake_vectors.PATH.read_text())["vectors"]
-vectors = pytest.mark.parametrize("vector", VECTORS, ids=[each["name"] for each in VECTORS])
+vectors = pytest.mark.parametrize("vector", VECTORS, ids=[vector["name"] for vector in VECTORS])
 CASES = list(handshake_vectors.cases())
 
 
@@ -32,12 +33,12 @@ def raw(vector: dict[str, Any], key: str) -> bytes:
 def settings_of(vector: dict[str, Any], side: str) -> PeerSettings:
     """What ``side`` knows of the other one."""
     other = "responder" if side == "initiator" else "initiator"
-    _, confidential, tag_bytes, mac_key_bits, max_envelope = vector[f"{side}_parameters"]
+    _, confidential, tag_bytes, mac_key_bits, max_envelope, features = vector[f"{side}_parameters"]
     return PeerSettings(
         other,
         KeyPair(raw(vector, f"{other}_static")).public,
         Secret(raw(vector, "psk")) if vector["psk"] else None,
-        Link((SUITES[vector["suite"]],), confidential, tag_bytes, mac_key_bits, max_envelope),
+        Link((SUITES[vector["suite"]],), confidential, tag_bytes, mac_key_bits, max_envelope, features=features),
     )
 
 
@@ -53,15 +54,17 @@ def check_keys(keys: Keys, vector: dict[str, Any]) -> None:
     for number, (side, other) in enumerate((("initiator", "responder"), ("responder", "initiator"))):
         index = int.from_bytes(bytes.fromhex(vector["entropy"][other][0]), "big")
         transport, is_first = keys.transport[number], side == "initiator"
-        protection = derive(keys.parameters, transport, keys.handshake_hash, from_initiator=is_first)
-        assert protection.tag_bytes == agreed.tag_bytes
+        sender = Session(X25519, replace(keys, remote_index=index), 1, 0.0, 180.0, is_initiator=is_first)
+        assert sender.tag_bytes == agreed.tag_bytes
         header = wire.envelope_header(index, 0)
-        envelope = protection.seal(header, 0, raw(vector, f"{side}_payload"))
+        envelope = sender.seal(raw(vector, f"{side}_payload"), 0.0)
         assert envelope == raw(vector, f"{side}_envelope")
-        assert protection.open(envelope, len(header), 0) == raw(vector, f"{side}_payload")
+        envelope_key = derive(keys.parameters, transport, keys.handshake_hash, from_initiator=is_first)
+        opened = unprotected(envelope_key, agreed.tag_bytes, envelope, len(header), 0)
+        assert opened == raw(vector, f"{side}_payload")
         if not keys.parameters.confidential:
-            tag = MacKey(raw(vector, f"{side}_envelope_key")).tag(envelope[: -protection.tag_bytes])
-            assert envelope.endswith(tag[: protection.tag_bytes])
+            tag = MacKey(raw(vector, f"{side}_envelope_key")).tag(envelope[: -agreed.tag_bytes])
+            assert envelope.endswith(tag[: agreed.tag_bytes])
         else:
             key = crypto.AeadKey(raw(vector, f"{side}_envelope_key"))
             assert key.open(0, envelope[len(header) :], header) == raw(vector, f"{side}_payload")
@@ -71,7 +74,7 @@ def check_keys(keys: Keys, vector: dict[str, Any]) -> None:
 def test_core_as_initiator(vector: dict[str, Any]) -> None:
     """The initiation is the recorded one, and the recorded response leads to the recorded keys."""
     settings = settings_of(vector, "initiator")
-    index, *drawn = (bytes.fromhex(each) for each in vector["entropy"]["initiator"])
+    index, *drawn = (bytes.fromhex(text) for text in vector["entropy"]["initiator"])
     initiated = handshake.initiate(
         KeyPair(raw(vector, "initiator_static")),
         settings,
@@ -87,7 +90,7 @@ def test_core_as_initiator(vector: dict[str, Any]) -> None:
 def test_core_as_responder(vector: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     """The recorded initiation leads to the recorded response; ML-KEM's encapsulation is the recorded one."""
     settings = settings_of(vector, "responder")
-    index, *drawn = (bytes.fromhex(each) for each in vector["entropy"]["responder"])
+    index, *drawn = (bytes.fromhex(text) for text in vector["entropy"]["responder"])
     if vector["group_ciphertext"]:
         encapsulated = raw(vector, "group_ciphertext"), raw(vector, "group_secret")
         monkeypatch.setattr(crypto, "mlkem_encapsulate", lambda bits, share: encapsulated)
@@ -104,7 +107,7 @@ def test_core_as_responder(vector: dict[str, Any], monkeypatch: pytest.MonkeyPat
 
 def test_every_suite_has_vectors_of_each_kind() -> None:
     """In both modes, with and without a PSK."""
-    kinds = {(each["suite"], each["psk"] is not None, each["agreed_parameters"][1]) for each in VECTORS}
+    kinds = {(vector["suite"], vector["psk"] is not None, vector["agreed_parameters"][1]) for vector in VECTORS}
     for suite in SUITES:
         assert {psk for number, psk, _ in kinds if number == suite} == {True, False}
         assert {confidential for number, _, confidential in kinds if number == suite} == {True, False}
@@ -112,8 +115,8 @@ def test_every_suite_has_vectors_of_each_kind() -> None:
 
 @pytest.mark.parametrize("case", CASES, ids=[case.name for case in CASES])
 def test_vectors_are_those_that_the_second_implementation_makes(case: handshake_vectors.Case) -> None:
-    """Made anew, a vector is the one in the file, but for what ML-KEM's encapsulation draws."""
+    """Made again, a vector is the one in the file, but for what ML-KEM's encapsulation draws."""
     made = handshake_vectors.make(case)
-    (kept,) = (each for each in VECTORS if each["name"] == case.name)
+    (kept,) = (candidate for candidate in VECTORS if candidate["name"] == case.name)
     same = set(made) if handshake_vectors.is_reproducible(case) else {"initiation", "entropy", "agreed_parameters"}
     assert {key: made[key] for key in same} == {key: kept[key] for key in same}

@@ -8,7 +8,7 @@ from typing import Any, cast
 import pytest
 
 from tests.core.harness import seeded
-from uavlinkd.core.constants import INDEX_QUARANTINE_S, RESTING_PER_PEER
+from uavlinkd.core.constants import INDEX_QUARANTINE_S, QUARANTINED_PER_PEER
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.indices import Indices
 
@@ -22,13 +22,13 @@ def drawing(*values: int) -> Callable[[int], bytes]:
 
 
 def test_zero_is_never_picked() -> None:
-    """Index 0 is no index."""
+    """Index 0 is reserved."""
     assert Indices(drawing(0, 0, 5)).pick(0.0) == 5
 
 
 def test_owned_index_is_not_picked() -> None:
     """No two sessions have one index; a pick alone does not take it."""
-    indices = Indices(drawing(5, 5, 5, 6))
+    indices = Indices[object](drawing(5, 5, 5, 6))
     assert indices.pick(0.0) == 5
     assert indices.pick(0.0) == 5
     indices.owners[5] = OWNER
@@ -36,9 +36,9 @@ def test_owned_index_is_not_picked() -> None:
     assert indices.pick(0.0) == 6
 
 
-def test_retired_index_rests_for_ten_minutes() -> None:
+def test_retired_index_is_quarantined_for_ten_minutes() -> None:
     """An index that carried a session is not picked again until just ten minutes later."""
-    indices = Indices(drawing(5, 6, 5, 7, 5))
+    indices = Indices[object](drawing(5, 6, 5, 7, 5))
     indices.owners[5] = OWNER
     indices.retire(5, "bravo", 100.0)
 
@@ -53,7 +53,7 @@ def test_retired_index_rests_for_ten_minutes() -> None:
 
 def test_quarantine_is_released_in_order() -> None:
     """Each index is free when its own time is over, and is then forgotten: the quarantine does not grow."""
-    indices = Indices(seeded(1))
+    indices = Indices[object](seeded(1))
     for index in (3, 7, 9):
         indices.retire(index, "bravo", float(index))
 
@@ -65,18 +65,18 @@ def test_quarantine_is_released_in_order() -> None:
 
 def test_forgotten_index_is_free_at_once() -> None:
     """An index that never carried a session needs no rest."""
-    indices = Indices(drawing(5))
+    indices = Indices[object](drawing(5))
     indices.owners[5] = OWNER
     indices.forget(5)
 
     assert not indices.is_quarantined(5, 0.0)
     assert indices.pick(0.0) == 5
-    indices.forget(5)  # nobody's: nothing happens
+    indices.forget(5)  # without an owner: nothing happens
 
 
-def test_when_every_index_is_taken_there_is_none() -> None:
+def test_no_index_is_picked_if_all_are_in_use() -> None:
     """Running out of indices is a drop, not an endless search, and the last free one is not needed to see it."""
-    indices = Indices(seeded(1))
+    indices = Indices[object](seeded(1))
     indices.owners.update(dict.fromkeys(range(1, 2**16), OWNER))
 
     with pytest.raises(Drop) as caught:
@@ -86,7 +86,7 @@ def test_when_every_index_is_taken_there_is_none() -> None:
 
 def test_indices_are_found_while_half_are_taken() -> None:
     """With half of all indices in use a free one is found as good as always."""
-    indices = Indices(seeded(1))
+    indices = Indices[object](seeded(1))
     indices.owners.update(dict.fromkeys(range(1, 2**15), OWNER))
 
     for _ in range(1000):
@@ -95,13 +95,13 @@ def test_indices_are_found_while_half_are_taken() -> None:
 
 def test_a_peer_that_makes_many_sessions_uses_up_its_own_share() -> None:
     """The oldest of its indices are free again before their time; those of another peer rest."""
-    indices = Indices(seeded(1))
+    indices = Indices[object](seeded(1))
     indices.retire(60_000, "charlie", 0.0)
-    for index in range(1, RESTING_PER_PEER + 3):
+    for index in range(1, QUARANTINED_PER_PEER + 3):
         indices.retire(index, "bravo", 1.0)
 
-    resting = [index for index in range(1, 2**16) if indices.is_quarantined(index, 2.0)]
-    assert resting == [*range(3, RESTING_PER_PEER + 3), 60_000]
+    quarantined = [index for index in range(1, 2**16) if indices.is_quarantined(index, 2.0)]
+    assert quarantined == [*range(3, QUARANTINED_PER_PEER + 3), 60_000]
     indices.pick(INDEX_QUARANTINE_S + 1.0)
     assert indices._quarantine == {}
-    assert indices._resting == {}
+    assert indices._quarantined_of == {}

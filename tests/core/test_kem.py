@@ -95,7 +95,7 @@ def test_public_value_outside_its_range_is_refused(bits: int) -> None:
         assert group.element(value.to_bytes(size, "big")) == value
 
 
-def test_value_that_is_no_square_gives_a_secret_and_no_exception() -> None:
+def test_value_outside_the_subgroup_gives_a_secret_and_no_exception() -> None:
     """A value in range but outside the subgroup of order q is worked with: ephemeral exponents lose one bit by it."""
     group, prime = FfdheGroup(2048), kem.ffdhe_prime(2048)
     exponent = seeded(2)(64)
@@ -145,7 +145,7 @@ def test_malformed_mlkem_share_is_refused(bits: int) -> None:
 
 @pytest.mark.parametrize("bits", [768, 1024])
 def test_any_ciphertext_decapsulates(bits: int) -> None:
-    """A ciphertext that nobody made gives a secret that nobody has, and no exception."""
+    """A random ciphertext gives a secret that no peer has, and no exception."""
     private = Mlkem(bits).generate(seeded(1))
     size = SUITES_BY_NAME[f"mlkem{bits}"].ciphertext_bytes
     made_up = [bytes(size), b"\xff" * size, random.Random(1).randbytes(size)]

@@ -1,4 +1,4 @@
-"""Authentic envelopes that somebody held back: what is refused, what waits, and what passes as before."""
+"""Authentic envelopes that an attacker delayed: which are refused, held or delivered."""
 
 from __future__ import annotations
 
@@ -17,16 +17,18 @@ from tests.core.harness import (
     payloads,
     quiet,
     reasons,
+    unsealed,
 )
 from uavlinkd.core import constants as c
-from uavlinkd.core import wire
+from uavlinkd.core import establish, wire
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.outputs import Dropped, PeerLost, PeerUp, Transmit
+from uavlinkd.core.path import Path
 from uavlinkd.core.session import Session
 from uavlinkd.core.suites import X25519
 
 SILENT = 30.0
-"""A moment at which nothing was heard for long."""
+"""A moment long after the last received envelope."""
 
 
 @pytest.fixture
@@ -42,7 +44,7 @@ def talk(pair: Pair, begin: float, end: float, interval_s: float = 0.1) -> None:
 
 
 def frame(side: Side, now: float, number: int = 0) -> bytes:
-    """An envelope with one frame that is told from others by its number."""
+    """An envelope with one frame that differs from others by its number."""
     return only(datagrams(side.send(now, numbered(number))))
 
 
@@ -52,9 +54,8 @@ def numbered(number: int) -> bytes:
 
 def echo_in(side: Side, datagram: bytes) -> wire.Echo:
     """The echo in an envelope to a side, read with its keys and past its session."""
-    _, counter, size = wire.parse_envelope_header(datagram)
-    session = next(each for each in side.peer.sessions.confirmed if datagram[1:3] == each.local_index.to_bytes(2))
-    payload = session._receive.open(datagram, size, counter)
+    session = next(one for one in side.peer.sessions.confirmed if datagram[1:3] == one.local_index.to_bytes(2))
+    payload = unsealed(session, datagram)
     assert payload is not None
     echo = wire.parse_control(payload)
     assert isinstance(echo, wire.Echo)
@@ -77,7 +78,7 @@ def test_held_back_envelope_is_refused_once_others_came_two_seconds_ago(pair: Pa
 
 
 def test_overtaken_envelope_is_delivered_within_two_seconds(pair: Pair) -> None:
-    """A radio's reordering is no attack: what others overtook by less than two seconds is delivered."""
+    """A radio may reorder: an envelope that others overtook by less than 2 s is delivered."""
     held = frame(pair.a, 1.0)
     talk(pair, 1.0, 0.99 + c.LATE_AFTER_S)
 
@@ -121,22 +122,22 @@ def test_frames_after_a_silence_wait_for_one_round_trip(pair: Pair) -> None:
 
 
 def test_frames_of_a_blackout_are_refused_and_new_ones_beside_them_pass(pair: Pair) -> None:
-    """All of thirty seconds was kept and comes at once: only what was sent lately is delivered."""
+    """All of thirty seconds was kept and comes at once: only what was sent recently is delivered."""
     kept = [frame(pair.a, 1.0 + second, second) for second in range(30)]
     now = 30.5
-    outputs = [out for each in kept for out in pair.b.receive(each, now)]
+    outputs = [out for envelope in kept for out in pair.b.receive(envelope, now)]
     assert payloads(outputs) == []
 
     answer = only(datagrams(pair.a.receive(only(datagrams(outputs)), now)))
     released = pair.b.receive(answer, now)
 
     assert payloads(released) == [numbered(28), numbered(29)]  # of the last two seconds, and a step
-    assert of(released, Dropped) == [Dropped(DropReason.DELAYED, "alpha", None, 28)]
+    assert of(released, Dropped) == [Dropped(DropReason.DELAYED, pair.b.peer, None, 28)]
     assert pair.carries(now)
 
 
-def test_what_the_peer_called_old_stays_refused(pair: Pair) -> None:
-    """Its word is a floor: an envelope that is released after the answer is delayed, though higher than any heard."""
+def test_counters_that_the_peer_reported_as_old_stay_refused(pair: Pair) -> None:
+    """An envelope that arrives after the answer is dropped as delayed, even if its counter is the highest yet."""
     old = frame(pair.a, 1.0), frame(pair.a, 1.0)
     answer = only(datagrams(pair.a.receive(only(datagrams(pair.b.receive(old[0], SILENT))), SILENT)))
     assert reasons(pair.b.receive(answer, SILENT)) == [DropReason.DELAYED]
@@ -149,24 +150,24 @@ def test_without_an_answer_what_is_held_is_given_up(pair: Pair) -> None:
     """Four questions within a second, then it is dropped and counted; the next envelope begins again."""
     questions = datagrams(pair.b.receive(frame(pair.a, SILENT), SILENT))
     moments = []
-    while (now := pair.b.node.next_deadline()) <= SILENT + c.DOUBT_S:
+    while (now := pair.b.node.next_deadline()) <= SILENT + c.HOLD_S:
         outputs = pair.b.timeout(now)
         questions += datagrams(outputs)
         moments.append(now)
 
     assert moments == [SILENT + 0.25, SILENT + 0.5, SILENT + 0.75, SILENT + 1.0]
     assert len(questions) == 4
-    assert of(outputs, Dropped) == [Dropped(DropReason.DOUBTFUL, "alpha", None, 1)]
+    assert of(outputs, Dropped) == [Dropped(DropReason.DOUBTFUL, pair.b.peer, None, 1)]
     # The answers come too late: old as they are they vouch for nothing.
-    for each in questions:
-        assert pair.b.receive(only(datagrams(pair.a.receive(each, SILENT))), SILENT + 1.9) == []
+    for question in questions:
+        assert pair.b.receive(only(datagrams(pair.a.receive(question, SILENT))), SILENT + 1.9) == []
     assert len(datagrams(pair.b.receive(frame(pair.a, SILENT + 1.9, 7), SILENT + 1.9))) == 1
-    assert reasons(pair.b.timeout(SILENT + 1.9 + c.DOUBT_S)) == [DropReason.DOUBTFUL]
+    assert reasons(pair.b.timeout(SILENT + 1.9 + c.HOLD_S)) == [DropReason.DOUBTFUL]
     assert pair.crosses(pair.a, pair.b, 40.0)
 
 
 @pytest.mark.parametrize("number", range(4))
-def test_any_question_of_the_doubt_may_be_answered(pair: Pair, number: int) -> None:
+def test_any_request_about_held_frames_may_be_answered(pair: Pair, number: int) -> None:
     """Lost questions and slow answers cost nothing as long as one comes within a second."""
     questions = datagrams(pair.b.receive(frame(pair.a, SILENT), SILENT))
     for _ in range(3):
@@ -175,7 +176,7 @@ def test_any_question_of_the_doubt_may_be_answered(pair: Pair, number: int) -> N
     answer = only(datagrams(pair.a.receive(questions[number], SILENT + 0.8)))
 
     assert payloads(pair.b.receive(answer, SILENT + 0.95)) == [numbered(0)]
-    assert pair.b.timeout(SILENT + c.DOUBT_S) == []
+    assert pair.b.timeout(SILENT + c.HOLD_S) == []
 
 
 def test_answer_from_before_the_silence_vouches_for_nothing(pair: Pair) -> None:
@@ -188,7 +189,7 @@ def test_answer_from_before_the_silence_vouches_for_nothing(pair: Pair) -> None:
     later = SILENT + 20.0
     assert payloads(pair.b.receive(kept, later)) == []
     assert payloads(pair.b.receive(old_answer, later)) == []
-    assert reasons(pair.b.timeout(later + c.DOUBT_S)) == [DropReason.DOUBTFUL]
+    assert reasons(pair.b.timeout(later + c.HOLD_S)) == [DropReason.DOUBTFUL]
 
 
 def test_control_records_are_not_held_and_end_no_silence(pair: Pair) -> None:
@@ -200,7 +201,7 @@ def test_control_records_are_not_held_and_end_no_silence(pair: Pair) -> None:
     assert payloads(pair.b.receive(kept, SILENT)) == []
 
 
-def test_frames_within_two_seconds_of_the_handshake_need_no_question() -> None:
+def test_frames_within_two_seconds_of_the_handshake_need_no_request() -> None:
     """The handshake is proof enough for the first of a session."""
     pair = Pair(link_a=quiet(), link_b=quiet()).establish()
     outputs = pair.b.receive(frame(pair.a, c.LATE_AFTER_S), c.LATE_AFTER_S)
@@ -222,23 +223,23 @@ def test_what_is_held_is_bounded_and_counted(pair: Pair) -> None:
     dropped = 0
     for number in range(100):
         out = pair.b.receive(only(datagrams(pair.a.send(SILENT, b"\xfd" + bytes([number]) * 1100))), SILENT)
-        dropped += sum(each.amount for each in of(out, Dropped))
+        dropped += sum(output.number for output in of(out, Dropped))
         if number == 0:
             question = only(datagrams(out))
     answer = only(datagrams(pair.a.receive(question, SILENT)))
     delivered = payloads(pair.b.receive(answer, SILENT))
 
     assert len(delivered) + dropped == 100
-    assert [each[1] for each in delivered] == list(range(dropped, 100))
+    assert [payload[1] for payload in delivered] == list(range(dropped, 100))
     assert pair.b.peer.traffic.drops == {DropReason.DOUBTFUL: dropped}
     assert sum(map(len, delivered)) <= c.HELD_BYTES
 
 
-def test_what_is_held_can_be_taken_while_the_question_stays_open(pair: Pair) -> None:
+def test_held_frames_can_be_popped_while_requests_continue(pair: Pair) -> None:
     """After a pause of this process the shell drops held frames. The core delivers the frames after the answer."""
     question = only(datagrams(pair.b.receive(frame(pair.a, SILENT, 1), SILENT)))
-    assert payloads(pair.b.node.take_held()) == [numbered(1)]
-    assert pair.b.node.take_held() == []
+    assert payloads(pair.b.node.pop_held()) == [numbered(1)]
+    assert pair.b.node.pop_held() == []
 
     answer = only(datagrams(pair.a.receive(question, SILENT + 0.1)))
     assert payloads(pair.b.receive(answer, SILENT + 0.2)) == []
@@ -260,34 +261,34 @@ def test_stretched_time_is_betrayed_by_the_round_trip() -> None:
         for question in datagrams(outputs):
             asked += 1
             sent += datagrams(pair.a.receive(question, now))
-        oldest_s = max([oldest_s, *(now - (int(each[-1]) / 10) for each in payloads(outputs))])
+        oldest_s = max([oldest_s, *(now - (int(payload[-1]) / 10) for payload in payloads(outputs))])
     assert asked > 4
     assert pair.b.peer.traffic.drops[DropReason.DOUBTFUL] > 20
     assert oldest_s < c.PROBE_INTERVAL_S + 2 * c.LATE_AFTER_S
 
 
-@pytest.mark.parametrize("ends_by", ["goodbye", "removal", "age", "daemon"])
-def test_frames_in_doubt_do_not_outlive_their_session(pair: Pair, ends_by: str) -> None:
+@pytest.mark.parametrize("ends_by", ["close", "removal", "age", "daemon"])
+def test_held_frames_do_not_outlive_their_session(pair: Pair, ends_by: str) -> None:
     """Whatever ends the session, what was held is counted and never delivered."""
     now = c.REJECT_AFTER_S - 0.1
     question = only(datagrams(pair.b.receive(frame(pair.a, now), now)))
     answer = only(datagrams(pair.a.receive(question, now)))
     peer = pair.b.peer
     match ends_by:
-        case "goodbye":
+        case "close":
             outputs = pair.b.receive(pair.a.envelope(now, wire.Close().encode()), now)
         case "removal":
-            outputs = pair.b.node.remove_peer("alpha", now)
+            outputs = pair.b.node.remove_peer(pair.b.peer, now)
         case "age":
             outputs = pair.b.timeout(c.REJECT_AFTER_S)
         case _:
             outputs = pair.b.node.close(now)
-    assert of(outputs, Dropped) == [Dropped(DropReason.DOUBTFUL, "alpha", None, 1)]
+    assert of(outputs, Dropped) == [Dropped(DropReason.DOUBTFUL, peer, None, 1)]
     assert peer.traffic.drops == {DropReason.DOUBTFUL: 1}
     assert payloads(pair.b.receive(answer, now)) == []
 
 
-# Who is up.
+# Which peers are up.
 
 
 def test_kept_envelopes_keep_no_link_up() -> None:
@@ -296,9 +297,9 @@ def test_kept_envelopes_keep_no_link_up() -> None:
     kept = [frame(pair.a, 0.5, number) for number in range(8)]
     pair.b.send(3.0)
     lost_at = 0.0
-    for number, each in enumerate(kept):
+    for number, envelope in enumerate(kept):
         now = 3.0 + number / 2
-        outputs = pair.b.receive(each, now) + pair.b.timeout(now)
+        outputs = pair.b.receive(envelope, now) + pair.b.timeout(now)
         assert payloads(outputs) == []
         if of(outputs, PeerLost):
             lost_at = now
@@ -309,7 +310,7 @@ def test_kept_envelopes_keep_no_link_up() -> None:
     question = only(datagrams(pair.b.receive(frame(pair.a, now, 9), now), wire.SHORT_ENVELOPE))
     assert not pair.b.peer.is_up
     outputs = pair.b.receive(only(datagrams(pair.a.receive(question, now))), now)
-    assert of(outputs, PeerUp) == [PeerUp("alpha")]
+    assert of(outputs, PeerUp) == [PeerUp(pair.b.peer)]
     assert payloads(outputs) == [numbered(9)]
 
 
@@ -340,22 +341,22 @@ def test_reordered_envelopes_are_not_missing(pair: Pair) -> None:
     """Ten in the opposite order, over and over: nine of each came after one that was sent later, none is missing."""
     for batch in range(10):
         now = 1.0 + batch / 2
-        for each in reversed([frame(pair.a, now, number) for number in range(10)]):
-            assert len(payloads(pair.b.receive(each, now))) == 1
+        for envelope in reversed([frame(pair.a, now, number) for number in range(10)]):
+            assert len(payloads(pair.b.receive(envelope, now))) == 1
     assert pair.b.peer.traffic.out_of_order == 90
     assert pair.b.peer.missing(60.0) == 0
 
 
 def test_unanswered_challenges_are_counted(pair: Pair) -> None:
-    """Each place where the peer's envelopes came from and nobody answered; one that was answered is none."""
+    """Each path on which a challenge expired without a response; an answered challenge is not counted."""
     question = only(of(pair.b.receive(frame(pair.a, 1.0), 1.0, ELSEWHERE), Transmit))
     answer = only(datagrams(pair.a.receive(question.datagram, 1.0)))
     pair.b.receive(answer, 1.1, ELSEWHERE)
     assert pair.b.peer.path == ELSEWHERE
     counted = pair.b.peer.traffic
 
-    pair.b.receive(frame(pair.a, 1.5), 1.5, (0, "203.0.113.1", 1))
-    pair.b.receive(frame(pair.a, 2.0), 2.0, (0, "203.0.113.2", 1))
+    pair.b.receive(frame(pair.a, 1.5), 1.5, Path(0, ("203.0.113.1", 1)))
+    pair.b.receive(frame(pair.a, 2.0), 2.0, Path(0, ("203.0.113.2", 1)))
     assert counted.challenges_unanswered == 1
     assert pair.b.node.next_deadline() <= 2.0 + c.CHALLENGE_LIFETIME_S
     pair.b.timeout(2.0 + c.CHALLENGE_LIFETIME_S)
@@ -367,23 +368,22 @@ def test_unanswered_challenges_are_counted(pair: Pair) -> None:
 # Sessions.
 
 
-def rekeyed(now: float, *, heard: bool = True) -> tuple[Pair, bytes]:
+def rekeyed(now: float, *, received: bool = True) -> tuple[Pair, bytes]:
     """A pair with a second session since ``now``, and an envelope that alpha sent on the first before."""
     pair = Pair(link_a=quiet(), link_b=quiet()).establish()
-    if heard:
+    if received:
         assert pair.carries(now - 0.5)
     old = frame(pair.a, now - 0.5, 5)
-    called = pair.a.peer.caller.call(pair.a.peer.path, pair.a.peer.sessions.generation, now)
-    assert called is not None
-    response = only(datagrams(pair.b.receive(called.datagram, now)))
+    initiation = only(datagrams(establish.initiate(pair.a.peer, now)))
+    response = only(datagrams(pair.b.receive(initiation, now)))
     pair.b.receive(only(datagrams(pair.a.receive(response, now))), now)
     assert len(pair.b.peer.sessions.confirmed) == 2
     return pair, old
 
 
 def test_late_frame_of_the_session_before_is_asked_about_on_it() -> None:
-    """The question goes on the session in doubt, and the answer tells of that session, whichever carries it."""
-    pair, old = rekeyed(10.0, heard=False)
+    """The request goes on the unverified session. The answer reports on that session, whichever carries it."""
+    pair, old = rekeyed(10.0, received=False)
     outputs = pair.b.receive(old, 10.1)
     assert payloads(outputs) == []
     question = only(datagrams(outputs))
@@ -400,10 +400,9 @@ def test_old_frame_of_the_session_before_is_refused() -> None:
     pair, old = rekeyed(10.0)
     outputs = exchange(pair.b, pair.a, pair.b.receive(old, 20.0), 20.0)
     assert payloads(outputs) == []
-    answer = [
-        out for each in datagrams(pair.b.receive(frame(pair.a, 20.0, 6), 20.0)) for out in pair.a.receive(each, 20.0)
-    ]
-    assert payloads([out for each in datagrams(answer) for out in pair.b.receive(each, 20.0)]) == [numbered(6)]
+    requests = datagrams(pair.b.receive(frame(pair.a, 20.0, 6), 20.0))
+    answers = datagrams(out for request in requests for out in pair.a.receive(request, 20.0))
+    assert payloads(out for answer in answers for out in pair.b.receive(answer, 20.0)) == [numbered(6)]
 
 
 def test_frames_of_the_session_before_end_with_the_first_on_the_next() -> None:
@@ -411,15 +410,14 @@ def test_frames_of_the_session_before_end_with_the_first_on_the_next() -> None:
     pair = Pair(link_a=quiet(), link_b=quiet()).establish()
     talk(pair, 1.0, 10.0)
     held = [frame(pair.a, 10.0 + number / 100, number) for number in range(40)]
-    called = pair.a.peer.caller.call(pair.a.peer.path, pair.a.peer.sessions.generation, 10.4)
-    assert called is not None
-    response = only(datagrams(pair.b.receive(called.datagram, 10.4)))
+    initiation = only(datagrams(establish.initiate(pair.a.peer, 10.4)))
+    response = only(datagrams(pair.b.receive(initiation, 10.4)))
     pair.b.receive(only(datagrams(pair.a.receive(response, 10.4))), 10.4)
     came = []
-    for number, each in enumerate(held):
+    for number, envelope in enumerate(held):
         now = 10.5 + 1.9 * number
         talk(pair, now, now + 1.8)  # on the new session all is well
-        if payloads(pair.b.receive(each, now)):
+        if payloads(pair.b.receive(envelope, now)):
             came.append(now)
     assert came == [10.5]
     assert pair.b.peer.traffic.drops[DropReason.DELAYED] + pair.b.peer.traffic.drops[DropReason.SESSION_EXPIRED] == 39
@@ -438,13 +436,12 @@ def test_overtaken_by_the_next_session_frames_have_two_seconds() -> None:
         assert pair.b.peer.missing(60.0) == 0
 
 
-def test_old_session_goes_on_until_the_peer_is_heard_on_the_new_one() -> None:
+def test_old_session_works_until_the_first_envelope_on_the_new_one() -> None:
     """The initiator has the new session first. Where its confirmation is lost, the peer sends on the old one on."""
     pair = Pair(link_a=quiet(), link_b=quiet()).establish()
     assert pair.carries(9.5)
-    called = pair.a.peer.caller.call(pair.a.peer.path, pair.a.peer.sessions.generation, 10.0)
-    assert called is not None
-    response = only(datagrams(pair.b.receive(called.datagram, 10.0)))
+    initiation = only(datagrams(establish.initiate(pair.a.peer, 10.0)))
+    response = only(datagrams(pair.b.receive(initiation, 10.0)))
     confirmation = only(datagrams(pair.a.receive(response, 10.0)))
     for number in range(10):
         now = 10.0 + number
@@ -453,21 +450,20 @@ def test_old_session_goes_on_until_the_peer_is_heard_on_the_new_one() -> None:
     assert pair.carries(19.6)
 
 
-def test_late_control_records_of_the_session_before_are_no_sign_of_life() -> None:
-    """They are acted on, but who keeps them cannot make a peer look alive that is gone."""
+def test_late_control_records_of_the_previous_session_do_not_keep_the_peer_up() -> None:
+    """The Node acts on them, but an attacker that delays them cannot keep a lost peer up."""
     pair = Pair(link_a=quiet(), link_b=quiet()).establish()
     assert pair.carries(9.5)
     kept = [pair.a.envelope(9.9, b"") for _ in range(8)]
     question = pair.a.envelope(9.9, wire.Echo(False, 7, 0, 0).encode())
-    called = pair.a.peer.caller.call(pair.a.peer.path, pair.a.peer.sessions.generation, 10.0)
-    assert called is not None
-    response = only(datagrams(pair.b.receive(called.datagram, 10.0)))
+    initiation = only(datagrams(establish.initiate(pair.a.peer, 10.0)))
+    response = only(datagrams(pair.b.receive(initiation, 10.0)))
     pair.b.receive(only(datagrams(pair.a.receive(response, 10.0))), 10.0)
-    for number, each in enumerate(kept):
-        pair.b.receive(each, 10.5 + number)
-    assert pair.b.peer.heard_at == 11.5
+    for number, envelope in enumerate(kept):
+        pair.b.receive(envelope, 10.5 + number)
+    assert pair.b.peer.received_at == 11.5
     assert len(datagrams(pair.b.receive(question, 20.0))) == 1
-    assert pair.b.peer.heard_at == 11.5
+    assert pair.b.peer.received_at == 11.5
 
 
 def test_frames_on_a_session_that_ends_as_it_is_confirmed_are_counted() -> None:
@@ -476,19 +472,18 @@ def test_frames_on_a_session_that_ends_as_it_is_confirmed_are_counted() -> None:
     peer = pair.a.peer
     waiting = []
     for _ in range(c.USABLE_PER_PEER + 1):
-        called = peer.caller.call(None, 0, 0.0) or peer.caller.call(pair.a.peer_at, 0, 0.0)
-        assert called is not None
-        waiting.append(only(datagrams(pair.b.receive(called.datagram, 0.0))))
+        initiation = only(datagrams(establish.initiate(peer, 0.0)))
+        waiting.append(only(datagrams(pair.b.receive(initiation, 0.0))))
     sessions = []
     for response in waiting:
         index = wire.parse_response(response).receiver_index
-        pending = peer.caller.pending.get(index)
+        pending = peer.initiator.pending.get(index)
         assert pending is not None
-        keys = peer.caller.receive_response(pending, wire.parse_response(response))
-        sessions.append(Session(peer, X25519, keys, index, 0.0, 180.0, is_initiator=True))
-    for number, each in enumerate(sessions[1:]):
-        pair.b.peer.sessions.unconfirmed[each.remote_index].session.created_at = float(number + 1)
-        pair.b.receive(each.seal(b"", 1.0), 1.0)
+        keys = peer.initiator.receive_response(pending, wire.parse_response(response))
+        sessions.append(Session(X25519, keys, index, 0.0, 180.0, is_initiator=True))
+    for number, session in enumerate(sessions[1:]):
+        pair.b.peer.sessions.unconfirmed[session.remote_index].session.created_at = float(number + 1)
+        pair.b.receive(session.seal(b"", 1.0), 1.0)
     outputs = pair.b.receive(sessions[0].seal(FRAME, 2.5), 2.5)
     assert reasons(outputs) == [DropReason.DOUBTFUL]
     assert payloads(outputs) == []

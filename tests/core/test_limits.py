@@ -75,7 +75,7 @@ def test_sources_have_their_own_buckets() -> None:
 
 
 def test_memory_for_sources_is_bounded() -> None:
-    """However many sources there are, no more than the capacity is remembered: those heard last."""
+    """However many sources there are, only the most recent ones are remembered, up to the capacity."""
     limiter = SourceLimiter(1.0, 1, 3)
     for source in range(1000):
         assert limiter.take(source, 0.0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-from base64 import b64encode
 from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
@@ -37,11 +36,12 @@ from tests.core.harness import (
     with_macs,
 )
 from uavlinkd.core import constants as c
-from uavlinkd.core import handshake, noise, wire
+from uavlinkd.core import establish, handshake, noise, wire
 from uavlinkd.core.crypto import Entropy, KeyPair, Secret
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.node import Node
-from uavlinkd.core.outputs import Dropped, Output, Path, SessionEstablished, Transmit
+from uavlinkd.core.outputs import Dropped, Output, SessionEstablished, Transmit
+from uavlinkd.core.path import Path
 from uavlinkd.core.settings import Link, PeerSettings
 from uavlinkd.core.suites import SUITES, SUITES_BY_NAME, Suite
 
@@ -58,7 +58,7 @@ def established(**links: Link) -> Pair:
 def made_initiation(
     identity: KeyPair = KEY_A, to: KeyPair = KEY_B, link: Link = PLAIN, index: int = 77, entropy: Entropy = ENTROPY
 ) -> bytes:
-    """An initiation of whoever holds this identity, made by hand."""
+    """An initiation by the holder of this identity, made by hand."""
     initiated = handshake.initiate(identity, PeerSettings("peer", to.public, None, link), index, 0, entropy)
     return with_macs(initiated.message, to.public)
 
@@ -70,7 +70,7 @@ def retried(pair: Pair, start: float) -> tuple[float, bytes]:
         made = datagrams(pair.a.timeout(now), wire.INITIATION)
         if made:
             return now, made[0]
-    raise AssertionError("alpha does not call")
+    raise AssertionError("alpha does not initiate")
 
 
 def completes(pair: Pair, initiation: bytes, now: float) -> bool:
@@ -84,7 +84,7 @@ def completes(pair: Pair, initiation: bytes, now: float) -> bool:
 
 
 def malformed(pair: Pair, now: float) -> list[Output]:
-    """A type that is none."""
+    """An unknown type."""
     return pair.b.receive(b"\x07hello", now)
 
 
@@ -94,7 +94,7 @@ def raw_mavlink(pair: Pair, now: float) -> list[Output]:
 
 
 def unexpected_response(pair: Pair, now: float) -> list[Output]:
-    """A response to a call that nobody made."""
+    """A response without an initiation."""
     header = wire.response_header(SUITES[0], 5, UNUSED_INDEX)
     message = header + bytes(wire.response_bytes(SUITES[0]) - len(header) - wire.MACS_BYTES)
     return pair.b.receive(with_macs(message, pair.b.node.public_key), now)
@@ -155,7 +155,7 @@ def suite_not_accepted(pair: Pair, now: float) -> list[Output]:
 
 
 def header_mismatch(pair: Pair, now: float) -> list[Output]:
-    """An initiation whose sender index was altered on the way."""
+    """An initiation whose sender index was altered in transit."""
     return pair.b.receive(repaired(flipped(made_initiation(), 3), KEY_B.public), now)
 
 
@@ -168,7 +168,7 @@ def no_free_index(pair: Pair, now: float) -> list[Output]:
     """An initiation when every index is taken."""
     owners = pair.b.node._indices.owners
     kept = dict(owners)
-    owners.update({index: pair.b.session for index in range(2**16) if index not in owners})
+    owners.update({index: (pair.b.peer, pair.b.session) for index in range(2**16) if index not in owners})
     outputs = pair.b.receive(made_initiation(), now)
     owners.clear()
     owners.update(kept)
@@ -212,7 +212,7 @@ def bad_cookie(pair: Pair, now: float) -> list[Output]:
 
 
 def unknown_index(pair: Pair, now: float) -> list[Output]:
-    """An envelope for nobody."""
+    """An envelope for an unknown session."""
     return pair.b.receive(wire.envelope_header(UNUSED_INDEX, 1) + bytes(20), now)
 
 
@@ -228,9 +228,7 @@ def late(pair: Pair, now: float) -> list[Output]:
 
 def made_initiation_of(pair: Pair, now: float) -> bytes:
     """An initiation that alpha waits for the answer of."""
-    called = pair.a.peer.caller.call(AT_B, 0, now)
-    assert called is not None
-    return called.datagram
+    return only(datagrams(establish.initiate(pair.a.peer, now)))
 
 
 def session_expired(pair: Pair, now: float) -> list[Output]:
@@ -276,27 +274,27 @@ def bad_tag(pair: Pair, now: float) -> list[Output]:
 
 
 def bad_control(pair: Pair, now: float) -> list[Output]:
-    """An authentic control record that is none."""
+    """An authentic control record of an unknown kind."""
     return pair.b.receive(pair.a.envelope(now, b"\x66"), now)
 
 
 def bad_path_response(pair: Pair, now: float) -> list[Output]:
-    """An answer to a question that nobody asked."""
+    """A path response without a challenge."""
     return pair.b.receive(pair.a.envelope(now, wire.PathResponse(bytes(8)).encode()), now)
 
 
 def doubtful(pair: Pair, now: float) -> list[Output]:
     """Frames after a silence, about which the peer says nothing."""
     envelope = pair.a.envelope(now)
-    pair.b.session.trusted_until = now - c.DOUBT_S - 1.0
-    pair.b.receive(envelope, now - c.DOUBT_S)
+    pair.b.session.trusted_until = now - c.HOLD_S - 1.0
+    pair.b.receive(envelope, now - c.HOLD_S)
     return pair.b.timeout(now)
 
 
 def no_session(pair: Pair, now: float) -> list[Output]:
     """Frames for a peer that was never linked."""
     pair.b.node.add_peer(PeerSettings("charlie", KEY_C.public), now)
-    return pair.b.node.send("charlie", [FRAME], now)
+    return pair.b.node.send(pair.b.node.peers["charlie"], [FRAME], now)
 
 
 def too_large(pair: Pair, now: float) -> list[Output]:
@@ -368,7 +366,7 @@ def test_a_drop_names_the_peer_whose_session_the_header_claims() -> None:
     """A claim is good for a counter: forgeries on a peer's session are counted there, others at the node."""
     pair = established()
 
-    assert of(bad_tag(pair, 1.0), Dropped) == [Dropped(DropReason.BAD_TAG, "alpha", AT_A)]
+    assert of(bad_tag(pair, 1.0), Dropped) == [Dropped(DropReason.BAD_TAG, pair.b.peer, AT_A)]
     assert pair.b.peer.traffic.drops[DropReason.BAD_TAG] == 1
     assert of(bad_mac1(pair, 1.0), Dropped) == [Dropped(DropReason.BAD_MAC1, None, AT_A)]
     assert pair.b.node.drops == {DropReason.BAD_MAC1: 1}
@@ -413,7 +411,7 @@ def finish(at: Stage, now: float) -> bool:
     assert reasons(outputs) == []
     for _ in range(3):
         side = at.pair.a if side is at.pair.b else at.pair.b
-        outputs = [out for each in datagrams(outputs) for out in side.receive(each, now)]
+        outputs = [out for datagram in datagrams(outputs) for out in side.receive(datagram, now)]
     return at.pair.carries(now)
 
 
@@ -428,7 +426,7 @@ def test_forgeries_of_a_message_change_nothing(name: str) -> None:
     forgeries += [at.message + b"\0", at.message + at.message]
     if name in ("initiation", "response"):
         # mac2 counts under load alone: an initiation that is altered only there is the genuine one.
-        forgeries = [each for each in forgeries if each[:-16] != at.message[:-16]]
+        forgeries = [forged for forged in forgeries if forged[:-16] != at.message[:-16]]
 
     for forged in forgeries:
         outputs = side.receive(forged, 0.0)
@@ -441,7 +439,7 @@ def test_forgeries_of_a_message_change_nothing(name: str) -> None:
 @pytest.mark.parametrize("suite", KINDS)
 @pytest.mark.parametrize("name", ["initiation", "response"])
 def test_forgeries_with_a_right_mac1_change_nothing(name: str, suite: Suite) -> None:
-    """Who knows the public key gets to the handshake itself and no further, at any byte of header or message."""
+    """With the public key an attacker reaches the handshake but no further, at any byte of header or message."""
     at = stage(name, suite)
     side = at.pair.b if at.to_bravo else at.pair.a
     before = state_of(side.node)
@@ -497,7 +495,7 @@ def test_no_bytes_make_a_node_raise_or_answer(head: bytes, rest: bytes) -> None:
     assert [type(out) for out in outputs] == [Dropped]
 
 
-def test_strangers_hear_nothing() -> None:
+def test_strangers_receive_no_answer() -> None:
     """Without a right mac1 there is no answer, not even under load; with it, only a peer has one."""
     pair = established()
     stranger = made_initiation(KEY_C)
@@ -527,7 +525,7 @@ def test_answers_are_never_longer_than_what_they_answer() -> None:
         assert len(only(datagrams(pair.b.receive(again, 0.1)))) < len(again)
 
 
-def test_altered_suite_byte_is_no_downgrade() -> None:
+def test_altered_suite_byte_does_not_downgrade() -> None:
     """The suite of an initiation cannot be steered: under any other it is refused, though bravo would accept all."""
     every = tuple(SUITES.values())
     for offered in every:
@@ -648,15 +646,15 @@ def test_memory_for_initiations_is_bounded(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(c, "REMEMBERED_INITIATIONS", 3)
     pair = established()
     made = [made_initiation() for _ in range(4)]
-    for each in made:
-        assert datagrams(pair.b.receive(each, 1.0), wire.RESPONSE)
-    for each in made[1:]:
-        assert reasons(pair.b.receive(each, 2.0)) == [DropReason.REPLAYED_INITIATION]
+    for initiation in made:
+        assert datagrams(pair.b.receive(initiation, 1.0), wire.RESPONSE)
+    for initiation in made[1:]:
+        assert reasons(pair.b.receive(initiation, 2.0)) == [DropReason.REPLAYED_INITIATION]
     assert datagrams(pair.b.receive(made[0], 2.0), wire.RESPONSE)
 
 
 def test_forged_initiations_are_not_remembered() -> None:
-    """Only authentic initiations of peers take a place in that memory: nobody else can flush it."""
+    """Only authentic initiations of peers are kept in that memory: no other sender can flush it."""
     pair = established()
     known = len(pair.b.node._remembered)
     for datagram in (made_initiation(KEY_C), repaired(flipped(made_initiation(), 60), KEY_B.public)):
@@ -697,7 +695,7 @@ def test_answers_to_one_peer_are_bounded(is_up: bool) -> None:
     assert datagrams(pair.b.receive(made_initiation(), now + 1 / rate), wire.RESPONSE)
 
 
-def test_what_goes_elsewhere_is_no_part_of_what_the_peer_was_sent() -> None:
+def test_bytes_to_other_addresses_are_counted_apart() -> None:
     """Answers to replayed initiations, and challenges for envelopes from afar, take nothing from a link's budget."""
     pair = established()
     traffic = pair.b.peer.traffic
@@ -758,7 +756,7 @@ def test_cookie_counts_from_its_address_only() -> None:
     now, again = retried(pair, 0.0)
     exhaust(pair.b, now)
 
-    moved = (AT_A[0], AT_A[1], AT_A[2] + 1)
+    moved = Path(0, (AT_A.host, AT_A.address[1] + 1))
     for place in (ELSEWHERE, moved):
         assert reasons(pair.b.receive(again, now, place)) == [DropReason.COOKIE_REQUIRED]
     assert completes(pair, again, now)
@@ -785,11 +783,11 @@ def test_cookie_of_the_previous_secret_counts_once_more(age: float, works: bool)
 
 
 def test_forged_cookie_is_harmless() -> None:
-    """Who sees an initiation can make a cookie for it: the link comes up all the same, under load or not."""
+    """An observer of an initiation can make a cookie for it. The link still comes up, under load or not."""
     for under_load in (False, True):
         pair = Pair(link_a=QUIET, link_b=QUIET)
         pair.initiation(0.0)
-        index, pending = next(iter(pair.a.peer.caller.pending.items()))
+        index, pending = next(iter(pair.a.peer.initiator.pending.items()))
         sealed = pair.b.node._mac_keys.seal_cookie(b"forged cookie!!!", bytes(16), pending.mac1)
         assert pair.a.receive(wire.encode_cookie_reply(index, bytes(16), sealed), 0.0) == []
 
@@ -804,12 +802,12 @@ def test_forged_cookie_is_harmless() -> None:
 
 
 def test_forged_cookie_does_not_replace_the_genuine_one() -> None:
-    """Who sees an initiation sends a cookie of his own behind the peer's: it is not taken, and the link comes up."""
+    """An observer of an initiation sends a second cookie. The initiator ignores it, and the link comes up."""
     pair = Pair(link_a=QUIET, link_b=QUIET)
     initiation = pair.initiation(0.0)
     exhaust(pair.b, 0.0)
     assert pair.a.receive(only(datagrams(pair.b.receive(initiation, 0.0))), 0.0) == []
-    index, pending = next(iter(pair.a.peer.caller.pending.items()))
+    index, pending = next(iter(pair.a.peer.initiator.pending.items()))
     sealed = pair.b.node._mac_keys.seal_cookie(b"forged cookie!!!", bytes(16), pending.mac1)
     forged = wire.encode_cookie_reply(index, bytes(16), sealed)
     assert reasons(pair.a.receive(forged, 0.01)) == [DropReason.UNEXPECTED_COOKIE]
@@ -871,10 +869,10 @@ def test_one_source_has_its_share_under_load() -> None:
 def test_neighbours_do_not_use_up_a_peers_share() -> None:
     """Others behind the same router have a share of their own: a peer is answered where it is known to be."""
     pair = established()
-    _, host, port = AT_A
+    host, port = AT_A.host, AT_A.address[1]
     rate_limited(pair, 1.0)  # at its own place: what is known there is one source, and its share is spent
-    pair.b.node.set_addresses("alpha", [(0, host, port + 1)], 1.0)
-    neighbour, peer = (0, host, port + 2), (0, host, port + 1)
+    pair.b.node.set_paths(pair.b.peer, [Path(0, (host, port + 1))], 1.0)
+    neighbour, peer = Path(0, (host, port + 2)), Path(0, (host, port + 1))
 
     def asked(place: Path, key: KeyPair) -> list[Output]:
         initiation = made_initiation(key)
@@ -891,28 +889,28 @@ def test_neighbours_do_not_use_up_a_peers_share() -> None:
 
 
 def test_removed_peer_is_cut_off_at_once() -> None:
-    """Its sessions end with a goodbye; its envelopes and its initiations are those of a stranger."""
+    """The Node closes its sessions, and treats its envelopes and initiations as those of a stranger."""
     pair = established()
     before = pair.a.envelope(1.0)
-    pair.b.knows_the_way(1.0)
+    pair.b.configure_path(1.0)
 
-    goodbye = only(datagrams(pair.b.node.remove_peer("alpha", 1.0)))
+    closing = only(datagrams(pair.b.node.remove_peer(pair.b.peer, 1.0)))
 
     assert reasons(pair.b.receive(before, 1.0)) == [DropReason.LATE]
-    told = Dropped(DropReason.UNKNOWN_PEER, None, AT_A, 1, f"key {b64encode(KEY_A.public).decode()}")
-    assert pair.b.receive(made_initiation(), 1.0) == [told]
+    reported = Dropped(DropReason.UNKNOWN_PEER, None, AT_A, 1, KEY_A.public)
+    assert pair.b.receive(made_initiation(), 1.0) == [reported]
     assert datagrams(pair.b.receive(wire.envelope_header(UNUSED_INDEX, 5) + bytes(20), 1.0)) == []
     assert pair.b.node._indices.owners == {}
     assert pair.b.node.handle_timeout(500.0) == []
     assert pair.b.node.next_deadline() == float("inf")
-    pair.a.receive(goodbye, 1.0)
+    pair.a.receive(closing, 1.0)
     assert pair.a.peer.sessions.current is None
 
 
 def test_removed_peer_may_come_back() -> None:
     """A peer that is added again starts without memory of the time before."""
     pair = established()
-    pair.b.node.remove_peer("alpha", 1.0)
+    pair.b.node.remove_peer(pair.b.peer, 1.0)
     pair.b.node.add_peer(PeerSettings("alpha", KEY_A.public, None, QUIET), 2.0)
     now, initiation = retried(pair, c.REKEY_AFTER_S)
 
@@ -920,7 +918,7 @@ def test_removed_peer_may_come_back() -> None:
 
 
 def test_names_and_keys_are_unique() -> None:
-    """One name has one key and one key one name; nobody is his own peer."""
+    """A name has one key, and a key one name. A Node cannot be its own peer."""
     pair = Pair()
     for settings in (
         PeerSettings("alpha", KEY_C.public),
@@ -932,13 +930,17 @@ def test_names_and_keys_are_unique() -> None:
     assert list(pair.b.node.peers) == ["alpha"]
 
 
-def test_sending_to_nobody_is_the_callers_mistake() -> None:
-    """An unknown name is an error of the program, not of the network."""
-    with pytest.raises(KeyError):
-        Pair().a.node.send("nobody", [FRAME], 0.0)
+def test_sending_to_a_removed_peer_drops_the_frame() -> None:
+    """It has no session any more, and the node does not wake up for it."""
+    pair = established()
+    peer = pair.a.peer
+    pair.a.node.remove_peer(peer, 1.0)
+    assert reasons(pair.a.node.send(peer, [FRAME], 1.0)) == [DropReason.NO_SESSION]
+    assert pair.a.timeout(1.0) == []
+    assert pair.a.node.next_deadline() == c.NEVER
 
 
-def test_node_without_peers_waits_for_ever() -> None:
+def test_node_without_peers_has_no_deadline() -> None:
     """There is nothing to do and nothing to say."""
     node = Node(Secret(bytes([5]) * 32), seeded(1), 0.0)
 
@@ -948,9 +950,9 @@ def test_node_without_peers_waits_for_ever() -> None:
 
 
 def test_addresses_can_change() -> None:
-    """A name that resolves to another place is called and believed there, and no longer at the old one."""
+    """The Node initiates to, and accepts hints from, the new address of a name, and no longer the old one."""
     pair = Pair(link_a=QUIET, link_b=QUIET)
-    pair.a.node.set_addresses("bravo", [ELSEWHERE], 0.0)
+    pair.a.node.set_paths(pair.a.peer, [ELSEWHERE], 0.0)
     stray = wire.envelope_header(UNUSED_INDEX, 5) + bytes(20)
 
     assert only(of(pair.a.timeout(0.0), Transmit)).path == ELSEWHERE
@@ -958,18 +960,32 @@ def test_addresses_can_change() -> None:
     assert only(of(pair.a.receive(stray, 5.0, ELSEWHERE), Transmit)).path == ELSEWHERE
 
 
+def test_address_of_two_peers_outlives_the_first() -> None:
+    """Two peers are configured at one address: a hint from there is for the last one, also when the first is gone."""
+    pair = established()
+    charlie = pair.b.node.add_peer(PeerSettings("charlie", KEY_C.public), 1.0)
+    pair.b.configure_path(1.0)
+    pair.b.node.set_paths(charlie, [AT_A], 1.0)
+    pair.b.node.remove_peer(pair.b.peer, 1.0)
+    assert (
+        len(datagrams(pair.b.receive(wire.envelope_header(UNUSED_INDEX, 5) + bytes(24), 1.0), wire.INITIATION)) == 1
+    )
+    pair.b.node.set_paths(charlie, [], 2.0)
+    assert datagrams(pair.b.receive(wire.envelope_header(UNUSED_INDEX, 5) + bytes(24), 9.0)) == []
+
+
 def test_several_peers_do_not_mix() -> None:
     """Each peer has its own sessions, timers and counters; a frame goes to the one it is for."""
     pair = established()
     charlie = Node(Secret(bytes([3]) * 32), seeded(3), 0.0)
-    at_c: Path = (0, "192.0.2.3", 14600)
+    at_c = Path(0, ("192.0.2.3", 14600))
     charlie.add_peer(PeerSettings("bravo", KEY_B.public, None, QUIET), 0.0)
-    charlie.set_addresses("bravo", [AT_B], 0.0)
+    charlie.set_paths(charlie.peers["bravo"], [AT_B], 0.0)
     pair.b.node.add_peer(PeerSettings("charlie", KEY_C.public, None, QUIET), 1.0)
     response = only(datagrams(pair.b.node.receive(only(datagrams(charlie.handle_timeout(1.0))), at_c, 1.0)))
     pair.b.node.receive(only(datagrams(charlie.receive(response, AT_B, 1.0))), at_c, 1.0)
 
-    out = only(of(pair.b.node.send("charlie", [FRAME], 2.0), Transmit))
+    out = only(of(pair.b.node.send(pair.b.node.peers["charlie"], [FRAME], 2.0), Transmit))
     assert out.path == at_c
     assert payloads(charlie.receive(out.datagram, AT_B, 2.0)) == [FRAME]
     assert len(reasons(pair.a.receive(out.datagram, 2.0))) == 1
@@ -977,7 +993,7 @@ def test_several_peers_do_not_mix() -> None:
 
 
 def test_index_of_zero_never_has_an_owner() -> None:
-    """No handshake uses index 0, so a header full of zeros names nobody."""
+    """No handshake uses index 0, so a header full of zeros names no session."""
     for seed in range(50):
         pair = Pair(seed=seed, link_a=QUIET, link_b=QUIET).establish()
         assert 0 not in pair.a.node._indices.owners
@@ -996,27 +1012,27 @@ def test_one_peer_cannot_flush_another_ones_memory(monkeypatch: pytest.MonkeyPat
 
     assert reasons(pair.b.receive(first, 2.0)) == [DropReason.REPLAYED_INITIATION]
     remembered = len(node._remembered)
-    node.remove_peer("noisy", 3.0)
+    node.remove_peer(node.peers["noisy"], 3.0)
     assert len(node._remembered) == remembered - 3
 
 
 @pytest.mark.parametrize("known_by", ["its path", "its configured address"])
 def test_all_sources_together_have_a_bound(monkeypatch: pytest.MonkeyPatch, known_by: str) -> None:
-    """Whoever owns many addresses, and holds a cookie for each, still costs a bounded number of key exchanges.
+    """An attacker with many addresses, and a cookie for each, causes a bounded number of key exchanges.
 
-    A peer at its configured address, or where it was heard last, does not queue with them.
+    A peer at its configured address, or at its last known one, does not queue with the attacker.
     """
     pair = established()
     node = pair.b.node
-    node.set_addresses("alpha", [], 0.5)
+    node.set_paths(pair.b.peer, [], 0.5)
     if known_by == "its configured address":
+        node._note_path(pair.b.peer.path, None)
         pair.b.peer.path = None
-        node._note_places()
     monkeypatch.setattr(node._cookies, "has_valid_mac2", lambda *_: True)
     while node._admission._initiations.take(1.0):
         pass
     fates = [
-        reasons(node.receive(made_initiation(KEY_C), (0, f"10.0.{number // 200}.{number % 200}", 1), 1.0))
+        reasons(node.receive(made_initiation(KEY_C), Path(0, (f"10.0.{number // 200}.{number % 200}", 1)), 1.0))
         for number in range(int(c.COOKIED_PER_S) + 5)
     ]
 
@@ -1025,7 +1041,7 @@ def test_all_sources_together_have_a_bound(monkeypatch: pytest.MonkeyPatch, know
     assert reasons(pair.b.receive(made_initiation(), 1.0, ELSEWHERE)) == [DropReason.RATE_LIMITED]
     if known_by == "its configured address":
         assert reasons(pair.b.receive(made_initiation(), 1.0)) == [DropReason.RATE_LIMITED]
-        node.set_addresses("alpha", [AT_A], 1.0)
+        node.set_paths(pair.b.peer, [AT_A], 1.0)
     assert datagrams(pair.b.receive(made_initiation(), 1.0), wire.RESPONSE)
 
 
@@ -1036,7 +1052,7 @@ def test_one_peer_is_answered_a_bounded_number_of_times(monkeypatch: pytest.Monk
     monkeypatch.setattr(node._cookies, "has_valid_mac2", lambda *_: True)
     answers = 0
     for number in range(100):
-        out = node.receive(made_initiation(), (0, f"10.0.0.{number}", 1), 1.0)
+        out = node.receive(made_initiation(), Path(0, (f"10.0.0.{number}", 1)), 1.0)
         answers += len(datagrams(out, wire.RESPONSE))
 
     assert answers <= c.ANSWERS_BURST + c.COOKIED_ANSWERS_PER_S + c.ANSWERS_PER_S

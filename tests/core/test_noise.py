@@ -206,7 +206,7 @@ def wrong_psk(state: HandshakeState) -> HandshakeState:
 
 @pytest.mark.parametrize("suite", KINDS)
 def test_another_psk_fails_at_the_response(suite: Suite) -> None:
-    """Who does not know the PSK cannot answer, and cannot read an answer."""
+    """A peer without the PSK cannot answer, and cannot read an answer."""
     initiator, responder = start(suite)
     initiator, message = first(initiator)
     read, _ = responder.read(responder.pattern.initiation, message)
@@ -272,7 +272,7 @@ def test_ephemeral_of_low_order_is_refused(low: bytes, suite: Suite) -> None:
 @pytest.mark.parametrize("suite", KINDS)
 @pytest.mark.parametrize("low", LOW_ORDER, ids=range(len(LOW_ORDER)))
 def test_static_key_of_low_order_is_refused(low: bytes, suite: Suite) -> None:
-    """A point of low order in place of s, properly sealed by whoever can talk to us, is refused."""
+    """A point of low order in place of s, properly sealed by a peer, is refused."""
     initiator, responder = start(suite)
     liar = KeyPair(bytes([9]) * 32)
     liar.public = low
@@ -282,7 +282,7 @@ def test_static_key_of_low_order_is_refused(low: bytes, suite: Suite) -> None:
 
 
 class LyingKem:
-    """A group of somebody who sends what he likes, and seals it well."""
+    """The group of a malicious peer: it sends a chosen share, properly sealed."""
 
     def __init__(self, part: bytes) -> None:
         self.share = part
@@ -292,7 +292,7 @@ class LyingKem:
         return self
 
     def encapsulate(self, share: bytes, entropy: Entropy) -> tuple[bytes, bytes]:
-        """The lie for a ciphertext, and a secret that is none."""
+        """The chosen share as the ciphertext, and an arbitrary secret."""
         return self.share, bytes(32)
 
     def decapsulate(self, ciphertext: bytes) -> bytes:

@@ -8,8 +8,8 @@ from uavlinkd.core.drops import DropReason
 from uavlinkd.core.outputs import Deliver, Dropped, Event, Output, Transmit
 
 
-def test_a_drop_is_one_datagram_of_nobody_unless_said() -> None:
-    """The plainest drop counts one and accuses nobody."""
+def test_drop_is_one_datagram_without_a_peer_by_default() -> None:
+    """By default a drop counts one datagram and names no peer."""
     assert Dropped(DropReason.MALFORMED) == Dropped(DropReason.MALFORMED, None, None, 1)
 
 

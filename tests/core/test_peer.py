@@ -1,4 +1,4 @@
-"""One peer's timers, confirmations, paths and goodbyes, between two nodes in the hands of the test."""
+"""One peer's timers, confirmations, paths and closes, between two nodes that the test drives."""
 
 from __future__ import annotations
 
@@ -26,14 +26,13 @@ from tests.core.harness import (
     seeded,
 )
 from uavlinkd.core import constants as c
-from uavlinkd.core import wire
+from uavlinkd.core import establish, wire
 from uavlinkd.core.crypto import Secret
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import (
     Dropped,
     Output,
-    Path,
     PathChanged,
     PeerClosed,
     PeerLost,
@@ -41,6 +40,7 @@ from uavlinkd.core.outputs import (
     SessionEstablished,
     Transmit,
 )
+from uavlinkd.core.path import Path
 from uavlinkd.core.settings import Link, PeerSettings
 from uavlinkd.core.suites import SUITES_BY_NAME
 
@@ -56,23 +56,23 @@ def pair() -> Pair:
 
 @pytest.fixture
 def watchful() -> Pair:
-    """A session at second 0; alpha has every timer and has just heard bravo, which only answers."""
+    """A session at second 0; alpha has every timer and has just received from bravo, which only answers."""
     made = Pair(link_a=lively(), link_b=quiet()).establish()
-    hear(made, 0.0)
+    receive_from_bravo(made, 0.0)
     return made
 
 
-def hear(pair: Pair, now: float) -> None:
-    """Let alpha hear bravo."""
-    for each in datagrams(pair.b.send(now)):
-        pair.a.receive(each, now)
+def receive_from_bravo(pair: Pair, now: float) -> None:
+    """Let alpha receive a frame from bravo."""
+    for datagram in datagrams(pair.b.send(now)):
+        pair.a.receive(datagram, now)
 
 
 def content(side: Side, datagram: bytes, now: float) -> bytes:
     """What an envelope for this side holds: looked at with its keys, past its node."""
     index, counter, size = wire.parse_envelope_header(datagram)
-    session = side.node._indices.owners[index]
-    assert session is side.session
+    peer, session = side.node._indices.owners[index]
+    assert (peer, session) == (side.peer, side.session)
     return side.session.open(datagram, size, counter, now)
 
 
@@ -100,16 +100,16 @@ def test_responder_sends_nothing_before_confirmation() -> None:
     assert pair.carries(0.0)
 
 
-def test_what_is_established_is_told() -> None:
-    """Both ends tell of the new session, and of the one that replaces it."""
+def test_established_session_is_reported() -> None:
+    """Both ends report the new session, and the one that replaces it."""
     pair = Pair(link_a=Link(confidential=True), link_b=Link(tag_bytes=32))
     response = only(datagrams(pair.b.receive(pair.initiation(0.0), 0.0)))
     outputs = pair.a.receive(response, 0.0)
 
-    assert of(outputs, SessionEstablished) == [SessionEstablished("bravo", 1, "x25519", True, 16, True, False)]
-    assert of(outputs, PeerUp) == [PeerUp("bravo")]
-    told = of(pair.b.receive(only(datagrams(outputs)), 0.0), SessionEstablished)
-    assert told == [SessionEstablished("alpha", 1, "x25519", True, 16, False, False)]
+    assert of(outputs, SessionEstablished) == [SessionEstablished(pair.a.peer, 1, "x25519", True, 16, True, False)]
+    assert of(outputs, PeerUp) == [PeerUp(pair.a.peer)]
+    reported = of(pair.b.receive(only(datagrams(outputs)), 0.0), SessionEstablished)
+    assert reported == [SessionEstablished(pair.b.peer, 1, "x25519", True, 16, False, False)]
 
 
 def test_lost_confirmation_is_repeated_by_the_first_frames() -> None:
@@ -157,7 +157,9 @@ def test_both_use_the_stronger_of_what_each_asks(
     pair = Pair(link_a=link_a, link_b=link_b).establish()
 
     assert pair.a.session.parameters == pair.b.session.parameters
-    assert pair.a.session.parameters == wire.Parameters(1, confidential, tag_bytes, mac_key_bits, max_envelope)
+    assert pair.a.session.parameters == wire.Parameters(
+        1, confidential, tag_bytes, mac_key_bits, max_envelope, c.FEATURE_REFUSALS
+    )
     assert pair.carries(0.0)
 
 
@@ -181,10 +183,10 @@ def test_frames_that_are_there_together_share_envelopes() -> None:
     frames = [FRAME + bytes((number,)) * number for number in range(40)]
 
     sent = datagrams(pair.a.send(1.0, *frames))
-    received = [payload for each in sent for payload in payloads(pair.b.receive(each, 1.0))]
+    received = [payload for datagram in sent for payload in payloads(pair.b.receive(datagram, 1.0))]
 
     assert b"".join(received) == b"".join(frames)
-    assert all(len(each) <= c.MIN_ENVELOPE_LIMIT for each in sent)
+    assert all(len(datagram) <= c.MIN_ENVELOPE_LIMIT for datagram in sent)
     assert len(sent) < len(frames) / 4
     sizes = [len(payload) for payload in received]
     limit = pair.a.session.payload_limit
@@ -198,8 +200,8 @@ def test_frame_larger_than_an_envelope_is_dropped_alone(pair: Pair) -> None:
 
     outputs = pair.a.send(1.0, FRAME, too_large, fits, too_large)
 
-    assert of(outputs, Dropped) == [Dropped(DropReason.TOO_LARGE, "bravo")] * 2
-    delivered = [payload for each in datagrams(outputs) for payload in payloads(pair.b.receive(each, 1.0))]
+    assert of(outputs, Dropped) == [Dropped(DropReason.TOO_LARGE, pair.a.peer)] * 2
+    delivered = [payload for datagram in datagrams(outputs) for payload in payloads(pair.b.receive(datagram, 1.0))]
     assert delivered == [FRAME, fits]
     assert pair.a.peer.traffic.drops[DropReason.TOO_LARGE] == 2
 
@@ -208,15 +210,16 @@ def test_without_a_session_frames_are_counted_and_dropped() -> None:
     """Nothing is kept for later: an old position is worth nothing."""
     pair = Pair()
 
-    assert pair.a.send(0.0, FRAME, FRAME, FRAME) == [Dropped(DropReason.NO_SESSION, "bravo", None, 3)]
+    assert pair.a.send(0.0, FRAME, FRAME, FRAME) == [Dropped(DropReason.NO_SESSION, pair.a.peer, None, 3)]
     assert pair.establish().carries(0.0)
 
 
 def test_session_at_its_last_counter_sends_no_more() -> None:
-    """Frames beyond the last counter are dropped, timers stay quiet, and the other side is still heard."""
+    """Frames beyond the last counter are dropped, timers stay quiet, and the side still accepts envelopes."""
     pair = Pair(link_a=lively(), link_b=quiet()).establish()
-    hear(pair, 0.0)
+    receive_from_bravo(pair, 0.0)
     pair.a.session.send_counter = c.SESSION_ENVELOPE_LIMIT - 1
+    pair.a.peer.set_initiate()  # as when half of the counters were used
     limit = pair.a.session.payload_limit
     frames = [b"\xfd" + bytes(limit - 1)] * 2
 
@@ -225,14 +228,28 @@ def test_session_at_its_last_counter_sends_no_more() -> None:
     assert reasons(outputs) == [DropReason.NO_SESSION]
     assert reasons(pair.a.send(1.0)) == [DropReason.NO_SESSION]
 
-    hear(pair, 1.0)
+    receive_from_bravo(pair, 1.0)
     for _ in range(50):
         now = pair.a.node.next_deadline()
         if now > 60.0:
             break
         assert datagrams(pair.a.timeout(now), *ENVELOPES) == []
         assert pair.a.node.next_deadline() > now
-    assert initiations(pair.a.timeout(60.0)) or pair.a.peer.caller.pending
+    assert initiations(pair.a.timeout(60.0)) or pair.a.peer.initiator.pending
+
+
+def test_silent_peer_is_lost_although_the_last_counter_is_used() -> None:
+    """No echo can be sent about the silence, and the peer is reported as lost after it."""
+    pair = Pair(link_a=lively(), link_b=quiet()).establish()
+    receive_from_bravo(pair, 0.0)
+    pair.a.session.send_counter = c.SESSION_ENVELOPE_LIMIT - 1
+    assert len(datagrams(pair.a.send(1.0))) == 1
+    lost: list[PeerLost] = []
+    while (now := pair.a.node.next_deadline()) <= 1.0 + c.LOST_AFTER_S:
+        outputs = pair.a.timeout(now)
+        assert datagrams(outputs, *ENVELOPES) == []
+        lost += of(outputs, PeerLost)
+    assert lost == [PeerLost(pair.a.peer, 4.0)]
 
 
 def test_traffic_is_counted(pair: Pair) -> None:
@@ -240,11 +257,11 @@ def test_traffic_is_counted(pair: Pair) -> None:
     ours, theirs = pair.a.peer.traffic, pair.b.peer.traffic
     before = (ours.envelopes_sent, ours.bytes_sent, theirs.envelopes_received, theirs.bytes_received)
     sent = datagrams(pair.a.send(1.0)) + datagrams(pair.a.send(1.0))
-    for each in sent:
-        pair.b.receive(each, 1.0)
+    for datagram in sent:
+        pair.b.receive(datagram, 1.0)
 
     after = (ours.envelopes_sent, ours.bytes_sent, theirs.envelopes_received, theirs.bytes_received)
-    size = sum(len(each) for each in sent)
+    size = sum(len(datagram) for datagram in sent)
     assert [late - early for late, early in zip(after, before, strict=True)] == [2, size, 2, size]
     assert ours.handshakes == theirs.handshakes == 1
 
@@ -253,7 +270,7 @@ def test_traffic_is_counted(pair: Pair) -> None:
 
 
 def test_initiator_makes_new_keys_at_its_time(pair: Pair) -> None:
-    """Just before 120 s nothing happens; at 120 s the initiator calls, and the frames of the old session go on."""
+    """Just before 120 s nothing happens; at 120 s the initiator starts a handshake; the old session goes on."""
     assert initiations(pair.a.timeout(c.REKEY_AFTER_S - 0.001)) == []
 
     initiation = only(initiations(pair.a.timeout(c.REKEY_AFTER_S)))
@@ -268,7 +285,7 @@ def test_initiator_makes_new_keys_at_its_time(pair: Pair) -> None:
 
 
 def test_responder_makes_new_keys_later(pair: Pair) -> None:
-    """The responder waits a quarter of the time that is left, so that in the ordinary case one side calls."""
+    """The responder waits a quarter of the time that is left, so that usually only one side initiates."""
     assert RESPONDER_REKEY_S == 135.0
     assert initiations(pair.b.timeout(RESPONDER_REKEY_S - 0.001)) == []
     assert len(initiations(pair.b.timeout(RESPONDER_REKEY_S))) == 1
@@ -278,15 +295,14 @@ def test_half_of_all_counters_ask_for_new_keys(watchful: Pair) -> None:
     """At 2^31 envelopes new keys are made; one before that they are not."""
     for sent, expected in ((c.REKEY_AFTER_ENVELOPES - 2, 0), (c.REKEY_AFTER_ENVELOPES - 1, 1)):
         now = 1.0 + expected
-        hear(watchful, now)
+        receive_from_bravo(watchful, now)
         watchful.a.session.send_counter = sent
         watchful.a.send(now)
-        due = now + c.ECHO_AFTER_S
-        assert len(initiations(watchful.a.timeout(due))) == expected
+        assert len(initiations(watchful.a.timeout(now))) == expected
 
 
 def test_keys_are_refused_and_forgotten_at_180_seconds(pair: Pair) -> None:
-    """Just before, the session carries frames both ways; at 180 s neither side seals, opens or keeps it."""
+    """Just before, the session carries frames in both directions; at 180 s neither side seals, opens or keeps it."""
     before = c.REJECT_AFTER_S - 0.001
     assert pair.carries(before)
     late = datagrams(pair.a.send(before)) + datagrams(pair.a.send(before))
@@ -301,7 +317,7 @@ def test_keys_are_refused_and_forgotten_at_180_seconds(pair: Pair) -> None:
     assert reasons(pair.b.receive(late[1], c.REJECT_AFTER_S)) == [DropReason.LATE]
 
 
-def test_an_index_rests_ten_minutes_after_its_session(pair: Pair) -> None:
+def test_index_is_quarantined_ten_minutes_after_its_session(pair: Pair) -> None:
     """An envelope of an ended session is late for ten minutes, and unknown after that."""
     envelope = only(datagrams(pair.a.send(1.0)))
     pair.b.timeout(c.REJECT_AFTER_S)
@@ -315,16 +331,41 @@ def test_an_index_rests_ten_minutes_after_its_session(pair: Pair) -> None:
 
 
 def test_keepalive_after_ten_quiet_seconds(watchful: Pair) -> None:
-    """When nothing was sent for 10 s an empty envelope goes out, just then."""
+    """When nothing was sent for 10 s an echo request goes out, just then."""
     assert datagrams(watchful.a.timeout(c.KEEPALIVE_S - 0.001)) == []
 
     keepalive = only(datagrams(watchful.a.timeout(c.KEEPALIVE_S)))
 
-    assert content(watchful.b, keepalive, c.KEEPALIVE_S) == b""
+    assert isinstance(wire.parse_control(content(watchful.b, keepalive, c.KEEPALIVE_S)), wire.Echo)
 
 
-def test_silence_is_asked_about_then_called_about_then_told(watchful: Pair) -> None:
-    """Sent and heard nothing: echo at 0.5 s, initiation at 1 s, lost at 3 s, each just then and not before."""
+def test_both_ends_measure_an_idle_link() -> None:
+    """The reply to the other end's request does not stand for an own measurement."""
+    pair = Pair(link_a=lively(), link_b=lively()).establish()
+    for _ in run(pair, 0.0, 30.0, lambda side, datagram, now: True):
+        pass
+    for side in (pair.a, pair.b):
+        assert side.peer.round_trip_s is not None
+        side.peer.round_trip_s = None
+    for _ in run(pair, 30.0, 30.0 + 1.1 * c.KEEPALIVE_S, lambda side, datagram, now: True):
+        pass
+    assert None not in (pair.a.peer.round_trip_s, pair.b.peer.round_trip_s)
+
+
+def test_probe_interval_holds_while_frames_flow() -> None:
+    """Between probes that are further apart than keepalives there are no other echo requests."""
+    pair = Pair(link_a=lively(probe_interval_s=35.0), link_b=quiet()).establish()
+    asked = []
+    for second in range(1, 40):
+        pair.a.send(float(second))
+        receive_from_bravo(pair, float(second))
+        if datagrams(pair.a.timeout(float(second))):
+            asked.append(second)
+    assert asked == [36]
+
+
+def test_silence_causes_an_echo_request_then_an_initiation_then_a_loss(watchful: Pair) -> None:
+    """Sent, received nothing: echo at 0.5 s, initiation at 1 s, lost at 3 s, each at its time and not before."""
     a, start = watchful.a, 2.0
     a.timeout(start)
     a.send(start)
@@ -339,12 +380,12 @@ def test_silence_is_asked_about_then_called_about_then_told(watchful: Pair) -> N
     assert len(initiations(a.timeout(start + c.HANDSHAKE_AFTER_S))) == 1
 
     assert of(a.timeout(start + c.LOST_AFTER_S - 0.001), PeerLost) == []
-    assert of(a.timeout(start + c.LOST_AFTER_S), PeerLost) == [PeerLost("bravo", start + c.LOST_AFTER_S)]
+    assert of(a.timeout(start + c.LOST_AFTER_S), PeerLost) == [PeerLost(a.peer, start + c.LOST_AFTER_S)]
     assert of(a.timeout(start + c.LOST_AFTER_S + 1.0), PeerLost) == []
 
 
 def test_deadlines_come_when_something_is_due(watchful: Pair) -> None:
-    """Who only wakes at the deadlines that the node names does everything at its time."""
+    """A shell that wakes only at the deadlines of the Node does everything at its time."""
     a, start = watchful.a, 2.0
     a.timeout(start)
     a.send(start)
@@ -361,8 +402,8 @@ def test_deadlines_come_when_something_is_due(watchful: Pair) -> None:
     }
 
 
-def test_a_lost_peer_that_is_heard_is_up_again(watchful: Pair) -> None:
-    """A valid envelope, once it is known to be new, ends the silence, and the calls with it."""
+def test_lost_peer_is_up_when_an_envelope_is_received(watchful: Pair) -> None:
+    """A valid envelope, once it is known to be new, ends the silence and the initiations."""
     a, b = watchful.a, watchful.b
     a.send(2.0)
     a.timeout(2.0 + c.LOST_AFTER_S)
@@ -372,7 +413,7 @@ def test_a_lost_peer_that_is_heard_is_up_again(watchful: Pair) -> None:
     assert not a.peer.is_up
     outputs = a.receive(only(datagrams(b.receive(question, 6.0))), 6.0)
 
-    assert of(outputs, PeerUp) == [PeerUp("bravo")]
+    assert of(outputs, PeerUp) == [PeerUp(a.peer)]
     assert initiations(a.timeout(9.0)) == []
 
 
@@ -407,14 +448,14 @@ def test_only_the_asked_echo_measures(watchful: Pair) -> None:
 
 
 def test_a_link_in_use_is_measured_now_and_then(watchful: Pair) -> None:
-    """Five seconds after frames were sent there is one echo, however well all is heard; idle links have none."""
+    """Five seconds after frames were sent there is one echo, however much was received. Idle links wait longer."""
     idle = Pair(link_a=watchful.link_a, link_b=watchful.link_b).establish()
-    hear(idle, 0.0)
+    receive_from_bravo(idle, 0.0)
     assert datagrams(idle.a.timeout(c.PROBE_INTERVAL_S + 1.0)) == []
     a = watchful.a
     start = 1.0
     a.send(start)
-    hear(watchful, start)
+    receive_from_bravo(watchful, start)
 
     assert datagrams(a.timeout(start + c.PROBE_INTERVAL_S - 0.001)) == []
     assert len(datagrams(a.timeout(start + c.PROBE_INTERVAL_S))) == 1
@@ -424,13 +465,13 @@ def test_probes_can_be_turned_off() -> None:
     """A probe interval of zero means none."""
     pair = Pair(link_a=lively(probe_interval_s=0.0, keepalive_s=60.0), link_b=quiet()).establish()
     pair.a.send(1.0)
-    hear(pair, 1.0)
+    receive_from_bravo(pair, 1.0)
 
     assert datagrams(pair.a.timeout(30.0)) == []
 
 
 def test_asking_and_answering_ends() -> None:
-    """Two watchful ends without traffic do not keep each other busy: echoes are not answered for ever."""
+    """Two watchful ends without traffic do not keep each other busy: echoes are not answered indefinitely."""
     pair = Pair(link_a=lively(), link_b=lively()).establish()
     sent = 0
 
@@ -443,11 +484,11 @@ def test_asking_and_answering_ends() -> None:
         pass
     assert pair.a.peer.is_up
     assert pair.b.peer.is_up
-    assert sent <= 6 * 100 / c.KEEPALIVE_S + 8
+    assert sent <= 4 * 100 / c.KEEPALIVE_S + 8
 
 
 def test_answer_comes_on_the_session_that_sends() -> None:
-    """A peer that never had our newest session is not lulled by replies on the old one: it calls within seconds.
+    """A peer that never had our newest session initiates within seconds, despite replies on the old one.
 
     Alpha has new keys, and every envelope under them is lost until bravo has forgotten its side of them.
     """
@@ -464,33 +505,33 @@ def test_answer_comes_on_the_session_that_sends() -> None:
     for now in run(pair, 0.0, end + 3.0, passes):
         if now >= last + 0.1:
             last = now
-            for each in datagrams(pair.b.send(now)):
-                pair.a.receive(each, now)
-            for each in datagrams(pair.a.send(now)):
-                if passes(pair.a, each, now) and payloads(pair.b.receive(each, now)):
+            for datagram in datagrams(pair.b.send(now)):
+                pair.a.receive(datagram, now)
+            for datagram in datagrams(pair.a.send(now)):
+                if passes(pair.a, datagram, now) and payloads(pair.b.receive(datagram, now)):
                     crossings.append(now)
     gaps = [later - earlier for earlier, later in pairwise(crossings)]
     assert max(gaps) < 3.0
     assert crossings[-1] > end
 
 
-# Both ends call.
+# Both ends initiate.
 
 
 @pytest.mark.parametrize("swapped", [False, True])
 def test_both_initiate_at_once_and_settle(swapped: bool) -> None:
-    """When both call at the same moment both answer, and both send on the session of the smaller key's call."""
+    """When both initiate at once both answer, and both send on the session that the smaller key initiated."""
     pair = Pair(swapped=swapped, link_a=quiet(), link_b=quiet())
-    pair.b.knows_the_way(0.0)
+    pair.b.configure_path(0.0)
     from_a, from_b = pair.initiation(0.0), only(initiations(pair.b.timeout(0.0)))
     answer_to_a = only(datagrams(pair.b.receive(from_a, 0.1)))
     answer_to_b = only(datagrams(pair.a.receive(from_b, 0.1)))
     confirmation_a = datagrams(pair.a.receive(answer_to_a, 0.2))
     confirmation_b = datagrams(pair.b.receive(answer_to_b, 0.2))
-    for each in confirmation_a:
-        pair.b.receive(each, 0.3)
-    for each in confirmation_b:
-        pair.a.receive(each, 0.3)
+    for datagram in confirmation_a:
+        pair.b.receive(datagram, 0.3)
+    for datagram in confirmation_b:
+        pair.a.receive(datagram, 0.3)
 
     assert pair.carries(0.4)
     assert (pair.a.session.local_index, pair.a.session.remote_index) == (
@@ -506,7 +547,7 @@ def test_peer_that_restarted_is_linked_again(pair: Pair) -> None:
     if fresh.public_key != pair.b.node.public_key:
         fresh = Node(Secret(bytes([1]) * 32), seeded(9), 50.0)
     fresh.add_peer(PeerSettings("alpha", pair.a.node.public_key, None, quiet()), 50.0)
-    fresh.set_addresses("alpha", [AT_A], 50.0)
+    fresh.set_paths(fresh.peers["alpha"], [AT_A], 50.0)
     pair.b = Side(fresh, AT_B, "alpha", AT_A)
 
     response = only(datagrams(pair.a.receive(only(initiations(pair.b.timeout(50.0))), 50.0)))
@@ -519,19 +560,16 @@ def test_peer_that_restarted_is_linked_again(pair: Pair) -> None:
 # Hints.
 
 
-def test_hint_about_a_peer_without_an_address_is_nothing_to_act_on() -> None:
-    """Nobody is called whose address is not known, now or later."""
+def test_hint_about_a_peer_without_an_address_has_no_effect() -> None:
+    """The Node sends no initiation to a peer without a known address, now or later."""
     pair = Pair(link_b=quiet())
-    outputs: list[Output] = []
 
-    pair.b.peer.hint(1.0, outputs)
-
-    assert outputs == []
+    assert establish.receive_hint(pair.b.peer, 1.0) == []
     assert pair.b.timeout(2.0) == []
 
 
 def stray() -> bytes:
-    """An envelope for a session that nobody has."""
+    """An envelope for an unknown session."""
     return wire.envelope_header(UNUSED_INDEX, 5) + bytes(24)
 
 
@@ -546,8 +584,8 @@ def test_unknown_envelope_from_the_peers_place_is_a_hint() -> None:
     assert len(datagrams(pair.a.receive(stray(), 0.01 + c.HINTS_INTERVAL_S))) == 1
 
 
-def test_unknown_envelope_from_elsewhere_is_no_hint() -> None:
-    """A stranger's envelope gets no answer and causes no call."""
+def test_unknown_envelope_from_elsewhere_does_not_hint() -> None:
+    """A stranger's envelope gets no answer and causes no initiation."""
     pair = Pair(link_a=quiet(), link_b=quiet())
     pair.initiation(0.0)
 
@@ -563,16 +601,16 @@ def test_hint_is_ignored_while_the_session_is_alive(watchful: Pair) -> None:
     assert len(initiations(watchful.a.receive(stray(), 2.0 + c.ECHO_AFTER_S))) == 1
 
 
-# Goodbye.
+# Close.
 
 
-def test_goodbye_ends_the_session_at_both_ends(pair: Pair) -> None:
-    """A closing side forgets every key; the other stops sending and calls again only a second later."""
-    farewell = only(datagrams(pair.b.node.close(5.0)))
+def test_close_ends_the_session_at_both_ends(pair: Pair) -> None:
+    """A closing side forgets every key; the other stops sending and initiates again only 1 s later."""
+    closing = only(datagrams(pair.b.node.close(5.0)))
     assert pair.b.peer.sessions.current is None
     assert pair.b.node.next_deadline() == float("inf")
 
-    assert of(pair.a.receive(farewell, 5.0), PeerClosed) == [PeerClosed("bravo")]
+    assert of(pair.a.receive(closing, 5.0), PeerClosed) == [PeerClosed(pair.a.peer)]
 
     assert not pair.a.peer.is_up
     assert reasons(pair.a.send(5.0)) == [DropReason.NO_SESSION]
@@ -580,30 +618,30 @@ def test_goodbye_ends_the_session_at_both_ends(pair: Pair) -> None:
     assert len(initiations(pair.a.timeout(5.0 + c.CLOSE_HOLDOFF_S))) == 1
 
 
-def test_late_goodbye_does_not_end_the_newer_session(pair: Pair) -> None:
-    """A goodbye on an old session, delayed until there is a newer one, ends the old one alone."""
-    farewell = pair.b.envelope(1.0, wire.Close().encode())
+def test_late_close_does_not_end_the_newer_session(pair: Pair) -> None:
+    """A close on an old session, delayed until there is a newer one, ends only the old one."""
+    closing = pair.b.envelope(1.0, wire.Close().encode())
     pair.establish(c.REKEY_AFTER_S)
 
-    assert pair.a.receive(farewell, 121.0) == []
+    assert pair.a.receive(closing, 121.0) == []
 
     assert len(pair.a.peer.sessions.confirmed) == 1
     assert pair.carries(121.0)
 
 
-def test_goodbye_cannot_be_replayed(pair: Pair) -> None:
-    """A goodbye of the time before does not count after a new handshake."""
-    farewell = only(datagrams(pair.a.node.close(5.0)))
-    pair.b.receive(farewell, 5.0)
-    pair.a.knows_the_way(7.0)  # alpha is started again
+def test_close_cannot_be_replayed(pair: Pair) -> None:
+    """A close of an earlier session is ignored after a new handshake."""
+    closing = only(datagrams(pair.a.node.close(5.0)))
+    pair.b.receive(closing, 5.0)
+    pair.a.configure_path(7.0)  # alpha is started again
     pair.establish(7.0)
 
-    assert reasons(pair.b.receive(farewell, 7.0)) == [DropReason.LATE]
+    assert reasons(pair.b.receive(closing, 7.0)) == [DropReason.LATE]
     assert pair.carries(7.0)
 
 
 def test_closing_without_a_session_says_nothing() -> None:
-    """A node that never had a session just stops, and takes no answer to its calls."""
+    """A node that never had a session just stops, and accepts no response to its initiations."""
     pair = Pair()
     response = only(datagrams(pair.b.receive(pair.initiation(0.0), 0.0)))
 
@@ -613,7 +651,7 @@ def test_closing_without_a_session_says_nothing() -> None:
 
 
 def test_closing_after_the_keys_ended_says_nothing(pair: Pair) -> None:
-    """Keys that are too old do not even seal a goodbye."""
+    """Keys that are too old do not even seal a close."""
     assert pair.a.node.close(c.REJECT_AFTER_S) == []
 
 
@@ -636,30 +674,76 @@ def test_traffic_follows_a_peer_that_answers_from_its_new_place(pair: Pair) -> N
 
     answer = only(of(pair.a.receive(question, 1.1), Transmit))
     assert answer.path == AT_B
-    assert pair.b.receive(answer.datagram, 1.2, ELSEWHERE) == [PathChanged("alpha", ELSEWHERE)]
+    assert pair.b.receive(answer.datagram, 1.2, ELSEWHERE) == [PathChanged(pair.b.peer, ELSEWHERE)]
 
     assert pair.b.peer.path == ELSEWHERE
     assert only(of(pair.b.send(1.2), Transmit)).path == ELSEWHERE
 
 
+def rekeyed_from(pair: Pair, now: float, path: Path, confirmed_from: Path) -> None:
+    """Alpha makes new keys: bravo gets the initiation along one path, and the confirmation along another."""
+    initiation = only(initiations(pair.a.timeout(now)))
+    response = only(datagrams(pair.b.receive(initiation, now, path), wire.RESPONSE))
+    pair.b.receive(only(datagrams(pair.a.receive(response, now))), now, confirmed_from)
+    assert pair.b.session.parameters.generation == 2
+
+
+@pytest.mark.parametrize("begun_at", [AT_A, ELSEWHERE], ids=["before the move", "after the move"])
+def test_challenge_stays_valid_through_new_keys(pair: Pair, begun_at: Path) -> None:
+    """A peer changes its address while keys change: the response moves traffic, and no challenge was unanswered."""
+    now = c.REKEY_AFTER_S
+    assert pair.carries(now - 0.5)
+    question = challenge_from(pair, now)
+    rekeyed_from(pair, now, begun_at, ELSEWHERE)
+    response = only(datagrams(pair.a.receive(question, now + 0.1)))
+
+    outputs = pair.b.receive(response, now + 0.2, ELSEWHERE)
+    assert outputs == ([PathChanged(pair.b.peer, ELSEWHERE)] if begun_at == AT_A else [])
+    assert pair.b.peer.path == ELSEWHERE
+    pair.b.timeout(now + 10.0)
+    assert pair.b.peer.traffic.challenges_unanswered == 0
+    assert not pair.b.peer.traffic.drops
+
+
+def test_handshake_proves_the_path_of_a_lost_challenge(pair: Pair) -> None:
+    """The challenge was lost, and new keys were made along its path: it is not counted as unanswered."""
+    now = c.REKEY_AFTER_S
+    assert pair.carries(now - 0.5)
+    challenge_from(pair, now)
+    rekeyed_from(pair, now, ELSEWHERE, ELSEWHERE)
+    pair.b.timeout(now + 10.0)
+    assert pair.b.peer.traffic.challenges_unanswered == 0
+
+
+def test_challenge_without_a_response_is_counted_after_new_keys(pair: Pair) -> None:
+    """An attacker that forwards envelopes is reported, also if keys change meanwhile."""
+    now = c.REKEY_AFTER_S
+    assert pair.carries(now - 0.5)
+    challenge_from(pair, now)
+    rekeyed_from(pair, now, AT_A, AT_A)
+    assert pair.b.peer.path == AT_A
+    pair.b.timeout(now + c.CHALLENGE_LIFETIME_S)
+    assert pair.b.peer.traffic.challenges_unanswered == 1
+
+
 def test_forwarded_envelope_does_not_pull_the_traffic(pair: Pair) -> None:
-    """Who forwards a captured envelope from its own place gets one question there, and nothing more."""
+    """An attacker that forwards a captured envelope from its own address gets one challenge there, and no more."""
     challenge_from(pair, 1.0)
 
     for moment in (1.0, 1.1, 2.0, 30.0):
         assert {out.path for out in of(pair.b.send(moment), Transmit)} == {AT_A}
 
 
-def test_question_is_never_longer_than_what_came(pair: Pair) -> None:
+def test_challenge_is_never_longer_than_its_cause(pair: Pair) -> None:
     """No more bytes go to an unproven place than came from it: a keepalive is too short to be asked about."""
     for size in range(14):
         envelope = pair.a.envelope(1.0, (FRAME + FRAME)[:size])
         outputs = pair.b.receive(envelope, 1.0 + size, ELSEWHERE)
-        assert all(len(each) <= len(envelope) for each in datagrams(outputs))
+        assert all(len(datagram) <= len(envelope) for datagram in datagrams(outputs))
         assert bool(datagrams(outputs)) == (size >= len(wire.PathChallenge(bytes(8)).encode()))
 
 
-def test_answer_is_never_longer_than_its_question(pair: Pair) -> None:
+def test_path_response_is_never_longer_than_its_challenge(pair: Pair) -> None:
     """Even where the answer needs the longer header it is no longer than the question was."""
     pair.a.session.send_counter = c.SHORT_COUNTER_LIMIT
     question = pair.b.envelope(1.0, wire.PathChallenge(bytes(8)).encode())
@@ -670,7 +754,7 @@ def test_answer_is_never_longer_than_its_question(pair: Pair) -> None:
     assert len(answer.datagram) <= len(question)
 
 
-def test_question_from_an_unproven_place_gets_its_answer_alone(pair: Pair) -> None:
+def test_challenge_from_an_unproven_address_gets_a_response_only(pair: Pair) -> None:
     """Together with a question of one's own it would be more than came; the next frame from there is asked about."""
     question = pair.b.envelope(1.0, wire.PathChallenge(bytes(8)).encode())
 
@@ -728,7 +812,7 @@ def test_an_answer_counts_once(pair: Pair) -> None:
     assert reasons(again) == [DropReason.BAD_PATH_RESPONSE]
 
 
-def test_questions_are_asked_four_times_a_second_at_most(pair: Pair) -> None:
+def test_at_most_four_challenges_are_sent_per_second(pair: Pair) -> None:
     """A new place is asked about at most each quarter second, however much comes from it."""
     challenge_from(pair, 1.0)
     for moment, expected in (
@@ -740,7 +824,7 @@ def test_questions_are_asked_four_times_a_second_at_most(pair: Pair) -> None:
         assert len(datagrams(outputs)) == expected
 
 
-def test_answer_to_the_first_question_counts_after_the_second(pair: Pair) -> None:
+def test_response_to_the_first_challenge_counts_after_the_second(pair: Pair) -> None:
     """Over a path slower than the questions come, the answer to any of them moves the traffic."""
     first = challenge_from(pair, 1.0)
     challenge_from(pair, 1.5)
@@ -771,7 +855,7 @@ def test_envelope_of_a_previous_session_asks_nothing(pair: Pair) -> None:
 
 
 def test_authentic_nonsense_is_counted_and_harmless(pair: Pair) -> None:
-    """A control record that is none is dropped under its reason; the session goes on."""
+    """A control record of an unknown kind is dropped with its reason; the session goes on."""
     outputs = pair.b.receive(pair.a.envelope(1.0, b"\x09nonsense"), 1.0)
 
     assert reasons(outputs) == [DropReason.BAD_CONTROL]

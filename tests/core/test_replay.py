@@ -62,9 +62,9 @@ EDGES = [
 def test_edge(accepted: list[int], counter: int, expected: DropReason | None) -> None:
     """After these counters, this one is accepted, replayed or too old."""
     window = ReplayWindow()
-    for each in accepted:
-        assert verdict(window, each) is None
-        window.mark(each)
+    for earlier in accepted:
+        assert verdict(window, earlier) is None
+        window.mark(earlier)
 
     assert verdict(window, counter) is expected
 

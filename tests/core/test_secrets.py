@@ -44,8 +44,8 @@ def reachable(thing: Any, seen: dict[int, Any]) -> Iterator[Any]:
         inside = list(thing)
     slots = [name for kind in type(thing).__mro__ for name in getattr(kind, "__slots__", ())]
     inside += [getattr(thing, name) for name in [*slots, *getattr(thing, "__dict__", {})] if hasattr(thing, name)]
-    for each in inside:
-        yield from reachable(each, seen)
+    for item in inside:
+        yield from reachable(item, seen)
 
 
 def shows(text: str, secret: bytes) -> bool:
@@ -70,7 +70,7 @@ def test_no_object_shows_a_secret(suite: Suite) -> None:
     drawn: list[bytes] = []
     for number, side in enumerate((pair.a, pair.b)):
         entropy = recording(50 + number, drawn)
-        side.node._entropy = side.peer._entropy = side.peer.caller._entropy = entropy
+        side.node._entropy = side.peer.entropy = side.peer.initiator._entropy = entropy
         side.node._indices._entropy = side.node._cookies._entropy = entropy
     printed, kinds, chaining_keys = list[str](), set[str](), list[bytes]()
 

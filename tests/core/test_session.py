@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, cast
 
 import pytest
 from hypothesis import given
@@ -37,12 +36,11 @@ def pair(
     handshake_hash: bytes = HASH,
 ) -> tuple[Session, Session]:
     """Initiator's and responder's session, from second 100 to second 280."""
-    nobody = cast(Any, None)
     ours = Keys(transport, handshake_hash, parameters, remote_index=9)
     theirs = Keys(transport, handshake_hash, parameters, remote_index=7)
     return (
-        Session(nobody, X25519, ours, 7, 100.0, 180.0, is_initiator=True),
-        Session(nobody, X25519, theirs, 9, 100.0, 180.0, is_initiator=False),
+        Session(X25519, ours, 7, 100.0, 180.0, is_initiator=True),
+        Session(X25519, theirs, 9, 100.0, 180.0, is_initiator=False),
     )
 
 
@@ -67,7 +65,7 @@ def reason_of(session: Session, datagram: bytes, now: float = 100.0) -> DropReas
 
 @pytest.mark.parametrize("parameters", MODES)
 @pytest.mark.parametrize("payload", [b"", b"\xfd", FRAME, FRAME * 40], ids=["empty", "byte", "frame", "many"])
-def test_envelope_round_trip_both_ways(parameters: Parameters, payload: bytes) -> None:
+def test_envelope_round_trip_in_both_directions(parameters: Parameters, payload: bytes) -> None:
     """What one side seals the other opens, in any mode; the length is what was announced."""
     initiator, responder = pair(parameters)
     for sender, receiver in ((initiator, responder), (responder, initiator)):

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from types import SimpleNamespace
-from typing import Any, cast
 
 import pytest
 
@@ -13,18 +11,19 @@ from uavlinkd.core import constants as c
 from uavlinkd.core.crypto import Secret
 from uavlinkd.core.handshake import Keys
 from uavlinkd.core.indices import Indices
+from uavlinkd.core.path import Path
 from uavlinkd.core.session import Session
 from uavlinkd.core.sessions import Sessions, Unconfirmed
 from uavlinkd.core.suites import X25519
 from uavlinkd.core.wire import Parameters
 
-PATH = (0, "192.0.2.1", 1)
+PATH = Path(0, ("192.0.2.1", 1))
 
 
 def session(index: int, generation: int = 1, *, initiator: bool = True, now: float = 0.0) -> Session:
     """A session with this local index, rejected 180 s after ``now``."""
     keys = Keys((Secret(bytes(32)), Secret(bytes(32))), bytes(32), Parameters(generation, False, 16, 256, 1232), 1)
-    return Session(cast(Any, SimpleNamespace(name="bravo")), X25519, keys, index, now, 180.0, is_initiator=initiator)
+    return Session(X25519, keys, index, now, 180.0, is_initiator=initiator)
 
 
 def unconfirmed(index: int, expires_at: float = 10.0, *, is_expected: bool = False) -> Unconfirmed:
@@ -35,12 +34,12 @@ def unconfirmed(index: int, expires_at: float = 10.0, *, is_expected: bool = Fal
 @pytest.fixture
 def sessions() -> Sessions:
     """The sessions of the side with the smaller key."""
-    return Sessions(Indices(seeded(1)), has_smaller_key=True)
+    return Sessions(Indices[object](seeded(1)), "bravo", has_smaller_key=True)
 
 
 def owners(sessions: Sessions) -> list[int]:
     """The indices that are in use."""
-    return sorted(sessions._indices.owners)
+    return sorted([*sessions.unconfirmed, *(session.local_index for session in sessions.confirmed)])
 
 
 def test_without_a_session_there_is_nothing_to_send_on(sessions: Sessions) -> None:
@@ -50,21 +49,21 @@ def test_without_a_session_there_is_nothing_to_send_on(sessions: Sessions) -> No
     assert sessions.next_expiry() == float("inf")
 
 
-def test_the_newest_generation_sends(sessions: Sessions) -> None:
+def test_the_newest_generation_sends() -> None:
     """Of confirmed sessions, in whatever order they came up, the one of the greatest generation sends."""
     for order in itertools.permutations((1, 2, 3)):
-        each = Sessions(Indices(seeded(1)), has_smaller_key=True)
+        sessions = Sessions(Indices[object](seeded(1)), "bravo", has_smaller_key=True)
         for generation in order:
-            each.confirm(session(generation, generation), 0.0)
-        assert [one.parameters.generation for one in each.confirmed] == [3, 2, 1]
-        assert each.generation == 3
+            sessions.confirm(session(generation, generation), 0.0)
+        assert [other.parameters.generation for other in sessions.confirmed] == [3, 2, 1]
+        assert sessions.generation == 3
 
 
 @pytest.mark.parametrize("smaller", [True, False])
 @pytest.mark.parametrize("own_first", [True, False])
 def test_of_one_generation_the_smaller_keys_initiation_sends(smaller: bool, own_first: bool) -> None:
     """Both ends initiated at once: the session that the smaller key initiated sends, at either end, in any order."""
-    sessions = Sessions(Indices(seeded(1)), has_smaller_key=smaller)
+    sessions = Sessions(Indices[object](seeded(1)), "bravo", has_smaller_key=smaller)
     for initiated_here in (own_first, not own_first):
         sessions.confirm(session(1 + initiated_here, 5, initiator=initiated_here), 0.0)
 
@@ -80,7 +79,7 @@ def test_of_equals_the_newest_sends(sessions: Sessions) -> None:
         assert sessions.current.local_index == index
 
 
-def test_confirmed_sessions_are_bounded_and_ended_ones_rest(sessions: Sessions) -> None:
+def test_confirmed_sessions_are_bounded_and_ended_indices_quarantined(sessions: Sessions) -> None:
     """The lowest rank goes when there are too many, and its index goes into quarantine."""
     for generation in range(1, c.USABLE_PER_PEER + 3):
         sessions.confirm(session(generation, generation), 0.0)
@@ -108,7 +107,7 @@ def test_waiting_sessions_are_bounded_and_the_oldest_goes(sessions: Sessions) ->
     assert not sessions._indices.is_quarantined(1, 0.0)
 
 
-def test_who_calls_from_where_it_is_goes_last(sessions: Sessions) -> None:
+def test_initiator_at_its_own_address_keeps_its_place(sessions: Sessions) -> None:
     """Calls from elsewhere, such as replayed ones, do not push out one from the peer's own place."""
     sessions.wait(unconfirmed(1))
     sessions.wait(unconfirmed(2, is_expected=True))
@@ -121,7 +120,7 @@ def test_who_calls_from_where_it_is_goes_last(sessions: Sessions) -> None:
 
 
 def test_waiting_session_expires(sessions: Sessions) -> None:
-    """A session that nobody confirms is forgotten at its time and not before."""
+    """An unconfirmed session is forgotten at the end of its lifetime and not before."""
     sessions.wait(unconfirmed(1, 10.0))
     sessions.wait(unconfirmed(2, 11.0))
 
@@ -146,11 +145,11 @@ def test_confirmed_session_expires(sessions: Sessions) -> None:
     assert sessions._indices.is_quarantined(1, 180.0)
 
 
-def test_goodbye_ends_this_session_and_what_is_below(sessions: Sessions) -> None:
-    """A goodbye ends the session that carried it and those before it, not what came after."""
+def test_close_ends_this_session_and_lower_ones(sessions: Sessions) -> None:
+    """A close ends the session that carried it and those before it, not what came after."""
     kept = [session(generation, generation) for generation in (1, 2, 3)]
-    for each in kept:
-        sessions.confirm(each, 0.0)
+    for kept_session in kept:
+        sessions.confirm(kept_session, 0.0)
 
     sessions.end_up_to(kept[1], 1.0)
 

@@ -30,7 +30,7 @@ def test_the_default_link_is_within_the_protocol() -> None:
 
 
 def test_settings_are_frozen() -> None:
-    """What the core was told cannot change behind its back."""
+    """Settings of the core cannot change after they were given."""
     settings = PeerSettings("bravo", bytes(32))
 
     with pytest.raises(dataclasses.FrozenInstanceError):

@@ -9,7 +9,9 @@ from pathlib import Path
 import pytest
 
 from uavlinkd.core import constants, wire
+from uavlinkd.core import constants as c
 from uavlinkd.core.drops import DropReason
+from uavlinkd.core.refusals import RefusalReport, Refused
 from uavlinkd.core.suites import SUITES
 
 CORE = Path(constants.__file__).parent
@@ -19,9 +21,9 @@ TEXT = (CORE / "README.md").read_text()
 
 def section(title: str) -> str:
     """The text under the heading that begins with ``title``."""
-    found = re.search(rf"^(#+) {re.escape(title)}[^\n]*\n(.*?)(?=^#{{1,3}} |\Z)", TEXT, re.MULTILINE | re.DOTALL)
-    assert found, title
-    return found[2]
+    match = re.search(rf"^(#+) {re.escape(title)}[^\n]*\n(.*?)(?=^#{{1,3}} |\Z)", TEXT, re.MULTILINE | re.DOTALL)
+    assert match, title
+    return match[2]
 
 
 def rows(text: str) -> list[list[str]]:
@@ -54,7 +56,7 @@ DEFINED = {
 
 @pytest.mark.parametrize("name", sorted(DEFINED | DOCUMENTED))
 def test_constant_is_the_documented_one(name: str) -> None:
-    """Every number of the protocol stands in the document with its value, and the document names no other."""
+    """Every number of the protocol is in the document with its value, and the document names no other."""
     assert DOCUMENTED.get(name) == DEFINED.get(name)
 
 
@@ -64,16 +66,16 @@ def test_names_in_capitals_are_constants() -> None:
 
 
 def test_every_drop_reason_is_documented() -> None:
-    """The table of reasons is the closed list, in its order."""
+    """The table of reasons is the closed list, in its order and with the meanings that the log writes."""
     table = rows(section("13 Receipt").split("Every reason:")[1])
-    assert [cells[0].strip("`") for cells in table[1:]] == [str(reason) for reason in DropReason]
+    assert table[1:] == [[f"`{reason}`", reason.meaning] for reason in DropReason]
 
 
 def test_checks_name_every_reason() -> None:
-    """Each reason has its place among the checks on receipt or on the way out, and a check names no other."""
+    """Each reason is listed among the checks on receipt or on sending, and a check names no other."""
     checks, reasons = section("13 Receipt").split("Every reason:")
     named = set(re.findall(r"`([a-z_]+\d?)`", checks)) - {"mac1", "mac2"}
-    outgoing = {cells[0].strip("`") for cells in rows(reasons) if cells[1].startswith("on the way out")}
+    outgoing = {cells[0].strip("`") for cells in rows(reasons) if "outgoing" in cells[1]}
     assert outgoing == {"no_session", "too_large"}
     assert named | outgoing == {str(reason) for reason in DropReason}
 
@@ -126,6 +128,7 @@ def test_types_and_sizes_of_records() -> None:
         "path challenge": wire.PathChallenge(bytes(8)),
         "path response": wire.PathResponse(bytes(8)),
         "close": wire.Close(),
+        "refusal report": RefusalReport((Refused(0xFFFFFF, 0xFFFF, 0xFF, 2**32 - 1),) * c.REFUSALS_PER_REPORT),
     }
     encoded = {name: record.encode() for name, record in records.items()}
     assert [(name, int(kind), int(size)) for kind, name, size in drawn] == [
@@ -134,7 +137,7 @@ def test_types_and_sizes_of_records() -> None:
 
 
 def test_odds_of_a_forgery() -> None:
-    """The table of forgeries is arithmetic: tries in a year by the chance of each."""
+    """The table of forgeries is arithmetic: tries in a year times the probability of each."""
     year_s = 365.25 * 86400
     table = [cells for cells in rows(section("16 Limits")) if cells[0].isdigit()]
     assert [int(cells[0]) for cells in table] == list(wire.TAG_LENGTHS)

@@ -21,7 +21,7 @@ from tests.core.harness import (
     reasons,
 )
 from uavlinkd.core import constants as c
-from uavlinkd.core import wire
+from uavlinkd.core import establish, freshness, wire
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import FreshnessUnverified, FreshnessVerified, PeerClosed, PeerLost
@@ -35,7 +35,7 @@ WATCHED = replace(PLAIN, timers=QUIET, verify_interval_s=c.VERIFY_INTERVAL_S)
 def split(payload: bytes) -> tuple[bytes, bytes]:
     """Commands must be new, reports may be old."""
     frames = [payload[at : at + len(FRAME)] for at in range(0, len(payload), len(FRAME))]
-    return b"".join(each for each in frames if each == REPORT), b"".join(each for each in frames if each != REPORT)
+    return b"".join(raw for raw in frames if raw == REPORT), b"".join(raw for raw in frames if raw != REPORT)
 
 
 def watched(monkeypatch: pytest.MonkeyPatch, link_b: Link = WATCHED, screen: Screen = split) -> Pair:
@@ -62,7 +62,7 @@ def reports(pair: Pair, begin: float, end: float) -> list[tuple[float, bytes]]:
         now = tenth / 10
         outputs = pair.b.timeout(now) + pair.b.receive(only(datagrams(pair.a.send(now, REPORT))), now)
         assert payloads(outputs) == [REPORT]
-        asked += [(now, each) for each in datagrams(outputs)]
+        asked += [(now, request) for request in datagrams(outputs)]
     return asked
 
 
@@ -112,17 +112,17 @@ def test_command_without_an_answer_is_dropped(pair: Pair) -> None:
     reports(pair, 0.0, 2.1)
     assert payloads(pair.b.receive(only(datagrams(pair.a.send(2.1, COMMAND))), 2.1)) == []
     reports(pair, 2.2, 3.1)
-    assert reasons(pair.b.timeout(2.1 + c.DOUBT_S)) == [DropReason.DOUBTFUL]
+    assert reasons(pair.b.timeout(2.1 + c.HOLD_S)) == [DropReason.DOUBTFUL]
 
 
 def test_held_command_that_is_old_is_delayed(pair: Pair) -> None:
     """The answer tells which counters are new: a command that was kept for three seconds is refused by it."""
     kept = [only(datagrams(pair.a.send(0.5, frame))) for frame in (*[REPORT] * 20, COMMAND)]
-    for number, each in enumerate(kept):
+    for number, envelope in enumerate(kept):
         now = 0.6 + number / 8
-        outputs = pair.b.timeout(now) + pair.b.receive(each, now)
-        assert payloads(outputs) == ([] if each is kept[-1] else [REPORT])
-    outputs += pair.b.timeout(now + c.DOUBT_ASK_S)
+        outputs = pair.b.timeout(now) + pair.b.receive(envelope, now)
+        assert payloads(outputs) == ([] if envelope is kept[-1] else [REPORT])
+    outputs += pair.b.timeout(now + c.HOLD_ASK_S)
     outputs = pair.b.receive(answer(pair.a, datagrams(outputs)[-1], now + 0.3), now + 0.3)
     assert payloads(outputs) == []
     assert reasons(outputs) == [DropReason.DELAYED]
@@ -163,17 +163,17 @@ def test_late_answer_is_late_however_many_requests_were_sent(pair: Pair, number:
     assert payloads(outputs) == []
 
 
-def test_second_answer_is_no_answer(pair: Pair) -> None:
+def test_second_reply_has_no_effect(pair: Pair) -> None:
     """A request is answered once: a peer that answers again extends nothing, and is not late either."""
     ((_, question),) = reports(pair, 0.0, 1.1)
     pair.b.receive(answer(pair.a, question, 1.1), 1.1)
-    token = wire.Echo(True, pair.b.peer._age._questions._last, 0, 0, 0).encode()
+    token = wire.Echo(True, pair.b.peer.echo_requests._last, 0, 0, 0).encode()
     pair.b.receive(pair.a.envelope(1.9, token), 1.9)
     assert pair.b.session.verification.until == 1.1 + c.LATE_AFTER_S
     reports(pair, 1.9, 2.4)
 
 
-def test_answer_to_no_request_is_no_sign_of_delay(pair: Pair) -> None:
+def test_reply_without_a_request_does_not_show_delay(pair: Pair) -> None:
     """A token that was never issued, such as one by a peer that lies, changes nothing."""
     reports(pair, 0.0, 1.0)
     for token in (0, 4_000_000_000):
@@ -185,13 +185,11 @@ def test_answer_about_a_session_that_has_ended_measures_the_round_trip(pair: Pai
     """Its question was asked a moment ago, so it is neither late nor proof of anything on the new session."""
     ((_, question),) = reports(pair, 0.0, 1.1)
     session = pair.b.session
-    outputs: list[object] = []
-    called = pair.a.peer.caller.call(pair.a.peer.path, pair.a.peer.sessions.generation, 1.1)
-    assert called is not None
-    response = only(datagrams(pair.b.receive(called.datagram, 1.1)))
+    initiation = only(datagrams(establish.initiate(pair.a.peer, 1.1)))
+    response = only(datagrams(pair.b.receive(initiation, 1.1)))
     pair.b.receive(only(datagrams(pair.a.receive(response, 1.1))), 1.1)
     assert len(pair.b.peer.sessions.confirmed) == 2
-    pair.b.peer._age.end(pair.b.peer.sessions._end([session], 1.2), outputs)  # type: ignore[arg-type]
+    freshness.end(pair.b.peer, pair.b.peer.sessions._end([session], 1.2))
     until = pair.b.session.verification.until
     pair.b.receive(answer(pair.a, question, 1.2), 1.3)
     assert pair.b.peer.round_trip_s == pytest.approx(0.3)
@@ -201,9 +199,8 @@ def test_answer_about_a_session_that_has_ended_measures_the_round_trip(pair: Pai
 def test_superseded_session_is_not_asked_about(pair: Pair) -> None:
     """The peer sends on it no more once its first envelope came on the next; until then it is in use."""
     old_a, old_b = pair.a.session, pair.b.session
-    called = pair.a.peer.caller.call(pair.a.peer.path, pair.a.peer.sessions.generation, 1.0)
-    assert called is not None
-    response = only(datagrams(pair.b.receive(called.datagram, 1.0)))
+    initiation = only(datagrams(establish.initiate(pair.a.peer, 1.0)))
+    response = only(datagrams(pair.b.receive(initiation, 1.0)))
     confirmation = only(datagrams(pair.a.receive(response, 1.0)))
     assert pair.a.peer.sessions.is_in_use(old_a)
     assert datagrams(pair.b.receive(old_a.seal(REPORT, 1.1), 1.1))
@@ -231,16 +228,16 @@ def test_recent_record_does_not_end_unverified_freshness(pair: Pair) -> None:
     reports(pair, 0.0, 2.1)
     pair.a.receive(only(datagrams(pair.b.send(2.1))), 2.1)
     proof = wire.Echo(False, 7, pair.a.session.received, pair.a.session.expected)
-    assert proof.expected > pair.b.session.fresh(2.2, c.DOUBT_S)
+    assert proof.expected > pair.b.session.fresh(2.2, c.HOLD_S)
     pair.b.receive(pair.a.envelope(2.2, proof.encode()), 2.2)
     assert payloads(pair.b.receive(only(datagrams(pair.a.send(2.3, COMMAND))), 2.3)) == []
 
 
 @pytest.mark.parametrize("expected_above", [0, 50])
 def test_record_that_proves_nothing_recent_extends_nothing(pair: Pair, expected_above: int) -> None:
-    """Neither one that tells of old envelopes, nor one that tells of more than were sent."""
+    """Neither one that reports only old envelopes, nor one that reports more than were sent."""
     reports(pair, 0.0, 1.5)
-    expected = pair.b.session.fresh(1.6, c.DOUBT_S) + expected_above
+    expected = pair.b.session.fresh(1.6, c.HOLD_S) + expected_above
     proof = wire.Echo(False, 7, 0, expected)
     pair.b.receive(pair.a.envelope(1.6, proof.encode()), 1.6)
     assert pair.b.session.verification.until == c.LATE_AFTER_S
@@ -253,8 +250,8 @@ def test_unverified_freshness_is_reported_once_and_until_it_ends(pair: Pair) -> 
         now = tenth / 10
         outputs = pair.b.timeout(now) + pair.b.receive(only(datagrams(pair.a.send(now, REPORT))), now)
         questions += datagrams(outputs)
-        events += [(now, each) for each in of(outputs, FreshnessUnverified)]
-    assert events == [(3.1, FreshnessUnverified("alpha"))]
+        events += [(now, event) for event in of(outputs, FreshnessUnverified)]
+    assert events == [(3.1, FreshnessUnverified(pair.b.peer))]
     assert pair.b.peer.unverified_since == 3.1
 
     outputs = pair.b.receive(answer(pair.a, questions[-1], 6.0), 6.0)

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from uavlinkd.core import constants as c
 from uavlinkd.core import wire
 from uavlinkd.core.drops import Drop, DropReason
+from uavlinkd.core.refusals import RefusalReport, Refused
 from uavlinkd.core.suites import SUITES, SUITES_BY_NAME, Suite
 from uavlinkd.core.wire import Parameters
 
@@ -28,6 +29,7 @@ PARAMETERS = st.builds(
     tag_bytes=st.sampled_from(wire.TAG_LENGTHS),
     mac_key_bits=st.sampled_from(wire.MAC_KEY_LENGTHS),
     max_envelope=st.integers(c.MIN_ENVELOPE_LIMIT, 2**16 - 1),
+    features=st.sampled_from((0, c.FEATURE_REFUSALS)),
 )
 T = TypeVar("T")
 CONTROL: st.SearchStrategy[wire.Control] = st.one_of(
@@ -36,6 +38,14 @@ CONTROL: st.SearchStrategy[wire.Control] = st.one_of(
     st.builds(wire.PathChallenge, st.binary(min_size=8, max_size=8)),
     st.builds(wire.PathResponse, st.binary(min_size=8, max_size=8)),
     st.just(wire.Close()),
+    st.builds(
+        RefusalReport,
+        st.lists(
+            st.builds(Refused, st.integers(0, 2**24 - 1), st.integers(0, 2**16 - 1), st.integers(0, 255), U32),
+            min_size=1,
+            max_size=c.REFUSALS_PER_REPORT,
+        ).map(tuple),
+    ),
 )
 
 
@@ -160,7 +170,7 @@ def test_unknown_suite_is_malformed(suite: Suite) -> None:
     ids=["initiation", "response sender", "response receiver", "cookie reply", "short envelope", "long envelope"],
 )
 def test_index_zero_is_malformed(parse: Callable[[bytes], object], message: bytes, at: int) -> None:
-    """Index 0 names no session, so a message with it in any of its index fields is no message."""
+    """Index 0 names no session. A message with it in any of its index fields is malformed."""
     parse(message)
     assert reason_of(parse, message[:at] + bytes(2) + message[at + 2 :]) is DropReason.MALFORMED
 
@@ -238,7 +248,7 @@ def test_unknown_features_and_flags_are_ignored(features: int, flags: int) -> No
 
     parsed = wire.parse_parameters(encoded[:4] + features.to_bytes(2, "big") + bytes((flags,)) + encoded[7:])
 
-    assert parsed == Parameters(7, bool(flags & 1), 16, 256, 1232)
+    assert parsed == Parameters(7, bool(flags & 1), 16, 256, 1232, features & c.FEATURE_REFUSALS)
 
 
 def test_other_tag_length_is_refused() -> None:
@@ -288,6 +298,7 @@ def test_both_ends_agree_on_the_stronger(ours: Parameters, theirs: Parameters) -
         assert agreed.tag_bytes >= side.tag_bytes
         assert agreed.mac_key_bits >= side.mac_key_bits
         assert agreed.max_envelope <= side.max_envelope
+        assert agreed.features & ~side.features == 0
         assert agreed.generation == min(2**32 - 1, 1 + max(ours.generation, theirs.generation))
 
 
@@ -303,6 +314,8 @@ STRENGTHS = [
     ("tag_bytes", 12, 32, 32),
     ("mac_key_bits", 256, 2048, 2048),
     ("max_envelope", 400, 1232, 400),
+    ("features", 0, 1, 0),
+    ("features", 1, 1, 1),
     ("generation", 3, 8, 9),
     ("generation", 2**32 - 1, 0, 2**32 - 1),
 ]
@@ -346,7 +359,7 @@ def test_challenge_with_other_padding_is_refused(padding: bytes) -> None:
 
 
 def test_close_with_more_behind_it_is_refused() -> None:
-    """A goodbye is one byte."""
+    """A close is one byte."""
     assert reason_of(wire.parse_control, b"\x05\0") is DropReason.BAD_CONTROL
 
 

@@ -1,7 +1,7 @@
 """Admission: which handshake messages may cost work, before anything in them is authentic or while replays are.
 
-Every limit that strangers can use up has a share beside it that they cannot: a sender that proves its address by a
-cookie, and most of all one at an address where a peer is known to be. README.md, sections 7 and 13.
+Every limit that strangers can use up has a share beside it that they cannot: for a sender that proves its address by
+a cookie, and above all for one at an address where a peer is known to be. README.md, sections 7 and 13.
 """
 
 from __future__ import annotations
@@ -14,9 +14,18 @@ from uavlinkd.core.cookie import CookieJar
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.group_budget import GroupBudget
 from uavlinkd.core.limits import SourceLimiter, TokenBucket, prefix_of, source_of
-from uavlinkd.core.outputs import Output, Path, Transmit
+from uavlinkd.core.outputs import Transmit
+from uavlinkd.core.path import Path, SocketAddress
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.suites import Suite
+
+
+class CookieRequired(Drop):
+    """A message is refused, and its sender gets a cookie to try again with."""
+
+    def __init__(self, reply: Transmit) -> None:
+        super().__init__(DropReason.COOKIE_REQUIRED)
+        self.reply = reply
 
 
 class Message(NamedTuple):
@@ -33,12 +42,12 @@ class Message(NamedTuple):
 
 
 class Admission:
-    """The budgets for handshake messages of one daemon. Methods that admit append cookie replies to ``out``.
+    """The budgets for handshake messages of one daemon. Each method returns if the message may cost that work.
 
-    ``is_known`` says whether a peer is configured or was last seen at a host and port.
+    ``is_known`` says whether a peer is configured or was last seen at an address.
     """
 
-    def __init__(self, is_known: Callable[[tuple[str, int]], bool], now: float) -> None:
+    def __init__(self, is_known: Callable[[SocketAddress], bool], now: float) -> None:
         self._is_known = is_known
         # Two budgets: a flood of initiations must not keep our own handshakes from finishing.
         self._initiations = TokenBucket(c.INITIATIONS_PER_S, c.INITIATIONS_BURST, now)
@@ -59,90 +68,86 @@ class Admission:
         self._group = GroupBudget(now)
 
     def read(self, path: Path, now: float) -> None:
-        """Whether an initiation from there may be read at all.
+        """An initiation from there is to be read.
 
         Raises:
             Drop: ``RATE_LIMITED``.
         """
-        address = path[1:]
+        address = path.address
         # Where a peer is known to be, a flood from elsewhere does not count.
         if not (self._is_known(address) and self._known_read.take(address, now)) and not self._read.take(now):
             raise Drop(DropReason.RATE_LIMITED)
 
-    def admit_initiation(self, message: Message, now: float, out: list[Output]) -> None:
-        """Whether an initiation may cost its key exchange.
+    def admit_initiation(self, message: Message, now: float) -> None:
+        """An initiation costs a key exchange.
 
         Raises:
             Drop: ``COOKIE_REQUIRED`` or ``RATE_LIMITED``.
         """
-        self._admit(self._initiations, self._cookied, message, now, out)
+        self._admit(self._initiations, self._cookied, message, now)
 
-    def admit_response(self, message: Message, now: float, out: list[Output]) -> None:
-        """Whether a response may cost its key exchange.
-
-        Raises:
-            Drop: ``COOKIE_REQUIRED`` or ``RATE_LIMITED``.
-        """
-        self._admit(self._responses, self._cookied, message, now, out)
-
-    def admit_answer(self, peer: Peer, message: Message, now: float, out: list[Output]) -> None:
-        """Whether an authentic initiation of this peer may be answered.
+    def admit_response(self, message: Message, now: float) -> None:
+        """A response costs a key exchange.
 
         Raises:
             Drop: ``COOKIE_REQUIRED`` or ``RATE_LIMITED``.
         """
-        # Recorded initiations of this peer can be replayed from anywhere: they may use up the answers to everybody,
-        # not those to the one who proves its address.
+        self._admit(self._responses, self._cookied, message, now)
+
+    def admit_answer(self, peer: Peer, message: Message, now: float) -> None:
+        """An authentic initiation of this peer is to be answered.
+
+        Raises:
+            Drop: ``COOKIE_REQUIRED`` or ``RATE_LIMITED``.
+        """
+        # Recorded initiations of this peer can be replayed from anywhere: they may use up the answers to all senders,
+        # not those to a sender that proves its address.
         answers = peer.answers_while_up if peer.is_up else peer.answers
-        self._admit(answers, peer.cookied_answers, message, now, out)
+        self._admit(answers, peer.cookied_answers, message, now)
 
-    def admit_group(self, peer: Peer, suite: Suite, message: Message, now: float, out: list[Output]) -> None:
-        """Whether an authentic initiation may cost the arithmetic of its group.
+    def admit_group(self, peer: Peer, suite: Suite, message: Message, now: float) -> None:
+        """An authentic initiation costs the arithmetic of its group.
 
         Raises:
             Drop: ``GROUP_BUDGET_SPENT``; ``COOKIE_REQUIRED`` or ``RATE_LIMITED`` where a cookie would help.
         """
         # An attacker can send a recorded initiation under the peer's own address: only a cookie proves an address.
-        is_there = message.path in peer.caller.candidates(peer.path)
+        is_there = message.path in peer.candidates()
         is_proven = is_there and message.has_cookie(now)
         if is_proven and peer.group_share.proven.take(now, suite.work):
             return
-        if self._group.take(peer.group_share, source_of(message.path[1]), suite.work, now):
+        if self._group.take(peer.group_share, source_of(message.path.host), suite.work, now):
             return
         if is_there and not is_proven:
-            self._require_cookie(message, now, out)
+            self._require_cookie(message, now)
         raise Drop(DropReason.GROUP_BUDGET_SPENT)
 
-    def _admit(
-        self, budget: TokenBucket, ceiling: TokenBucket, message: Message, now: float, out: list[Output]
-    ) -> None:
+    def _admit(self, budget: TokenBucket, ceiling: TokenBucket, message: Message, now: float) -> None:
         """Until the budget is spent, each message; then those with a cookie, by their source's share."""
         if budget.take(now):
             return
         if not message.has_cookie(now):
-            self._require_cookie(message, now, out)
-        # Who proved an address of a peer does not queue with strangers: neither with those of its host or network,
-        # such as others behind one router, nor with those of many addresses, for whom the ceiling is.
-        _, host, port = message.path
-        is_known = self._is_known((host, port))
-        if not self._sources.take((ceiling, (host, port) if is_known else source_of(host)), now):
+            self._require_cookie(message, now)
+        # A sender with a cookie for a known address has its own rate limit: it does not queue with others of its host
+        # or network, such as those behind one router, nor with the owner of many addresses, which the ceiling limits.
+        path = message.path
+        is_known = self._is_known(path.address)
+        if not self._sources.take((ceiling, path.address if is_known else source_of(path.host)), now):
             raise Drop(DropReason.RATE_LIMITED)
         if not is_known and not ceiling.take(now):
             raise Drop(DropReason.RATE_LIMITED)
 
-    def _require_cookie(self, message: Message, now: float, out: list[Output]) -> NoReturn:
+    def _require_cookie(self, message: Message, now: float) -> NoReturn:
         """Refuse a message without a cookie, and send one back unless too many were sent there.
 
         Raises:
             Drop: ``COOKIE_REQUIRED``, or ``RATE_LIMITED`` without a reply.
         """
         datagram, sender_index, path, cookies = message
-        _, host, port = path
-        is_due = self._is_known((host, port)) and self._known.take((host, port), now)
+        is_due = self._is_known(path.address) and self._known.take(path.address, now)
         # The total is looked at first: a flood from many prefixes then costs no more than this.
         if not is_due and self._cookie_replies.has(now):
-            is_due = self._prefixes.take(prefix_of(host), now) and self._cookie_replies.take(now)
+            is_due = self._prefixes.take(prefix_of(path.host), now) and self._cookie_replies.take(now)
         if not is_due:
             raise Drop(DropReason.RATE_LIMITED)
-        out.append(Transmit(cookies.reply(datagram, sender_index, path, now), path))
-        raise Drop(DropReason.COOKIE_REQUIRED)
+        raise CookieRequired(Transmit(cookies.reply(datagram, sender_index, path, now), path))

@@ -23,17 +23,22 @@ AEAD_TAG_BYTES = 16
 MAC_BYTES = 16
 """mac1, mac2 and a cookie."""
 COOKIE_NONCE_BYTES = 16
-"""Drawn anew for each cookie reply: its key is derived from it, so it must not repeat."""
+"""Random for each cookie reply: its key is derived from it, so it must not repeat."""
 PATH_TOKEN_BYTES = 8
 """Of a path challenge, which a guess hits once in 2^64."""
 
 SESSION_ENVELOPE_LIMIT = 2**32 - 1
-"""Envelopes that one session's keys may seal, each way. The counter after the last one fits an echo's 32 bits."""
+"""Envelopes that a session may seal in each direction. The counter after the last one fits an echo's 32 bits."""
 SHORT_COUNTER_LIMIT = 2**16
 """Counters below this travel in two bytes, others in four; either in the other's form is refused."""
+FEATURE_REFUSALS = 1
+"""Bit of the parameters' features: the sender understands refusal reports. Both ends must set it."""
+REFUSALS_PER_REPORT = 16
+"""Entries of a refusal report at most: with 161 bytes it fits the smallest envelope."""
+
 LATE_AFTER_S = 2.0
-"""What was sent longer ago than this is late: refused where that can be told, asked about where it cannot. Both ends
-must mean the same by it. Far above any radio's reordering; a command that old is no longer what its sender wants."""
+"""What was sent longer ago than this is late: refused if the receiver can see it, else asked about. Both ends must
+use the same value. Far above any radio's reordering; a command that old is no longer what its sender wants."""
 
 # Implementation constants. Ours; changing one does not change the wire.
 
@@ -50,25 +55,25 @@ in the ordinary case one side rekeys, not both."""
 RETRY_MIN_S = 0.25
 """First wait for a response. ArduPilot's ground-station failsafe trips after 5 s: several tries must fit."""
 RETRIES_PER_WAIT = 12
-"""So many tries before the wait doubles. A try over a link that loses 30 % each way fails in 51 % of cases: with ten
-tries in the first 3 s all of them fail once in 800 links, with two dozen in the first 10 s once in ten million."""
+"""Tries before the wait doubles. If a link loses 30 % in each direction, a try fails in 51 % of cases: all of ten
+tries in the first 3 s fail once in 800 links, all of two dozen in the first 10 s once in ten million."""
 RETRY_MAX_S = 1.5
-"""Longest wait between tries, for ever. With the jitter it stays under 2 s, so a link that comes back after
+"""Longest wait between tries, which never end. With the jitter it stays under 2 s, so a link that comes back after
 any outage carries frames within that; a try each 1.5 s costs a dead link about 1 kbit/s with x25519."""
 RETRY_JITTER = 0.25
 """Each wait is longer by up to this share, so that two ends do not stay in step."""
 KEEPALIVE_S = 10.0
-"""Silence after which an empty envelope keeps a NAT's mapping alive."""
+"""An idle end asks for an echo this often: it keeps a NAT's mapping alive and measures the round trip."""
 ECHO_AFTER_S = 0.5
-"""Sent, and heard nothing for this long: ask for an echo."""
+"""Sent, and received nothing for this long: ask for an echo."""
 HANDSHAKE_AFTER_S = 1.0
-"""Sent, and heard nothing for this long: the other end may have restarted, so initiate too."""
+"""Sent, and received nothing for this long: the other end may have restarted, so initiate too."""
 LOST_AFTER_S = 3.0
-"""Sent, and heard nothing for this long: the peer is lost. Inside every autopilot's failsafe."""
+"""Sent, and received nothing for this long: the peer is lost. Inside every autopilot's failsafe."""
 PROBE_INTERVAL_S = 5.0
 """How often a link in use measures its round trip and reports its losses."""
 CLOSE_HOLDOFF_S = 1.0
-"""After a peer said goodbye it is not called for this long: its daemon is stopping."""
+"""After a peer's close no initiation is sent to it for this long: its daemon is stopping."""
 
 UNCONFIRMED_PER_PEER = 16
 """Sessions that answer an initiation and wait for their first envelope."""
@@ -102,7 +107,7 @@ COOKIED_PER_SOURCE_PER_S = 10.0
 COOKIED_PER_SOURCE_BURST = 10
 """So many at once, after a quiet while."""
 COOKIED_PER_S = 200
-"""The same from all sources together: whoever owns many addresses still costs a bounded share of a core."""
+"""The same from all sources together: an attacker with many addresses still costs a bounded share of a core."""
 INITIATIONS_READ_PER_S = 2000
 """Initiations a second of which mac1 is checked. What is beyond costs a third, so a flood leaves time for frames."""
 INITIATIONS_READ_BURST = 1000
@@ -147,17 +152,17 @@ HINTS_INTERVAL_S = 1.0
 """An unknown index from a peer's address makes us initiate at most this often."""
 INDEX_QUARANTINE_S = 600.0
 """An index that carried a session is not used again for this long: a late envelope is late, not forged."""
-RESTING_PER_PEER = 1024
-"""Indices that rest so of one peer: who makes more sessions cannot use up the indices of all others."""
+QUARANTINED_PER_PEER = 1024
+"""Quarantined indices of one peer: a peer that makes more sessions cannot use up the indices of all others."""
 CHALLENGE_INTERVAL_S = 0.25
 """A new path is challenged at most this often."""
 CHALLENGE_LIFETIME_S = 5.0
 """How long a path challenge may be answered."""
 LATE_STEP_S = 0.25
 """Counters of the past are remembered in such steps: what is late is so by up to one of them more."""
-DOUBT_S = 1.0
+HOLD_S = 1.0
 """How long frames that came after a silence wait for the peer's word on their age, and how old that word may be."""
-DOUBT_ASK_S = 0.25
+HOLD_ASK_S = 0.25
 """How often the peer is asked meanwhile: as often as for a handshake."""
 VERIFY_INTERVAL_S = 1.0
 """While frames arrive, the peer is asked for an echo this often. A link with a budget has a longer interval."""
@@ -165,6 +170,12 @@ VERIFY_REPEAT_SHARE = 0.25
 """After one interval without an answer the request is repeated each time this share of an interval has passed."""
 VERIFIED_INTERVALS = 2
 """Freshness stays verified for so many intervals after an answer, at least for `LATE_AFTER_S`."""
+REFUSALS_INTERVAL_S = 2.0
+"""A peer gets a refusal report at most this often: with 16 entries and 12 bytes of tag under 1 kbit/s."""
+REFUSALS_SENDS = 2
+"""A changed count is in so many reports: at 30 % loss at least one of them arrives in 91 % of cases."""
+REFUSALS_KEPT = 64
+"""Kinds of refused frames that are counted for one peer, and claims of it that are kept."""
 HELD_BYTES = 65536
 """Of frames that wait so, on one session: the largest envelope fits; a second of a fast link does too."""
 HELD_OVERHEAD_BYTES = 64

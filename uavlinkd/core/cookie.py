@@ -10,7 +10,7 @@ from uavlinkd.core import constants as c
 from uavlinkd.core import wire
 from uavlinkd.core.crypto import AeadKey, Entropy, equal, hmac_sha256, sha256
 from uavlinkd.core.drops import Drop, DropReason
-from uavlinkd.core.outputs import Path
+from uavlinkd.core.path import Path
 
 _NO_COOKIE = bytes(c.MAC_BYTES)
 
@@ -63,7 +63,7 @@ def mac1_of(datagram: bytes) -> bytes:
 
 
 class CookieJar:
-    """Cookies for whoever sends to us: an HMAC of the source address, so nothing is remembered about anyone."""
+    """Cookies for senders: an HMAC of the source address, so the daemon remembers nothing about a sender."""
 
     def __init__(self, keys: MacKeys, entropy: Entropy, now: float) -> None:
         self._keys = keys
@@ -72,12 +72,12 @@ class CookieJar:
         self._changed_at = now
 
     def has_valid_mac2(self, datagram: bytes, path: Path, now: float) -> bool:
-        """Whether mac2 was made with a cookie that we gave to this source, at most four minutes ago."""
+        """Whether mac2 was made with a cookie that this daemon sent to this source, at most four minutes ago."""
         covered, mac2 = datagram[: -c.MAC_BYTES], datagram[-c.MAC_BYTES :]
         if mac2 == _NO_COOKIE:
             return False
         self._change_secret(now)
-        # Both are computed always: which secret fits is nobody's business.
+        # Always compute both, so that the time does not show which secret fits.
         fits = [
             equal(hmac_sha256(_cookie(secret, path), covered)[: c.MAC_BYTES], mac2)
             for secret in (self._secret, self._previous)
@@ -98,10 +98,9 @@ class CookieJar:
         fresh = self._entropy(c.KEY_BYTES)
         # After a long silence the secret before this one is too old as well.
         self._previous = self._secret if age < 2 * c.COOKIE_SECRET_LIFETIME_S else fresh
-        # When it was due, not now: a secret that nobody asked for lately would be honoured for longer.
+        # The time when it was due, not now: an unused secret would be valid for longer.
         self._secret, self._changed_at = fresh, now - age % c.COOKIE_SECRET_LIFETIME_S
 
 
 def _cookie(secret: bytes, path: Path) -> bytes:
-    _, host, port = path
-    return hmac_sha256(secret, f"{host} {port}".encode())[: c.MAC_BYTES]
+    return hmac_sha256(secret, " ".join(map(str, path.address)).encode())[: c.MAC_BYTES]

@@ -1,7 +1,7 @@
 """Primitives, typed: the only module that imports ``cryptography``. All of them are OpenSSL's underneath.
 
-A secret here does not print. A public value that is no good raises :class:`Drop`; where a tag does not verify there
-is no plaintext, and the caller names the reason.
+A secret here does not print. An invalid public value raises :class:`Drop`. If a tag does not verify, there is no
+plaintext, and the calling code has the reason.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import hmac
 import warnings
+from collections.abc import Callable
 from typing import Protocol
 
 from cryptography.exceptions import InvalidTag
@@ -22,6 +23,9 @@ from uavlinkd.core.constants import KEY_BYTES
 from uavlinkd.core.drops import Drop, DropReason
 
 Bytes = bytes | bytearray | memoryview
+
+equal: Callable[[Bytes, Bytes], bool] = hmac.compare_digest
+"""Whether two byte strings are the same, in time that tells nothing of where they differ."""
 
 
 class Entropy(Protocol):
@@ -56,11 +60,6 @@ class Secret:
         raise TypeError("a secret is not pickled")
 
 
-def equal(a: Bytes, b: Bytes) -> bool:
-    """Whether two byte strings are the same, in time that tells nothing of where they differ."""
-    return hmac.compare_digest(a, b)
-
-
 def sha256(data: bytes) -> bytes:
     """SHA-256 (FIPS 180-4)."""
     return hashlib.sha256(data).digest()
@@ -84,17 +83,18 @@ def hkdf_expand(key: bytes, info: bytes, length: int) -> bytes:
 class MacKey:
     """HMAC-SHA256 with its two inner states prepared once, so that a tag costs no key schedule."""
 
-    __slots__ = ("_prepared",)
+    __slots__ = ("prepared",)
 
     def __init__(self, key: bytes) -> None:
-        self._prepared = HMAC(key, SHA256())
+        self.prepared = HMAC(key, SHA256())
+        """Make a tag with a copy of it. The path of a frame does so without a call of :meth:`tag`."""
 
     def __repr__(self) -> str:
         return "MacKey(<redacted>)"
 
     def tag(self, data: Bytes) -> bytes:
         """The 32-byte tag over ``data``."""
-        mac = self._prepared.copy()
+        mac = self.prepared.copy()
         mac.update(data)
         return mac.finalize()
 
@@ -145,7 +145,7 @@ class KeyPair:
         """The shared secret with the holder of ``public``.
 
         Raises:
-            Drop: ``INVALID_KEY_SHARE`` for a point of low order, whose secret anybody knows (RFC 7748, section 6.1).
+            Drop: ``INVALID_KEY_SHARE`` for a point of low order, whose secret is public (RFC 7748, section 6.1).
         """
         try:
             return self._private.exchange(X25519PublicKey.from_public_bytes(public))
@@ -159,7 +159,7 @@ def x25519_public_key(private: bytes) -> bytes:
 
 
 def is_usable_public_key(public: bytes) -> bool:
-    """Whether ``public`` has 32 bytes and is no point of low order."""
+    """Whether ``public`` has 32 bytes and its point does not have a low order."""
     if len(public) != KEY_BYTES:
         return False
     try:
@@ -190,7 +190,7 @@ class MlkemPrivateKey(Protocol):
     """What ML-KEM-768 and ML-KEM-1024 private keys share."""
 
     def decapsulate(self, ciphertext: bytes) -> bytes:
-        """The shared secret; a wrong ciphertext gives a secret that nobody else has (FIPS 203)."""
+        """The shared secret; a wrong ciphertext leads to a secret that the peer does not have (FIPS 203)."""
 
 
 def mlkem_generate(bits: int, seed: bytes) -> tuple[MlkemPrivateKey, bytes]:

@@ -1,93 +1,110 @@
-"""Why a datagram, or a frame on its way out, was discarded. Every reason has a name and a counter."""
+"""Why the daemon drops a datagram, or an outgoing frame. Every reason has a name, a meaning and a counter."""
 
 from __future__ import annotations
 
 from enum import StrEnum
+from typing import Self
 
 
-class DropReason(StrEnum):
-    """The closed list of reasons. The value is the name in logs, status and metrics."""
+class Reason(StrEnum):
+    """A closed list of reasons: each member is its name in logs, status and metrics, and has a meaning for people."""
+
+    meaning: str
+    """One sentence that an operator understands, without a full stop."""
+
+    def __new__(cls, name: str, meaning: str) -> Self:
+        """A member is written as its name and its meaning."""
+        member = str.__new__(cls, name)
+        member._value_ = name
+        member.meaning = meaning
+        return member
+
+
+class DropReason(Reason):
+    """Why a datagram or a frame is dropped. README.md, section 13, has the order of the checks and these meanings."""
 
     # Not our protocol.
-    MALFORMED = "malformed"
-    """Length or type fits no message."""
-    RAW_MAVLINK = "raw_mavlink"
-    """A bare MAVLink frame at the peers' port."""
+    MALFORMED = "malformed", "the length or type fits no message, or an index or counter has an invalid value"
+    RAW_MAVLINK = "raw_mavlink", "a bare MAVLink frame arrived at the port for peers: any sender could have sent it"
 
-    # Handshake. The order of the checks is in README.md, section 13.
-    UNEXPECTED_RESPONSE = "unexpected_response"
-    """A response to no initiation of ours that still waits."""
-    BAD_MAC1 = "bad_mac1"
-    """The sender does not know our public key, or the datagram was altered."""
-    COOKIE_REQUIRED = "cookie_required"
-    """Under load, or one peer's initiations come too fast; without a valid cookie: one was sent back."""
-    RATE_LIMITED = "rate_limited"
-    """Under load: this source, or all sources together, have had their share of work or of cookie replies."""
-    REPLAYED_INITIATION = "replayed_initiation"
-    """An initiation that was read before, whether it was answered or not."""
-    INVALID_KEY_SHARE = "invalid_key_share"
-    """A public value outside its group, or one that gives a secret anybody knows."""
-    BAD_HANDSHAKE = "bad_handshake"
-    """The Noise message does not authenticate: altered, or made with other keys or another PSK."""
-    UNKNOWN_PEER = "unknown_peer"
-    """A sound initiation under a static key that is not configured."""
-    SUITE_NOT_ACCEPTED = "suite_not_accepted"
-    """The peer offered a suite that this configuration does not list."""
-    HEADER_MISMATCH = "header_mismatch"
-    """The header in clear differs from the one that the peer sealed inside."""
-    BAD_PARAMETERS = "bad_parameters"
-    """The peer's parameters are outside the protocol."""
-    GROUP_BUDGET_SPENT = "group_budget_spent"
-    """An authentic handshake whose group arithmetic would take more CPU time than its sender may cause now."""
-    NO_FREE_INDEX = "no_free_index"
-    """Every session index is in use or in quarantine."""
-    UNEXPECTED_COOKIE = "unexpected_cookie"
-    """A cookie for no message of ours that still waits."""
-    BAD_COOKIE = "bad_cookie"
-    """A cookie that does not open."""
+    # Handshake.
+    UNEXPECTED_RESPONSE = "unexpected_response", "the response belongs to no pending initiation of this daemon"
+    BAD_MAC1 = "bad_mac1", "the sender does not know this daemon's public key, or the message was altered"
+    COOKIE_REQUIRED = (
+        "cookie_required",
+        "the daemon is under load, or a peer initiates too often: it sent a cookie, which the sender must return",
+    )
+    RATE_LIMITED = (
+        "rate_limited",
+        "handshake messages or cookie replies exceed the limit of one source, or of all sources together",
+    )
+    REPLAYED_INITIATION = "replayed_initiation", "the daemon read this initiation before: a sender replays it"
+    INVALID_KEY_SHARE = (
+        "invalid_key_share",
+        "the public value is outside its group, or leads to a secret that anyone knows",
+    )
+    BAD_HANDSHAKE = (
+        "bad_handshake",
+        "the Noise message does not authenticate: it was altered, or the sender uses another key or PSK",
+    )
+    UNKNOWN_PEER = "unknown_peer", "the initiation is authentic, but its static key is not configured"
+    SUITE_NOT_ACCEPTED = "suite_not_accepted", "the peer offers a suite that is not in its list"
+    HEADER_MISMATCH = "header_mismatch", "the header in clear differs from the one sealed inside: it was altered"
+    BAD_PARAMETERS = "bad_parameters", "the peer's parameters are outside the protocol"
+    GROUP_BUDGET_SPENT = (
+        "group_budget_spent",
+        "the handshake is authentic, but its group needs more CPU time than the sender may cause now",
+    )
+    NO_FREE_INDEX = "no_free_index", "every session index is in use or in quarantine"
+    UNEXPECTED_COOKIE = (
+        "unexpected_cookie",
+        "the cookie belongs to no pending message, or the message has a cookie already",
+    )
+    BAD_COOKIE = "bad_cookie", "the cookie does not decrypt"
 
     # Envelopes.
-    UNKNOWN_INDEX = "unknown_index"
-    """An envelope for a session that is not here: this side restarted, or it was never ours."""
-    LATE = "late"
-    """An envelope for a session that ended here lately."""
-    OVER_SHARE = "over_share"
-    """This daemon is busy, and the sender has more waiting than its share: dropped unread."""
-    TOO_LONG = "too_long"
-    """The envelope is longer than the two ends agreed."""
-    SESSION_EXPIRED = "session_expired"
-    """An envelope under keys that are too old."""
-    LONG_COUNTER = "long_counter"
-    """A small counter written in the long form."""
-    REPLAYED = "replayed"
-    """The counter was accepted before."""
-    TOO_OLD = "too_old"
-    """The counter is behind the replay window."""
-    DELAYED = "delayed"
-    """Held back on the way: the peer sent it longer ago than anything may take to arrive."""
-    BAD_TAG = "bad_tag"
-    """The envelope was altered or forged."""
-    BAD_CONTROL = "bad_control"
-    """An authentic envelope with a control record that is not one."""
-    BAD_PATH_RESPONSE = "bad_path_response"
-    """An answer to no path challenge, or from another path than the challenged."""
-    DOUBTFUL = "doubtful"
-    """Frames after a silence, or such as must be new, and the peer did not say in time that they are."""
+    UNKNOWN_INDEX = (
+        "unknown_index",
+        "the envelope names a session that does not exist here: one side restarted, or the envelope is forged",
+    )
+    LATE = "late", "the envelope belongs to a session that ended recently"
+    OVER_SHARE = "over_share", "the daemon is busy, and the sender has more datagrams waiting than its share"
+    TOO_LONG = "too_long", "the envelope is longer than both ends agreed"
+    SESSION_EXPIRED = "session_expired", "the keys of the envelope are too old"
+    LONG_COUNTER = "long_counter", "the envelope has a small counter in the long form"
+    REPLAYED = (
+        "replayed",
+        "the counter was accepted before: an attacker replays the envelope, or the network duplicated it",
+    )
+    TOO_OLD = "too_old", "the counter is behind the replay window: the envelope was replayed or delayed"
+    DELAYED = "delayed", "the peer sent the envelope too long ago: it was delayed on its path"
+    BAD_TAG = "bad_tag", "the tag does not verify: the envelope was altered or forged"
+    BAD_CONTROL = "bad_control", "the envelope is authentic, but its control record is invalid"
+    BAD_PATH_RESPONSE = (
+        "bad_path_response",
+        "the response belongs to no path challenge, came too late, or came along another path",
+    )
+    DOUBTFUL = (
+        "doubtful",
+        "the peer did not confirm in time that the frames are new, after a silence or while freshness is unverified",
+    )
 
-    # On the way out.
-    NO_SESSION = "no_session"
-    """Frames for a peer with which there are no keys now. Nothing is kept for later."""
-    TOO_LARGE = "too_large"
-    """A frame larger than an envelope to this peer may be."""
+    # Outgoing frames.
+    NO_SESSION = (
+        "no_session",
+        "outgoing frames have no session with the peer: the daemon does not keep them for later",
+    )
+    TOO_LARGE = "too_large", "an outgoing frame is larger than an envelope to the peer may be"
 
 
 class Drop(Exception):  # noqa: N818  not an error of ours: the ordinary fate of a bad datagram
-    """Raised inside the core where a datagram turns out to be bad. ``Node.receive`` counts it and raises nothing."""
+    """Raised inside the core for a bad datagram. ``Node.receive`` catches it, counts it and raises nothing."""
 
-    def __init__(self, reason: DropReason, detail: str = "") -> None:
+    def __init__(self, reason: DropReason, detail: bytes | str = "") -> None:
         super().__init__(reason)
         self.reason = reason
-        self.peer = ""
-        """The name of the peer that authentically sent it, where one did."""
         self.detail = detail
-        """For people: which key was unknown, which suite was offered."""
+        """The public key that is not configured (bytes), or the name of the suite that the peer offered (str).
+
+        The log formats it when it writes a line, not for each drop.
+        """

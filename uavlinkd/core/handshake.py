@@ -1,7 +1,7 @@
 """The two handshake messages: the Noise messages, the headers in front of them and what is sealed inside.
 
-Functions without state: each takes what it needs and returns what follows. Who may do this when, and what it
-changes, is in ``node.py``, ``peer.py`` and ``caller.py``.
+Functions without state. ``node.py``, ``establish.py`` and ``initiator.py`` decide when a message is read or written,
+and what it changes.
 """
 
 from __future__ import annotations
@@ -52,7 +52,8 @@ def pattern_of(suite: Suite) -> Pattern:
 
 def parameters_of(link: Link, generation: int) -> Parameters:
     """What this side asks of a session."""
-    return Parameters(generation, link.confidential, link.tag_bytes, link.mac_key_bits, link.max_envelope)
+    least = link.confidential, link.tag_bytes, link.mac_key_bits, link.max_envelope
+    return Parameters(generation, *least, link.features)
 
 
 def initiate(identity: KeyPair, peer: PeerSettings, index: int, generation: int, entropy: Entropy) -> Initiated:
@@ -112,7 +113,7 @@ def receive_response(initiated: Initiated, response: wire.Response) -> Keys:
 def _open_payload(payload: bytes, header: bytes) -> Parameters:
     """The sender's parameters; the header in clear must be the one that it sealed in front of them.
 
-    Without this an altered index would leave two ends that agree on keys and never hear each other.
+    Without this an altered index would leave two ends that agree on keys and never receive each other's envelopes.
     """
     repeated, parameters = payload[: len(header) - 1], payload[len(header) - 1 :]
     if repeated != header[1:]:

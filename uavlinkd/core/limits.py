@@ -17,22 +17,22 @@ class TokenBucket:
         self._tokens = burst
         self._at = now
 
-    def has(self, now: float, amount: float = 1.0) -> bool:
-        """Whether so many tokens are there."""
+    def has(self, now: float, count: float = 1.0) -> bool:
+        """Whether the bucket has this many tokens."""
         self._tokens = min(self._burst, self._tokens + (now - self._at) * self._rate)
         self._at = now
-        return self._tokens >= amount
+        return self._tokens >= count
 
-    def take(self, now: float, amount: float = 1.0) -> bool:
-        """Take so many tokens; False, and none is taken, when there are fewer."""
-        if not self.has(now, amount):
+    def take(self, now: float, count: float = 1.0) -> bool:
+        """Remove this many tokens. With fewer, remove nothing and return False."""
+        if not self.has(now, count):
             return False
-        self._tokens -= amount
+        self._tokens -= count
         return True
 
 
 def source_of(host: str) -> Hashable:
-    """Whom a numeric host stands for: itself, or its /64 in IPv6, of which a single machine has every address."""
+    """The source of a numeric host: itself, or its /64 in IPv6, because one machine may have every address of it."""
     return IPv6Address(host).packed[:8] if ":" in host else host
 
 
@@ -42,7 +42,7 @@ def prefix_of(host: str) -> Hashable:
 
 
 class SourceLimiter:
-    """A token bucket per source, for the ``capacity`` sources heard last."""
+    """A token bucket per source, for the ``capacity`` sources that were received last."""
 
     def __init__(self, rate: float, burst: float, capacity: int) -> None:
         self._rate = rate
@@ -50,10 +50,10 @@ class SourceLimiter:
         self._capacity = capacity
         self._buckets: dict[Hashable, TokenBucket] = {}
 
-    def take(self, source: Hashable, now: float, amount: float = 1.0) -> bool:
-        """Take so many tokens of this source; False, and none is taken, when it has fewer."""
+    def take(self, source: Hashable, now: float, count: float = 1.0) -> bool:
+        """Remove this many tokens of the source. With fewer, remove nothing and return False."""
         bucket = self._buckets.pop(source, None) or TokenBucket(self._rate, self._burst, now)
         self._buckets[source] = bucket  # a dict keeps order: the longest silent source comes first
         if len(self._buckets) > self._capacity:
             del self._buckets[next(iter(self._buckets))]
-        return bucket.take(now, amount)
+        return bucket.take(now, count)

@@ -4,7 +4,7 @@ Letters are the Noise specification's: s and e are static and ephemeral keys, rs
 h the transcript hash, ck the chaining key, k and n the cipher's key and nonce.
 
 A state is frozen. Consuming a message computes the next state from the old one, so a forged message
-leaves no trace: the caller still holds the state that the genuine message completes.
+leaves no trace: the old state still exists, and the genuine message completes it.
 """
 
 from __future__ import annotations
@@ -154,7 +154,7 @@ class HandshakeState:
         """WriteMessage: the next state and the message.
 
         Raises:
-            Drop: ``INVALID_KEY_SHARE`` where the other side's share is no good.
+            Drop: ``INVALID_KEY_SHARE`` if the other side's share is invalid.
         """
         state, parts = self, []
         for token in tokens:

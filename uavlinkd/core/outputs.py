@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 from uavlinkd.core.drops import DropReason
+from uavlinkd.core.path import Path
 
-Path = tuple[int, str, int]
-"""One way to a peer: (number of the local socket, the peer's numeric host, its port)."""
+
+class LinkedPeer(Protocol):
+    """The peer that an output is about: the object that :meth:`uavlinkd.core.node.Node.add_peer` returned."""
+
+    @property
+    def name(self) -> str:
+        """Its name in the configuration of this node."""
 
 
 class Transmit(NamedTuple):
@@ -20,43 +26,46 @@ class Transmit(NamedTuple):
 class Deliver(NamedTuple):
     """Whole MAVLink frames, back to back, from this peer: authentic, unaltered, new."""
 
-    peer: str
+    peer: LinkedPeer
     payload: bytes
 
 
 class Dropped(NamedTuple):
-    """``amount`` datagrams or frames were discarded. ``peer`` is whose session the header claims, None without."""
+    """``number`` datagrams or frames were dropped. ``peer`` is the peer whose session the header names, or None.
+
+    ``detail`` is a fact about the datagram, as in :class:`~uavlinkd.core.drops.Drop`.
+    """
 
     reason: DropReason
-    peer: str | None = None
+    peer: LinkedPeer | None = None
     path: Path | None = None
-    amount: int = 1
-    detail: str = ""
+    number: int = 1
+    detail: bytes | str = ""
 
 
 class PeerUp(NamedTuple):
     """A valid envelope or response came from a peer that was not up."""
 
-    peer: str
+    peer: LinkedPeer
 
 
 class PeerLost(NamedTuple):
     """Nothing valid came from the peer for ``silent_s`` seconds, or its last session ended."""
 
-    peer: str
+    peer: LinkedPeer
     silent_s: float
 
 
 class PeerClosed(NamedTuple):
-    """The peer said goodbye."""
+    """The peer closed its sessions."""
 
-    peer: str
+    peer: LinkedPeer
 
 
 class SessionEstablished(NamedTuple):
-    """New keys carry the traffic from now on. ``rekey`` where they replace others."""
+    """New keys carry the traffic from now on. ``rekey``: they replace others."""
 
-    peer: str
+    peer: LinkedPeer
     generation: int
     suite: str
     confidential: bool
@@ -66,22 +75,22 @@ class SessionEstablished(NamedTuple):
 
 
 class PathChanged(NamedTuple):
-    """The peer proved that it hears us at ``path``; traffic goes there now."""
+    """The peer proved that it receives along ``path``; traffic goes there now."""
 
-    peer: str
+    peer: LinkedPeer
     path: Path
 
 
 class FreshnessUnverified(NamedTuple):
-    """Frames of the peer arrive, and it does not answer: those that must be new are held back, the others pass."""
+    """Frames of the peer arrive, but no answers: frames that must be new are held, the others are delivered."""
 
-    peer: str
+    peer: LinkedPeer
 
 
 class FreshnessVerified(NamedTuple):
     """The peer answers again, ``unverified_s`` after it stopped."""
 
-    peer: str
+    peer: LinkedPeer
     unverified_s: float
 
 

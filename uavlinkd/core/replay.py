@@ -15,6 +15,7 @@ class ReplayWindow:
     remembers *which* counter came last at that place, so advancing, by one or by a billion, clears nothing.
 
     Two steps, because nothing may be written before the tag is verified: :meth:`check`, verify, :meth:`mark`.
+    A counter above :attr:`highest` passes the check always.
     """
 
     __slots__ = ("_slots", "highest")

@@ -2,80 +2,24 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol
-
 from uavlinkd.core import constants as c
 from uavlinkd.core import wire
 from uavlinkd.core.constants import NEVER
+from uavlinkd.core.counter_history import CounterHistory
 from uavlinkd.core.crypto import AeadKey, MacKey, Secret, equal, hkdf_expand
 from uavlinkd.core.drops import Drop, DropReason
-from uavlinkd.core.freshness import Doubt, Lately, Verification
 from uavlinkd.core.handshake import Keys
 from uavlinkd.core.replay import ReplayWindow
 from uavlinkd.core.suites import Suite
+from uavlinkd.core.verification import HeldFrames, Verification
 from uavlinkd.core.wire import Parameters
 
-if TYPE_CHECKING:
-    from uavlinkd.core.peer import Peer
+EnvelopeKey = MacKey | AeadKey
+"""The key of one direction: of HMAC-SHA256, or in a confidential session of ChaCha20-Poly1305."""
 
 
-class Protection(Protocol):
-    """How payloads are protected in one direction."""
-
-    tag_bytes: int
-
-    def seal(self, header: bytes, counter: int, payload: bytes) -> bytes:
-        """The envelope: header, payload, tag."""
-
-    def open(self, datagram: bytes, header_bytes: int, counter: int) -> bytes | None:
-        """The payload, or None where the tag does not verify."""
-
-
-class Authenticated:
-    """HMAC-SHA256 over header and payload, cut to ``tag_bytes``. The payload stays readable."""
-
-    __slots__ = ("_key", "tag_bytes")
-
-    def __init__(self, key: bytes, tag_bytes: int) -> None:
-        self._key = MacKey(key)
-        self.tag_bytes = tag_bytes
-
-    def seal(self, header: bytes, counter: int, payload: bytes) -> bytes:
-        """Header, payload, tag."""
-        signed = header + payload
-        return signed + self._key.tag(signed)[: self.tag_bytes]
-
-    def open(self, datagram: bytes, header_bytes: int, counter: int) -> bytes | None:
-        """The payload, or None where the tag does not verify."""
-        tag_at = len(datagram) - self.tag_bytes
-        if tag_at < header_bytes:
-            return None
-        expected = self._key.tag(datagram[:tag_at])
-        if not equal(expected[: self.tag_bytes], datagram[tag_at:]):
-            return None
-        return datagram[header_bytes:tag_at]
-
-
-class Confidential:
-    """ChaCha20-Poly1305: nonce is the counter, the header is associated data."""
-
-    __slots__ = ("_key", "tag_bytes")
-
-    def __init__(self, key: bytes) -> None:
-        self._key = AeadKey(key)
-        self.tag_bytes = c.AEAD_TAG_BYTES
-
-    def seal(self, header: bytes, counter: int, payload: bytes) -> bytes:
-        """Header, ciphertext, tag."""
-        return header + self._key.seal(counter, payload, header)
-
-    def open(self, datagram: bytes, header_bytes: int, counter: int) -> bytes | None:
-        """The plaintext, or None where the tag does not verify."""
-        return self._key.open(counter, memoryview(datagram)[header_bytes:], datagram[:header_bytes])
-
-
-def derive(parameters: Parameters, transport: Secret, handshake_hash: bytes, *, from_initiator: bool) -> Protection:
-    """The protection of one direction, from that direction's key of Noise ``Split()``.
+def derive(parameters: Parameters, transport: Secret, handshake_hash: bytes, *, from_initiator: bool) -> EnvelopeKey:
+    """The envelope key of one direction, from that direction's key of Noise ``Split()``.
 
     The label names purpose and direction; the transcript hash behind it ties the key to every byte of the handshake.
     """
@@ -83,9 +27,8 @@ def derive(parameters: Parameters, transport: Secret, handshake_hash: bytes, *, 
     purpose = b" confidential" if parameters.confidential else b" authenticated"
     info = c.PROTOCOL_NAME + purpose + direction + handshake_hash
     if parameters.confidential:
-        return Confidential(hkdf_expand(transport.reveal(), info, c.KEY_BYTES))
-    key = hkdf_expand(transport.reveal(), info, parameters.mac_key_bits // 8)
-    return Authenticated(key, parameters.tag_bytes)
+        return AeadKey(hkdf_expand(transport.reveal(), info, c.KEY_BYTES))
+    return MacKey(hkdf_expand(transport.reveal(), info, parameters.mac_key_bits // 8))
 
 
 class Session:
@@ -96,24 +39,24 @@ class Session:
 
     __slots__ = (
         "_floor",
-        "_heard_lately",
         "_receive",
+        "_received_history",
         "_send",
-        "_sent_lately",
+        "_sent_history",
         "created_at",
-        "doubt",
-        "heard_first_at",
+        "first_received_at",
+        "held",
         "is_initiator",
         "local_index",
         "max_envelope",
         "parameters",
         "payload_limit",
-        "peer",
         "received",
         "reject_at",
         "remote_index",
         "send_counter",
         "suite",
+        "tag_bytes",
         "trusted_until",
         "verification",
         "window",
@@ -121,7 +64,6 @@ class Session:
 
     def __init__(
         self,
-        peer: Peer,
         suite: Suite,
         keys: Keys,
         local_index: int,
@@ -134,7 +76,6 @@ class Session:
         first = derive(keys.parameters, keys.transport[0], keys.handshake_hash, from_initiator=True)
         second = derive(keys.parameters, keys.transport[1], keys.handshake_hash, from_initiator=False)
         self._send, self._receive = (first, second) if is_initiator else (second, first)
-        self.peer = peer
         self.suite = suite
         self.parameters = keys.parameters
         self.is_initiator = is_initiator
@@ -146,30 +87,27 @@ class Session:
         self.received = 0
         self.window = ReplayWindow()
         self.trusted_until = now + c.LATE_AFTER_S
-        """Until then what comes is new: the silence before it was short, or there was none since the handshake."""
-        self.heard_first_at = NEVER
+        """An envelope that arrives until then is new: the silence before it was short."""
+        self.first_received_at = NEVER
         """When the peer's first envelope came: from then on it sends on this session, or on one of higher rank."""
-        self.doubt = Doubt()
+        self.held = HeldFrames()
         self.verification = Verification(now, verify_interval_s)
         self._floor = -1  # the peer said that this counter, and those below, are of the past
-        self._heard_lately = Lately(now)
-        self._sent_lately = Lately(now)
+        self._received_history = CounterHistory(now)
+        self._sent_history = CounterHistory(now)
+        self.tag_bytes = c.AEAD_TAG_BYTES if keys.parameters.confidential else keys.parameters.tag_bytes
+        """Length of the tag in both directions."""
         self.max_envelope = keys.parameters.max_envelope
-        self.payload_limit = keys.parameters.max_envelope - wire.LONG_HEADER_BYTES - first.tag_bytes
+        self.payload_limit = keys.parameters.max_envelope - wire.LONG_HEADER_BYTES - self.tag_bytes
         """Longest payload that fits into an envelope to the peer."""
 
     def __repr__(self) -> str:
         return f"Session(generation={self.parameters.generation}, local_index={self.local_index})"
 
-    @property
-    def tag_bytes(self) -> int:
-        """Length of the tag, both ways."""
-        return self._send.tag_bytes
-
     def envelope_bytes(self, payload_bytes: int) -> int:
         """Length of the next envelope around a payload of this length."""
         header = wire.SHORT_HEADER_BYTES if self.send_counter < c.SHORT_COUNTER_LIMIT else wire.LONG_HEADER_BYTES
-        return header + payload_bytes + self._send.tag_bytes
+        return header + payload_bytes + self.tag_bytes
 
     @property
     def expected(self) -> int:
@@ -190,7 +128,7 @@ class Session:
 
         ``age_s`` is :data:`c.LATE_AFTER_S`, or less.
         """
-        return self._sent_lately.past(self.send_counter - 1, self.send_counter, now, age_s)[0] + 1
+        return self._sent_history.past(self.send_counter - 1, self.send_counter, now, age_s)[0] + 1
 
     def refuse_below(self, fresh: int) -> None:
         """The peer says that it sealed what has a lower counter than this too long ago."""
@@ -198,17 +136,24 @@ class Session:
 
     def missing(self, now: float) -> int:
         """Envelopes that the peer sent and that can be accepted no more, as far as is known here."""
-        highest, received = self._heard_lately.past(self.window.highest, self.received, now)
+        highest, received = self._received_history.past(self.window.highest, self.received, now)
         return highest + 1 - received
 
     def seal(self, payload: bytes, now: float) -> bytes:
-        """The next envelope. A counter is never used twice: see :attr:`is_used_up`."""
+        """The next envelope: header, payload, tag. A counter is never used twice: see :attr:`is_used_up`."""
         counter = self.send_counter
         assert counter < c.SESSION_ENVELOPE_LIMIT
-        if now >= self._sent_lately.next_at:
-            self._sent_lately.note(counter - 1, counter, now)
+        if now >= self._sent_history.next_at:
+            self._sent_history.note(counter - 1, counter, now)
         self.send_counter = counter + 1
-        return self._send.seal(wire.envelope_header(self.remote_index, counter), counter, payload)
+        header = wire.envelope_header(self.remote_index, counter)
+        key = self._send
+        if isinstance(key, AeadKey):
+            return header + key.seal(counter, payload, header)
+        signed = header + payload
+        mac = key.prepared.copy()
+        mac.update(signed)
+        return signed + mac.finalize()[: self.tag_bytes]
 
     def open(self, datagram: bytes, header_bytes: int, counter: int, now: float) -> bytes:
         """The payload of an envelope whose header says it is for this session.
@@ -221,22 +166,33 @@ class Session:
         if now >= self.reject_at:
             raise Drop(DropReason.SESSION_EXPIRED)
         window = self.window
-        window.check(counter)
-        is_overtaken = counter < window.highest
+        is_overtaken = counter <= window.highest
+        if is_overtaken:  # a counter above the highest is neither replayed nor too old
+            window.check(counter)
         if counter <= self._floor or (is_overtaken and self._is_late(counter, now)):
             raise Drop(DropReason.DELAYED)
-        payload = self._receive.open(datagram, header_bytes, counter)
-        if payload is None:
-            raise Drop(DropReason.BAD_TAG)
+
+        key, tag_at = self._receive, len(datagram) - self.tag_bytes
+        if isinstance(key, AeadKey):
+            payload = key.open(counter, memoryview(datagram)[header_bytes:], datagram[:header_bytes])
+            if payload is None:
+                raise Drop(DropReason.BAD_TAG)
+        else:
+            mac = key.prepared.copy()
+            mac.update(datagram[:tag_at])
+            if tag_at < header_bytes or not equal(mac.finalize()[: self.tag_bytes], datagram[tag_at:]):
+                raise Drop(DropReason.BAD_TAG)
+            payload = datagram[header_bytes:tag_at]
+
         if not self.received:
-            self.heard_first_at = now
-        if now >= self._heard_lately.next_at:
-            self._heard_lately.note(window.highest, self.received, now)
+            self.first_received_at = now
+        if now >= self._received_history.next_at:
+            self._received_history.note(window.highest, self.received, now)
         if is_overtaken:
-            self._heard_lately.add(counter)
+            self._received_history.add(counter)
         window.mark(counter)
         self.received += 1
         return payload
 
     def _is_late(self, counter: int, now: float) -> bool:
-        return counter <= self._heard_lately.past(self.window.highest, self.received, now)[0]
+        return counter <= self._received_history.past(self.window.highest, self.received, now)[0]

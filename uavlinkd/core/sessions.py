@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 from uavlinkd.core import constants as c
 from uavlinkd.core.indices import Indices
-from uavlinkd.core.outputs import Path
+from uavlinkd.core.path import Path
 from uavlinkd.core.session import Session
 
 
@@ -24,14 +24,14 @@ class Unconfirmed:
 
     session: Session
     path: Path
-    """Where the response went: whoever confirms has read it there."""
+    """Where the response went: the side that confirms has read it there."""
     is_expected: bool
     """Whether that is where the peer is, as far as is known: others must not push it out."""
     mac1: bytes
-    """Of the response, which a cookie reply refers to."""
+    """Of the response; a cookie reply refers to it."""
     expires_at: float
     has_cookie: bool = False
-    """Whether one came for it: a second is not taken."""
+    """Whether a cookie reply to it was accepted: a second one is not."""
 
 
 class Sessions:
@@ -41,81 +41,78 @@ class Sessions:
     quarantine, any other is free at once.
     """
 
-    __slots__ = ("_has_smaller_key", "_indices", "confirmed", "unconfirmed")
+    __slots__ = ("_has_smaller_key", "_indices", "_peer", "confirmed", "current", "unconfirmed")
 
-    def __init__(self, indices: Indices, *, has_smaller_key: bool) -> None:
+    def __init__(self, indices: Indices[object], peer: str, *, has_smaller_key: bool) -> None:
         self._indices = indices
+        self._peer = peer
         self._has_smaller_key = has_smaller_key
+        self.current: Session | None = None
+        """The session that sends: the first of the confirmed ones."""
         self.confirmed: list[Session] = []
         """The highest rank first."""
         self.unconfirmed: dict[int, Unconfirmed] = {}
         """By our index, the oldest first."""
 
     @property
-    def current(self) -> Session | None:
-        """The session that sends."""
-        return self.confirmed[0] if self.confirmed else None
-
-    @property
     def generation(self) -> int:
         """Of the current session; 0 without one."""
-        return self.confirmed[0].parameters.generation if self.confirmed else 0
+        return 0 if self.current is None else self.current.parameters.generation
 
     def wait(self, unconfirmed: Unconfirmed) -> None:
         """Keep a session until it is confirmed; when there are too many, the oldest that was not expected goes."""
         while len(self.unconfirmed) >= c.UNCONFIRMED_PER_PEER:
             oldest = next(iter(self.unconfirmed))
-            unexpected = (index for index, each in self.unconfirmed.items() if not each.is_expected)
+            unexpected = (index for index, waiting in self.unconfirmed.items() if not waiting.is_expected)
             self._forget(next(unexpected, oldest))
-        index = unconfirmed.session.local_index
-        self.unconfirmed[index] = unconfirmed
-        self._indices.owners[index] = unconfirmed.session
+        self.unconfirmed[unconfirmed.session.local_index] = unconfirmed
 
     def confirm(self, session: Session, now: float) -> list[Session]:
-        """A session is proven to be the peer's too: it takes the place that its rank gives it. What that ended."""
-        self._indices.owners[session.local_index] = session
+        """The peer proved that it has the session: give it the place of its rank. Returns what ends."""
+        self.unconfirmed.pop(session.local_index, None)
         self.confirmed = sorted([session, *self.confirmed], key=self._rank, reverse=True)
         return self._end(self.confirmed[c.USABLE_PER_PEER :], now)
 
     def end_up_to(self, session: Session, now: float) -> list[Session]:
-        """End this session and those ranked below it: a late goodbye does not end what came after a restart."""
-        return self._end([each for each in self.confirmed if self._rank(each) <= self._rank(session)], now)
+        """End this session and those ranked below it: a late close does not end what came after a restart."""
+        rank = self._rank(session)
+        return self._end([other for other in self.confirmed if self._rank(other) <= rank], now)
 
     def expire(self, now: float) -> list[Session]:
-        """Drop the keys of sessions that are too old, and answers that nobody confirmed. What ended."""
-        for index in [i for i, each in self.unconfirmed.items() if now >= each.expires_at]:
+        """Drop the keys of sessions that are too old, and sessions that were not confirmed. Returns what ends."""
+        for index in [index for index, waiting in self.unconfirmed.items() if now >= waiting.expires_at]:
             self._forget(index)
-        return self._end([each for each in self.confirmed if now >= each.reject_at], now)
+        return self._end([session for session in self.confirmed if now >= session.reject_at], now)
 
     def clear(self, now: float) -> list[Session]:
-        """Drop every key. What ended."""
+        """Drop every key. Returns what ends."""
         for index in list(self.unconfirmed):
             self._forget(index)
         return self._end(list(self.confirmed), now)
 
-    def is_left_behind(self, session: Session, now: float) -> bool:
+    def is_superseded(self, session: Session, now: float) -> bool:
         """Whether the peer has been sending on a session of higher rank since :data:`c.LATE_AFTER_S` ago.
 
-        Frames on this one were sent before that: who still lets them through has held them back.
+        Frames on this one were sent before that: an attacker held them back.
         """
-        for each in self.confirmed:
-            if each is session:
+        for higher in self.confirmed:
+            if higher is session:
                 break
-            if now >= each.heard_first_at + c.LATE_AFTER_S:
+            if now >= higher.first_received_at + c.LATE_AFTER_S:
                 return True
         return False
 
     def is_in_use(self, session: Session) -> bool:
         """Whether the peer may go on sending on this session: nothing came yet on one of higher rank."""
-        for each in self.confirmed:
-            if each is session or each.heard_first_at != c.NEVER:
-                return each is session
+        for higher in self.confirmed:
+            if higher is session or higher.first_received_at != c.NEVER:
+                return higher is session
         return False
 
     def next_expiry(self) -> float:
         """When :meth:`expire` has something to do."""
-        moments = [each.reject_at for each in self.confirmed]
-        moments += [each.expires_at for each in self.unconfirmed.values()]
+        moments = [session.reject_at for session in self.confirmed]
+        moments += [waiting.expires_at for waiting in self.unconfirmed.values()]
         return min(moments, default=c.NEVER)
 
     def _rank(self, session: Session) -> tuple[int, bool, float]:
@@ -126,7 +123,8 @@ class Sessions:
     def _end(self, sessions: list[Session], now: float) -> list[Session]:
         for session in sessions:
             self.confirmed.remove(session)
-            self._indices.retire(session.local_index, session.peer.name, now)
+            self._indices.retire(session.local_index, self._peer, now)
+        self.current = self.confirmed[0] if self.confirmed else None
         return sessions
 
     def _forget(self, index: int) -> None:

@@ -46,6 +46,8 @@ class Link:
     mac_key_bits: int = 256
     max_envelope: int = c.DEFAULT_ENVELOPE_LIMIT
     timers: Timers = field(default_factory=Timers)
+    features: int = c.FEATURE_REFUSALS
+    """Bits of the protocol extensions that this side offers. A session has those that both offer."""
     verify_interval_s: float = field(default=c.VERIFY_INTERVAL_S, compare=False)
     """How often freshness is verified while frames arrive. A session keeps the interval that it began with."""
 

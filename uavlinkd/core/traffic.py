@@ -16,8 +16,8 @@ class Traffic:
     """Envelopes and handshake messages; ``bytes_sent`` are theirs."""
     bytes_sent: int = 0
     bytes_elsewhere: int = 0
-    """Of answers and path challenges to places where the peer is not known to be. Whoever replays its handshakes or
-    its envelopes causes them: they are no part of ``bytes_sent``, from which a link's budget is reckoned."""
+    """Of answers and path challenges to addresses where the peer is not known to be. An attacker that replays its
+    handshakes or envelopes causes them, so ``bytes_sent``, which a link's budget pays for, does not include them."""
     envelopes_sent: int = 0
     envelopes_received: int = 0
     bytes_received: int = 0
@@ -29,12 +29,12 @@ class Traffic:
     out_of_order: int = 0
     """Envelopes accepted after one that was sent later."""
     challenges_unanswered: int = 0
-    """Paths from which the peer's envelopes came, and where nobody proved to be the peer."""
+    """Paths from which the peer's envelopes came, and along which no challenge was answered."""
     echoes_unanswered: int = 0
-    """Own echo requests to which nothing came within what is late."""
+    """Own echo requests without an answer in time."""
     handshakes_unanswered: int = 0
-    """Initiations on a link that is up to which no response came before the next try."""
+    """Initiations on a link that is up, without a response before the next try."""
     cookies_taken: int = 0
-    """Cookies of a peer under load. Who knows both public keys can make them too."""
+    """Cookies of a peer under load. An attacker that knows both public keys can make them too."""
     reported: tuple[int, int] = (0, 0)
     """Of the current session, as the peer last reported: envelopes expected there, and received."""

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 from uavlinkd.core import constants as c
 from uavlinkd.core.drops import Drop, DropReason
+from uavlinkd.core.refusals import REFUSAL_REPORT, RefusalReport, parse_report
 from uavlinkd.core.suites import SUITES, Suite
 
 INITIATION, RESPONSE, COOKIE = 1, 2, 3
@@ -48,7 +49,7 @@ class Parameters:
 
         offset size field
         0      4    generation     of the session on which the sender sends to the peer, or 0
-        4      2    features       bits of protocol extensions; none is defined, others' are ignored
+        4      2    features       bits of protocol extensions: 1 refusal reports; others are ignored
         6      1    flags          bit 0: confidential
         7      1    tag length     bytes: 8, 12, 16 or 32
         8      2    MAC key bits   256, 512, 1024 or 2048
@@ -60,16 +61,18 @@ class Parameters:
     tag_bytes: int
     mac_key_bits: int
     max_envelope: int
+    features: int = 0
 
     SIZE = 12  # of the encoding
 
     def encode(self) -> bytes:
         """The twelve bytes drawn above."""
         flags = _CONFIDENTIAL if self.confidential else 0
-        return _PARAMETERS.pack(self.generation, 0, flags, self.tag_bytes, self.mac_key_bits, self.max_envelope)
+        sizes = self.tag_bytes, self.mac_key_bits, self.max_envelope
+        return _PARAMETERS.pack(self.generation, self.features, flags, *sizes)
 
     def stronger(self, other: Parameters) -> Parameters:
-        """What both ends use: in each the stronger of the two, and the smaller envelope.
+        """What both ends use: in each the stronger of the two, the smaller envelope, and the features of both.
 
         The generation is one more than the newest of either, capped where it would overflow.
         """
@@ -79,6 +82,7 @@ class Parameters:
             tag_bytes=max(self.tag_bytes, other.tag_bytes),
             mac_key_bits=max(self.mac_key_bits, other.mac_key_bits),
             max_envelope=min(self.max_envelope, other.max_envelope),
+            features=self.features & other.features,
         )
 
 
@@ -88,10 +92,11 @@ def parse_parameters(data: bytes) -> Parameters:
     Raises:
         Drop: ``BAD_PARAMETERS`` for values outside the protocol.
     """
-    generation, _features, flags, tag_bytes, mac_key_bits, max_envelope = _PARAMETERS.unpack(data)
+    generation, features, flags, tag_bytes, mac_key_bits, max_envelope = _PARAMETERS.unpack(data)
     if tag_bytes not in TAG_LENGTHS or mac_key_bits not in MAC_KEY_LENGTHS or max_envelope < c.MIN_ENVELOPE_LIMIT:
         raise Drop(DropReason.BAD_PARAMETERS)
-    return Parameters(generation, bool(flags & _CONFIDENTIAL), tag_bytes, mac_key_bits, max_envelope)
+    known = features & c.FEATURE_REFUSALS
+    return Parameters(generation, bool(flags & _CONFIDENTIAL), tag_bytes, mac_key_bits, max_envelope, known)
 
 
 # Handshake messages.
@@ -314,7 +319,7 @@ class Echo(NamedTuple):
     received: int
     expected: int
     fresh: int = 0
-    """On the session that carried the request: the lowest counter that the replier used lately, or its next one."""
+    """On the session that carried the request: the lowest counter that the replier used recently, or its next one."""
 
     def encode(self) -> bytes:
         """The thirteen bytes of a request or seventeen of a reply, as drawn above."""
@@ -327,7 +332,7 @@ class PathChallenge(NamedTuple):
     """Eight bytes that come back only from where they were sent, and two of padding.
 
     The padding keeps the response shorter than the challenge even where the header that it goes
-    under is the longer one: nobody gets more bytes back than were spent on asking.
+    under is the longer one: a challenge never causes more bytes than it has.
     """
 
     token: bytes
@@ -355,7 +360,7 @@ class Close(NamedTuple):
         return bytes((CLOSE,))
 
 
-Control = Echo | PathChallenge | PathResponse | Close
+Control = Echo | PathChallenge | PathResponse | Close | RefusalReport
 
 
 def parse_control(payload: bytes) -> Control:
@@ -377,11 +382,13 @@ def parse_control(payload: bytes) -> Control:
         return PathResponse(payload[1:])
     if kind == CLOSE and size == 1:
         return Close()
+    if kind == REFUSAL_REPORT and (report := parse_report(payload)) is not None:
+        return report
     raise Drop(DropReason.BAD_CONTROL)
 
 
 def claimed_receiver_index(datagram: bytes) -> int:
-    """The receiver index in the header of any message that has one; 0, which is no index, of all else."""
+    """The receiver index in the header of a message that has one; 0, which is never an index, of other datagrams."""
     kind = datagram[0] if len(datagram) >= LONG_HEADER_BYTES else 0
     if kind in (SHORT_ENVELOPE, LONG_ENVELOPE):
         return int.from_bytes(datagram[1:3], "big")

@@ -1,0 +1,157 @@
+"""How sessions with a peer begin and end: initiations, responses, confirmation, close."""
+
+from __future__ import annotations
+
+from uavlinkd.core import constants as c
+from uavlinkd.core import freshness, handshake, wire
+from uavlinkd.core.cookie import mac1_of
+from uavlinkd.core.drops import Drop
+from uavlinkd.core.handshake import Keys, Received
+from uavlinkd.core.initiator import Pending
+from uavlinkd.core.outputs import Output, PeerClosed, SessionEstablished
+from uavlinkd.core.path import Path
+from uavlinkd.core.peer import Peer
+from uavlinkd.core.send import ask_for_echo, seal, transmit
+from uavlinkd.core.session import Session
+from uavlinkd.core.sessions import Unconfirmed
+from uavlinkd.core.suites import Suite
+from uavlinkd.core.timers import Timer
+
+# The initiator's side.
+
+
+def initiate(peer: Peer, now: float) -> list[Output]:
+    """Send the next initiation, and set when to repeat it. Without an address nothing is sent."""
+    initiator = peer.initiator
+    if not (candidates := peer.candidates()):
+        return []
+    if peer.keys_wanted_at() > initiator.initiated_at:  # none was wanted between the last initiation and this one
+        initiator.reset()
+    if initiator.attempts and peer.is_up:
+        peer.traffic.handshakes_unanswered += 1
+    path = initiator.next_path(candidates, now)
+    peer.set_initiate()
+    try:
+        index = peer.indices.pick(now)
+    except Drop as drop:  # every index is taken: as if the initiation had been lost
+        return peer.drop(drop.reason, 1)
+    pending, datagram = initiator.initiate(index, path, peer.sessions.generation, now)
+    peer.indices.owners[index] = peer, pending
+    peer.timers.set(Timer.INITIATION_EXPIRY, initiator.next_expiry())
+    return transmit(peer, datagram, path)
+
+
+def receive_response(peer: Peer, pending: Pending, response: wire.Response, now: float) -> list[Output]:
+    """The response to an own initiation: the session is confirmed here, and the peer learns it at once.
+
+    Raises:
+        Drop: as :meth:`Initiator.receive_response`; then nothing was changed.
+    """
+    keys = peer.initiator.receive_response(pending, response)
+    session = _session(peer, response.suite, keys, response.receiver_index, now, is_initiator=True)
+    events = adopt(peer, session, pending.path, now) + peer.note_received(now)
+    # The confirmation; any later envelope repeats it. It asks for an echo: so it is long enough to be challenged if a
+    # relay sends it from elsewhere, and it gives the round trip at once. It goes out before the events: what those
+    # end, such as a session by a previous key, must not end before the peer has this session.
+    return ask_for_echo(peer, session, pending.path, now) + events
+
+
+def receive_cookie(peer: Peer, mac1: bytes, path: Path, reply: wire.CookieReply, now: float) -> None:
+    """The peer is under load and asks us to prove our address.
+
+    Raises:
+        Drop: ``BAD_COOKIE``.
+    """
+    peer.initiator.receive_cookie(mac1, path, reply, now)
+    peer.traffic.cookies_taken += 1
+    peer.set_initiate()
+
+
+def receive_hint(peer: Peer, now: float) -> list[Output]:
+    """An envelope for a session unknown here came from the peer's address: perhaps this daemon restarted."""
+    silent_since = peer.unanswered_since
+    is_silent = silent_since is not None and now >= silent_since + peer.durations.echo_after_s
+    if peer.sessions.current is not None and not is_silent:
+        return []  # the peer sends on a session of ours: the hint is false, and anyone can replay an old envelope
+    if now < peer.hinted_at + c.HINTS_INTERVAL_S:
+        return []
+    peer.hinted_at = now
+    return initiate(peer, now)
+
+
+# The responder's side.
+
+
+def answer(peer: Peer, received: Received, path: Path, now: float) -> list[Output]:
+    """Answer an authentic initiation. The session waits, beside what is there, until it is confirmed.
+
+    Raises:
+        Drop: ``NO_FREE_INDEX`` or ``INVALID_KEY_SHARE``.
+    """
+    suite = received.initiation.suite
+    index = peer.indices.pick(now)
+    message, keys = handshake.respond(received, peer.settings, index, peer.sessions.generation, peer.entropy)
+    datagram = peer.initiator.add_macs(message, path, now)
+    session = _session(peer, suite, keys, index, now, is_initiator=False)
+    is_expected, expires_at = path in peer.candidates(), now + c.UNCONFIRMED_LIFETIME_S
+    peer.sessions.wait(Unconfirmed(session, path, is_expected, mac1_of(datagram), expires_at))
+    peer.indices.owners[index] = peer, session
+    peer.timers.set(Timer.SESSION_EXPIRY, peer.sessions.next_expiry())
+    return transmit(peer, datagram, path)
+
+
+# Both sides.
+
+
+def adopt(peer: Peer, session: Session, path: Path, now: float) -> list[Output]:
+    """A session is confirmed. If it has the highest rank, traffic goes on it now, along the path that made it."""
+    is_rekey = peer.sessions.current is not None
+    peer.indices.owners[session.local_index] = peer, session
+    out = freshness.end(peer, peer.sessions.confirm(session, now))
+    peer.initiator.cancel()
+    peer.initiator.reset()
+    peer.timers.stop(Timer.INITIATION_EXPIRY)
+    peer.traffic.handshakes += 1
+    if peer.sessions.current is session:
+        peer.path = path
+        peer.established_at = now
+        peer.traffic.reported = (0, 0)
+        peer.challenger.note_handshake(path)
+        peer.timers.set(Timer.KEEPALIVE, peer.sent_at + peer.durations.keepalive_s)
+        agreed = session.parameters
+        facts = agreed.generation, session.suite.name, agreed.confidential, session.tag_bytes, session.is_initiator
+        out.append(SessionEstablished(peer, *facts, is_rekey))
+    peer.timers.set(Timer.SESSION_EXPIRY, peer.sessions.next_expiry())
+    peer.set_initiate()
+    return out
+
+
+def receive_close(peer: Peer, session: Session, now: float) -> list[Output]:
+    """The peer ends this session and those ranked below it."""
+    out = freshness.end(peer, peer.sessions.end_up_to(session, now))
+    if peer.sessions.current is None:
+        peer.is_up = False
+        peer.unverified_since = None
+        peer.unanswered_since = None
+        peer.initiator.reset()
+        peer.initiator.retry_at = now + c.CLOSE_HOLDOFF_S
+        out.append(PeerClosed(peer))
+    peer.set_initiate()
+    return out
+
+
+def close(peer: Peer, now: float) -> list[Output]:
+    """Send a close on the current session and forget every key."""
+    session, out = peer.sessions.current, list[Output]()
+    if session is not None and peer.path is not None and now < session.reject_at:
+        out += seal(peer, session, wire.Close().encode(), peer.path, now)
+    out += freshness.end(peer, peer.sessions.clear(now))
+    peer.initiator.cancel()
+    peer.is_up = False
+    peer.timers.stop_all()
+    return out
+
+
+def _session(peer: Peer, suite: Suite, keys: Keys, index: int, now: float, *, is_initiator: bool) -> Session:
+    lifetime_s, interval_s = peer.durations.reject_after_s, peer.verify_interval_s
+    return Session(suite, keys, index, now, lifetime_s, is_initiator=is_initiator, verify_interval_s=interval_s)

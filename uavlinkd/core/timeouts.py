@@ -1,0 +1,103 @@
+"""What a peer does when its timers expire."""
+
+from __future__ import annotations
+
+from uavlinkd.core import freshness
+from uavlinkd.core.constants import NEVER
+from uavlinkd.core.establish import initiate
+from uavlinkd.core.outputs import Output
+from uavlinkd.core.peer import Peer
+from uavlinkd.core.send import ask_for_echo
+from uavlinkd.core.timers import Timer
+
+
+def handle_timeout(peer: Peer, now: float) -> list[Output]:
+    """Do what is due at ``now``."""
+    out: list[Output] = []
+    for timer in peer.timers.expired(now):
+        match timer:
+            case Timer.SESSION_EXPIRY:
+                out += _expire_sessions(peer, now)
+            case Timer.FRESHNESS:
+                out += freshness.handle_timeout(peer, now)
+            case Timer.INITIATION_EXPIRY:
+                peer.initiator.expire(now)
+                peer.timers.set(timer, peer.initiator.next_expiry())
+            case Timer.CHALLENGE_EXPIRY:
+                peer.challenger.expire(now)
+                peer.timers.set(timer, peer.challenger.next_expiry())
+            case Timer.SILENCE:
+                out += _handle_silence(peer, now)
+            case Timer.INITIATE:
+                out += _initiate(peer, now)
+            case Timer.PROBE:
+                out += _probe(peer, now)
+            case Timer.KEEPALIVE:  # pragma: no branch  # the last one
+                out += _keep_alive(peer, now)
+    return out
+
+
+def _expire_sessions(peer: Peer, now: float) -> list[Output]:
+    out = freshness.end(peer, peer.sessions.expire(now))
+    peer.timers.set(Timer.SESSION_EXPIRY, peer.sessions.next_expiry())
+    if peer.is_up and peer.sessions.current is None:
+        out += peer.note_lost(now)
+    peer.set_initiate()
+    return out
+
+
+def _handle_silence(peer: Peer, now: float) -> list[Output]:
+    """Nothing came since something was sent: ask for an echo, initiate beside the session, give the peer up."""
+    silent_since, durations = peer.unanswered_since, peer.durations
+    if silent_since is None:
+        return []  # the next envelope sets the timer
+    out: list[Output] = []
+    handshake_at, lost_at = silent_since + durations.handshake_after_s, silent_since + durations.lost_after_s
+    stages: list[float] = []
+    if peer.is_up and now >= lost_at:
+        out += peer.note_lost(now)
+    if now >= handshake_at:
+        peer.set_initiate()
+    else:
+        stages.append(handshake_at)
+    if peer.is_up:
+        stages.append(lost_at)
+        session = peer.sending_session()
+        if session is not None and peer.path is not None:
+            if now >= peer.echo_at:
+                out += ask_for_echo(peer, session, peer.path, now)
+            stages.append(peer.echo_at)
+    if stages:
+        peer.timers.set(Timer.SILENCE, min(stages))
+    return out
+
+
+def _initiate(peer: Peer, now: float) -> list[Output]:
+    if now >= peer.keys_wanted_at():
+        return initiate(peer, now)
+    peer.initiator.reset()
+    peer.set_initiate()
+    return []
+
+
+def _probe(peer: Peer, now: float) -> list[Output]:
+    session = peer.sending_session()
+    return [] if session is None or peer.path is None else ask_for_echo(peer, session, peer.path, now)
+
+
+def _keep_alive(peer: Peer, now: float) -> list[Output]:
+    session = peer.sending_session()
+    if session is None or peer.path is None:
+        return []  # the next session sets the timer
+    out = ask_for_echo(peer, session, peer.path, now) if now >= _keepalive_at(peer) else []
+    peer.timers.set(Timer.KEEPALIVE, _keepalive_at(peer))
+    return out
+
+
+def _keepalive_at(peer: Peer) -> float:
+    """When an idle link is to be measured. Both ends do it, although the reply to the other keeps the path open too.
+
+    While frames flow, the probe measures the link.
+    """
+    is_idle = peer.timers.deadlines[Timer.PROBE] == NEVER
+    return (peer.asked_at if is_idle else peer.sent_at) + peer.durations.keepalive_s
