@@ -78,7 +78,7 @@ def test_screen_splits_a_payload_and_keeps_the_order() -> None:
 
 
 def test_ground_station_in_mavlink_1_waits_too() -> None:
-    """The type stands at another offset there."""
+    """The type is at another offset there."""
     old = bytearray(mavlink.MAVLink_heartbeat_message(6, 3, 81, 0, 4, 3).pack(_SENDER, force_mavlink1=True))
     assert screen(bytes(old)) == (b"", bytes(old))
 
@@ -87,8 +87,8 @@ def test_unknown_message_must_be_new() -> None:
     """What the dialect does not have, or has in another form, may do anything."""
     raw = bytearray(ATTITUDE)
     raw[7:10] = (11_999).to_bytes(3, "little")
-    found = [bytes(raw[:-2]) + number.to_bytes(2, "little") for number in range(65536)]
-    unknown = next(each for each in found if screen(each + ATTITUDE) == (ATTITUDE, each))
+    frames = [bytes(raw[:-2]) + number.to_bytes(2, "little") for number in range(65536)]
+    unknown = next(candidate for candidate in frames if screen(candidate + ATTITUDE) == (ATTITUDE, candidate))
     assert screen(unknown) == (b"", unknown)
 
 

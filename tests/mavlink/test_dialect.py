@@ -14,6 +14,7 @@ from fastcrc.crc16 import mcrf4xx
 from uavlinkd.mavlink import dialect, dialect_generate, dialect_table
 
 
+@pytest.mark.long
 def test_table_equals_what_the_installed_pymavlink_says() -> None:
     """The committed table is the one that the generator would write from the installed pymavlink."""
     assert Path(dialect_table.__file__).read_text(encoding="utf-8") == dialect_generate.source()
@@ -21,8 +22,8 @@ def test_table_equals_what_the_installed_pymavlink_says() -> None:
 
 def upstream() -> dict[int, ElementTree.Element]:
     """The messages that are added to pymavlink's."""
-    found = ElementTree.parse(dialect_generate.UPSTREAM).iter("message")
-    return {int(message.attrib["id"]): message for message in found}
+    messages = ElementTree.parse(dialect_generate.UPSTREAM).iter("message")
+    return {int(message.attrib["id"]): message for message in messages}
 
 
 def test_every_message_has_pymavlinks_name_crc_extra_and_length() -> None:
@@ -45,7 +46,7 @@ SIZES |= {"float": 4, "double": 8, "int64_t": 8, "uint64_t": 8}
 
 
 @pytest.mark.parametrize("msgid", sorted(upstream()))
-def test_upstream_message_stands_in_the_table_as_mavlink_defines_it(msgid: int) -> None:
+def test_table_has_upstream_message_as_mavlink_defines_it(msgid: int) -> None:
     """Reckoned by https://mavlink.io/en/guide/serialization.html: CRC_EXTRA, lengths and offsets are the table's."""
     message = upstream()[msgid]
     parts = [part for part in message if part.tag in ("field", "extensions")]
@@ -188,7 +189,7 @@ def test_reports_ask_for_nothing(asking: str) -> None:
     assert not set(dialect.GROUPS[asking]) & doing
 
 
-def test_unknown_names_are_told_from_known_ones() -> None:
+def test_unknown_names_differ_from_known_ones() -> None:
     """Lookups answer None, or the number itself, for what the dialect does not have."""
     assert dialect.facts(0xABCDEF) is None
     assert dialect.name_of(0xABCDEF) == "11259375"

@@ -78,20 +78,20 @@ def test_sender_is_a_choice_and_the_sequence_its_own() -> None:
     ],
 )
 def test_worst_figure_decides_how_fast_autopilots_send(changed: dict[str, Any], txbuf: int) -> None:
-    """txbuf falls with demand and with loss on the way out, at the limits and beyond, not with loss on the way in."""
+    """txbuf falls with demand and with outgoing loss, at the limits and beyond, but not with incoming loss."""
     assert said(replace(GOOD, **changed)).txbuf == txbuf
 
 
 @pytest.mark.parametrize(("round_trip_s", "txbuf"), [(0.13, 100), (0.2, 92), (0.4, 50), (0.9, 30), (1.5, TXBUF_FULL)])
-def test_full_buffers_on_the_way_slow_autopilots_down(round_trip_s: float, txbuf: int) -> None:
+def test_full_buffers_along_the_path_slow_autopilots_down(round_trip_s: float, txbuf: int) -> None:
     """A round trip that grows beyond its best is time spent in buffers."""
     source = RadioStatusSource()
     source.frame(GOOD)
     assert decoded(source.frame(replace(GOOD, round_trip_s=round_trip_s))).txbuf == txbuf
 
 
-def test_long_path_is_not_a_full_buffer_for_ever() -> None:
-    """A satellite's 700 ms are no congestion, from the start or within minutes after the path has changed."""
+def test_long_path_does_not_look_like_a_full_buffer_indefinitely() -> None:
+    """A satellite's 700 ms do not count as congestion, at the start or some minutes after the path has changed."""
     slow = replace(GOOD, round_trip_s=0.7)
     assert said(slow).txbuf == 100
     source = RadioStatusSource()
@@ -101,7 +101,7 @@ def test_long_path_is_not_a_full_buffer_for_ever() -> None:
 
 
 def test_lost_peer_is_said_to_be_lost() -> None:
-    """A lost peer has no signal either way, so failsafes that watch remrssi see it; and the rate is left alone."""
+    """A lost peer has no signal in either direction, so failsafes that watch remrssi see it. The rate stays."""
     message = said(replace(GOOD, is_up=False, demand=3.0))
     assert (message.rssi, message.remrssi, message.txbuf) == (0, 0, 50)
 

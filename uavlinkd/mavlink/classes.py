@@ -1,7 +1,7 @@
 """Two facts about a message: its class, and whether it may be delivered while its age is not known.
 
 *Class*: a `critical` frame must arrive, a `stream` frame is followed by another, a `bulk` frame can wait. The lane
-`urgent` of :mod:`.egress_kinds` is the part of `critical` that a slow link sends first.
+`urgent` of :mod:`.egress.kinds` is the part of `critical` that a slow link sends first.
 
 *Age*: after a silence, or without an answer from the peer, a frame may be old (specification, section 11). Only a
 report may be delivered then: a message that asks its receiver for nothing. Positions of other vehicles are reports.

@@ -1,11 +1,10 @@
-"""What messages are called, and which belong together.
+"""Names of messages, and groups of them.
 
 A *group* is a tuple of message names that a policy can allow or deny by one word. Groups may share messages.
-Each message of the dialect is in one of them at least, and in ``all``.
+Each message of the dialect is in at least one group, and in ``all``.
 
-Groups follow what a message can *do* to an autopilot. That matters for messages that both report and inform:
-DISTANCE_SENSOR is telemetry to a ground station, and to an autopilot an obstacle. Such a message is in
-`telemetry` and in `sensors`.
+Groups follow the effect of a message on an autopilot. This matters for messages with two uses: DISTANCE_SENSOR is
+telemetry to a ground station, and an obstacle to an autopilot. Such a message is in `telemetry` and in `sensors`.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ ALL: Final = "all"
 
 
 class MessageFacts(NamedTuple):
-    """What the dialect says of one message. Lengths and offsets in bytes of the payload; None: no such field."""
+    """The dialect's facts about one message. Lengths and offsets in bytes of the payload; None: no such field."""
 
     name: str
     crc_extra: int
@@ -32,7 +31,7 @@ class MessageFacts(NamedTuple):
 
 
 def facts(msgid: int) -> MessageFacts | None:
-    """What is known of a message, or None."""
+    """The facts about a message, or None if the dialect lacks it."""
     row = MESSAGES.get(msgid)
     return MessageFacts(*row) if row else None
 
@@ -74,14 +73,14 @@ def _names(text: str) -> tuple[str, ...]:
 
 
 GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
-    # "I am here, of this kind, in this state."
+    # Presence, type and state of a component.
     "heartbeat": ("HEARTBEAT",),
-    # Where a vehicle is, how it moves and where it is going: what others need to fly beside it.
+    # Position, movement and target of a vehicle, for others that fly beside it.
     "position": _names(
         "ATTITUDE ATTITUDE_QUATERNION GLOBAL_POSITION_INT LOCAL_POSITION_NED VFR_HUD "
         "POSITION_TARGET_GLOBAL_INT HOME_POSITION EXTENDED_SYS_STATE"
     ),
-    # What a vehicle reports of itself: nothing in here asks anyone for anything.
+    # Reports of a vehicle about itself, without any request.
     "telemetry": _names(
         "HEARTBEAT SYS_STATUS SYSTEM_TIME GPS_RAW_INT GPS_STATUS SCALED_IMU RAW_IMU RAW_PRESSURE "
         "SCALED_PRESSURE ATTITUDE ATTITUDE_QUATERNION LOCAL_POSITION_NED GLOBAL_POSITION_INT "
@@ -113,7 +112,7 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
         "FUEL_STATUS TIME_ESTIMATE_TO_TARGET FIGURE_EIGHT_EXECUTION_STATUS ILLUMINATOR_STATUS PROTOCOL_VERSION "
         "COMPONENT_INFORMATION COMPONENT_INFORMATION_BASIC COMPONENT_METADATA EVENT CURRENT_EVENT_SEQUENCE"
     ),
-    # Other aircraft and ships around. Autopilots evade what they are told of here, and follow a FOLLOW_TARGET.
+    # Other aircraft and ships nearby. Autopilots evade what these messages report, and follow a FOLLOW_TARGET.
     "traffic": _names("ADSB_VEHICLE COLLISION AIS_VESSEL FOLLOW_TARGET UTM_GLOBAL_POSITION"),
     # An ADS-B transponder: what it sends, and its state.
     "transponder": _names(
@@ -127,11 +126,11 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
         "OPEN_DRONE_ID_SYSTEM OPEN_DRONE_ID_OPERATOR_ID OPEN_DRONE_ID_MESSAGE_PACK OPEN_DRONE_ID_ARM_STATUS "
         "OPEN_DRONE_ID_SYSTEM_UPDATE"
     ),
-    # Anything that carries a MAV_CMD to be done at once or given up, the older SET_MODE, and the answer to them.
+    # Messages that carry a MAV_CMD to execute now or to cancel, the older SET_MODE, and the answer to them.
     "commands": _names(
         "COMMAND_LONG COMMAND_INT COMMAND_ACK COMMAND_CANCEL SET_MODE COMMAND_INT_STAMPED COMMAND_LONG_STAMPED"
     ),
-    # A vehicle's side of what an operator starts: commands, parameters, missions, logs.
+    # A vehicle's answers to an operator: commands, parameters, missions, logs.
     "answers": _names(
         "COMMAND_ACK PARAM_VALUE PARAM_VALUE_ARRAY PARAM_ERROR PARAM_EXT_VALUE PARAM_EXT_ACK "
         "MISSION_REQUEST MISSION_REQUEST_INT MISSION_COUNT MISSION_ITEM MISSION_ITEM_INT MISSION_ACK "
@@ -141,7 +140,7 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
         "CHANGE_OPERATOR_CONTROL_ACK TERRAIN_REQUEST TERRAIN_REPORT AUTOPILOT_VERSION RESPONSE_EVENT_ERROR "
         "SUPPORTED_TUNES"
     ),
-    # What cameras, gimbals and other payloads report.
+    # Reports of cameras, gimbals and other payloads.
     "payload-reports": _names(
         "CAMERA_TRIGGER CAMERA_INFORMATION CAMERA_SETTINGS STORAGE_INFORMATION CAMERA_CAPTURE_STATUS "
         "CAMERA_IMAGE_CAPTURED CAMERA_FEEDBACK CAMERA_STATUS CAMERA_FOV_STATUS CAMERA_TRACKING_IMAGE_STATUS "
@@ -158,11 +157,11 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
         "SET_MAG_OFFSETS OSD_PARAM_CONFIG OSD_PARAM_CONFIG_REPLY OSD_PARAM_SHOW_CONFIG "
         "OSD_PARAM_SHOW_CONFIG_REPLY"
     ),
-    # Only asking for parameters.
+    # Requests for parameters only.
     "parameter-reads": _names(
         "PARAM_REQUEST_READ PARAM_REQUEST_LIST PARAM_EXT_REQUEST_READ PARAM_EXT_REQUEST_LIST OSD_PARAM_SHOW_CONFIG"
     ),
-    # Missions, fences, rally points, home and origin, both ways.
+    # Missions, fences, rally points, home and origin, in both directions.
     "mission": _names(
         "MISSION_REQUEST_PARTIAL_LIST MISSION_WRITE_PARTIAL_LIST MISSION_ITEM MISSION_REQUEST "
         "MISSION_SET_CURRENT MISSION_CURRENT MISSION_REQUEST_LIST MISSION_COUNT MISSION_CLEAR_ALL "
@@ -171,7 +170,7 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
         "RALLY_POINT RALLY_FETCH_POINT SET_HOME_POSITION HOME_POSITION SET_GPS_GLOBAL_ORIGIN "
         "GPS_GLOBAL_ORIGIN"
     ),
-    # Only reading a mission back.
+    # Requests to read a mission only.
     "mission-reads": _names(
         "MISSION_REQUEST_LIST MISSION_REQUEST_PARTIAL_LIST MISSION_REQUEST MISSION_REQUEST_INT MISSION_ACK "
         "FENCE_FETCH_POINT RALLY_FETCH_POINT"
@@ -181,9 +180,9 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
         "SET_ATTITUDE_TARGET SET_POSITION_TARGET_LOCAL_NED SET_POSITION_TARGET_GLOBAL_INT "
         "SET_ACTUATOR_CONTROL_TARGET TRAJECTORY_REPRESENTATION_WAYPOINTS TRAJECTORY_REPRESENTATION_BEZIER"
     ),
-    # A joystick in place of the pilot's transmitter.
+    # A joystick instead of the pilot's transmitter.
     "manual": _names("MANUAL_CONTROL RC_CHANNELS_OVERRIDE RADIO_RC_CHANNELS"),
-    # Measurements from outside that an autopilot steers by: whoever can send these can lead it astray.
+    # External measurements for an autopilot's navigation: their sender can mislead the autopilot.
     "sensors": _names(
         "GPS_INPUT VISION_POSITION_ESTIMATE VISION_SPEED_ESTIMATE VISION_POSITION_DELTA "
         "GLOBAL_VISION_POSITION_ESTIMATE VICON_POSITION_ESTIMATE ATT_POS_MOCAP ODOMETRY OPTICAL_FLOW "
@@ -194,12 +193,12 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
     "rtk": _names("GPS_RTCM_DATA GPS_INJECT_DATA"),
     # Terrain heights for the autopilot.
     "terrain": _names("TERRAIN_REQUEST TERRAIN_DATA TERRAIN_CHECK TERRAIN_REPORT"),
-    # A simulator in place of the sensors.
+    # A simulator instead of the sensors.
     "simulation": _names(
         "HIL_STATE HIL_CONTROLS HIL_RC_INPUTS_RAW HIL_ACTUATOR_CONTROLS HIL_SENSOR HIL_GPS HIL_OPTICAL_FLOW "
         "HIL_STATE_QUATERNION SIM_STATE SIMSTATE"
     ),
-    # Asking for telemetry, at a rate or again.
+    # Requests for telemetry, once or at a rate.
     "streams": _names("REQUEST_DATA_STREAM MESSAGE_INTERVAL DATA_STREAM AUTOPILOT_VERSION_REQUEST REQUEST_EVENT"),
     # Clocks and round trips.
     "time": _names("SYSTEM_TIME TIMESYNC PING"),
@@ -235,30 +234,30 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
         "LOG_REQUEST_END LOGGING_DATA LOGGING_DATA_ACKED LOGGING_ACK REMOTE_LOG_DATA_BLOCK "
         "REMOTE_LOG_BLOCK_STATUS DATA_TRANSMISSION_HANDSHAKE ENCAPSULATED_DATA RESOURCE_REQUEST"
     ),
-    # Only reading files and logs: of FILE_TRANSFER_PROTOCOL the requests that read and their answers
-    # (`policy_settings.READING_OPCODES`).
+    # Reading files and logs only: the reading requests of FILE_TRANSFER_PROTOCOL and their answers
+    # (`policy.settings.READING_OPCODES`).
     "files-read": _names(
         "FILE_TRANSFER_PROTOCOL LOG_REQUEST_LIST LOG_ENTRY LOG_REQUEST_DATA LOG_DATA LOG_REQUEST_END"
     ),
-    # Bytes for a shell, a serial port, a bus or a program: no policy can see what they do.
+    # Bytes for a shell, a serial port, a bus or other software: a policy cannot inspect their effect.
     "shell": _names(
         "SERIAL_CONTROL TUNNEL V2_EXTENSION CAN_FRAME CANFD_FRAME CAN_FILTER_MODIFY DEVICE_OP_READ "
         "DEVICE_OP_READ_REPLY DEVICE_OP_WRITE DEVICE_OP_WRITE_REPLY DATA16 DATA32 DATA64 DATA96"
     ),
     # New firmware.
     "firmware": _names("CUBEPILOT_FIRMWARE_UPDATE_START CUBEPILOT_FIRMWARE_UPDATE_RESP"),
-    # Who may control, and secrets for it.
+    # Requests for control, and secrets for it.
     "control-access": _names(
         "CHANGE_OPERATOR_CONTROL CHANGE_OPERATOR_CONTROL_ACK AUTH_KEY SECURE_COMMAND SECURE_COMMAND_REPLY"
     ),
-    # A MAVLink 2 signing key in clear. Never crosses a link, whatever a policy says.
+    # A MAVLink 2 signing key in clear. No policy passes it.
     "signing": ("SETUP_SIGNING",),
-    # Made for testing MAVLink itself.
+    # Tests of MAVLink itself.
     "test": _names(
         "TEST_TYPES ARRAY_TEST_0 ARRAY_TEST_1 ARRAY_TEST_3 ARRAY_TEST_4 ARRAY_TEST_5 ARRAY_TEST_6 "
         "ARRAY_TEST_7 ARRAY_TEST_8"
     ),
-    # What must get through a slow radio first: life signs, commands and their answers.
+    # What a slow radio must carry first: heartbeats, commands and their answers.
     "urgent": _names(
         "HEARTBEAT COMMAND_LONG COMMAND_INT COMMAND_ACK COMMAND_CANCEL SET_MODE COMMAND_INT_STAMPED "
         "COMMAND_LONG_STAMPED MANUAL_CONTROL RC_CHANNELS_OVERRIDE"

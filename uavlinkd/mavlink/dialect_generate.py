@@ -1,17 +1,17 @@
 """Writes `dialect_table.py`: ``python -m uavlinkd.mavlink.dialect_generate``.
 
-The daemon needs a few numbers of each message in pymavlink's dialect ``all``. pymavlink keeps them in classes
-that are slow and large to load, so they are copied into a table once, here; a test compares that table with
-the pymavlink that is installed.
+The daemon needs a few numbers of each message in pymavlink's dialect ``all``. pymavlink has them in classes
+that are slow and large to load, so this module copies them into a table. A test compares the table with the installed
+pymavlink.
 
-Two sources are needed: the classes know the layout on the wire, and only the XML definitions beside them tell
-which fields are MAVLink 2 extensions (the shortest MAVLink 1 payload ends before those).
+There are two sources. The classes contain the layout on the wire. Only the XML definitions beside them show which
+fields are MAVLink 2 extensions (the shortest MAVLink 1 payload ends before those).
 
-Other dialects of pymavlink define some of the same numbers otherwise. A parser that was built with one of those
-accepts frames by its CRC_EXTRA, so these are in the table too (``OTHER_EXTRAS``).
+Other dialects of pymavlink define some of the same numbers differently. A parser built with such a dialect accepts
+frames by its CRC_EXTRA, so the table contains these too (``OTHER_EXTRAS``).
 
-``all`` follows ArduPilot's copy of MAVLink's definitions, which lacks messages that PX4 sends. Those, and what was
-added to the ends of others, are in `upstream_messages.xml`.
+``all`` follows ArduPilot's copy of MAVLink's definitions, which lacks messages that PX4 sends. These, and messages
+with additional fields at their end, are in `upstream_messages.xml`.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def messages() -> dict[int, Row]:
             message.name, message.crc_extra, message.wire_min_length, message.wire_length, message.field_offsets
         )
         known = rows.get(message.id)
-        # Another message under a number that pymavlink has gives way. The same message may only have grown.
+        # Where pymavlink has the number, only a longer version of the same message replaces its row.
         if known is None or (known[:3] == row[:3] and known[3] < row[3]):
             rows[message.id] = row
     return dict(sorted(rows.items()))
@@ -53,18 +53,18 @@ def upstream() -> list[Any]:
 
 
 def other_extras() -> dict[int, tuple[int, ...]]:
-    """The CRC_EXTRAs by which other dialects, old ones among them, know a message's number."""
-    found: dict[int, set[int]] = {}
+    """The CRC_EXTRAs of other dialects, including old ones, for a message's number."""
+    known: dict[int, set[int]] = {}
     for package_name in DIALECT_PACKAGES:
         package = importlib.import_module(package_name)
         for module in pkgutil.iter_modules(package.__path__):
             dialect = importlib.import_module(f"{package_name}.{module.name}")
             for msgid, message in dialect.mavlink_map.items():
-                found.setdefault(msgid, set()).add(int(message.crc_extra))
+                known.setdefault(msgid, set()).add(int(message.crc_extra))
     for message in upstream():
-        found.setdefault(message.id, set()).add(int(message.crc_extra))
+        known.setdefault(message.id, set()).add(int(message.crc_extra))
     table = messages()
-    others = {msgid: extras - ({table[msgid][1]} if msgid in table else set()) for msgid, extras in found.items()}
+    others = {msgid: extras - ({table[msgid][1]} if msgid in table else set()) for msgid, extras in known.items()}
     return {msgid: tuple(sorted(extras)) for msgid, extras in sorted(others.items()) if extras}
 
 
@@ -121,8 +121,8 @@ def _row(name: Any, crc_extra: Any, shortest: int, longest: Any, offsets: dict[s
 
 
 def _field_offsets(message: Any) -> dict[str, int]:
-    """Where each of a message's single-valued fields starts in the payload."""
-    # unpacker.format has one code per field in wire order, an array's with its length in front ("<Q16sH").
+    """The offset of each of a message's single-valued fields in the payload."""
+    # unpacker.format has one code for each field in wire order; that of an array follows its length ("<Q16sH").
     offsets: dict[str, int] = {}
     offset = 0
     sizes = {"int8_t": 1, "uint8_t": 1, "char": 1, "int16_t": 2, "uint16_t": 2, "float": 4, "double": 8}
@@ -138,7 +138,7 @@ def _field_offsets(message: Any) -> dict[str, int]:
 
 
 def _lengths_without_extensions(definition: Path) -> dict[int, int]:
-    """Payload length without extension fields, by message id, of an XML definition and what it includes."""
+    """Payload length without extension fields, by message id, of an XML definition and its includes."""
     lengths: dict[int, int] = {}
     waiting, seen = [definition], set[Path]()
     while waiting:
@@ -154,7 +154,7 @@ def _lengths_without_extensions(definition: Path) -> dict[int, int]:
 
 def _parsed(definition: Path) -> Any:
     mavparse = importlib.import_module("pymavlink.generator.mavparse")
-    with contextlib.redirect_stdout(None):  # it comments on enums, which are of no use here
+    with contextlib.redirect_stdout(None):  # its output is about enums, which are not used here
         return mavparse.MAVXML(str(definition), "2.0")
 
 

@@ -1,42 +1,41 @@
-"""RADIO_STATUS for a local autopilot, from what the link knows of itself.
+"""RADIO_STATUS for a local autopilot, from the daemon's measurements of the link.
 
-An autopilot sends as fast as its own port takes it, and knows nothing of the radio behind. Radios therefore
-insert RADIO_STATUS once a second, and autopilots slow down by it. What the two read, by their sources:
+An autopilot sends as fast as its own port accepts, and knows nothing of the radio behind it. Radios therefore insert
+RADIO_STATUS once a second, and autopilots slow down by it. How receivers read it, by their sources:
 
 * ArduPilot (libraries/GCS_MAVLink/GCS_Common.cpp, ``handle_radio_status``): ``txbuf``, free space in the
   transmitter's buffer in percent. Under 20 each message adds 60 ms to the interval of its streams, under 50 it
-  adds 20 ms, up to 2 s; over 90 it takes 20 ms away, over 95 it takes 40 ms away. Parameter lists and file
-  transfer pause at 33 and under (50 in older releases). ``rssi`` / 254 is the radio's signal, 255 none known.
-  ``remrssi``: not 0 says that the ground heard us; a plane with FS_GCS_ENABL = 2 (heartbeat and REMRSSI) starts
-  its failsafe when it stays 0 (GCS_FAILSAFE_HB_RSSI).
+  adds 20 ms, up to 2 s; over 90 it subtracts 20 ms, over 95 it subtracts 40 ms. Parameter lists and file
+  transfer pause at 33 and under (50 in older releases). ``rssi`` / 254 is the radio's signal; 255 is unknown.
+  ``remrssi``: a value other than 0 means that the ground receives the vehicle. A plane with FS_GCS_ENABL = 2
+  (heartbeat and REMRSSI) starts its failsafe when it stays 0 (GCS_FAILSAFE_HB_RSSI).
 * PX4 (src/modules/mavlink/mavlink_main.cpp, ``update_radio_status``): under 25 each message cuts the rate by
-  20 %, under 35 by 2.5 %, and parameters stop; over 50 it rises by 2.5 %. All that where MAV_n_RADIO_CTL is on;
-  the rest is published.
+  20 %, under 35 by 2.5 %, and parameters stop; over 50 it rises by 2.5 %. This applies where MAV_n_RADIO_CTL is on.
+  The other fields are published.
 * QGroundControl (Vehicle, ``_handleRadioStatus``): shows ``rssi`` and ``remrssi`` as dBm, for system 51,
-  component 68 by the scale of a SiK radio (rssi / 1.9 - 127, up to 0), for others as a signed byte. It takes
-  none of it for a sign of life.
+  component 68 by the scale of a SiK radio (rssi / 1.9 - 127, up to 0), for others as a signed byte. It does not
+  treat the message as a sign of life.
 
-Neither autopilot looks at the sender (ArduPilot's check for its ground station's system id excepts the message,
-and it does not forward it). SiK radios send as system 51, component 68 ('3', 'D'; MAV_COMP_ID_TELEMETRY_RADIO
-is 68), wfb-ng as 3, 68. 51 and 68 is the default here, because programs know it as a radio and show a scale
-that rises with the signal.
+Neither autopilot looks at the sender (ArduPilot exempts the message from the check of its ground station's system id,
+and does not forward it). SiK radios send as system 51, component 68 ('3', 'D'; MAV_COMP_ID_TELEMETRY_RADIO is 68),
+wfb-ng as 3, 68. The default here is 51 and 68, because clients know it as a radio and show a scale that rises with
+the signal.
 
-What we say:
+The fields that this daemon sends:
 
 =============  ==========================================================================================
 field          value
 =============  ==========================================================================================
-``txbuf``      by the worst of demand on the budget, loss on the way out and queueing delay: see LEVELS
-``rssi``       share of the peer's envelopes that reach us, 1 .. 254; 0: the peer is lost
-``remrssi``    share of our envelopes that reach the peer, 1 .. 254; 0: the peer is lost
-``noise``      255, not known; the same for ``remnoise``
-``rxerrors``   envelopes that were lost on the way to us, modulo 65536
-``fixed``      0: nothing is corrected
+``txbuf``      by the worst of demand on the budget, outgoing loss and queueing delay: see LEVELS
+``rssi``       share of the peer's envelopes that arrive here, 1 .. 254; 0: the peer is lost
+``remrssi``    share of our envelopes that arrive at the peer, 1 .. 254; 0: the peer is lost
+``noise``      255, unknown; the same for ``remnoise``
+``rxerrors``   incoming envelopes that were lost, modulo 65536
+``fixed``      0: no errors are corrected
 =============  ==========================================================================================
 
-A lost peer is never hidden: rssi and remrssi are 0 from that moment. It is no reason to slow down, though:
-nothing is sent to it, and an autopilot told to slow down would take up to a minute to recover once the peer is
-back.
+A lost peer is never hidden: rssi and remrssi are 0 from that moment. But an autopilot need not slow down then: no
+frames are sent to the peer, and a slower autopilot would need up to a minute to recover when the peer is back.
 """
 
 from __future__ import annotations
@@ -46,10 +45,8 @@ from dataclasses import dataclass
 from struct import Struct
 from typing import Final, NamedTuple
 
-from fastcrc.crc16 import mcrf4xx
-
-from uavlinkd.mavlink.dialect import facts, ids_by_name
-from uavlinkd.mavlink.frames import MAVLINK2
+from uavlinkd.mavlink import own_frames
+from uavlinkd.mavlink.dialect import ids_by_name
 
 SYSTEM: Final = 51
 COMPONENT: Final = 68
@@ -58,13 +55,11 @@ INTERVAL_S: Final = 1.0
 """How often to send: both autopilots step by each message, made for a radio that sends one a second."""
 
 _PAYLOAD = Struct("<HHBBBBB")  # rxerrors, fixed, rssi, remrssi, txbuf, noise, remnoise
-_HEADER = Struct("<BBBBBBHB")  # length, incompat_flags, compat_flags, seq, system, component, message id 16 + 8
-_CRC = Struct("<H")
 _MSGID: Final = ids_by_name()["RADIO_STATUS"]
 
 
 class Level(NamedTuple):
-    """What is said in ``txbuf`` while none of the figures is above these."""
+    """The value of ``txbuf`` while no figure is above these."""
 
     txbuf: int
     demand: float
@@ -86,7 +81,7 @@ _BASE_CREEP: Final = 0.01
 
 @dataclass(frozen=True, slots=True)
 class LinkFigures:
-    """The link, since it was last measured. Losses are shares of envelopes, 0 to 1; others are clipped to that."""
+    """The link since its last measurement. Losses are shares of envelopes; values outside 0 to 1 are clipped."""
 
     is_up: bool
     loss_in: float
@@ -97,16 +92,16 @@ class LinkFigures:
 
 
 def worst(figures: Sequence[LinkFigures]) -> LinkFigures:
-    """One link that stands for all of them, at least one: a program is told of the worst that is up."""
-    up = [each for each in figures if each.is_up] or figures
-    trips = [each.round_trip_s for each in up if each.round_trip_s is not None]
+    """The worst figures of the links that are up, as one link. There must be at least one link."""
+    up = [link for link in figures if link.is_up] or figures
+    trips = [link.round_trip_s for link in up if link.round_trip_s is not None]
     return LinkFigures(
-        is_up=any(each.is_up for each in figures),
-        loss_in=max(each.loss_in for each in up),
-        loss_out=max(each.loss_out for each in up),
+        is_up=any(link.is_up for link in figures),
+        loss_in=max(link.loss_in for link in up),
+        loss_out=max(link.loss_out for link in up),
         round_trip_s=max(trips, default=None),
-        demand=max(each.demand for each in up),
-        receive_errors=sum(each.receive_errors for each in figures),
+        demand=max(link.demand for link in up),
+        receive_errors=sum(link.receive_errors for link in figures),
     )
 
 
@@ -128,17 +123,14 @@ class RadioStatusSource:
         remrssi = _quality(figures.loss_out) if figures.is_up else 0
         txbuf = _txbuf(figures, queueing_s) if figures.is_up else TXBUF_LOST
         payload = _PAYLOAD.pack(figures.receive_errors % 65536, 0, rssi, remrssi, txbuf, UNKNOWN, UNKNOWN)
-        header = _HEADER.pack(
-            len(payload), 0, 0, self._seq, self._system, self._component, _MSGID & 0xFFFF, _MSGID >> 16
-        )
-        self._seq = (self._seq + 1) % 256
-        covered = header + payload
-        return bytes((MAVLINK2,)) + covered + _CRC.pack(mcrf4xx(covered + _CRC_EXTRA))
+        seq, self._seq = self._seq, (self._seq + 1) % 256
+        return own_frames.pack(_MSGID, payload, seq, self._system, self._component)
 
     def _queueing_s(self, round_trip_s: float | None) -> float:
-        """How much longer than at its best a round trip takes: the wait in buffers on the way.
+        """How much longer a round trip is than the best one: the wait in buffers along the path.
 
-        The best creeps towards what is measured, so that a longer path is not for ever taken for full buffers.
+        The best value creeps towards the measured one, so that a longer path does not look like full buffers
+        indefinitely.
         """
         if round_trip_s is None:
             return 0.0
@@ -159,14 +151,5 @@ def _txbuf(figures: LinkFigures, queueing_s: float) -> int:
 
 
 def _quality(loss: float) -> int:
-    """1 .. 254: a peer that is up is heard, however little."""
+    """1 .. 254: from a peer that is up, some envelopes arrive."""
     return max(1, round(254 * (1 - min(max(loss, 0.0), 1.0))))
-
-
-def _crc_extra() -> bytes:
-    found = facts(_MSGID)
-    assert found is not None
-    return bytes((found.crc_extra,))
-
-
-_CRC_EXTRA: Final = _crc_extra()

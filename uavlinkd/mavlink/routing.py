@@ -1,27 +1,28 @@
-"""Where a frame goes: to the ports behind which its target was heard.
+"""Where a frame goes: to the ports behind which its target was received.
 
 A *port* is one local client or one peer, named by any hashable value. The rules are MAVLink's
-(https://mavlink.io/en/guide/routing.html), as mavlink-router and ArduPilot keep them:
+(https://mavlink.io/en/guide/routing.html), as in mavlink-router and ArduPilot:
 
-* A frame without a target, with target 0, or of a message that cannot be read goes to all other ports.
-* A frame for a component goes to the ports where that component was heard. If it was not heard anywhere, or the
-  frame is for all of a system's components, it goes to the ports where the system was heard.
-* Nothing goes back to the port that it came from.
-* A frame whose target was heard nowhere else, or behind its own port alone, goes to all other ports, as a network
-  switch does with an address that it has not learnt: a link must carry the first word to a system that is silent
+* A frame without a target, with target 0, or of a message that cannot be read goes to all other ports. From a local
+  client it does not go to another local client that is silent (`Router.set_silent`).
+* A frame for a component goes to the ports where that component was received. If the component was received
+  nowhere, or the frame is for all components of a system, it goes to the ports where the system was received.
+* A frame never goes back to its own port.
+* A frame whose target was received nowhere else, or behind its own port alone, goes to all other ports, as in a
+  network switch that has not learnt an address. A link must carry the first message to a system that is silent
   until it is asked, and a port that mirrors both sides of a conversation. mavlink-router drops such frames;
   ``floods_unknown=False`` does too.
 
-Two more keep a mesh of daemons from multiplying frames:
+Two more rules keep a mesh of daemons from multiplying frames:
 
-* What comes from a peer goes to local ports only, unless this daemon relays.
-* A frame that came lately from another port is a duplicate, and dropped. From the same port it is a sender's own
+* A frame from a peer goes to local ports only, unless this daemon relays.
+* A frame that came recently from another port is a duplicate, and dropped. From the same port it is the sender's own
   repetition, and passes.
 
-All ports where an address was heard get its frames. So whoever claims a system's id gains a copy of what is sent to
-it, and takes nothing from the real one; but who may claim another's system can say a frame before that other does,
-and the real one is then the duplicate. Which ids a port may claim is for the policy to say. Only frames that passed
-the policy may be given to `Router.route`: it learns from them.
+All ports where an address was received get its frames. So a sender that claims a system's id gets a copy of the
+frames for that system, and the real system loses none of them. But a sender that may claim another system's id can
+send a frame before that system does, and the real frame is then the duplicate. The policy says which ids a port may
+claim. Only frames that passed the policy may be passed to `Router.route`: it learns from them.
 """
 
 from __future__ import annotations
@@ -31,32 +32,42 @@ from collections.abc import Callable, Hashable
 from enum import StrEnum
 from typing import Final, Generic, TypeVar
 
-from uavlinkd.mavlink.frames import Frame, Header
+from uavlinkd.mavlink.frames import Frame
+from uavlinkd.mavlink.headers import Header
 
-# MAVLink's components send a HEARTBEAT a second; satellite links report every few, to a minute.
 ROUTE_LIFETIME_S: Final = 120.0
-LIFETIME_PARTS: Final = 8  # what is heard, and what is silent, is noted this often in a lifetime
-# Longer than two ways differ in delay, shorter than a sender with the same bytes again behind another port.
-DUPLICATE_WINDOW_S: Final = 1.0  # at least; up to twice that
+"""MAVLink components send a HEARTBEAT each second. On satellite links the interval is some seconds to a minute."""
+LIFETIME_PARTS: Final = 8
+"""So often per lifetime the router notes which addresses are received and which are silent."""
+DUPLICATE_WINDOW_S: Final = 1.0
+"""At least, and up to twice that. Longer than the delays of two routes differ, shorter than a sender needs to send
+the same bytes again behind another port."""
 
-MAX_ADDRESSES_PER_PORT: Final = 512  # systems and components heard behind one port
-MAX_FRAMES_REMEMBERED: Final = 4096  # in each half of the window
+MAX_ADDRESSES_PER_PORT: Final = 512
+MAX_FRAMES_REMEMBERED: Final = 4096
+"""In each half of the window."""
 MAX_DECISIONS: Final = 4096
+MAX_OWN_FRAMES: Final = 64
 
-Address = tuple[int, int]  # system, component
+SystemComponent = tuple[int, int]
+"""A MAVLink address: system id and component id."""
 P = TypeVar("P", bound=Hashable)
+
+
+_OWN: Final = object()
+"""The source of the daemon's own frames."""
 
 
 class Unrouted(StrEnum):
     """Why a frame goes nowhere."""
 
-    DUPLICATE = "duplicate"  # came by another way already
-    UNKNOWN_TARGET = "unknown_target"  # its target was not heard, or not lately
-    NO_OTHER_PORT = "no_other_port"  # its target is behind the port that it came from, or there is nobody else
+    DUPLICATE = "duplicate"  # it came by another route already
+    UNKNOWN_TARGET = "unknown_target"  # its target was not received, or not recently
+    NO_OTHER_PORT = "no_other_port"  # its target is behind its own port, or there is no other port
 
 
 class Router(Generic[P]):
-    """Learns who is behind which port, and says where frames go. All times in seconds, monotonic."""
+    """Learns which addresses are behind which port, and says where frames go. All times are monotonic seconds."""
 
     def __init__(
         self,
@@ -71,67 +82,89 @@ class Router(Generic[P]):
         self._floods_unknown = floods_unknown
         self._lifetime_s = route_lifetime_s
         self._window_s = duplicate_window_s
-        self._is_peer: dict[P, bool] = {}  # every port, in the order in which they came
-        self._heard_at: dict[P, dict[Address, float]] = {}  # by port: when each address was heard last
-        self._ports_of: dict[int, dict[int, set[P]]] = {}  # the other way round: by system, component
+        self._is_peer: dict[P, bool] = {}
+        """Every port, in the order in which they were added."""
+        self._silent: set[P] = set()
+        self._received_at: dict[P, dict[SystemComponent, float]] = {}
+        """By port: when each address was received last. The least recently received is first."""
+        self._ports_of: dict[int, dict[int, set[P]]] = {}
+        """The reverse: by system and component."""
         self._decisions: dict[tuple[P, int, int], tuple[P, ...]] = {}
-        # Which port each frame came from, in the running half of the window and the one before.
-        self._seen: dict[bytes, P] = {}
-        self._seen_before: dict[bytes, P] = {}
+        self._seen: dict[bytes, Hashable] = {}
+        """The port that each frame came from, in the current half of the window."""
+        self._seen_before: dict[bytes, Hashable] = {}
+        """The same for the previous half."""
+        self._own: dict[bytes, None] = {}
+        """The daemon's own frames, the oldest first."""
         self._window_ends_at = float("-inf")
         self.refresh_at = float("-inf")
+        """When :meth:`refresh` is due."""
         self.edition = 0
-        """Grows whenever an answer of :meth:`route` may have become another."""
+        """Grows whenever a result of :meth:`route` may have changed."""
 
     def add_port(self, port: P, *, is_peer: bool = False) -> None:
-        """From now on frames may come from and go to this port. Adding it again changes its kind."""
+        """Accept frames from this port, and send frames to it. Adding it again changes its kind."""
         self._is_peer[port] = is_peer
-        self._heard_at.setdefault(port, {})
+        self._received_at.setdefault(port, {})
         self._forget_decisions()
 
     def remove_port(self, port: P) -> None:
-        """Forgets the port and who was behind it."""
+        """Forget the port and the addresses behind it."""
         self._is_peer.pop(port, None)
-        for address in self._heard_at.pop(port, {}):
+        self._silent.discard(port)
+        for address in self._received_at.pop(port, {}):
             self._unlink(port, address)
         self._forget_decisions()
 
+    def set_silent(self, port: P, *, is_silent: bool) -> None:
+        """A silent local client gets frames with a target and frames of peers, but no others: it may have gone."""
+        if is_silent:
+            self._silent.add(port)
+        else:
+            self._silent.discard(port)
+        self._forget_decisions()
+
     def forget_systems(self, port: P, which: Callable[[int], bool]) -> None:
-        """Some of the systems that were heard behind a port are no longer looked for there."""
-        heard = self._heard_at.get(port, {})
-        for address in [each for each in heard if which(each[0])]:
-            del heard[address]
+        """Forget the systems behind a port for which ``which`` is true."""
+        received_at = self._received_at.get(port, {})
+        for address in [address for address in received_at if which(address[0])]:
+            del received_at[address]
             self._unlink(port, address)
         self._forget_decisions()
 
     def refresh(self, now: float) -> None:
-        """Forgets who has gone silent. Due at :attr:`refresh_at`.
+        """Forget the addresses that have been silent for long. Due at :attr:`refresh_at`.
 
-        As long as :attr:`edition` stays the same, the ports that :meth:`route` gave for a frame are right for all
-        from that source with its header, as far as :meth:`is_first` lets them pass.
+        As long as :attr:`edition` stays the same, the ports that :meth:`route` returned for a frame are valid for all
+        frames from that source with its header that are not duplicates (:meth:`is_first`).
         """
         self.refresh_at = now + self._lifetime_s / LIFETIME_PARTS
         self._forget_decisions()
-        for port, heard in self._heard_at.items():
-            for address in [a for a, heard_at in heard.items() if now - heard_at >= self._lifetime_s]:
-                del heard[address]
+        for port, received_at in self._received_at.items():
+            for address in [a for a, at in received_at.items() if now - at >= self._lifetime_s]:
+                del received_at[address]
                 self._unlink(port, address)
 
-    def route(self, frame: Frame, source: P, now: float) -> tuple[P, ...]:
-        """The ports to send this frame to. Learns its sender; counts why where there is none.
+    def route(self, frame: Frame, source: P, now: float, *, has_one_route: bool = False) -> tuple[P, ...]:
+        """The ports to send this frame to. Learns its sender; counts the reason if there is no port.
+
+        ``has_one_route``: no other port may send frames of this system, so this is not a duplicate.
 
         Raises:
-            KeyError: the source is no port that was added.
+            KeyError: the source is not a port that was added.
         """
-        heard = self._heard_at[source]
-        if not self.is_first(frame.raw, source, now):
+        received_at = self._received_at[source]
+        if frame.raw in self._own:
+            self.unrouted[Unrouted.DUPLICATE] += 1
+            return ()
+        if not has_one_route and not self.is_first(frame.raw, source, now):
             return ()
         header = frame.header
-        if header.system != 0:  # 0 means all: no sender is that
+        if header.system != 0:  # 0 means all systems: no sender has this id
             address = (header.system, header.component)
-            if address not in heard:
+            if received_at.pop(address, None) is None:
                 self._learn(source, address)
-            heard[address] = now
+            received_at[address] = now
         if now >= self.refresh_at:
             self.refresh(now)
 
@@ -147,7 +180,7 @@ class Router(Generic[P]):
         return ports
 
     def is_first(self, raw: bytes, source: P, now: float) -> bool:
-        """Whether these bytes came from no other port lately. Remembers them; counts duplicates."""
+        """Whether these bytes did not come from another port recently. Remembers them; counts duplicates."""
         if now >= self._window_ends_at:
             self._turn_window(now)
         came_from = self._seen.get(raw)
@@ -162,30 +195,43 @@ class Router(Generic[P]):
         self.unrouted[Unrouted.DUPLICATE] += 1
         return False
 
+    def note_own(self, raw: bytes, now: float) -> None:
+        """The daemon itself sent these bytes to local clients: if a client returns them, they are a duplicate.
+
+        Until the client sends other frames with that header, this holds for the last :data:`MAX_OWN_FRAMES`, else
+        for the window of duplicates.
+        """
+        self._own[raw] = None
+        if len(self._own) > MAX_OWN_FRAMES:
+            del self._own[next(iter(self._own))]
+        if now >= self._window_ends_at or len(self._seen) >= MAX_FRAMES_REMEMBERED:
+            self._turn_window(now)
+        self._seen[raw] = _OWN
+
     def forget_frame(self, raw: bytes) -> None:
-        """These bytes were not delivered: should another port send the same, it is the first to do so."""
+        """These bytes were not delivered: the same bytes from another port are not a duplicate."""
         self._seen.pop(raw, None)
         self._seen_before.pop(raw, None)
 
-    def addresses(self, port: P) -> list[Address]:
-        """The systems and components heard behind a port lately, sorted."""
-        return sorted(self._heard_at.get(port, ()))
+    def addresses(self, port: P) -> list[SystemComponent]:
+        """The addresses received behind a port recently, sorted."""
+        return sorted(self._received_at.get(port, ()))
 
     def _turn_window(self, now: float) -> None:
-        """Forgets the older half of what was seen: each frame is remembered for one to two windows."""
+        """Forget the older half of the frames: each is remembered for one to two windows."""
         is_gap = now >= self._window_ends_at + self._window_s
         self._seen_before = {} if is_gap else self._seen
         self._seen = {}
         is_early = now < self._window_ends_at
         self._window_ends_at = (now if is_gap or is_early else self._window_ends_at) + self._window_s
 
-    def _learn(self, port: P, address: Address) -> None:
-        heard = self._heard_at[port]
-        if len(heard) >= MAX_ADDRESSES_PER_PORT:
-            # Whoever makes up addresses crowds out only those behind its own port.
-            oldest = next(iter(heard))
-            del heard[oldest]
-            self._unlink(port, oldest)
+    def _learn(self, port: P, address: SystemComponent) -> None:
+        received_at = self._received_at[port]
+        if len(received_at) >= MAX_ADDRESSES_PER_PORT:
+            # A sender that invents addresses displaces only those behind its own port.
+            least_recent = next(iter(received_at))
+            del received_at[least_recent]
+            self._unlink(port, least_recent)
         system, component = address
         self._ports_of.setdefault(system, {}).setdefault(component, set()).add(port)
         self._forget_decisions()
@@ -194,7 +240,7 @@ class Router(Generic[P]):
         self._decisions.clear()
         self.edition += 1
 
-    def _unlink(self, port: P, address: Address) -> None:
+    def _unlink(self, port: P, address: SystemComponent) -> None:
         system, component = address
         components = self._ports_of[system]
         components[component].discard(port)
@@ -210,14 +256,14 @@ class Router(Generic[P]):
             if port != source and (self._relays or not (is_peer and self._is_peer[source]))
         ]
         if target_system == 0:
-            return tuple(others)
+            return tuple(port for port in others if port not in self._silent or self._is_peer[source])
         components = self._ports_of.get(target_system, {})
-        # Component 0 is nobody's own id, even if a sender uses it: it means all of the system.
+        # Component 0 is not an id of its own, even if a sender uses it: it means the whole system.
         of_component = components.get(target_component) if target_component != 0 else None
-        heard = of_component or set().union(*components.values())
-        if self._floods_unknown and not heard - {source}:
+        matches = of_component or set().union(*components.values())
+        if self._floods_unknown and not matches - {source}:
             return tuple(others)
-        return tuple(port for port in others if port in heard)
+        return tuple(port for port in others if port in matches)
 
     def _why_nowhere(self, header: Header) -> Unrouted:
         is_unknown = header.target_system != 0 and header.target_system not in self._ports_of

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.mavlink.egress.test_egress import MAKERS, attitude, heartbeat, parameter
-from uavlinkd.mavlink.egress.coalescing import Coalescer, make_egress
+from tests.mavlink.egress.samples import MAKERS, attitude, heartbeat, parameter
 from uavlinkd.mavlink.egress.budgeted import Egress, EgressSettings, EnvelopeShape
+from uavlinkd.mavlink.egress.coalescing import Coalescer, make_egress
 from uavlinkd.mavlink.egress.lanes import EgressDrop
 from uavlinkd.mavlink.frames import Frame
 
@@ -56,26 +56,6 @@ def test_sends_what_an_egress_without_a_budget_sends(gaps: list[tuple[int, list[
     assert sent_by(coalescer, puts) == sent_by(egress, puts)
     assert (coalescer.queued_frames, coalescer.queued_bytes) == (0, 0)
     assert coalescer.totals == egress.totals == {}
-
-
-def test_frames_wait_for_company_and_no_longer() -> None:
-    """The first decides when all go."""
-    coalescer = Coalescer(SETTINGS)
-    assert coalescer.next_deadline() == inf
-    coalescer.put([attitude(1)], 5.0)
-    coalescer.put([parameter(2)], 5.05)
-    assert coalescer.take(5.099) == []
-    assert coalescer.next_deadline() == 5.1
-    assert coalescer.take(5.1) == [attitude(1).raw, parameter(2).raw]
-    assert coalescer.next_deadline() == inf
-
-
-def test_urgent_frame_takes_along_what_waits() -> None:
-    """A heartbeat goes at once, behind what came before it."""
-    coalescer = Coalescer(SETTINGS)
-    coalescer.put([attitude(1)], 0.0)
-    coalescer.put([heartbeat(2)], 0.01)
-    assert coalescer.take(0.01) == [attitude(1).raw, heartbeat(2).raw]
 
 
 @pytest.mark.parametrize(("taken_at", "sent"), [(1.0, 1), (1.001, 0)])

@@ -10,11 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import all as mavlink
 
-from tests.mavlink.egress.test_egress import attitude, battery, command, frame, heartbeat, parameter
+from tests.mavlink.egress.samples import attitude, battery, command, frame, heartbeat, parameter
 from tests.policies import TRUSTED
-from uavlinkd.mavlink.policy.delivery import Source
-from uavlinkd.mavlink.egress.kinds import flow_key, kind_of
-from uavlinkd.mavlink.egress.lanes import EgressDrop
 from uavlinkd.mavlink.egress.fair_queue import (
     LANE_BYTES,
     MAX_SOURCES,
@@ -24,8 +21,11 @@ from uavlinkd.mavlink.egress.fair_queue import (
     URGENT_PART,
     FairQueue,
 )
+from uavlinkd.mavlink.egress.kinds import flow_key, kind_of
+from uavlinkd.mavlink.egress.lanes import EgressDrop
 from uavlinkd.mavlink.frames import Frame
 from uavlinkd.mavlink.policy.compilation import compile_policy
+from uavlinkd.mavlink.policy.delivery import Source
 
 GATE = compile_policy(TRUSTED).incoming
 HONEST, CAPTURED = Source("honest", GATE), Source("captured", GATE)
@@ -58,8 +58,8 @@ def popped(queue: FairQueue, byte_count: float = 1e9, now: float = 0.0) -> list[
 
 def bytes_by_source(gone: list[tuple[Frame, Source]]) -> Counter[Source]:
     sums: Counter[Source] = Counter()
-    for each, source in gone:
-        sums[source] += len(each.raw)
+    for item, source in gone:
+        sums[source] += len(item.raw)
     return sums
 
 
@@ -120,7 +120,7 @@ def test_burst_of_commands_is_not_interrupted() -> None:
     queue.put([parameter(number) for number in range(100)], HONEST, 0.0)
     commands = [command(number) for number in range(URGENT_LEAD_BYTES // len(command(0).raw))]
     queue.put(commands, CAPTURED, 0.0)
-    assert [each for each, _ in popped(queue)[: len(commands)]] == commands
+    assert [item for item, _ in popped(queue)[: len(commands)]] == commands
 
 
 def test_source_that_was_idle_has_saved_nothing_up() -> None:
@@ -159,7 +159,7 @@ def test_source_that_left_the_line_pays_for_what_it_was_sent() -> None:
 
 
 def waiting_sources(queue: FairQueue) -> set[Source]:
-    return {source for source, each in queue._sources.items() if each.lanes.count}
+    return {source for source, waiting in queue._sources.items() if waiting.lanes.count}
 
 
 def test_newest_state_wins() -> None:
@@ -169,7 +169,7 @@ def test_newest_state_wins() -> None:
     queue.put([attitude(1)], HONEST, SUPERSEDED_S + 0.01)
     queue.put([attitude(2)], HONEST, SUPERSEDED_S + 0.02)
     gone = popped(queue, now=SUPERSEDED_S + 0.02)
-    assert [each for each, _ in gone] == [command(0), attitude(1), attitude(0, 3), attitude(2)]
+    assert [item for item, _ in gone] == [command(0), attitude(1), attitude(0, 3), attitude(2)]
     assert dropped == {EgressDrop.THINNED: 1}
 
 
@@ -177,7 +177,7 @@ def test_states_that_came_together_are_not_thinned() -> None:
     """One envelope may carry several of a flow: they go where there is room for all."""
     queue, dropped = make()
     queue.put([attitude(number) for number in range(5)], HONEST, 0.0)
-    assert [each for each, _ in popped(queue)] == [attitude(number) for number in range(5)]
+    assert [item for item, _ in popped(queue)] == [attitude(number) for number in range(5)]
     assert not dropped
 
 
@@ -188,10 +188,10 @@ def test_flood_drops_its_own_oldest_frames() -> None:
     queue.put(honest, HONEST, 0.0)
     flood = [attitude(number, number % 250 + 1) for number in range(5000)]
     queue.put(flood, CAPTURED, 0.0)
-    assert queue.size <= LANE_BYTES + sum(len(each.raw) for each in honest)
+    assert queue.size <= LANE_BYTES + sum(len(item.raw) for item in honest)
     gone = popped(queue)
-    assert [each for each, source in gone if source is HONEST] == honest
-    left = [each for each, source in gone if source is CAPTURED]
+    assert [item for item, source in gone if source is HONEST] == honest
+    left = [item for item, source in gone if source is CAPTURED]
     assert sorted(map(flood.index, left)) == list(range(5000 - len(left), 5000))
     assert dropped == {EgressDrop.OVERFLOW: 5000 - len(left)}
 
@@ -201,12 +201,12 @@ def test_queue_is_bounded_over_all_sources() -> None:
     queue, _ = make()
     honest = [parameter(number) for number in range(50)]
     queue.put(honest, HONEST, 0.0)
-    for each in range(10):
-        flooding = Source(f"captured{each}", GATE)
+    for captured in range(10):
+        flooding = Source(f"captured{captured}", GATE)
         for lane in (lambda n: heartbeat(n, 2, n % 250 + 1), part, lambda n: attitude(n, n % 250 + 1)):
             queue.put([lane(number) for number in range(1500)], flooding, 0.0)
             assert queue.size <= QUEUE_BYTES
-    assert [each for each, source in popped(queue) if source is HONEST] == honest
+    assert [item for item, source in popped(queue) if source is HONEST] == honest
 
 
 def test_stale_frames_are_dropped_when_their_turn_comes() -> None:
@@ -255,24 +255,24 @@ def test_each_frame_leaves_once_and_flows_keep_their_order(steps: list[tuple[str
     put_order: dict[int, int] = {}
     gone: list[tuple[Frame, Source]] = []
     kept: list[Frame] = []  # so that no id is used twice
-    for step, which, kind, amount in steps:
+    for step, which, kind, count in steps:
         if step == "put":
-            frames = [FRAMES[kind](put_count + each) for each in range(amount)]
-            for each in frames:
-                put_order[id(each)] = len(put_order)
-            put_count += amount
+            frames = [FRAMES[kind](put_count + number) for number in range(count)]
+            for item in frames:
+                put_order[id(item)] = len(put_order)
+            put_count += count
             queue.put(frames, SOURCES[which], now)
             kept.extend(frames)
         elif step == "pop":
-            gone += popped(queue, amount * 10, now)
+            gone += popped(queue, count * 10, now)
         else:
-            now += amount / 1000
+            now += count / 1000
         assert put_count == len(gone) + dropped.total() + queue.count
-        assert queue.size == sum(each.lanes.size for each in queue._sources.values())
+        assert queue.size == sum(waiting.lanes.size for waiting in queue._sources.values())
     gone += popped(queue, now=now)
     assert put_count == len(gone) + dropped.total()
     last: dict[object, int] = defaultdict(lambda: -1)
-    for each, source in gone:
-        flow = (source, flow_key(each, kind_of(each)))
-        assert put_order[id(each)] > last[flow]
-        last[flow] = put_order[id(each)]
+    for item, source in gone:
+        flow = (source, flow_key(item, kind_of(item)))
+        assert put_order[id(item)] > last[flow]
+        last[flow] = put_order[id(item)]

@@ -1,4 +1,4 @@
-"""Frames made for smuggling: what the tests of delivered streams share."""
+"""Hidden frames for the tests of delivered streams."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from collections.abc import Iterator
 
 from fastcrc.crc16 import mcrf4xx
 
-from uavlinkd.mavlink.policy.delivery import Source
 from uavlinkd.mavlink.dialect_table import MESSAGES, OTHER_EXTRAS
 from uavlinkd.mavlink.frames import Frame, SplitCounters, split_payload
 from uavlinkd.mavlink.policy.compilation import compile_policy
+from uavlinkd.mavlink.policy.delivery import Source
 
 ATTITUDE, PARAM_REQUEST_READ, SET_MODE, COMMAND_LONG, HEARTBEAT = 30, 20, 11, 76, 0
 HOME_POSITION, SETUP_SIGNING = 242, 256
@@ -17,7 +17,7 @@ SIGNATURE = bytes(range(13))
 
 
 def v2(msgid: int, payload: bytes, system: int = 1, *, signature: bytes = b"", extra: int | None = None) -> bytes:
-    """A MAVLink 2 frame, by the CRC_EXTRA of the table unless another is given."""
+    """A MAVLink 2 frame, with the CRC_EXTRA of the table by default."""
     header = bytes((len(payload), bool(signature), 0, 7, system, 1)) + msgid.to_bytes(3, "little")
     covered = header + payload
     crc = mcrf4xx(covered + bytes((MESSAGES[msgid][1] if extra is None else extra,)))
@@ -25,14 +25,14 @@ def v2(msgid: int, payload: bytes, system: int = 1, *, signature: bytes = b"", e
 
 
 def v1(msgid: int, payload: bytes, system: int = 1, *, extra: int | None = None) -> bytes:
-    """A MAVLink 1 frame, likewise."""
+    """The same as MAVLink 1."""
     covered = bytes((len(payload), 7, system, 1, msgid)) + payload
     crc = mcrf4xx(covered + bytes((MESSAGES[msgid][1] if extra is None else extra,)))
     return b"\xfe" + covered + crc.to_bytes(2, "little")
 
 
 def hidden_header(msgid: int, payload_bytes: int, system: int = 255) -> bytes:
-    """The header of a frame that is to be hidden. It fits into a signature."""
+    """The header of a hidden frame. It fits into a signature."""
     return bytes((0xFD, payload_bytes, 0, 0, 7, system, 1)) + msgid.to_bytes(3, "little")
 
 
@@ -50,18 +50,18 @@ def split_over(middle: bytes = b"", msgid: int = COMMAND_LONG, system: int = 1) 
 
 
 def source(role: str = "swarm-member", systems: object = (1,), **more: object) -> Source:
-    """A peer of this role, that may speak as these systems."""
+    """A policy of a peer with this role and these systems."""
     return Source(role, compile_policy({"role": role, "system_ids": systems, **more}).incoming)
 
 
 def parsed(raw: bytes) -> Frame:
-    """The frame that these bytes are."""
+    """The only frame in these bytes."""
     (frame,) = split_payload(raw, SplitCounters())
     return frame
 
 
 def valid_frames(stream: bytes, *, any_extra: bool = False) -> Iterator[tuple[int, bytes]]:
-    """Every offset at which a valid frame begins, and the frame without its signature. The plainest search."""
+    """Every offset at which a valid frame begins, and the frame without its signature. The simplest search."""
     for start in range(len(stream)):
         if stream[start] == 0xFE:
             header, id_at, id_bytes = 6, start + 5, 1

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from uavlinkd.mavlink import dialect
-from uavlinkd.mavlink.policy.alternatives import EFFECTS
 from uavlinkd.mavlink.dialect_table import COMMANDS
+from uavlinkd.mavlink.policy.alternatives import EFFECTS
 from uavlinkd.mavlink.policy.compilation import compile_policy
 
 
@@ -54,8 +54,8 @@ def test_alternatives_of_a_denied_command_are_named(denied: str, named: list[str
 
 def test_a_denied_message_is_named_as_it_was_denied() -> None:
     """Denying SET_MODE leaves the command with its effect open: only the message is said to be kept out."""
-    assert "deny_in keeps out SET_MODE, but changing the mode" in warnings(deny_in=["SET_MODE"])
-    assert "keeps out MAV_CMD_DO_SET_MODE" in warnings(deny_in=["SET_MODE", "MAV_CMD_DO_SET_MODE"])
+    assert "deny_in refuses SET_MODE, but changing the mode" in warnings(deny_in=["SET_MODE"])
+    assert "refuses MAV_CMD_DO_SET_MODE" in warnings(deny_in=["SET_MODE", "MAV_CMD_DO_SET_MODE"])
 
 
 def test_what_the_role_refuses_is_not_named() -> None:
@@ -99,7 +99,7 @@ def test_allow_list_with_a_denial_names_what_it_allows() -> None:
     assert "stays possible by MAV_CMD_DO_REPOSITION:" in warning
 
 
-def test_both_ways_are_looked_at() -> None:
-    """A ground station denies what goes to a vehicle."""
+def test_both_directions_are_checked() -> None:
+    """A ground station denies outgoing messages to a vehicle."""
     made = compile_policy({"role": "vehicle", "system_ids": [1], "deny_out": ["MAV_CMD_NAV_LAND"]})
-    assert any(warning.startswith("deny_out keeps out MAV_CMD_NAV_LAND") for warning in made.warnings)
+    assert any(warning.startswith("deny_out refuses MAV_CMD_NAV_LAND") for warning in made.warnings)

@@ -1,4 +1,4 @@
-"""The group `files-read`: MAVFTP's requests that read, log download, and nothing that writes."""
+"""The group `files-read`: MAVFTP's reading requests and log download, without writing."""
 
 from __future__ import annotations
 
@@ -12,15 +12,8 @@ from uavlinkd.mavlink.policy.gate import Gate, Refusal
 
 FTP = dialect.ids_by_name()["FILE_TRANSFER_PROTOCOL"]
 READING = {
-    "TERMINATESESSION",
-    "RESETSESSION",
-    "LISTDIRECTORY",
-    "OPENFILERO",
-    "READFILE",
-    "CALCFILECRC",
-    "BURSTREADFILE",
-    "ACK",
-    "NAK",
+    *("TERMINATESESSION", "RESETSESSION", "LISTDIRECTORY", "OPENFILERO", "READFILE", "CALCFILECRC"),
+    *("BURSTREADFILE", "ACK", "NAK"),
 }
 OPCODES = {
     name.removeprefix("MAV_FTP_OPCODE_"): number
@@ -38,32 +31,32 @@ def request(opcode: int, *, version: int = 2, data: bytes = b"/fs/x") -> Frame:
 
 @pytest.fixture
 def gate() -> Gate:
-    """Reading files, and nothing else."""
+    """A policy that allows only reading files."""
     return incoming({"system_ids": "all", "allow_in": ["files-read"]})
 
 
 def test_reading_opcodes_exist() -> None:
-    """The names of this test are those of MAVLink's definition."""
+    """MAVLink's definition has the names of this test."""
     assert set(OPCODES) > READING
 
 
 @pytest.mark.parametrize("version", [1, 2])
 @pytest.mark.parametrize("name", OPCODES)
 def test_each_opcode(gate: Gate, name: str, version: int) -> None:
-    """What reads passes; create, write, remove, rename, truncate, directories and opening to write do not."""
+    """Reading passes; create, write, remove, rename, truncate, directories and opening to write do not."""
     refusal = gate.check(request(OPCODES[name], version=version), 0.0)
     assert refusal == (None if name in READING else Refusal.FILE_WRITE_NOT_ALLOWED)
 
 
 def test_opcode_beyond_the_definition_is_refused(gate: Gate) -> None:
-    """A number that MAVLink does not define may do anything."""
+    """A number that MAVLink does not define may have any effect."""
     for opcode in set(range(256)) - set(OPCODES.values()):
         assert gate.check(request(opcode), 0.0) is Refusal.FILE_WRITE_NOT_ALLOWED
 
 
 @pytest.mark.parametrize("length", [1, 3, 6])
 def test_opcode_that_was_cut_off_is_zero(gate: Gate, length: int) -> None:
-    """MAVLink 2 cuts zeros at a payload's end: a frame that ends before the opcode has opcode 0, which is refused."""
+    """MAVLink 2 truncates zeros: a frame that ends before the opcode has opcode 0, which is refused."""
     assert gate.check(raw_frame(FTP, b"\x01" * length), 0.0) is Refusal.FILE_WRITE_NOT_ALLOWED
 
 
@@ -74,13 +67,13 @@ def test_payload_that_ends_with_its_opcode_is_read(gate: Gate) -> None:
 
 
 def test_another_definition_is_refused(gate: Gate) -> None:
-    """Where the message is not the dialect's, its opcode cannot be read."""
+    """In another definition than the dialect's, the opcode cannot be read."""
     frame = raw_frame(FTP, b"\x05" * 20, crc_extra=1)
     assert gate.check(frame, 0.0) is Refusal.UNKNOWN_MESSAGE
 
 
 def test_logs_are_read_and_not_erased(gate: Gate) -> None:
-    """Log download passes both ways, LOG_ERASE and other transfers do not."""
+    """Log download passes in both directions; LOG_ERASE and other transfers do not."""
     for msgid in ids("LOG_REQUEST_LIST", "LOG_REQUEST_DATA", "LOG_REQUEST_END", "LOG_ENTRY", "LOG_DATA"):
         assert gate.check(blank(msgid), 0.0) is None
     for msgid in ids("LOG_ERASE", "LOGGING_DATA", "REMOTE_LOG_BLOCK_STATUS", "RESOURCE_REQUEST", "PARAM_SET"):
@@ -96,21 +89,21 @@ def test_wider_entry_allows_writing(more: str | int) -> None:
 
 @pytest.mark.parametrize("deny", ["files", "files-read", "FILE_TRANSFER_PROTOCOL", 110])
 def test_denied_is_denied_whole(deny: str | int) -> None:
-    """A denial concerns the whole message, so that denying to read does not leave writing open."""
+    """A denial applies to the whole message, so that denying to read does not leave writing open."""
     gate = incoming({"system_ids": "all", "allow_in": ["all", "files-read"], "deny_in": [deny]})
     for name in ("READFILE", "WRITEFILE"):
         assert gate.check(request(OPCODES[name]), 0.0) is Refusal.MESSAGE_NOT_ALLOWED
 
 
-def test_rate_holds_for_reading() -> None:
-    """A refused write uses up no rate."""
+def test_rate_applies_to_reading() -> None:
+    """A refused write does not use the rate."""
     gate = incoming({"system_ids": "all", "allow_in": ["files-read"], "rate_in": {"files-read": 1}})
     assert gate.check(request(OPCODES["WRITEFILE"]), 0.0) is Refusal.FILE_WRITE_NOT_ALLOWED
     assert [gate.check(request(OPCODES["READFILE"]), 0.0) for _ in range(3)] == [None, None, Refusal.RATE_LIMITED]
 
 
 def test_observer_may_be_given_files_to_read() -> None:
-    """Beside a role the group widens it, each way."""
+    """The group extends a role, in each direction."""
     data = {"role": "observer", "system_ids": [254], "allow_in": ["files-read"], "allow_out": ["files-read"]}
     made = compiled(data)
     assert made.incoming.check(request(OPCODES["OPENFILEWO"]), 0.0) is Refusal.FOREIGN_SYSTEM

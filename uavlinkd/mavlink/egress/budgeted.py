@@ -1,28 +1,27 @@
-"""What waits for one peer whose link is slow or paid by the byte.
+"""The frames that wait for one peer whose link is slow or paid by the byte.
 
-A peer with neither a budget nor a coalescing delay needs none of this. Otherwise its frames wait here, for two
-reasons:
+A peer without a budget and without a coalescing delay needs none of this. The frames of other peers wait here, for
+two reasons:
 
 *Coalescing*: frames wait at most ``coalesce_s`` after the first of them, or until an envelope is full, and then
-share one envelope. An urgent frame (:mod:`.egress_kinds`) ends the wait at once and takes along what waits.
+share an envelope. An urgent frame (:mod:`.kinds`) ends the wait at once and takes along the frames that wait.
 
-*The budget*: a bucket of bytes that fills at the budget's rate, and that every datagram to the peer empties by
-all it takes on the wire: IP and UDP header, envelope, handshakes and echoes too. It holds a quarter of a
-second, or one largest frame in an envelope where that is more: so much, and never more, can stand in a radio's
-own buffer because of these frames.
+*The budget*: a bucket of bytes. It fills at the budget's rate. Every datagram to the peer empties it by all its bytes
+on the wire: IP and UDP header, envelope, handshakes and echoes too. It holds a quarter of a second of the budget, or
+one largest frame in an envelope if that is more. So a radio's own buffer never holds more of these frames than that.
 
-While the bucket covers all that waits, everything goes out in the order in which it came. When it does not:
+While the bucket covers all waiting frames, they leave in their order of arrival. When it does not:
 
-* Urgent frames go first, of each sender in turn. They share an envelope with what else waits.
-* The rest of the budget is halved between events and states, while both wait, by their bytes.
-* Of a state only the newest waits; what it replaces is counted as THINNED. The flow that was sent the longest
-  ago is next, so all are thinned alike and none starves. Events keep their order within a flow; flows take
+* Urgent frames go first, of each sender in turn. They share an envelope with other waiting frames.
+* The rest of the budget is divided equally, by bytes, between events and states, while both wait.
+* Of a state only the newest frame waits. The older one is counted as THINNED. The flow that was sent the longest time
+  ago is next, so all flows are thinned alike and none starves. Events keep their order within a flow; flows take
   turns.
-* A frame that has waited longer than ``max_age_s`` is dropped as STALE: nothing is ever delivered late. Lanes and
-  flows are bounded in bytes as well, the oldest frame dropped first as OVERFLOW.
+* A frame that has waited longer than ``max_age_s`` is dropped as STALE: no frame is delivered late. Lanes and flows
+  are also bounded in bytes. The oldest frame is dropped first, as OVERFLOW.
 
 Within a flow (one message of one sender about one thing, to one target) the order is never reversed. Sans-IO:
-`now` is monotonic seconds.
+``now`` is monotonic seconds.
 """
 
 from __future__ import annotations
@@ -39,21 +38,21 @@ from uavlinkd.mavlink.egress.queue import Waiting
 from uavlinkd.mavlink.frames import MAX_FRAME_BYTES, Frame
 
 BURST_S: Final = 0.25
-"""The bucket holds this much of the budget: no more than this stands in a radio's own buffer before a command."""
+"""The bucket holds this much of the budget: a command waits for no more than this in a radio's own buffer."""
 URGENT_SHARING_S: Final = 0.4
-"""While the budget is short an urgent frame waits at most so long for others to share the cost of its envelope."""
+"""While the budget is short, an urgent frame waits at most this long for others to share the cost of its envelope."""
 URGENT_SHARING: Final = 4
-"""... and no longer than until this many times the cost of an empty envelope can be paid."""
+"""It waits no longer than until the bucket holds this many times the cost of an empty envelope."""
 SHARING_OF_AGE: Final = 0.5
-"""The rest waits at most this part of ``max_age_s`` for its envelope to fill."""
+"""Other frames wait at most this part of ``max_age_s`` for their envelope to fill."""
 DEBT_S: Final = 1.0
-"""What the core sends is never refused, so the bucket can be in debt. Beyond this much it is not made deeper: a long
-outage's handshakes must not silence the link once it is back."""
+"""The bucket can be in debt, because the core's own datagrams are never refused. The debt is at most this much: the
+handshakes of a long outage must not silence the link after it."""
 MIN_LANE_BYTES: Final = 8 * 1024
 MAX_LANE_BYTES: Final = 80 * 1024
-"""Bounds on what waits in each of the three lanes; in between, as much as the budget carries in ``max_age_s``."""
+"""Bounds of each of the three lanes. Between them, a lane holds as much as the budget carries in ``max_age_s``."""
 MAX_FLOWS: Final = 4096
-"""Flows that are remembered while nothing of them waits."""
+"""Flows that are remembered while none of their frames waits."""
 DEMAND_WINDOW_S: Final = 2.0
 _SLACK_BYTES: Final = 0.5  # a deadline computed in floating point must not come a hair early, over and over
 
@@ -82,9 +81,9 @@ class EgressSettings:
 
 @dataclass(frozen=True, slots=True)
 class EnvelopeShape:
-    """What an envelope holds and costs, in bytes: header and tag, and around it IP and UDP (48 over IPv6).
+    """The payload and the cost of an envelope, in bytes: header and tag, and around it IP and UDP (48 over IPv6).
 
-    What stands here holds before the first session: a little less than envelopes of the default size over IPv4.
+    The default values are used before the first session: a little less than envelopes of the default size over IPv4.
     """
 
     payload_limit: int = 1200
@@ -93,16 +92,16 @@ class EnvelopeShape:
 
     @property
     def overhead(self) -> int:
-        """What an envelope takes on the wire besides its frames."""
+        """The bytes of an envelope on the wire besides its frames."""
         return self.seal_bytes + self.carrier_bytes
 
 
 class Egress:
     """The frames that wait for one peer, and the budget they wait for.
 
-    Frames come in by :meth:`put`. :meth:`take` gives those for one envelope, to be sent at once; call it until it
-    gives none. Every datagram that really goes to the peer is reported by :meth:`spend` before the next take:
-    taking alone costs nothing. Call :meth:`take` again at :meth:`next_deadline`, which any call may change.
+    :meth:`put` adds frames. :meth:`take` pops those of one envelope, to be sent at once; call it until it returns
+    none. Report every datagram that is sent to the peer by :meth:`spend` before the next take: taking alone costs
+    nothing. Call :meth:`take` again at :meth:`next_deadline`, which any call may change.
     """
 
     def __init__(self, settings: EgressSettings, now: float, shape: EnvelopeShape | None = None) -> None:
@@ -119,7 +118,7 @@ class Egress:
 
     @property
     def shape(self) -> EnvelopeShape:
-        """What an envelope to this peer holds and costs now."""
+        """The payload and the cost of an envelope to this peer."""
         return self._shape
 
     @shape.setter
@@ -139,18 +138,23 @@ class Egress:
         return self._lanes.size
 
     def demand(self, now: float) -> float:
-        """What was sent and what had to be dropped over the last seconds, as a share of the budget; 0 without one."""
+        """The bytes sent and dropped over the last seconds, as a share of the budget; 0 without a budget."""
         self._advance(now)
         return self._offered / (DEMAND_WINDOW_S * self._rate) if self._rate else 0.0
 
+    def has_room(self, payload_bytes: int, now: float) -> bool:
+        """Whether an envelope with this payload may go out now: no frame waits, and the budget covers it."""
+        self._advance(now)
+        return not self.queued_frames and self._bytes >= self._overhead + payload_bytes
+
     def put(self, frames: Sequence[Frame], now: float) -> None:
-        """Frames for the peer, in their order."""
+        """Let frames for the peer wait, in their order."""
         self._advance(now)
         for frame in frames:
             self._lanes.put(frame, now)
 
     def take(self, now: float) -> list[bytes]:
-        """The frames of the next envelope, in order; none if there is nothing to be sent now."""
+        """Pop the frames of the next envelope, in order. Empty if none is due now."""
         self._advance(now)
         lanes = self._lanes
         lanes.drop_stale(now, self.settings.max_age_s)
@@ -167,12 +171,12 @@ class Egress:
             lanes.serve(waiting, now)
             batch.append(waiting)
             waiting = next_one()
-        # By turns it was decided which frames go; within the envelope they are in the order in which they came.
+        # The turns decide which frames go. Within the envelope they are in the order of arrival.
         batch.sort(key=by_number)
-        return [each.frame.raw for each in batch]
+        return [popped.frame.raw for popped in batch]
 
     def spend(self, datagram_bytes: int, now: float, datagrams: int = 1) -> None:
-        """Datagrams that have gone to the peer, of so many bytes together: envelopes, handshakes, all there is."""
+        """Charge datagrams to the peer, of so many bytes together: envelopes, handshakes and all others."""
         self._advance(now)
         if not self._rate:
             return
@@ -182,7 +186,7 @@ class Egress:
             self._bytes -= wire_bytes
 
     def next_deadline(self) -> float:
-        """When :meth:`take` is to be called next; infinity while nothing waits."""
+        """When :meth:`take` is due next; infinity while no frame waits."""
         first = self._lanes.next()
         if first is None:
             return inf
@@ -190,7 +194,7 @@ class Egress:
         return max(self._due_at(), self._now + missing / self._rate if missing > 0 else self._now)
 
     def clear(self, now: float) -> None:
-        """Drop all that waits: the peer is gone."""
+        """Drop all frames that wait: the peer is lost."""
         self._advance(now)
         self._lanes.clear()
 
@@ -205,14 +209,14 @@ class Egress:
                 self._offered *= exp(-elapsed / DEMAND_WINDOW_S)
 
     def _is_short(self, more_bytes: int) -> bool:
-        """Whether the bucket falls short of what waits and this."""
+        """Whether the bucket holds less than the cost of the waiting frames and of this many bytes more."""
         size = self.queued_bytes + more_bytes
         envelopes = 1 + size // self._shape.payload_limit
         return size + envelopes * self._overhead > self._bytes
 
     def _price(self, first: Waiting) -> float:
-        """What the bucket must hold for an envelope to go: enough for its first frame, and if that leaves others
-        waiting, enough to be worth the overhead."""
+        """What the bucket must hold before an envelope is sent: enough for its first frame and, if others would still
+        wait, enough to be worth the overhead."""
         overhead = self._overhead
         all_of_it = overhead + min(self.queued_bytes, self._shape.payload_limit)
         if first.flow.lane is Lane.URGENT:
@@ -222,13 +226,13 @@ class Egress:
         return max(overhead + len(first.frame.raw), min(all_of_it, worth))
 
     def _due_at(self) -> float:
-        """When coalescing ends for what waits; there must be something."""
+        """When coalescing ends for the waiting frames. There must be one."""
         urgent, *rest = self._lanes.queues
         if urgent.count or self.queued_bytes >= self._shape.payload_limit:
             return -inf
         return min(oldest.put_at for queue in rest if (oldest := queue.oldest())) + self.settings.coalesce_s
 
-    # What the lanes ask and report.
+    # Callbacks of the lanes.
 
     def _is_superseded(self, waiting: Waiting, newer: Frame, now: float) -> bool:
         """A newer state replaces an older one while the budget is short."""

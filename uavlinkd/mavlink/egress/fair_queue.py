@@ -1,14 +1,14 @@
-"""What waits for one slow local client: urgent frames first, and each source its fair share of the bytes.
+"""The frames that wait for one slow local client: urgent ones first, and for each source its fair share of the bytes.
 
-A captured member may send what its policy allows, as fast as its link carries it. It can invent component ids and
-instances, so fairness between flows alone would let it take almost everything. Therefore a frame's turn depends on
-its *source* first, and on lane and flow within the source after that:
+A captured member may send everything that its policy allows, as fast as its link carries it. It can invent component
+ids and instances, so with fairness between flows alone it would get almost all bytes. Therefore a frame's turn
+depends on its *source* first, and on lane and flow within the source after that:
 
-* Urgent frames (:mod:`.egress_kinds`) of all sources go first. While other frames wait too, urgent ones get three of
+* Urgent frames (:mod:`.kinds`) of all sources go first. While other frames wait too, urgent ones get three of
   four bytes, so a flood of HEARTBEAT stops neither a mission upload nor positions.
 * In both classes the source that was sent the fewest bytes is next, counted from when it began to wait (start-time
   fair queueing). A source that asks for less than its share waits for at most one frame of each other source.
-* Within a source the lanes and flows take turns (:mod:`.egress_lanes`).
+* Within a source the lanes and flows take turns (:mod:`.lanes`).
 * A newer state replaces an older one that has waited for ``SUPERSEDED_S``: counted as THINNED. Up to then both are
   delivered, since one envelope may carry several of a flow and the client may have room for all.
 * A frame that waited longer than ``max_age_s`` is dropped as STALE. Bytes are bounded for each source, and together:
@@ -23,11 +23,11 @@ from collections.abc import Callable, Sequence
 from heapq import heappop, heappush, heapreplace
 from typing import Final
 
-from uavlinkd.mavlink.policy.delivery import Source
 from uavlinkd.mavlink.egress.kinds import Lane
 from uavlinkd.mavlink.egress.lanes import EgressDrop, Lanes, OnDrop
 from uavlinkd.mavlink.egress.queue import Waiting
 from uavlinkd.mavlink.frames import Frame
+from uavlinkd.mavlink.policy.delivery import Source
 
 SUPERSEDED_S: Final = 0.1
 """A state that waited so long is replaced by a newer one of its flow."""
@@ -86,7 +86,7 @@ class _Line:
         self._number = 0
 
     def join(self, place: _Place) -> None:
-        """A frame of this source waits. A source that was idle has saved nothing up, and owes what it was sent."""
+        """A frame of this source waits. A source that was idle has no credit, and owes the bytes that it was sent."""
         if not place.is_in_line:
             place.is_in_line = True
             self._number += 1
@@ -100,7 +100,7 @@ class _Line:
                 return place, waiting
             heappop(self._heap)
             place.is_in_line = False
-        self._clock = self._most_paid  # none waits: all are quits
+        self._clock = self._most_paid  # no source waits: no source owes anything
         return None
 
     def charge(self, size: int) -> None:
@@ -178,14 +178,14 @@ class FairQueue:
         return frame, place.frames.source
 
     def drop_stale(self, now: float) -> None:
-        """Drop what has waited too long."""
-        for each in self._sources.values():
-            each.lanes.drop_stale(now, self._max_age_s)
+        """Drop the frames that have waited too long."""
+        for source in self._sources.values():
+            source.lanes.drop_stale(now, self._max_age_s)
 
     def clear(self) -> None:
-        """Drop all that waits: the client is gone."""
-        for each in self._sources.values():
-            each.lanes.clear()
+        """Drop all frames that wait: the client is gone."""
+        for source in self._sources.values():
+            source.lanes.clear()
 
     def _turn(self, now: float) -> tuple[_Place, Waiting] | None:
         """The frame that goes next, and its source's place. It is not stale."""
@@ -198,7 +198,7 @@ class FairQueue:
 
     def _add(self, source: Source) -> _SourceFrames:
         if len(self._sources) >= self._sources_limit:
-            self._sources = {at: each for at, each in self._sources.items() if self._is_needed(each)}
+            self._sources = {source: frames for source, frames in self._sources.items() if self._is_needed(frames)}
             self._sources_limit = max(MAX_SOURCES, 2 * len(self._sources))
         added = self._sources[source] = _SourceFrames(source, self._on_drop)
         return added

@@ -1,19 +1,18 @@
-"""What kind of message a frame is to a link that cannot carry everything.
+"""What kind of message a frame is, for a link that cannot carry all of them.
 
-Two questions decide. *Does it matter now?* Heartbeats, commands, their answers and manual control go before all
-else (the group ``urgent``). *Is it replaceable?* A message is a **state** if a newer one from the same source
-says all that the older one said: attitude, position, battery, a setpoint. Of states only the newest is worth
-sending. Everything else is an **event**, which nothing replaces: a parameter, a mission item, a part of a file,
-a text, a command, and whatever the dialect does not know.
+Two questions decide. *Is it urgent?* Heartbeats, commands, their answers and manual control go before all others (the
+group ``urgent``). *Can it be replaced?* A message is a **state** if a newer one from the same source contains
+everything that the older one said: attitude, position, battery, a setpoint. Of states only the newest is worth
+sending. Every other message is an **event**, which no later message replaces: a parameter, a mission item, a part of
+a file, a text, a command, and every message that the dialect does not define.
 
 Frames that replace or follow one another form a *flow*:
 
-* of a state: one message of one sender to one target, of one instance. Some messages speak of several things in
-  turn (BATTERY_STATUS of two batteries, ADSB_VEHICLE of the aircraft around): newest-wins over all of them
-  would starve some, so the field that tells them apart is part of the flow.
-* of an event: one message of one sender, whoever it is for; but what asks for something at once and its answer
-  (COMMAND_LONG, COMMAND_INT, SET_MODE, COMMAND_ACK ...) is one flow of a sender, since arming comes before
-  take-off.
+* Of a state: one message of one sender to one target, of one instance. Some messages describe several things in turn
+  (BATTERY_STATUS of two batteries, ADSB_VEHICLE of the aircraft around). If the newest replaced all of them, some
+  would starve. So the field that tells them apart is part of the flow.
+* Of an event: one message of one sender, for any target. But requests for immediate action and their answers
+  (COMMAND_LONG, COMMAND_INT, SET_MODE, COMMAND_ACK …) are one flow of a sender, because arming comes before take-off.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from uavlinkd.mavlink.dialect import GROUPS, ids_by_name
 from uavlinkd.mavlink.frames import MAVLINK2, Frame
 
 FlowKey = tuple[int | bytes, ...]
-"""What frames of one flow have in common."""
+"""The key that all frames of one flow share."""
 
 COMMANDS: Final = -1
 """In place of the message id in the flow of commands and answers."""
@@ -39,8 +38,8 @@ class Lane(IntEnum):
     STATES = 2
 
 
-class Kind(NamedTuple):
-    """How a message waits. The instance: where in the payload is what tells one thing reported from another."""
+class MessageKind(NamedTuple):
+    """How a message waits. The instance is the part of the payload that tells one reported thing from another."""
 
     lane: Lane
     is_state: bool
@@ -118,32 +117,32 @@ INSTANCES: Final[dict[str, tuple[int, int]]] = {
 }
 
 
-def _kinds() -> dict[int, Kind]:
+def _kinds() -> dict[int, MessageKind]:
     names = {name for group in _STATE_GROUPS for name in GROUPS[group]} | _MORE_STATES
     states = names - _EVENTS_AMONG_THEM
     urgent = set(GROUPS["urgent"])
     ids = ids_by_name()
     kinds = {
-        ids[name]: Kind(Lane.URGENT if name in urgent else Lane.STATES, True, *INSTANCES.get(name, (0, 0)))
+        ids[name]: MessageKind(Lane.URGENT if name in urgent else Lane.STATES, True, *INSTANCES.get(name, (0, 0)))
         for name in states
     }
-    return kinds | {ids[name]: Kind(Lane.URGENT, False) for name in urgent - states}
+    return kinds | {ids[name]: MessageKind(Lane.URGENT, False) for name in urgent - states}
 
 
 SAID_ONCE: Final = frozenset(ids_by_name()[name] for name in _EVENTS_AMONG_THEM)
-"""Message ids in groups of states that no later frame makes up for, such as a line of STATUSTEXT."""
+"""Message ids in groups of states that no later frame replaces, such as a line of STATUSTEXT."""
 KINDS: Final = _kinds()
 """By message id. A message that is not here is an event."""
-EVENT: Final = Kind(Lane.EVENTS, False)
+EVENT: Final = MessageKind(Lane.EVENTS, False)
 
 
-def kind_of(frame: Frame) -> Kind:
-    """How this frame waits. What the dialect does not know, or knows otherwise, is an event."""
+def kind_of(frame: Frame) -> MessageKind:
+    """How this frame waits. A message that the dialect does not define, or not in this form, is an event."""
     return KINDS.get(frame.header.msgid, EVENT) if frame.header.is_known else EVENT
 
 
-def flow_key(frame: Frame, kind: Kind) -> FlowKey:
-    """What frames of this frame's flow have in common."""
+def flow_key(frame: Frame, kind: MessageKind) -> FlowKey:
+    """The key that all frames of this frame's flow share."""
     if not kind.is_state:
         msgid = frame.header.msgid if kind.lane is Lane.EVENTS else COMMANDS
         return (msgid, frame.header.system, frame.header.component)

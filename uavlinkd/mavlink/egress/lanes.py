@@ -1,7 +1,7 @@
-"""What waits for one slow link, or of one source for one slow client: three lanes, bounded, each with its flows.
+"""The frames that wait for one slow link, or of one source for one slow client: three bounded lanes of flows.
 
-Urgent frames are next. The rest of what the link carries is halved between events and states, while both wait, by
-their bytes. Sans-IO: `now` is monotonic seconds.
+Urgent frames are next. The rest of the link's capacity is divided equally, by bytes, between events and states, while
+both wait. Sans-IO: ``now`` is monotonic seconds.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from uavlinkd.mavlink.egress.queue import Flow, Queue, Waiting
 from uavlinkd.mavlink.frames import Frame
 
 FLOWS_PER_LANE: Final = 2
-"""One flow has this part of its lane at most. A flow that floods a lane drops its own frames, not another's."""
+"""One flow gets at most this part of its lane. A flow that floods a lane drops its own frames, not another's."""
 
 
 class EgressDrop(StrEnum):
     """Why a frame was not sent."""
 
     STALE = "stale"  # waited longer than max_age_s
-    THINNED = "thinned"  # a newer one of the same state came
-    OVERFLOW = "overflow"  # the oldest of too much
-    CLOSED = "closed"  # the peer is gone
+    THINNED = "thinned"  # a newer frame of the same state arrived
+    OVERFLOW = "overflow"  # the oldest of too many
+    CLOSED = "closed"  # the peer is lost
 
 
 IsSuperseded = Callable[[Waiting, Frame, float], bool]
@@ -74,7 +74,7 @@ class Lanes:
         return urgent.size + events.size + states.size
 
     def put(self, frame: Frame, now: float) -> Lane:
-        """Have a frame wait. A state replaces older ones that are superseded. The oldest of too much is dropped.
+        """Let a frame wait. A state replaces older ones that are superseded. The oldest of too many is dropped.
 
         Returns:
             The frame's lane.
@@ -97,12 +97,12 @@ class Lanes:
         return flow.lane
 
     def first(self) -> Waiting | None:
-        """The oldest frame first: there is room for everything."""
+        """The oldest frame: there is room for all."""
         heads = [oldest for queue in self.queues if (oldest := queue.oldest())]
         return min(heads, key=by_number) if heads else None
 
     def next(self) -> Waiting | None:
-        """What matters most."""
+        """The most important frame."""
         return self.next_urgent() or self.next_of_the_rest()
 
     def next_urgent(self) -> Waiting | None:
@@ -127,7 +127,7 @@ class Lanes:
         self.queues[lane].serve(waiting, now)
 
     def drop_stale(self, now: float, max_age_s: float) -> None:
-        """Drop what has waited longer than ``max_age_s``."""
+        """Drop the frames that have waited longer than ``max_age_s``."""
         for queue in self.queues:
             while (oldest := queue.oldest()) is not None and now - oldest.put_at > max_age_s:
                 self.drop(oldest, EgressDrop.STALE)
@@ -139,7 +139,7 @@ class Lanes:
         self.drop(oldest, EgressDrop.OVERFLOW)
 
     def clear(self) -> None:
-        """Drop all that waits: the link is gone."""
+        """Drop all frames that wait: the link is lost."""
         for queue in self.queues:
             while (oldest := queue.oldest()) is not None:
                 self.drop(oldest, EgressDrop.CLOSED)
@@ -155,7 +155,7 @@ class Lanes:
         flow = self._flows.get(key)
         if flow is None:
             if len(self._flows) >= self._flows_limit:
-                self._flows = {at: each for at, each in self._flows.items() if each.frames}
+                self._flows = {key: flow for key, flow in self._flows.items() if flow.frames}
                 self._flows_limit = max(self._max_flows, 2 * len(self._flows))
             flow = self._flows[key] = Flow(kind, now)
         return flow

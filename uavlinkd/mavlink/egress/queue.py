@@ -1,11 +1,11 @@
-"""Who waits, and whose turn it is: one lane of a slow link. No clock, no budget: :mod:`.egress` has those."""
+"""One lane of a slow link: the frames that wait, and whose turn it is. :mod:`.budgeted` has clock and budget."""
 
 from __future__ import annotations
 
 from collections import deque
 from heapq import heapify, heappop, heappush
 
-from uavlinkd.mavlink.egress.kinds import Kind, Lane
+from uavlinkd.mavlink.egress.kinds import Lane, MessageKind
 from uavlinkd.mavlink.frames import Frame
 
 
@@ -25,21 +25,21 @@ class Waiting:
 class Flow:
     """Frames that follow or replace one another, the oldest first."""
 
-    __slots__ = ("frames", "is_state", "lane", "sent_at", "since", "size", "stands")
+    __slots__ = ("frames", "is_in_line", "is_state", "lane", "sent_at", "since", "size")
 
-    def __init__(self, kind: Kind, now: float) -> None:
+    def __init__(self, kind: MessageKind, now: float) -> None:
         self.lane = kind.lane
         self.is_state = kind.is_state
         self.frames: deque[Waiting] = deque()
         self.size = 0  # bytes of these
-        # A new flow is as if just sent: else new ones, which anyone can invent, would always come before the known.
+        # A new flow counts as just sent. Otherwise new flows, which a sender can invent, would always go first.
         self.sent_at = now
-        self.since = now  # it has had something to send; that a newer state replaced it does not count
-        self.stands = False  # in its lane's line
+        self.since = now  # when it began to have frames; a newer state that replaces an older one changes nothing
+        self.is_in_line = False  # of its lane
 
     @property
     def rank(self) -> float:
-        """Whose turn is next: the rest by when they were sent last, the urgent by how long they have waited."""
+        """The lowest is next: of urgent flows the longest waiting one, of others the one not sent for longest."""
         return max(self.since, self.sent_at) if self.lane is Lane.URGENT else self.sent_at
 
 
@@ -50,7 +50,7 @@ class Queue:
 
     def __init__(self) -> None:
         self.arrivals: deque[Waiting] = deque()  # with some that no longer wait
-        self.line: list[tuple[float, int, Flow]] = []  # a heap, with some flows that have nothing left
+        self.line: list[tuple[float, int, Flow]] = []  # a heap, with some flows without frames
         self.count = 0
         self.size = 0  # bytes that wait
 
@@ -63,19 +63,19 @@ class Queue:
         flow.size += len(frame.frame.raw)
         self.size += len(frame.frame.raw)
         if len(self.arrivals) > 2 * self.count + 64:
-            self.arrivals = deque(each for each in self.arrivals if each.is_waiting)
-        if not flow.stands:
-            self._stand(flow)
+            self.arrivals = deque(frame for frame in self.arrivals if frame.is_waiting)
+        if not flow.is_in_line:
+            self._join_line(flow)
 
-    def _stand(self, flow: Flow) -> None:
+    def _join_line(self, flow: Flow) -> None:
         """Put the flow in line."""
         if len(self.line) > 2 * self.count + 64:
-            for *_, each in self.line:
-                each.stands = bool(each.frames)
-            self.line = [place for place in self.line if place[2].stands]
+            for *_, other in self.line:
+                other.is_in_line = bool(other.frames)
+            self.line = [place for place in self.line if place[2].is_in_line]
             heapify(self.line)
         heappush(self.line, (flow.rank, flow.frames[0].number, flow))
-        flow.stands = True
+        flow.is_in_line = True
 
     def head(self) -> Waiting:
         """The frame whose turn it is. There must be one."""
@@ -84,9 +84,9 @@ class Queue:
             if flow.frames and flow.rank <= rank:
                 return flow.frames[0]
             heappop(self.line)
-            flow.stands = False
+            flow.is_in_line = False
             if flow.frames:  # sent since, out of turn
-                self._stand(flow)
+                self._join_line(flow)
 
     def oldest(self) -> Waiting | None:
         """The frame that has waited longest: always the first of its flow."""

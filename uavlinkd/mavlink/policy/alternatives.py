@@ -1,8 +1,8 @@
-"""Which other messages and commands have the effect of a denied command.
+"""Other messages and commands that have the effect of a denied command.
 
-An autopilot does most things in more than one way, and new firmware adds ways. So a denied command is best effort:
-this table holds what is known of ArduPilot and PX4, and cannot be complete. An allow-list without the effect's
-alternatives is the only policy that keeps an effect out.
+Most functions of an autopilot have more than one command, and new firmware adds more. So denial is best effort: this
+table contains what is known of ArduPilot and PX4, and cannot be complete. Only an allow-list without the alternatives
+of an effect blocks the effect.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from uavlinkd.mavlink import dialect
 
 
 class Effect(NamedTuple):
-    """What a command does to a vehicle, and what else does it. Names as in MAVLink's definitions."""
+    """An effect on a vehicle, and what can cause it. Names as in MAVLink's definitions."""
 
     name: str
     commands: tuple[str, ...]
-    """The commands for this effect: a policy that denies one of them is meant to keep the effect out."""
+    """The commands for this effect: a policy that denies one of them is intended to block the effect."""
     alternatives: tuple[str, ...]
     """Messages, and commands that start with MAV_CMD_, that can cause the effect too."""
 
 
 class OpenEffect(NamedTuple):
-    """An effect whose command is denied, and what a policy still lets through that causes it."""
+    """An effect whose command is denied, and the messages that cause it and that a policy still passes."""
 
     name: str
     denied: tuple[str, ...]
@@ -35,7 +35,7 @@ def _commands(names: str) -> tuple[str, ...]:
     return tuple(f"MAV_CMD_{name}" for name in names.split())
 
 
-# A joystick and an overridden transmitter have the sticks and, by RCx_OPTION or a button's function, every switch.
+# A joystick and an overridden transmitter control the sticks and, by RCx_OPTION or a button's function, every switch.
 _REMOTE_CONTROL: Final = ("RC_CHANNELS_OVERRIDE", "MANUAL_CONTROL")
 _PARAMETERS: Final = ("PARAM_SET", "PARAM_EXT_SET", "PARAM_MAP_RC", *_commands("DO_SET_PARAMETER PREFLIGHT_STORAGE"))
 _SETPOINTS: Final = (

@@ -1,49 +1,51 @@
-"""Who may say what: a policy for one peer or one local endpoint, each way.
+"""Policies: the messages that one peer or one local endpoint may send and receive.
 
-*In* is what comes from the peer or endpoint, *out* what goes to it. The keys::
+*In* is the direction from the peer or endpoint, *out* the direction to it. The keys::
 
-    role = "operator"                    a preset to start from, see `roles`; "all" lets everything through
-    system_ids = [1, "10-20"]            MAVLink systems it may speak as; "all" trusts it with every one
+    role = "operator"                    a preset, see `roles`; "all" passes everything
+    system_ids = [1, "10-20"]            MAVLink systems that it may send as; "all" trusts it with every system
     allow_in  = ["telemetry", "PING"]    what passes
-    deny_in   = ["MAV_CMD_DO_FLIGHTTERMINATION"]            what does not, whatever allows it
-    allow_out, deny_out                  the same for the other way
+    deny_in   = ["MAV_CMD_DO_FLIGHTTERMINATION"]            what does not pass, even if allowed
+    allow_out, deny_out                  the same for the other direction
     rate_in   = { ATTITUDE = 10 }        frames a second of each message and component; also of a group's messages;
-                                         swarm-member and observer have rates of their own, which these go before
-    rate_out                             the same for the other way; also of each target and instance (battery 0, 1),
-                                         to each program; telemetry's not of what is said once (STATUSTEXT)
+                                         replaces a rate of the role (swarm-member and observer have rates)
+    rate_out                             the same for the other direction, for each target, instance (battery 0, 1)
+                                         and client; telemetry's does not apply to messages sent once (STATUSTEXT)
     mavlink1 = true                      whether MAVLink 1 frames pass
     ground_station = true                whether its HEARTBEAT may claim to be a ground station's
 
-A peer's policy fails closed: it needs `system_ids`, and a role or both `allow_in` and `allow_out` ([] lets nothing
-pass). All keys are optional for a local endpoint, whose wire is trusted: without a role and a list everything passes.
+A peer's policy fails closed: it needs `system_ids`, and a role or both `allow_in` and `allow_out` ([] passes
+nothing). All keys are optional for a local endpoint, whose wire is trusted: without a role and a list everything
+passes.
 
-Denial is best effort. An autopilot does most things in several ways (`alternatives` lists those that are known), and
-its next release may add one. To keep an effect out, allow what is needed and nothing else.
+Denial is best effort. Most functions of an autopilot have several commands (`alternatives` lists the known ones), and
+its next release may add one. To block an effect, allow only the messages that are needed.
 
-A list's entries add up, a role's entries among them, and what is denied is denied whatever allows it. An entry is
+The entries of a list add to those of the role. A denied entry is denied even if another entry allows it. An entry is
 
 ``telemetry``            a group of `dialect.GROUPS` (small letters), or ``all``
 ``ATTITUDE``             a message by its name (capitals)
-``files-read``           a group that allows only what reads of FILE_TRANSFER_PROTOCOL (READING_OPCODES)
-``30``                   a message by its number: the way to name one that the dialect does not know
-``MAV_CMD_NAV_TAKEOFF``  a command by its name; ``command:22`` by its number. Allowing one lets it through in
-                         COMMAND_LONG and COMMAND_INT. Denying one keeps it out of all that carries commands, mission
-                         items and cancellations among them, and with it what does the same: SET_MODE is
-                         MAV_CMD_DO_SET_MODE, a mission item to fly to now is MAV_CMD_DO_REPOSITION, and
-                         MAV_CMD_DO_AUX_FUNCTION can arm (`policy_settings.DONE_BY`).
+``files-read``           a group that allows only the reading requests of FILE_TRANSFER_PROTOCOL (READING_OPCODES)
+``30``                   a message by its number, for messages that the dialect does not know
+``MAV_CMD_NAV_TAKEOFF``  a command by its name; ``command:22`` by its number. An allowed command passes in
+                         COMMAND_LONG and COMMAND_INT. A denied command is refused in all messages that carry
+                         commands, including mission items and cancellations. So are messages and commands with the
+                         same effect: SET_MODE is MAV_CMD_DO_SET_MODE, a mission item to fly to now is
+                         MAV_CMD_DO_REPOSITION, and MAV_CMD_DO_AUX_FUNCTION can arm (`settings.DONE_BY`).
 
-A rate is kept for each component by itself: an autopilot and its gimbal both send HEARTBEAT, and were the rate theirs
-together, whoever comes first in each second would silence the other for minutes. But what comes in may name any
-component, so all components of a system together have SYSTEM_SHARE times the rate: invented ones gain no more. What
-goes out has passed another's gate already, so there each flow has the rate, as where a link thins (`egress_kinds`),
-to each of the programs at an endpoint. And from groups of what is reported again and again, as `telemetry`, what is
-said once or in parts is not thinned out: a line of a text that is missing never comes again. Named by itself it is.
+Each component has a rate of its own. An autopilot and its gimbal both send HEARTBEAT: with a common rate, the first
+sender of each second would silence the other for minutes. An incoming frame may name any component, so all components
+of a system together have SYSTEM_SHARE times the rate: invented components do not raise it further. Outgoing frames
+have passed another gate already, so there each flow to each client has the rate, as in the egress (`egress.kinds`).
+The rate of a group of repeated reports, such as `telemetry`, does not apply to its messages that are sent once or in
+parts: a missing line of text is never repeated. A rate for such a message by name applies.
 
-What a policy cannot see into passes or not as a whole: files, shells, tunnels, raw buses. A policy that denies a
-command and lets one of those through gets a warning, as the command may travel inside. A message that the dialect
-does not know, or in another definition than the dialect's, passes only where ``all`` or its number is allowed.
+A policy cannot inspect the content of files, shells, tunnels and raw buses: it passes or refuses these messages as a
+whole. A policy that denies a command and passes one of them causes a warning, because the message may contain the
+command. A message that the dialect does not know, or that has another definition than the dialect's, passes only if
+``all`` or its number is allowed.
 
-SETUP_SIGNING carries a signing key in clear. It never passes, whatever a policy says.
+SETUP_SIGNING carries a signing key in clear. No policy passes it.
 """
 
 from __future__ import annotations
@@ -52,14 +54,14 @@ from collections.abc import Mapping
 from typing import Final, NamedTuple
 
 from uavlinkd.mavlink import dialect
-from uavlinkd.mavlink.policy.alternatives import full_command_name, open_effects
 from uavlinkd.mavlink.dialect_table import MESSAGES
+from uavlinkd.mavlink.policy.alternatives import full_command_name, open_effects
 from uavlinkd.mavlink.policy.gate import SAME_AS_COMMAND, Condition, Gate, Refusal
 from uavlinkd.mavlink.policy.settings import PolicyError, PolicyProblem, Rules, Settings, read_settings
 
 __all__ = ["Policy", "PolicyError", "PolicyProblem", "PolicyRow", "compile_policy"]
 
-# What can carry a command where no policy sees it.
+# Messages that can contain a command which a policy cannot inspect.
 OPAQUE: Final = (*dialect.GROUPS["shell"], "FILE_TRANSFER_PROTOCOL")
 
 
@@ -72,7 +74,7 @@ class PolicyRow(NamedTuple):
 
 
 class Policy:
-    """What one peer or endpoint may say (`incoming`) and be told (`outgoing`)."""
+    """What one peer or endpoint may send (`incoming`) and receive (`outgoing`)."""
 
     __slots__ = ("_settings", "incoming", "outgoing", "warnings")
 
@@ -94,11 +96,11 @@ class Policy:
             mavlink1=settings.mavlink1,
             ground_station=True,
         )
-        # Sentences for the operator, the gravest first.
+        # Sentences for the operator, the most severe first.
         self.warnings = tuple(_warnings(settings, self.incoming, self.outgoing))
 
     def describe(self) -> list[PolicyRow]:
-        """The policy as a table: each group of messages, and what holds beside them."""
+        """The policy as a table: each group of messages, and the other rules."""
         settings = self._settings
         rules = (settings.rules_in, settings.rules_out)
         gates = (self.incoming, self.outgoing)
@@ -124,10 +126,10 @@ class Policy:
 
 
 def compile_policy(data: Mapping[str, object], *, is_local: bool = False) -> Policy:
-    """The policy that plain data (see this module's head) describes.
+    """The policy that plain data describes, see this module's docstring.
 
-    `is_local`: of a local endpoint, where every key is optional and no data lets everything pass. A peer's policy
-    must say what passes each way and which systems the peer may speak as.
+    `is_local`: for a local endpoint, where every key is optional and everything passes without data. A peer's policy
+    must define what passes in each direction, and the systems that the peer may send as.
 
     Raises:
         PolicyError: with every problem in the data, each with its key and its remedy.
@@ -137,13 +139,13 @@ def compile_policy(data: Mapping[str, object], *, is_local: bool = False) -> Pol
 
 def _warnings(settings: Settings, incoming: Gate, outgoing: Gate) -> list[str]:
     if settings.is_empty:
-        return ["no policy: it may speak as any system and send anything but SETUP_SIGNING"]
-    found = []
+        return ["no policy: it may send as any system, and any message but SETUP_SIGNING"]
+    warnings = []
     if settings.role == dialect.ALL:
-        found.append('role = "all": it may send every message and command that no list denies')
+        warnings.append('role = "all": it may send every message and command that no list denies')
     if settings.systems is None:
-        found.append('system_ids is "all": it may speak as any system, the ground station\'s among them')
-    for way, rules, gate in (("in", settings.rules_in, incoming), ("out", settings.rules_out, outgoing)):
+        warnings.append('system_ids is "all": it may send as any system, including the ground station')
+    for direction, rules, gate in (("in", settings.rules_in, incoming), ("out", settings.rules_out, outgoing)):
         if rules.denies_all:
             continue
         # A denied message with the effect of a command counts as that command.
@@ -156,10 +158,11 @@ def _warnings(settings: Settings, incoming: Gate, outgoing: Gate) -> list[str]:
             full_command_name(number): name for number, name in same.items() if number not in rules.denied_commands
         }
         for name, denied, still_open in open_effects(rules.denied_commands | set(same), gate.lets_act):
-            asked = ", ".join(by_message.get(command, command) for command in denied)
-            found.append(
-                f"deny_{way} keeps out {asked}, but {name} stays possible by {', '.join(still_open)}:"
-                f" denial is best effort; to keep the effect out, write no role and allow_{way} = what is needed"
+            asked = ", ".join(by_message.get(command, command) for command in denied)  # as the file names them
+            warnings.append(
+                f"deny_{direction} refuses {asked}, but {name} stays possible by {', '.join(still_open)}:"
+                f" denial is best effort; to block the effect, write no role, and in allow_{direction} only what is"
+                " needed"
             )
         if not rules.denied_commands:
             continue
@@ -171,18 +174,25 @@ def _warnings(settings: Settings, incoming: Gate, outgoing: Gate) -> list[str]:
             and (rules.allows_all or ids[name] in rules.allowed or ids[name] in rules.allowed_numbers)
         ]
         if through:
-            found.append(f"deny_{way} names commands that may still travel unseen inside {', '.join(through)}")
-    return found
+            warnings.append(
+                f"deny_{direction} names commands that may still pass inside {', '.join(through)}: a policy cannot"
+                " inspect these messages"
+            )
+    return warnings
 
 
 def _group_text(gate: Gate, members: tuple[str, ...]) -> str:
-    """Which of a group's messages pass."""
+    """The messages of a group that pass, as text."""
     ids = dialect.ids_by_name()
     verdicts = {name: gate.decide(ids[name], is_known=True) for name in members}
     passing = [name for name, verdict in verdicts.items() if not isinstance(verdict, Refusal)]
     conditions = {name: verdict for name in passing if isinstance(verdict := verdicts[name], Condition)}
-    limited = [name for name, each in conditions.items() if each.only_commands is not None or each.never_commands]
-    reading = [name for name, each in conditions.items() if each.only_reads_files]
+    limited = [
+        name
+        for name, condition in conditions.items()
+        if condition.only_commands is not None or condition.never_commands
+    ]
+    reading = [name for name, condition in conditions.items() if condition.only_reads_files]
     if not passing:
         return "none" if members != ("SETUP_SIGNING",) else "never"
     if len(passing) == len(members):

@@ -20,7 +20,8 @@ start byte in it, separator bytes end what it reads there.
 
 A hidden frame that every source of its bytes may send is harmless: the download of a recorded flight carries whole
 frames of the vehicle itself. Rates do not apply to hidden frames. Dialects that the daemon does not know are a limit:
-a receiver with a private definition may accept what is no frame here, unless a policy lets unknown messages pass.
+a receiver with a private definition may accept bytes that are not a frame here, unless a policy lets unknown
+messages pass.
 """
 
 from __future__ import annotations
@@ -28,9 +29,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final, final
 
-from uavlinkd.mavlink.policy import hidden
 from uavlinkd.mavlink.egress.kinds import Lane, kind_of
-from uavlinkd.mavlink.frames import MAVLINK1, MAX_FRAME_BYTES, Frame, Header
+from uavlinkd.mavlink.frames import MAVLINK1, MAX_FRAME_BYTES, Frame
+from uavlinkd.mavlink.headers import Header
+from uavlinkd.mavlink.policy import hidden
 from uavlinkd.mavlink.policy.gate import Gate, Refusal
 
 LAST_COMMON_ID: Final = 149
@@ -46,11 +48,11 @@ Report = Callable[[str, Header, Refusal, float], None]
 
 
 Forget = Callable[[bytes], None]
-"""Receives the bytes of a frame that was not delivered: the same from another source is no duplicate of it."""
+"""Receives the bytes of a frame that was not delivered: the same frame from another source is not its duplicate."""
 
 
 def _forget_nothing(raw: bytes) -> None:
-    """No other source sends the same."""
+    """For a source whose frames no other source sends."""
 
 
 def _report_nothing(name: str, header: Header, refusal: Refusal, now: float) -> None:
@@ -105,7 +107,7 @@ class DeliveredStream:
     def admit(self, frame: Frame, source: Source, now: float) -> bytes:
         """The bytes to deliver for a frame: itself, perhaps behind separator bytes. None of them: it is refused."""
         raw = frame.raw
-        if not hidden.has_start(raw):
+        if raw.count(b"\xfd") + raw.count(b"\xfe") == 1:  # no other start byte but the frame's own
             if not self._starts:
                 return raw
             authors = self._authors

@@ -5,19 +5,21 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import Final
 
+from uavlinkd.core.drops import Reason
 from uavlinkd.mavlink import dialect
 from uavlinkd.mavlink.dialect_table import COMMANDS, MESSAGES
 from uavlinkd.mavlink.egress.kinds import FlowKey, flow_key, kind_of
-from uavlinkd.mavlink.frames import Frame, Header
+from uavlinkd.mavlink.frames import Frame
+from uavlinkd.mavlink.headers import Header
 from uavlinkd.mavlink.policy.settings import FILE_TRANSFER, READING_OPCODES, Rules
 
 ANY_OTHER: Final = -1  # stands for every message beyond those that are counted by themselves
-MAX_COUNTED: Final = 1024  # message ids and reasons counted by themselves, of one policy and way
-MAX_BUCKETS: Final = 4096  # flows, and messages of systems, with a rate limit, likewise
-MAX_DECISIONS: Final = 1024  # message ids whose decision is remembered, likewise
+# Limits of one policy in one direction:
+MAX_COUNTED: Final = 1024  # message ids and reasons that are counted by themselves
+MAX_BUCKETS: Final = 4096  # flows, and messages of systems, with a rate limit
+MAX_DECISIONS: Final = 1024  # message ids whose decision is remembered
 BURST_S: Final = 0.5  # how much of a second's frames may come at once
 SYSTEM_SHARE: Final = 16  # what all components of a system may send of a message, in rates of one
 
@@ -25,6 +27,7 @@ HEARTBEAT: Final = 0
 TYPE_IN_HEARTBEAT: Final = 4  # offset in its payload
 MAV_TYPE_GCS: Final = 6
 
+NAMED_COMMANDS: Final = frozenset(COMMANDS.values())
 COMMAND_CARRIERS: Final = frozenset(msgid for msgid, row in MESSAGES.items() if row[6] is not None)
 DIRECT_COMMANDS: Final = frozenset(dialect.ids_by_name()[name] for name in ("COMMAND_LONG", "COMMAND_INT"))
 
@@ -53,7 +56,7 @@ SAME_AS_COMMAND: Final[Mapping[int, int]] = {
     if (number := dialect.command_number(command)) is not None
 }
 
-# ArduPilot does at once, whatever its command, what such a mission item says: by the value of `current`.
+# ArduPilot executes such a mission item at once, by the value of `current` and not by its command.
 MISSION_ITEMS: Final = frozenset(dialect.ids_by_name()[name] for name in ("MISSION_ITEM", "MISSION_ITEM_INT"))
 CURRENT_IN_MISSION_ITEM: Final = 35  # offset in the payload of both
 DONE_AT_ONCE: Final[Mapping[int, int]] = {
@@ -68,19 +71,31 @@ OPCODE_IN_FILE_TRANSFER: Final = 6
 CARRIES_MANY_COMMANDS: Final = frozenset({dialect.ids_by_name()["TRAJECTORY_REPRESENTATION_WAYPOINTS"]})
 
 
-class Refusal(StrEnum):
-    """Why a frame may not pass."""
+class Refusal(Reason):
+    """Why a policy refuses a frame. How a frame can hide another one: see `delivery`."""
 
-    FOREIGN_SYSTEM = "foreign_system"  # speaks as a system that it is not
-    MESSAGE_NOT_ALLOWED = "message_not_allowed"
-    UNKNOWN_MESSAGE = "unknown_message"  # not in the dialect, or not as the dialect defines it
-    COMMAND_NOT_ALLOWED = "command_not_allowed"
-    FILE_WRITE_NOT_ALLOWED = "file_write_not_allowed"  # FILE_TRANSFER_PROTOCOL, and not what reads
-    SETUP_SIGNING = "setup_signing"
-    MAVLINK1_NOT_ALLOWED = "mavlink1_not_allowed"
-    GROUND_STATION_NOT_ALLOWED = "ground_station_not_allowed"
-    RATE_LIMITED = "rate_limited"
-    HIDDEN_FRAME = "hidden_frame"  # its bytes hold, or complete, another frame that may not pass: see `delivery`
+    FOREIGN_SYSTEM = "foreign_system", "the system id of the frame is not in system_ids"
+    MESSAGE_NOT_ALLOWED = "message_not_allowed", "the role, or the lists, do not allow the message"
+    UNKNOWN_MESSAGE = (
+        "unknown_message",
+        "the dialect does not define the message, or not with this length: a list may allow its number",
+    )
+    COMMAND_NOT_ALLOWED = "command_not_allowed", "the role, or the lists, do not allow the command"
+    FILE_WRITE_NOT_ALLOWED = (
+        "file_write_not_allowed",
+        "the file transfer writes, where the policy allows only reading",
+    )
+    SETUP_SIGNING = "setup_signing", "the message contains a MAVLink signing key in clear, which never crosses a link"
+    MAVLINK1_NOT_ALLOWED = "mavlink1_not_allowed", "the policy does not allow MAVLink 1"
+    GROUND_STATION_NOT_ALLOWED = (
+        "ground_station_not_allowed",
+        "the heartbeat is that of a ground station, which the role does not allow",
+    )
+    RATE_LIMITED = "rate_limited", "the messages exceed rate_in or rate_out"
+    HIDDEN_FRAME = (
+        "hidden_frame",
+        "the frame hides another frame that the policy refuses: an attack, or a file with such frames",
+    )
 
 
 _Buckets = dict[FlowKey, tuple[float, float]]
@@ -104,7 +119,7 @@ class Condition:
 
 
 class Gate:
-    """One way of one policy."""
+    """One direction of one policy."""
 
     __slots__ = (
         "_buckets",
@@ -118,6 +133,9 @@ class Gate:
         "_rules",
         "_systems",
         "refused",
+        "refused_commands",
+        "refused_systems",
+        "totals",
     )
 
     def __init__(
@@ -145,11 +163,16 @@ class Gate:
         self._buckets: _Buckets = {}
         self._of_systems: _Buckets = {}
         self.refused: Counter[tuple[int, Refusal]] = Counter()  # by message id (or ANY_OTHER) and reason
+        # Of DIRECT_COMMANDS, by message id, command and reason. Numbers without a name share one entry (ANY_OTHER)
+        # for each reason: they are bounded by themselves, and leave room for every command that a person knows.
+        self.refused_commands: Counter[tuple[int, int, Refusal]] = Counter()
+        self.refused_systems: Counter[int] = Counter()  # the senders' system ids of FOREIGN_SYSTEM
+        self.totals: Counter[Refusal] = Counter()
 
     def check(self, frame: Frame, now: float, to: int = 0) -> Refusal | None:
         """None if the frame may pass, else why not, which is counted. `now` in seconds, monotonic.
 
-        `to`: which of several programs it goes out to. Each has the rate: a frame is another one for each of them.
+        `to`: the client that an outgoing frame goes to, by its number. Each client has a rate limit of its own.
         """
         verdict = self._verdict(frame.header)
         refusal = self._unmet(verdict, frame, now, to) if isinstance(verdict, Condition) else verdict
@@ -163,6 +186,13 @@ class Gate:
         if len(self.refused) >= MAX_COUNTED and counted not in self.refused:
             counted = (ANY_OTHER, refusal)
         self.refused[counted] += 1
+        self.totals[refusal] += 1
+        if refusal is Refusal.FOREIGN_SYSTEM:
+            self.refused_systems[header.system] += 1
+        if header.msgid in DIRECT_COMMANDS:
+            number = header.command
+            named = (ANY_OTHER, ANY_OTHER) if number not in NAMED_COMMANDS else (header.msgid, number)
+            self.refused_commands[*named, refusal] += 1
 
     def permits(self, frame: Frame) -> bool:
         """Whether the frame may pass, at any rate. Counts nothing and uses up no rate."""
@@ -173,11 +203,23 @@ class Gate:
 
     @property
     def passes_unknown(self) -> bool:
-        """Whether a message that the dialect does not know may pass: of some systems, but not of every one.
+        """Whether a message that the dialect does not define may pass, from some systems but not from all.
 
-        Then a frame is valid by any CRC_EXTRA. Where all that there is may pass, nothing needs to be told apart.
+        Then a frame is valid by any CRC_EXTRA. If every frame may pass, the difference does not matter.
         """
         return self._passes_unknown
+
+    @property
+    def passes_nothing(self) -> bool:
+        """Whether the rules allow no message at all, such as ``allow_in = []``."""
+        rules = self._rules
+        allows = (rules.allows_all, rules.allowed, rules.allowed_numbers, rules.allowed_commands, rules.reads_files)
+        return rules.denies_all or not any(allows)
+
+    @property
+    def systems(self) -> frozenset[int] | None:
+        """The systems whose frames are let pass; None: any."""
+        return self._systems
 
     def may_speak_as(self, system: int) -> bool:
         """Whether frames of this system are let pass at all."""
@@ -250,7 +292,7 @@ class Gate:
 
     def _remember(self, key: int, verdict: Refusal | Condition | None) -> Refusal | Condition | None:
         if len(self._decisions) >= MAX_DECISIONS:
-            self._decisions.clear()  # only someone who sends random message ids gets here
+            self._decisions.clear()  # only a sender of random message ids causes this
         self._decisions[key] = verdict
         return verdict
 

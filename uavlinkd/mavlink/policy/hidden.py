@@ -52,23 +52,19 @@ _FILLERS: Final = (*range(2, MAVLINK1 - 1), 0xFF)
 """Values of separator bytes: no start byte, and as incompat_flags each of them ends a header at once."""
 
 
-def has_start(raw: bytes) -> bool:
-    """Whether a frame has a start byte anywhere but at its start."""
-    return raw.count(b"\xfd") + raw.count(b"\xfe") != 1
-
-
 def starts_in(data: bytes, begin: int) -> list[Start]:
     """Where frames may begin, from `begin` on."""
     return [(match.start(), match[0] == _MAVLINK1) for match in _PLAUSIBLE.finditer(data, begin)]
 
 
 def restart(data: bytes, start: Start, end: int) -> Start | None:
-    """Where a parser begins anew that rejects the frame from `start` to `end`, if it does so in MAVLink 1."""
+    """Where a parser that rejects the frame from `start` to `end` resumes in MAVLink 1, if it does."""
     return (end - 1, True) if start[1] and data[end - 1] == MAVLINK2 else None
 
 
 def end_of_checksum(data: bytes, start: Start) -> int | None:
-    """Where the checksum of the frame at `start` ends; None if its header is incomplete, :data:`PAST` if it is none.
+    """Where the checksum of the frame at `start` ends; None if its header is incomplete, :data:`PAST` if no frame
+    begins there.
 
     `start` must be at a start byte.
     """
@@ -101,7 +97,7 @@ def frame_at(data: bytes, start: Start, end: int) -> Frame:
     if is_mavlink1:
         raw = _MAVLINK1 + raw[1:]
     elif raw[2]:
-        raw += bytes(SIGNATURE_BYTES)  # whatever it will be
+        raw += bytes(SIGNATURE_BYTES)  # of any content
     frame = parse_frame(raw)
     assert frame is not None, "its checksum fits some CRC_EXTRA"
     return frame

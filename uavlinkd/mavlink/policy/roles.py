@@ -1,13 +1,12 @@
-"""Presets for policies: what a peer or endpoint is, and so what it may say.
+"""Presets for policies: each role allows the messages that a kind of peer or endpoint needs.
 
-The roles are seen from the daemon whose configuration names them: ``role = "vehicle"`` on a ground station's peer
-means that this peer is a vehicle. `vehicle` and `operator` are each other's mirror image. Between two vehicles only
-`swarm-member` is right: a vehicle's answers to a ground station (file transfer, mission items) are writes to another
-autopilot.
+A role describes the other end: ``role = "vehicle"`` in a ground station's configuration means that this peer is a
+vehicle. `vehicle` and `operator` are the mirror image of each other. Between two vehicles only `swarm-member` is
+right: a vehicle's answers to a ground station (file transfer, mission items) are writes to another autopilot.
 
-A role that does not operate comes with incoming rates, in frames a second of each message and
-component. All components of a system together have `policy.SYSTEM_SHARE` times the rate. The configuration's own
-`rate_in` for a message goes before the role's.
+The roles that do not operate a vehicle have incoming rates, in frames a second of each message and component. All
+components of a system together have `gate.SYSTEM_SHARE` times the rate. A `rate_in` of the configuration replaces the
+role's rate for that message.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from uavlinkd.mavlink.dialect import ALL
 
 
 class Role(NamedTuple):
-    """The lists that a policy starts from."""
+    """The presets of one role."""
 
     about: str
     allow_in: tuple[str, ...]
@@ -29,20 +28,20 @@ class Role(NamedTuple):
     rate_in: Mapping[str, float] = MappingProxyType({})  # frames a second by group or message, as in a configuration
 
 
-# What a vehicle tells its operator.
+# Messages of a vehicle to its operator.
 _FROM_VEHICLE: Final = (
     *("heartbeat", "telemetry", "position", "traffic", "identification", "answers", "payload-reports"),
     *("time", "FILE_TRANSFER_PROTOCOL", "RADIO", "RADIO_STATUS", "CELLULAR_STATUS", "LINK_NODE_STATUS"),
     *("UAVIONIX_ADSB_OUT_STATUS", "UAVIONIX_ADSB_TRANSCEIVER_HEALTH_REPORT"),
     "MAV_CMD_ACCELCAL_VEHICLE_POS",  # ArduPilot's "now put me on my left side", asked of the person
 )
-# What an operator tells a vehicle: everything but shells, buses, firmware, secrets, and a simulator's sensors.
+# Messages of an operator to a vehicle: all but shells, buses, firmware, secrets, and a simulator's sensors.
 _FROM_OPERATOR: Final = (
     *("heartbeat", "commands", "parameters", "mission", "setpoints", "manual", "files", "streams", "time"),
     *("rtk", "terrain", "camera", "gimbal", "signals", "traffic", "transponder", "identification", "STATUSTEXT"),
     *("CHANGE_OPERATOR_CONTROL", "CHANGE_OPERATOR_CONTROL_ACK"),
 )
-# Questions that change nothing in the vehicle. No HEARTBEAT: it would keep the failsafe for a lost operator quiet.
+# Requests that change nothing in the vehicle. No HEARTBEAT: it would suppress the failsafe for a lost operator.
 _FROM_OBSERVER: Final = (
     *("parameter-reads", "mission-reads", "PING", "REQUEST_EVENT"),
     *("MAV_CMD_REQUEST_MESSAGE", "MAV_CMD_REQUEST_PROTOCOL_VERSION", "MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES"),
@@ -52,12 +51,12 @@ _TO_OBSERVER: Final = (
     *("heartbeat", "telemetry", "position", "traffic", "identification", "answers", "payload-reports", "PING"),
     *("CELLULAR_STATUS", "LINK_NODE_STATUS"),
 )
-# That it is there and where: enough to keep apart and to follow. No `traffic`: autopilots evade what it reports.
+# Presence and position: enough to keep distance and to follow. No `traffic`: autopilots evade what it reports.
 _BETWEEN_MEMBERS: Final = ("heartbeat", "position")
 # An autopilot sends HEARTBEAT at 1/s, and positions at 50/s at most by its defaults; following needs some 10/s. A
 # recorded dive has bursts of 127 VFR_HUD in 0.1 s.
 _MEMBER_RATES: Final = MappingProxyType({"HEARTBEAT": 5.0, "position": 50.0, "VFR_HUD": 250.0})
-# A client asks again for parameters that it missed: a recorded one for 10 at once.
+# A client requests the parameters that it missed once more: a recorded one requested 10 at a time.
 _OBSERVER_RATES: Final = MappingProxyType(
     {
         "parameter-reads": 50.0,
@@ -71,7 +70,7 @@ _OBSERVER_RATES: Final = MappingProxyType(
 
 ROLES: Final[Mapping[str, Role]] = {
     "vehicle": Role(
-        "a vehicle that is operated from here: reports, answers, asks for nothing",
+        "a vehicle that is operated from here: it reports and answers, and requests nothing",
         allow_in=_FROM_VEHICLE,
         allow_out=_FROM_OPERATOR,
         ground_station=False,
@@ -83,21 +82,21 @@ ROLES: Final[Mapping[str, Role]] = {
         ground_station=True,
     ),
     "observer": Role(
-        "looks on: sees telemetry, may read parameters and the mission, changes nothing",
+        "reads telemetry, parameters and the mission, and changes nothing",
         allow_in=_FROM_OBSERVER,
         allow_out=_TO_OBSERVER,
         ground_station=False,
         rate_in=_OBSERVER_RATES,
     ),
     "swarm-member": Role(
-        "a vehicle that flies along: each tells the other that it is there and where, and no more",
+        "a vehicle of the same swarm: both exchange presence and position only",
         allow_in=_BETWEEN_MEMBERS,
         allow_out=_BETWEEN_MEMBERS,
         ground_station=False,
         rate_in=_MEMBER_RATES,
     ),
     ALL: Role(
-        "trusted with everything: any message and command both ways, except SETUP_SIGNING",
+        "trusted with everything: any message and command in both directions, except SETUP_SIGNING",
         allow_in=(ALL,),
         allow_out=(ALL,),
         ground_station=True,

@@ -1,4 +1,4 @@
-"""Reads a policy's plain data into sets of numbers, or names every problem in it. The syntax is in `policy`."""
+"""Converts a policy's plain data to sets of numbers, or reports every problem in it. `compilation` has the syntax."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ KEYS: Final = (
     *("mavlink1", "ground_station"),
 )
 
-# Commands by which an autopilot can be made to do what another says: whoever denies the one means the others too.
-# DO_AUX_FUNCTION does what a switch of the remote control would (ArduPilot's RCx_OPTION): modes, arming, a stop.
+# Commands with the same effect as another: a policy that denies a command denies these too. DO_AUX_FUNCTION has the
+# effect of a switch of the remote control (ArduPilot's RCx_OPTION): modes, arming, a stop.
 _DONE_BY: Final[Mapping[str, tuple[str, ...]]] = {
     "COMPONENT_ARM_DISARM": ("DO_AUX_FUNCTION",),
     "DO_FLIGHTTERMINATION": ("DO_AUX_FUNCTION",),
@@ -46,7 +46,7 @@ DONE_BY: Final[Mapping[int, frozenset[int]]] = {
 FILES_READ: Final = "files-read"
 FILE_TRANSFER: Final = dialect.ids_by_name()["FILE_TRANSFER_PROTOCOL"]
 # MAVLink's MAV_FTP_OPCODE (https://mavlink.io/en/services/ftp.html). The others create, write, truncate, rename or
-# remove; a number that the definition does not have may do anything.
+# remove; a number outside the definition may have any effect.
 READING_OPCODES: Final = frozenset(
     {
         1,  # TerminateSession
@@ -63,7 +63,7 @@ READING_OPCODES: Final = frozenset(
 
 
 class PolicyProblem(NamedTuple):
-    """One thing wrong in a policy's data."""
+    """One problem in a policy's data."""
 
     key: str  # with the place in a list: "allow_in[2]"
     problem: str
@@ -74,7 +74,7 @@ class PolicyProblem(NamedTuple):
 
 
 class PolicyError(ValueError):
-    """A policy's data does not say what it should. Lists every problem."""
+    """A policy's data is invalid. Lists every problem."""
 
     def __init__(self, problems: Iterable[PolicyProblem]) -> None:
         self.problems = tuple(problems)
@@ -83,25 +83,25 @@ class PolicyError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Rules:
-    """What passes one way. Numbers are message ids, or commands where the name says so."""
+    """The rules for one direction. Numbers are message ids, or commands if the name contains `commands`."""
 
     allows_all: bool
     allowed: frozenset[int]  # by name or group: the message as the dialect defines it
-    allowed_numbers: frozenset[int]  # by number: in whatever definition
+    allowed_numbers: frozenset[int]  # by number: in any definition
     allowed_commands: frozenset[int]
-    reads_files: bool  # of FILE_TRANSFER_PROTOCOL, READING_OPCODES pass
+    reads_files: bool  # whether READING_OPCODES of FILE_TRANSFER_PROTOCOL pass
     denies_all: bool
-    denied: frozenset[int]  # in whatever definition
+    denied: frozenset[int]  # in any definition
     denied_commands: frozenset[int]
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """A policy's data, read."""
+    """A policy's data after reading."""
 
-    is_empty: bool  # there was none: only a local endpoint may have none
+    is_empty: bool  # no data, which only a local endpoint may have
     role: str | None
-    systems: frozenset[int] | None  # that it may speak as; None: any
+    systems: frozenset[int] | None  # that it may send as; None: any
     systems_text: str
     rules_in: Rules
     rules_out: Rules
@@ -115,7 +115,7 @@ Report = Callable[[str, str, str], None]  # key, problem, remedy
 
 
 class _Entry(NamedTuple):
-    """What one entry of a list stands for."""
+    """The meaning of one entry of a list."""
 
     is_all: bool = False
     messages: tuple[int, ...] = ()
@@ -125,10 +125,10 @@ class _Entry(NamedTuple):
 
 
 def read_settings(data: Mapping[str, object], *, is_local: bool) -> Settings:
-    """Read a policy's plain data. ``is_local``: of an endpoint, where a missing list lets everything through.
+    """Read a policy's plain data. ``is_local``: for an endpoint, where everything passes without a list.
 
     Raises:
-        PolicyError: with every problem in it.
+        PolicyError: with every problem of the data.
     """
     problems: list[PolicyProblem] = []
 
@@ -147,14 +147,14 @@ def read_settings(data: Mapping[str, object], *, is_local: bool) -> Settings:
     systems, systems_text = _systems(data, report, is_needed=not is_local)
     rules = {}
     rates = {}
-    for way, preset in (("in", role and role.allow_in), ("out", role and role.allow_out)):
-        allow = _list(data, f"allow_{way}", report)
-        deny = _list(data, f"deny_{way}", report)
-        _check_entries(f"allow_{way}", allow, report)
-        _check_entries(f"deny_{way}", deny, report)
-        allows_all = is_local and preset is None and f"allow_{way}" not in data
-        rules[way] = _rules((*(preset or ()), *allow), deny, allows_all=allows_all)
-        rates[way] = _rates(data, f"rate_{way}", report)
+    for direction, preset in (("in", role and role.allow_in), ("out", role and role.allow_out)):
+        allow = _list(data, f"allow_{direction}", report)
+        deny = _list(data, f"deny_{direction}", report)
+        _check_entries(f"allow_{direction}", allow, report)
+        _check_entries(f"deny_{direction}", deny, report)
+        allows_all = is_local and preset is None and f"allow_{direction}" not in data
+        rules[direction] = _rules((*(preset or ()), *allow), deny, allows_all=allows_all)
+        rates[direction] = _rates(data, f"rate_{direction}", report)
     if role is not None:
         rates["in"] = {**_rates({"rate_in": role.rate_in}, "rate_in", report), **rates["in"]}
     settings = Settings(
@@ -175,24 +175,24 @@ def read_settings(data: Mapping[str, object], *, is_local: bool) -> Settings:
 
 
 def _check_is_complete(data: Mapping[str, object], report: Report) -> None:
-    """A peer's policy says what passes each way: nothing is allowed because a key is missing."""
+    """Report a missing list of a peer's policy: a missing key never allows a message."""
     if "role" in data:
         return
     missing = [key for key in ("allow_in", "allow_out") if key not in data]
     if len(missing) == 2:
         names = ", ".join(f'"{name}"' for name in ROLES if name != dialect.ALL)
-        remedy = f'write role = one of {names}, or both lists; role = "{dialect.ALL}" lets everything through'
-        report("role", "missing, and there is no allow_in and no allow_out: nothing says what may pass", remedy)
+        remedy = f'write role = one of {names}, or both lists; role = "{dialect.ALL}" passes everything'
+        report("role", "missing, as are allow_in and allow_out: the policy does not define what passes", remedy)
     for key in missing if len(missing) == 1 else ():
         direction = "come from" if key == "allow_in" else "go to"
         report(
             key,
-            f"missing: without a role, nothing says what may {direction} this peer",
-            f'write {key} = ["telemetry"] or what else may pass; [] is nothing, ["{dialect.ALL}"] everything',
+            f"missing: without a role, the policy does not define what may {direction} this peer",
+            f'write {key} = ["telemetry"] or other entries; [] passes nothing, ["{dialect.ALL}"] everything',
         )
 
 
-@lru_cache(maxsize=256)  # a fleet's peers mostly have the same lists, and may then share what these became
+@lru_cache(maxsize=256)  # a fleet's peers mostly have the same lists, and share their rules
 def _rules(allow: tuple[str | int, ...], deny: tuple[str | int, ...], *, allows_all: bool) -> Rules:
     allowed = [_as_allowed(entry) for entry in map(_entry, allow) if isinstance(entry, _Entry)]
     denied = [entry for entry in map(_entry, deny) if isinstance(entry, _Entry)]
@@ -206,7 +206,7 @@ def _rules(allow: tuple[str | int, ...], deny: tuple[str | int, ...], *, allows_
         reads_files=any(entry.reads_files for entry in allowed),
         denies_all=any(entry.is_all for entry in denied),
         denied=frozenset(denied_messages | {entry.number for entry in denied if entry.number is not None}),
-        denied_commands=frozenset(denied_commands.union(*(DONE_BY.get(each, ()) for each in denied_commands))),
+        denied_commands=frozenset(denied_commands.union(*(DONE_BY.get(number, ()) for number in denied_commands))),
     )
 
 
@@ -218,7 +218,7 @@ def _as_allowed(entry: _Entry) -> _Entry:
 
 
 def _entry(item: str | int) -> _Entry | PolicyProblem:
-    """What a list's entry stands for, or what is wrong with it (without its key)."""
+    """The meaning of a list's entry, or its problem (without its key)."""
     if isinstance(item, str) and item.isdecimal():
         item = int(item)
     if isinstance(item, int):
@@ -237,7 +237,7 @@ def _entry(item: str | int) -> _Entry | PolicyProblem:
         ids = tuple(dialect.ids_by_name()[name] for name in members)
         return _Entry(messages=ids, reads_files=item == FILES_READ)
     known = (*dialect.GROUPS, *dialect.ids_by_name())
-    remedy = "groups are in small letters, messages in capitals, an unknown message goes by its number"
+    remedy = "write groups in small letters, messages in capitals, and an unknown message by its number"
     return PolicyProblem("", f"no such group or message: {item!r}", _did_you_mean(item, known, remedy))
 
 
@@ -264,19 +264,19 @@ def _check_entries(key: str, items: tuple[str | int, ...], report: Report) -> No
 def _list(data: Mapping[str, object], key: str, report: Report) -> tuple[str | int, ...]:
     value = data.get(key, ())
     if isinstance(value, (list, tuple)):
-        # No True in there: it equals 1, also as a key of the cache of `_rules`.
+        # True is excluded: it equals 1, also as a key of the cache of `_rules`.
         return tuple(item if isinstance(item, str) or type(item) is int else repr(item) for item in value)
-    report(key, f"{value!r} is no list", f'write {key} = ["telemetry", "PING"]')
+    report(key, f"{value!r} is not a list", f'write {key} = ["telemetry", "PING"]')
     return ()
 
 
 def _systems(data: Mapping[str, object], report: Report, *, is_needed: bool) -> tuple[frozenset[int] | None, str]:
-    """The systems it may speak as, and the same for people."""
-    remedy = 'write the systems it is, such as system_ids = [1] or [1, "10-20"], or "all" to trust it with every one'
+    """The systems that it may send as, and the same as text."""
+    remedy = 'write its systems, such as system_ids = [1] or [1, "10-20"], or "all" to trust it with every system'
     value = data.get("system_ids")
     if value is None:
         if is_needed:
-            report("system_ids", "missing: which systems may it speak as?", remedy)
+            report("system_ids", "missing: which systems may it send as?", remedy)
         return None, "any system"
     if value in (dialect.ALL, [dialect.ALL]):
         return None, "any system"
@@ -288,22 +288,22 @@ def _systems(data: Mapping[str, object], report: Report, *, is_needed: bool) -> 
         first, _, last = str(item).partition("-")
         numbers = (first, last or first)
         if isinstance(item, bool) or not all(n.isdecimal() and 1 <= int(n) <= MAX_SYSTEM for n in numbers):
-            report(f"system_ids[{place}]", f"{item!r} is no system from 1 to {MAX_SYSTEM}", remedy)
+            report(f"system_ids[{place}]", f"{item!r} is not a system from 1 to {MAX_SYSTEM}", remedy)
         elif int(numbers[0]) > int(numbers[1]):
-            report(f"system_ids[{place}]", f"{item!r} runs backwards", f'write "{last}-{first}"')
+            report(f"system_ids[{place}]", f"{item!r} is in descending order", f'write "{last}-{first}"')
         else:
             systems.update(range(int(numbers[0]), int(numbers[1]) + 1))
     return frozenset(systems), ", ".join(map(str, value))
 
 
 def _rates(data: Mapping[str, object], key: str, report: Report) -> Mapping[int, float]:
-    """Frames a second by message id. A message's own rate goes before its groups', the lowest of those counts.
+    """Frames a second by message id. A message's own rate replaces those of its groups, of which the lowest counts.
 
-    On the way out the rate of a group of reports, as telemetry, leaves alone what is said once among them.
+    An outgoing rate of a group of reports, such as telemetry, does not apply to its messages that are sent once.
     """
     value = data.get(key, {})
     if not isinstance(value, Mapping):
-        report(key, f"{value!r} is no table", f"write {key} = {{ ATTITUDE = 10 }}")
+        report(key, f"{value!r} is not a table", f"write {key} = {{ ATTITUDE = 10 }}")
         return {}
     of_groups: dict[int, float] = {}
     of_messages: dict[int, float] = {}
@@ -317,7 +317,9 @@ def _rates(data: Mapping[str, object], key: str, report: Report) -> Mapping[int,
             report(f"{key}.{name}", "a rate is for messages", "name a message or a group")
         if isinstance(rate, bool) or not isinstance(rate, (int, float)) or not math.isfinite(rate) or rate <= 0:
             report(
-                f"{key}.{name}", f"{rate!r} is no rate", "write frames a second, above 0; to stop a message deny it"
+                f"{key}.{name}",
+                f"{rate!r} is not a rate",
+                "write frames a second, above 0; to stop a message, deny it",
             )
             continue
         if entry.number is not None or name in dialect.ids_by_name():
@@ -338,7 +340,7 @@ def _flag(data: Mapping[str, object], key: str, default: bool, report: Report) -
 
 
 def _did_you_mean(word: str, known: Iterable[str], otherwise: str) -> str:
-    """The known word most like this one, whatever its letters' size."""
+    """A suggestion: the known word that is most similar, in capitals or small letters."""
     by_small = {name.lower(): name for name in known}
     close = difflib.get_close_matches(word.lower(), by_small, n=1)
     return f"did you mean {by_small[close[0]]!r}?" if close else otherwise

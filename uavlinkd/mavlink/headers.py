@@ -1,0 +1,125 @@
+"""The facts in a frame's header: sender, message, target and command. Frames with the same facts share one object.
+
+Routing and policy decide once for each header object, not once for each frame. So the objects are kept: for each
+sender and message, and for each target and command where a message carries them.
+"""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple, final
+
+from uavlinkd.mavlink.dialect_table import MESSAGES
+
+MAX_SENDER_MESSAGES: Final = 2048
+"""Messages of one sender each whose headers are kept."""
+MAX_TARGETED_HEADERS: Final = 8192
+"""Headers with a target or command that are kept, of all senders: 2 MB. A ground station that sends thirty different
+commands to each of 250 systems stays below."""
+
+
+@final
+class Header:
+    """What a frame's header, its target and its command say. Frames with the same facts share one object.
+
+    A MAVLink 2 sender cuts zero bytes from the payload's end. A target or command that was cut is 0, as it is for
+    every receiver.
+    """
+
+    __slots__ = (
+        "command",
+        "component",
+        "is_known",
+        "is_mavlink1",
+        "msgid",
+        "system",
+        "target_component",
+        "target_system",
+    )
+
+    def __init__(
+        self,
+        msgid: int,
+        system: int,
+        component: int,
+        target: tuple[int, int] = (0, 0),
+        command: int | None = None,
+        *,
+        is_known: bool = True,
+        is_mavlink1: bool = False,
+    ) -> None:
+        self.msgid = msgid
+        self.system = system
+        """The sender's system id."""
+        self.component = component
+        """The sender's component id."""
+        self.target_system, self.target_component = target
+        """0 in each: all, or the message has no target."""
+        self.command = command
+        """The MAV_CMD that the frame requests or that a mission item carries; None for a message without one."""
+        self.is_known = is_known
+        """Whether the checksum fits the dialect's definition. Otherwise target and command could not be read."""
+        self.is_mavlink1 = is_mavlink1
+
+
+class SenderMessage(NamedTuple):
+    """The facts that depend on sender and message id alone."""
+
+    definition: tuple[str, int, int, int, int | None, int | None, int | None] | None
+    """The row of :data:`.dialect_table.MESSAGES`; None if the dialect does not define the message."""
+    longest: int
+    """The longest payload by this definition, in bytes; 255 without one."""
+    known: Header | None
+    """The header of a frame by this definition; None if its payload holds a target or a command."""
+    unknown: Header
+    """The header of a frame by another definition."""
+
+
+OTHER_DEFINITION: Final = b"?"
+"""Follows the key of a message whose payload has a length that the table's definition does not allow."""
+
+sender_messages: Final[dict[bytes, SenderMessage]] = {}
+"""By the header's bytes from system to message id, 5 in MAVLink 2 and 3 in MAVLink 1. The oldest first."""
+targeted_headers: Final[dict[tuple[bytes, int, int, int | None], Header]] = {}
+"""By the same bytes, target and command. The oldest first."""
+
+
+def add_sender_message(key: bytes) -> SenderMessage:
+    """Look up the facts that depend on sender and message id, and keep them in :data:`sender_messages`."""
+    is_mavlink1 = len(key) < 5
+    system, component = key[0], key[1]
+    msgid = key[2] if is_mavlink1 else int.from_bytes(key[2:5], "little")
+    definition = None if len(key) in (4, 6) else MESSAGES.get(msgid)
+    longest = 255 if definition is None else definition[3]
+    known = None
+    if definition is not None and definition[4] is None and definition[6] is None:
+        known = Header(msgid, system, component, is_mavlink1=is_mavlink1)
+    unknown = Header(msgid, system, component, is_known=False, is_mavlink1=is_mavlink1)
+    if len(sender_messages) >= MAX_SENDER_MESSAGES:
+        del sender_messages[next(iter(sender_messages))]
+    message = sender_messages[key] = SenderMessage(definition, longest, known, unknown)
+    return message
+
+
+def targeted_header(key: bytes, message: SenderMessage, payload: bytes) -> Header:
+    """The header of a frame whose payload holds a target or a command."""
+    assert message.definition is not None, "without a definition the payload cannot be read"
+    _, _, _, _, target_system_at, target_component_at, command_at = message.definition
+    length = len(payload)
+    target_system = target_component = 0
+    if target_system_at is not None and target_system_at < length:
+        target_system = payload[target_system_at]
+    if target_component_at is not None and target_component_at < length:
+        target_component = payload[target_component_at]
+    command: int | None = None
+    if command_at is not None:
+        # Little-endian: if the sender cut the payload within the command, the byte that is left is the low one.
+        command = int.from_bytes(payload[command_at : command_at + 2], "little")
+    facts = key, target_system, target_component, command
+    header = targeted_headers.get(facts)
+    if header is None:
+        like, target = message.unknown, (target_system, target_component)
+        header = Header(like.msgid, like.system, like.component, target, command, is_mavlink1=like.is_mavlink1)
+        if len(targeted_headers) >= MAX_TARGETED_HEADERS:
+            del targeted_headers[next(iter(targeted_headers))]
+        targeted_headers[facts] = header
+    return header
