@@ -1,4 +1,4 @@
-"""What the tests of endpoints share: a daemon's stand-in, frames that can be told apart, and a measurement."""
+"""Helpers of the tests of endpoints: a daemon's stand-in, numbered frames, and a measurement."""
 
 from __future__ import annotations
 
@@ -6,26 +6,26 @@ import asyncio
 import socket
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from statistics import median
 from time import monotonic
 
 from pymavlink.dialects.v20 import common as mavlink
 
 from tests.policies import TRUSTED
-from uavlinkd.system.addresses import Address
-from uavlinkd.system.clock import monotonic as boot_time
+from tests.waiting import PATIENCE_S, until
 from uavlinkd.endpoints.ports import Endpoint, LocalPort
+from uavlinkd.endpoints.stream_endpoint import StreamEndpoint
 from uavlinkd.endpoints.udp import UdpClient
-from uavlinkd.mavlink.policy.delivery import Source
 from uavlinkd.mavlink.frames import Frame, SplitCounters, split_payload
 from uavlinkd.mavlink.policy.compilation import compile_policy
+from uavlinkd.mavlink.policy.delivery import Source
+from uavlinkd.system.addresses import Address
+from uavlinkd.system.clock import monotonic as boot_time
 from uavlinkd.system.stall import StallWatch
-
-PATIENCE_S = 60.0
-"""After which what was to happen has not."""
 
 
 def frame(number: int) -> bytes:
-    """A genuine frame of some 30 bytes that says ``number``."""
+    """A genuine frame of some 30 bytes that contains ``number``."""
     message = mavlink.MAVLink_named_value_int_message(number, b"number", number)
     return bytes(message.pack(mavlink.MAVLink(None, srcSystem=1, srcComponent=1)))
 
@@ -37,7 +37,7 @@ def large_frame(number: int) -> bytes:
 
 
 def heartbeat() -> bytes:
-    """A frame that goes before others."""
+    """A frame of the urgent lane."""
     message = mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)
     return bytes(message.pack(mavlink.MAVLink(None, srcSystem=255, srcComponent=1)))
 
@@ -61,23 +61,13 @@ def write(endpoint: Endpoint, port: LocalPort, raws: Sequence[bytes], now: float
     endpoint.write(port, frames_of(raws), source, now)
 
 
-async def eventually(condition: Callable[[], bool]) -> None:
-    """Wait until something is so.
-
-    Raises:
-        TimeoutError: where it is not.
-    """
-    async with asyncio.timeout(PATIENCE_S):
-        while not condition():  # noqa: ASYNC110  what is waited for is a socket's doing and sets no event
-            await asyncio.sleep(0.002)
-
-
 class Recorder:
-    """Remembers what endpoints report."""
+    """Remembers the reports of endpoints."""
 
     def __init__(self) -> None:
         self.open: list[LocalPort] = []
         self.closed: list[LocalPort] = []
+        self.silent: list[str] = []
         self.batches: list[list[bytes]] = []
         """One for each call."""
         self.epochs: list[int] = []
@@ -86,7 +76,7 @@ class Recorder:
         self.on_batch: Callable[[], None] = lambda: None
 
     @property
-    def heard(self) -> list[bytes]:
+    def received(self) -> list[bytes]:
         return [raw for batch in self.batches for raw in batch]
 
     def on_port_opened(self, port: LocalPort) -> None:
@@ -96,35 +86,55 @@ class Recorder:
         self.open.remove(port)
         self.closed.append(port)
 
+    def on_port_silent(self, port: LocalPort) -> None:
+        self.silent.append(port.name)
+
+    def on_port_active(self, port: LocalPort) -> None:
+        self.silent.remove(port.name)
+
     def on_frames(self, port: LocalPort, frames: list[Frame], now: float, epoch: int, waited_s: float = 0.0) -> None:
         assert port in self.open, "a port speaks after it is opened and before it is closed"
-        self.batches.append([each.raw for each in frames])
+        self.batches.append([frame.raw for frame in frames])
         self.epochs.append(epoch)
         self.on_batch()
 
 
+def recorder(endpoint: StreamEndpoint) -> Recorder:
+    """The recorder to which an endpoint reports."""
+    assert isinstance(endpoint.handler, Recorder)
+    return endpoint.handler
+
+
+def unused_address() -> Address:
+    """An address on which no process listens."""
+    with socket.socket() as sock:
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        sock.bind(("127.0.0.1", 0))
+        return Address(*sock.getsockname())
+
+
 @dataclass(frozen=True)
 class Delivery:
-    """What a program at a UDP endpoint got, and the longest that a batch took to get there."""
+    """The frames that a UDP client got, and the median delay of a batch: a dead endpoint would delay each of them."""
 
     frames: list[bytes]
-    slowest_s: float
+    usual_s: float
     sent: int
 
 
 async def measure_udp_delivery(*others: Endpoint, batches: int = 200, frames_per_batch: int = 20) -> Delivery:
-    """Write the same frames to a UDP program and to every port of the other endpoints, as the daemon does."""
-    program = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    program.bind(("127.0.0.1", 0))
-    program.setblocking(False)
-    endpoint = UdpClient("udp", Address(*program.getsockname()), Recorder())
+    """Write the same frames to a UDP client and to every port of the other endpoints, as the daemon does."""
+    client = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    client.bind(("127.0.0.1", 0))
+    client.setblocking(False)
+    endpoint = UdpClient("udp", Address(*client.getsockname()), Recorder())
     endpoint.start()
     loop = asyncio.get_running_loop()
     got = bytearray()
-    slowest_s = 0.0
+    delays_s: list[float] = []
     sent = 0
     try:
-        await eventually(lambda: len(endpoint.ports) == 1)
+        await until(lambda: len(endpoint.ports) == 1)
         for number in range(batches):
             frames = [large_frame(number)] * frames_per_batch
             began = now = monotonic()
@@ -135,10 +145,10 @@ async def measure_udp_delivery(*others: Endpoint, batches: int = 200, frames_per
             sent += sum(map(len, frames))
             async with asyncio.timeout(PATIENCE_S):
                 while len(got) < sent:
-                    got += await loop.sock_recv(program, 65536)
-            slowest_s = max(slowest_s, monotonic() - began)
+                    got += await loop.sock_recv(client, 65536)
+            delays_s.append(monotonic() - began)
     finally:
         endpoint.close()
-        program.close()
+        client.close()
     size = len(large_frame(0))
-    return Delivery([bytes(got[at : at + size]) for at in range(0, len(got), size)], slowest_s, sent // size)
+    return Delivery([bytes(got[at : at + size]) for at in range(0, len(got), size)], median(delays_s), sent // size)

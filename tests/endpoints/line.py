@@ -67,18 +67,18 @@ class Line:
     def __init__(self, bytes_per_s: float, clock: Callable[[], float]) -> None:
         self.bytes_per_s = bytes_per_s
         self.most_held = 0
-        """Bytes in the queue, at most, after any write."""
+        """The most bytes in the queue after a write."""
         self.arrivals: list[tuple[float, bytes]] = []
         """When the last byte of each write arrived, and the write."""
         self._clock = clock
         self._empty_at = 0.0
 
     def held(self) -> int:
-        """Bytes that the wire has not carried."""
+        """The bytes that the wire has not carried yet."""
         return round(max(0.0, self._empty_at - self._clock()) * self.bytes_per_s)
 
     def write(self, data: bytes) -> int:
-        """Take all bytes."""
+        """Accept all bytes."""
         self._empty_at = max(self._empty_at, self._clock()) + len(data) / self.bytes_per_s
         self.most_held = max(self.most_held, self.held())
         self.arrivals.append((self._empty_at, data))
@@ -97,7 +97,7 @@ class LineChannel(SerialChannel):
         super().__init__(cast(BaseSerial, device), round(line.bytes_per_s * 10))
 
     def hand_over(self, data: bytes) -> int:
-        """Hand bytes to the line."""
+        """Write bytes to the line."""
         return self._line.write(data)
 
     def _end(self) -> None:

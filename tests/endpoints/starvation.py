@@ -16,11 +16,12 @@ from unittest.mock import patch
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from tests.endpoints.line import Line, LineChannel, VirtualTimeLoop
 from tests.endpoints.clients import Recorder, frames_of, source
-from uavlinkd.endpoints import serial, stream_endpoint as streams
+from tests.endpoints.line import Line, LineChannel, VirtualTimeLoop
+from uavlinkd.endpoints import serial, stream_endpoint
 from uavlinkd.endpoints.stream_endpoint import StreamEndpoint
-from uavlinkd.mavlink.frames import Frame, StreamSplitter
+from uavlinkd.mavlink.frames import Frame
+from uavlinkd.mavlink.stream_splitter import StreamSplitter
 
 BAUD = 57600
 RATES_KBIT_S = (0, 64, 192, 512, 2000)
@@ -40,7 +41,7 @@ def pack(message: Any, system: int, component: int = 1, seq: int = 0) -> bytes:
 
 
 def command(number: int) -> bytes:
-    """A command of the operator that says its number."""
+    """A command of the operator that contains its number."""
     return pack(mavlink.MAVLink_command_long_message(1, 1, 176, 0, number, 1, 1, 1, 1, 1, 1), OPERATOR, seq=number)
 
 
@@ -50,13 +51,13 @@ def heartbeat(number: int) -> bytes:
 
 
 def position(number: int) -> bytes:
-    """The flood: where the captured member is."""
+    """The flood: positions of the captured member."""
     message = mavlink.MAVLink_global_position_int_message(number, 1, 2, 3, 4, 5, 6, 7, 8)
     return pack(message, CAPTURED, seq=number)
 
 
 def member_heartbeat(number: int) -> bytes:
-    """The flood in the lane of urgent frames, of another component each time."""
+    """The flood in the lane of urgent frames, with another component in each frame."""
     return pack(mavlink.MAVLink_heartbeat_message(2, 3, 0, number, 4, 3), CAPTURED, number % 250 + 1, number)
 
 
@@ -68,7 +69,7 @@ def without_starts(make: Make) -> Make:
 
 
 class Result(NamedTuple):
-    """What came through one flood."""
+    """The frames that arrived in spite of one flood."""
 
     commands: int
     heartbeats: int
@@ -76,6 +77,10 @@ class Result(NamedTuple):
     worst_added_s: float
     flood_frames: int
     most_held: int
+    flood_median_s: float = 0.0
+    """Of the flood's frames that arrived, where the times at which they were sent are known."""
+    lost_to_waiting: int = 0
+    """Envelopes of the operator that the kernel or the daemon dropped because the daemon did not run."""
 
 
 class LineEndpoint(StreamEndpoint):
@@ -89,7 +94,7 @@ def starve(kbit_s: float, flood: Make = position) -> Result:
     """Flood a serial endpoint for DURATION_S of virtual time, beside an operator."""
     with asyncio.Runner(loop_factory=VirtualTimeLoop) as runner:
         loop = runner.get_loop()
-        with patch.object(streams, "monotonic", loop.time), patch.object(serial, "monotonic", loop.time):
+        with patch.object(stream_endpoint, "monotonic", loop.time), patch.object(serial, "monotonic", loop.time):
             return runner.run(_starve(kbit_s, flood))
 
 
@@ -122,22 +127,26 @@ async def _starve(kbit_s: float, flood: Make) -> Result:
 
 def _result(line: Line, sent_at: dict[bytes, float]) -> Result:
     splitter = StreamSplitter()
-    arrivals = ((at, each) for at, data in line.arrivals for each in splitter.feed(data, at))
+    arrivals = ((at, frame) for at, data in line.arrivals for frame in splitter.feed(data, at))
     return summary(arrivals, sent_at, line.bytes_per_s, line.most_held)
 
 
 def summary(
     arrivals: Iterable[tuple[float, Frame]], sent_at: dict[bytes, float], bytes_per_s: float, most_held: int
 ) -> Result:
-    """What came of the operator's frames, which were sent at these times."""
+    """The delays of the operator's frames, which were sent at these times."""
     added: dict[bytes, float] = {}
     flooded = 0
+    flood_added_s: list[float] = []
     for at, (raw, header) in arrivals:
-        if raw in sent_at:
+        if header.system == CAPTURED:
+            flooded += 1
+            if raw in sent_at:
+                flood_added_s.append(at - sent_at[raw])
+        elif raw in sent_at:
             added[raw] = at - sent_at[raw] - len(raw) / bytes_per_s
-        flooded += header.system == CAPTURED
     commands = {command(number) for number in range(COMMANDS)}
-    of_commands = [each for raw, each in added.items() if raw in commands]
+    of_commands = [added_s for raw, added_s in added.items() if raw in commands]
     return Result(
         len(of_commands),
         len(added) - len(of_commands),
@@ -145,11 +154,12 @@ def summary(
         max(of_commands, default=0.0),
         flooded,
         most_held,
+        median(flood_added_s) if flood_added_s else 0.0,
     )
 
 
 def row(label: object, result: Result) -> str:
-    """A line of the table."""
+    """A row of the table."""
     return (
         f"{label:>8} {result.commands:4} of {COMMANDS} {result.heartbeats:4} of {HEARTBEATS} "
         f"{result.median_added_s * 1000:8.1f} {result.worst_added_s * 1000:8.1f} {result.flood_frames:8}"

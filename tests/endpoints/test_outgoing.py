@@ -1,4 +1,4 @@
-"""Frames into one byte stream: whole, each once, committed one after the other."""
+"""Frames in one byte stream: whole, each once, committed in order."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 
 from tests.endpoints.clients import PASSES, frame, frames_of, heartbeat, large_frame, source
 from uavlinkd.endpoints.outgoing import OutgoingFrames
+from uavlinkd.mavlink.frames import SplitCounters
 from uavlinkd.mavlink.policy.delivery import DeliveredStream
-from uavlinkd.mavlink.frames import SplitCounters, StreamSplitter
+from uavlinkd.mavlink.stream_splitter import StreamSplitter
 
 A, B, C = large_frame(1), large_frame(2), large_frame(3)
 SIZE = len(A)
@@ -23,7 +24,7 @@ def outgoing() -> tuple[OutgoingFrames, Counter[str]]:
 
 
 def test_frames_leave_whole_and_in_order() -> None:
-    """What fits is committed together, and stays until it is marked as written."""
+    """Frames that fit are committed together, and stay until they are marked as written."""
     waiting, dropped = outgoing()
     waiting.put(frames_of([A, B, C]), PASSES, now=0.0)
     waiting.commit_next(0, 2 * SIZE, now=0.5)
@@ -36,7 +37,7 @@ def test_frames_leave_whole_and_in_order() -> None:
 
 @pytest.mark.parametrize("written", [1, SIZE - 1, SIZE, SIZE + 1])
 def test_committed_frame_is_finished_first(written: int) -> None:
-    """Neither age nor an urgent frame comes between the bytes of a committed frame."""
+    """Age and urgent frames do not interrupt the bytes of a committed frame."""
     waiting, dropped = outgoing()
     waiting.commit(frames_of([A, B]), PASSES, 0.0)
     assert waiting.mark_written(written) == written // SIZE
@@ -55,7 +56,7 @@ def test_committed_frame_is_finished_first(written: int) -> None:
 def test_frame_is_committed_where_it_fits_or_the_kernel_holds_nothing(
     held: int, limit: int, committed: bytes
 ) -> None:
-    """A frame larger than the limit goes whole, or the slowest line would carry none."""
+    """A frame larger than the limit is sent whole. Otherwise the slowest line would carry no frame."""
     waiting, _ = outgoing()
     waiting.put(frames_of([A, B, C]), PASSES, now=0.0)
     waiting.commit_next(held, limit, now=0.0)
@@ -63,7 +64,7 @@ def test_frame_is_committed_where_it_fits_or_the_kernel_holds_nothing(
 
 
 def test_what_waits_at_the_end_is_counted() -> None:
-    """A half-written frame is one that has not been sent."""
+    """A frame that was written in part counts as unsent."""
     waiting, dropped = outgoing()
     waiting.commit(frames_of([A, B]), PASSES, 0.0)
     waiting.put(frames_of([C]), PASSES, now=0.0)
@@ -75,7 +76,7 @@ def test_what_waits_at_the_end_is_counted() -> None:
 
 @pytest.mark.parametrize(("now", "left"), [(1.0, A + B), (1.01, B), (1.5, B), (1.51, b"")])
 def test_frame_that_waited_too_long_is_dropped(now: float, left: bytes) -> None:
-    """At the greatest age a frame still goes; beyond it, it is counted as stale and not sent."""
+    """A frame of the maximum age is sent. An older one is counted as stale and dropped."""
     waiting, dropped = outgoing()
     waiting.put(frames_of([A]), PASSES, now=0.0)
     waiting.put(frames_of([B]), PASSES, now=0.5)
@@ -93,14 +94,14 @@ STEPS = st.lists(
 
 @given(STEPS)
 def test_stream_is_whole_frames_in_order_whatever_the_kernel_takes(steps: list[tuple[str, int, float]]) -> None:
-    """Every frame is either on the wire whole and in its turn, or waits, or is in a counter."""
+    """Every frame is on the wire, whole and in order, or waits, or is counted."""
     waiting, dropped = outgoing()
     now, number, completed = 0.0, 0, 0
     wire = bytearray()
     for step, count, detail in steps:
         if step == "put":
             now += detail
-            waiting.put(frames_of([frame(number + each) for each in range(count)]), PASSES, now)
+            waiting.put(frames_of([frame(number + offset) for offset in range(count)]), PASSES, now)
             number += count
         else:
             waiting.commit_next(int(detail), 90, now)
@@ -113,8 +114,8 @@ def test_stream_is_whole_frames_in_order_whatever_the_kernel_takes(steps: list[t
     wire += waiting.committed
     completed += waiting.mark_written(len(waiting.committed))
     counters = SplitCounters()
-    sent = [each.raw for each in StreamSplitter(counters).feed(bytes(wire), now)]
+    sent = [frame.raw for frame in StreamSplitter(counters).feed(bytes(wire), now)]
     assert b"".join(sent) == wire
     assert len(sent) == completed
-    everything = iter([frame(each) for each in range(number)])
-    assert all(each in everything for each in sent)  # in order, none twice
+    everything = iter([frame(n) for n in range(number)])
+    assert all(raw in everything for raw in sent)  # in order, none twice

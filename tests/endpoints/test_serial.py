@@ -1,4 +1,4 @@
-"""Serial ports: there when the device is, and no one's trouble when it is not. Pseudo-terminals stand for them."""
+"""Serial endpoints: open whenever the device is present. Pseudo-terminals take the place of devices."""
 
 from __future__ import annotations
 
@@ -17,14 +17,23 @@ from typing import Any, cast
 import pytest
 from serialx import BaseSerial
 
-from tests.endpoints.clients import PATIENCE_S, Recorder, eventually, frame, large_frame, measure_udp_delivery, write
-from uavlinkd.system.addresses import Address
+from tests.endpoints.clients import (
+    Recorder,
+    frame,
+    large_frame,
+    measure_udp_delivery,
+    recorder,
+    unused_address,
+    write,
+)
+from tests.waiting import PATIENCE_S, until
 from uavlinkd.endpoints import serial
 from uavlinkd.endpoints.serial import SerialChannel, SerialEndpoint
 from uavlinkd.endpoints.stream_endpoint import STALLED_S
 from uavlinkd.endpoints.tcp import TcpServer, tcp_listener
+from uavlinkd.endpoints.udp import UdpClient
 from uavlinkd.endpoints.url import SerialUrl
-from uavlinkd.mavlink.frames import StreamSplitter
+from uavlinkd.system.addresses import Address
 
 
 class Autopilot:
@@ -50,7 +59,7 @@ class Autopilot:
         while select.select([self.master], [], [], 0)[0]:
             try:
                 got += os.read(self.master, 65536)
-            except OSError:  # nobody has the device open
+            except OSError:  # no process has the device open
                 break
         return got
 
@@ -74,76 +83,71 @@ async def endpoint(autopilot: Autopilot) -> AsyncIterator[SerialEndpoint]:
     port.close()
 
 
-def recorder(endpoint: SerialEndpoint) -> Recorder:
-    assert isinstance(endpoint.handler, Recorder)
-    return endpoint.handler
-
-
 async def opened(endpoint: SerialEndpoint) -> None:
-    await eventually(lambda: len(endpoint.ports) == 1)
+    await until(lambda: len(endpoint.ports) == 1)
 
 
-async def test_frames_go_both_ways(autopilot: Autopilot, endpoint: SerialEndpoint) -> None:
-    """Every byte as it is: a terminal's own ideas about newlines, control characters and echo are off."""
+async def test_frames_go_in_both_directions(autopilot: Autopilot, endpoint: SerialEndpoint) -> None:
+    """Bytes are unchanged: the terminal does not process newlines, control characters or echo."""
     autopilot.plug_in()
     await opened(endpoint)
     assert endpoint.ports[0].name == str(autopilot.device)
     from_autopilot = [frame(number) for number in (10, 13, 0x03, 0x11, 0x13, 0x04, 0x1A, 0xFF)]
     os.write(autopilot.master, b"".join(from_autopilot))
-    await eventually(lambda: recorder(endpoint).heard == from_autopilot)
-    assert endpoint.ports[0].heard_at is not None
+    await until(lambda: recorder(endpoint).received == from_autopilot)
+    assert endpoint.ports[0].received_at is not None
     assert autopilot.read() == b""
     write(endpoint, endpoint.ports[0], from_autopilot, monotonic())
-    await eventually(lambda: bool(select.select([autopilot.master], [], [], 0)[0]))
+    await until(lambda: bool(select.select([autopilot.master], [], [], 0)[0]))
     assert autopilot.read() == b"".join(from_autopilot)
 
 
-async def test_device_that_is_not_there_yet_is_no_error(autopilot: Autopilot, endpoint: SerialEndpoint) -> None:
-    """It is looked for again and again, and there is nothing to write to until it is found."""
-    await eventually(lambda: endpoint.failures["ENOENT"] >= 3)
+async def test_device_may_be_missing_at_first(autopilot: Autopilot, endpoint: SerialEndpoint) -> None:
+    """The endpoint looks for it repeatedly, and has no port until it is present."""
+    await until(lambda: endpoint.failures["ENOENT"] >= 3)
     assert list(endpoint.ports) == []
     autopilot.plug_in()
     await opened(endpoint)
     assert endpoint.failures.keys() == {"ENOENT"}
 
 
-async def test_unplugged_device_is_gone_and_comes_back(autopilot: Autopilot, endpoint: SerialEndpoint) -> None:
-    """It may come back as another terminal: its lasting name is opened anew."""
+async def test_unplugged_device_is_opened_again(autopilot: Autopilot, endpoint: SerialEndpoint) -> None:
+    """It may return as another terminal. The endpoint opens its permanent name again."""
     for number in range(3):
         autopilot.plug_in()
         await opened(endpoint)
         (port,) = endpoint.ports
         os.write(autopilot.master, frame(number))
-        await eventually(lambda: len(recorder(endpoint).heard) > len(recorder(endpoint).closed))
+        await until(lambda: len(recorder(endpoint).received) > len(recorder(endpoint).closed))
         autopilot.unplug()
-        await eventually(lambda: recorder(endpoint).open == [])
+        await until(lambda: recorder(endpoint).open == [])
         assert recorder(endpoint).closed[-1] is port
         write(endpoint, port, [frame(99)], monotonic())
         assert list(endpoint.ports) == []
-    assert recorder(endpoint).heard == [frame(0), frame(1), frame(2)]
+    assert recorder(endpoint).received == [frame(0), frame(1), frame(2)]
     assert endpoint.failures["unsent"] == 3
 
 
 async def test_unplugged_device_is_noticed_by_writing(autopilot: Autopilot, endpoint: SerialEndpoint) -> None:
-    """An error of a write is one of the device, and nothing is raised or reported from within it."""
+    """An error of a write ends the connection. The write raises and reports nothing."""
     autopilot.plug_in()
     await opened(endpoint)
     (port,) = endpoint.ports
     autopilot.unplug()
     write(endpoint, port, [frame(1)], monotonic())
     assert recorder(endpoint).closed == []
-    await eventually(lambda: recorder(endpoint).closed == [port])
+    await until(lambda: recorder(endpoint).closed == [port])
     assert (endpoint.failures["EIO"], endpoint.failures["unsent"]) == (1, 1)
 
 
-async def test_device_is_ours_alone(autopilot: Autopilot, endpoint: SerialEndpoint) -> None:
-    """Two programs that read one wire would each get half of it: the second waits until the first is gone."""
+async def test_device_is_opened_exclusively(autopilot: Autopilot, endpoint: SerialEndpoint) -> None:
+    """Two readers of one wire would get half of the bytes each: the second waits until the first has closed it."""
     autopilot.plug_in()
     await opened(endpoint)
     second = SerialEndpoint("second", SerialUrl(str(autopilot.device), 57600), Recorder())
     second.start()
     try:
-        await eventually(lambda: second.failures["EBUSY"] >= 2)
+        await until(lambda: second.failures["EBUSY"] >= 2)
         assert list(second.ports) == []
         endpoint.close()
         await opened(second)
@@ -155,7 +159,7 @@ async def test_device_is_ours_alone(autopilot: Autopilot, endpoint: SerialEndpoi
     ("baud", "constant"), [(57600, termios.B57600), (921600, termios.B921600), (420000, None), (1_870_000, None)]
 )
 async def test_baud_rate_is_set(autopilot: Autopilot, baud: int, constant: int | None) -> None:
-    """Those with a name of their own in the system, and any other."""
+    """Standard rates, which have a constant in termios, and others."""
     autopilot.plug_in()
     endpoint = SerialEndpoint("serial", SerialUrl(str(autopilot.device), baud), Recorder())
     endpoint.start()
@@ -170,10 +174,10 @@ async def test_baud_rate_is_set(autopilot: Autopilot, baud: int, constant: int |
 
 
 @pytest.mark.parametrize("what", ["/dev/null", "a file", "a folder"])
-async def test_what_is_no_serial_port_is_never_opened(
+async def test_only_serial_devices_are_opened(
     autopilot: Autopilot, endpoint: SerialEndpoint, tmp_path: Path, what: str
 ) -> None:
-    """A mistaken path is counted under what the kernel says, and does no harm."""
+    """A wrong path is counted under the kernel's error, and does no harm."""
     place = Path(what) if what.startswith("/") else tmp_path / "mistake"
     if what == "a file":
         place.write_text("precious")
@@ -181,58 +185,27 @@ async def test_what_is_no_serial_port_is_never_opened(
         place.mkdir()
     autopilot.device.symlink_to(place)
     reason = "EISDIR" if what == "a folder" else "ENOTTY"
-    await eventually(lambda: endpoint.failures[reason] >= 2)
+    await until(lambda: endpoint.failures[reason] >= 2)
     assert recorder(endpoint).open == []
     if what == "a file":
         assert place.read_text() == "precious"
 
 
-async def test_boot_text_and_noise_are_survived(autopilot: Autopilot, endpoint: SerialEndpoint) -> None:
-    """An autopilot that boots writes text, and a wrong baud rate makes noise: frames after it are heard."""
+async def test_boot_text_and_noise_are_skipped(autopilot: Autopilot, endpoint: SerialEndpoint) -> None:
+    """An autopilot writes text while it boots, and a wrong baud rate causes noise. Later frames are received."""
     autopilot.plug_in()
     await opened(endpoint)
     noise = b"\r\nInit ArduCopter V4.6\r\nFree RAM: 21345\r\n" + bytes(range(256)) * 4 + b"GET / HTTP/1.1"
     os.write(autopilot.master, noise + b"".join(map(frame, range(20))))
-    await eventually(lambda: recorder(endpoint).heard[-1:] == [frame(19)])
+    await until(lambda: recorder(endpoint).received[-1:] == [frame(19)])
     assert endpoint.counters.garbage_bytes >= len(noise) - 1
     assert recorder(endpoint).closed == []
 
 
-# A device that does not take what is written.
-
-
-async def test_device_that_takes_nothing_gets_stale_frames_never(
+async def test_device_that_accepts_no_bytes_for_long_is_opened_again(
     autopilot: Autopilot, endpoint: SerialEndpoint
 ) -> None:
-    """When it takes bytes again, what waited too long is not among them, and no frame is half."""
-    autopilot.plug_in()
-    await opened(endpoint)
-    (port,) = endpoint.ports
-    (connection,) = endpoint._connections.values()
-    before = monotonic() - 60
-    count = 0
-    while not connection._awaits_writable:
-        write(endpoint, port, [large_frame(count)], before)
-        count += 1
-    write(endpoint, port, [large_frame(200)] * 50, before)
-    write(endpoint, port, [frame(1), frame(2)], monotonic())
-    got = b""
-    while connection.outgoing:
-        got += autopilot.read()
-        await asyncio.sleep(0)
-    await eventually(lambda: bool(select.select([autopilot.master], [], [], 0)[0]))
-    got += autopilot.read()
-    frames = [each.raw for each in StreamSplitter().feed(got, 0.0)]
-    assert b"".join(frames) == got
-    assert frames[-2:] == [frame(1), frame(2)]
-    assert large_frame(200) not in frames
-    assert endpoint.failures["stale"] == count + 52 - len(frames)
-
-
-async def test_device_that_takes_nothing_for_long_is_opened_anew(
-    autopilot: Autopilot, endpoint: SerialEndpoint
-) -> None:
-    """What hangs may not hang any more when it has been closed, and what the kernel held is forgotten."""
+    """Closing may end the problem. The kernel's unsent bytes are discarded."""
     autopilot.plug_in()
     await opened(endpoint)
     (port,) = endpoint.ports
@@ -244,10 +217,7 @@ async def test_device_that_takes_nothing_for_long_is_opened_anew(
     assert endpoint.failures["stalled"] == 0
     endpoint.do_housekeeping(began + STALLED_S)
     assert endpoint.failures["stalled"] == 1
-    await eventually(lambda: recorder(endpoint).closed == [port] and len(endpoint.ports) == 1)
-
-
-# How much the kernel is given.
+    await until(lambda: recorder(endpoint).closed == [port] and len(endpoint.ports) == 1)
 
 
 def device_with(in_kernel: int) -> BaseSerial:
@@ -257,21 +227,21 @@ def device_with(in_kernel: int) -> BaseSerial:
 
 @pytest.mark.parametrize(("baud", "limit"), [(57600, 115), (921600, 1843), (300, 1)])
 def test_kernel_holds_no_more_than_20_ms_of_line_time(baud: int, limit: int) -> None:
-    """A byte is ten bits on the line; what the kernel reports counts at once."""
+    """A byte is ten bits on the line. The kernel's count is used at once."""
     channel = SerialChannel(device_with(100), baud)
     assert channel.limit_bytes == limit
     assert channel.held(now=0.0) == 100
 
 
 class HiddenBuffer(SerialChannel):
-    """A USB adapter that takes all bytes into a buffer of its own: the kernel counts none of them."""
+    """A USB adapter with a buffer that accepts all bytes: the kernel does not count them."""
 
     def hand_over(self, data: bytes) -> int:
         return len(data)
 
 
 def test_bytes_that_the_line_cannot_have_carried_count(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An adapter's own buffer is bounded too: the baud rate says when the line has carried what was written."""
+    """The adapter's buffer is bounded too: the baud rate says when the line has carried the written bytes."""
     now = 50.0
     monkeypatch.setattr(serial, "monotonic", lambda: now)
     channel = HiddenBuffer(device_with(0), 57600)
@@ -293,7 +263,7 @@ def test_timer_waits_until_a_quarter_of_the_limit_is_free() -> None:
 
 
 def test_device_without_line_rate_is_bounded_in_bytes() -> None:
-    """Its baud rate says nothing: only the kernel's own count does."""
+    """Its baud rate has no meaning. Only the kernel's count is used."""
     channel = SerialChannel(device_with(4000), None)
     assert (channel.held(now=0.0), channel.limit_bytes) == (4000, serial.IN_FLIGHT_BYTES)
     assert channel.drain_s(0, now=0.0) == serial.POLL_S
@@ -311,46 +281,51 @@ def test_device_without_line_rate_is_bounded_in_bytes() -> None:
     ],
 )
 def test_line_rate_is_that_of_the_device_behind_a_link(tmp_path: Path, device: str, is_uart: bool) -> None:
-    """Names under /dev/serial/by-id are links, and say nothing about the kind."""
+    """Names under /dev/serial/by-id are links and do not show the type."""
     link = tmp_path / "usb-Autopilot"
     link.symlink_to(tmp_path / device)
     assert serial.has_line_rate(str(link)) is serial.has_line_rate(str(tmp_path / device)) is is_uart
 
 
 async def test_pseudo_terminal_is_not_paced(autopilot: Autopilot, endpoint: SerialEndpoint) -> None:
-    """It has no line: a second of line time at 57,600 baud goes at once."""
+    """It has no line: a second of line time at 57,600 baud is written at once."""
     autopilot.plug_in()
     await opened(endpoint)
     write(endpoint, endpoint.ports[0], [frame(number) for number in range(100)], monotonic())
     assert endpoint.frames_sent == 100
 
 
-async def test_dead_endpoints_hold_nobody_up(autopilot: Autopilot, endpoint: SerialEndpoint, tmp_path: Path) -> None:
-    """With a device unplugged, one that takes nothing and a TCP client that never reads, others get all in time."""
+async def test_dead_endpoints_delay_no_other_endpoint(
+    autopilot: Autopilot, endpoint: SerialEndpoint, tmp_path: Path
+) -> None:
+    """Beside a blocked and an unplugged device, a TCP client that never reads, and an absent UDP client."""
     alone = await measure_udp_delivery()
     autopilot.plug_in()
     await opened(endpoint)
     unplugged = SerialEndpoint("unplugged", SerialUrl(str(tmp_path / "absent"), 57600), Recorder())
     server = TcpServer("server", tcp_listener(Address("127.0.0.1", 0)), Recorder())
+    absent = UdpClient("absent", unused_address(), Recorder())
+    others = (unplugged, server, absent)
     with socket.create_connection(server.address) as never_reads:
         never_reads.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-        for each in (unplugged, server):
-            each.start()
+        for other in others:
+            other.start()
         try:
-            await eventually(lambda: len(server.ports) == 1 and unplugged.failures["ENOENT"] > 0)
-            beside = await measure_udp_delivery(endpoint, unplugged, server)
+            await until(lambda: len(server.ports) == 1 and unplugged.failures["ENOENT"] > 0)
+            beside = await measure_udp_delivery(endpoint, *others)
         finally:
-            for each in (unplugged, server):
-                each.close()
+            for other in others:
+                other.close()
     assert endpoint.failures["outgoing_full"] > 0
     assert server.failures["outgoing_full"] > 0
+    assert absent.frames_sent > 0
     assert beside.frames == alone.frames
     assert len(beside.frames) == beside.sent
-    assert beside.slowest_s < alone.slowest_s + 0.1
+    assert beside.usual_s < alone.usual_s + 0.1
 
 
-async def test_device_that_hangs_on_opening_holds_nobody_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Opening waits for the hardware: not here, and one device's trouble is not another's."""
+async def test_device_that_hangs_delays_no_other_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Opening waits for the hardware, in a thread for each device."""
     pipe_read, pipe_write = os.pipe()
 
     def hang(*_: Any, **__: Any) -> BaseSerial:
@@ -359,21 +334,21 @@ async def test_device_that_hangs_on_opening_holds_nobody_up(monkeypatch: pytest.
 
     monkeypatch.setattr(serial, "serial_for_url", hang)
     hanging = [SerialEndpoint(f"hangs-{n}", SerialUrl("/dev/x", 57600), Recorder()) for n in range(10)]
-    for each in hanging:
-        each.start()
+    for endpoint in hanging:
+        endpoint.start()
     try:
         beside = await measure_udp_delivery(*hanging, batches=20)
         assert len(beside.frames) == beside.sent
     finally:
         os.close(pipe_write)
-        await eventually(lambda: all(each.failures["EIO"] for each in hanging))
-        for each in hanging:
-            each.close()
+        await until(lambda: all(endpoint.failures["EIO"] for endpoint in hanging))
+        for endpoint in hanging:
+            endpoint.close()
         os.close(pipe_read)
 
 
 async def test_closed_endpoint_leaves_the_device_to_others(autopilot: Autopilot, endpoint: SerialEndpoint) -> None:
-    """Closed while open, while opening or while waiting: nothing is reported, and the device is not held."""
+    """Closed while open, while opening or while waiting: no report follows, and the device is free."""
     autopilot.plug_in()
     await opened(endpoint)
     endpoint.close()
@@ -400,5 +375,5 @@ async def test_device_that_opens_after_all_is_closed(monkeypatch: pytest.MonkeyP
     await asyncio.sleep(0)
     endpoint.close()
     may_open.set()
-    await eventually(done.is_set)
+    await until(done.is_set)
     assert recorder(endpoint).open == []

@@ -1,4 +1,4 @@
-"""A captured swarm member floods a serial line, and the operator's commands arrive all the same."""
+"""The operator's commands arrive although a captured swarm member floods a serial line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""MAVLink URLs: the five forms, and what to write for those of other programs."""
+"""MAVLink URLs: the five forms, and what to write for those of other clients."""
 
 from __future__ import annotations
 
@@ -6,23 +6,23 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from uavlinkd.endpoints.url import EndpointKind, NetworkUrl, SerialUrl, UrlError, parse_url
 from uavlinkd.system.addresses import Address
-from uavlinkd.endpoints.url import Kind, NetworkUrl, SerialUrl, UrlError, parse_url
 
 
 @pytest.mark.parametrize(
     ("text", "url"),
     [
-        ("udpin:127.0.0.1:14550", NetworkUrl(Kind.UDPIN, Address("127.0.0.1", 14550))),
-        ("udpin://127.0.0.1:14550", NetworkUrl(Kind.UDPIN, Address("127.0.0.1", 14550))),
-        ("udpin://127.0.0.1:14550/", NetworkUrl(Kind.UDPIN, Address("127.0.0.1", 14550))),
-        ("udpin:localhost:14550", NetworkUrl(Kind.UDPIN, Address("127.0.0.1", 14550))),
-        ("udpin:0.0.0.0:14550", NetworkUrl(Kind.UDPIN, Address("0.0.0.0", 14550))),
-        ("udpin:[::1]:14550", NetworkUrl(Kind.UDPIN, Address("::1", 14550))),
-        ("udpout:10.0.0.5:14540", NetworkUrl(Kind.UDPOUT, Address("10.0.0.5", 14540))),
-        ("udpout://tablet.local:14550", NetworkUrl(Kind.UDPOUT, Address("tablet.local", 14550))),
-        ("tcp:127.0.0.1:5760", NetworkUrl(Kind.TCP, Address("127.0.0.1", 5760))),
-        ("tcpin://127.0.0.1:5760", NetworkUrl(Kind.TCPIN, Address("127.0.0.1", 5760))),
+        ("udpin:127.0.0.1:14550", NetworkUrl(EndpointKind.UDPIN, Address("127.0.0.1", 14550))),
+        ("udpin://127.0.0.1:14550", NetworkUrl(EndpointKind.UDPIN, Address("127.0.0.1", 14550))),
+        ("udpin://127.0.0.1:14550/", NetworkUrl(EndpointKind.UDPIN, Address("127.0.0.1", 14550))),
+        ("udpin:localhost:14550", NetworkUrl(EndpointKind.UDPIN, Address("127.0.0.1", 14550))),
+        ("udpin:0.0.0.0:14550", NetworkUrl(EndpointKind.UDPIN, Address("0.0.0.0", 14550))),
+        ("udpin:[::1]:14550", NetworkUrl(EndpointKind.UDPIN, Address("::1", 14550))),
+        ("udpout:10.0.0.5:14540", NetworkUrl(EndpointKind.UDPOUT, Address("10.0.0.5", 14540))),
+        ("udpout://tablet.local:14550", NetworkUrl(EndpointKind.UDPOUT, Address("tablet.local", 14550))),
+        ("tcp:127.0.0.1:5760", NetworkUrl(EndpointKind.TCP, Address("127.0.0.1", 5760))),
+        ("tcpin://127.0.0.1:5760", NetworkUrl(EndpointKind.TCPIN, Address("127.0.0.1", 5760))),
         ("serial:/dev/ttyACM0:57600", SerialUrl("/dev/ttyACM0", 57600)),
         ("serial:///dev/ttyACM0:921600", SerialUrl("/dev/ttyACM0", 921600)),
         (
@@ -49,7 +49,7 @@ def test_url_is_read(text: str, url: NetworkUrl | SerialUrl) -> None:
         ("127.0.0.1:14550", "write udpin:127.0.0.1:14550 to listen or udpout:127.0.0.1:14550"),
         ("[::1]:14550", "write udpin:[::1]:14550"),
         ("14550", "write udpin:127.0.0.1:14550"),
-        ("ws://127.0.0.1:8088", "ws: is not carried"),
+        ("ws://127.0.0.1:8088", "ws: is not supported"),
         # MAVSDK
         ("udp://:14540", "write udpin:14540"),
         ("tcpout://127.0.0.1:5760", "write tcp:127.0.0.1:5760"),
@@ -87,13 +87,13 @@ def test_url_is_read(text: str, url: NetworkUrl | SerialUrl) -> None:
         ("serial:COM3:57600", "Windows"),
         ("serial:/dev/ttyACM0:57", "from 300 to"),
         ("serial:/dev/ttyACM0:99999999", "from 300 to"),
-        ("autopilot", "is no MAVLink URL"),
+        ("autopilot", "is not a MAVLink URL"),
         ("bluetooth:00-11", "no known scheme"),
-        ("", "is no MAVLink URL"),
+        ("", "is not a MAVLink URL"),
     ],
 )
 def test_other_spellings_are_refused_with_ours(text: str, says: str) -> None:
-    """Whatever another program would call the endpoint, the message says how it is written here."""
+    """Whatever another client would call the endpoint, the message says how it is written here."""
     with pytest.raises(UrlError) as caught:
         parse_url(text)
     assert says in str(caught.value)

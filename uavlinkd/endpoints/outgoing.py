@@ -1,9 +1,9 @@
-"""Frames on their way into one byte stream: those that wait, and the bytes that the stream must finish.
+"""Outgoing frames of one byte stream: those that wait, and the committed bytes, which the stream must carry whole.
 
-A frame leaves the queue once, at the moment its bytes are committed: the stream carries committed bytes next, in the
-order in which they were committed. What the kernel did not take of them is kept, because the client could not find
-the start of the next frame behind half a frame. The delivered stream (:mod:`uavlinkd.mavlink.policy.delivery`) decides at
-that moment which bytes a frame becomes: it sees the frames in the order in which the client reads them.
+A frame leaves the queue when its bytes are committed. The stream carries committed bytes next, in their order. Bytes
+that the kernel did not accept are kept: behind half a frame the client could not find the start of the next one. The
+delivered stream (:mod:`uavlinkd.mavlink.policy.delivery`) decides at that moment which bytes a frame becomes: it sees
+the frames in the order in which the client reads them.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ from collections import Counter, deque
 from collections.abc import Sequence
 from math import inf
 
-from uavlinkd.mavlink.policy.delivery import DeliveredStream, Source
-from uavlinkd.mavlink.egress.lanes import EgressDrop
 from uavlinkd.mavlink.egress.fair_queue import FairQueue
+from uavlinkd.mavlink.egress.lanes import EgressDrop
 from uavlinkd.mavlink.frames import Frame
+from uavlinkd.mavlink.policy.delivery import DeliveredStream, Source
 
 _REASONS = {EgressDrop.OVERFLOW: "outgoing_full", EgressDrop.CLOSED: "unsent"}
 
@@ -23,7 +23,7 @@ _REASONS = {EgressDrop.OVERFLOW: "outgoing_full", EgressDrop.CLOSED: "unsent"}
 class OutgoingFrames:
     """The frames for one connection. ``dropped`` counts ``stale``, ``thinned``, ``outgoing_full`` and ``unsent``.
 
-    A frame that the delivered stream refuses is counted by its source.
+    The source of a frame counts it if the delivered stream refuses it.
     """
 
     def __init__(self, max_age_s: float, dropped: Counter[str], delivered: DeliveredStream) -> None:
@@ -31,40 +31,42 @@ class OutgoingFrames:
         self._admit = delivered.admit
         self._queue = FairQueue(max_age_s, self._on_drop)
         self._committed = b""
-        self._ends: deque[int] = deque()  # sizes of the committed frames; of the first, what is left of it
+        self._ends: deque[int] = deque()  # sizes of the committed frames; for the first, of its unwritten rest
 
     def __len__(self) -> int:
-        """How many frames are not wholly written."""
+        """How many frames are not completely written."""
         return self._queue.count + len(self._ends)
 
     @property
     def committed(self) -> bytes:
-        """What to write next."""
+        """The bytes to write next."""
         return self._committed
 
     @property
     def waiting(self) -> int:
-        """How many frames wait whose bytes are not committed."""
+        """How many frames wait that are not committed."""
         return self._queue.count
 
     def put(self, frames: Sequence[Frame], source: Source, now: float) -> None:
-        """Have frames of one source wait for their turn."""
+        """Queue frames of one source."""
         self._queue.put(frames, source, now)
 
     def next_bytes(self, now: float) -> int:
-        """How large the frame is whose turn it is; 0 if none waits."""
+        """The size of the next frame in the queue; 0 if the queue is empty."""
         return self._queue.next_bytes(now)
 
     def commit(self, frames: Sequence[Frame], source: Source, now: float) -> None:
-        """Write these frames next: they need not wait. Call it only while none waits."""
+        """Commit these frames without queueing. Call it only while the queue is empty."""
         admit = self._admit
         parts = [data for frame in frames if (data := admit(frame, source, now))]
         self._ends.extend(map(len, parts))
         self._committed += b"".join(parts)
 
     def commit_next(self, held: int, limit: int, now: float) -> None:
-        """Commit frames in turn while the kernel's ``held`` bytes and they are at most ``limit``: at least one frame
-        where it holds nothing."""
+        """Commit frames from the queue while they and the kernel's ``held`` bytes are at most ``limit``.
+
+        If the kernel holds no bytes, commit at least one frame.
+        """
         held += len(self._committed)
         parts = []
         while (popped := self._queue.pop(limit - held if held else inf, now)) is not None:
@@ -75,7 +77,7 @@ class OutgoingFrames:
         self._committed += b"".join(parts)
 
     def mark_written(self, count: int) -> int:
-        """The stream has taken the first ``count`` committed bytes. Returns how many frames are now complete."""
+        """The kernel has accepted the first ``count`` committed bytes. Returns how many frames are now complete."""
         if count == len(self._committed):
             completed = len(self._ends)
             self._committed = b""
@@ -90,11 +92,11 @@ class OutgoingFrames:
         return completed
 
     def drop_stale(self, now: float) -> None:
-        """Drop what waited too long. Committed bytes have no age."""
+        """Drop frames that waited too long. Committed frames are kept."""
         self._queue.drop_stale(now)
 
     def drop_all(self) -> None:
-        """The connection is gone: count what is not wholly written as ``unsent``."""
+        """The connection ended: count frames that are not completely written as ``unsent``."""
         self._queue.clear()
         if self._ends:
             self._dropped["unsent"] += len(self._ends)

@@ -1,7 +1,7 @@
-"""What all local endpoints share. A port is one program behind an endpoint: an autopilot, a ground station.
+"""The interface of local endpoints. A port is one client of an endpoint: an autopilot, a ground station.
 
-An endpoint reports to its daemon which ports are there and what they say, and sends them what it is given. It never
-blocks, never raises for what the other side does, and holds a bounded amount back.
+An endpoint reports its clients and their frames to the daemon, and sends frames to them. It never blocks, raises no
+exception because of what a client does, and queues a bounded count of bytes.
 """
 
 from __future__ import annotations
@@ -11,26 +11,26 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Protocol
 
-from uavlinkd.mavlink.policy.delivery import DeliveredStream, Source
 from uavlinkd.mavlink.frames import Frame, SplitCounters
+from uavlinkd.mavlink.policy.delivery import DeliveredStream, Source
 from uavlinkd.system.stall import StallWatch
 
 
 class LocalPort:
-    """One program behind an endpoint. Compared by identity."""
+    """One client of an endpoint. Compared by identity."""
 
-    __slots__ = ("delivered", "endpoint", "heard_at", "name")
+    __slots__ = ("delivered", "endpoint", "name", "received_at")
 
     def __init__(
-        self, endpoint: Endpoint, name: str, heard_at: float | None, delivered: DeliveredStream | None = None
+        self, endpoint: Endpoint, name: str, received_at: float | None, delivered: DeliveredStream | None = None
     ) -> None:
         self.endpoint = endpoint
         self.name = name
-        """Where it is, for people: ``127.0.0.1:14550``, ``/dev/ttyACM0``."""
-        self.heard_at = heard_at
-        """Monotonic seconds; None for one that is there by configuration and has not been heard."""
+        """Its address, for people: ``127.0.0.1:14550``, ``/dev/ttyACM0``."""
+        self.received_at = received_at
+        """When its last frame was received, in monotonic seconds; None before the first frame."""
         self.delivered = delivered or DeliveredStream()
-        """The stream that it reads. Its endpoint asks it for the bytes of each frame, in the order of delivery."""
+        """The byte stream that it reads. It decides which bytes a frame becomes, in the order of delivery."""
 
     def __repr__(self) -> str:
         return f"LocalPort({self.endpoint.name}, {self.name})"
@@ -41,56 +41,62 @@ class LocalPort:
 
 
 class PortHandler(Protocol):
-    """What an endpoint reports to. ``now`` is monotonic seconds."""
+    """Receives the reports of an endpoint. ``now`` is monotonic seconds."""
 
     stall: StallWatch
     """Endpoints report their reads to it."""
 
     def on_port_opened(self, port: LocalPort) -> None:
-        """A program is there."""
+        """A client connected."""
 
     def on_port_closed(self, port: LocalPort) -> None:
-        """It is gone."""
+        """A client disconnected, or was silent for too long."""
+
+    def on_port_silent(self, port: LocalPort) -> None:
+        """A client that may have gone is silent. It needs no broadcast frames of other clients until it is active."""
+
+    def on_port_active(self, port: LocalPort) -> None:
+        """A silent client sent a frame, which follows."""
 
     def on_frames(self, port: LocalPort, frames: list[Frame], now: float, epoch: int, waited_s: float = 0.0) -> None:
-        """What it sent, all that was there at once, in order; the first of it has waited so long already.
+        """Everything that a client sent since the last read, in order. The first frame has waited for ``waited_s``.
 
-        ``epoch``: when it was read (:mod:`uavlinkd.system.stall`). The handler drops frames of any but the present one.
+        ``epoch``: when it was read (:mod:`uavlinkd.system.stall`). The handler drops the frames of earlier epochs.
         """
 
 
 class Endpoint(Protocol):
-    """A local MAVLink port of the daemon, with no, one or many programs behind it."""
+    """A local MAVLink endpoint of the daemon, with no, one or many clients."""
 
     name: str
     counters: SplitCounters
-    """What was found in the bytes that came."""
+    """Frames and garbage in the received bytes."""
     failures: Counter[str]
-    """What went wrong, by name: errors of the kernel (``ECONNREFUSED``), and the endpoint's own reasons."""
+    """Errors by name: the kernel's (``ECONNREFUSED``), and the endpoint's own reasons."""
     bytes_received: int
     bytes_sent: int
     frames_sent: int
 
     @property
     def ports(self) -> Sequence[LocalPort]:
-        """Who is there now."""
+        """The present clients."""
 
     def gather(self, seconds: float) -> None:
-        """From now on frames may wait unread for so long: whoever they are for makes them wait anyway."""
+        """From now on, frames may wait this long before they are read: all peers make them wait anyway."""
 
     def start(self) -> None:
-        """Begin to work, in the running event loop. The daemon has bound what listens already."""
+        """Begin to work, in the running event loop. Sockets that listen are bound already."""
 
     def write(self, port: LocalPort, frames: Sequence[Frame], source: Source, now: float) -> None:
-        """Send frames of one source to one port, or drop and count them. Returns at once."""
+        """Send frames of one source to one client, or drop and count them. Returns at once."""
 
     def do_housekeeping(self, now: float) -> None:
-        """Called each second: forget who is gone."""
+        """Forget clients that have gone. The daemon calls this each second."""
 
     def close(self) -> None:
         """Stop and close everything. Reports no port as closed any more."""
 
 
 def failure_name(error: OSError) -> str:
-    """A short stable name for what the kernel said: ``ECONNREFUSED`` and so on."""
+    """A short stable name for an error of the kernel, such as ``ECONNREFUSED``."""
     return errno.errorcode.get(error.errno or 0, type(error).__name__)

@@ -1,8 +1,8 @@
-"""What TCP and serial ports share: frames into and out of byte streams, and a bounded wait for a slow other side.
+"""The common part of TCP and serial endpoints: frames in byte streams, and a bounded wait for slow clients.
 
-What the kernel does not take at once waits in its connection's own queue (:mod:`.outgoing`): urgent frames first,
-each source its fair share, the newest state. The kernel holds little, because frames there can be neither dropped
-nor overtaken.
+Frames that the kernel does not accept at once wait in a queue of their connection (:mod:`.outgoing`): urgent frames
+first, a fair share for each source, only the newest state. The kernel holds few bytes, because frames there can be
+neither dropped nor overtaken.
 """
 
 from __future__ import annotations
@@ -12,74 +12,44 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Sequence
 from math import inf
-from typing import Protocol
 
 import structlog
 
-from uavlinkd.system.clock import monotonic
+from uavlinkd.endpoints.byte_channel import ByteChannel
 from uavlinkd.endpoints.outgoing import OutgoingFrames
 from uavlinkd.endpoints.ports import LocalPort, PortHandler, failure_name
+from uavlinkd.mavlink.frames import Frame, SplitCounters
 from uavlinkd.mavlink.policy.delivery import DeliveredStreams, Source
-from uavlinkd.mavlink.frames import MAX_GAP_S, Frame, SplitCounters, StreamSplitter
+from uavlinkd.mavlink.stream_splitter import MAX_GAP_S, StreamSplitter
+from uavlinkd.system.clock import monotonic
+from uavlinkd.system.error_meanings import NAME_NOT_RESOLVED, meaning_of
 from uavlinkd.system.stall import STALE, Backlog
 
 MAX_AGE_S = 1.0
-"""A frame that waited longer than this for its turn is not sent any more."""
+"""A frame that waited longer than this is dropped."""
 READ_BYTES = 4096
-"""Read of one connection in a wake-up; then the others have their turn. The costliest bytes take some 10 ms."""
+"""Read from one connection in a wake-up. Then the other connections have their turn. The costliest bytes take some
+10 ms."""
 STALLED_S = 30.0
-"""A connection that took no byte for this long is closed, so that what nobody reads is not held for ever."""
+"""A connection that accepted no byte for this long is closed, so that its queue is not held indefinitely."""
 LASTED_S = 60.0
-"""An endpoint that was open for so long and then is not is news; one that comes and goes fills no log."""
+"""After an endpoint was open for this long, its next failure is logged again. Shorter times would fill the log."""
 
 DISCONNECTED = "disconnected"
 
 _MEANINGS = {
-    "ENOENT": "there is no such device now",
-    "EACCES": "this user may not open it: add it to the device's group, often dialout",
-    "EPERM": "this service may not open it: see DeviceAllow in its unit",
-    "EBUSY": "another program has it open: end it (ModemManager takes new serial ports)",
-    "ECONNREFUSED": "nobody listens there now",
-    "connect_timeout": "nothing answers there now",
-    "not_resolved": "its name has no address now",
+    "EPERM": "this service may not open the device: see DeviceAllow in its unit",
+    "connect_timeout": "there is no answer from there now",
+    "not_resolved": meaning_of(NAME_NOT_RESOLVED),
 }
-"""What a person should understand by the reason for which an endpoint is not open. It is tried again, for ever."""
-
-
-class Channel(Protocol):
-    """The kernel's side of one connection. Nothing of it blocks."""
-
-    def fileno(self) -> int:
-        """For the event loop."""
-
-    def read(self, size: int) -> bytes:
-        """What is there, up to ``size`` bytes; none at the end. ``BlockingIOError`` where nothing is there now."""
-
-    def write(self, data: bytes) -> int:
-        """Hand bytes over; how many were taken. ``BlockingIOError`` for none."""
-
-    def capacity(self) -> int:
-        """How many received bytes the kernel can hold now."""
-
-    @property
-    def limit_bytes(self) -> int:
-        """The kernel is handed no more than this, except for a single larger frame while it holds nothing."""
-
-    def held(self, now: float) -> int:
-        """How many bytes the kernel holds that count towards the limit."""
-
-    def drain_s(self, to_bytes: int, now: float) -> float:
-        """In how many seconds the kernel should hold no more than ``to_bytes``."""
-
-    def close(self, *, abort: bool) -> None:
-        """Close it; ``abort`` forgets what the kernel has not sent."""
+"""Why an endpoint is not open, where the common table does not say it. The daemon tries again indefinitely."""
 
 
 class Connection:
-    """One open byte stream and the program at its other end."""
+    """One open byte stream and the client at its other end."""
 
     def __init__(
-        self, endpoint: StreamEndpoint, channel: Channel, name: str, opened_at: float, opened_in: int
+        self, endpoint: StreamEndpoint, channel: ByteChannel, name: str, opened_at: float, opened_in: int
     ) -> None:
         self.port = LocalPort(endpoint, name, None, endpoint.delivered.of(name))
         self.channel = channel
@@ -104,16 +74,16 @@ class Connection:
 
     @property
     def silent_since(self) -> float:
-        """When it last sent a genuine frame; when it was opened, if it never did."""
-        return self.opened_at if self.port.heard_at is None else self.port.heard_at
+        """When it last sent a genuine frame; if it never did, when it was opened."""
+        return self.opened_at if self.port.received_at is None else self.port.received_at
 
     @property
     def ended_well(self) -> bool:
-        """Whether the other side ended it, and may still read what the kernel holds."""
+        """Whether the client ended it, and may still read the kernel's bytes."""
         return self._lost_by == DISCONNECTED
 
     def on_readable(self, now: float) -> None:
-        """Read what is there, and hand over its frames at once."""
+        """Read the received bytes and deliver their frames."""
         epoch = self._backlog.begin(now)
         is_empty = False
         chunks: list[bytes] = []
@@ -140,19 +110,19 @@ class Connection:
                 return
         self._endpoint.bytes_received += len(data)
         self._age(epoch)
-        # Stale bytes are split too: a stream that is cut amid a frame begins with any bytes of that.
+        # Stale bytes are split too: otherwise the stream would go on in the middle of a frame.
         is_fresh = self._splitter.is_fresh
         frames = self._splitter.feed(data, now)
         if ended is not None:
             frames += self._splitter.end()
         if frames:
-            self.port.heard_at = now
+            self.port.received_at = now
             self._endpoint.handler.on_frames(self.port, frames, now, epoch if is_fresh else STALE)
         if ended is not None:
             self.lose(ended)
 
     def write(self, frames: Sequence[Frame], source: Source, now: float) -> None:
-        """Send frames, or have them wait for those that wait already."""
+        """Send frames, or queue them behind those that wait already."""
         if not self._is_open:
             self._endpoint.failures["unsent"] += len(frames)
         elif self._awaits_writable or self._room_timer is not None:
@@ -161,14 +131,14 @@ class Connection:
             self._write_at_once(frames, source, now)
 
     def on_writable(self, now: float) -> None:
-        """The kernel has room again."""
+        """Write more: the kernel has room again."""
         self._blocked_since = None
         self._awaits_writable = False
         self._loop.remove_writer(self._fd)
         self._flush(now)
 
     def check(self, now: float) -> None:
-        """Drop what got stale; close the connection if nothing of it has moved for long."""
+        """Drop stale frames. Close the connection if the kernel has accepted no byte for long."""
         self._age(self._stall.epoch)
         epoch = self._epoch if self._splitter.is_fresh else STALE
         if frames := self._splitter.give_up(now):
@@ -178,13 +148,13 @@ class Connection:
             self.lose("stalled")
 
     def _age(self, epoch: int) -> None:
-        """What is held of a frame came before a pause: then the frame is not new."""
+        """Mark the part of a frame that arrived before a pause: the whole frame is not new."""
         if epoch != self._epoch:
             self._epoch = epoch
             self._splitter.age()
 
     def lose(self, reason: str) -> None:
-        """Stop, count why, and report the port as closed soon: never from within ``write``."""
+        """Stop, count the reason, and report the port as closed in the loop's next turn: never within ``write``."""
         if self._is_open:
             self._endpoint.failures[reason] += 1
             self._lost_by = reason
@@ -192,7 +162,7 @@ class Connection:
             self._loop.call_soon(self._endpoint.forget, self)
 
     def stop(self) -> None:
-        """Watch it no more. What waits is dropped."""
+        """Stop watching the channel, and drop the frames that wait."""
         self._is_open = False
         self._loop.remove_reader(self._fd)
         if self._awaits_writable:
@@ -202,7 +172,7 @@ class Connection:
         self.outgoing.drop_all()
 
     def _write_at_once(self, frames: Sequence[Frame], source: Source, now: float) -> None:
-        """Write what the kernel has room for, while no other frame waits. The rest waits for its turn."""
+        """Write while the kernel has room, and queue the other frames. Call it only while no frame waits."""
         count = 0
         try:
             while count < len(frames) and not self._awaits_writable:
@@ -222,7 +192,7 @@ class Connection:
                 self._flush(now)
 
     def _count_fitting(self, frames: Sequence[Frame], first: int, now: float) -> int:
-        """How far the frames from ``first`` on fit into the kernel's room. One always fits where it holds nothing."""
+        """The end of the frames from ``first`` on that fit. One always fits while the kernel holds no bytes."""
         held = self.channel.held(now)
         limit = self.channel.limit_bytes
         count = first
@@ -235,7 +205,7 @@ class Connection:
         return count
 
     def _flush(self, now: float) -> None:
-        """Write what waits until the kernel has no room for more."""
+        """Write waiting frames until the kernel has no more room."""
         channel = self.channel
         outgoing = self.outgoing
         try:
@@ -251,10 +221,10 @@ class Connection:
             self.lose(failure_name(error))
 
     def _write_committed(self, now: float) -> bool:
-        """Hand committed bytes to the kernel. Returns whether it took them all; else wait until it takes more.
+        """Pass committed bytes to the kernel. Returns whether it accepted all; if not, wait until it accepts more.
 
         Raises:
-            OSError: the connection is gone.
+            OSError: the connection has ended.
         """
         data = self.outgoing.committed
         try:
@@ -276,10 +246,10 @@ class Connection:
         self._loop.add_writer(self._fd, lambda: self.on_writable(monotonic()))
 
     def _await_room(self, now: float) -> None:
-        """Look again when the next frame should fit. The kernel sends no event while this side leaves it empty.
+        """Look again when the next frame should fit. The kernel sends no event for room that was never used up.
 
         Raises:
-            OSError: the connection is gone.
+            OSError: the connection has ended.
         """
         self._blocked_since = self._blocked_since if self._blocked_since is not None else now
         size = self.outgoing.next_bytes(now)
@@ -287,7 +257,7 @@ class Connection:
         self._room_timer = self._loop.call_later(self.channel.drain_s(to_bytes, now), self._on_room_timer)
 
     def _on_room_timer(self) -> None:
-        # Goes on while the kernel holds bytes even if all that waited got stale, so that a stall is known as one.
+        # Go on while the kernel holds bytes, even if no frame waits any more, so that a stall is detected.
         now = monotonic()
         self._room_timer = None
         try:
@@ -303,36 +273,36 @@ class Connection:
 
 
 class StreamEndpoint(ABC):
-    """An endpoint whose programs are at the other end of byte streams.
+    """An endpoint whose clients are connected by byte streams.
 
-    Every frame given to ``write`` is in ``frames_sent``, or waits, or was refused (:mod:`uavlinkd.mavlink.policy.delivery`),
-    or is in ``failures``: as ``outgoing_full``, ``stale``, ``thinned`` (a newer state replaced it), or ``unsent``
-    where its connection ended. Connections that ended are counted there as ``disconnected`` by the other side,
-    ``stalled``, or under the kernel's error.
+    Every frame passed to ``write`` is counted in ``frames_sent``, or waits, or was refused
+    (:mod:`uavlinkd.mavlink.policy.delivery`), or is counted in ``failures``: ``outgoing_full``, ``stale``,
+    ``thinned`` (a newer state replaced it), or ``unsent`` (its connection ended). ``failures`` also counts the
+    connections that ended: ``disconnected`` (by the client), ``stalled``, or the kernel's error.
     """
 
     max_gap_s = MAX_GAP_S
-    """A silence inside a frame, after which it is taken for broken."""
+    """A frame with a longer gap inside counts as broken."""
     max_hold_s = inf
-    """How long all of a frame may take: on a serial line as long as it does."""
+    """How long a frame may take as a whole. Serial lines have no limit."""
 
     def __init__(self, name: str, handler: PortHandler, max_age_s: float) -> None:
         self.name = name
         self.handler = handler
         self.max_age_s = max_age_s
         self.counters = SplitCounters()
-        """What was found in the bytes of all connections."""
+        """Frames and garbage in the bytes of all connections."""
         self.failures: Counter[str] = Counter()
         self.bytes_received = 0
         self.bytes_sent = 0
         self.frames_sent = 0
         self.delivered = DeliveredStreams()
         self._connections: dict[LocalPort, Connection] = {}
-        self._told: set[str] = set()  # why it could not be opened, since it last was for long
+        self._logged: set[str] = set()  # reasons of failures to open it, since it was last open for long
 
     @property
     def ports(self) -> Sequence[LocalPort]:
-        """Who is connected now."""
+        """The present clients."""
         return list(self._connections)
 
     @abstractmethod
@@ -340,10 +310,10 @@ class StreamEndpoint(ABC):
         """Begin to listen or to connect, in the running event loop."""
 
     def gather(self, seconds: float) -> None:  # noqa: B027
-        """Nothing: a stream's bytes gather in the kernel, and in its splitter, as they are."""
+        """Do nothing: the bytes of a stream gather in the kernel anyway."""
 
     def write(self, port: LocalPort, frames: Sequence[Frame], source: Source, now: float) -> None:
-        """Send frames to one client, now or when it has room. Returns at once; reports nothing."""
+        """Send frames to one client, now or when it has room. Returns at once and reports no event."""
         connection = self._connections.get(port)
         if connection is None:
             self.failures["unsent"] += len(frames)
@@ -351,7 +321,7 @@ class StreamEndpoint(ABC):
             connection.write(frames, source, now)
 
     def do_housekeeping(self, now: float) -> None:
-        """Close what has stalled."""
+        """Close connections that have stalled."""
         for connection in list(self._connections.values()):
             connection.check(now)
 
@@ -364,11 +334,11 @@ class StreamEndpoint(ABC):
             connection.channel.close(abort=False)
 
     def objection(self, first_bytes: bytes) -> str | None:
-        """Why a connection that begins with these bytes is to be closed at once; None to keep it."""
+        """The reason to close a connection that begins with these bytes, or None."""
         return None
 
-    def open(self, channel: Channel, name: str, now: float, opened_in: int) -> Connection:
-        """Take a connection over, and report its port. ``opened_in``: the epoch in which opening it began."""
+    def open(self, channel: ByteChannel, name: str, now: float, opened_in: int) -> Connection:
+        """Add a connection and report its port. ``opened_in`` is the epoch in which opening it began."""
         connection = Connection(self, channel, name, now, opened_in)
         self._connections[connection.port] = connection
         self.handler.on_port_opened(connection.port)
@@ -377,16 +347,16 @@ class StreamEndpoint(ABC):
     def could_not_open(self, reason: str) -> None:
         """Count an attempt that failed. Each reason is logged once, until the endpoint has been open for long."""
         self.failures[reason] += 1
-        if reason not in self._told:
-            self._told.add(reason)
-            meaning = _MEANINGS.get(reason, "it is tried again, for ever")
+        if reason not in self._logged:
+            self._logged.add(reason)
+            meaning = _MEANINGS.get(reason) or meaning_of(reason) or "it is tried again indefinitely"
             structlog.get_logger().warning("endpoint_not_open", endpoint=self.name, reason=reason, meaning=meaning)
 
     def forget(self, connection: Connection) -> None:
         """Report the port of a lost connection as closed, once."""
         if self._connections.pop(connection.port, None) is not None:
             if monotonic() - connection.opened_at >= LASTED_S:
-                self._told.clear()
+                self._logged.clear()
             self.handler.on_port_closed(connection.port)
             self.dispose(connection)
             connection.lost.set()

@@ -1,6 +1,6 @@
-"""Local MAVLink ports on TCP: ``tcp`` connects, again and again; ``tcpin`` listens, for many clients.
+"""Local MAVLink endpoints on TCP: ``tcp`` connects, and connects again; ``tcpin`` listens for several clients.
 
-The kernel holds little of what it cannot send (TCP_NOTSENT_LOWAT): there a frame can be neither dropped nor
+The kernel holds few bytes that it cannot send (TCP_NOTSENT_LOWAT), because frames there can be neither dropped nor
 overtaken.
 """
 
@@ -14,56 +14,57 @@ import sys
 from contextlib import suppress
 from secrets import SystemRandom
 
-from uavlinkd.system.addresses import Address
-from uavlinkd.system.clock import monotonic
 from uavlinkd.endpoints.ports import PortHandler, failure_name
 from uavlinkd.endpoints.sockets import bind, cannot_listen, unbound_socket
 from uavlinkd.endpoints.stream_endpoint import MAX_AGE_S, STALLED_S, StreamEndpoint
+from uavlinkd.system.addresses import Address
+from uavlinkd.system.clock import monotonic
 from uavlinkd.system.stall import Backlog
 from uavlinkd.system.tasks import keep_running
 from uavlinkd.system.threads import Threads
 
 CLIENTS_PER_ENDPOINT = 32
-"""Programs that one ``tcpin`` endpoint serves."""
-CLIENT_QUIET_S = 5.0
-"""When all places are taken, the client that was quiet longest, and this long, gives its own to a newcomer."""
+"""Most clients of one ``tcpin`` endpoint."""
+CLIENT_SILENT_S = 5.0
+"""When all places are taken, the client that has been silent longest loses its place to a new client, if it has been
+silent for this long."""
 FIRST_WAIT_S = 0.25
 LONGEST_WAIT_S = 5.0
-"""Between two attempts to connect. Each wait is twice the one before, and up to a quarter longer, by chance."""
+"""Wait between two attempts to connect. It doubles each time, and is up to a quarter longer at random."""
 CONNECT_TIMEOUT_S = 5.0
-"""For one address; a name may have several."""
+"""For one address. A name may have several."""
 MAX_GAP_S = 2.0
-"""Inside a frame, and for all of it: TCP loses nothing, but what it has to repeat comes late; later than this a frame
-is old, or was none, from a serial line behind a server."""
+"""Longest gap in a frame, and longest duration of a frame. TCP loses no bytes, but repeats some of them late. After
+this time a frame is too old, or a serial line behind the server has lost a part of it."""
 MAX_ADDRESSES = 8
-"""Tried of one name in one attempt."""
+"""Addresses of a name that one attempt tries."""
 ACCEPT_PAUSE_S = 1.0
-"""Without a file descriptor or memory for a client there is nothing to do but wait."""
+"""Wait before the next accept when the system has no file descriptor or memory for a client."""
 
 _SEND_BUFFER_BYTES = 16384
 _NOT_SENT_BYTES = 1024
-"""The kernel takes a write while it holds fewer bytes than this beyond those on their way."""
+"""The kernel accepts a write while it holds fewer unsent bytes than this."""
 _WRITE_BYTES = 1400
-"""One write: a segment at most. The kernel takes all of a write that it begins to take."""
+"""Most bytes of one write: a segment. The kernel accepts a write whole or not at all."""
 _OWN_SEGMENT = socket.MSG_EOR if sys.platform == "linux" else 0
 _BACKLOG = 32
-_Sockaddr = tuple[str | int, ...]  # of either family, as the kernel takes it
-_Found = tuple[socket.AddressFamily, _Sockaddr]
+_Sockaddr = tuple[str | int, ...]  # of either family
+_Resolved = tuple[socket.AddressFamily, _Sockaddr]
 
-# A web page can make the browser of this machine send any bytes to any local port, but only after these: a method of
-# HTTP, or the beginning of TLS, whose session ticket may be any bytes.
+# A web page can have a browser on this machine send any bytes to any local port, but only after these: an HTTP
+# method, or the start of TLS, whose session ticket may be any bytes.
 _BROWSER = (b"GET ", b"POST ", b"HEAD ", b"PUT ", b"OPTIONS ", b"PATCH ", b"DELETE ", b"CONNECT ", b"\x16\x03")
 
 
 def tcp_listener(address: Address) -> socket.socket:
-    """A TCP socket that listens on a numeric address, which may come later.
+    """Make a TCP socket that listens on a numeric address, which an interface may get later.
 
     Raises:
-        BindError: with the address and the reason.
+        BindError: the address cannot be used; with the reason.
     """
     sock, sockaddr = unbound_socket(address, socket.SOCK_STREAM)
     try:
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # connections of before may still be ending
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # earlier connections may still be closing
         bind(sock, sockaddr, may_come_later=True)
         sock.listen(_BACKLOG)
     except OSError as error:
@@ -81,22 +82,22 @@ class SocketChannel:
         self.read = sock.recv
 
     def write(self, data: bytes) -> int:
-        """Hand bytes to the kernel. Each write is a segment of its own: the kernel would add to the last one that it
-        has not sent, up to 64 kB, whatever TCP_NOTSENT_LOWAT says."""
+        """Pass bytes to the kernel. Each write is a segment of its own: otherwise the kernel adds up to 64 kB to the
+        last unsent segment, in spite of TCP_NOTSENT_LOWAT."""
         return self._sock.send(data, _OWN_SEGMENT)
 
     def capacity(self) -> int:
-        """The receive buffer, as large as it is now."""
+        """The present size of the receive buffer."""
         return self._sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
 
     limit_bytes = _WRITE_BYTES
 
     def held(self, now: float) -> int:
-        """The kernel has its own limit, and reports when it has room again."""
+        """0: the kernel has its own limit, and reports when it has room again."""
         return 0
 
     def drain_s(self, to_bytes: int, now: float) -> float:
-        """Nothing is held."""
+        """0: the kernel reports when it has room."""
         return 0.0
 
     def close(self, *, abort: bool) -> None:
@@ -107,10 +108,10 @@ class SocketChannel:
 
 
 class TcpServer(StreamEndpoint):
-    """``tcpin``: whoever connects, up to a bound, is a port until it ends.
+    """``tcpin``: each connection is a client, up to a limit.
 
-    In ``failures`` there are besides: ``too_many_clients``, who were not let in; ``displaced``, who had to give
-    their place; ``http``, who turned out to be a browser.
+    Further names in ``failures``: ``too_many_clients`` (refused connections), ``displaced`` (clients that lost their
+    place to a new one) and ``http`` (connections of browsers).
     """
 
     max_gap_s = max_hold_s = MAX_GAP_S
@@ -125,21 +126,21 @@ class TcpServer(StreamEndpoint):
 
     @property
     def address(self) -> tuple[str, int]:
-        """Where it listens."""
+        """The address on which it listens."""
         host, port = self._listener.getsockname()[:2]
         return host, port
 
     def share_socket(self) -> socket.socket:
-        """Its socket once more, for another endpoint in its place. Each is closed by its own."""
+        """A duplicate of the socket, for another endpoint in place of this one. Each endpoint closes its own."""
         return self._listener.dup()
 
     def start(self) -> None:
-        """Accept whoever comes."""
+        """Accept connections from now on."""
         asyncio.get_running_loop().add_reader(self._listener.fileno(), lambda: self.on_acceptable(monotonic()))
 
     def on_acceptable(self, now: float) -> None:
-        """Let in who waits, as far as there are places."""
-        # A client that connected during a pause may have sent something. Its connection is stale as this queue is.
+        """Accept the waiting connections, as far as there are places."""
+        # A client that connected during a pause may have sent frames. Its connection is as stale as this queue.
         epoch = self._backlog.begin(now)
         for _ in range(_BACKLOG):
             try:
@@ -149,7 +150,7 @@ class TcpServer(StreamEndpoint):
                 return
             except OSError as error:
                 self.failures[failure_name(error)] += 1
-                if error.errno in _EXHAUSTED:  # else the one client is gone already
+                if error.errno in _EXHAUSTED:  # else this client has gone already
                     self._pause()
                     return
                 continue
@@ -162,11 +163,11 @@ class TcpServer(StreamEndpoint):
             self.open(SocketChannel(sock), str(Address(*sockaddr[:2])), now, epoch)
 
     def objection(self, first_bytes: bytes) -> str | None:
-        """``http`` for what a browser begins with, whatever follows."""
+        """``http`` for the first bytes of a browser."""
         return "http" if first_bytes.startswith(_BROWSER) else None
 
     def close(self) -> None:
-        """Stop listening, and close every connection."""
+        """Stop listening and close every connection."""
         if self._resume is not None:
             self._resume.cancel()
         if self._listener.fileno() >= 0:
@@ -175,14 +176,14 @@ class TcpServer(StreamEndpoint):
         super().close()
 
     def _has_place(self, now: float) -> bool:
-        """Whether one more may come in, if need be in the place of who was quiet for long."""
+        """Whether there is a place for one more client. A client that has been silent for long loses its place."""
         if len(self._connections) < CLIENTS_PER_ENDPOINT:
             return True
-        quietest = min(self._connections.values(), key=lambda each: each.silent_since)
-        if now - quietest.silent_since < CLIENT_QUIET_S:
+        silent = min(self._connections.values(), key=lambda connection: connection.silent_since)
+        if now - silent.silent_since < CLIENT_SILENT_S:
             return False
-        quietest.lose("displaced")
-        self.forget(quietest)
+        silent.lose("displaced")
+        self.forget(silent)
         return True
 
     def _pause(self) -> None:
@@ -192,10 +193,10 @@ class TcpServer(StreamEndpoint):
 
 
 class TcpClient(StreamEndpoint):
-    """``tcp``: connects, and connects again when that ends; for ever. The name is looked up each time.
+    """``tcp``: connects, and connects again whenever the connection ends. Each attempt resolves the name.
 
-    In ``failures`` there are besides: what attempts ended with, by the kernel's name of it (``ECONNREFUSED``), as
-    ``connect_timeout`` or ``not_resolved``.
+    Further names in ``failures``, for attempts to connect: the kernel's (``ECONNREFUSED``), ``connect_timeout`` and
+    ``not_resolved``.
     """
 
     max_gap_s = max_hold_s = MAX_GAP_S
@@ -204,7 +205,7 @@ class TcpClient(StreamEndpoint):
         super().__init__(name, handler, max_age_s)
         self._address = address
         self._task: asyncio.Task[None] | None = None
-        # One thread of its own: a name server that does not answer must not keep others from theirs.
+        # An own thread: a silent name server must not delay the look-ups of others.
         self._threads = Threads(1, f"look-up-{name}")
 
     def start(self) -> None:
@@ -212,13 +213,13 @@ class TcpClient(StreamEndpoint):
         self._task = keep_running(self._keep_connected(), f"the endpoint {self.name}")
 
     def close(self) -> None:
-        """Stop connecting, and close the connection."""
+        """Stop connecting and close the connection."""
         if self._task is not None:
             self._task.cancel()
         super().close()
 
     async def _keep_connected(self) -> None:
-        chance = SystemRandom()
+        rng = SystemRandom()
         wait_s = FIRST_WAIT_S
         while True:
             epoch = self.handler.stall.epoch
@@ -226,14 +227,14 @@ class TcpClient(StreamEndpoint):
             if sock is not None:
                 connection = self.open(SocketChannel(sock), str(self._address), monotonic(), epoch)
                 await connection.lost.wait()
-                # A server that only accepts and closes is not asked at once again.
-                if connection.port.heard_at is not None or monotonic() - connection.opened_at >= LONGEST_WAIT_S:
+                # A server that only accepts and closes is not tried again at once.
+                if connection.port.received_at is not None or monotonic() - connection.opened_at >= LONGEST_WAIT_S:
                     wait_s = FIRST_WAIT_S
-            await asyncio.sleep(wait_s * chance.uniform(1.0, 1.25))
+            await asyncio.sleep(wait_s * rng.uniform(1.0, 1.25))
             wait_s = min(2 * wait_s, LONGEST_WAIT_S)
 
     async def _connect(self) -> socket.socket | None:
-        """A socket connected to the first address that answers."""
+        """Connect a socket to the first address that answers. Returns None if no address does."""
         for family, sockaddr in await self._resolve():
             try:
                 sock = socket.socket(family, socket.SOCK_STREAM)
@@ -260,10 +261,10 @@ class TcpClient(StreamEndpoint):
         async with asyncio.timeout(CONNECT_TIMEOUT_S):
             await asyncio.get_running_loop().sock_connect(sock, sockaddr)
         if sock.getsockname() == sock.getpeername():
-            # Where nobody listens on a local port, the kernel may in time choose that port for our own side.
+            # When no process listens on a local port, the kernel may choose that port for our own side.
             raise ConnectionRefusedError(errno.ECONNREFUSED, "connected to itself")
 
-    async def _resolve(self) -> list[_Found]:
+    async def _resolve(self) -> list[_Resolved]:
         try:
             if self._address.ip is not None:
                 return _look_up(self._address, socket.AI_NUMERICHOST)
@@ -273,19 +274,19 @@ class TcpClient(StreamEndpoint):
             return []
 
 
-def _look_up(address: Address, flags: int) -> list[_Found]:
-    found = socket.getaddrinfo(*address.sockaddr, type=socket.SOCK_STREAM, flags=flags)
-    return [(family, (str(each[0]), int(each[1]), *each[2:])) for family, _, _, _, each in found[:MAX_ADDRESSES]]
+def _look_up(address: Address, flags: int) -> list[_Resolved]:
+    answers = socket.getaddrinfo(*address.sockaddr, type=socket.SOCK_STREAM, flags=flags)[:MAX_ADDRESSES]
+    return [(family, (str(host), int(port), *rest)) for family, _, _, _, (host, port, *rest) in answers]
 
 
 _EXHAUSTED = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM})
 
-# (level, name of the option, value); systems that do not know one do without.
+# Level, name and value. An option that the system does not have is left out.
 _OPTIONS = (
     (socket.IPPROTO_TCP, "TCP_NODELAY", 1),
     (socket.SOL_SOCKET, "SO_SNDBUF", _SEND_BUFFER_BYTES),
     (socket.IPPROTO_TCP, "TCP_NOTSENT_LOWAT", _NOT_SENT_BYTES),
-    # A machine that vanished is noticed by its silence, and by what it does not acknowledge.
+    # Detect a machine that vanished: it is silent, or does not acknowledge.
     (socket.SOL_SOCKET, "SO_KEEPALIVE", 1),
     (socket.IPPROTO_TCP, "TCP_KEEPIDLE", 10),
     (socket.IPPROTO_TCP, "TCP_KEEPINTVL", 5),
@@ -295,7 +296,7 @@ _OPTIONS = (
 
 
 def _prepare(sock: socket.socket) -> None:
-    """Make a socket hold little back, and notice when the other side is gone."""
+    """Configure a socket to hold few bytes, and to detect that the other side has gone."""
     sock.setblocking(False)
     for level, name, value in _OPTIONS:
         number = getattr(socket, name, None)

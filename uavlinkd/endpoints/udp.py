@@ -1,54 +1,95 @@
-"""Local MAVLink ports on UDP: ``udpin`` listens, ``udpout`` sends to one address.
+"""Local MAVLink endpoints on UDP: ``udpin`` listens, ``udpout`` sends to one address.
 
-A wake-up drains the socket and hands over everything at once, so frames that arrived together travel together.
+Frames that arrived together are delivered together, so that they can share an envelope.
 """
 
 from __future__ import annotations
 
 import asyncio
+import errno
 import socket
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Sequence
+from math import inf
+from typing import Any
 
 import structlog
 
-from uavlinkd.system.addresses import Address
-from uavlinkd.system.clock import monotonic
+from uavlinkd.endpoints.error_queue import ErrorReports, enable_error_queue, read_error_queue, send_again
 from uavlinkd.endpoints.ports import LocalPort, PortHandler, failure_name
-from uavlinkd.endpoints.sockets import Batch, BindError, Reader, numeric_host, udp_socket
+from uavlinkd.endpoints.reader import Datagrams, Reader
+from uavlinkd.endpoints.sockets import BindError, udp_socket
+from uavlinkd.mavlink.frames import MIN_FRAME_BYTES, Frame, SplitCounters, split_datagram
 from uavlinkd.mavlink.policy.delivery import DeliveredStreams, Source
-from uavlinkd.mavlink.frames import MAX_GAP_S, MIN_FRAME_BYTES, Frame, SplitCounters, StreamSplitter, split_datagram
+from uavlinkd.mavlink.stream_splitter import MAX_GAP_S, StreamSplitter
+from uavlinkd.system.addresses import Address, numeric_host
+from uavlinkd.system.clock import monotonic
 from uavlinkd.system.resolver import Resolved, keep_resolving
 from uavlinkd.system.stall import STALE
 from uavlinkd.system.tasks import keep_running
 
 CLIENTS_PER_ENDPOINT = 32
-"""Programs that one ``udpin`` endpoint serves."""
+"""Most clients of one ``udpin`` endpoint."""
 CLIENT_IDLE_S = 60.0
-"""A program that says nothing for this long is forgotten; even a listener sends a heartbeat each second."""
-CLIENT_QUIET_S = 5.0
-"""When all places are taken, one that was quiet for this long gives its own to a newcomer; no other does."""
+"""``udpin`` forgets a client that is silent for this long. Even a listener sends a heartbeat each second."""
+CLIENT_SILENT_S = 5.0
+"""A client that is silent for this long gets no broadcast frames of other clients. When all places are taken, it
+loses its place to a new client."""
 REMOTE_SILENT_S = 5.0
-"""A name whose address says nothing for this long is looked up again."""
+"""The name of a ``udpout`` endpoint is looked up again when its address is silent for this long."""
 LOCAL_DATAGRAM_BYTES = 296
-"""Frames for one program share a datagram up to this size: MAVROS reads no more of one, and loses the rest
+"""Frames for one client share a datagram up to this size: MAVROS reads no more of a datagram and loses the rest
 (libmavconn, MsgBuffer::MAX_SIZE)."""
 
 _ANY = {socket.AF_INET: Address("0.0.0.0", 0), socket.AF_INET6: Address("::", 0)}
 
-Sockaddr = tuple[str, int]
+SocketAddress = tuple[Any, ...]
+"""As the kernel takes and returns it: host and port; for IPv6 also the flow label and the interface."""
+
+
+class UdpPort(LocalPort):
+    """A client of a UDP endpoint."""
+
+    __slots__ = ("_udp", "address")
+
+    def __init__(self, endpoint: UdpEndpoint, name: str, address: SocketAddress, received_at: float | None) -> None:
+        super().__init__(endpoint, name, received_at, endpoint.delivered.of(name))
+        self.address = address
+        self._udp = endpoint
+
+    def send(self, frames: Sequence[Frame], source: Source, now: float, waited_s: float = 0.0) -> None:
+        """Send frames to the client, together where they fit. The endpoint counts what the kernel refuses."""
+        admit = self.delivered.admit
+        batch: list[bytes] = []
+        size = 0
+        for frame in frames:
+            data = admit(frame, source, now)
+            if not data:
+                continue
+            if size + len(data) > LOCAL_DATAGRAM_BYTES:
+                if batch:
+                    self._udp.send(b"".join(batch), self.address, len(batch))
+                    batch, size = [], 0
+                if len(data) > LOCAL_DATAGRAM_BYTES:  # a separator and the frame
+                    cut = len(data) - len(frame.raw)
+                    self._udp.send(data[:cut], self.address, 0)
+                    data = data[cut:]
+            batch.append(data)
+            size += len(data)
+        if batch:
+            self._udp.send(b"".join(batch), self.address, len(batch))
 
 
 class UdpEndpoint(ABC):
-    """A UDP socket, and the programs at its other side. The two kinds of it are below."""
+    """A UDP socket and the clients at its other side."""
 
     def __init__(self, name: str, sock: socket.socket, handler: PortHandler) -> None:
         self.name = name
         self.counters = SplitCounters()
-        """What was found in the datagrams."""
+        """Frames and garbage in the datagrams."""
         self.failures: Counter[str] = Counter()
-        """What the kernel refused, by the name of the error; and ``stranger``, ``too_many_clients``."""
+        """Errors by the kernel's name, and ``stranger`` and ``too_many_clients``."""
         self.bytes_received = 0
         self.bytes_sent = 0
         self.frames_sent = 0
@@ -56,59 +97,46 @@ class UdpEndpoint(ABC):
         self._handler = handler
         self._epoch = handler.stall.epoch  # of the last read
         self._gather_s = 0.0
-        self._gathering: asyncio.TimerHandle | None = None
-        self._delivered = DeliveredStreams()
-        self._ports: dict[Sockaddr, LocalPort] = {}  # the longest silent first
-        self._addresses: dict[LocalPort, Sockaddr] = {}
-        self._cutters: dict[Sockaddr, StreamSplitter] = {}  # the programs that cut frames apart
+        self._reader: Reader | None = None
+        self.delivered = DeliveredStreams()
+        self._ports: dict[SocketAddress, UdpPort] = {}
+        self._silent: set[LocalPort] = set()
+        self._splitters: dict[SocketAddress, StreamSplitter] = {}  # of clients that cut frames apart
 
     @property
-    def ports(self) -> Sequence[LocalPort]:
-        """Who is there now."""
+    def ports(self) -> Sequence[UdpPort]:
+        """The present clients."""
         return list(self._ports.values())
 
     @property
-    def address(self) -> Sockaddr:
-        """Where the socket is bound."""
+    def address(self) -> tuple[str, int]:
+        """The socket's own address."""
         host, port = self._sock.getsockname()[:2]
         return host, port
 
     def start(self) -> None:
-        """Read whenever something is there."""
-        self._watch(Reader(self._sock, self._count_failure, self._handler.stall))
+        """Read whenever datagrams are there."""
+        self._reader = Reader(self._sock, self.take, self._on_read_error, self._handler.stall)
+        self._reader.gather(self._gather_s)
+        self._reader.start()
 
     def gather(self, seconds: float) -> None:
-        """One wake-up for all that comes within ``seconds``, rather than one for each datagram."""
+        """Read once for all datagrams that arrive within ``seconds``, and not for each of them."""
         self._gather_s = seconds
+        if self._reader is not None:
+            self._reader.gather(seconds)
 
-    def _watch(self, reader: Reader) -> None:
-        asyncio.get_running_loop().add_reader(self._sock, self._on_readable, reader)
-
-    def _on_readable(self, reader: Reader) -> None:
-        if self._gather_s:
-            loop = asyncio.get_running_loop()
-            loop.remove_reader(self._sock)
-            self._gathering = loop.call_later(self._gather_s, self._on_gathered, reader, self._gather_s)
-        else:
-            self.take(reader.read())
-
-    def _on_gathered(self, reader: Reader, waited_s: float) -> None:
-        self._gathering = None
-        self._watch(reader)
-        self.take(reader.read(), waited_s)
-
-    def take(self, batch: Batch, waited_s: float = 0.0) -> None:
-        """Hand over the frames of each sender in their order; the first of them has waited so long already."""
-        datagrams, now, epoch = batch
-        arrived: dict[Sockaddr, list[Frame]] = {}
-        stale: set[Sockaddr] = set()
+    def take(self, datagrams: Datagrams, now: float, epoch: int, waited_s: float = 0.0) -> None:
+        """Deliver the frames of each client, in their order."""
+        received: dict[SocketAddress, list[Frame]] = {}
+        stale: set[SocketAddress] = set()
         counters = self.counters
-        self._age(epoch)
-        for datagram, source in datagrams:
+        if epoch != self._epoch:
+            self._age(epoch)
+        for datagram, address in datagrams:
             self.bytes_received += len(datagram)
-            address = source if len(source) == 2 else (numeric_host(source), source[1])
-            if self._cutters and address in self._cutters:
-                splitter = self._cutters[address]
+            if self._splitters and address in self._splitters:
+                splitter = self._splitters[address]
                 if not splitter.is_fresh:
                     stale.add(address)
                 frames = splitter.feed(datagram, now)
@@ -118,145 +146,172 @@ class UdpEndpoint(ABC):
                 if counters.garbage_bytes != garbage and address in self._ports:
                     self._follow_cuts(address, datagram, len(frames), now)
             if frames:
-                if address in arrived:
-                    arrived[address] += frames
+                if address in received:
+                    received[address] += frames
                 else:
-                    arrived[address] = frames
-        for address, frames in arrived.items():
-            port = self._port_of(address, now)
+                    received[address] = frames
+        for address, frames in received.items():
+            port = self._ports.get(address) or self._admit(address, now)
             if port is not None:
-                port.heard_at = now
+                port.received_at = now
+                if port in self._silent:
+                    self._silent.remove(port)
+                    self._handler.on_port_active(port)
                 self._handler.on_frames(port, frames, now, STALE if address in stale else epoch, waited_s)
 
-    def _follow_cuts(self, address: Sockaddr, datagram: bytes, found: int, now: float) -> None:
-        """A program that is known sent what is no frame. Where its datagram ends amid one, the rest is to come.
+    def _follow_cuts(self, address: SocketAddress, datagram: bytes, complete: int, now: float) -> None:
+        """Read a known client's datagrams as a stream from now on, if this one ends within a frame.
 
-        A bridge from a serial line may cut its bytes where it pleases. From then on they are taken as a stream.
-        ``found``: how many frames were. Where fewer come before that end, the others stand after it, and it is none.
-        A few bytes are a stray start rather; a bridge cuts elsewhere soon.
+        A bridge from a serial line may cut its bytes anywhere. ``complete`` is the number of frames in the datagram.
+        If the splitter finds fewer, the others are behind the start that it holds, and that is not a frame's start.
+        A few bytes are more likely a stray start byte; a bridge soon cuts elsewhere.
         """
         splitter = StreamSplitter(SplitCounters(), max_hold_s=MAX_GAP_S, gives_up=True)
-        if len(splitter.feed(datagram, now)) == found and splitter.pending_bytes >= MIN_FRAME_BYTES:
+        if len(splitter.feed(datagram, now)) == complete and splitter.pending_bytes >= MIN_FRAME_BYTES:
             self.counters.garbage_bytes -= splitter.pending_bytes
             splitter.counters = self.counters
-            self._cutters[address] = splitter
+            self._splitters[address] = splitter
 
     def _age(self, epoch: int) -> None:
-        """What programs cut apart began before a pause: then none of it is new."""
+        """Mark the parts of frames that arrived before a pause: the whole frames are not new."""
         if epoch != self._epoch:
             self._epoch = epoch
-            for splitter in self._cutters.values():
+            for splitter in self._splitters.values():
                 splitter.age()
 
     def write(self, port: LocalPort, frames: Sequence[Frame], source: Source, now: float) -> None:
-        """Send frames to one program, together where they fit. What the kernel does not take is counted."""
-        address = self._addresses.get(port)
-        if address is None:
+        """Send frames of one source to one client."""
+        port.send(frames, source, now, 0.0)
+
+    def send(self, datagram: bytes, address: SocketAddress, frames: int) -> None:
+        """Send a datagram with so many frames, and count it."""
+        if address not in self._ports:
             return
-        admit = port.delivered.admit
-        batch: list[bytes] = []
-        size = 0
-        for frame in frames:
-            data = admit(frame, source, now)
-            if not data:
-                continue
-            if size + len(data) > LOCAL_DATAGRAM_BYTES:
-                if batch:
-                    self._send(b"".join(batch), address, len(batch))
-                    batch, size = [], 0
-                if len(data) > LOCAL_DATAGRAM_BYTES:  # a separator and the frame
-                    cut = len(data) - len(frame.raw)
-                    self._send(data[:cut], address, 0)
-                    data = data[cut:]
-            batch.append(data)
-            size += len(data)
-        if batch:
-            self._send(b"".join(batch), address, len(batch))
+        try:
+            self._sock.sendto(datagram, address)
+        except OSError as error:
+            last = send_again(self._sock, datagram, address, error, self._take_errors)
+            if last is not None:
+                self.failures[failure_name(last)] += frames
+                return
+        self.bytes_sent += len(datagram)
+        self.frames_sent += frames
 
     def do_housekeeping(self, now: float) -> None:
-        """Forget who is gone, and what waits for an end that does not come."""
+        """Give up incomplete frames whose rest does not arrive."""
         self._age(self._handler.stall.epoch)
-        for address, splitter in self._cutters.items():
+        for address, splitter in self._splitters.items():
             epoch = self._epoch if splitter.is_fresh else STALE
             if frames := splitter.give_up(now):
                 self._handler.on_frames(self._ports[address], frames, now, epoch)
 
     def close(self) -> None:
         """Close the socket."""
-        if self._gathering is not None:
-            self._gathering.cancel()
-        asyncio.get_running_loop().remove_reader(self._sock)
+        if self._reader is not None:
+            self._reader.stop()
         self._sock.close()
 
     @abstractmethod
-    def _port_of(self, address: Sockaddr, now: float) -> LocalPort | None:
-        """The program at ``address``, which just sent a genuine frame; None where it is not listened to."""
+    def _admit(self, address: SocketAddress, now: float) -> UdpPort | None:
+        """The new client at ``address``, which sent a genuine frame; None if the endpoint does not accept it."""
 
-    def _open(self, address: Sockaddr, heard_at: float | None) -> LocalPort:
-        name = str(Address(*address))
-        port = LocalPort(self, name, heard_at, self._delivered.of(name))
+    def _open(self, address: SocketAddress, received_at: float | None) -> UdpPort:
+        port = UdpPort(self, str(Address(numeric_host(address), address[1])), address, received_at)
         self._ports[address] = port
-        self._addresses[port] = address
         self._handler.on_port_opened(port)
         return port
 
-    def _forget(self, port: LocalPort) -> None:
-        address = self._addresses.pop(port)
-        del self._ports[address]
-        self._cutters.pop(address, None)
+    def _forget(self, port: UdpPort) -> None:
+        del self._ports[port.address]
+        self._silent.discard(port)
+        self._splitters.pop(port.address, None)
         self._handler.on_port_closed(port)
 
-    def _count_failure(self, error: OSError) -> None:
-        self.failures[failure_name(error)] += 1
+    def _on_read_error(self, error: OSError) -> None:
+        if not self._take_errors():
+            self.failures[failure_name(error)] += 1
 
-    def _send(self, datagram: bytes, address: Sockaddr, frames: int) -> None:
-        try:
-            self._sock.sendto(datagram, address)
-        except OSError as error:
-            self.failures[failure_name(error)] += frames
-        else:
-            self.bytes_sent += len(datagram)
-            self.frames_sent += frames
+    @abstractmethod
+    def _take_errors(self) -> bool:
+        """Count the errors of earlier datagrams. Returns whether there were any."""
 
 
 class UdpServer(UdpEndpoint):
-    """``udpin``: whoever sent a genuine frame lately is a port, up to a bound; each gets what comes."""
+    """``udpin``: each address that recently sent a genuine frame is a client, up to a limit.
+
+    A client whose port refuses a datagram is forgotten at once. Otherwise each restart of a client, with a new port,
+    would add work for every frame. An attacker that forges the ICMP message can have a client forgotten until its
+    next frame. Such an attacker could forge the client's frames too.
+    """
+
+    def __init__(self, name: str, sock: socket.socket, handler: PortHandler) -> None:
+        super().__init__(name, sock, handler)
+        self._refusing: set[UdpPort] = set()  # to be forgotten in the loop's next turn
+        enable_error_queue(sock)
 
     def share_socket(self) -> socket.socket:
-        """Its socket once more, for another endpoint in its place. Each is closed by its own."""
+        """A duplicate of the socket, for another endpoint in place of this one. Each endpoint closes its own."""
         return self._sock.dup()
 
+    def close(self) -> None:
+        """Close the socket."""
+        self._ports.clear()
+        super().close()
+
     def do_housekeeping(self, now: float) -> None:
-        """Forget the programs that went silent."""
+        """Forget idle clients, and report those that became silent."""
         super().do_housekeeping(now)
         for port in self.ports:
-            if port.heard_at is not None and now - port.heard_at >= CLIENT_IDLE_S:
+            silent_s = 0.0 if port.received_at is None else now - port.received_at
+            if silent_s >= CLIENT_IDLE_S:
                 self._forget(port)
+            elif silent_s >= CLIENT_SILENT_S and port not in self._silent:
+                self._silent.add(port)
+                self._handler.on_port_silent(port)
 
-    def _port_of(self, address: Sockaddr, now: float) -> LocalPort | None:
-        port = self._ports.pop(address, None)
-        if port is not None:
-            self._ports[address] = port  # now the last to have been silent
-            return port
+    def _admit(self, address: SocketAddress, now: float) -> UdpPort | None:
         if len(self._ports) >= CLIENTS_PER_ENDPOINT:
-            silent = next(iter(self._ports.values()))
-            if silent.heard_at is None or now - silent.heard_at < CLIENT_QUIET_S:
+            silent = min(self._ports.values(), key=lambda port: port.received_at or -inf)
+            if silent.received_at is None or now - silent.received_at < CLIENT_SILENT_S:
                 self.failures["too_many_clients"] += 1
                 return None
             self._forget(silent)
         return self._open(address, now)
 
+    def _take_errors(self) -> bool:
+        has_errors = False
+        for address, number in read_error_queue(self._sock):
+            has_errors = True
+            self.failures[errno.errorcode.get(number, "OSError")] += 1
+            port = self._ports.get(address)
+            if number == errno.ECONNREFUSED and port is not None and port not in self._refusing:
+                # Not within this call: it may be forwarding a frame of that client.
+                self._refusing.add(port)
+                asyncio.get_running_loop().call_soon(self._forget_refusing, port)
+        if self._reader is not None:
+            self._reader.renew()
+        return has_errors
+
+    def _forget_refusing(self, port: UdpPort) -> None:
+        self._refusing.discard(port)
+        if self._ports.get(port.address) is port:
+            self._forget(port)
+
 
 class UdpClient(UdpEndpoint):
-    """``udpout``: one program, at the address named; nothing is taken from any other."""
+    """``udpout``: one client, at the configured address. Datagrams from other addresses are counted and dropped.
+
+    If no process listens there, the kernel's ``ECONNREFUSED`` is counted: some of each second, not all.
+    """
 
     def __init__(self, name: str, remote: Address, handler: PortHandler) -> None:
         super().__init__(name, udp_socket(_ANY.get(remote.family, _ANY[socket.AF_INET])), handler)
+        self._reports = ErrorReports(self._sock)
         self._remote = remote
         self._task: asyncio.Task[None] | None = None
 
     def start(self) -> None:
-        """Read whenever something is there, and follow the name."""
+        """Read whenever datagrams are there, and resolve the name again when its address is silent."""
         super().start()
         log = structlog.get_logger().bind(endpoint=self.name)
         following = keep_resolving((self._remote,), self._is_silent, self._on_resolved, log)
@@ -268,13 +323,26 @@ class UdpClient(UdpEndpoint):
             self._task.cancel()
         super().close()
 
-    def _is_silent(self) -> bool:
-        heard = [port.heard_at for port in self.ports if port.heard_at is not None]
-        return self._remote.ip is None and (not heard or monotonic() - max(heard) >= REMOTE_SILENT_S)
+    def do_housekeeping(self, now: float) -> None:
+        """Have the kernel report errors again."""
+        super().do_housekeeping(now)
+        self._reports.renew()
 
-    def _on_resolved(self, found: Resolved) -> bool:
-        family, host, port = found[0]
-        if (host, port) in self._ports:
+    def _take_errors(self) -> bool:
+        reports = self._reports.take()
+        for _, number in reports:
+            self.failures[errno.errorcode.get(number, "OSError")] += 1
+        if self._reader is not None:
+            self._reader.renew()
+        return bool(reports)
+
+    def _is_silent(self) -> bool:
+        received = [port.received_at for port in self.ports if port.received_at is not None]
+        return self._remote.ip is None and (not received or monotonic() - max(received) >= REMOTE_SILENT_S)
+
+    def _on_resolved(self, resolved: Resolved) -> bool:
+        family, address = resolved[0]
+        if address in self._ports:
             return True
         if family != self._sock.family:
             try:
@@ -284,14 +352,13 @@ class UdpClient(UdpEndpoint):
                 return False
             super().close()
             self._sock = sock
+            self._reports = ErrorReports(sock)
             super().start()
-        for gone in self.ports:
-            self._forget(gone)
-        self._open((host, port), None)
+        for port in self.ports:
+            self._forget(port)
+        self._open(address, None)
         return True
 
-    def _port_of(self, address: Sockaddr, now: float) -> LocalPort | None:
-        port = self._ports.get(address)
-        if port is None:
-            self.failures["stranger"] += 1
-        return port
+    def _admit(self, address: SocketAddress, now: float) -> UdpPort | None:
+        self.failures["stranger"] += 1
+        return None

@@ -1,4 +1,4 @@
-"""MAVLink URLs: how a local endpoint is written.
+"""MAVLink URLs: the notation of local endpoints.
 
 ::
 
@@ -8,8 +8,8 @@
     tcp:HOST:PORT       connect there                  tcp:127.0.0.1:5760
     serial:DEVICE:BAUD  a serial port                  serial:/dev/ttyACM0:57600
 
-``udpin://HOST:PORT`` and so on mean the same. Other programs spell these in other ways; each of those is
-refused with the spelling that is meant, because some (``udp:``) mean opposite things in different programs.
+``udpin://HOST:PORT`` and so on mean the same. Other software has other spellings. They are refused, and the message
+says what to write, because some (``udp:``) mean opposite things in different software.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from uavlinkd.system.addresses import Address, AddressError, parse_address
 
 
 class UrlError(ValueError):
-    """Text that is no endpoint URL. The message says what to write."""
+    """The text is not an endpoint URL. The message says what to write."""
 
 
-class Kind(StrEnum):
-    """What an endpoint is. The value is the URL's scheme."""
+class EndpointKind(StrEnum):
+    """The type of an endpoint. The value is the URL's scheme."""
 
     UDPIN = "udpin"
     UDPOUT = "udpout"
@@ -35,14 +35,14 @@ class Kind(StrEnum):
     SERIAL = "serial"
 
 
-_LISTENING = frozenset({Kind.UDPIN, Kind.TCPIN})
+_LISTENING = frozenset({EndpointKind.UDPIN, EndpointKind.TCPIN})
 
 
 @dataclass(frozen=True, slots=True)
 class NetworkUrl:
     """An endpoint on UDP or TCP. The host of a listening one is numeric."""
 
-    kind: Kind
+    kind: EndpointKind
     address: Address
 
     def __str__(self) -> str:
@@ -50,12 +50,12 @@ class NetworkUrl:
 
     @property
     def listens(self) -> bool:
-        """Whether others come to it."""
+        """Whether clients connect to it."""
         return self.kind in _LISTENING
 
     @property
     def is_exposed(self) -> bool:
-        """Whether its plain MAVLink can leave this machine, or come from another one."""
+        """Whether its plain MAVLink can leave this machine, or arrive from another one."""
         return not self.address.is_loopback
 
 
@@ -70,18 +70,18 @@ class SerialUrl:
         return f"{self.kind}:{self.device}:{self.baud}"
 
     @property
-    def kind(self) -> Kind:
+    def kind(self) -> EndpointKind:
         """Always ``SERIAL``."""
-        return Kind.SERIAL
+        return EndpointKind.SERIAL
 
     @property
     def listens(self) -> bool:
-        """Never: a wire has one other end."""
+        """Always false: a wire has one other end."""
         return False
 
     @property
     def is_exposed(self) -> bool:
-        """Never: a wire is reached with hands."""
+        """Always false: access to a wire needs presence."""
         return False
 
 
@@ -90,22 +90,22 @@ EndpointUrl = NetworkUrl | SerialUrl
 _MAX_BAUD = 20_000_000
 _FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT, tcpin:HOST:PORT or serial:/dev/DEVICE:BAUD"
 
-# Schemes of other programs, and ours for the same thing.
+# Schemes of other software, and ours for the same type.
 # pymavlink and MAVProxy: udp, udpbcast, mcast, ws; MAVSDK: tcpout, serial_flowcontrol, raw; mavp2p: udps,
 # udpc, udpb, tcps, tcpc; mavlink-server: udpserver, udpclient, tcpserver, tcpclient, tlogreader; MAVROS:
 # udp-b, udp-pb, tcp-l, serial-hwfc.
 _SAME = {
-    "udps": Kind.UDPIN,
-    "udpserver": Kind.UDPIN,
-    "udpc": Kind.UDPOUT,
-    "udpclient": Kind.UDPOUT,
-    "tcpc": Kind.TCP,
-    "tcpclient": Kind.TCP,
-    "tcpout": Kind.TCP,
-    "tcps": Kind.TCPIN,
-    "tcpserver": Kind.TCPIN,
-    "tcp-l": Kind.TCPIN,
-    "uart": Kind.SERIAL,
+    "udps": EndpointKind.UDPIN,
+    "udpserver": EndpointKind.UDPIN,
+    "udpc": EndpointKind.UDPOUT,
+    "udpclient": EndpointKind.UDPOUT,
+    "tcpc": EndpointKind.TCP,
+    "tcpclient": EndpointKind.TCP,
+    "tcpout": EndpointKind.TCP,
+    "tcps": EndpointKind.TCPIN,
+    "tcpserver": EndpointKind.TCPIN,
+    "tcp-l": EndpointKind.TCPIN,
+    "uart": EndpointKind.SERIAL,
 }
 _BROADCASTS = frozenset({"udpb", "udpbcast", "udp-b", "udp-pb", "mcast"})
 _FLOW_CONTROLLED = frozenset({"serial-hwfc", "serial_flowcontrol"})
@@ -118,27 +118,27 @@ _DEVICE = re.compile(r"/[\x21-\x7e]+")
 
 
 def parse_url(text: str) -> EndpointUrl:
-    """The endpoint that a URL names. ``str()`` of the result gives its usual form.
+    """Parse a URL. ``str()`` of the result gives its usual form.
 
     Raises:
-        UrlError: with what to write instead.
+        UrlError: the text is not a URL; the message says what to write.
     """
     if device := _BARE_DEVICE.fullmatch(text):
-        raise UrlError(f"names a serial port alone: write serial:{device[1]}:{device[2] or 57600}")
+        raise UrlError(f"is only a device: write serial:{device[1]}:{device[2] or 57600}")
     if _BARE_ADDRESS.fullmatch(text):
         where = text if ":" in text else f"127.0.0.1:{text}"
-        raise UrlError(f"does not say how: write udpin:{where} to listen or udpout:{where} to send there")
+        raise UrlError(f"has no scheme: write udpin:{where} to listen or udpout:{where} to send there")
     parts = _SCHEME.fullmatch(text)
     if parts is None:
-        raise UrlError(f"is no MAVLink URL: write {_FORMS}")
+        raise UrlError(f"is not a MAVLink URL: write {_FORMS}")
     scheme, rest = parts[1], parts[3].removesuffix("/")
-    if scheme not in set(Kind):
+    if scheme not in set(EndpointKind):
         raise UrlError(_foreign(scheme.lower(), rest))
-    kind = Kind(scheme)
-    return _serial(rest) if kind is Kind.SERIAL else _network(kind, rest)
+    kind = EndpointKind(scheme)
+    return _serial(rest) if kind is EndpointKind.SERIAL else _network(kind, rest)
 
 
-def _network(kind: Kind, rest: str) -> NetworkUrl:
+def _network(kind: EndpointKind, rest: str) -> NetworkUrl:
     if "@" in rest:
         raise UrlError(_two_addresses(kind.value))
     if "?" in rest or "/" in rest:
@@ -174,41 +174,41 @@ def _serial(rest: str) -> SerialUrl:
 
 
 def _foreign(scheme: str, rest: str) -> str:
-    """What to write for the spelling of another program, or for none known."""
-    if scheme in set(Kind):
-        return f"schemes are in small letters: write {scheme}:{_shown(rest)}"
+    """The message for a spelling of other software, or an unknown one."""
+    if scheme in set(EndpointKind):
+        return f"schemes are lower-case: write {scheme}:{_shown(rest)}"
     if "@" in rest:
         return _two_addresses(scheme)
     if scheme == "udp":
         where = _shown(rest.lstrip(":"))
         return (
-            "udp: means listening to some programs and sending to others:"
+            "udp: listens in some software and sends in other:"
             f" write udpin:{where} to listen there or udpout:{where} to send there"
         )
     if scheme in _SAME:
         return f"that is written {_SAME[scheme]}: here: write {_SAME[scheme]}:{_shown(rest)}"
     if scheme in _BROADCASTS:
         return (
-            "broadcast and multicast would hand the link to everyone on the network:"
+            "broadcast and multicast would send frames to the whole network:"
             " write one endpoint udpout:HOST:PORT for each receiver"
         )
     if scheme in _FLOW_CONTROLLED:
-        return f"serial ports with hardware flow control are not offered: write serial:{_shown(rest)}"
+        return f"hardware flow control is not supported: write serial:{_shown(rest)}"
     if scheme in _NOT_LINKS:
-        return f"{scheme}: is not carried: write {_FORMS}"
+        return f"{scheme}: is not supported: write {_FORMS}"
     return f"has no known scheme: write {_FORMS}"
 
 
 def _two_addresses(scheme: str) -> str:
-    """MAVROS joins both addresses of a socket by an @."""
+    """MAVROS writes both addresses of a socket, with an @ between them."""
     if scheme == "udp":
         return (
-            "one address, not BIND@REMOTE: write udpin:HOST:PORT with the address to listen on, which answers"
-            " whoever sends there, or udpout:HOST:PORT with the remote one"
+            "one address, not BIND@REMOTE: write udpin:HOST:PORT with the address to listen on, which serves"
+            " every client that sends there, or udpout:HOST:PORT with the remote address"
         )
     return f"one address, not BIND@REMOTE: write {_FORMS}"
 
 
 def _shown(rest: str) -> str:
-    """The rest of a URL where it is plain; a placeholder where it is not."""
+    """The rest of a URL if it is plain; otherwise a placeholder."""
     return rest if re.fullmatch(r"[\[\]A-Za-z0-9.:/_-]{1,80}", rest) else "HOST:PORT"

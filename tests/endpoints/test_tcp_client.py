@@ -1,0 +1,229 @@
+"""``tcp`` endpoints: they connect, and connect again when a connection ends or a server is missing."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import socket
+from collections.abc import AsyncIterator
+from time import monotonic
+
+import pytest
+from structlog.testing import capture_logs
+
+from tests.endpoints.clients import (
+    Recorder,
+    frame,
+    recorder,
+    unused_address,
+    write,
+)
+from tests.waiting import Stopwatch, until
+from uavlinkd.endpoints import tcp
+from uavlinkd.endpoints.tcp import (
+    TcpClient,
+    TcpServer,
+    tcp_listener,
+)
+from uavlinkd.system.addresses import Address
+
+ANY_PORT = Address("127.0.0.1", 0)
+
+
+@pytest.fixture
+async def tcp_client(server: TcpServer) -> AsyncIterator[TcpClient]:
+    """An endpoint that connects to the server, not yet started."""
+    endpoint = TcpClient("tcp_client", Address(*server.address), Recorder())
+    yield endpoint
+    endpoint.close()
+
+
+async def test_frames_go_in_both_directions(server: TcpServer, tcp_client: TcpClient) -> None:
+    """`tcp` and `tcpin` endpoints are each other's clients."""
+    server.start()
+    tcp_client.start()
+    await until(lambda: len(server.ports) == len(tcp_client.ports) == 1)
+    assert tcp_client.ports[0].name == str(Address(*server.address))
+    write(tcp_client, tcp_client.ports[0], [frame(1), frame(2)], monotonic())
+    write(server, server.ports[0], [frame(3)], monotonic())
+    await until(
+        lambda: recorder(server).received == [frame(1), frame(2)] and recorder(tcp_client).received == [frame(3)]
+    )
+
+
+async def test_client_waits_for_a_server_that_is_not_there_yet() -> None:
+    """The client connects to a server that starts late, and has no port until then."""
+    address = unused_address()
+    tcp_client = TcpClient("tcp_client", address, Recorder())
+    tcp_client.start()
+    try:
+        with capture_logs() as logs:
+            await until(lambda: tcp_client.failures["ECONNREFUSED"] >= 3)
+        (line,) = logs  # not one a try
+        assert (line["event"], line["log_level"]) == ("endpoint_not_open", "warning")
+        assert (line["endpoint"], line["reason"], line["meaning"]) == (
+            "tcp_client",
+            "ECONNREFUSED",
+            "no process listens there now: start it, or correct the port",
+        )
+        assert list(tcp_client.ports) == []
+        with capture_logs() as logs:
+            with tcp_listener(address):
+                await until(lambda: len(tcp_client.ports) == 1)
+            tried = tcp_client.failures["ECONNREFUSED"]
+            await until(lambda: tcp_client.failures["ECONNREFUSED"] > tried)
+        assert logs == []  # it was open for a moment only
+    finally:
+        tcp_client.close()
+
+
+async def test_client_follows_a_server_that_restarts(server: TcpServer, tcp_client: TcpClient) -> None:
+    """The port is reported as closed, and a new one as opened, within a second if the server had sent frames."""
+    server.start()
+    tcp_client.start()
+    await until(lambda: len(server.ports) == 1)
+    write(server, server.ports[0], [frame(1)], monotonic())
+    await until(lambda: recorder(tcp_client).received == [frame(1)])
+    (before,) = tcp_client.ports
+    address = Address(*server.address)
+    server.close()
+    await until(lambda: recorder(tcp_client).closed == [before])
+    again = TcpServer("again", tcp_listener(address), Recorder())
+    again.start()
+    watch = Stopwatch()
+    try:
+        await until(lambda: len(again.ports) == 1)
+        assert watch.calm_s < 1.0
+        write(again, again.ports[0], [frame(2)], monotonic())
+        await until(lambda: recorder(tcp_client).received == [frame(1), frame(2)])
+        assert tcp_client.ports[0] is not before
+    finally:
+        again.close()
+
+
+async def test_waits_grow_where_a_server_only_accepts_and_closes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each wait is twice the previous one, up to the longest, although every attempt connects."""
+    waits: list[float] = []
+    sleep = asyncio.sleep
+
+    async def short(delay: float) -> None:
+        waits.append(delay)
+        await sleep(0)
+
+    def accept_and_close() -> None:
+        listener.accept()[0].close()
+
+    listener = tcp_listener(ANY_PORT)
+    asyncio.get_running_loop().add_reader(listener, accept_and_close)
+    tcp_client = TcpClient("tcp_client", Address(*listener.getsockname()), Recorder())
+    with monkeypatch.context() as patched:
+        patched.setattr(asyncio, "sleep", short)
+        tcp_client.start()
+        while len(waits) < 8:
+            await sleep(0)
+        tcp_client.close()
+    asyncio.get_running_loop().remove_reader(listener)
+    listener.close()
+    for wait_s, least_s in zip(waits, [0.25, 0.5, 1.0, 2.0, 4.0, 5.0, 5.0, 5.0], strict=False):
+        assert least_s <= wait_s <= 1.25 * least_s
+
+
+async def test_name_is_looked_up_at_each_attempt(server: TcpServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The client reaches an autopilot that has a new address."""
+    server.start()
+    asked: list[tuple[str, int]] = []
+    elsewhere = unused_address()
+
+    def look_up(host: str, port: int, **_: object) -> list[tuple[object, ...]]:
+        asked.append((host, port))
+        if len(asked) == 1:
+            raise socket.gaierror(socket.EAI_NONAME, "unknown")
+        sockaddr = elsewhere.sockaddr if len(asked) == 2 else server.address
+        return [(socket.AF_INET, socket.SOCK_STREAM, 6, "", sockaddr)]
+
+    monkeypatch.setattr(socket, "getaddrinfo", look_up)
+    tcp_client = TcpClient("tcp_client", Address("autopilot.test", 5760), Recorder())
+    tcp_client.start()
+    try:
+        await until(lambda: len(tcp_client.ports) == 1)
+        assert asked == [("autopilot.test", 5760)] * 3
+        assert tcp_client.failures == {"not_resolved": 1, "ECONNREFUSED": 1}
+        assert tcp_client.ports[0].name == "autopilot.test:5760"
+    finally:
+        tcp_client.close()
+
+
+async def test_next_address_of_a_name_is_tried(server: TcpServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After an address that refuses, or of an unsupported family, the next one is tried."""
+    server.start()
+    answers = [
+        (socket.AF_INET, socket.SOCK_STREAM, 6, "", unused_address().sockaddr),
+        (12345, socket.SOCK_STREAM, 6, "", ("::1", 1, 0, 0)),
+        (socket.AF_INET, socket.SOCK_STREAM, 6, "", server.address),
+    ]
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: answers)
+    tcp_client = TcpClient("tcp_client", Address("autopilot.test", 5760), Recorder())
+    tcp_client.start()
+    try:
+        await until(lambda: len(tcp_client.ports) == 1)
+        assert tcp_client.failures == {"ECONNREFUSED": 1, "EAFNOSUPPORT": 1}
+    finally:
+        tcp_client.close()
+
+
+async def test_address_that_does_not_answer_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """There is no answer and no refusal: a firewall, or a machine that is off."""
+    monkeypatch.setattr(tcp, "CONNECT_TIMEOUT_S", 0.05)
+    with socket.socket() as deaf:
+        deaf.bind(("127.0.0.1", 0))
+        deaf.listen(0)
+        with socket.create_connection(
+            deaf.getsockname()
+        ):  # the one place in the queue of a listener who never accepts
+            tcp_client = TcpClient("tcp_client", Address(*deaf.getsockname()), Recorder())
+            tcp_client.start()
+            await until(lambda: tcp_client.failures["connect_timeout"] > 0)
+            tcp_client.close()
+    assert tcp_client.failures.keys() == {"connect_timeout"}
+
+
+async def test_connection_to_oneself_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """If no process listens, the kernel may pick the same port for our side, and TCP connects to itself."""
+    address = unused_address()
+    prepare = tcp._prepare
+
+    def prepare_there(sock: socket.socket) -> None:
+        prepare(sock)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        sock.bind(address.sockaddr)
+
+    monkeypatch.setattr(tcp, "_prepare", prepare_there)
+    tcp_client = TcpClient("tcp_client", address, Recorder())
+    tcp_client.start()
+    await until(lambda: tcp_client.failures["ECONNREFUSED"] > 0)
+    assert recorder(tcp_client).open == []
+    tcp_client.close()
+
+
+async def test_sockets_hold_little_and_notice_the_end(server: TcpServer, tcp_client: TcpClient) -> None:
+    """Both sides send at once, hold few bytes, and probe the other side."""
+    server.start()
+    tcp_client.start()
+    await until(lambda: len(server.ports) == len(tcp_client.ports) == 1)
+    for endpoint in (server, tcp_client):
+        (connection,) = endpoint._connections.values()
+        assert not os.get_blocking(connection.channel.fileno())
+        with socket.socket(fileno=os.dup(connection.channel.fileno())) as sock:
+            assert sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY) == 1
+            assert sock.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE) == 1
+            assert sock.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF) <= 32768
+
+
+async def test_closed_client_leaves_nothing_behind(tcp_client: TcpClient) -> None:
+    """Closed before it was started, while it connects or while it waits: no port, and no socket (a warning here)."""
+    tcp_client.start()
+    await asyncio.sleep(0)
+    tcp_client.close()
+    await asyncio.sleep(0)
+    assert list(tcp_client.ports) == []
+    assert recorder(tcp_client).open == []

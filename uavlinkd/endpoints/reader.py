@@ -1,0 +1,226 @@
+"""Reads datagrams from a socket, in batches when it is busy."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from array import array
+from collections.abc import Callable
+from math import inf
+from typing import Any
+
+from uavlinkd.system.clock import monotonic
+from uavlinkd.system.stall import STALE, STALL_S, Backlog, StallWatch
+
+try:
+    import fcntl
+    import termios
+except ImportError:  # Windows
+    _CAN_ASK = False
+else:
+    _CAN_ASK = True
+
+DATAGRAMS_PER_WAKE_UP = 128
+"""Most datagrams that one read takes from a socket. Then the other sockets have their turn."""
+RECEIVE_BYTES = 65536
+_buffer = memoryview(bytearray(RECEIVE_BYTES))
+"""Every datagram is read into this buffer and copied at its own size. A new buffer of 64 KiB for each of them would
+leave holes between objects that live long, and the heap would grow for hours (tests/soak/README.md)."""
+BUSY_S = 0.0005
+"""A socket that is readable again so soon after its last batch was handled is busy: about 2,000 datagrams/s."""
+PAUSE_S = 0.001
+"""How long datagrams gather in a busy socket. A radio's delay is many times that. At 10,000 datagrams/s the process
+has a third less to do than with a quarter of it."""
+DATAGRAM_OVERHEAD_BYTES = 256
+"""A datagram takes at least this much of a receive buffer in addition to its length: the kernel's own record of it
+(struct sk_buff). Linux 6.18 on x86-64 takes 830."""
+
+Datagrams = list[tuple[bytes, tuple[Any, ...]]]
+"""Datagrams, each with the socket address of its sender."""
+
+
+DatagramHandler = Callable[[Datagrams, float, int, float], None]
+"""Receives the datagrams of one read. The numbers: the monotonic time and the epoch of the read
+(:mod:`uavlinkd.system.stall`), and for how many seconds the first datagram may have waited in the socket."""
+
+
+class Reader:
+    """Reads a socket in the running loop and delivers its datagrams in batches.
+
+    A wake-up costs more than a datagram. So the reader adapts to the traffic, as drivers of network cards do:
+
+    * A quiet socket is read when it becomes readable: one datagram.
+    * If it is readable again within :data:`BUSY_S`, the rest of a burst is there: all datagrams are read.
+    * If it is readable within :data:`BUSY_S` once more, it is busy. The loop stops to watch it, and a timer reads it
+      every :data:`PAUSE_S` until a read finds fewer than two datagrams.
+
+    ``on_failure`` receives each error that a read returns, such as the failure of an earlier send.
+    """
+
+    __slots__ = (
+        "_deliver",
+        "_done_at",
+        "_found_several",
+        "_gather_s",
+        "_is_burst",
+        "_is_watched",
+        "_loop",
+        "_on_failure",
+        "_sock",
+        "_stall",
+        "_timer",
+        "_waiting",
+        "backlog",
+    )
+
+    def __init__(
+        self, sock: socket.socket, deliver: DatagramHandler, on_failure: Callable[[OSError], None], stall: StallWatch
+    ) -> None:
+        self.backlog = Backlog(stall, sock.fileno(), lambda: sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF))
+        self._sock = sock
+        self._deliver = deliver
+        self._on_failure = on_failure
+        self._stall = stall
+        self._loop = asyncio.get_running_loop()
+        self._is_watched = False  # by the loop
+        self._timer: asyncio.TimerHandle | None = None  # reads the socket next, and not the loop
+        self._gather_s = 0.0
+        self._done_at = -inf  # when the last batch had been delivered
+        self._is_burst = False  # the last read was soon after the one before it
+        self._found_several = False  # the last read found more than one datagram
+        self._waiting = array("i", [0])
+
+    @property
+    def is_paused(self) -> bool:
+        """Whether datagrams gather, and a timer reads them."""
+        return self._timer is not None
+
+    def gather(self, seconds: float) -> None:
+        """Read ``seconds`` after a datagram arrives; 0: at once."""
+        self._gather_s = seconds
+
+    def start(self) -> None:
+        """Read whenever datagrams are there."""
+        self._is_watched = True
+        self._loop.add_reader(self._sock, self._on_readable)
+
+    def stop(self) -> None:
+        """Read no more. Call it before the socket is closed."""
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        elif self._is_watched:
+            self._unwatch()
+
+    def renew(self) -> None:
+        """Have the loop watch the socket again: libuv stops watching a socket that has an error pending."""
+        if self._is_watched:
+            self._unwatch()
+            self.start()
+
+    def _on_readable(self) -> None:
+        now = monotonic()
+        stall = self._stall
+        is_quiet = now - self._done_at >= BUSY_S
+        has_paused = now - stall.turned_at > STALL_S or self.backlog.left
+        if not is_quiet or self._found_several or self._gather_s or has_paused:
+            self._on_several(now, is_quiet=is_quiet)
+            return
+        # At most rates a datagram comes alone. Each call costs, so this case has none of its own.
+        stall.turned_at = now
+        self._is_burst = False
+        try:
+            size, source = self._sock.recvfrom_into(_buffer)
+        except OSError as error:
+            self._is_drained(error)
+            self.renew()
+            return
+        self._deliver([(bytes(_buffer[:size]), source)], now, stall.epoch, 0.0)
+        self._done_at = monotonic()
+
+    def _on_several(self, now: float, *, is_quiet: bool) -> None:
+        """Several datagrams may be there, or may soon be."""
+        if self._gather_s:
+            self._pause(self._gather_s)
+        elif is_quiet:
+            self._is_burst = False
+            self.read(now, drains=False)
+        elif self._is_burst:
+            self._pause(PAUSE_S)
+        else:
+            self._is_burst = True
+            self.read(now)
+
+    def _pause(self, seconds: float) -> None:
+        self._unwatch()
+        self._timer = self._loop.call_later(seconds, self._on_timer, seconds)
+
+    def _on_timer(self, waited_s: float) -> None:
+        count = 0
+        try:
+            count = self.read(monotonic(), waited_s)
+        finally:
+            if self._timer is not None:  # the handler of the datagrams did not stop this reader
+                self._timer = None
+                if count < 2 or self._gather_s:
+                    self.start()
+                else:
+                    seconds = PAUSE_S if count < DATAGRAMS_PER_WAKE_UP else 0.0
+                    self._timer = self._loop.call_later(seconds, self._on_timer, seconds)
+
+    def _unwatch(self) -> None:
+        self._is_watched = False
+        self._loop.remove_reader(self._sock)
+
+    def read(self, now: float, waited_s: float = 0.0, *, drains: bool = True) -> int:
+        """Read up to :data:`DATAGRAMS_PER_WAKE_UP` datagrams and deliver them. Returns how many there were.
+
+        Without ``drains``, read a second one only if FIONREAD reports it. Asking is cheaper than reading in vain.
+        """
+        datagrams: Datagrams = []
+        epoch = self.backlog.begin(now)
+        if epoch == STALE:
+            # Only a read in vain shows that the queue is empty: FIONREAD reports 0 for an empty datagram too.
+            is_empty = self._drain(datagrams)
+            self.backlog.end(
+                sum(len(datagram) + DATAGRAM_OVERHEAD_BYTES for datagram, _ in datagrams), is_empty=is_empty
+            )
+        elif drains or self._has_more_than_one(datagrams):
+            self._drain(datagrams)
+        count = len(datagrams)
+        self._found_several = count > 1
+        self._deliver(datagrams, now, epoch, waited_s)
+        # Behind a full batch, more datagrams have gathered already. New ones must not wait behind stale ones.
+        self._done_at = -inf if epoch == STALE or count == DATAGRAMS_PER_WAKE_UP else monotonic()
+        return count
+
+    def _has_more_than_one(self, datagrams: Datagrams) -> bool:
+        """Read the first datagram. Returns whether another may be behind it."""
+        try:
+            size, source = self._sock.recvfrom_into(_buffer)
+        except OSError as error:
+            return not self._is_drained(error)
+        datagrams.append((bytes(_buffer[:size]), source))
+        if not _CAN_ASK:
+            return True
+        fcntl.ioctl(self._sock, termios.FIONREAD, self._waiting)
+        return self._waiting[0] > 0
+
+    def _drain(self, datagrams: Datagrams) -> bool:
+        """Read up to a batch. Returns whether the queue is empty now."""
+        for _ in range(DATAGRAMS_PER_WAKE_UP - len(datagrams)):
+            try:
+                size, source = self._sock.recvfrom_into(_buffer)
+                datagrams.append((bytes(_buffer[:size]), source))
+            except OSError as error:
+                if self._is_drained(error):
+                    return True
+        return False
+
+    def _is_drained(self, error: OSError) -> bool:
+        """Whether the error means that the queue is empty. Report any other."""
+        if isinstance(error, BlockingIOError):
+            return True
+        self._on_failure(error)
+        self.renew()
+        return False
