@@ -1,4 +1,4 @@
-"""The configuration: what a file means, and everything that is said about one that means nothing."""
+"""The configuration: the meaning of a valid file, and the problems and warnings of others."""
 
 from __future__ import annotations
 
@@ -15,9 +15,8 @@ from pathlib import Path
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
-from uavlinkd.config import keys
-from uavlinkd.system.addresses import Address
-from uavlinkd.config import Config, ConfigError, Recording, Routing, load_config
+from uavlinkd.config import Config, ConfigError, Recording, Routing, keys
+from uavlinkd.config.load import load_config
 from uavlinkd.config.schema import (
     EndpointSection,
     LinkSection,
@@ -32,8 +31,9 @@ from uavlinkd.core.suites import SUITES_BY_NAME
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
 from uavlinkd.mavlink.frames import Frame, SplitCounters, split_payload
 from uavlinkd.mavlink.policy.gate import Refusal
-from uavlinkd.mavlink.policy.settings import KEYS
 from uavlinkd.mavlink.policy.roles import ROLES
+from uavlinkd.mavlink.policy.settings import KEYS
+from uavlinkd.system.addresses import Address
 
 EXAMPLES = Path(__file__).parents[2] / "configs"
 Load = Callable[[str], Config]
@@ -78,7 +78,7 @@ def load(folder: Path) -> Load:
 
 @pytest.fixture
 def refused(load: Load) -> Refused:
-    """Loads a text that has problems; gives messages by key."""
+    """Loads a text that has problems; returns the messages by key."""
 
     def refusing(text: str) -> dict[str, str]:
         with pytest.raises(ConfigError) as caught:
@@ -90,7 +90,7 @@ def refused(load: Load) -> Refused:
 
 
 def test_ten_lines_are_enough(load: Load, folder: Path) -> None:
-    """What is left out has the specification's defaults; the keys are loaded."""
+    """Other keys have the specification's defaults; the key files are loaded."""
     config = load(_GOOD)
     private = (folder / "drone0.key").read_text()
     assert (config.name, config.path) == ("drone0", folder / "drone0.toml")
@@ -151,7 +151,7 @@ def test_every_suite_can_be_named(load: Load) -> None:
 
 
 def test_defaults_are_the_cores() -> None:
-    """What the schema says without a file is what the core says without a configuration."""
+    """The defaults of the schema are those of the core."""
     section = LinkSection()
     assert {name: getattr(section, name) for name in Timers.__slots__} == dataclasses.asdict(Timers())
     assert (section.tag_bits, section.mac_key_bits, section.confidential) == (
@@ -162,15 +162,15 @@ def test_defaults_are_the_cores() -> None:
     assert (tuple(section.suites), section.max_envelope_bytes) == (Link().suites, DEFAULT_ENVELOPE_LIMIT)
 
 
-def test_control_socket_stands_beside_the_file(load: Load, folder: Path) -> None:
-    """Relative to the file, wherever the daemon is started; an absolute path as it is; none unless named."""
+def test_control_socket_is_relative_to_the_file(load: Load, folder: Path) -> None:
+    """The working directory does not matter. An absolute path is used unchanged. Off by default."""
     assert load(_GOOD).control_socket is None
     assert load(f'control_socket = "drone0.sock"\n{_GOOD}').control_socket == folder / "drone0.sock"
     assert load(f'control_socket = "/run/drone0.sock"\n{_GOOD}').control_socket == Path("/run/drone0.sock")
 
 
 def test_routing_section_is_read(load: Load) -> None:
-    """Without one, peers do not reach each other through here, and a frame for nobody known goes to all."""
+    """Without one, the daemon does not relay between peers, and a frame for an unknown target goes to all."""
     assert load(_GOOD).routing == Routing(relay=False, unknown_targets="flood")
     changed = load(f'{_GOOD}[routing]\nrelay = true\nunknown_targets = "drop"\n')
     assert changed.routing == Routing(relay=True, unknown_targets="drop")
@@ -197,22 +197,22 @@ def test_freshness_is_verified_within_a_share_of_the_budget(load: Load) -> None:
     assert fast == Link().verify_interval_s == load(_GOOD).peers[0].settings.link.verify_interval_s == 1.0
 
 
-def test_other_budget_is_no_other_link(load: Load) -> None:
-    """The interval follows from it, and a session goes on while it changes."""
+def test_a_changed_budget_keeps_the_link(load: Load) -> None:
+    """The interval depends on the budget, and a session continues when it changes."""
     before, after = (load(f"{_GOOD}budget_bits_s = {budget}\n").peers[0] for budget in (4000, 8000))
     assert before.settings.link.verify_interval_s != after.settings.link.verify_interval_s
     assert before.settings == after.settings
 
 
 def test_metrics_are_off_unless_an_address_is_named(load: Load) -> None:
-    """An address is the switch, and loopback gives no warning."""
+    """An address turns them on, and loopback causes no warning."""
     assert load(_GOOD).metrics is None
     config = load(f'{_GOOD}[metrics]\nlisten = "127.0.0.1:9790"\n')
     assert (config.metrics, config.warnings) == (Address("127.0.0.1", 9790), ())
 
 
 def test_recording_is_off_unless_a_folder_is_named(load: Load, folder: Path) -> None:
-    """The folder is the switch, and stands beside the file; the rest has defaults."""
+    """A folder turns it on, relative to the file; the other keys have defaults."""
     assert load(_GOOD).recording is None
     assert load(f"{_GOOD}[recording]\nmax_files = 2\n").recording is None
     assert load(f'{_GOOD}[recording]\nfolder = "flights"\n').recording == Recording(
@@ -225,12 +225,15 @@ def test_recording_is_off_unless_a_folder_is_named(load: Load, folder: Path) -> 
 
 
 def test_endpoint_has_an_age_and_a_radio_status_of_its_own(load: Load) -> None:
-    """What [link] says of peers is not an endpoint's."""
+    """The keys of [link] apply to peers, not to endpoints."""
     config = load(
         f"{_TOP}{_LISTEN}[link]\nmax_age_s = 5\n{_ENDPOINT}max_age_s = 0.1\nradio_status = true\n"
         f'[[endpoint]]\nname = "gcs"\nurl = "tcpin:127.0.0.1:5760"\n{_PEER}'
     )
-    assert [(each.max_age_s, each.radio_status) for each in config.endpoints] == [(0.1, True), (1.0, False)]
+    assert [(endpoint.max_age_s, endpoint.radio_status) for endpoint in config.endpoints] == [
+        (0.1, True),
+        (1.0, False),
+    ]
     assert config.peers[0].egress.max_age_s == 5
 
 
@@ -245,7 +248,7 @@ def _frame(raw: bytes) -> Frame:
 
 
 def test_policy_reaches_the_gate(load: Load) -> None:
-    """A peer speaks as what the file says it is; an endpoint's keys mean the same; who has none says anything."""
+    """A policy limits a peer or an endpoint to its systems and messages; an endpoint without one sends anything."""
     config = load(
         f'{_GOOD}rate_in = {{ HEARTBEAT = 1 }}\n[[endpoint]]\nname = "tablet"\nurl = "udpin:127.0.0.1:14551"\n'
         'system_ids = [254]\nrole = "observer"\n'
@@ -261,7 +264,7 @@ def test_policy_reaches_the_gate(load: Load) -> None:
 
 
 def test_each_policy_made_counts_for_itself(load: Load) -> None:
-    """A policy has state, and a configuration none: the second one made starts with its whole rate."""
+    """A policy has state, and a configuration has none: a second policy starts with its whole rate."""
     peer = load(f"{_GOOD}rate_in = {{ HEARTBEAT = 1 }}\n").peers[0]
     first, second = peer.make_policy(), peer.make_policy()
     assert [first.incoming.check(_heartbeat(2), 0.0) for _ in range(3)] == [None, None, Refusal.RATE_LIMITED]
@@ -270,7 +273,7 @@ def test_each_policy_made_counts_for_itself(load: Load) -> None:
 
 
 def test_policy_data_is_compared_and_never_changed(load: Load) -> None:
-    """On reload the daemon sees whether a peer's policy is another one; nobody changes it in between."""
+    """On reload the daemon detects whether a peer's policy has changed. The data is immutable."""
     text = f'{_GOOD}allow_in = ["PING"]\nrate_in = {{ PING = 1 }}\n'
     first, second = load(text).peers[0].policy, load(text).peers[0].policy
     assert first == second
@@ -282,7 +285,7 @@ def test_policy_data_is_compared_and_never_changed(load: Load) -> None:
     assert first["allow_in"] == ("PING",)
 
 
-def test_policy_may_stand_in_a_table_of_its_own(load: Load) -> None:
+def test_policy_may_have_a_table_of_its_own(load: Load) -> None:
     """TOML has two ways to write a table, and both are read."""
     inline = load(f"{_GOOD}rate_in = {{ ATTITUDE = 10, telemetry = 2.5 }}\n")
     below = load(f"{_GOOD}[peer.rate_in]\nATTITUDE = 10\ntelemetry = 2.5\n")
@@ -291,7 +294,7 @@ def test_policy_may_stand_in_a_table_of_its_own(load: Load) -> None:
 
 @pytest.mark.parametrize("url", ["udpin:127.0.0.1:1", "udpout:127.0.0.1:1", "tcp:127.0.0.1:1", "tcpin:127.0.0.1:1"])
 def test_every_kind_of_endpoint_is_carried(load: Load, url: str) -> None:
-    """The network's four kinds, and beside each of them the serial one."""
+    """The four kinds of network endpoints, each together with a serial one."""
     serial = '[[endpoint]]\nname = "radio"\nurl = "serial:/dev/ttyACM0:57600"\n'
     config = load(_GOOD.replace("udpin:127.0.0.1:14550", url) + serial)
     assert [str(endpoint.url) for endpoint in config.endpoints] == [url, "serial:/dev/ttyACM0:57600"]
@@ -319,7 +322,7 @@ def test_nothing_of_a_configuration_changes_or_shows_a_secret(load: Load, folder
 
 @pytest.mark.parametrize("in_a_folder", [False, True])
 def test_keys_come_from_systemd_where_there_is_no_file(tmp_path: Path, in_a_folder: bool) -> None:
-    """A credential's name stands where a file's would, for the private key and for PSKs; or a folder's."""
+    """A file name in the configuration may name a credential, for the private key and for PSKs."""
     credentials = tmp_path / "credentials"
     credentials.mkdir()
     for name in ("drone0.key", "pair.psk"):
@@ -336,339 +339,185 @@ def test_keys_come_from_systemd_where_there_is_no_file(tmp_path: Path, in_a_fold
         load_config(path, {})
 
 
-def test_a_key_that_is_not_there_is_not_to_be_made_where_it_does_harm(tmp_path: Path) -> None:
-    """A PSK is the peer's; a service's key belongs to root and is handed over; a unit's folder is found."""
+def test_remedy_for_a_missing_key_fits_its_kind(tmp_path: Path) -> None:
+    """A PSK is copied from the peer; a service's key belongs to root; a unit's folder is suggested."""
     path = tmp_path / "drone0.toml"
     path.write_text(f'{_GOOD}psk_file = "pair.psk"\n')
 
-    def told(environ: dict[str, str]) -> list[str]:
+    def problems(environ: dict[str, str]) -> list[str]:
         with pytest.raises(ConfigError) as caught:
             load_config(path, environ)
-        return [str(each) for each in caught.value.problems]
+        return [str(problem) for problem in caught.value.problems]
 
-    private, psk = told({})
+    private, psk = problems({})
     assert f"make it with `uavlinkd keygen --out {tmp_path}/drone0.key`" in private
-    assert "it is the same as the peer's: copy that, or, on one of the two, `uavlinkd psk --out" in psk
+    assert "copy it from the peer, or make it on one of the two with `uavlinkd psk --out" in psk
     assert "--keys" not in private + psk
     for folder in ("keys", "drone0"):
         (tmp_path / folder).mkdir()
-        assert all(f"add `--keys {tmp_path}/{folder}` to `uavlinkd check`" in each for each in told({}))
+        assert all(f"add `--keys {tmp_path}/{folder}` to `uavlinkd check`" in problem for problem in problems({}))
         (tmp_path / folder).rmdir()
     credentials = tmp_path / "credentials"
     credentials.mkdir()
-    for each in told({"CREDENTIALS_DIRECTORY": str(credentials)}):
-        assert "LoadCredential=" in each
-        assert "restart" in each
-        assert "keygen" not in each
-        assert "uavlinkd psk" not in each
+    for problem in problems({"CREDENTIALS_DIRECTORY": str(credentials)}):
+        assert "LoadCredential=" in problem
+        assert "next start" in problem
+        assert "keygen" not in problem
+        assert "uavlinkd psk" not in problem
 
 
-# Text in place of the ten lines -> the key that is named, and a part of what is said.
-_REFUSED = {
-    "no name": (_GOOD.replace('name = "drone0"', ""), "name", 'is missing: write name = "drone0"'),
-    "name with a space": (_GOOD.replace('"drone0"', '"drone 0"'), "name", "letters, digits"),
-    "name is a number": (_GOOD.replace('"drone0"', "0"), "name", "text in quotes"),
-    "private key missing": (
-        _GOOD.replace('"drone0.key"', '"other.key"'),
-        "private_key_file",
-        "uavlinkd keygen --out",
-    ),
-    "private key is a folder": (_GOOD.replace('"drone0.key"', '"."'), "private_key_file", "not a regular file"),
-    "private key file unnamed": (_GOOD.replace('"drone0.key"', '""'), "private_key_file", "must name a file"),
-    "listen is text": (_GOOD.replace('["0.0.0.0:5790"]', '"0.0.0.0:5790"'), "listen", 'listen = ["0.0.0.0:5790"]'),
-    "listen has no port": (_GOOD.replace("0.0.0.0:5790", "0.0.0.0"), "listen[0]", "write 0.0.0.0:5790"),
-    "listen is a name": (_GOOD.replace("0.0.0.0:5790", "drone0.local:5790"), "listen[0]", "numeric"),
-    "listen twice": (
-        _GOOD.replace('["0.0.0.0:5790"]', '["0.0.0.0:5790", "127.0.0.1:5790"]'),
-        "listen",
-        "cannot listen on at once",
-    ),
-    "link in double brackets": (_GOOD + "[[link]]\ntag_bits = 96\n", "link", "write [link]"),
-    "log is text": ('log = "info"\n' + _GOOD, "log", "write [log]"),
-    "log level": (_GOOD + '[log]\nlevel = "verbose"\n', "log.level", "'debug', 'info', 'warning' or 'error'"),
-    "endpoint in single brackets": (_GOOD.replace("[[endpoint]]", "[endpoint]"), "endpoint", "[[endpoint]]"),
-    "peers are numbers": (f"peer = [1]\n{_TOP}{_LISTEN}{_ENDPOINT}", "peer", "[[peer]]"),
-    "endpoint without url": (
-        _GOOD.replace('url = "udpin:127.0.0.1:14550"', ""),
-        "endpoint[0].url (autopilot)",
-        'url = "udpin:127.0.0.1:14550"',
-    ),
-    "endpoint of another program": (_GOOD.replace("udpin:", "udp:"), "endpoint[0].url (autopilot)", "udpout:127"),
-    "serial device given twice": (
-        _GOOD.replace("udpin:127.0.0.1:14550", "serial:/dev/ttyACM0:57600")
-        + '[[endpoint]]\nname = "radio"\nurl = "serial:/dev/ttyACM0:115200"\n',
-        "endpoint[1].url (radio)",
+_GCS = _ENDPOINT.replace("autopilot", "gcs")
+_GCS_ANYWHERE = _GCS.replace("127.0.0.1", "0.0.0.0")
+_HEAD = _TOP + _LISTEN
+_URL = "udpin:127.0.0.1:14550"
+_FIRST_URL, _SECOND_URL = "endpoint[0].url (autopilot)", "endpoint[1].url (gcs)"
+
+
+def _changed(change: str | tuple[str, str]) -> str:
+    """The good file with a text at its end, with one text in place of another, or (``""``) with one at its start."""
+    if isinstance(change, str):
+        return change if _TOP in change else _GOOD + change
+    old, new = change
+    return _GOOD.replace(old, new) if old else new + _GOOD
+
+
+# Lines added to the peer, the key of the problem, and a part of its message.
+_PEER_REFUSED = [
+    ("BlockMsgIdIn = [76]", "BlockMsgIdIn", "write deny_in"),
+    ('AllowedIPs = ["10.13.0.2/32"]', "AllowedIPs", "write role and system_ids"),
+    ("budget_bits_s = 999", "budget_bits_s", "write 1000 or more, in bits a second, or 0 for no limit"),
+    ("budget_bits_s = -1", "budget_bits_s", "0 or more"),
+    ("budget_bits_s = 1_000_000_001", "budget_bits_s", "write 1000000000 or less"),
+    ("budget_bits_s = 4e3", "budget_bits_s", "whole number"),
+    ("coalesce_s = 0.51", "coalesce_s", "0.5 or less"),
+    ("max_age_s = 61", "max_age_s", "60 or less"),
+    ("coalesce_s = 0.2\nmax_age_s = 0.2", "max_age_s", "more than coalesce_s (0.2)"),
+    ('allow_in = ["PING", "telemetry", "ATITUDE"]', "allow_in[2]", "did you mean 'ATTITUDE'?"),
+    ("rate_out = { ATTITUDE = 0 }", "rate_out.ATTITUDE", "not a rate"),
+    ("alow_in = []", "alow_in", "did you mean allow_in?"),
+    ('psk_file = "no.psk"', "psk_file", "uavlinkd psk"),
+    ('psk_file = "drone0.key"', "psk_file", "holds this daemon's private key"),
+    ("suites = []", "suites", 'write ["x25519"]'),
+    ("suites = ['x25519', 'x25519']", "suites", "twice"),
+    ("suites = ['X25519']", "suites[0]", "write one of x25519"),
+    ("suites = ['mlkem512']", "suites[0]", "is not a suite"),
+    ("tag_bits = 16", "tag_bits", "64, 96, 128 or 256"),
+    ('tag_bits = "128"', "tag_bits", "64, 96, 128 or 256"),
+    ("mac_key_bits = 4096", "mac_key_bits", "256, 512, 1024 or 2048"),
+    ('confidential = "yes"', "confidential", "write confidential = true"),
+    ("max_envelope_bytes = 319", "max_envelope_bytes", "320 or more"),
+    ("max_envelope_bytes = 65001", "max_envelope_bytes", "65000 or less"),
+    ("max_envelope_bytes = 500.5", "max_envelope_bytes", "whole number"),
+    ('keepalive_s = "10"', "keepalive_s", "write keepalive_s = 10"),
+    ("keepalive_s = true", "keepalive_s", "write keepalive_s = 10"),
+    ("keepalive_s = inf", "keepalive_s", "finite"),
+    ("keepalive_s = nan", "keepalive_s", "finite"),
+    ("keepalive_s = -1", "keepalive_s", "0.1 or more"),
+    ("keepalive_s = 10000", "keepalive_s", "3600 or less"),
+    ("echo_after_s = 1.0", "handshake_after_s", "more than echo_after_s (1)"),
+    ("lost_after_s = 1.0", "lost_after_s", "more than handshake_after_s (1)"),
+    ("retry_min_s = 2\nretry_max_s = 1", "retry_max_s", "at least retry_min_s (2)"),
+    ("rekey_after_s = 120\nretry_max_s = 10\nreject_after_s = 139", "reject_after_s", "140 or more"),
+    ('listen = ["0.0.0.0:1"]', "listen", "at the top"),
+    ('Endpoint = "10.0.0.1:1"', "Endpoint", "addresses"),
+    ("colour = 'red'", "colour", "the keys are"),
+]
+# Change of the file -> the key that the problem names, and a part of its message.
+_REFUSED: list[tuple[str | tuple[str, str], str, str]] = [
+    (('name = "drone0"', ""), "name", 'is missing: write name = "drone0"'),
+    (('"drone0"', '"drone 0"'), "name", "letters, digits"),
+    (('"drone0"', "0"), "name", "text in quotes"),
+    (('"drone0.key"', '"other.key"'), "private_key_file", "uavlinkd keygen --out"),
+    (('"drone0.key"', '"."'), "private_key_file", "not a regular file"),
+    (('"drone0.key"', '""'), "private_key_file", "must name a file"),
+    (('["0.0.0.0:5790"]', '"0.0.0.0:5790"'), "listen", 'listen = ["0.0.0.0:5790"]'),
+    (("0.0.0.0:5790", "0.0.0.0"), "listen[0]", "write 0.0.0.0:5790"),
+    (("0.0.0.0:5790", "drone0.local:5790"), "listen[0]", "numeric"),
+    (('["0.0.0.0:5790"]', '["0.0.0.0:5790", "127.0.0.1:5790"]'), "listen", "cannot listen on at once"),
+    ("[[link]]\ntag_bits = 96\n", "link", "write [link]"),
+    (("", 'log = "info"\n'), "log", "write [log]"),
+    ('[log]\nlevel = "verbose"\n', "log.level", "'debug', 'info', 'warning' or 'error'"),
+    (("[[endpoint]]", "[endpoint]"), "endpoint", "[[endpoint]]"),
+    (f"peer = [1]\n{_HEAD}{_ENDPOINT}", "peer", "[[peer]]"),
+    (('url = "udpin:127.0.0.1:14550"', ""), _FIRST_URL, 'url = "udpin:127.0.0.1:14550"'),
+    (("udpin:", "udp:"), _FIRST_URL, "udpout:127"),
+    (
+        _GOOD.replace(_URL, "serial:/dev/a:57600") + _GCS.replace(_URL, "serial:/dev/a:115200"),
+        _SECOND_URL,
         "is the device of endpoint[0] (autopilot) too",
     ),
-    "two servers on one port": (
-        _GOOD.replace("udpin", "tcpin")
-        + _ENDPOINT.replace("autopilot", "gcs").replace("udpin", "tcpin").replace("127.0.0.1", "0.0.0.0"),
-        "endpoint[1].url (gcs)",
-        "listens where endpoint[0] (autopilot) does",
-    ),
-    "mavlink-router's port": (
-        _GOOD.replace("[[peer]]", "Port = 14550\n[[peer]]"),
-        "endpoint[0].Port (autopilot)",
-        'write url = "udpin:127.0.0.1:14550"',
-    ),
-    "mavlink-router's baud": (
-        _GOOD.replace("[[peer]]", "Baud = 57600\n[[peer]]"),
+    ((_GOOD + _GCS_ANYWHERE).replace("udpin", "tcpin"), _SECOND_URL, "listens where endpoint[0] (autopilot) does"),
+    (("[[peer]]", "Port = 14550\n[[peer]]"), "endpoint[0].Port (autopilot)", 'write url = "udpin:127.0.0.1:14550"'),
+    (
+        ("[[peer]]", "Baud = 57600\n[[peer]]"),
         "endpoint[0].Baud (autopilot)",
         'write url = "serial:/dev/ttyACM0:57600"',
     ),
-    "mavlink-router's filter": (_GOOD + "BlockMsgIdIn = [76]\n", "peer[0].BlockMsgIdIn (drone1)", "write deny_in"),
-    "WireGuard's addresses": (
-        _GOOD + 'AllowedIPs = ["10.13.0.2/32"]\n',
-        "peer[0].AllowedIPs (drone1)",
-        "write role and system_ids",
-    ),
-    "log level at the top": ('log_level = "debug"\n' + _GOOD, "log_level", "write [log]"),
-    "endpoint's age": (
-        _GOOD.replace("[[peer]]", "max_age_s = 0.09\n[[peer]]"),
-        "endpoint[0].max_age_s (autopilot)",
-        "0.1 or more",
-    ),
-    "endpoint's radio status": (
-        _GOOD.replace("[[peer]]", "radio_status = 1\n[[peer]]"),
-        "endpoint[0].radio_status (autopilot)",
-        "write radio_status = true",
-    ),
-    "endpoint's policy": (
-        _GOOD.replace("[[peer]]", 'deny_in = ["shells"]\n[[peer]]'),
-        "endpoint[0].deny_in[0] (autopilot)",
-        "did you mean 'shell'?",
-    ),
-    "relay in quotes": (_GOOD + '[routing]\nrelay = "no"\n', "routing.relay", "write relay = true"),
-    "unknown targets": (
-        _GOOD + '[routing]\nunknown_targets = "ask"\n',
-        "routing.unknown_targets",
-        "'flood' or 'drop'",
-    ),
-    "routing in double brackets": (_GOOD + "[[routing]]\nrelay = true\n", "routing", "write [routing]"),
-    "routing key at the top": ("relay = true\n" + _GOOD, "relay", "in [routing]"),
-    "policy in link": (
-        f'{_TOP}{_LISTEN}[link]\nrole = "vehicle"\n{_ENDPOINT}{_PEER}',
-        "link.role",
-        "in a [[peer]] or an [[endpoint]]",
-    ),
-    "budget of a modem's letters": (
-        _GOOD + "budget_bits_s = 999\n",
-        "peer[0].budget_bits_s (drone1)",
-        "write 1000 or more, in bits a second, or 0 for no limit",
-    ),
-    "budget negative": (_GOOD + "budget_bits_s = -1\n", "peer[0].budget_bits_s (drone1)", "0 or more"),
-    "budget too large": (
-        _GOOD + "budget_bits_s = 1_000_000_001\n",
-        "peer[0].budget_bits_s (drone1)",
-        "write 1000000000 or less",
-    ),
-    "budget broken": (_GOOD + "budget_bits_s = 4e3\n", "peer[0].budget_bits_s (drone1)", "whole number"),
-    "coalescing for ever": (_GOOD + "coalesce_s = 0.51\n", "peer[0].coalesce_s (drone1)", "0.5 or less"),
-    "age for ever": (_GOOD + "max_age_s = 61\n", "peer[0].max_age_s (drone1)", "60 or less"),
-    "old before it goes": (
-        _GOOD + "coalesce_s = 0.2\nmax_age_s = 0.2\n",
-        "peer[0].max_age_s (drone1)",
-        "more than coalesce_s (0.2)",
-    ),
-    "role unknown": (_GOOD.replace("swarm-member", "pilot"), "peer[0].role (drone1)", "the roles are vehicle, "),
-    "systems left out": (_GOOD.replace("system_ids", "#"), "peer[0].system_ids (drone1)", "which systems"),
-    "system zero": (_GOOD.replace("[2]", "[2, 0]"), "peer[0].system_ids[1] (drone1)", "no system from 1 to 255"),
-    "message misspelt": (
-        _GOOD + 'allow_in = ["PING", "telemetry", "ATITUDE"]\n',
-        "peer[0].allow_in[2] (drone1)",
-        "did you mean 'ATTITUDE'?",
-    ),
-    "command misspelt": (
-        _GOOD + 'deny_in = ["MAV_CMD_NAV_TAKEOF"]\n',
-        "peer[0].deny_in[0] (drone1)",
-        "did you mean 'MAV_CMD_NAV_TAKEOFF'?",
-    ),
-    "rate of nothing": (_GOOD + "rate_out = { ATTITUDE = 0 }\n", "peer[0].rate_out.ATTITUDE (drone1)", "is no rate"),
-    "list is text": (_GOOD + 'allow_out = "telemetry"\n', "peer[0].allow_out (drone1)", "is no list"),
-    "flag in quotes": (_GOOD + 'mavlink1 = "no"\n', "peer[0].mavlink1 (drone1)", "write mavlink1 = true or"),
-    "policy key misspelt": (_GOOD + "alow_in = []\n", "peer[0].alow_in (drone1)", "did you mean allow_in?"),
-    "control socket unnamed": ('control_socket = ""\n' + _GOOD, "control_socket", "must name a file"),
-    "endpoint names alike": (
-        _GOOD + _ENDPOINT.replace("14550", "14551"),
-        "endpoint[1].name (autopilot)",
-        "name of endpoint[0] (autopilot)",
-    ),
-    "endpoints on one port": (
-        _GOOD + _ENDPOINT.replace("autopilot", "gcs").replace("127.0.0.1", "0.0.0.0"),
-        "endpoint[1].url (gcs)",
-        "listens where endpoint[0] (autopilot) does",
-    ),
-    "endpoint on the link's port": (
-        _GOOD.replace("14550", "5790"),
-        "endpoint[0].url (autopilot)",
-        "on which peers are listened for",
-    ),
-    "endpoint into the link's port": (
-        _GOOD.replace("udpin:127.0.0.1:14550", "udpout:127.0.0.1:5790"),
-        "endpoint[0].url (autopilot)",
-        "own port for peers",
-    ),
-    "endpoint into another": (
-        _GOOD + _ENDPOINT.replace("autopilot", "gcs").replace("udpin", "udpout"),
-        "endpoint[1].url (gcs)",
-        "frames would go round",
-    ),
-    "endpoint sends twice": (
-        _GOOD.replace("udpin", "udpout") + _ENDPOINT.replace("autopilot", "gcs").replace("udpin", "udpout"),
-        "endpoint[1].url (gcs)",
-        "arrive twice",
-    ),
-    "peer without key": (
-        _GOOD.replace("public_key", "#"),
-        "peer[0].public_key (drone1)",
-        "what `uavlinkd pubkey` prints on the peer",
-    ),
-    "peer key too short": (_GOOD.replace(_ONE, "AAAA"), "peer[0].public_key (drone1)", "is no key"),
-    "peer names alike": (
-        _GOOD + _PEER.replace(_ONE, _TWO),
-        "peer[1].name (drone1)",
-        "is the name of peer[0] (drone1) too",
-    ),
-    "peer keys alike": (
-        _GOOD + _PEER.replace("drone1", "drone2"),
-        "peer[1].public_key (drone2)",
-        "is the key of peer[0] (drone1) too",
-    ),
-    "peer address without port": (_GOOD.replace(".2:5790", ".2"), "peer[0].addresses[0] (drone1)", "10.13.0.2:5790"),
-    "peer address is a wildcard": (
-        _GOOD.replace("10.13.0.2", "0.0.0.0"),
-        "peer[0].addresses[0] (drone1)",
-        "every address of this machine",
-    ),
-    "peer address is ours": (
-        _GOOD.replace("10.13.0.2", "localhost"),
-        "peer[0].addresses (drone1)",
-        "where this daemon listens",
-    ),
-    "peer address twice": (
-        _GOOD.replace('["10.13.0.2:5790"]', '["a:1", "a:1"]'),
-        "peer[0].addresses (drone1)",
-        "names an address twice",
-    ),
-    "nobody can call": (
-        _GOOD.replace(_LISTEN, "").replace('addresses = ["10.13.0.2:5790"]', ""),
-        "peer[0].addresses (drone1)",
-        "neither end could call",
-    ),
-    "psk missing": (_GOOD + 'psk_file = "no.psk"\n', "peer[0].psk_file (drone1)", "uavlinkd psk"),
-    "psk is the private key": (
-        _GOOD + 'psk_file = "drone0.key"\n',
-        "peer[0].psk_file (drone1)",
-        "holds this daemon's private key",
-    ),
-    "no suite": (_GOOD + "suites = []\n", "peer[0].suites (drone1)", 'write ["x25519"]'),
-    "suite twice": (_GOOD + "suites = ['x25519', 'x25519']\n", "peer[0].suites (drone1)", "twice"),
-    "suite in capitals": (_GOOD + "suites = ['X25519']\n", "peer[0].suites[0] (drone1)", "write one of x25519"),
-    "suite unknown": (_GOOD + "suites = ['mlkem512']\n", "peer[0].suites[0] (drone1)", "is no suite"),
-    "tag in bytes": (_GOOD + "tag_bits = 16\n", "peer[0].tag_bits (drone1)", "64, 96, 128 or 256"),
-    "tag in quotes": (_GOOD + 'tag_bits = "128"\n', "peer[0].tag_bits (drone1)", "64, 96, 128 or 256"),
-    "mac key": (_GOOD + "mac_key_bits = 4096\n", "peer[0].mac_key_bits (drone1)", "256, 512, 1024 or 2048"),
-    "confidential in quotes": (
-        _GOOD + 'confidential = "yes"\n',
-        "peer[0].confidential (drone1)",
-        "write confidential = true",
-    ),
-    "envelope too small": (
-        _GOOD + "max_envelope_bytes = 319\n",
-        "peer[0].max_envelope_bytes (drone1)",
-        "320 or more",
-    ),
-    "envelope too large": (
-        _GOOD + "max_envelope_bytes = 65001\n",
-        "peer[0].max_envelope_bytes (drone1)",
-        "65000 or less",
-    ),
-    "envelope broken": (
-        _GOOD + "max_envelope_bytes = 500.5\n",
-        "peer[0].max_envelope_bytes (drone1)",
-        "whole number",
-    ),
-    "timer in quotes": (_GOOD + 'keepalive_s = "10"\n', "peer[0].keepalive_s (drone1)", "write keepalive_s = 10"),
-    "timer true": (_GOOD + "keepalive_s = true\n", "peer[0].keepalive_s (drone1)", "write keepalive_s = 10"),
-    "timer infinite": (_GOOD + "keepalive_s = inf\n", "peer[0].keepalive_s (drone1)", "finite"),
-    "timer no number": (_GOOD + "keepalive_s = nan\n", "peer[0].keepalive_s (drone1)", "finite"),
-    "timer negative": (_GOOD + "keepalive_s = -1\n", "peer[0].keepalive_s (drone1)", "0.1 or more"),
-    "timer in milliseconds": (_GOOD + "keepalive_s = 10000\n", "peer[0].keepalive_s (drone1)", "3600 or less"),
-    "echo after handshake": (
-        _GOOD + "echo_after_s = 1.0\n",
-        "peer[0].handshake_after_s (drone1)",
-        "more than echo_after_s (1)",
-    ),
-    "lost before handshake": (
-        _GOOD + "lost_after_s = 1.0\n",
-        "peer[0].lost_after_s (drone1)",
-        "more than handshake_after_s (1)",
-    ),
-    "retries shrink": (
-        _GOOD + "retry_min_s = 2\nretry_max_s = 1\n",
-        "peer[0].retry_max_s (drone1)",
-        "no less than retry_min_s (2)",
-    ),
-    "no time to rekey": (
-        _GOOD + "rekey_after_s = 120\nretry_max_s = 10\nreject_after_s = 139\n",
-        "peer[0].reject_after_s (drone1)",
-        "140 or more",
-    ),
-    "disorder in link": (
-        f"{_TOP}{_LISTEN}[link]\nlost_after_s = 1\n{_ENDPOINT}{_PEER}",
-        "link.lost_after_s",
-        "more than handshake_after_s (1)",
-    ),
-    "disorder between peer and link": (
-        f"{_TOP}{_LISTEN}[link]\nlost_after_s = 8\n{_ENDPOINT}{_PEER}handshake_after_s = 9\n",
+    (("", 'log_level = "debug"\n'), "log_level", "write [log]"),
+    (("[[peer]]", "max_age_s = 0.09\n[[peer]]"), "endpoint[0].max_age_s (autopilot)", "0.1 or more"),
+    (("[[peer]]", "radio_status = 1\n[[peer]]"), "endpoint[0].radio_status (autopilot)", "write radio_status = true"),
+    (("[[peer]]", 'deny_in = ["shells"]\n[[peer]]'), "endpoint[0].deny_in[0] (autopilot)", "did you mean 'shell'?"),
+    ('[routing]\nrelay = "no"\n', "routing.relay", "write relay = true"),
+    ('[routing]\nunknown_targets = "ask"\n', "routing.unknown_targets", "'flood' or 'drop'"),
+    ("[[routing]]\nrelay = true\n", "routing", "write [routing]"),
+    (("", "relay = true\n"), "relay", "in [routing]"),
+    (f'{_HEAD}[link]\nrole = "vehicle"\n{_ENDPOINT}{_PEER}', "link.role", "in a [[peer]] or an [[endpoint]]"),
+    (("swarm-member", "pilot"), "peer[0].role (drone1)", "the roles are vehicle, "),
+    (("system_ids", "#"), "peer[0].system_ids (drone1)", "which systems"),
+    (("", 'control_socket = ""\n'), "control_socket", "must name a file"),
+    (_GOOD + _ENDPOINT.replace("14550", "14551"), "endpoint[1].name (autopilot)", "name of endpoint[0] (autopilot)"),
+    (_GOOD + _GCS_ANYWHERE, _SECOND_URL, "listens where endpoint[0] (autopilot) does"),
+    (("14550", "5790"), _FIRST_URL, "has the port that `listen` has for peers"),
+    (("udpin:127.0.0.1:14550", "udpout:127.0.0.1:5790"), _FIRST_URL, "own port for peers"),
+    (_GOOD + _GCS.replace("udpin", "udpout"), _SECOND_URL, "frames would loop"),
+    ((_GOOD + _GCS).replace("udpin", "udpout"), _SECOND_URL, "arrive twice"),
+    (("public_key", "#"), "peer[0].public_key (drone1)", "what `uavlinkd pubkey` prints on the peer"),
+    ((_ONE, "AAAA"), "peer[0].public_key (drone1)", "is not a key"),
+    (_GOOD + _PEER.replace(_ONE, _TWO), "peer[1].name (drone1)", "is the name of peer[0] (drone1) too"),
+    (_GOOD + _PEER.replace("drone1", "drone2"), "peer[1].public_key (drone2)", "is the key of peer[0] (drone1) too"),
+    ((".2:5790", ".2"), "peer[0].addresses[0] (drone1)", "10.13.0.2:5790"),
+    (("10.13.0.2", "0.0.0.0"), "peer[0].addresses[0] (drone1)", "every address of this machine"),
+    (("10.13.0.2", "localhost"), "peer[0].addresses (drone1)", "where this daemon listens"),
+    (('["10.13.0.2:5790"]', '["a:1", "a:1"]'), "peer[0].addresses (drone1)", "names an address twice"),
+    (_TOP + _ENDPOINT + _PEER.replace("addresses", "#"), "peer[0].addresses (drone1)", "neither end could initiate"),
+    (f"{_HEAD}[link]\nlost_after_s = 1\n{_ENDPOINT}{_PEER}", "link.lost_after_s", "more than handshake_after_s (1)"),
+    (
+        f"{_HEAD}[link]\nlost_after_s = 8\n{_ENDPOINT}{_PEER}handshake_after_s = 9\n",
         "peer[0].lost_after_s (drone1)",
         "more than handshake_after_s (9)",
     ),
-    "metrics without port": (_GOOD + '[metrics]\nlisten = "127.0.0.1"\n', "metrics.listen", "127.0.0.1:5790"),
-    "metrics of a name": (_GOOD + '[metrics]\nlisten = "drone0.local:9790"\n', "metrics.listen", "numeric"),
-    "metrics at an endpoint's port": (
+    ('[metrics]\nlisten = "127.0.0.1"\n', "metrics.listen", "127.0.0.1:5790"),
+    ('[metrics]\nlisten = "drone0.local:9790"\n', "metrics.listen", "numeric"),
+    (
         _GOOD.replace("udpin", "tcpin") + '[metrics]\nlisten = "127.0.0.1:14550"\n',
         "metrics.listen",
         "is where endpoint[0] (autopilot) listens",
     ),
-    "recording at the top": ('folder = "flights"\n' + _GOOD, "folder", "in [recording]"),
-    "recording unnamed": (_GOOD + '[recording]\nfolder = ""\n', "recording.folder", "must name a file"),
-    "recording in tiny files": (_GOOD + "[recording]\nmax_file_bytes = 9999\n", "recording.max_file_bytes", "10000"),
-    "recording in broken files": (
-        _GOOD + "[recording]\nmax_file_bytes = 1e6\n",
-        "recording.max_file_bytes",
-        "max_file_bytes = 64_000_000",
-    ),
-    "recording fills the disk": (_GOOD + "[recording]\nmin_free_bytes = 0\n", "recording.min_free_bytes", "100000"),
-    "recording with fewer files than peers": (
+    (("", 'folder = "flights"\n'), "folder", "in [recording]"),
+    ('[recording]\nfolder = ""\n', "recording.folder", "must name a file"),
+    ("[recording]\nmax_file_bytes = 9999\n", "recording.max_file_bytes", "10000"),
+    ("[recording]\nmax_file_bytes = 1e6\n", "recording.max_file_bytes", "max_file_bytes = 64_000_000"),
+    ("[recording]\nmin_free_bytes = 0\n", "recording.min_free_bytes", "100000"),
+    (
         _GOOD + _OTHER_PEER + '[recording]\nfolder = "flights"\nmax_files = 2\n',
         "recording.max_files",
         "more than the number of peers, each of which has a file: write 3",
     ),
-    "misspelt key": (
-        "confidental = true\n".join((_GOOD, "")),
-        "peer[0].confidental (drone1)",
-        "did you mean confidential?",
-    ),
-    "camel case": (
-        _GOOD.replace("public_key", "PublicKey"),
-        "peer[0].PublicKey (drone1)",
-        "did you mean public_key?",
-    ),
-    "plural section": (_GOOD.replace("[[peer]]", "[[peers]]"), "peers", "did you mean [[peer]]?"),
-    "key of another section": ("tag_bits = 96\n" + _GOOD, "tag_bits", "in [link] or in a [[peer]]"),
-    "top key below a section": (_GOOD + 'listen = ["0.0.0.0:1"]\n', "peer[0].listen (drone1)", "at the top"),
-    "key of WireGuard": (_GOOD + 'Endpoint = "10.0.0.1:1"\n', "peer[0].Endpoint (drone1)", "addresses"),
-    "key in the file": (f'private_key = "{_TWO}"\n{_GOOD}', "private_key", "a key never stands in this file"),
-    "key not thought of": (_GOOD + "colour = 'red'\n", "peer[0].colour (drone1)", "the keys are"),
-}
+    ("confidental = true\n", "peer[0].confidental (drone1)", "did you mean confidential?"),
+    (("public_key", "PublicKey"), "peer[0].PublicKey (drone1)", "did you mean public_key?"),
+    (("[[peer]]", "[[peers]]"), "peers", "did you mean [[peer]]?"),
+    (("", "tag_bits = 96\n"), "tag_bits", "in [link] or in a [[peer]]"),
+    (("", f'private_key = "{_TWO}"\n'), "private_key", "this file never contains a key"),
+    *((f"{lines}\n", f"peer[0].{key} (drone1)", says) for lines, key, says in _PEER_REFUSED),
+]
 
 
-@pytest.mark.parametrize("case", _REFUSED)
-def test_problem_is_named_with_what_to_write(refused: Refused, case: str) -> None:
-    """Each mistake is found alone: under its key, with what to write instead, and with nothing else."""
-    text, key, says = _REFUSED[case]
-    problems = refused(text)
+@pytest.mark.parametrize(("change", "key", "says"), _REFUSED, ids=[f"{key}: {says}" for _, key, says in _REFUSED])
+def test_problem_is_named_with_what_to_write(
+    refused: Refused, change: str | tuple[str, str], key: str, says: str
+) -> None:
+    """Each mistake causes one problem: it names the key and what to write instead."""
+    problems = refused(_changed(change))
     assert says in problems.get(key, f"not among {problems}")
     # A key that has another name is also missing under its own.
     assert all(other == key or "is missing" in message for other, message in problems.items()), problems
@@ -677,21 +526,12 @@ def test_problem_is_named_with_what_to_write(refused: Refused, case: str) -> Non
 @pytest.mark.parametrize(
     "name",
     [
-        "modp768",
-        "modp1024",
-        "MODP-1024",
-        "ffdhe512",
-        "ffdhe1024",
-        "dh1024",
-        "dh_1024",
-        "dhe768",
-        "group1",
-        "group2",
-        "1024",
+        *("modp768", "modp1024", "MODP-1024", "ffdhe512", "ffdhe1024", "dh1024"),
+        *("dh_1024", "dhe768", "group1", "group2", "1024"),
     ],
 )
 def test_small_diffie_hellman_group_is_refused_with_the_reason(refused: Refused, name: str) -> None:
-    """Whatever it is called: groups of 1024 bits and less are broken in advance, for everybody at once."""
+    """Under any common name: one computation in advance breaks all exchanges in a group of 1024 bits or less."""
     for message in (
         refused(f'{_GOOD}suites = ["x25519", "{name}"]\n')["peer[0].suites[1] (drone1)"],
         refused(f'{_TOP}{_LISTEN}[link]\nsuites = ["{name}"]\n{_ENDPOINT}{_PEER}')["link.suites[0]"],
@@ -705,11 +545,11 @@ def test_small_group_as_a_number_is_refused_with_the_reason(refused: Refused) ->
 
 
 def test_larger_unknown_group_is_not_called_breakable(refused: Refused) -> None:
-    """The reason is given only where it holds."""
+    """The message names the reason only where it applies."""
     for name in ("modp2048", "ffdhe1025", "group14", "p256"):
         message = refused(f'{_GOOD}suites = ["{name}"]\n')["peer[0].suites[0] (drone1)"]
         assert "Logjam" not in message
-        assert "is no suite" in message
+        assert "is not a suite" in message
 
 
 # u-coordinates whose multiples by 8 vanish, from their definition: 0 (order 2 on the curve), 1 and -1 (order 4).
@@ -718,20 +558,20 @@ _PRIME = 2**255 - 19
 
 @pytest.mark.parametrize("number", [0, 1, _PRIME - 1, _PRIME, _PRIME + 1, 2**255, 2**255 + 1])
 def test_public_key_of_low_order_is_refused(refused: Refused, number: int) -> None:
-    """With such a point everybody knows the shared secret, however it is written."""
+    """With such a point everyone knows the shared secret, in any encoding."""
     text = base64.b64encode(number.to_bytes(32, "little")).decode()
     assert "low order" in refused(_GOOD.replace(_ONE, text))["peer[0].public_key (drone1)"]
 
 
 def test_second_spelling_of_a_point_is_refused(refused: Refused) -> None:
-    """The same point with its unused bit set would pass for another peer."""
+    """The same point with its unused bit set would look like another peer."""
     number = int.from_bytes(keys.decode_key(_ONE), "little") | 2**255
     text = base64.b64encode(number.to_bytes(32, "little")).decode()
-    assert "no key that X25519 gives" in refused(_GOOD.replace(_ONE, text))["peer[0].public_key (drone1)"]
+    assert "not a public key of X25519" in refused(_GOOD.replace(_ONE, text))["peer[0].public_key (drone1)"]
 
 
-def test_own_keys_are_no_peers(refused: Refused, folder: Path) -> None:
-    """Neither our public key, nor, by an accident worse, our private one."""
+def test_own_keys_are_refused_for_peers(refused: Refused, folder: Path) -> None:
+    """This daemon's public key and, by a worse accident, its private key."""
     private = (folder / "drone0.key").read_text().strip()
     own = refused(_GOOD.replace(_ONE, keys.public_key_text(private)))
     assert "own key" in own["peer[0].public_key (drone1)"]
@@ -740,23 +580,20 @@ def test_own_keys_are_no_peers(refused: Refused, folder: Path) -> None:
     assert private not in str(leaked)
 
 
+def test_hub_needs_no_endpoint(load: Load) -> None:
+    """A daemon that relays between two peers or more works without clients."""
+    assert load(f"{_TOP}{_LISTEN}{_PEER}{_OTHER_PEER}[routing]\nrelay = true\n").warnings == ()
+
+
 def test_peer_with_a_name_for_address_may_be_anywhere(load: Load) -> None:
-    """Nothing is said of a reach that only a resolver knows, nor of a peer that is here as we are."""
+    """There is no warning about an address that only a resolver knows, nor about a peer on this machine."""
     local = _GOOD.replace("0.0.0.0", "127.0.0.1")
     assert load(local.replace("10.13.0.2", "drone1.local")).warnings == ()
     assert load(local.replace("10.13.0.2:5790", "127.0.0.1:5791")).warnings == ()
 
 
-@pytest.mark.parametrize("name", ["drone0.key", "pair.psk"])
-def test_key_file_that_others_can_read_is_refused(refused: Refused, folder: Path, name: str) -> None:
-    """With the command that mends it; the same for the private key and for PSKs."""
-    (folder / name).chmod(0o640)
-    (message,) = refused(f'{_GOOD}psk_file = "pair.psk"\n').values()
-    assert f"chmod 600 {folder / name}" in message
-
-
 def test_every_problem_is_listed_at_once(refused: Refused) -> None:
-    """One run tells all of them, also those between values while other values are wrong."""
+    """One run reports all problems, also those between values while other values are invalid."""
     problems = refused(
         """
         name = "drone 0"
@@ -783,30 +620,16 @@ def test_every_problem_is_listed_at_once(refused: Refused) -> None:
         """
     )
     assert set(problems) == {
-        "name",
-        "private_key_file",
-        "listen",
-        "link.suites[0]",
-        "link.handshake_after_s",
-        "link.colour",
-        "endpoint[0].url (a)",
-        "endpoint[1].name (a)",
-        "endpoint[1].url (a)",
-        "peer[0].public_key (b)",
-        "peer[0].retry_max_s (b)",
-        "peer[0].role (b)",
-        "peer[0].system_ids (b)",
-        "peer[1].name (b)",
-        "peer[1].public_key (b)",
-        "peer[1].addresses[0] (b)",
-        "peer[1].psk_file (b)",
-        "peer[1].role (b)",
-        "peer[1].system_ids (b)",
+        *("name", "private_key_file", "listen", "link.suites[0]", "link.handshake_after_s", "link.colour"),
+        *("endpoint[0].url (a)", "endpoint[1].name (a)", "endpoint[1].url (a)", "peer[0].public_key (b)"),
+        *("peer[0].retry_max_s (b)", "peer[0].role (b)", "peer[0].system_ids (b)", "peer[1].name (b)"),
+        *("peer[1].public_key (b)", "peer[1].addresses[0] (b)", "peer[1].psk_file (b)"),
+        *("peer[1].role (b)", "peer[1].system_ids (b)"),
     }
 
 
 def test_problem_of_link_is_not_repeated_for_every_peer(refused: Refused) -> None:
-    """What a peer inherits is told once, where it stands; a wrong value makes no second problem."""
+    """A problem that a peer inherits is reported once, for [link]; an invalid value causes no second problem."""
     two = _PEER + _PEER.replace("drone1", "drone2").replace(_ONE, _TWO).replace("10.13.0.2", "10.13.0.3")
     assert set(refused(f"{_TOP}{_LISTEN}[link]\nlost_after_s = 0.5\n{two}")) == {"link.lost_after_s"}
     wrong = f'{_TOP}{_LISTEN}[link]\nlost_after_s = "long"\n{two}handshake_after_s = 5\n'
@@ -814,7 +637,7 @@ def test_problem_of_link_is_not_repeated_for_every_peer(refused: Refused) -> Non
 
 
 def test_problem_reads_as_a_line(load: Load, folder: Path) -> None:
-    """File, key with the section's name, what is wrong and what to write."""
+    """File, key with the section's name, the problem and what to write."""
     with pytest.raises(ConfigError) as caught:
         load(_GOOD.replace(".2:5790", ".2"))
     assert str(caught.value) == (
@@ -822,7 +645,7 @@ def test_problem_reads_as_a_line(load: Load, folder: Path) -> None:
     )
 
 
-_SECRET_TEXT = base64.b64encode(b"thirty-two bytes nobody may see!").decode()
+_SECRET_TEXT = base64.b64encode(b"thirty-two bytes, to be secret!!").decode()
 
 
 @pytest.mark.parametrize(
@@ -872,7 +695,7 @@ _SECRET_TEXT = base64.b64encode(b"thirty-two bytes nobody may see!").decode()
     ],
 )
 def test_no_message_repeats_a_key(load: Load, text: str) -> None:
-    """Wherever a key was pasted by mistake, what is printed has no part of it, nor has the exception."""
+    """A key that was pasted by mistake appears neither in the output nor in the exception, not even in part."""
     with pytest.raises(ConfigError) as caught:
         load(text)
     for shown in (str(caught.value), repr(caught.value), repr(caught.value.problems)):
@@ -883,7 +706,7 @@ def test_no_message_repeats_a_key(load: Load, text: str) -> None:
     assert caught.value.__suppress_context__ or caught.value.__context__ is None
 
 
-def test_message_controls_no_terminal(load: Load) -> None:
+def test_message_cannot_control_a_terminal(load: Load) -> None:
     """Escape sequences in keys and values stay in the file."""
     with pytest.raises(ConfigError) as caught:
         load(f'{_GOOD}"\\u001b[2J" = 1\npsk_file = "\\u001b[2J"\n'.replace('"drone0"', '"\\u001b[2J"'))
@@ -894,12 +717,10 @@ def test_message_controls_no_terminal(load: Load) -> None:
 @pytest.mark.parametrize(
     ("content", "line", "column", "says"),
     [
-        (b"name = drone0\n", 1, 8, "text must be in quotes"),
-        (b'name = "drone0"\nlisten = ["0.0.0.0:5790"\n', 3, 1, "Unclosed array"),
-        (b'name = "a"\nname = "b"\n', 2, 11, "Cannot overwrite a value"),
-        (b"[link]\n[link]\n", 2, 6, "Cannot declare twice"),
+        (b"name = drone0\n", 1, 8, "without quotation marks"),
+        (b"x.y = \n", 1, 7, "not valid TOML here: Invalid value"),
         (b'name = "drone\xff"\n', 1, 14, "UTF-8"),
-        (b"\nx = 1\nname = True\n", 3, 8, "true and false in small letters"),
+        (b"\nx = 1\nname = True\n", 3, 8, "true or false in small letters"),
     ],
 )
 def test_syntax_error_has_its_line_and_column(
@@ -911,135 +732,106 @@ def test_syntax_error_has_its_line_and_column(
     with pytest.raises(ConfigError) as caught:
         load_config(path, {})
     (problem,) = caught.value.problems
-    assert problem.file.startswith(f"{path}:{line}:")
-    if says != "Cannot overwrite a value":  # whose column differs between versions of Python
-        assert problem.file == f"{path}:{line}:{column}"
+    assert problem.file == f"{path}:{line}:{column}"
     assert says in problem.message
 
 
 @pytest.mark.parametrize("content", ["x = " + "[" * 100_000, "x = " + "9" * 100_000, "#" * (1 << 20) + "\n"])
-def test_file_that_no_parser_takes_is_a_problem_too(load: Load, content: str) -> None:
-    """Neither depth, nor length of a number or of the file, raises anything else."""
+def test_file_that_the_parser_refuses_is_a_problem(load: Load, content: str) -> None:
+    """Deep nesting, a long number and a long file raise a ConfigError, and no other exception."""
     with pytest.raises(ConfigError):
         load(content)
 
 
 @pytest.mark.parametrize("value", [hex(1 << 40_000), f"[{hex(1 << 40_000)}]", f'["{"9" * 40_000}"]', "[2024-01-01]"])
 @pytest.mark.parametrize("key", ["system_ids", "allow_in", "rate_in", "mavlink1"])
-def test_value_that_no_policy_takes_is_a_problem_too(load: Load, key: str, value: str) -> None:
-    """Neither a number of ten thousand digits nor a date raises anything else, or fills a screen."""
+def test_value_that_the_policy_refuses_is_a_problem(load: Load, key: str, value: str) -> None:
+    """A number of ten thousand digits and a date raise a ConfigError with a short message."""
     with pytest.raises(ConfigError) as caught:
         load(f"{_GOOD.replace('system_ids', '#')}{key} = {value}\n")
     assert len(str(caught.value)) < 1000
 
 
 def test_file_that_cannot_be_read_is_named(folder: Path) -> None:
-    """A missing file and a folder are told apart."""
+    """The message distinguishes a missing file and a folder."""
     with pytest.raises(ConfigError, match=r"none\.toml: cannot be read: No such file"):
         load_config(folder / "none.toml", {})
     with pytest.raises(ConfigError, match="cannot be read: Is a directory"):
         load_config(folder, {})
 
 
-def test_byte_order_mark_is_no_mistake(folder: Path) -> None:
+def test_byte_order_mark_is_accepted(folder: Path) -> None:
     """Some editors write one."""
     path = folder / "drone0.toml"
     path.write_bytes(b"\xef\xbb\xbf" + _GOOD.encode())
     assert load_config(path, {}).name == "drone0"
 
 
-# Text -> a part of the one warning it gives.
-_WARNED = {
-    "open endpoint": (_GOOD.replace("127.0.0.1", "0.0.0.0"), r"listens beyond loopback.*stranger.*arm.*parameters"),
-    "open IPv6 endpoint": (_GOOD.replace("127.0.0.1", "[::]"), "listens beyond loopback"),
-    "sending endpoint": (_GOOD.replace("udpin:127.0.0.1", "udpout:10.0.0.9"), "sends beyond this machine"),
-    "open metrics": (
-        _GOOD + '[metrics]\nlisten = "0.0.0.0:9790"\n',
-        r'metrics\.listen is beyond loopback.*who is linked with whom.*listen = "127\.0\.0\.1:9790"',
+# Change of the file -> a part of its only warning.
+_WARNED: list[tuple[str | tuple[str, str], str]] = [
+    (("127.0.0.1", "0.0.0.0"), r"listens beyond loopback.*any sender.*arm.*parameters"),
+    (("127.0.0.1", "[::]"), "listens beyond loopback"),
+    (("udpin:127.0.0.1", "udpout:10.0.0.9"), "sends beyond this machine"),
+    (
+        '[metrics]\nlisten = "0.0.0.0:9790"\n',
+        r'metrics\.listen is beyond loopback.*reads the links of this daemon.*listen = "127\.0\.0\.1:9790"',
     ),
-    "no endpoint": (_TOP + _LISTEN + _PEER, r"no \[\[endpoint\]\]"),
-    "no peer": (_TOP + _LISTEN + _ENDPOINT, r"no \[\[peer\]\]"),
-    "short tag": (_GOOD + "tag_bits = 64\n", "tags of 64 bits with drone1"),
-    "short tag for all": (
-        f"{_TOP}{_LISTEN}[link]\ntag_bits = 64\n{_ENDPOINT}{_PEER}{_OTHER_PEER}",
-        "with every peer:",
-    ),
-    "long MAC key": (_GOOD + "mac_key_bits = 1024\n", r"over 512 bits.*RFC 2104"),
-    "tag of a confidential link": (_GOOD + "confidential = true\ntag_bits = 64\n", "mean nothing with drone1"),
-    "large envelope": (_GOOD + "max_envelope_bytes = 1453\n", "envelopes over 1,452 bytes"),
-    "mlkem768": (_GOOD + "suites = ['mlkem768']\n", r"mlkem768.*1,3\d\d bytes.*1,280"),
-    "mlkem1024": (_GOOD + "suites = ['x25519', 'mlkem1024']\n", r"mlkem1024.*1,7\d\d bytes.*fragments"),
-    "peer of another family": (_GOOD.replace("10.13.0.2", "[2001:db8::2]"), r'add "\[::\]:5790"'),
-    "link on loopback": (_GOOD.replace("0.0.0.0", "127.0.0.1"), "neither reaches the other"),
-    "one address for two": (
-        _GOOD + _OTHER_PEER + 'addresses = ["10.13.0.2:5790"]\n',
-        "10.13.0.2:5790 in common",
-    ),
-    "one PSK for two": (
-        f'{_GOOD}psk_file = "pair.psk"\n{_OTHER_PEER}psk_file = "pair.psk"\n',
-        "have the same PSK",
-    ),
-    "open server": (
-        _GOOD.replace("udpin:127.0.0.1", "tcpin:0.0.0.0"),
-        r"listens beyond loopback.*stranger.*tcpin:127\.0\.0\.1:14550",
-    ),
-    "open endpoint with a policy": (
+    (_TOP + _LISTEN + _PEER, r"no \[\[endpoint\]\]"),
+    (_TOP + _LISTEN + _ENDPOINT, r"no \[\[peer\]\]"),
+    (_TOP + _LISTEN + _PEER + "[routing]\nrelay = true\n", r"no \[\[endpoint\]\]"),
+    ("tag_bits = 64\n", "tags of 64 bits with drone1"),
+    (f"{_HEAD}[link]\ntag_bits = 64\n{_ENDPOINT}{_PEER}{_OTHER_PEER}", "with every peer:"),
+    ("mac_key_bits = 1024\n", r"over 512 bits.*RFC 2104"),
+    ("confidential = true\ntag_bits = 64\n", "have no effect with drone1"),
+    ("max_envelope_bytes = 1453\n", "envelopes over 1,452 bytes"),
+    ("suites = ['mlkem768']\n", r"mlkem768.*1,3\d\d bytes.*1,280"),
+    ("suites = ['x25519', 'mlkem1024']\n", r"mlkem1024.*1,7\d\d bytes.*fragments"),
+    (("10.13.0.2", "[2001:db8::2]"), r'add "\[::\]:5790"'),
+    (("0.0.0.0", "127.0.0.1"), "neither reaches the other"),
+    (_GOOD + _OTHER_PEER + 'addresses = ["10.13.0.2:5790"]\n', "share the address 10.13.0.2:5790"),
+    (f'{_GOOD}psk_file = "pair.psk"\n{_OTHER_PEER}psk_file = "pair.psk"\n', "have the same PSK"),
+    (("udpin:127.0.0.1", "tcpin:0.0.0.0"), r"listens beyond loopback.*any sender.*tcpin:127\.0\.0\.1:14550"),
+    (
         _GOOD.replace("127.0.0.1", "0.0.0.0").replace("[[peer]]", 'role = "observer"\n[[peer]]'),
-        r"stranger.*say and hear what its policy lets through",
+        r"any sender.*send and receive what its policy passes",
     ),
-    "connection into the network": (
-        _GOOD.replace("udpin:127.0.0.1", "tcp:10.0.0.9"),
-        r"connects beyond this machine.*speak to every peer with any message",
-    ),
-    "peer trusted with everything": (
-        _GOOD.replace("swarm-member", "all"),
-        r'^peer "drone1": role = "all": it may send every message',
-    ),
-    "two peers trusted with everything": (
-        (_GOOD + _OTHER_PEER).replace("swarm-member", "all"),
-        r'^peer "drone1", peer "drone2": role = "all"',
-    ),
-    "peer trusted with every system": (_GOOD.replace("[2]", '["all"]'), r'^peer "drone1": system_ids is "all"'),
-    "command denied that may travel unseen": (
-        _GOOD + 'allow_in = ["commands", "files"]\ndeny_in = ["MAV_CMD_NAV_PATHPLANNING"]\n',
+    (("udpin:127.0.0.1", "tcp:10.0.0.9"), r"connects beyond this machine.*send to every peer any message"),
+    (("swarm-member", "all"), r'^peer "drone1": role = "all": it may send every message'),
+    ((_GOOD + _OTHER_PEER).replace("swarm-member", "all"), r'^peer "drone1", peer "drone2": role = "all"'),
+    (("[2]", '["all"]'), r'^peer "drone1": system_ids is "all"'),
+    (
+        'allow_in = ["commands", "files"]\ndeny_in = ["MAV_CMD_NAV_PATHPLANNING"]\n',
         r'^peer "drone1": deny_in.*FILE_TRANSFER_PROTOCOL',
     ),
-    "the same at an endpoint": (
-        _GOOD.replace("[[peer]]", 'deny_in = ["MAV_CMD_NAV_PATHPLANNING"]\n[[peer]]'),
-        r'^endpoint "autopilot": deny_in',
-    ),
-    "command denied whose effect stays possible": (
-        _GOOD + 'allow_in = ["manual", "MAV_CMD_COMPONENT_ARM_DISARM"]\ndeny_in = ["MAV_CMD_COMPONENT_ARM_DISARM"]\n',
+    (("[[peer]]", 'deny_in = ["MAV_CMD_NAV_PATHPLANNING"]\n[[peer]]'), r'^endpoint "autopilot": deny_in'),
+    (
+        'allow_in = ["manual", "MAV_CMD_COMPONENT_ARM_DISARM"]\ndeny_in = ["MAV_CMD_COMPONENT_ARM_DISARM"]\n',
         r"arming and disarming stays possible by RC_CHANNELS_OVERRIDE, MANUAL_CONTROL: denial is best effort",
     ),
-    "endpoint trusted with every system in so many words": (
-        _GOOD.replace("[[peer]]", 'system_ids = "all"\n[[peer]]'),
-        r'^endpoint "autopilot": system_ids is "all"',
-    ),
-    "one system for two peers": (
+    (("[[peer]]", 'system_ids = "all"\n[[peer]]'), r'^endpoint "autopilot": system_ids is "all"'),
+    (
         _GOOD.replace("[2]", '["1-3"]') + _OTHER_PEER.replace("[3]", "[1, 3, 4]"),
-        r'^peer "drone1" and peer "drone2" may speak as the same systems 1, 3:',
+        r'^peer "drone1" and peer "drone2" may send as the same systems 1, 3:',
     ),
-    "one system for three": (
+    (
         (_GOOD + _OTHER_PEER).replace("[3]", "[2]").replace('14550"', '14550"\nsystem_ids = [2]'),
-        r'^peer "drone1", peer "drone2" and endpoint "autopilot" may speak as the same system 2:',
+        r'^peer "drone1", peer "drone2" and endpoint "autopilot" may send as the same system 2:',
     ),
-    "vehicles relayed to vehicles": (
+    (
         (_GOOD + _OTHER_PEER).replace("swarm-member", "vehicle") + "[routing]\nrelay = true\n",
-        r'relay = true.*"drone1", "drone2".*write to another vehicle',
+        r'relay = true.*"drone1", "drone2".*writes to another vehicle.*accept only the operator.s system_ids$',
     ),
-    "handshake that takes longer than its retry": (
-        _GOOD + "budget_bits_s = 9000\nsuites = ['ffdhe8192']\nretry_max_s = 1\n",
+    (
+        "budget_bits_s = 9000\nsuites = ['ffdhe8192']\nretry_max_s = 1\n",
         r"handshake with ffdhe8192 takes 1\.1 s at 9,000 bits/s.*retry_max_s = 3$",
     ),
-}
+]
 
 
-@pytest.mark.parametrize("case", _WARNED)
-def test_what_a_person_should_know_is_said_once(load: Load, case: str) -> None:
-    """One sentence for each, and the configuration is good."""
-    text, says = _WARNED[case]
-    (warning,) = load(text).warnings
+@pytest.mark.parametrize(("change", "says"), _WARNED, ids=[says for _, says in _WARNED])
+def test_warning_is_given_once(load: Load, change: str | tuple[str, str], says: str) -> None:
+    """One sentence for each case, and the configuration is valid."""
+    (warning,) = load(_changed(change)).warnings
     assert re.search(says, warning)
 
 
@@ -1056,21 +848,24 @@ def test_what_a_person_should_know_is_said_once(load: Load, case: str) -> None:
         '[[endpoint]]\nname = "companion"\nurl = "tcp:127.0.0.1:5760"\nsystem_ids = [1]\nrole = "vehicle"',
     ],
 )
-def test_what_is_well_gives_no_warning(load: Load, lines: str) -> None:
+def test_values_below_the_limit_cause_no_warning(load: Load, lines: str) -> None:
     """The last value before each warning."""
     assert load(f"{_GOOD}{lines}\n").warnings == ()
 
 
-_CALLED = {"slow-radio": "drone2"}  # files that are called for what they show
+_NAMES = {"slow-radio": "drone2"}  # files whose name describes their subject
+_OTHERS = {"mitm"}  # configurations of other commands, with tests of their own
 
 
-_OTHERS = {"mitm"}  # files of other programs, with tests of their own
+def _warnings(config: Config) -> list[str]:
+    """The warnings, without those about the keys of the examples."""
+    return [warning for warning in config.warnings if "the key of an example" not in warning]
 
 
 @pytest.mark.parametrize(
-    "path", sorted(each for each in EXAMPLES.glob("*.toml") if each.stem not in _OTHERS), ids=lambda path: path.stem
+    "path", sorted(path for path in EXAMPLES.glob("*.toml") if path.stem not in _OTHERS), ids=lambda path: path.stem
 )
-def test_example_is_good(tmp_path: Path, path: Path) -> None:
+def test_example_is_valid(tmp_path: Path, path: Path) -> None:
     """Each file in configs/ loads without a warning, beside the key files that it names."""
     copy = Path(shutil.copy(path, tmp_path))
     assert not list(tmp_path.glob("*.key"))
@@ -1078,19 +873,19 @@ def test_example_is_good(tmp_path: Path, path: Path) -> None:
         tmp_path / tomllib.loads(path.read_text())["private_key_file"], keys.generate_private_key()
     )
     config = load_config(copy, {})
-    assert (config.name, config.warnings) == (_CALLED.get(path.stem, path.stem), ())
+    assert (config.name, _warnings(config)) == (_NAMES.get(path.stem, path.stem), [])
     assert config.peers
     assert config.endpoints
 
 
 def test_example_with_every_link_key_has_the_defaults() -> None:
-    """What the ground station's file says of defaults is so, and it leaves none out."""
+    """The ground station's file contains every default, with its value."""
     table = tomllib.loads((EXAMPLES / "ground-station.toml").read_text())
     assert set(table["link"]) == set(LinkSection.model_fields)
     assert LinkSection.model_validate(table["link"]) == LinkSection()
     assert set(table["routing"]) == set(RoutingSection.model_fields)
     assert RoutingSection.model_validate(table["routing"]) == RoutingSection()
-    off = {"metrics": {"listen"}, "recording": {"folder"}}  # what is off by default stands there as a comment
+    off = {"metrics": {"listen"}, "recording": {"folder"}}  # the file has these as comments
     for name, model in (("metrics", MetricsSection), ("recording", RecordingSection)):
         assert set(table[name]) == set(model.model_fields) - off[name]
         assert model.model_validate(table[name]) == model()
@@ -1101,7 +896,7 @@ def test_example_with_every_link_key_has_the_defaults() -> None:
 
 
 def test_what_is_off_in_the_example_can_be_switched_on(tmp_path: Path) -> None:
-    """The lines of [metrics] and [recording] that are comments are good, and give no warning."""
+    """The commented lines of [metrics] and [recording] are valid and cause no warning."""
     text = (EXAMPLES / "ground-station.toml").read_text()
     keys.write_secret_file(tmp_path / "ground-station.key", keys.generate_private_key())
     (tmp_path / "on.toml").write_text(re.sub(r"(?m)^# (?=(listen|folder) = )", "", text))
@@ -1109,40 +904,44 @@ def test_what_is_off_in_the_example_can_be_switched_on(tmp_path: Path) -> None:
     assert config.metrics == Address("127.0.0.1", 9790)
     assert config.recording is not None
     assert config.recording.folder == tmp_path / "recordings"
-    assert config.warnings == ()
+    assert _warnings(config) == []
 
 
 def test_example_explains_every_policy_key() -> None:
-    """Each stands in the ground station's file, in its comment if not in a peer."""
+    """The ground station's file has each key, in a peer or in its comment."""
     words = set(re.findall(r"\w+", (EXAMPLES / "ground-station.toml").read_text()))
     assert set(PolicySection.model_fields) == set(KEYS)
     assert set(KEYS) <= words
     assert set(ROLES) <= set(re.findall(r"[\w-]+", (EXAMPLES / "ground-station.toml").read_text()))
 
 
-def test_what_an_example_has_in_comments_is_good_too(tmp_path: Path) -> None:
-    """The ground station and the observer of drone0.toml, once their lines are no comments."""
+def test_commented_lines_of_an_example_are_valid(tmp_path: Path) -> None:
+    """The ground station and the observer of drone0.toml, with their lines uncommented."""
     text = (EXAMPLES / "drone0.toml").read_text()
     more = text[text.index("# [[peer]]") :]
     keys.write_secret_file(tmp_path / "drone0.key", keys.generate_private_key())
     (tmp_path / "drone0.toml").write_text(text + "\n" + re.sub(r"(?m)^# ?", "", more))
     config = load_config(tmp_path / "drone0.toml", {})
     assert [peer.name for peer in config.peers] == ["drone1", "ground-station", "observer"]
-    assert config.warnings == ()
+    assert _warnings(config) == []
 
 
-_README = Path(__file__).parents[2] / "README.md"
-_BLOCKS = re.findall(r"^```toml\n(.*?)^```", _README.read_text(), re.DOTALL | re.MULTILINE)
+_PAGES = ("README.md", "uavlinkd/config/README.md")
+_BLOCKS = [
+    block
+    for page in _PAGES
+    for block in re.findall(r"^```toml\n(.*?)^```", (EXAMPLES.parent / page).read_text(), re.DOTALL | re.MULTILINE)
+]
 
 
-def test_readme_has_a_configuration() -> None:
-    """There is one to be tested below."""
-    assert _BLOCKS
+def test_each_page_has_a_configuration() -> None:
+    """The test below reads one from each page."""
+    assert len(_BLOCKS) == len(_PAGES)
 
 
 @pytest.mark.parametrize("text", _BLOCKS)
-def test_configuration_in_the_readme_is_good(tmp_path: Path, text: str) -> None:
-    """Copied as it is, beside the key files that it names, it loads."""
+def test_configuration_in_a_readme_is_valid(tmp_path: Path, text: str) -> None:
+    """The loader accepts it as it is, beside the key files that it names."""
     table = tomllib.loads(text)
     keys.write_secret_file(tmp_path / table["private_key_file"], keys.generate_private_key())
     for peer in table.get("peer", []):
@@ -1155,22 +954,22 @@ def test_configuration_in_the_readme_is_good(tmp_path: Path, text: str) -> None:
 
 
 def test_examples_name_one_another() -> None:
-    """Each pair of files agrees about its keys: a peer called drone1 has one key in all of them."""
-    found: dict[str, set[str]] = {}
+    """Each pair of files agrees about its keys: a peer with the name drone1 has one key in all of them."""
+    keys_by_peer: dict[str, set[str]] = {}
     for path in EXAMPLES.glob("*.toml"):
         for peer in tomllib.loads(path.read_text()).get("peer", []):
-            found.setdefault(peer["name"], set()).add(peer["public_key"])
-    assert {"drone0", "drone1"} <= set(found)
-    assert all(len(known) == 1 for known in found.values())
+            keys_by_peer.setdefault(peer["name"], set()).add(peer["public_key"])
+    assert {"drone0", "drone1"} <= set(keys_by_peer)
+    assert all(len(known) == 1 for known in keys_by_peer.values())
 
 
 def test_no_private_key_is_kept_with_the_examples() -> None:
-    """Their keys were thrown away: a copied example cannot be spoken for by anybody."""
+    """Their keys were deleted: no attacker can use the key of a copied example."""
     assert [path.name for path in EXAMPLES.iterdir() if path.suffix in (".key", ".psk")] == []
 
 
-def test_environment_is_the_callers(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The process's own variables are not looked at behind the caller's back."""
+def test_environment_is_an_argument(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The loader uses only the environment that it is given, not that of the process."""
     os.rename(folder / "drone0.key", folder / "moved")
     (folder / "elsewhere").mkdir()
     os.rename(folder / "moved", folder / "elsewhere" / "drone0.key")

@@ -1,11 +1,11 @@
-"""What a new configuration changes in a running daemon."""
+"""The changes between a running daemon's configuration and a new one."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 from uavlinkd.config.errors import ConfigError, Problem
-from uavlinkd.config.model import Config, Endpoint, Peer
+from uavlinkd.config.model import Config, EndpointConfig, PeerConfig
 
 _FIXED = {
     "name": "name",
@@ -18,39 +18,39 @@ _FIXED = {
     "recording": "recording",
     "key_grace_s": "key_grace_s",
 }
-"""Of the configuration, what is set for as long as the daemon runs; and the key that a person finds in the file."""
+"""Fields that cannot change while the daemon runs, with the key of each in the file."""
 _NEEDS_RESTART = "cannot change while the daemon runs: restart it, or put the old value back"
 
 
 @dataclass(frozen=True, slots=True)
-class Changes:
-    """Peers and endpoints that come, go, or get other rules. A peer whose keys or link settings change comes anew."""
+class ConfigChanges:
+    """Added, removed and changed peers and endpoints. A peer with new keys or link settings is removed and added."""
 
     removed_peers: tuple[str, ...]
-    added_peers: tuple[Peer, ...]
-    changed_peers: tuple[Peer, ...]
+    added_peers: tuple[PeerConfig, ...]
+    changed_peers: tuple[PeerConfig, ...]
     closed_endpoints: tuple[str, ...]
-    opened_endpoints: tuple[Endpoint, ...]
-    changed_endpoints: tuple[Endpoint, ...]
+    opened_endpoints: tuple[EndpointConfig, ...]
+    changed_endpoints: tuple[EndpointConfig, ...]
 
     def summary(self) -> dict[str, list[str]]:
-        """Names, for a log; kinds of change that there are none of are left out."""
+        """Names by kind of change, for a log, without kinds that did not occur."""
         named = {
             "peers_removed": list(self.removed_peers),
-            "peers_added": [each.name for each in self.added_peers],
-            "peers_changed": [each.name for each in self.changed_peers],
+            "peers_added": [peer.name for peer in self.added_peers],
+            "peers_changed": [peer.name for peer in self.changed_peers],
             "endpoints_closed": list(self.closed_endpoints),
-            "endpoints_opened": [each.name for each in self.opened_endpoints],
-            "endpoints_changed": [each.name for each in self.changed_endpoints],
+            "endpoints_opened": [endpoint.name for endpoint in self.opened_endpoints],
+            "endpoints_changed": [endpoint.name for endpoint in self.changed_endpoints],
         }
         return {kind: names for kind, names in named.items() if names}
 
 
-def compare(old: Config, new: Config) -> Changes:
-    """What to do to a daemon that runs with ``old`` so that it runs with ``new``.
+def compare(old: Config, new: Config) -> ConfigChanges:
+    """The changes that make a daemon that runs with ``old`` run with ``new``.
 
     Raises:
-        ConfigError: where only a restart can do it; every such key is named.
+        ConfigError: every key whose change needs a restart.
     """
     fixed = tuple(
         Problem(str(new.path), key, _NEEDS_RESTART)
@@ -59,12 +59,12 @@ def compare(old: Config, new: Config) -> Changes:
     )
     if new.previous_private_key not in (None, old.previous_private_key):
         fixed += (Problem(str(new.path), "previous_private_key_file", _NEEDS_RESTART),)
-    endpoints_before = {each.name: each for each in old.endpoints}
-    endpoints_now = {each.name: each for each in new.endpoints}
+    endpoints_before = {endpoint.name: endpoint for endpoint in old.endpoints}
+    endpoints_now = {endpoint.name: endpoint for endpoint in new.endpoints}
     same_endpoints = [
         name
-        for name, each in endpoints_now.items()
-        if name in endpoints_before and endpoints_before[name].url == each.url
+        for name, endpoint in endpoints_now.items()
+        if name in endpoints_before and endpoints_before[name].url == endpoint.url
     ]
     fixed += tuple(
         Problem(str(new.path), f"endpoint.max_age_s ({name})", _NEEDS_RESTART)
@@ -73,25 +73,25 @@ def compare(old: Config, new: Config) -> Changes:
     )
     if fixed:
         raise ConfigError(fixed)
-    peers_before = {each.name: each for each in old.peers}
-    peers_now = {each.name: each for each in new.peers}
+    peers_before = {peer.name: peer for peer in old.peers}
+    peers_now = {peer.name: peer for peer in new.peers}
     same_peers = {
         name
-        for name, each in peers_now.items()
-        if name in peers_before and _is_accepted_already(each, peers_before[name])
+        for name, peer in peers_now.items()
+        if name in peers_before and _is_accepted_already(peer, peers_before[name])
     }
-    return Changes(
+    return ConfigChanges(
         removed_peers=tuple(name for name in peers_before if name not in same_peers),
-        added_peers=tuple(each for name, each in peers_now.items() if name not in same_peers),
+        added_peers=tuple(peer for name, peer in peers_now.items() if name not in same_peers),
         changed_peers=tuple(peers_now[name] for name in same_peers if peers_now[name] != peers_before[name]),
         closed_endpoints=tuple(name for name in endpoints_before if name not in same_endpoints),
-        opened_endpoints=tuple(each for name, each in endpoints_now.items() if name not in same_endpoints),
+        opened_endpoints=tuple(endpoint for name, endpoint in endpoints_now.items() if name not in same_endpoints),
         changed_endpoints=tuple(
             endpoints_now[name] for name in same_endpoints if endpoints_now[name] != endpoints_before[name]
         ),
     )
 
 
-def _is_accepted_already(peer: Peer, before: Peer) -> bool:
-    """Whether a link made for ``before`` takes this peer by every key that it may have now."""
+def _is_accepted_already(peer: PeerConfig, before: PeerConfig) -> bool:
+    """Whether a link made for ``before`` accepts this peer with every key that it may have now."""
     return peer.settings == before.settings and peer.previous_public_key in (None, before.previous_public_key)

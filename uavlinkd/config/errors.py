@@ -1,4 +1,4 @@
-"""What is told of a configuration that is wrong."""
+"""The problems of an invalid configuration."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 
 class Problem(NamedTuple):
-    """One thing that is wrong: in which file, under which key (empty: the file itself), and what to do."""
+    """One problem: its file, its key (empty: the file itself), what is wrong and what to do."""
 
     file: str
     key: str
@@ -17,7 +17,7 @@ class Problem(NamedTuple):
 
 
 class ConfigError(Exception):
-    """Every problem of a file. ``str()`` gives one a line."""
+    """Every problem of a file. ``str()`` has one line for each."""
 
     def __init__(self, problems: tuple[Problem, ...]) -> None:
         super().__init__(problems)

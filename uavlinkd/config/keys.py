@@ -1,6 +1,6 @@
 """Keys as files: 32 bytes in base64 on one line, as WireGuard's ``genkey``, ``pubkey`` and ``genpsk`` write.
 
-Nothing here repeats what a file holds, not even in part: a message about a key names the file.
+No message repeats the content of a key file, not even in part: a message about a key names the file.
 """
 
 from __future__ import annotations
@@ -23,7 +23,10 @@ KEY_TEXT_LENGTH = 44
 CREDENTIALS = "CREDENTIALS_DIRECTORY"
 """The environment variable in which systemd names the folder with a service's keys."""
 _READ_LIMIT = 256
-"""Bytes read of a key file: enough to see that there is more than a key."""
+"""Bytes read of a key file: enough to detect that it contains more than a key."""
+_HAS_OWNERS = hasattr(os, "geteuid")
+"""Files have owners and modes, and folders can be synced. Windows has none of this, and no flags for these files."""
+_NONBLOCK, _CLOEXEC = getattr(os, "O_NONBLOCK", 0), getattr(os, "O_CLOEXEC", 0)
 _FIELD_PRIME = 2**255 - 19
 """The field of X25519 (RFC 7748, section 4.1)."""
 
@@ -35,12 +38,24 @@ class KeyFileError(Exception):
 def generate_private_key() -> str:
     """A new private key, from the operating system's generator.
 
-    The bits that X25519 sets and clears in any case (RFC 7748, section 5) are so already, as ``wg genkey`` has it.
+    The bits that X25519 sets and clears (RFC 7748, section 5) are set and cleared already, as by ``wg genkey``. One
+    of 16 public keys has such bits too. Then another pair is made, so that :func:`looks_private` distinguishes every
+    private key from every public key.
     """
-    key = bytearray(secrets.token_bytes(KEY_BYTES))
-    key[0] &= 248
-    key[31] = key[31] & 127 | 64
-    return encode_key(bytes(key))
+    while True:
+        key = bytearray(secrets.token_bytes(KEY_BYTES))
+        key[0] &= 248
+        key[31] = key[31] & 127 | 64
+        if not looks_private(x25519_public_key(bytes(key))):
+            return encode_key(bytes(key))
+
+
+def looks_private(key: bytes) -> bool:
+    """Whether a key has the fixed bits of a private key of ``uavlinkd keygen`` or ``wg genkey``.
+
+    No public key of ``uavlinkd keygen`` has them, and one of 16 public keys of other software.
+    """
+    return key[0] & 7 == 0 and key[31] & 0xC0 == 0x40
 
 
 def generate_psk() -> str:
@@ -52,7 +67,7 @@ def public_key_text(private_text: str) -> str:
     """The public key of a private key, both in base64.
 
     Raises:
-        ValueError: the text is no key; the message does not repeat it.
+        ValueError: the text is not a key; the message does not repeat it.
     """
     return encode_key(x25519_public_key(decode_key(private_text)))
 
@@ -65,8 +80,8 @@ def encode_key(key: bytes) -> str:
 def decode_key(text: str) -> bytes:
     """The 32 bytes of a key in base64. A newline or spaces around it do not matter.
 
-    Only the one spelling that WireGuard writes is taken: Python's decoder would also take loose bits at the
-    end, and two spellings of a key would count as two keys.
+    Only the spelling that WireGuard writes is accepted. Python's decoder also accepts unused bits at the end, and
+    then two spellings of a key would count as two keys.
 
     Raises:
         ValueError: with a message that does not repeat the text.
@@ -77,30 +92,30 @@ def decode_key(text: str) -> bytes:
     except (binascii.Error, ValueError):
         key = b""
     if len(key) != KEY_BYTES or encode_key(key) != stripped:
-        raise ValueError(f"is no key: one has {KEY_TEXT_LENGTH} characters of base64, the last of them =")
+        raise ValueError(f"is not a key: a key has {KEY_TEXT_LENGTH} characters of base64 and ends in =")
     return key
 
 
 def is_canonical_public_key(public: bytes) -> bool:
-    """Whether X25519 could have given these bytes: a number below the field's prime.
+    """Whether X25519 can return these bytes: a number below the field's prime.
 
-    Larger ones are taken modulo the prime, so the same point would have a second name.
+    X25519 reduces larger numbers modulo the prime, so the same point would have two encodings.
     """
     return int.from_bytes(public, "little") < _FIELD_PRIME
 
 
 def short_form(public: bytes) -> str:
-    """The first characters of a public key, by which a person knows it again."""
+    """The first characters of a public key, by which a person recognises it."""
     return encode_key(public)[:8] + "..."
 
 
 def write_secret_file(path: Path, text: str) -> None:
-    """Write a key to a new file that its owner alone may read, safe against a power cut.
+    """Write a key to a new file that only its owner may read, and sync it to the disk.
 
     Raises:
-        KeyFileError: the file exists (a key is never overwritten), or could not be written.
+        KeyFileError: the file exists (a key is never overwritten), or cannot be written.
     """
-    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | _CLOEXEC
     try:
         descriptor = os.open(path, flags, 0o600)
     except FileExistsError:
@@ -109,14 +124,16 @@ def write_secret_file(path: Path, text: str) -> None:
         raise KeyFileError(f"{path}: cannot be made: {error.strerror}") from None
     try:
         with os.fdopen(descriptor, "w", encoding="ascii") as file:
-            # Against a umask that takes the owner's rights too.
-            os.fchmod(file.fileno(), 0o600)
+            # A umask could remove the owner's rights too.
+            if _HAS_OWNERS:
+                os.fchmod(file.fileno(), 0o600)
             file.write(text.strip() + "\n")
             file.flush()
             os.fsync(file.fileno())
-        _sync_folder(path.parent)
+        if _HAS_OWNERS:
+            _sync_folder(path.parent)
     except BaseException as error:
-        # Half a key is worse than none: the next try would find a file in its way.
+        # Delete half a key: otherwise the next attempt would refuse to overwrite it.
         with suppress(OSError):
             path.unlink()
         if isinstance(error, OSError):
@@ -125,8 +142,8 @@ def write_secret_file(path: Path, text: str) -> None:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Make the new name itself last."""
-    descriptor = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
+    """Sync the directory entry of a new file."""
+    descriptor = os.open(folder, os.O_RDONLY | _CLOEXEC)
     try:
         os.fsync(descriptor)
     finally:
@@ -134,36 +151,36 @@ def _sync_folder(folder: Path) -> None:
 
 
 def find_secret_file(name: str, folder: Path, environ: Mapping[str, str]) -> tuple[Path, bool]:
-    """Where a key file is, and whether it is a systemd credential.
+    """The path of a key file, and whether it is a systemd credential.
 
-    A credential of that name is taken first (systemd.exec(5), LoadCredential=), or one that systemd found in a folder
-    handed over as ``keys``, which it calls ``keys_NAME``; its name has no folder in it. Else ``name`` is relative to
-    ``folder``.
+    A credential with that name comes first (systemd.exec(5), LoadCredential=). Then comes ``keys_NAME``, systemd's
+    name for a file in a folder that it loads as ``keys``. A credential's name contains no folder. Otherwise ``name``
+    is relative to ``folder``.
     """
     path = folder / name
     credentials = environ.get(CREDENTIALS, "")
     if credentials and name not in (".", "..") and "/" not in name:
-        for each in (name, f"keys_{name}"):
-            credential = Path(credentials) / each
+        for credential_name in (name, f"keys_{name}"):
+            credential = Path(credentials) / credential_name
             if os.path.lexists(credential):
                 return credential, True
     return path, False
 
 
 def read_secret_file(path: Path, *, credential: bool = False) -> Secret:
-    """The key in a regular file of this process's user or of root, to which no other user has a right.
+    """The key in a regular file of this process's user or of root that no other user may access.
 
     A file's owner can always change it and its mode, so a key file of another user is refused (as by sshd).
 
-    ``credential``: systemd grants a service its credentials through an access list, whose mask shows as the
-    group's right to read. In the service's own folder that is no exposure, so it is let pass there.
+    ``credential``: systemd grants a service its credentials through an access control list, whose mask appears as
+    the group's right to read. The folder is the service's own, so this right is allowed there.
 
     Raises:
         KeyFileError: with the remedy.
     """
     try:
-        # O_NONBLOCK: opening a pipe must not wait for its writer. The checks are made on what was opened.
-        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+        # O_NONBLOCK: opening a pipe must not wait for its writer. The checks apply to the opened file.
+        descriptor = os.open(path, os.O_RDONLY | _NONBLOCK | _CLOEXEC)
     except FileNotFoundError:
         raise KeyFileError(f"{path}: no such file") from None
     except (OSError, ValueError) as error:
@@ -173,11 +190,8 @@ def read_secret_file(path: Path, *, credential: bool = False) -> Secret:
         status = os.fstat(descriptor)
         if not stat.S_ISREG(status.st_mode):
             raise KeyFileError(f"{path}: is not a regular file")
-        if status.st_uid not in (0, os.geteuid()):
-            raise KeyFileError(f"{path}: {_owned_by_another(path, status.st_uid)}")
-        allowed = 0o740 if credential else 0o700
-        if excess := stat.S_IMODE(status.st_mode) & 0o777 & ~allowed:
-            raise KeyFileError(f"{path}: {_who(excess)}: run `chmod 600 {shlex.quote(str(path))}`")
+        if _HAS_OWNERS:
+            _check_access(path, status, 0o740 if credential else 0o700)
         content = os.read(descriptor, _READ_LIMIT)
     except OSError as error:
         raise KeyFileError(f"{path}: cannot be read: {error.strerror}") from None
@@ -186,21 +200,28 @@ def read_secret_file(path: Path, *, credential: bool = False) -> Secret:
     try:
         key = decode_key(content.decode("ascii", errors="replace"))
     except ValueError as error:
-        raise KeyFileError(f"{path}: {error}; nothing else may be in the file") from None
+        raise KeyFileError(f"{path}: {error}; the file may contain only the key") from None
     if not any(key):
-        raise KeyFileError(f"{path}: is all zeros, a key that everybody knows: make another")
+        raise KeyFileError(f"{path}: is all zeros, a key that everyone knows: make another")
     return Secret(key)
+
+
+def _check_access(path: Path, status: os.stat_result, allowed: int) -> None:
+    if status.st_uid not in (0, os.geteuid()):
+        raise KeyFileError(f"{path}: {_owned_by_another(path, status.st_uid)}")
+    if excess := stat.S_IMODE(status.st_mode) & 0o777 & ~allowed:
+        raise KeyFileError(f"{path}: {_excess_text(excess)}: run `chmod 600 {shlex.quote(str(path))}`")
 
 
 def _owned_by_another(path: Path, owner: int) -> str:
     quoted = shlex.quote(str(path))
     return (
-        f"belongs to another user (uid {owner}), who can read and replace it: if the key is known to be yours, run"
-        f" `chown {os.geteuid()} {quoted}` as root, or this command as that user"
+        f"belongs to another user (uid {owner}), who can read and replace it: if you are sure that the key is yours,"
+        f" run `chown {os.geteuid()} {quoted}` as root, or run this command as that user"
     )
 
 
-def _who(excess: int) -> str:
-    whom = " and ".join(name for name, bits in (("its group", 0o070), ("others", 0o007)) if excess & bits)
-    what = "read" if excess & 0o044 else "change" if excess & 0o022 else "execute"
-    return f"{whom} may {what} it"
+def _excess_text(excess: int) -> str:
+    users = " and ".join(name for name, bits in (("its group", 0o070), ("others", 0o007)) if excess & bits)
+    right = "read" if excess & 0o044 else "change" if excess & 0o022 else "execute"
+    return f"{users} may {right} it"

@@ -1,19 +1,19 @@
-"""Reading a configuration file: TOML, then each section, then what lies between them, then the key files."""
+"""Reading a configuration file: TOML, then each section and its key files, then the rules between sections."""
 
 from __future__ import annotations
 
 import os
-import re
 import shlex
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from uavlinkd.config import checks, policies
+from uavlinkd.config import checks, pasted_keys, policies
 from uavlinkd.config.advice import advice
 from uavlinkd.config.errors import ConfigError, Problem
-from uavlinkd.config.model import Config, Endpoint, Log, Peer, Recording, Routing
+from uavlinkd.config.keys import CREDENTIALS, KeyFileError, find_secret_file, read_secret_file
+from uavlinkd.config.model import Config, EndpointConfig, Log, PeerConfig, Recording, Routing
 from uavlinkd.config.pace import verify_interval_s
 from uavlinkd.config.problems import Problems, Values
 from uavlinkd.config.schema import (
@@ -27,19 +27,21 @@ from uavlinkd.config.schema import (
     RoutingSection,
     Section,
 )
+from uavlinkd.config.syntax import at, syntax_problem
 from uavlinkd.core.crypto import Secret, x25519_public_key
 from uavlinkd.core.settings import Link, PeerSettings, Timers
-from uavlinkd.config.keys import CREDENTIALS, KeyFileError, find_secret_file, read_secret_file
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
+from uavlinkd.system.threads import Threads
 
 _MAX_FILE_BYTES = 1 << 20
+_THREAD = Threads(1, "configuration")
 
 
 def load_config(path: Path, environ: Mapping[str, str]) -> Config:
-    """The configuration in a file. Of ``environ``, only ``CREDENTIALS_DIRECTORY`` is looked at.
+    """The configuration in a file. Of ``environ``, only ``CREDENTIALS_DIRECTORY`` is used.
 
     Raises:
-        ConfigError: with every problem of the file. Nothing is replaced by a default because it is wrong.
+        ConfigError: with every problem of the file. An invalid value never becomes a default.
     """
     table = _read_toml(path)
     problems = Problems(str(path))
@@ -60,6 +62,13 @@ def load_config(path: Path, environ: Mapping[str, str]) -> Config:
     checks.names(problems, endpoints)
     checks.names(problems, peers)
     checks.public_keys(problems, peers, public, private.reveal() if private else None)
+    pasted_keys.check(
+        problems,
+        peers,
+        private.reveal() if private else None,
+        [psk.reveal() if psk else None for psk in psks],
+        path.absolute().parent,
+    )
     checks.previous_keys(problems, top, peers, public, None if previous is None else _public(previous))
     checks.reachability(problems, top, peers)
     checks.endpoints(problems, top, endpoints)
@@ -74,46 +83,63 @@ def load_config(path: Path, environ: Mapping[str, str]) -> Config:
         if psk is not None and psk == private:
             problems.add(
                 peer.place.key("psk_file"),
-                "holds this daemon's private key, which nobody else may see: make a PSK with `uavlinkd psk`",
+                "holds this daemon's private key, which must stay secret: make a PSK with `uavlinkd psk`",
             )
     problems.raise_any()
 
     assert private is not None  # its absence is a problem, raised above
-    listen = tuple(top.good.get("listen", ()))
-    good_endpoints = tuple(map(_endpoint, endpoints))
-    good_peers = tuple(_peer(peer, psk, link) for peer, psk in zip(peers, psks, strict=True))
-    good_routing = Routing(**RoutingSection.model_construct(**routing.good).model_dump())
+    listen = tuple(top.valid.get("listen", ()))
+    endpoint_configs = tuple(map(_endpoint, endpoints))
+    peer_configs = tuple(_peer(peer, psk, link) for peer, psk in zip(peers, psks, strict=True))
+    routing_config = Routing(**RoutingSection.model_construct(**routing.valid).model_dump())
     return Config(
         path=path,
-        name=top.good["name"],
+        name=top.valid["name"],
         private_key=private,
         public_key=_public(private),
         listen=listen,
-        endpoints=good_endpoints,
-        peers=good_peers,
-        routing=good_routing,
-        control_socket=_beside(path, top.good.get("control_socket")),
-        metrics=metrics.good.get("listen"),
+        endpoints=endpoint_configs,
+        peers=peer_configs,
+        routing=routing_config,
+        control_socket=_beside(path, top.valid.get("control_socket")),
+        metrics=metrics.valid.get("listen"),
         recording=_recording(path, recording),
-        log=Log(**LogSection.model_construct(**log.good).model_dump()),
+        log=Log(**LogSection.model_construct(**log.valid).model_dump()),
         previous_private_key=previous,
-        key_grace_s=FileSection.model_construct(**top.good).key_grace_s,
-        warnings=tuple(advice(listen, good_endpoints, good_peers, good_routing, metrics.good.get("listen"))),
+        key_grace_s=FileSection.model_construct(**top.valid).key_grace_s,
+        warnings=(
+            *pasted_keys.advice(private.reveal(), peer_configs),
+            *advice(listen, endpoint_configs, peer_configs, routing_config, metrics.valid.get("listen")),
+        ),
     )
 
 
-def load_control_socket(path: Path) -> Path | None:
-    """Where the daemon of a configuration is asked, if anywhere; of the rest, nothing has to be good, or even here.
+async def load_in_thread(path: Path, environ: Mapping[str, str]) -> Config:
+    """Run :func:`load_config` in a worker thread: a slow disk or a named pipe must not stop the event loop.
+
+    If the task is cancelled, the thread ends later and its result is discarded.
 
     Raises:
-        ConfigError: the file cannot be read, or what it says of the socket is wrong.
+        ConfigError: every problem of the file, or no thread can be started now.
+    """
+    try:
+        return await _THREAD.run(load_config, path, environ)
+    except OSError as error:
+        raise ConfigError((Problem(str(path), "", f"cannot be read now: {error.strerror}: try again"),)) from None
+
+
+def load_control_socket(path: Path) -> Path | None:
+    """The control socket of a configuration, if it has one. The other keys may be invalid or missing.
+
+    Raises:
+        ConfigError: the file cannot be read, or its value for the socket is invalid.
     """
     table = _read_toml(path)
     problems = Problems(str(path))
     top = problems.read(FileSection, table, "")
-    if "control_socket" in top.bad:
+    if "control_socket" in top.invalid:
         problems.raise_any()
-    return _beside(path, top.good.get("control_socket"))
+    return _beside(path, top.valid.get("control_socket"))
 
 
 def _public(private: Secret) -> bytes:
@@ -121,36 +147,37 @@ def _public(private: Secret) -> bytes:
 
 
 def _beside(path: Path, name: str | None) -> Path | None:
-    """A file named in the configuration, which is relative to it."""
+    """The path of a file that the configuration names relative to itself."""
     return None if name is None else path.absolute().parent / name
 
 
 def _recording(path: Path, section: Values) -> Recording | None:
-    keys = RecordingSection.model_construct(**section.good)
+    keys = RecordingSection.model_construct(**section.valid)
     folder = _beside(path, keys.folder)
     if folder is None:
         return None
     return Recording(folder, keys.max_file_bytes, keys.max_files, keys.min_free_bytes)
 
 
-def _endpoint(section: Values) -> Endpoint:
-    keys = EndpointSection.model_construct(**section.good)
-    return Endpoint(
+def _endpoint(section: Values) -> EndpointConfig:
+    keys = EndpointSection.model_construct(**section.valid)
+    return EndpointConfig(
         name=keys.name,
         url=keys.url,
         policy=policies.data(section),
         max_age_s=keys.max_age_s,
         radio_status=keys.radio_status,
+        status_text=keys.status_text,
     )
 
 
-def _peer(peer: Values, psk: Secret | None, link: Values) -> Peer:
+def _peer(peer: Values, psk: Secret | None, link: Values) -> PeerConfig:
     keys = LinkSection.model_construct(**checks.inherited(link, peer))
     tag_bytes = keys.tag_bits // 8
-    return Peer(
+    return PeerConfig(
         settings=PeerSettings(
-            name=peer.good["name"],
-            public_key=peer.good["public_key"],
+            name=peer.valid["name"],
+            public_key=peer.valid["public_key"],
             psk=psk,
             link=Link(
                 suites=tuple(keys.suites),
@@ -172,8 +199,8 @@ def _peer(peer: Values, psk: Secret | None, link: Values) -> Peer:
                 verify_interval_s=verify_interval_s(keys.budget_bits_s, tag_bytes),
             ),
         ),
-        addresses=tuple(peer.good.get("addresses", ())),
-        previous_public_key=peer.good.get("previous_public_key"),
+        addresses=tuple(peer.valid.get("addresses", ())),
+        previous_public_key=peer.valid.get("previous_public_key"),
         policy=policies.data(peer),
         egress=EgressSettings(
             budget_bits_s=keys.budget_bits_s,
@@ -187,7 +214,7 @@ def _read_toml(path: Path) -> dict[str, Any]:
     """The file's tables.
 
     Raises:
-        ConfigError: it cannot be read, or is no TOML: nothing more can be said about it then.
+        ConfigError: the file cannot be read, or is not valid TOML.
     """
     try:
         with path.open("rb") as file:
@@ -196,45 +223,21 @@ def _read_toml(path: Path) -> dict[str, Any]:
         reason = error.strerror if isinstance(error, OSError) else "not a file name"
         raise ConfigError((Problem(str(path), "", f"cannot be read: {reason}"),)) from None
     if len(content) > _MAX_FILE_BYTES:
-        raise ConfigError((Problem(str(path), "", "is over a megabyte: this is no configuration"),))
+        raise ConfigError((Problem(str(path), "", "is over a megabyte: name a configuration file"),))
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = content.count(b"\n", 0, error.start) + 1
         column = error.start - content.rfind(b"\n", 0, error.start)
-        raise ConfigError((_syntax(path, line, column, "is no text in UTF-8: save the file as UTF-8"),)) from None
+        raise ConfigError((at(path, line, column, "is not text in UTF-8: save the file as UTF-8"),)) from None
     try:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:
-        raise ConfigError((_toml_problem(path, text, error),)) from None
-
-
-_AT = re.compile(r"(.*) \(at (?:line (\d+), column (\d+)|end of document)\)", re.DOTALL)
-_VALUE_HINT = "text must be in quotes, true and false in small letters"
-
-
-def _toml_problem(path: Path, text: str, error: Exception) -> Problem:
-    """Where TOML's grammar ends. Of the message, only what stands before a quotation is repeated."""
-    found = _AT.fullmatch(str(error))
-    if found is None:
-        return Problem(str(path), "", "is no TOML that can be read: a number too long, or brackets too deep")
-    lines = text.split("\n")
-    line, column = (int(found[2]), int(found[3])) if found[2] else (len(lines), len(lines[-1]) + 1)
-    message = f"is no TOML here: {_without_names(found[1])}"
-    return _syntax(path, line, column, f"{message}; {_VALUE_HINT}" if "nvalid value" in message else message)
-
-
-def _without_names(message: str) -> str:
-    """``Cannot declare ('a', 'b') twice`` quotes keys: they are left out, the line says which."""
-    return re.sub(r"\s*(\(.*\)|'.*'|\".*\")", "", message)
-
-
-def _syntax(path: Path, line: int, column: int, message: str) -> Problem:
-    return Problem(f"{path}:{line}:{column}", "", message)
+        raise ConfigError((syntax_problem(path, text, error),)) from None
 
 
 def _table(problems: Problems, table: Mapping[str, Any], key: str) -> Mapping[str, Any]:
-    """A section that stands once."""
+    """A section that a file has at most once."""
     value = table.get(key, {})
     if isinstance(value, dict):
         return value
@@ -243,7 +246,7 @@ def _table(problems: Problems, table: Mapping[str, Any], key: str) -> Mapping[st
 
 
 def _sections(problems: Problems, table: Mapping[str, Any], key: str, model: type[Section]) -> list[Values]:
-    """The sections of a kind that stands many times."""
+    """The sections of a kind that a file may have many times."""
     value = table.get(key, [])
     sections = value if isinstance(value, list) else [value]
     if sections is not value or not all(isinstance(section, dict) for section in sections):
@@ -256,8 +259,8 @@ def _sections(problems: Problems, table: Mapping[str, Any], key: str, model: typ
 
 
 def _secret(problems: Problems, section: Values, key: str, config: Path, environ: Mapping[str, str]) -> Secret | None:
-    """The key in the file that a section names, if it names one."""
-    name = section.good.get(key)
+    """The content of the key file that a section names, if it names one."""
+    name = section.valid.get(key)
     if name is None:
         return None
     path, is_credential = find_secret_file(name, config.parent, environ)
@@ -276,8 +279,8 @@ def _secret(problems: Problems, section: Values, key: str, config: Path, environ
 
 
 _FOR_A_SERVICE = (
-    "a service's keys belong into the folder that LoadCredential= names in its unit, root's and of mode 0600, "
-    "and it has a new one after a restart"
+    "put a service's keys into the folder that LoadCredential= names in its unit, owned by root and with mode 0600; "
+    "the service reads them at its next start"
 )
 
 
@@ -285,13 +288,14 @@ def _how_to_get(key: str, path: Path, config: Path) -> str:
     """The remedy for a key file that is not there."""
     where = shlex.quote(str(path))
     if key == "previous_private_key_file":
-        return "it holds the key before this one; where that is lost, delete this line"
+        return "it holds the previous key; if that is lost, delete this line"
     if key == "psk_file":
-        remedy = f"it is the same as the peer's: copy that, or, on one of the two, `uavlinkd psk --out {where}`"
+        remedy = f"copy it from the peer, or make it on one of the two with `uavlinkd psk --out {where}`"
     else:
         remedy = f"make it with `uavlinkd keygen --out {where}`"
-    # Where the units have the keys of a configuration that names them as if they stood beside it.
+    # Folders where the systemd units look for key files that the configuration names without a folder.
     for folder in (config.parent / "keys", config.with_suffix("")):
         if folder.is_dir():
-            return f"{remedy}; or is it a service's? Then add `--keys {shlex.quote(str(folder))}` to `uavlinkd check`"
+            option = f"--keys {shlex.quote(str(folder))}"
+            return f"{remedy}; for a service's configuration, add `{option}` to `uavlinkd check`"
     return remedy

@@ -1,4 +1,4 @@
-"""A configuration that was found good: checked, inherited and loaded, with nothing left to look up."""
+"""A valid configuration: checked, with inherited values and the content of its key files."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Literal
 
-from uavlinkd.system.addresses import Address
 from uavlinkd.core.crypto import Secret
 from uavlinkd.core.settings import PeerSettings
 from uavlinkd.endpoints.url import EndpointUrl
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
 from uavlinkd.mavlink.policy.compilation import Policy, compile_policy
+from uavlinkd.system.addresses import Address
 
 PolicyData = Mapping[str, object]
-"""A policy as plain data, which cannot change: :mod:`uavlinkd.mavlink.policy.compilation` says what the keys mean."""
+"""A policy as immutable plain data. :mod:`uavlinkd.mavlink.policy.compilation` documents its keys."""
 
 
 def _trust_all() -> PolicyData:
@@ -24,11 +24,12 @@ def _trust_all() -> PolicyData:
 
 
 @dataclass(frozen=True, slots=True)
-class Endpoint:
+class EndpointConfig:
     """A local MAVLink port.
 
-    ``max_age_s``: a frame that waited longer for the port to take it is dropped. ``radio_status``: whether this
-    daemon tells the program there how the link is, by a RADIO_STATUS a second.
+    ``max_age_s``: a frame that waited longer for the port is dropped. ``radio_status``: whether this daemon reports
+    the state of the link to the client there, by a RADIO_STATUS every second. ``status_text``: whether it reports
+    lost links and withheld commands to the pilot there.
     """
 
     name: str
@@ -36,6 +37,7 @@ class Endpoint:
     policy: PolicyData = field(default_factory=_trust_all)
     max_age_s: float = 1.0
     radio_status: bool = False
+    status_text: bool = False
 
     def make_policy(self) -> Policy:
         """A new policy: its counters at zero, its rates unused."""
@@ -43,10 +45,10 @@ class Endpoint:
 
 
 @dataclass(frozen=True, slots=True)
-class Peer:
-    """Another daemon: what the core needs of it, and where it is called. Without addresses, it calls.
+class PeerConfig:
+    """Another daemon: its settings in the core, and its addresses. Without addresses, the peer initiates.
 
-    ``previous_public_key``: what its key was, while it changes.
+    ``previous_public_key``: its old key, while the key changes.
     """
 
     settings: PeerSettings
@@ -57,7 +59,7 @@ class Peer:
 
     @property
     def name(self) -> str:
-        """What the peer is called here; unique among the peers."""
+        """The name of the peer in this configuration, unique among the peers."""
         return self.settings.name
 
     def make_policy(self) -> Policy:
@@ -67,9 +69,9 @@ class Peer:
 
 @dataclass(frozen=True, slots=True)
 class Routing:
-    """``relay``: whether what comes from a peer may go to other peers.
+    """``relay``: whether frames from a peer may go to other peers.
 
-    ``unknown_targets``: where a frame goes whose target was never heard. ``flood``: to every other port, as a network
+    ``unknown_targets``: where a frame goes whose target was never seen. ``flood``: to every other port, as a network
     switch does; ``drop``: nowhere.
     """
 
@@ -79,9 +81,9 @@ class Routing:
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """Where what crosses the link is kept, in files of up to ``max_file_bytes``, the newest ``max_files`` of them.
+    """Recordings of the frames on the link: the newest ``max_files`` files of up to ``max_file_bytes``.
 
-    ``min_free_bytes`` of the disk are left to others.
+    ``min_free_bytes``: free space to keep on the disk.
     """
 
     folder: Path
@@ -100,10 +102,10 @@ class Log:
 
 @dataclass(frozen=True, slots=True)
 class Config:
-    """Everything that a daemon is told. Secrets in it do not print.
+    """The complete configuration of a daemon. Its secrets do not print.
 
-    ``listen`` is empty where the daemon only calls. ``metrics`` is where Prometheus is answered. ``warnings`` are
-    sentences for a person: nothing in them keeps the daemon from running. Previous keys are good for
+    ``listen`` is empty if the daemon only initiates. ``metrics`` is the address of the server for Prometheus.
+    ``warnings`` are sentences for a person; the daemon runs in spite of them. Previous keys are valid for
     ``key_grace_s``, or until the new ones are confirmed.
     """
 
@@ -112,8 +114,8 @@ class Config:
     private_key: Secret
     public_key: bytes
     listen: tuple[Address, ...]
-    endpoints: tuple[Endpoint, ...]
-    peers: tuple[Peer, ...]
+    endpoints: tuple[EndpointConfig, ...]
+    peers: tuple[PeerConfig, ...]
     routing: Routing
     control_socket: Path | None
     metrics: Address | None

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from typing import Final
 
-from uavlinkd.system.addresses import IPV6_UDP_BYTES
 from uavlinkd.core import constants as c
 from uavlinkd.core import wire
+from uavlinkd.system.addresses import IPV6_UDP_BYTES
 
 VERIFYING_SHARE: Final = 0.05
 """Share of the budget that the echo requests and replies of one end may use."""
 
 
 def verify_interval_s(budget_bits_s: int, tag_bytes: int) -> float:
-    """Seconds between two echo requests, at least :data:`c.VERIFY_INTERVAL_S`; a budget of 0 is no limit.
+    """Seconds between two echo requests, at least :data:`c.VERIFY_INTERVAL_S`. A budget of 0 means unlimited.
 
-    Counted are the request and its reply, with the long header and over IPv6: the most that they can take.
+    The request and its reply count, with the long header and over IPv6: their largest size.
     """
     if not budget_bits_s:
         return c.VERIFY_INTERVAL_S

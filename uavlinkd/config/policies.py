@@ -11,8 +11,8 @@ from uavlinkd.config.problems import Problems, Values
 from uavlinkd.config.schema import PolicySection
 from uavlinkd.mavlink.policy.compilation import PolicyError, compile_policy
 
-# A policy's messages repeat what was written, so that a person finds it: a group, a message, a command, a number.
-# Whatever else stands there may be a secret, or control a terminal, or have a million digits.
+# A policy's messages repeat a group, a message, a command or a number, so that a person can search for it.
+# Any other text may be a secret, or control a terminal, or have a million digits.
 _WORD = re.compile(r"[A-Za-z0-9_:. -]{1,32}|[A-Z][A-Z0-9_]{0,55}|command:[A-Z0-9_]{1,55}")
 _MOST = 2**63
 _HIDDEN = "…"
@@ -21,31 +21,31 @@ _HIDDEN = "…"
 def data(section: Values) -> PolicyData:
     """The section's policy, as data that cannot change and that messages may repeat."""
     return MappingProxyType(
-        {key: _frozen(key, value) for key, value in section.good.items() if key in PolicySection.model_fields}
+        {key: _frozen(key, value) for key, value in section.valid.items() if key in PolicySection.model_fields}
     )
 
 
 def check(problems: Problems, section: Values, *, is_local: bool) -> None:
-    """Note whatever is wrong in the section's policy."""
+    """Add every problem of the section's policy."""
     try:
         compile_policy(data(section), is_local=is_local)
     except PolicyError as error:
-        for found in error.problems:
-            problems.add(section.place.key(found.key), f"{found.problem}; {found.remedy}")
+        for problem in error.problems:
+            problems.add(section.place.key(problem.key), f"{problem.problem}; {problem.remedy}")
 
 
 def _frozen(key: str, value: Any) -> object:
     if key == "system_ids" and value == ["all"]:
-        return "all"  # two ways to write one thing
+        return "all"  # two spellings of one value
     if isinstance(value, list):
         return tuple(map(_leaf, value))
     if isinstance(value, dict):
-        return MappingProxyType({_leaf(key): _leaf(each) for key, each in value.items()})
+        return MappingProxyType({_leaf(key): _leaf(item) for key, item in value.items()})
     return _leaf(value)
 
 
 def _leaf(value: Any) -> object:
-    """One word or number. Anything else is none that a policy knows, and so is what stands for it."""
+    """One word or number. Any other value becomes a placeholder, which a policy does not know either."""
     if isinstance(value, str):
         return value if _WORD.fullmatch(value) else _HIDDEN
     if isinstance(value, float) or (isinstance(value, int) and abs(value) < _MOST):

@@ -1,7 +1,7 @@
-"""What is wrong in a configuration file, said to the person who wrote it.
+"""Problems of a configuration file, for the person who wrote it.
 
-A message gives the file, the key, what is wrong and what to write instead. It never repeats a value: what stands
-in the wrong place may be a secret.
+A message names the file, the key, the problem and what to write instead. It never repeats a value: a value in
+the wrong place may be a secret.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from uavlinkd.config.schema import (
 )
 
 
-class Place(NamedTuple):
-    """A section of the file: ``peer[1]``, and the name that was given to it there."""
+class SectionName(NamedTuple):
+    """A section of the file: ``peer[1]``, and the name that it has there."""
 
     section: str
     name: str = ""
@@ -42,11 +42,11 @@ class Place(NamedTuple):
 
 
 class Values(NamedTuple):
-    """What a section gives and is good, by key; and the keys whose values are not."""
+    """The valid values of a section by key, and the keys whose values are invalid."""
 
-    place: Place
-    good: dict[str, Any]
-    bad: frozenset[str]
+    place: SectionName
+    valid: dict[str, Any]
+    invalid: frozenset[str]
 
 
 class Problems:
@@ -57,30 +57,30 @@ class Problems:
         self._found: list[Problem] = []
 
     def add(self, key: str, message: str) -> None:
-        """Note one."""
+        """Add one problem."""
         self._found.append(Problem(self._file, key, message))
 
     def raise_any(self) -> None:
-        """Raise ConfigError, unless there is none."""
+        """Raise ConfigError if there is a problem."""
         if self._found:
             raise ConfigError(tuple(self._found))
 
     def read(self, model: type[Section], table: Mapping[str, Any], section: str) -> Values:
-        """Check one section by its model and note what is wrong in it."""
-        good: dict[str, Any] = {}
-        bad: set[str] = set()
+        """Check one section by its model and add its problems."""
+        valid: dict[str, Any] = {}
+        invalid: set[str] = set()
         try:
-            model.model_validate(table, context=good)
+            model.model_validate(table, context=valid)
         except ValidationError as error:
-            place = Place(section, good.get("name", "") if section else "")
+            place = SectionName(section, valid.get("name", "") if section else "")
             for details in error.errors(include_url=False, include_input=False):
-                bad.add(str(details["loc"][0]))
+                invalid.add(str(details["loc"][0]))
                 self.add(place.key(_path(details["loc"])), _message(details, model))
-        # A list with one bad item is not kept, but a key may have been kept before a check of all of it.
+        # The context has no list with an invalid item, but it may have a value that a later check refused.
         return Values(
-            Place(section, good.get("name", "") if section else ""),
-            {key: value for key, value in good.items() if key not in bad},
-            frozenset(bad),
+            SectionName(section, valid.get("name", "") if section else ""),
+            {key: value for key, value in valid.items() if key not in invalid},
+            frozenset(invalid),
         )
 
 
@@ -88,7 +88,7 @@ _BARE_KEY = re.compile(r"[A-Za-z0-9_-]{1,32}")
 
 
 def _path(location: tuple[int | str, ...]) -> str:
-    """``suites[0]``. A key that is no plain word is not repeated: it may be a secret, or control a terminal."""
+    """``suites[0]``. Only a plain word is repeated: another key may be a secret, or control a terminal."""
     parts = [
         f"[{part}]" if isinstance(part, int) else part if _BARE_KEY.fullmatch(part) else "…" for part in location
     ]
@@ -96,7 +96,7 @@ def _path(location: tuple[int | str, ...]) -> str:
 
 
 def _message(details: ErrorDetails, model: type[Section]) -> str:
-    """What is wrong and what to write, in our words for each kind of error that the schema can give."""
+    """The problem and its remedy, for each kind of error that the schema can raise."""
     key = str(details["loc"][0])
     context = details.get("ctx", {})
     match details["type"]:
@@ -107,7 +107,7 @@ def _message(details: ErrorDetails, model: type[Section]) -> str:
         case "value_error":
             return str(context["error"])
         case "bool_type":
-            # Who writes the key wants what is not the default.
+            # A person who writes the key wants another value than the default.
             other = str(not model.model_fields[key].default).lower()
             return f"must be true or false, without quotes: write {key} = {other}"
         case "int_type":
@@ -124,12 +124,12 @@ def _message(details: ErrorDetails, model: type[Section]) -> str:
             return f"must be {context['expected']}"
         case "list_type":
             return f"must be a list: write {key} = {_example(model, key)}"
-        case _:  # a kind of error that the schema does not give today
+        case _:  # a kind of error that the schema does not raise today
             return f"cannot be used: write {key} = {_example(model, key)}"
 
 
 def _number(limit: object) -> str:
-    """As it can be written: a whole number stays one."""
+    """As text for the file: a whole number has no decimal point."""
     return f"{limit:g}" if isinstance(limit, float) else str(limit)
 
 
@@ -139,6 +139,30 @@ def _example(model: type[Section], key: str) -> str:
     if field.examples:
         return str(field.examples[0])
     return f"{field.default:g}"
+
+
+# The policy's keys are checked by the policy itself, so the schema has no examples of them.
+_EXAMPLES = {
+    "role": '"swarm-member"',
+    "system_ids": "[2]",
+    **dict.fromkeys(("allow_in", "deny_in", "allow_out", "deny_out"), '["heartbeat", "telemetry"]'),
+    **dict.fromkeys(("rate_in", "rate_out"), "{ ATTITUDE = 10 }"),
+    **dict.fromkeys(("mavlink1", "ground_station"), "false"),
+}
+
+
+def example_of(key: str) -> str | None:
+    """A value of a key as it is written in TOML; None if no section has the key."""
+    if key in _EXAMPLES:
+        return _EXAMPLES[key]
+    for model in _SECTIONS.values():
+        if key in model.model_fields and (field := model.model_fields[key]).annotation is not Any:
+            if field.examples:
+                return str(field.examples[0])
+            if isinstance(field.default, bool):
+                return str(field.default).lower()
+            return f'"{field.default}"' if isinstance(field.default, str) else f"{field.default:g}"
+    return None
 
 
 _SECTIONS: dict[str, type[Section]] = {
@@ -153,12 +177,12 @@ _SECTIONS: dict[str, type[Section]] = {
     "in [recording]": RecordingSection,
 }
 
-# What WireGuard, mavlink-router and plain expectation call our keys.
+# Names that WireGuard, mavlink-router and common usage have for these keys.
 _OTHERS_CALL_IT = {
-    "private_key": "private_key_file, the name of a file that holds the key: a key never stands in this file",
+    "private_key": "private_key_file, the name of a file that holds the key: this file never contains a key",
     "key": "private_key_file, or public_key in a [[peer]]",
-    "psk": "psk_file, the name of a file that holds the key: a key never stands in this file",
-    "preshared_key": "psk_file, the name of a file that holds the key: a key never stands in this file",
+    "psk": "psk_file, the name of a file that holds the key: this file never contains a key",
+    "preshared_key": "psk_file, the name of a file that holds the key: this file never contains a key",
     "listen_port": 'listen, with an address: listen = ["0.0.0.0:5790"]',
     "port": 'listen, with an address: listen = ["0.0.0.0:5790"]',
     "persistent_keepalive": "keepalive_s, in seconds",

@@ -1,6 +1,6 @@
-"""The keys of a configuration file, with their ranges and defaults: one class a section.
+"""The keys of a configuration file, with their ranges and defaults: one class for each section.
 
-What is checked here concerns one value alone. What concerns several is in :mod:`uavlinkd.config.checks`.
+The checks here concern a single value. Checks of several values are in :mod:`uavlinkd.config.checks`.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from pydantic import (
     field_validator,
 )
 
-from uavlinkd.system.addresses import Address, parse_address
+from uavlinkd.config.keys import decode_key, is_canonical_public_key
 from uavlinkd.core import constants as c
 from uavlinkd.core.crypto import is_usable_public_key
 from uavlinkd.core.suites import SUITES_BY_NAME, X25519, Suite
 from uavlinkd.endpoints.url import EndpointUrl, parse_url
-from uavlinkd.config.keys import decode_key, is_canonical_public_key
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
+from uavlinkd.system.addresses import Address, parse_address
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}")
-# A key in base64 or hex, whole or nearly: such a thing is never repeated in a message.
+# A complete or nearly complete key in base64 or hex: no message repeats it.
 _LIKE_A_KEY = re.compile(r"[A-Za-z0-9+/_-]{40,}={0,2}")
 _FINITE_FIELD = re.compile(r"(?:modp|ffdhe?|dhe?)?[-_ ]?(\d{1,5})(?:[-_ ]?bits?)?")
 # IKE's numbers for small groups: RFC 2409 section 6, RFC 5114 section 2.1.
@@ -46,7 +46,7 @@ def _text(value: Any) -> str:
 
 
 def _name(value: Any) -> str:
-    # Names stand in logs, metrics and file names: no character in them may mean something there.
+    # Logs, metrics and file names contain names, so a name has no character with a special meaning there.
     if not _NAME.fullmatch(_text(value)):
         raise ValueError("must be a name of up to 63 letters, digits, dots, hyphens and underscores")
     return str(value)
@@ -55,7 +55,7 @@ def _name(value: Any) -> str:
 def _file_name(value: Any) -> str:
     text = _text(value)
     if _LIKE_A_KEY.fullmatch(text.strip()):
-        raise ValueError("holds a key, not the name of a file: write the key to a file of mode 0600 and name that")
+        raise ValueError("is a key, not the name of a file: write the key to a file of mode 0600 and name that file")
     if not text or not text.isprintable():
         raise ValueError('must name a file: write a name such as "drone0.key"')
     return text
@@ -68,12 +68,12 @@ def _public_key(value: Any) -> bytes:
         raise ValueError(f"{error}: write what `uavlinkd pubkey` prints on the peer") from None
     if not is_usable_public_key(key):
         raise ValueError(
-            "is a point of low order, with which everybody knows the shared secret:"
+            "is a point of low order, with which everyone knows the shared secret:"
             " write what `uavlinkd pubkey` prints on the peer"
         )
     if not is_canonical_public_key(key):
         raise ValueError(
-            "is no key that X25519 gives, perhaps a private one, which nobody else may see:"
+            "is not a public key of X25519, but perhaps a private key, which must stay secret:"
             " write what `uavlinkd pubkey` prints on the peer"
         )
     return key
@@ -90,19 +90,19 @@ def _suite(value: Any) -> Suite:
     if bits is not None and 0 < bits <= _BREAKABLE_BITS:
         raise ValueError(
             f"is a Diffie-Hellman group of {bits} bits: groups of {_BREAKABLE_BITS} bits and less are refused."
-            " One long computation in advance, within a state's reach, breaks every exchange in such a group"
-            " (Logjam, 2015), so they are there for measurements only;"
+            " One long computation in advance, which a state can afford, breaks every exchange in such a group"
+            " (Logjam, 2015), so they are for measurements only;"
             ' write "x25519", or "ffdhe2048" and above'
         )
     names = ", ".join(SUITES_BY_NAME)
-    raise ValueError(f"is no suite: write one of {names}")
+    raise ValueError(f"is not a suite: write one of {names}")
 
 
 def _suites(values: list[Suite]) -> list[Suite]:
     if not values:
         raise ValueError('must name a suite: write ["x25519"]')
     if len(set(values)) != len(values):
-        raise ValueError("names a suite twice: write each once, the one to offer first")
+        raise ValueError("names a suite twice: write each once, first the one to offer")
     return values
 
 
@@ -142,10 +142,9 @@ class Section(BaseModel):
     @field_validator("*")
     @classmethod
     def _keep(cls, value: Any, info: ValidationInfo) -> Any:
-        """Put each good value that the file gives into the context, if there is one.
+        """Put each valid value of the file into the context, if there is one.
 
-        So the checks across values can be made on what is good while something else is wrong, and every
-        problem is told at once.
+        The checks of several values use it while other values are invalid, so one run reports every problem.
         """
         if info.context is not None:
             info.context[info.field_name] = value
@@ -153,22 +152,22 @@ class Section(BaseModel):
 
 
 class LinkSection(Section):
-    """``[link]``, and the same keys in ``[[peer]]``: how peers are spoken to."""
+    """``[link]``, and the same keys in ``[[peer]]``: how to communicate with peers."""
 
     suites: Annotated[list[Annotated[Suite, PlainValidator(_suite)]], AfterValidator(_suites)] = Field(
         default=[X25519], examples=['["x25519"]']
     )
-    """Accepted, the first is offered."""
+    """Accepted suites. The first is offered."""
     confidential: bool = False
-    """Whether frames are encrypted too. Both ends use the stronger of what they ask for."""
+    """Whether frames are encrypted too. Both ends use the stronger of the two settings."""
     tag_bits: Literal[64, 96, 128, 256] = 128
-    """Length of an envelope's HMAC tag. Does not concern confidential links, whose tag has 128 bits."""
+    """Length of an envelope's HMAC tag. Confidential links always have a tag of 128 bits."""
     mac_key_bits: Literal[256, 512, 1024, 2048] = 256
     max_envelope_bytes: int = Field(
         default=c.DEFAULT_ENVELOPE_LIMIT, ge=c.MIN_ENVELOPE_LIMIT, le=c.MAX_ENVELOPE_LIMIT
     )
     """Largest datagram that carries frames. The default passes every IPv6 path (MTU 1,280 less 48 for IPv6 and
-    UDP); the least holds the largest MAVLink frame; the most fits a UDP datagram. Over the path's MTU less 48
+    UDP). The minimum holds the largest MAVLink frame; the maximum fits a UDP datagram. Above the path's MTU less 48
     (28 for IPv4) the network splits datagrams, and losing one part loses all."""
 
     keepalive_s: float = _seconds(c.KEEPALIVE_S, 0.1, 3600)
@@ -182,17 +181,17 @@ class LinkSection(Section):
     probe_interval_s: float = _seconds(c.PROBE_INTERVAL_S, 0.1, 3600)
 
     budget_bits_s: Annotated[int, AfterValidator(_budget)] = Field(default=_EGRESS.budget_bits_s, ge=0, le=10**9)
-    """At most so many bits a second go to the peer, with IP's and UDP's headers. 0: no limit."""
+    """Most bits per second to the peer, including the headers of IP and UDP. 0: no limit."""
     coalesce_s: float = _seconds(_EGRESS.coalesce_s, 0, 0.5)
-    """So long a frame may wait for others to share its envelope. 0: only with those that are there already."""
+    """How long a frame may wait for others to share its envelope. 0: it shares only with frames that already wait."""
     max_age_s: float = _seconds(_EGRESS.max_age_s, *_AGES)
-    """A frame that waited longer for its turn is dropped: nothing stale arrives."""
+    """A frame that waited longer for its turn is dropped as stale."""
 
 
 class PolicySection(Section):
-    """The keys in ``[[peer]]`` and ``[[endpoint]]`` which say what may be said there.
+    """The keys in ``[[peer]]`` and ``[[endpoint]]`` that limit messages.
 
-    They are checked together, by :func:`uavlinkd.mavlink.policy.compilation.compile_policy`, which knows what they mean.
+    :func:`uavlinkd.mavlink.policy.compilation.compile_policy` checks them together.
     """
 
     role: Any = None
@@ -217,12 +216,12 @@ class PeerSection(LinkSection, PolicySection):
     addresses: Annotated[list[Annotated[Address, PlainValidator(_peer_address)]], AfterValidator(_addresses)] = Field(
         default=[], examples=['["10.13.0.2:5790"]']
     )
-    """Where it is called. Without any, it calls."""
+    """Where this daemon reaches it. Empty: the peer initiates."""
     psk_file: FileName | None = Field(default=None, examples=['"drone0-drone1.psk"'])
     previous_public_key: Annotated[bytes, PlainValidator(_public_key)] | None = Field(
         default=None, examples=['"…", what its public key was']
     )
-    """While the peer's key changes: accepted too, until a session was made with the new one, or the grace is over."""
+    """Also accepted while the peer's key changes, until the first session with the new key or ``key_grace_s``."""
 
 
 class EndpointSection(PolicySection):
@@ -233,36 +232,38 @@ class EndpointSection(PolicySection):
         examples=['"udpin:127.0.0.1:14550"']
     )
     max_age_s: float = _seconds(_EGRESS.max_age_s, *_AGES)
-    """A frame that waited longer for a TCP connection or a serial port to take it is dropped."""
+    """A frame that waited longer for a TCP connection or a serial port is dropped."""
     radio_status: bool = False
-    """Whether a RADIO_STATUS a second, made of the link's own loss and round-trip figures, goes to this endpoint."""
+    """Whether this endpoint gets a RADIO_STATUS every second, from the link's own loss and round-trip figures."""
+    status_text: bool = False
+    """Whether this endpoint gets a STATUSTEXT when a link is lost or restored, or a command is withheld."""
 
 
 class RoutingSection(Section):
     """``[routing]``."""
 
     relay: bool = False
-    """Whether what comes from a peer may go to other peers."""
+    """Whether frames from a peer may go to other peers."""
     unknown_targets: Literal["flood", "drop"] = "flood"
-    """Where a frame goes whose target was never heard: to every other port, or nowhere."""
+    """Where a frame goes whose target was never seen: to every other port, or nowhere."""
 
 
 class MetricsSection(Section):
     """``[metrics]``."""
 
     listen: ListenAddress | None = Field(default=None, examples=['"127.0.0.1:9790"'])
-    """Where Prometheus is answered, over HTTP. None unless named."""
+    """Where the daemon serves metrics to Prometheus, over HTTP. Off by default."""
 
 
 class RecordingSection(Section):
     """``[recording]``."""
 
     folder: FileName | None = Field(default=None, examples=['"recordings"'])
-    """Where what crosses the link is kept as telemetry logs. Relative to the file; nothing is kept unless named."""
+    """Folder for telemetry logs of the frames on the link, relative to the file. Off by default."""
     max_file_bytes: int = Field(default=64_000_000, ge=10_000, le=10**12, examples=["64_000_000"])
     max_files: int = Field(default=100, ge=2, le=100_000)
     min_free_bytes: int = Field(default=1_000_000_000, ge=100_000, le=10**15, examples=["1_000_000_000"])
-    """So much of the disk is left to others: rather than that, the oldest recordings are deleted."""
+    """Free space to keep on the disk: the daemon deletes the oldest recordings for it."""
 
 
 class LogSection(Section):
@@ -273,18 +274,18 @@ class LogSection(Section):
 
 
 class FileSection(Section):
-    """The top of the file. Its sections are read one by one, so that each problem has its place."""
+    """The top of the file. Its sections are read one by one, so that each problem names its section."""
 
     name: Name = Field(examples=['"drone0"'])
     private_key_file: FileName = Field(examples=['"drone0.key"'])
     listen: list[ListenAddress] = Field(default=[], examples=['["0.0.0.0:5790"]'])
-    """Where peers reach this daemon. Without any, it only calls."""
+    """Where peers reach this daemon. Empty: it only initiates."""
     previous_private_key_file: FileName | None = Field(default=None, examples=['"drone0.previous.key"'])
-    """While this daemon's key changes: peers that do not know the new one yet are linked by this."""
+    """The old key while this daemon's key changes, for peers that do not know the new one yet."""
     key_grace_s: float = _seconds(_KEY_GRACE_S, 1, 365 * 24 * 3600)
-    """So long previous keys are good, from when the daemon has them: read at its start, or in a reload."""
+    """How long previous keys stay valid after the start or reload in which the daemon read them."""
     control_socket: FileName | None = Field(default=None, examples=['"drone0.sock"'])
-    """A Unix socket on which the daemon tells its owner how it is. Relative to the file; none unless named."""
+    """A Unix socket for status and commands, relative to the file. Off by default."""
     link: Any = None
     log: Any = None
     routing: Any = None
