@@ -1,9 +1,10 @@
-"""The commands: arguments in, exit status out."""
+"""The command line: arguments in, exit status out."""
 
 from __future__ import annotations
 
 import io
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -11,11 +12,11 @@ from pathlib import Path
 
 import pytest
 
-from tests.daemon.harness import need
+from tests.needs import need
 from uavlinkd import __version__
-from uavlinkd.config import keys
 from uavlinkd.cli import FAILED, OK, WRONG, main
-from uavlinkd.lab.sim import demo
+from uavlinkd.config import keys
+from uavlinkd.lab.sim import demo, demo_results
 
 
 def test_keygen_writes_a_key_that_only_its_owner_reads(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -32,7 +33,7 @@ def test_keygen_writes_a_key_that_only_its_owner_reads(tmp_path: Path, capsys: p
 
 @pytest.mark.parametrize("command", ["keygen", "psk"])
 def test_a_key_is_never_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str) -> None:
-    """A file that is there stays as it is; one line says so, status 1."""
+    """An existing file stays as it is; one line reports it, status 1."""
     path = tmp_path / "some.key"
     path.write_text("precious")
     assert main([command, "--out", str(path)]) == FAILED
@@ -52,19 +53,10 @@ def test_keygen_without_a_file_is_a_filter(capsys: pytest.CaptureFixture[str]) -
     assert private not in err
 
 
-def test_every_key_is_another(capsys: pytest.CaptureFixture[str]) -> None:
-    """Two calls give two keys."""
-    for command in ("keygen", "psk"):
-        main([command])
-        main([command])
-        first, second = capsys.readouterr().out.splitlines()
-        assert first != second
-
-
 def test_pubkey_reads_a_file_or_standard_input(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Both ways give the public key that keygen printed."""
+    """Both print the public key that keygen printed."""
     path = tmp_path / "drone0.key"
     main(["keygen", "--out", str(path)])
     printed = capsys.readouterr().out
@@ -76,10 +68,10 @@ def test_pubkey_reads_a_file_or_standard_input(
 
 
 @pytest.mark.parametrize("text", ["", "hunter2", "A" * 43, "A" * 45, "-" * 44])
-def test_pubkey_of_no_key_is_refused(
+def test_pubkey_of_an_invalid_key_is_refused(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, text: str
 ) -> None:
-    """One line, which does not repeat what was given: it may be nearly a key."""
+    """One line, which does not repeat the input: it may be almost a key."""
     monkeypatch.setattr(sys, "stdin", io.StringIO(text))
     assert main(["pubkey"]) == FAILED
     out, err = capsys.readouterr()
@@ -88,14 +80,14 @@ def test_pubkey_of_no_key_is_refused(
     assert not text or text not in err
 
 
-def test_pubkey_of_an_absent_file_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """With its name."""
+def test_pubkey_of_an_absent_file_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The message has the file's name."""
     assert main(["pubkey", str(tmp_path / "absent.key")]) == FAILED
     assert "absent.key" in capsys.readouterr().err
 
 
 def test_keys_are_those_of_wireguard(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    """``wg pubkey`` agrees with ours, and we take what ``wg genkey`` and ``wg genpsk`` make."""
+    """``wg pubkey`` prints the same public key; keys of ``wg genkey`` and ``wg genpsk`` are valid here."""
     wg = shutil.which("wg")
     need(wg is not None, "wg, of wireguard-tools")
     assert wg is not None
@@ -120,13 +112,14 @@ def test_keys_are_those_of_wireguard(capsys: pytest.CaptureFixture[str], monkeyp
         ["run", "--config"],
         ["demo", "--seconds", "many"],
         ["sim", "--system-id", "x"],
-        ["demo", "--seconds", "0"],
+        *(["demo", f"--seconds={seconds}"] for seconds in ("0", "-1", "nan", "inf")),
+        *(["demo", "--attack", attack] for attack in ("nonsense", "bit-flip,size=3", "misroute")),
         ["sim", "--speed", "-1"],
         ["sim", "--speed", "nan"],
     ],
 )
 def test_a_wrong_command_line_gives_status_2(arguments: list[str]) -> None:
-    """Whatever is wrong with it."""
+    """Status 2 for a missing, unknown or invalid argument."""
     try:
         status = main(arguments)
     except SystemExit as ended:
@@ -134,8 +127,8 @@ def test_a_wrong_command_line_gives_status_2(arguments: list[str]) -> None:
     assert status == WRONG
 
 
-def test_the_version_is_told(capsys: pytest.CaptureFixture[str]) -> None:
-    """``--version`` gives it and status 0."""
+def test_version_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    """``--version`` prints it, with status 0."""
     with pytest.raises(SystemExit) as ended:
         main(["--version"])
     assert ended.value.code == OK
@@ -144,7 +137,7 @@ def test_the_version_is_told(capsys: pytest.CaptureFixture[str]) -> None:
 
 @pytest.mark.parametrize("command", ["run", "check", "status", "reload", "peer list"])
 def test_an_absent_file_gives_status_2(tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str) -> None:
-    """One line with its name."""
+    """One line with the file's name."""
     assert main([*command.split(), "--config", str(tmp_path / "absent.toml")]) == WRONG
     out, err = capsys.readouterr()
     assert out == ""
@@ -153,24 +146,27 @@ def test_an_absent_file_gives_status_2(tmp_path: Path, capsys: pytest.CaptureFix
 
 
 def test_sim_flies_and_ends(capsys: pytest.CaptureFixture[str]) -> None:
-    """With a time given it ends after that, with status 0 and a report."""
+    """With ``--seconds`` it ends by itself, with status 0 and a report."""
     assert main(["sim", "--url", "udpout:127.0.0.1:9", "--seconds", "0.1"]) == OK
-    assert "frames_sent" in capsys.readouterr().out
+    first, *_, last = capsys.readouterr().out.splitlines()
+    assert first == "copter with system ID 1, sends to udpout:127.0.0.1:9; Ctrl-C ends it"
+    assert re.fullmatch(r"sent \d+ frames, received 0 in \d+\.\d s", last)
 
 
 @pytest.mark.parametrize(
     ("arguments", "names", "status"),
     [
         (["--url", "nowhere"], "nowhere", WRONG),
-        (["--tlog", "absent.tlog"], "absent.tlog", FAILED),
+        (["--url", "udp:127.0.0.1:14550"], "write udpin:127.0.0.1:14550 to listen there", WRONG),
+        (["--tlog", "absent.tlog"], "cannot read absent.tlog: No such file or directory", FAILED),
         (["--system-id", "256"], "256", WRONG),
         (["--seconds", "nan"], "--seconds", WRONG),
     ],
 )
-def test_sim_that_cannot_fly_says_why(
+def test_sim_that_cannot_fly_reports_the_reason(
     capsys: pytest.CaptureFixture[str], arguments: list[str], names: str, status: int
 ) -> None:
-    """One line that names what is wrong; status 2 where it is the command line."""
+    """One line names the wrong value; status 2 if the command line is wrong."""
     assert main(["sim", *arguments]) == status
     out, err = capsys.readouterr()
     assert out == ""
@@ -178,24 +174,24 @@ def test_sim_that_cannot_fly_says_why(
     assert err.count("\n") == 1
 
 
-PERFECT = demo.Summary(1.0, 100, 100, 0, 2, {}, 0.2)
+PERFECT = demo_results.Summary(1.0, 100, 100, 0, 2, {}, 0.2)
 
 
 @pytest.mark.parametrize(
     ("summary", "status"),
     [
         (PERFECT, OK),
-        (demo.Summary(1.0, 100, 99, 0, 2, {}, 0.2), FAILED),
-        (demo.Summary(1.0, 100, 100, 1, 2, {}, 0.2), FAILED),
-        (demo.Summary(1.0, 0, 0, 0, 2, {}, None), FAILED),
+        (demo_results.Summary(1.0, 100, 99, 0, 2, {}, 0.2), FAILED),
+        (demo_results.Summary(1.0, 100, 100, 1, 2, {}, 0.2), FAILED),
+        (demo_results.Summary(1.0, 0, 0, 0, 2, {}, None), FAILED),
     ],
 )
-def test_the_demo_passes_only_when_every_frame_did(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, summary: demo.Summary, status: int
+def test_the_demo_succeeds_only_if_every_frame_arrived(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, summary: demo_results.Summary, status: int
 ) -> None:
-    """A frame lost, a frame altered, or none sent: status 1. The last line is the summary either way."""
+    """A frame lost, a frame altered, or no frame sent: status 1. The last line is always the summary."""
 
-    async def run_demo(seconds: float, *, show: bool, attack: str | None) -> demo.Summary:
+    async def run_demo(seconds: float, *, show: bool, attack: str | None) -> demo_results.Summary:
         assert (seconds, show, attack) == (7.0, False, None)
         return summary
 
@@ -204,12 +200,12 @@ def test_the_demo_passes_only_when_every_frame_did(
     assert json.loads(capsys.readouterr().out.splitlines()[-1])["frames_sent"] == summary.frames_sent
 
 
-def test_a_demo_that_cannot_start_says_why(
+def test_a_demo_that_cannot_start_reports_the_reason(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Status 1 and the reason."""
 
-    async def run_demo(seconds: float, *, show: bool, attack: str | None) -> demo.Summary:
+    async def run_demo(seconds: float, *, show: bool, attack: str | None) -> demo_results.Summary:
         raise demo.DemoError("no room")
 
     monkeypatch.setattr(demo, "run_demo", run_demo)
@@ -218,10 +214,10 @@ def test_a_demo_that_cannot_start_says_why(
 
 
 def test_pubkey_of_bytes_is_refused(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    """A key as raw bytes is no text: one line, no traceback."""
+    """A key as raw bytes is not text: one line, no traceback."""
     monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(b"\xff\xfe" + bytes(30)), encoding="utf-8"))
     assert main(["pubkey"]) == FAILED
-    assert capsys.readouterr().err.startswith("standard input: is no key")
+    assert capsys.readouterr().err.startswith("standard input: is not a key")
 
 
 _SERVICE = """
@@ -242,8 +238,8 @@ system_ids = [2]
 """
 
 
-def test_check_looks_for_a_services_keys_where_it_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The keys of a service lie in a folder of their own; without --keys the message says how to name it."""
+def test_check_reads_a_services_keys_from_their_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A service has its keys in a separate folder; without ``--keys`` the message shows the option."""
     (tmp_path / "keys").mkdir()
     assert main(["keygen", "--out", str(tmp_path / "keys" / "drone0.key")]) == OK
     path = tmp_path / "drone0.toml"
@@ -255,8 +251,10 @@ def test_check_looks_for_a_services_keys_where_it_is_told(tmp_path: Path, capsys
     assert main(["check", "--config", str(path), "--keys", str(tmp_path / "keys")]) == OK
 
 
-def test_a_daemon_is_asked_without_its_keys(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Of its configuration, status, reload and peer list need the socket alone; the rest may be wrong by now."""
+def test_status_needs_only_the_control_socket_of_a_configuration(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """``status`` works without the keys, and if other values in the file are wrong."""
     path = tmp_path / "drone0.toml"
     path.write_text(_SERVICE.replace("system_ids = [2]", "system_ids = [900]"))
     assert main(["status", "--config", str(path)]) == FAILED
@@ -266,15 +264,21 @@ def test_a_daemon_is_asked_without_its_keys(tmp_path: Path, capsys: pytest.Captu
     assert "control_socket" in capsys.readouterr().err
 
 
-def test_the_checker_imports_nothing_from_the_current_folder(tmp_path: Path) -> None:
-    """Where `uavlinkd run` is called, a file of a module's name is no module of it."""
-    (tmp_path / "tomllib.py").write_text("raise SystemExit('imported from the current folder')")
-    script = shutil.which("uavlinkd", path=str(Path(sys.executable).parent))
-    need(script is not None, "uavlinkd, installed beside this Python")
-    assert script is not None
-    (tmp_path / "empty.toml").write_text("")
-    command = [script, "run", "--config", "empty.toml"]
-    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert ended.returncode == WRONG
-    assert "private_key_file: is missing" in ended.stderr
-    assert "current folder" not in ended.stderr
+def test_evaluate_lists_its_evaluations(capsys: pytest.CaptureFixture[str]) -> None:
+    """The parser imports their definitions only now, and its help has them."""
+    with pytest.raises(SystemExit) as ended:
+        main(["evaluate", "--help"])
+    assert ended.value.code == OK
+    assert "tampering" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", ["demo", "sim"])
+def test_missing_pymavlink_is_reported(command: str) -> None:
+    """The Debian package has no pymavlink: the message names the remedy."""
+    hide = "import sys; sys.modules['pymavlink'] = None"
+    code = f"{hide}; from uavlinkd.cli import main; sys.exit(main(['{command}']))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+
+    assert done.returncode == FAILED
+    assert "pip install ." in done.stderr
+    assert "Traceback" not in done.stderr

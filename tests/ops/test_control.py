@@ -1,4 +1,4 @@
-"""The control socket: one line asks, one line of JSON answers, and nobody but the owner may."""
+"""The control socket: a line of text, an answer in JSON, for the owner only."""
 # ruff: noqa: ASYNC240  (small local files; nothing else waits in this loop)
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from uavlinkd.ops.control import MAX_CONNECTIONS, MAX_REQUEST_BYTES, ControlErro
 
 @pytest.fixture
 def path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A path short enough for a socket, however deep the temporary folder is."""
+    """A path that is short enough for a socket."""
     monkeypatch.chdir(tmp_path)
     return Path("control.sock")
 
 
 @pytest.fixture
 async def server(path: Path) -> AsyncIterator[ControlServer]:
-    """Knows the request ``status``."""
+    """A server that knows the request ``status``."""
     server = ControlServer(path, lambda request: {"name": "drone0"} if request == "status" else None)
     await server.start()
     yield server
@@ -43,7 +43,7 @@ async def request(path: Path, data: bytes) -> bytes:
 
 
 async def read_to_end(reader: asyncio.StreamReader) -> bytes:
-    """What comes until the other side closes; a reset, where it closed with bytes of ours unread, is an end too."""
+    """Read until the server closes. A reset also ends the read: the server closed with unread bytes."""
     try:
         return await asyncio.wait_for(reader.read(), 5)
     except ConnectionResetError:
@@ -51,32 +51,32 @@ async def read_to_end(reader: asyncio.StreamReader) -> bytes:
 
 
 async def close(writer: asyncio.StreamWriter) -> None:
-    """Close a connection, whatever the other side did to it."""
+    """Close a connection in any state."""
     writer.close()
     with suppress(OSError):
         await writer.wait_closed()
 
 
-async def test_it_answers_what_it_knows(server: ControlServer, path: Path) -> None:
-    """The client gives what the server's function returned."""
+async def test_known_request_is_answered(server: ControlServer, path: Path) -> None:
+    """The client returns the result of the server's function."""
     assert await asyncio.to_thread(ask, path, "status") == {"name": "drone0"}
 
 
-async def test_an_unknown_request_is_an_error(server: ControlServer, path: Path) -> None:
-    """It is answered as such, and the client raises."""
+async def test_unknown_request_is_an_error(server: ControlServer, path: Path) -> None:
+    """The answer says so, and the client raises."""
     with pytest.raises(ControlError, match="does not know the request 'dance'"):
         await asyncio.to_thread(ask, path, "dance")
 
 
 @pytest.mark.parametrize("data", [b"\n", b"\xff\xfe\x00\n", b"status extra\n", b'{"status": 1}\n'])
-async def test_hostile_requests_get_an_error_and_nothing_more(server: ControlServer, path: Path, data: bytes) -> None:
-    """Bytes that are no request are answered as unknown, and the next client is served."""
+async def test_hostile_requests_get_an_error_only(server: ControlServer, path: Path, data: bytes) -> None:
+    """Arbitrary bytes are an unknown request, and the next client is served."""
     assert json.loads(await request(path, data)) == {"error": "unknown request"}
     assert await asyncio.to_thread(ask, path, "status") == {"name": "drone0"}
 
 
-async def test_a_request_without_end_is_cut_off(server: ControlServer, path: Path) -> None:
-    """More bytes than a request has close the connection with an error."""
+async def test_endless_request_is_refused(server: ControlServer, path: Path) -> None:
+    """Beyond the limit, the server answers with an error and closes the connection."""
     reader, writer = await asyncio.open_unix_connection(path)
     writer.write(b"x" * (4 * MAX_REQUEST_BYTES))
     answer = await asyncio.wait_for(reader.readline(), 5)
@@ -86,8 +86,8 @@ async def test_a_request_without_end_is_cut_off(server: ControlServer, path: Pat
     assert await asyncio.to_thread(ask, path, "status") == {"name": "drone0"}
 
 
-async def test_how_long_a_request_may_be_is_the_servers_to_say(path: Path) -> None:
-    """To the byte; of a longer one the client says why it was refused, and does not repeat it."""
+async def test_server_limits_the_request_exactly(path: Path) -> None:
+    """The client reports why a longer request was refused, and does not repeat the request."""
     server = ControlServer(path, lambda request: {"length": len(request)}, max_request_bytes=4096)
     await server.start()
     assert await asyncio.to_thread(ask, path, "x" * 4096) == {"length": 4096}
@@ -96,10 +96,10 @@ async def test_how_long_a_request_may_be_is_the_servers_to_say(path: Path) -> No
     await server.stop()
 
 
-async def test_mute_clients_do_not_keep_others_out_for_ever(
+async def test_silent_clients_do_not_block_others_indefinitely(
     server: ControlServer, path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """All places taken by clients that say nothing: others are turned away, until the mute ones have timed out."""
+    """While silent clients use all connections, others are refused, until the silent ones time out."""
     monkeypatch.setattr(control, "REQUEST_TIMEOUT_S", 0.2)
     mute = [await asyncio.open_unix_connection(path) for _ in range(MAX_CONNECTIONS)]
     assert await request(path, b"status\n") == b""
@@ -110,15 +110,15 @@ async def test_mute_clients_do_not_keep_others_out_for_ever(
 
 
 async def test_only_the_owner_may_connect(server: ControlServer, path: Path) -> None:
-    """The socket's mode is 0600, and the process's umask is as before."""
+    """The socket has mode 0600, and the umask of the process is unchanged."""
     assert path.stat().st_mode & 0o777 == 0o600
     mask = os.umask(0o022)
     os.umask(mask)
     assert mask != 0o177
 
 
-async def test_it_is_gone_afterwards(path: Path) -> None:
-    """A server that stopped leaves no socket, and a client says that nobody answers."""
+async def test_stopped_server_leaves_no_socket(path: Path) -> None:
+    """The client reports that no daemon answers."""
     server = ControlServer(path, lambda _: {})
     await server.start()
     await server.stop()
@@ -127,8 +127,8 @@ async def test_it_is_gone_afterwards(path: Path) -> None:
         ask(path, "status")
 
 
-async def test_the_socket_of_a_dead_daemon_is_replaced(path: Path) -> None:
-    """A socket in which nobody listens any more is in nobody's way."""
+async def test_socket_of_a_dead_daemon_is_replaced(path: Path) -> None:
+    """No process listens on it."""
     with socket.socket(socket.AF_UNIX) as dead:
         dead.bind(str(path))
     server = ControlServer(path, lambda _: {"name": "new"})
@@ -137,15 +137,15 @@ async def test_the_socket_of_a_dead_daemon_is_replaced(path: Path) -> None:
     await server.stop()
 
 
-async def test_the_socket_of_a_living_daemon_is_left_alone(server: ControlServer, path: Path) -> None:
-    """Where one answers, a second server does not start, and the first goes on."""
+async def test_socket_of_a_running_daemon_is_kept(server: ControlServer, path: Path) -> None:
+    """A second server does not start, and the first one still answers."""
     with pytest.raises(ControlError, match="another daemon answers there"):
         await ControlServer(path, lambda _: {}).start()
     assert await asyncio.to_thread(ask, path, "status") == {"name": "drone0"}
 
 
-async def test_a_file_in_its_place_is_left_alone(path: Path) -> None:
-    """What is no socket is not deleted: the server does not start, and says where it could not."""
+async def test_file_in_place_of_the_socket_is_kept(path: Path) -> None:
+    """The server does not delete it, does not start, and reports the path."""
     path.write_text("precious")
     with pytest.raises(ControlError, match=r"cannot listen on the control socket control\.sock"):
         await ControlServer(path, lambda _: {}).start()
@@ -153,15 +153,26 @@ async def test_a_file_in_its_place_is_left_alone(path: Path) -> None:
 
 
 @pytest.mark.parametrize("where", [Path("no-such-folder/control.sock"), Path("x" * 200)])
-async def test_a_place_that_cannot_be_is_told(path: Path, where: Path) -> None:
-    """A folder that is absent, a name too long for a socket: one line that names the path."""
+async def test_impossible_path_is_reported(path: Path, where: Path) -> None:
+    """A missing folder or a too long name causes one line with the path."""
     with pytest.raises(ControlError, match="cannot listen on the control socket"):
         await ControlServer(where, lambda _: {}).start()
 
 
+async def test_missing_folder_has_a_remedy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The message has the command. Only a service's folder is made by the service."""
+    folder = tmp_path / "missing"
+    server = ControlServer(folder / "control.sock", lambda _: {})
+    with pytest.raises(ControlError, match=rf"run `mkdir -p {folder}`; for a service, write control_socket"):
+        await server.start()
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
+    with pytest.raises(ControlError, match=rf"run `mkdir -p {folder}`, or start the service, which makes it$"):
+        await server.start()
+
+
 @pytest.mark.parametrize("answer", [b"", b"nonsense\n", b"[1]\n", b'{"error": "no"}\n'])
-async def test_the_client_believes_no_nonsense(path: Path, answer: bytes) -> None:
-    """Whatever answers that is no daemon gives an error of one line."""
+async def test_invalid_answer_is_an_error(path: Path, answer: bytes) -> None:
+    """If another process answers, the error has one line."""
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         await reader.readline()
@@ -174,8 +185,8 @@ async def test_the_client_believes_no_nonsense(path: Path, answer: bytes) -> Non
             await asyncio.to_thread(ask, path, "status")
 
 
-async def test_the_client_does_not_wait_for_ever(path: Path) -> None:
-    """A daemon that hangs is told as one that does not answer."""
+async def test_client_does_not_wait_indefinitely(path: Path) -> None:
+    """A daemon that hangs is reported as one that does not answer."""
     with socket.socket(socket.AF_UNIX) as mute:
         mute.bind(str(path))
         mute.listen()
@@ -183,8 +194,8 @@ async def test_the_client_does_not_wait_for_ever(path: Path) -> None:
             await asyncio.to_thread(ask, path, "status", 0.05)
 
 
-async def test_an_answer_takes_as_long_as_it_takes(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Neither side gives up where the client waits on; it is told each time that it has waited."""
+async def test_answer_may_take_long(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With `on_waiting`, neither side times out, and the client is called after each wait."""
     monkeypatch.setattr(control, "REQUEST_TIMEOUT_S", 0.05)
     waited = 0
     release = asyncio.Event()
@@ -207,8 +218,8 @@ async def test_an_answer_takes_as_long_as_it_takes(path: Path, monkeypatch: pyte
     await server.stop()
 
 
-async def test_an_answer_may_be_long(path: Path) -> None:
-    """Longer than a read, or a buffer of the kernel."""
+async def test_answer_may_be_long(path: Path) -> None:
+    """It is longer than a read, and than a kernel buffer."""
     long = {"problems": ["x" * 1000] * 1000}
     server = ControlServer(path, lambda _: long)  # type: ignore[arg-type,return-value]
     await server.start()

@@ -1,4 +1,4 @@
-"""The text that Prometheus reads: by its own checker, with every number where the status has it."""
+"""The metrics: each number of the status under its name and labels, in a format that Prometheus accepts."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ import copy
 import re
 import shutil
 import subprocess
+import sys
 from typing import Any
 
 import pytest
 
-from tests.daemon.harness import need
+from tests.needs import need
 from uavlinkd import __version__
 from uavlinkd.core.drops import DropReason
 from uavlinkd.mavlink.policy.gate import Refusal
@@ -20,7 +21,7 @@ PEER: dict[str, Any] = {
     "state": "up",
     "session": {"suite": "x25519", "mode": "authenticated", "tag_bits": 128},
     "handshake_s": 12.5,
-    "heard_s": 0.25,
+    "last_received_s": 0.25,
     "round_trip_s": 0.003,
     "freshness_unverified_s": None,
     "loss_in": 0.125,
@@ -46,13 +47,24 @@ PEER: dict[str, Any] = {
         "out": {},
     },
 }
-NEVER_UP = {**PEER, "state": "waiting", "session": None, "handshake_s": None, "heard_s": None, "round_trip_s": None}
+UNKNOWN = dict.fromkeys(("session", "handshake_s", "last_received_s", "round_trip_s"))
+NEVER_UP = {**PEER, **UNKNOWN, "state": "waiting"}
+FINDING = {
+    "cause": "wrong_psk",
+    "severity": "fault",
+    "subject": "peer",
+    "name": "drone2",
+    "text": "the PSKs differ",
+    "remedy": "give both ends the same psk_file",
+}
 STATUS: dict[str, Any] = {
     "name": "drone0",
+    "frames_pass": False,
+    "findings": [FINDING, FINDING | {"text": "other evidence of the same"}],
     "peers": {"drone1": PEER, "drone2": NEVER_UP},
     "endpoints": {
         "autopilot": {
-            "programs": {"127.0.0.1:14550": {}, "127.0.0.1:14551": {}},
+            "clients": {"127.0.0.1:14550": {}, "127.0.0.1:14551": {}},
             "frames_received": 20,
             "frames_sent": 21,
             "bytes_received": 22,
@@ -75,8 +87,8 @@ _LABEL = re.compile(r'(\w+)="((?:[^"\\]|\\.)*)"(?:,|$)')
 
 
 def samples(text: bytes) -> dict[tuple[str, frozenset[tuple[str, str]]], float]:
-    """Values by name and labels; each is there once."""
-    found: dict[tuple[str, frozenset[tuple[str, str]]], float] = {}
+    """Values by name and labels; each pair occurs once."""
+    values: dict[tuple[str, frozenset[tuple[str, str]]], float] = {}
     for line in text.decode().splitlines():
         if line.startswith("#"):
             continue
@@ -85,12 +97,12 @@ def samples(text: bytes) -> dict[tuple[str, frozenset[tuple[str, str]]], float]:
         labels = match[2] or ""
         assert _LABEL.sub("", labels) == "", line
         key = (match[1], frozenset(_LABEL.findall(labels)))
-        assert key not in found, line
-        found[key] = float(match[3])
-    return found
+        assert key not in values, line
+        values[key] = float(match[3])
+    return values
 
 
-def value(name: str, **labels: str) -> float:
+def value(name: str, /, **labels: str) -> float:
     """One sample of the status above."""
     return samples(exposition(STATUS, 5.0))[f"uavlinkd_{name}", frozenset(labels.items())]
 
@@ -99,13 +111,16 @@ def value(name: str, **labels: str) -> float:
     ("name", "labels", "expected"),
     [
         ("uptime_seconds", {}, 5.0),
+        ("schema_info", {"status": "1", "log": "1", "metrics": "1"}, 1),
+        ("frames_pass", {}, 0),
+        ("finding", {"cause": "wrong_psk", "severity": "fault", "subject": "peer", "name": "drone2"}, 1),
         ("peer_up", {"peer": "drone1"}, 1),
         ("peer_up", {"peer": "drone2"}, 0),
         ("peer_info", {"peer": "drone1", "suite": "x25519", "mode": "authenticated", "tag_bits": "128"}, 1),
         ("path_loss_ratio", {"peer": "drone1", "direction": "in"}, 0.125),
         ("path_loss_ratio", {"peer": "drone1", "direction": "out"}, 0.5),
         ("peer_last_handshake_age_seconds", {"peer": "drone1"}, 12.5),
-        ("peer_last_heard_age_seconds", {"peer": "drone1"}, 0.25),
+        ("peer_last_received_age_seconds", {"peer": "drone1"}, 0.25),
         ("round_trip_seconds", {"peer": "drone1"}, 0.003),
         ("peer_freshness_unverified", {"peer": "drone1"}, 0),
         ("peer_handshakes_total", {"peer": "drone1"}, 3),
@@ -127,7 +142,7 @@ def value(name: str, **labels: str) -> float:
         ("rx_dropped_total", {"peer": "", "reason": "malformed"}, 30),
         ("peer_refused_frames_total", {"peer": "drone1", "direction": "in", "reason": "message_not_allowed"}, 3),
         ("peer_refused_frames_total", {"peer": "drone1", "direction": "in", "reason": "rate_limited"}, 4),
-        ("endpoint_programs", {"endpoint": "autopilot"}, 2),
+        ("endpoint_clients", {"endpoint": "autopilot"}, 2),
         ("endpoint_receive_frames_total", {"endpoint": "autopilot"}, 20),
         ("endpoint_transmit_frames_total", {"endpoint": "autopilot"}, 21),
         ("endpoint_receive_bytes_total", {"endpoint": "autopilot"}, 22),
@@ -150,24 +165,24 @@ def value(name: str, **labels: str) -> float:
         ("recording_failures_total", {"reason": "ENOSPC"}, 43),
     ],
 )
-def test_number_of_the_status_is_told(name: str, labels: dict[str, str], expected: float) -> None:
-    """Exactly, under its name and labels."""
+def test_number_of_the_status_is_exported(name: str, labels: dict[str, str], expected: float) -> None:
+    """The value is unchanged, under its metric name and labels."""
     assert value(name, **labels) == expected
 
 
-def test_version_is_told() -> None:
-    """As a label, for joining."""
+def test_version_is_exported() -> None:
+    """The version is a label, which a query can join with other metrics."""
     assert f'version="{__version__}"'.encode() in exposition(STATUS, 0.0)
 
 
-def test_the_process_is_measured() -> None:
-    """Its time and its memory."""
+def test_process_is_measured() -> None:
+    """CPU time and memory of the daemon are exported."""
     assert value("cpu_seconds_total") > 0
     assert value("resident_memory_bytes") > 1_000_000
 
 
-def test_prometheus_finds_nothing_to_say() -> None:
-    """Its own checker takes format and names."""
+def test_prometheus_accepts_the_format() -> None:
+    """The checker of Prometheus accepts format and names without a remark."""
     promtool = shutil.which("promtool")
     need(promtool is not None, "promtool, of Debian's package prometheus")
     done = subprocess.run(
@@ -176,43 +191,51 @@ def test_prometheus_finds_nothing_to_say() -> None:
     assert (done.returncode, done.stdout, done.stderr) == (0, b"", b"")
 
 
-def test_what_tells_of_an_attack_is_there_as_zero() -> None:
-    """Every reason, for every peer: an increase is seen from the first."""
-    found = samples(exposition(STATUS, 0.0))
+def test_counters_of_attacks_start_at_zero() -> None:
+    """Every reason exists for every peer, so Prometheus sees the first increase."""
+    values = samples(exposition(STATUS, 0.0))
     for peer in ("", "drone1", "drone2"):
-        told = {dict(labels)["reason"] for name, labels in found if ("peer", peer) in labels and "rx_dropped" in name}
-        assert told == set(DropReason)
+        drops = {labels for name, labels in values if ("peer", peer) in labels and "rx_dropped" in name}
+        reasons = {dict(labels)["reason"] for labels in drops}
+        assert reasons == set(DropReason)
     for kind, part in (("peer", "drone1"), ("endpoint", "autopilot")):
-        told = {
+        reasons = {
             dict(labels)["reason"]
-            for name, labels in found
+            for name, labels in values
             if (kind, part) in labels and ("direction", "in") in labels and name.endswith("refused_frames_total")
         }
-        assert told == set(Refusal)
+        assert reasons == set(Refusal)
 
 
-def test_nothing_is_made_up() -> None:
-    """What is not known of a peer has no sample; without recording there is none of it."""
+def test_unknown_values_have_no_sample() -> None:
+    """A peer that was never up has no ages; a daemon without recording has no recording metrics."""
     names = {name for name, labels in samples(exposition(STATUS, 0.0)) if ("peer", "drone2") in labels}
     assert not names & {
         "uavlinkd_round_trip_seconds",
         "uavlinkd_path_loss_ratio",
         "uavlinkd_peer_info",
         "uavlinkd_peer_last_handshake_age_seconds",
-        "uavlinkd_peer_last_heard_age_seconds",
+        "uavlinkd_peer_last_received_age_seconds",
     }
     status = copy.deepcopy(STATUS) | {"recording": None}
     assert b"recording" not in exposition(status, 0.0)
 
 
 def test_unverified_freshness_is_one() -> None:
-    """However long it has lasted."""
+    """The metric is a flag, whatever the duration."""
     status = STATUS | {"peers": {"drone1": PEER | {"freshness_unverified_s": 12.5}}}
-    assert b'uavlinkd_peer_freshness_unverified{peer="drone1"} 1\n' in exposition(status, 0.0)
+    key = "uavlinkd_peer_freshness_unverified", frozenset({("peer", "drone1")})
+    assert samples(exposition(status, 0.0))[key] == 1
 
 
-def test_strange_names_stay_inside_their_quotes() -> None:
-    """Names come from the configuration, which allows none of these; the format is kept without leaning on that."""
+def test_names_with_special_characters_are_escaped() -> None:
+    """The configuration refuses such names, but the format must not depend on that."""
     status = STATUS | {"peers": {'a"} 1\nb\\': PEER}}
-    (found,) = [dict(labels) for name, labels in samples(exposition(status, 0.0)) if name == "uavlinkd_peer_up"]
-    assert found == {"peer": r"a\"} 1\nb\\"}
+    (values,) = [dict(labels) for name, labels in samples(exposition(status, 0.0)) if name == "uavlinkd_peer_up"]
+    assert values == {"peer": r"a\"} 1\nb\\"}
+
+
+def test_daemon_without_metrics_does_not_load_the_library() -> None:
+    """Its start time and memory do not pay for `prometheus_client`."""
+    script = "import sys, uavlinkd.link.daemon; sys.exit('prometheus_client' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0

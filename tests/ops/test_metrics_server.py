@@ -1,26 +1,31 @@
-"""The HTTP that Prometheus speaks, and what anybody else may send."""
+"""The HTTP server for Prometheus, and hostile clients of it."""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
+import socket
+from collections.abc import AsyncIterator, Callable
 
 import pytest
+import uvloop
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.daemon.harness import has_ipv6, need
-from tests.waiting import until
-from uavlinkd.ops import metrics_server
-from uavlinkd.system.addresses import Address
+from tests.needs import need
+from tests.waiting import PATIENCE_S, until
 from uavlinkd.endpoints.sockets import BindError
+from uavlinkd.lab.sim.loopback_ports import has_ipv6
+from uavlinkd.ops import metrics_server
 from uavlinkd.ops.metrics_server import MAX_CONNECTIONS, MAX_REQUEST_BYTES, MetricsServer
+from uavlinkd.system.addresses import Address
 
 BODY = b"# HELP x y\nx 1\n"
+REQUEST = b"GET /metrics HTTP/1.1\r\n\r\n"
+Connection = tuple[asyncio.StreamReader, asyncio.StreamWriter]
 
 
 class Source:
-    """Content that counts how often it is made."""
+    """Content that counts how often it is computed."""
 
     def __init__(self) -> None:
         self.made = 0
@@ -32,7 +37,7 @@ class Source:
 
 @pytest.fixture
 def source() -> Source:
-    """What the server answers with."""
+    """The content of the server."""
     return Source()
 
 
@@ -46,13 +51,13 @@ async def server(source: Source) -> AsyncIterator[MetricsServer]:
 
 
 async def exchange(server: MetricsServer, request: bytes, *, end: bool = True) -> bytes:
-    """All that comes back."""
+    """The whole response."""
     reader, writer = await asyncio.open_connection(*server.address.sockaddr)
     try:
         writer.write(request)
         if end:
             writer.write_eof()
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(PATIENCE_S):
             return await reader.read()
     except ConnectionError:
         return b""
@@ -60,8 +65,27 @@ async def exchange(server: MetricsServer, request: bytes, *, end: bool = True) -
         writer.close()
 
 
+async def connect(server: MetricsServer, sent: bytes) -> Connection:
+    """A client that sends this and then hangs: it neither reads nor closes."""
+    reader, writer = await asyncio.open_connection(*server.address.sockaddr)
+    writer.write(sent)
+    return reader, writer
+
+
+async def is_closed(connection: Connection) -> bool:
+    """Wait until the server closed the connection; False if it does not."""
+    try:
+        async with asyncio.timeout(PATIENCE_S):
+            await connection[0].read()
+    except ConnectionError:
+        return True
+    except TimeoutError:
+        return False
+    return connection[0].at_eof()
+
+
 def status(response: bytes) -> int:
-    """Of a response that is whole."""
+    """The status code of a complete response."""
     head, _, body = response.partition(b"\r\n\r\n")
     lines = head.split(b"\r\n")
     headers = dict(line.lower().split(b": ", 1) for line in lines[1:])
@@ -71,7 +95,7 @@ def status(response: bytes) -> int:
 
 
 async def test_prometheus_is_answered(server: MetricsServer) -> None:
-    """With the content, under its type, whether or not the client says that it is done."""
+    """The response has content and type, whether or not the client ends its side."""
     for end in (True, False):
         request = b"GET /metrics HTTP/1.1\r\nHost: 127.0.0.1:9790\r\nAccept: */*\r\n\r\n"
         reader, writer = await asyncio.open_connection(*server.address.sockaddr)
@@ -86,7 +110,7 @@ async def test_prometheus_is_answered(server: MetricsServer) -> None:
 
 
 async def test_head_has_the_length_and_no_body(server: MetricsServer) -> None:
-    """As RFC 9110 section 9.3.2 says."""
+    """RFC 9110 section 9.3.2."""
     response = await exchange(server, b"HEAD /metrics HTTP/1.0\r\n\r\n")
     assert f"Content-Length: {len(BODY)}".encode() in response
     assert response.endswith(b"\r\n\r\n")
@@ -117,16 +141,16 @@ async def test_head_has_the_length_and_no_body(server: MetricsServer) -> None:
         (b"GET /metrics HTTP/1.1\r\nHost: 127.0.0.1\r\nHost: evil.example", 421),
     ],
 )
-async def test_what_is_asked_decides_what_is_answered(
+async def test_status_code_fits_the_request(
     server: MetricsServer, source: Source, request_head: bytes, expected: int
 ) -> None:
-    """GET /metrics, and nothing else; on loopback, under no foreign name (DNS rebinding)."""
+    """Only GET /metrics succeeds; on loopback, a foreign host name fails (DNS rebinding)."""
     assert status(await exchange(server, request_head + b"\r\n\r\n")) == expected
     assert source.made == (expected == 200)
 
 
-async def test_beyond_loopback_any_name_will_do(source: Source) -> None:
-    """There it is no secret to pages, and Prometheus may know it by a name."""
+async def test_beyond_loopback_any_host_name_is_accepted(source: Source) -> None:
+    """The network reaches the port anyway, and Prometheus may use a name."""
     server = MetricsServer(Address("0.0.0.0", 0), source, "text/x-test")
     await server.start()
     reader, writer = await asyncio.open_connection("127.0.0.1", server.address.port)
@@ -136,75 +160,113 @@ async def test_beyond_loopback_any_name_will_do(source: Source) -> None:
     server.stop()
 
 
-async def test_a_request_without_end_is_refused(server: MetricsServer, source: Source) -> None:
-    """At the limit of its size."""
+async def test_endless_request_is_refused(server: MetricsServer, source: Source) -> None:
+    """The size of a request is limited."""
     response = await exchange(server, b"GET /metrics HTTP/1.1\r\nX: " + b"x" * 4 * MAX_REQUEST_BYTES, end=False)
     assert response == b"" or status(response) == 431
     assert source.made == 0
 
 
-async def test_a_client_that_says_nothing_is_left(
+async def test_silent_client_times_out(
     server: MetricsServer, monkeypatch: pytest.MonkeyPatch, source: Source
 ) -> None:
-    """After a while; one that says half of something too."""
+    """So does a client that sends half a request."""
     monkeypatch.setattr(metrics_server, "REQUEST_TIMEOUT_S", 0.05)
     for said in (b"", b"GET /metr"):
         assert await exchange(server, said, end=False) == b""
     assert source.made == 0
 
 
-async def test_a_client_that_goes_on_talking_is_left(server: MetricsServer, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It gets its answer, and what it sends beside is read into nothing."""
+async def test_client_that_keeps_sending_times_out(server: MetricsServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It gets its answer, and its further bytes are discarded."""
     monkeypatch.setattr(metrics_server, "REQUEST_TIMEOUT_S", 0.2)
     reader, writer = await asyncio.open_connection(*server.address.sockaddr)
-    writer.write(b"GET /metrics HTTP/1.1\r\n\r\n")
+    writer.write(REQUEST)
     assert (await reader.readuntil(b"\r\n\r\n")).startswith(b"HTTP/1.1 200")
     with pytest.raises(ConnectionError):
-        await talk_for_ever(writer)
+        await send_indefinitely(writer)
     writer.close()
 
 
-async def talk_for_ever(writer: asyncio.StreamWriter) -> None:
-    """Send as long as somebody takes it."""
-    async with asyncio.timeout(10):
+async def send_indefinitely(writer: asyncio.StreamWriter) -> None:
+    """Send until the server closes the connection."""
+    async with asyncio.timeout(PATIENCE_S):
         while True:
             writer.write(b"x" * 4096)
             await writer.drain()
 
 
-async def test_connections_are_bounded(server: MetricsServer) -> None:
-    """One too many is closed at once; when another is done, the next is answered."""
-    idle = [await asyncio.open_connection(*server.address.sockaddr) for _ in range(MAX_CONNECTIONS)]
-    request = b"GET /metrics HTTP/1.1\r\n\r\n"
-    await until(lambda: server._connections == MAX_CONNECTIONS)
-    assert await exchange(server, request) == b""
-    idle.pop()[1].close()
-    await until(lambda: server._connections < MAX_CONNECTIONS)
-    assert status(await exchange(server, request)) == 200
-    for _, writer in idle:
+@pytest.mark.parametrize("sent", [b"", b"GET /metr", REQUEST], ids=["nothing", "half a request", "a request"])
+async def test_hung_connections_do_not_block_others(server: MetricsServer, sent: bytes) -> None:
+    """With all connections in use, the server closes the oldest and answers the new one at once."""
+    hung = [await connect(server, sent) for _ in range(MAX_CONNECTIONS)]
+    await until(lambda: len(server._connections) == MAX_CONNECTIONS)
+    assert status(await exchange(server, REQUEST)) == 200
+    assert len(server._connections) <= MAX_CONNECTIONS
+    assert await is_closed(hung[0])
+    for _, writer in hung:
         writer.close()
 
 
-async def test_who_asks_all_the_time_costs_little(
+async def test_silent_connection_is_closed_before_one_with_a_request(server: MetricsServer) -> None:
+    """A client that asked may still be reading its answer, even if its connection is the oldest."""
+    asked = await connect(server, REQUEST)
+    await until(lambda: True in server._connections.values())
+    silent = [await connect(server, b"") for _ in range(MAX_CONNECTIONS)]
+    assert await is_closed(silent[0])
+    assert status(await asked[0].read()) == 200
+    for _, writer in (asked, *silent):
+        writer.close()
+
+
+@pytest.mark.parametrize("new_loop", [asyncio.SelectorEventLoop, uvloop.new_event_loop])
+def test_closing_a_connection_that_does_not_read_its_answer_causes_no_failure(
+    new_loop: Callable[[], asyncio.AbstractEventLoop],
+) -> None:
+    """An error would write a traceback to the log, for each connection of a hostile client."""
+    errors: list[object] = []
+
+    async def run() -> None:
+        asyncio.get_running_loop().set_exception_handler(lambda loop, context: errors.append(context))
+        server = MetricsServer(Address("127.0.0.1", 0), lambda: bytes(20_000_000), "text/x-test")
+        await server.start()
+        clients = [socket.create_connection(server.address.sockaddr) for _ in range(MAX_CONNECTIONS)]
+        for client in clients:
+            client.send(REQUEST)
+        await until(lambda: list(server._connections.values()) == [True] * MAX_CONNECTIONS)
+        server._evict()
+        await until(lambda: len(server._connections) == MAX_CONNECTIONS - 1)
+        await asyncio.sleep(0.05)
+        for client in clients:
+            client.close()
+        server.stop()
+        await until(lambda: not server._connections)
+
+    with asyncio.Runner(loop_factory=new_loop) as runner:
+        runner.run(run())
+    assert errors == []
+
+
+async def test_frequent_requests_reuse_the_answer(
     server: MetricsServer, source: Source, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The answer is made anew when it is old."""
+    """The content is computed again only when it is old."""
     now = [100.0]
     monkeypatch.setattr(metrics_server, "monotonic", lambda: now[0])
     for at in (100.0, 100.0, 100.0 + metrics_server.CONTENT_AGE_S - 0.01, 100.0 + metrics_server.CONTENT_AGE_S):
         now[0] = at
-        await exchange(server, b"GET /metrics HTTP/1.1\r\n\r\n")
+        await exchange(server, REQUEST)
     assert source.made == 2
 
 
-async def test_an_address_in_use_is_told(server: MetricsServer, source: Source) -> None:
-    """As for every other socket of the daemon."""
+async def test_address_in_use_is_an_error(server: MetricsServer, source: Source) -> None:
+    """The error is the same as for other sockets of the daemon."""
     with pytest.raises(BindError, match=f"cannot listen on {server.address}: Address already in use"):
         await MetricsServer(server.address, source, "text/x-test").start()
 
 
-async def test_it_listens_on_ipv6(source: Source) -> None:
-    """Too."""
+async def test_server_listens_on_ipv6(source: Source) -> None:
+    """A host header with brackets is accepted."""
     need(has_ipv6(), "an IPv6 loopback")
     server = MetricsServer(Address("::1", 0), source, "text/x-test")
     await server.start()
@@ -215,6 +277,6 @@ async def test_it_listens_on_ipv6(source: Source) -> None:
 @given(request=st.binary(max_size=200))
 @settings(max_examples=300, deadline=None)
 def test_any_bytes_are_answered(request: bytes) -> None:
-    """Never an exception, never the content by chance."""
+    """The server raises no exception and does not send the content."""
     server = MetricsServer(Address("127.0.0.1", 9790), lambda: BODY, "text/x-test")
     assert status(server._respond(request + b"\r\n\r\n")) in (400, 404, 405, 421)

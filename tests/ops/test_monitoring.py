@@ -1,4 +1,4 @@
-"""Alert rules and dashboard in configs/: by Prometheus's own tool, and about metrics that there are."""
+"""Alert rules and dashboard in configs/: Prometheus's tool accepts them, and their metrics exist."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from tests.daemon.harness import need
+from tests.needs import need
 from tests.ops.test_metrics import STATUS
 from uavlinkd.core.drops import DropReason
 from uavlinkd.ops.metrics import exposition
@@ -24,7 +24,7 @@ KNOWN = set(re.findall(r"(?m)^(uavlinkd_\w+)", exposition(STATUS, 1.0).decode())
 
 
 def promtool(*arguments: str | Path) -> str:
-    """What Prometheus's tool says; it has to be content."""
+    """The output of Prometheus's tool, which must succeed."""
     path = shutil.which("promtool")
     need(path is not None, "promtool, of Debian's package prometheus")
     done = subprocess.run([str(path), *map(str, arguments)], capture_output=True, text=True, check=False)
@@ -33,7 +33,7 @@ def promtool(*arguments: str | Path) -> str:
 
 
 def expressions() -> list[str]:
-    """Of the dashboard, with its variables replaced as Grafana does."""
+    """The expressions of the dashboard, with its variables replaced as Grafana does."""
     return [
         target["expr"].replace("$__rate_interval", "1m").replace("$instance", ".*").replace("$peer", ".*")
         for panel in DASHBOARD["panels"]
@@ -41,23 +41,33 @@ def expressions() -> list[str]:
     ]
 
 
-def test_prometheus_takes_the_alerts() -> None:
-    """All of them."""
+def test_prometheus_accepts_the_alerts() -> None:
+    """The tool reads all of them."""
     assert f"SUCCESS: {ALERTS.read_text().count('- alert:')} rules found" in promtool("check", "rules", ALERTS)
 
 
 _REFUSED = 'uavlinkd_peer_refused_frames_total{instance="a",peer="b"'
 
-# Alert -> what Prometheus has sampled, each 15 s; when it is looked at; whether it is raised then.
+_FINDING = 'uavlinkd_finding{instance="a",cause="wrong_psk",subject="peer",name="b"'
+
+# Alert -> the samples of Prometheus, every 15 s; then times, and whether the alert fires at each.
 CASES: dict[str, tuple[dict[str, str], list[tuple[str, bool]]]] = {
-    "UavlinkdNotThere": ({'up{job="uavlinkd",instance="a"}': "1 0x20"}, [("15s", False), ("1m", True)]),
-    "UavlinkdStartsAgainAndAgain": (
+    "UavlinkdDown": ({'up{job="uavlinkd",instance="a"}': "1 0x20"}, [("15s", False), ("1m", True)]),
+    "UavlinkdRestarts": (
         {'uavlinkd_uptime_seconds{instance="a"}': "1 16 1 16 1 16 1 16"},
         [("45s", False), ("2m", True), ("15m", False)],
     ),
     "UavlinkdPeerDown": (
         {'uavlinkd_peer_up{instance="a",peer="b"}': "1 1 0x20"},
         [("15s", False), ("30s", False), ("1m", True)],
+    ),
+    "UavlinkdSecurity": (
+        {f'{_FINDING},severity="security"}}': "_ 1 1 _ _ _ _ _ _ _ _ _ _ _ _ _ _ _ _ _ _ _ _ _ _ _"},
+        [("0s", False), ("15s", True), ("6m15s", False)],
+    ),
+    "UavlinkdFault": (
+        {f'{_FINDING},severity="fault"}}': "_ 1x20", f'{_FINDING},severity="warning"}}': "1x20"},
+        [("30s", False), ("1m", True)],
     ),
     "UavlinkdLoss": (
         {'uavlinkd_path_loss_ratio{instance="a",peer="b",direction="in"}': "0.2x4 0.21x20"},
@@ -83,14 +93,14 @@ CASES: dict[str, tuple[dict[str, str], list[tuple[str, bool]]]] = {
         [("4m", False), ("8m", True)],
     ),
     "UavlinkdFlood": (
-        {  # Only all of them together are above 50 a second.
+        {  # Only their sum is above 50 per second.
             'uavlinkd_rx_dropped_total{instance="a",peer="",reason="rate_limited"}': "0+100x20 2000+400x20",
             'uavlinkd_rx_dropped_total{instance="a",peer="b",reason="over_share"}': "0+0x20 0+300x20",
             'uavlinkd_rx_dropped_total{instance="a",peer="b",reason="group_budget_spent"}': "0+0x20 0+300x20",
         },
         [("4m", False), ("8m", True)],
     ),
-    "UavlinkdPeerOversteps": (
+    "UavlinkdPolicyViolation": (
         {
             f'{_REFUSED},direction="in",reason="foreign_system"}}': "0x4 1x40",
             f'{_REFUSED},direction="in",reason="rate_limited"}}': "0+9x40",
@@ -98,15 +108,15 @@ CASES: dict[str, tuple[dict[str, str], list[tuple[str, bool]]]] = {
         },
         [("1m", False), ("2m", True)],
     ),
-    "UavlinkdNobodyAtEndpoint": (
-        {'uavlinkd_endpoint_programs{instance="a",endpoint="autopilot"}': "1x4 0x20"},
+    "UavlinkdNoClient": (
+        {'uavlinkd_endpoint_clients{instance="a",endpoint="autopilot"}': "1x4 0x20"},
         [("1m", False), ("3m", True)],
     ),
     "UavlinkdEndpointSilent": (
         {
-            'uavlinkd_endpoint_programs{instance="a",endpoint="autopilot"}': "1x40",
+            'uavlinkd_endpoint_clients{instance="a",endpoint="autopilot"}': "1x40",
             'uavlinkd_endpoint_receive_frames_total{instance="a",endpoint="autopilot"}': "0+50x8 400x20",
-            'uavlinkd_endpoint_programs{instance="a",endpoint="spare"}': "0x40",
+            'uavlinkd_endpoint_clients{instance="a",endpoint="spare"}': "0x40",
             'uavlinkd_endpoint_receive_frames_total{instance="a",endpoint="spare"}': "0x40",
         },
         [("2m", False), ("3m", False), ("4m30s", True)],
@@ -118,18 +128,18 @@ CASES: dict[str, tuple[dict[str, str], list[tuple[str, bool]]]] = {
 }
 
 
-def test_every_alert_is_tried() -> None:
-    """Below."""
+def test_every_alert_has_a_case() -> None:
+    """Each alert is in the table above."""
     assert set(CASES) == set(re.findall(r"- alert: (\w+)", ALERTS.read_text()))
 
 
 @pytest.mark.parametrize("alert", CASES)
-def test_alert_is_raised_when_it_should_be(tmp_path: Path, alert: str) -> None:
-    """By Prometheus's own unit tests: not just before, but then, and its words can be made."""
+def test_alert_fires_at_the_right_time(tmp_path: Path, alert: str) -> None:
+    """Prometheus's unit tests: it does not fire just before, it fires then, and its text can be expanded."""
     series, moments = CASES[alert]
     lines = [f"rule_files: [{json.dumps(str(ALERTS))}]", "evaluation_interval: 15s", "tests:", "- interval: 15s"]
     lines.append("  input_series:")
-    lines += [f"  - {{series: {json.dumps(name)}, values: {json.dumps(each)}}}" for name, each in series.items()]
+    lines += [f"  - {{series: {json.dumps(name)}, values: {json.dumps(values)}}}" for name, values in series.items()]
     lines.append("  promql_expr_test:")
     for at, is_raised in moments:
         expected = "[{value: 1}]" if is_raised else "[]"
@@ -140,29 +150,31 @@ def test_alert_is_raised_when_it_should_be(tmp_path: Path, alert: str) -> None:
     promtool("test", "rules", path)
 
 
-def test_alerts_and_dashboard_ask_for_what_there_is() -> None:
-    """Every metric in them stands in a real exposition, every reason is one."""
+def test_metrics_of_alerts_and_dashboard_exist() -> None:
+    """Every metric is in a real exposition, and every reason is a member of its enum."""
     text = ALERTS.read_text() + json.dumps(DASHBOARD)
-    asked = set(re.findall(r"\buavlinkd_\w+", text))
-    assert asked
-    assert asked <= KNOWN
+    used = set(re.findall(r"\buavlinkd_\w+", text))
+    assert used
+    assert used <= KNOWN
     dropped = re.findall(r'rx_dropped_total\{reason=~"([\w|]+)"', ALERTS.read_text())
-    assert {reason for each in dropped for reason in each.split("|")} <= set(DropReason)
+    assert {reason for reasons in dropped for reason in reasons.split("|")} <= set(DropReason)
 
 
-def test_prometheus_takes_the_expressions_of_the_dashboard(tmp_path: Path) -> None:
-    """Written as recording rules, each is one that it can evaluate."""
-    rules = [f"  - {{record: panel_{n}, expr: {json.dumps(each)}}}" for n, each in enumerate(expressions())]
+def test_prometheus_accepts_the_expressions_of_the_dashboard(tmp_path: Path) -> None:
+    """As recording rules, it can evaluate them all."""
+    rules = [
+        f"  - {{record: panel_{n}, expr: {json.dumps(expression)}}}" for n, expression in enumerate(expressions())
+    ]
     path = tmp_path / "rules.yml"
     path.write_text("groups:\n- name: dashboard\n  rules:\n" + "\n".join(rules))
     assert f"SUCCESS: {len(rules)} rules found" in promtool("check", "rules", path)
 
 
-def test_dashboard_has_what_grafana_needs() -> None:
-    """The keys of its model (dashboard schema 36), panels with ids of their own that do not overlap."""
+def test_dashboard_has_the_keys_that_grafana_needs() -> None:
+    """It has the keys of the dashboard schema 36, and panels with unique ids that do not overlap."""
     assert {"title", "uid", "schemaVersion", "panels", "templating", "time"} <= set(DASHBOARD)
     assert DASHBOARD["schemaVersion"] == 36
-    assert "id" not in DASHBOARD  # Grafana gives it when the file is imported
+    assert "id" not in DASHBOARD  # Grafana assigns it at the import
     panels: list[dict[str, Any]] = DASHBOARD["panels"]
     assert len({panel["id"] for panel in panels}) == len(panels)
     for panel in panels:
@@ -180,10 +192,10 @@ def test_dashboard_has_what_grafana_needs() -> None:
         )
 
 
-def test_dashboard_is_bound_to_no_one_source() -> None:
-    """Whoever imports it chooses the Prometheus; and every variable that it uses is there."""
+def test_dashboard_works_with_any_data_source() -> None:
+    """The user selects the Prometheus at the import, and every used variable is defined."""
     text = json.dumps(DASHBOARD["panels"])
     assert set(re.findall(r'"uid": "([^"]*)"', text)) == {"${datasource}"}
-    variables = {each["name"] for each in DASHBOARD["templating"]["list"]}
+    variables = {variable["name"] for variable in DASHBOARD["templating"]["list"]}
     used = set(re.findall(r"\$\{?(\w+)", text)) - {"__rate_interval"}
     assert used <= variables == {"datasource", "instance", "peer"}

@@ -1,4 +1,4 @@
-"""The table of a policy: short, and whoever reads it knows of each message whether it passes."""
+"""The table of a policy: it is short, and shows for each message whether it passes."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import pytest
 from rich.console import Console
 
 from uavlinkd.mavlink import dialect
-from uavlinkd.mavlink.policy.gate import Gate, Refusal
 from uavlinkd.mavlink.policy.compilation import compile_policy
+from uavlinkd.mavlink.policy.gate import Gate, Refusal
 from uavlinkd.mavlink.policy.roles import ROLES
 from uavlinkd.ops.policy_table import table_rows, tables
 
@@ -34,7 +34,7 @@ _POLICIES: dict[str, dict[str, object]] = {
 
 
 def _read(cells: dict[str, str]) -> set[str]:
-    """The messages that pass, as a person reads them from one side of a table."""
+    """The messages that pass, as a reader understands one side of a table."""
     passing: set[str] = set()
     refused: set[str] = set()
     for group, cell in cells.items():
@@ -57,8 +57,8 @@ def _passing(gate: Gate) -> set[str]:
 
 
 @pytest.mark.parametrize("case", _POLICIES)
-def test_reader_knows_of_each_message_whether_it_passes(case: str) -> None:
-    """What is left out of a long cell is told in another row: the table is read back into what the gates do."""
+def test_table_agrees_with_the_gates(case: str) -> None:
+    """A message that a long cell omits is in another row: the table, read back, allows what the gates allow."""
     data = {"system_ids": [1], **_POLICIES[case]}
     policy = compile_policy(data)
     rows = [row for row in table_rows(policy, data) if row.subject in dialect.GROUPS]
@@ -66,15 +66,15 @@ def test_reader_knows_of_each_message_whether_it_passes(case: str) -> None:
     assert _read({row.subject: row.outgoing for row in rows}) == _passing(policy.outgoing)
 
 
-def test_every_message_that_goes_first_is_in_another_group() -> None:
-    """So the table may leave out the group that only says what goes first."""
+def test_every_urgent_message_is_in_another_group() -> None:
+    """Therefore the table may omit the group `urgent`, which sets only the order."""
     assert "urgent" not in {row.subject for row in table_rows(compile_policy({}, is_local=True), {})}
     elsewhere = {name for group, members in dialect.GROUPS.items() if group != "urgent" for name in members}
     assert set(dialect.GROUPS["urgent"]) <= elsewhere
 
 
 def test_long_cell_is_shorter_than_the_policys_own() -> None:
-    """Telemetry to a vehicle is 15 messages, of which other rows tell all but one; the commands in it stay told."""
+    """Telemetry to a vehicle has 15 messages, and other rows list all but one. The commands in it stay listed."""
     data: dict[str, object] = {"role": "operator", "system_ids": [255], "deny_in": ["MAV_CMD_DO_FLIGHTTERMINATION"]}
     rows = {row.subject: row for row in table_rows(compile_policy(data), data)}
     assert rows["telemetry"].incoming == "only STATUSTEXT, 14 listed in other rows"
@@ -95,8 +95,8 @@ def test_names_of_groups_are_whole_on_eighty_columns() -> None:
     assert {"parameter-reads", "mission-reads", "control-access"} <= words
 
 
-def test_exceptions_are_told_once_too() -> None:
-    """What a group lacks because another group is refused as a whole is told there."""
+def test_exceptions_are_listed_once() -> None:
+    """A message that is refused with a whole group is listed in the row of that group only."""
     data: dict[str, object] = {"role": "vehicle", "system_ids": [1], "deny_out": ["files"]}
     rows = {row.subject: row for row in table_rows(compile_policy(data), data)}
     assert rows["files"].outgoing == "none"
@@ -105,8 +105,8 @@ def test_exceptions_are_told_once_too() -> None:
     )
 
 
-def test_rates_stand_as_they_were_written() -> None:
-    """A group's rate is one entry, not one for each of its messages; without any there is a dash."""
+def test_rates_are_shown_as_in_the_file() -> None:
+    """A group's rate is one entry, not one for each of its messages; a dash means no rate."""
     data: dict[str, object] = {"role": "all", "system_ids": [1], "rate_out": {"telemetry": 0.5, "ATTITUDE": 2}}
     (rates,) = (row for row in table_rows(compile_policy(data), data) if row.subject == "rates")
     assert (rates.incoming, rates.outgoing) == ("-", "telemetry 0.5/s, ATTITUDE 2/s")

@@ -1,4 +1,4 @@
-"""Recording beside the frame path: what crossed the link, both ways, and nothing that holds the link up."""
+"""The recorder: it records the frames of a link, and never delays them."""
 
 from __future__ import annotations
 
@@ -19,11 +19,12 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from structlog.testing import capture_logs
 from structlog.typing import FilteringBoundLogger
 
-from tests.daemon.harness import frame, heartbeat, need
+from tests.daemon.frames import frame, heartbeat
+from tests.needs import need
 from tests.waiting import until
 from uavlinkd.config import Recording
-from uavlinkd.ops.recorder import CLOCK_STEP_S, FROM_PEER, MAX_BUFFERED_BYTES, RETRY_S, TO_PEER, Recorder
 from uavlinkd.lab.sim.tlog import read_tlog
+from uavlinkd.ops.recorder import CLOCK_STEP_S, FROM_PEER, MAX_BUFFERED_BYTES, RETRY_S, TO_PEER, Recorder
 from uavlinkd.ops.tlog_files import TlogFolder
 
 NOW_S = 1_700_000_000.0
@@ -43,27 +44,27 @@ def setup_signing() -> bytes:
 
 
 def recorded(path: Path) -> list[list[tuple[int, bytes]]]:
-    """Times and frames, file by file."""
+    """Times and frames of each file."""
     files = sorted((path / "flights").iterdir())
-    return [[(each.time_us, each.frame) for each in read_tlog(file).records] for file in files]
+    return [[(entry.time_us, entry.frame) for entry in read_tlog(file).records] for file in files]
 
 
-async def test_pymavlink_reads_what_was_recorded(tmp_path: Path) -> None:
-    """Frames, times, and which way each went: its link number."""
+async def test_pymavlink_reads_a_recording(tmp_path: Path) -> None:
+    """It reads frames, times, and the direction as the link number."""
     recorder = Recorder(Recording(tmp_path / "flights", 1 << 20, 9, 0), log(), lambda: NOW_S)
     recorder.add("drone1", [frame(1), frame(2)], FROM_PEER, 0.0)
     recorder.add("drone1", [frame(3)], TO_PEER, 1.5)
     recorder.stop(2.0)
     (path,) = (tmp_path / "flights").iterdir()
     reader = mavutil.mavlink_connection(str(path))
-    seen = [(each.value, each._link, each._timestamp) for each in iter(reader.recv_msg, None)]
+    seen = [(message.value, message._link, message._timestamp) for message in iter(reader.recv_msg, None)]
     reader.close()
     assert [one[:2] for one in seen] == [(1, FROM_PEER), (2, FROM_PEER), (3, TO_PEER)]
     assert [one[2] for one in seen] == pytest.approx([NOW_S, NOW_S, NOW_S + 1.5], abs=1e-5)
 
 
-async def test_tools_read_what_was_recorded(tmp_path: Path) -> None:
-    """mavlogdump prints it, with the reader that MAVProxy's MAVExplorer has too."""
+async def test_tools_read_a_recording(tmp_path: Path) -> None:
+    """mavlogdump prints it, with the same reader as MAVProxy's MAVExplorer."""
     tool = shutil.which("mavlogdump.py", path=str(Path(sys.executable).parent))
     need(tool is not None, "mavlogdump.py, which pymavlink brings")
     recorder = Recorder(Recording(tmp_path / "flights", 1 << 20, 9, 0), log(), lambda: NOW_S)
@@ -75,24 +76,29 @@ async def test_tools_read_what_was_recorded(tmp_path: Path) -> None:
     done = await asyncio.create_subprocess_exec(sys.executable, str(tool), "--format=json", path, stdout=PIPE)
     output, _ = await done.communicate()
     seen = [json.loads(line) for line in output.splitlines()]
-    assert [each["meta"]["type"] for each in seen] == ["HEARTBEAT", "NAMED_VALUE_INT", "STATUSTEXT", "HEARTBEAT"]
+    assert [message["meta"]["type"] for message in seen] == [
+        "HEARTBEAT",
+        "NAMED_VALUE_INT",
+        "STATUSTEXT",
+        "HEARTBEAT",
+    ]
     assert seen[2]["data"]["text"] == "found in the recording"
-    assert [each["meta"]["timestamp"] - NOW_S for each in seen] == pytest.approx([0, 0, 0, 1], abs=1e-4)
+    assert [message["meta"]["timestamp"] - NOW_S for message in seen] == pytest.approx([0, 0, 0, 1], abs=1e-4)
 
 
-async def test_secrets_are_left_out(tmp_path: Path) -> None:
-    """SETUP_SIGNING is not recorded, and what is beside it is."""
+async def test_secrets_are_not_recorded(tmp_path: Path) -> None:
+    """SETUP_SIGNING is omitted, and other frames of the batch are recorded."""
     recorder = Recorder(Recording(tmp_path / "flights", 1 << 20, 9, 0), log())
     recorder.add("drone1", [frame(1), setup_signing(), frame(2)], FROM_PEER, 0.0)
     recorder.add("drone1", [setup_signing()], TO_PEER, 0.0)
     recorder.stop(0.0)
     (path,) = (tmp_path / "flights").iterdir()
     assert b"secret" not in path.read_bytes()
-    assert [each.frame for each in read_tlog(path).records] == [frame(1), frame(2)]
+    assert [entry.frame for entry in read_tlog(path).records] == [frame(1), frame(2)]
 
 
-async def test_what_came_is_written_at_housekeeping(tmp_path: Path) -> None:
-    """Once a second at most, and counted; nothing new, nothing written."""
+async def test_buffer_is_written_at_housekeeping(tmp_path: Path) -> None:
+    """Frames are written and counted; without new frames there is no write."""
     recorder = Recorder(Recording(tmp_path / "flights", 1 << 20, 9, 0), log())
     recorder.do_housekeeping(0.0)
     assert not (tmp_path / "flights").exists()
@@ -103,8 +109,8 @@ async def test_what_came_is_written_at_housekeeping(tmp_path: Path) -> None:
     recorder.stop(2.0)
 
 
-async def test_a_clock_that_is_set_begins_a_file_and_drift_does_not(tmp_path: Path) -> None:
-    """Within a file, times differ by what passed."""
+async def test_clock_change_begins_a_file_and_drift_does_not(tmp_path: Path) -> None:
+    """Within a file, time differences are real durations."""
     clock = [0.0]
     recorder = Recorder(Recording(tmp_path / "flights", 1 << 20, 9, 0), log(), lambda: clock[0])
     for now, time_s in ((0.0, 5.0), (10.0, 15.0 + CLOCK_STEP_S - 0.01), (20.0, NOW_S), (30.0, NOW_S + 10)):
@@ -116,8 +122,8 @@ async def test_a_clock_that_is_set_begins_a_file_and_drift_does_not(tmp_path: Pa
     assert times == [pytest.approx([5.0, 15.0], abs=1e-5), pytest.approx([NOW_S, NOW_S + 10], abs=1e-5)]
 
 
-async def test_times_before_1970_are_none(tmp_path: Path) -> None:
-    """A clock below zero gives zero."""
+async def test_time_before_1970_is_zero(tmp_path: Path) -> None:
+    """A negative clock is recorded as zero."""
     recorder = Recorder(Recording(tmp_path / "flights", 1 << 20, 9, 0), log(), lambda: -5.0)
     recorder.add("drone1", [frame(1)], TO_PEER, 0.0)
     recorder.stop(0.0)
@@ -125,7 +131,7 @@ async def test_times_before_1970_are_none(tmp_path: Path) -> None:
 
 
 async def test_full_disk_stops_recording_and_room_resumes_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Said once each; what came in between is counted, and nothing is tried before its time."""
+    """Each is logged once. Frames in between are counted as lost, and no write is tried too early."""
     tries: list[float] = []
     is_full = [True]
     append = TlogFolder.append
@@ -150,11 +156,11 @@ async def test_full_disk_stops_recording_and_room_resumes_it(tmp_path: Path, mon
         recorder.stop(3 * RETRY_S)
     assert tries == [0.0, RETRY_S, 2 * RETRY_S]
     assert (recorder.frames, recorder.frames_lost, recorder.failures) == (2, 6, {"ENOSPC": 2})
-    assert [each["event"] for each in logs] == ["recording_stopped", "recording_resumed"]
+    assert [line["event"] for line in logs] == ["recording_stopped", "recording_resumed"]
 
 
-async def test_a_disk_that_hangs_holds_nothing_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Frames go on being taken, up to the bound; then they are counted; and the end does not wait for ever."""
+async def test_hanging_disk_delays_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Frames are buffered up to the limit, then counted as lost, and the stop does not wait indefinitely."""
     answer = threading.Event()
     monkeypatch.setattr(TlogFolder, "append", lambda *_: answer.wait(30) and 0)
     monkeypatch.setattr("uavlinkd.ops.recorder.STOP_WAIT_S", 0.05)
@@ -165,15 +171,15 @@ async def test_a_disk_that_hangs_holds_nothing_up(tmp_path: Path, monkeypatch: p
     while not recorder.frames_lost:
         recorder.add("drone1", batch, FROM_PEER, 1.0)
         recorder.do_housekeeping(1.0)
-    assert recorder._buffered_bytes < MAX_BUFFERED_BYTES + sum(8 + len(each) for each in batch)
+    assert recorder._buffered_bytes < MAX_BUFFERED_BYTES + sum(8 + len(raw) for raw in batch)
     assert recorder.frames_lost == len(batch)
     recorder.stop(2.0)
     answer.set()
     await until(lambda: not recorder._thread.is_alive())
 
 
-async def test_a_folder_of_another_daemon_is_left_to_it(tmp_path: Path) -> None:
-    """Under a reason of its own."""
+async def test_folder_of_another_daemon_is_not_used(tmp_path: Path) -> None:
+    """The failure has its own reason."""
     settings = Recording(tmp_path / "flights", 1 << 20, 9, 0)
     first, second = Recorder(settings, log()), Recorder(settings, log())
     first.add("drone1", [frame(1)], FROM_PEER, 0.0)
@@ -184,6 +190,6 @@ async def test_a_folder_of_another_daemon_is_left_to_it(tmp_path: Path) -> None:
         second.do_housekeeping(0.0)
         await until(lambda: bool(second.failures))
     assert second.failures == {"folder_in_use": 1}
-    assert [each["reason"] for each in logs] == ["folder_in_use"]
+    assert [line["reason"] for line in logs] == ["folder_in_use"]
     first.stop(1.0)
     second.stop(1.0)

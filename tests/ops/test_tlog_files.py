@@ -1,4 +1,4 @@
-"""The folder of recordings: whole records, bounded files, the oldest deleted, and nobody else's."""
+"""The folder of recordings: whole records, bounded files, and deletion of our oldest files only."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.daemon.harness import frame, need
+from tests.daemon.frames import frame
+from tests.needs import need
 from uavlinkd.config import Recording
 from uavlinkd.lab.sim.tlog import read_tlog
 from uavlinkd.ops.tlog_files import SYNC_INTERVAL_S, FolderInUseError, TlogFolder
@@ -23,7 +24,7 @@ DAY_S = 1_700_000_000
 
 
 def record(number: int) -> bytes:
-    """A genuine record of 34 bytes, a second after the one before."""
+    """A genuine record of 34 bytes, one second after the record before."""
     return ((DAY_S + number) * 1_000_000).to_bytes(8) + frame(number)
 
 
@@ -33,20 +34,20 @@ SIZE = len(record(1))
 def folder_at(
     path: Path, max_file_bytes: int = 10 * SIZE, max_files: int = 100, min_free_bytes: int = 0
 ) -> TlogFolder:
-    """A folder there."""
+    """A folder with these settings."""
     return TlogFolder(Recording(path / "flights", max_file_bytes, max_files, min_free_bytes))
 
 
 def kept(path: Path) -> dict[str, list[bytes]]:
-    """What the files hold, by name, in the order of their names."""
+    """The content of the files, in the order of their names."""
     return {
-        each.name: [one.time_us.to_bytes(8) + one.frame for one in read_tlog(each).records]
-        for each in sorted((path / "flights").iterdir())
+        file.name: [entry.time_us.to_bytes(8) + entry.frame for entry in read_tlog(file).records]
+        for file in sorted((path / "flights").iterdir())
     }
 
 
-def test_each_peer_has_a_file_for_its_owner_alone(tmp_path: Path) -> None:
-    """Named by number, time and peer; the folder is made."""
+def test_each_peer_has_a_private_file(tmp_path: Path) -> None:
+    """Its name has number, time and peer; the folder is created."""
     folder = folder_at(tmp_path)
     assert folder.append("drone1", [record(1), record(2)], 0, 0.0) == 2 * SIZE
     folder.append("drone2", [record(3)], 0, 0.0)
@@ -56,12 +57,12 @@ def test_each_peer_has_a_file_for_its_owner_alone(tmp_path: Path) -> None:
         "00000001-20231114T221321Z-drone1.tlog": [record(1), record(2), record(4)],
         "00000002-20231114T221323Z-drone2.tlog": [record(3)],
     }
-    assert {each.stat().st_mode & 0o777 for each in (tmp_path / "flights").iterdir()} == {0o600}
+    assert {file.stat().st_mode & 0o777 for file in (tmp_path / "flights").iterdir()} == {0o600}
     assert (tmp_path / "flights").stat().st_mode & 0o777 == 0o700
 
 
-def test_file_ends_where_the_next_record_does_not_fit(tmp_path: Path) -> None:
-    """At the limit it still does; one byte less, and it goes into the next file."""
+def test_record_that_does_not_fit_goes_into_the_next_file(tmp_path: Path) -> None:
+    """At the limit it fits; with one byte less it does not."""
     for limit, files in ((10 * SIZE, [10, 1]), (10 * SIZE - 1, [9, 2])):
         path = tmp_path / str(limit)
         path.mkdir()
@@ -69,39 +70,39 @@ def test_file_ends_where_the_next_record_does_not_fit(tmp_path: Path) -> None:
         for number in range(11):
             folder.append("drone1", [record(number)], 0, 0.0)
         folder.close()
-        assert [len(each) for each in kept(path).values()] == files
+        assert [len(records) for records in kept(path).values()] == files
 
 
 @given(batches=st.lists(st.integers(0, 40), min_size=1, max_size=12), limit=st.integers(SIZE, 30 * SIZE))
 @settings(max_examples=30, deadline=None)
-def test_what_comes_in_any_batches_is_kept_in_order(
+def test_batches_of_any_size_are_written_in_order(
     tmp_path_factory: pytest.TempPathFactory, batches: list[int], limit: int
 ) -> None:
-    """Every record once, no file over its limit."""
+    """Every record is written once, and no file exceeds its limit."""
     path = tmp_path_factory.mktemp("any")
     folder = folder_at(path, limit, max_files=1000)
     records = [record(number) for number in range(sum(batches))]
     at = 0
-    for amount in batches:
-        folder.append("drone1", records[at : at + amount], 0, 0.0)
-        at += amount
+    for count in batches:
+        folder.append("drone1", records[at : at + count], 0, 0.0)
+        at += count
     folder.close()
-    found = kept(path)
-    assert [each for one in found.values() for each in one] == records
-    assert all((path / "flights" / name).stat().st_size <= limit for name in found)
+    files = kept(path)
+    assert [entry for file in files.values() for entry in file] == records
+    assert all((path / "flights" / name).stat().st_size <= limit for name in files)
 
 
 def test_oldest_are_deleted_for_the_newest_by_number(tmp_path: Path) -> None:
-    """Not by time: a drone that boots in 1970 keeps the flight of today."""
+    """The time does not matter: a drone that boots in 1970 keeps today's flight."""
     folder = folder_at(tmp_path, max_file_bytes=SIZE, max_files=3)
     for number in range(5):
         folder.append("drone1", [bytes(8) + frame(number)], 0, 0.0)
     folder.close()
-    assert [name[:17] for name in kept(tmp_path)] == [f"0000000{each}-19700101" for each in (3, 4, 5)]
+    assert [name[:17] for name in kept(tmp_path)] == [f"0000000{number}-19700101" for number in (3, 4, 5)]
 
 
-def test_numbers_go_on_after_a_restart(tmp_path: Path) -> None:
-    """And the recordings of before count as ours."""
+def test_numbers_continue_after_a_restart(tmp_path: Path) -> None:
+    """The earlier recordings are ours too."""
     for number in range(3):
         folder = folder_at(tmp_path, max_files=2)
         folder.append("drone1", [record(number)], 0, 0.0)
@@ -109,8 +110,8 @@ def test_numbers_go_on_after_a_restart(tmp_path: Path) -> None:
     assert [name[:8] for name in kept(tmp_path)] == ["00000002", "00000003"]
 
 
-def test_what_is_not_ours_stays(tmp_path: Path) -> None:
-    """However full it gets."""
+def test_other_files_are_never_deleted(tmp_path: Path) -> None:
+    """They stay on a full disk too."""
     (tmp_path / "flights").mkdir()
     others = [
         "flight.tlog",
@@ -128,28 +129,28 @@ def test_what_is_not_ours_stays(tmp_path: Path) -> None:
     assert len(list((tmp_path / "flights").iterdir())) == len(others) + 2
 
 
-def test_no_file_is_deleted_that_is_written_to(tmp_path: Path) -> None:
-    """More peers than files: each keeps the one that it has."""
+def test_open_file_is_not_deleted(tmp_path: Path) -> None:
+    """With more peers than files, each peer keeps its open file."""
     folder = folder_at(tmp_path, max_files=2)
     for number in range(4):
         folder.append(f"drone{number}", [record(number)], 0, 0.0)
     folder.append("drone0", [record(9)], 0, 0.0)
     folder.close()
-    assert [len(each) for each in kept(tmp_path).values()] == [2, 1, 1, 1]
+    assert [len(records) for records in kept(tmp_path).values()] == [2, 1, 1, 1]
 
 
-def test_a_clock_that_was_set_begins_a_file(tmp_path: Path) -> None:
-    """Time runs evenly in each."""
+def test_clock_change_begins_a_file(tmp_path: Path) -> None:
+    """Time does not jump within a file."""
     folder = folder_at(tmp_path)
     folder.append("drone1", [bytes(8) + frame(1)], 0, 0.0)
     folder.append("drone1", [record(2)], 1, 0.0)
     folder.append("drone1", [record(3)], 1, 0.0)
     folder.close()
-    assert [len(each) for each in kept(tmp_path).values()] == [1, 2]
+    assert [len(records) for records in kept(tmp_path).values()] == [1, 2]
 
 
-def test_disk_keeps_what_is_of_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The oldest go first, then nothing more is written; when there is room again, it goes on."""
+def test_reserved_space_stays_free(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The oldest files are deleted, then writing stops, and resumes with free space."""
     folder = folder_at(tmp_path, max_file_bytes=SIZE, min_free_bytes=1000)
     for number in range(3):
         folder.append("drone1", [record(number)], 0, 0.0)
@@ -176,8 +177,8 @@ def test_disk_keeps_what_is_of_others(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize("fault", ["error", "short"])
-def test_half_a_record_is_taken_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: str) -> None:
-    """A disk that takes a part, or fails: the file ends with a whole record, and an empty one is no file."""
+def test_partial_record_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: str) -> None:
+    """After a short write or an error, the file ends with a whole record. An empty file is deleted."""
     folder = folder_at(tmp_path)
     folder.append("drone1", [record(1)], 0, 0.0)
     write = os.write
@@ -199,7 +200,7 @@ def test_half_a_record_is_taken_back(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 
 def test_two_daemons_do_not_share_a_folder(tmp_path: Path) -> None:
-    """The second is told; once the first is done, it has it."""
+    """The second gets an error, until the first closes the folder."""
     first, second = folder_at(tmp_path), folder_at(tmp_path)
     first.append("drone1", [record(1)], 0, 0.0)
     with pytest.raises(FolderInUseError):
@@ -210,8 +211,8 @@ def test_two_daemons_do_not_share_a_folder(tmp_path: Path) -> None:
     assert len(kept(tmp_path)) == 2
 
 
-def test_a_file_that_was_taken_away_is_not_written_to(tmp_path: Path) -> None:
-    """What comes after is in a new one."""
+def test_removed_file_is_not_written(tmp_path: Path) -> None:
+    """Later records go into a new file."""
     folder = folder_at(tmp_path)
     folder.append("drone1", [record(1)], 0, 0.0)
     next((tmp_path / "flights").iterdir()).unlink()
@@ -220,8 +221,8 @@ def test_a_file_that_was_taken_away_is_not_written_to(tmp_path: Path) -> None:
     assert list(kept(tmp_path).values()) == [[record(2)]]
 
 
-def test_a_link_in_the_way_is_not_followed(tmp_path: Path) -> None:
-    """Nobody makes the daemon write elsewhere by foreseeing a name."""
+def test_symbolic_link_is_not_followed(tmp_path: Path) -> None:
+    """An attacker who predicts a name cannot redirect the file."""
     (tmp_path / "flights").mkdir()
     (tmp_path / "elsewhere").write_text("precious")
     folder = folder_at(tmp_path)
@@ -233,8 +234,8 @@ def test_a_link_in_the_way_is_not_followed(tmp_path: Path) -> None:
     assert (tmp_path / "elsewhere").read_text() == "precious"
 
 
-def test_power_may_fail(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every few seconds, what was written is brought to the disk."""
+def test_files_are_synced_for_a_power_cut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every few seconds, written records are flushed to the disk."""
     folder = folder_at(tmp_path)
     synced: list[int] = []
     monkeypatch.setattr(os, "fdatasync", synced.append)
@@ -253,29 +254,29 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     where.mkdir()
     command = ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(where)]
     can = os.geteuid() == 0 and subprocess.run(command, capture_output=True, check=False).returncode == 0
-    need(can, "root, and leave to mount a file system")
+    need(can, "root, and permission to mount a file system")
     yield where
     subprocess.run(["umount", "--lazy", str(where)], check=True)
 
 
 @pytest.mark.parametrize("min_free_bytes", [0, 300_000])
-def test_a_real_disk_is_never_filled(small_disk: Path, min_free_bytes: int) -> None:
-    """Five times what it holds: as much stays free as was asked for, the newest is kept, in whole records."""
-    other = small_disk / "of-somebody-else"
+def test_real_disk_is_never_filled(small_disk: Path, min_free_bytes: int) -> None:
+    """After five times its capacity, the reserved space is free, and the newest whole records are there."""
+    other = small_disk / "of-another-process"
     other.write_bytes(bytes(200_000))
     folder = folder_at(small_disk, max_file_bytes=50_000, min_free_bytes=min_free_bytes)
     batch, number = 200, 0
     for _ in range(5_000_000 // (batch * SIZE)):
-        records = [record(number + each) for each in range(batch)]
+        records = [record(number + offset) for offset in range(batch)]
         with suppress(OSError):
             folder.append("drone1", records, 0, float(number))
             number += batch
-        found = os.statvfs(small_disk)
-        assert found.f_bavail * found.f_frsize >= min_free_bytes
+        disk = os.statvfs(small_disk)
+        assert disk.f_bavail * disk.f_frsize >= min_free_bytes
     folder.close()
     assert other.stat().st_size == 200_000
     files = kept(small_disk)
     assert len(files) > 2
-    last = [each for file in files.values() for each in file]
-    assert last == [record(each) for each in range(number - len(last), number)]
+    last = [entry for file in files.values() for entry in file]
+    assert last == [record(index) for index in range(number - len(last), number)]
     assert number * SIZE > 4_000_000

@@ -1,4 +1,4 @@
-"""What ``uavlinkd check`` prints: everything a person must see, and no secret."""
+"""The output of ``uavlinkd check``: all facts for a review, and no secret."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from uavlinkd.config import keys
-from uavlinkd.config import Config, Endpoint, load_config
+from uavlinkd.config import Config, EndpointConfig, keys
 from uavlinkd.config.advice import exposure
+from uavlinkd.config.load import load_config
 from uavlinkd.endpoints.url import SerialUrl
 from uavlinkd.mavlink.policy.roles import ROLES
 from uavlinkd.ops.topology import describe, print_topology
@@ -66,8 +66,8 @@ def _line(printed: str, start: str) -> str:
     return next(line for line in printed.splitlines() if line.startswith(start))
 
 
-def test_who_and_where(folder: Path) -> None:
-    """Our name, our whole public key, and where we listen."""
+def test_identity_is_printed(folder: Path) -> None:
+    """The output has the name, the whole public key, and the listening addresses."""
     config = _load(folder, _FILE)
     printed = _printed(config)
     assert _line(printed, "name").split() == ["name", "drone0"]
@@ -77,10 +77,10 @@ def test_who_and_where(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("listen", "says"), [('["127.0.0.1:5790"]', "this machine only"), ("[]", "it calls its peers")]
+    ("listen", "says"), [('["127.0.0.1:5790"]', "this machine only"), ("[]", "it connects to its peers")]
 )
-def test_listening_less_is_said(folder: Path, listen: str, says: str) -> None:
-    """A daemon on loopback, or one that only calls, is not called open."""
+def test_daemon_that_the_network_cannot_reach_is_not_open(folder: Path, listen: str, says: str) -> None:
+    """It listens on loopback only, or connects only."""
     text = _FILE.split('[[peer]]\nname = "observer"', maxsplit=1)[0].replace('["0.0.0.0:5790"]', listen)
     line = _line(_printed(_load(folder, text)), "listens on")
     assert says in line
@@ -91,11 +91,11 @@ def test_each_peer_has_a_line(folder: Path) -> None:
     """Name, start of the key, addresses, suites, mode and PSK."""
     printed = _printed(_load(folder, _FILE))
     first, second = _line(printed, "drone1 "), _line(printed, "observer ")
-    assert "(it calls)" not in first
+    assert "(it connects)" not in first
     for part in (_PUBLIC[0][:8], "10.13.0.2:5790", "x25519", "authentic, 128-bit tag", "yes"):
         assert part in first
     assert "drone1.local:5790" in printed
-    for part in (_PUBLIC[1][:8], "(it calls)", "mlkem768 x25519", "encrypted", "no"):
+    for part in (_PUBLIC[1][:8], "(it connects)", "mlkem768 x25519", "encrypted", "no"):
         assert part in second
 
 
@@ -112,15 +112,15 @@ def test_sizes_are_those_of_the_wire(folder: Path) -> None:
     assert "adding 13-15" in short_tag
 
 
-def test_mac_key_length_is_told_where_it_was_chosen(folder: Path) -> None:
-    """The default is not worth a word."""
+def test_chosen_mac_key_length_is_printed(folder: Path) -> None:
+    """The default length is not."""
     chosen = _printed(_load(folder, _FILE.replace("psk_file", "mac_key_bits = 512\npsk_file")))
     assert "512-bit" in _line(chosen, "drone1 ")
     assert "512-bit" not in _printed(_load(folder, _FILE))
 
 
-def test_open_endpoint_stands_out(folder: Path) -> None:
-    """The one that the network reaches is told from the one it does not, in the table and in the warnings."""
+def test_open_endpoint_is_marked(folder: Path) -> None:
+    """An endpoint that the network reaches differs from others in the table, and causes a warning."""
     printed = _printed(_load(folder, _FILE))
     assert _line(printed, "autopilot").endswith("this machine")
     assert _line(printed, "tablet").endswith("THE NETWORK")
@@ -128,13 +128,13 @@ def test_open_endpoint_stands_out(folder: Path) -> None:
     assert "No warnings" not in printed
 
 
-def test_wire_is_open_to_nobody() -> None:
-    """A serial port is reached with hands."""
-    assert exposure(Endpoint("autopilot", SerialUrl("/dev/ttyACM0", 57600))) == "wire"
+def test_serial_port_is_not_open() -> None:
+    """The network does not reach it."""
+    assert exposure(EndpointConfig("autopilot", SerialUrl("/dev/ttyACM0", 57600))) == "wire"
 
 
 def test_every_warning_is_printed_whole(folder: Path) -> None:
-    """Folded, not cut."""
+    """Long warnings are folded, not cut."""
     config = _load(folder, _FILE)
     printed = " ".join(_printed(config).split())
     assert len(config.warnings) == 2
@@ -142,8 +142,8 @@ def test_every_warning_is_printed_whole(folder: Path) -> None:
         assert f"warning: {' '.join(warning.split())}" in printed
 
 
-def test_quiet_configuration_says_so(folder: Path) -> None:
-    """No warning is a statement too."""
+def test_configuration_without_warnings_is_reported(folder: Path) -> None:
+    """The output says that there are no warnings."""
     text = _FILE.replace("0.0.0.0:14551", "127.0.0.1:14551").replace('"mlkem768", ', "")
     assert _printed(_load(folder, text)).endswith("No warnings.\n")
 
@@ -156,30 +156,31 @@ def test_empty_sections_are_left_out(folder: Path) -> None:
     assert printed.count("warning:") == 2
 
 
-def test_routing_is_told(folder: Path) -> None:
-    """What may pass between peers, and where a frame for nobody known goes: the default and the other."""
-    told = " ".join(_printed(_load(folder, _FILE)).split())
-    assert "routing between peers and endpoints, from no peer to another; a frame for a system not heard yet" in told
-    assert "goes to all others" in told
+def test_routing_is_printed(folder: Path) -> None:
+    """The output has the rule between peers, and the rule for unknown systems."""
+    text = " ".join(_printed(_load(folder, _FILE)).split())
+    assert "routing between peers and endpoints only; a frame for an unknown system goes to all others" in text
     changed = '[routing]\nrelay = true\nunknown_targets = "drop"\n[[endpoint]]'
-    told = " ".join(_printed(_load(folder, _FILE.replace("[[endpoint]]", changed, 1))).split())
-    assert "routing from peers to other peers too; a frame for a system not heard yet goes nowhere" in told
+    text = " ".join(_printed(_load(folder, _FILE.replace("[[endpoint]]", changed, 1))).split())
+    assert (
+        "routing between peers and endpoints, and from peer to peer; a frame for an unknown system is dropped" in text
+    )
 
 
-def test_pace_is_told_for_those_who_share_it(folder: Path) -> None:
-    """Budget, delay and age; one line where every peer has the same."""
+def test_budget_is_printed_once_for_peers_that_share_it(folder: Path) -> None:
+    """A line has budget, delay and age, and the peers that have these values."""
     assert "every peer  each frame at once" in _printed(_load(folder, _FILE))
     slow = "budget_bits_s = 64000\ncoalesce_s = 0.25\nmax_age_s = 2.5\npsk_file"
     printed = _printed(_load(folder, _FILE.replace("psk_file", slow)))
-    on_the_way = printed.split("On the way to a peer\n")[1].split("\n\n")[0].splitlines()
-    assert on_the_way == [
-        "drone1    up to 64,000 bits/s; up to 0.25 s to share an envelope; what waited 2.5 s is dropped",
+    lines = printed.split("Sending to a peer\n")[1].split("\n\n")[0].splitlines()
+    assert lines == [
+        "drone1    up to 64,000 bits/s; up to 0.25 s to share an envelope; dropped after 2.5 s",
         "observer  each frame at once",
     ]
 
 
-def test_endpoint_is_told_with_its_age_and_radio_status(folder: Path) -> None:
-    """Each endpoint's own."""
+def test_endpoint_is_printed_with_age_and_radio_status(folder: Path) -> None:
+    """Each endpoint has its own values."""
     text = _FILE.replace(':14550"', ':14550"\nmax_age_s = 0.5\nradio_status = true')
     printed = _printed(_load(folder, text))
     assert _line(printed, "autopilot").split()[2:5] == ["0.5", "s", "yes"]
@@ -187,44 +188,44 @@ def test_endpoint_is_told_with_its_age_and_radio_status(folder: Path) -> None:
 
 
 def _policies(printed: str) -> dict[str, str]:
-    """The printed policies by the names of those who have them, spaces made one."""
+    """The printed policies by the names of their peers and endpoints, with single spaces."""
     parts = printed.split("\nPolicy of ")[1:]
     return {part.split("\n")[0]: " ".join(part.split("\n\n")[0].split()[1:]) for part in parts}
 
 
-def test_coalescing_alone_is_told(folder: Path) -> None:
-    """Frames wait without a budget too."""
+def test_coalescing_without_a_budget_is_printed(folder: Path) -> None:
+    """Frames wait although there is no budget."""
     printed = _printed(_load(folder, _FILE.replace("psk_file", "coalesce_s = 0.1\npsk_file")))
-    assert "drone1    no budget; up to 0.1 s to share an envelope; what waited 1 s is dropped" in printed
+    assert "drone1    no budget; up to 0.1 s to share an envelope; dropped after 1 s" in printed
 
 
 def test_policy_without_exceptions_has_no_table(folder: Path) -> None:
-    """Where everything but signing passes both ways, two lines say so."""
+    """If everything but signing passes in both directions, two lines are enough."""
     text = _FILE.replace('role = "swarm-member"', 'role = "all"')
     policy = _policies(_printed(_load(folder, text)))["drone1"]
-    assert policy.startswith("both ways heartbeat, position, telemetry, ")
-    assert policy.endswith("HEARTBEAT neither way signing")
+    assert policy.startswith("both directions heartbeat, position, telemetry, ")
+    assert policy.endswith("HEARTBEAT no direction signing")
 
 
-def test_each_peer_and_endpoint_is_told_with_its_role(folder: Path) -> None:
-    """Its name and its systems; a peer that may say everything is highlighted, with what that means."""
+def test_each_peer_and_endpoint_is_printed_with_its_role(folder: Path) -> None:
+    """A line has the name and the system ids. A peer that may send everything is highlighted."""
     printed = _printed(
         _load(folder, _FILE.replace('role = "observer"\nsystem_ids = [254]', 'role = "all"\nsystem_ids = "all"'))
     )
-    summary = printed.split("Who may say what\n")[1].split("\n\n")[0]
+    summary = printed.split("Roles\n")[1].split("\n\n")[0]
     rows = [line.split() for line in summary.splitlines()[2:]]
-    nothing_said = ["may", "say", "anything", "but", "SETUP_SIGNING", "any", "system"]
+    unlimited = ["may", "send", "everything", "except", "SETUP_SIGNING", "any"]
     assert rows == [
         ["peer", "drone1", "swarm-member", "2"],
-        ["peer", "observer", "all:", *nothing_said[2:]],
-        ["endpoint", "autopilot", *nothing_said],
-        ["endpoint", "tablet", *nothing_said],
+        ["peer", "observer", "all:", *unlimited[2:], "system"],
+        ["endpoint", "autopilot", *unlimited],
+        ["endpoint", "tablet", *unlimited],
     ]
     assert list(_policies(printed)) == ["drone1", "observer"]
 
 
-def test_policy_is_told_once_for_all_who_have_it(folder: Path) -> None:
-    """Peers and endpoints with other system ids, but the same rules, share a table."""
+def test_equal_policies_are_printed_once(folder: Path) -> None:
+    """Peers and endpoints with other system ids but the same rules share a table."""
     same = _FILE.replace('role = "observer"', 'role = "swarm-member"')
     same = same.replace(':14550"', ':14550"\nrole = "observer"\nsystem_ids = [1]')
     assert list(_policies(_printed(_load(folder, same)))) == ["drone1, observer", "autopilot"]
@@ -232,27 +233,27 @@ def test_policy_is_told_once_for_all_who_have_it(folder: Path) -> None:
     assert list(_policies(_printed(_load(folder, different)))) == ["drone1", "observer", "autopilot"]
 
 
-def test_where_metrics_are_and_recordings_go_is_told(folder: Path) -> None:
-    """A folder that a service cannot write to is seen here first."""
+def test_metrics_and_recordings_are_printed(folder: Path) -> None:
+    """The output has the URL of the metrics, and the folder of the recordings."""
     printed = _printed(
         _load(folder, _FILE + '[metrics]\nlisten = "127.0.0.1:9790"\n[recording]\nfolder = "flights"\n')
     )
-    told = "".join(printed.split())  # long lines are folded
-    assert "metricshttp://127.0.0.1:9790/metrics" in told
-    assert f"recordsin{folder / 'flights'}(1GBofitsdisk" in told
+    text = "".join(printed.split())  # long lines are folded
+    assert "metricshttp://127.0.0.1:9790/metrics" in text
+    assert f"recordings{folder / 'flights'}(keeps1GBofthedisk" in text
     plain = _printed(_load(folder, _FILE))
-    assert "records in" not in plain
+    assert "recordings" not in plain
     assert "metrics" not in plain
 
 
-def test_policy_tells_what_passes_and_what_does_not(folder: Path) -> None:
-    """Whole groups in a line each way, then what differs; a rate as it was written."""
+def test_policy_shows_what_passes_and_what_does_not(folder: Path) -> None:
+    """Whole groups share a line; then come the exceptions, and the rates as in the file."""
     text = _FILE.replace(
         'role = "swarm-member"', 'role = "swarm-member"\nallow_in = ["commands"]\nrate_out = { position = 2.5 }'
     ).replace("[2]", '[2]\ndeny_in = ["MAV_CMD_DO_FLIGHTTERMINATION"]\nmavlink1 = false')
     policy = _policies(_printed(_load(folder, text)))["drone1"]
-    both, rest = policy.split(" neither way ")
-    assert both == "both ways heartbeat, position"
+    both, rest = policy.split(" no direction ")
+    assert both == "both directions heartbeat, position"
     neither, rest = rest.split(" otherwise ")
     assert {"parameters", "mission-reads", "shell", "signing", "MAVLink 1"} <= set(neither.split(", "))
     assert "commands" not in neither.split(", ")
@@ -264,14 +265,14 @@ def test_policy_tells_what_passes_and_what_does_not(folder: Path) -> None:
 
 @pytest.mark.parametrize("role", ROLES)
 def test_plain_output_has_a_hundred_columns(folder: Path, role: str) -> None:
-    """Every role's table can be read without scrolling sideways."""
+    """The table of every role fits without horizontal scrolling."""
     printed = _printed(_load(folder, _FILE.replace('role = "observer"', f'role = "{role}"')))
     assert max(map(len, printed.splitlines())) <= 100
     assert "…" not in printed
 
 
 def test_plain_output_is_plain(folder: Path) -> None:
-    """Where there is no terminal: no control sequences, no spaces at line ends, nothing folded early."""
+    """Without a terminal there are no control sequences, no trailing spaces, and no narrow columns."""
     printed = _printed(_load(folder, _FILE))
     assert "\x1b" not in printed
     assert all(line == line.rstrip() for line in printed.splitlines())
@@ -279,7 +280,7 @@ def test_plain_output_is_plain(folder: Path) -> None:
 
 
 def test_terminal_output_fits_the_terminal(folder: Path) -> None:
-    """On 80 columns with colours nothing is cut off: cells are folded."""
+    """On 80 columns with colours, cells are folded and not cut."""
     console = Console(file=io.StringIO(), width=80, force_terminal=True, color_system="standard")
     with console.capture() as captured:
         print_topology(_load(folder, _FILE), console)
@@ -292,7 +293,7 @@ def test_terminal_output_fits_the_terminal(folder: Path) -> None:
 
 
 def test_no_secret_is_printed(folder: Path) -> None:
-    """Neither the private key nor a PSK, in no form."""
+    """The output has neither the private key nor a PSK, in any encoding."""
     printed = _printed(_load(folder, _FILE))
     for name in ("drone0.key", "pair.psk"):
         text = (folder / name).read_text().strip()
@@ -302,7 +303,7 @@ def test_no_secret_is_printed(folder: Path) -> None:
 
 
 def test_standard_output_is_the_default(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Without a console it goes where the command's output goes, the same as into a file."""
+    """Without a console, the text goes to standard output, as into a file."""
     config = _load(folder, _FILE)
     print_topology(config)
     assert capsys.readouterr().out == _printed(config)

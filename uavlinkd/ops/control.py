@@ -1,7 +1,7 @@
 """The control socket: a Unix socket on which the daemon answers its owner, and the client for it.
 
-One line of text asks, one line of JSON answers, and the connection is closed. Only the owner of the process may
-connect: the socket's mode is 0600.
+A request is one line of text, the answer one line of JSON. Then the server closes the connection. Only the owner of
+the process may connect: the socket has mode 0600.
 """
 
 from __future__ import annotations
@@ -16,23 +16,24 @@ from pathlib import Path
 from typing import Any
 
 MAX_REQUEST_BYTES = 256
-"""Unless the server is told otherwise: the longest request is a word."""
+"""Default limit: the daemon's requests are single words."""
 UNKNOWN = "unknown request"
 REQUEST_TIMEOUT_S = 5.0
-"""For the request to come, and for the answer to be taken. To find the answer takes as long as it takes."""
+"""Limit for sending the request, and for reading the answer. Making the answer has no limit."""
 MAX_CONNECTIONS = 8
 RECEIVE_BYTES = 65536
+_NO_UNIX_SOCKETS = "Python has no Unix sockets on this system: delete control_socket from the configuration"
 
 
 Answer = dict[str, object] | None
 
 
 class ControlError(Exception):
-    """The daemon could not be asked, or did not answer. The message is for a person."""
+    """The daemon did not get the request, or did not answer. The message says what to do."""
 
 
 class ControlServer:
-    """Answers requests with what ``answer`` gives, at once or later; None for a request that it does not know."""
+    """Answers requests with the result of ``answer``, which may be awaitable. None means an unknown request."""
 
     def __init__(
         self,
@@ -47,19 +48,21 @@ class ControlServer:
         self._connections = 0
 
     async def start(self) -> None:
-        """Listen.
+        """Listen on the socket.
 
         Raises:
-            ControlError: where the path cannot be used.
+            ControlError: the path cannot be used.
         """
-        if self._is_served():
+        if not hasattr(socket, "AF_UNIX"):
+            raise ControlError(_NO_UNIX_SOCKETS)
+        if is_served(self._path):
             raise ControlError(
-                f"cannot listen on the control socket {self._path}: another daemon answers there: name another"
+                f"cannot listen on the control socket {self._path}: another daemon answers there: choose another path"
             )
         sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
             if self._path.is_socket():
-                self._path.unlink()  # of a daemon that was killed: a socket without a listener is no use to anyone
+                self._path.unlink()  # left by a daemon that was killed: no process listens
             mask = os.umask(0o177)
             try:
                 sock.bind(str(self._path))
@@ -69,9 +72,7 @@ class ControlServer:
         except OSError as error:
             sock.close()
             raise ControlError(
-                f"cannot listen on the control socket {self._path}: {error.strerror or error}: "
-                f"its folder must be there and writable; of a service it is {_runtime_folder()}: write"
-                f' control_socket = "{_runtime_folder()}/control.sock"'
+                f"cannot listen on the control socket {self._path}: {error.strerror or error}: {_remedy(self._path)}"
             ) from None
 
     async def stop(self) -> None:
@@ -80,14 +81,6 @@ class ControlServer:
             self._server.close()
             with suppress(OSError):
                 self._path.unlink()
-
-    def _is_served(self) -> bool:
-        with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as sock:
-            sock.setblocking(False)  # a daemon that is busy has room in its queue, or says so at once
-            with suppress(BlockingIOError):
-                sock.connect(str(self._path))
-            return True
-        return False
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self._connections += 1
@@ -99,12 +92,12 @@ class ControlServer:
                 except ValueError:
                     answer = _line({"error": f"the request is longer than {self._max_request_bytes} bytes"})
                 else:
-                    answer = await self._respond(line)  # which takes as long as it takes
+                    answer = await self._respond(line)  # without a time limit
                 async with asyncio.timeout(REQUEST_TIMEOUT_S):
                     writer.write(answer)
                     await writer.drain()
         except (OSError, TimeoutError):
-            pass  # the client went away, or stalled: its loss
+            pass  # the client disconnected or hangs
         finally:
             self._connections -= 1
             writer.close()
@@ -116,6 +109,16 @@ class ControlServer:
         return _line({"error": UNKNOWN} if answer is None else answer)
 
 
+def is_served(path: Path) -> bool:
+    """Whether a daemon listens on this control socket."""
+    with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as sock:
+        sock.setblocking(False)  # a busy daemon has room in its queue, or refuses at once
+        with suppress(BlockingIOError):
+            sock.connect(str(path))
+        return True
+    return False
+
+
 def _line(answer: dict[str, object]) -> bytes:
     return json.dumps(answer).encode() + b"\n"
 
@@ -123,13 +126,15 @@ def _line(answer: dict[str, object]) -> bytes:
 def ask(
     path: Path, request: str, timeout_s: float = REQUEST_TIMEOUT_S, on_waiting: Callable[[], None] | None = None
 ) -> dict[str, Any]:
-    """Ask the daemon that listens at ``path``, and wait for its answer.
+    """Send a request to the daemon that listens at ``path``, and return its answer.
 
-    With ``on_waiting`` an answer may take longer: it is called after each ``timeout_s`` without one.
+    With ``on_waiting`` there is no time limit: it is called after each ``timeout_s`` without an answer.
 
     Raises:
-        ControlError: where there is no daemon, or no permission, or no answer but an error.
+        ControlError: no daemon listens, it refuses the client or the request, or it does not answer in time.
     """
+    if not hasattr(socket, "AF_UNIX"):
+        raise ControlError(_NO_UNIX_SOCKETS)
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as sock:
             sock.settimeout(timeout_s)
@@ -138,12 +143,12 @@ def ask(
             answer = json.loads(_read_answer(sock, on_waiting))
     except PermissionError:
         raise ControlError(
-            f"not allowed to ask at {path}: only root and the daemon's own user may, use sudo"
+            f"no permission to connect to {path}: only root and the daemon's user have it; use sudo"
         ) from None
     except OSError as error:
         raise ControlError(f"no daemon answers at {path}: {error.strerror or error}") from None
     except ValueError:
-        raise ControlError(f"the daemon at {path} gave no answer that can be read") from None
+        raise ControlError(f"the answer of the daemon at {path} is not valid JSON") from None
     if not isinstance(answer, dict) or answer.get("error") == UNKNOWN:
         raise ControlError(f"the daemon at {path} does not know the request {request!r}")
     if "error" in answer:
@@ -151,16 +156,25 @@ def ask(
     return answer
 
 
+def _remedy(path: Path) -> str:
+    """What to do about a socket that cannot be made."""
+    folder, of_service = path.parent, _runtime_folder()
+    if folder.is_relative_to(of_service):
+        return f"run `mkdir -p {folder}`, or start the service, which makes it"
+    make = "its folder must be writable" if folder.is_dir() else f"run `mkdir -p {folder}`"
+    return f'{make}; for a service, write control_socket = "{of_service}/control.sock"'
+
+
 def _runtime_folder() -> str:
-    """Where a service may put its socket: systemd says so (RuntimeDirectory= in systemd.exec(5))."""
+    """The folder for the socket of a service (RuntimeDirectory= in systemd.exec(5))."""
     return os.environ.get("RUNTIME_DIRECTORY", "/run/uavlinkd").partition(":")[0]
 
 
 def _read_answer(sock: socket.socket, on_waiting: Callable[[], None] | None) -> bytes:
-    """What comes until the daemon closes the connection.
+    """Read until the daemon closes the connection.
 
     Raises:
-        OSError: nothing came in time, and nobody wants to wait on.
+        OSError: no bytes arrived in time, and there is no ``on_waiting``.
     """
     answer = bytearray()
     while True:

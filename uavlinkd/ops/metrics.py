@@ -1,13 +1,13 @@
-"""Metrics for Prometheus, made of what the daemon tells about itself, in the text format 0.0.4
-(https://prometheus.io/docs/instrumenting/exposition_formats/).
+"""The daemon's status as metrics for Prometheus, in its text format 0.0.4.
 
-Names follow https://prometheus.io/docs/practices/naming/: base units, ``_total`` for what only grows. Labels are
-names from the configuration and reasons from closed lists: their number is bounded, whatever comes from the network.
-What tells of an attack is there from the start, as zero: Prometheus sees no increase in what was not there before.
+Names follow https://prometheus.io/docs/practices/naming/: base units, and ``_total`` for counters. Label values are
+names from the configuration and reasons from closed lists, so the network cannot increase their number. A counter
+that shows an attack starts at zero: Prometheus cannot see an increase of a series that did not exist before.
 
-Ages, not points in time: a drone without a clock does not know when a handshake was, but how long ago.
+Points in time are exported as ages: a drone without a set clock knows how old a handshake is, but not its date.
 
-Written here and not by a library: the loop that answers carries the link, and this takes a tenth of the time.
+``prometheus_client`` writes the format. Only the metrics server imports this module: the library takes memory and
+start time, which a daemon without metrics saves.
 """
 
 from __future__ import annotations
@@ -15,205 +15,204 @@ from __future__ import annotations
 import os
 import platform
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from prometheus_client import CONTENT_TYPE_PLAIN_0_0_4, CollectorRegistry, generate_latest
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.registry import Collector
+
 from uavlinkd import __version__
 from uavlinkd.core.drops import DropReason
 from uavlinkd.mavlink.policy.gate import Refusal
+from uavlinkd.ops.schema_versions import LOG_SCHEMA, METRICS_SCHEMA, STATUS_SCHEMA
 
-CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
+CONTENT_TYPE = CONTENT_TYPE_PLAIN_0_0_4
 
 Status = Mapping[str, Any]
-Sample = tuple[str, float]
-"""Labels as they are written, and the value."""
+Sample = tuple[Sequence[str], float]
+"""Label values, and the value."""
 
 _STATM = Path("/proc/self/statm")
 
 _PEER_AGES = {
-    "handshake_s": ("peer_last_handshake_age_seconds", "Since the last handshake that made new keys."),
-    "heard_s": ("peer_last_heard_age_seconds", "Since the last authentic datagram from the peer."),
-    "round_trip_s": ("round_trip_seconds", "To the peer and back."),
+    "handshake_s": ("peer_last_handshake_age_seconds", "Time since the last handshake that established keys."),
+    "last_received_s": ("peer_last_received_age_seconds", "Time since the last authentic datagram from the peer."),
+    "round_trip_s": ("round_trip_seconds", "Round-trip time to the peer."),
 }
 _PEER_TOTALS = {
     "bytes_received": ("peer_receive_bytes_total", "Bytes of datagrams from the peer."),
     "bytes_sent": ("peer_transmit_bytes_total", "Bytes of datagrams to the peer."),
     "bytes_elsewhere": (
         "peer_elsewhere_bytes_total",
-        "Bytes of answers to places where the peer is not known to be: somebody replays what it said.",
+        "Bytes of replies to addresses that the peer has not proved: an attacker replays its datagrams.",
     ),
-    "envelopes_received": ("peer_receive_envelopes_total", "Envelopes from the peer, authentic and new."),
+    "envelopes_received": ("peer_receive_envelopes_total", "Authentic envelopes from the peer, without duplicates."),
     "envelopes_sent": ("peer_transmit_envelopes_total", "Envelopes to the peer."),
     "frames_received": ("peer_receive_frames_total", "MAVLink frames from the peer."),
-    "handshakes": ("peer_handshakes_total", "Handshakes that made new keys."),
-    "envelopes_missing": ("peer_missing_envelopes_total", "Envelopes that the peer sent and that never came."),
-    "envelopes_out_of_order": ("peer_out_of_order_envelopes_total", "Envelopes that came after later ones."),
-    "challenges_unanswered": ("peer_unanswered_challenges_total", "Places that spoke as the peer and are not it."),
+    "handshakes": ("peer_handshakes_total", "Handshakes that established keys."),
+    "envelopes_missing": ("peer_missing_envelopes_total", "Envelopes that the peer sent and that did not arrive."),
+    "envelopes_out_of_order": ("peer_out_of_order_envelopes_total", "Envelopes that arrived after later ones."),
+    "challenges_unanswered": (
+        "peer_unanswered_challenges_total",
+        "Path challenges without a response: the address is not the peer's.",
+    ),
     "handshakes_unanswered": (
         "peer_unanswered_handshakes_total",
-        "Calls for new keys that had to be repeated while the peer was up.",
+        "Handshakes for new keys that were repeated while the peer was up.",
     ),
-    "cookies_taken": ("peer_taken_cookies_total", "Cookies taken from the peer, which it sends under load."),
+    "cookies_taken": ("peer_taken_cookies_total", "Cookies received from the peer, which sends them under load."),
     "echoes_unanswered": ("peer_unanswered_echoes_total", "Echo requests that the peer did not answer."),
 }
 _ENDPOINT_TOTALS = {
-    "bytes_received": ("endpoint_receive_bytes_total", "Bytes from the endpoint's programs."),
-    "bytes_sent": ("endpoint_transmit_bytes_total", "Bytes to the endpoint's programs."),
-    "frames_received": ("endpoint_receive_frames_total", "MAVLink frames from the endpoint's programs."),
-    "frames_sent": ("endpoint_transmit_frames_total", "MAVLink frames to the endpoint's programs."),
-    "garbage_bytes": ("endpoint_garbage_bytes_total", "Bytes from its programs that are in no MAVLink frame."),
+    "bytes_received": ("endpoint_receive_bytes_total", "Bytes from the clients of the endpoint."),
+    "bytes_sent": ("endpoint_transmit_bytes_total", "Bytes to the clients of the endpoint."),
+    "frames_received": ("endpoint_receive_frames_total", "MAVLink frames from the clients of the endpoint."),
+    "frames_sent": ("endpoint_transmit_frames_total", "MAVLink frames to the clients of the endpoint."),
+    "garbage_bytes": ("endpoint_garbage_bytes_total", "Bytes from clients that belong to no MAVLink frame."),
 }
 _RECORDING_TOTALS = {
     "frames": ("recording_frames_total", "Frames written to recordings."),
     "bytes": ("recording_bytes_total", "Bytes written to recordings."),
-    "frames_lost": ("recording_lost_frames_total", "Frames not recorded: the disk was full, broken or slow."),
+    "frames_lost": ("recording_lost_frames_total", "Frames that a full, failing or slow disk did not record."),
 }
 
 
 def exposition(status: Status, uptime_s: float) -> bytes:
-    """A status (:func:`uavlinkd.link.status.daemon_status`) as the text that Prometheus reads."""
-    peers, endpoints = status["peers"], status["endpoints"]
-    lines = [
-        *_daemon(status, uptime_s),
-        *_links(peers),
-        *_drops(status),
-        *_totals("peer", peers, _PEER_TOTALS),
-        *_reasons("peer_malformed_total", "Faults in what the peer said.", "peer", peers, "malformed"),
-        *_reasons("peer_unsent_frames_total", "Frames that its budget held back.", "peer", peers, "waiting_dropped"),
-        *_refused("peer", peers),
-        *_family(
-            "endpoint_programs",
-            "Programs at the endpoint.",
-            [(_labels(endpoint=name), len(each["programs"])) for name, each in endpoints.items()],
-        ),
-        *_totals("endpoint", endpoints, _ENDPOINT_TOTALS),
-        *_reasons("endpoint_malformed_total", "Faults in what programs said.", "endpoint", endpoints, "faults"),
-        *_reasons("endpoint_failures_total", "What went wrong there.", "endpoint", endpoints, "failures"),
-        *_refused("endpoint", endpoints),
-        *_recording(status["recording"]),
-        "",
-    ]
-    return "\n".join(lines).encode()
+    """Write a status (:func:`uavlinkd.link.status.daemon_status`) as the text that Prometheus reads."""
+    registry = CollectorRegistry()  # not the global one of the library, which measures the process its own way
+    registry.register(_StatusCollector(status, uptime_s))
+    return generate_latest(registry)
 
 
-def _daemon(status: Status, uptime_s: float) -> Iterator[str]:
-    labels = _labels(name=status["name"], version=__version__, python=platform.python_version())
-    yield from _family("build_info", "Which daemon this is.", [(labels, 1)])
-    yield from _family("uptime_seconds", "Since the daemon started.", [("", uptime_s)])
-    yield from _family("cpu_seconds_total", "Processor time of the daemon.", [("", time.process_time())])
+class _StatusCollector(Collector):
+    """Makes metrics from one status."""
+
+    def __init__(self, status: Status, uptime_s: float) -> None:
+        self._status = status
+        self._uptime_s = uptime_s
+
+    def collect(self) -> Iterator[Metric]:
+        """Every metric of the daemon."""
+        status, peers, endpoints = self._status, self._status["peers"], self._status["endpoints"]
+        yield from _daemon(status, self._uptime_s)
+        yield _findings(status["findings"])
+        yield from _links(peers)
+        yield from _drops(status)
+        yield from _totals("peer", peers, _PEER_TOTALS)
+        yield _reasons("peer_malformed_total", "Malformed payloads and frames.", "peer", peers, "malformed")
+        text = "Frames that waited for the peer's budget and were dropped."
+        yield _reasons("peer_unsent_frames_total", text, "peer", peers, "waiting_dropped")
+        yield _refused("peer", peers)
+        clients = [([name], len(endpoint["clients"])) for name, endpoint in endpoints.items()]
+        yield _family("endpoint_clients", "Clients of the endpoint.", ["endpoint"], clients)
+        yield from _totals("endpoint", endpoints, _ENDPOINT_TOTALS)
+        yield _reasons("endpoint_malformed_total", "Malformed input of clients.", "endpoint", endpoints, "faults")
+        yield _reasons("endpoint_failures_total", "Errors of the endpoint.", "endpoint", endpoints, "failures")
+        yield _refused("endpoint", endpoints)
+        yield from _recording(status["recording"])
+
+
+def _daemon(status: Status, uptime_s: float) -> Iterator[Metric]:
+    build = {"name": status["name"], "version": __version__, "python": platform.python_version()}
+    yield _family("build_info", "Name and version of the daemon.", [*build], [([*build.values()], 1)])
+    schemas = {"status": STATUS_SCHEMA, "log": LOG_SCHEMA, "metrics": METRICS_SCHEMA}
+    text = "Versions of the names in the JSON of `status`, in the log and in the metrics."
+    yield _family("schema_info", text, [*schemas], [([*map(str, schemas.values())], 1)])
+    passes = status["frames_pass"]
+    yield _family("frames_pass", "1 if every peer is up and no traffic is wholly refused.", [], [([], passes)])
+    yield _family("uptime_seconds", "Time since the daemon started.", [], [([], uptime_s)])
+    yield _family("cpu_seconds_total", "CPU time of the daemon.", [], [([], time.process_time())])
     with suppress(OSError, ValueError, IndexError):
-        pages = int(_STATM.read_text().split()[1])
-        resident = pages * os.sysconf("SC_PAGE_SIZE")
-        yield from _family("resident_memory_bytes", "Memory of the daemon.", [("", resident)])
+        resident = int(_STATM.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+        yield _family("resident_memory_bytes", "Resident memory of the daemon.", [], [([], resident)])
 
 
-def _links(peers: Mapping[str, Status]) -> Iterator[str]:
-    up = [(_labels(peer=name), peer["state"] == "up") for name, peer in peers.items()]
-    yield from _family("peer_up", "Whether the peer is linked.", up)
-    unverified = [(_labels(peer=name), peer["freshness_unverified_s"] is not None) for name, peer in peers.items()]
-    text = "Whether frames arrive that the peer does not confirm to be new: commands are dropped."
-    yield from _family("peer_freshness_unverified", text, unverified)
+def _findings(findings: Sequence[Mapping[str, str]]) -> Metric:
+    """One sample per cause and name: causes are a closed list, names are in the configuration."""
+    labels = ("cause", "severity", "subject", "name")
+    problems = dict.fromkeys(tuple(finding[label] for label in labels) for finding in findings)
+    return _family(
+        "finding", "1 for each problem that `uavlinkd status` shows.", labels, [(key, 1) for key in problems]
+    )
+
+
+def _links(peers: Mapping[str, Status]) -> Iterator[Metric]:
+    up = [([name], peer["state"] == "up") for name, peer in peers.items()]
+    yield _family("peer_up", "1 if the link to the peer is up.", ["peer"], up)
+    unverified = [([name], peer["freshness_unverified_s"] is not None) for name, peer in peers.items()]
+    text = "1 if the peer does not prove the freshness of its frames: the daemon drops its commands."
+    yield _family("peer_freshness_unverified", text, ["peer"], unverified)
     linked = {name: peer for name, peer in peers.items() if peer["session"] is not None}
-    yield from _family(
-        "peer_info",
-        "How the peer is spoken to, while it is.",
-        [
-            (_labels(peer=name, **{key: str(peer["session"][key]) for key in ("suite", "mode", "tag_bits")}), 1)
-            for name, peer in linked.items()
-        ],
-    )
-    yield from _family(
-        "path_loss_ratio",
-        "Envelopes that were lost lately, of those sent.",
-        [
-            (_labels(peer=name, direction=direction), peer[f"loss_{direction}"])
-            for name, peer in linked.items()
-            for direction in ("in", "out")
-        ],
-    )
-    for key, (name, text) in _PEER_AGES.items():
-        known = [(_labels(peer=peer), each[key]) for peer, each in peers.items() if each[key] is not None]
-        yield from _family(name, text, known)
+    shown = ["suite", "mode", "tag_bits"]
+    sessions = [([name, *(str(peer["session"][key]) for key in shown)], 1) for name, peer in linked.items()]
+    yield _family("peer_info", "Suite and mode of the session.", ["peer", *shown], sessions)
+    losses = [
+        ([name, direction], peer[f"loss_{direction}"]) for name, peer in linked.items() for direction in ("in", "out")
+    ]
+    yield _family("path_loss_ratio", "Share of recent envelopes that were lost.", ["peer", "direction"], losses)
+    for key, (metric, text) in _PEER_AGES.items():
+        yield _family(
+            metric, text, ["peer"], [([name], peer[key]) for name, peer in peers.items() if peer[key] is not None]
+        )
 
 
-def _drops(status: Status) -> Iterator[str]:
+def _drops(status: Status) -> Iterator[Metric]:
     by_peer = {"": status["drops"], **{name: peer["drops"] for name, peer in status["peers"].items()}}
-    yield from _family(
+    yield _family(
         "rx_dropped_total",
-        "Datagrams discarded; the peer is empty where they are of nobody known.",
-        [
-            (_labels(peer=peer, reason=reason), drops.get(reason, 0))
-            for peer, drops in by_peer.items()
-            for reason in DropReason
-        ],
+        "Dropped datagrams; the peer is empty if the datagram names no session of a peer.",
+        ["peer", "reason"],
+        [([peer, reason], drops.get(reason, 0)) for peer, drops in by_peer.items() for reason in DropReason],
     )
-    yield from _counts("send_failures_total", "Datagrams that the kernel did not take.", status["send_failures"])
-    yield from _counts("unrouted_frames_total", "Frames that belong nowhere.", status["unrouted"])
-    stale = [(_labels(source=who), amount) for who, amount in status["stale"].items()]
-    yield from _family("stale_frames_total", "Frames that had waited while the daemon stood still.", stale)
+    yield _counts("send_failures_total", "Datagrams the kernel refused to send.", "reason", status["send_failures"])
+    yield _counts("unrouted_frames_total", "Frames without a route.", "reason", status["unrouted"])
+    text = "Frames dropped because they waited while the daemon was stopped or suspended."
+    yield _counts("stale_frames_total", text, "source", status["stale"])
 
 
-def _recording(recording: Status | None) -> Iterator[str]:
+def _recording(recording: Status | None) -> Iterator[Metric]:
     if recording is None:
         return
-    yield from _family("recording_up", "Whether recordings can be written.", [("", recording["is_recording"])])
+    yield _family("recording_up", "1 if the last write succeeded.", [], [([], recording["is_recording"])])
     for key, (name, text) in _RECORDING_TOTALS.items():
-        yield from _family(name, text, [("", recording[key])])
-    yield from _counts("recording_failures_total", "What the disk said.", recording["failures"])
+        yield _family(name, text, [], [([], recording[key])])
+    yield _counts("recording_failures_total", "Failed writes.", "reason", recording["failures"])
 
 
-def _counts(name: str, text: str, counts: Mapping[str, int]) -> Iterator[str]:
-    return _family(name, text, [(_labels(reason=reason), amount) for reason, amount in counts.items()])
+def _counts(name: str, text: str, label: str, counts: Mapping[str, int]) -> Metric:
+    return _family(name, text, [label], [([key], count) for key, count in counts.items()])
 
 
-def _totals(kind: str, parts: Mapping[str, Status], names: Mapping[str, tuple[str, str]]) -> Iterator[str]:
+def _totals(kind: str, parts: Mapping[str, Status], names: Mapping[str, tuple[str, str]]) -> Iterator[Metric]:
     for key, (name, text) in names.items():
-        yield from _family(name, text, [(_labels(**{kind: part}), each[key]) for part, each in parts.items()])
+        yield _family(name, text, [kind], [([part], status[key]) for part, status in parts.items()])
 
 
-def _reasons(name: str, text: str, kind: str, parts: Mapping[str, Status], key: str) -> Iterator[str]:
-    samples = [
-        (_labels(**{kind: part}, reason=reason), amount)
-        for part, each in parts.items()
-        for reason, amount in each[key].items()
-    ]
-    return _family(name, text, samples)
+def _reasons(name: str, text: str, kind: str, parts: Mapping[str, Status], key: str) -> Metric:
+    counts = [([part, reason], count) for part, status in parts.items() for reason, count in status[key].items()]
+    return _family(name, text, [kind, "reason"], counts)
 
 
-def _refused(kind: str, parts: Mapping[str, Status]) -> Iterator[str]:
-    """Summed over the messages: which of them they were is in the status."""
+def _refused(kind: str, parts: Mapping[str, Status]) -> Metric:
+    """Summed over the message types; the status has the counts of each type."""
     samples: list[Sample] = []
-    for part, each in parts.items():
-        for direction, messages in each["refused"].items():
-            sums = _summed(messages.values())
-            for reason in Refusal:
-                samples.append((_labels(**{kind: part}, direction=direction, reason=reason), sums.get(reason, 0)))
+    for part, status in parts.items():
+        for direction, messages in status["refused"].items():
+            sums = Counter[str]()
+            for counts in messages.values():
+                sums.update(counts)
+            samples += [([part, direction, reason], sums[reason]) for reason in Refusal]
     text = f"Frames from (in) and to (out) the {kind} that its policy refused."
-    return _family(f"{kind}_refused_frames_total", text, samples)
+    return _family(f"{kind}_refused_frames_total", text, [kind, "direction", "reason"], samples)
 
 
-def _summed(counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
-    sums: dict[str, int] = {}
-    for each in counts:
-        for reason, amount in each.items():
-            sums[reason] = sums.get(reason, 0) + amount
-    return sums
-
-
-def _family(name: str, text: str, samples: Iterable[Sample]) -> Iterator[str]:
-    """A metric with its samples; ``text`` has no backslash and no line break in it."""
-    full = f"uavlinkd_{name}"
-    yield f"# HELP {full} {text}"
-    yield f"# TYPE {full} {'counter' if name.endswith('_total') else 'gauge'}"
-    for labels, value in samples:
-        yield f"{full}{labels} {value:d}" if isinstance(value, int) else f"{full}{labels} {value!r}"
-
-
-def _labels(**labels: str) -> str:
-    return "{" + ",".join([f'{name}="{_escaped(value)}"' for name, value in labels.items()]) + "}"
-
-
-def _escaped(value: str) -> str:
-    return value.replace("\\", r"\\").replace('"', r"\"").replace("\n", r"\n")
+def _family(name: str, text: str, labels: Sequence[str], samples: Iterable[Sample]) -> Metric:
+    make = CounterMetricFamily if name.endswith("_total") else GaugeMetricFamily
+    family = make(f"uavlinkd_{name}", text, labels=labels)
+    for values, value in samples:
+        family.add_metric(values, value)
+    return family

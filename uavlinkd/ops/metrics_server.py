@@ -1,7 +1,8 @@
-"""As much of HTTP/1.1 (RFC 9112) as Prometheus needs: ``GET /metrics``, one request a connection.
+"""The part of HTTP/1.1 (RFC 9112) that Prometheus needs: ``GET /metrics``, one request per connection.
 
-Whoever reaches the port may send anything. So everything is bounded: connections, a request's size and time, and how
-often the answer is made anew.
+Any sender that reaches the port may send anything. Therefore connections, the size and time of a request, and the
+rate of new answers are bounded. The server of ``prometheus_client`` is not used: it starts a thread per connection
+and bounds none of these.
 """
 
 from __future__ import annotations
@@ -12,24 +13,28 @@ from collections.abc import Callable
 from http import HTTPStatus
 from ipaddress import ip_address
 
-from uavlinkd.system.addresses import Address
-from uavlinkd.system.clock import monotonic
 from uavlinkd.endpoints.sockets import BindError
 from uavlinkd.endpoints.tcp import tcp_listener
 from uavlinkd.ops.metrics import CONTENT_TYPE, Status, exposition
+from uavlinkd.system.addresses import Address
+from uavlinkd.system.clock import monotonic
 
 MAX_REQUEST_BYTES = 8192
 REQUEST_TIMEOUT_S = 5.0
 MAX_CONNECTIONS = 8
 CONTENT_AGE_S = 0.5
-"""Made anew no more often than this: who asks all the time takes no time from the link."""
+"""An answer is reused for this long: frequent requests must not take CPU time from the links."""
 
 _REQUEST_LINE = re.compile(rb"([A-Z]{1,16}) (/[!-~]*) HTTP/1\.[01]")
 _TEXT = "text/plain; charset=utf-8"
 
 
 class MetricsServer:
-    """Answers Prometheus with what ``content`` gives."""
+    """Answers Prometheus with the result of ``content``.
+
+    Without a free connection, a new one replaces the oldest that has not sent a request: hung clients do not block
+    others.
+    """
 
     def __init__(self, address: Address, content: Callable[[], bytes], content_type: str) -> None:
         self._address = address
@@ -38,11 +43,12 @@ class MetricsServer:
         self._content = b""
         self._made_at = -CONTENT_AGE_S
         self._server: asyncio.Server | None = None
-        self._connections = 0
+        self._connections: dict[asyncio.StreamWriter, bool] = {}
+        """The open connections, oldest first, and whether each has sent a whole request."""
 
     @property
     def address(self) -> Address:
-        """Where it listens."""
+        """The address on which it listens."""
         assert self._server is not None
         return Address(*self._server.sockets[0].getsockname()[:2])
 
@@ -50,7 +56,7 @@ class MetricsServer:
         """Listen.
 
         Raises:
-            BindError: with the address and the reason.
+            BindError: the address cannot be used; the text has the address and the reason.
         """
         try:
             sock = tcp_listener(self._address)
@@ -59,35 +65,47 @@ class MetricsServer:
         self._server = await asyncio.start_server(self._serve, sock=sock, limit=MAX_REQUEST_BYTES)
 
     def stop(self) -> None:
-        """Listen no more."""
+        """Stop listening."""
         if self._server is not None:
             self._server.close()
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        self._connections += 1
+        if len(self._connections) >= MAX_CONNECTIONS:
+            self._evict()
+        self._connections[writer] = False
         try:
-            if self._connections > MAX_CONNECTIONS:
-                return
             async with asyncio.timeout(REQUEST_TIMEOUT_S):
-                writer.write(self._respond(await reader.readuntil(b"\r\n\r\n")))
+                request = await reader.readuntil(b"\r\n\r\n")
+                if writer not in self._connections:  # evicted meanwhile
+                    return
+                self._connections[writer] = True
+                writer.write(self._respond(request))
                 await writer.drain()
+                if writer not in self._connections:  # evicted: uvloop raises RuntimeError for a closed transport
+                    return
                 writer.write_eof()
-                while await reader.read(MAX_REQUEST_BYTES):  # until the client has it all: closing earlier could
-                    pass  # cut it off
+                while await reader.read(MAX_REQUEST_BYTES):  # wait for the client's end: closing earlier could cut
+                    pass  # the answer off
         except asyncio.LimitOverrunError:
             writer.write(_response(HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE))
         except (OSError, TimeoutError, asyncio.IncompleteReadError):
-            writer.transport.abort()  # what it has not taken by now it does not get
+            writer.transport.abort()  # discard what the client has not read
         finally:
-            self._connections -= 1
+            self._connections.pop(writer, None)
             writer.close()
+
+    def _evict(self) -> None:
+        silent = (writer for writer, has_asked in self._connections.items() if not has_asked)
+        oldest = next(silent, next(iter(self._connections)))
+        del self._connections[oldest]
+        oldest.transport.abort()
 
     def _respond(self, request: bytes) -> bytes:
         line, *headers = request.removesuffix(b"\r\n\r\n").split(b"\r\n")
         match = _REQUEST_LINE.fullmatch(line)
         if match is None:
             return _response(HTTPStatus.BAD_REQUEST)
-        if not self._is_meant(headers):
+        if not self._is_addressed(headers):
             return _response(HTTPStatus.MISDIRECTED_REQUEST)
         method, target = match[1], match[2]
         if target.partition(b"?")[0] != b"/metrics":
@@ -99,20 +117,21 @@ class MetricsServer:
             self._content, self._made_at = self._make_content(), now
         return _response(HTTPStatus.OK, self._content, self._content_type, with_body=method == b"GET")
 
-    def _is_meant(self, headers: list[bytes]) -> bool:
-        """On loopback, whether the client knows that this is loopback.
+    def _is_addressed(self, headers: list[bytes]) -> bool:
+        """On loopback: whether each Host header names this machine.
 
-        A page in this machine's browser may come from a name that leads here (DNS rebinding); it must not read on.
+        A web page can make its name resolve to loopback (DNS rebinding). The browser must not let it read the answer.
         """
-        hosts = [each.partition(b":")[2] for each in headers if each.partition(b":")[0].lower() == b"host"]
-        return not self._address.is_loopback or all(_is_number_or_localhost(each) for each in hosts)
+        fields = [header.partition(b":") for header in headers]
+        hosts = [value for name, _, value in fields if name.lower() == b"host"]
+        return not self._address.is_loopback or all(_is_number_or_localhost(host) for host in hosts)
 
 
 async def serve_metrics(address: Address, status: Callable[[], Status]) -> MetricsServer:
-    """Answer Prometheus with what a status gives.
+    """Start a server that answers with the metrics of ``status()``.
 
     Raises:
-        BindError: with the address and the reason.
+        BindError: the address cannot be used; the text has the address and the reason.
     """
     started_at = monotonic()
     server = MetricsServer(address, lambda: exposition(status(), monotonic() - started_at), CONTENT_TYPE)

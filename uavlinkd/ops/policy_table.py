@@ -1,4 +1,4 @@
-"""Who may say what, as tables that a person can review."""
+"""The policies as tables, for a review."""
 
 from __future__ import annotations
 
@@ -12,47 +12,51 @@ from rich.text import Text
 
 from uavlinkd.config import Config, PolicyData
 from uavlinkd.mavlink import dialect
-from uavlinkd.mavlink.policy.gate import Gate, Refusal
 from uavlinkd.mavlink.policy.compilation import Policy, PolicyRow
+from uavlinkd.mavlink.policy.gate import Gate, Refusal
 from uavlinkd.mavlink.policy.roles import ROLES
 
 _IN_THE_SUMMARY: Final = frozenset({"role", "may speak as"})
-_SAID_BY_OTHER_ROWS: Final = frozenset({"urgent"})  # says what goes first; each of its messages is in another group
+_COVERED: Final = frozenset({"urgent"})  # the group sets only the order; each of its messages is in another group
 _LONG = 64  # characters: a cell of two lines
-_MANY = 3  # messages: to tell fewer of them again takes no more room than to say where they are told
+_MANY = 3  # messages: fewer of them take no more room than the reference to other rows
 _EMPTY: Final = ("-", "-")
-_WHOLE: Final = (("both ways", ("all", "passes")), ("neither way", ("none", "never", "refused")))
+_WHOLE: Final = (("both directions", ("all", "passes")), ("no direction", ("none", "never", "refused")))
 
 _Rows = tuple[PolicyRow, ...]
 
 
 def review(config: Config) -> list[RenderableType]:
-    """A line for each peer and endpoint; then each policy once, with the names of those who have it."""
-    speakers = [("peer", peer.name, peer.policy, peer.make_policy()) for peer in config.peers]
-    speakers += [("endpoint", each.name, each.policy, each.make_policy()) for each in config.endpoints]
-    if not speakers:
+    """A line for each peer and endpoint; then each policy once, with the names of its peers and endpoints."""
+    senders = [("peer", peer.name, peer.policy, peer.make_policy()) for peer in config.peers]
+    senders += [("endpoint", endpoint.name, endpoint.policy, endpoint.make_policy()) for endpoint in config.endpoints]
+    if not senders:
         return []
     summary = Table(box=SIMPLE_HEAD, pad_edge=False, show_edge=False)
-    for column in ("", "name", "role", "speaks as"):
+    for column in ("", "name", "role", "system ids"):
         summary.add_column(column, overflow="fold")
-    having: dict[_Rows, list[str]] = {}
-    for kind, name, data, policy in speakers:
+    names_of: dict[_Rows, list[str]] = {}
+    for kind, name, data, policy in senders:
         if not data:
-            summary.add_row(kind, Text(name), Text("may say anything but SETUP_SIGNING"), "any system")
+            summary.add_row(kind, Text(name), Text("may send everything except SETUP_SIGNING"), "any")
             continue
-        said = {row.subject: row.incoming for row in policy.describe()}
-        trusts_all = kind == "peer" and said["role"] == dialect.ALL
-        role = Text("all: anything but SETUP_SIGNING", style="bold yellow") if trusts_all else Text(said["role"])
-        summary.add_row(kind, Text(name), role, Text(said["may speak as"]))
-        having.setdefault(table_rows(policy, data), []).append(name)
-    parts: list[RenderableType] = [Text("\nWho may say what", style="bold"), summary]
-    for rows, names in having.items():
+        incoming = {row.subject: row.incoming for row in policy.describe()}
+        trusts_all = kind == "peer" and incoming["role"] == dialect.ALL
+        role = (
+            Text("all: everything except SETUP_SIGNING", style="bold yellow")
+            if trusts_all
+            else Text(incoming["role"])
+        )
+        summary.add_row(kind, Text(name), role, Text(incoming["may speak as"]))
+        names_of.setdefault(table_rows(policy, data), []).append(name)
+    parts: list[RenderableType] = [Text("\nRoles", style="bold"), summary]
+    for rows, names in names_of.items():
         parts += [Text(f"\nPolicy of {', '.join(names)}", style="bold"), *tables(rows)]
     return parts
 
 
 def tables(rows: _Rows) -> list[RenderableType]:
-    """What passes both ways, what passes neither way, and the rest: rows with the same on both sides together."""
+    """The groups that pass in both directions, those that pass in none, and a table of the rest."""
     alike: dict[tuple[str, str], list[str]] = {}
     for row in rows:
         alike.setdefault((row.incoming, row.outgoing), []).append(row.subject)
@@ -66,7 +70,7 @@ def tables(rows: _Rows) -> list[RenderableType]:
     table = Table(box=SIMPLE_HEAD, pad_edge=False, show_edge=False, expand=True)
     widest = max(len(f"{word},") for subjects in alike.values() for subject in subjects for word in subject.split())
     table.add_column("otherwise", width=widest, overflow="fold")
-    for column in ("from there", "to there"):
+    for column in ("from it", "to it"):
         table.add_column(column, ratio=1, overflow="fold")
     for sides, subjects in alike.items():
         table.add_row(*map(Text, (", ".join(subjects), *sides)))
@@ -74,52 +78,52 @@ def tables(rows: _Rows) -> list[RenderableType]:
 
 
 def table_rows(policy: Policy, data: PolicyData) -> tuple[PolicyRow, ...]:
-    """The policy's own rows, with long cells made shorter.
+    """The rows of the policy, with long cells shortened. ``data`` is the source of the policy.
 
-    A message passes one way if a row says so, for its group or by name, and no row says that none of a group of it
-    does. ``data`` is what the policy was made of.
+    A message passes in a direction if a row allows its group or its name, and no row refuses a whole group that
+    contains it.
     """
-    found = []
+    rows = []
     for row in policy.describe():
         sides = row.incoming, row.outgoing
-        if row.subject in _SAID_BY_OTHER_ROWS or row.subject in _IN_THE_SUMMARY:
+        if row.subject in _COVERED or row.subject in _IN_THE_SUMMARY:
             continue
         if members := dialect.GROUPS.get(row.subject):
             sides = _short(sides[0], members, policy.incoming), _short(sides[1], members, policy.outgoing)
         elif row.subject == "rates":
-            # As they were written: a group's rate is that of a hundred messages.
+            # As in the file: a group may have a hundred messages, each with this rate.
             role = ROLES.get(str(data.get("role")))
             sides = _rates(data.get("rate_in"), role.rate_in if role else {}), _rates(data.get("rate_out"), {})
-        found.append(PolicyRow(row.subject, *sides))
-    return tuple(found)
+        rows.append(PolicyRow(row.subject, *sides))
+    return tuple(rows)
 
 
 def _rates(written: object, by_role: Mapping[str, float]) -> str:
-    """The rates as they were written, and the role's where they still hold."""
+    """The rates of the file, and those of the role that the file does not replace."""
     own = written if isinstance(written, Mapping) else {}
-    replaced = {name for each in own for name in _members(str(each))}
-    left = {each: rate for each, rate in by_role.items() if not replaced.issuperset(_members(each))}
+    replaced = {name for key in own for name in _members(str(key))}
+    left = {key: rate for key, rate in by_role.items() if not replaced.issuperset(_members(key))}
     return ", ".join(f"{name} {rate:g}/s" for name, rate in {**own, **left}.items()) or "-"
 
 
 def _members(name: str) -> tuple[str, ...]:
-    """The messages that a rate is for."""
+    """The messages that a rate applies to."""
     return dialect.GROUPS.get(name, (name,))
 
 
 def _short(text: str, members: Sequence[str], gate: Gate) -> str:
-    """What a row says of a group's messages, those left out of which another row tells the same.
+    """Shorten the cell of a group by the messages that another row lists with the same result.
 
-    Groups overlap: a message that passes as one of a group that passes whole is told there, and one that does not
-    pass as one of a group of which nothing does.
+    Groups overlap. Another row covers a message if a group that contains it passes as a whole, or is refused as a
+    whole.
     """
     if len(text) <= _LONG:
         return text
     passing = _passing(members, gate)
     names_passing = text.startswith("only")
     listed = [name for name in members if (name in passing) == names_passing]
-    told = _told(gate, passing=names_passing)
-    rest = [name for name in listed if name not in told]
+    covered = _covered(gate, passing=names_passing)
+    rest = [name for name in listed if name not in covered]
     if len(listed) - len(rest) < _MANY:
         return text
     rest.append(f"{len(listed) - len(rest)} listed in other rows")
@@ -132,8 +136,8 @@ def _passing(members: Sequence[str], gate: Gate) -> set[str]:
     return {name for name in members if not isinstance(gate.decide(ids[name], is_known=True), Refusal)}
 
 
-def _told(gate: Gate, *, passing: bool) -> set[str]:
-    """The messages of the groups that pass whole, or not at all."""
-    groups = (members for name, members in dialect.GROUPS.items() if name not in _SAID_BY_OTHER_ROWS)
+def _covered(gate: Gate, *, passing: bool) -> set[str]:
+    """The messages of the groups that pass as a whole, or that are refused as a whole."""
+    groups = (members for name, members in dialect.GROUPS.items() if name not in _COVERED)
     wanted = ((members, _passing(members, gate)) for members in groups)
     return {name for members, those in wanted if len(those) == (len(members) if passing else 0) for name in members}

@@ -1,12 +1,11 @@
-"""Recording: what crossed the link, in the telemetry logs that ground control programs open.
+"""Records the frames that crossed a link, as telemetry logs that ground control software opens.
 
-The frame path only puts frames into a bounded buffer; a thread of its own writes them, once a second. A slow or full
-disk costs recordings, which are counted, and never a frame.
+The frame path only appends to a bounded buffer. A thread writes the buffer once a second. A slow or full disk loses
+recorded frames, which are counted, but never delays a frame on the link.
 
-Frames have the time of the system's clock, for people: nothing else in the daemon asks what time it is, and nothing
-depends on it. In each file time runs evenly; where the clock is set meanwhile, another file begins. The lowest two
-bits of the time say which way a frame went, where MAVProxy and pymavlink keep the number of a link: 0 from the peer,
-1 to the peer.
+The time of a frame is that of the system's clock, which the daemon uses for recordings only. If that clock is set, a
+new file begins, so that time never jumps within a file. The lowest two bits of the time are the direction: 0 from the
+peer, 1 to the peer. MAVProxy and pymavlink store the number of a link there.
 """
 
 from __future__ import annotations
@@ -27,22 +26,22 @@ from uavlinkd.endpoints.ports import failure_name
 from uavlinkd.mavlink.dialect import SETUP_SIGNING
 from uavlinkd.mavlink.frames import MAVLINK2
 from uavlinkd.ops.tlog_files import STAMP_BYTES, FolderInUseError, TlogFolder
+from uavlinkd.system.error_meanings import meaning_of
 
 MAX_BUFFERED_BYTES = 4 << 20
-"""Of all peers; what comes while the disk takes longer than that is not recorded."""
+"""Limit of the buffer of all peers. Frames beyond it are not recorded."""
 RETRY_S = 0.5
-"""After a failure nothing is kept for so long, and the next housekeeping tries again: a disk with room again is used
-within 2 s."""
+"""Pause after a failed write. The housekeeping after it tries again: a disk with free space is used within 2 s."""
 CLOCK_STEP_S = 2.0
-"""A clock that is this far from where it was has been set; less is the drift of an honest one."""
+"""A jump of the clock by this much means that it was set; less is drift."""
 STOP_WAIT_S = 2.0
-"""How long the end of the daemon may wait for the disk."""
+"""Limit of the wait for the disk when the daemon stops."""
 
 FROM_PEER, TO_PEER = 0, 1
 _LINK_BITS = 3
 _SETUP_SIGNING = SETUP_SIGNING.to_bytes(3, "little")
 
-Batch = dict[tuple[str, int], list[bytes]]
+_Batch = dict[tuple[str, int], list[bytes]]
 """Records by peer and epoch."""
 
 
@@ -54,37 +53,37 @@ class _Written(NamedTuple):
 
 
 class Recorder:
-    """Records frames. ``now`` is monotonic seconds; to be used from the running event loop alone."""
+    """Records frames. Use it from the running event loop only. ``now`` is monotonic seconds."""
 
     def __init__(
         self, settings: Recording, log: FilteringBoundLogger, clock: Callable[[], float] = time.time
     ) -> None:
         self.frames = 0
-        """Written."""
+        """Frames written."""
         self.bytes = 0
-        """Written."""
+        """Bytes written."""
         self.frames_lost = 0
-        """Not recorded: the disk was full, broken or slow."""
+        """Frames that a full, failing or slow disk did not record."""
         self.failures: Counter[str] = Counter()
-        """What the disk said, by the name of the error; and ``folder_in_use``."""
+        """Failed writes by the name of the error, or ``folder_in_use``."""
         self._log = log
         self._clock = clock
         self._folder = str(settings.folder)
         self._loop = asyncio.get_running_loop()
-        self._batch: Batch = {}
+        self._batch: _Batch = {}
         self._buffered_bytes = 0
         self._epoch = 0
-        self._offset_s: float | None = None  # from the monotonic clock to the system's
+        self._offset_s: float | None = None  # system time minus monotonic time
         self._is_writing = False
         self._paused_until = 0.0
-        self._jobs: SimpleQueue[tuple[Batch, float] | None] = SimpleQueue()
-        # A daemon thread: a disk that never answers must not keep the process from ending.
+        self._jobs: SimpleQueue[tuple[_Batch, float] | None] = SimpleQueue()
+        # A daemon thread: a hanging disk must not delay the end of the process.
         self._thread = threading.Thread(target=self._write_jobs, args=(TlogFolder(settings),), daemon=True)
         self._thread.start()
 
     @property
     def is_recording(self) -> bool:
-        """Whether the last try to write went well."""
+        """Whether the last write succeeded."""
         return self._paused_until == 0.0
 
     def add(self, peer: str, frames: Sequence[bytes], link: int, now: float) -> None:
@@ -104,7 +103,7 @@ class Recorder:
             self._buffered_bytes += STAMP_BYTES + len(frame)
 
     def do_housekeeping(self, now: float) -> None:
-        """Have what is there written, unless the disk is still busy with what was there before."""
+        """Pass the buffer to the thread, unless it still writes the one before."""
         if not self._is_writing and self._buffered_bytes:
             self._submit(now)
         offset_s = self._clock() - now
@@ -113,7 +112,7 @@ class Recorder:
             self._offset_s = offset_s
 
     def stop(self, now: float) -> None:
-        """Write what is left, within :data:`STOP_WAIT_S`."""
+        """Write the rest of the buffer, within :data:`STOP_WAIT_S`."""
         self._submit(now)
         self._jobs.put(None)
         self._thread.join(STOP_WAIT_S)
@@ -133,16 +132,20 @@ class Recorder:
             reason = "folder_in_use" if isinstance(written.error, FolderInUseError) else failure_name(written.error)
             self.failures[reason] += 1
             if self.is_recording:
-                told = written.error.strerror or str(written.error)
                 self._log.warning(
-                    "recording_stopped", reason=reason, error=told, folder=self._folder, retried_every_s=RETRY_S
+                    "recording_stopped",
+                    reason=reason,
+                    error=written.error.strerror or str(written.error),
+                    folder=self._folder,
+                    retried_every_s=RETRY_S,
+                    meaning=meaning_of(reason),
                 )
             self._paused_until = now + RETRY_S
         elif not self.is_recording:
             self._paused_until = 0.0
             self._log.info("recording_resumed", frames_lost=self.frames_lost)
 
-    # In the thread.
+    # These run in the thread.
 
     def _write_jobs(self, folder: TlogFolder) -> None:
         while (job := self._jobs.get()) is not None:
@@ -152,7 +155,7 @@ class Recorder:
         folder.close()
 
 
-def _write(folder: TlogFolder, batch: Batch, now: float) -> _Written:
+def _write(folder: TlogFolder, batch: _Batch, now: float) -> _Written:
     frames = size = 0
     total = sum(map(len, batch.values()))
     for (peer, epoch), records in batch.items():

@@ -1,7 +1,8 @@
-"""What the service manager is told: that the daemon is ready, how it is, and that its loop still turns.
+"""Reports to the service manager: ready, reloading or stopping, a status line, and the watchdog.
 
-One datagram a message to the socket that ``NOTIFY_SOCKET`` names (sd_notify(3)); without it nothing is sent. Nothing
-here raises or waits: a service manager that does not listen costs the link nothing.
+Each message is one datagram to the socket in ``NOTIFY_SOCKET`` (sd_notify(3)). No call raises or waits, so a service
+manager that does not read costs the links nothing. This is why it is our own: the libraries block on a full socket,
+or need libsystemd.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from time import monotonic
 from uavlinkd.core.constants import NEVER
 
 UNSENT_MESSAGES = 16
-"""Kept for a service manager that does not take them now; then the oldest are given up."""
+"""Limit of messages that wait for the service manager. Beyond it, the oldest is dropped."""
 
 
 class Supervisor:
@@ -32,29 +33,29 @@ class Supervisor:
             self._socket.setblocking(False)
 
     def ready(self, note: str = "") -> None:
-        """Everything is bound, after the start or a reload: what waits for the service may go on.
+        """Report that all sockets are bound, after the start or a reload. Units that wait for the service may start.
 
-        ``note`` stands behind the status from now on.
+        ``note`` is appended to the status line from now on.
         """
         self._note = f"; {note}" if note else ""
-        self._tell("READY=1")
+        self._send_in_order("READY=1")
 
     def reloading(self) -> None:
-        """The configuration is being read again; :meth:`ready` ends it."""
-        # systemd from 253 on compares the time with that of its signal, on the same clock.
-        self._tell(f"RELOADING=1\nMONOTONIC_USEC={monotonic() * 1e6:.0f}")
+        """Report that a reload begins. :meth:`ready` reports its end."""
+        # systemd 253 and later compares this time with the time of its signal, on the same clock.
+        self._send_in_order(f"RELOADING=1\nMONOTONIC_USEC={monotonic() * 1e6:.0f}")
 
     def stopping(self) -> None:
-        """The end has begun; nothing is told after it."""
-        self._tell("STOPPING=1")
+        """Report that the daemon stops. No report follows."""
+        self._send_in_order("STOPPING=1")
         if self._socket is not None:
             self._socket.close()
             self._socket = None
 
     def turn(self, status: str, now: float) -> None:
-        """Call this from the loop, a few times within the watchdog's time: it is the proof that the loop turns.
+        """Feed the watchdog and report the status line. Call it from the loop, several times per watchdog interval.
 
-        ``status`` is one line for a person, which ``systemctl status`` shows.
+        ``systemctl status`` shows ``status``.
         """
         if self._socket is None:
             return
@@ -65,8 +66,8 @@ class Supervisor:
         if now >= self._ping_at and self._send("WATCHDOG=1"):
             self._ping_at = now + self._ping_interval_s
 
-    def _tell(self, message: str) -> None:
-        """Send what must arrive in its order: where the socket is full, at the next turn."""
+    def _send_in_order(self, message: str) -> None:
+        """Send a message that must arrive in order. If the socket is full, it waits for the next turn."""
         if self._socket is not None:
             self._unsent.append(message)
             self._send_unsent()
@@ -86,15 +87,15 @@ class Supervisor:
 
 
 def _socket_address(name: str) -> str | None:
-    """The path of a Unix socket, or the name of an abstract one, which is written with ``@`` in place of a zero."""
+    """The path of a Unix socket, or the name of an abstract one, where ``@`` stands for the first zero byte."""
     if name.startswith("@") and len(name) > 1:
         return "\0" + name[1:]
     return name if name.startswith("/") else None
 
 
 def _watchdog_s(environ: Mapping[str, str], process_id: int) -> float:
-    """How often the service manager wants to hear from this process; infinity where it does not."""
-    usec, meant = environ.get("WATCHDOG_USEC", ""), environ.get("WATCHDOG_PID", str(process_id))
-    if meant != str(process_id) or not (usec.isascii() and usec.isdigit()) or int(usec) == 0:
+    """The watchdog interval of this process in seconds; infinity without a watchdog."""
+    usec, pid = environ.get("WATCHDOG_USEC", ""), environ.get("WATCHDOG_PID", str(process_id))
+    if pid != str(process_id) or not (usec.isascii() and usec.isdigit()) or int(usec) == 0:
         return NEVER
     return int(usec) / 1e6

@@ -1,7 +1,8 @@
-"""``uavlinkd status`` for people: what is broken stands first, and is red."""
+"""The screen of ``uavlinkd status``: what is wrong comes first, with its remedy; attacks in red."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, Final
 
 from rich.box import SIMPLE_HEAD
@@ -9,130 +10,185 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from uavlinkd.ops.log import DISTURBANCES, UNVERIFIED
 from uavlinkd.mavlink.policy.gate import Refusal
+from uavlinkd.ops.reason_phrases import (
+    DATAGRAMS,
+    ENDPOINT_FAILURES,
+    FAULTS,
+    LINK_PROBLEMS,
+    QUEUED,
+    REFUSALS,
+    phrase,
+)
+from uavlinkd.system.error_meanings import meaning_of
 
 Status = dict[str, Any]
+_Count = tuple[str, int]
+"""A reason in plain words, and how often."""
 
 _STYLES = {"up": "green", "lost": "bold red", "waiting": "bold yellow"}
-_SHOWN_DROPS = 3
-_SHOWN_FIRST: Final = (Refusal.HIDDEN_FRAME.value,)
-"""Reasons that no count of others may push out: a captured member could choose those counts."""
-_SIGNS = tuple(each for each in DISTURBANCES if each != "envelopes_missing")
-"""What is told with the drops. What is missing shows in the column of losses."""
+_SEVERITY_STYLES: Final = {"security": "bold red", "fault": "bold yellow", "warning": "yellow"}
+_SHOWN_REASONS: Final = 3
+_SHOWN_FINDINGS: Final = 20
+_SHOWN_FIRST: Final = (phrase(Refusal.HIDDEN_FRAME, REFUSALS),)
+"""Reasons that are always shown. A captured member could cause greater counts of other reasons to hide them."""
 
 
-def all_up(status: Status) -> bool:
-    """Whether there are peers and every one is up."""
-    peers = status["peers"].values()
-    return bool(peers) and all(peer["state"] == "up" for peer in peers)
+def frames_pass(status: Status) -> bool:
+    """Whether every peer is up, and no traffic was wholly refused within the last 10 s."""
+    return bool(status["frames_pass"])
 
 
 def render_status(status: Status) -> RenderableType:
-    """One screen: a headline, the peers with the broken ones first, the endpoints, and what came from strangers."""
-    parts: list[RenderableType] = [_headline(status), _peers(status), _endpoints(status)]
-    for label, counts in (
-        ("from no known peer", status["drops"]),
-        ("not sent", status["send_failures"]),
-        ("stale, as the daemon stood still", status["stale"]),
-    ):
-        if counts:
-            parts.append(Text(f"{label}: {_counts(counts)}", style="yellow"))
-    recording = status["recording"]
-    if recording is not None and not recording["is_recording"]:
-        parts.append(Text(f"nothing is recorded now: {_counts(recording['failures'])}", style="bold red"))
+    """One screen: a headline, the problems, the peers with the broken ones first, the endpoints, and other counts."""
+    parts: list[RenderableType] = [_headline(status)]
+    if status["findings"]:
+        parts.append(_findings(status["findings"]))
+    parts += [_peers(status), _endpoints(status)]
+    if dropped := _listed(_by_count(status["drops"], DATAGRAMS)):
+        parts.append(Text(f"dropped, from no known peer: {dropped}", style="yellow"))
+    for error, count in _ranked(list(status["send_failures"].items()))[:_SHOWN_REASONS]:
+        parts.append(Text(f"not sent: {count:,}, because {meaning_of(error) or error}", style="yellow"))
+    if stale := sum(status["stale"].values()):
+        parts.append(Text(f"dropped after a pause of the daemon: {stale:,} frames", style="yellow"))
     return Group(*parts)
 
 
 def render_peers(status: Status) -> RenderableType:
-    """``uavlinkd peer list``: names and keys, a line each."""
+    """``uavlinkd peer list``: one line per peer, with its name, key and state, the broken ones first; then why."""
     table = Table.grid(padding=(0, 2))
-    for name, peer in status["peers"].items():
+    for name, peer in _by_state(status):
         table.add_row(Text(name), peer["public_key"], Text(peer["state"], style=_STYLES[peer["state"]]))
-    return table
+    findings = [finding for finding in status["findings"] if finding["subject"] == "peer"]
+    return Group(table, _findings(findings)) if findings else table
 
 
 def _headline(status: Status) -> Text:
     peers = status["peers"].values()
     up = sum(peer["state"] == "up" for peer in peers)
     text = Text(f"{status['name']}  ", style="bold")
-    return text.append(f"{up} of {len(peers)} peers up", style="bold green" if all_up(status) else "bold red")
+    text.append(f"{up} of {len(peers)} peers up", style="bold green" if frames_pass(status) else "bold red")
+    for blocked in status["blocked"]:
+        towards = "from" if blocked["direction"] == "in" else "to"
+        text.append(f", all frames {towards} {blocked['name']} are refused", style="bold red")
+    return text
+
+
+def _findings(findings: list[dict[str, str]]) -> Table:
+    """A line per problem with its cause and remedy, security first. Too many others never push those out."""
+    table = Table.grid(padding=(0, 1, 0, 0))
+    table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")
+    security = [finding for finding in findings if finding["severity"] == "security"]
+    others = [finding for finding in findings if finding["severity"] != "security"]
+    for finding in [*security, *others[:_SHOWN_FINDINGS]]:
+        style = _SEVERITY_STYLES[finding["severity"]]
+        label = finding["severity"]
+        subject = {"peer": finding["name"], "endpoint": f"endpoint {finding['name']}"}.get(finding["subject"], "")
+        line = Text(f"{subject}: " if subject else "", style="bold")
+        line.append(finding["text"], style=style if label == "security" else "not bold")
+        line.append(f". Remedy: {finding['remedy']}", style="not bold")
+        table.add_row(Text(label.upper() if label == "security" else label, style=style), line)
+    if len(others) > _SHOWN_FINDINGS:
+        left = len(others) - _SHOWN_FINDINGS
+        table.add_row("", Text(f"and {left} more: `uavlinkd status --json` has all of them"))
+    return table
 
 
 def _peers(status: Status) -> Group:
-    """How each does, the broken ones first; below, in the same order, where it is and with which keys; and troubles.
+    """A table of link quality, a table of paths and sessions in the same order, and the problems.
 
-    It fits into 80 columns, names and IPv6 addresses folded where they are long.
+    The tables fit into 80 columns; long names and IPv6 addresses are folded.
     """
     health = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
     health.add_column("peer", overflow="fold")
-    for name in ("state", "heard", "rtt", "loss in/out", "in", "out"):
+    for name in ("state", "silent", "rtt", "loss in/out", "in", "out"):
         health.add_column(name, no_wrap=True)
-    ways = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    paths = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
     for name in ("peer", "path"):
-        ways.add_column(name, overflow="fold")
+        paths.add_column(name, overflow="fold")
     for name in ("suite", "mode", "key age"):
-        ways.add_column(name, no_wrap=True)
-    troubles: list[RenderableType] = []
-    for name, peer in sorted(status["peers"].items(), key=lambda item: (item[1]["state"] == "up", item[0])):
+        paths.add_column(name, no_wrap=True)
+    problems: list[RenderableType] = []
+    for name, peer in _by_state(status):
         health.add_row(
             Text(name, style="bold"),
             Text(peer["state"], style=_STYLES[peer["state"]]),
-            _age(peer["heard_s"]),
+            _age(peer["last_received_s"]),
             "-" if peer["round_trip_s"] is None else f"{1000 * peer['round_trip_s']:.1f} ms",
             _loss(peer),
             _rate(peer["bytes_in_s"]),
             _rate(peer["bytes_out_s"]),
         )
-        if peer["freshness_unverified_s"] is not None:
-            since = _age(peer["freshness_unverified_s"])
-            troubles.append(Text(f"{name} freshness unverified for {since}: {UNVERIFIED}", style="bold red"))
-        if dropped := _counts(_troubles(peer)):
-            troubles.append(Text(f"{name} dropped: {dropped}"))
+        if dropped := _listed(_drops(peer)):
+            problems.append(Text(f"{name} dropped: {dropped}"))
         session = peer["session"] or {}
         age = _age(peer["handshake_s"]) if session else "-"
-        ways.add_row(Text(name), Text(peer["path"] or "-"), session.get("suite", "-"), session.get("mode", "-"), age)
-    return Group(health, ways, *troubles)
+        paths.add_row(Text(name), Text(peer["path"] or "-"), session.get("suite", "-"), session.get("mode", "-"), age)
+    return Group(health, paths, *problems)
+
+
+def _by_state(status: Status) -> list[tuple[str, Status]]:
+    """The peers by name, the broken ones first."""
+    return sorted(status["peers"].items(), key=lambda item: (item[1]["state"] == "up", item[0]))
 
 
 def _endpoints(status: Status) -> Table:
     table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
-    for name in ("endpoint", "programs", "frames in", "frames out", "trouble"):
+    for name in ("endpoint", "clients (silent)", "frames in", "frames out", "problems"):
         table.add_column(name, overflow="fold")
     for name, endpoint in status["endpoints"].items():
-        programs = ", ".join(f"{at} ({_age(each['heard_s'])})" for at, each in endpoint["programs"].items())
-        is_heard = bool(endpoint["programs"]) and endpoint["frames_received"] > 0
-        trouble = _counts({**endpoint["faults"], **endpoint["failures"], **_refused(endpoint)})
+        clients = endpoint["clients"].items()
+        listed = ", ".join(f"{address} ({_age(client['last_received_s'])})" for address, client in clients)
+        is_active = bool(clients) and endpoint["frames_received"] > 0
+        problems = _listed(
+            _by_count(endpoint["faults"], FAULTS)
+            + _by_count(endpoint["failures"], ENDPOINT_FAILURES)
+            + _by_count(_refused(endpoint), REFUSALS)
+        )
         table.add_row(
             Text(name, style="bold"),
-            Text(programs or "nobody", style="" if is_heard else "bold yellow"),
+            Text(listed or "no client", style="" if is_active else "bold yellow"),
             f"{endpoint['frames_received']:,}",
             f"{endpoint['frames_sent']:,}",
-            trouble or "-",
+            problems or "-",
         )
     return table
 
 
-def _troubles(peer: Status) -> dict[str, int]:
-    signs = {name: peer[name] for name in _SIGNS if peer[name]}
-    return {**peer["drops"], **peer["malformed"], **peer["waiting_dropped"], **_refused(peer), **signs}
+def _drops(peer: Status) -> list[_Count]:
+    return [
+        *_by_count(peer["drops"], DATAGRAMS),
+        *_by_count(peer["malformed"], FAULTS),
+        *_by_count(peer["waiting_dropped"], QUEUED),
+        *_by_count(_refused(peer), REFUSALS),
+        *((words, peer[problem]) for problem, words in LINK_PROBLEMS.items() if peer[problem]),
+    ]
 
 
 def _refused(part: Status) -> dict[str, int]:
-    """What a policy refused, summed by reason."""
+    """Refused frames of a policy, summed by reason."""
     sums: dict[str, int] = {}
     for messages in part["refused"].values():
         for reasons in messages.values():
-            for reason, amount in reasons.items():
-                sums[reason] = sums.get(reason, 0) + amount
+            for reason, count in reasons.items():
+                sums[reason] = sums.get(reason, 0) + count
     return sums
 
 
-def _counts(counts: dict[str, int]) -> str:
-    """The most frequent first, after `_SHOWN_FIRST`; a few are enough to know where to look."""
-    ranked = sorted(counts.items(), key=lambda item: (item[0] not in _SHOWN_FIRST, -item[1]))
-    text = ", ".join(f"{amount:,} {reason}" for reason, amount in ranked[:_SHOWN_DROPS])
-    return text + (", …" if len(ranked) > _SHOWN_DROPS else "")
+def _by_count(counts: dict[str, int], words: Mapping[str, str]) -> list[_Count]:
+    return [(phrase(code, words), count) for code, count in counts.items() if count]
+
+
+def _ranked(counts: list[_Count]) -> list[_Count]:
+    """The most frequent reasons first, after those in `_SHOWN_FIRST`."""
+    return sorted(counts, key=lambda item: (item[0] not in _SHOWN_FIRST, -item[1]))
+
+
+def _listed(counts: list[_Count]) -> str:
+    ranked = _ranked(counts)
+    text = ", ".join(f"{count:,} {reason}" for reason, count in ranked[:_SHOWN_REASONS])
+    return text + (", …" if len(ranked) > _SHOWN_REASONS else "")
 
 
 def _loss(peer: Status) -> Text:

@@ -1,17 +1,17 @@
-"""Telemetry logs in a folder: one file a peer at a time, of bounded size, the oldest deleted for the newest.
+"""Telemetry logs in a folder: one open file per peer, of bounded size. The oldest file is deleted for a new one.
 
 ::
 
     00000042-20261121T092345Z-drone1.tlog
 
-The number rises from file to file, over restarts too, so it tells old from new where no clock does. What is not named
-like that is not ours and stays. Everything here may wait for the disk: it runs in the recorder's own thread.
+The number increases with each file, also after a restart. It orders the files even if the clock was wrong. A file
+with another kind of name is not ours and is never deleted. All calls may wait for the disk: they run in the
+recorder's thread.
 """
 
 from __future__ import annotations
 
 import errno
-import fcntl
 import os
 import re
 import time
@@ -22,14 +22,14 @@ from dataclasses import dataclass
 from uavlinkd.config.model import Recording
 
 SYNC_INTERVAL_S = 5.0
-"""What a power cut may take."""
+"""A power cut loses at most this much."""
 STAMP_BYTES = 8
 
 _NAME = re.compile(r"(\d{8,12})-\d{8}T\d{6}Z-.+\.tlog")
 
 
 class FolderInUseError(OSError):
-    """Another daemon records there."""
+    """Another daemon records into the folder."""
 
 
 @dataclass(slots=True)
@@ -42,23 +42,23 @@ class _File:
 
 
 class TlogFolder:
-    """Our recordings in one folder. Opened when something is to be kept, and again after each failure."""
+    """Our recordings in one folder. It is opened at the first write, and again after each failure."""
 
     def __init__(self, settings: Recording) -> None:
         self._settings = settings
         self._folder = -1
         self._next_number = 1
-        self._closed: dict[int, str] = {}  # names by number: the least is the oldest
+        self._closed: dict[int, str] = {}  # names by number: the lowest is the oldest
         self._open: dict[str, _File] = {}
         self._synced_at = 0.0
 
     def append(self, peer: str, records: Sequence[bytes], epoch: int, now: float) -> int:
-        """Keep records, each a time and a frame, in the file of a peer; how many bytes that took.
+        """Write records, each a time and a frame, to the file of a peer. Returns the bytes written.
 
-        A new ``epoch``, which is when the clock was set, begins a new file: time never leaps within one.
+        A new ``epoch`` means that the clock was set. It begins a new file, so that time never jumps within a file.
 
         Raises:
-            OSError: they could not all be kept. What was kept is whole.
+            OSError: not all records were written. The file still ends with a whole record.
         """
         if self._folder < 0:
             self._open_folder()
@@ -66,7 +66,7 @@ class TlogFolder:
         for chunk in _chunks(records, self._settings.max_file_bytes):
             data = b"".join(chunk)
             file = self._open.get(peer)
-            if file is not None and not self._takes(file, len(data), epoch):
+            if file is not None and not self._fits(file, len(data), epoch):
                 self._close_file(peer)
                 file = None
             self._make_room(len(data))
@@ -81,7 +81,7 @@ class TlogFolder:
         return written
 
     def close(self) -> None:
-        """Close everything; what the disk says to that is of no use any more."""
+        """Close all files. Errors of the disk are ignored."""
         for peer in list(self._open):
             self._close_file(peer)
         if self._folder >= 0:
@@ -89,44 +89,46 @@ class TlogFolder:
             self._folder = -1
 
     def _open_folder(self) -> None:
+        import fcntl  # noqa: PLC0415  Windows has no such module
+
         path = self._settings.folder
         with suppress(FileExistsError):
             path.mkdir(mode=0o700)
         folder = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         try:
-            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)  # two that delete each other's oldest keep nothing
-            found = [(int(match[1]), match[0]) for each in os.listdir(folder) if (match := _NAME.fullmatch(each))]
+            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)  # two daemons would delete each other's files
+            files = [(int(match[1]), match[0]) for name in os.listdir(folder) if (match := _NAME.fullmatch(name))]
         except OSError as error:
             os.close(folder)
             if isinstance(error, BlockingIOError):
                 raise FolderInUseError(f"another daemon records in {path}") from None
             raise
         self._folder = folder
-        self._closed = dict(sorted(found))
+        self._closed = dict(sorted(files))
         self._next_number = max(self._closed, default=0) + 1
 
-    def _takes(self, file: _File, amount: int, epoch: int) -> bool:
-        """Whether more of this epoch fits into a file, and it is still in the folder."""
+    def _fits(self, file: _File, size: int, epoch: int) -> bool:
+        """Whether records of this epoch fit into the file, and the file is still in the folder."""
         return (
             file.epoch == epoch
-            and file.size + amount <= self._settings.max_file_bytes
+            and file.size + size <= self._settings.max_file_bytes
             and os.fstat(file.descriptor).st_nlink > 0
         )
 
-    def _make_room(self, amount: int) -> None:
-        """Delete our oldest until others have what is theirs.
+    def _make_room(self, size: int) -> None:
+        """Delete our oldest files until min_free_bytes stay free.
 
         Raises:
-            OSError: there is nothing of ours left to delete.
+            OSError: no file of ours is left to delete.
         """
-        while self._free_bytes() < self._settings.min_free_bytes + amount:
+        while self._free_bytes() < self._settings.min_free_bytes + size:
             if not self._closed:
-                raise OSError(errno.ENOSPC, "the disk is as full as it may become: min_free_bytes are left to others")
+                raise OSError(errno.ENOSPC, "only min_free_bytes are free, which are reserved for others")
             self._delete(next(iter(self._closed)))
 
     def _free_bytes(self) -> int:
         state = os.fstatvfs(self._folder)
-        return (state.f_bavail - 1) * state.f_frsize  # what is written may begin a block more
+        return (state.f_bavail - 1) * state.f_frsize  # a write may begin another block
 
     def _delete(self, number: int) -> None:
         with suppress(FileNotFoundError):
@@ -150,7 +152,7 @@ class TlogFolder:
                 raise OSError(errno.ENOSPC, "no space left on the device")
         except OSError:
             with suppress(OSError):
-                os.ftruncate(file.descriptor, file.size)  # no half record in the middle of a recording
+                os.ftruncate(file.descriptor, file.size)  # remove a partial record
             self._close_file(peer)
             if file.size == 0:
                 self._delete(file.number)
@@ -168,7 +170,7 @@ class TlogFolder:
 
 
 def _chunks(records: Sequence[bytes], limit: int) -> list[list[bytes]]:
-    """Records in their order, together as long as they fit into one file."""
+    """Split records into chunks, in their order, that each fit into one file."""
     chunks: list[list[bytes]] = []
     size = limit
     for record in records:

@@ -1,0 +1,103 @@
+"""The names in the JSON of ``status``, from real daemons in several states."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from tests.daemon.frames import frame
+from tests.daemon.harness import Stage
+from uavlinkd.ops.findings import Finding, Severity, Subject
+
+MAPS = ("peers", "endpoints", "endpoints.*.clients")
+"""Objects whose keys are names of the configuration or addresses."""
+COUNTS: Mapping[str, int] = {
+    "drops": 1,
+    "stale": 1,
+    "unrouted": 1,
+    "send_failures": 1,
+    "recording.failures": 1,
+    "peers.*.drops": 1,
+    "peers.*.malformed": 1,
+    "peers.*.waiting_dropped": 1,
+    "peers.*.refused": 3,
+    "peers.*.refused_commands": 3,
+    "endpoints.*.faults": 1,
+    "endpoints.*.failures": 1,
+    "endpoints.*.refused": 3,
+    "endpoints.*.refused_commands": 3,
+}
+"""Objects that count by reason, or by direction, message and reason: how many keys lead to a count."""
+ALSO = {
+    "peers.*.freshness_unverified_s": "number",
+    "peers.*.role": "null",
+    "endpoints.*.clients.*.last_received_s": "null",
+    "recording": "null",
+}
+"""Types that the daemons here do not show."""
+
+_TYPES = {bool: "boolean", int: "integer", float: "number", str: "string", type(None): "null", list: "list"}
+
+
+class Seen(NamedTuple):
+    """What daemons said."""
+
+    names: dict[str, str]
+    """Every name in the status, with the types that were seen."""
+    lines: list[dict[str, Any]]
+    """Of the log."""
+
+
+async def observed() -> Seen:
+    """Start a daemon, then its peer, and send a frame to each."""
+    statuses: list[dict[str, Any]] = []
+    async with Stage() as stage:
+        a, b = stage.pair(probe_interval_s=0.1)
+        a.config["peer"][0]["system_ids"] = [9]
+        a.config["recording"] = {"folder": "recordings"}
+        into_a, into_b = a.add_endpoint("autopilot"), b.add_endpoint("autopilot")
+        await stage.start(a, linked=False)
+        statuses.append(await a.status())
+        await stage.start(b)
+        clients = await stage.client(), await stage.client()
+
+        def is_complete(status: dict[str, Any]) -> bool:
+            clients[0].send(frame(1, 7), into_a)  # again each time: what was refused 10 s ago is not shown
+            clients[1].send(frame(1, 2), into_b)
+            is_measured = status["peers"]["drone1"]["round_trip_s"] is not None
+            return is_measured and bool(status["blocked"]) and bool(status["endpoints"]["autopilot"]["clients"])
+
+        statuses.append(await a.until(is_complete))
+    findings = [Finding("cause", Severity.FAULT, Subject.PEER, "name", "text", "remedy").as_json()]
+    types: dict[str, set[str]] = {name: {kind} for name, kind in ALSO.items()}
+    for status in statuses:
+        _walk(status | {"findings": findings}, "", types)
+    names = {name: "|".join(sorted(kinds)) for name, kinds in types.items()}
+    return Seen(names, [*a.events(), *b.events()])
+
+
+def _walk(value: Any, path: str, types: dict[str, set[str]]) -> None:
+    if path in COUNTS:
+        _check_counts(value, COUNTS[path], path)
+        types.setdefault(path, set()).add("counts" if COUNTS[path] == 1 else f"counts of {COUNTS[path]} levels")
+    elif isinstance(value, dict):
+        if path:
+            types.setdefault(path, set()).add("object")
+        for key, item in value.items():
+            name = "*" if path in MAPS else key
+            _walk(item, f"{path}.{name}" if path else name, types)
+    elif isinstance(value, list):
+        types.setdefault(path, set()).add("list")
+        for item in value:
+            _walk(item, f"{path}[]", types)
+    else:
+        types.setdefault(path, set()).add(_TYPES[type(value)])
+
+
+def _check_counts(value: Any, levels: int, path: str) -> None:
+    assert isinstance(value, dict), path
+    for item in value.values():
+        if levels == 1:
+            assert isinstance(item, int), path
+        else:
+            _check_counts(item, levels - 1, path)

@@ -1,0 +1,170 @@
+"""``uavlinkd report``: one file for a support request, without keys and addresses of others."""
+
+from __future__ import annotations
+
+import asyncio
+import builtins
+from pathlib import Path
+
+import pytest
+
+from tests.daemon.harness import Stage, secret_forms
+from tests.waiting import until
+from uavlinkd.cli import FAILED, OK, main
+from uavlinkd.config import keys
+from uavlinkd.ops import redaction
+from uavlinkd.ops import support_report as report
+from uavlinkd.ops.redaction import Redactor
+
+KEY = "eZPBKM+9Oztdms1v2yiR+byync+zZsR87etuOX4heHE="
+OTHER_KEY = "3NNFMbj2qtFyJqKVHtuuoixhFmd1DvyLQR2FuMwgtkY="
+
+
+def test_same_value_has_the_same_pseudonym() -> None:
+    """Keys and addresses can be compared, but not read."""
+    redactor = Redactor()
+    redactor.add_peer("10.13.0.2")
+    redactor.add_peer("drone1.example")
+    text = redactor.redact(f'"{KEY}" {OTHER_KEY} {KEY} 10.13.0.2:5790 Drone1.Example:5790 203.0.113.9 [fd00::2]:1')
+    assert text == '"key-1" key-2 key-1 peer-address-1:5790 peer-address-2:5790 address-1 [address-2]:1'
+
+
+def test_beginning_of_a_key_is_replaced() -> None:
+    """`check` shows the first characters: they become the pseudonym of the whole key."""
+    assert Redactor().redact(f"{OTHER_KEY} {KEY} {KEY[:8]}... {'Ab1' * 3}...") == "key-1 key-2 key-2... Ab1Ab1Ab1..."
+    assert Redactor().redact(f"drone1  {KEY[:8]}...  10") == "drone1  key-1...  10"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f'public_key = "{KEY[:30]}"',
+        f"PrivateKey = {KEY[:-1]}",
+        f"PresharedKey={KEY}",
+        f'{{"psk": "{KEY[:20]}"}}',
+        f"it came with {KEY[:-1]}",
+        keys.decode_key(KEY).hex(),
+        f'private_key = "{KEY}{KEY}"',
+    ],
+)
+def test_keys_in_any_form_are_replaced(text: str) -> None:
+    """Whole, damaged, without padding, as hexadecimal digits, in TOML, JSON or WireGuard's format."""
+    redacted = Redactor().redact(text)
+    assert "key-" in redacted
+    assert not any(part in redacted for part in (KEY[:12], KEY[10:22], keys.decode_key(KEY).hex()[:12]))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "2026-11-22T22:27:00.123456Z",
+        'private_key_file = "drone0.key"',
+        '"accepts_previous_key": false',
+        "127.0.0.1:14550 0.0.0.0:5790 [::]:5790 [::1]:5790",
+        "10.13.0.1:5790 and fe80::1%wlan0",
+        "Python 3.11.7, uavlinkd 0.1.0",
+        "/usr/lib/python3/dist-packages/somewhere/deep/inside",
+    ],
+)
+def test_harmless_text_stays(text: str) -> None:
+    """Times, versions, file names, loopback and this machine's own addresses."""
+    assert Redactor(["10.13.0.1", "fe80::1"]).redact(text) == text
+
+
+async def test_report_of_a_running_pair_has_no_secret(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No key, PSK or address of a peer from configuration, status, log or check is in it."""
+    async with Stage() as stage:
+        a, b = stage.pair()
+        addresses = ["203.0.113.7:5790", "[2001:db8::7]:5790", "drone1.invalid:5790"]
+        a.config["peer"][0]["addresses"] += addresses
+        await stage.start(a, b)
+        await a.until_logged("name_not_resolved")
+        monkeypatch.setattr(report, "_log", lambda: "\n".join(a.lines))
+        with a.config_file.open("a") as file:
+            file.write(f"\n# once was {KEY} at 198.51.100.1\n")
+        text = await asyncio.to_thread(report.make_report, [a.config_file], [a.folder / "control.sock"])
+        for secret in [*stage.secrets, a.public_key, b.public_key, KEY]:
+            assert not any(form in text for form in secret_forms(secret))
+        for address in ("203.0.113.7", "2001:db8::7", "drone1.invalid", "198.51.100.1"):
+            assert address not in text
+        titles = ("versions", "configuration", "check", "status", "log", "sockets", "network interfaces", "routes")
+        assert all(f"## {title}" in text for title in titles)
+        for part in ("peer-address-1:5790", "peer-address-3", '"state": "up"', "daemon_started", "uavlinkd 0."):
+            assert part in text
+        await until(lambda: a.is_running)
+
+
+def test_report_is_shown_and_confirmed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """On a terminal the user reads it and agrees; any other answer writes nothing."""
+    monkeypatch.setattr(report, "make_report", lambda configs, sockets: "## versions\n")
+    monkeypatch.setattr(report, "_is_terminal", lambda: True)
+    path = tmp_path / "report.txt"
+    arguments = ["report", "--socket", str(tmp_path / "absent.sock"), "--out", str(path)]
+    for answer in ("", "n"):
+        monkeypatch.setattr(builtins, "input", lambda prompt, answer=answer: answer)
+        assert main(arguments) == FAILED
+        assert "## versions" in capsys.readouterr().out
+        assert not path.exists()
+    monkeypatch.setattr(builtins, "input", lambda prompt: "y")
+    assert main(arguments) == OK
+    assert path.read_text() == "## versions\n"
+    assert path.stat().st_mode & 0o777 == 0o600
+    assert main(arguments) == FAILED  # an existing file is kept
+    assert "report.txt: cannot be written" in capsys.readouterr().err
+
+
+def test_without_a_terminal_it_needs_consent(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A script has to say ``--yes``."""
+    monkeypatch.setattr(report, "make_report", lambda configs, sockets: "## versions\n")
+    path = tmp_path / "report.txt"
+    arguments = ["report", "--socket", str(tmp_path / "absent.sock"), "--out", str(path)]
+    assert main(arguments) == FAILED
+    assert "add --yes" in capsys.readouterr().err
+    assert main([*arguments, "--yes"]) == OK
+    assert path.exists()
+
+
+def test_missing_tools_are_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The report says what it lacks, and a daemon that does not run is a fact too."""
+    monkeypatch.setenv("PATH", str(tmp_path))
+    text = report.make_report([tmp_path / "absent.toml"], [tmp_path / "absent.sock"])
+    for part in ("journalctl is not installed here", "ss is not installed", "no daemon answers", "cannot be read"):
+        assert part in text
+
+
+HEX = keys.decode_key(KEY).hex()
+PAIRS = [HEX[at : at + 2] for at in range(0, 64, 2)]
+
+
+@pytest.mark.parametrize(
+    ("text", "redacted"),
+    [
+        (f"0x{HEX} 0X{HEX.upper()}", "key-1 key-2"),
+        (f"dump: {' '.join(PAIRS)}.", "dump: key-1."),
+        (f"id {':'.join(PAIRS)}", "id key-1"),
+        (r"{\"psk\": \"hunter2 secret\", \"name\": 1}", r"{\"psk\": \"key-1\", \"name\": 1}"),
+        (r'psk = "hunter2\"secret" # x', 'psk = "key-1" # x'),
+    ],
+)
+def test_keys_in_dumps_and_in_quoted_json(text: str, redacted: str) -> None:
+    """With a prefix, as pairs of digits, and behind escaped quotation marks."""
+    assert Redactor().redact(text) == redacted
+
+
+def test_addresses_are_looked_for_in_linear_time() -> None:
+    """An address has 45 characters at most: a log line of colons must not stop the report."""
+    assert "{0,45}:[0-9A-Fa-f:]{0,45}(" in redaction._IPV6.pattern
+    assert Redactor().redact(":" * 300_000 + "g") == ":" * 300_000 + "g"
+
+
+def test_a_section_is_redacted_before_it_is_cut(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The rest of a key that is cut has no form that shows what it is."""
+    monkeypatch.setattr(report, "MAX_SECTION", 30)
+    monkeypatch.setattr(report, "_log", lambda: f"public_key {KEY}")
+    text = report.make_report([], [])
+    assert KEY[-20:] not in text
+    assert "public_key key-" in text

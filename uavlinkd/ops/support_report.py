@@ -1,0 +1,226 @@
+"""``uavlinkd report``: one file for a support request, without keys and without the addresses of other machines."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+from uavlinkd import __version__
+from uavlinkd.ops.control import ControlError, ask
+from uavlinkd.ops.redaction import Redactor
+from uavlinkd.system.terminal import printable
+
+COMMAND_TIMEOUT_S: Final = 60.0
+LOG_LINES: Final = 300
+MAX_SECTION: Final = 200_000
+"""Characters of a section; of a longer one the end is kept."""
+SERVICE_FILES: Final = Path("/etc/uavlinkd")
+_PACKAGES: Final = (
+    *("cryptography", "fastcrc", "prometheus_client", "pydantic"),
+    *("rich", "serialx", "structlog", "uvloop"),
+)
+_INTRODUCTION: Final = """\
+uavlinkd report. Keys are replaced by key-1, …, the addresses of peers by peer-address-1, …, and other addresses by
+address-1, …. The names of peers and this machine's own addresses are readable. Read it before you send it."""
+
+
+class ReportPart(NamedTuple):
+    """A part of the report."""
+
+    title: str
+    text: str
+
+
+def make_report(configs: Sequence[Path], sockets: Sequence[Path]) -> str:
+    """Collect everything, and redact it."""
+    interfaces = _run("ip", "-brief", "address")
+    redactor = Redactor(re.findall(r"[0-9A-Fa-f:.]+(?=/\d)", interfaces))
+    statuses = [_status(socket) for socket in sockets]
+    log = _log()
+    for host in [*_hosts_of_configs(configs), *_hosts_of_statuses(statuses), *_hosts_of_log(log)]:
+        redactor.add_peer(host)
+    sections = [
+        ReportPart("versions", _versions()),
+        *(ReportPart(f"configuration {path}", _without_comments(path)) for path in configs),
+        *(ReportPart(f"check {path}", _check(path)) for path in configs),
+        *(ReportPart(f"status at {path}", text) for path, text in zip(sockets, map(_as_text, statuses), strict=True)),
+        ReportPart("log", log),
+        ReportPart("sockets", _run("ss", "--no-header", "-lntup")),
+        ReportPart("network interfaces", interfaces),
+        ReportPart("routes", _run("ip", "route") + _run("ip", "-6", "route")),
+    ]
+    # Redacted before it is cut: the rest of a cut key has no form that shows what it is.
+    parts = [
+        f"## {redactor.redact(section.title)}\n\n{redactor.redact(section.text.strip())[-MAX_SECTION:]}"
+        for section in sections
+    ]
+    return printable("\n\n".join([_INTRODUCTION, *parts]) + "\n", keep="\n")
+
+
+def _versions() -> str:
+    lines = [
+        f"uavlinkd {__version__}, Python {platform.python_version()}, {platform.system()} {platform.release()}"
+        f" {platform.machine()}",
+        f"written at {time.strftime('%Y-%m-%d %H:%M:%S %z')}",
+    ]
+    lines += [
+        line for line in _read(Path("/etc/os-release")).splitlines() if line.startswith(("PRETTY_NAME", "VERSION_ID"))
+    ]
+    return "\n".join([*lines, *_packages()])
+
+
+def _packages() -> Iterator[str]:
+    for name in _PACKAGES:
+        try:
+            yield f"{name} {metadata.version(name)}"
+        except metadata.PackageNotFoundError:
+            yield f"{name}: not installed"
+
+
+def _check(path: Path) -> str:
+    folders = [folder for folder in (path.parent / "keys", path.with_suffix("")) if folder.is_dir()]
+    keys = ["--keys", str(folders[0])] if folders else []
+    return _run(sys.executable, "-m", "uavlinkd", "check", "--config", str(path), *keys)
+
+
+def _status(socket: Path) -> dict[str, Any] | str:
+    try:
+        return ask(socket, "status")
+    except ControlError as error:
+        return str(error)
+
+
+def _as_text(status: dict[str, Any] | str) -> str:
+    return status if isinstance(status, str) else json.dumps(status, indent=1)
+
+
+def _log() -> str:
+    units = ("--unit", "uavlinkd", "--unit", "uavlinkd@*")
+    text = _run("journalctl", *units, "--lines", str(LOG_LINES), "--no-pager", "--output", "cat")
+    return text or "the journal has no line of the units uavlinkd and uavlinkd@NAME"
+
+
+def _run(*command: str) -> str:
+    """The output of a command, or why it has no output."""
+    try:
+        done = subprocess.run(  # noqa: S603  the commands are fixed, and the paths are those of the user
+            command,
+            capture_output=True,
+            text=True,
+            errors="backslashreplace",
+            timeout=COMMAND_TIMEOUT_S,
+            check=False,
+            stdin=subprocess.DEVNULL,
+            env={**os.environ, "COLUMNS": "120", "NO_COLOR": "1"},
+        )
+    except FileNotFoundError:
+        return f"{command[0]} is not installed here\n"
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return f"{command[0]} did not work: {error}\n"
+    failed = f"{command[0]} ended with exit status {done.returncode}\n" if done.returncode else ""
+    return done.stdout + done.stderr + failed
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_text(errors="backslashreplace")
+    except OSError as error:
+        return f"cannot be read: {error.strerror}"
+
+
+_CODE = re.compile(r"""(?:[^"'#]|"(?:\\.|[^"\\])*"|'[^']*')*""")
+"""A line up to its comment."""
+
+
+def _without_comments(path: Path) -> str:
+    """The lines of a configuration. A comment may hold anything, so it is left out."""
+    lines = [match[0].rstrip() for line in _read(path).split("\n") if (match := _CODE.match(line)) is not None]
+    return "\n".join(filter(None, lines))
+
+
+# The addresses of peers.
+
+
+def _hosts_of_configs(paths: Sequence[Path]) -> Iterator[str]:
+    for path in paths:
+        for listed in re.findall(r"""(?ms)^\s*["']?addresses["']?\s*=\s*\[(.*?)\]\s*(?:#[^\n]*)?$""", _read(path)):
+            yield from (host for host, _ in map(_split, re.findall(r"""["']([^"']+)["']""", listed)))
+
+
+def _hosts_of_statuses(statuses: Sequence[dict[str, Any] | str]) -> Iterator[str]:
+    for status in statuses:
+        if isinstance(status, dict):
+            yield from (_split(peer["path"])[0] for peer in status["peers"].values() if peer["path"])
+
+
+def _hosts_of_log(log: str) -> Iterator[str]:
+    for line in log.splitlines():
+        try:
+            event = json.loads(line)
+        except ValueError:
+            continue
+        if isinstance(event, dict) and "peer" in event:
+            named = event.get("addresses")
+            for text in [*(named if isinstance(named, list) else ()), event.get("path")]:
+                if isinstance(text, str):
+                    yield _split(text)[0]
+        if isinstance(event, dict) and event.get("event") == "name_not_resolved":
+            yield str(event.get("host", ""))
+
+
+def _split(address: str) -> tuple[str, str]:
+    host, _, port = address.rpartition(":")
+    return (host, port) if host else (address, "")
+
+
+# The command.
+
+
+def write_report(options: argparse.Namespace, configs: Sequence[Path], sockets: Sequence[Path]) -> str | None:
+    """Make the report, show it and write it. Returns why it was not written.
+
+    On a terminal the user confirms it. Without a terminal, only ``--yes`` writes it.
+    """
+    is_asked = not options.yes
+    if is_asked and not _is_terminal():
+        return "a person has to read the report before it is written: run it on a terminal, or add --yes"
+    path = options.out or Path(time.strftime("uavlinkd-report-%Y%m%d-%H%M%S.txt"))
+    text = make_report(configs, sockets)
+    if is_asked:
+        print(text)
+        try:
+            answer = input(f"Write this to {path}? [y/N] ")
+        except EOFError:
+            answer = ""
+        if answer.strip().lower() not in ("y", "yes"):
+            return "the report was not written"
+    try:
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+        with os.fdopen(descriptor, "w") as file:
+            file.write(text)
+    except OSError as error:
+        return f"{path}: cannot be written: {error.strerror}"
+    print(path)
+    return None
+
+
+def _is_terminal() -> bool:
+    return sys.stdin.isatty() and sys.stdout.isatty()
+
+
+def service_files() -> list[Path]:
+    """The configurations of the service and its instances."""
+    try:
+        return sorted(SERVICE_FILES.glob("*.toml"))
+    except OSError:
+        return []
