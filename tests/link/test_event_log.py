@@ -1,156 +1,305 @@
-"""What disturbs a link, for the log: at once when it begins, and no flood."""
+"""Events in the log: link problems, findings, pauses, and the limit on lines."""
 
 from __future__ import annotations
 
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 from structlog import get_logger
 from structlog.testing import capture_logs
 
-from tests.link.test_switch import Program
-from uavlinkd.system.addresses import Address
-from uavlinkd.core.outputs import FreshnessUnverified, FreshnessVerified, PeerUp
-from uavlinkd.link.event_log import LINES_BURST, LINES_PER_S, EventLog
-from uavlinkd.ops.log import SUMMARY_INTERVAL_S
+from tests.core.harness import Named
+from tests.link.test_switch import Client
+from uavlinkd.config.errors import ConfigError, Problem
+from uavlinkd.core.outputs import PeerLost, PeerUp, SessionEstablished
+from uavlinkd.core.traffic import Traffic
+from uavlinkd.link import daemon
+from uavlinkd.link.conditions import HOUR_S, LINES_BURST, LINES_PER_S, QUIET_S
+from uavlinkd.link.event_log import CLIENT_RESTART_S, FINDING_DELAY_S, FINDING_QUIET_S, EventLog
+from uavlinkd.link.peer_link import PeerLink
+from uavlinkd.ops.causes import Cause
+from uavlinkd.ops.findings import Finding, Severity, Subject
+from uavlinkd.ops.link_problems import LinkProblem
 
 
-def told(log: EventLog, peer: str, now: float, **totals: int) -> list[dict[str, Any]]:
-    """The lines that these totals cause."""
-    with capture_logs() as lines:
-        log.disturbed(peer, totals, now)
-    return [dict(line) for line in lines]
+class Link:
+    """A link with totals that a test chooses."""
+
+    def __init__(self, name: str) -> None:
+        self.peer = self
+        self.name = name
+        self.traffic = Traffic()
+        self.totals: dict[LinkProblem, int] = dict.fromkeys(LinkProblem, 0)
+
+    def problems(self, now: float) -> dict[LinkProblem, int]:
+        """Its totals."""
+        return self.totals
 
 
 @pytest.fixture
 def log() -> EventLog:
-    """One that has told nothing yet."""
+    """A log without lines."""
     return EventLog(get_logger())
 
 
-def test_it_is_told_when_it_begins(log: EventLog) -> None:
-    """What is zero is no news; the first that is not has a line, with its number and what it means."""
-    assert told(log, "b", 1.0, envelopes_missing=0, challenges_unanswered=0) == []
-    (line,) = told(log, "b", 2.0, envelopes_missing=3, challenges_unanswered=0)
-    assert (line["event"], line["log_level"], line["peer"]) == ("link_disturbed", "warning", "b")
-    assert line["envelopes_missing"] == 3
-    assert "challenges_unanswered" not in line
-    assert "never came" in line["meaning"]
-
-
-def test_a_bad_radio_is_a_line_each_ten_seconds(log: EventLog) -> None:
-    """All that grows meanwhile is in the one line, as what came since the last."""
-    lines = [line for second in range(60) for line in told(log, "b", float(second), envelopes_missing=2 * second)]
-    assert len(lines) == 60 / SUMMARY_INTERVAL_S
-    assert [line["envelopes_missing"] for line in lines] == [2, 20, 20, 20, 20, 20]
-
-
-def test_peers_are_told_apart(log: EventLog) -> None:
-    """The quiet after a line is that peer's."""
-    assert told(log, "b", 1.0, envelopes_out_of_order=1)
-    assert told(log, "c", 1.0, envelopes_out_of_order=1)
-    assert not told(log, "b", 1.0, envelopes_out_of_order=2)
-    log.forget("b")
-    assert told(log, "b", 1.0, envelopes_out_of_order=2)
-
-
-def test_unverified_freshness_is_logged_when_it_begins_and_ends(log: EventLog) -> None:
-    """The first as a warning with its meaning, the second with its duration."""
+def run(log: EventLog, link: Link, begin: int, end: int, **rates: int) -> list[dict[str, Any]]:
+    """The lines of some seconds with 20 envelopes a second, and these counts of problems a second."""
     with capture_logs() as lines:
-        log.write(FreshnessUnverified("b"), 1.0)
-        log.write(FreshnessVerified("b", 12.3456), 13.0)
-    assert [(line["event"], line["log_level"], line["peer"]) for line in lines] == [
-        ("freshness_unverified", "warning", "b"),
-        ("freshness_verified", "info", "b"),
+        for second in range(begin, end):
+            link.traffic.envelopes_received += 20
+            for name, rate in rates.items():
+                link.totals[LinkProblem[name.upper()]] += rate
+            log.check_link(cast(PeerLink, link), float(second))
+            log.check(float(second))
+    return [dict(line) for line in lines]
+
+
+def test_link_problem_has_a_line_at_its_beginning_and_at_its_end(log: EventLog) -> None:
+    """The first with its share and meaning, the last with the total and the duration."""
+    link = Link("b")
+    assert run(log, link, 0, 100) == []
+    (began,) = run(log, link, 100, 400, envelopes_missing=5)
+    assert (began["event"], began["log_level"], began["peer"]) == ("link_problem_began", "warning", "b")
+    assert began["problem"] == "envelopes_missing"
+    assert 0.05 <= began["share"] <= 0.2
+    assert "did not arrive" in began["meaning"]
+    (ended,) = run(log, link, 400, 700)
+    assert (ended["event"], ended["log_level"]) == ("link_problem_ended", "info")
+    assert ended["count"] == 1500
+    assert 300 < ended["duration_s"] < 400
+    assert log.totals == {"envelopes_missing": 1500}
+
+
+def test_lasting_link_problem_has_further_lines(log: EventLog) -> None:
+    """After an hour, and after three, with what was counted so far."""
+    lines = run(log, Link("b"), 0, 4 * int(HOUR_S), echoes_unanswered=1)
+    assert [line["event"] for line in lines] == ["link_problem_began"] + 2 * ["link_problem_continued"]
+    assert lines[1]["count"] < lines[2]["count"]
+    assert "share" not in lines[0]
+
+
+def test_problems_of_removed_peers_are_still_counted(log: EventLog) -> None:
+    """Nothing is lost from the totals that the daemon writes when it stops."""
+    for name in ("b", "c"):
+        link = Link(name)
+        run(log, link, 0, 3, envelopes_missing=1)
+    log.forget("b")
+    assert log.totals == {"envelopes_missing": 6}
+
+
+def test_waiting_problems_are_logged_at_the_end(log: EventLog) -> None:
+    """A daemon that stops writes the totals of all open conditions."""
+    run(log, Link("b"), 0, 60, challenges_unanswered=1)
+    with capture_logs() as lines:
+        log.close()
+    assert [(line["event"], line["count"]) for line in lines] == [("link_problem_ended", 60)]
+
+
+def finding(severity: Severity, cause: str = "wrong_psk") -> Finding:
+    """A finding about peer b."""
+    return Finding(cause, severity, Subject.PEER, "b", "the PSKs differ", "write the same PSK at both ends")
+
+
+def test_finding_has_a_line_when_it_begins_and_one_when_it_has_ended(log: EventLog) -> None:
+    """The first with cause, text and remedy; the last with the duration."""
+    with capture_logs() as lines:
+        for second in range(100):
+            log.write_findings([finding(Severity.FAULT)] if second < 50 + FINDING_DELAY_S else [], float(second))
+            log.check(float(second))
+    began, ended = lines
+    facts = {"cause": "wrong_psk", "severity": "fault", "subject": "peer", "name": "b"}
+    assert began == {
+        "event": "problem_began",
+        "log_level": "warning",
+        **facts,
+        "text": "the PSKs differ",
+        "remedy": "write the same PSK at both ends",
+    }
+    assert ended == {"event": "problem_ended", "log_level": "info", **facts, "duration_s": 49.0}
+
+
+def test_short_finding_is_not_logged(log: EventLog) -> None:
+    """Such as a moment of unverified freshness, after three lost answers in a row. An attack is logged at once."""
+    with capture_logs() as lines:
+        for second in range(100):
+            present = second % 10 < FINDING_DELAY_S
+            log.write_findings([finding(Severity.FAULT)] if present else [], float(second))
+            log.check(float(second))
+        log.write_findings([finding(Severity.SECURITY, "key_on_two_machines")], 100.0)
+    assert [line["cause"] for line in lines] == ["key_on_two_machines"]
+
+
+def test_restarted_client_is_not_logged_as_silent(log: EventLog) -> None:
+    """An endpoint that never had frames is reported sooner than one whose client may restart."""
+    endpoint, silent = (
+        Client("autopilot"),
+        Finding("client_silent", Severity.WARNING, Subject.ENDPOINT, "autopilot", "", ""),
+    )
+
+    def began_after() -> float | None:
+        with capture_logs() as lines:
+            for second in range(60):
+                log.note_endpoint(endpoint)
+                log.write_findings([silent], float(second))
+                if lines:
+                    log.forget_endpoint("autopilot")
+                    log.write_findings([], 60.0)
+                    return second
+        return None
+
+    assert began_after() == FINDING_DELAY_S
+    endpoint.counters.frames += 1
+    assert began_after() == CLIENT_RESTART_S
+
+
+def test_withheld_commands_are_not_a_warning(log: EventLog) -> None:
+    """The role is meant to withhold them: one line when it begins, and one when it has ended."""
+    with capture_logs() as lines:
+        for second in range(4 * int(HOUR_S)):
+            log.write_findings([finding(Severity.WARNING, Cause.COMMANDS_WITHHELD)], float(second))
+            log.check(float(second))
+        log.close()
+    assert [(line["event"], line["log_level"]) for line in lines] == [
+        ("problem_began", "info"),
+        ("problem_ended", "info"),
     ]
-    assert "held and dropped" in lines[0]["meaning"]
-    assert lines[1]["unverified_s"] == 12.346
 
 
-def test_a_silent_endpoint_is_told_once_each_time(log: EventLog) -> None:
-    """A wrong speed, an unpowered autopilot: after ten seconds one line; again when it spoke meanwhile."""
-    endpoint = Program("autopilot")
-    endpoint.port.name = "/dev/ttyACM0"
-
-    def lines(seconds: range) -> list[Any]:
-        with capture_logs() as told:
-            for second in seconds:
-                log.look_at(endpoint, float(second))
-        return told
-
-    endpoint.counters.garbage_bytes = 77
-    assert lines(range(10)) == []
-    (line,) = lines(range(10, 100))
-    assert (line["event"], line["endpoint"], line["programs"]) == ("endpoint_silent", "autopilot", ["/dev/ttyACM0"])
-    assert line["garbage_bytes"] == 77
-    endpoint.counters.frames += 1
-    assert lines(range(100, 110)) == []
-    assert len(lines(range(110, 200))) == 1
-    log.forget_endpoint("autopilot")  # closed and opened anew
-    assert len(lines(range(200, 220))) == 1
-    endpoint.counters.frames += 1
-    endpoint.ports.clear()  # nobody is there: that is told otherwise
-    assert lines(range(220, 300)) == []
+@pytest.mark.parametrize("cause", [Cause.DAEMON_PAUSED, Cause.RECORDING_STOPPED])
+def test_findings_with_events_of_their_own_are_not_logged_twice(log: EventLog, cause: Cause) -> None:
+    """The events have more facts."""
+    with capture_logs() as lines:
+        for second in range(60):
+            log.write_findings([finding(Severity.WARNING, cause)], float(second))
+    assert lines == []
 
 
-def test_an_unheard_peer_is_told_with_what_to_look_at(log: EventLog) -> None:
-    """One that is called, and one that has to call."""
-    with capture_logs() as told:
-        log.unheard("b", [Address("10.0.0.1", 5790)])
-        log.unheard("c", [])
-    events = [(each["event"], each["peer"]) for each in told]
-    assert events == [("peer_not_answering", "b"), ("peer_not_calling", "c")]
-    assert told[0]["called_at"] == ["10.0.0.1:5790"]
-    assert "has to call" in told[1]["meaning"]
+def test_finding_that_flaps_settles(log: EventLog) -> None:
+    """An attacker that causes a finding again and again causes a few lines."""
+    with capture_logs() as lines:
+        for second in range(0, 24 * int(HOUR_S), 5):
+            log.write_findings([finding(Severity.FAULT)] if second // 60 % 2 else [], float(second))
+            log.check(float(second))
+    assert len(lines) < 20
+    assert lines[-1]["event"] == "problem_continued"
 
 
-def test_what_waits_is_told_in_the_end(log: EventLog) -> None:
-    """When the daemon stops no line is owed."""
-    told(log, "b", 1.0, echoes_unanswered=1)
-    (line,) = told(log, "b", float("inf"), echoes_unanswered=4)
-    assert line["echoes_unanswered"] == 3
+def test_security_finding_is_an_error(log: EventLog) -> None:
+    """It is logged although other findings of the peer have used up its lines."""
+    with capture_logs() as lines:
+        everyday = [finding(Severity.WARNING, f"cause{number}") for number in range(LINES_BURST + 1)]
+        log.write_findings(everyday, 1.0)
+        log.write_findings([*everyday, finding(Severity.SECURITY, "key_on_two_machines")], 1.0 + FINDING_DELAY_S)
+    assert len(lines) == LINES_BURST + 1
+    assert (lines[-1]["event"], lines[-1]["log_level"]) == ("problem_began", "error")
 
 
-def test_counters_that_begin_anew_are_no_news(log: EventLog) -> None:
-    """After a change of keys the figures are another's: what they have by then is not told, what is added is."""
-    told(log, "b", 1.0, envelopes_missing=9)
-    assert told(log, "b", 50.0, envelopes_missing=2) == []
-    (line,) = told(log, "b", 51.0, envelopes_missing=5)
-    assert line["envelopes_missing"] == 3
+def test_findings_of_removed_peers_end(log: EventLog) -> None:
+    """The configuration no longer has the peer."""
+    for now in (1.0, 1.0 + FINDING_DELAY_S):
+        log.write_findings([finding(Severity.FAULT)], now)
+    with capture_logs() as lines:
+        log.forget("b")
+        log.check(9 + FINDING_QUIET_S)
+    assert [line["event"] for line in lines] == ["problem_ended"]
 
 
-def test_counters_that_begin_anew_in_the_quiet_after_a_line_are_told_after_it(log: EventLog) -> None:
-    """The quiet neither ends early nor hides what came in it."""
-    told(log, "b", 1.0, envelopes_missing=9)
-    assert told(log, "b", 2.0, envelopes_missing=0) == []
-    assert told(log, "b", 3.0, envelopes_missing=4) == []
-    (line,) = told(log, "b", 1.0 + SUMMARY_INTERVAL_S, envelopes_missing=4)
-    assert line["envelopes_missing"] == 4
+def test_rekeys_are_logged_for_debugging_only(log: EventLog) -> None:
+    """A first session is news; a rekey happens every two minutes."""
+    with capture_logs() as lines:
+        for rekey in (False, True):
+            log.write(SessionEstablished(Named("b"), 1, "x25519", False, 16, True, rekey), 1.0)
+    assert [(line["log_level"], line["rekey"]) for line in lines] == [("info", False), ("debug", True)]
 
 
-def test_programs_that_come_and_go_are_no_flood(log: EventLog) -> None:
-    """Whoever connects and leaves again for hours gets a bounded number of lines, and the others keep theirs."""
+def test_debug_lines_are_limited_too(log: EventLog) -> None:
+    """A peer that makes keys all the time uses up no lines of its other events."""
+    with capture_logs() as lines:
+        for _ in range(LINES_BURST + 10):
+            log.write(SessionEstablished(Named("b"), 1, "x25519", False, 16, True, True), 1.0)
+        log.write(PeerUp(Named("b")), 1.0)
+    assert [line["log_level"] for line in lines] == LINES_BURST * ["debug"] + ["info"]
+
+
+def test_pauses_are_one_condition(log: EventLog) -> None:
+    """A machine that is too busy for hours causes a line when it begins, and one with the sum at its end."""
+    with capture_logs() as lines:
+        for second in range(600):
+            log.write_pause(0.5, float(second))
+            log.check(float(second))
+        log.check(600 + QUIET_S)
+    assert [(line["event"], line["count"], line["seconds"]) for line in lines] == [
+        ("daemon_paused", 1, 0.5),
+        ("pauses_ended", 600, 300.0),
+    ]
+
+
+def test_single_pause_is_one_line(log: EventLog) -> None:
+    """Its end says nothing new. The next one starts at zero."""
+    with capture_logs() as lines:
+        for begin in (0.0, 2 * HOUR_S):
+            log.write_pause(9.0, begin)
+            log.check(begin + QUIET_S)
+    assert [(line["event"], line["seconds"]) for line in lines] == 2 * [("daemon_paused", 9.0)]
+
+
+def test_clients_that_reconnect_do_not_flood_the_log(log: EventLog) -> None:
+    """A client that reconnects for hours causes a bounded number of lines, and does not affect other endpoints."""
     with capture_logs() as lines:
         for number in range(10000):
-            log.program("program_found", "tcp", f"127.0.0.1:{number}", 0.36 * number)
-        log.program("program_found", "udp", "127.0.0.1:9", 3600.0)
-        log.write(PeerUp("tcp"), 3600.0)
+            log.write_client("client_connected", "tcp", f"127.0.0.1:{number}", 0.36 * number)
+        log.write_client("client_connected", "udp", "127.0.0.1:9", 3600.0)
+        log.write(PeerUp(Named("tcp")), 3600.0)
     assert LINES_BURST <= len(lines) - 2 <= LINES_BURST + LINES_PER_S * 3600 + 1
-    assert sum(1 + line.get("omitted_before", 0) for line in lines[:-2]) > 9990
+    assert sum(1 + line.get("omitted_before", 0) for line in lines[:-2]) > 9000
     assert lines[-2:] == [
-        {"event": "program_found", "log_level": "info", "endpoint": "udp", "program": "127.0.0.1:9"},
+        {"event": "client_connected", "log_level": "info", "endpoint": "udp", "client": "127.0.0.1:9"},
         {"event": "peer_up", "log_level": "info", "peer": "tcp"},
     ]
 
 
+def test_log_ends_with_the_state_of_a_link_that_flaps(log: EventLog) -> None:
+    """The latest state that a limit omitted is written when the limit permits it, and every line is counted."""
+    with capture_logs() as lines:
+        for number in range(100):
+            log.write(PeerUp(Named("b")), 10.0 + number / 10)
+            log.write(PeerLost(Named("b"), 3.0), 10.0 + number / 10)
+        assert len(lines) == LINES_BURST
+        log.check(21.0)
+        assert len(lines) == LINES_BURST
+        log.check(21.0 + 1 / LINES_PER_S)
+        log.check(21.0 + 2 / LINES_PER_S)
+    assert len(lines) == LINES_BURST + 1
+    assert lines[-1]["event"] == "peer_lost"
+    assert lines[-1]["omitted_before"] == 200 - LINES_BURST - 1
+
+
 @pytest.mark.parametrize("name", ["b", "b (previous key)", "b (previous key) (our previous key)"])
-def test_a_forgotten_peer_leaves_nothing_by_any_name(log: EventLog, name: str) -> None:
-    """While keys change the core has it by several; whoever comes back begins with every line, and owes none."""
+def test_removed_peer_leaves_no_state(log: EventLog, name: str) -> None:
+    """During a key change the core has the peer under several names; a peer that returns has its whole limit."""
     for peer in ("c", name):
         for _ in range(LINES_BURST + 1):
-            log.write(PeerUp(peer), 1.0)
+            log.write(PeerUp(Named(peer)), 1.0)
     log.forget("b")
     with capture_logs() as lines:
-        log.write(PeerUp(name), 1.0)
-        log.write(PeerUp("c"), 1.0)
+        log.write(PeerUp(Named(name)), 1.0)
+        log.write(PeerUp(Named("c")), 1.0)
     assert [dict(line) for line in lines] == [{"event": "peer_up", "log_level": "info", "peer": name}]
+
+
+async def test_problems_of_a_refused_configuration_control_no_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A name of a file may have any character; each problem stays one text."""
+
+    async def refuse(*_: object) -> None:
+        raise ConfigError(
+            (Problem("a\x1b]0;owned\x07.toml:1:1", "name", "is missing"), Problem("b.toml", "", "empty"))
+        )
+
+    monkeypatch.setattr(daemon, "load_in_thread", refuse)
+    stub = SimpleNamespace(config=SimpleNamespace(path="a.toml"), log=get_logger())
+    with capture_logs() as lines, pytest.raises(ConfigError):
+        await daemon.Daemon._reload(cast(daemon.Daemon, stub))
+    ((problems, event),) = [(line["problems"], line["event"]) for line in lines]
+    assert event == "configuration_refused"
+    assert problems == [r"a\x1b]0;owned\x07.toml:1:1: name: is missing", "b.toml: empty"]

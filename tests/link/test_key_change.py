@@ -10,9 +10,10 @@ import pytest
 from rich.console import Console
 
 from tests.policies import TRUSTED
-from uavlinkd.config import keys
-from uavlinkd.config import Config, ConfigError, Peer, load_config
+from uavlinkd.config import Config, ConfigError, keys
+from uavlinkd.config import PeerConfig as Peer
 from uavlinkd.config.changes import compare
+from uavlinkd.config.load import load_config
 from uavlinkd.core.crypto import KeyPair, Secret
 from uavlinkd.core.node import Node
 from uavlinkd.core.settings import PeerSettings
@@ -51,26 +52,26 @@ def test_every_pair_of_keys_that_may_be_right_is_tried() -> None:
     """Two keys of ours and two of theirs make four, the current ones first; each has a name that leads back."""
     now, before = bytes([1]) * 32, bytes([2]) * 32
     peer = Peer(PeerSettings("b", now), (), TRUSTED, previous_public_key=before)
-    found = pairings(peer, has_previous_key=True)
+    pairs = pairings(peer, has_previous_key=True)
 
-    assert [(each.settings.public_key, each.by_our_previous) for each in found] == [
+    assert [(pair.settings.public_key, pair.by_our_previous) for pair in pairs] == [
         (now, False),
         (before, False),
         (now, True),
         (before, True),
     ]
-    names = [each.settings.name for each in found]
+    names = [pair.settings.name for pair in pairs]
     assert names[0] == "b"
     assert len(set(names)) == 4
     assert {link_name(name) for name in names} == {"b"}
-    assert [each.by_our_previous for each in found] == [False, False, True, True]
-    assert [each.by_their_previous for each in found] == [False, True, False, True]
+    assert [pair.by_our_previous for pair in pairs] == [False, False, True, True]
+    assert [pair.by_their_previous for pair in pairs] == [False, True, False, True]
     assert len(pairings(Peer(PeerSettings("b", now), (), TRUSTED), has_previous_key=False)) == 1
 
 
 def test_the_end_of_their_change_leaves_ours() -> None:
     """Their previous key is out of the file: the peer is still accepted where it knows us by our previous one."""
-    now, before = (KeyPair(keys.decode_key(each)).public for each in (THEIRS, THEIRS_BEFORE))
+    now, before = (KeyPair(keys.decode_key(text)).public for text in (THEIRS, THEIRS_BEFORE))
     node = Node(Secret(keys.decode_key(OWN)), bytes, 0.0, Secret(keys.decode_key(PREVIOUS)))
     config = Peer(PeerSettings("b", now), (), TRUSTED, previous_public_key=before)
     link = PeerLink(config, node, lambda _: None, 0.0)
@@ -90,16 +91,16 @@ def test_previous_keys_are_loaded(tmp_path: Path) -> None:
     assert config.previous_private_key.reveal() == keys.decode_key(PREVIOUS)
     assert config.key_grace_s == 60
     before = keys.decode_key(keys.public_key_text(THEIRS_BEFORE))
-    assert [each.previous_public_key for each in config.peers] == [before, None]
+    assert [peer.previous_public_key for peer in config.peers] == [before, None]
 
 
 def test_previous_keys_are_shown(tmp_path: Path) -> None:
-    """`uavlinkd check` says which keys are good too, and for how long."""
+    """`uavlinkd check` prints the previous keys that are valid, and for how long."""
     text = printed(load(tmp_path, f"{OUR_LINE}\nkey_grace_s = 60", was(THEIRS_BEFORE)))
-    assert f"before      {keys.public_key_text(PREVIOUS)}" in text
-    assert "good too, until the new one is confirmed: 60 s at most" in text
+    assert f"previous key  {keys.public_key_text(PREVIOUS)}" in text
+    assert "valid until the peer confirms the new key, at most 60 s" in text
     assert f"or {keys.short_form(keys.decode_key(keys.public_key_text(THEIRS_BEFORE)))}" in text
-    assert "7 days at most" in printed(load(tmp_path, OUR_LINE))
+    assert "at most 7 days" in printed(load(tmp_path, OUR_LINE))
     assert "before" not in printed(load(tmp_path))
 
 
@@ -110,11 +111,11 @@ def printed(config: Config) -> str:
     return file.getvalue()
 
 
-def test_without_previous_keys_there_are_none(tmp_path: Path) -> None:
+def test_peers_have_no_previous_keys_by_default(tmp_path: Path) -> None:
     """A file that names none accepts none."""
     config = load(tmp_path)
     assert config.previous_private_key is None
-    assert [each.previous_public_key for each in config.peers] == [None, None]
+    assert [peer.previous_public_key for peer in config.peers] == [None, None]
 
 
 @pytest.mark.parametrize(
@@ -128,12 +129,13 @@ def test_without_previous_keys_there_are_none(tmp_path: Path) -> None:
         (OUR_LINE, was(PREVIOUS), "peer[0].previous_public_key (b)"),
         ("", 'previous_public_key = "none"', "peer[0].previous_public_key (b)"),
     ],
+    ids=["own key", "missing file", "no grace", "a peer's key", "our key", "our previous key", "malformed"],
 )
 def test_impossible_previous_keys_are_refused(tmp_path: Path, own: str, theirs: str, key: str) -> None:
-    """A previous key is another than every key that is somebody's now."""
+    """A previous key differs from every current key."""
     with pytest.raises(ConfigError) as error:
         load(tmp_path, own, theirs)
-    assert [each.key for each in error.value.problems] == [key]
+    assert [problem.key for problem in error.value.problems] == [key]
 
 
 def test_previous_keys_of_two_peers_differ(tmp_path: Path) -> None:
@@ -155,17 +157,17 @@ def test_previous_keys_of_two_peers_differ(tmp_path: Path) -> None:
         path.write_text(top + b + c)
         with pytest.raises(ConfigError) as error:
             load_config(path, {})
-        assert [each.key for each in error.value.problems] == [place]
+        assert [problem.key for problem in error.value.problems] == [place]
 
 
 def test_a_peers_previous_key_comes_with_a_new_link(tmp_path: Path) -> None:
-    """A link accepts what it was made to accept: a previous key more makes it anew, one less does not."""
+    """A link accepts the keys that it was created with: one more previous key replaces it, one less does not."""
     without, having = load(tmp_path), load(tmp_path, theirs=was(THEIRS_BEFORE))
     coming, going = compare(without, having), compare(having, without)
     assert coming.removed_peers == ("b",)
-    assert [each.name for each in coming.added_peers] == ["b"]
+    assert [peer.name for peer in coming.added_peers] == ["b"]
     assert (going.removed_peers, going.added_peers) == ((), ())
-    assert [each.name for each in going.changed_peers] == ["b"]
+    assert [peer.name for peer in going.changed_peers] == ["b"]
 
 
 def test_grace_is_fixed(tmp_path: Path) -> None:
@@ -182,9 +184,9 @@ def test_previous_key_may_go_while_the_daemon_runs_and_not_come(tmp_path: Path) 
         compare(without, having)
 
 
-def test_a_link_made_anew_gets_no_second_grace() -> None:
-    """A reload that makes a link anew revives no key that was given up, and no time; only the operator does."""
-    now, before = (KeyPair(keys.decode_key(each)).public for each in (THEIRS, THEIRS_BEFORE))
+def test_link_that_is_created_again_gets_no_second_grace() -> None:
+    """A reload that creates a link again revives neither an ended key nor its time; only the operator does."""
+    now, before = (KeyPair(keys.decode_key(text)).public for text in (THEIRS, THEIRS_BEFORE))
     node = Node(Secret(keys.decode_key(OWN)), bytes, 0.0, Secret(keys.decode_key(PREVIOUS)))
     config = Peer(PeerSettings("b", now), (), TRUSTED, previous_public_key=before)
     graces = Graces()
@@ -192,7 +194,7 @@ def test_a_link_made_anew_gets_no_second_grace() -> None:
     def joined(at: float) -> PeerLink:
         if "b" in node.peers:
             for name in list(node.peers):
-                node.remove_peer(name, at)
+                node.remove_peer(node.peers[name], at)
         link = PeerLink(config, node, lambda _: None, at)
         link.join(at, graces, 10.0, has_previous_key=True)
         return link
@@ -209,14 +211,14 @@ def test_a_link_made_anew_gets_no_second_grace() -> None:
     graces.follow([config], [without])
     graces.follow([without], [config])
     link = joined(12.0)
-    assert list(node.peers) == ["b", "b (previous key)"]  # it is theirs that is good anew, not ours
+    assert list(node.peers) == ["b", "b (previous key)"]  # theirs is valid again, not ours
     assert link.confirm(13.0, graces)
     assert not joined(14.0).accepts_previous_keys
 
 
 def test_our_previous_key_stays_given_up_when_their_key_changes() -> None:
     """A peer that knows our new key does not bring the one before back by a new key of its own."""
-    first, second = (KeyPair(keys.decode_key(each)).public for each in (THEIRS_BEFORE, THEIRS))
+    first, second = (KeyPair(keys.decode_key(text)).public for text in (THEIRS_BEFORE, THEIRS))
     graces = Graces()
     node = Node(Secret(keys.decode_key(OWN)), bytes, 0.0, Secret(keys.decode_key(PREVIOUS)))
     link = PeerLink(Peer(PeerSettings("b", first), (), TRUSTED), node, lambda _: None, 0.0)

@@ -3,26 +3,30 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
-from tests.core.harness import AT_A, AT_B, ELSEWHERE, KEY_A, KEY_B, PLAIN, QUIET, Pair, exchange, of, payloads
+from tests.core.harness import AT_A, AT_B, ELSEWHERE, KEY_A, KEY_B, PLAIN, QUIET, Pair, Side, exchange, of, payloads
 from tests.endpoints.clients import PASSES
 from tests.policies import TRUSTED
-from uavlinkd.system.addresses import Address
-from uavlinkd.config import Peer
+from uavlinkd.config import PeerConfig as Peer
 from uavlinkd.config.pace import verify_interval_s
 from uavlinkd.core import handshake
+from uavlinkd.core.constants import NEVER
 from uavlinkd.core.cookie import MacKeys
-from uavlinkd.core.outputs import Output, Path, Transmit
+from uavlinkd.core.outputs import Output, Transmit
+from uavlinkd.core.path import Path
 from uavlinkd.core.settings import Link, PeerSettings
+from uavlinkd.core.timers import Schedule
+from uavlinkd.link.peer_link import PeerLink, radio_figures
+from uavlinkd.link.status import peer_status
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
 from uavlinkd.mavlink.frames import Frame, SplitCounters, split_payload
 from uavlinkd.mavlink.radio_status import LinkFigures
-from uavlinkd.link.peer_link import PeerLink, radio_figures
-from uavlinkd.link.status import peer_status
+from uavlinkd.system.addresses import Address
 
 BUDGET_BITS_S = 4000
 REPLAYS_PER_S = 4
@@ -30,9 +34,16 @@ SECONDS = 60
 
 
 def recorded_initiation(entropy: random.Random) -> bytes:
-    """An initiation of alpha's that bravo never heard."""
+    """An initiation of alpha's that bravo never received."""
     made = handshake.initiate(KEY_A, PeerSettings("bravo", KEY_B.public, None, PLAIN), 77, 0, entropy.randbytes)
     return MacKeys(KEY_B.public).add_macs(made.message, None)
+
+
+def link_of(side: Side, config: Peer, perform: Callable[[list[Output]], None]) -> PeerLink:
+    """The link to the peer that this side's node has already."""
+    link = PeerLink(config, side.node, perform, 0.0)
+    link.peers.append(side.peer)
+    return link
 
 
 def heartbeat() -> list[Frame]:
@@ -54,7 +65,7 @@ def test_replayed_handshakes_do_not_silence_a_link_with_a_budget(source: Path) -
         TRUSTED,
         egress=EgressSettings(budget_bits_s=BUDGET_BITS_S),
     )
-    peer_link = PeerLink(config, pair.b.node, outputs.extend, 0.0)
+    peer_link = link_of(pair.b, config, outputs.extend)
     peer_link.on_session()
     heartbeats = heartbeat()
     entropy, arrived = random.Random(7), 0
@@ -78,7 +89,7 @@ def test_a_budget_that_comes_with_a_reload_pays_for_nothing_before_it() -> None:
     pair = Pair(link_a=link, link_b=link).establish()
     outputs: list[Output] = []
     config = Peer(PeerSettings("alpha", KEY_A.public, None, link), (), TRUSTED)
-    peer_link = PeerLink(config, pair.b.node, outputs.extend, 0.0)
+    peer_link = link_of(pair.b, config, outputs.extend)
     while pair.b.peer.traffic.bytes_sent < 1_000_000:
         peer_link.send(heartbeat() * 20, PASSES, 1.0, 0.0)
     peer_link.change(replace(config, egress=EgressSettings(budget_bits_s=BUDGET_BITS_S)), 2.0)
@@ -94,7 +105,7 @@ def test_new_budget_changes_the_interval_of_the_next_session() -> None:
     link = Link(suites=PLAIN.suites, timers=QUIET)
     pair = Pair(link_a=link, link_b=link).establish()
     config = Peer(PeerSettings("alpha", KEY_A.public, None, link), (), TRUSTED)
-    peer_link = PeerLink(config, pair.b.node, lambda _: None, 0.0)
+    peer_link = link_of(pair.b, config, lambda _: None)
     slower = replace(config.settings, link=replace(link, verify_interval_s=5.0))
     peer_link.change(replace(config, settings=slower), 1.0)
     assert pair.b.peer.verify_interval_s == 5.0
@@ -105,8 +116,8 @@ def test_new_budget_changes_the_interval_of_the_next_session() -> None:
 def test_status_has_the_time_of_unverified_freshness(since: float | None, shown: float | None) -> None:
     """In seconds until now; nothing while freshness is verified."""
     pair = Pair().establish()
-    pair.b.peer._age.unverified_since = since
-    peer_link = PeerLink(Peer(PeerSettings("alpha", KEY_A.public), (), TRUSTED), pair.b.node, lambda _: None, 0.0)
+    pair.b.peer.unverified_since = since
+    peer_link = link_of(pair.b, Peer(PeerSettings("alpha", KEY_A.public), (), TRUSTED), lambda _: None)
     assert peer_status(peer_link, 12.5)["freshness_unverified_s"] == shown
 
 
@@ -114,46 +125,80 @@ def test_a_peer_whose_addresses_are_other_ones_is_not_called_at_those_before() -
     """Its new names may have no address yet. The path that is in use goes on being so."""
     pair = Pair(link_a=Link(suites=PLAIN.suites, timers=QUIET), link_b=PLAIN).establish()
     config = Peer(PeerSettings("bravo", KEY_B.public, None, PLAIN), (Address("192.0.2.2", 14600),), TRUSTED)
-    link = PeerLink(config, pair.a.node, lambda _: None, 0.0)
-    assert list(pair.a.peer.caller.addresses) == [AT_B]
+    link = link_of(pair.a, config, lambda _: None)
+    assert list(pair.a.peer.initiator.paths) == [AT_B]
     link.change(replace(config, egress=EgressSettings(coalesce_s=0.01)), 1.0)
-    assert list(pair.a.peer.caller.addresses) == [AT_B]
+    assert list(pair.a.peer.initiator.paths) == [AT_B]
     link.change(replace(config, addresses=(Address("new.test", 14600),)), 2.0)
-    assert list(pair.a.peer.caller.addresses) == []
+    assert list(pair.a.peer.initiator.paths) == []
     assert pair.a.peer.path == AT_B
 
 
-@pytest.mark.parametrize(("addresses", "told_at"), [((Address("192.0.2.2", 14600),), 5), ((), 30)])
-def test_a_peer_that_is_not_heard_is_told_of_once(addresses: tuple[Address, ...], told_at: int) -> None:
-    """Soon where it is called in vain, later where it has to call; and again only when it was up meanwhile."""
+@pytest.mark.parametrize(("addresses", "reported_at"), [((Address("192.0.2.2", 14600),), 5), ((), 10)])
+def test_silent_peer_is_reported_in_time(addresses: tuple[Address, ...], reported_at: int) -> None:
+    """After 5 s if this daemon connects to it, after 10 s if it has to connect; again only after it was up."""
     pair = Pair(link_a=Link(suites=PLAIN.suites, timers=QUIET), link_b=PLAIN)
     config = Peer(PeerSettings("bravo", KEY_B.public, None, PLAIN), addresses, TRUSTED)
-    link = PeerLink(config, pair.a.node, lambda _: None, 0.0)
-    assert [second for second in range(200) if link.is_unheard(float(second))] == [told_at]
-    link.change(replace(config, addresses=(Address("192.0.2.3", 14600),)), 200.0)  # told anew, of the new address
-    assert [second for second in range(200, 300) if link.is_unheard(float(second))] == [205]
+    link = link_of(pair.a, config, lambda _: None)
+    assert [second for second in range(20) if link.is_overdue(float(second))] == list(range(reported_at, 20))
+    link.change(
+        replace(config, addresses=(Address("192.0.2.3", 14600),)), 200.0
+    )  # reported again, with the new address
+    assert [second for second in range(200, 220) if link.is_overdue(float(second))] == list(range(205, 220))
     link.set_paths([AT_B], 300.0)
     pair.establish(300.0)
-    assert not link.is_unheard(300.0)
+    assert not link.is_overdue(300.0)
+    link.note_silence(300.0)
+    link.peer.is_up = False
+    assert not link.is_overdue(304.9)
+    assert link.is_overdue(305.0)
 
 
 def measured(config: Peer, figures: LinkFigures) -> PeerLink:
     """A link that measured this."""
-    link = PeerLink(config, Pair().a.node, lambda _: None, 0.0)
+    link = link_of(Pair().a, config, lambda _: None)
     link._figures = figures
     return link
 
 
 def test_an_autopilot_slows_down_for_operators_not_for_neighbours() -> None:
-    """The worst link to an operator is told; that to a neighbour only where no role says who operates."""
+    """The worst link to an operator counts; that to a neighbour counts only without roles."""
     good, bad, worse = (LinkFigures(True, loss, loss, 0.1) for loss in (0.0, 0.1, 0.4))
     role = {"system_ids": [2], "role": "swarm-member"}
     neighbour = measured(Peer(PeerSettings("n", KEY_A.public), (), policy=role), worse)
     operators = [
-        measured(Peer(PeerSettings("o", KEY_A.public), (), policy={**role, "role": "operator"}), each)
-        for each in (good, bad)
+        measured(Peer(PeerSettings("o", KEY_A.public), (), policy={**role, "role": "operator"}), figures)
+        for figures in (good, bad)
     ]
     assert radio_figures([neighbour, *operators]) == bad
     assert radio_figures([neighbour, operators[0]]) == good
     assert radio_figures([neighbour]) == worse
     assert radio_figures([]) is None
+
+
+def test_only_links_with_waiting_frames_are_scheduled() -> None:
+    """Of two links the one whose frames wait is due, at its time; afterwards none is, and a removed link never."""
+    schedule = Schedule[PeerLink]()
+    link = Link(suites=PLAIN.suites, timers=QUIET)
+    pair = Pair(link_a=link, link_b=link).establish()
+    config = Peer(
+        PeerSettings("alpha", KEY_A.public, None, link), (), TRUSTED, egress=EgressSettings(coalesce_s=0.01)
+    )
+    links = [PeerLink(config, pair.b.node, lambda _: None, 0.0, None, schedule) for _ in range(2)]
+    for member in links:
+        member.peers.append(pair.b.peer)
+        member.on_session()
+    assert schedule.next_at == NEVER
+
+    attitude = split_payload(
+        bytes(mavlink.MAVLink_attitude_message(1, 0, 0, 0, 0, 0, 0).pack(mavlink.MAVLink(None))), SplitCounters()
+    )
+    links[0].send(attitude, PASSES, 1.0, 0.0)
+    assert schedule.next_at == 1.01
+    assert schedule.pop(1.01) == [links[0]]
+    links[0].send_waiting(1.01)
+    assert schedule.next_at == NEVER
+
+    links[0].send(attitude, PASSES, 2.0, 0.0)
+    links[0].leave(2.0)
+    assert schedule.next_at == NEVER

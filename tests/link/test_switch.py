@@ -1,4 +1,4 @@
-"""What the switch remembers about a sender's messages is never older than the rules and the routes."""
+"""The flows that the switch remembers are never older than the rules and the routes."""
 
 from __future__ import annotations
 
@@ -10,25 +10,26 @@ from fastcrc.crc16 import mcrf4xx
 from pymavlink.dialects.v20 import all as mavlink
 
 from tests.mavlink.policy.smuggling import v2
-from uavlinkd.link import switch as switch_module
 from uavlinkd.endpoints.ports import LocalPort
-from uavlinkd.mavlink.policy.delivery import Source
-from uavlinkd.mavlink.frames import Frame, Header, SplitCounters, split_datagram
-from uavlinkd.mavlink.policy.gate import Refusal
-from uavlinkd.mavlink.policy.compilation import Policy, compile_policy
-from uavlinkd.mavlink.routing import ROUTE_LIFETIME_S, Router, Unrouted
+from uavlinkd.link import switch as switch_module
 from uavlinkd.link.switch import Switch
+from uavlinkd.mavlink.frames import Frame, SplitCounters, split_datagram
+from uavlinkd.mavlink.headers import Header
+from uavlinkd.mavlink.policy.compilation import Policy, compile_policy
+from uavlinkd.mavlink.policy.delivery import Source
+from uavlinkd.mavlink.policy.gate import Refusal
+from uavlinkd.mavlink.routing import ROUTE_LIFETIME_S, Router, Unrouted
 
 
-class Program:
-    """An endpoint with one program behind it, that keeps what it is told."""
+class Client:
+    """An endpoint with one client, which keeps the frames that it receives."""
 
     def __init__(self, name: str) -> None:
         self.name = name
         self.counters = SplitCounters()
         self.failures: Counter[str] = Counter()
         self.bytes_received = self.bytes_sent = self.frames_sent = 0
-        self.told: list[bytes] = []
+        self.received: list[bytes] = []
         self.port = LocalPort(self, name, None)
         self.ports = [self.port]
 
@@ -40,7 +41,7 @@ class Program:
 
     def write(self, port: LocalPort, frames: Sequence[Frame], source: Source, now: float) -> None:
         """Keep them."""
-        self.told += [raw for raw, _ in frames]
+        self.received += [raw for raw, _ in frames]
 
     def do_housekeeping(self, now: float) -> None:
         """Nothing to do."""
@@ -50,26 +51,26 @@ class Program:
 
 
 class Stage:
-    """Three programs at one switch, where everything passes at first."""
+    """Three clients at one switch, where everything passes at first."""
 
     def __init__(self) -> None:
         self.refused: list[tuple[str, Refusal]] = []
         self.router = Router[switch_module.Port]()
         self.withheld: list[tuple[str, Refusal]] = []
         self.switch = Switch(self.router, self.refuse)
-        self.a, self.b, self.c = (Program(name) for name in "abc")
-        for each in (self.a, self.b, self.c):
-            self.switch.add(each.port, policy())
+        self.a, self.b, self.c = (Client(name) for name in "abc")
+        for client in (self.a, self.b, self.c):
+            self.switch.add(client.port, policy())
 
-    def refuse(self, who: str, header: Header, refusal: Refusal, now: float, *, to_them: bool) -> None:
-        """Keep it, by whether they said it or were not told."""
-        (self.withheld if to_them else self.refused).append((who, refusal))
+    def refuse(self, name: str, header: Header, refusal: Refusal, now: float, *, to_them: bool) -> None:
+        """Keep it, by its direction."""
+        (self.withheld if to_them else self.refused).append((name, refusal))
 
-    def told(self) -> tuple[int, int, int]:
-        """How many frames each was told since the last call."""
-        counts = len(self.a.told), len(self.b.told), len(self.c.told)
-        for each in (self.a, self.b, self.c):
-            each.told.clear()
+    def delivered(self) -> tuple[int, int, int]:
+        """How many frames each client received since the last call."""
+        counts = len(self.a.received), len(self.b.received), len(self.c.received)
+        for client in (self.a, self.b, self.c):
+            client.received.clear()
         return counts
 
 
@@ -90,137 +91,177 @@ def request(number: int, target: int) -> Frame:
 
 def made(message: mavlink.MAVLink_message, system: int) -> Frame:
     """The frame of a message."""
-    (found,) = split_datagram(message.pack(mavlink.MAVLink(None, system, 1)), SplitCounters())
-    return found
+    (frame,) = split_datagram(message.pack(mavlink.MAVLink(None, system, 1)), SplitCounters())
+    return frame
 
 
 @pytest.fixture
 def stage() -> Stage:
-    """Anew for each test."""
+    """A new one for each test."""
     return Stage()
 
 
-def test_each_frame_of_a_message_goes_the_same_way_once(stage: Stage) -> None:
-    """Remembered or not: to all others, none twice, one that came elsewhere already not at all."""
+def test_each_frame_of_a_message_goes_to_the_same_ports_once(stage: Stage) -> None:
+    """Remembered or not: to all others, once. A frame that another port sent already is dropped."""
     for number in range(3):
         stage.switch.forward(stage.a.port, [attitude(number)], 0.1 * number)
-        assert stage.told() == (0, 1, 1)
+        assert stage.delivered() == (0, 1, 1)
     stage.switch.forward(stage.b.port, [attitude(9, system=2)], 0.4)
-    assert stage.told() == (1, 0, 1)
-    stage.switch.forward(stage.b.port, [attitude(2)], 0.5)  # a's, by another way
-    assert stage.told() == (0, 0, 0)
+    assert stage.delivered() == (1, 0, 1)
+    stage.switch.forward(stage.b.port, [attitude(2)], 0.5)  # a's, by another route
+    assert stage.delivered() == (0, 0, 0)
     assert stage.router.unrouted == {Unrouted.DUPLICATE: 1}
 
 
+def test_duplicates_are_looked_for_where_a_frame_can_arrive_by_two_routes(stage: Stage) -> None:
+    """Not while policy accepts a system from one port alone; from the moment on at which another may send it too."""
+    for system, client in enumerate((stage.a, stage.b, stage.c), start=1):
+        stage.switch.set_policy(client.port, policy(system_ids=[system]))
+    for number in range(3):
+        stage.switch.forward(stage.a.port, [attitude(number)], 0.1)
+    assert stage.delivered() == (0, 3, 3)
+    assert not stage.router._seen
+    stage.switch.set_policy(stage.c.port, policy(system_ids=[1, 3]))
+    for number in range(3, 6):
+        stage.switch.forward(stage.a.port, [attitude(number)], 0.2)
+        stage.switch.forward(stage.c.port, [attitude(number)], 0.2)
+    assert stage.delivered() == (0, 3, 3)
+    assert stage.router.unrouted == {Unrouted.DUPLICATE: 3}
+
+
 def test_a_new_rule_holds_for_the_next_frame(stage: Stage) -> None:
-    """On the way in, and on the way out; and when it is lifted again."""
+    """For incoming and outgoing frames, and also when the rule is removed again."""
     number = 0
 
-    def told() -> tuple[int, int, int]:
+    def delivered() -> tuple[int, int, int]:
         nonlocal number
         number += 1
         stage.switch.forward(stage.a.port, [attitude(number)], 0.01 * number)
-        return stage.told()
+        return stage.delivered()
 
-    assert told() == (0, 1, 1)
+    assert delivered() == (0, 1, 1)
     stage.switch.set_policy(stage.b.port, policy(deny_out=["ATTITUDE"]))
-    assert (told(), told()) == ((0, 0, 1), (0, 0, 1))
+    assert (delivered(), delivered()) == ((0, 0, 1), (0, 0, 1))
     assert stage.withheld == [("b", Refusal.MESSAGE_NOT_ALLOWED)] * 2
     stage.switch.set_policy(stage.b.port, policy())
-    assert told() == (0, 1, 1)
+    assert delivered() == (0, 1, 1)
     stage.switch.set_policy(stage.a.port, policy(system_ids=[7]))
-    assert (told(), told()) == ((0, 0, 0), (0, 0, 0))
+    assert (delivered(), delivered()) == ((0, 0, 0), (0, 0, 0))
     assert stage.refused == [("a", Refusal.FOREIGN_SYSTEM)] * 2
     assert len(stage.withheld) == 2
 
 
-def test_what_depends_on_the_frame_is_asked_each_time(stage: Stage) -> None:
+def test_rule_that_depends_on_the_frame_is_checked_for_each_frame(stage: Stage) -> None:
     """A rate limit counts frames, however often the same message came before."""
     stage.switch.set_policy(stage.c.port, policy(rate_out={"ATTITUDE": 4}))
     stage.switch.forward(stage.a.port, [attitude(number) for number in range(10)], 0.0)
-    assert stage.told() == (0, 10, 2)
+    assert stage.delivered() == (0, 10, 2)
     assert (stage.withheld, stage.refused) == ([("c", Refusal.RATE_LIMITED)] * 8, [])
 
 
-def test_programs_of_an_endpoint_each_have_the_rate(stage: Stage) -> None:
-    """One policy for both: who is asked second, or connects again, is told as much as the first."""
+def test_flow_is_routed_once_even_if_policy_decides_about_each_frame(
+    stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A role that limits the rate of telemetry does not cause a new decision of the router for each frame."""
+    stage.switch.set_policy(stage.a.port, policy(rate_in={"ATTITUDE": 4}))
+    stage.switch.set_policy(stage.b.port, policy(deny_out=["ATTITUDE"]))
+    routed: list[Frame] = []
+    route = stage.router.route
+
+    def count(
+        frame: Frame, source: switch_module.Port, now: float, **options: bool
+    ) -> tuple[switch_module.Port, ...]:
+        routed.append(frame)
+        return route(frame, source, now, **options)
+
+    monkeypatch.setattr(stage.router, "route", count)
+    stage.switch.forward(stage.a.port, [attitude(number) for number in range(10)], 0.0)
+    stage.switch.forward(stage.c.port, [attitude(0)], 0.1)
+    assert len(routed) == 2  # once for each source
+    assert stage.delivered() == (0, 0, 2)
+    assert (len(stage.refused), len(stage.withheld)) == (8, 2)
+    assert stage.router.unrouted == {Unrouted.DUPLICATE: 1}
+
+
+def test_clients_of_an_endpoint_each_have_the_rate(stage: Stage) -> None:
+    """They share one policy. The second one, and one that connects again, receives as much as the first."""
     shared = policy(rate_out={"ATTITUDE": 1})
-    for each in (stage.b, stage.c):
-        stage.switch.set_policy(each.port, shared)
+    for client in (stage.b, stage.c):
+        stage.switch.set_policy(client.port, shared)
     for second in range(30):
         stage.switch.forward(stage.a.port, [attitude(second)], float(second))
-    assert stage.told() == (0, 30, 30)
+    assert stage.delivered() == (0, 30, 30)
     stage.switch.remove(stage.b.port)
     stage.switch.add(stage.b.port, shared)
     stage.switch.forward(stage.a.port, [attitude(number) for number in range(31, 41)], 29.0)
-    assert stage.told() == (0, 2, 1)
+    assert stage.delivered() == (0, 2, 1)
 
 
-def test_a_target_is_followed_to_where_it_is_heard(stage: Stage) -> None:
-    """Flooded while unknown; then where it was heard; to both once heard at two; and no more where it is silent."""
+def test_target_is_followed_to_where_it_is_received(stage: Stage) -> None:
+    """Flooded while unknown, then only to ports where it was received, and no more to a port where it is silent."""
     stage.switch.forward(stage.a.port, [request(1, target=2)], 0.0)
-    assert stage.told() == (0, 1, 1)
+    assert stage.delivered() == (0, 1, 1)
     stage.switch.forward(stage.b.port, [attitude(1, system=2)], 0.1)
-    stage.told()
+    stage.delivered()
     stage.switch.forward(stage.a.port, [request(2, target=2)], 0.2)
-    assert stage.told() == (0, 1, 0)
+    assert stage.delivered() == (0, 1, 0)
     stage.switch.forward(stage.c.port, [attitude(2, system=2)], 0.3)
-    stage.told()
+    stage.delivered()
     stage.switch.forward(stage.a.port, [request(3, target=2)], 0.4)
-    assert stage.told() == (0, 1, 1)
-    # b stays there, by frames whose way is long known; c falls silent.
+    assert stage.delivered() == (0, 1, 1)
+    # b keeps it by frames of a flow that is remembered; c falls silent.
     for second in range(1, int(ROUTE_LIFETIME_S) + 10):
         stage.switch.forward(stage.b.port, [attitude(second, system=2)], 0.4 + second)
-    stage.told()
+    stage.delivered()
     stage.switch.forward(stage.a.port, [request(4, target=2)], ROUTE_LIFETIME_S + 10)
-    assert stage.told() == (0, 1, 0)
+    assert stage.delivered() == (0, 1, 0)
 
 
-def test_whom_a_port_may_not_speak_for_any_more_is_not_looked_for_there(stage: Stage) -> None:
-    """A peer whose system was taken from it by a reload gets no copy of what is meant for that system."""
+def test_system_that_a_port_may_no_longer_send_as_is_not_looked_for_there(stage: Stage) -> None:
+    """A reload takes a system from a peer: the peer gets no more copies of frames for that system."""
     stage.switch.forward(stage.b.port, [attitude(1, system=2), attitude(2, system=3)], 0.0)
     stage.switch.forward(stage.c.port, [attitude(3, system=2)], 0.0)
-    stage.told()
+    stage.delivered()
     stage.switch.set_policy(stage.b.port, policy(system_ids=[3]))
     stage.switch.forward(stage.a.port, [request(1, target=2)], 0.1)
-    assert stage.told() == (0, 0, 1)
+    assert stage.delivered() == (0, 0, 1)
     stage.switch.forward(stage.a.port, [request(2, target=3)], 0.2)
-    assert stage.told() == (0, 1, 0)
+    assert stage.delivered() == (0, 1, 0)
 
 
-def test_who_comes_and_who_goes_is_noticed(stage: Stage) -> None:
-    """A program that left is told nothing more, one that came is told the next frame."""
+def test_switch_notices_clients_that_come_and_go(stage: Stage) -> None:
+    """A client that left receives no more frames, a new one receives the next frame."""
     stage.switch.forward(stage.a.port, [attitude(1)], 0.0)
     stage.switch.remove(stage.b.port)
     stage.switch.forward(stage.a.port, [attitude(2)], 0.1)
-    assert stage.told() == (0, 1, 2)
+    assert stage.delivered() == (0, 1, 2)
     stage.switch.add(stage.b.port, policy())
     stage.switch.forward(stage.a.port, [attitude(3)], 0.2)
-    assert stage.told() == (0, 1, 1)
+    assert stage.delivered() == (0, 1, 1)
 
 
 def test_memory_is_bounded(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whoever makes up senders is forwarded, and fills no memory."""
+    """Frames of invented senders are forwarded, and fill no memory."""
     monkeypatch.setattr(switch_module, "MAX_FLOWS", 16)
     for system in range(1, 200):
         stage.switch.forward(stage.a.port, [attitude(1, system)], 0.0)
         assert len(stage.switch._flows[stage.a.port]) <= 16
-    assert stage.told() == (0, 199, 199)
+    assert stage.delivered() == (0, 199, 199)
 
 
-class Reader(Program):
-    """A program that is sent what a real endpoint would send it."""
+class StreamClient(Client):
+    """A client that receives what a real endpoint would send it."""
 
     def write(self, port: LocalPort, frames: Sequence[Frame], source: Source, now: float) -> None:
         """Keep the frames that are delivered."""
-        self.told += [frame.raw for frame in frames if port.delivered.admit(frame, source, now)]
+        self.received += [frame.raw for frame in frames if port.delivered.admit(frame, source, now)]
 
 
-def test_frame_that_was_refused_is_no_reason_to_drop_the_same_from_another() -> None:
+def test_refused_frame_does_not_make_the_same_frame_of_another_port_a_duplicate() -> None:
     """A captured operator sends the other's next heartbeat first, made to complete a hidden command of its own."""
     scene = Stage()
     scene.switch.remove(scene.a.port)
-    scene.a = Reader("a")
+    scene.a = StreamClient("a")
     scene.switch.add(scene.a.port, policy())
     scene.switch.set_policy(scene.b.port, policy(role="operator", system_ids=[255], deny_in=["SET_MODE"]))
     beat = made(mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3), 255)
@@ -228,7 +269,7 @@ def test_frame_that_was_refused_is_no_reason_to_drop_the_same_from_another() -> 
     scene.switch.forward(scene.b.port, [opening, beat], 1.0)
     assert scene.refused == [("b", Refusal.HIDDEN_FRAME)]
     scene.switch.forward(scene.c.port, [beat], 1.1)
-    assert scene.a.told == [opening.raw, beat.raw]
+    assert scene.a.received == [opening.raw, beat.raw]
 
 
 def opening_before(victim: bytes) -> bytes:

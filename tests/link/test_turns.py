@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from itertools import islice
 
-from uavlinkd.core.outputs import Path
+from uavlinkd.core.path import Path
 from uavlinkd.link.turns import STARTS_OF_A_FRAME, WAITING_BYTES, WAITING_OVERHEAD_BYTES, Turns, cost_of
 
-HERE: Path = (0, "192.0.2.1", 1)
+HERE = Path(0, ("192.0.2.1", 1))
 
 
 def test_each_sender_has_one_turn_a_round() -> None:
@@ -19,7 +19,7 @@ def test_each_sender_has_one_turn_a_round() -> None:
 
     rounds = [[[datagram for datagram, _ in islice(turn, 2)] for turn, _ in turns.round()] for _ in range(2)]
     assert rounds == [[[b"loud 0", b"loud 1"], [b"quiet"]], [[b"loud 2", b"loud 3"]]]
-    assert not turns
+    assert not turns.queues
 
 
 def test_what_one_sender_has_waiting_is_bounded() -> None:

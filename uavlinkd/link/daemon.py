@@ -1,68 +1,71 @@
 """The shell: sockets, one timer, signals. It turns wake-ups into calls of the core, and outputs into sends and logs.
 
-There is no task, queue, lock or ``await`` between reading a frame and sending it, but for what a slow radio's budget
-or a slow program makes wait.
+Between reading and sending a frame there is no task, queue, lock or ``await``. Frames wait only for a slow radio's
+budget or a slow client.
 """
 
 from __future__ import annotations
 
 import asyncio
 import os
-import signal
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
 import structlog
 
-from uavlinkd.system.addresses import Address
-from uavlinkd.system.clock import monotonic
-from uavlinkd.config import Config, ConfigError
-from uavlinkd.config import Endpoint as EndpointConfig
-from uavlinkd.config import Peer as PeerConfig
+from uavlinkd.config import Config, ConfigError, PeerConfig
 from uavlinkd.config.changes import compare
-from uavlinkd.config.reader import read_config
-from uavlinkd.ops.control import ControlServer
+from uavlinkd.config.load import load_in_thread
 from uavlinkd.core import outputs as o
 from uavlinkd.core.constants import NEVER
 from uavlinkd.core.node import Node
-from uavlinkd.core.outputs import Output
-from uavlinkd.link.opening import open_first, open_new
-from uavlinkd.endpoints.ports import Endpoint, LocalPort
+from uavlinkd.core.outputs import LinkedPeer, Output
+from uavlinkd.core.timers import Schedule
+from uavlinkd.endpoints.ports import LocalPort
+from uavlinkd.link.conditions import LineLimits
+from uavlinkd.link.diagnosis import find
+from uavlinkd.link.drop_summary import DropSummary, ShellReason
 from uavlinkd.link.event_log import EventLog
+from uavlinkd.link.evidence import Evidence
+from uavlinkd.link.history import History
 from uavlinkd.link.intake import Intake
-from uavlinkd.link.key_change import Graces, link_name
-from uavlinkd.ops.log import DropSummary
-from uavlinkd.mavlink.classes import screen
-from uavlinkd.mavlink.policy.delivery import Source
-from uavlinkd.mavlink.frames import Frame, SplitCounters, split_payload
-from uavlinkd.mavlink.policy.compilation import Policy, compile_policy
-from uavlinkd.mavlink.radio_status import INTERVAL_S, RadioStatusSource
-from uavlinkd.mavlink.routing import Router
+from uavlinkd.link.key_change import Graces
+from uavlinkd.link.local_endpoints import LocalEndpoints
+from uavlinkd.link.passage import Passage
 from uavlinkd.link.peer_link import PeerLink, radio_figures
 from uavlinkd.link.peer_sockets import PeerSockets
-from uavlinkd.ops.recorder import FROM_PEER, Recorder
-from uavlinkd.ops.sdnotify import Supervisor
-from uavlinkd.system.stall import StallWatch
+from uavlinkd.link.pilot_notes import PilotNotes
 from uavlinkd.link.status import daemon_status
 from uavlinkd.link.switch import Switch
-from uavlinkd.link.turns import cost_of
+from uavlinkd.mavlink.classes import screen
+from uavlinkd.mavlink.frames import Frame
+from uavlinkd.mavlink.radio_status import INTERVAL_S
+from uavlinkd.mavlink.routing import Router
+from uavlinkd.ops.control import ControlServer
+from uavlinkd.ops.recorder import Recorder
+from uavlinkd.ops.schema_versions import LOG_SCHEMA
+from uavlinkd.ops.sdnotify import Supervisor
+from uavlinkd.system.clock import monotonic
+from uavlinkd.system.signals import on_signal
+from uavlinkd.system.stall import STALL_S, StallWatch
+from uavlinkd.system.terminal import printable
 
 if TYPE_CHECKING:
     from uavlinkd.ops.metrics_server import MetricsServer
 
 LOOP_TICK_S = 0.001
-"""A loop may fire a timer up to one tick of its clock early; this much later it is not early."""
+"""A loop may fire a timer up to one tick of its clock early. The timer is set later by this."""
 GATHER_AT_MOST_S = 0.005
-"""Where every peer's frames wait for company, but no longer than this, programs are read only so often: wake-ups are
-what costs. A longer wait is the queues', which know what is urgent."""
+"""If the coalescing delay of every peer is at most this, clients are read only this often: each wake-up costs. With
+longer delays frames wait in the queues, which know what is urgent."""
 HOUSEKEEPING_S = INTERVAL_S
-"""How often links are measured, and idle programs forgotten."""
+"""How often links are measured, and idle clients forgotten."""
 
 
 class Daemon:
     """One uavlinkd: the peers on one side, the local MAVLink endpoints on the other.
 
-    Use :meth:`run`; or :meth:`start`, and :meth:`stop` in the end.
+    Call :meth:`run`, or :meth:`start` and later :meth:`stop`.
     """
 
     def __init__(self, config: Config) -> None:
@@ -70,27 +73,31 @@ class Daemon:
         self.log = structlog.get_logger().bind(daemon=config.name)
         now = monotonic()
         self.node = Node(config.private_key, os.urandom, now, config.previous_private_key, screen=screen)
-        self.endpoints: list[Endpoint] = []
-        self.endpoint_policies: dict[str, Policy] = {}
         self.links: dict[str, PeerLink] = {}
+        self._link_of: dict[LinkedPeer, PeerLink] = {}
+        self.evidence = Evidence(self.links, config.public_key)
+        self.history = History(now)
+        self.passage = Passage()
         self._graces = Graces()
         routing = config.routing
         router = Router[PeerLink | LocalPort](relays=routing.relay, floods_unknown=routing.unknown_targets == "flood")
         self._loop = asyncio.get_running_loop()
-        self._drops = DropSummary(self.log)
+        self._started_at = now
+        limits = LineLimits()
+        self._drops = DropSummary(self.log, limits)
         self.switch = Switch(router, self._drops.add_refused)
-        self._events = EventLog(self.log)
+        self._notes = PilotNotes(router.addresses)
+        self._events = EventLog(self.log, limits)
         self.stall = StallWatch(now, self._on_pause)
-        self._intake = Intake(self.node, self.stall, self._perform, self._on_peer_frames, self._settle)
-        self.peer_sockets = PeerSockets(self._intake.on_arrived, self.stall, self._drops, self.log)
-        self._radio_status: dict[str, RadioStatusSource] = {}
-        # Of the frames that this daemon makes itself.
-        self._own = Source(config.name, compile_policy({}, is_local=True).incoming)
+        self._intake = Intake(
+            self.node, self.stall, self.switch, self._link_of, self._perform, self._on_peer_frames, self._settle
+        )
+        self.peer_sockets = PeerSockets(self._intake.receive, self.stall, self._drops, self.evidence, self.log)
+        self.local = LocalEndpoints(config.name, self.switch, self._events, self.stall, self.on_frames)
         self._timer: asyncio.TimerHandle | None = None
         self._timer_at = NEVER
         self._housekeeping_at = now + HOUSEKEEPING_S
-        self._gather_s = 0.0
-        self._can_wait = False  # whether any peer's frames ever wait
+        self._waiting = Schedule[PeerLink]()
         self._reloading = asyncio.Lock()
         self._hangups: set[asyncio.Task[None]] = set()
         self._control: ControlServer | None = None
@@ -104,14 +111,14 @@ class Daemon:
         """Start, work until SIGTERM or SIGINT, and end cleanly.
 
         Raises:
-            BindError: where an address cannot be listened on; nothing has been started then.
-            ControlError: likewise for the control socket.
+            BindError: if the daemon cannot listen on an address. Then nothing was started.
+            ControlError: if it cannot open the control socket. Then nothing was started.
         """
         stop = asyncio.Event()
-        for number in (signal.SIGTERM, signal.SIGINT):
-            self._loop.add_signal_handler(number, stop.set)
+        for name in ("SIGTERM", "SIGINT"):
+            on_signal(name, stop.set)
         self._loop.set_exception_handler(self._drops.on_loop_failure)
-        self._loop.add_signal_handler(signal.SIGHUP, self._on_hangup)
+        on_signal("SIGHUP", self._on_hangup)
         await self.start()
         try:
             await stop.wait()
@@ -119,18 +126,17 @@ class Daemon:
             await self.stop()
 
     async def start(self) -> None:
-        """Bind every socket, then let things happen.
+        """Bind every socket, then start to read.
 
         Raises:
-            BindError: where an address cannot be listened on.
-            ControlError: where the control socket cannot be made.
+            BindError: if the daemon cannot listen on an address.
+            ControlError: if it cannot open the control socket.
         """
         try:
             self.peer_sockets.open(self.config.listen)
-            for each in self.config.endpoints:
-                self.endpoints.append(open_first(each, self))
+            self.local.open(self.config.endpoints)
             if self.config.metrics is not None:
-                from uavlinkd.ops.metrics_server import serve_metrics  # noqa: PLC0415  where asked for
+                from uavlinkd.ops.metrics_server import serve_metrics  # noqa: PLC0415  only if configured
 
                 self._metrics = await serve_metrics(self.config.metrics, lambda: daemon_status(self, monotonic()))
             if self.config.control_socket is not None:
@@ -144,20 +150,20 @@ class Daemon:
         for peer in self.config.peers:
             self._add_peer(peer)
         self.peer_sockets.start()
-        for endpoint, config in zip(self.endpoints, self.config.endpoints, strict=True):
-            self._start_endpoint(endpoint, config)
+        self.local.start(self.config.endpoints)
         self._warn()
         self.log.info(
             "daemon_started",
-            listen=[str(each) for each in self.peer_sockets.addresses],
-            endpoints={each.name: str(each.url) for each in self.config.endpoints},
+            log_schema=LOG_SCHEMA,
+            listen=[str(address) for address in self.peer_sockets.addresses],
+            endpoints={endpoint.name: str(endpoint.url) for endpoint in self.config.endpoints},
             peers=list(self.links),
         )
         self._arm()
         self.supervisor.ready()
 
     async def stop(self) -> None:
-        """Tell the peers, and close everything."""
+        """Close the sessions with the peers, and all sockets."""
         self.supervisor.stopping()
         if self._timer is not None:
             self._timer.cancel()
@@ -166,17 +172,19 @@ class Daemon:
         self._close_sockets()
         if self._control is not None:
             await self._control.stop()
-        self._drops.flush(NEVER)
+        now = monotonic()
         for link in self.links.values():
-            self._events.disturbed(link.peer.name, link.disturbances(monotonic()), NEVER)
+            self._events.check_link(link, now)
+        self._drops.close()
+        self._events.close()
         if self.recorder is not None:
-            self.recorder.stop(monotonic())
-        self.log.info("daemon_stopped")
+            self.recorder.stop(now)
+        counted = {**self._drops.plain_totals(), **self._events.totals}
+        self.log.info("daemon_stopped", uptime_s=round(now - self._started_at, 1), counted=counted)
 
     def _close_sockets(self) -> None:
         self.peer_sockets.close()
-        for endpoint in self.endpoints:
-            endpoint.close()
+        self.local.close()
         if self._metrics is not None:
             self._metrics.stop()
 
@@ -184,16 +192,16 @@ class Daemon:
         for warning in self.config.warnings:
             self.log.warning("configuration_warning", warning=warning)
 
-    # What may change while it runs.
+    # Reload.
 
     async def reload(self) -> None:
-        """Read the configuration again and make it so, without touching what did not change.
+        """Read the configuration again and apply its changes. Everything else stays as it is.
 
-        One at a time, in the order in which they were asked for: what the last one reads stays in force.
+        Reloads run one at a time, in the order of the requests. The configuration of the last one stays in force.
 
         Raises:
-            ConfigError: the new file is wrong, changes what only a restart can, or has an endpoint that cannot be
-                opened; the old one stays in force, whole.
+            ConfigError: the new file is wrong, changes what only a restart can change, or has an endpoint that cannot
+                be opened. The old configuration stays in force, as a whole.
         """
         async with self._reloading:
             self.supervisor.reloading()
@@ -206,39 +214,37 @@ class Daemon:
 
     async def _reload(self) -> None:
         try:
-            config = await read_config(self.config.path)
+            config = await load_in_thread(self.config.path, os.environ)
             changes = compare(self.config, config)
-            urls = {each.name: each.url for each in self.config.endpoints}
-            leaving = {urls[each.name]: each for each in self.endpoints if each.name in changes.closed_endpoints}
-            opened = open_new(config, changes.opened_endpoints, leaving, self)
+            opened = self.local.open_new(config, self.config, changes)
         except ConfigError as error:
-            self.log.error("configuration_refused", problems=str(error).splitlines())
+            self.log.error("configuration_refused", problems=[printable(line) for line in str(error).split("\n")])
             raise
         self._graces.follow(self.config.peers, config.peers)
         self.config = config
         if config.previous_private_key is None:
             for link in self.links.values():
                 link.give_up_ours(monotonic())
+            self._map_peers()
             self.node.forget_previous_key()
         for name in changes.removed_peers:
             self._remove_peer(name)
-        for peer in changes.changed_peers:  # before any comes who may have a key that one of them gives up
+        for peer in changes.changed_peers:  # first: a new peer may have a key that one of these gives up
             self._change_peer(peer)
         for peer in changes.added_peers:
             self._add_peer(peer)
         for name in changes.closed_endpoints:
-            self._close_endpoint(name)
-        for endpoint, each in zip(opened, changes.opened_endpoints, strict=True):
-            self.endpoints.append(endpoint)
-            self._start_endpoint(endpoint, each)
-        for each in changes.changed_endpoints:
-            self._change_endpoint(each)
+            self.local.close_one(name)
+        for endpoint, endpoint_config in zip(opened, changes.opened_endpoints, strict=True):
+            self.local.add(endpoint, endpoint_config)
+        for endpoint_config in changes.changed_endpoints:
+            self.local.change(endpoint_config)
         self._warn()
         self.log.info("configuration_reloaded", **changes.summary())
         self._arm()
 
     def _on_hangup(self) -> None:
-        if len(self._hangups) < 2:  # else one waits already, which reads the file later than now
+        if len(self._hangups) < 2:  # otherwise one waits already, which will read the file later
             task = self._loop.create_task(self._reload_for_signal())
             self._hangups.add(task)
             task.add_done_callback(self._hangups.discard)
@@ -249,97 +255,71 @@ class Daemon:
 
     def _add_peer(self, config: PeerConfig) -> None:
         now, has_previous = monotonic(), self.config.previous_private_key is not None
-        link = PeerLink(config, self.node, self._perform, now, self.recorder)
+        link = PeerLink(config, self.node, self._perform, now, self.recorder, self._waiting)
         link.join(now, self._graces, self.config.key_grace_s, has_previous_key=has_previous)
         self.links[config.name] = link
+        self._map_peers()
         self.switch.add(link, link.policy)
-        self._note_who_waits()
+        self._note_delays()
         self.peer_sockets.follow(link, self._arm)
 
     def _remove_peer(self, name: str) -> None:
-        """End the link at once: from now on nothing of this peer is accepted."""
+        """End the link at once: nothing of this peer is accepted any more."""
         self.peer_sockets.stop_following(name)
         link = self.links[name]
+        self.history.add_former_key(link.config.settings.public_key, name)
         self.switch.remove(link)
         link.leave(monotonic())
         del self.links[name]
-        self._note_who_waits()
+        self._map_peers()
+        self._note_delays()
         self._events.forget(name)
+        self._drops.forget(name)
 
     def _change_peer(self, config: PeerConfig) -> None:
-        """Other rules or addresses for the same identity: its session goes on."""
+        """Apply other rules or addresses to the same identity. Its session continues."""
         link = self.links[config.name]
         self.peer_sockets.stop_following(config.name)
         link.change(config, monotonic())
+        self._map_peers()
         self.switch.set_policy(link, link.policy)
-        self._note_who_waits()
+        self._drops.forget(config.name)  # the new policy may withhold other frames
+        self._note_delays()
         self.peer_sockets.follow(link, self._arm)
 
-    def _note_who_waits(self) -> None:
-        self._can_wait = any(link.egress is not None for link in self.links.values())
+    def _map_peers(self) -> None:
+        self._link_of.clear()
+        self._link_of.update((peer, link) for link in self.links.values() for peer in link.peers)
+
+    def _note_delays(self) -> None:
         gather_s = min((link.gather_s for link in self.links.values()), default=0.0)
-        self._gather_s = gather_s if gather_s <= GATHER_AT_MOST_S else 0.0
-        for endpoint in self.endpoints:
-            endpoint.gather(self._gather_s)
+        self.local.gather(gather_s if gather_s <= GATHER_AT_MOST_S else 0.0)
 
-    def _start_endpoint(self, endpoint: Endpoint, config: EndpointConfig) -> None:
-        self._change_endpoint(config)
-        endpoint.gather(self._gather_s)
-        endpoint.start()
-
-    def _close_endpoint(self, name: str) -> None:
-        endpoint = next(each for each in self.endpoints if each.name == name)
-        self.endpoints.remove(endpoint)
-        for port in endpoint.ports:
-            self.switch.remove(port)
-        endpoint.close()
-        del self.endpoint_policies[name]
-        self._events.forget_endpoint(name)
-        self._radio_status.pop(name, None)
-
-    def _change_endpoint(self, config: EndpointConfig) -> None:
-        policy = self.endpoint_policies[config.name] = config.make_policy()
-        for endpoint in self.endpoints:
-            if endpoint.name == config.name:
-                for port in endpoint.ports:
-                    self.switch.set_policy(port, policy)
-        self._radio_status.pop(config.name, None)
-        if config.radio_status:
-            self._radio_status[config.name] = RadioStatusSource()
-
-    # What the endpoints report.
-
-    def on_port_opened(self, port: LocalPort) -> None:
-        """A local program is there: frames may come from it and go to it."""
-        self._events.program("program_found", port.endpoint.name, port.name, monotonic())
-        self.switch.add(port, self.endpoint_policies[port.endpoint.name])
-
-    def on_port_closed(self, port: LocalPort) -> None:
-        """A local program is gone."""
-        self._events.program("program_gone", port.endpoint.name, port.name, monotonic())
-        self.switch.remove(port)
+    # Frames.
 
     def on_frames(self, port: LocalPort, frames: list[Frame], now: float, epoch: int, waited_s: float = 0.0) -> None:
-        """What a local program sent in one wake-up."""
-        self._forward(port, frames, now, epoch, waited_s)
+        """Forward the frames that a local client sent in one wake-up."""
+        stall = self.stall
+        if epoch == stall.epoch and monotonic() - stall.turned_at <= STALL_S:
+            self.switch.forward(port, frames, now, waited_s)
+        else:
+            self._forward_if_fresh(port, frames, now, epoch, waited_s)
         self._settle()
 
-    # What the peers send.
+    def _on_peer_frames(self, link: PeerLink, frames: list[Frame], now: float, epoch: int) -> None:
+        link.record_received(frames, now)
+        self._forward_if_fresh(link, frames, now, epoch)
 
-    def _on_peer_frames(self, name: str, frames: list[Frame], now: float, epoch: int) -> None:
-        if self.recorder is not None:
-            self.recorder.add(name, [frame.raw for frame in frames], FROM_PEER, now)
-        self._forward(self.links[name], frames, now, epoch)
-
-    def _forward(
+    def _forward_if_fresh(
         self, source: PeerLink | LocalPort, frames: list[Frame], now: float, epoch: int, waited_s: float = 0.0
     ) -> None:
-        if epoch != self.stall.turn(monotonic()):  # every frame passes here; a pause may have been since its read
-            who = source.name if isinstance(source, PeerLink) else source.endpoint.name
-            self.stall.dropped[who] += len(frames)
-            self._drops.add("frames_dropped", "stale", who, len(frames), now)
-        else:
+        """Drop frames from before a pause, and forward others. The process may have paused after it read them."""
+        if epoch == self.stall.turn(monotonic()):
             self.switch.forward(source, frames, now, waited_s)
+        else:
+            name = source.name if isinstance(source, PeerLink) else source.endpoint.name
+            self.stall.dropped[name] += len(frames)
+            self._drops.add("frames_dropped", ShellReason.STALE, name, len(frames), now)
 
     # Outputs of the core.
 
@@ -348,47 +328,40 @@ class Daemon:
             if isinstance(output, o.Transmit):
                 self.peer_sockets.send(*output)
             elif isinstance(output, o.Deliver):
-                name = link_name(output.peer)
-                frames = split_payload(output.payload, self.links[name].counters)
-                self._intake.add(name, frames, cost_of(output.payload, len(frames)))
+                self._intake.add(output)
             elif isinstance(output, o.Dropped):
-                self._on_dropped(output)
+                now = monotonic()
+                self._drops.add_dropped(output, now)
+                self.evidence.add_dropped(output, now)
             else:
                 self._on_event(output)
-
-    def _on_dropped(self, dropped: o.Dropped) -> None:
-        reason, peer, path, amount, detail = dropped
-        if path is None:
-            self._drops.add("frames_dropped", reason, peer or "", amount, monotonic())
-        else:
-            last = f"{detail} from {Address(*path[1:])}".strip()
-            self._drops.add("datagrams_dropped", reason, peer or "", amount, monotonic(), last)
 
     def _on_event(self, event: o.Event) -> None:
         now = monotonic()
         self._events.write(event, now)
-        link = self.links[link_name(event.peer)]
+        link = self._link_of[event.peer]
         if isinstance(event, o.PeerLost | o.PeerClosed):
-            if not link.peer.is_up:  # by no key
+            if not link.peer.is_up:  # with any key
                 link.on_down(now)
         elif isinstance(event, o.PathChanged | o.SessionEstablished):
             link.on_session()
-            is_current = isinstance(event, o.SessionEstablished) and event.peer == link.name
+            if isinstance(event, o.SessionEstablished) and link.peer.path is not None:
+                self.history.add_session(link.name, link.peer.path.address, now)
+            is_current = isinstance(event, o.SessionEstablished) and event.peer is link.peers[0]
             if is_current and link.confirm(now, self._graces):
+                self._map_peers()
                 self.log.info("key_change_confirmed", peer=link.name)
 
     # Time.
 
     def _settle(self) -> None:
-        """Something came: what it made due may be earlier than the timer."""
-        if self._can_wait or self.node.next_deadline() < self._timer_at:
+        """After new input: a deadline may now be earlier than the timer."""
+        if self.node.next_deadline() < self._timer_at or self._waiting.next_at < self._timer_at:
             self._arm()
 
     def _arm(self) -> None:
-        """Have the one timer fire at the next deadline. A later one is cheap: it is moved only to be earlier."""
-        deadline = min(self.node.next_deadline(), self._drops.next_flush, self._housekeeping_at)
-        if self._can_wait:
-            deadline = min(deadline, *(link.next_deadline() for link in self.links.values()))
+        """Set the one timer to the next deadline. It is moved only to an earlier time: firing too early is cheap."""
+        deadline = min(self.node.next_deadline(), self._waiting.next_at, self._housekeeping_at)
         if deadline < self._timer_at:
             if self._timer is not None:
                 self._timer.cancel()
@@ -400,9 +373,8 @@ class Daemon:
         self.stall.turn(now)
         try:
             self._perform(self.node.handle_timeout(now))
-            for link in self.links.values():
+            for link in self._waiting.pop(now):
                 link.send_waiting(now)
-            self._drops.flush(now)
             if now >= self._housekeeping_at:
                 self._housekeeping_at = now + HOUSEKEEPING_S
                 self._do_housekeeping(now)
@@ -410,29 +382,30 @@ class Daemon:
             self._arm()
 
     def _on_pause(self, pause_s: float) -> None:
-        self.log.warning("daemon_stood_still", seconds=round(pause_s, 3))
+        self.history.paused = monotonic(), pause_s
+        self._events.write_pause(pause_s, monotonic())
 
     def _do_housekeeping(self, now: float) -> None:
         up = sum(link.peer.is_up for link in self.links.values())
         self.supervisor.turn(f"{up} of {len(self.links)} peers up", now)
         if self.recorder is not None:
             self.recorder.do_housekeeping(now)
+        self.peer_sockets.do_housekeeping()
         for link in self.links.values():
-            if link.is_unheard(now):
-                self._events.unheard(link.name, link.config.addresses)
+            link.note_silence(now)
             link.measure(now)
-            self._events.disturbed(link.peer.name, link.disturbances(now), now)
+            link.report_refusals(now)
+            self._events.check_link(link, now)
             if link.end_graces(now, self._graces):
+                self._map_peers()
                 self.log.warning("previous_key_expired", peer=link.name)
-        radio = radio_figures(self.links.values())
-        for endpoint in self.endpoints:
-            endpoint.do_housekeeping(now)
-            self._events.look_at(endpoint, now)
-            source = self._radio_status.get(endpoint.name)
-            if source is not None and radio is not None:
-                frames = split_payload(source.frame(radio), SplitCounters())
-                for port in endpoint.ports:
-                    endpoint.write(port, frames, self._own, now)
+        self.passage.add_sample(self.links.values(), self.local.judged)
+        self.history.sample(self.links.values(), self.local.judged, now)
+        self.local.do_housekeeping(radio_figures(self.links.values()), now)
+        self.local.write_note(self._notes.next(self.links.values(), now), now)
+        self._events.write_findings(find(self, now), now)
+        self._drops.check(now)
+        self._events.check(now)
 
     # The control socket.
 
@@ -445,5 +418,5 @@ class Daemon:
                     await self.reload()
                 except ConfigError as error:
                     return {"problems": str(error).splitlines()}
-                return {"problems": []}
+                return {"problems": [], "name": self.config.name}
         return None

@@ -1,44 +1,128 @@
-"""What happens to the links, for the log: a line an event, and a bound on the lines that anybody can cause."""
+"""Events of the links in the log, with a limit on the lines that an attacker can cause."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable
 
 from structlog.typing import FilteringBoundLogger
 
-from uavlinkd.system.addresses import Address
 from uavlinkd.core import outputs as o
-from uavlinkd.core.constants import NEVER
-from uavlinkd.core.limits import TokenBucket
 from uavlinkd.endpoints.ports import Endpoint
+from uavlinkd.link.conditions import Conditions, LineLimits, OpenCondition, Phase
 from uavlinkd.link.key_change import link_name
-from uavlinkd.ops.log import MEANINGS, SUMMARY_INTERVAL_S, UNVERIFIED
+from uavlinkd.link.link_watch import THRESHOLDS, LinkWatch, is_noteworthy
+from uavlinkd.link.peer_link import PeerLink
+from uavlinkd.ops.causes import Cause
+from uavlinkd.ops.findings import Finding, Severity, Subject
+from uavlinkd.ops.link_problems import LinkProblem
+from uavlinkd.system.addresses import Address
 
-LINES_PER_S = 0.5
-"""Of one peer or endpoint, on average: some 10 MB a day at worst. Whoever has a peer's key can cause handshakes and
-new paths, and whoever reaches a ``tcpin`` can connect and leave again."""
-LINES_BURST = 50
-ENDPOINT_SILENT_S = 10.0
-"""An endpoint whose programs say nothing for so long is worth a line: who speaks MAVLink beats each second."""
+FINDING_DELAY_S = 2.0
+"""A finding is logged if it lasts for so long; one about an attack at once. Three lost answers in a row make a moment
+of unverified freshness, which 1 % of loss causes about once a day."""
+CLIENT_RESTART_S = 15.0
+"""The same for an endpoint that had frames before: its client may restart."""
+FINDING_QUIET_S = 10.0
+"""A finding has ended when it was absent for so long, see :data:`uavlinkd.link.conditions.QUIET_S`."""
+
+_OTHER_EVENTS = frozenset[str]({Cause.DAEMON_PAUSED, Cause.RECORDING_STOPPED})
+"""Findings that are logged by events of their own."""
+_State = o.PeerUp | o.PeerLost | o.PeerClosed
+_FindingKey = tuple[str, Subject, str]
 
 
 class EventLog:
-    """Writes what happens. What is left out is counted, and told with the next line of that peer or endpoint."""
+    """Writes events. The next line of a peer or endpoint has the count of the lines that its limit omitted."""
 
-    def __init__(self, log: FilteringBoundLogger) -> None:
+    def __init__(self, log: FilteringBoundLogger, limits: LineLimits | None = None) -> None:
         self._log = log
-        self._budgets: dict[tuple[str, str], TokenBucket] = {}  # by peer or endpoint, which may share a name
-        self._omitted: Counter[tuple[str, str]] = Counter()
-        self._disturbances: dict[str, tuple[Mapping[str, int], float]] = {}  # as told, and when to tell again
-        self._frames: dict[str, tuple[int, float]] = {}  # of an endpoint: how many, and when they last grew
+        self._limits = limits or LineLimits()
+        self._states: dict[str, _State] = {}  # of a peer: the latest that was omitted
+        self._used: set[str] = set()  # endpoints that have had frames
+        self._watches: dict[str, LinkWatch] = {}
+        self._shares: dict[tuple[str, LinkProblem], float] = {}
+        self._findings: dict[_FindingKey, Finding] = {}
+        self._present: dict[_FindingKey, float] = {}  # since when
+        self._forgotten: Counter[LinkProblem] = Counter()  # problems of peers that were removed
+        self._problem_conditions = Conditions[tuple[str, LinkProblem]](
+            "link",
+            self._limits,
+            self._write_problem,
+            name_of=lambda key: key[0],
+            is_security=lambda key: key[1] is LinkProblem.CHALLENGES_UNANSWERED,
+        )
+        self._pauses = Conditions[str]("pause", self._limits, self._write_pause, name_of=lambda _: "")
+        self._paused_s = 0.0
+        self._finding_conditions = Conditions[_FindingKey](
+            "finding",
+            self._limits,
+            self._write_finding,
+            name_of=lambda key: key[2],
+            is_security=lambda key: self._findings[key].severity is Severity.SECURITY,
+            quiet_s=FINDING_QUIET_S,
+        )
+
+    @property
+    def totals(self) -> dict[str, int]:
+        """All link problems since the start, logged or not."""
+        return {
+            problem.value: count
+            for problem in LinkProblem
+            if (count := self._forgotten[problem] + sum(watch.totals[problem] for watch in self._watches.values()))
+        }
+
+    def check(self, now: float) -> None:
+        """Write the lines that are due. Call it about once a second."""
+        for name, state in list(self._states.items()):
+            del self._states[name]
+            self._write_event(state, now)
+        self._problem_conditions.check(now)
+        self._pauses.check(now)
+        self._finding_conditions.check(now)
+
+    def close(self) -> None:
+        """Write the ends of all conditions: the daemon stops."""
+        for conditions in (self._problem_conditions, self._pauses, self._finding_conditions):
+            conditions.close()
+
+    def forget(self, peer: str) -> None:
+        """Forget a peer that was removed, under its previous keys too."""
+        self._problem_conditions.close(lambda key: link_name(key[0]) == peer)
+        self._finding_conditions.close(lambda key: key[1] is Subject.PEER and key[2] == peer)
+        for name in [name for name in self._watches if link_name(name) == peer]:
+            self._forgotten += self._watches.pop(name).totals
+        for name in [name for name in self._states if link_name(name) == peer]:
+            del self._states[name]
+        for key in [key for key in self._shares if link_name(key[0]) == peer]:
+            del self._shares[key]
+        self._limits.forget(lambda name: link_name(name) == peer)
+
+    # Events of the core.
 
     def write(self, event: o.Event, now: float) -> None:
-        """Write one, if its peer has a line left. ``now`` is monotonic seconds."""
-        omitted = self._take_line("peer", event.peer, now)
-        if omitted is None:
+        """Write an event, within the limit of its peer. ``now`` is monotonic seconds."""
+        if isinstance(event, o.FreshnessUnverified | o.FreshnessVerified):  # a finding reports it
             return
-        log = self._log.bind(peer=event.peer, **omitted)
+        if isinstance(event, o.SessionEstablished) and event.rekey:
+            omitted = self._limits.take("debug", event.peer.name, now)
+            if omitted is not None:
+                self._log.debug("session_established", peer=event.peer.name, **_session_facts(event), **omitted)
+            return
+        self._write_event(event, now)
+
+    def _write_event(self, event: o.Event, now: float) -> None:
+        name = event.peer.name
+        omitted = self._limits.take("peer", name, now)
+        if omitted is None:
+            if name in self._states or not isinstance(event, _State):
+                self._limits.omit("peer", name)
+            if isinstance(event, _State):  # it is written later, so that the log ends with the state of the link
+                self._states[name] = event
+            return
+        if self._states.pop(name, None) is not None:
+            omitted["omitted_before"] = omitted.get("omitted_before", 0) + 1
+        log = self._log.bind(peer=name, **omitted)
         match event:
             case o.PeerUp():
                 log.info("peer_up")
@@ -46,85 +130,119 @@ class EventLog:
                 log.warning("peer_lost", silent_s=round(silent_s, 3))
             case o.PeerClosed():
                 log.info("peer_closed")
-            case o.PathChanged(_, (_, host, port)):
-                log.info("path_changed", path=str(Address(host, port)))
-            case o.FreshnessUnverified():
-                log.warning("freshness_unverified", meaning=UNVERIFIED)
-            case o.FreshnessVerified(_, unverified_s):
-                log.info("freshness_verified", unverified_s=round(unverified_s, 3))
-            case o.SessionEstablished() as made:
-                log.info(
-                    "session_established",
-                    generation=made.generation,
-                    suite=made.suite,
-                    mode="confidential" if made.confidential else "authenticated",
-                    tag_bits=8 * made.tag_bytes,
-                    initiated_by="us" if made.initiator else "peer",
-                    rekey=made.rekey,
-                )
+            case o.PathChanged(_, path):
+                log.info("path_changed", path=str(Address.of(path.address)))
+            case o.SessionEstablished():
+                log.info("session_established", **_session_facts(event))
 
-    def program(self, event: str, endpoint: str, program: str, now: float) -> None:
-        """Write that a program came or went, if its endpoint has a line left."""
-        omitted = self._take_line("endpoint", endpoint, now)
-        if omitted is not None:
-            self._log.info(event, endpoint=endpoint, program=program, **omitted)
-
-    def unheard(self, peer: str, called_at: Sequence[Address]) -> None:
-        """Write that a peer has not been heard for long, and what a person may look at."""
-        if called_at:
-            meaning = "it is not reachable there, or has another key for us, another PSK, or no common suite"
-            self._log.warning("peer_not_answering", peer=peer, called_at=[*map(str, called_at)], meaning=meaning)
+    def write_client(self, event: str, endpoint: str, client: str, now: float) -> None:
+        """Write that a client connected or disconnected, within the limit of its endpoint."""
+        omitted = self._limits.take("client", endpoint, now)
+        if omitted is None:
+            self._limits.omit("client", endpoint)
         else:
-            meaning = "no addresses of it are known here, so it has to call: has its file this daemon's address?"
-            self._log.warning("peer_not_calling", peer=peer, meaning=meaning)
+            self._log.info(event, endpoint=endpoint, client=client, **omitted)
 
-    def look_at(self, endpoint: Endpoint, now: float) -> None:
-        """Write, once, that nothing comes from the programs of an endpoint. Call it about once a second."""
-        frames, since = self._frames.get(endpoint.name, (-1, now))
-        if not endpoint.ports or endpoint.counters.frames != frames:
-            self._frames[endpoint.name] = endpoint.counters.frames, now
-        elif now - since >= ENDPOINT_SILENT_S:
-            self._frames[endpoint.name] = frames, NEVER
-            self._log.warning(
-                "endpoint_silent",
-                endpoint=endpoint.name,
-                programs=[port.name for port in endpoint.ports],
-                garbage_bytes=endpoint.counters.garbage_bytes,
-                meaning="no MAVLink comes: is it on, is MAVLink on at that port, with that speed and wiring, and does"
-                " nothing else read it? Or the program is closed, or only listens",
-            )
+    # Conditions.
+
+    def note_endpoint(self, endpoint: Endpoint) -> None:
+        """Note whether an endpoint has had frames. Call it about once a second."""
+        if endpoint.counters.frames:
+            self._used.add(endpoint.name)
 
     def forget_endpoint(self, name: str) -> None:
-        """The endpoint was closed: another one of its name begins anew."""
-        self._frames.pop(name, None)
+        """The endpoint was closed; a later one of that name starts without history."""
+        self._used.discard(name)
+        self._finding_conditions.close(lambda key: key[1] is Subject.ENDPOINT and key[2] == name)
 
-    def _take_line(self, kind: str, name: str, now: float) -> dict[str, int] | None:
-        """What to say of lines that were left out before this one; None where this one is to be left out too."""
-        if not self._budgets.setdefault((kind, name), TokenBucket(LINES_PER_S, LINES_BURST, now)).take(now):
-            self._omitted[kind, name] += 1
-            return None
-        omitted = self._omitted.pop((kind, name), 0)
-        return {"omitted_before": omitted} if omitted else {}
+    def check_link(self, link: PeerLink, now: float) -> None:
+        """Note the problems of a link that exceed their thresholds. Call it about once a second."""
+        peer = link.peer.name
+        watch = self._watches.get(peer)
+        if watch is None:
+            watch = self._watches[peer] = LinkWatch()
+        received = link.peer.traffic.envelopes_received
+        for problem, growth in watch.measure(link.problems(now), received, now).items():
+            key = peer, problem
+            is_open = key in self._problem_conditions
+            if growth.minute and is_noteworthy(problem, growth, is_logged=is_open):
+                self._shares[key] = growth.share
+                self._problem_conditions.note(key, now, growth.since if is_open else growth.minute)
 
-    def disturbed(self, peer: str, totals: Mapping[str, int], now: float) -> None:
-        """Write what grew of that for which no datagram was dropped, if it is time for a line again.
-
-        Call it about once a second: a line comes when it begins, then one each ``SUMMARY_INTERVAL_S`` a peer. Totals
-        that are smaller than those before began anew: what they have by then is not told, what comes on top is.
-        """
-        before, quiet_until = self._disturbances.get(peer, ({}, now))
-        told = {what: min(before.get(what, 0), total) for what, total in totals.items()}
-        news = {what: total - told[what] for what, total in totals.items() if total > told[what]}
-        if not news or now < quiet_until:
-            self._disturbances[peer] = told, quiet_until
+    def _write_problem(
+        self, key: tuple[str, LinkProblem], phase: Phase, condition: OpenCondition, omitted: dict[str, int]
+    ) -> None:
+        peer, problem = key
+        log = self._log.bind(peer=peer, problem=problem.value, count=condition.count, **omitted)
+        if phase is Phase.ENDED:
+            log.info("link_problem_ended", duration_s=condition.duration_s)
+            return
+        if THRESHOLDS[problem].share:
+            log = log.bind(share=round(self._shares[key], 3))
+        if phase is Phase.BEGAN:
+            log.warning("link_problem_began", meaning=problem.meaning)
         else:
-            self._disturbances[peer] = dict(totals), now + SUMMARY_INTERVAL_S
-            self._log.warning("link_disturbed", peer=peer, **news, meaning="; ".join(MEANINGS[each] for each in news))
+            log.warning("link_problem_continued", duration_s=condition.duration_s)
 
-    def forget(self, peer: str) -> None:
-        """The peer is no longer configured. The core may have had it by previous keys too."""
-        for name in [each for each in self._disturbances if link_name(each) == peer]:
-            del self._disturbances[name]
-        for key in [each for each in self._budgets if each[0] == "peer" and link_name(each[1]) == peer]:
-            del self._budgets[key]
-            self._omitted.pop(key, None)
+    def write_pause(self, pause_s: float, now: float) -> None:
+        """Note that the process was paused."""
+        self._paused_s += pause_s
+        self._pauses.note("", now)
+
+    def _write_pause(self, _: str, phase: Phase, condition: OpenCondition, omitted: dict[str, int]) -> None:
+        seconds = round(self._paused_s, 3)
+        if phase is Phase.ENDED:
+            self._paused_s = 0.0
+            if condition.count > 1:  # otherwise the first line has it all
+                self._log.info(
+                    "pauses_ended", count=condition.count, seconds=seconds, duration_s=condition.duration_s, **omitted
+                )
+        else:
+            self._log.warning("daemon_paused", count=condition.count, seconds=seconds, **omitted)
+
+    def write_findings(self, findings: Iterable[Finding], now: float) -> None:
+        """Note the present findings. Call it about once a second."""
+        present = {}
+        for finding in findings:
+            if finding.cause in _OTHER_EVENTS:
+                continue
+            key = finding.cause, finding.subject, finding.name
+            present[key] = since = self._present.get(key, now)
+            self._findings[key] = finding
+            if now - since >= self._delay_s(finding) or key in self._finding_conditions:
+                self._finding_conditions.note(key, now)
+        self._present = present
+
+    def _delay_s(self, finding: Finding) -> float:
+        if finding.severity is Severity.SECURITY:
+            return 0.0
+        is_restart = finding.subject is Subject.ENDPOINT and finding.name in self._used
+        return CLIENT_RESTART_S if is_restart else FINDING_DELAY_S
+
+    def _write_finding(
+        self, key: _FindingKey, phase: Phase, condition: OpenCondition, omitted: dict[str, int]
+    ) -> None:
+        finding = self._findings[key]
+        if phase is Phase.ENDED:
+            facts = {field: fact for field, fact in finding.as_json().items() if field not in ("text", "remedy")}
+            self._log.info("problem_ended", **facts, duration_s=condition.duration_s, **omitted)
+            return
+        is_intended = finding.cause == Cause.COMMANDS_WITHHELD  # if the role is right
+        log = self._log.info if is_intended else self._log.warning
+        if finding.severity is Severity.SECURITY:
+            log = self._log.error
+        if phase is Phase.BEGAN:
+            log("problem_began", **finding.as_json(), **omitted)
+        elif not is_intended:
+            log("problem_continued", **finding.as_json(), duration_s=condition.duration_s, **omitted)
+
+
+def _session_facts(session: o.SessionEstablished) -> dict[str, object]:
+    return {
+        "generation": session.generation,
+        "suite": session.suite,
+        "mode": "confidential" if session.confidential else "authenticated",
+        "tag_bits": 8 * session.tag_bytes,
+        "initiated_by": "us" if session.initiator else "peer",
+        "rekey": session.rekey,
+    }

@@ -3,63 +3,99 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from time import thread_time
 
-from uavlinkd.system.clock import monotonic
 from uavlinkd.core.node import Node
-from uavlinkd.core.outputs import Output, Path
+from uavlinkd.core.outputs import Deliver, LinkedPeer, Output
+from uavlinkd.core.path import Path, SocketAddress
 from uavlinkd.core.wire import ENVELOPE_STARTS
-from uavlinkd.mavlink.frames import Frame
-from uavlinkd.link.peer_sockets import Arrived
-from uavlinkd.system.stall import StallWatch
-from uavlinkd.link.turns import TURN_FRAMES, TURN_S, Turns
+from uavlinkd.endpoints.reader import Datagrams
+from uavlinkd.link.peer_link import PeerLink
+from uavlinkd.link.switch import Switch
+from uavlinkd.link.turns import TURN_FRAMES, TURN_S, Turns, WaitingDatagram, cost_of
+from uavlinkd.mavlink.frames import Frame, split_payload
+from uavlinkd.system.clock import monotonic
+from uavlinkd.system.stall import STALL_S, StallWatch
+
+MAX_PATHS = 1024
+"""Paths of received datagrams that are remembered: a frame on one of them costs no new object."""
 
 
 class Intake:
-    """Receives what arrives from the peers, and forwards the frames in it once in each turn.
+    """Receives the datagrams of the peers, and forwards the frames in them once per turn.
 
-    ``perform`` gets the core's outputs, and reports frames among them by :meth:`add`. ``forward`` gets the frames of
-    one peer, with the time and the epoch of their reading. ``settle`` is called when the core may have new deadlines.
+    ``links`` has the link of each peer of the core. ``perform`` executes the core's outputs, and passes frames among
+    them to :meth:`add`. ``forward`` receives the frames of one peer with the time and the epoch of their reading, and
+    drops those from before a pause. Without a pause the frames of a datagram that arrived alone go to the switch
+    directly. ``settle`` is called when the core may have new deadlines.
     """
 
     def __init__(
         self,
         node: Node,
         stall: StallWatch,
+        switch: Switch,
+        links: Mapping[LinkedPeer, PeerLink],
         perform: Callable[[list[Output]], None],
-        forward: Callable[[str, list[Frame], float, int], None],
+        forward: Callable[[PeerLink, list[Frame], float, int], None],
         settle: Callable[[], None],
     ) -> None:
         self._node = node
         self._stall = stall
+        self._switch = switch
+        self._links = links
         self._perform = perform
         self._forward = forward
         self._settle = settle
         self._loop = asyncio.get_running_loop()
         self._turns = Turns()
-        self._frames: dict[str, list[Frame]] = {}
+        self._frames: dict[PeerLink, list[Frame]] = {}
         self._cost = 0
+        self._paths: dict[tuple[int, SocketAddress], Path] = {}
 
-    def on_arrived(self, arrived: Arrived, now: float, epoch: int) -> None:
-        """Receive what came in one wake-up, or have it wait for its senders' turns."""
-        if len(arrived) == 1 and not self._turns:  # a turn of one needs no clock
-            self._perform(self._node.receive(*arrived[0], now))
-            self._deliver(now, epoch)
-        else:
-            envelopes = self._receive_handshakes(arrived, now)
-            if self._turns:
-                self._have_wait(envelopes, epoch)
+    def receive(self, socket: int, datagrams: Datagrams, now: float, epoch: int, waited_s: float) -> None:
+        """Receive the datagrams of one wake-up from a socket, or let them wait for their senders' turns."""
+        paths = self._paths
+        arrived: list[WaitingDatagram] = []
+        for datagram, address in datagrams:
+            path = paths.get((socket, address))
+            if path is None:
+                if len(paths) >= MAX_PATHS:
+                    paths.clear()
+                path = paths[socket, address] = Path(socket, address)
+            arrived.append((datagram, path))
+        if len(arrived) == 1 and not self._turns.queues:  # a turn of one datagram needs no clock
+            outputs = self._node.receive(*arrived[0], now)
+            stall = self._stall
+            is_fresh = epoch == stall.epoch and monotonic() - stall.turned_at <= STALL_S
+            if is_fresh and len(outputs) == 1 and type(outputs[0]) is Deliver:
+                peer, payload = outputs[0]
+                link = self._links[peer]
+                frames = split_payload(payload, link.counters)
+                if link.recorder is not None:
+                    link.record_received(frames, now)
+                self._switch.forward(link, frames, now)
             else:
-                arriving = iter(envelopes)
-                self._take_turn(arriving, now, epoch)
-                if rest := list(arriving):
-                    self._have_wait(rest, epoch)
-                    self._loop.call_soon(self._take_turns)
+                self._perform(outputs)
+                self._deliver(now, epoch)
+        else:
+            self._receive_in_turn(arrived, now, epoch)
         self._settle()
 
-    def _receive_handshakes(self, arrived: Arrived, now: float) -> Arrived:
-        """Receive all but envelopes, which are returned.
+    def _receive_in_turn(self, arrived: list[WaitingDatagram], now: float, epoch: int) -> None:
+        envelopes = self._receive_handshakes(arrived, now)
+        if self._turns.queues:
+            self._add_to_turns(envelopes, epoch)
+        else:
+            arriving = iter(envelopes)
+            self._do_turn(arriving, now, epoch)
+            if rest := list(arriving):
+                self._add_to_turns(rest, epoch)
+                self._loop.call_soon(self._do_turns)
+
+    def _receive_handshakes(self, arrived: list[WaitingDatagram], now: float) -> list[WaitingDatagram]:
+        """Receive everything but envelopes, which are returned.
 
         Handshake messages have budgets of their own in the core. If they waited for turns, their senders would repeat
         them meanwhile, and a busy daemon would be busier.
@@ -72,37 +108,39 @@ class Intake:
                 self._perform(self._node.receive(datagram, path, now))
         return envelopes
 
-    def add(self, peer: str, frames: list[Frame], cost: int) -> None:
-        """Frames of a peer came out of the core. They go on when the turn is over; ``cost`` is charged to it."""
-        self._cost += cost
-        if peer in self._frames:
-            self._frames[peer] += frames
+    def add(self, delivered: Deliver) -> None:
+        """Keep frames that the core delivers until the turn is over. Their cost is charged to it."""
+        link = self._links[delivered.peer]
+        frames = split_payload(delivered.payload, link.counters)
+        self._cost += cost_of(delivered.payload, len(frames))
+        if link in self._frames:
+            self._frames[link] += frames
         else:
-            self._frames[peer] = frames
+            self._frames[link] = frames
 
     def clear(self) -> None:
-        """Forget what waits."""
+        """Forget the datagrams that wait."""
         self._turns = Turns()
 
-    def _have_wait(self, arrived: Arrived, epoch: int) -> None:
-        sender_of = self._node.sender_of
+    def _add_to_turns(self, arrived: list[WaitingDatagram], epoch: int) -> None:
+        claimed_sender = self._node.claimed_sender
         for datagram, path in arrived:
-            for pushed_out in self._turns.put(sender_of(datagram, path), datagram, path, epoch):
+            for pushed_out in self._turns.put(claimed_sender(datagram, path), datagram, path, epoch):
                 self._perform([self._node.refuse(*pushed_out)])
 
-    def _take_turns(self) -> None:
-        """Let each sender have one turn; then the sockets, the timer and the control socket have theirs."""
+    def _do_turns(self) -> None:
+        """Do one turn of each sender. Then the sockets, the timer and the control socket have theirs."""
         self._stall.turn(monotonic())
         try:
             for turn, epoch in self._turns.round():
-                self._take_turn(turn, monotonic(), epoch)
+                self._do_turn(turn, monotonic(), epoch)
         finally:
-            if self._turns:
-                self._loop.call_soon(self._take_turns)
+            if self._turns.queues:
+                self._loop.call_soon(self._do_turns)
             self._settle()
 
-    def _take_turn(self, arriving: Iterator[tuple[bytes, Path]], now: float, epoch: int) -> None:
-        """Receive until there is no more, or the turn is over; deliver the frames."""
+    def _do_turn(self, arriving: Iterator[WaitingDatagram], now: float, epoch: int) -> None:
+        """Receive datagrams until there are no more, or the turn is over. Forward the frames."""
         # Stale datagrams are opened too: their counters must be used up, or an attacker could replay them as new.
         receive, self._cost, ends_at = self._node.receive, 0, thread_time() + TURN_S
         for datagram, path in arriving:
@@ -113,7 +151,7 @@ class Intake:
 
     def _deliver(self, now: float, epoch: int) -> None:
         if epoch != self._stall.epoch:
-            self._perform(self._node.take_held())  # stale as well, even if the peer calls them new later
+            self._perform(self._node.pop_held())  # stale as well, even if the peer reports them as new later
         delivered, self._frames = self._frames, {}
-        for peer, frames in delivered.items():
-            self._forward(peer, frames, now, epoch)
+        for link, frames in delivered.items():
+            self._forward(link, frames, now, epoch)

@@ -1,50 +1,49 @@
-"""From an endpoint in the configuration to one that works."""
+"""Opens the endpoints of a configuration."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from uavlinkd.config import Config, ConfigError
-from uavlinkd.config import Endpoint as EndpointConfig
+from uavlinkd.config import Config, ConfigError, EndpointConfig
 from uavlinkd.config.errors import Problem
 from uavlinkd.endpoints.ports import Endpoint, PortHandler
 from uavlinkd.endpoints.sockets import BindError, udp_socket
 from uavlinkd.endpoints.udp import UdpClient, UdpServer
-from uavlinkd.endpoints.url import EndpointUrl, Kind, NetworkUrl, SerialUrl
+from uavlinkd.endpoints.url import EndpointKind, EndpointUrl, NetworkUrl, SerialUrl
 
-# TCP and serial are imported where they are asked for: a daemon on UDP starts without them, and stays smaller.
+# TCP and serial are imported only if configured: a daemon on UDP starts faster and stays smaller.
 # ruff: noqa: PLC0415
 
 
 def open_new(
     config: Config, wanted: Sequence[EndpointConfig], leaving: Mapping[EndpointUrl, Endpoint], handler: PortHandler
 ) -> list[Endpoint]:
-    """Make endpoints of a new configuration while those that it closes are still open, by their URLs in ``leaving``.
+    """Open endpoints of a new configuration while those that it closes are still open, by their URLs in ``leaving``.
 
-    Who listens where one of those does takes over its socket: so endpoints can get other names, or swap ports.
+    An endpoint that listens at the same address takes over the socket. So endpoints can be renamed, or swap ports.
 
     Raises:
-        ConfigError: where one cannot be opened; then none is, and the others are as they were.
+        ConfigError: if one cannot be opened. Then none is, and the others are as they were.
     """
     opened: list[Endpoint] = []
-    for each in wanted:
+    for endpoint_config in wanted:
         try:
-            opened.append(open_endpoint(each, handler, leaving.get(each.url)))
+            opened.append(open_endpoint(endpoint_config, handler, leaving.get(endpoint_config.url)))
         except (BindError, OSError) as error:
             for endpoint in opened:
                 endpoint.close()
             is_taken = isinstance(error, BindError) and error.is_taken
             remedy = "; if it is this daemon, restart it" if is_taken else ""
-            problem = Problem(str(config.path), _key(each), f"{error}{remedy}")
+            problem = Problem(str(config.path), _key(endpoint_config), f"{error}{remedy}")
             raise ConfigError((problem,)) from None
     return opened
 
 
 def open_first(config: EndpointConfig, handler: PortHandler) -> Endpoint:
-    """Make an endpoint of a daemon that starts.
+    """Open an endpoint of a daemon that starts.
 
     Raises:
-        BindError: where its address cannot be listened on, with the key that says so.
+        BindError: if the daemon cannot listen on its address. The message names the key.
     """
     try:
         return open_endpoint(config, handler)
@@ -57,24 +56,24 @@ def _key(config: EndpointConfig) -> str:
 
 
 def open_endpoint(config: EndpointConfig, handler: PortHandler, instead_of: Endpoint | None = None) -> Endpoint:
-    """Make the endpoint, with what it listens on bound. It begins to work when it is started.
+    """Open the endpoint: a socket that listens is bound. It begins to work when it is started.
 
-    ``instead_of``: one with the same URL that is about to be closed.
+    ``instead_of``: an endpoint with the same URL that is about to be closed.
 
     Raises:
-        BindError: where its address cannot be listened on.
+        BindError: if the daemon cannot listen on its address.
     """
     match config.url:
-        case NetworkUrl(Kind.UDPIN, address):
+        case NetworkUrl(EndpointKind.UDPIN, address):
             sock = (
                 instead_of.share_socket()
                 if isinstance(instead_of, UdpServer)
                 else udp_socket(address, may_come_later=True)
             )
             return UdpServer(config.name, sock, handler)
-        case NetworkUrl(Kind.UDPOUT, address):
+        case NetworkUrl(EndpointKind.UDPOUT, address):
             return UdpClient(config.name, address, handler)
-        case NetworkUrl(Kind.TCPIN, address):
+        case NetworkUrl(EndpointKind.TCPIN, address):
             from uavlinkd.endpoints.tcp import TcpServer, tcp_listener
 
             sock = instead_of.share_socket() if isinstance(instead_of, TcpServer) else tcp_listener(address)

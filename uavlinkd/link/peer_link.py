@@ -1,52 +1,73 @@
-"""One peer as the shell sees it: its policy, what waits for it on a slow radio, and how its link does."""
+"""One peer as the shell sees it: its policy, the frames that wait for a slow radio, and the quality of its link."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from operator import itemgetter
 
-from uavlinkd.system.addresses import IPV4_UDP_BYTES, IPV6_UDP_BYTES
-from uavlinkd.config import Peer as PeerConfig
+from uavlinkd.config import PeerConfig
 from uavlinkd.core.constants import NEVER
 from uavlinkd.core.node import Node
-from uavlinkd.core.outputs import Output, Path, Transmit
+from uavlinkd.core.outputs import Output, Transmit
+from uavlinkd.core.path import Path
 from uavlinkd.core.peer import Peer
+from uavlinkd.core.refusals import LARGEST_REPORT
+from uavlinkd.core.timers import Deadline, Schedule
 from uavlinkd.link.key_change import Graces, KeyPairing, pairings
-from uavlinkd.mavlink.egress.coalescing import Coalescer, make_egress
-from uavlinkd.mavlink.policy.delivery import Source
 from uavlinkd.mavlink.egress.budgeted import Egress, EnvelopeShape
+from uavlinkd.mavlink.egress.coalescing import Coalescer, make_egress
 from uavlinkd.mavlink.frames import Frame, SplitCounters
+from uavlinkd.mavlink.policy.delivery import Source
+from uavlinkd.mavlink.policy.refusal_totals import TotalsWatch
 from uavlinkd.mavlink.radio_status import LinkFigures, worst
-from uavlinkd.ops.recorder import TO_PEER, Recorder
+from uavlinkd.ops.link_problems import LinkProblem
+from uavlinkd.ops.recorder import FROM_PEER, TO_PEER, Recorder
+from uavlinkd.system.addresses import IPV4_UDP_BYTES, IPV6_UDP_BYTES
 
-UNANSWERED_S = 5.0
-"""A peer that is called in vain for this long is worth a line in the log."""
-UNCALLED_S = 30.0
-"""The same of one that has to call."""
+NOT_ANSWERING_S = 5.0
+"""The log reports a peer that does not answer our handshakes for this long."""
+NOT_CONNECTING_S = 10.0
+"""The same for a peer without an address here, which has to connect."""
 
 Perform = Callable[[list[Output]], None]
+_RAW = itemgetter(0)
+"""The bytes of a frame."""
 
 
 class PeerLink:
     """Carries frames to one peer of a node. Compared by identity; times are monotonic seconds."""
 
     def __init__(
-        self, config: PeerConfig, node: Node, perform: Perform, now: float, recorder: Recorder | None = None
+        self,
+        config: PeerConfig,
+        node: Node,
+        perform: Perform,
+        now: float,
+        recorder: Recorder | None = None,
+        schedule: Schedule[PeerLink] | None = None,
     ) -> None:
         self.config = config
         self.name = config.name
         self.policy = config.make_policy()
         self.counters = SplitCounters()
-        """What was found in its payloads."""
+        """Frames and faults in its payloads."""
+        self._refusals = TotalsWatch()
+        self.frames_sent = 0
+        """Frames for it that its policy let pass."""
         self.egress = make_egress(config.egress, now)
-        """Where frames wait; None where nothing makes them wait."""
+        """Frames that wait; None if frames never wait."""
+        self.timers = Deadline()
+        """When :meth:`send_waiting` is due."""
+        self._schedule = schedule or Schedule[PeerLink]()
         self._node = node
         self._perform = perform
-        self._recorder = recorder
-        self._names = [config.name]  # in the core, the one of the current keys first
-        self._previous: dict[str, tuple[KeyPairing, float]] = {}  # the others, and until when they are good
-        self._charged: dict[str, tuple[int, int]] = {}  # datagrams and bytes that the budget has been told of
-        self._unheard_since = now
-        self._is_told = False
+        self.recorder = recorder
+        self.peers: list[Peer] = []
+        """In the core: the one of the current keys first, then those of the pairs with a previous key."""
+        self._previous: dict[Peer, tuple[KeyPairing, float]] = {}  # the latter, and until when they are valid
+        self._charged: dict[Peer, tuple[int, int]] = {}  # datagrams and bytes that the budget was charged for
+        self.silent_since = now
+        """When it was up last, to the second; before that, when the daemon began to expect it."""
         self._sample: _Sample | None = None
         self._measured = now, config.name, 0, 0  # when, what, and the bytes received and sent then
         self.bytes_s = 0.0, 0.0
@@ -58,150 +79,174 @@ class PeerLink:
 
     @property
     def peer(self) -> Peer:
-        """The core's side of it: by the current keys, or by those before while only they work."""
+        """Its object in the core: that of the current keys, or of previous keys while only they work."""
         if self._previous:
-            for name in self._names:
-                if self._node.peers[name].is_up:
-                    return self._node.peers[name]
-        return self._node.peers[self.name]
+            for peer in self.peers:
+                if peer.is_up:
+                    return peer
+        return self.peers[0]
 
     @property
     def accepts_previous_keys(self) -> bool:
-        """Whether a key is changing, and the new one not yet confirmed."""
+        """Whether a key is being changed, and the new one is not confirmed yet."""
         return bool(self._previous)
 
     def join(self, now: float, graces: Graces, grace_s: float, *, has_previous_key: bool) -> None:
-        """Have the core accept the peer; by previous keys too, for what is left of ``grace_s``."""
+        """Add the peer to the core, with its previous keys too for the rest of ``grace_s``."""
         for pairing in pairings(self.config, has_previous_key):
-            name = pairing.settings.name
-            if name != self.name:
-                until = graces.until(pairing, now, grace_s)
-                if now >= until:
-                    continue
-                self._names.append(name)
-                self._previous[name] = pairing, until
-            self._node.add_peer(pairing.settings, now, by_previous_key=pairing.by_our_previous)
+            until = graces.until(pairing, now, grace_s) if self.peers else NEVER
+            if now >= until:
+                continue
+            peer = self._node.add_peer(pairing.settings, now, by_previous_key=pairing.by_our_previous)
+            if self.peers:
+                self._previous[peer] = pairing, until
+            self.peers.append(peer)
 
     def leave(self, now: float) -> None:
         """Cut the peer off at once."""
-        for name in self._names:
-            self._perform(self._node.remove_peer(name, now))
+        for peer in self.peers:
+            self._perform(self._node.remove_peer(peer, now))
+        self._schedule.remove(self)
 
     def give_up_theirs(self, now: float) -> None:
-        """Accept the peer's previous key no longer."""
-        self._give_up([each for each, _ in self._previous.values() if each.by_their_previous], now)
+        """Stop accepting the peer's previous key."""
+        self._give_up([peer for peer, (pairing, _) in self._previous.items() if pairing.by_their_previous], now)
 
     def give_up_ours(self, now: float) -> None:
-        """Accept our own previous key no longer."""
-        self._give_up([each for each, _ in self._previous.values() if each.by_our_previous], now)
+        """Stop accepting our own previous key."""
+        self._give_up([peer for peer, (pairing, _) in self._previous.items() if pairing.by_our_previous], now)
 
     def end_graces(self, now: float, graces: Graces) -> bool:
-        """Give up the previous keys that were accepted for long enough; whether there were any."""
-        return self._end([each for each, until in self._previous.values() if now >= until], now, graces)
+        """Stop accepting previous keys whose grace has ended. Returns whether there were any."""
+        return self._end([peer for peer, (_, until) in self._previous.items() if now >= until], now, graces)
 
     def confirm(self, now: float, graces: Graces) -> bool:
-        """The peer has the current keys: give up all previous ones; whether there were any."""
-        return self._end([each for each, _ in self._previous.values()], now, graces)
+        """The peer has the current keys: stop accepting all previous ones. Returns whether there were any."""
+        return self._end(list(self._previous), now, graces)
 
-    def _end(self, gone: Sequence[KeyPairing], now: float, graces: Graces) -> bool:
-        """Give these up for as long as the daemon runs: no reload brings them back."""
-        for pairing in gone:
-            graces.end(pairing)
+    def _end(self, gone: Sequence[Peer], now: float, graces: Graces) -> bool:
+        """Stop accepting these for as long as the daemon runs: no reload brings them back."""
+        for peer in gone:
+            graces.end(self._previous[peer][0])
         self._give_up(gone, now)
         return bool(gone)
 
-    def _give_up(self, gone: Sequence[KeyPairing], now: float) -> None:
-        names = [each.settings.name for each in gone]
-        self._names = [name for name in self._names if name not in names]
-        for name in names:
-            del self._previous[name]
-        for name in names:  # what comes of it sees none of them any more
-            self._perform(self._node.remove_peer(name, now))
+    def _give_up(self, gone: Sequence[Peer], now: float) -> None:
+        self.peers = [peer for peer in self.peers if peer not in gone]
+        for peer in gone:
+            del self._previous[peer]
+            self._charged.pop(peer, None)
+        for peer in gone:  # the outputs of one removal find none of them any more
+            self._perform(self._node.remove_peer(peer, now))
 
     def set_paths(self, paths: Sequence[Path], now: float) -> None:
-        """Where to call it."""
-        for name in reversed(self._names):  # the last one is who is thought to be at an address
-            self._node.set_addresses(name, paths, now)
+        """Connect to the peer along these paths."""
+        for peer in reversed(self.peers):  # a hint from an address is for the one that was set last
+            self._node.set_paths(peer, paths, now)
 
     def change(self, config: PeerConfig, now: float) -> None:
-        """Other rules for the same peer. What waits for it is dropped only where the way of waiting changes."""
+        """Apply other rules to the same peer. Frames that wait are dropped only if budget or delay change."""
         if config.policy != self.config.policy:
             self.policy = config.make_policy()
         if config.egress != self.config.egress:
             self.egress = make_egress(config.egress, now)
-            self._charged = {name: self._sent(name) for name in self._names}
+            self._charged = {peer: _sent(peer) for peer in self.peers}
         if config.addresses != self.config.addresses:
-            self._unheard_since, self._is_told = now, False
-            self.set_paths((), now)  # its names may have no address now: it is not called at the old ones
+            self.silent_since = now
+            self.set_paths((), now)  # its new names may have no address: do not connect to the old ones
         if config.previous_public_key is None:
             self.give_up_theirs(now)
-        for name in self._names:
-            self._node.peers[name].verify_interval_s = config.settings.link.verify_interval_s
+        for peer in self.peers:
+            peer.verify_interval_s = config.settings.link.verify_interval_s
         self.config = config
         self.on_session()
 
     def send(self, frames: Sequence[Frame], source: Source, now: float, waited_s: float) -> None:
-        """Send frames that are here together: at once, or when the budget lets them.
+        """Send frames that arrived together: at once, or when budget and coalescing delay allow it.
 
-        ``source``: where they came from. ``waited_s``: how long the first of them has waited already.
+        ``source``: the port that sent them. ``waited_s``: how long the first of them has waited already.
         """
-        if self.egress is None:
-            self._give([raw for raw, _ in frames], now)
+        self.frames_sent += len(frames)
+        if self.egress is not None:
+            self.egress.put(frames, now - waited_s)
+            self.send_waiting(now)
             return
-        self.egress.put(frames, now - waited_s)
-        self.send_waiting(now)
+        raws = list(map(_RAW, frames))
+        outputs = self._node.send(self.peer if self._previous else self.peers[0], raws, now)
+        if self.recorder is not None:
+            self._record_sent(raws, outputs, now)
+        self._perform(outputs)
 
     @property
     def gather_s(self) -> float:
-        """How long frames for it may wait unread, as they would wait here anyway."""
+        """How long frames for it may wait before they are read: they would wait here anyway."""
         return self.egress.settings.coalesce_s if isinstance(self.egress, Coalescer) else 0.0
 
     def send_waiting(self, now: float) -> None:
-        """Send what is due of what waits."""
+        """Send the waiting frames that are due, and schedule the next ones."""
         if self.egress is None:
             return
         self._charge(self.egress, now)
         while batch := self.egress.take(now):
-            self._give(batch, now)
+            outputs = self._node.send(self.peer, batch, now)
+            if self.recorder is not None:
+                self._record_sent(batch, outputs, now)
+            self._perform(outputs)
+            self._charge(self.egress, now)
+        self._set_deadline()
+
+    def report_refusals(self, now: float) -> None:
+        """Report to the peer which of its frames the policy refuses. Call it about once a second."""
+        if not self.peer.is_up or (self.egress is not None and not self.egress.has_room(LARGEST_REPORT, now)):
+            return  # totals lose nothing until the next call
+        self._perform(self._node.report_refusals(self.peer, self._refusals.changed(self.policy.incoming), now))
+        if self.egress is not None:
             self._charge(self.egress, now)
 
-    def _give(self, frames: list[bytes], now: float) -> None:
-        outputs = self._node.send(self.peer.name, frames, now)
-        # Without a session nothing crosses the link.
-        if self._recorder is not None and any(isinstance(each, Transmit) for each in outputs):
-            self._recorder.add(self.name, frames, TO_PEER, now)
-        self._perform(outputs)
+    def record_received(self, frames: Sequence[Frame], now: float) -> None:
+        """Record frames of the peer, if this daemon records."""
+        if self.recorder is not None:
+            self.recorder.add(self.name, list(map(_RAW, frames)), FROM_PEER, now)
 
-    def next_deadline(self) -> float:
-        """When :meth:`send_waiting` has something to do."""
-        return NEVER if self.egress is None else self.egress.next_deadline()
+    def _record_sent(self, frames: list[bytes], outputs: Sequence[Output], now: float) -> None:
+        # Without a session no frame crosses the link.
+        if self.recorder is not None and any(isinstance(output, Transmit) for output in outputs):
+            self.recorder.add(self.name, frames, TO_PEER, now)
+
+    def _set_deadline(self) -> None:
+        self.timers.next_at = NEVER if self.egress is None else self.egress.next_deadline()
+        self._schedule.update(self)
 
     def on_session(self) -> None:
-        """A session began: its envelopes may be shaped otherwise."""
+        """A session began: its envelopes may have another size."""
         session, path = self.peer.sessions.current, self.peer.path
         if self.egress is not None and session is not None and path is not None:
-            carrier = IPV6_UDP_BYTES if ":" in path[1] else IPV4_UDP_BYTES
+            carrier = IPV6_UDP_BYTES if ":" in path.host else IPV4_UDP_BYTES
             seal = session.parameters.max_envelope - session.payload_limit
             self.egress.shape = EnvelopeShape(session.payload_limit, seal, carrier)
+        self._set_deadline()
 
     def on_down(self, now: float) -> None:
-        """The peer is lost: what waits for it would be old when it is back."""
+        """The peer is lost: drop the frames that wait, which would be old when it is back."""
         if self.egress is not None:
             self.egress.clear(now)
+            self._set_deadline()
 
-    def is_unheard(self, now: float) -> bool:
-        """Once each time that the peer is not heard for long: :data:`UNANSWERED_S`, or :data:`UNCALLED_S`."""
+    def note_silence(self, now: float) -> None:
+        """Note whether the peer is up. Call it about once a second."""
         if self.peer.is_up:
-            self._unheard_since = now
-            self._is_told = False
-            return False
-        if self._is_told or now - self._unheard_since < (UNANSWERED_S if self.config.addresses else UNCALLED_S):
-            return False
-        self._is_told = True
-        return True
+            self.silent_since = now
+
+    def is_overdue(self, now: float) -> bool:
+        """Whether to report that the peer is silent, after a time by its kind.
+
+        It is :data:`NOT_ANSWERING_S` if the daemon connects to the peer, else :data:`NOT_CONNECTING_S`.
+        """
+        limit_s = NOT_ANSWERING_S if self.config.addresses else NOT_CONNECTING_S
+        return not self.peer.is_up and now - self.silent_since >= limit_s
 
     def measure(self, now: float) -> LinkFigures:
-        """How the link does, over the time since the last call; call it once a second or less often."""
+        """The quality of the link since the last call. Call it once a second or less often."""
         peer = self.peer
         measured_at, name, received, sent = self._measured
         if now > measured_at and name == peer.name:
@@ -216,7 +261,7 @@ class PeerLink:
         if before is not None and before.index == self._sample.index:
             loss_in = _lost(self._sample.expected - before.expected, self._sample.received - before.received)
             there = self._sample.expected_there - before.expected_there
-            # The peer reports now and then; until it does, its last word stands.
+            # The peer reports now and then. Until the next report the last one is valid.
             loss_out = (
                 _lost(there, self._sample.received_there - before.received_there) if there else self._figures.loss_out
             )
@@ -230,46 +275,42 @@ class PeerLink:
         )
         return self._figures
 
-    def disturbances(self, now: float) -> dict[str, int]:
-        """What went wrong between here and the peer, and no datagram that came was to blame for.
+    def problems(self, now: float) -> dict[LinkProblem, int]:
+        """The totals of problems that no dropped datagram explains.
 
-        It only grows for one peer of the core; by other keys it is another one, and begins anew.
+        A total only grows for one peer of the core. Another key is another peer, whose totals start at zero.
         """
         traffic = self.peer.traffic
         return {
-            "envelopes_missing": self.peer.missing(now),
-            "envelopes_out_of_order": traffic.out_of_order,
-            "challenges_unanswered": traffic.challenges_unanswered,
-            "echoes_unanswered": traffic.echoes_unanswered,
-            "handshakes_unanswered": traffic.handshakes_unanswered,
-            "cookies_taken": traffic.cookies_taken,
+            LinkProblem.ENVELOPES_MISSING: self.peer.missing(now),
+            LinkProblem.ENVELOPES_OUT_OF_ORDER: traffic.out_of_order,
+            LinkProblem.CHALLENGES_UNANSWERED: traffic.challenges_unanswered,
+            LinkProblem.ECHOES_UNANSWERED: traffic.echoes_unanswered,
+            LinkProblem.HANDSHAKES_UNANSWERED: traffic.handshakes_unanswered,
+            LinkProblem.COOKIES_TAKEN: traffic.cookies_taken,
         }
 
     @property
     def figures(self) -> LinkFigures:
-        """What :meth:`measure` gave last."""
+        """The last result of :meth:`measure`."""
         return self._figures
 
     def _charge(self, egress: Egress | Coalescer, now: float) -> None:
-        """Tell the budget of everything that went to the peer, handshakes and echoes too."""
-        for name in self._names:
-            told = self._charged.get(name, (0, 0))
-            total = self._sent(name)
-            if total != told:
-                egress.spend(total[1] - told[1], now, datagrams=total[0] - told[0])
-                self._charged[name] = total
-
-    def _sent(self, name: str) -> tuple[int, int]:
-        traffic = self._node.peers[name].traffic
-        return traffic.datagrams_sent, traffic.bytes_sent
+        """Charge the budget for all datagrams to the peer, handshakes and echoes too."""
+        for peer in self.peers:
+            charged = self._charged.get(peer, (0, 0))
+            total = _sent(peer)
+            if total != charged:
+                egress.spend(total[1] - charged[1], now, datagrams=total[0] - charged[0])
+                self._charged[peer] = total
 
 
 def radio_figures(links: Iterable[PeerLink]) -> LinkFigures | None:
-    """What an autopilot is told of its radio: the worst of the links to operators; of all, where no role says who is.
+    """The figures for an autopilot's RADIO_STATUS: the worst link to an operator; without roles, the worst of all.
 
-    It slows down for those who watch and command it, not for a neighbour at the edge of its range.
+    An autopilot slows down for its operators, not for a neighbour at the edge of its range.
     """
-    by_role = [(each.config.policy.get("role"), each.figures) for each in links]
+    by_role = [(link.config.policy.get("role"), link.figures) for link in links]
     chosen = [figures for role, figures in by_role if role == "operator"] or [figures for _, figures in by_role]
     return worst(chosen) if chosen else None
 
@@ -291,6 +332,10 @@ class _Sample:
         if session is None:
             return cls(0, 0, 0, (0, 0))
         return cls(session.local_index, session.expected, session.received, peer.traffic.reported)
+
+
+def _sent(peer: Peer) -> tuple[int, int]:
+    return peer.traffic.datagrams_sent, peer.traffic.bytes_sent
 
 
 def _lost(expected: int, received: int) -> float:

@@ -1,4 +1,4 @@
-"""The UDP sockets towards the peers, and the way from a peer's names to paths along them."""
+"""The UDP sockets for the peers, and the resolution of a peer's names to paths."""
 
 from __future__ import annotations
 
@@ -6,60 +6,88 @@ import asyncio
 import socket
 from collections import Counter
 from collections.abc import Callable, Sequence
-from typing import Any
+from functools import partial
+from typing import Protocol
 
 from structlog.typing import FilteringBoundLogger
 
+from uavlinkd.core.path import Path, SocketAddress
+from uavlinkd.endpoints.error_queue import ErrorReports, send_again
+from uavlinkd.endpoints.ports import failure_name
+from uavlinkd.endpoints.reader import Datagrams, Reader
+from uavlinkd.endpoints.sockets import BindError, is_absent, is_here, udp_socket
+from uavlinkd.link.drop_summary import DropSummary
+from uavlinkd.link.evidence import Evidence
+from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.clock import monotonic
-from uavlinkd.core.outputs import Path
-from uavlinkd.endpoints.ports import failure_name
-from uavlinkd.endpoints.sockets import BindError, Reader, numeric_host, udp_socket
-from uavlinkd.ops.log import DropSummary
-from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.system.resolver import Resolved, keep_resolving
 from uavlinkd.system.stall import StallWatch
 from uavlinkd.system.tasks import keep_running
 
 _EPHEMERAL = (Address("0.0.0.0", 0), Address("::", 0))
-"""Without a listen address the daemon only calls, from any port."""
+"""Without a listen address the daemon only connects to peers, from any port."""
 
-Arrived = Sequence[tuple[bytes, Path]]
-"""Datagrams, each with the path that it came along."""
+
+class Receive(Protocol):
+    """Receives the datagrams of one read."""
+
+    def __call__(self, socket: int, datagrams: Datagrams, now: float, epoch: int, waited_s: float, /) -> None:
+        """``socket`` is the number of the socket. The rest is as in :class:`uavlinkd.endpoints.reader.Deliver`."""
 
 
 class PeerSockets:
-    """Reads and sends the peers' datagrams. A path's first number is the place of its socket here.
-
-    ``on_arrived`` gets what came in one wake-up, with the monotonic time and the epoch of it.
-    """
+    """Reads and sends the peers' datagrams. A path's first number is the place of its socket here."""
 
     def __init__(
         self,
-        on_arrived: Callable[[Arrived, float, int], None],
+        receive: Receive,
         stall: StallWatch,
         drops: DropSummary,
+        evidence: Evidence,
         log: FilteringBoundLogger,
     ) -> None:
         self.failures: Counter[str] = Counter()
-        """What the kernel did not take towards the peers, by the name of the error."""
-        self._on_arrived = on_arrived
+        """Datagrams to peers that the kernel did not accept, by the name of the error."""
+        self.unresolved: dict[str, set[str]] = {}
+        """The host names that have no address now, by peer."""
+        self.without_socket: set[str] = set()
+        """The peers none of whose addresses is of a listen address's family."""
+        self._receive = receive
         self._stall = stall
         self._drops = drops
+        self._evidence = evidence
         self._log = log
         self._sockets: list[socket.socket] = []
+        self._readers: list[Reader] = []
+        self._reports: list[ErrorReports] = []
         self._following: dict[str, asyncio.Task[None]] = {}
 
     @property
     def addresses(self) -> list[Address]:
-        """Where the sockets are bound."""
-        return [Address(*each.getsockname()[:2]) for each in self._sockets]
+        """The addresses that the sockets are bound to."""
+        return [Address(*sock.getsockname()[:2]) for sock in self._sockets]
+
+    def absent_addresses(self) -> list[Address]:
+        """The listen addresses that no interface of this machine has now."""
+        absent = zip(self._sockets, self.addresses, strict=True)
+        return [address for sock, address in absent if is_absent(sock)]
+
+    def is_own(self, address: SocketAddress) -> bool:
+        """Whether an address leads to one of these sockets."""
+        host, port, *rest = address
+        return any(
+            sock.getsockname()[1] == port
+            and (own.host == host or (own.is_wildcard and is_here(sock.family, (host, 0, *rest))))
+            for sock, own in zip(self._sockets, self.addresses, strict=True)
+            if (sock.family == socket.AF_INET6) == (":" in host)
+        )
 
     def open(self, addresses: Sequence[Address]) -> None:
         """Bind a socket to each address, or ephemeral ones without any.
 
         Raises:
-            BindError: where an address cannot be listened on, with the key that says so.
+            BindError: if the daemon cannot listen on an address. The message names the key.
         """
         for address in addresses or _EPHEMERAL:
             try:
@@ -68,69 +96,92 @@ class PeerSockets:
                 raise BindError(f"listen: {error}") from None
 
     def start(self) -> None:
-        """Read whenever something is there."""
-        loop = asyncio.get_running_loop()
+        """Start to read."""
         for number, sock in enumerate(self._sockets):
-            loop.add_reader(sock, self._on_readable, number, Reader(sock, self._count_failure, self._stall))
+            on_failure = partial(self._on_read_error, number)
+            reader = Reader(sock, partial(self._receive, number), on_failure, self._stall)
+            reader.start()
+            self._readers.append(reader)
+            self._reports.append(ErrorReports(sock))
+
+    def do_housekeeping(self) -> None:
+        """Have the kernel report errors again. Call it once a second."""
+        for reports in self._reports:
+            reports.renew()
 
     def close(self) -> None:
-        """Close the sockets, and follow no name any more."""
+        """Close the sockets and stop resolving names."""
         for name in list(self._following):
             self.stop_following(name)
-        loop = asyncio.get_running_loop()
+        for reader in self._readers:
+            reader.stop()
         for sock in self._sockets:
-            loop.remove_reader(sock)
             sock.close()
 
-    def _on_readable(self, number: int, reader: Reader) -> None:
-        arrived, now, epoch = reader.read()
-        self._on_arrived([(datagram, _path(number, source)) for datagram, source in arrived], now, epoch)
-
     def send(self, datagram: bytes, path: Path) -> None:
-        """Hand a datagram to the kernel."""
-        number, host, port = path
+        """Pass a datagram to the kernel."""
+        number, address = path
         try:
-            self._sockets[number].sendto(datagram, (host, port))
+            self._sockets[number].sendto(datagram, address)
         except OSError as error:
-            # Full buffers, no route, a firewall: as if the network had lost it, and the timers see to the rest.
-            self._count_failure(error)
+            sock, take_errors = self._sockets[number], partial(self._take_errors, number)
+            last = send_again(sock, datagram, address, error, take_errors)
+            if last is not None:
+                # Full buffers, no route, a firewall: as if the network had lost it. The core's timers do the rest.
+                self._count_failure(last, address)
 
-    def _count_failure(self, error: OSError) -> None:
+    def _on_read_error(self, number: int, error: OSError) -> None:
+        if not self._take_errors(number):
+            self._count_failure(error, None)
+
+    def _take_errors(self, number: int) -> bool:
+        """Note the ICMP errors of earlier datagrams. Returns whether there were any."""
+        if not self._reports:  # not started
+            return False
+        reports = self._reports[number].take()
+        for address, code in reports:
+            self._evidence.add_report(code, address, monotonic())
+        self._readers[number].renew()
+        return bool(reports)
+
+    def _count_failure(self, error: OSError, address: SocketAddress | None) -> None:
         name = failure_name(error)
         self.failures[name] += 1
         self._drops.add("sends_failed", name, "", 1, monotonic())
+        self._evidence.add_failure(name, address, monotonic())
 
-    def follow(self, link: PeerLink, on_found: Callable[[], None]) -> None:
-        """Call the peer where its names point now, from every socket of the right family.
+    def follow(self, link: PeerLink, on_resolved: Callable[[], None]) -> None:
+        """Resolve the peer's names, and connect to it at their addresses from every socket of the same family.
 
-        ``on_found`` is told each time that they point elsewhere.
+        ``on_resolved`` is called after each change of the addresses.
         """
         if not link.config.addresses:
             link.set_paths((), monotonic())
             return
 
-        def on_resolved(found: Resolved) -> bool:
-            paths: list[Path] = [
-                (number, host, port)
-                for family, host, port in found
+        def set_paths(addresses: Resolved) -> bool:
+            paths = [
+                Path(number, sockaddr)
+                for family, sockaddr in addresses
                 for number, sock in enumerate(self._sockets)
                 if sock.family == family
             ]
+            self.without_socket.discard(link.name)
             if not paths:
+                self.without_socket.add(link.name)
                 self._log.warning("peer_unreachable", peer=link.name, reason="no listen address of its family")
             link.set_paths(paths, monotonic())
-            on_found()
+            on_resolved()
             return True
 
-        work = keep_resolving(link.config.addresses, lambda: not link.peer.is_up, on_resolved, self._log)
+        unresolved = self.unresolved[link.name] = set[str]()
+        work = keep_resolving(link.config.addresses, lambda: not link.peer.is_up, set_paths, self._log, unresolved)
         self._following[link.name] = keep_running(work, f"the search for {link.name}")
 
     def stop_following(self, name: str) -> None:
-        """Look this peer's names up no more."""
+        """Stop resolving this peer's names."""
+        self.unresolved.pop(name, None)
+        self.without_socket.discard(name)
         task = self._following.pop(name, None)
         if task is not None:
             task.cancel()
-
-
-def _path(number: int, source: tuple[Any, ...]) -> Path:
-    return (number, *source) if len(source) == 2 else (number, numeric_host(source), source[1])

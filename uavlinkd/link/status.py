@@ -1,53 +1,90 @@
-"""What a daemon tells about itself: plain values, ready for JSON. No secret is among them."""
+"""The status of a daemon: plain values for JSON, without secrets."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
-from uavlinkd.system.addresses import Address
-from uavlinkd.endpoints.ports import Endpoint
 from uavlinkd.config.keys import encode_key
-from uavlinkd.mavlink.dialect import name_of
-from uavlinkd.mavlink.policy.gate import ANY_OTHER
+from uavlinkd.endpoints.ports import Endpoint
+from uavlinkd.link import refused_there
+from uavlinkd.link.diagnosis import find
+from uavlinkd.mavlink.dialect import command_name, name_of
 from uavlinkd.mavlink.policy.compilation import Policy
+from uavlinkd.mavlink.policy.gate import ANY_OTHER
+from uavlinkd.ops.schema_versions import STATUS_SCHEMA
+from uavlinkd.system.addresses import Address
 
 if TYPE_CHECKING:
-    from uavlinkd.link.daemon import Daemon
+    from uavlinkd.config import Config
+    from uavlinkd.core.node import Node
+    from uavlinkd.link.evidence import Evidence
+    from uavlinkd.link.history import History
+    from uavlinkd.link.local_endpoints import LocalEndpoints
+    from uavlinkd.link.passage import Passage
     from uavlinkd.link.peer_link import PeerLink
+    from uavlinkd.link.peer_sockets import PeerSockets
+    from uavlinkd.link.switch import Switch
     from uavlinkd.ops.recorder import Recorder
+    from uavlinkd.system.stall import StallWatch
 
 
-def daemon_status(daemon: Daemon, now: float) -> dict[str, object]:
-    """The whole daemon. Times are seconds before now; rates are the reader's to make, from two of these."""
+class DaemonParts(Protocol):
+    """The parts of a daemon that its status describes."""
+
+    config: Config
+    node: Node
+    evidence: Evidence
+    history: History
+    passage: Passage
+    links: dict[str, PeerLink]
+    local: LocalEndpoints
+    switch: Switch
+    peer_sockets: PeerSockets
+    stall: StallWatch
+    recorder: Recorder | None
+
+
+def daemon_status(daemon: DaemonParts, now: float) -> dict[str, object]:
+    """The status of the whole daemon. Times are ages in seconds. A client computes rates from two of these.
+
+    ``frames_pass``: every peer is up, and within the last 10 s no traffic was wholly refused. ``blocked`` names it.
+    """
     node = daemon.node
+    blocked = daemon.passage.blocked(daemon.links.values(), daemon.local.judged)
+    all_up = bool(daemon.links) and all(link.peer.is_up for link in daemon.links.values())
     return {
+        "schema": STATUS_SCHEMA,
         "name": daemon.config.name,
         "public_key": encode_key(node.public_key),
         "monotonic_s": now,
+        "frames_pass": all_up and not blocked,
+        "blocked": [dict(zip(("subject", "name", "direction"), key, strict=True)) for key in blocked],
+        "findings": [finding.as_json() for finding in find(daemon, now)],
         "peers": {name: peer_status(link, now) for name, link in daemon.links.items()},
         "endpoints": {
-            each.name: endpoint_status(each, daemon.endpoint_policies[each.name], now) for each in daemon.endpoints
+            endpoint.name: endpoint_status(endpoint, daemon.local.policies[endpoint.name], now)
+            for endpoint in daemon.local.endpoints
         },
-        "drops": {reason.value: amount for reason, amount in node.drops.items()},
+        "drops": {reason.value: count for reason, count in node.drops.items()},
         "stale": dict(daemon.stall.dropped),
-        "unrouted": {reason.value: amount for reason, amount in daemon.switch.router.unrouted.items()},
+        "unrouted": {reason.value: count for reason, count in daemon.switch.router.unrouted.items()},
         "send_failures": dict(daemon.peer_sockets.failures),
         "recording": None if daemon.recorder is None else recording_status(daemon.recorder),
     }
 
 
 def peer_status(link: PeerLink, now: float) -> dict[str, object]:
-    """One peer. ``state`` is ``up``, ``lost`` (was up) or ``waiting`` (never was)."""
+    """The status of a peer. ``state`` is ``up``, ``lost`` (was up) or ``waiting`` (was never up)."""
     peer, figures = link.peer, link.figures
     session = peer.sessions.current
     traffic = peer.traffic
     expected_there, received_there = traffic.reported
     return {
-        "state": "up" if peer.is_up else "lost" if peer.heard_at is not None else "waiting",
+        "state": "up" if peer.is_up else "lost" if peer.received_at is not None else "waiting",
         "public_key": encode_key(peer.settings.public_key),
         "accepts_previous_key": link.accepts_previous_keys,
-        "path": None if peer.path is None else str(Address(*peer.path[1:])),
-        "heard_s": None if peer.heard_at is None else now - peer.heard_at,
+        "path": None if peer.path is None else str(Address.of(peer.path.address)),
+        "last_received_s": None if peer.received_at is None else now - peer.received_at,
         "handshake_s": None if peer.established_at is None else now - peer.established_at,
         "round_trip_s": peer.round_trip_s,
         "freshness_unverified_s": None if peer.unverified_since is None else now - peer.unverified_since,
@@ -73,23 +110,28 @@ def peer_status(link: PeerLink, now: float) -> dict[str, object]:
         "bytes_sent": traffic.bytes_sent,
         "bytes_elsewhere": traffic.bytes_elsewhere,
         "bytes_received": traffic.bytes_received,
-        **link.disturbances(now),
+        **{problem.value: count for problem, count in link.problems(now).items()},
+        "role": link.config.policy.get("role"),
+        "frames_sent": link.frames_sent,
         "frames_received": link.counters.frames,
         "frames_unknown": link.counters.unknown,
-        "malformed": {fault.value: amount for fault, amount in link.counters.faults.items()},
+        "malformed": {fault.value: count for fault, count in link.counters.faults.items()},
         "refused": policy_status(link.policy),
+        "refused_commands": commands_status(link.policy),
+        "refused_there": refused_there.as_json(link, now),
         "waiting_dropped": {}
         if link.egress is None
-        else {reason.value: amount for reason, amount in link.egress.totals.items()},
-        "drops": {reason.value: amount for reason, amount in traffic.drops.items()},
+        else {reason.value: count for reason, count in link.egress.totals.items()},
+        "drops": {reason.value: count for reason, count in traffic.drops.items()},
     }
 
 
 def endpoint_status(endpoint: Endpoint, policy: Policy, now: float) -> dict[str, object]:
-    """One local endpoint, and who is there."""
+    """The status of a local endpoint and its clients."""
     return {
-        "programs": {
-            port.name: {"heard_s": None if port.heard_at is None else now - port.heard_at} for port in endpoint.ports
+        "clients": {
+            port.name: {"last_received_s": None if port.received_at is None else now - port.received_at}
+            for port in endpoint.ports
         },
         "frames_received": endpoint.counters.frames,
         "frames_unknown": endpoint.counters.unknown,
@@ -97,14 +139,15 @@ def endpoint_status(endpoint: Endpoint, policy: Policy, now: float) -> dict[str,
         "bytes_received": endpoint.bytes_received,
         "bytes_sent": endpoint.bytes_sent,
         "garbage_bytes": endpoint.counters.garbage_bytes,
-        "faults": {fault.value: amount for fault, amount in endpoint.counters.faults.items()},
+        "faults": {fault.value: count for fault, count in endpoint.counters.faults.items()},
         "failures": dict(endpoint.failures),
         "refused": policy_status(policy),
+        "refused_commands": commands_status(policy),
     }
 
 
 def recording_status(recorder: Recorder) -> dict[str, object]:
-    """What was recorded, and what was not."""
+    """The counts of recorded and lost frames."""
     return {
         "is_recording": recorder.is_recording,
         "frames": recorder.frames,
@@ -115,11 +158,23 @@ def recording_status(recorder: Recorder) -> dict[str, object]:
 
 
 def policy_status(policy: Policy) -> dict[str, dict[str, dict[str, int]]]:
-    """What a policy refused: each way, by message, by reason."""
-    told: dict[str, dict[str, dict[str, int]]] = {}
-    for way, gate in (("in", policy.incoming), ("out", policy.outgoing)):
-        messages = told[way] = {}
-        for (msgid, refusal), amount in gate.refused.items():
+    """Refused frames by direction, message and reason."""
+    status: dict[str, dict[str, dict[str, int]]] = {}
+    for direction, gate in (("in", policy.incoming), ("out", policy.outgoing)):
+        messages = status[direction] = {}
+        for (msgid, refusal), count in gate.refused.items():
             name = "others" if msgid == ANY_OTHER else name_of(msgid)
-            messages.setdefault(name, {})[refusal.value] = amount
-    return told
+            messages.setdefault(name, {})[refusal.value] = count
+    return status
+
+
+def commands_status(policy: Policy) -> dict[str, dict[str, dict[str, int]]]:
+    """Refused COMMAND_LONG and COMMAND_INT by direction, command and reason."""
+    status: dict[str, dict[str, dict[str, int]]] = {}
+    for direction, gate in (("in", policy.incoming), ("out", policy.outgoing)):
+        commands = status[direction] = {}
+        for (_, command, refusal), count in gate.refused_commands.items():
+            name = "others" if command == ANY_OTHER else command_name(command)
+            counts = commands.setdefault(name, {})
+            counts[refusal.value] = counts.get(refusal.value, 0) + count
+    return status

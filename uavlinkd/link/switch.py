@@ -1,63 +1,80 @@
-"""The switch: takes frames from a port, asks policy and router, and hands them to the ports where they belong.
+"""The switch: consumes frames of a port, asks policy and router, and sends them to the ports where they belong.
 
-A port is a local program or a peer. Work is done by the batch: what came in one wake-up leaves in one call a port.
-And what policy and router answer about a header is remembered, where the answer is the same for every frame with it:
-then a frame costs a look-up, and the question whether it came by another way already.
+A port is a local client or a peer. The switch works in batches: the frames that arrived in one wake-up leave in one
+call per port. It remembers a flow: the ports where all frames of a source with one header go. So a frame of a known
+flow costs a look-up. Where a frame can arrive by two routes, it costs the check for duplicates too.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import count
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from uavlinkd.endpoints.ports import LocalPort
-from uavlinkd.mavlink.policy.delivery import Source
-from uavlinkd.mavlink.frames import Frame, Header
-from uavlinkd.mavlink.policy.gate import Refusal
-from uavlinkd.mavlink.policy.compilation import Policy
-from uavlinkd.mavlink.routing import Router
 from uavlinkd.link.peer_link import PeerLink
+from uavlinkd.mavlink.frames import Frame
+from uavlinkd.mavlink.headers import Header
+from uavlinkd.mavlink.policy.compilation import Policy
+from uavlinkd.mavlink.policy.delivery import Source
+from uavlinkd.mavlink.policy.gate import Refusal
+from uavlinkd.mavlink.routing import Router
 
 MAX_FLOWS = 2048
-"""Headers of one source, of which the way is remembered."""
+"""Flows of one source that are remembered."""
 
 Port = LocalPort | PeerLink
 
 
-class Refused(Protocol):
-    """Hears of each frame that a policy does not let pass."""
+class OnRefused(Protocol):
+    """Receives each frame that a policy does not let pass."""
 
-    def __call__(self, who: str, header: Header, refusal: Refusal, now: float, *, to_them: bool) -> None:
-        """``who``: the peer or endpoint that said it, or that is not to be told (``to_them``)."""
+    def __call__(self, name: str, header: Header, refusal: Refusal, now: float, *, to_them: bool) -> None:
+        """``name``: the peer or endpoint that sent the frame, or that does not receive it (``to_them``)."""
+
+
+class Route(NamedTuple):
+    """Where the frames of one source with one header go."""
+
+    ports: tuple[Port, ...]
+    has_one_route: bool
+    """No other port may send frames of this system, so none of them is a duplicate."""
+    is_conditional: bool
+    """A policy decides about each frame, by its contents or by a rate limit. Otherwise all of them pass."""
 
 
 class Switch:
     """Knows every port and its policy. All times are monotonic seconds."""
 
-    def __init__(self, router: Router[Port], refused: Refused) -> None:
+    def __init__(self, router: Router[Port], on_refused: OnRefused) -> None:
         self.router = router
-        self._refused = refused
+        self._on_refused = on_refused
         self._policies: dict[Port, Policy] = {}
         self._sources: dict[Port, Source] = {}
-        self._numbers: dict[Port, int] = {}  # never used again, for what a policy remembers of each
+        self._numbers: dict[Port, int] = {}
+        """What a policy's rate limits know each port by. A number is never used again."""
         self._unused = count()
-        self._flows: dict[Port, dict[Header, tuple[Port, ...]]] = {}
-        self._edition = -1  # of the router's answers in the flows
+        self._flows: dict[Port, dict[Header, Route]] = {}
+        self._edition = -1
+        """That of the router's results in the flows."""
+        self._senders: dict[int, int] = {}
+        """By system: how many ports may send its frames."""
 
     def add(self, port: Port, policy: Policy) -> None:
-        """From now on frames may come from and go to this port, as far as the policy lets them."""
+        """Accept frames from this port, and send frames to it, as far as its policy allows."""
         self._policies[port] = policy
         self._sources[port] = Source(_owner(port), policy.incoming, self._report, self.router.forget_frame)
         _set_outgoing(port, policy)
         self._numbers[port] = next(self._unused)
         self._flows[port] = {}
+        self._senders.clear()
         self.router.add_port(port, is_peer=isinstance(port, PeerLink))
 
     def set_policy(self, port: Port, policy: Policy) -> None:
-        """Other rules for a port that is there. Whom it may not speak for any more is not looked for behind it."""
+        """Change the rules of a port. Systems whose frames it may no longer send are not looked for behind it."""
         self._policies[port] = policy
         self._sources[port].gate = policy.incoming
+        self._senders.clear()
         _set_outgoing(port, policy)
         self.router.forget_systems(port, lambda system: not policy.incoming.may_speak_as(system))
         self._forget_flows()
@@ -68,10 +85,15 @@ class Switch:
         del self._sources[port]
         del self._numbers[port]
         del self._flows[port]
+        self._senders.clear()
         self.router.remove_port(port)
 
+    def set_silent(self, port: Port, *, is_silent: bool) -> None:
+        """Whether a local client is silent: then broadcasts of other local clients do not go to it."""
+        self.router.set_silent(port, is_silent=is_silent)
+
     def forward(self, source: Port, frames: Sequence[Frame], now: float, waited_s: float = 0.0) -> None:
-        """Carry frames from ``source`` to where they belong. What policy refuses is counted and goes nowhere.
+        """Send frames of ``source`` where they belong. A frame that a policy refuses is counted and dropped.
 
         ``waited_s``: how long the first of them has waited for the others.
         """
@@ -79,14 +101,18 @@ class Switch:
         if now >= router.refresh_at or router.edition != self._edition:
             router.refresh(now)
             self._forget_flows()
-        flows = self._flows[source]
+        routes = self._flows[source]
         batches: dict[Port, list[Frame]] = {}
         for frame in frames:
-            ports = flows.get(frame.header)
-            if ports is None:
-                ports = self._way_of(frame, source, now)
-            elif not router.is_first(frame.raw, source, now):
-                continue
+            route = routes.get(frame.header)
+            if route is None:
+                ports = self._route(frame, source, now)
+            else:
+                ports, has_one_route, is_conditional = route
+                if is_conditional:
+                    ports = self._pass(frame, source, route, now)
+                elif not has_one_route and not router.is_first(frame.raw, source, now):
+                    continue
             for port in ports:
                 if port in batches:
                     batches[port].append(frame)
@@ -95,36 +121,57 @@ class Switch:
         for port, batch in batches.items():
             port.send(batch, self._sources[source], now, waited_s)
 
-    def _way_of(self, frame: Frame, source: Port, now: float) -> tuple[Port, ...]:
-        """Where this one frame goes. Remembered for all of its header, if nothing about it depends on the frame."""
+    def _route(self, frame: Frame, source: Port, now: float) -> tuple[Port, ...]:
+        """The ports where the first frame of a flow goes. Remember them for the next one."""
+        header = frame.header
         incoming = self._policies[source].incoming
         refusal = incoming.check(frame, now)
         if refusal is not None:
-            self._refused(_owner(source), frame.header, refusal, now, to_them=False)
+            self._on_refused(_owner(source), header, refusal, now, to_them=False)
             return ()
-        routed = self.router.route(frame, source, now)
-        passed: list[Port] = []
-        always = bool(routed) and incoming.always_passes(frame.header)
-        for port in routed:
-            outgoing = self._policies[port].outgoing
-            refusal = outgoing.check(frame, now, self._numbers[port])
-            if refusal is not None:
-                self._refused(_owner(port), frame.header, refusal, now, to_them=True)
-            else:
-                passed.append(port)
-            always = always and outgoing.always_passes(frame.header)
-        ways = tuple(passed)
-        if always:
+        has_one_route = self._has_one_route(header.system)
+        ports = self.router.route(frame, source, now, has_one_route=has_one_route)
+        if ports:
             if self.router.edition != self._edition:
                 self._forget_flows()
             flows = self._flows[source]
             if len(flows) >= MAX_FLOWS:
-                flows.clear()
-            flows[frame.header] = ways
-        return ways
+                del flows[next(iter(flows))]
+            gates = (incoming, *(self._policies[port].outgoing for port in ports))
+            is_conditional = not all(gate.always_passes(header) for gate in gates)
+            flows[header] = Route(ports, has_one_route, is_conditional)
+        return self._pass_outgoing(frame, ports, now)
 
-    def _report(self, who: str, header: Header, refusal: Refusal, now: float) -> None:
-        self._refused(who, header, refusal, now, to_them=False)
+    def _pass(self, frame: Frame, source: Port, route: Route, now: float) -> tuple[Port, ...]:
+        """The ports of a conditional route to which the policies let this frame pass."""
+        refusal = self._policies[source].incoming.check(frame, now)
+        if refusal is not None:
+            self._on_refused(_owner(source), frame.header, refusal, now, to_them=False)
+            return ()
+        if not route.has_one_route and not self.router.is_first(frame.raw, source, now):
+            return ()
+        return self._pass_outgoing(frame, route.ports, now)
+
+    def _pass_outgoing(self, frame: Frame, ports: tuple[Port, ...], now: float) -> tuple[Port, ...]:
+        passed: list[Port] = []
+        for port in ports:
+            refusal = self._policies[port].outgoing.check(frame, now, self._numbers[port])
+            if refusal is None:
+                passed.append(port)
+            else:
+                self._on_refused(_owner(port), frame.header, refusal, now, to_them=True)
+        return tuple(passed)
+
+    def _has_one_route(self, system: int) -> bool:
+        """Whether no port but one may send frames of this system."""
+        senders = self._senders.get(system)
+        if senders is None:
+            senders = sum(policy.incoming.may_speak_as(system) for policy in self._policies.values())
+            self._senders[system] = senders
+        return senders == 1
+
+    def _report(self, name: str, header: Header, refusal: Refusal, now: float) -> None:
+        self._on_refused(name, header, refusal, now, to_them=False)
 
     def _forget_flows(self) -> None:
         for flows in self._flows.values():

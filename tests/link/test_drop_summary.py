@@ -1,0 +1,266 @@
+"""The log of drops: one line per reason and interval, with the meaning of the reason."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from tests.core.harness import KEY_A, Named, Pair
+from tests.policies import TRUSTED
+from uavlinkd.config import PeerConfig as Peer
+from uavlinkd.config.keys import encode_key
+from uavlinkd.core.drops import DropReason, Reason
+from uavlinkd.core.outputs import Dropped
+from uavlinkd.core.path import Path
+from uavlinkd.core.settings import PeerSettings
+from uavlinkd.link import drop_summary
+from uavlinkd.link.conditions import HOUR_S, LINES_BURST, QUIET_S
+from uavlinkd.link.drop_summary import EVERYDAY, PERSISTENT_S, SECURITY, DropSummary, Fact, ShellReason
+from uavlinkd.link.peer_link import PeerLink
+from uavlinkd.mavlink.headers import Header
+from uavlinkd.mavlink.policy.gate import Refusal
+from uavlinkd.ops import metrics
+from uavlinkd.ops.link_problems import LinkProblem
+
+
+def test_link_problems_are_what_the_status_counts() -> None:
+    """Status, metrics and log have the same names."""
+    pair = Pair()
+    link = PeerLink(Peer(PeerSettings("alpha", KEY_A.public), (), TRUSTED), pair.b.node, lambda _: None, 0.0)
+    link.peers.append(pair.b.peer)
+    assert set(link.problems(0.0)) == set(LinkProblem) <= set(metrics._PEER_TOTALS)
+
+
+@pytest.mark.parametrize("reasons", [DropReason, Refusal, LinkProblem, ShellReason])
+def test_every_reason_has_a_meaning(reasons: type[Reason]) -> None:
+    """An operator reads a sentence, not only a name."""
+    assert all(len(reason.meaning.split()) > 3 for reason in reasons)
+
+
+class Recorder:
+    """Records the lines of the log."""
+
+    def __init__(self) -> None:
+        self.lines: list[tuple[str, dict[str, Any]]] = []
+
+    def warning(self, event: str, **fields: Any) -> None:
+        """Record a line."""
+        self.lines.append((event, fields))
+
+    def info(self, event: str, **fields: Any) -> None:
+        """Record a line with its level."""
+        self.lines.append((f"info: {event}", fields))
+
+    def counts(self) -> list[int]:
+        """The count of each line."""
+        return [fields["count"] for _, fields in self.lines]
+
+
+@pytest.fixture
+def recorder() -> Recorder:
+    """A recorder without lines."""
+    return Recorder()
+
+
+@pytest.fixture
+def summary(recorder: Recorder) -> DropSummary:
+    """A summary that writes to the recorder."""
+    return DropSummary(recorder)  # type: ignore[arg-type]
+
+
+def test_first_drop_is_logged_at_once(recorder: Recorder, summary: DropSummary) -> None:
+    """The line has the reason, its meaning and the peer."""
+    summary.add("datagrams_dropped", DropReason.BAD_TAG, "drone1", 1, 100.0)
+    facts = {"reason": "bad_tag", "who": "drone1", "count": 1, "meaning": DropReason.BAD_TAG.meaning}
+    assert recorder.lines == [("datagrams_dropped", facts)]
+
+
+def test_totals_are_plain_strings_in_a_log(summary: DropSummary) -> None:
+    """A terminal's log shows no Python code."""
+    summary.add("datagrams_dropped", DropReason.BAD_TAG, "drone1", 1, 100.0)
+    assert repr(summary.plain_totals()) == "{'bad_tag': 1}"
+
+
+@pytest.mark.parametrize(
+    ("detail", "last"),
+    [
+        ("", "from 10.0.0.1:5790"),
+        ("x25519", "suite x25519 from 10.0.0.1:5790"),
+        (bytes(32), f"key {encode_key(bytes(32))} from 10.0.0.1:5790"),
+    ],
+)
+def test_dropped_datagram_is_logged_with_its_source(
+    recorder: Recorder, summary: DropSummary, detail: bytes | str, last: str
+) -> None:
+    """The line has the address, and the key or suite that the core refused."""
+    summary.add_dropped(Dropped(DropReason.UNKNOWN_PEER, None, Path(0, ("10.0.0.1", 5790)), 1, detail), 100.0)
+    ((event, facts),) = recorder.lines
+    assert (event, facts["last"]) == ("datagrams_dropped", last)
+    assert "who" not in facts
+
+
+def test_dropped_frames_have_no_source(recorder: Recorder, summary: DropSummary) -> None:
+    """Outgoing frames have no source."""
+    summary.add_dropped(Dropped(DropReason.TOO_LARGE, Named("drone1"), None, 3), 100.0)
+    ((event, facts),) = recorder.lines
+    assert (event, facts["who"], facts["count"]) == ("frames_dropped", "drone1", 3)
+    assert "last" not in facts
+
+
+def test_refused_frame_is_logged_with_its_message(recorder: Recorder, summary: DropSummary) -> None:
+    """A withheld frame is an info line, not a warning: our own policy works as configured."""
+    header = Header(30, 7, 1)
+    summary.add_refused("drone1", header, Refusal.RATE_LIMITED, 100.0, to_them=False)
+    summary.add_refused("drone1", header, Refusal.RATE_LIMITED, 100.0, to_them=True)
+    facts = {"reason": "rate_limited", "who": "drone1", "last": "ATTITUDE of system 7"}
+    facts["meaning"] = Refusal.RATE_LIMITED.meaning
+    assert recorder.lines == [("frames_refused", {**facts, "count": 1}), ("info: frames_withheld", facts)]
+
+
+def test_flood_formats_text_for_written_lines_only(
+    recorder: Recorder, summary: DropSummary, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A thousand refused frames and forged datagrams in one interval cost two texts, not a thousand each."""
+    described: list[Fact] = []
+    describe = drop_summary._describe
+
+    def counted(fact: Fact) -> str:
+        described.append(fact)
+        return describe(fact)
+
+    monkeypatch.setattr(drop_summary, "_describe", counted)
+    for _ in range(1000):
+        summary.add_refused("drone1", Header(30, 7, 1), Refusal.RATE_LIMITED, 100.0, to_them=False)
+        summary.add_dropped(Dropped(DropReason.UNKNOWN_PEER, None, Path(0, ("10.0.0.1", 5790)), 1, bytes(32)), 100.0)
+    assert len(described) == len(recorder.lines) == 2
+    summary.check(200.0)
+    assert len(described) == 4
+    assert recorder.counts() == [1, 1, 1000, 1000]
+
+
+def test_unknown_sender_has_no_name(recorder: Recorder, summary: DropSummary) -> None:
+    """A datagram that names no session belongs to no peer."""
+    summary.add("datagrams_dropped", DropReason.MALFORMED, "", 1, 100.0)
+    assert "who" not in recorder.lines[0][1]
+
+
+def test_flood_is_a_line_when_it_begins_and_one_when_it_has_ended(recorder: Recorder, summary: DropSummary) -> None:
+    """A hundred drops a second for a minute are two lines; the last one has them all."""
+    for number in range(6000):
+        summary.add("datagrams_dropped", DropReason.BAD_TAG, "b", 1, number / 100)
+        summary.check(number / 100)
+    summary.check(60 + QUIET_S)
+    (began, _), (event, facts) = recorder.lines
+    assert (began, event) == ("datagrams_dropped", "info: drops_ended")
+    assert facts == {"kind": "datagrams_dropped", "reason": "bad_tag", "who": "b", "count": 6000, "duration_s": 60.0}
+
+
+def test_lasting_drops_have_further_lines(recorder: Recorder, summary: DropSummary) -> None:
+    """The line has the totals so far, and is a warning as the first one."""
+    for second in range(int(1.5 * HOUR_S)):
+        summary.add("frames_refused", Refusal.MESSAGE_NOT_ALLOWED, "b", 2, float(second), Header(30, 7, 1))
+        summary.check(float(second))
+    (_, (event, facts)) = recorder.lines
+    assert (event, facts["kind"], facts["count"], facts["duration_s"]) == (
+        "drops_continued",
+        "frames_refused",
+        2 * HOUR_S + 2,
+        HOUR_S,
+    )
+    assert facts["last"] == "ATTITUDE of system 7"
+
+
+def test_what_a_policy_withholds_is_logged_once_per_start(recorder: Recorder, summary: DropSummary) -> None:
+    """A role that withholds telemetry for a day causes one line for each reason, and is counted."""
+    for second in range(24 * int(HOUR_S)):
+        summary.add("frames_withheld", Refusal.MESSAGE_NOT_ALLOWED, "b", 10, float(second), Header(30, 7, 1))
+        summary.check(float(second))
+    summary.close()
+    ((event, facts),) = recorder.lines
+    assert (event, facts["reason"], facts["who"]) == ("info: frames_withheld", "message_not_allowed", "b")
+    assert summary.totals == {"message_not_allowed": 24 * HOUR_S * 10}
+    summary.forget("b")  # it has another policy now
+    summary.add("frames_withheld", Refusal.MESSAGE_NOT_ALLOWED, "b", 10, 1e6, Header(30, 7, 1))
+    assert len(recorder.lines) == 2
+
+
+def test_withheld_hidden_frame_is_a_warning(recorder: Recorder, summary: DropSummary) -> None:
+    """No policy withholds it by design: a sender attacks."""
+    summary.add_refused("b", Header(30, 7, 1), Refusal.HIDDEN_FRAME, 1.0, to_them=True)
+    assert recorder.lines[0][0] == "frames_withheld"
+
+
+@pytest.mark.parametrize("reason", sorted(EVERYDAY))
+def test_everyday_drops_are_logged_only_if_they_persist(
+    recorder: Recorder, summary: DropSummary, reason: str
+) -> None:
+    """A lost response or a restarted peer causes some of them at once, or one in a while."""
+    for minute in range(60):
+        for _ in range(30):
+            summary.add("datagrams_dropped", reason, "b", 1, 60.0 * minute)
+        summary.check(60.0 * minute)
+    assert recorder.lines == []
+    for second in range(3600, 3600 + PERSISTENT_S):
+        summary.add("datagrams_dropped", reason, "b", 1, float(second))
+    ((event, facts),) = recorder.lines
+    assert (event, facts["count"]) == ("datagrams_dropped", 60 * 30 + PERSISTENT_S)
+    summary.add("datagrams_dropped", reason, "b", 1, 3700.0)
+    summary.close()
+    assert recorder.lines[1][1]["count"] == 60 * 30 + PERSISTENT_S + 1
+
+
+@pytest.mark.parametrize("reason", sorted(SECURITY))
+def test_security_drops_are_logged_at_once(recorder: Recorder, summary: DropSummary, reason: str) -> None:
+    """Also while everyday drops of the same peer have used up its lines."""
+    for number in range(LINES_BURST + 10):
+        summary.add("sends_failed", f"E{number}", "b", 1, 1.0)
+    assert len(recorder.lines) == LINES_BURST
+    summary.add("datagrams_dropped", reason, "b", 1, 1.0)
+    assert recorder.lines[-1][1]["reason"] == reason
+
+
+def test_frames_without_a_session_are_counted_only(recorder: Recorder, summary: DropSummary) -> None:
+    """The line of the lost peer explains them."""
+    for second in range(1000):
+        summary.add_dropped(Dropped(DropReason.NO_SESSION, Named("b"), None, 3), float(second))
+    summary.close()
+    assert recorder.lines == []
+    assert summary.totals == {"no_session": 3000}
+
+
+def test_reasons_and_peers_are_separate(recorder: Recorder, summary: DropSummary) -> None:
+    """A flood of one reason hides neither another reason nor another peer."""
+    for name in ("drone1", "drone2"):
+        for reason in (DropReason.BAD_TAG, DropReason.REPLAYED):
+            summary.add("datagrams_dropped", reason, name, 2, 100.0)
+    assert recorder.counts() == [2, 2, 2, 2]
+
+
+@pytest.mark.parametrize("name", ["b", "b (previous key)"])
+def test_removed_peer_has_its_totals_written(recorder: Recorder, summary: DropSummary, name: str) -> None:
+    """Under its previous keys too. Other peers continue."""
+    for peer in (name, "c"):
+        summary.add("datagrams_dropped", DropReason.BAD_TAG, peer, 5, 1.0)
+    summary.forget("b")
+    assert [(event, facts["who"]) for event, facts in recorder.lines[2:]] == [("info: drops_ended", name)]
+    summary.add("datagrams_dropped", DropReason.BAD_TAG, "c", 5, 2.0)
+    summary.close()
+    assert recorder.lines[-1][1]["count"] == 10
+
+
+def test_system_errors_of_the_loop_are_summed(recorder: Recorder, summary: DropSummary) -> None:
+    """A system error that only the loop knows is summed up; any other error keeps its traceback."""
+    handled: list[dict[str, object]] = []
+    loop = cast(asyncio.AbstractEventLoop, SimpleNamespace(default_exception_handler=handled.append))
+    for _ in range(100):
+        summary.on_loop_failure(loop, {"message": "accept() failed", "exception": OSError(errno.EMFILE, "full")})
+    ((event, facts),) = recorder.lines
+    assert (event, facts["reason"], facts["last"]) == ("connections_failed", "EMFILE", "accept() failed")
+    assert handled == []
+    mistake = {"message": "a mistake", "exception": KeyError("x")}
+    summary.on_loop_failure(loop, mistake)
+    assert handled == [mistake]

@@ -1,0 +1,148 @@
+"""The evidence and the counters behind findings: what they count for, when they expire, and their bounds."""
+
+from __future__ import annotations
+
+import errno
+import os
+from typing import Any
+
+import pytest
+
+from tests.core.harness import PLAIN
+from tests.policies import TRUSTED
+from uavlinkd.config import PeerConfig
+from uavlinkd.core.crypto import Secret
+from uavlinkd.core.drops import DropReason
+from uavlinkd.core.node import Node
+from uavlinkd.core.outputs import Dropped
+from uavlinkd.core.path import Path
+from uavlinkd.core.settings import PeerSettings
+from uavlinkd.link.evidence import EVIDENCE_S, MAX_DETAILS, PLACES_S, REPORTED, Evidence
+from uavlinkd.link.history import MAX_FORMER_KEYS, REMEMBERED_S, History, RecentGrowth
+from uavlinkd.link.peer_link import PeerLink
+from uavlinkd.system.addresses import Address
+
+HOST = "192.0.2.2"
+THERE = (HOST, 5790)
+OWN_KEY = bytes([7]) * 32
+
+
+class Scene:
+    """One peer, configured at :data:`THERE`, and the evidence about it."""
+
+    def __init__(self) -> None:
+        self.links: dict[str, PeerLink] = {}
+        self.evidence = Evidence(self.links, OWN_KEY)
+        self.node = Node(Secret(bytes([1]) * 32), os.urandom, 0.0)
+        self.link = self.add("drone1", bytes([2]) * 32, [THERE])
+
+    def add(self, name: str, key: bytes, addresses: list[tuple[str, int]]) -> PeerLink:
+        """Another peer, at these addresses."""
+        config = PeerConfig(PeerSettings(name, key, None, PLAIN), tuple(Address(*a) for a in addresses), TRUSTED)
+        link = self.links[name] = PeerLink(config, self.node, lambda outputs: None, 0.0)
+        link.peers.append(self.node.add_peer(config.settings, 0.0))
+        link.set_paths([Path(0, address) for address in addresses], 0.0)
+        return link
+
+    def drop(self, address: tuple[str, int], now: float, detail: bytes | str = b"key") -> None:
+        """An initiation by an unknown key came from there."""
+        self.evidence.add_dropped(Dropped(DropReason.UNKNOWN_PEER, None, Path(0, address), 1, detail), now)
+
+    def seen(self, link: PeerLink, now: float) -> Any:
+        """What counts for a peer."""
+        return self.evidence.seen(DropReason.UNKNOWN_PEER, link, now)
+
+
+@pytest.fixture
+def scene() -> Scene:
+    return Scene()
+
+
+@pytest.mark.parametrize("address", [THERE, (HOST, 40000)], ids=["its address", "another port of its host"])
+def test_evidence_from_the_host_of_a_peer_counts_until_it_expires(scene: Scene, address: tuple[str, int]) -> None:
+    """Other ports count too: a router or a restart changes them."""
+    scene.drop(address, 10.0)
+    assert scene.seen(scene.link, 10.0 + EVIDENCE_S).address == address
+    assert scene.seen(scene.link, 10.1 + EVIDENCE_S) is None
+    scene.drop(address, 100.0, b"other")
+    assert list(scene.seen(scene.link, 100.0).details) == [b"other"]
+    assert scene.seen(scene.link, 100.0).count == 1
+
+
+def test_evidence_from_elsewhere_counts_for_no_peer(scene: Scene) -> None:
+    """It counts for no configured address."""
+    scene.drop(("198.51.100.1", 5790), 10.0)
+    assert scene.seen(scene.link, 10.0) is None
+    elsewhere = scene.evidence.seen_elsewhere(DropReason.UNKNOWN_PEER, 10.0)
+    assert elsewhere is not None
+    assert elsewhere.address == ("198.51.100.1", 5790)
+
+
+def test_evidence_at_an_address_is_not_that_of_another_peer_of_its_host(scene: Scene) -> None:
+    """Two peers behind one router have different ports."""
+    other = scene.add("drone2", bytes([3]) * 32, [(HOST, 5791)])
+    scene.drop(THERE, 10.0)
+    assert scene.seen(scene.link, 10.0) is not None
+    assert scene.seen(other, 10.0) is None
+
+
+def test_a_flood_takes_no_memory(scene: Scene) -> None:
+    """Many sources, keys and ports: one entry for each kind and configured place."""
+    for number in range(5000):
+        scene.drop((f"198.51.{number // 250}.{number % 250}", number), 10.0, number.to_bytes(32, "big"))
+        scene.drop((HOST, number), 10.0, number.to_bytes(32, "big"))
+    assert len(scene.evidence._sightings) == 2
+    assert len(scene.seen(scene.link, 10.0).details) == MAX_DETAILS
+
+
+def test_evidence_of_a_removed_peer_is_forgotten(scene: Scene) -> None:
+    """With the next evidence after a second."""
+    scene.drop(THERE, 10.0)
+    del scene.links["drone1"]
+    scene.drop(THERE, 10.0 + PLACES_S)
+    assert [place for _, place in scene.evidence._sightings] == [()]
+
+
+def test_other_keys_do_not_hide_the_own_one(scene: Scene) -> None:
+    """An attacker can make initiations by any number of keys of its own."""
+    scene.drop(THERE, 10.0, OWN_KEY)
+    for number in range(100):
+        scene.drop(THERE, 11.0, number.to_bytes(32, "big"))
+    assert scene.evidence.own_key_elsewhere == (10.0, THERE)
+    assert OWN_KEY not in scene.seen(scene.link, 11.0).details
+
+
+def test_errors_of_sending_and_icmp_differ(scene: Scene) -> None:
+    """What this kernel refuses is certain, what a message reports is a hint."""
+    scene.evidence.add_failure("EPERM", THERE, 1.0)
+    scene.evidence.add_failure("ENOMEM", None, 1.0)
+    scene.evidence.add_report(errno.ECONNREFUSED, THERE, 2.0)
+    scene.evidence.add_report(9999, THERE, 2.0)
+    for kind in ("EPERM", f"{REPORTED}ECONNREFUSED", f"{REPORTED}OSError"):
+        assert scene.evidence.seen(kind, scene.link, 3.0) is not None
+    assert scene.evidence.seen("ECONNREFUSED", scene.link, 3.0) is None
+    assert scene.evidence.seen_anywhere("ENOMEM", 3.0) is not None
+
+
+def test_growth_is_remembered_and_begins_again() -> None:
+    """A counter that restarts at zero counts from there; one that is quiet for long is forgotten."""
+    growth = RecentGrowth[str]()
+    assert growth.update({"a": 3, "b": 1}, 0.0) == {"a": 3, "b": 1}
+    assert growth.update({"a": 3, "b": 1}, 1.0) == {}
+    assert growth.update({"a": 5, "b": 1}, 2.0) == {"a": 2}
+    assert growth.within(1.0, 2.0) == {"a": 5}
+    assert growth.within(2.0, 2.0) == {"a": 5, "b": 1}
+    assert growth.update({"a": 1}, 3.0) == {"a": 1}
+    assert growth.within(1.0, 3.0) == {"a": 6}
+    growth.update({"a": 1, "c": 1}, 4.0 + REMEMBERED_S)
+    assert set(growth._recent) == {"c"}
+
+
+def test_former_keys_are_bounded() -> None:
+    """The oldest is forgotten first; one that is replaced again is the newest."""
+    history = History(0.0)
+    for number in [*range(MAX_FORMER_KEYS), 0, MAX_FORMER_KEYS]:
+        history.add_former_key(bytes([number]), "drone1")
+    assert len(history.former_keys) == MAX_FORMER_KEYS
+    assert bytes([0]) in history.former_keys
+    assert bytes([1]) not in history.former_keys

@@ -1,0 +1,240 @@
+"""What the pilot is shown, and when: severe texts first, one a second, nothing that is not true any more."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from tests.core.harness import KEY_B, Pair, quiet
+from tests.daemon.frames import command_long, heartbeat
+from uavlinkd.config import PeerConfig
+from uavlinkd.core.refusals import RefusalReport, Refused
+from uavlinkd.core.settings import PeerSettings
+from uavlinkd.link.peer_link import PeerLink
+from uavlinkd.link.pilot_notes import PilotNotes
+from uavlinkd.mavlink.frames import SplitCounters, split_payload
+from uavlinkd.mavlink.routing import SystemComponent
+from uavlinkd.mavlink.status_text import TEXT_BYTES, Note, TextSeverity
+
+ARM = Refused(76, 400, 2, 1)
+
+
+class Cockpit:
+    """One link, whose state a test sets, and the notes about it."""
+
+    def __init__(self, name: str = "drone1", **policy: object) -> None:
+        policy = {"role": "swarm-member", "system_ids": "all"} | policy
+        self.pair = Pair().establish()
+        config = PeerConfig(PeerSettings(name, KEY_B.public, None, quiet()), (), policy)
+        self.link = PeerLink(config, self.pair.a.node, lambda _: None, 0.0)
+        self.link.peers.append(self.pair.a.peer)
+        self.addresses: list[SystemComponent] = [(1, 1)]
+        self.notes = PilotNotes(lambda _: self.addresses)
+        self.next(0.0)
+
+    def next(self, now: float) -> Note | None:
+        """The next text."""
+        return self.notes.next([self.link], now)
+
+    def set_up(self, is_up: bool) -> None:
+        """The link comes or goes."""
+        self.link.peer.is_up = is_up
+
+    def claim(self, now: float, *refused: Refused) -> None:
+        """The peer reports."""
+        self.link.peer.refusal_claims.note(RefusalReport(refused), now)
+
+    def withhold(self, *raws: bytes) -> None:
+        """Frames to the peer meet its policy."""
+        for frame in split_payload(b"".join(raws), SplitCounters()):
+            self.link.policy.outgoing.check(frame, 0.0)
+
+
+def test_a_healthy_link_is_silent() -> None:
+    """Also one that comes up for the first time."""
+    cockpit = Cockpit()
+    cockpit.set_up(False)
+    fresh = PilotNotes(lambda _: [(1, 1)])
+    assert fresh.next([cockpit.link], 0.0) is None
+    cockpit.set_up(True)
+    assert [fresh.next([cockpit.link], float(second)) for second in range(1, 20)] == [None] * 19
+
+
+def test_lost_and_restored() -> None:
+    """Each once."""
+    cockpit = Cockpit()
+    cockpit.set_up(False)
+    assert cockpit.next(1.0) == Note(TextSeverity.CRITICAL, "link to drone1 lost", 1)
+    assert cockpit.next(2.0) is None
+    cockpit.set_up(True)
+    assert cockpit.next(3.0) == Note(TextSeverity.NOTICE, "link to drone1 restored", 1)
+    assert cockpit.next(4.0) is None
+
+
+def test_texts_that_are_not_true_any_more_are_dropped() -> None:
+    """Freshness is verified again before its text had its turn."""
+    cockpit = Cockpit()
+    cockpit.set_up(False)
+    cockpit.link.peer.unverified_since = 1.0
+    assert cockpit.next(1.0) == Note(TextSeverity.CRITICAL, "link to drone1 lost", 1)
+    cockpit.link.peer.unverified_since = None
+    assert cockpit.next(2.0) is None
+
+
+def test_one_a_second_and_severe_ones_first() -> None:
+    """A lost link comes before unverified frames, and these before a withheld command."""
+    cockpit = Cockpit()
+    cockpit.claim(0.5, ARM)
+    cockpit.link.peer.unverified_since = 0.5
+    cockpit.set_up(False)
+    texts = [note.text if (note := cockpit.next(1.0 + 0.5 * half)) else "" for half in range(8)]
+    assert texts == [
+        "link to drone1 lost",
+        "",
+        "link to drone1: age of commands unverified",
+        "",
+        "drone1: (DIS)ARM withheld there, role or list",
+        *[""] * 3,
+    ]
+
+
+@pytest.mark.parametrize(
+    ("refused", "text"),
+    [
+        (ARM, "drone1: (DIS)ARM withheld there, role or list"),
+        (Refused(75, 22, 4, 1), "drone1: TAKEOFF withheld there, role or list"),
+        (Refused(76, 176, 1, 1), "drone1: SET_MODE withheld there, system id"),
+        (Refused(76, 65000, 9, 1), "drone1: 65000 withheld there, too many"),
+        (Refused(23, 0, 200, 1), "drone1: PARAM_SET withheld there, policy"),
+        (Refused(0, 0, 8, 1), None),
+        (Refused(30, 0, 2, 1), None),
+        (Refused(253, 0, 2, 1), None),
+        (Refused(0xFFFFFF, 0, 2, 1), None),
+    ],
+)
+def test_only_what_a_pilot_sent_on_purpose(refused: Refused, text: str | None) -> None:
+    """Commands, parameters, missions and setpoints; no heartbeats, reports and unknown messages."""
+    cockpit = Cockpit()
+    cockpit.claim(0.5, refused)
+    note = cockpit.next(1.0)
+    assert (note and note.text) == text
+
+
+@pytest.mark.parametrize("is_here", [True, False])
+def test_commands_before_the_first_look(is_here: bool) -> None:
+    """A daemon looks once a second: a command may be withheld before it looks for the first time."""
+    cockpit = Cockpit()
+    cockpit.notes = PilotNotes(lambda _: cockpit.addresses)
+    if is_here:
+        cockpit.withhold(command_long(400, 255))
+    else:
+        cockpit.claim(0.5, ARM)
+    assert cockpit.next(1.0) is None
+    note = cockpit.next(2.0)
+    assert note is not None
+    assert "(DIS)ARM withheld" in note.text
+
+
+def test_commands_withheld_here() -> None:
+    """This end's own policy: with its role."""
+    cockpit = Cockpit()
+    cockpit.withhold(command_long(400, 255), heartbeat(9))
+    assert cockpit.next(1.0) == Note(TextSeverity.WARNING, "drone1: (DIS)ARM withheld here, role swarm-member", 1)
+    lists = Cockpit(role="all", deny_out=["MAV_CMD_NAV_TAKEOFF"])
+    lists.link.config = replace(lists.link.config, policy={})
+    lists.withhold(command_long(22, 255))
+    assert lists.next(1.0) == Note(TextSeverity.WARNING, "drone1: TAKEOFF withheld here, role or list", 1)
+
+
+@pytest.mark.parametrize("name", ["d", "n" * 14, "n" * 64])
+def test_texts_fit(name: str) -> None:
+    """A long name is cut, not the reason."""
+    cockpit = Cockpit(name)
+    cockpit.claim(0.5, Refused(76, 31014, 4, 1))  # a command with a long name
+    note = cockpit.next(1.0)
+    assert note is not None
+    assert len(note.text) <= TEXT_BYTES
+    assert note.text.endswith(" withheld there, role or list")
+
+
+def test_a_hostile_peer_cannot_fill_the_screen() -> None:
+    """It claims new refusals each second: one text in ten seconds, and a lost link comes at once."""
+    cockpit, shown = Cockpit(), []
+    for second in range(1, 100):
+        cockpit.claim(float(second), *(Refused(76, 400 + second * 16 + place, 2, 1) for place in range(16)))
+        if note := cockpit.next(second + 0.5):
+            shown.append(second)
+    assert shown == list(range(1, 100, 10))
+    cockpit.set_up(False)
+    note = cockpit.next(101.0)
+    assert note is not None
+    assert note.severity is TextSeverity.CRITICAL
+
+
+def test_the_vehicle_behind_the_link() -> None:
+    """Its autopilot's system, as received last; else the only one that the policy allows; else the text waits."""
+    cockpit = Cockpit()
+    cockpit.addresses = [(9, 191), (7, 1)]
+    cockpit.set_up(False)
+    note = cockpit.next(1.0)
+    assert note is not None
+    assert note.system == 7
+    cockpit.addresses = []
+    cockpit.set_up(True)
+    note = cockpit.next(2.0)
+    assert note is not None
+    assert note.system == 7
+
+    alone = Cockpit(system_ids=[3])
+    alone.addresses = []
+    alone.set_up(False)
+    note = alone.next(1.0)
+    assert note is not None
+    assert note.system == 3
+
+    unknown = Cockpit()
+    unknown.notes = PilotNotes(lambda _: unknown.addresses)
+    unknown.addresses = []
+    unknown.next(0.0)
+    unknown.set_up(False)
+    assert unknown.next(1.0) is None
+    unknown.addresses = [(4, 154)]
+    note = unknown.next(2.0)
+    assert note is not None
+    assert note.system == 4
+
+
+def test_a_text_does_not_wait_for_long() -> None:
+    """After ten seconds it is dropped."""
+    cockpit = Cockpit()
+    cockpit.notes = PilotNotes(lambda _: cockpit.addresses)
+    cockpit.addresses = []
+    cockpit.next(0.0)
+    cockpit.set_up(False)
+    assert cockpit.next(1.0) is None
+    cockpit.addresses = [(1, 1)]
+    assert cockpit.next(11.5) is None
+
+
+def test_removed_peer() -> None:
+    """Nothing about it is shown any more, and a new one of its name begins without history."""
+    cockpit = Cockpit()
+    cockpit.notes.next([], 1.0)
+    cockpit.set_up(False)
+    assert cockpit.next(2.0) is None
+    other = Cockpit()
+    other.set_up(False)
+    assert cockpit.notes.next([other.link], 3.0) is None
+
+
+def test_claims_do_not_hide_what_is_withheld_here() -> None:
+    """A peer that claims something new each second: each own text is shown all the same, and at once."""
+    cockpit, shown = Cockpit(), []
+    for second in range(1, 61):
+        cockpit.claim(float(second), Refused(76, 22, 4, second))
+        if second % 20 == 7:
+            cockpit.withhold(command_long(400, 255))
+        if (note := cockpit.next(float(second))) and "withheld here" in note.text:
+            shown.append(second)
+    assert shown == [7, 27, 47]

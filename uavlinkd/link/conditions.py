@@ -1,0 +1,229 @@
+"""Conditions in the log: one line at the beginning, fewer and fewer while it lasts, and one at the end.
+
+A condition is a kind of drop, a link problem, or a finding. It is open from its first occurrence
+until it did not occur for its quiet time. A condition that soon begins again has a longer quiet time, so a problem
+that comes and goes all day causes a few lines, not two each time.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass
+from enum import Enum
+from typing import Generic, TypeVar
+
+from uavlinkd.core.limits import TokenBucket
+
+HOUR_S = 3600.0
+"""A condition that lasts has a line after an hour, then after two more, four more and so on, up to a day."""
+LONGEST_INTERVAL_S = 24 * HOUR_S
+GROWTH = 10
+"""A security condition has an early line if it occurred this many times as often since its last line as that line
+added. So a few datagrams, which keep it open, cannot hide a flood."""
+GROWTH_FROM = 1000
+"""Occurrences since its last line that are worth an early one."""
+EARLY_S = 600.0
+"""No early line comes sooner after the last one."""
+QUIET_S = 60.0
+"""A condition has ended when it did not occur for this long. If it begins again within :data:`HOUR_S`, this time is
+doubled, up to :data:`HOUR_S`."""
+
+LINES_PER_S = 1 / 300
+"""The average limit of one peer or endpoint, for each kind of line. An attacker with a peer's key can cause
+handshakes and new paths, and a client of a ``tcpin`` can connect repeatedly."""
+LINES_BURST = 40
+TOTAL_LINES_PER_S = 1 / 30
+"""The average limit of all peers or endpoints together, for each kind of line."""
+TOTAL_BURST = 1000
+"""A fleet of 200 that starts needs three lines for each peer."""
+
+K = TypeVar("K", bound=Hashable)
+
+
+class Phase(Enum):
+    """Which line of a condition it is."""
+
+    BEGAN = "began"
+    CONTINUED = "continued"
+    ENDED = "ended"
+
+
+@dataclass(slots=True)
+class OpenCondition:
+    """One condition that is open. Times are monotonic seconds."""
+
+    began_at: float
+    seen_at: float
+    """When it occurred last."""
+    quiet_s: float
+    line_at: float
+    """When its next line is due while it lasts."""
+    count: int = 0
+    """All occurrences since it began."""
+    is_logged: bool = False
+    """Whether its first line was written."""
+    counted: int = 0
+    """The count of its previous line."""
+    gained: int = 0
+    """What the previous line added to the count."""
+    interval_s: float = HOUR_S
+    """From its previous line to the next one."""
+
+    def has_grown(self, now: float) -> bool:
+        """Whether it occurs far more often than its previous line says."""
+        is_early = now < self.line_at - self.interval_s + EARLY_S
+        return not is_early and self.count - self.counted >= max(GROWTH_FROM, GROWTH * self.gained)
+
+    def note_line(self, now: float) -> None:
+        """A line is written now."""
+        self.gained, self.counted = self.count - self.counted, self.count
+        self.line_at = now + self.interval_s
+
+    @property
+    def duration_s(self) -> float:
+        """From the first to the latest occurrence."""
+        return round(self.seen_at - self.began_at, 1)
+
+
+class LineLimits:
+    """The limits on lines that others can cause: of each peer or endpoint, and in total.
+
+    Each kind of line has its own limits, and security lines have separate ones, which everyday lines cannot use up.
+    The next line of a name has the count of its omitted lines.
+    """
+
+    def __init__(self) -> None:
+        self._limits: dict[tuple[str, str, bool], TokenBucket] = {}
+        self._totals: dict[tuple[str, bool], TokenBucket] = {}
+        self._omitted: Counter[tuple[str, str]] = Counter()
+
+    def take(self, kind: str, name: str, now: float, *, is_security: bool = False) -> dict[str, int] | None:
+        """The field with the count of omitted lines; None if this line exceeds a limit."""
+        limit = self._limits.get((kind, name, is_security))
+        if limit is None:
+            limit = self._limits[kind, name, is_security] = TokenBucket(LINES_PER_S, LINES_BURST, now)
+        total = self._totals.get((kind, is_security))
+        if total is None:
+            total = self._totals[kind, is_security] = TokenBucket(TOTAL_LINES_PER_S, TOTAL_BURST, now)
+        if not (limit.has(now) and total.take(now)):
+            return None
+        limit.take(now)
+        return self.pop_omitted(kind, name)
+
+    def pop_omitted(self, kind: str, name: str) -> dict[str, int]:
+        """The field with the count of omitted lines, for a line that is written in any case."""
+        omitted = self._omitted.pop((kind, name), 0)
+        return {"omitted_before": omitted} if omitted else {}
+
+    def omit(self, kind: str, name: str) -> None:
+        """A line was omitted."""
+        self._omitted[kind, name] += 1
+
+    def forget(self, is_forgotten: Callable[[str], bool]) -> None:
+        """Forget the names that the configuration no longer has."""
+        for key in [key for key in self._limits if is_forgotten(key[1])]:
+            del self._limits[key]
+        for kind, name in [key for key in self._omitted if is_forgotten(key[1])]:
+            del self._omitted[kind, name]
+
+
+class Conditions(Generic[K]):
+    """The open conditions of one kind, by key. Keys come from closed lists and the configuration: memory is bounded.
+
+    ``write`` gets a line that is within the limits: key, phase, condition, and the field of omitted lines.
+    ``name_of`` is the peer or endpoint whose limit applies. The first line of a security condition since the start of
+    the daemon is never omitted. ``counts_events``: counts are of what occurred, not of looks at what lasts.
+    """
+
+    def __init__(
+        self,
+        kind: str,
+        limits: LineLimits,
+        write: Callable[[K, Phase, OpenCondition, dict[str, int]], None],
+        *,
+        name_of: Callable[[K], str],
+        is_security: Callable[[K], bool] = lambda _: False,
+        counts_events: bool = False,
+        quiet_s: float = QUIET_S,
+    ) -> None:
+        self._kind = kind
+        self._limits = limits
+        self._write = write
+        self._name_of = name_of
+        self._is_security = is_security
+        self._counts_events = counts_events
+        self._quiet_s = quiet_s
+        self._open: dict[K, OpenCondition] = {}
+        self._ended: dict[K, tuple[float, float]] = {}  # when, and with which quiet time
+        self._known: set[K] = set()  # those that were logged at least once
+
+    def __contains__(self, key: K) -> bool:
+        return key in self._open
+
+    def note(self, key: K, now: float, count: int = 1) -> None:
+        """The condition occurs now: ``count`` times, or still."""
+        condition = self._open.get(key)
+        if condition is not None:
+            condition.count += count
+            condition.seen_at = now
+            return
+        condition = self._open[key] = OpenCondition(now, now, self._quiet_after(key, now), now, count)
+        self._begin(key, condition, now)
+
+    def check(self, now: float) -> None:
+        """Write the lines that are due. Call it about once a second."""
+        # What begins is more urgent than what has ended.
+        for key, condition in sorted(self._open.items(), key=lambda item: item[1].is_logged):
+            if now - condition.seen_at >= condition.quiet_s:
+                self._end(key, condition, now)
+            elif not condition.is_logged:
+                self._begin(key, condition, now)
+            elif (now >= condition.line_at or self._is_flood(key, condition, now)) and (
+                omitted := self._take(key, now)
+            ) is not None:
+                if now >= condition.line_at:
+                    condition.interval_s = min(LONGEST_INTERVAL_S, 2 * condition.interval_s)
+                condition.note_line(now)
+                self._write(key, Phase.CONTINUED, condition, omitted)
+
+    def close(self, is_closed: Callable[[K], bool] = lambda _: True) -> None:
+        """End conditions at once: the daemon stops, or their peer was removed. Their totals are written."""
+        for key in [key for key in self._open if is_closed(key)]:
+            condition = self._open.pop(key)
+            phase = Phase.ENDED if condition.is_logged else Phase.BEGAN
+            self._write(key, phase, condition, self._limits.pop_omitted(self._kind, self._name_of(key)))
+        for key in [key for key in self._known if is_closed(key)]:
+            self._known.remove(key)
+            self._ended.pop(key, None)
+
+    def _quiet_after(self, key: K, now: float) -> float:
+        ended_at, quiet_s = self._ended.pop(key, (now - HOUR_S, self._quiet_s))
+        return min(HOUR_S, 2 * quiet_s) if now - ended_at < HOUR_S else self._quiet_s
+
+    def _begin(self, key: K, condition: OpenCondition, now: float) -> None:
+        if key not in self._known and self._is_security(key):
+            omitted: dict[str, int] | None = self._limits.pop_omitted(self._kind, self._name_of(key))
+        else:
+            omitted = self._take(key, now)
+        if omitted is not None:
+            self._known.add(key)
+            condition.is_logged = True
+            condition.note_line(now)
+            self._write(key, Phase.BEGAN, condition, omitted)
+
+    def _is_flood(self, key: K, condition: OpenCondition, now: float) -> bool:
+        return self._counts_events and condition.has_grown(now) and self._is_security(key)
+
+    def _end(self, key: K, condition: OpenCondition, now: float) -> None:
+        if not condition.is_logged:
+            self._limits.omit(self._kind, self._name_of(key))
+        elif (omitted := self._take(key, now)) is not None:
+            self._write(key, Phase.ENDED, condition, omitted)
+        else:  # the line waits until the limit permits it
+            return
+        del self._open[key]
+        self._ended[key] = now, condition.quiet_s
+
+    def _take(self, key: K, now: float) -> dict[str, int] | None:
+        return self._limits.take(self._kind, self._name_of(key), now, is_security=self._is_security(key))

@@ -1,0 +1,222 @@
+"""Why a link is down: what is certain on this machine, then hints from the network, then silence.
+
+Any sender can forge a hint. So each hint names its source and a remedy that is safe if the hint is forged: no remedy
+accepts a key, a name or an address because it arrived.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Final, Protocol
+
+from uavlinkd.config import Config
+from uavlinkd.config.keys import encode_key
+from uavlinkd.core.drops import DropReason
+from uavlinkd.core.path import SocketAddress
+from uavlinkd.link.evidence import REPORTED, Evidence, Sighting
+from uavlinkd.link.history import History
+from uavlinkd.link.peer_link import PeerLink
+from uavlinkd.link.peer_sockets import PeerSockets
+from uavlinkd.ops.causes import Cause
+from uavlinkd.ops.findings import Finding, Subject
+from uavlinkd.system.addresses import Address
+from uavlinkd.system.error_meanings import meaning_of
+
+CONFIRM_S: Final = 2.0
+"""A handshake that is not complete after this time is reported."""
+_UNROUTED: Final = ("ENETUNREACH", "EHOSTUNREACH", "ENETDOWN", "EADDRNOTAVAIL", "EINVAL", "EMSGSIZE", "EAFNOSUPPORT")
+"""Errors of sending that are certain: this machine's kernel reports them at once."""
+_UNREACHABLE: Final = ("EHOSTUNREACH", "ENETUNREACH", "EACCES")
+"""Errors that ICMP messages report, except a closed port."""
+
+
+class Network(Protocol):
+    """The parts of a daemon that know about its links."""
+
+    config: Config
+    links: dict[str, PeerLink]
+    peer_sockets: PeerSockets
+    evidence: Evidence
+    history: History
+
+
+def finding(cause: Cause, subject: Subject, name: str, text: str, remedy: str) -> Finding:
+    """A finding with the severity of its cause."""
+    return Finding(cause, cause.severity, subject, name, text, remedy)
+
+
+def link_down(daemon: Network, link: PeerLink, now: float) -> list[Finding]:
+    """Why a peer is not up: a line for each cause with evidence; without any, one about its silence."""
+    certain = [*_configured(daemon, link), *_not_sent(daemon, link, now)]
+    findings = [*certain, *_reported(daemon, link, now), *_hints(daemon, link, now)]
+    if not findings and link.is_overdue(now):
+        findings.append(_silence(daemon, link))
+    return findings
+
+
+# Certain: this machine.
+
+
+def _configured(daemon: Network, link: PeerLink) -> Iterator[Finding]:
+    name, sockets = link.name, daemon.peer_sockets
+    if names := sorted(sockets.unresolved.get(name, ())):
+        remedy = f"see `getent hosts {names[0]}`, or write an IP address; the daemon tries again each second"
+        yield _about(Cause.NAME_NOT_RESOLVED, name, f"{', '.join(names)} has no address now", remedy)
+    for path in link.peers[0].initiator.paths:
+        if path.host.startswith("fe80:") and path.address[-1] == 0:  # of a name: a file must have the interface
+            text = f"{shown(path.address)} is valid on one interface only, and names none"
+            remedy = f'write it with its interface, as in "[{path.host}%wlan0]:{path.address[1]}"'
+            yield _about(Cause.ZONE_MISSING, name, text, remedy)
+    if name in sockets.without_socket:
+        text = f"no address in listen is of the family of {_addresses(link)}"
+        yield _about(Cause.FAMILY_MISSING, name, text, 'add "[::]:5790" to listen for IPv6, "0.0.0.0:5790" for IPv4')
+
+
+def _not_sent(daemon: Network, link: PeerLink, now: float) -> Iterator[Finding]:
+    if (sighting := _seen(daemon, "EPERM", link, now)) is not None:
+        text = f"this machine refuses to send to {_at(sighting)} (EPERM)"
+        remedy = "allow outgoing UDP from the daemon's port: see `sudo nft list ruleset`"
+        yield _about(Cause.FIREWALL_HERE, link.name, text, remedy)
+    if daemon.peer_sockets.absent_addresses():
+        return  # reported once, for the daemon
+    for error in _UNROUTED:
+        if (sighting := _seen(daemon, error, link, now)) is not None:
+            yield _about(
+                Cause.NO_ROUTE,
+                link.name,
+                f"this machine cannot send to {_at(sighting)} ({error})",
+                meaning_of(error),
+            )
+            return
+
+
+# Hints: anything here may be forged.
+
+
+def _reported(daemon: Network, link: PeerLink, now: float) -> Iterator[Finding]:
+    if (sighting := _seen(daemon, f"{REPORTED}ECONNREFUSED", link, now)) is not None:
+        text = f"no process listens at {_at(sighting)}, or a firewall there rejects (ICMP)"
+        remedy = f"start uavlinkd at {link.name}, and compare its `listen` with `addresses` here"
+        yield _about(Cause.NO_LISTENER, link.name, text, remedy)
+    for error in _UNREACHABLE:
+        if (sighting := _seen(daemon, REPORTED + error, link, now)) is not None:
+            text = f"the network reports that {_at(sighting)} is not reachable ({error})"
+            remedy = (
+                f"switch {link.name} on, and compare its address with `addresses` here; see `ip route get ADDRESS`"
+            )
+            yield _about(Cause.HOST_UNREACHABLE, link.name, text, remedy)
+            return
+
+
+def _hints(daemon: Network, link: PeerLink, now: float) -> Iterator[Finding]:
+    if (sighting := _handshake_seen(daemon, DropReason.UNKNOWN_PEER, link, now)) is not None:
+        yield from _other_key(daemon, link, sighting)
+    if (sighting := _handshake_seen(daemon, DropReason.BAD_MAC1, link, now)) is not None:
+        yield _our_key_there(daemon, link, sighting)
+    psk = _seen(daemon, DropReason.BAD_HANDSHAKE, link, now)
+    if psk is not None:
+        text = f"the response from {_at(psk)} does not authenticate: the PSKs differ, or only one end has one"
+        remedy = "give both ends the same psk_file; never remove a PSK: the message may be forged"
+        yield _about(Cause.WRONG_PSK, link.name, text, remedy)
+    if (sighting := _seen(daemon, DropReason.SUITE_NOT_ACCEPTED, link, now)) is not None:
+        offered = ", ".join(str(suite) for suite in sighting.details)
+        accepted = ", ".join(suite.name for suite in link.config.settings.link.suites)
+        text = f"it offers the suite {offered}; this end accepts {accepted}"
+        remedy = (
+            f"write this end's suites at {link.name}, or stronger ones at both ends; never weaker ones: an old"
+            " recording can cause this"
+        )
+        yield _about(Cause.NO_COMMON_SUITE, link.name, text, remedy)
+    elif psk is None and now - link.silent_since >= CONFIRM_S and _has_unconfirmed(link):
+        text = "it initiates, and does not confirm this daemon's responses"
+        remedy = f"compare the PSKs; let UDP from this daemon through the firewall at {link.name}"
+        yield _about(Cause.NOT_CONFIRMED, link.name, text, remedy)
+
+
+def _other_key(daemon: Network, link: PeerLink, sighting: Sighting) -> Iterator[Finding]:
+    name, keys = link.name, [key for key in sighting.details if isinstance(key, bytes)]
+    former = [key for key in keys if key in daemon.history.former_keys or key == link.config.previous_public_key]
+    if former:
+        key = encode_key(former[-1])
+        text = f"a sender at {_at(sighting)} uses the former key {key}, or an attacker replays an old recording"
+        remedy = f"carry the new files to {name} and restart it; if the former key was stolen, this may be the thief"
+        yield _about(Cause.FORMER_KEY, name, text, remedy)
+    if others := [encode_key(key) for key in keys if key not in former and key != daemon.config.public_key]:
+        which = "the key" if len(others) == 1 else f"{len(others)} keys, so at least one is not {name}:"
+        text = f"a sender at {_at(sighting)} uses {which} {', '.join(others)}, which this file does not have"
+        remedy = (
+            f"run `uavlinkd pubkey` at {name}, and write into this file what that prints: a key that arrives proves"
+            " nothing. After a change of keys, restart it with its new files"
+        )
+        yield _about(Cause.WRONG_KEY_HERE, name, text, remedy)
+
+
+def _our_key_there(daemon: Network, link: PeerLink, sighting: Sighting) -> Finding:
+    name, own = link.name, daemon.config.name
+    if sighting.address is not None and daemon.peer_sockets.is_own(sighting.address):
+        text = f"{_at(sighting)} in addresses leads to this daemon itself"
+        return _about(Cause.OWN_ADDRESS, name, text, f"write the address of {name}")
+    text = f"a sender at {_at(sighting)} does not know this daemon's public key: that end may have another key for it"
+    remedy = (
+        f'at {name}, write public_key = "{encode_key(daemon.config.public_key)}" for {own}; if its key file was'
+        " replaced, restart this daemon"
+    )
+    return _about(Cause.WRONG_KEY_THERE, name, text, remedy)
+
+
+def _silence(daemon: Network, link: PeerLink) -> Finding:
+    name = link.name
+    if link.config.addresses:
+        text = f"no answer from {_addresses(link)}: it is off, a firewall drops UDP, or addresses or keys differ"
+        remedy = (
+            f"run `uavlinkd status` at {name}: it names the cause if datagrams arrive there; else open its firewall"
+        )
+        return _about(Cause.NO_ANSWER, name, text, remedy)
+    text = f"{name} has not connected, and this file has no address of it"
+    remedy = f"start {name}, and write this daemon's address into its file, or its address into this one"
+    return _about(Cause.NOT_CONNECTING, name, text, remedy)
+
+
+# Evidence about one link.
+
+
+def _seen(daemon: Network, kind: str, link: PeerLink, now: float) -> Sighting | None:
+    """Evidence since the link went down."""
+    sighting = daemon.evidence.seen(kind, link, now)
+    return None if sighting is None or sighting.last_at < link.silent_since else sighting
+
+
+def _handshake_seen(daemon: Network, reason: DropReason, link: PeerLink, now: float) -> Sighting | None:
+    """The same; of a peer without addresses, from any sender while it is the only such peer that is not up."""
+    if link.config.addresses:
+        return _seen(daemon, reason, link, now)
+    waiting = [other for other in daemon.links.values() if not other.config.addresses and not other.peer.is_up]
+    sighting = daemon.evidence.seen_elsewhere(reason, now) if len(waiting) == 1 else None
+    return None if sighting is None or sighting.last_at < link.silent_since else sighting
+
+
+def _has_unconfirmed(link: PeerLink) -> bool:
+    return any(peer.sessions.unconfirmed for peer in link.peers)
+
+
+def _about(cause: Cause, name: str, text: str, remedy: str) -> Finding:
+    return finding(cause, Subject.PEER, name, text, remedy)
+
+
+def _at(sighting: Sighting) -> str:
+    return "its address" if sighting.address is None else shown(sighting.address)
+
+
+def shown(address: SocketAddress) -> str:
+    """An address for people."""
+    return str(Address.of(address))
+
+
+def _addresses(link: PeerLink) -> str:
+    return listed(map(str, link.config.addresses))
+
+
+def listed(names: Iterable[str], most: int = 4) -> str:
+    """The first names of a list that an attacker may make long."""
+    first = list(names)
+    return ", ".join(first[:most]) + (f" and {len(first) - most} more" if len(first) > most else "")

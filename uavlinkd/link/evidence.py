@@ -1,0 +1,149 @@
+"""What this end sees of peers that it is not linked with: dropped datagrams, and errors of sending.
+
+Most of it is not authentic: any sender can forge a datagram or an ICMP message with a peer's address. So it is a hint
+that an operator checks. It counts for :data:`EVIDENCE_S`, and only the place of a configured peer has entries of its
+own. All other places share one entry per kind, so that an attacker cannot use up memory.
+"""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Mapping
+from typing import Final
+
+from uavlinkd.core.drops import DropReason
+from uavlinkd.core.outputs import Dropped
+from uavlinkd.core.path import SocketAddress
+from uavlinkd.link.key_change import link_name
+from uavlinkd.link.peer_link import PeerLink
+
+EVIDENCE_S: Final = 30.0
+"""Evidence is forgotten after this time without more of it."""
+PLACES_S: Final = 1.0
+"""The places of the peers are looked up at most this often."""
+MAX_DETAILS: Final = 4
+"""Different details that one sighting remembers, such as public keys."""
+
+Place = tuple[object, ...]
+"""A configured peer, by name; an address or a host of one; or, empty, any other place."""
+ELSEWHERE: Final[Place] = ()
+
+REPORTED: Final = "icmp_"
+"""Before the name of an error that an ICMP message reported."""
+
+_HINTS: Final = frozenset(
+    {
+        *(DropReason.RAW_MAVLINK, DropReason.BAD_MAC1, DropReason.UNKNOWN_PEER, DropReason.BAD_HANDSHAKE),
+        *(DropReason.SUITE_NOT_ACCEPTED, DropReason.COOKIE_REQUIRED, DropReason.RATE_LIMITED),
+    }
+)
+
+
+class Sighting:
+    """One kind of evidence at one place."""
+
+    __slots__ = ("address", "count", "details", "first_at", "last_at")
+
+    def __init__(self, now: float) -> None:
+        self.count = 0
+        self.first_at = self.last_at = now
+        self.address: SocketAddress | None = None
+        """The latest source or destination."""
+        self.details: dict[bytes | str, None] = {}
+        """Different details, the latest last."""
+
+    def add(self, address: SocketAddress | None, detail: bytes | str, now: float) -> None:
+        """The same was seen again."""
+        if now - self.last_at > EVIDENCE_S:
+            self.count, self.first_at = 0, now
+            self.details.clear()
+        self.count += 1
+        self.last_at, self.address = now, address
+        if detail:
+            self.details.pop(detail, None)
+            if len(self.details) >= MAX_DETAILS:
+                del self.details[next(iter(self.details))]
+            self.details[detail] = None
+
+
+class Evidence:
+    """The latest evidence by kind and place. Times are monotonic seconds."""
+
+    def __init__(self, links: Mapping[str, PeerLink], own_key: bytes) -> None:
+        self._links = links
+        self._own_key = own_key
+        self.own_key_elsewhere: tuple[float, SocketAddress | None] | None = None
+        """When an initiation came last that only a holder of this daemon's private key can make, and from where.
+
+        Not among the other keys: an attacker could push it out with initiations by keys of its own.
+        """
+        self._sightings: dict[tuple[str, Place], Sighting] = {}
+        self._places: frozenset[Place] = frozenset()
+        self._placed_at = -PLACES_S
+
+    def add_dropped(self, dropped: Dropped, now: float) -> None:
+        """A datagram was dropped."""
+        reason, peer, path, _, detail = dropped
+        if reason in _HINTS:
+            address = None if path is None else path.address
+            if detail == self._own_key and reason is DropReason.UNKNOWN_PEER:
+                self.own_key_elsewhere = now, address
+                return
+            place = self._place(address, now) if peer is None else ("peer", link_name(peer.name))
+            self._add(reason, place, address, detail, now)
+
+    def add_failure(self, error: str, address: SocketAddress | None, now: float) -> None:
+        """The kernel refused to send to an address. ``error`` is its name, such as ``EPERM``. This is certain."""
+        self._add(error, self._place(address, now), address, "", now)
+
+    def add_report(self, number: int, address: SocketAddress, now: float) -> None:
+        """An ICMP message says that a datagram did not arrive. ``number``: the error that the kernel derives."""
+        self._add(REPORTED + errno.errorcode.get(number, "OSError"), self._place(address, now), address, "", now)
+
+    def seen(self, kind: str, link: PeerLink, now: float) -> Sighting | None:
+        """The newest evidence of this kind about a peer, or from its addresses or hosts."""
+        places = [("peer", link.name), *_places_of(link)]
+        return self._newest(kind, places, now)
+
+    def seen_elsewhere(self, kind: str, now: float) -> Sighting | None:
+        """The newest evidence of this kind from a place that is not a configured peer's."""
+        return self._newest(kind, [ELSEWHERE], now)
+
+    def seen_anywhere(self, kind: str, now: float) -> Sighting | None:
+        """The newest evidence of this kind."""
+        return self._newest(kind, [place for a_kind, place in self._sightings if a_kind == kind], now)
+
+    def _newest(self, kind: str, places: list[Place], now: float) -> Sighting | None:
+        sightings = [sighting for place in places if (sighting := self._sightings.get((kind, place))) is not None]
+        recent = [sighting for sighting in sightings if now - sighting.last_at <= EVIDENCE_S]
+        return max(recent, key=lambda sighting: sighting.last_at, default=None)
+
+    def _add(self, kind: str, place: Place, address: SocketAddress | None, detail: bytes | str, now: float) -> None:
+        sighting = self._sightings.get((kind, place))
+        if sighting is None:
+            sighting = self._sightings[kind, place] = Sighting(now)
+        sighting.add(address, detail, now)
+
+    def _place(self, address: SocketAddress | None, now: float) -> Place:
+        """The most exact configured place of an address."""
+        if address is None:
+            return ELSEWHERE
+        if now - self._placed_at >= PLACES_S:
+            self._find_places(now)
+        for place in (("address", address), ("host", address[0])):
+            if place in self._places:
+                return place
+        return ELSEWHERE
+
+    def _find_places(self, now: float) -> None:
+        """Look up where the peers are configured to be, and forget the sightings of all other places."""
+        self._placed_at = now
+        self._places = frozenset(place for link in self._links.values() for place in _places_of(link))
+        known = {ELSEWHERE, *self._places, *(("peer", name) for name in self._links)}
+        for key in [key for key in self._sightings if key[1] not in known]:
+            del self._sightings[key]
+
+
+def _places_of(link: PeerLink) -> list[Place]:
+    addresses = [path.address for path in link.peers[0].initiator.paths] if link.peers else []
+    return [*(("address", address) for address in addresses), *(("host", address[0]) for address in addresses)]
