@@ -1,1 +1,1 @@
-"""A whole fleet from one command: keys, pairwise secrets, and a complete configuration for each vehicle."""
+"""The keys and configurations of a whole fleet, made and maintained by one command."""

@@ -1,4 +1,4 @@
-"""The fleet commands: options in; what changed is told, and the exit status comes back."""
+"""The fleet commands: they take the parsed options, print the changes, and return the exit status."""
 
 from __future__ import annotations
 
@@ -6,29 +6,29 @@ import argparse
 import os
 import sys
 
-from uavlinkd.system.addresses import AddressError, parse_address
-from uavlinkd.fleet import operations as work
-from uavlinkd.fleet.manifest import Kind, Settings
-from uavlinkd.fleet.plan import FleetError, FleetFileError
+from uavlinkd.fleet import operations
+from uavlinkd.fleet.errors import FleetError, FleetFileError
+from uavlinkd.fleet.manifest import FleetSettings, MemberKind
 from uavlinkd.fleet.operations import Result
+from uavlinkd.system.addresses import AddressError, parse_address
 from uavlinkd.system.terminal import printable
 
 OK, FAILED, WRONG = 0, 1, 2
 
 
 def act(options: argparse.Namespace) -> int:
-    """Do what ``options.action`` names, and tell what has to be carried where."""
+    """Run ``options.action``, and print the fleet and what to do next."""
     try:
         result = _ACTIONS[options.action](options)
     except FleetError as error:
         print(printable(str(error), keep="\n"), file=sys.stderr)
         return FAILED if isinstance(error, FleetFileError) else WRONG
-    _tell(options, result)
+    _print_result(options, result)
     return OK
 
 
 def _init(options: argparse.Namespace) -> Result:
-    settings = Settings(
+    settings = FleetSettings(
         address_plan=options.address_plan,
         suite=options.suite,
         psk=options.psk,
@@ -37,7 +37,7 @@ def _init(options: argparse.Namespace) -> Result:
         ground_station_url=options.ground_station_url,
         observer_url=options.observer_url,
     )
-    return work.init(options.out, settings, options.drones, options.ground_stations, options.observers)
+    return operations.init(options.out, settings, options.drones, options.ground_stations, options.observers)
 
 
 def _add(options: argparse.Namespace) -> Result:
@@ -45,52 +45,78 @@ def _add(options: argparse.Namespace) -> Result:
         address = None if options.address is None else parse_address(options.address, allow_names=True)
     except AddressError as error:
         raise FleetError(f"--address: {error}") from None
-    return work.add(options.out, options.name, Kind(options.kind), address=address, system_id=options.system_id)
+    return operations.add(
+        options.out, options.name, MemberKind(options.kind), address=address, system_id=options.system_id
+    )
 
 
 def _remove(options: argparse.Namespace) -> Result:
-    return work.remove(options.out, options.name)
+    return operations.remove(options.out, options.name)
 
 
 def _rotate(options: argparse.Namespace) -> Result:
     if options.finish:
-        return work.finish_rotation(options.out, options.name)
-    return work.rotate(options.out, options.name, at_once=options.at_once)
+        if sys.stdin.isatty() and sys.stdout.isatty() and not options.yes:
+            _ask_before_finish(options.name)
+        return operations.finish_rotation(options.out, options.name)
+    return operations.rotate(options.out, options.name, at_once=options.at_once)
+
+
+def _ask_before_finish(name: str) -> None:
+    """Ask a person whether the old key is no longer in use.
+
+    Raises:
+        FleetError: the answer is not yes.
+    """
+    question = (
+        f"Was {name} restarted, and do all members have its new key? `uavlinkd status` on each shows it up. [y/N] "
+    )
+    if input(question).strip().lower() not in ("y", "yes"):
+        raise FleetError(f"nothing was changed: carry the files of the rotation first, and restart {name}")
 
 
 _ACTIONS = {"init": _init, "add": _add, "remove": _remove, "rotate": _rotate}
 
 
-def _tell(options: argparse.Namespace, result: Result) -> None:
-    """The fleet as a table, and what is to be done with it."""
-    rows = [("name", "kind", "id", "called at", "public key")]
+def _print_result(options: argparse.Namespace, result: Result) -> None:
+    """Print the fleet as a table, and what to do next."""
+    rows = [("name", "kind", "id", "address", "public key")]
     for member in result.fleet.members:
-        address = "(it calls)" if member.address is None else str(member.address)
-        key = f"{member.public_key[:8]}..." + (" (changing)" if member.previous_public_key else "")
+        address = "(initiates)" if member.address is None else str(member.address)
+        key = f"{member.public_key[:8]}..." + (" (rotating)" if member.previous_public_key else "")
         rows.append((member.name, member.kind.value, str(member.system_id), address, key))
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
         _print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
-    everybody = {each.name for each in result.fleet.members} <= set(result.changed)
-    changed = "every folder" if everybody else ", ".join(result.changed)
+    is_all = {member.name for member in result.fleet.members} <= set(result.changed)
+    changed = "all folders" if is_all else ", ".join(result.changed)
     if result.changed:
         _print(f"\nChanged in {options.out}: {changed}. Carry each to its owner so that no other person can read it.")
         _print(
-            "Set SYSID_THISMAV or MAV_SYS_ID of each autopilot, and the id of each ground program, to its id above:"
-            " as any other it is refused."
+            "Set SYSID_THISMAV or MAV_SYS_ID of each autopilot, and the id of each ground control station, to the id"
+            " above: peers refuse frames with another id."
         )
+        # The units make this folder.
+        is_service = result.fleet.settings.control_socket.startswith("/run/uavlinkd/{name}/")
+        start = "systemctl enable --now uavlinkd@NAME" if is_service else "uavlinkd run --config NAME.toml"
         _print(
-            "There: uavlinkd run --config NAME.toml; where a daemon runs already: uavlinkd reload, or SIGHUP"
-            " (a restart, where systemd hands it new keys)."
+            f"On each machine: {start}. If the daemon runs already: uavlinkd reload, or SIGHUP"
+            " (restart it if systemd gives it new keys)."
         )
     for note in result.notes:
         _print(note)
     if options.action == "rotate" and options.at_once:
-        _print(f"{options.name} needs a restart.")
+        _print(f"Restart {options.name}.")
     elif options.action == "rotate" and not options.finish:
-        _print(f"{options.name} needs a restart. In any order; then: uavlinkd fleet rotate {options.name} --finish")
+        _print(f"Carry the files in any order, and restart {options.name}. When all members have their files:")
+        _print(operations.finish_command(options.out, options.name))
+    elif options.action == "rotate":
+        _print(
+            f"The old key of {options.name} is revoked when the files arrive. If it was not restarted since the"
+            f" rotation, its links end then: restart {options.name} with its files before the others reload."
+        )
     if options.action == "remove" and os.path.exists(folder := options.out / options.name):
-        _print(f"{folder} was left: delete it when nothing in it is needed any more.")
+        _print(f"{folder} was kept: delete it when you no longer need it.")
 
 
 def _print(text: str) -> None:

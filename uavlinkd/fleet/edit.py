@@ -1,7 +1,7 @@
-"""Changes in a configuration that a person may have edited since: one section or a few lines, the rest stays.
+"""Changes in a configuration that the user may have edited: one section or a few lines, the rest is kept.
 
-The text is changed line by line, so comments and order stay; what came of it is then compared with the same change
-made to the parsed file, and refused where the two differ (a section inside a long string, say).
+The text is changed line by line, which keeps comments and order. The parsed result is then compared with the parsed
+original after the same change. If they differ, the change is refused: a multi-line string may contain a ``[[peer]]``.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ import tomllib
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
+from uavlinkd.fleet.errors import FleetError
 from uavlinkd.fleet.files import key_lines, public_key_lines
 from uavlinkd.fleet.manifest import Member
-from uavlinkd.fleet.plan import FleetError
 
 _HEADER = re.compile(r"[ \t]*\[")
 _KEY = re.compile(r"[ \t]*(?:\"([^\"]*)\"|'([^']*)'|([A-Za-z0-9_-]+))[ \t]*=")
@@ -25,29 +25,29 @@ Change = Callable[[str], str]
 
 
 def set_peer(text: str, section: str, name: str) -> str:
-    """The configuration with this section for a peer, in place of the one that it has, or at the end.
+    """Replace the section of a peer, or append it.
 
     Raises:
-        FleetError: the text is not such that it could be changed safely.
+        FleetError: the text cannot be changed safely.
     """
     (added,) = tomllib.loads(section)["peer"]
 
     def change(table: Table) -> None:
-        table["peer"] = [each for each in table.get("peer", []) if each.get("name") != name] + [added]
+        table["peer"] = [peer for peer in table.get("peer", []) if peer.get("name") != name] + [added]
 
     kept = _without(_sections(text), name)
     return _checked(text, "".join(kept).rstrip("\n") + "\n\n" + section, change)
 
 
 def remove_peer(text: str, name: str) -> str:
-    """The configuration without a peer.
+    """Delete the section of a peer.
 
     Raises:
-        FleetError: as :func:`set_peer`.
+        FleetError: the text cannot be changed safely.
     """
 
     def change(table: Table) -> None:
-        left = [each for each in table.get("peer", []) if each.get("name") != name]
+        left = [peer for peer in table.get("peer", []) if peer.get("name") != name]
         table.pop("peer", None)
         if left:
             table["peer"] = left
@@ -56,45 +56,45 @@ def remove_peer(text: str, name: str) -> str:
 
 
 def section_with_key(text: str, public_keys: Iterable[str]) -> str | None:
-    """Which ``[[peer]]`` of a configuration has one of these keys, present or previous; None for none."""
+    """The ``[[peer]]`` that contains one of these keys, as current or previous key; None without one."""
     unwanted = set(public_keys)
     try:
         peers = tomllib.loads(text).get("peer", [])
-    except ValueError:  # no daemon takes it
+    except ValueError:  # a daemon would refuse the file
         return None
-    for number, each in enumerate(peers if isinstance(peers, list) else []):
-        # As a daemon reads them: with spaces around a key it is the same key.
-        if isinstance(each, dict) and unwanted & {str(each.get(key)).strip() for key in _PUBLIC}:
-            return f"peer[{number}] ({each.get('name')})"
+    for number, peer in enumerate(peers if isinstance(peers, list) else []):
+        # A daemon ignores spaces around a key.
+        if isinstance(peer, dict) and unwanted & {str(peer.get(key)).strip() for key in _PUBLIC}:
+            return f"peer[{number}] ({peer.get('name')})"
     return None
 
 
 def set_public_keys(text: str, peer: Member) -> str:
-    """The configuration with a peer's keys as they are now.
+    """Replace the public keys of a peer by its current ones.
 
     Raises:
-        FleetError: as :func:`set_peer`; likewise where there is no such peer.
+        FleetError: the text cannot be changed safely, or has no such peer.
     """
     lines = public_key_lines(peer)
 
     def change(table: Table) -> None:
-        for each in table.get("peer", []):
-            if each.get("name") == peer.name:
-                _set_keys(each, _PUBLIC, lines)
+        for section in table.get("peer", []):
+            if section.get("name") == peer.name:
+                _set_keys(section, _PUBLIC, lines)
 
     sections = _sections(text)
-    found = [number for number, each in enumerate(sections) if _peer_name(each) == peer.name]
-    if len(found) != 1:
-        raise FleetError(f'it has no [[peer]] with the name "{peer.name}": write one, or move the file away')
-    sections[found[0]] = _with_lines(sections[found[0]], _PUBLIC, lines)
+    places = [number for number, section in enumerate(sections) if _peer_name(section) == peer.name]
+    if len(places) != 1:
+        raise FleetError(f'it has no [[peer]] with the name "{peer.name}": add it, or move the file away')
+    sections[places[0]] = _with_lines(sections[places[0]], _PUBLIC, lines)
     return _checked(text, "".join(sections), change)
 
 
 def set_private_keys(text: str, member: Member) -> str:
-    """The configuration with the names of the member's own key files as they are now.
+    """Replace the names of the member's own key files by the current ones.
 
     Raises:
-        FleetError: as :func:`set_peer`.
+        FleetError: the text cannot be changed safely.
     """
     lines = key_lines(member)
     sections = _sections(text)
@@ -109,7 +109,11 @@ def _set_keys(table: Table, keys: Sequence[str], lines: Sequence[str]) -> None:
 
 
 def _checked(before: str, after: str, change: Callable[[Table], None]) -> str:
-    """``after``, if it says what ``before`` says once changed."""
+    """``after``, if it parses to the same as ``before`` with the change.
+
+    Raises:
+        FleetError: it does not.
+    """
     try:
         table = tomllib.loads(before)
         change(table)
@@ -117,12 +121,12 @@ def _checked(before: str, after: str, change: Callable[[Table], None]) -> str:
     except (ValueError, TypeError, AttributeError):
         same = False
     if not same:
-        raise FleetError("it was edited in a way that cannot be kept: move it away, and it is written anew")
+        raise FleetError("its edits cannot be kept: move it away, and run the command again to write a new one")
     return after
 
 
 def _sections(text: str) -> list[str]:
-    """The text cut before each ``[`` or ``[[`` at the start of a line; the first piece is what stands before any."""
+    """The text, split before each line that starts with ``[``. The first piece is before any section."""
     pieces: list[list[str]] = [[]]
     for line in text.splitlines(keepends=True):
         if _HEADER.match(line):
@@ -132,11 +136,11 @@ def _sections(text: str) -> list[str]:
 
 
 def _without(sections: Sequence[str], name: str) -> list[str]:
-    return [each for each in sections if _peer_name(each) != name]
+    return [section for section in sections if _peer_name(section) != name]
 
 
 def _peer_name(section: str) -> object:
-    """The name of the peer that a section is about; None for other sections."""
+    """The name in a ``[[peer]]`` section; None for other sections."""
     try:
         peer = tomllib.loads(section).get("peer")
     except ValueError:
@@ -145,12 +149,12 @@ def _peer_name(section: str) -> object:
 
 
 def _with_lines(section: str, keys: Sequence[str], lines: Sequence[str]) -> str:
-    """The section with these lines where the first of the keys stood."""
+    """Replace the lines with these keys. The new lines are where the first of them was, or else at the end."""
     kept: list[str] = []
     at: int | None = None
     for line in section.splitlines(keepends=True):
-        found = _KEY.match(line)
-        if found is not None and next(filter(None, found.groups()), "") in keys:
+        match = _KEY.match(line)
+        if match is not None and next(filter(None, match.groups()), "") in keys:
             at = len(kept) if at is None else at
         else:
             kept.append(line)

@@ -1,45 +1,45 @@
-"""What stands in a member's folder: its configuration, as text for a person, and the names of its key files."""
+"""The files in a member's folder: the text of its configuration, and the names of its key files."""
 
 from __future__ import annotations
 
-from uavlinkd.system.addresses import Address
-from uavlinkd.fleet.manifest import ROLES, Fleet, Kind, Member, literal
+from uavlinkd.fleet.manifest import ROLES, Fleet, Member, MemberKind, literal
 from uavlinkd.fleet.plan import listen_address
+from uavlinkd.system.addresses import Address
 
 _ENDPOINT_NAMES = {
-    Kind.DRONE: "autopilot",
-    Kind.GROUND_STATION: "ground-control",
-    Kind.OBSERVER: "ground-control",
+    MemberKind.DRONE: "autopilot",
+    MemberKind.GROUND_STATION: "ground-control",
+    MemberKind.OBSERVER: "ground-control",
 }
 
 
 def config_file(member: Member) -> str:
-    """Of the configuration, in the member's folder."""
+    """The name of a member's configuration file."""
     return f"{member.name}.toml"
 
 
 def key_file(member: Member) -> str:
-    """Of the private key."""
+    """The name of its private key file."""
     return f"{member.name}.key"
 
 
 def previous_key_file(member: Member) -> str:
-    """Of the private key before, while it is being changed."""
+    """The name of the file with its previous private key, during a rotation."""
     return f"{member.name}.previous.key"
 
 
 def psk_file(other: Member) -> str:
-    """Of the key shared with another member."""
+    """The name of the file with the PSK that it shares with another member."""
     return f"{other.name}.psk"
 
 
 def write_config(fleet: Fleet, member: Member) -> str:
-    """A complete configuration."""
+    """The text of a member's configuration."""
     settings = fleet.settings
     listen = [] if member.address is None else [str(listen_address(member.address))]
     lines = [
-        f"# {member.name}, {_DESCRIPTIONS[member.kind]} of MAVLink system id {member.system_id}.",
-        "# Written by `uavlinkd fleet`; what you change here stays, other members' keys are kept up to date.",
+        f"# {member.name}, {_DESCRIPTIONS[member.kind]} with MAVLink system id {member.system_id}.",
+        "# Written by `uavlinkd fleet`. Later commands change keys and peers, and keep your other edits.",
         "",
         f"name = {literal(member.name)}",
         *key_lines(member),
@@ -54,21 +54,21 @@ def write_config(fleet: Fleet, member: Member) -> str:
         f"url = {literal(settings.url_of(member))}",
         f"system_ids = [{member.system_id}]",
     ]
-    if member.kind is Kind.OBSERVER:
+    if member.kind is MemberKind.OBSERVER:
         lines.append('role = "observer"')
     sections = ["\n".join(lines) + "\n", *(peer_section(fleet, member, peer) for peer in fleet.peers_of(member))]
     return "\n".join(sections)
 
 
 _DESCRIPTIONS = {
-    Kind.DRONE: "a drone",
-    Kind.GROUND_STATION: "a ground station",
-    Kind.OBSERVER: "an observer",
+    MemberKind.DRONE: "a drone",
+    MemberKind.GROUND_STATION: "a ground station",
+    MemberKind.OBSERVER: "an observer",
 }
 
 
 def key_lines(member: Member) -> list[str]:
-    """Which private keys it has."""
+    """The lines that name a member's private key files."""
     lines = [f"private_key_file = {literal(key_file(member))}"]
     if member.previous_public_key is not None:
         lines.append(f"previous_private_key_file = {literal(previous_key_file(member))}")
@@ -76,11 +76,11 @@ def key_lines(member: Member) -> list[str]:
 
 
 def peer_section(fleet: Fleet, member: Member, peer: Member) -> str:
-    """What a member's configuration says about another."""
+    """The ``[[peer]]`` section about another member."""
     addresses: list[Address] = [] if peer.address is None else [peer.address]
     lines = ["[[peer]]", f"name = {literal(peer.name)}", *public_key_lines(peer)]
     if addresses:
-        lines.append(f"addresses = {literal([str(each) for each in addresses])}")
+        lines.append(f"addresses = {literal([str(address) for address in addresses])}")
     if fleet.settings.psk:
         lines.append(f"psk_file = {literal(psk_file(peer))}")
     lines += [f"role = {literal(ROLES[member.kind, peer.kind])}", f"system_ids = [{peer.system_id}]"]
@@ -88,7 +88,7 @@ def peer_section(fleet: Fleet, member: Member, peer: Member) -> str:
 
 
 def public_key_lines(peer: Member) -> list[str]:
-    """By which keys it is known."""
+    """The lines with a peer's public keys."""
     lines = [f"public_key = {literal(peer.public_key)}"]
     if peer.previous_public_key is not None:
         lines.append(f"previous_public_key = {literal(peer.previous_public_key)}")

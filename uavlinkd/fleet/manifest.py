@@ -1,6 +1,6 @@
-"""The fleet's manifest: who belongs to it. Public facts only, so that it may lie in any repository.
+"""The fleet's manifest: its members and their public keys. It contains no secret and may be in a public repository.
 
-``fleet.toml`` is written last by every command: what it says is what the folders hold.
+Every command writes ``fleet.toml`` last, so that it describes what the folders contain.
 """
 
 from __future__ import annotations
@@ -14,11 +14,12 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-from uavlinkd.system.addresses import Address, AddressError, parse_address
-from uavlinkd.core.suites import SUITES_BY_NAME
-from uavlinkd.fleet.plan import DEFAULT_PLAN, SYSTEM_IDS, AddressPlan, FleetError, FleetFileError
-from uavlinkd.fleet.template import TemplateError, fill
 from uavlinkd.config.keys import decode_key
+from uavlinkd.core.suites import SUITES_BY_NAME
+from uavlinkd.fleet.errors import FleetError, FleetFileError, no_fleet
+from uavlinkd.fleet.plan import DEFAULT_PLAN, SYSTEM_IDS, AddressPlan
+from uavlinkd.fleet.template import TemplateError, fill
+from uavlinkd.system.addresses import Address, AddressError, parse_address
 from uavlinkd.system.terminal import printable
 
 FILE_NAME = "fleet.toml"
@@ -26,8 +27,8 @@ _TEMPLATES = ("control_socket", "drone_url", "ground_station_url", "observer_url
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}")
 
 
-class Kind(StrEnum):
-    """What a member is."""
+class MemberKind(StrEnum):
+    """The kinds of members."""
 
     DRONE = "drone"
     GROUND_STATION = "ground-station"
@@ -35,178 +36,180 @@ class Kind(StrEnum):
 
 
 ROLES = {
-    # (who reads, whom it is about): the role of the second in the first's configuration.
-    (Kind.DRONE, Kind.DRONE): "swarm-member",
-    (Kind.DRONE, Kind.GROUND_STATION): "operator",
-    (Kind.DRONE, Kind.OBSERVER): "observer",
-    (Kind.GROUND_STATION, Kind.DRONE): "vehicle",
-    (Kind.OBSERVER, Kind.DRONE): "vehicle",
+    # (member, peer): the role of the peer in the member's configuration.
+    (MemberKind.DRONE, MemberKind.DRONE): "swarm-member",
+    (MemberKind.DRONE, MemberKind.GROUND_STATION): "operator",
+    (MemberKind.DRONE, MemberKind.OBSERVER): "observer",
+    (MemberKind.GROUND_STATION, MemberKind.DRONE): "vehicle",
+    (MemberKind.OBSERVER, MemberKind.DRONE): "vehicle",
 }
-"""Who is linked with whom, and as what. Ground stations and observers have nothing to say to one another."""
+"""Which members are linked, and with which role. Ground stations and observers are not linked with each other."""
 
 
 @dataclass(frozen=True, slots=True)
 class Member:
-    """One vehicle, ground station or observer. ``previous_public_key``: accepted too, while its key changes."""
+    """One vehicle, ground station or observer. ``previous_public_key`` is also accepted during a rotation."""
 
     name: str
-    kind: Kind
+    kind: MemberKind
     system_id: int
     public_key: str
     address: Address | None = None
-    """Where others call it; None for one that only calls."""
+    """The address to which others initiate; None if only this member initiates."""
     previous_public_key: str | None = None
 
     @property
     def public_keys(self) -> tuple[str, ...]:
-        """By which others know it now."""
+        """The keys by which others accept it now."""
         return (self.public_key,) if self.previous_public_key is None else (self.public_key, self.previous_public_key)
 
     @property
     def is_drone(self) -> bool:
-        """Whether it flies."""
-        return self.kind is Kind.DRONE
+        """Whether it is a drone."""
+        return self.kind is MemberKind.DRONE
 
 
 @dataclass(frozen=True, slots=True)
-class Settings:
-    """What holds for all members. In URLs, ``{n}`` is the member's system id and ``{name}`` its name."""
+class FleetSettings:
+    """The settings of all members. In templates, ``{n}`` is the member's system id and ``{name}`` its name."""
 
     address_plan: str = DEFAULT_PLAN
     suite: str = "x25519"
     psk: bool = False
-    """Whether each pair shares a key of its own."""
+    """Whether each pair has a PSK."""
     control_socket: str = "{name}.sock"
     drone_url: str = "udpin:127.0.0.1:14550"
     ground_station_url: str = "udpout:127.0.0.1:14550"
     observer_url: str = "udpout:127.0.0.1:14550"
 
     def url_of(self, member: Member) -> str:
-        """Its local endpoint."""
+        """The URL of a member's endpoint."""
         template: str = getattr(self, f"{member.kind.value.replace('-', '_')}_url")
         return fill(template, member.system_id, member.name)
 
     def control_socket_of(self, member: Member) -> str:
-        """Where its daemon is asked."""
+        """The control socket of a member's daemon."""
         return fill(self.control_socket, member.system_id, member.name)
 
 
 @dataclass(frozen=True, slots=True)
 class Fleet:
-    """All members, in the order in which they came."""
+    """A fleet. ``members`` is in the order in which they were added."""
 
-    settings: Settings = field(default_factory=Settings)
+    settings: FleetSettings = field(default_factory=FleetSettings)
     members: tuple[Member, ...] = ()
 
     def member(self, name: str) -> Member:
-        """The member of this name.
+        """The member with this name.
 
         Raises:
-            FleetError: there is none.
+            FleetError: it does not exist.
         """
         for member in self.members:
             if member.name == name:
                 return member
-        there = ", ".join(each.name for each in self.members)
-        raise FleetError(f'there is no "{printable(name)}" in this fleet: it has {there or "no members"}')
+        names = ", ".join(member.name for member in self.members)
+        raise FleetError(f'this fleet has no "{printable(name)}": its members are {names or "none"}')
 
     def peers_of(self, member: Member) -> list[Member]:
-        """With whom it is linked."""
-        return [each for each in self.members if each.name != member.name and (member.kind, each.kind) in ROLES]
+        """The members with which it is linked."""
+        return [peer for peer in self.members if peer.name != member.name and (member.kind, peer.kind) in ROLES]
 
     def with_member(self, member: Member) -> Fleet:
-        """With one more, or with what it is now.
+        """Add a member, or replace the member with its name.
 
         Raises:
-            FleetError: another has its name, system id or address.
+            FleetError: another member has its system id or address.
         """
-        for each in self.members:
-            if each.name == member.name:
+        for other in self.members:
+            if other.name == member.name:
                 continue
-            if each.system_id == member.system_id:
-                raise FleetError(f"{member.name} would have the system id of {each.name}, {each.system_id}")
-            if each.address is not None and each.address == member.address:
-                raise FleetError(f"{member.name} would have the address of {each.name}, {each.address}")
-        if any(each.name == member.name for each in self.members):
-            members = tuple(member if each.name == member.name else each for each in self.members)
+            if other.system_id == member.system_id:
+                raise FleetError(f"{member.name} would have the system id of {other.name}, {other.system_id}")
+            if other.address is not None and other.address == member.address:
+                raise FleetError(f"{member.name} would have the address of {other.name}, {other.address}")
+        if any(other.name == member.name for other in self.members):
+            members = tuple(member if other.name == member.name else other for other in self.members)
         else:
             members = (*self.members, member)
         return Fleet(self.settings, members)
 
     def without(self, name: str) -> Fleet:
-        """Without one."""
-        return Fleet(self.settings, tuple(each for each in self.members if each.name != name))
+        """Remove a member."""
+        return Fleet(self.settings, tuple(member for member in self.members if member.name != name))
 
     def new_member(
-        self, name: str, kind: Kind, public_key: str, *, address: Address | None = None, system_id: int | None = None
+        self,
+        name: str,
+        kind: MemberKind,
+        public_key: str,
+        *,
+        address: Address | None = None,
+        system_id: int | None = None,
     ) -> Member:
-        """A member as the plan has it: drones count from 1 up, ground stations and observers from 255 down.
+        """Make a member. By default drones have the next system id from 1 up, others from 255 down.
 
         Raises:
-            FleetError: for a name that is none or taken, or a plan without room.
+            FleetError: the name is not valid or is taken, or there is no free system id or address.
         """
         if not _NAME.fullmatch(name):
             raise FleetError(
-                f'"{printable(name)}" is no name: write up to 63 letters, digits, dots, hyphens and underscores'
+                f'"{printable(name)}" is not a name: write up to 63 letters, digits, dots, hyphens and underscores'
             )
-        if any(each.name == name for each in self.members):
-            raise FleetError(f'there is a "{name}" in this fleet already')
-        taken = {each.system_id for each in self.members}
-        ids: Iterable[int] = SYSTEM_IDS if kind is Kind.DRONE else reversed(SYSTEM_IDS)
-        number = next((each for each in ids if each not in taken), None) if system_id is None else system_id
+        if any(member.name == name for member in self.members):
+            raise FleetError(f'this fleet has a "{name}" already')
+        taken = {member.system_id for member in self.members}
+        ids: Iterable[int] = SYSTEM_IDS if kind is MemberKind.DRONE else reversed(SYSTEM_IDS)
+        number = next((free for free in ids if free not in taken), None) if system_id is None else system_id
         if number is None or number not in SYSTEM_IDS:
             raise FleetError("a system id is a number from 1 to 255, and each member has its own")
         member = Member(name, kind, number, public_key, address)
-        if kind is not Kind.OBSERVER and address is None:
+        if kind is not MemberKind.OBSERVER and address is None:
             planned = AddressPlan.parse(self.settings.address_plan).address_of(member)
             member = Member(name, kind, number, public_key, planned)
         return member
 
 
-# The file.
-
-
 def write_manifest(fleet: Fleet) -> str:
-    """The manifest's text."""
+    """The text of a manifest."""
     lines = [
-        "# The fleet: public facts only. `uavlinkd fleet` reads and writes this file; the keys are in the folders.",
+        "# A fleet: public facts only. `uavlinkd fleet` reads and writes this file. The keys are in the folders.",
         "",
         "[fleet]",
     ]
-    lines += [f"{each.name} = {literal(getattr(fleet.settings, each.name))}" for each in fields(Settings)]
+    lines += [f"{key.name} = {literal(getattr(fleet.settings, key.name))}" for key in fields(FleetSettings)]
     for member in fleet.members:
         lines += ["", "[[member]]"]
-        for each in fields(Member):
-            value = getattr(member, each.name)
+        for key in fields(Member):
+            value = getattr(member, key.name)
             if value is not None:
-                lines.append(f"{each.name} = {literal(value if isinstance(value, int) else str(value))}")
+                lines.append(f"{key.name} = {literal(value if isinstance(value, int) else str(value))}")
     return "\n".join(lines) + "\n"
 
 
 def literal(value: object) -> str:
-    """A value as TOML has it: what JSON writes of text, numbers, truth and lists is TOML too."""
+    """A value in TOML. JSON writes strings, numbers, booleans and lists in the same way."""
     return json.dumps(value, ensure_ascii=False)
 
 
 def read_manifest(folder: Path) -> Fleet:
-    """The fleet of a folder.
+    """Read the manifest in a folder.
 
     Raises:
-        FleetError: there is none, or the file was damaged.
+        FleetError: there is no manifest, or it is damaged.
+        FleetFileError: it cannot be read.
     """
     path = folder / FILE_NAME
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise FleetError(
-            f"there is no fleet in {folder}: make one with `uavlinkd fleet init --out {folder}`"
-        ) from None
+        raise no_fleet(folder) from None
     except (OSError, ValueError, RecursionError) as error:
         if isinstance(error, OSError):
             raise FleetFileError(f"{path} cannot be read: {error.strerror}") from None
-        raise FleetError(f"{path} cannot be read: it is no TOML") from None
+        raise FleetError(f"{path} is not valid TOML: restore it from a copy") from None
     try:
-        fleet = Fleet(Settings(**table.pop("fleet")))
+        fleet = Fleet(FleetSettings(**table.pop("fleet")))
         check_settings(fleet.settings)
         for section in table.pop("member", []):
             fleet = fleet.with_member(_member(section))
@@ -215,21 +218,21 @@ def read_manifest(folder: Path) -> Fleet:
     except FleetError as error:
         raise FleetError(f"{path}: {error}") from None
     except (TypeError, ValueError, LookupError, AttributeError):
-        raise FleetError(f"{path} is no manifest as `uavlinkd fleet` writes it: put the written one back") from None
+        raise FleetError(f"{path} is not a manifest of `uavlinkd fleet`: restore it from a copy") from None
     return fleet
 
 
-def check_settings(settings: Settings) -> None:
-    """See that they can be what they say.
+def check_settings(settings: FleetSettings) -> None:
+    """Check the values of all settings.
 
     Raises:
-        FleetError: one cannot.
+        FleetError: one is not valid.
     """
-    for each in fields(Settings):
-        if not isinstance(getattr(settings, each.name), bool if each.name == "psk" else str):
-            raise FleetError(f"{each.name} has a value of the wrong kind")
+    for setting in fields(FleetSettings):
+        if not isinstance(getattr(settings, setting.name), bool if setting.name == "psk" else str):
+            raise FleetError(f"{setting.name} has a value of the wrong type")
     if settings.suite not in SUITES_BY_NAME:
-        raise FleetError(f'there is no suite "{settings.suite}": take one of {", ".join(SUITES_BY_NAME)}')
+        raise FleetError(f'the suite "{settings.suite}" does not exist: use one of {", ".join(SUITES_BY_NAME)}')
     AddressPlan.parse(settings.address_plan)
     for key in _TEMPLATES:
         template = getattr(settings, key)
@@ -245,14 +248,14 @@ def _member(section: dict[str, Any]) -> Member:
     address = section.pop("address", None)
     try:
         member = Member(
-            kind=Kind(section.pop("kind")),
+            kind=MemberKind(section.pop("kind")),
             address=None if address is None else parse_address(address, allow_names=True),
             **section,
         )
     except AddressError as error:
         raise FleetError(str(error)) from None
     if not (_NAME.fullmatch(member.name) and member.system_id in SYSTEM_IDS):
-        raise ValueError("no member")
+        raise ValueError("not a member")
     for key in (member.public_key, member.previous_public_key):
         if key is not None:
             decode_key(key)

@@ -1,4 +1,4 @@
-"""Templates of the fleet commands: text in which ``{n}`` and ``{name}`` stand for a member's number and name."""
+"""Templates of the fleet commands: text with ``{n}`` and ``{name}`` for a member's number and name."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ _BRACES = re.compile(r"\{n\}|\{name\}|[{}]")
 
 
 class TemplateError(ValueError):
-    """A template has something other than ``{n}`` and ``{name}`` in braces, or an unpaired brace."""
+    """A template contains braces other than ``{n}`` and ``{name}``."""
 
 
 def fill(template: str, number: int, name: str) -> str:
-    """Put a number and a name into a template. ``str.format`` is not used: it gives access to attributes.
+    """Replace ``{n}`` and ``{name}``. ``str.format`` would give access to attributes.
 
     Raises:
-        TemplateError: see there.
+        TemplateError: the template contains other braces.
     """
     values = {"{n}": str(number), "{name}": name}
 

@@ -1,0 +1,174 @@
+"""Changes of a fleet's files, made as a whole: if a step fails, all files are as before."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from uavlinkd.config import ConfigError, keys
+from uavlinkd.config.load import load_config
+from uavlinkd.fleet.errors import FleetError, FleetFileError
+from uavlinkd.fleet.files import config_file
+from uavlinkd.fleet.manifest import FILE_NAME, Fleet, Member, write_manifest
+
+
+@dataclass(slots=True)
+class FileChanges:
+    """The files that a command changes, by path. ``notes`` are sentences for the person who runs the command."""
+
+    secrets: dict[Path, str] = field(default_factory=dict)
+    """New key files."""
+    texts: dict[Path, str] = field(default_factory=dict)
+    """Configurations, which replace existing ones."""
+    moved: dict[Path, Path] = field(default_factory=dict)
+    """Files to rename, with their new paths."""
+    deleted: list[Path] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+
+def apply(changes: FileChanges, folder: Path, fleet: Fleet, checked: Sequence[Member] = ()) -> None:
+    """Write all changes and then the manifest, or leave every file as before.
+
+    The configurations of the members in ``checked`` must load afterwards.
+
+    Raises:
+        FleetError: one of them does not load.
+        FleetFileError: a file cannot be written.
+    """
+    rollback = Rollback()
+    texts: Mapping[Path, str] = {**changes.texts, folder / FILE_NAME: write_manifest(fleet)}
+    try:
+        # The steps that need disk space come first.
+        prepared = {path: rollback.prepare(path, text) for path, text in texts.items()}
+        for path in changes.deleted:
+            rollback.set_aside(path)
+        for path, to in changes.moved.items():
+            rollback.move(path, to)
+        for path, text in changes.secrets.items():
+            rollback.make_folder(path.parent)
+            keys.write_secret_file(path, text)
+            rollback.created.append(path)
+        for path, new in prepared.items():
+            rollback.replace(path, new)
+        check_members(folder, checked)
+    except BaseException as error:
+        rollback.undo()
+        if isinstance(error, OSError):
+            raise FleetFileError(f"{error.filename or folder} cannot be written: {error.strerror}") from None
+        if isinstance(error, keys.KeyFileError):
+            raise FleetFileError(str(error)) from None
+        raise
+    changes.notes += rollback.finish()
+
+
+class Rollback:
+    """The steps done so far, and how to undo them. Undoing only renames and deletes, because the disk may be full."""
+
+    def __init__(self) -> None:
+        self.created: list[Path] = []
+        self._moved: list[tuple[Path, Path]] = []  # from, to
+        self._set_aside: list[tuple[Path, Path]] = []
+        self._folders: list[Path] = []
+
+    def make_folder(self, folder: Path) -> None:
+        """Create a folder unless it exists."""
+        if not folder.exists():
+            folder.mkdir(mode=0o700)
+            self._folders.append(folder)
+
+    def move(self, path: Path, to: Path) -> None:
+        """Rename a file.
+
+        Raises:
+            FileExistsError: a file has that name already.
+        """
+        if to.exists():
+            raise FileExistsError(errno.EEXIST, "it exists: move it away", str(to))
+        path.rename(to)
+        self._moved.append((path, to))
+
+    def set_aside(self, path: Path) -> None:
+        """Give a file a temporary name. :meth:`finish` deletes it."""
+        if path.exists():
+            aside = _aside(path)
+            path.rename(aside)
+            self._set_aside.append((path, aside))
+
+    def prepare(self, path: Path, text: str) -> Path:
+        """Write the new content of a file to a temporary file beside it, and return its path."""
+        self.make_folder(path.parent)
+        new = path.with_name(f".{path.name}.new")
+        self.created.append(new)
+        with new.open("wb") as file:
+            file.write(text.encode())
+            file.flush()
+            os.fsync(file.fileno())
+        return new
+
+    def replace(self, path: Path, new: Path) -> None:
+        """Replace a file by a prepared one, atomically: a reader finds the old or the new content."""
+        if path.exists():
+            aside = _aside(path)
+            aside.unlink(missing_ok=True)
+            try:
+                aside.hardlink_to(path)
+            except OSError:  # a file system without hard links
+                path.rename(aside)
+            self._set_aside.append((path, aside))
+        else:
+            self.created.append(path)
+        new.rename(path)
+
+    def finish(self) -> list[str]:
+        """Delete the files that were set aside. Return a sentence about each that cannot be deleted."""
+        notes: list[str] = []
+        for _, aside in self._set_aside:
+            try:
+                aside.unlink()
+            except OSError as error:
+                notes.append(f"Delete {aside}: its content is no longer valid ({error.strerror}).")
+        return notes
+
+    def undo(self) -> None:
+        """Undo every step. If one cannot be undone, the others still are."""
+        for path in self.created:
+            with suppress(OSError):
+                path.unlink(missing_ok=True)
+        for path, other in reversed(self._moved + self._set_aside):
+            with suppress(OSError):
+                other.rename(path)
+                other.unlink(missing_ok=True)  # rename does nothing if both are hard links of one file
+        for folder in reversed(self._folders):
+            with suppress(OSError):
+                folder.rmdir()
+
+
+def _aside(path: Path) -> Path:
+    return path.with_name(f".{path.name}.old")
+
+
+def is_loadable(folder: Path, member: Member) -> bool:
+    """Whether a daemon would accept a member's files as they are here. Some may be on the vehicle only."""
+    try:
+        load_config(folder / member.name / config_file(member), {})
+    except ConfigError:
+        return False
+    return True
+
+
+def check_members(folder: Path, members: Iterable[Member]) -> None:
+    """Load the configurations of these members as their daemons would.
+
+    Raises:
+        FleetError: a daemon would refuse one; with every problem in it.
+    """
+    for member in members:
+        try:
+            load_config(folder / member.name / config_file(member), {})
+        except ConfigError as error:
+            problems = "\n".join(f"{member.name}: {problem.key}: {problem.message}" for problem in error.problems)
+            raise FleetError(f"the resulting configuration is not valid:\n{problems}") from None
