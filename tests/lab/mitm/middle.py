@@ -1,47 +1,60 @@
-"""A man in the middle in the simulated network: two nodes that know each other only at his addresses."""
+"""A man in the middle in the simulated network: two nodes that know each other only by its addresses."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Self
 
 from tests.network.network import Address, Drone, Network
 from uavlinkd.core.settings import Link
-from uavlinkd.lab.mitm.attack import NEVER, Action, AttackObject, Intervention, Surroundings, Way
-from uavlinkd.lab.mitm.channel import Channel
+from uavlinkd.lab.mitm.attack import NEVER, Action, AttackContext, AttackObject, Direction, Intervention
+from uavlinkd.lab.mitm.channel import AttackChannel
 
-Make = Callable[[Surroundings, float], Sequence[AttackObject]]
+Make = Callable[[AttackContext, float], Sequence[AttackObject]]
 
 
 class Middle:
-    """Stands between the drones of a network. Each pair of drones has two faces, one address for each of them."""
+    """A man in the middle between the drones of a network. Each pair has two listeners, one per drone."""
 
     def __init__(self, network: Network, *drones: Drone, knows_keys: bool = True) -> None:
         self.network = network
         self.drones = {drone.name: drone for drone in drones}
         keys = {drone.name: drone.public_key for drone in drones} if knows_keys else {}
-        self.surroundings = Surroundings.between(*self.drones, public_keys=keys)
-        self.channel = Channel(self.surroundings)
+        self.context = AttackContext.between(*self.drones, public_keys=keys)
+        self.channel = AttackChannel(self.context)
         self.interventions: list[Intervention] = []
         self.to_strangers: list[tuple[str, int, bytes]] = []
         self.bytes_to_strangers: dict[tuple[str, int], int] = {}
         self.bytes_from_strangers: dict[tuple[str, int], int] = {}
-        self._faces: dict[Address, Way] = {}
+        self._listeners: dict[Address, Direction] = {}
         self._waits_until = NEVER
-        for number, way in enumerate(self.surroundings.ways):
-            self._faces["192.0.2.1", 5800 + number] = way
-        for address in self._faces:
+        for number, direction in enumerate(self.context.directions):
+            self._listeners["192.0.2.1", 5800 + number] = direction
+        for address in self._listeners:
             network.attackers[address] = self
         for number in range(256):
             network.attackers[f"198.51.100.{number}", 6000] = self
 
-    def face(self, peer: str, other: str) -> Address:
+    @classmethod
+    def between(
+        cls, network: Network, link: Link | None = None, *, knows_keys: bool = True
+    ) -> tuple[Self, Drone, Drone]:
+        """Between two new drones, a and b, which have been started."""
+        a, b = network.add("a"), network.add("b", clock=1e6)
+        middle = cls(network, a, b, knows_keys=knows_keys)
+        middle.introduce(link)
+        a.start()
+        b.start()
+        return middle, a, b
+
+    def listener(self, peer: str, other: str) -> Address:
         """Where ``peer`` reaches ``other``."""
-        return next(address for address, way in self._faces.items() if way == Way(peer, other))
+        return next(address for address, direction in self._listeners.items() if direction == Direction(peer, other))
 
     def introduce(self, link: Link | None = None) -> None:
-        """Every drone knows every other, at its face."""
-        for way in self.surroundings.ways:
-            self.drones[way.sender].knows(self.drones[way.receiver], [self.face(*way)], link)
+        """Every drone knows all others by their listeners."""
+        for direction in self.context.directions:
+            self.drones[direction.sender].knows(self.drones[direction.receiver], [self.listener(*direction)], link)
 
     def attack(self, *attacks: AttackObject) -> None:
         """Do this from now on."""
@@ -49,14 +62,14 @@ class Middle:
         self._wait()
 
     def overhear(self, datagram: bytes, source: Address, destination: Address) -> None:
-        """Nothing is overheard: what a drone sends, it sends to us."""
+        """Do nothing: the drones send to us."""
 
     def receive(self, datagram: bytes, source: Address, destination: Address) -> None:
-        """A drone sent something to an address of ours."""
+        """A drone sent a datagram to one of our addresses."""
         now = self.network.now
-        way = self._faces.get(destination)
-        if way is not None:
-            self._perform(self.channel.on_datagram(datagram, way, now))
+        direction = self._listeners.get(destination)
+        if direction is not None:
+            self._perform(self.channel.on_datagram(datagram, direction, now))
             return
         peer = next(name for name, drone in self.drones.items() if source in drone.addresses)
         stranger = int(destination[0].rpartition(".")[2])
@@ -70,12 +83,16 @@ class Middle:
             if isinstance(action, Intervention):
                 self.interventions.append(action)
                 continue
-            datagram, way, stranger = action
-            source = self.face(way.receiver, way.sender) if stranger is None else (f"198.51.100.{stranger}", 6000)
+            datagram, direction, stranger = action
+            source = (
+                self.listener(direction.receiver, direction.sender)
+                if stranger is None
+                else (f"198.51.100.{stranger}", 6000)
+            )
             if stranger is not None:
-                key = (way.receiver, stranger)
+                key = (direction.receiver, stranger)
                 self.bytes_from_strangers[key] = self.bytes_from_strangers.get(key, 0) + len(datagram)
-            self.network.inject(datagram, source, self.drones[way.receiver].addresses[0])
+            self.network.inject(datagram, source, self.drones[direction.receiver].addresses[0])
         self._wait()
 
     def _wait(self) -> None:

@@ -8,50 +8,51 @@ from random import Random
 from uavlinkd.core.crypto import Secret, x25519_public_key
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Deliver, Output, Transmit
+from uavlinkd.core.path import Path
 from uavlinkd.core.settings import Link, PeerSettings
 from uavlinkd.core.suites import X25519, Suite
 from uavlinkd.lab.mitm.anatomy import mavlink_frame
-from uavlinkd.lab.mitm.attack import Action, AttackObject, Intervention, Send, Surroundings, Way
+from uavlinkd.lab.mitm.attack import Action, AttackContext, AttackObject, Direction, Intervention, Send
 
-AB = Way("a", "b")
-BA = AB.back
+AB = Direction("a", "b")
+BA = AB.reverse
 HEARTBEAT = mavlink_frame(0, bytes((0, 0, 0, 0, 2, 3, 81, 4, 3)), 50, system=1)
 ATTITUDE = mavlink_frame(30, bytes(range(1, 29)), 39, system=1)
 
 
 @dataclass
 class Conversation:
-    """What two nodes said to one another: a handshake, then envelopes each way."""
+    """The datagrams of two nodes: a handshake, then envelopes in both directions."""
 
     keys: dict[str, bytes]
-    said: list[tuple[bytes, Way]] = field(default_factory=list)
+    said: list[tuple[bytes, Direction]] = field(default_factory=list)
 
     @property
     def initiation(self) -> bytes:
         """Of a."""
-        return next(datagram for datagram, way in self.said if datagram[0] == 1 and way == AB)
+        return next(datagram for datagram, direction in self.said if datagram[0] == 1 and direction == AB)
 
     @property
     def response(self) -> bytes:
         """Of b."""
-        return next(datagram for datagram, way in self.said if datagram[0] == 2 and way == BA)
+        return next(datagram for datagram, direction in self.said if datagram[0] == 2 and direction == BA)
 
-    def envelopes(self, way: Way = AB) -> list[bytes]:
+    def envelopes(self, direction: Direction = AB) -> list[bytes]:
         """All of one direction, the confirmation first."""
-        return [datagram for datagram, each in self.said if datagram[0] == 0x40 and each == way]
+        return [datagram for datagram, sent_in in self.said if datagram[0] == 0x40 and sent_in == direction]
 
     @property
-    def surroundings(self) -> Surroundings:
+    def context(self) -> AttackContext:
         """Of an attacker who knows both public keys."""
-        return Surroundings.between("a", "b", public_keys=self.keys)
+        return AttackContext.between("a", "b", public_keys=self.keys)
 
 
 def converse(seed: int = 0, suite: Suite = X25519, frames: int = 40, *, confidential: bool = False) -> Conversation:
     """A link from its first initiation on, over a perfect network."""
-    chance = Random(f"conversation {seed}")
-    private = {name: chance.randbytes(32) for name in "ab"}
+    rng = Random(f"conversation {seed}")
+    private = {name: rng.randbytes(32) for name in "ab"}
     keys = {name: x25519_public_key(private[name]) for name in "ab"}
-    nodes = {name: Node(Secret(private[name]), chance.randbytes, 0.0) for name in "ab"}
+    nodes = {name: Node(Secret(private[name]), rng.randbytes, 0.0) for name in "ab"}
     link = Link(suites=(suite,), confidential=confidential)
     nodes["a"].add_peer(PeerSettings("b", keys["b"], link=link), 0.0)
     nodes["b"].add_peer(PeerSettings("a", keys["a"], link=link), 0.0)
@@ -62,32 +63,32 @@ def converse(seed: int = 0, suite: Suite = X25519, frames: int = 40, *, confiden
         receiver = "b" if sender == "a" else "a"
         for output in outputs:
             if isinstance(output, Transmit):
-                conversation.said.append((output.datagram, Way(sender, receiver)))
-                deliver(receiver, nodes[receiver].receive(output.datagram, (0, sender, 1), now))
+                conversation.said.append((output.datagram, Direction(sender, receiver)))
+                deliver(receiver, nodes[receiver].receive(output.datagram, Path(0, (sender, 1)), now))
             assert not isinstance(output, Deliver) or output.payload in (HEARTBEAT, ATTITUDE)
 
-    nodes["a"].set_addresses("b", [(0, "b", 1)], now)
+    nodes["a"].set_paths(nodes["a"].peers["b"], [Path(0, ("b", 1))], now)
     deliver("a", nodes["a"].handle_timeout(now))
     for number in range(frames):
         now += 0.02
         frame = HEARTBEAT if number % 10 == 0 else ATTITUDE
         for sender, receiver in ("ab", "ba"):
-            deliver(sender, nodes[sender].send(receiver, [frame], now))
+            deliver(sender, nodes[sender].send(nodes[sender].peers[receiver], [frame], now))
     return conversation
 
 
 def sends(actions: list[Action]) -> list[Send]:
     """Only what is sent."""
-    return [each for each in actions if isinstance(each, Send)]
+    return [action for action in actions if isinstance(action, Send)]
 
 
 def notes(actions: list[Action]) -> list[Intervention]:
-    """Only what is told."""
-    return [each for each in actions if isinstance(each, Intervention)]
+    """Only the log entries."""
+    return [action for action in actions if isinstance(action, Intervention)]
 
 
 def play(
-    attack: AttackObject, said: list[tuple[bytes, Way]], interval_s: float = 0.01, after_s: float = 5.0
+    attack: AttackObject, said: list[tuple[bytes, Direction]], interval_s: float = 0.01, after_s: float = 5.0
 ) -> list[Action]:
     """Let a recorded conversation go by an attack, and some time after it."""
     actions: list[Action] = []
@@ -98,11 +99,11 @@ def play(
             if attack.next_deadline() > until:
                 return
             actions.extend(attack.due(attack.next_deadline()))
-        raise AssertionError("the attack asks to be woken for ever")
+        raise AssertionError("the attack requests wake-ups indefinitely")
 
-    for datagram, way in said:
+    for datagram, direction in said:
         wait(now)
-        actions.extend(attack.on_datagram(datagram, way, now))
+        actions.extend(attack.on_datagram(datagram, direction, now))
         now += interval_s
     wait(now + after_s)
     return actions

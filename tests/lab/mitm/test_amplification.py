@@ -1,4 +1,4 @@
-"""More bytes back to an address than came from it are found, however many went unanswered before."""
+"""An answer larger than its request is detected, also after unanswered requests."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ def excess(back: int, *, questions: int, at: float = 0.0, answered_at: float = 0
     amplification = Amplification()
     for number in range(questions):
         amplification.sent("drone0", 3, 100, at + number / 1000)
-    amplification.came_back("drone0", 3, back, answered_at)
+    amplification.received("drone0", 3, back, answered_at)
     return amplification.excess["drone0", 3]
 
 
-@pytest.mark.parametrize(("back", "found"), [(0, 0), (100, 0), (101, 1), (200, 100)])
-def test_one_question_is_worth_its_own_size(back: int, found: int) -> None:
-    """An answer as long as the question is none; a byte more is."""
-    assert excess(back, questions=1) == found
+@pytest.mark.parametrize(("back", "result"), [(0, 0), (100, 0), (101, 1), (200, 100)])
+def test_one_question_is_worth_its_own_size(back: int, result: int) -> None:
+    """An answer as long as the request is not an amplification; one byte more is."""
+    assert excess(back, questions=1) == result
 
 
 def test_what_was_not_answered_long_ago_hides_nothing() -> None:
@@ -28,28 +28,28 @@ def test_what_was_not_answered_long_ago_hides_nothing() -> None:
     for number in range(1000):
         amplification.sent("drone0", 3, 100, number / 1000)
     amplification.sent("drone0", 3, 100, 1.0 + CREDIT_S)
-    amplification.came_back("drone0", 3, 200, 1.01 + CREDIT_S)
+    amplification.received("drone0", 3, 200, 1.01 + CREDIT_S)
     assert amplification.excess == {("drone0", 3): 100}
 
 
-def test_strangers_and_peers_are_told_apart() -> None:
-    """What one sent is no credit for another, nor of another peer."""
+def test_strangers_and_peers_are_distinguished() -> None:
+    """The bytes of one stranger are not a credit for another stranger or peer."""
     amplification = Amplification()
     amplification.sent("drone0", 3, 100, 0.0)
-    amplification.came_back("drone0", 4, 60, 0.1)
-    amplification.came_back("drone1", 3, 70, 0.1)
+    amplification.received("drone0", 4, 60, 0.1)
+    amplification.received("drone1", 3, 70, 0.1)
     assert amplification.excess == {("drone0", 4): 60, ("drone1", 3): 70}
 
 
 def test_several_answers_share_what_was_sent() -> None:
     """Two of sixty bytes are too much for one question of a hundred, and not for two."""
-    for questions, found in ((1, 20), (2, 0)):
+    for questions, result in ((1, 20), (2, 0)):
         amplification = Amplification()
         for _ in range(questions):
             amplification.sent("drone0", 3, 100, 0.0)
         for _ in range(2):
-            amplification.came_back("drone0", 3, 60, 0.1)
-        assert amplification.excess.total() == found
+            amplification.received("drone0", 3, 60, 0.1)
+        assert amplification.excess.total() == result
 
 
 def test_an_answer_may_take_so_long_and_no_longer() -> None:

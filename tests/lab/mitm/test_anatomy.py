@@ -11,7 +11,7 @@ from tests.lab.mitm.samples import ATTITUDE, HEARTBEAT, converse
 from uavlinkd.core.cookie import MacKeys
 from uavlinkd.core.suites import SUITES, Suite
 from uavlinkd.lab.mitm import anatomy
-from uavlinkd.lab.mitm.anatomy import Kind, envelope_of, kind_of, message_ids, parts_of, with_mac1
+from uavlinkd.lab.mitm.anatomy import DatagramKind, envelope_of, kind_of, message_ids, parts_of, with_mac1
 from uavlinkd.lab.mitm.attacks.forgery import _COMMANDS
 
 CONVERSATION = converse()
@@ -20,20 +20,20 @@ CONVERSATION = converse()
 @pytest.mark.parametrize(
     ("datagram", "kind"),
     [
-        (b"", Kind.EMPTY),
-        (b"\x01", Kind.INITIATION),
-        (b"\x02x", Kind.RESPONSE),
-        (b"\x03", Kind.COOKIE),
-        (b"\x40", Kind.ENVELOPE),
-        (b"\x41", Kind.ENVELOPE),
-        (b"\xfd", Kind.MAVLINK),
-        (b"\xfe", Kind.MAVLINK),
-        (b"\x00", Kind.OTHER),
-        (b"\x42", Kind.OTHER),
+        (b"", DatagramKind.EMPTY),
+        (b"\x01", DatagramKind.INITIATION),
+        (b"\x02x", DatagramKind.RESPONSE),
+        (b"\x03", DatagramKind.COOKIE),
+        (b"\x40", DatagramKind.ENVELOPE),
+        (b"\x41", DatagramKind.ENVELOPE),
+        (b"\xfd", DatagramKind.MAVLINK),
+        (b"\xfe", DatagramKind.MAVLINK),
+        (b"\x00", DatagramKind.OTHER),
+        (b"\x42", DatagramKind.OTHER),
     ],
 )
-def test_kind_is_told_by_the_first_byte(datagram: bytes, kind: Kind) -> None:
-    """The header's claim, whatever follows."""
+def test_first_byte_determines_the_kind(datagram: bytes, kind: DatagramKind) -> None:
+    """The first byte only, for any following bytes."""
     assert kind_of(datagram) is kind
 
 
@@ -55,7 +55,7 @@ def test_handshake_messages_of_every_suite_are_cut_and_joined_again(suite: Suite
 
 
 def test_mac1_is_the_one_that_the_receiver_checks() -> None:
-    """Made here with the public key alone, it passes the core's own check; without the key nothing is changed."""
+    """Made with the public key, it passes the core's check; without the key, the datagram is unchanged."""
     altered = CONVERSATION.initiation[:10] + b"x" + CONVERSATION.initiation[11:]
     repaired = with_mac1(altered, CONVERSATION.keys["b"])
     MacKeys(CONVERSATION.keys["b"]).check_mac1(repaired)
@@ -66,8 +66,8 @@ def test_mac1_is_the_one_that_the_receiver_checks() -> None:
 
 
 def test_frames_are_read_where_they_are_readable() -> None:
-    """In the authenticated mode the message numbers stand there for everyone; encrypted, none is read."""
-    readable = [message_ids(each) for each in CONVERSATION.envelopes()]
+    """In the authenticated mode the message IDs are readable; in the confidential mode they are not."""
+    readable = [message_ids(envelope) for envelope in CONVERSATION.envelopes()]
     assert (0,) in readable
     assert (30,) in readable
     header, tag = b"\x40\x00\x01\x00\x02", bytes(16)
@@ -98,7 +98,7 @@ def test_frames_of_the_attackers_own_are_mavlink() -> None:
 
 @given(st.binary(max_size=1400), st.sampled_from([None, bytes(32)]))
 def test_nothing_raises_whatever_the_bytes(data: bytes, key: bytes | None) -> None:
-    """Any bytes are described, and come back whole where they are not touched."""
+    """The functions accept any bytes, and unchanged parts join to the same bytes."""
     parts = parts_of(data)
     assert parts is None or parts.join() == data
     envelope_of(data)

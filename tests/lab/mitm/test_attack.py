@@ -9,11 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.lab.mitm.samples import AB, BA, converse, notes, play, sends
-from uavlinkd.lab.mitm.attack import NEVER, SHOTS_AT_ONCE, AttackError, Send, Surroundings, What
+from uavlinkd.lab.mitm.attack import CATCH_UP_LIMIT, NEVER, AttackContext, AttackError, Operation, Send
 from uavlinkd.lab.mitm.attacks import ATTACKS, parse_attack
 
 CONVERSATION = converse()
-AMONG_THREE = Surroundings.between("a", "b", "c", public_keys={name: bytes([9]) + bytes(31) for name in "abc"})
+AMONG_THREE = AttackContext.between("a", "b", "c", public_keys={name: bytes([9]) + bytes(31) for name in "abc"})
 
 
 @pytest.mark.parametrize("name", ATTACKS)
@@ -25,18 +25,18 @@ def test_same_seed_gives_the_same_actions(name: str) -> None:
 
 @pytest.mark.parametrize("text", ["bit-flip,share=0.5", "replay-data,origin=stranger", "flood-garbage", "forge-data"])
 def test_another_seed_gives_another_attack(text: str) -> None:
-    """Where chance plays a part, it follows from the seed."""
+    """The seed determines all random choices."""
     one, other = (play(parse_attack(text).make(AMONG_THREE, seed), CONVERSATION.said) for seed in (1, 2))
     assert one != other
 
 
 @pytest.mark.parametrize("name", ATTACKS)
 def test_attack_that_has_ended_lets_everything_pass(name: str) -> None:
-    """After its seconds the datagrams go on as they came, and nothing is sent beside them."""
+    """After its end, datagrams pass unaltered, and none is injected."""
     attack = parse_attack(f"{name},seconds=0.001,begin_s=0").make(AMONG_THREE, 1)
     attack.due(0.0)
-    for datagram, way in CONVERSATION.said:
-        assert attack.on_datagram(datagram, way, 10.0) == [Send(datagram, way)]
+    for datagram, direction in CONVERSATION.said:
+        assert attack.on_datagram(datagram, direction, 10.0) == [Send(datagram, direction)]
     assert not sends(attack.due(10.0))
     assert attack.next_deadline() == NEVER
 
@@ -45,66 +45,59 @@ def test_attack_that_has_ended_lets_everything_pass(name: str) -> None:
 def test_attack_that_has_not_begun_lets_everything_pass(name: str) -> None:
     """Before begin_s it only watches."""
     attack = parse_attack(f"{name},begin_s=100").make(AMONG_THREE, 1)
-    for datagram, way in CONVERSATION.said:
-        assert attack.on_datagram(datagram, way, 1.0) == [Send(datagram, way)]
+    for datagram, direction in CONVERSATION.said:
+        assert attack.on_datagram(datagram, direction, 1.0) == [Send(datagram, direction)]
     assert attack.due(1.0) == []
-    assert attack.strikes == 0
+    assert attack.attempts == 0
 
 
 def test_way_leaves_the_other_direction_alone() -> None:
     """One direction is attacked, the other passes untouched."""
-    attack = parse_attack("drop,way=b>a").make(CONVERSATION.surroundings)
-    passed = [(each.datagram, each.way) for each in sends(play(attack, CONVERSATION.said))]
-    assert passed == [each for each in CONVERSATION.said if each[1] == AB]
+    attack = parse_attack("drop,direction=b>a").make(CONVERSATION.context)
+    passed = [(send.datagram, send.direction) for send in sends(play(attack, CONVERSATION.said))]
+    assert passed == [item for item in CONVERSATION.said if item[1] == AB]
 
 
 def test_way_that_is_not_there_is_refused() -> None:
     """The message names those that are."""
     with pytest.raises(AttackError, match="a>b, b>a"):
-        parse_attack("drop,way=a>c").make(CONVERSATION.surroundings)
+        parse_attack("drop,direction=a>c").make(CONVERSATION.context)
 
 
 def test_skip_and_limit_choose_exactly() -> None:
     """skip=3,limit=2: the fourth and the fifth of those that could be attacked, no other."""
-    attack = parse_attack("drop,kinds=envelope,skip=3,limit=2").make(CONVERSATION.surroundings)
+    attack = parse_attack("drop,kinds=envelope,skip=3,limit=2").make(CONVERSATION.context)
     actions = play(attack, CONVERSATION.said)
-    passed = {each.datagram for each in sends(actions)}
+    passed = {send.datagram for send in sends(actions)}
     envelopes = [datagram for datagram, _ in CONVERSATION.said if datagram[0] == 0x40]
-    assert [each for each in envelopes if each not in passed] == envelopes[3:5]
-    assert [each.number for each in notes(actions)] == [6, 7]  # behind the two messages of the handshake
+    assert [envelope for envelope in envelopes if envelope not in passed] == envelopes[3:5]
+    assert [note.number for note in notes(actions)] == [6, 7]  # behind the two messages of the handshake
 
 
 def test_share_attacks_that_share() -> None:
     """Of 2,000 datagrams about a quarter, within five standard deviations."""
-    attack = parse_attack("drop,share=0.25").make(CONVERSATION.surroundings, 3)
+    attack = parse_attack("drop,share=0.25").make(CONVERSATION.context, 3)
     for number in range(2000):
         attack.on_datagram(b"\x40" + number.to_bytes(20, "big"), AB, 0.0)
-    assert abs(attack.strikes - 500) < 5 * math.sqrt(2000 * 0.25 * 0.75)
+    assert abs(attack.attempts - 500) < 5 * math.sqrt(2000 * 0.25 * 0.75)
 
 
 def test_intervention_names_the_datagram() -> None:
     """Number, kind, length and moment are those of what was attacked."""
-    attack = parse_attack("tamper-key,message=response").make(CONVERSATION.surroundings)
-    (told,) = notes(play(attack, CONVERSATION.said))
-    assert (told.attack, told.what, told.way, told.number, told.kind, told.length, told.at) == (
-        "tamper-key",
-        What.ALTERED,
-        BA,
-        2,
-        "response",
-        103,
-        0.01,
-    )
-    assert told.to_dict()["way"] == "b>a"
+    attack = parse_attack("tamper-key,message=response").make(CONVERSATION.context)
+    (note,) = notes(play(attack, CONVERSATION.said))
+    seen = (note.attack, note.operation, note.direction, note.number, note.kind, note.length, note.at)
+    assert seen == ("tamper-key", Operation.ALTERED, BA, 2, "response", 103, 0.01)
+    assert note.to_dict()["direction"] == "b>a"
 
 
 def test_flood_keeps_its_rate_and_makes_up_for_little() -> None:
-    """100 a second for a second are 100; after a pause of an hour no more than a handful comes at once."""
-    attack = parse_attack("raw-mavlink,rate_per_s=100,seconds=1").make(CONVERSATION.surroundings)
+    """100 per second are 100 in a second; after a pause of an hour, only a few are sent at once."""
+    attack = parse_attack("raw-mavlink,rate_per_s=100,seconds=1").make(CONVERSATION.context)
     play(attack, [], after_s=2.0)
-    assert attack.strikes == 100
-    asleep = parse_attack("raw-mavlink,rate_per_s=100").make(CONVERSATION.surroundings)
-    assert len(sends(asleep.due(3600.0))) == SHOTS_AT_ONCE
+    assert attack.attempts == 100
+    asleep = parse_attack("raw-mavlink,rate_per_s=100").make(CONVERSATION.context)
+    assert len(sends(asleep.due(3600.0))) == CATCH_UP_LIMIT
     assert len(sends(asleep.due(3600.0))) <= 1
     assert asleep.next_deadline() == pytest.approx(3600.0, abs=0.011)
 
@@ -113,16 +106,16 @@ def test_flood_keeps_its_rate_and_makes_up_for_little() -> None:
 @settings(max_examples=15, deadline=None)
 @given(data=st.data())
 def test_no_datagram_raises(name: str, data: st.DataObject) -> None:
-    """Whatever comes by or comes back, an attack goes on."""
+    """Any datagram and any answer are handled."""
     attack = parse_attack(name).make(AMONG_THREE, 1)
     starts = st.sampled_from([b"", b"\x01\x00", b"\x02\x00", b"\x03\x00", b"\x40", b"\x41", b"\xfd"])
-    ways = st.sampled_from(AMONG_THREE.ways)
+    directions = st.sampled_from(AMONG_THREE.directions)
     now = 0.0
     for _ in range(data.draw(st.integers(1, 12))):
         datagram = data.draw(starts) + data.draw(
             st.one_of(st.binary(max_size=64), st.just(bytes(145)), st.just(bytes(101)))
         )
-        attack.on_datagram(datagram, data.draw(ways), now)
+        attack.on_datagram(datagram, data.draw(directions), now)
         attack.on_answer(datagram, "b", data.draw(st.integers(0, 255)), now)
         now += data.draw(st.floats(0, 1))
         attack.due(now)

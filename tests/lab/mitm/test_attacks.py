@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from uavlinkd.lab.mitm.attack import AttackError, Options, Surroundings, describe_options
+from uavlinkd.lab.mitm.attack import AttackContext, AttackError, Options, describe_options
 from uavlinkd.lab.mitm.attacks import ATTACKS, attack_from_table, list_attacks, parse_attack
 
 # What an attacker without keys cannot do: the full relay (H2), group keys and stolen keys (H6, H7, D19, D20), clocks
@@ -34,7 +34,7 @@ def test_list_names_every_attack_and_every_parameter() -> None:
 @pytest.mark.parametrize("name", ATTACKS)
 def test_text_of_a_request_reads_back_as_itself(name: str) -> None:
     """The text form in logs is what the command line takes."""
-    spec = parse_attack(f"{name},begin_s=1.5,way=a>b,limit=3")
+    spec = parse_attack(f"{name},begin_s=1.5,direction=a>b,limit=3")
     assert str(parse_attack(str(spec))) == str(spec)
     assert parse_attack(str(spec)) == spec
 
@@ -73,14 +73,14 @@ def test_bad_request_is_refused_with_what_to_write(text: str, message: str) -> N
 
 @pytest.mark.parametrize("table", [{}, {"name": 3}, {"name": "hold", "hold_s": "long"}, {"name": "hold", "x": 1}])
 def test_bad_table_is_refused(table: dict[str, object]) -> None:
-    """Nothing falls back to a default."""
+    """A wrong value is an error, never a default."""
     with pytest.raises(AttackError):
         attack_from_table(table)
 
 
 def test_what_the_surroundings_lack_is_said() -> None:
     """A third peer, a public key."""
-    two = Surroundings.between("a", "b")
+    two = AttackContext.between("a", "b")
     with pytest.raises(AttackError, match="three peers"):
         parse_attack("misroute").make(two)
     with pytest.raises(AttackError, match="public_key"):

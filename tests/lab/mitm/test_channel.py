@@ -1,4 +1,4 @@
-"""Attacks one behind the other, then a radio: the order holds, and pausing lets everything pass."""
+"""A chain of attacks, then a radio: in order; a pause passes all datagrams."""
 
 from __future__ import annotations
 
@@ -7,33 +7,33 @@ import pytest
 from tests.lab.mitm.samples import AB, BA, converse, notes, sends
 from uavlinkd.lab.mitm.attack import NEVER, Action, Send
 from uavlinkd.lab.mitm.attacks import parse_attack
-from uavlinkd.lab.mitm.channel import Channel
-from uavlinkd.lab.mitm.radio import Fate, RadioSettings
+from uavlinkd.lab.mitm.channel import AttackChannel
+from uavlinkd.lab.mitm.radio import Outcome, RadioSettings
 
 CONVERSATION = converse()
 ENVELOPE = CONVERSATION.envelopes()[3]
 
 
-def _channel(*attacks: str, radio: RadioSettings | None = None, seed: int = 0) -> Channel:
-    made = [parse_attack(each).make(CONVERSATION.surroundings, seed) for each in attacks]
-    return Channel(CONVERSATION.surroundings, made, {AB: radio} if radio else None, seed)
+def _channel(*attacks: str, radio: RadioSettings | None = None, seed: int = 0) -> AttackChannel:
+    made = [parse_attack(attack).make(CONVERSATION.context, seed) for attack in attacks]
+    return AttackChannel(CONVERSATION.context, made, {AB: radio} if radio else None, seed)
 
 
 def test_empty_channel_is_a_cable() -> None:
     """Everything passes at once and unaltered."""
     channel = _channel()
-    for datagram, way in CONVERSATION.said:
-        assert channel.on_datagram(datagram, way, 0.0) == [Send(datagram, way)]
+    for datagram, direction in CONVERSATION.said:
+        assert channel.on_datagram(datagram, direction, 0.0) == [Send(datagram, direction)]
     assert channel.next_deadline() == NEVER
 
 
 def test_later_attack_meets_what_the_earlier_one_lets_pass() -> None:
     """What is doubled first is altered twice; what is dropped first is not altered."""
     doubled = _channel("duplicate", "extend").on_datagram(ENVELOPE, AB, 0.0)
-    assert [len(each.datagram) - len(ENVELOPE) for each in sends(doubled)] == [1, 2]
+    assert [len(send.datagram) - len(ENVELOPE) for send in sends(doubled)] == [1, 2]
     dropped = _channel("drop", "extend").on_datagram(ENVELOPE, AB, 0.0)
     assert sends(dropped) == []
-    assert {each.attack for each in notes(dropped)} == {"drop"}
+    assert {note.attack for note in notes(dropped)} == {"drop"}
 
 
 def test_what_comes_from_strangers_meets_no_later_attack() -> None:
@@ -44,11 +44,11 @@ def test_what_comes_from_strangers_meets_no_later_attack() -> None:
 
 
 def test_what_an_attack_sends_by_itself_meets_the_later_ones() -> None:
-    """A flood under the peer's address stands in front of the drop."""
+    """A flood from the peer's address passes the drop."""
     channel = _channel("raw-mavlink,origin=sender", "drop")
     actions = channel.due(0.0)
     assert sends(actions) == []
-    assert [each.attack for each in notes(actions)] == ["drop", "raw-mavlink"]
+    assert [note.attack for note in notes(actions)] == ["drop", "raw-mavlink"]
 
 
 def test_radio_is_behind_the_attacks() -> None:
@@ -65,7 +65,7 @@ def test_radio_loses_its_share() -> None:
     """It is the emulator of radio.py, with its counters."""
     channel = _channel(radio=RadioSettings(loss=0.5))
     passed = sum(len(sends(channel.on_datagram(ENVELOPE, AB, 0.0))) for _ in range(1000))
-    assert channel.radios[AB].fates[Fate.LOST] == 1000 - passed
+    assert channel.radios[AB].outcomes[Outcome.LOST] == 1000 - passed
     assert 400 < passed < 600
 
 
@@ -79,15 +79,15 @@ def test_paused_channel_attacks_nothing_and_goes_on_afterwards() -> None:
     assert channel.due(3.0) == []
     assert channel.on_answer(b"x", "a", 0, 3.0) == []
     channel.is_paused = False
-    assert [(each.datagram, each.way) for each in sends(channel.due(3.0))] == [(ENVELOPE, AB)]
+    assert [(send.datagram, send.direction) for send in sends(channel.due(3.0))] == [(ENVELOPE, AB)]
 
 
 class _Mirror:
-    """Any object with the four methods can stand in the way: here one that sends everything back."""
+    """Any object with the four methods is an attack: here one that reflects everything."""
 
     name = "mirror"
 
-    def on_datagram(self, datagram: bytes, way: object, now: float) -> list[Action]:
+    def on_datagram(self, datagram: bytes, direction: object, now: float) -> list[Action]:
         return [Send(datagram, BA)]
 
     def on_answer(self, datagram: bytes, peer: str, stranger: int, now: float) -> list[Action]:
@@ -101,8 +101,8 @@ class _Mirror:
 
 
 def test_foreign_attack_object_is_taken() -> None:
-    """Nothing of ours is asked of it."""
-    channel = Channel(CONVERSATION.surroundings, [_Mirror()])
+    """It needs none of our base classes."""
+    channel = AttackChannel(CONVERSATION.context, [_Mirror()])
     assert channel.on_datagram(ENVELOPE, AB, 0.0) == [Send(ENVELOPE, BA)]
     assert channel.on_answer(b"x", "a", 3, 0.0) == [Send(b"x", AB)]
 
@@ -114,6 +114,11 @@ def test_same_seed_gives_the_same_channel() -> None:
         channel = _channel(
             "bit-flip,share=0.5", "duplicate,share=0.3", radio=RadioSettings(loss=0.2, jitter_s=0.1), seed=5
         )
-        runs.append([channel.on_datagram(each, way, n * 0.01) for n, (each, way) in enumerate(CONVERSATION.said)])
+        runs.append(
+            [
+                channel.on_datagram(datagram, direction, n * 0.01)
+                for n, (datagram, direction) in enumerate(CONVERSATION.said)
+            ]
+        )
         runs[-1].append(channel.due(10.0))
     assert runs[0] == runs[1]

@@ -1,4 +1,4 @@
-"""The command line of the man in the middle: what is wrong is said in one line each, with status 2."""
+"""The command line of the man in the middle: one line per problem, and status 2."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ def test_list_prints_every_attack(capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "stands between two peers"),
-        (PAIR[:2], "name the two peers of a link"),
+        ([], "at least two peers are required"),
+        (PAIR[:2], "at least one link is required"),
         ([*PAIR, "--attack=misroute"], "three peers"),
-        ([*PAIR, "--attack=drop,way=a>z"], "way is both"),
-        ([*PAIR, "--radio=way=a>z"], "way is both"),
+        ([*PAIR, "--attack=drop,direction=a>z"], "direction must be both"),
+        ([*PAIR, "--radio=direction=a>z"], "direction must be both"),
         ([*PAIR, "--seconds=0"], "--seconds"),
         ([*PAIR, "--seconds=nan"], "--seconds"),
         (["--ask=statistics"], "--control-socket"),
@@ -43,15 +43,15 @@ def test_wrong_command_line_ends_with_status_2(
 
 @pytest.mark.parametrize("flag", ["--attack=dropp", "--radio=loss=9", "--peer=x", "--link=a"])
 def test_flag_that_cannot_be_read_is_explained(flag: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """By argparse, with what the parser has to say."""
+    """argparse shows the message of the parser."""
     with pytest.raises(SystemExit) as caught:
         main([*PAIR, flag])
     assert caught.value.code == 2
     assert flag.partition("=")[0] in capsys.readouterr().err
 
 
-def test_nobody_to_ask_is_status_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """One line says where."""
+def test_no_running_proxy_is_status_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """One line names the socket."""
     assert main([f"--control-socket={tmp_path / 'none'}", "--ask=statistics"]) == 1
     assert "no daemon answers" in capsys.readouterr().err
 

@@ -1,4 +1,4 @@
-"""The log of a run holds every intervention until there are too many of a kind; then it counts."""
+"""The log of a run has a line for each intervention until there are too many; then totals."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from typing import Any
 import structlog
 from structlog.testing import capture_logs
 
-from uavlinkd.lab.mitm.anatomy import Kind
-from uavlinkd.lab.mitm.attack import NEVER, Intervention, Way, What
+from uavlinkd.lab.mitm.anatomy import DatagramKind
+from uavlinkd.lab.mitm.attack import NEVER, Direction, Intervention, Operation
 from uavlinkd.lab.mitm.journal import SUM_INTERVAL_S, Journal
 
 
-def _done(at: float, number: int, attack: str = "drop", what: What = What.DROPPED) -> Intervention:
-    return Intervention(at, attack, what, Way("a", "b"), number, Kind.ENVELOPE, 40)
+def _done(at: float, number: int, attack: str = "drop", operation: Operation = Operation.DROPPED) -> Intervention:
+    return Intervention(at, attack, operation, Direction("a", "b"), number, DatagramKind.ENVELOPE, 40)
 
 
 def _lines(path: Path) -> list[dict[str, Any]]:
@@ -23,32 +23,32 @@ def _lines(path: Path) -> list[dict[str, Any]]:
 
 
 def test_first_interventions_stand_one_by_one_the_others_are_summed(tmp_path: Path) -> None:
-    """Five in full, the rest in one line; nothing is lost from the sum."""
+    """Five have a line each, the others one together; the total is complete."""
     path = tmp_path / "run.jsonl"
     journal = Journal(path, structlog.get_logger(), 100.0, detail=5)
     for number in range(1, 1001):
         journal.add(_done(100.0 + number / 1000, number))
-    journal.add(_done(101.5, 1001, "hold", What.HELD))
+    journal.add(_done(101.5, 1001, "hold", Operation.HELD))
     assert journal.next_flush() == 100.001 + SUM_INTERVAL_S
     journal.flush(111.0)
     assert journal.next_flush() == NEVER
     journal.add(_done(112.0, 1002))
     journal.close()
     lines = _lines(path)
-    full = [each for each in lines if each["event"] == "intervention"]
-    assert [each["number"] for each in full] == [1, 2, 3, 4, 5, 1001]
+    full = [line for line in lines if line["event"] == "intervention"]
+    assert [line["number"] for line in full] == [1, 2, 3, 4, 5, 1001]
     assert full[0] == {
         "event": "intervention",
         "at": 0.001,
         "attack": "drop",
-        "what": "dropped",
-        "way": "a>b",
+        "operation": "dropped",
+        "direction": "a>b",
         "number": 1,
         "kind": "envelope",
         "length": 40,
         "detail": "",
     }
-    summed = [each["count"] for each in lines if each["event"] == "interventions_summed"]
+    summed = [record["count"] for record in lines if record["event"] == "interventions_summed"]
     assert summed == [995, 1]
     assert journal.counts == {("drop", "dropped"): 1001, ("hold", "held"): 1}
 
@@ -62,10 +62,10 @@ def test_operators_log_has_one_line_when_it_begins_and_one_for_each_interval() -
         journal.flush(SUM_INTERVAL_S + 0.1)
         journal.flush(SUM_INTERVAL_S + 0.2)
         journal.close()
-    assert [(each["event"], each.get("count")) for each in logs] == [("attack_began", None), ("attack_went_on", 500)]
+    assert [(log["event"], log.get("count")) for log in logs] == [("attack_began", None), ("attack_continued", 500)]
 
 
-def test_events_of_the_run_stand_in_both_logs(tmp_path: Path) -> None:
+def test_events_of_the_run_are_in_both_logs(tmp_path: Path) -> None:
     """With the time since the start."""
     path = tmp_path / "run.jsonl"
     with capture_logs() as logs:
@@ -73,7 +73,7 @@ def test_events_of_the_run_stand_in_both_logs(tmp_path: Path) -> None:
         journal.event("mitm_paused", 51.5)
         journal.close()
     assert _lines(path) == [{"event": "mitm_paused", "at": 1.5}]
-    assert [each["event"] for each in logs] == ["mitm_paused"]
+    assert [log["event"] for log in logs] == ["mitm_paused"]
 
 
 def test_a_run_after_another_adds_to_its_log(tmp_path: Path) -> None:
@@ -83,14 +83,14 @@ def test_a_run_after_another_adds_to_its_log(tmp_path: Path) -> None:
         journal = Journal(path, structlog.get_logger(), 0.0, detail=1)
         journal.event(event, 1.0)
         journal.close()
-    assert [each["event"] for each in _lines(path)] == ["first", "second"]
+    assert [line["event"] for line in _lines(path)] == ["first", "second"]
 
 
-def test_a_full_disk_is_told_once_and_ends_nothing() -> None:
-    """Lines are lost, and nothing is raised into the way of the datagrams."""
+def test_a_full_disk_is_logged_once_and_does_not_stop_the_run() -> None:
+    """Lines are lost, but no exception stops the datagrams."""
     with capture_logs() as logs:
         journal = Journal(Path("/dev/full"), structlog.get_logger(), 0.0, detail=100)
         for number in range(3):
             journal.add(_done(1.0, number))
         journal.close()
-    assert [each["event"] for each in logs if each["log_level"] == "error"] == ["journal_not_written"]
+    assert [log["event"] for log in logs if log["log_level"] == "error"] == ["journal_not_written"]

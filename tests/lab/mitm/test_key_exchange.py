@@ -1,4 +1,4 @@
-"""Each attack on the key exchange does to the message what its name says, and to nothing else."""
+"""Each attack on the key exchange changes only the documented fields."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from uavlinkd.core.crypto import KeyPair
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.suites import SUITES_BY_NAME
 from uavlinkd.lab.mitm.anatomy import Parts, parts_of
-from uavlinkd.lab.mitm.attack import Send, Surroundings
+from uavlinkd.lab.mitm.attack import AttackContext, Send
 from uavlinkd.lab.mitm.attacks import parse_attack
 from uavlinkd.lab.mitm.attacks.key_exchange import ELEMENTS
 
@@ -31,24 +31,24 @@ class Change:
 
 def _changes(text: str, conversation: Conversation, seed: int = 0) -> list[Change]:
     """What an attack does to initiation and response; everything else passes untouched."""
-    attack = parse_attack(text).make(conversation.surroundings, seed)
+    attack = parse_attack(text).make(conversation.context, seed)
     changes: list[Change] = []
-    for datagram, way in conversation.said:
-        (sent,) = sends(attack.on_datagram(datagram, way, 0.0))
-        assert sent.way == way
+    for datagram, direction in conversation.said:
+        (sent,) = sends(attack.on_datagram(datagram, direction, 0.0))
+        assert sent.direction == direction
         before, after = parts_of(datagram), parts_of(sent.datagram)
         if sent.datagram == datagram:
             continue
         assert before is not None
         assert after is not None, "the altered message is still one of the protocol's"
         # mac1 fits again, so the alteration reaches the cryptography of the receiver.
-        MacKeys(conversation.keys[way.receiver]).check_mac1(sent.datagram)
+        MacKeys(conversation.keys[direction.receiver]).check_mac1(sent.datagram)
         changes.append(Change(before, after))
     return changes
 
 
 def _same_but(change: Change, *fields: str) -> bool:
-    """Whether nothing but these fields (and the macs) differs, and each of these does."""
+    """Whether exactly these fields differ, apart from the MACs."""
     before, after = change.before._asdict(), change.after._asdict()
     return {name for name in before if name != "macs" and before[name] != after[name]} == set(fields)
 
@@ -79,16 +79,16 @@ def test_replace_key_puts_the_given_key_in_place() -> None:
 
 
 def test_random_draws_for_each_direction_by_itself() -> None:
-    """Over many handshakes all four pairs of tampering and replacing come up."""
-    attack = parse_attack("random").make(PLAIN.surroundings, 5)
+    """Over many handshakes, all four combinations of altering and replacing occur."""
+    attack = parse_attack("random").make(PLAIN.context, 5)
     seen: set[tuple[bool, bool]] = set()
     for _ in range(60):
-        told = [
+        reported = [
             note.detail.startswith("public key replaced")
-            for datagram, way in ((PLAIN.initiation, AB), (PLAIN.response, BA))
-            for note in notes(attack.on_datagram(datagram, way, 0.0))
+            for datagram, direction in ((PLAIN.initiation, AB), (PLAIN.response, BA))
+            for note in notes(attack.on_datagram(datagram, direction, 0.0))
         ]
-        seen.add((told[0], told[1]))
+        seen.add((reported[0], reported[1]))
     assert seen == {(False, False), (False, True), (True, False), (True, True)}
 
 
@@ -115,8 +115,8 @@ def test_suite_downgrade_names_another_suite_at_its_length(
 
 
 def test_suite_downgrade_may_keep_the_length() -> None:
-    """Then the message is none of that suite."""
-    attack = parse_attack("suite-downgrade,adapt_length=false").make(GROUP.surroundings)
+    """Then the length does not match the suite."""
+    attack = parse_attack("suite-downgrade,adapt_length=false").make(GROUP.context)
     (sent,) = sends(attack.on_datagram(GROUP.initiation, AB, 0.0))
     assert len(sent.datagram) == len(GROUP.initiation)
     with pytest.raises(Drop, match=DropReason.MALFORMED):
@@ -131,8 +131,8 @@ def test_invalid_elements_give_a_secret_that_anyone_knows(name: str) -> None:
 
 
 def test_invalid_element_puts_each_in_its_turn() -> None:
-    """All of them come up, and nothing but the key is changed."""
-    attack = parse_attack("invalid-element,message=initiation").make(PLAIN.surroundings)
+    """All values occur, and only the key changes."""
+    attack = parse_attack("invalid-element,message=initiation").make(PLAIN.context)
     put: list[bytes] = []
     for _ in ELEMENTS:
         (sent,) = sends(attack.on_datagram(PLAIN.initiation, AB, 0.0))
@@ -146,7 +146,7 @@ def test_invalid_element_puts_each_in_its_turn() -> None:
 
 
 def test_corrupt_share_alters_the_sealed_share_where_there_is_one() -> None:
-    """In a suite with a group both messages; in one without, none."""
+    """Both messages in a suite with a group; no message in a suite without."""
     changes = _changes("corrupt-share", GROUP)
     assert [_same_but(change, "share") for change in changes] == [True, True]
     assert _changes("corrupt-share", PLAIN) == []
@@ -163,24 +163,24 @@ def test_corrupt_share_alters_the_sealed_share_where_there_is_one() -> None:
 def test_alter_indices_alters_those_that_it_names(options: str, expected: list[tuple[bool, bool | None]]) -> None:
     """Sender and receiver index; an initiation has no receiver index."""
     changes = _changes(f"alter-indices,{options}", PLAIN)
-    found: list[tuple[bool, bool | None]] = []
+    result: list[tuple[bool, bool | None]] = []
     for change in changes:
         before, after = change.before.header, change.after.header
         assert _same_but(change, "header")
         assert before[:2] == after[:2]
-        found.append((before[2:4] != after[2:4], before[4:6] != after[4:6] if before[4:6] else None))
-    assert found == expected
+        result.append((before[2:4] != after[2:4], before[4:6] != after[4:6] if before[4:6] else None))
+    assert result == expected
 
 
-def test_zero_indices_are_no_message_of_the_protocol() -> None:
+def test_zero_indices_are_malformed() -> None:
     """The receiver refuses them before anything else, although mac1 fits."""
-    attack = parse_attack("alter-indices,field=both,value=zero").make(PLAIN.surroundings)
+    attack = parse_attack("alter-indices,field=both,value=zero").make(PLAIN.context)
     altered = []
-    for datagram, way in PLAIN.said:
-        (sent,) = sends(attack.on_datagram(datagram, way, 0.0))
+    for datagram, direction in PLAIN.said:
+        (sent,) = sends(attack.on_datagram(datagram, direction, 0.0))
         if sent.datagram != datagram:
             assert parts_of(sent.datagram) is None
-            MacKeys(PLAIN.keys[way.receiver]).check_mac1(sent.datagram)
+            MacKeys(PLAIN.keys[direction.receiver]).check_mac1(sent.datagram)
             altered.append(sent.datagram[2:6])
     initiation, response = altered
     assert (initiation[:2], response) == (bytes(2), bytes(4))
@@ -188,8 +188,8 @@ def test_zero_indices_are_no_message_of_the_protocol() -> None:
 
 @pytest.mark.parametrize("mac", ["mac1", "mac2"])
 def test_alter_macs_alters_that_mac_alone(mac: str) -> None:
-    """The other bytes stay."""
-    attack = parse_attack(f"alter-macs,mac={mac}").make(PLAIN.surroundings)
+    """The other bytes are unchanged."""
+    attack = parse_attack(f"alter-macs,mac={mac}").make(PLAIN.context)
     (sent,) = sends(attack.on_datagram(PLAIN.initiation, AB, 0.0))
     differ = [n for n in range(147) if sent.datagram[n] != PLAIN.initiation[n]]
     assert len(differ) == 1
@@ -199,7 +199,7 @@ def test_alter_macs_alters_that_mac_alone(mac: str) -> None:
 def test_splice_handshake_joins_two_messages() -> None:
     """Header and key of the second, all that is sealed from the first; never of a message with itself."""
     first, second = converse(5, frames=0), converse(6, frames=0)
-    attack = parse_attack("splice-handshake").make(second.surroundings)
+    attack = parse_attack("splice-handshake").make(second.context)
     assert attack.on_datagram(first.initiation, AB, 0.0) == [Send(first.initiation, AB)]
     assert attack.on_datagram(first.initiation, AB, 0.0) == [Send(first.initiation, AB)]
     (sent,) = sends(attack.on_datagram(second.initiation, AB, 0.0))
@@ -212,8 +212,8 @@ def test_splice_handshake_joins_two_messages() -> None:
 
 
 def test_genuine_message_follows_where_it_is_to() -> None:
-    """beside=true sends the altered one first, then the genuine one."""
-    attack = parse_attack("tamper-key,beside=true").make(PLAIN.surroundings)
+    """With beside=true, the genuine message follows the altered one."""
+    attack = parse_attack("tamper-key,beside=true").make(PLAIN.context)
     altered, genuine = sends(attack.on_datagram(PLAIN.initiation, AB, 0.0))
     assert genuine == Send(PLAIN.initiation, AB)
     assert altered.datagram != PLAIN.initiation
@@ -222,7 +222,7 @@ def test_genuine_message_follows_where_it_is_to() -> None:
 @pytest.mark.parametrize("options", ["", ",repair_mac1=false"])
 def test_mac1_stays_stale_without_the_public_key(options: str) -> None:
     """Then the receiver's first HMAC ends it."""
-    knows = Surroundings.between("a", "b") if not options else PLAIN.surroundings
+    knows = AttackContext.between("a", "b") if not options else PLAIN.context
     attack = parse_attack(f"tamper-key{options}").make(knows)
     actions = attack.on_datagram(PLAIN.initiation, AB, 0.0)
     with pytest.raises(Drop, match=DropReason.BAD_MAC1):
@@ -234,5 +234,5 @@ def test_mac1_stays_stale_without_the_public_key(options: str) -> None:
 @pytest.mark.parametrize("name", ["tamper-key", "replace-key", "random", "suite-downgrade", "invalid-element"])
 def test_only_the_message_that_is_named_is_altered(name: str, message: str) -> None:
     """The other one passes."""
-    told = notes(play(parse_attack(f"{name},message={message}").make(PLAIN.surroundings), PLAIN.said))
-    assert [each.kind for each in told] == [message]
+    reported = notes(play(parse_attack(f"{name},message={message}").make(PLAIN.context), PLAIN.said))
+    assert [note.kind for note in reported] == [message]

@@ -1,4 +1,4 @@
-"""The man in the middle with real sockets: faces, strangers, the control socket, the log."""
+"""The man in the middle with real sockets: listeners, strangers, control socket, log."""
 
 from __future__ import annotations
 
@@ -15,24 +15,26 @@ from typing import Any
 
 import pytest
 
-from tests.daemon.harness import Program, free_port, open_program
-from uavlinkd.system.addresses import Address
-from uavlinkd.ops.control import ControlError, ask
+from tests.daemon.udp import Client, open_client
 from uavlinkd.endpoints.sockets import BindError
-from uavlinkd.lab.mitm.attack import Way
-from uavlinkd.lab.mitm.attacks import parse_attack
+from uavlinkd.lab.child_processes import end_with_parent
+from uavlinkd.lab.mitm.attack import Direction
+from uavlinkd.lab.mitm.attacks import ATTACKS, parse_attack
 from uavlinkd.lab.mitm.cli import main
 from uavlinkd.lab.mitm.proxy import Proxy
-from uavlinkd.lab.mitm.radio import RadioSettings
 from uavlinkd.lab.mitm.proxy_settings import MitmLink, MitmPeer, ProxySettings
+from uavlinkd.lab.mitm.radio import RadioSettings
+from uavlinkd.lab.sim.loopback_ports import free_port
+from uavlinkd.ops.control import ask
+from uavlinkd.system.addresses import Address
 
 ANY = Address("127.0.0.1", 0)
 
 
 @asynccontextmanager
-async def _between(*attacks: str, **more: Any) -> AsyncIterator[tuple[Program, Program, Proxy]]:
-    """Two programs, and a proxy between them."""
-    a, b = await open_program(), await open_program()
+async def _between(*attacks: str, **more: Any) -> AsyncIterator[tuple[Client, Client, Proxy]]:
+    """Two clients, and a proxy between them."""
+    a, b = await open_client(), await open_client()
     settings = ProxySettings(
         peers=(MitmPeer("a", Address(*a.address)), MitmPeer("b", Address(*b.address))),
         links=(MitmLink(("a", "b"), (ANY, ANY)),),
@@ -50,62 +52,62 @@ async def _between(*attacks: str, **more: Any) -> AsyncIterator[tuple[Program, P
 
 
 async def _until(condition: Callable[[], bool]) -> None:
-    """Let the loop turn until a condition holds."""
-    async with asyncio.timeout(5):
+    """Run the event loop until a condition holds."""
+    async with asyncio.timeout(240):
         while not condition():  # noqa: ASYNC110  what is waited for happens in a callback of the proxy
             await asyncio.sleep(0)
 
 
 async def test_each_peer_hears_the_other_from_the_face_it_knows() -> None:
-    """Both ways, byte for byte, empty datagrams too, many in one wake-up."""
+    """In both directions, byte for byte, empty datagrams too, many in one wake-up."""
     async with _between() as (a, b, proxy):
         said = [b"", b"one", bytes(1400), *(bytes([n]) * 10 for n in range(200))]
         for datagram in said:
-            a.send(datagram, proxy.faces["a", "b"])
+            a.send(datagram, proxy.listeners["a", "b"])
         await b.until(lambda: len(b.datagrams) == len(said))
         assert b.datagrams == said
-        assert set(b.sources) == {proxy.faces["b", "a"]}
-        b.send(b"back", proxy.faces["b", "a"])
+        assert set(b.sources) == {proxy.listeners["b", "a"]}
+        b.send(b"back", proxy.listeners["b", "a"])
         await a.until(lambda: a.datagrams == [b"back"])
-        assert a.sources == [proxy.faces["a", "b"]]
+        assert a.sources == [proxy.listeners["a", "b"]]
         assert proxy.statistics()["sent"] == {"a>b": len(said), "b>a": 1}
 
 
-async def test_others_who_speak_to_a_face_are_not_heard() -> None:
+async def test_other_senders_at_a_listener_are_ignored() -> None:
     """Only the peer itself is attacked; the others are counted."""
     async with _between() as (a, b, proxy):
-        stranger = await open_program()
-        stranger.send(b"hello", proxy.faces["a", "b"])
-        a.send(b"genuine", proxy.faces["a", "b"])
+        stranger = await open_client()
+        stranger.send(b"hello", proxy.listeners["a", "b"])
+        a.send(b"genuine", proxy.listeners["a", "b"])
         await b.until(lambda: b.datagrams == [b"genuine"])
-        assert proxy.troubles["from nobody we know"] == 1
+        assert proxy.errors["unknown sender"] == 1
         stranger.close()
 
 
-async def test_peer_without_an_address_is_where_it_was_heard_last() -> None:
-    """A daemon that only calls, from any port."""
+async def test_peer_without_an_address_is_learned_from_its_datagrams() -> None:
+    """A daemon with an unknown address initiates from any port."""
     async with _between() as (a, b, known):
         settings = replace(known.settings, peers=(MitmPeer("a"), known.settings.peers[1]))
         proxy = Proxy(settings)
         await proxy.start()
-        b.send(b"too early", proxy.faces["b", "a"])
-        a.send(b"here", proxy.faces["a", "b"])
+        b.send(b"too early", proxy.listeners["b", "a"])
+        a.send(b"here", proxy.listeners["a", "b"])
         await b.until(lambda: b.datagrams == [b"here"])
-        b.send(b"found", proxy.faces["b", "a"])
+        b.send(b"found", proxy.listeners["b", "a"])
         await a.until(lambda: a.datagrams == [b"found"])
-        assert proxy.troubles["to nobody we know"] == 1
+        assert proxy.errors["unknown receiver"] == 1
         await proxy.stop()
 
 
 async def test_strangers_have_addresses_of_their_own_and_hear_answers() -> None:
-    """A flood comes from many hosts of the loopback network; what is sent back there is counted."""
-    async with _between("flood-garbage,rate_per_s=2000,sources=40,limit=300,way=a>b") as (_, b, proxy):
+    """A flood comes from many addresses of the loopback network, and answers to them are counted."""
+    async with _between("flood-garbage,rate_per_s=2000,sources=40,limit=300,direction=a>b") as (_, b, proxy):
         await b.until(lambda: len(b.datagrams) >= 295)
         hosts = {host for host, _ in b.sources}
         if sys.platform == "linux":
             assert len(hosts) > 30
         assert len(set(b.sources)) > 30
-        assert not {proxy.faces["b", "a"]} & set(b.sources)
+        assert not {proxy.listeners["b", "a"]} & set(b.sources)
         b.send(b"who is there", b.sources[0])
         await _until(lambda: bool(proxy.stranger_bytes_back))
         assert proxy.stranger_bytes_back.total() == len(b"who is there")
@@ -113,11 +115,11 @@ async def test_strangers_have_addresses_of_their_own_and_hear_answers() -> None:
 
 
 async def test_held_datagrams_are_released_by_the_timer() -> None:
-    """Nothing else has to happen for it."""
+    """The timer needs no other event."""
     async with _between("hold,kinds=any,hold_s=0.2") as (a, b, proxy):
         loop = asyncio.get_running_loop()
         begin = loop.time()
-        a.send(b"later", proxy.faces["a", "b"])
+        a.send(b"later", proxy.listeners["a", "b"])
         await b.until(lambda: b.datagrams == [b"later"])
         assert loop.time() - begin >= 0.2
 
@@ -127,8 +129,8 @@ async def test_radio_delays_real_datagrams() -> None:
     async with _between(radios=(("a>b", RadioSettings(delay_s=0.15)),)) as (a, b, proxy):
         loop = asyncio.get_running_loop()
         begin = loop.time()
-        a.send(b"slow", proxy.faces["a", "b"])
-        b.send(b"fast", proxy.faces["b", "a"])
+        a.send(b"slow", proxy.listeners["a", "b"])
+        b.send(b"fast", proxy.listeners["b", "a"])
         await a.until(lambda: a.datagrams == [b"fast"])
         assert b.datagrams == []
         await b.until(lambda: b.datagrams == [b"slow"])
@@ -136,31 +138,33 @@ async def test_radio_delays_real_datagrams() -> None:
 
 
 async def test_control_socket_changes_pauses_and_tells(tmp_path: Path) -> None:
-    """Another attack while it runs; a bad one is refused and changes nothing."""
+    """The attacks can change at run time; a refused request changes nothing."""
     path = tmp_path / "control"
 
     async def tell(request: str) -> dict[str, Any]:
         return await asyncio.to_thread(ask, path, request)
 
     async with _between(control_socket=path) as (a, b, proxy):
-        assert (await tell("attack drop,way=a>b extend"))["attacks"] == ["drop", "extend"]
-        a.send(b"lost", proxy.faces["a", "b"])
-        b.send(b"long", proxy.faces["b", "a"])
+        assert (await tell("attack drop,direction=a>b extend"))["attacks"] == ["drop", "extend"]
+        a.send(b"lost", proxy.listeners["a", "b"])
+        b.send(b"long", proxy.listeners["b", "a"])
         await a.until(lambda: len(a.datagrams) == 1)
         assert (await tell("attack drop,colour=red"))["refused"].startswith("drop: has no such parameter")
         assert "three peers" in (await tell("attack misroute"))["refused"]
         assert (await tell("statistics"))["attacks"] == ["drop", "extend"]
         await tell("pause")
-        a.send(b"passes", proxy.faces["a", "b"])
+        a.send(b"passes", proxy.listeners["a", "b"])
         await b.until(lambda: b.datagrams == [b"passes"])
         await tell("resume")
         assert (await tell("attack none"))["attacks"] == []
-        a.send(b"passes too", proxy.faces["a", "b"])
+        a.send(b"passes too", proxy.listeners["a", "b"])
         await b.until(lambda: len(b.datagrams) == 2)
-        with pytest.raises(ControlError):
-            await tell("nonsense")
-        with pytest.raises(ControlError):
-            await tell("")
+        for nonsense in ("nonsense", "", "attack", "pause now"):
+            refused = (await tell(nonsense))["refused"]
+            assert refused.startswith(f"there is no request {nonsense!r}: write")
+            assert '"statistics", "pause"' in refused
+        refused = (await tell("attack bogus"))["refused"]
+        assert all(name in refused for name in ATTACKS), "the list"
         await tell("stop")
         assert proxy.stopping.is_set()
     assert not path.exists()
@@ -169,19 +173,19 @@ async def test_control_socket_changes_pauses_and_tells(tmp_path: Path) -> None:
 async def test_log_of_a_run_begins_and_ends(tmp_path: Path) -> None:
     """Seed and attacks first, every intervention, the statistics last."""
     path = tmp_path / "run.jsonl"
-    async with _between("bit-flip,kinds=any,way=a>b", log=path, seed=5) as (a, b, proxy):
-        a.send(b"\x40 something", proxy.faces["a", "b"])
+    async with _between("bit-flip,kinds=any,direction=a>b", log=path, seed=5) as (a, b, proxy):
+        a.send(b"\x40 something", proxy.listeners["a", "b"])
         await b.until(lambda: len(b.datagrams) == 1)
         assert b.datagrams != [b"\x40 something"]
     first, middle, last = map(json.loads, path.read_text().splitlines())
     assert (first["event"], first["seed"], first["attacks"]) == ("mitm_started", 5, ["bit-flip"])
-    assert (middle["what"], middle["way"], middle["number"]) == ("altered", "a>b", 1)
+    assert (middle["operation"], middle["direction"], middle["number"]) == ("altered", "a>b", 1)
     assert (last["event"], last["interventions"]) == ("mitm_stopped", {"bit-flip: altered": 1})
 
 
-async def test_address_in_use_is_told_and_nothing_stays_open() -> None:
-    """And the first face can be bound again."""
-    taken = await open_program()
+async def test_address_in_use_is_reported_and_no_socket_stays_open() -> None:
+    """The first listener can be bound again."""
+    taken = await open_client()
     port = free_port()
     settings = ProxySettings(
         peers=(MitmPeer("a", ANY), MitmPeer("b", ANY)),
@@ -194,40 +198,36 @@ async def test_address_in_use_is_told_and_nothing_stays_open() -> None:
     taken.close()
 
 
-async def test_attacks_given_as_objects_stand_in_the_way() -> None:
-    """Those of the settings do not, then."""
+async def test_attacks_can_be_objects() -> None:
+    """They replace the attacks of the settings."""
     async with _between() as (a, b, known):
-        attack = parse_attack("drop").make(known.surroundings)
+        attack = parse_attack("drop").make(known.context)
         proxy = Proxy(known.settings, [attack])
         await proxy.start()
-        a.send(b"x", proxy.faces["a", "b"])
-        await _until(lambda: attack.strikes > 0)
+        a.send(b"x", proxy.listeners["a", "b"])
+        await _until(lambda: attack.attempts > 0)
         assert proxy.journal.counts["drop", "dropped"] == 1
         proxy.change_attacks([])
-        a.send(b"y", proxy.faces["a", "b"])
+        a.send(b"y", proxy.listeners["a", "b"])
         await b.until(lambda: b.datagrams == [b"y"])
-        assert proxy.received[Way("a", "b")] == 2
+        assert proxy.received[Direction("a", "b")] == 2
         await proxy.stop()
 
 
-async def test_command_runs_until_it_is_told_to_stop(tmp_path: Path) -> None:
+async def test_command_runs_until_a_stop_request(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """As a process: it forwards, answers on its control socket, and ends on SIGTERM with status 0 and a whole log."""
-    a, b = await open_program(), await open_program()
+    a, b = await open_client(), await open_client()
     ports = free_port(), free_port()
     arguments = [
-        f"--peer=a=127.0.0.1:{a.address[1]}",
-        f"--peer=b=127.0.0.1:{b.address[1]}",
-        f"--link=a@127.0.0.1:{ports[0]},b@127.0.0.1:{ports[1]}",
-        f"--log={tmp_path / 'log'}",
-        f"--control-socket={tmp_path / 'control'}",
-        "--attack=extend,kinds=any,way=a>b",
-        "--seed=3",
+        *(f"--peer=a=127.0.0.1:{a.address[1]}", f"--peer=b=127.0.0.1:{b.address[1]}"),
+        *(f"--link=a@127.0.0.1:{ports[0]},b@127.0.0.1:{ports[1]}", f"--log={tmp_path / 'log'}"),
+        *(f"--control-socket={tmp_path / 'control'}", "--attack=extend,kinds=any,direction=a>b", "--seed=3"),
     ]
     process = await asyncio.create_subprocess_exec(
-        sys.executable, "-m", "uavlinkd.lab.mitm", *arguments, stderr=asyncio.subprocess.PIPE
+        *end_with_parent(sys.executable, "-m", "uavlinkd.lab.mitm", *arguments), stderr=asyncio.subprocess.PIPE
     )
     try:
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(240):
             while not b.datagrams:  # until the process listens
                 a.send(b"hello", ("127.0.0.1", ports[0]))
                 await asyncio.sleep(0.05)
@@ -235,6 +235,9 @@ async def test_command_runs_until_it_is_told_to_stop(tmp_path: Path) -> None:
         assert len(b.datagrams[0]) == 6
         status = await asyncio.to_thread(main, [f"--control-socket={tmp_path / 'control'}", "--ask=statistics"])
         assert status == 0
+        status = await asyncio.to_thread(main, [f"--control-socket={tmp_path / 'control'}", "--ask=bogus"])
+        assert status == 1
+        assert "there is no request 'bogus': write \"statistics\"" in capsys.readouterr().err
     finally:
         process.send_signal(signal.SIGTERM)
         _, errors = await process.communicate()

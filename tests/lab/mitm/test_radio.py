@@ -1,4 +1,4 @@
-"""The emulated radio: each impairment by itself, within exact bounds, and all of them together."""
+"""The emulated radio: each impairment within exact bounds, and all of them together."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from uavlinkd.lab.mitm.radio import Bursts, Fate, Outage, Radio, RadioSettings
+from uavlinkd.lab.mitm.radio import Bursts, Outage, Outcome, Radio, RadioSettings
 
 N = 20_000
 
@@ -27,7 +27,7 @@ def _play(radio: Radio, datagrams: list[bytes], interval_s: float = 0.01) -> lis
     def drain(until: float) -> None:
         while radio.next_deadline() <= until:
             moment = radio.next_deadline()
-            arrivals.extend((moment, each) for each in radio.due(moment))
+            arrivals.extend((moment, datagram) for datagram in radio.due(moment))
 
     for number, datagram in enumerate(datagrams):
         drain(number * interval_s)
@@ -37,28 +37,26 @@ def _play(radio: Radio, datagrams: list[bytes], interval_s: float = 0.01) -> lis
 
 
 def _is_accounted_for(radio: Radio) -> bool:
-    fates = radio.fates
+    outcomes = radio.outcomes
     ends = (
-        Fate.DELIVERED,
-        Fate.LOST,
-        Fate.LOST_IN_BURST,
-        Fate.LOST_IN_OUTAGE,
-        Fate.QUEUE_FULL,
-        Fate.TOO_MANY_IN_FLIGHT,
+        *(Outcome.DELIVERED, Outcome.LOST, Outcome.LOST_IN_BURST, Outcome.LOST_IN_OUTAGE),
+        *(Outcome.QUEUE_FULL, Outcome.TOO_MANY_IN_FLIGHT),
     )
-    return fates[Fate.SENT] + fates[Fate.DUPLICATED] == sum(fates[end] for end in ends) + radio.in_flight
+    return (
+        outcomes[Outcome.SENT] + outcomes[Outcome.DUPLICATED] == sum(outcomes[end] for end in ends) + radio.in_flight
+    )
 
 
 def test_default_radio_changes_nothing() -> None:
     """Without settings every datagram is due at once, unaltered and in order."""
     radio = Radio(RadioSettings(), Random(1))
     datagrams = _numbered(100)
-    assert _play(radio, datagrams) == [(number * 0.01, each) for number, each in enumerate(datagrams)]
-    assert radio.fates == {Fate.SENT: 100, Fate.DELIVERED: 100, Fate.HELD_BACK: 0}
+    assert _play(radio, datagrams) == [(number * 0.01, datagram) for number, datagram in enumerate(datagrams)]
+    assert radio.outcomes == {Outcome.SENT: 100, Outcome.DELIVERED: 100, Outcome.HELD_BACK: 0}
 
 
 def test_nothing_is_due_before_its_time() -> None:
-    """A datagram comes out at its delivery time and not a moment before; then never again."""
+    """A datagram is delivered exactly at its time, and once."""
     radio = Radio(RadioSettings(delay_s=0.5), Random(1))
     radio.send(b"a", 1.0)
     assert radio.next_deadline() == 1.5
@@ -70,32 +68,32 @@ def test_nothing_is_due_before_its_time() -> None:
 
 @pytest.mark.parametrize("loss", [0.0, 0.01, 0.3, 0.6, 1.0])
 def test_independent_loss_has_its_share(loss: float) -> None:
-    """The share lost is the share asked for, within four standard deviations."""
+    """The share of losses matches the setting, within four standard deviations."""
     radio = Radio(RadioSettings(loss=loss), Random(2))
     arrivals = _play(radio, _numbered(N))
     deviation = math.sqrt(loss * (1 - loss) / N)
-    assert abs(radio.fates[Fate.LOST] / N - loss) <= 4 * deviation
-    assert len(arrivals) == N - radio.fates[Fate.LOST]
+    assert abs(radio.outcomes[Outcome.LOST] / N - loss) <= 4 * deviation
+    assert len(arrivals) == N - radio.outcomes[Outcome.LOST]
 
 
 def test_independent_loss_has_no_memory() -> None:
-    """After a loss the next datagram is lost as often as after none."""
+    """A loss does not change the probability of the next one."""
     radio = Radio(RadioSettings(loss=0.3), Random(3))
-    arrived = {each for _, each in _play(radio, _numbered(N))}
-    is_lost = [each not in arrived for each in _numbered(N)]
+    arrived = {datagram for _, datagram in _play(radio, _numbered(N))}
+    is_lost = [datagram not in arrived for datagram in _numbered(N)]
     after_loss = [later for earlier, later in pairwise(is_lost) if earlier]
     assert abs(sum(after_loss) / len(after_loss) - 0.3) < 4 * math.sqrt(0.3 * 0.7 / len(after_loss))
 
 
 def test_bursts_have_their_length_and_share() -> None:
-    """Bursts last 1 / to_good datagrams in the mean, and swallow to_bad / (to_bad + to_good) of all."""
+    """Bursts have a mean length of 1 / to_good datagrams, and a share of to_bad / (to_bad + to_good)."""
     radio = Radio(RadioSettings(bursts=Bursts(to_bad=0.02, to_good=0.1)), Random(4))
-    arrived = {each for _, each in _play(radio, _numbered(N))}
-    lost = "".join(" " if each in arrived else "x" for each in _numbered(N)).split()
+    arrived = {datagram for _, datagram in _play(radio, _numbered(N))}
+    lost = "".join(" " if datagram in arrived else "x" for datagram in _numbered(N)).split()
     lengths = [len(burst) for burst in lost]
     assert 9 < sum(lengths) / len(lengths) < 11
     assert 0.14 < sum(lengths) / N < 0.19  # 1/6; the bursts are few, so it scatters more than single losses
-    assert radio.fates[Fate.LOST_IN_BURST] == sum(lengths)
+    assert radio.outcomes[Outcome.LOST_IN_BURST] == sum(lengths)
 
 
 def test_losses_inside_and_outside_bursts_have_their_shares() -> None:
@@ -103,19 +101,19 @@ def test_losses_inside_and_outside_bursts_have_their_shares() -> None:
     bursts = Bursts(to_bad=0.1, to_good=0.1, loss_in_bad=0.8, loss_in_good=0.1)
     radio = Radio(RadioSettings(bursts=bursts), Random(5))
     _play(radio, _numbered(N))
-    assert abs(radio.fates[Fate.LOST_IN_BURST] / N - 0.45) < 0.02
+    assert abs(radio.outcomes[Outcome.LOST_IN_BURST] / N - 0.45) < 0.02
 
 
 def test_delay_is_exact_and_jitter_even() -> None:
-    """Each datagram takes the delay and up to the jitter more, in the mean half of it."""
+    """Each datagram takes the delay plus a jitter, whose mean is half of its maximum."""
     radio = Radio(RadioSettings(delay_s=0.2, jitter_s=0.1), Random(6))
-    took = {each: moment for moment, each in _play(radio, _numbered(N))}
-    times = [took[each] - number * 0.01 for number, each in enumerate(_numbered(N))]
+    took = {datagram: moment for moment, datagram in _play(radio, _numbered(N))}
+    times = [took[datagram] - number * 0.01 for number, datagram in enumerate(_numbered(N))]
     assert len(times) == N
     assert min(times) >= 0.2 - 1e-9
     assert max(times) <= 0.3 + 1e-9
     assert abs(sum(times) / N - 0.25) < 4 * (0.1 / math.sqrt(12)) / math.sqrt(N)
-    quarters = Counter(int((each - 0.2) / 0.025) for each in times)
+    quarters = Counter(int((seconds - 0.2) / 0.025) for seconds in times)
     assert all(abs(quarters[quarter] - N / 4) < 4 * math.sqrt(N * 3 / 16) for quarter in range(4))
 
 
@@ -123,31 +121,31 @@ def test_delay_is_exact_and_jitter_even() -> None:
 def test_jitter_lets_datagrams_overtake_unless_order_is_kept(keeps_order: bool) -> None:
     """Jitter longer than the interval reorders; as a queue it does not."""
     radio = Radio(RadioSettings(jitter_s=0.1, keeps_order=keeps_order), Random(7))
-    order = [each for _, each in _play(radio, _numbered(1000))]
+    order = [datagram for _, datagram in _play(radio, _numbered(1000))]
     assert sorted(order) == _numbered(1000)
     assert (order == _numbered(1000)) is keeps_order
 
 
 def test_reordering_holds_its_share_back() -> None:
-    """The share asked for comes later by the time asked for, and nothing else does."""
+    """The requested share arrives later by the requested time, and all others in time."""
     settings = RadioSettings(delay_s=0.1, keeps_order=True, reordering=0.05, held_back_s=0.035)
     radio = Radio(settings, Random(8))
     arrivals = _play(radio, _numbered(N))
-    took = Counter(round(moment - int.from_bytes(each, "big") * 0.01, 6) for moment, each in arrivals)
+    took = Counter(round(moment - int.from_bytes(datagram, "big") * 0.01, 6) for moment, datagram in arrivals)
     assert set(took) == {0.1, 0.135}
-    assert took[0.135] == radio.fates[Fate.HELD_BACK]
+    assert took[0.135] == radio.outcomes[Outcome.HELD_BACK]
     assert abs(took[0.135] / N - 0.05) < 4 * math.sqrt(0.05 * 0.95 / N)
-    assert [each for _, each in arrivals] != _numbered(N)
+    assert [arrival for _, arrival in arrivals] != _numbered(N)
 
 
 def test_duplication_makes_its_share_of_copies() -> None:
-    """The share asked for arrives twice, nothing three times, and copies have a jitter of their own."""
+    """The requested share arrives twice, at most twice, and copies have their own jitter."""
     radio = Radio(RadioSettings(duplication=0.2, jitter_s=0.05), Random(9))
     arrivals = _play(radio, _numbered(N))
-    times = Counter(each for _, each in arrivals)
+    times = Counter(arrival for _, arrival in arrivals)
     twice = sum(1 for count in times.values() if count == 2)
     assert max(times.values()) == 2
-    assert twice == radio.fates[Fate.DUPLICATED]
+    assert twice == radio.outcomes[Outcome.DUPLICATED]
     assert abs(twice / N - 0.2) < 4 * math.sqrt(0.16 / N)
     assert len(set(arrivals)) == len(arrivals)
 
@@ -163,13 +161,13 @@ def test_bandwidth_spaces_datagrams_and_the_queue_drops_its_tail() -> None:
         moments.append(round(radio.next_deadline(), 9))
         radio.due(radio.next_deadline())
     assert moments == [0.6, 0.7, 0.8]
-    assert radio.fates[Fate.QUEUE_FULL] == 2
+    assert radio.outcomes[Outcome.QUEUE_FULL] == 2
     radio.send(b"later", 0.31)
     assert radio.next_deadline() == pytest.approx(0.31 + 0.033 + 0.5)
 
 
 def test_room_in_the_queue_to_the_byte() -> None:
-    """A datagram that fills the queue to its last byte is taken, one byte more is not."""
+    """A datagram that fills the queue exactly is accepted; one byte more is dropped."""
     for size, fits in ((172, True), (173, False)):
         radio = Radio(RadioSettings(bits_per_s=8000, queue_bytes=300), Random(11))
         radio.send(bytes(72), 0.0)
@@ -191,11 +189,11 @@ def test_throughput_is_the_bandwidth() -> None:
     ("moment", "is_carried"), [(0.99, True), (1.0, False), (2.99, False), (3.0, True), (11.5, True), (1e9, True)]
 )
 def test_outage_has_sharp_ends(moment: float, is_carried: bool) -> None:
-    """The link is down from the first moment of an outage to just before its end, and once only."""
+    """The link is down from the start of an outage until just before its end, once."""
     radio = Radio(RadioSettings(outages=(Outage(1, 3),)), Random(13))
     radio.send(b"a", moment)
     assert (radio.in_flight == 1) is is_carried
-    assert radio.fates[Fate.LOST_IN_OUTAGE] == (not is_carried)
+    assert radio.outcomes[Outcome.LOST_IN_OUTAGE] == (not is_carried)
 
 
 @pytest.mark.parametrize(
@@ -209,22 +207,22 @@ def test_outage_comes_again(moment: float, is_carried: bool) -> None:
 
 
 def test_outage_takes_what_is_on_the_air_and_leaves_what_has_left() -> None:
-    """A datagram is lost when any part of its sending falls into an outage; one that was sent before arrives."""
+    """A datagram is lost if an outage overlaps its transmission; one sent before arrives."""
     settings = RadioSettings(bits_per_s=8000, overhead_bytes=0, outages=(Outage(0.95, 2),), delay_s=1.0)
     radio = Radio(settings, Random(15))
     for _ in range(11):
         radio.send(bytes(100), 0.0)  # 0.1 s each, one behind the other
-    assert radio.fates[Fate.LOST_IN_OUTAGE] == 2
+    assert radio.outcomes[Outcome.LOST_IN_OUTAGE] == 2
     assert len(radio.due(3.0)) == 9
 
 
 def test_in_flight_is_bounded() -> None:
-    """A radio never holds more datagrams than its limit, however long its delay."""
+    """A radio never holds more datagrams than its limit, for any delay."""
     radio = Radio(RadioSettings(delay_s=3600, duplication=1.0, in_flight_limit=100), Random(16))
     for datagram in _numbered(1000):
         radio.send(datagram, 0.0)
         assert radio.in_flight <= 100
-    assert radio.fates[Fate.TOO_MANY_IN_FLIGHT] == 1900
+    assert radio.outcomes[Outcome.TOO_MANY_IN_FLIGHT] == 1900
     assert _is_accounted_for(radio)
 
 
@@ -242,14 +240,14 @@ def test_changing_one_setting_leaves_the_luck_of_the_others() -> None:
     losses = []
     for more in ({}, {"jitter_s": 0.5}, {"duplication": 0.5}, {"reordering": 0.5}):
         radio = Radio(RadioSettings(loss=0.3, **more), Random(17))  # type: ignore[arg-type]
-        arrived = {each for _, each in _play(radio, _numbered(500))}
+        arrived = {datagram for _, datagram in _play(radio, _numbered(500))}
         losses.append(set(_numbered(500)) - arrived)
     assert len(losses[0]) > 100
-    assert all(each == losses[0] for each in losses)
+    assert all(loss == losses[0] for loss in losses)
 
 
-def test_settings_may_change_on_the_way() -> None:
-    """New settings count for what is sent from then on; what is on its way stays there."""
+def test_settings_may_change_with_datagrams_in_flight() -> None:
+    """New settings apply to later datagrams; those in flight are unaffected."""
     radio = Radio(RadioSettings(delay_s=1.0), Random(18))
     radio.send(b"slow", 0.0)
     radio.settings = RadioSettings()
@@ -282,7 +280,7 @@ _SETTINGS = st.builds(
 
 @given(settings=_SETTINGS, seed=st.integers(0, 2**32), gaps=st.lists(st.floats(0, 0.2), max_size=60))
 def test_every_datagram_is_accounted_for(settings: RadioSettings, seed: int, gaps: list[float]) -> None:
-    """Whatever is combined: nothing is invented or altered, nothing is early, and every fate is counted."""
+    """With any settings, datagrams are neither invented, altered nor early, and each outcome is counted."""
     radio, now = Radio(settings, Random(seed)), 0.0
     sent_at: dict[bytes, float] = {}
     arrived: Counter[bytes] = Counter()
@@ -291,16 +289,16 @@ def test_every_datagram_is_accounted_for(settings: RadioSettings, seed: int, gap
         datagram = number.to_bytes(4, "big")
         sent_at[datagram] = now
         radio.send(datagram, now)
-        for each in radio.due(now):
-            assert now >= sent_at[each] + settings.delay_s
-            arrived[each] += 1
+        for one in radio.due(now):
+            assert now >= sent_at[one] + settings.delay_s
+            arrived[one] += 1
         assert radio.in_flight <= settings.in_flight_limit
         assert radio.next_deadline() > now
         assert _is_accounted_for(radio)
     arrived.update(radio.due(math.inf))
     assert set(arrived) <= set(sent_at)
     assert all(count <= 2 for count in arrived.values())
-    assert radio.fates[Fate.DELIVERED] == arrived.total()
+    assert radio.outcomes[Outcome.DELIVERED] == arrived.total()
     assert _is_accounted_for(radio)
 
 
@@ -316,9 +314,9 @@ def test_every_datagram_is_accounted_for(settings: RadioSettings, seed: int, gap
         (lambda: RadioSettings(queue_bytes=-1), "queue_bytes"),
         (lambda: RadioSettings(in_flight_limit=0), "in_flight_limit"),
         (lambda: Bursts(to_bad=2, to_good=0.1), "to_bad"),
-        (lambda: Outage(3, 3), "ends after it begins"),
-        (lambda: Outage(-1, 3), "ends after it begins"),
-        (lambda: Outage(1, 3, every_s=1.5), "over before the next"),
+        (lambda: Outage(3, 3), "must end after it begins"),
+        (lambda: Outage(-1, 3), "must end after it begins"),
+        (lambda: Outage(1, 3, every_s=1.5), "must end before the next"),
     ],
 )
 def test_settings_that_no_radio_has_are_refused(make: object, named: str) -> None:

@@ -6,18 +6,20 @@ import pytest
 
 from tests.lab.mitm.samples import AB, BA, converse, notes, sends
 from uavlinkd.core import wire
-from uavlinkd.lab.mitm.attack import NEVER, Send, What
+from uavlinkd.lab.mitm.attack import NEVER, Operation, Send
 from uavlinkd.lab.mitm.attacks import parse_attack, stretch
 
 CONVERSATION = converse(1)
-ENVELOPES = [datagram for datagram, way in CONVERSATION.said if way == AB and datagram[0] == wire.SHORT_ENVELOPE]
+ENVELOPES = [
+    datagram for datagram, direction in CONVERSATION.said if direction == AB and datagram[0] == wire.SHORT_ENVELOPE
+]
 
 
 def test_one_envelope_passes_each_interval_in_the_order_sent() -> None:
     """The first after one interval; what is sent meanwhile waits behind it."""
-    attack = parse_attack("stretch,interval_s=2").make(CONVERSATION.surroundings)
-    for number, each in enumerate(ENVELOPES[:3]):
-        assert sends(attack.on_datagram(each, AB, number / 10)) == []
+    attack = parse_attack("stretch,interval_s=2").make(CONVERSATION.context)
+    for number, envelope in enumerate(ENVELOPES[:3]):
+        assert sends(attack.on_datagram(envelope, AB, number / 10)) == []
     assert attack.next_deadline() == 2.0
     assert sends(attack.due(1.9)) == []
     assert sends(attack.due(2.0)) == [Send(ENVELOPES[0], AB)]
@@ -29,17 +31,17 @@ def test_one_envelope_passes_each_interval_in_the_order_sent() -> None:
 @pytest.mark.parametrize("blocks", [True, False])
 def test_handshake_messages_are_dropped_in_both_directions(blocks: bool) -> None:
     """Also where one direction alone is delayed; on request they pass."""
-    text = f"stretch,way=a>b,block_handshakes={str(blocks).lower()}"
-    attack = parse_attack(text).make(CONVERSATION.surroundings)
-    for datagram, way in ((CONVERSATION.initiation, AB), (CONVERSATION.response, BA)):
-        actions = attack.on_datagram(datagram, way, 0.0)
-        assert sends(actions) == ([] if blocks else [Send(datagram, way)])
-        assert [each.what for each in notes(actions)] == ([What.DROPPED] if blocks else [])
+    text = f"stretch,direction=a>b,block_handshakes={str(blocks).lower()}"
+    attack = parse_attack(text).make(CONVERSATION.context)
+    for datagram, direction in ((CONVERSATION.initiation, AB), (CONVERSATION.response, BA)):
+        actions = attack.on_datagram(datagram, direction, 0.0)
+        assert sends(actions) == ([] if blocks else [Send(datagram, direction)])
+        assert [note.operation for note in notes(actions)] == ([Operation.DROPPED] if blocks else [])
 
 
 def test_other_direction_of_a_stretched_one_passes() -> None:
-    """Unless it is asked for both; and after its end nothing more is delayed."""
-    attack = parse_attack("stretch,way=a>b,seconds=5").make(CONVERSATION.surroundings)
+    """Both directions are stretched only if selected; after its end, no datagram is delayed."""
+    attack = parse_attack("stretch,direction=a>b,seconds=5").make(CONVERSATION.context)
     assert sends(attack.on_datagram(ENVELOPES[0], BA, 0.0)) == [Send(ENVELOPES[0], BA)]
     assert sends(attack.on_datagram(ENVELOPES[0], AB, 5.0)) == [Send(ENVELOPES[0], AB)]
 
@@ -48,7 +50,7 @@ def test_other_direction_of_a_stretched_one_passes() -> None:
 @pytest.mark.parametrize("is_reply", [True, False])
 def test_echo_records_of_the_other_direction_are_dropped_by_their_length(is_reply: bool, tag_bytes: int) -> None:
     """Encrypted or not, with each length of tag; frames pass there."""
-    attack = parse_attack("stretch-one-way,way=a>b").make(CONVERSATION.surroundings)
+    attack = parse_attack("stretch-one-way,direction=a>b").make(CONVERSATION.context)
     record = wire.Echo(is_reply, 1, 2, 3).encode()
     echo = wire.envelope_header(7, 9) + record + bytes(tag_bytes)
     assert sends(attack.on_datagram(echo, BA, 0.0)) == []
@@ -57,14 +59,14 @@ def test_echo_records_of_the_other_direction_are_dropped_by_their_length(is_repl
 
 
 def test_whole_other_direction_can_be_blocked() -> None:
-    """Nothing comes back."""
-    attack = parse_attack("stretch-one-way,way=a>b,back=all").make(CONVERSATION.surroundings)
+    """All datagrams of the other direction are dropped."""
+    attack = parse_attack("stretch-one-way,direction=a>b,back=all").make(CONVERSATION.context)
     assert sends(attack.on_datagram(ENVELOPES[0], BA, 0.0)) == []
 
 
 def test_share_of_the_envelopes_passes_at_once() -> None:
     """Those that are not chosen are not delayed."""
-    attack = parse_attack("stretch,skip=1").make(CONVERSATION.surroundings)
+    attack = parse_attack("stretch,skip=1").make(CONVERSATION.context)
     assert sends(attack.on_datagram(ENVELOPES[0], AB, 0.0)) == [Send(ENVELOPES[0], AB)]
     assert sends(attack.on_datagram(ENVELOPES[1], AB, 0.0)) == []
 
@@ -72,6 +74,6 @@ def test_share_of_the_envelopes_passes_at_once() -> None:
 def test_queue_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     """What does not fit is dropped: if it passed at once, others would overtake the queue."""
     monkeypatch.setattr(stretch, "HELD_LIMIT", 2)
-    attack = parse_attack("stretch").make(CONVERSATION.surroundings)
-    whats = [each.what for one in ENVELOPES[:3] for each in notes(attack.on_datagram(one, AB, 0.0))]
-    assert whats == [What.HELD, What.HELD, What.DROPPED]
+    attack = parse_attack("stretch").make(CONVERSATION.context)
+    whats = [note.operation for one in ENVELOPES[:3] for note in notes(attack.on_datagram(one, AB, 0.0))]
+    assert whats == [Operation.HELD, Operation.HELD, Operation.DROPPED]

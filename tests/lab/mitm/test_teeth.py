@@ -1,6 +1,6 @@
-"""Attacks have teeth: a receiver that leaves out one check, here and nowhere else, falls to the attack on it.
+"""The attacks are effective: each succeeds against a receiver without the check that prevents it.
 
-With its checks the same receiver falls to none of them: see ``test_under_attack.py``.
+With all checks, they fail against the same receiver: see ``test_under_attack.py``.
 """
 
 from __future__ import annotations
@@ -11,17 +11,20 @@ import pytest
 
 from tests.lab.mitm.middle import Middle
 from tests.network.network import Drone, Flow, Network
-from uavlinkd.core import handshake, session, wire
+from uavlinkd.core import handshake, receive, session, wire
 from uavlinkd.core.cookie import CookieJar, MacKeys
+from uavlinkd.core.drops import Drop
 from uavlinkd.core.drops import DropReason as Reason
-from uavlinkd.core.freshness import Questions, Verification
+from uavlinkd.core.echo_requests import EchoRequests
 from uavlinkd.core.indices import Indices
 from uavlinkd.core.node import Node
-from uavlinkd.core.outputs import Path
+from uavlinkd.core.outputs import Output
+from uavlinkd.core.path import Path
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.replay import ReplayWindow
 from uavlinkd.core.settings import Link, Timers
-from uavlinkd.lab.mitm.anatomy import Kind, kind_of
+from uavlinkd.core.verification import Verification
+from uavlinkd.lab.mitm.anatomy import DatagramKind, kind_of
 from uavlinkd.lab.mitm.attacks import parse_attack
 from uavlinkd.lab.mitm.radio import RadioSettings
 
@@ -29,7 +32,7 @@ FAST = Link(timers=Timers(rekey_after_s=1.0, reject_after_s=6.0))
 
 
 class Stage:
-    """A linked pair, the man between them, and traffic both ways."""
+    """A linked pair, the man in the middle, and traffic in both directions."""
 
     def __init__(self, network: Network, link: Link | None = None, *, knows_keys: bool = True) -> None:
         self.network = network
@@ -52,7 +55,7 @@ class Stage:
 
     def _attack(self, *attacks: str) -> None:
         now = self.network.now
-        self.middle.attack(*(parse_attack(each).make(self.middle.surroundings, 1, now) for each in attacks))
+        self.middle.attack(*(parse_attack(attack).make(self.middle.context, 1, now) for attack in attacks))
 
 
 def _stage(link: Link | None = None, *, knows_keys: bool = True) -> Stage:
@@ -62,14 +65,14 @@ def _stage(link: Link | None = None, *, knows_keys: bool = True) -> Stage:
 
 
 @pytest.mark.parametrize("attack", ["alter-frame", "bit-flip", "splice", "forge-data", "extend", "truncate"])
-def test_receiver_without_tag_check_delivers_what_nobody_sent(attack: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_receiver_without_tag_check_delivers_forged_frames(attack: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The network's own check at delivery finds the false frame."""
     monkeypatch.setattr(session, "equal", lambda _one, _other: True)
     stage = _stage()
     stage.begin(f"{attack},begin_s=0.1")
     with pytest.raises(AssertionError) as caught:
         stage.network.run(5)
-    assert caught.traceback[-1].name in ("deliver", "perform"), "the payload that came out is no frame that was sent"
+    assert caught.traceback[-1].name in ("deliver", "perform"), "the delivered payload was never sent"
 
 
 def test_receiver_without_tag_check_accepts_a_false_tag(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -78,7 +81,7 @@ def test_receiver_without_tag_check_accepts_a_false_tag(monkeypatch: pytest.Monk
     stage = _stage()
     stage.begin("tamper-tag,tag=zero")
     stage.network.run(3)
-    assert [each for each in stage.middle.interventions if each.attack == "tamper-tag"]
+    assert [intervention for intervention in stage.middle.interventions if intervention.attack == "tamper-tag"]
     assert stage.a.drops[Reason.BAD_TAG] == stage.b.drops[Reason.BAD_TAG] == 0
     assert not stage.flows[0].lost(1.0, stage.network.now - 0.1)
 
@@ -88,12 +91,16 @@ def test_receiver_that_marks_before_it_verifies_loses_the_link_to_one_counter(
 ) -> None:
     """One forged envelope with the last counter there is, and every genuine one is too old."""
 
-    def marks_at_once(self: ReplayWindow, counter: int) -> None:
-        genuine_check(self, counter)
-        self.mark(counter)
+    def marks_at_once(self: session.Session, datagram: bytes, header_bytes: int, counter: int, now: float) -> bytes:
+        try:
+            return genuine_open(self, datagram, header_bytes, counter, now)
+        except Drop as drop:
+            if drop.reason is Reason.BAD_TAG:
+                self.window.mark(counter)
+            raise
 
-    genuine_check = ReplayWindow.check
-    monkeypatch.setattr(ReplayWindow, "check", marks_at_once)
+    genuine_open = session.Session.open
+    monkeypatch.setattr(session.Session, "open", marks_at_once)
     stage = _stage()
     stage.begin("counter-jump,to=last,limit=2")
     stage.network.run(0.5)
@@ -103,7 +110,7 @@ def test_receiver_that_marks_before_it_verifies_loses_the_link_to_one_counter(
 
 @pytest.mark.parametrize("attack", ["replay-data", "duplicate", "replay-data,when=later,delay_s=2"])
 def test_receiver_without_replay_check_delivers_twice(attack: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same frame comes out again."""
+    """The same frame is delivered again."""
     monkeypatch.setattr(ReplayWindow, "check", lambda _self, _counter: None)
     stage = _stage()
     stage.begin(attack)
@@ -115,15 +122,15 @@ def test_receiver_without_replay_check_delivers_twice(attack: str, monkeypatch: 
 def test_receiver_without_a_sense_of_time_delivers_what_was_held(
     attack: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Authentic and five seconds old, whether others came through meanwhile or nothing did."""
+    """The frame is authentic and 5 s old, with or without other frames meanwhile."""
     genuine = session.Session.__init__
 
-    def trusts_for_ever(self: session.Session, *facts: Any, **named: Any) -> None:
+    def trusts_indefinitely(self: session.Session, *facts: Any, **named: Any) -> None:
         genuine(self, *facts, **named)
         self.trusted_until = float("inf")
 
     monkeypatch.setattr("uavlinkd.core.peer.c.LATE_AFTER_S", float("inf"))
-    monkeypatch.setattr(session.Session, "__init__", trusts_for_ever)
+    monkeypatch.setattr(session.Session, "__init__", trusts_indefinitely)
     stage = _stage()
     stage.begin(attack)
     stage.network.run(12)
@@ -142,17 +149,17 @@ def test_receiver_that_needs_no_answers_delivers_stretched_frames(
         self.until = self.look_at = float("inf")
 
     monkeypatch.setattr(Verification, "__init__", lasts)
-    monkeypatch.setattr(Questions, "is_issued", lambda _self, _token: False)
+    monkeypatch.setattr(EchoRequests, "was_sent", lambda _self, _token: False)
     stage = _stage()
-    stage.begin(f"{attack},way=a>b")
+    stage.begin(f"{attack},direction=a>b")
     stage.network.run(30)
     assert stage.flows[0].oldest_s > 25.0
 
 
 def test_receiver_with_one_key_for_both_directions_takes_its_own_frames(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where neither the key nor the index tells the direction, a reflected envelope is the peer's."""
+    """If neither key nor index depends on the direction, a reflected envelope looks like the peer's."""
 
-    def derive(*facts: Any, from_initiator: bool) -> session.Protection:
+    def derive(*facts: Any, from_initiator: bool) -> session.EnvelopeKey:
         return genuine_derive(facts[0], facts[1], facts[2], from_initiator=from_initiator or True)
 
     genuine_derive = session.derive
@@ -164,7 +171,7 @@ def test_receiver_with_one_key_for_both_directions_takes_its_own_frames(monkeypa
             self._send = self._receive
 
     monkeypatch.setattr(session, "derive", derive)
-    monkeypatch.setattr("uavlinkd.core.peer.Session", OneKey)
+    monkeypatch.setattr("uavlinkd.core.establish.Session", OneKey)
     monkeypatch.setattr(Indices, "pick", lambda _self, _now: 7)
     monkeypatch.setattr(ReplayWindow, "check", lambda _self, _counter: None)
     stage = _stage()
@@ -191,7 +198,7 @@ def test_receiver_that_takes_the_header_as_it_is_never_hears_its_peer(monkeypatc
 
 
 def test_receiver_without_mac1_check_answers_strangers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whoever sends enough gets a cookie, and knows that somebody is there."""
+    """A sender under load gets a cookie reply, which shows that a daemon listens."""
     monkeypatch.setattr(MacKeys, "check_mac1", lambda _self, _datagram: None)
     stage = _stage(knows_keys=False)
     stage.begin("flood-initiations,mac1=bad")
@@ -201,7 +208,7 @@ def test_receiver_without_mac1_check_answers_strangers(monkeypatch: pytest.Monke
 
 @pytest.mark.parametrize("origin", ["sender", "stranger"])
 def test_receiver_without_memory_of_initiations_answers_replays(origin: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each replay costs it a handshake and a place for a session; even then the session in use goes on."""
+    """Each replay costs a handshake and an index, but the session in use continues."""
     monkeypatch.setattr(Node, "_remember", lambda *_: None)
     stage = _stage(FAST)
     answered: list[bytes] = []
@@ -211,13 +218,13 @@ def test_receiver_without_memory_of_initiations_answers_replays(origin: str, mon
             answered.append(datagram)
 
         def receive(self, datagram: bytes, source: object, destination: object) -> None:
-            """Nothing is sent to it."""
+            """It receives no datagrams."""
 
     stage.network.listeners.append(Listener())
     stage.begin(f"replay-initiation,copies=3,origin={origin},limit=5")
     stage.network.run(6)
-    initiations = [each for each in answered if kind_of(each) is Kind.INITIATION]
-    responses = [each for each in answered if kind_of(each) is Kind.RESPONSE]
+    initiations = [datagram for datagram in answered if kind_of(datagram) is DatagramKind.INITIATION]
+    responses = [datagram for datagram in answered if kind_of(datagram) is DatagramKind.RESPONSE]
     assert stage.a.drops[Reason.REPLAYED_INITIATION] + stage.b.drops[Reason.REPLAYED_INITIATION] == 0
     assert len(responses) >= len(initiations) + 5  # a burst, then two a second while the link is up
 
@@ -225,10 +232,11 @@ def test_receiver_without_memory_of_initiations_answers_replays(origin: str, mon
 def test_receiver_that_follows_every_address_loses_its_traffic(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without a path challenge one forwarded envelope pulls the frames to the attacker, who then stops."""
 
-    def follow(self: Peer, _session: object, path: Path, *_rest: object) -> None:
-        self.path = path
+    def follow(peer: Peer, _session: object, path: Path, *_rest: object) -> list[Output]:
+        peer.path = path
+        return []
 
-    monkeypatch.setattr(Peer, "_challenge_path", follow)
+    monkeypatch.setattr(receive, "challenge", follow)
     stage = _stage()
     stage.begin("roam,mode=race")
     stage.network.run(3)
@@ -238,9 +246,9 @@ def test_receiver_that_follows_every_address_loses_its_traffic(monkeypatch: pyte
 
 
 def test_receiver_with_long_cookie_replies_is_found_by_the_probe(monkeypatch: pytest.MonkeyPatch) -> None:
-    """More bytes back than were sent there: the probe says so."""
+    """The probe reports that a stranger received more bytes than it sent."""
     monkeypatch.setattr(CookieJar, "reply", lambda *_: b"\x03" + bytes(2000))
     stage = _stage()
     stage.begin("amplification-probe,rate_per_s=1000")
     stage.network.run(3)
-    assert any("amplified" in each.detail for each in stage.middle.interventions)
+    assert any("amplified" in intervention.detail for intervention in stage.middle.interventions)

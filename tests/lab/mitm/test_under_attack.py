@@ -1,6 +1,6 @@
-"""Two nodes of the core under each attack, in virtual time: nothing false gets in, and the link comes back by itself.
+"""Two nodes of the core under each attack, in virtual time: no false frame is delivered, and the link recovers.
 
-That what comes out was sent, unaltered and once, is held at every delivery by the simulated network.
+The simulated network checks at every delivery that the frame was sent, is unaltered, and is delivered once.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from tests.network.network import Drone, Network
 from uavlinkd.core.drops import DropReason as Reason
 from uavlinkd.core.settings import Link, Timers
 from uavlinkd.core.suites import SUITES_BY_NAME
-from uavlinkd.lab.mitm.attack import Attack, Options, What
+from uavlinkd.lab.mitm.attack import Attack, Operation, Options
 from uavlinkd.lab.mitm.attacks import ATTACKS, parse_attack
 from uavlinkd.lab.mitm.radio import RadioSettings
 
 FAST = Timers(rekey_after_s=1.0, reject_after_s=6.0)
-"""Handshakes each second, so that attacks on them have something to attack."""
+"""A handshake per second, so that attacks on handshakes have targets."""
 ATTACK_S = 8.0
 RECOVERY_S = 2.0
 
-# What a person finds in the counters of drops afterwards, and below in those of what disturbed the link.
+# The expected counters of drops, and below those of link problems.
 EXPECTED: dict[str, set[Reason]] = {
     "tamper-key": {Reason.BAD_HANDSHAKE},
     "replace-key": {Reason.BAD_HANDSHAKE},
@@ -80,54 +80,38 @@ DISTURBS: dict[str, str] = {
     "stolen-cookie": "cookies_taken",
 }
 COSTS_NOTHING = {
-    "replay-initiation",
-    "replay-response",
-    "replay-data",
-    "duplicate",
-    "reflect",
-    "misroute",
-    "counter-jump",
-    "forge-data",
-    "flood-envelopes",
-    "raw-mavlink",
-    "flood-initiations",
-    "flood-replays",
-    "flood-garbage",
-    "stranger-scan",
-    "amplification-probe",
-    "forge-hints",
-    "forge-cookie",
-    "roam",
-    "cross-initiations",
-    "reorder",
+    *("replay-initiation", "replay-response", "replay-data", "duplicate", "reflect", "misroute"),
+    *("counter-jump", "forge-data", "flood-envelopes", "raw-mavlink", "flood-initiations", "flood-replays"),
+    *("flood-garbage", "stranger-scan", "amplification-probe", "forge-hints", "forge-cookie", "roam"),
+    *("cross-initiations", "reorder"),
 }
-"""Attacks that add datagrams, and take none away for long."""
+"""Attacks that add datagrams and do not withhold any for long."""
 VALIDATES = {"wander"}
-"""It carries answers back, so its addresses prove themselves."""
+"""It relays answers, so its strangers become validated addresses."""
 OPTIONS = {
-    "drop-heartbeats": ",size=45",  # the network's frames are no MAVLink: they are told by their size
+    "drop-heartbeats": ",size=45",  # the network's frames are not MAVLink: their size identifies them
     "drop": ",share=0.5",
-    "hold": ",share=0.3,hold_s=2.6",  # longer, and the sessions are over
+    "hold": ",share=0.3,hold_s=2.6",  # longer, and the sessions expire
 }
 
 
 @dataclass
 class Outcome:
-    """What an attack left."""
+    """The state after an attack."""
 
     attack: Attack[Options]
     middle: Middle
     drops: Counter[str]
-    disturbances: Counter[str]
+    link_problems: Counter[str]
     lost: int
     recovery_s: float
 
 
 def _attack(name: str, options: str = "") -> Outcome:
-    """A linked pair (three where it takes three), the attack, and three seconds after it."""
+    """Run a linked pair (or three drones, if needed) under the attack, and three seconds after it."""
     suite = SUITES_BY_NAME["ffdhe2048" if name == "corrupt-share" else "x25519"]
     with Network(f"attack {name}", RadioSettings(delay_s=0.01)) as network:
-        drones: list[Drone] = [network.add(each) for each in ("abc" if name == "misroute" else "ab")]
+        drones: list[Drone] = [network.add(letter) for letter in ("abc" if name == "misroute" else "ab")]
         middle = Middle(network, *drones)
         middle.introduce(Link(suites=(suite,), timers=FAST))
         for drone in drones:
@@ -138,11 +122,11 @@ def _attack(name: str, options: str = "") -> Outcome:
         for drone in drones:
             before += drone.drops
         attack = parse_attack(f"{name},seconds={ATTACK_S}{OPTIONS.get(name, '')}{options}").make(
-            middle.surroundings, 1, network.now
+            middle.context, 1, network.now
         )
-        # Cookies are given under load only.
+        # Cookies are sent only under load.
         load = parse_attack(f"flood-initiations,rate_per_s=200,seconds={ATTACK_S}")
-        loads = [load.make(middle.surroundings, 1, network.now)] if "cookie" in name + options else []
+        loads = [load.make(middle.context, 1, network.now)] if "cookie" in name + options else []
         middle.attack(*loads, attack)
         begin = network.now
         network.run(ATTACK_S)
@@ -155,36 +139,36 @@ def _attack(name: str, options: str = "") -> Outcome:
             attack,
             middle,
             drops - before,
-            _disturbances(drones),
+            _link_problems(drones),
             sum(len(flow.lost(begin, end)) for flow in flows),
             max(flow.first_delivery(end) - end for flow in flows),
         )
 
 
-def _disturbances(drones: list[Drone]) -> Counter[str]:
-    found: Counter[str] = Counter()
+def _link_problems(drones: list[Drone]) -> Counter[str]:
+    result: Counter[str] = Counter()
     for drone in drones:
         assert drone.node is not None
         for peer in drone.node.peers.values():
-            found["missing"] += peer.missing(drone.local_now)
+            result["missing"] += peer.missing(drone.local_now)
             for name in set(DISTURBS.values()) - {"missing"}:
-                found[name] += getattr(peer.traffic, name)
-    return found
+                result[name] += getattr(peer.traffic, name)
+    return result
 
 
 @pytest.mark.parametrize("name", ATTACKS)
 def test_link_holds_against_the_attack_and_comes_back_after_it(name: str) -> None:
-    """It reached the wire, left its reason, amplified nothing, and frames flow within two seconds of its end."""
+    """The attack had targets, left a counter, amplified nothing, and frames flow again within 2 s."""
     outcome = _attack(name)
-    told = [each for each in outcome.middle.interventions if each.attack == name]
-    assert outcome.attack.strikes > 0
-    assert told
+    reported = [intervention for intervention in outcome.middle.interventions if intervention.attack == name]
+    assert outcome.attack.attempts > 0
+    assert reported
     assert outcome.recovery_s <= RECOVERY_S
     missing = EXPECTED.get(name, set()) - set(outcome.drops)
     assert not missing, f"not counted: {missing}; counted: {outcome.drops}"
     if name in DISTURBS:
-        assert outcome.disturbances[DISTURBS[name]] > 0
-    assert outcome.drops or +outcome.disturbances, "it left nothing that a person can find"
+        assert outcome.link_problems[DISTURBS[name]] > 0
+    assert outcome.drops or +outcome.link_problems, "it left nothing that a person can find"
     if name in COSTS_NOTHING:
         assert outcome.lost == 0
     if name not in VALIDATES:
@@ -196,25 +180,23 @@ def test_link_holds_against_the_attack_and_comes_back_after_it(name: str) -> Non
 def test_link_comes_back_whichever_message_is_dropped(message: str) -> None:
     """Exactly that message of every handshake, for eight seconds."""
     outcome = _attack("drop-message", f",message={message}")
-    told = [each for each in outcome.middle.interventions if each.attack == "drop-message"]
-    assert told
-    assert {each.what for each in told} == {What.DROPPED}
+    reported = [
+        intervention for intervention in outcome.middle.interventions if intervention.attack == "drop-message"
+    ]
+    assert reported
+    assert {note.operation for note in reported} == {Operation.DROPPED}
     assert outcome.recovery_s <= RECOVERY_S
 
 
 @pytest.mark.parametrize("when", ["later,delay_s=3", "rekey", "restart"])
 @pytest.mark.parametrize("name", ["replay-data", "replay-initiation", "duplicate"])
 def test_replay_at_another_time_gets_nothing_in(name: str, when: str) -> None:
-    """Three seconds later, after new keys, after a restart of one side: nothing comes out twice, nothing is lost."""
+    """After 3 s, after a rekey, after a restart of one side: no frame is delivered twice or lost."""
     with Network(f"replay {name} {when}", RadioSettings(delay_s=0.01)) as network:
-        a, b = network.add("a"), network.add("b")
-        middle = Middle(network, a, b)
-        middle.introduce(Link(timers=FAST))
-        a.start()
-        b.start()
+        middle, a, b = Middle.between(network, Link(timers=FAST))
         flows = network.talk(a, b)
         network.run(1)
-        middle.attack(parse_attack(f"{name},when={when}").make(middle.surroundings, 1, network.now))
+        middle.attack(parse_attack(f"{name},when={when}").make(middle.context, 1, network.now))
         network.run(4)
         before = a.drops + b.drops
         b.stop()
@@ -223,7 +205,9 @@ def test_replay_at_another_time_gets_nothing_in(name: str, when: str) -> None:
         network.run(2)
         settled = network.now
         network.run(5)
-        replayed = [each for each in middle.interventions if each.what is What.REPLAYED]
+        replayed = [
+            intervention for intervention in middle.interventions if intervention.operation is Operation.REPLAYED
+        ]
         assert replayed
         assert not [n for flow in flows for n in flow.lost(settled, network.now - 0.1)]
         refused = {
@@ -238,47 +222,43 @@ def test_replay_at_another_time_gets_nothing_in(name: str, when: str) -> None:
         judged = a.drops + b.drops if when == "restart" else before
         assert refused & set(judged)
         if when == "restart" and name == "replay-data":
-            again = [each for each in replayed if each.at < network.now - 0.1]  # the others are still on their way
-            gone = sum(judged[each] for each in refused) - sum(before[each] for each in refused)
+            again = [note for note in replayed if note.at < network.now - 0.1]  # the others are still in flight
+            gone = sum(judged[reason] for reason in refused) - sum(before[reason] for reason in refused)
             assert gone >= len(again) > 0
 
 
 def test_stranger_without_the_public_key_gets_no_answer() -> None:
-    """Floods, scans and probes of someone who knows no public key: not one datagram comes back."""
+    """Floods, scans and probes without a public key get no answer."""
     for text in ("stranger-scan,rate_per_s=500", "flood-garbage", "flood-initiations,mac1=bad", "raw-mavlink"):
         with Network(f"silence {text}", RadioSettings(delay_s=0.01)) as network:
-            a, b = network.add("a"), network.add("b")
-            middle = Middle(network, a, b, knows_keys=False)
-            middle.introduce()
-            a.start()
-            b.start()
+            middle, a, b = Middle.between(network, knows_keys=False)
             flows = network.talk(a, b)
             network.run(1)
             begin = network.now
-            attack = parse_attack(text).make(middle.surroundings, 1, network.now)
+            attack = parse_attack(text).make(middle.context, 1, network.now)
             middle.attack(attack)
             network.run(5)
-            assert attack.strikes >= 50
+            assert attack.attempts >= 50
             assert middle.to_strangers == []
             assert not [n for flow in flows for n in flow.lost(begin, network.now - 0.1)]
 
 
 @pytest.mark.parametrize(("hold_s", "come_out"), [(1.5, True), (5.0, False)])
 def test_held_envelopes_come_out_within_two_seconds_or_never(hold_s: float, come_out: bool) -> None:
-    """A tag does not tell the hour, but what came after it does: released too late it is refused, and counted."""
+    """A tag has no time, but later envelopes reveal the delay: a late release is refused and counted."""
     with Network("hold", RadioSettings(delay_s=0.01)) as network:
-        a, b = network.add("a"), network.add("b")
-        middle = Middle(network, a, b)
-        middle.introduce()
-        a.start()
-        b.start()
+        middle, a, b = Middle.between(network)
         flow, _ = network.talk(a, b)
         network.run(1)
         begin = network.now
-        middle.attack(parse_attack(f"hold,hold_s={hold_s},share=0.1,seconds=4").make(middle.surroundings, 1, begin))
+        middle.attack(parse_attack(f"hold,hold_s={hold_s},share=0.1,seconds=4").make(middle.context, 1, begin))
         network.run(12)
         late = [n for n, at in flow.delivered.items() if at - flow.sent_at[n] > hold_s - 0.1]
-        released = [each for each in middle.interventions if each.what is What.RELEASED and str(each.way) == "a>b"]
+        released = [
+            intervention
+            for intervention in middle.interventions
+            if intervention.operation is Operation.RELEASED and str(intervention.direction) == "a>b"
+        ]
         assert released
         assert bool(late) == come_out
         assert bool(flow.lost(begin, network.now - 0.1)) != come_out
@@ -286,21 +266,17 @@ def test_held_envelopes_come_out_within_two_seconds_or_never(hold_s: float, come
 
 
 def test_attacks_combine_with_one_another_and_with_a_bad_radio() -> None:
-    """Five at once over a link that loses a fifth: nothing false comes out, and it recovers."""
+    """Five attacks at once over a link with 20 % loss: no false frame is delivered, and the link recovers."""
     names = ("replay-data", "bit-flip,share=0.2", "tamper-key,share=0.5", "reflect,share=0.3", "flood-garbage")
     with Network("many", RadioSettings(delay_s=0.02, loss=0.2)) as network:
-        a, b = network.add("a"), network.add("b")
-        middle = Middle(network, a, b)
-        middle.introduce(Link(timers=FAST))
-        a.start()
-        b.start()
+        middle, a, b = Middle.between(network, Link(timers=FAST))
         flows = network.talk(a, b)
         network.run(3)
-        attacks = [parse_attack(f"{name},seconds=10").make(middle.surroundings, 1, network.now) for name in names]
+        attacks = [parse_attack(f"{name},seconds=10").make(middle.context, 1, network.now) for name in names]
         middle.attack(*attacks)
         network.run(10)
         end = network.now
         network.run(3)
-        assert all(attack.strikes > 0 for attack in attacks)
+        assert all(attack.attempts > 0 for attack in attacks)
         assert all(flow.first_delivery(end) - end <= RECOVERY_S for flow in flows)
         assert any(flow.first_delivery(end - 10) < end for flow in flows)

@@ -1,11 +1,11 @@
-"""Ground stations by others, run as programs: each flies whatever vehicle answers at a URL, and prints what it saw.
+"""Ground stations of other projects, as processes: each flies the vehicle at a URL, and prints its observations.
 
-What it saw is the last line printed, as JSON.
+The last line has the observations as JSON.
 
 Usage: python clients.py mavsdk|mavutil URL
 
-It imports nothing of the project, so any interpreter that has the client library can run it, and a library that
-crashes takes no test with it. Everything goes through the library's own calls, as in a user's program.
+It imports no module of the project, so any interpreter with the client library can run it, and a crash of the library
+does not stop the tests. It uses only the library's public functions, as a user does.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from collections.abc import Callable
 from contextlib import aclosing
 from typing import Any
 
-TIMEOUT_S = 30.0
+TIMEOUT_S = 240.0
 ALTITUDE_M = 3.0
 
 # (command, frame, parameters, latitude and longitude in 1e-7 degrees, altitude in m). Item 0 is home, as ArduPilot's.
@@ -61,7 +61,7 @@ async def fly_with_mavsdk(url: str) -> dict[str, Any]:
             TelemetryAsync(system),
         )
         every = await parameters.get_all_params()
-        table = {each.name: each.value for each in [*every.int_params, *every.float_params]}
+        table = {param.name: param.value for param in [*every.int_params, *every.float_params]}
         await parameters.set_param_float("WPNAV_SPEED_UP", 500.0)
         await parameters.set_param_int("LAND_SPEED", 200)
         after = [await parameters.get_param_float("WPNAV_SPEED_UP"), await parameters.get_param_int("LAND_SPEED")]

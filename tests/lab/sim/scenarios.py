@@ -19,21 +19,22 @@ from typing import Any
 
 import pytest
 
+from uavlinkd.lab.child_processes import end_with_parent
 from uavlinkd.lab.sim.flight import Flight
 
-TIMEOUT_S = 90.0
+TIMEOUT_S = 600.0
 PYTHON = os.environ.get("UAVLINKD_CLIENT_PYTHON", sys.executable)
 CLIENTS = Path(__file__).with_name("clients.py")
 
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """What a ground station saw of the vehicle."""
+    """The observations of a ground station."""
 
     system_id: int
     parameters: dict[str, float]
     parameters_set: list[float]  # WPNAV_SPEED_UP and LAND_SPEED, set to 500 and 200 and read back
-    plan: list[Any]  # the mission, as it came back
+    plan: list[Any]  # the mission as read back
     top_m: float
 
 
@@ -41,26 +42,26 @@ def plan_sent() -> list[Any]:
     """The mission that every scenario uploads, in the form of ``Seen.plan``."""
     text = CLIENTS.read_text()
     names: dict[str, Any] = {"__name__": "clients"}
-    exec(compile(text, CLIENTS, "exec"), names)  # the file is a program, not a module of this package
+    exec(compile(text, CLIENTS, "exec"), names)  # a script, not a module of this package
     return list(json.loads(json.dumps(names["PLAN"])))
 
 
 @functools.cache
 def missing(module: str) -> str | None:
-    """Why a client cannot run; None if it can."""
-    found = subprocess.run([PYTHON, "-c", f"import {module}"], capture_output=True, check=False, text=True)
-    return None if found.returncode == 0 else f"{module} is not importable: {found.stderr.strip().splitlines()[-1]}"
+    """The reason why a client cannot run; None if it can."""
+    result = subprocess.run([PYTHON, "-c", f"import {module}"], capture_output=True, check=False, text=True)
+    return None if result.returncode == 0 else f"{module} is not importable: {result.stderr.strip().splitlines()[-1]}"
 
 
 def need(module: str) -> None:
-    """Skip the test, with the reason, if a client is not installed; in CI that is a failure (tests/conftest.py)."""
+    """Skip the test, with the reason, if a client is not installed; in CI it fails (tests/conftest.py)."""
     reason = missing(module)
     if reason:
         pytest.skip(reason)
 
 
 def check(seen: Seen, *, system_id: int, parameters: dict[str, float]) -> None:
-    """The station saw all that there is, and what it changed came back changed."""
+    """The station received all messages, and its changes took effect."""
     assert seen.system_id == system_id
     assert seen.parameters == pytest.approx(parameters, rel=1e-5, abs=1e-6)  # MAVProxy prints six decimals
     assert seen.parameters_set == [500, 200]
@@ -90,7 +91,9 @@ async def fly_with_mavutil(url: str) -> Seen:
 
 async def _run_client(client: str, url: str) -> Seen:
     process = await asyncio.create_subprocess_exec(
-        PYTHON, str(CLIENTS), client, url, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT
+        *end_with_parent(PYTHON, str(CLIENTS), client, url),
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.STDOUT,
     )
     try:
         output, _ = await asyncio.wait_for(process.communicate(), TIMEOUT_S)
@@ -103,7 +106,7 @@ async def _run_client(client: str, url: str) -> Seen:
 
 
 class Terminal:
-    """A program that is typed at, and what it has printed."""
+    """A process with input and output."""
 
     def __init__(self, process: asyncio.subprocess.Process) -> None:
         self._process = process
@@ -115,7 +118,7 @@ class Terminal:
         self._process.stdin.write(line.encode() + b"\n")
 
     async def see(self, wanted: str, timeout_s: float = 30.0) -> None:
-        """Read on until some text comes, after what was seen before."""
+        """Read until a text appears after the output so far."""
         if not await self._saw(wanted, timeout_s):
             raise AssertionError(f"{wanted!r} did not come:\n{self.text}")
 
@@ -147,7 +150,7 @@ async def fly_with_mavproxy(url: str, folder: Path, flight: Flight) -> Seen:
     sent, back = folder / "sent.txt", folder / "back.txt"
     sent.write_text(_as_mavproxy_file(plan_sent()))
     process = await asyncio.create_subprocess_exec(
-        *(PYTHON, "-u", "-m", "MAVProxy.mavproxy", f"--master={url}", f"--state-basedir={folder}"),
+        *end_with_parent(PYTHON, "-u", "-m", "MAVProxy.mavproxy", f"--master={url}", f"--state-basedir={folder}"),
         *(f"--logfile={folder / 'flight.tlog'}", "--default-modules=log,wp,ftp,param,arm,mode,misc,cmdlong"),
         cwd=folder,
         env={**os.environ, "HOME": str(folder), "PYTHONUNBUFFERED": "1"},
@@ -178,7 +181,7 @@ async def fly_with_mavproxy(url: str, folder: Path, flight: Flight) -> Seen:
         await terminal.see("ARMED")
         terminal.type("takeoff 3")
         await terminal.see("NAV_TAKEOFF: ACCEPTED")
-        await flight.until(lambda: flight.autopilot.vehicle.altitude_m > 2.7, timeout_s=30)
+        await flight.until(lambda: flight.autopilot.vehicle.altitude_m > 2.7, timeout_s=240)
         top_m = flight.autopilot.vehicle.altitude_m
         terminal.type("mode land")
         await terminal.see("DISARMED")
@@ -213,7 +216,7 @@ def _of_mavproxy_file(text: str) -> list[Any]:
 
 
 async def _end(process: asyncio.subprocess.Process) -> None:
-    """End a program that this module started, and close its pipes."""
+    """Stop a process of this module, and close its pipes."""
     if process.returncode is None:
         process.kill()
     await process.communicate()

@@ -28,7 +28,7 @@ class Station:
         return decode(self.autopilot.receive(self.encode(message), self.now))
 
     def heartbeat(self) -> list[Any]:
-        """Say that the station is there."""
+        """Send a heartbeat of the station."""
         return self.tell(mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_GCS, 8, 0, 0, 0, 3))
 
     def command(self, number: int, *parameters: float, target: tuple[int, int] = (1, 1)) -> list[Any]:
@@ -44,17 +44,17 @@ class Station:
         return int(acknowledgement.result)
 
     def wait(self, seconds: float, heartbeats: bool = True) -> list[Any]:
-        """Let time pass in small steps; what the autopilot says in it."""
-        heard: list[Any] = []
+        """Advance in small steps, and return the autopilot's messages."""
+        received: list[Any] = []
         end = self.now + seconds
         beat_at = self.now
         while self.now < end:
             if heartbeats and self.now >= beat_at:
                 beat_at += 1
-                heard += self.heartbeat()
+                received += self.heartbeat()
             self.now = min(end, self.now + 0.05)
-            heard += decode(self.autopilot.advance(self.now))
-        return heard
+            received += decode(self.autopilot.advance(self.now))
+        return received
 
     def take_off(self, altitude_m: float = 5.0) -> None:
         """Bring the copter up, and wait until it is there."""

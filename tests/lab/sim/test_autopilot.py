@@ -37,10 +37,10 @@ def mode(here: Station) -> Mode:
 
 
 def test_telemetry_comes_at_its_rates() -> None:
-    """A fresh copter sends each message as often as its settings say."""
-    heard = station(attitude_rate_hz=50, position_rate_hz=4).wait(10.0)
+    """A new copter sends each message at the rate of its settings."""
+    received = station(attitude_rate_hz=50, position_rate_hz=4).wait(10.0)
     counts = {
-        name: len(of_type(heard, name)) for name in ("HEARTBEAT", "ATTITUDE", "GLOBAL_POSITION_INT", "SYS_STATUS")
+        name: len(of_type(received, name)) for name in ("HEARTBEAT", "ATTITUDE", "GLOBAL_POSITION_INT", "SYS_STATUS")
     }
     assert {name: pytest.approx(count, abs=2) for name, count in counts.items()} == {
         "HEARTBEAT": 10,
@@ -58,13 +58,13 @@ def test_frames_are_numbered_without_gaps() -> None:
 
 
 def test_its_ids_are_in_every_frame() -> None:
-    """Everything comes from the system and component of the settings."""
-    heard = station(system_id=42, component_id=7).wait(2.0)
-    assert {(message.get_srcSystem(), message.get_srcComponent()) for message in heard} == {(42, 7)}
+    """Every frame has the system and component of the settings."""
+    received = station(system_id=42, component_id=7).wait(2.0)
+    assert {(message.get_srcSystem(), message.get_srcComponent()) for message in received} == {(42, 7)}
 
 
 def test_equal_seed_and_input_give_equal_frames() -> None:
-    """Nothing but settings, input and time decides what is sent."""
+    """Settings, input and time determine all frames."""
 
     def flight(seed: int) -> list[bytes]:
         autopilot = Autopilot(AutopilotSettings(seed=seed), unix_epoch_us=10**15)
@@ -96,7 +96,7 @@ def test_impossible_settings_are_refused(wrong: dict[str, Any]) -> None:
 
 
 def test_it_arms_takes_off_lands_and_disarms() -> None:
-    """A flight in GUIDED goes through the landed states in their order, and up to where it was told."""
+    """A flight in GUIDED has the landed states in order, and reaches its altitude."""
     here = station()
     assert here.result(mavlink.MAV_CMD_DO_SET_MODE, 1, 4) == ACCEPTED
     assert here.result(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1) == ACCEPTED
@@ -138,7 +138,7 @@ def test_it_arms_takes_off_lands_and_disarms() -> None:
     ],
 )
 def test_a_command_that_cannot_be_done_says_so(number: int, parameters: tuple[float, ...], result: int) -> None:
-    """Every command is acknowledged, and one that fails changes nothing."""
+    """Every command is acknowledged, and a failed one changes nothing."""
     here = station()
     assert here.result(number, *parameters) == result
     assert not here.autopilot.vehicle.armed
@@ -156,7 +156,7 @@ def test_disarming_in_the_air_takes_force() -> None:
 
 
 def test_a_command_int_counts_as_a_command_long() -> None:
-    """A take-off to an altitude above the sea goes up by what home lacks to it."""
+    """A take-off to an altitude above mean sea level subtracts that of home."""
     here = station()
     here.result(mavlink.MAV_CMD_DO_SET_MODE, 1, 4)
     here.result(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1)
@@ -178,7 +178,7 @@ def test_set_mode_is_acknowledged() -> None:
 
 
 def test_acknowledgements_name_who_asked() -> None:
-    """With several stations on a link, each can tell its own acknowledgement."""
+    """Each of several stations can identify its own acknowledgement."""
     autopilot = Autopilot()
     for ids in ((255, 190), (250, 1)):
         acknowledgement = Station(autopilot, *ids).command(mavlink.MAV_CMD_NAV_LAND)[-1]
@@ -187,7 +187,7 @@ def test_acknowledgements_name_who_asked() -> None:
 
 @pytest.mark.parametrize("target", [(2, 1), (2, 0), (1, 100)])
 def test_what_is_meant_for_others_is_left_to_them(target: tuple[int, int]) -> None:
-    """A command with another target is neither done nor answered."""
+    """A command for another target is neither executed nor answered."""
     here = station()
     assert here.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1, target=target) == []
     assert not here.autopilot.vehicle.armed
@@ -201,87 +201,11 @@ def test_a_broadcast_is_meant_for_it_too(target: tuple[int, int]) -> None:
     assert here.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1, target=target)[-1].result == ACCEPTED
 
 
-def test_its_own_frames_come_back_unheard() -> None:
+def test_its_own_frames_are_ignored() -> None:
     """A link that loops does not make the copter talk to itself."""
     autopilot = Autopilot()
     own = Station(autopilot, system_id=1, component_id=1)
     assert own.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1) == []
-
-
-def test_message_intervals_are_heeded() -> None:
-    """SET_MESSAGE_INTERVAL raises, stops and restores a rate, and GET_MESSAGE_INTERVAL tells it."""
-    here = station()
-    attitude = mavlink.MAVLINK_MSG_ID_ATTITUDE
-
-    def per_second() -> float:
-        return len(of_type(here.wait(4.0), "ATTITUDE")) / 4
-
-    assert here.result(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, attitude, 20_000) == ACCEPTED
-    assert per_second() == pytest.approx(50, rel=0.1)
-    assert here.command(mavlink.MAV_CMD_GET_MESSAGE_INTERVAL, attitude)[0].interval_us == 20_000
-    assert here.result(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, attitude, -1) == ACCEPTED
-    assert per_second() == 0
-    assert here.command(mavlink.MAV_CMD_GET_MESSAGE_INTERVAL, attitude)[0].interval_us == -1
-    assert here.result(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, attitude, 0) == ACCEPTED
-    assert per_second() == pytest.approx(10, rel=0.1)
-    assert here.result(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, attitude, 1e12) == ACCEPTED
-    assert here.command(mavlink.MAV_CMD_GET_MESSAGE_INTERVAL, attitude)[0].interval_us == 2**31 - 1
-
-
-def test_data_streams_are_heeded() -> None:
-    """REQUEST_DATA_STREAM sets a group, or all; stopping them leaves the heartbeat."""
-    here = station()
-    here.tell(mavlink.MAVLink_request_data_stream_message(1, 1, mavlink.MAV_DATA_STREAM_EXTRA1, 25, 1))
-    assert len(of_type(here.wait(4.0), "ATTITUDE")) == pytest.approx(100, abs=5)
-    here.tell(mavlink.MAVLink_request_data_stream_message(1, 1, mavlink.MAV_DATA_STREAM_ALL, 4, 0))
-    rest = here.wait(4.0)
-    assert of_type(rest, "ATTITUDE") == of_type(rest, "GLOBAL_POSITION_INT") == []
-    assert len(of_type(rest, "HEARTBEAT")) >= 3
-
-
-@pytest.mark.parametrize(
-    ("number", "name"),
-    [
-        (mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION, "AUTOPILOT_VERSION"),
-        (mavlink.MAVLINK_MSG_ID_HOME_POSITION, "HOME_POSITION"),
-        (mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, "ATTITUDE_QUATERNION"),
-        (mavlink.MAVLINK_MSG_ID_RAW_IMU, "RAW_IMU"),
-        (mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE, "SCALED_PRESSURE"),
-        (mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN, "GPS_GLOBAL_ORIGIN"),
-    ],
-)
-def test_messages_come_on_request(number: int, name: str) -> None:
-    """REQUEST_MESSAGE is answered by the message and an acknowledgement."""
-    answers = station().command(mavlink.MAV_CMD_REQUEST_MESSAGE, number)
-    assert [answer.get_type() for answer in answers] == [name, "COMMAND_ACK"]
-    assert answers[-1].result == ACCEPTED
-
-
-def test_timesync_and_ping_are_answered() -> None:
-    """A request carries its own time back; an answer is not answered."""
-    here = station()
-    here.now = 2.5
-    synced = here.tell(mavlink.MAVLink_timesync_message(0, 123))
-    assert [(answer.tc1, answer.ts1) for answer in synced] == [(2_500_000_000, 123)]
-    assert here.tell(mavlink.MAVLink_timesync_message(77, 123)) == []
-    answer = here.tell(mavlink.MAVLink_ping_message(99, 7, 0, 0))[0]
-    assert (answer.time_usec, answer.seq, answer.target_system, answer.target_component) == (99, 7, 255, 190)
-    assert here.tell(mavlink.MAVLink_ping_message(99, 7, 1, 1)) == []
-
-
-@pytest.mark.parametrize(
-    ("number", "parameters", "names"),
-    [
-        (mavlink.MAV_CMD_GET_HOME_POSITION, (), ["HOME_POSITION", "COMMAND_ACK"]),
-        (mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES, (1,), ["AUTOPILOT_VERSION", "COMMAND_ACK"]),
-        (mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES, (0,), ["COMMAND_ACK"]),
-    ],
-)
-def test_the_older_requests_work_too(number: int, parameters: tuple[float, ...], names: list[str]) -> None:
-    """Stations that ask by special commands get the same messages."""
-    answers = station().command(number, *parameters)
-    assert [answer.get_type() for answer in answers] == names
-    assert answers[-1].result == ACCEPTED
 
 
 @pytest.mark.parametrize(
@@ -310,35 +234,26 @@ def test_a_speed_is_heeded() -> None:
     assert of_type(here.wait(10), "VFR_HUD")[-1].groundspeed == pytest.approx(3, abs=0.1)
 
 
-def test_file_transfer_is_refused_once() -> None:
-    """A request for a file gets a NAK, so that the station turns to the parameter protocol; a NAK gets nothing."""
-    here = station()
-    request = [5, 0, 3, 4] + [0] * 247
-    answer = here.tell(mavlink.MAVLink_file_transfer_protocol_message(0, 1, 1, request))[0].payload
-    assert answer[:6] == [6, 0, 3, 129, 1, 4]
-    assert here.tell(mavlink.MAVLink_file_transfer_protocol_message(0, 1, 1, answer)) == []
-
-
 def test_a_lost_ground_station_brings_the_copter_home() -> None:
-    """Silence for FS_GCS_TIMEOUT in flight means RTL, not sooner; the copter lands, and the station may come back."""
+    """In flight, silence for FS_GCS_TIMEOUT causes RTL; the copter lands, and the station may return."""
     here = station()
     here.wait(1.0)
     here.take_off()
     here.heartbeat()
     here.wait(4.9, heartbeats=False)
     assert mode(here) is Mode.GUIDED
-    heard = here.wait(0.3, heartbeats=False)
+    received = here.wait(0.3, heartbeats=False)
     assert mode(here) is Mode.RTL
-    assert [message.text for message in of_type(heard, "STATUSTEXT")] == ["GCS Failsafe"]
+    assert [message.text for message in of_type(received, "STATUSTEXT")] == ["GCS Failsafe"]
     here.wait(40, heartbeats=False)
     assert here.autopilot.vehicle.landed is Landed.ON_GROUND
     here.heartbeat()
     events = here.autopilot.counters.events
-    assert (events["gcs_lost"], events["gcs_failsafe"], events["gcs_heard"], events["landed"]) == (1, 1, 2, 1)
+    assert (events["gcs_lost"], events["gcs_failsafe"], events["gcs_connected"], events["landed"]) == (1, 1, 2, 1)
 
 
 def test_a_disabled_failsafe_leaves_the_copter_where_it_is() -> None:
-    """With FS_GCS_ENABLE 0 the loss is reported and nothing else happens."""
+    """With FS_GCS_ENABLE 0, the loss is only reported."""
     here = station()
     here.tell(mavlink.MAVLink_param_set_message(1, 1, b"FS_GCS_ENABLE", 0.0, mavlink.MAV_PARAM_TYPE_INT8))
     here.take_off()
@@ -361,21 +276,8 @@ def test_it_goes_where_it_is_sent() -> None:
     """DO_REPOSITION and a position target in GUIDED fly to the place."""
     here = station()
     here.take_off()
-    place = mavlink.MAVLink_command_int_message(
-        1,
-        1,
-        mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT,
-        mavlink.MAV_CMD_DO_REPOSITION,
-        0,
-        0,
-        -1,
-        0,
-        0,
-        0,
-        473980000,
-        85460000,
-        9,
-    )
+    there = (1, 1, mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT, mavlink.MAV_CMD_DO_REPOSITION, 0, 0, -1, 0, 0, 0)
+    place = mavlink.MAVLink_command_int_message(*there, 473980000, 85460000, 9)
     assert here.tell(place)[-1].result == ACCEPTED
     last = of_type(here.wait(30), "GLOBAL_POSITION_INT")[-1]
     assert (last.lat, last.lon) == (pytest.approx(473980000, abs=60), pytest.approx(85460000, abs=60))
@@ -395,10 +297,10 @@ def _hostile_frame(number: int, payload: bytes) -> bytes:
 HANDLED = [0, 4, 11, 20, 21, 23, 39, 40, 41, 43, 44, 45, 47, 51, 66, 73, 75, 76, 86, 110, 111]
 
 
-@settings(deadline=None)  # a busy machine is no fault of the copter's
+@settings(deadline=None)  # the machine may be busy
 @given(number=st.sampled_from(HANDLED), payload=st.binary(min_size=1, max_size=255), aimed=st.booleans())
 def test_genuine_frames_of_any_content_do_not_stop_it(number: int, payload: bytes, aimed: bool) -> None:
-    """Whatever a well-formed frame says, the copter goes on sending what can be decoded."""
+    """After any well-formed frame, the copter continues to send valid frames."""
     here = station()
     frame = _hostile_frame(number, payload)
     if aimed:
@@ -423,8 +325,8 @@ def test_random_bytes_do_not_stop_it() -> None:
     assert here.result(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1) == ACCEPTED
 
 
-def test_a_message_that_nobody_knows_is_passed_over() -> None:
-    """A frame with an unknown message id is no reason for an answer or an error."""
+def test_an_unknown_message_is_ignored() -> None:
+    """A frame with an unknown message ID causes neither an answer nor an error."""
     here = station()
     head = struct.pack("<BBBBBB", 1, 0, 0, 0, 255, 190) + (9_999_999).to_bytes(3, "little")
     crc = mavlink.x25crc(head + b"x" + b"\0").crc
@@ -441,7 +343,7 @@ def test_mavlink_1_stations_are_understood() -> None:
 
 
 def test_next_due_at_is_never_later_than_what_is_due() -> None:
-    """A caller that sleeps until then misses nothing: no frame comes from advancing before it."""
+    """Advancing before the next due time sends no frame."""
     autopilot = Autopilot(AutopilotSettings(attitude_rate_hz=33))
     now, sent = 0.0, len(autopilot.advance(0.0))
     for _ in range(400):

@@ -9,7 +9,7 @@ import socket
 import pytest
 
 from tests.lab.sim.recorded import frames
-from uavlinkd.lab.sim.links import MAX_CORRESPONDENTS, Collector, LinkError, LinkURL, open_link, parse_url
+from uavlinkd.lab.sim.links import MAX_CLIENTS, Collector, LinkError, LinkURL, open_connection, parse_url
 
 
 @pytest.mark.parametrize(
@@ -19,7 +19,6 @@ from uavlinkd.lab.sim.links import MAX_CORRESPONDENTS, Collector, LinkError, Lin
         ("udpin://127.0.0.1:14550", LinkURL("udpin", "127.0.0.1", 14550)),
         ("udpout:drone.local:14550", LinkURL("udpout", "drone.local", 14550)),
         ("udpin::14550", LinkURL("udpin", "0.0.0.0", 14550)),
-        ("udp://:14550", LinkURL("udpin", "0.0.0.0", 14550)),
         ("udpin:127.0.0.1:0", LinkURL("udpin", "127.0.0.1", 0)),
         ("tcp:10.0.0.1:5760", LinkURL("tcp", "10.0.0.1", 5760)),
         ("tcpout://10.0.0.1:5760/", LinkURL("tcp", "10.0.0.1", 5760)),
@@ -32,25 +31,22 @@ def test_a_url_is_read(text: str, url: LinkURL) -> None:
     assert parse_url(str(url)) == url
 
 
+def test_udp_is_refused_with_both_meanings() -> None:
+    """It listens in some software and sends in other, as for the daemon's endpoints."""
+    with pytest.raises(LinkError, match=r"write udpin:127\.0\.0\.1:14550 to listen there, or udpout:127"):
+        parse_url("udp://127.0.0.1:14550")
+
+
 @pytest.mark.parametrize(
     "text",
     [
-        "",
-        "udpin",
-        "udpin:127.0.0.1",
-        "udpin:127.0.0.1:",
-        "udpin:127.0.0.1:x",
-        "udpin:127.0.0.1:65536",
-        "udpin:::1:14550",
-        "udpout::14550",
-        "udpout:127.0.0.1:0",
-        "tcp::5760",
-        "serial:/dev/ttyS0:57600",
-        "/dev/ttyACM0",
+        *("", "udpin", "udpin:127.0.0.1", "udpin:127.0.0.1:", "udpin:127.0.0.1:x", "udpin:127.0.0.1:65536"),
+        *("udpin:::1:14550", "udpout::14550", "udpout:127.0.0.1:0", "tcp::5760"),
+        *("serial:/dev/ttyS0:57600", "/dev/ttyACM0"),
     ],
 )
-def test_what_is_no_url_is_refused_in_one_line(text: str) -> None:
-    """The error quotes what was given, on one line."""
+def test_invalid_urls_are_refused_in_one_line(text: str) -> None:
+    """The error quotes the URL, on one line."""
     with pytest.raises(LinkError) as failure:
         parse_url(text)
     assert repr(text) in str(failure.value)
@@ -58,7 +54,7 @@ def test_what_is_no_url_is_refused_in_one_line(text: str) -> None:
 
 
 @pytest.mark.parametrize(("listening", "calling"), [("udpin", "udpout"), ("tcpin", "tcp")])
-async def test_frames_go_both_ways_unchanged(listening: str, calling: str) -> None:
+async def test_frames_pass_unchanged_in_both_directions(listening: str, calling: str) -> None:
     """What one end sends, the other collects byte for byte; a listener answers who called."""
     sent, answers = frames(20), frames(20, system_id=255)
     async with Collector(f"{listening}:127.0.0.1:0") as ground:
@@ -74,42 +70,42 @@ async def test_frames_go_both_ways_unchanged(listening: str, calling: str) -> No
 
 
 async def test_several_correspondents_hear_the_same() -> None:
-    """A listener sends to everyone who was heard."""
+    """A listener sends to all clients."""
     async with Collector("udpin:127.0.0.1:0") as ground:
         url = f"udpout:127.0.0.1:{ground.address[1]}"
         async with Collector(url) as one, Collector(url) as two:
             one.send(frames(1)[0])
             two.send(frames(1)[0])
-            await ground.until(lambda: ground.link.correspondents == 2)
+            await ground.until(lambda: ground.link.receivers == 2)
             ground.send(frames(2)[1])
             await one.until(lambda: len(one.frames) == 1)
             await two.until(lambda: len(two.frames) == 1)
 
 
-async def test_whoever_sends_no_mavlink_is_sent_none() -> None:
-    """Noise makes nobody a correspondent, and a flood of callers pushes out the oldest only."""
+async def test_senders_without_mavlink_are_not_clients() -> None:
+    """Noise does not make a sender a client, and a flood of clients evicts only the oldest."""
     async with Collector("udpin:127.0.0.1:0") as ground:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
             stranger.sendto(random.Random(1).randbytes(400), ground.address)
-            await ground.until(lambda: ground.link.correspondents == 0)
-            callers = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(MAX_CORRESPONDENTS + 5)]
-            for caller in callers:
-                caller.sendto(frames(1)[0], ground.address)
-            await ground.until(lambda: len(ground.frames) == len(callers))
-            assert ground.link.correspondents == MAX_CORRESPONDENTS
+            await ground.until(lambda: ground.link.receivers == 0)
+            senders = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(MAX_CLIENTS + 5)]
+            for sender in senders:
+                sender.sendto(frames(1)[0], ground.address)
+            await ground.until(lambda: len(ground.frames) == len(senders))
+            assert ground.link.receivers == MAX_CLIENTS
             assert ground.link.split.garbage_bytes == 400
-            for caller in callers:
-                caller.close()
+            for sender in senders:
+                sender.close()
 
 
-async def test_an_address_in_use_is_told_in_one_line() -> None:
+async def test_an_address_in_use_is_reported_in_one_line() -> None:
     """The error names the URL."""
     async with Collector("udpin:127.0.0.1:0") as ground:
         with pytest.raises(LinkError, match=f"udpin:127.0.0.1:{ground.address[1]}: "):
-            await open_link(ground.url, lambda _frame: None)
+            await open_connection(ground.url, lambda _frame: None)
 
 
-async def test_nobody_listening_is_no_error_on_udp_and_one_on_tcp() -> None:
+async def test_a_closed_port_is_an_error_only_with_tcp() -> None:
     """A datagram may be sent before the other end is up; a connection cannot."""
     with socket.socket() as bound:
         bound.bind(("127.0.0.1", 0))
@@ -119,13 +115,13 @@ async def test_nobody_listening_is_no_error_on_udp_and_one_on_tcp() -> None:
             await asyncio.wait_for(air.link.refused.wait(), 5)
             assert air.send(frames(1)[0])
         with pytest.raises(LinkError, match=r"tcp:127\.0\.0\.1"):
-            await open_link(f"tcp:127.0.0.1:{port}", lambda _frame: None)
+            await open_connection(f"tcp:127.0.0.1:{port}", lambda _frame: None)
 
 
 async def test_a_closed_connection_is_noticed() -> None:
     """The calling end of TCP learns that the other has gone."""
     async with Collector("tcpin:127.0.0.1:0") as ground:
-        air = await open_link(f"tcp:127.0.0.1:{ground.address[1]}", lambda _frame: None)
+        air = await open_connection(f"tcp:127.0.0.1:{ground.address[1]}", lambda _frame: None)
         air.send(frames(1)[0])
         await ground.until(lambda: len(ground.frames) == 1)
     await asyncio.wait_for(air.lost.wait(), 5)
@@ -133,7 +129,7 @@ async def test_a_closed_connection_is_noticed() -> None:
 
 
 async def test_waiting_for_what_does_not_come_ends() -> None:
-    """A condition that never holds is a TimeoutError after its time."""
+    """A condition that never holds causes a TimeoutError."""
     async with Collector("udpin:127.0.0.1:0") as ground:
         with pytest.raises(TimeoutError):
             await ground.until(lambda: bool(ground.frames), timeout_s=0.01)

@@ -1,4 +1,4 @@
-"""The timetable of telemetry: even intervals, changes that hold, no bursts."""
+"""The schedule of telemetry: regular intervals, lasting changes, no bursts."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ HEARTBEAT, ATTITUDE = mavlink.MAVLINK_MSG_ID_HEARTBEAT, mavlink.MAVLINK_MSG_ID_A
 
 
 def test_each_message_comes_at_its_own_rate() -> None:
-    """Over ten seconds, looked at every 10 ms, each came as often as its rate says."""
+    """During 10 s, polled every 10 ms, each message has its rate."""
     rates = default_rates(attitude_rate_hz=20, position_rate_hz=5)
     streams = Streams(rates, 0.0)
     sent = Counter(message for step in range(1000) for message in streams.take_due(step / 100))
@@ -28,7 +28,7 @@ def test_a_fast_stream_keeps_its_rate_on_a_slow_clock() -> None:
 
 
 def test_after_a_pause_there_is_no_burst() -> None:
-    """What is later than MAX_LATE_S is left out, and the timetable goes on from now."""
+    """Messages later than MAX_LATE_S are skipped, and the schedule continues from now."""
     streams = Streams(default_rates(200, 0), 0.0)
     streams.take_due(0.0)
     assert streams.take_due(MAX_LATE_S).count(ATTITUDE) >= 0.9 * 200 * MAX_LATE_S
@@ -56,7 +56,7 @@ def test_rates_are_bounded() -> None:
 
 
 def test_the_heartbeat_cannot_be_stopped() -> None:
-    """Neither by itself nor with all streams."""
+    """Neither alone nor with all streams."""
     streams = Streams(default_rates(10, 5), 0.0)
     assert not streams.set_rate(HEARTBEAT, 0, 0.0)
     assert streams.set_group(mavlink.MAV_DATA_STREAM_ALL, 0, 0.0)
@@ -65,7 +65,7 @@ def test_the_heartbeat_cannot_be_stopped() -> None:
 
 
 def test_unknown_messages_and_groups_are_refused() -> None:
-    """What is not simulated cannot be asked for."""
+    """Messages that are not simulated cannot be requested."""
     streams = Streams(default_rates(10, 5), 0.0)
     assert not streams.set_rate(mavlink.MAVLINK_MSG_ID_CAMERA_TRIGGER, 10, 0.0)
     assert streams.rate_hz(mavlink.MAVLINK_MSG_ID_CAMERA_TRIGGER) is None

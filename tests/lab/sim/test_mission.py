@@ -60,20 +60,20 @@ def download(here: Station, kind: int = 0) -> list[tuple[int, int, int, int, flo
         here.tell(mavlink.MAVLink_mission_request_int_message(1, 1, sequence, kind))[-1]
         for sequence in range(announced.count)
     ]
-    assert [each.seq for each in got] == list(range(announced.count))
-    return [(each.command, each.frame, each.x, each.y, each.z) for each in got]
+    assert [answer.seq for answer in got] == list(range(announced.count))
+    return [(message.command, message.frame, message.x, message.y, message.z) for message in got]
 
 
 @pytest.mark.parametrize("kind", [0, 1, 2])
 def test_what_is_uploaded_comes_back(here: Station, kind: int) -> None:
-    """Plan, fence and rally points are kept apart and come back as they went up."""
+    """Plan, fence and rally points are separate and unchanged."""
     assert upload(here, kind=kind) == mavlink.MAV_MISSION_ACCEPTED
     assert download(here, kind) == PLAN
     assert download(here, (kind + 1) % 3) == []
 
 
 def test_the_old_list_holds_until_the_new_one_is_complete(here: Station) -> None:
-    """An upload that stops half way changes nothing."""
+    """An incomplete upload changes nothing."""
     upload(here)
     here.tell(count(3))
     here.tell(item(0))
@@ -85,14 +85,14 @@ def test_the_old_list_holds_until_the_new_one_is_complete(here: Station) -> None
 def test_a_lost_item_is_asked_for_again_and_then_given_up(here: Station) -> None:
     """The request is repeated a bounded number of times, then the upload is cancelled and a new one may start."""
     here.tell(count(2))
-    heard = here.wait(REQUEST_AGAIN_AFTER_S * (MAX_REQUESTS_AGAIN + 3))
-    assert [request.seq for request in of_type(heard, "MISSION_REQUEST_INT")] == [0] * MAX_REQUESTS_AGAIN
-    assert [end.type for end in of_type(heard, "MISSION_ACK")] == [mavlink.MAV_MISSION_OPERATION_CANCELLED]
+    received = here.wait(REQUEST_AGAIN_AFTER_S * (MAX_REQUESTS_AGAIN + 3))
+    assert [request.seq for request in of_type(received, "MISSION_REQUEST_INT")] == [0] * MAX_REQUESTS_AGAIN
+    assert [end.type for end in of_type(received, "MISSION_ACK")] == [mavlink.MAV_MISSION_OPERATION_CANCELLED]
     assert upload(here) == mavlink.MAV_MISSION_ACCEPTED
 
 
 def test_a_repeated_item_is_not_taken_twice(here: Station) -> None:
-    """An item that comes again, or out of order, is passed over."""
+    """A repeated or reordered item is ignored."""
     here.tell(count(3))
     assert here.tell(item(0))[-1].seq == 1
     assert here.tell(item(0)) == []
@@ -103,14 +103,14 @@ def test_a_repeated_item_is_not_taken_twice(here: Station) -> None:
 
 
 def test_a_lost_acknowledgement_is_given_again(here: Station) -> None:
-    """A station that repeats its last item, having missed the end, hears of the end."""
+    """A station that repeats its last item gets the acknowledgement again."""
     upload(here)
     last = here.tell(item(len(PLAN) - 1))
     assert [answer.type for answer in last] == [mavlink.MAV_MISSION_ACCEPTED]
 
 
 def test_one_upload_at_a_time(here: Station) -> None:
-    """While one station uploads, another is denied; items of the other are not taken."""
+    """During the upload of one station, uploads and items of others are refused."""
     other = Station(here.autopilot, system_id=250)
     here.tell(count(2))
     assert other.tell(count(1))[-1].type == mavlink.MAV_MISSION_DENIED
@@ -127,23 +127,23 @@ def test_one_upload_at_a_time(here: Station) -> None:
     ],
 )
 def test_the_count_is_bounded(here: Station, items: int, result: int) -> None:
-    """A list longer than there is room for is refused at once, and an empty one clears."""
+    """A list above the limit is refused immediately, and an empty one clears."""
     upload(here)
     assert here.tell(count(items))[-1].type == result
     assert len(here.autopilot.missions.plan) == (0 if items == 0 else len(PLAN))
 
 
 @pytest.mark.parametrize("altitude", [math.nan, math.inf])
-def test_an_altitude_that_is_no_number_ends_the_upload(here: Station, altitude: float) -> None:
-    """Such an item is invalid, and the old list holds."""
+def test_an_altitude_of_nan_or_infinity_ends_the_upload(here: Station, altitude: float) -> None:
+    """The item is invalid, and the old list stays."""
     here.tell(count(2))
     assert here.tell(item(0, z=altitude))[-1].type == mavlink.MAV_MISSION_INVALID
     assert here.autopilot.missions.plan == []
 
 
 @pytest.mark.parametrize("x", [math.nan, math.inf])
-def test_a_repeated_last_item_that_is_no_number_is_not_it(here: Station, x: float) -> None:
-    """Nor does it end the flight: whatever comes is answered or not."""
+def test_a_repeated_last_item_with_nan_is_not_acknowledged(here: Station, x: float) -> None:
+    """The flight continues."""
     upload(here)
     last = item(len(PLAN) - 1)
     odd = mavlink.MAVLink_mission_item_message(1, 1, last.seq, 3, last.command, 0, 1, 0, 0, 0, 0, x, 0, 0)
@@ -169,7 +169,7 @@ def test_what_is_not_there_cannot_be_fetched(here: Station) -> None:
 
 
 def test_items_in_degrees_are_the_same_items(here: Station) -> None:
-    """The old MISSION_ITEM is stored as its integer form, and given in degrees when asked for so."""
+    """The old MISSION_ITEM is stored as integers, and sent in degrees on request."""
     here.tell(count(1))
     old = mavlink.MAVLink_mission_item_message(1, 1, 0, RELATIVE, 16, 0, 1, 0, 0, 0, 0, 47.5, -8.25, 10.0, 0)
     assert here.tell(old)[-1].type == mavlink.MAV_MISSION_ACCEPTED
@@ -188,15 +188,15 @@ def test_the_current_item_can_be_set(here: Station) -> None:
 
 
 def test_a_mission_is_flown_to_its_end(here: Station) -> None:
-    """In AUTO the copter visits each item in order, comes home and lands."""
+    """In AUTO, the copter visits all items in order, returns and lands."""
     upload(here)
     here.result(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1)
     assert here.result(mavlink.MAV_CMD_MISSION_START) == mavlink.MAV_RESULT_ACCEPTED
-    heard = here.wait(120)
-    assert [message.seq for message in of_type(heard, "MISSION_ITEM_REACHED")] == [1, 2, 3, 4, 5]
+    received = here.wait(120)
+    assert [message.seq for message in of_type(received, "MISSION_ITEM_REACHED")] == [1, 2, 3, 4, 5]
     assert here.autopilot.vehicle.landed is Landed.ON_GROUND
     assert not here.autopilot.vehicle.armed
-    positions = of_type(heard, "GLOBAL_POSITION_INT")
+    positions = of_type(received, "GLOBAL_POSITION_INT")
     for _, _, x, y, z in (PLAN[2], PLAN[4]):
         assert (
             min(
@@ -209,12 +209,12 @@ def test_a_mission_is_flown_to_its_end(here: Station) -> None:
 
 
 def test_a_landing_in_a_mission_ends_it_on_the_ground(here: Station) -> None:
-    """NAV_LAND comes down where the copter is and stops the motors."""
+    """NAV_LAND lands at the position of the copter and stops the motors."""
     plan = [item(0), item(1), item(2)]
     plan[2].command = mavlink.MAV_CMD_NAV_LAND
     answers = here.tell(count(3))
-    for each in plan:
-        answers = here.tell(each)
+    for frame in plan:
+        answers = here.tell(frame)
     assert answers[-1].type == mavlink.MAV_MISSION_ACCEPTED
     here.result(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1)
     here.result(mavlink.MAV_CMD_MISSION_START)
@@ -223,7 +223,7 @@ def test_a_landing_in_a_mission_ends_it_on_the_ground(here: Station) -> None:
 
 
 def test_a_waypoint_without_a_take_off_stays_on_the_ground(here: Station) -> None:
-    """AUTO does not lift a copter that was told to go, but not to take off."""
+    """AUTO does not lift a copter without a take-off command."""
     here.tell(count(2))
     here.tell(item(0))
     waypoint = item(2)

@@ -9,7 +9,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from tests.lab.sim.station import Station, of_type
 from uavlinkd.lab.sim.autopilot import Autopilot
-from uavlinkd.lab.sim.parameters import LARGEST_FLOAT32, Kind, Parameters
+from uavlinkd.lab.sim.parameters import LARGEST_FLOAT32, ParameterTable, ParameterType
 
 
 @pytest.fixture
@@ -38,7 +38,7 @@ def test_the_list_is_complete_and_spread(here: Station) -> None:
     }
 
 
-def test_a_second_request_starts_the_list_anew(here: Station) -> None:
+def test_a_second_request_restarts_the_list(here: Station) -> None:
     """A station that asks again while the list is under way gets all of it."""
     here.tell(mavlink.MAVLink_param_request_list_message(1, 1))
     here.wait(0.1)
@@ -57,7 +57,7 @@ def test_one_is_read_by_name_and_by_index(here: Station) -> None:
 
 @pytest.mark.parametrize(("name", "index"), [(b"NO_SUCH", -1), (b"", -1), (b"RTL_ALT", 9999), (b"", 32767)])
 def test_one_that_does_not_exist_is_not_answered(here: Station, name: bytes, index: int) -> None:
-    """Neither an unknown name nor an index outside the table brings anything."""
+    """An unknown name or an index outside the table gets no answer."""
     assert here.tell(mavlink.MAVLink_param_request_read_message(1, 1, name, index)) == []
 
 
@@ -95,9 +95,9 @@ def test_a_value_that_its_type_cannot_hold_is_refused(here: Station, name: bytes
 
 
 def test_the_type_is_the_vehicles_own(here: Station) -> None:
-    """A station that sends everything as REAL32 sets an integer all the same, and is told the true type."""
+    """A station may set an integer with the type REAL32; the answer has the true type."""
     answer = here.tell(mavlink.MAVLink_param_set_message(1, 1, b"RTL_ALT", 2000.0, mavlink.MAV_PARAM_TYPE_REAL32))[0]
-    assert (answer.param_value, answer.param_type) == (2000, Kind.INT32)
+    assert (answer.param_value, answer.param_type) == (2000, ParameterType.INT32)
 
 
 def test_speeds_are_heeded(here: Station) -> None:
@@ -109,8 +109,8 @@ def test_speeds_are_heeded(here: Station) -> None:
 
 
 def test_every_default_travels_unchanged() -> None:
-    """A default is a float32 and fits its type, so a list read and written back changes nothing."""
-    parameters = Parameters(system_id=255)
+    """A default is a float32 in the range of its type: writing a read list changes nothing."""
+    parameters = ParameterTable(system_id=255)
     for parameter in parameters.table:
         before = parameter.value
         assert parameter.read_only or parameters.set(parameter.name, before)
@@ -121,4 +121,4 @@ def test_every_default_travels_unchanged() -> None:
 @pytest.mark.parametrize(("value", "is_taken"), [(LARGEST_FLOAT32, True), (LARGEST_FLOAT32 * 1.001, False)])
 def test_a_real_is_what_a_float32_holds(value: float, is_taken: bool) -> None:
     """Beyond the largest float32 a value is refused, not an error."""
-    assert Parameters(1).set("WPNAV_SPEED", value) is is_taken
+    assert ParameterTable(1).set("WPNAV_SPEED", value) is is_taken

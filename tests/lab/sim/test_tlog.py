@@ -14,7 +14,7 @@ from uavlinkd.lab.sim.tlog import LATEST_STAMP_US, TlogError, parse_tlog, read_t
 
 
 def test_every_kind_of_frame_is_read_as_it_was() -> None:
-    """MAVLink 1, MAVLink 2 and signed frames come back byte for byte, with their times and senders."""
+    """MAVLink 1, MAVLink 2 and signed frames are unchanged, with their times and senders."""
     sent = frames(30, system_id=9)
     assert {(frame[0], frame[2] & 1) for frame in sent if frame[0] == 0xFD} == {(0xFD, 0), (0xFD, 1)}
     log = parse_tlog(log_of(sent), strict=True)
@@ -26,7 +26,7 @@ def test_every_kind_of_frame_is_read_as_it_was() -> None:
 
 
 def test_an_unknown_message_is_read_by_its_length() -> None:
-    """A frame whose checksum nobody here can check is kept, for its record is followed by another."""
+    """A frame with an unknown checksum is kept, because another record follows."""
     unknown = b"\xfd\x02\x00\x00\x05\x01\x01\x7f\x96\x98ab\x12\x34"
     sent = [*frames(2), unknown, *frames(2)]
     assert [record.frame for record in parse_tlog(log_of(sent), strict=True).records] == sent
@@ -48,7 +48,7 @@ def test_a_log_cut_anywhere_keeps_its_whole_records() -> None:
 
 
 def test_garbage_between_records_is_skipped() -> None:
-    """Bytes that are no record cost nothing but themselves, and the place of the first is told."""
+    """Bytes outside records are skipped, and the offset of the first is reported."""
     sent = frames(6)
     one, two = log_of(sent[:3]), log_of(sent[3:])
     noise = random.Random(3).randbytes(500)
@@ -80,8 +80,8 @@ def test_a_flipped_length_costs_one_record() -> None:
 
 
 @pytest.mark.parametrize(("stamp", "is_read"), [(LATEST_STAMP_US, True), (LATEST_STAMP_US + 1, False)])
-def test_a_time_after_this_century_is_no_time(stamp: int, is_read: bool) -> None:
-    """So a run of 0xFF is not taken for a stamp, and the limit itself still is."""
+def test_a_time_after_this_century_is_invalid(stamp: int, is_read: bool) -> None:
+    """The limit is valid, and a run of 0xFF is not a timestamp."""
     frame = frames(1)[0]
     if is_read:
         assert parse_tlog(stamp.to_bytes(8) + frame).records[0].time_us == stamp
@@ -92,21 +92,21 @@ def test_a_time_after_this_century_is_no_time(stamp: int, is_read: bool) -> None
 
 @pytest.mark.parametrize("data", [b"", b"\0" * 100, b"not a log at all", frames(1)[0], bytes(8)])
 def test_what_holds_no_record_is_an_error(data: bytes) -> None:
-    """An empty or foreign file is told as such."""
+    """An empty or foreign file is an error."""
     with pytest.raises(TlogError, match="no MAVLink frame"):
         parse_tlog(data)
 
 
 @pytest.mark.parametrize("byte", [b"\xfd", b"\xfe", b"\0"])
 def test_a_long_run_of_garbage_is_passed_in_one_go(byte: bytes) -> None:
-    """Half a megabyte that looks like starts of frames, or like none, takes time in proportion to their length."""
+    """The time for 0.5 MB of garbage, with or without start bytes, is proportional to its length."""
     sent = frames(2)
     log = parse_tlog(log_of(sent[:1]) + 500_000 * byte + log_of(sent[1:]))
     assert [record.frame for record in log.records] == sent
     assert log.skipped_bytes == 500_000
 
 
-@settings(deadline=None)  # a busy machine is no fault of the parser's
+@settings(deadline=None)  # the machine may be busy
 @given(st.binary(max_size=600), st.integers(0, 5))
 def test_any_bytes_give_a_log_or_an_error(noise: bytes, genuine: int) -> None:
     """Every byte of any file is in a record or counted as skipped."""
@@ -121,7 +121,7 @@ def test_any_bytes_give_a_log_or_an_error(noise: bytes, genuine: int) -> None:
     assert [record.frame for record in log.records[: genuine - 1]] == sent[: genuine - 1]
 
 
-def test_a_file_that_is_no_log_is_named(tmp_path: Path) -> None:
+def test_a_file_without_records_is_named(tmp_path: Path) -> None:
     """The error has the path, for the operator."""
     path = tmp_path / "flight.tlog"
     path.write_bytes(b"nothing")
@@ -140,7 +140,7 @@ def test_a_file_that_is_no_log_is_named(tmp_path: Path) -> None:
     ],
 )
 def test_recorded_flights_are_read_to_the_last_byte(shared_data: Path, name: str, systems: set[int]) -> None:
-    """Real logs of both versions have nothing in them that is not understood, but for a last record that was cut."""
+    """Real logs of both versions are read completely, except for a truncated last record."""
     data = (shared_data / name).read_bytes()
     log = parse_tlog(data)
     read = b"".join(record.time_us.to_bytes(8) + record.frame for record in log.records)

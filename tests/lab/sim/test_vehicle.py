@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from uavlinkd.lab.sim.vehicle import MAX_CATCH_UP_S, Axes, Landed, Mode, Place, Vehicle
+from uavlinkd.lab.sim.vehicle import MAX_CATCH_UP_S, Axes, GeoPoint, Landed, Mode, Vehicle
 
-HOME = Place(47.4, 8.5, 488.0)
+HOME = GeoPoint(47.4, 8.5, 488.0)
 
 
 def in_the_air(altitude_m: float = 10.0) -> Vehicle:
@@ -46,7 +46,7 @@ def test_it_arrives_and_stays(north: float, east: float, up: float, step_s: floa
 
 
 def test_it_does_not_move_unarmed() -> None:
-    """Without motors nothing lifts it, whatever the target."""
+    """Without motors, the vehicle stays on the ground, for any target."""
     vehicle = Vehicle(HOME)
     vehicle.go_to(Axes(100, 100, 100))
     vehicle.step(5)
@@ -70,7 +70,7 @@ def test_a_landing_ends_on_the_ground_with_the_motors_off() -> None:
 
 
 def test_a_return_climbs_first_and_lands_at_home() -> None:
-    """RTL goes up to its altitude, home, and down."""
+    """RTL climbs to its altitude, returns home, and lands."""
     vehicle = in_the_air(4)
     vehicle.go_to(Axes(40, -20, 4))
     for _ in range(200):
@@ -86,7 +86,7 @@ def test_a_return_climbs_first_and_lands_at_home() -> None:
 
 
 def test_a_change_of_mode_holds_the_position() -> None:
-    """On the way to a far target, LOITER stops where it is."""
+    """During a flight to a far target, LOITER stops at the current position."""
     vehicle = in_the_air()
     vehicle.go_to(Axes(500, 0, 10))
     vehicle.step(4)
@@ -98,7 +98,7 @@ def test_a_change_of_mode_holds_the_position() -> None:
 
 
 def test_a_long_pause_is_not_made_up_for() -> None:
-    """A process that was suspended for an hour goes on from there; so does a clock that went back."""
+    """After a suspension of an hour, or a clock that went back, the model continues from its state."""
     vehicle = in_the_air()
     vehicle.go_to(Axes(100_000, 0, 10))
     vehicle.step(3600)
@@ -112,13 +112,13 @@ def test_a_long_pause_is_not_made_up_for() -> None:
 @given(st.floats(-85, 85), st.floats(-180, 179.9), st.floats(-3000, 3000), st.floats(-3000, 3000))
 def test_a_place_and_its_point_belong_together(latitude: float, longitude: float, north: float, east: float) -> None:
     """From metres to degrees and back is the same point, also over the 180th meridian."""
-    vehicle = Vehicle(Place(latitude, longitude, 100.0))
+    vehicle = Vehicle(GeoPoint(latitude, longitude, 100.0))
     point = vehicle.point_of(vehicle.place_of(Axes(north, east, 25.0)))
     assert (point.north, point.east, point.up) == pytest.approx((north, east, 25.0), abs=1e-3)
 
 
 def test_the_battery_drains_faster_in_flight_and_not_below_nothing() -> None:
-    """Hovering costs more than standing, and an empty battery stays at 0 percent."""
+    """Hovering uses more charge than standing, and an empty battery stays at 0 percent."""
     flying, standing = in_the_air(), Vehicle(HOME)
     for vehicle in (flying, standing):
         before = vehicle.used_mah

@@ -1,1 +1,2 @@
-"""What stands between two daemons without any of their keys: an emulated radio, and the man in the middle."""
+"""A man in the middle and an emulated radio between two daemons. Neither has a key.
+--"""

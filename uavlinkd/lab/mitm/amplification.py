@@ -1,34 +1,34 @@
-"""Whether a peer sends more to an address than came from there: it could be used to flood whoever that is."""
+"""Detects amplification: a peer that sends more to an address than it received from there can flood that address."""
 
 from __future__ import annotations
 
 from collections import Counter, deque
 
 CREDIT_S = 10.0
-"""How long a datagram may be answered. Were it for ever, a thousand unanswered ones would hide a thousand answers of
-twice the size of what they answer. Long enough for a busy machine."""
+"""How long a datagram counts as a request. Without a limit, a thousand unanswered datagrams would hide a thousand
+answers of twice the size. 10 s is enough for a busy machine."""
 
 
 class Amplification:
-    """Compares what came back with what was sent within :data:`CREDIT_S` before, for each peer and stranger.
+    """Compares the bytes received by a stranger with the bytes it sent within :data:`CREDIT_S` before, per peer.
 
-    A stranger is an address of the attacker's own: it has proved nothing, and may get as many bytes as it sent. Times
-    are monotonic seconds. What it remembers is bounded by the rate of the attack.
+    A stranger is an address of the attacker. It is not validated, so a peer may send it as many bytes as it received
+    from there. Times are monotonic seconds. The rate of the attack bounds the memory.
     """
 
     def __init__(self) -> None:
         self.excess: Counter[tuple[str, int]] = Counter()
-        """By peer and stranger: bytes that came back beyond those sent lately."""
-        self._credits: dict[tuple[str, int], deque[list[float]]] = {}  # when, and the bytes that are left of it
+        """By peer and stranger: bytes received beyond those recently sent."""
+        self._credits: dict[tuple[str, int], deque[list[float]]] = {}  # time, remaining bytes
 
     def sent(self, peer: str, stranger: int, size: int, now: float) -> None:
-        """So many bytes went from the stranger to the peer."""
+        """The stranger sent ``size`` bytes to the peer."""
         unanswered = self._credits.setdefault((peer, stranger), deque())
         self._expire(unanswered, now)
         unanswered.append([now, size])
 
-    def came_back(self, peer: str, stranger: int, size: int, now: float) -> None:
-        """So many came back: they use up what was sent, the oldest first."""
+    def received(self, peer: str, stranger: int, size: int, now: float) -> None:
+        """The peer sent ``size`` bytes to the stranger. They use up the oldest sent bytes first."""
         unanswered = self._credits.get((peer, stranger), deque())
         self._expire(unanswered, now)
         left = float(size)

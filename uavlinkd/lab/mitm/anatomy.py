@@ -1,7 +1,6 @@
-"""What a datagram shows to whoever stands in the way: its kind, its header, its frames where they are readable.
+"""The parts of a datagram that an attacker without keys can read: kind, header, and frames that are not encrypted.
 
-And the one thing that can be computed about it without any secret: ``mac1``, for which the receiver's public key is
-enough. Nothing here raises, whatever the bytes.
+It can also compute ``mac1``, which needs only the receiver's public key. The functions accept any bytes.
 """
 
 from __future__ import annotations
@@ -16,11 +15,12 @@ import fastcrc
 from uavlinkd.core import constants as c
 from uavlinkd.core import wire
 from uavlinkd.core.drops import Drop
+from uavlinkd.core.refusals import REFUSAL_REPORT, parse_report
 from uavlinkd.core.suites import Suite
 
 
-class Kind(StrEnum):
-    """What a datagram says that it is, by its first byte."""
+class DatagramKind(StrEnum):
+    """The kind of a datagram, by its first byte."""
 
     INITIATION = "initiation"
     RESPONSE = "response"
@@ -32,31 +32,31 @@ class Kind(StrEnum):
     OTHER = "other"
 
 
-HANDSHAKE = frozenset((Kind.INITIATION, Kind.RESPONSE))
+HANDSHAKE = frozenset((DatagramKind.INITIATION, DatagramKind.RESPONSE))
 _KINDS = {
-    wire.INITIATION: Kind.INITIATION,
-    wire.RESPONSE: Kind.RESPONSE,
-    wire.COOKIE: Kind.COOKIE,
-    wire.SHORT_ENVELOPE: Kind.ENVELOPE,
-    wire.LONG_ENVELOPE: Kind.ENVELOPE,
-    0xFD: Kind.MAVLINK,
-    0xFE: Kind.MAVLINK,
+    wire.INITIATION: DatagramKind.INITIATION,
+    wire.RESPONSE: DatagramKind.RESPONSE,
+    wire.COOKIE: DatagramKind.COOKIE,
+    wire.SHORT_ENVELOPE: DatagramKind.ENVELOPE,
+    wire.LONG_ENVELOPE: DatagramKind.ENVELOPE,
+    0xFD: DatagramKind.MAVLINK,
+    0xFE: DatagramKind.MAVLINK,
 }
-_HEADER_BYTES = {Kind.INITIATION: 4, Kind.RESPONSE: 6}
+_HEADER_BYTES = {DatagramKind.INITIATION: 4, DatagramKind.RESPONSE: 6}
 
 
-def kind_of(datagram: bytes) -> Kind:
+def kind_of(datagram: bytes) -> DatagramKind:
     """The kind that the first byte claims."""
-    return _KINDS.get(datagram[0], Kind.OTHER) if datagram else Kind.EMPTY
+    return _KINDS.get(datagram[0], DatagramKind.OTHER) if datagram else DatagramKind.EMPTY
 
 
 # Handshake messages.
 
 
 class Parts(NamedTuple):
-    """A handshake message, cut where its fields end. ``share`` is empty in a suite without a group."""
+    """The fields of a handshake message. ``share`` is empty in a suite without a group."""
 
-    kind: Kind
+    kind: DatagramKind
     suite: Suite
     header: bytes
     ephemeral: bytes
@@ -73,10 +73,10 @@ def parts_of(datagram: bytes) -> Parts | None:
     """The fields of an initiation or a response; None for anything else."""
     kind = kind_of(datagram)
     try:
-        if kind is Kind.INITIATION:
+        if kind is DatagramKind.INITIATION:
             suite = wire.parse_initiation(datagram).suite
             sealed = suite.share_bytes
-        elif kind is Kind.RESPONSE:
+        elif kind is DatagramKind.RESPONSE:
             suite = wire.parse_response(datagram).suite
             sealed = suite.ciphertext_bytes
         else:
@@ -97,21 +97,21 @@ def parts_of(datagram: bytes) -> Parts | None:
     )
 
 
-def message_bytes(kind: Kind, suite: Suite) -> int:
+def message_bytes(kind: DatagramKind, suite: Suite) -> int:
     """The length of an initiation or a response of a suite."""
-    return wire.initiation_bytes(suite) if kind is Kind.INITIATION else wire.response_bytes(suite)
+    return wire.initiation_bytes(suite) if kind is DatagramKind.INITIATION else wire.response_bytes(suite)
 
 
 def has_cookie(datagram: bytes) -> bool:
-    """Whether a handshake message carries a ``mac2``: its sender was given a cookie."""
+    """Whether a handshake message carries a ``mac2``: its sender has a cookie."""
     parts = parts_of(datagram)
     return parts is not None and parts.macs[c.MAC_BYTES :] != bytes(c.MAC_BYTES)
 
 
 def with_mac1(datagram: bytes, public_key: bytes | None) -> bytes:
-    """The datagram with the ``mac1`` that fits its bytes, for the receiver with this public key.
+    """The datagram with a valid ``mac1`` for the receiver with this public key. ``mac2`` stays unchanged.
 
-    Without the key, and where there is no room for macs, it stays as it is. ``mac2`` stays in any case.
+    Without the key, or if the datagram is too short for MACs, it stays unchanged.
     """
     if public_key is None or len(datagram) < wire.MACS_BYTES:
         return datagram
@@ -121,8 +121,8 @@ def with_mac1(datagram: bytes, public_key: bytes | None) -> bytes:
 
 
 def initiation(suite: Suite, index: int, noise: bytes, public_key: bytes | None) -> bytes:
-    """An initiation around any bytes, cut or padded to the length of the suite; ``mac2`` is zero."""
-    room = wire.initiation_bytes(suite) - _HEADER_BYTES[Kind.INITIATION] - wire.MACS_BYTES
+    """An initiation with ``noise`` as its body, cut or padded to the length of the suite; ``mac2`` is zero."""
+    room = wire.initiation_bytes(suite) - _HEADER_BYTES[DatagramKind.INITIATION] - wire.MACS_BYTES
     body = wire.initiation_header(suite, index) + noise[:room].ljust(room, b"\0")
     return with_mac1(body + bytes(wire.MACS_BYTES), public_key)
 
@@ -131,7 +131,7 @@ def initiation(suite: Suite, index: int, noise: bytes, public_key: bytes | None)
 
 
 class Envelope(NamedTuple):
-    """The header of an envelope, and how long it is."""
+    """The header of an envelope, and its length."""
 
     receiver_index: int
     counter: int
@@ -140,7 +140,7 @@ class Envelope(NamedTuple):
 
 def envelope_of(datagram: bytes) -> Envelope | None:
     """The header of an envelope; None for anything else."""
-    if kind_of(datagram) is not Kind.ENVELOPE:
+    if kind_of(datagram) is not DatagramKind.ENVELOPE:
         return None
     try:
         return Envelope(*wire.parse_envelope_header(datagram))
@@ -148,24 +148,33 @@ def envelope_of(datagram: bytes) -> Envelope | None:
         return None
 
 
+def is_refusal_report(datagram: bytes) -> bool:
+    """Whether an envelope seems to carry a refusal report. In a confidential session that is a guess."""
+    envelope = envelope_of(datagram)
+    if envelope is None or datagram[envelope.header_bytes] != REFUSAL_REPORT:
+        return False
+    payload = datagram[envelope.header_bytes :]
+    return any(parse_report(payload[:-tag_bytes]) is not None for tag_bytes in wire.TAG_LENGTHS)
+
+
 def message_ids(datagram: bytes) -> tuple[int, ...]:
-    """The MAVLink messages in an envelope, by number; none where it is encrypted, or carries no frames."""
+    """The message IDs of the frames in an envelope; empty if it is encrypted or has no frames."""
     envelope = envelope_of(datagram)
     if envelope is None:
         return ()
-    found: list[int] = []
+    message_ids: list[int] = []
     at = envelope.header_bytes
     while len(datagram) - at not in wire.TAG_LENGTHS:
         size, message_id = _frame_at(datagram, at)
         if not size or at + size + wire.TAG_LENGTHS[0] > len(datagram):
-            return ()  # the frames do not end where a tag begins: what looked like frames is ciphertext
-        found.append(message_id)
+            return ()  # the frames do not end where a tag begins: the bytes are ciphertext
+        message_ids.append(message_id)
         at += size
-    return tuple(found)
+    return tuple(message_ids)
 
 
 def _frame_at(data: bytes, at: int) -> tuple[int, int]:
-    """Length and message number of the frame there; length 0 where there is none."""
+    """Length and message ID of the frame at ``at``; length 0 if there is no frame."""
     if len(data) - at < 10:
         return 0, 0
     if data[at] == 0xFD:
@@ -176,12 +185,12 @@ def _frame_at(data: bytes, at: int) -> tuple[int, int]:
     return 0, 0
 
 
-# Frames of the attacker's own: anyone can make them.
+# Bare frames need no key.
 
 
 def mavlink_frame(message_id: int, payload: bytes, crc_extra: int, system: int = 255, seq: int = 0) -> bytes:
-    """A MAVLink 2 frame with a good checksum, from any system. The payload is not empty."""
-    payload = payload.rstrip(b"\0") or b"\0"  # MAVLink 2 sends no zeros at the end, but one byte at least
+    """A MAVLink 2 frame with a valid checksum, from any system."""
+    payload = payload.rstrip(b"\0") or b"\0"  # MAVLink 2 omits trailing zeros, except the first byte
     header = bytes((len(payload), 0, 0, seq % 256, system, 190)) + message_id.to_bytes(3, "little")
     checksum = fastcrc.crc16.mcrf4xx(header + payload + bytes((crc_extra,)))
     return b"\xfd" + header + payload + checksum.to_bytes(2, "little")

@@ -1,8 +1,8 @@
-"""What an attack is: datagrams and ``now`` in, what to send and what to note out. No I/O, no clock, no key.
+"""The base classes of attacks: datagrams and ``now`` in, datagrams to send and log entries out. No I/O, clock or key.
 
-An attack stands in the way between peers. It sees each datagram that they send, and what they send to addresses of
-its own; it may let pass, alter, drop, hold and repeat, and send what it makes up. The same attack object and the same
-calls give the same actions, so a run can be repeated by its seed.
+An attack sees each datagram between the peers, and each datagram that a peer sends to an address of the attacker. It
+may pass, alter, drop, hold or repeat datagrams, and inject its own. Equal seeds and equal calls return equal actions,
+so a run can be repeated.
 """
 
 from __future__ import annotations
@@ -13,52 +13,52 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from random import Random
-from typing import Any, ClassVar, Generic, Literal, NamedTuple, Protocol, TypeVar
+from typing import Any, ClassVar, Final, Generic, Literal, NamedTuple, Protocol, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from uavlinkd.lab.mitm.anatomy import HANDSHAKE, Kind, kind_of
+from uavlinkd.lab.mitm.anatomy import HANDSHAKE, DatagramKind, is_refusal_report, kind_of
 
 NEVER = math.inf
 STRANGERS = 256
-"""Addresses of the attacker's own, numbered from 0."""
-SHOTS_AT_ONCE = 256
-"""What was due while nobody looked is made up for to this extent; the rest of it is never sent."""
+"""Addresses of the attacker, numbered from 0. To a peer, each is an unknown sender."""
+CATCH_UP_LIMIT = 256
+"""Datagrams that one call of ``due`` may send. After a pause, those beyond this count are never sent."""
 
 
 class AttackError(ValueError):
-    """An attack that cannot be made from what was asked. The message says what to write instead."""
+    """The parameters or the peers do not allow this attack. The message says what to write instead."""
 
 
-class Way(NamedTuple):
-    """From one peer to another, by their names."""
+class Direction(NamedTuple):
+    """From one peer to another, by name."""
 
     sender: str
     receiver: str
 
     @property
-    def back(self) -> Way:
-        """The other direction."""
-        return Way(self.receiver, self.sender)
+    def reverse(self) -> Direction:
+        """The opposite direction."""
+        return Direction(self.receiver, self.sender)
 
     def __str__(self) -> str:
         return f"{self.sender}>{self.receiver}"
 
 
 class Send(NamedTuple):
-    """Send a datagram to ``way.receiver``.
+    """Send a datagram to ``direction.receiver``.
 
-    It comes from where ``way.sender`` is for the receiver; or, with a number, from that ``stranger``, an address of
-    the attacker's own. To let a datagram pass is to send it as it came; to drop it is to send nothing.
+    The source is the address at which the receiver knows ``direction.sender``, or the ``stranger`` with this number.
+    To pass a datagram is to send it unchanged; to drop it is to send nothing.
     """
 
     datagram: bytes
-    way: Way
+    direction: Direction
     stranger: int | None = None
 
 
-class What(StrEnum):
-    """What was done to a datagram, or with it."""
+class Operation(StrEnum):
+    """What an attack did with a datagram."""
 
     ALTERED = "altered"
     DROPPED = "dropped"
@@ -69,36 +69,36 @@ class What(StrEnum):
     REFLECTED = "reflected"
     MISROUTED = "misrouted"
     FORWARDED = "forwarded"
-    """From an address of the attacker's own."""
+    """From a stranger's address."""
     INJECTED = "injected"
-    """Of the attacker's own making."""
+    """Made by the attacker."""
     ANSWERED = "answered"
-    """A peer sent something to an address of the attacker's own."""
+    """A peer sent a datagram to a stranger."""
 
 
 @dataclass(frozen=True, slots=True)
 class Intervention:
-    """One thing that an attack did, for the log."""
+    """One operation of an attack, for the log."""
 
     at: float
-    """Seconds on the caller's clock."""
+    """Monotonic seconds."""
     attack: str
-    what: What
-    way: Way
+    operation: Operation
+    direction: Direction
     number: int
-    """Which of the datagrams that the attack has seen, from 1; 0 for one of its own making."""
-    kind: Kind
+    """Position of the datagram among those that the attack has seen, from 1; 0 for an injected one."""
+    kind: DatagramKind
     length: int
-    """Of what was seen, or made: bytes."""
+    """Of the datagram, in bytes."""
     detail: str = ""
 
     def to_dict(self) -> dict[str, object]:
-        """As it stands in the log."""
+        """The fields of its log line."""
         return {
             "at": round(self.at, 6),
             "attack": self.attack,
-            "what": self.what.value,
-            "way": str(self.way),
+            "operation": self.operation.value,
+            "direction": str(self.direction),
             "number": self.number,
             "kind": self.kind.value,
             "length": self.length,
@@ -110,262 +110,279 @@ Action = Send | Intervention
 
 
 class AttackObject(Protocol):
-    """All that a channel asks of an attack. Whoever has this can stand in the way."""
+    """The interface that a channel requires of an attack."""
 
     @property
     def name(self) -> str:
         """For the log."""
 
-    def on_datagram(self, datagram: bytes, way: Way, now: float) -> list[Action]:
+    def on_datagram(self, datagram: bytes, direction: Direction, now: float) -> list[Action]:
         """A peer sent a datagram to another."""
 
     def on_answer(self, datagram: bytes, peer: str, stranger: int, now: float) -> list[Action]:
-        """A peer sent a datagram to an address of the attacker's own."""
+        """A peer sent a datagram to a stranger."""
 
     def due(self, now: float) -> list[Action]:
-        """What is to be done at ``now``, without anyone having sent anything."""
+        """The actions that are due at ``now``."""
 
     def next_deadline(self) -> float:
-        """When :meth:`due` has something to do; infinity for never."""
+        """The time of the next call of :meth:`due`; infinity for never."""
 
 
 @dataclass(frozen=True, slots=True)
-class Surroundings:
-    """What an attacker knows about where it stands."""
+class AttackContext:
+    """What an attacker knows: the directions between the peers, and public keys."""
 
-    ways: tuple[Way, ...]
-    """Between whom it stands, both directions of each link."""
+    directions: tuple[Direction, ...]
+    """Both directions of each link."""
     public_keys: Mapping[str, bytes] = field(default_factory=dict)
-    """Of those peers whose public key it has found out: enough to make ``mac1``."""
+    """The known public keys, by peer: they are sufficient for ``mac1``."""
 
     @classmethod
-    def between(cls, *peers: str, public_keys: Mapping[str, bytes] | None = None) -> Surroundings:
-        """Between each pair of these peers."""
-        ways = tuple(Way(one, other) for one in peers for other in peers if one != other)
-        return cls(ways, public_keys or {})
+    def between(cls, *peers: str, public_keys: Mapping[str, bytes] | None = None) -> AttackContext:
+        """The context with a link between each pair of these peers."""
+        directions = tuple(Direction(one, other) for one in peers for other in peers if one != other)
+        return cls(directions, public_keys or {})
 
     @property
     def peers(self) -> tuple[str, ...]:
-        """Everyone who sends or receives here."""
-        return tuple(dict.fromkeys(way.sender for way in self.ways))
+        """The names of all peers."""
+        return tuple(dict.fromkeys(direction.sender for direction in self.directions))
 
-    def select(self, text: str) -> tuple[Way, ...]:
-        """The ways that ``both`` or ``A>B`` means.
+    def select(self, text: str) -> tuple[Direction, ...]:
+        """The directions that ``both`` or ``A>B`` means.
 
         Raises:
-            AttackError: there is no such way.
+            AttackError: there is no such direction.
         """
-        chosen = tuple(way for way in self.ways if text in ("both", str(way)))
+        chosen = tuple(direction for direction in self.directions if text in ("both", str(direction)))
         if not chosen:
-            raise AttackError(f"way is both or one of {', '.join(map(str, self.ways))}")
+            raise AttackError(f"direction must be both or one of {', '.join(map(str, self.directions))}")
         return chosen
 
 
 class Options(BaseModel):
-    """The parameters that every attack takes. Unknown ones are refused."""
+    """The parameters of every attack. Unknown ones are refused."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, hide_input_in_errors=True, allow_inf_nan=False)
 
-    begin_s: float = Field(0.0, ge=0, description="wait so many seconds before it begins")
-    seconds: float | None = Field(None, gt=0, description="end so many seconds after it began")
-    way: str = Field("both", description="both, or one direction: A>B")
-    share: float = Field(1.0, gt=0, le=1, description="share of the datagrams it could attack that it does attack")
-    skip: int = Field(0, ge=0, description="let so many of them pass first")
-    limit: int | None = Field(None, ge=1, description="attack no more than so many")
+    begin_s: float = Field(0.0, ge=0, description="seconds before the attack begins")
+    seconds: float | None = Field(None, gt=0, description="duration of the attack in seconds")
+    direction: str = Field("both", description="both, or one direction: A>B")
+    share: float = Field(1.0, gt=0, le=1, description="share of the matching datagrams that are attacked")
+    skip: int = Field(0, ge=0, description="number of matching datagrams that pass first")
+    limit: int | None = Field(None, ge=1, description="maximum number of attacked datagrams")
 
 
 O = TypeVar("O", bound=Options)  # noqa: E741
 
 
-class Attack(ABC, Generic[O]):
-    """What the attacks here have in common: when they are on, in which direction, how often.
-
-    The first line of a class's docstring is what the list of attacks says about it.
-    """
-
-    name: ClassVar[str]
-    catalogue: ClassVar[tuple[str, ...]]
-    """Numbers of the threat catalogue: H for the handshake, D for data."""
-    options_model: ClassVar[type[Options]]
-
-    def __init__(self, options: O, surroundings: Surroundings, chance: Random, now: float) -> None:
-        self.options = options
-        self.surroundings = surroundings
-        self.chance = chance
-        self.ways = surroundings.select(options.way)
-        self.begins_at = now + options.begin_s
-        self.ends_at = NEVER if options.seconds is None else self.begins_at + options.seconds
-        self.seen = 0
-        """Datagrams that came by."""
-        self.strikes = 0
-        """Those that were attacked, and those made up."""
-        self._eligible = 0
-
-    @classmethod
-    def summary(cls) -> str:
-        """One line on what it does."""
-        return (cls.__doc__ or "").partition("\n")[0].removesuffix(".")
-
-    # What a channel calls.
-
-    def on_datagram(self, datagram: bytes, way: Way, now: float) -> list[Action]:
-        """A peer sent a datagram to another."""
-        self.seen += 1
-        if way not in self.ways:
-            return [Send(datagram, way)]
-        self.observe(datagram, way, now)
-        return self.meet(datagram, way, now) if self.is_on(now) else [Send(datagram, way)]
+class PassiveAttack:
+    """The base class of attacks that by default ignore answers and inject nothing."""
 
     def on_answer(self, datagram: bytes, peer: str, stranger: int, now: float) -> list[Action]:
-        """A peer sent a datagram to an address of the attacker's own."""
+        """A peer sent a datagram to a stranger."""
         del datagram, peer, stranger, now
         return []
 
     def due(self, now: float) -> list[Action]:
-        """What is to be done at ``now``."""
+        """The actions that are due at ``now``."""
         del now
         return []
 
     def next_deadline(self) -> float:
-        """When :meth:`due` has something to do."""
+        """The time of the next call of :meth:`due`."""
         return NEVER
 
-    # What an attack is made of.
 
-    def observe(self, datagram: bytes, way: Way, now: float) -> None:
-        """Learn from a datagram, also while the attack is not on."""
+class Attack(PassiveAttack, ABC, Generic[O]):
+    """The base class of all attacks: when they are active, in which direction, and how often.
 
-    def meet(self, datagram: bytes, way: Way, now: float) -> list[Action]:
-        """What becomes of a datagram while the attack is on."""
+    ``uavlink-mitm --list`` shows the first line of a subclass's docstring.
+    """
+
+    name: ClassVar[str]
+    catalogue: ClassVar[tuple[str, ...]]
+    """IDs of the threat catalogue: H for the handshake, D for data."""
+    options_model: ClassVar[type[Options]]
+
+    def __init__(self, options: O, context: AttackContext, rng: Random, now: float) -> None:
+        self.options = options
+        self.context = context
+        self.rng = rng
+        self.directions = context.select(options.direction)
+        self.begins_at = now + options.begin_s
+        self.ends_at = NEVER if options.seconds is None else self.begins_at + options.seconds
+        self.seen = 0
+        """Datagrams received."""
+        self.attempts = 0
+        """Datagrams attacked or injected."""
+        self._eligible = 0
+
+    @classmethod
+    def summary(cls) -> str:
+        """A description in one line."""
+        return (cls.__doc__ or "").partition("\n")[0].removesuffix(".")
+
+    # The interface for a channel.
+
+    def on_datagram(self, datagram: bytes, direction: Direction, now: float) -> list[Action]:
+        """A peer sent a datagram to another."""
+        self.seen += 1
+        if direction not in self.directions:
+            return [Send(datagram, direction)]
+        self.observe(datagram, direction, now)
+        return self.intercept(datagram, direction, now) if self.is_on(now) else [Send(datagram, direction)]
+
+    # Hooks for subclasses.
+
+    def observe(self, datagram: bytes, direction: Direction, now: float) -> None:
+        """Learn from a datagram, also while the attack is inactive."""
+
+    def intercept(self, datagram: bytes, direction: Direction, now: float) -> list[Action]:
+        """Handle a datagram while the attack is active."""
         del now
-        return [Send(datagram, way)]
+        return [Send(datagram, direction)]
 
     def is_on(self, now: float) -> bool:
-        """Whether it has begun, and not ended."""
+        """Whether the attack is active."""
         return self.begins_at <= now < self.ends_at and not self.is_exhausted
 
     @property
     def is_exhausted(self) -> bool:
-        """Whether it has done all that it may."""
-        return self.options.limit is not None and self.strikes >= self.options.limit
+        """Whether the limit is reached."""
+        return self.options.limit is not None and self.attempts >= self.options.limit
 
-    def strikes_now(self) -> bool:
-        """Whether to attack a datagram that it could attack: ``skip``, ``share`` and ``limit``."""
+    def should_attack(self) -> bool:
+        """Whether to attack a matching datagram, by ``skip``, ``share`` and ``limit``. Counts the attempt."""
         self._eligible += 1
-        is_chosen = self.chance.random() < self.options.share
+        is_chosen = self.rng.random() < self.options.share
         if self._eligible <= self.options.skip or not is_chosen or self.is_exhausted:
             return False
-        self.strikes += 1
+        self.attempts += 1
         return True
 
     def note(
-        self, what: What, datagram: bytes, way: Way, now: float, detail: str = "", *, own: bool = False
+        self,
+        operation: Operation,
+        datagram: bytes,
+        direction: Direction,
+        now: float,
+        detail: str = "",
+        *,
+        own: bool = False,
     ) -> Intervention:
-        """What is told about an intervention."""
+        """The log entry of an intervention. ``own``: the attack injected the datagram."""
         number = 0 if own else self.seen
-        return Intervention(now, self.name, what, way, number, kind_of(datagram), len(datagram), detail)
+        return Intervention(now, self.name, operation, direction, number, kind_of(datagram), len(datagram), detail)
 
 
 class Alteration(Attack[O]):
-    """An attack that changes datagrams on their way. With an option ``beside`` the genuine one may pass too."""
+    """An attack that alters datagrams. With the option ``beside``, the genuine datagram passes too."""
 
-    def meet(self, datagram: bytes, way: Way, now: float) -> list[Action]:
-        """Alter it, where it can be altered and is to be."""
-        if not self.is_target(datagram) or not self.strikes_now():
-            return [Send(datagram, way)]
-        altered, detail = self.alter(datagram, way)
-        if altered == datagram:  # such as a header put in place of the same one: nothing was done, so nothing is told
-            self.strikes -= 1
-            return [Send(datagram, way)]
-        actions: list[Action] = [Send(altered, way), self.note(What.ALTERED, datagram, way, now, detail)]
+    def intercept(self, datagram: bytes, direction: Direction, now: float) -> list[Action]:
+        """Alter the datagram, if it matches."""
+        if not self.is_target(datagram) or not self.should_attack():
+            return [Send(datagram, direction)]
+        altered, detail = self.alter(datagram, direction)
+        if altered == datagram:  # for example, a header replaced by an equal one
+            self.attempts -= 1
+            return [Send(datagram, direction)]
+        actions: list[Action] = [
+            Send(altered, direction),
+            self.note(Operation.ALTERED, datagram, direction, now, detail),
+        ]
         if self.lets_pass:
-            actions.append(Send(datagram, way))
+            actions.append(Send(datagram, direction))
         return actions
 
     @property
     def lets_pass(self) -> bool:
-        """Whether the genuine datagram follows."""
+        """Whether the genuine datagram follows the altered one."""
         return bool(getattr(self.options, "beside", False))
 
     @abstractmethod
     def is_target(self, datagram: bytes) -> bool:
-        """Whether it can be altered."""
+        """Whether this attack can alter the datagram."""
 
     @abstractmethod
-    def alter(self, datagram: bytes, way: Way) -> tuple[bytes, str]:
-        """Another datagram, and what was done."""
+    def alter(self, datagram: bytes, direction: Direction) -> tuple[bytes, str]:
+        """The altered datagram, and a description of the change."""
 
 
 class TimedOptions(Options):
-    """The parameters of attacks that send by themselves."""
+    """The parameters of attacks that inject datagrams at a rate."""
 
-    rate_per_s: float = Field(10.0, gt=0, le=100_000, description="datagrams a second")
+    rate_per_s: float = Field(10.0, gt=0, le=100_000, description="datagrams per second")
 
 
 T = TypeVar("T", bound=TimedOptions)
 
 
 class Timed(Attack[T]):
-    """An attack that sends by itself, at a rate."""
+    """An attack that injects datagrams at a rate."""
 
-    def __init__(self, options: T, surroundings: Surroundings, chance: Random, now: float) -> None:
-        super().__init__(options, surroundings, chance, now)
+    def __init__(self, options: T, context: AttackContext, rng: Random, now: float) -> None:
+        super().__init__(options, context, rng, now)
         self._next_at = self.begins_at
-        self.shots = 0
+        self.sent_count = 0
 
     def due(self, now: float) -> list[Action]:
-        """Everything whose time has come."""
+        """Send the datagrams that are due."""
         actions: list[Action] = []
         interval_s = 1.0 / self.options.rate_per_s
-        for _ in range(SHOTS_AT_ONCE):
+        for _ in range(CATCH_UP_LIMIT):
             if self._next_at > now or self._next_at >= self.ends_at or self.is_exhausted:
                 return actions
-            actions += self.shoot(now)
-            self.shots += 1
+            actions += self.send_next(now)
+            self.sent_count += 1
             self._next_at += interval_s
         self._next_at = max(self._next_at, now)
         return actions
 
     def next_deadline(self) -> float:
-        """The next shot."""
+        """The time of the next datagram."""
         return NEVER if self.is_exhausted or self._next_at >= self.ends_at else self._next_at
 
     @abstractmethod
-    def shoot(self, now: float) -> list[Action]:
-        """One shot. It counts its own :attr:`strikes`; with nothing to shoot at it gives nothing."""
+    def send_next(self, now: float) -> list[Action]:
+        """Inject the next datagram with :meth:`inject`, or nothing if there is no target yet."""
 
     def inject(
-        self, datagram: bytes, way: Way, now: float, detail: str = "", stranger: int | None = None
+        self, datagram: bytes, direction: Direction, now: float, detail: str = "", stranger: int | None = None
     ) -> list[Action]:
-        """Send a datagram of our own."""
-        self.strikes += 1
+        """Send a datagram made by the attacker."""
+        self.attempts += 1
         origin = "" if stranger is None else f"{detail and ', '}from stranger {stranger}"
         return [
-            Send(datagram, way, stranger),
-            self.note(What.INJECTED, datagram, way, now, detail + origin, own=True),
+            Send(datagram, direction, stranger),
+            self.note(Operation.INJECTED, datagram, direction, now, detail + origin, own=True),
         ]
 
 
-Kinds = Literal["any", "handshake", "initiation", "response", "cookie", "envelope"]
+KindFilter = Literal["any", "handshake", "initiation", "response", "cookie", "envelope", "report"]
+KINDS: Final = "any, handshake, initiation, response, cookie, envelope, or report (a refusal report in the clear)"
 
 
-def is_of(kinds: Kinds, datagram: bytes) -> bool:
-    """Whether a datagram is of the kinds that a parameter names."""
+def matches_kind(kinds: KindFilter, datagram: bytes) -> bool:
+    """Whether a datagram is of the kinds that the parameter names."""
     kind = kind_of(datagram)
     match kinds:
         case "any":
             return True
         case "handshake":
             return kind in HANDSHAKE
+        case "report":
+            return is_refusal_report(datagram)
         case _:
             return kind.value == kinds
 
 
 def describe_options(model: type[Options]) -> list[tuple[str, Any, str]]:
-    """Name, default and meaning of each parameter, those of this attack before those that all have."""
+    """Name, default and description of each parameter. The common parameters come last."""
     own = [name for name in model.model_fields if name not in Options.model_fields]
     rows: list[tuple[str, Any, str]] = []
     for name in (*own, *Options.model_fields):
-        found = model.model_fields[name]
-        rows.append((name, found.default, found.description or ""))
+        field_info = model.model_fields[name]
+        rows.append((name, field_info.default, field_info.description or ""))
     return rows

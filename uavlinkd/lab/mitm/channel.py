@@ -1,7 +1,7 @@
-"""What lies between peers: attacks, one behind the other, then a radio for each direction. Sans-IO and seeded.
+"""The path between peers: a chain of attacks, then a radio for each direction. Sans-IO and seeded.
 
-What one attack sends under a peer's address is what the next one sees, as if they stood one behind the other on the
-cable. What is sent from an address of the attacker's own goes straight to the receiver.
+The next attack gets the datagrams that an attack sends from a peer's address. Datagrams from a stranger's address go
+directly to the receiver.
 """
 
 from __future__ import annotations
@@ -9,57 +9,57 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from random import Random
 
-from uavlinkd.lab.mitm.attack import NEVER, Action, AttackObject, Intervention, Send, Surroundings, Way
+from uavlinkd.lab.mitm.attack import NEVER, Action, AttackContext, AttackObject, Direction, Intervention, Send
 from uavlinkd.lab.mitm.radio import Radio, RadioSettings
 
 
-class Channel:
+class AttackChannel:
     """Attacks and radios between peers; an :class:`AttackObject` itself.
 
     Args:
-        surroundings: between whom it stands.
-        attacks: in the order in which a datagram meets them.
-        radios: what each direction does to what the attacks let pass. Without settings nothing.
-        seed: of the radios' luck; the attacks have their own.
-        now: seconds on the caller's clock.
+        context: the directions between the peers.
+        attacks: in the order in which a datagram passes them.
+        radios: the radio of each direction. A direction without one passes datagrams unchanged.
+        seed: of the radios. Each attack has its own random source.
+        now: monotonic seconds.
     """
 
     name = "channel"
 
     def __init__(
         self,
-        surroundings: Surroundings,
+        context: AttackContext,
         attacks: Sequence[AttackObject] = (),
-        radios: Mapping[Way, RadioSettings] | None = None,
+        radios: Mapping[Direction, RadioSettings] | None = None,
         seed: int | str = 0,
         now: float = 0.0,
     ) -> None:
-        self.surroundings = surroundings
+        self.context = context
         self.attacks: tuple[AttackObject, ...] = tuple(attacks)
-        """May be replaced at any time; what the old ones held is lost then."""
+        """May be replaced at any time. Datagrams that the old attacks hold are lost."""
         self.is_paused = False
-        """Everything passes, and nothing is done; what attacks hold waits."""
-        self.radios: dict[Way, Radio] = {}
-        for way, settings in (radios or {}).items():
-            self.radios[way] = Radio(settings, Random(f"radio {seed} {way}"), now)  # noqa: S311  luck, no secret
+        """While paused, datagrams bypass the attacks; held datagrams stay held."""
+        self.radios: dict[Direction, Radio] = {}
+        for direction, settings in (radios or {}).items():
+            self.radios[direction] = Radio(settings, Random(f"radio {seed} {direction}"), now)  # noqa: S311  not a secret
 
-    def on_datagram(self, datagram: bytes, way: Way, now: float) -> list[Action]:
+    def on_datagram(self, datagram: bytes, direction: Direction, now: float) -> list[Action]:
         """A peer sent a datagram to another."""
-        return self._carry([Send(datagram, way)], 0, now)
+        return self._carry([Send(datagram, direction)], 0, now)
 
     def on_answer(self, datagram: bytes, peer: str, stranger: int, now: float) -> list[Action]:
-        """A peer sent a datagram to an address of the attacker's own."""
+        """A peer sent a datagram to a stranger."""
         if self.is_paused:
             return []
         return self._each(lambda attack: attack.on_answer(datagram, peer, stranger, now), now)
 
     def due(self, now: float) -> list[Action]:
-        """What is to be done at ``now``."""
+        """The actions that are due at ``now``."""
         actions = [] if self.is_paused else self._each(lambda attack: attack.due(now), now)
         return actions + self._arrived(now)
 
     def next_deadline(self) -> float:
-        """When :meth:`due` has something to do."""
+        """The time of the next call of :meth:`due`."""
         deadlines = [] if self.is_paused else [attack.next_deadline() for attack in self.attacks]
         deadlines += [radio.next_deadline() for radio in self.radios.values()]
         return min(deadlines, default=NEVER)
@@ -72,20 +72,20 @@ class Channel:
         ]
 
     def _carry(self, actions: Sequence[Action], position: int, now: float) -> list[Action]:
-        """Past the attacks from ``position`` on, then onto the radio."""
+        """Pass the attacks from ``position`` on, then the radio."""
         carried: list[Action] = []
         for action in actions:
             if isinstance(action, Intervention) or action.stranger is not None:
                 carried.append(action)
             elif position < len(self.attacks) and not self.is_paused:
-                met = self.attacks[position].on_datagram(action.datagram, action.way, now)
+                met = self.attacks[position].on_datagram(action.datagram, action.direction, now)
                 carried += self._carry(met, position + 1, now)
-            elif action.way in self.radios:
-                self.radios[action.way].send(action.datagram, now)
+            elif action.direction in self.radios:
+                self.radios[action.direction].send(action.datagram, now)
                 carried += self._arrived(now)
             else:
                 carried.append(action)
         return carried
 
     def _arrived(self, now: float) -> list[Action]:
-        return [Send(datagram, way) for way, radio in self.radios.items() for datagram in radio.due(now)]
+        return [Send(datagram, direction) for direction, radio in self.radios.items() for datagram in radio.due(now)]

@@ -1,6 +1,6 @@
 """The command ``uavlink-mitm``: a man in the middle between daemons, and an emulated radio.
 
-0: done. 1: it could not be done, and one line says why. 2: the command line or the configuration is wrong.
+Exit status 0: success. 1: failure, and standard error has the reason. 2: wrong command line or configuration.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ import asyncio
 import json
 import math
 import os
-import signal
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -18,12 +17,10 @@ from pathlib import Path
 from typing import TypeVar
 
 from uavlinkd import __version__
-from uavlinkd.ops.control import ControlError, ask
 from uavlinkd.endpoints.sockets import BindError
-from uavlinkd.ops.log import set_up_logging
 from uavlinkd.lab.mitm.attack import AttackError
 from uavlinkd.lab.mitm.attacks import list_attacks, parse_attack
-from uavlinkd.lab.mitm.proxy import Proxy
+from uavlinkd.lab.mitm.proxy import REQUESTS, Proxy
 from uavlinkd.lab.mitm.proxy_settings import (
     ProxySettings,
     SettingsError,
@@ -33,24 +30,27 @@ from uavlinkd.lab.mitm.proxy_settings import (
     parse_peer,
     parse_radio,
 )
+from uavlinkd.ops.control import ControlError, ask
+from uavlinkd.ops.log import set_up_logging
+from uavlinkd.system.signals import on_signal
 from uavlinkd.system.terminal import printable
 
 OK, FAILED, WRONG = 0, 1, 2
 _EPILOG = """\
-Example, between drone0 at port 5791 and drone1 at port 5792 of this machine; drone0 is configured to find drone1 at
-127.0.0.1:5801, and drone1 to find drone0 at 127.0.0.1:5802:
+Example: drone0 listens on port 5791 of this machine and drone1 on port 5792. In drone0's configuration, drone1 has
+the address 127.0.0.1:5801; in drone1's, drone0 has 127.0.0.1:5802:
 
   uavlink-mitm --peer drone0=127.0.0.1:5791 --peer drone1=127.0.0.1:5792 \\
       --link drone0@127.0.0.1:5801,drone1@127.0.0.1:5802 --attack replay-data,share=0.1 --radio loss=0.05,delay_s=0.02
 
-Attack only links of your own.
+Attack only your own links.
 """
 
 _Parsed = TypeVar("_Parsed")
 
 
 def _read_by(parse: Callable[[str], _Parsed]) -> Callable[[str], _Parsed]:
-    """For argparse: what a parser has to say is what the operator reads."""
+    """An argparse type that shows the error message of ``parse``."""
 
     def read(text: str) -> _Parsed:
         try:
@@ -64,20 +64,22 @@ def _read_by(parse: Callable[[str], _Parsed]) -> Callable[[str], _Parsed]:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="uavlink-mitm",
-        description="Stands between uavlinkd daemons without their keys: attacks the link, or emulates a radio.",
+        description="A proxy between uavlinkd daemons, without their keys. It attacks the link, or emulates a radio.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"uavlink-mitm {__version__}")
     parser.add_argument("--list", action="store_true", help="list the attacks and their parameters")
-    parser.add_argument("--config", metavar="FILE", type=Path, help="what the flags below say, in a file")
+    parser.add_argument(
+        "--config", metavar="FILE", type=Path, help="read the settings of the options below from FILE"
+    )
     parser.add_argument(
         "--peer",
         metavar="NAME=HOST:PORT[,KEY]",
         type=_read_by(parse_peer),
         action="append",
         default=[],
-        help="a daemon; with its public key, attacks can repair mac1",
+        help="a daemon; with its public key, attacks can compute a valid mac1",
     )
     parser.add_argument(
         "--link",
@@ -85,7 +87,7 @@ def _parser() -> argparse.ArgumentParser:
         type=_read_by(parse_link),
         action="append",
         default=[],
-        help="where A, and where B, finds the other: addresses to listen on",
+        help="listening addresses: where A reaches B, and where B reaches A",
     )
     parser.add_argument(
         "--attack",
@@ -93,7 +95,7 @@ def _parser() -> argparse.ArgumentParser:
         type=_read_by(parse_attack),
         action="append",
         default=[],
-        help="may stand several times: each sees what the one before it lets pass",
+        help="an attack; repeat it for a chain in which each attack gets the output of the one before",
     )
     parser.add_argument(
         "--radio",
@@ -103,15 +105,14 @@ def _parser() -> argparse.ArgumentParser:
         default=[],
         help="an emulated radio behind the attacks: loss, delay_s, jitter_s, bits_per_s and so on",
     )
-    parser.add_argument("--seed", type=int, metavar="N", help="the same seed, the same attack (default: 0)")
-    parser.add_argument("--log", metavar="FILE", type=Path, help="add every intervention there, in JSON lines")
-    parser.add_argument("--control-socket", metavar="PATH", type=Path, help="answer requests there")
-    parser.add_argument("--seconds", type=float, metavar="N", help="end after N seconds")
+    parser.add_argument("--seed", type=int, metavar="N", help="equal seeds cause equal attacks (default: 0)")
+    parser.add_argument("--log", metavar="FILE", type=Path, help="append each intervention to FILE, in JSON lines")
+    parser.add_argument("--control-socket", metavar="PATH", type=Path, help="answer the requests of --ask at PATH")
+    parser.add_argument("--seconds", type=float, metavar="N", help="stop after N seconds")
     parser.add_argument(
         "--ask",
         metavar="REQUEST",
-        help='ask the one that runs, by its --control-socket: "statistics", "pause", "resume", "stop",'
-        ' "attack NAME,key=value ...", "attack none"',
+        help=f"send a request to the running process by its --control-socket: {REQUESTS}",
     )
     return parser
 
@@ -122,7 +123,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.list:
         return _list()
     if options.seconds is not None and not (math.isfinite(options.seconds) and options.seconds > 0):
-        return _fail("--seconds is a number above 0", WRONG)
+        return _fail("--seconds must be a number above 0", WRONG)
     try:
         settings = load_proxy_settings(options.config) if options.config is not None else ProxySettings((), ())
         settings = overridden(
@@ -153,15 +154,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 async def run(settings: ProxySettings, seconds: float | None = None) -> None:
-    """Stand in the way until SIGTERM, SIGINT, ``stop`` on the control socket, or the end of the time.
+    """Run until SIGTERM, SIGINT, ``stop`` on the control socket, or for ``seconds``.
 
     Raises:
-        BindError, AttackError, ControlError, OSError: as :meth:`Proxy.start`.
+        BindError, AttackError, ControlError, OSError: see :meth:`Proxy.start`.
     """
     proxy = Proxy(settings)
-    loop = asyncio.get_running_loop()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        loop.add_signal_handler(number, proxy.stopping.set)
+    for name in ("SIGTERM", "SIGINT"):
+        on_signal(name, proxy.stopping.set)
     await proxy.start()
     try:
         with suppress(TimeoutError):
@@ -174,7 +174,7 @@ async def run(settings: ProxySettings, seconds: float | None = None) -> None:
 def _list() -> int:
     try:
         print(list_attacks(), flush=True)
-    except BrokenPipeError:  # the reader left: `uavlink-mitm --list | head`
+    except BrokenPipeError:  # standard output was closed: `uavlink-mitm --list | head`
         with suppress(OSError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILED
@@ -183,13 +183,15 @@ def _list() -> int:
 
 def _ask(path: Path | None, request: str) -> int:
     if path is None:
-        return _fail("--ask takes --control-socket, or a --config that names one", WRONG)
+        return _fail("--ask needs --control-socket, or a --config that names one", WRONG)
     try:
         answer = ask(path, request)
     except ControlError as error:
         return _fail(error)
+    if "refused" in answer:
+        return _fail(answer["refused"])
     print(json.dumps(answer, indent=2))
-    return FAILED if "refused" in answer else OK
+    return OK
 
 
 def _fail(problem: object, status: int = FAILED) -> int:

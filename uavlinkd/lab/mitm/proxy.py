@@ -1,8 +1,8 @@
-"""The man in the middle as a daemon: sockets and one timer around a :class:`Channel`.
+"""The man in the middle as a daemon: sockets and one timer around an :class:`AttackChannel`.
 
-For each peer of a link there is a *face*: an address that stands for the other peer. What a peer sends to its face is
-what it sends to the other; what the other is to get comes from the face that it knows. Addresses of the attacker's
-own, the *strangers*, are opened when an attack first uses them.
+Each peer of a link has a *listener*: an address that the peer believes to be the other peer. Datagrams that a peer
+sends to its listener are meant for the other peer, which receives them from its own listener. The attacker's own
+addresses, the *strangers*, are opened at their first use.
 """
 
 from __future__ import annotations
@@ -17,74 +17,74 @@ from time import monotonic
 
 import structlog
 
-from uavlinkd.system.addresses import Address
-from uavlinkd.ops.control import ControlServer
-from uavlinkd.endpoints.sockets import DATAGRAMS_PER_WAKE_UP, RECEIVE_BYTES, BindError, udp_socket
+from uavlinkd.endpoints.reader import DATAGRAMS_PER_WAKE_UP, RECEIVE_BYTES
+from uavlinkd.endpoints.sockets import BindError, udp_socket
 from uavlinkd.lab.mitm.amplification import Amplification
-from uavlinkd.lab.mitm.attack import NEVER, Action, AttackError, AttackObject, Intervention, Surroundings, Way
+from uavlinkd.lab.mitm.attack import NEVER, Action, AttackContext, AttackError, AttackObject, Direction, Intervention
 from uavlinkd.lab.mitm.attacks import parse_attack
-from uavlinkd.lab.mitm.channel import Channel
+from uavlinkd.lab.mitm.channel import AttackChannel
 from uavlinkd.lab.mitm.journal import Journal
 from uavlinkd.lab.mitm.proxy_settings import ProxySettings
+from uavlinkd.ops.control import ControlServer
+from uavlinkd.system.addresses import Address
 
+REQUESTS = '"statistics", "pause", "resume", "stop", "attack none" or "attack NAME,key=value ..."'
 MAX_REQUEST_BYTES = 4096
-"""To the control socket: several attacks, each with all that can be said of it."""
+"""Of the control socket: enough for several attacks with all their parameters."""
 LOOP_TICK_S = 0.001
-"""A loop may fire a timer up to one tick of its clock early."""
+"""An event loop may fire a timer up to one clock tick early."""
 
 Sockaddr = tuple[str, int]
 
 
 class Proxy:
-    """One man in the middle. :meth:`start` it, and :meth:`stop` it in the end.
+    """A man in the middle between daemons. Call :meth:`start` first and :meth:`stop` last.
 
     Args:
-        settings: between whom it stands.
-        attacks: what stands in the way; None for the attacks that the settings name.
+        settings: the peers, links, attacks and radios.
+        attacks: replace the attacks of the settings, unless None.
     """
 
     def __init__(self, settings: ProxySettings, attacks: Sequence[AttackObject] | None = None) -> None:
         self.settings = settings
-        self.surroundings: Surroundings = settings.surroundings
+        self.context: AttackContext = settings.context
         self.log = structlog.get_logger().bind(daemon="mitm")
-        self.faces: dict[tuple[str, str], Sockaddr] = {}
-        """By peer and by whom it reaches there."""
-        self.sent: Counter[Way] = Counter()
-        self.received: Counter[Way] = Counter()
+        self.listeners: dict[tuple[str, str], Sockaddr] = {}
+        """The address at which the first peer reaches the second."""
+        self.sent: Counter[Direction] = Counter()
+        self.received: Counter[Direction] = Counter()
         self.stranger_bytes_sent: Counter[tuple[str, int]] = Counter()
         self.stranger_bytes_back: Counter[tuple[str, int]] = Counter()
-        """By peer and stranger: what went there, what came from there. Each stranger is an unvalidated address."""
+        """By peer and stranger: bytes sent to the peer, and bytes received from it. Strangers are not validated."""
         self.amplification = Amplification()
-        self.troubles: Counter[str] = Counter()
-        """Datagrams that went nowhere, by the reason."""
-        self._given = attacks
+        self.errors: Counter[str] = Counter()
+        """Datagrams that were not forwarded, by reason."""
+        self._attacks = attacks
         self._now = monotonic()
         self._sockets: dict[tuple[str, str], socket.socket] = {}
         self._strangers: dict[tuple[int, int], socket.socket] = {}
         self._addresses: dict[str, Sockaddr] = {}
-        self._is_fixed = {each.name: each.address is not None for each in settings.peers}
+        self._is_fixed = {peer.name: peer.address is not None for peer in settings.peers}
         self._timer: asyncio.TimerHandle | None = None
         self._timer_at = NEVER
         self._control: ControlServer | None = None
         self.stopping = asyncio.Event()
-        """Set when the control socket asked for the end."""
-
-    # Life.
+        """Set by the request ``stop`` on the control socket."""
 
     async def start(self) -> None:
-        """Bind every face, then stand in the way.
+        """Bind all listeners and start forwarding.
 
         Raises:
-            BindError: an address that cannot be listened on, or a peer's name that cannot be resolved.
-            AttackError: an attack that these peers do not allow.
-            ControlError: a control socket that cannot be used.
-            OSError: a log file that cannot be written.
+            BindError: an address cannot be bound, or a peer's host name cannot be resolved.
+            AttackError: these peers do not allow an attack.
+            ControlError: the control socket cannot be used.
+            OSError: the log file cannot be written.
         """
         self._began_at = self._now = monotonic()
         self._loop = asyncio.get_running_loop()
-        attacks = self._made() if self._given is None else self._given
+        attacks = self._make_attacks() if self._attacks is None else self._attacks
         radios = self.settings.radio_of()
-        self.channel = Channel(self.surroundings, attacks, radios, self.settings.seed, self._now)
+        self.channel = AttackChannel(self.context, attacks, radios, self.settings.seed, self._now)
         try:
             await self._resolve()
             self._bind()
@@ -98,18 +98,18 @@ class Proxy:
                 await self._control.stop()
             raise
         for (peer, other), sock in self._sockets.items():
-            self._loop.add_reader(sock, self._on_face_readable, sock, Way(peer, other))
+            self._loop.add_reader(sock, self._on_listener_readable, sock, Direction(peer, other))
         self.journal.event(
             "mitm_started",
             self._now,
             seed=self.settings.seed,
-            faces={f"{peer} reaches {other}": str(Address(*at)) for (peer, other), at in self.faces.items()},
+            listeners={f"{peer} reaches {other}": str(Address(*at)) for (peer, other), at in self.listeners.items()},
             attacks=self._names(),
         )
         self._arm()
 
     async def stop(self) -> None:
-        """Close everything, and finish the log."""
+        """Close the sockets and the log."""
         if self._timer is not None:
             self._timer.cancel()
         for sock in (*self._sockets.values(), *self._strangers.values()):
@@ -121,9 +121,9 @@ class Proxy:
         self.journal.event("mitm_stopped", monotonic(), **statistics)
         self.journal.close()
 
-    def _made(self) -> list[AttackObject]:
+    def _make_attacks(self) -> list[AttackObject]:
         return [
-            spec.make(self.surroundings, f"{self.settings.seed} {position}", self._now)
+            spec.make(self.context, f"{self.settings.seed} {position}", self._now)
             for position, spec in enumerate(self.settings.attacks)
         ]
 
@@ -131,10 +131,10 @@ class Proxy:
         for peer in self.settings.peers:
             if peer.address is not None:
                 try:
-                    found = await self._loop.getaddrinfo(*peer.address.sockaddr, type=socket.SOCK_DGRAM)
+                    addresses = await self._loop.getaddrinfo(*peer.address.sockaddr, type=socket.SOCK_DGRAM)
                 except OSError as error:
-                    raise BindError(f"cannot find {peer.name} at {peer.address}: {error.strerror}") from None
-                host, port = found[0][4][:2]
+                    raise BindError(f"cannot resolve {peer.name} at {peer.address}: {error.strerror}") from None
+                host, port = addresses[0][4][:2]
                 self._addresses[peer.name] = str(host), int(port)
 
     def _bind(self) -> None:
@@ -142,7 +142,7 @@ class Proxy:
             for peer, other, address in zip(link.peers, link.peers[::-1], link.listen, strict=True):
                 sock = udp_socket(address)
                 self._sockets[peer, other] = sock
-                self.faces[peer, other] = sock.getsockname()[:2]
+                self.listeners[peer, other] = sock.getsockname()[:2]
 
     def _close_sockets(self) -> None:
         for sock in (*self._sockets.values(), *self._strangers.values()):
@@ -150,36 +150,36 @@ class Proxy:
         self._sockets.clear()
         self._strangers.clear()
 
-    # While it runs.
-
     def change_attacks(self, attacks: Sequence[AttackObject]) -> None:
-        """Others from now on. What the old ones hold is lost."""
+        """Replace the attacks. Datagrams that the old ones hold are lost."""
         self.channel.attacks = tuple(attacks)
         self.journal.event("attacks_changed", monotonic(), attacks=self._names())
         self._arm()
 
     def pause(self) -> None:
-        """Let everything pass, until :meth:`resume`."""
+        """Pass all datagrams unchanged until :meth:`resume`."""
         self.channel.is_paused = True
         self.journal.event("mitm_paused", monotonic())
 
     def resume(self) -> None:
-        """Attack again."""
+        """End a pause."""
         self.channel.is_paused = False
         self.journal.event("mitm_resumed", monotonic())
         self._arm()
 
     def statistics(self) -> dict[str, object]:
-        """What was seen and done so far; plain data."""
+        """The counters of this run, as plain data."""
         sent, back = self.stranger_bytes_sent, self.stranger_bytes_back
         return {
             "seconds": round(monotonic() - self._began_at, 3),
             "seed": self.settings.seed,
             "is_paused": self.channel.is_paused,
             "attacks": self._names(),
-            "received": {str(way): count for way, count in self.received.items()},
-            "sent": {str(way): count for way, count in self.sent.items()},
-            "interventions": {f"{attack}: {what}": count for (attack, what), count in self.journal.counts.items()},
+            "received": {str(direction): count for direction, count in self.received.items()},
+            "sent": {str(direction): count for direction, count in self.sent.items()},
+            "interventions": {
+                f"{attack}: {operation}": count for (attack, operation), count in self.journal.counts.items()
+            },
             "strangers": {
                 "bytes_sent": sent.total(),
                 "bytes_back": back.total(),
@@ -187,14 +187,14 @@ class Proxy:
                     f"{peer} to {number}": excess for (peer, number), excess in self.amplification.excess.items()
                 },
             },
-            "radios": {str(way): dict(radio.fates) for way, radio in self.channel.radios.items()},
-            "troubles": dict(self.troubles),
+            "radios": {str(direction): dict(radio.outcomes) for direction, radio in self.channel.radios.items()},
+            "errors": dict(self.errors),
         }
 
     def _names(self) -> list[str]:
         return [attack.name for attack in self.channel.attacks]
 
-    def _answer(self, request: str) -> dict[str, object] | None:
+    def _answer(self, request: str) -> dict[str, object]:
         match request.split():
             case ["statistics"]:
                 return self.statistics()
@@ -207,7 +207,7 @@ class Proxy:
             case ["attack", first, *others]:
                 return self._attack([first, *others])
             case _:
-                return None
+                return {"refused": f"there is no request {request!r}: write {REQUESTS}"}
         return {"done": request}
 
     def _attack(self, words: list[str]) -> dict[str, object]:
@@ -215,31 +215,31 @@ class Proxy:
             specs = () if words == ["none"] else tuple(map(parse_attack, words))
             self._now = monotonic()
             self.settings = replace(self.settings, attacks=specs)
-            self.change_attacks(self._made())
+            self.change_attacks(self._make_attacks())
         except AttackError as error:
             return {"refused": str(error)}
         return {"done": "attack", "attacks": self._names()}
 
     # Datagrams.
 
-    def _on_face_readable(self, sock: socket.socket, way: Way) -> None:
+    def _on_listener_readable(self, sock: socket.socket, direction: Direction) -> None:
         now = monotonic()
         for _ in range(DATAGRAMS_PER_WAKE_UP):
             try:
                 datagram, source = sock.recvfrom(RECEIVE_BYTES)
             except BlockingIOError:
                 break
-            except OSError as error:  # an earlier datagram found nobody there
-                self._trouble(error)
+            except OSError as error:  # an earlier datagram was refused
+                self._count_error(error)
                 continue
-            if self._is_fixed[way.sender]:
-                if source[:2] != self._addresses[way.sender]:
-                    self.troubles["from nobody we know"] += 1
+            if self._is_fixed[direction.sender]:
+                if source[:2] != self._addresses[direction.sender]:
+                    self.errors["unknown sender"] += 1
                     continue
             else:
-                self._addresses[way.sender] = source[:2]
-            self.received[way] += 1
-            self._perform(self.channel.on_datagram(datagram, way, now))
+                self._addresses[direction.sender] = source[:2]
+            self.received[direction] += 1
+            self._perform(self.channel.on_datagram(datagram, direction, now))
         self._arm()
 
     def _on_stranger_readable(self, sock: socket.socket, stranger: int) -> None:
@@ -250,14 +250,14 @@ class Proxy:
             except BlockingIOError:
                 break
             except OSError as error:
-                self._trouble(error)
+                self._count_error(error)
                 continue
             peer = next((name for name, at in self._addresses.items() if at == source[:2]), None)
             if peer is None:
-                self.troubles["from nobody we know"] += 1
+                self.errors["unknown sender"] += 1
                 continue
             self.stranger_bytes_back[peer, stranger] += len(datagram)
-            self.amplification.came_back(peer, stranger, len(datagram), now)
+            self.amplification.received(peer, stranger, len(datagram), now)
             self._perform(self.channel.on_answer(datagram, peer, stranger, now))
         self._arm()
 
@@ -266,46 +266,44 @@ class Proxy:
             if isinstance(action, Intervention):
                 self.journal.add(action)
                 continue
-            datagram, way, stranger = action
-            to = self._addresses.get(way.receiver)
-            sock = self._sockets.get((way.receiver, way.sender)) if to and stranger is None else None
+            datagram, direction, stranger = action
+            to = self._addresses.get(direction.receiver)
+            sock = self._sockets.get((direction.receiver, direction.sender)) if to and stranger is None else None
             try:
                 if to is not None and stranger is not None:
                     sock = self._stranger(stranger, to)
                 if to is None or sock is None:
-                    self.troubles["to nobody we know"] += 1
+                    self.errors["unknown receiver"] += 1
                     continue
                 sock.sendto(datagram, to)
             except OSError as error:
-                self._trouble(error)
+                self._count_error(error)
                 continue
             if stranger is None:
-                self.sent[way] += 1
+                self.sent[direction] += 1
             else:
-                self.stranger_bytes_sent[way.receiver, stranger] += len(datagram)
-                self.amplification.sent(way.receiver, stranger, len(datagram), monotonic())
+                self.stranger_bytes_sent[direction.receiver, stranger] += len(datagram)
+                self.amplification.sent(direction.receiver, stranger, len(datagram), monotonic())
 
     def _stranger(self, number: int, to: Sockaddr) -> socket.socket:
-        """The socket of a stranger. On loopback each has an address of its own, elsewhere a port of its own."""
+        """The socket of a stranger. On loopback each stranger has its own address, elsewhere its own port."""
         family = socket.AF_INET6 if ":" in to[0] else socket.AF_INET
         sock = self._strangers.get((number, family))
         if sock is None:
             sock = socket.socket(family, socket.SOCK_DGRAM)
             sock.setblocking(False)
             if to[0].startswith("127."):
-                with suppress(OSError):  # not every system has all of 127.0.0.0/8; a port of its own will do
+                with suppress(OSError):  # some systems lack the rest of 127.0.0.0/8; then it has its own port
                     sock.bind((f"127.0.{1 + number // 250}.{1 + number % 250}", 0))
             self._strangers[number, family] = sock
             self._loop.add_reader(sock, self._on_stranger_readable, sock, number)
         return sock
 
-    def _trouble(self, error: OSError) -> None:
-        self.troubles[error.strerror or type(error).__name__] += 1
-
-    # Time.
+    def _count_error(self, error: OSError) -> None:
+        self.errors[error.strerror or type(error).__name__] += 1
 
     def _arm(self) -> None:
-        """Have the one timer fire at the next deadline."""
+        """Set the timer to the next deadline."""
         deadline = min(self.channel.next_deadline(), self.journal.next_flush())
         if deadline < self._timer_at:
             if self._timer is not None:

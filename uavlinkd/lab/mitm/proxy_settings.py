@@ -1,6 +1,6 @@
-"""Between whom the man in the middle stands, and what it does: from a file, or from flags.
+"""The settings of the man in the middle, from a file or from command-line options.
 
-Every problem of a file is told at once. Nothing falls back to a default because it could not be read.
+All problems of a file are reported at once. An unreadable value is an error, never replaced by a default.
 """
 
 from __future__ import annotations
@@ -9,25 +9,25 @@ import base64
 import binascii
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, PlainValidator, ValidationError
 
-from uavlinkd.system.addresses import Address, parse_address
 from uavlinkd.core.constants import KEY_BYTES
-from uavlinkd.lab.mitm.attack import AttackError, Surroundings, Way
+from uavlinkd.lab.mitm.attack import AttackContext, AttackError, Direction
 from uavlinkd.lab.mitm.attacks import AttackSpec, attack_from_table
 from uavlinkd.lab.mitm.radio import Bursts, Outage, RadioSettings
+from uavlinkd.system.addresses import Address, parse_address
 
 MAX_FILE_BYTES = 1 << 20
 LOG_DETAIL = 1000
-"""Interventions of a kind that are logged one by one; the others are counted."""
+"""Interventions of one attack and operation that have a log line each. Later ones are counted."""
 
 
 class SettingsError(ValueError):
-    """What is wrong, one problem a line."""
+    """The settings are wrong: one problem per line."""
 
     def __init__(self, problems: Sequence[str]) -> None:
         super().__init__("\n".join(problems))
@@ -40,69 +40,71 @@ class MitmPeer:
 
     name: str
     address: Address | None = None
-    """Where it listens. None: learned from what it sends, and nobody can reach it before."""
+    """Where it listens. None: learned from its datagrams; it is unreachable before."""
     public_key: bytes | None = None
-    """What the attacker has found out: enough to make ``mac1``."""
+    """If known, attacks can compute a valid ``mac1``."""
 
 
 @dataclass(frozen=True, slots=True)
 class MitmLink:
-    """Two peers, and where each of them reaches the other: addresses of the man in the middle."""
+    """Two peers, and the addresses of the man in the middle where each reaches the other."""
 
     peers: tuple[str, str]
     listen: tuple[Address, Address]
-    """For the first peer, where it believes the second to be; and the other way round. Port 0: any."""
+    """The address for the first peer, and the one for the second. Port 0: any free port."""
 
 
 @dataclass(frozen=True, slots=True)
 class ProxySettings:
-    """All of it."""
+    """All settings of the man in the middle."""
 
     peers: tuple[MitmPeer, ...]
     links: tuple[MitmLink, ...]
     attacks: tuple[AttackSpec, ...] = ()
     radios: tuple[tuple[str, RadioSettings], ...] = ()
-    """With the way of each, ``both`` or ``A>B``; the last that names a way counts."""
+    """Direction (``both`` or ``A>B``) and settings. The last entry for a direction applies."""
     seed: int = 0
     log: Path | None = None
     log_detail: int = LOG_DETAIL
     control_socket: Path | None = None
 
     @property
-    def surroundings(self) -> Surroundings:
-        """What the attacks know."""
-        ways = tuple(way for link in self.links for way in (Way(*link.peers), Way(*link.peers).back))
-        keys = {each.name: each.public_key for each in self.peers if each.public_key is not None}
-        return Surroundings(ways, keys)
+    def context(self) -> AttackContext:
+        """The directions and public keys that the attacks know."""
+        directions = tuple(
+            direction for link in self.links for direction in (Direction(*link.peers), Direction(*link.peers).reverse)
+        )
+        keys = {peer.name: peer.public_key for peer in self.peers if peer.public_key is not None}
+        return AttackContext(directions, keys)
 
-    def radio_of(self) -> dict[Way, RadioSettings]:
+    def radio_of(self) -> dict[Direction, RadioSettings]:
         """The radio of each direction that has one.
 
         Raises:
-            AttackError: a way that is not there.
+            AttackError: there is no such direction.
         """
-        surroundings = self.surroundings
-        return {way: settings for text, settings in self.radios for way in surroundings.select(text)}
+        context = self.context
+        return {direction: settings for text, settings in self.radios for direction in context.select(text)}
 
     def check(self) -> list[str]:
-        """What is wrong between the sections."""
+        """The inconsistencies between sections."""
         problems: list[str] = []
-        names = [each.name for each in self.peers]
+        names = [peer.name for peer in self.peers]
         if len(self.peers) < 2:
-            problems.append("peer: a man in the middle stands between two peers at least")
+            problems.append("peer: at least two peers are required")
         if len(set(names)) < len(names):
-            problems.append("peer: a name stands for one peer: give each its own")
+            problems.append("peer: two peers have the same name: names must be unique")
         if not self.links:
-            problems.append("link: name the two peers of a link, and an address for each")
+            problems.append("link: at least one link is required")
         for number, link in enumerate(self.links):
-            unknown = [each for each in link.peers if each not in names]
+            unknown = [name for name in link.peers if name not in names]
             if unknown or link.peers[0] == link.peers[1]:
                 problems.append(f"link[{number}].between: must name two of the peers, which are {', '.join(names)}")
         if len({frozenset(link.peers) for link in self.links}) < len(self.links):
-            problems.append("link: two peers have one link")
-        taken = [each for link in self.links for each in link.listen if each.port]
-        if len(set(taken)) < len(taken):
-            problems.append("link: each listen address serves one peer on one link")
+            problems.append("link: there are two links between the same peers: remove one")
+        listening = [address for link in self.links for address in link.listen if address.port]
+        if len(set(listening)) < len(listening):
+            problems.append("link: a listen address is used twice: each must be unique")
         if not problems:
             problems += self._check_attacks()
         return problems
@@ -111,7 +113,7 @@ class ProxySettings:
         problems: list[str] = []
         for spec in self.attacks:
             try:
-                spec.make(self.surroundings)
+                spec.make(self.context)
             except AttackError as error:
                 problems.append(f"attack {spec.name}: {error}")
         try:
@@ -121,13 +123,13 @@ class ProxySettings:
         return problems
 
 
-# What stands in a file.
+# The file.
 
 
 def _peer_address(value: object) -> Address:
     address = parse_address(_text(value), allow_names=True)
     if address.is_wildcard:
-        raise ValueError("is every address of a machine: write the one where the peer listens")
+        raise ValueError("is a wildcard address: write the address where the peer listens")
     return address
 
 
@@ -142,15 +144,15 @@ def _name(value: object) -> str:
     if not (0 < len(text) <= 32 and text.isascii() and text.replace("-", "").replace("_", "").isalnum()):
         raise ValueError("must be letters, digits, - and _, at most 32")
     if text == "both":
-        raise ValueError("means both directions: choose another")
+        raise ValueError("is reserved for both directions: choose another name")
     return text
 
 
 def parse_public_key(value: object) -> bytes:
-    """A public key as ``uavlinkd pubkey`` prints it.
+    """Decode a public key as ``uavlinkd pubkey`` prints it.
 
     Raises:
-        ValueError: with what to write.
+        ValueError: it is not a public key.
     """
     try:
         key = base64.b64decode(_text(value), validate=True)
@@ -183,44 +185,45 @@ class _LinkSection(_Section):
     listen: Annotated[list[_ListenAddress], Field(min_length=2, max_length=2)]
 
 
+_PERFECT = RadioSettings()
+
+
 class RadioSection(_Section):
     """One or both directions of an emulated radio; see :class:`RadioSettings`."""
 
-    way: str = "both"
-    loss: float = 0.0
-    duplication: float = 0.0
-    delay_s: float = 0.0
-    jitter_s: float = 0.0
-    keeps_order: bool = False
-    reordering: float = 0.0
-    held_back_s: float = 0.05
-    bits_per_s: float | None = None
-    queue_bytes: int = 16384
+    direction: str = "both"
+    loss: float = _PERFECT.loss
+    duplication: float = _PERFECT.duplication
+    delay_s: float = _PERFECT.delay_s
+    jitter_s: float = _PERFECT.jitter_s
+    keeps_order: bool = _PERFECT.keeps_order
+    reordering: float = _PERFECT.reordering
+    held_back_s: float = _PERFECT.held_back_s
+    bits_per_s: float | None = _PERFECT.bits_per_s
+    queue_bytes: int = _PERFECT.queue_bytes
     bursts_begin: float = 0.0
     """Probability that a burst of losses begins, for each datagram; 0: no bursts."""
     bursts_end: float = 0.25
-    """Probability that it ends: a mean burst is 1 / bursts_end datagrams."""
+    """Probability that a burst ends, for each datagram: a mean burst is 1 / bursts_end datagrams long."""
     outage_at_s: float | None = None
-    """Nothing passes from then on,"""
+    """When the outage begins, in seconds after the start; None: no outage."""
     outage_s: float = 1.0
-    """for so long,"""
+    """Its duration."""
     outage_every_s: float | None = None
-    """and again after so long."""
+    """The interval at which it repeats; None: once."""
 
     def settings(self) -> RadioSettings:
-        """For the emulator.
+        """The settings of the emulator.
 
         Raises:
-            ValueError: for a value that no radio has.
+            ValueError: a value is out of range.
         """
-        same = ("loss", "duplication", "delay_s", "jitter_s", "keeps_order", "reordering", "held_back_s")
+        same = self.model_fields_set & {field.name for field in fields(RadioSettings)}
         outages: tuple[Outage, ...] = ()
         if self.outage_at_s is not None:
             outages = (Outage(self.outage_at_s, self.outage_at_s + self.outage_s, self.outage_every_s),)
         return RadioSettings(
             **{name: getattr(self, name) for name in same},
-            bits_per_s=self.bits_per_s,
-            queue_bytes=self.queue_bytes,
             bursts=Bursts(self.bursts_begin, self.bursts_end) if self.bursts_begin else None,
             outages=outages,
         )
@@ -238,10 +241,10 @@ class _FileSection(_Section):
 
 
 def load_proxy_settings(path: Path) -> ProxySettings:
-    """The settings in a TOML file. Files that it names are relative to it.
+    """Read the settings from a TOML file. Paths in it are relative to its folder.
 
     Raises:
-        SettingsError: with every problem of the file.
+        SettingsError: with all problems of the file.
     """
     try:
         return _from_table(_read(path), path.absolute().parent)
@@ -252,32 +255,32 @@ def load_proxy_settings(path: Path) -> ProxySettings:
 def _from_table(table: Mapping[str, Any], folder: Path) -> ProxySettings:
     problems: list[str] = []
     try:
-        found = _FileSection.model_validate(table)
+        file = _FileSection.model_validate(table)
     except ValidationError as error:
-        raise SettingsError([_problem(each["loc"], each["msg"]) for each in error.errors()]) from None
+        raise SettingsError([_problem(item["loc"], item["msg"]) for item in error.errors()]) from None
     attacks: list[AttackSpec] = []
-    for number, each in enumerate(found.attack):
+    for number, attack in enumerate(file.attack):
         try:
-            attacks.append(attack_from_table(each))
+            attacks.append(attack_from_table(attack))
         except AttackError as error:
             problems.append(f"attack[{number}]: {error}")
     radios: list[tuple[str, RadioSettings]] = []
-    for number, section in enumerate(found.radio):
+    for number, section in enumerate(file.radio):
         try:
-            radios.append((section.way, section.settings()))
+            radios.append((section.direction, section.settings()))
         except ValueError as error:
             problems.append(f"radio[{number}]: {error}")
     settings = ProxySettings(
-        peers=tuple(MitmPeer(each.name, each.address, each.public_key) for each in found.peer),
+        peers=tuple(MitmPeer(peer.name, peer.address, peer.public_key) for peer in file.peer),
         links=tuple(
-            MitmLink((each.between[0], each.between[1]), (each.listen[0], each.listen[1])) for each in found.link
+            MitmLink((link.between[0], link.between[1]), (link.listen[0], link.listen[1])) for link in file.link
         ),
         attacks=tuple(attacks),
         radios=tuple(radios),
-        seed=found.seed,
-        log=None if found.log is None else folder / found.log,
-        log_detail=found.log_detail,
-        control_socket=None if found.control_socket is None else folder / found.control_socket,
+        seed=file.seed,
+        log=None if file.log is None else folder / file.log,
+        log_detail=file.log_detail,
+        control_socket=None if file.control_socket is None else folder / file.control_socket,
     )
     problems += settings.check()
     if problems:
@@ -286,8 +289,8 @@ def _from_table(table: Mapping[str, Any], folder: Path) -> ProxySettings:
 
 
 def _problem(location: tuple[int | str, ...], message: str) -> str:
-    parts = [f"[{each}]" if isinstance(each, int) else f".{each[:32]}" for each in location]
-    plain = message.removeprefix("Value error, ").replace("Extra inputs are not permitted", "Is not known here")
+    parts = [f"[{key}]" if isinstance(key, int) else f".{key[:32]}" for key in location]
+    plain = message.removeprefix("Value error, ").replace("Extra inputs are not permitted", "Is an unknown key")
     return f"{''.join(parts).lstrip('.')}: {plain[0].lower()}{plain[1:]}"
 
 
@@ -298,21 +301,21 @@ def _read(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise SettingsError([f"cannot be read: {error.strerror}"]) from None
     if len(content) > MAX_FILE_BYTES:
-        raise SettingsError(["is over a megabyte: this is no configuration"])
+        raise SettingsError(["is larger than 1 MiB: this is not a configuration"])
     try:
         return tomllib.loads(content.decode())
     except (ValueError, RecursionError) as error:
-        raise SettingsError([f"is no TOML that can be read: {error}"]) from None
+        raise SettingsError([f"is not valid TOML: {error}"]) from None
 
 
-# What stands in flags.
+# Command-line options.
 
 
 def parse_peer(text: str) -> MitmPeer:
-    """``NAME=HOST:PORT`` or ``NAME=HOST:PORT,PUBLICKEY``.
+    """Parse ``NAME=HOST:PORT`` or ``NAME=HOST:PORT,PUBLICKEY``.
 
     Raises:
-        ValueError: with what to write.
+        ValueError: the text is malformed.
     """
     name, _, rest = text.partition("=")
     address, comma, key = rest.partition(",")
@@ -320,33 +323,33 @@ def parse_peer(text: str) -> MitmPeer:
 
 
 def parse_link(text: str) -> MitmLink:
-    """``A@HOST:PORT,B@HOST:PORT``: where A, and where B, finds the other.
+    """Parse ``A@HOST:PORT,B@HOST:PORT``: where A reaches B, and where B reaches A.
 
     Raises:
-        ValueError: with what to write.
+        ValueError: the text is malformed.
     """
     ends = [part.partition("@") for part in text.split(",")]
     if len(ends) != 2 or not all(at for _, at, _ in ends):
-        raise ValueError("is written A@HOST:PORT,B@HOST:PORT")
+        raise ValueError("must be A@HOST:PORT,B@HOST:PORT")
     (one, _, for_one), (other, _, for_other) = ends
     listen = (parse_address(for_one, allow_names=False), parse_address(for_other, allow_names=False))
     return MitmLink((_name(one), _name(other)), listen)
 
 
 def parse_radio(text: str) -> tuple[str, RadioSettings]:
-    """``key=value,key=value``: the keys of :class:`RadioSection`.
+    """Parse ``key=value,key=value`` with the keys of :class:`RadioSection`.
 
     Raises:
-        ValueError: with what to write.
+        ValueError: the text is malformed.
     """
     values = {key.strip(): value.strip() for key, _, value in (pair.partition("=") for pair in text.split(","))}
     try:
         section = RadioSection.model_validate_strings(values)
     except ValidationError as error:
-        raise ValueError("; ".join(_problem(each["loc"], each["msg"]) for each in error.errors())) from None
-    return section.way, section.settings()
+        raise ValueError("; ".join(_problem(item["loc"], item["msg"]) for item in error.errors())) from None
+    return section.direction, section.settings()
 
 
 def overridden(settings: ProxySettings, **flags: Any) -> ProxySettings:
-    """The settings, with the flags that were given (neither None nor empty) in place of what the file says."""
+    """The settings, overridden by the options that are neither None nor empty."""
     return replace(settings, **{name: value for name, value in flags.items() if value not in (None, ())})

@@ -1,11 +1,11 @@
 """One direction of a bad radio link, seeded: datagrams and ``now`` in, datagrams when they are due out.
 
 No I/O and no clock. The same code impairs the simulated network of the tests, the link of a man in the middle, and
-an emulated radio between two daemons; a two-way link is two of these.
+an emulated radio between two daemons. A two-way link has two of them.
 
-A datagram goes this way: queue of the transmitter (bandwidth, tail drop), outage, loss, duplication, delay. Each
-datagram takes the same number of draws whatever the settings are, so that one setting can be changed in an
-experiment and the luck of all others stays what it was.
+The stages of a datagram are: queue of the transmitter (bandwidth, tail drop), outage, loss, duplication, delay. Each
+datagram uses the same number of random draws with any settings. So an experiment can change one setting without
+changing the random results of the others.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from random import Random
 
 @dataclass(frozen=True, slots=True)
 class Bursts:
-    """Losses in bursts: the two states of Gilbert and Elliott, judged anew at each datagram.
+    """Losses in bursts: the Gilbert-Elliott model with a state transition at each datagram.
 
     The mean length of a burst is ``1 / to_good`` datagrams, the share of datagrams in bursts
     ``to_bad / (to_bad + to_good)``.
@@ -44,13 +44,13 @@ class Outage:
     down_at_s: float
     up_at_s: float
     every_s: float | None = None
-    """The outage comes again after so many seconds, for ever; None for once."""
+    """The interval at which the outage repeats; None for once."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.down_at_s < self.up_at_s:
-            raise ValueError(f"an outage ends after it begins: {self.down_at_s} s to {self.up_at_s} s")
+            raise ValueError(f"an outage must end after it begins: {self.down_at_s} s to {self.up_at_s} s")
         if self.every_s is not None and self.every_s < self.up_at_s - self.down_at_s:
-            raise ValueError(f"an outage every {self.every_s} s is over before the next begins")
+            raise ValueError(f"an outage every {self.every_s} s must end before the next begins")
 
     def overlaps(self, begin_s: float, end_s: float) -> bool:
         """Whether the link is down at any moment from ``begin_s`` to ``end_s``, both included."""
@@ -65,59 +65,59 @@ class Outage:
 
 @dataclass(frozen=True, slots=True)
 class RadioSettings:
-    """What one direction does to datagrams. The defaults do nothing. Shares are 0 to 1, durations seconds.
+    """The impairments of one direction. The defaults are a perfect link. Shares are 0 to 1, durations seconds.
 
     Raises:
-        ValueError: for a value that no radio has.
+        ValueError: a value is out of range.
     """
 
     loss: float = 0.0
-    """Share of datagrams lost, each independently."""
+    """Share of datagrams lost, independently of each other."""
     bursts: Bursts | None = None
-    """Losses in bursts, beside the independent ones."""
+    """Losses in bursts, in addition to the independent ones."""
     duplication: float = 0.0
-    """Share of datagrams that arrive twice; the second has a jitter of its own."""
+    """Share of datagrams that arrive twice. The copy has its own jitter."""
     delay_s: float = 0.0
-    """What every datagram takes on its way."""
+    """The minimum delay."""
     jitter_s: float = 0.0
-    """Each takes up to this much longer, evenly distributed."""
+    """The maximum additional delay, uniformly distributed."""
     keeps_order: bool = False
-    """Jitter lets no datagram overtake another, as in a queue."""
+    """Jitter does not reorder datagrams, as in a queue."""
     reordering: float = 0.0
-    """Share of datagrams held back for ``held_back_s``, so that later ones overtake, also where order is kept."""
+    """Share of datagrams delayed by ``held_back_s`` so that later ones overtake them, also with ``keeps_order``."""
     held_back_s: float = 0.05
     bits_per_s: float | None = None
-    """What the transmitter sends; None for no limit."""
+    """The bandwidth of the transmitter; None for no limit."""
     queue_bytes: int = 16384
-    """What waits in front of it: a datagram that finds no room is dropped. Only where there is a bandwidth."""
+    """The queue of the transmitter: it drops datagrams that do not fit. Requires a bandwidth."""
     overhead_bytes: int = 28
-    """What each datagram costs beside its own bytes: the headers of IPv4 and UDP."""
+    """Added to each datagram's length: the headers of IPv4 and UDP."""
     outages: tuple[Outage, ...] = ()
     in_flight_limit: int = 65536
-    """Datagrams on their way at once; more are dropped. A bound on memory, not a trait of a radio."""
+    """The maximum number of datagrams in flight; more are dropped. It bounds memory and does not model a radio."""
 
     def __post_init__(self) -> None:
         _check_shares(self, "loss", "duplication", "reordering")
         for name in ("delay_s", "jitter_s", "held_back_s", "queue_bytes", "overhead_bytes"):
             value = getattr(self, name)
             if not 0 <= value < math.inf:
-                raise ValueError(f"{name} is 0 or more, not {value}")
+                raise ValueError(f"{name} must be 0 or more, not {value}")
         if self.bits_per_s is not None and not 0 < self.bits_per_s < math.inf:
-            raise ValueError(f"bits_per_s is more than 0, not {self.bits_per_s}")
+            raise ValueError(f"bits_per_s must be more than 0, not {self.bits_per_s}")
         if self.in_flight_limit < 1:
-            raise ValueError(f"in_flight_limit is at least 1, not {self.in_flight_limit}")
+            raise ValueError(f"in_flight_limit must be at least 1, not {self.in_flight_limit}")
 
 
-class Fate(StrEnum):
-    """What became of datagrams: ``SENT + DUPLICATED`` are those in flight and all others but ``HELD_BACK``."""
+class Outcome(StrEnum):
+    """What happened to datagrams: ``SENT + DUPLICATED`` is in flight plus all others except ``HELD_BACK``."""
 
     SENT = "sent"
     DELIVERED = "delivered"
     DUPLICATED = "duplicated"
-    """Copies that were made."""
+    """Copies made."""
     HELD_BACK = "held_back"
     LOST = "lost"
-    """By the independent loss."""
+    """By independent loss."""
     LOST_IN_BURST = "lost_in_burst"
     LOST_IN_OUTAGE = "lost_in_outage"
     QUEUE_FULL = "queue_full"
@@ -128,64 +128,66 @@ class Radio:
     """One direction of a link.
 
     Args:
-        settings: what it does to datagrams.
-        chance: where its luck comes from; the same generator and the same calls give the same results.
-        now: seconds on the caller's monotonic clock; outages are counted from here.
+        settings: the impairments.
+        rng: the random source. An equal generator and equal calls return equal results.
+        now: monotonic seconds; outages are relative to this time.
     """
 
-    def __init__(self, settings: RadioSettings, chance: Random, now: float = 0.0) -> None:
-        self.fates: Counter[Fate] = Counter()
+    def __init__(self, settings: RadioSettings, rng: Random, now: float = 0.0) -> None:
+        self.outcomes: Counter[Outcome] = Counter()
         self.settings = settings
-        """May be replaced at any time; what is on its way stays on its way."""
-        self._chance = chance
+        """May be replaced at any time; datagrams in flight stay in flight."""
+        self._rng = rng
         self._began_at = now
-        self._idle_at = now  # the transmitter has sent all that waits
+        self._idle_at = now  # when the transmitter's queue is empty
         self._last_arrival_at = now
         self._is_in_burst = False
-        self._in_flight: list[tuple[float, int, bytes]] = []  # a heap; the number keeps equals in their order
+        self._in_flight: list[tuple[float, int, bytes]] = []  # a heap; the number keeps the order of equal times
         self._number = 0
 
     def send(self, datagram: bytes, now: float) -> None:
-        """Put a datagram on its way. ``now`` never goes back."""
-        settings, fates = self.settings, self.fates
-        fates[Fate.SENT] += 1
-        turn, burst_luck, luck, copy_luck, hold_luck, jitter, copy_jitter = (self._chance.random() for _ in range(7))
+        """Send a datagram. ``now`` must not decrease."""
+        settings, outcomes = self.settings, self.outcomes
+        outcomes[Outcome.SENT] += 1
+        turn, burst_draw, loss_draw, copy_draw, hold_draw, jitter, copy_jitter = (
+            self._rng.random() for _ in range(7)
+        )
         if not self._has_room(len(datagram), now):
-            fates[Fate.QUEUE_FULL] += 1
+            outcomes[Outcome.QUEUE_FULL] += 1
             return
         begun_at = max(now, self._idle_at)
         sent_at = self._idle_at = begun_at + self._airtime_s(len(datagram))
-        is_lost_in_burst = self._is_lost_in_burst(turn, burst_luck)
+        is_lost_in_burst = self._is_lost_in_burst(turn, burst_draw)
         if self._is_down(begun_at, sent_at):
-            fates[Fate.LOST_IN_OUTAGE] += 1
+            outcomes[Outcome.LOST_IN_OUTAGE] += 1
         elif is_lost_in_burst:
-            fates[Fate.LOST_IN_BURST] += 1
-        elif luck < settings.loss:
-            fates[Fate.LOST] += 1
+            outcomes[Outcome.LOST_IN_BURST] += 1
+        elif loss_draw < settings.loss:
+            outcomes[Outcome.LOST] += 1
         else:
             arrival_at = sent_at + settings.delay_s
-            is_held_back = hold_luck < settings.reordering
-            fates[Fate.HELD_BACK] += is_held_back
+            is_held_back = hold_draw < settings.reordering
+            outcomes[Outcome.HELD_BACK] += is_held_back
             self._carry(datagram, arrival_at + settings.jitter_s * jitter, is_held_back=is_held_back)
-            if copy_luck < settings.duplication:
-                fates[Fate.DUPLICATED] += 1
+            if copy_draw < settings.duplication:
+                outcomes[Outcome.DUPLICATED] += 1
                 self._carry(datagram, arrival_at + settings.jitter_s * copy_jitter, is_held_back=False)
 
     def due(self, now: float) -> list[bytes]:
-        """The datagrams that have arrived by ``now``, in the order of their arrival; each is given once."""
+        """Pop the datagrams that have arrived by ``now``, in the order of arrival."""
         arrived: list[bytes] = []
         while self._in_flight and self._in_flight[0][0] <= now:
             arrived.append(heapq.heappop(self._in_flight)[2])
-        self.fates[Fate.DELIVERED] += len(arrived)
+        self.outcomes[Outcome.DELIVERED] += len(arrived)
         return arrived
 
     def next_deadline(self) -> float:
-        """When :meth:`due` has something to give; infinity where nothing is on its way."""
+        """The time of the next arrival; infinity if nothing is in flight."""
         return self._in_flight[0][0] if self._in_flight else math.inf
 
     @property
     def in_flight(self) -> int:
-        """Datagrams on their way."""
+        """The number of datagrams in flight."""
         return len(self._in_flight)
 
     def _airtime_s(self, size: int) -> float:
@@ -203,17 +205,17 @@ class Radio:
         begin_s, end_s = begin_at - self._began_at, end_at - self._began_at
         return any(outage.overlaps(begin_s, end_s) for outage in self.settings.outages)
 
-    def _is_lost_in_burst(self, turn: float, luck: float) -> bool:
+    def _is_lost_in_burst(self, turn: float, loss_draw: float) -> bool:
         bursts = self.settings.bursts
         if bursts is None:
             return False
         if turn < (bursts.to_good if self._is_in_burst else bursts.to_bad):
             self._is_in_burst = not self._is_in_burst
-        return luck < (bursts.loss_in_bad if self._is_in_burst else bursts.loss_in_good)
+        return loss_draw < (bursts.loss_in_bad if self._is_in_burst else bursts.loss_in_good)
 
     def _carry(self, datagram: bytes, arrival_at: float, *, is_held_back: bool) -> None:
         if len(self._in_flight) >= self.settings.in_flight_limit:
-            self.fates[Fate.TOO_MANY_IN_FLIGHT] += 1
+            self.outcomes[Outcome.TOO_MANY_IN_FLIGHT] += 1
             return
         if is_held_back:
             arrival_at += self.settings.held_back_s
@@ -227,4 +229,4 @@ def _check_shares(settings: object, *names: str) -> None:
     for name in names:
         value = getattr(settings, name)
         if not 0 <= value <= 1:
-            raise ValueError(f"{name} is a share from 0 to 1, not {value}")
+            raise ValueError(f"{name} must be a share from 0 to 1, not {value}")

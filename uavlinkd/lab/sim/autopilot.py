@@ -1,11 +1,9 @@
-"""A simulated autopilot without I/O: what comes in and the time are arguments, what goes out is returned.
+"""A simulated autopilot without I/O: received frames and the time are arguments, frames to send are return values.
 
-It speaks as ArduCopter does towards ground stations, well enough that QGroundControl, MAVSDK and MAVProxy take it for
-one. It is a tool to try a link with: the full decoder of pymavlink is used here, and nowhere on a frame's way through
-the daemon.
+It behaves like ArduCopter towards ground stations: QGroundControl, MAVSDK and MAVProxy accept it. It uses the full
+decoder of pymavlink; the daemon does not decode the frames that it forwards.
 
-All that it sends is meant for everyone who is heard: the stations share one link and one sequence of frames, as over
-a radio.
+All ground stations receive each frame: they share one link and one sequence of frames, as over a radio.
 """
 
 from __future__ import annotations
@@ -18,20 +16,20 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from uavlinkd.mavlink.frames import SplitCounters, split_datagram
 from uavlinkd.lab.sim.mav_commands import Command, Commands
-from uavlinkd.lab.sim.mission import PLAN, Missions
-from uavlinkd.lab.sim.parameters import Parameters
-from uavlinkd.lab.sim.pilot import MissionPilot, point_of
 from uavlinkd.lab.sim.message_rates import MAX_RATE_HZ, Streams, default_rates
+from uavlinkd.lab.sim.mission import PLAN, Missions
+from uavlinkd.lab.sim.parameters import ParameterTable
+from uavlinkd.lab.sim.pilot import MissionPilot, point_of
 from uavlinkd.lab.sim.telemetry import Telemetry
-from uavlinkd.lab.sim.vehicle import Landed, Mode, Place, Vehicle
+from uavlinkd.lab.sim.vehicle import GeoPoint, Landed, Mode, Vehicle
+from uavlinkd.mavlink.frames import SplitCounters, split_datagram
 
 MOVE_EVERY_S: Final = 0.05
-# A whole list at once would overrun a radio; ArduPilot spreads it too.
+# The complete list at once would overload a radio. ArduPilot limits the rate too.
 PARAMETERS_PER_S: Final = 200.0
 MAX_STATIONS: Final = 32
-HOME: Final = Place(47.397742, 8.545594, 488.0)
+HOME: Final = GeoPoint(47.397742, 8.545594, 488.0)
 
 FTP_NAK: Final = 129
 FTP_FILE_NOT_FOUND: Final = 10
@@ -42,13 +40,13 @@ Message = Any  # a pymavlink message: pymavlink has no types
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AutopilotSettings:
-    """What one simulated copter is like. Rates are messages a second, until a ground station asks for others."""
+    """The settings of one simulated copter. Rates are messages per second until a ground station requests others."""
 
     system_id: int = 1
     component_id: int = 1
     attitude_rate_hz: float = 10.0
     position_rate_hz: float = 5.0
-    home: Place = HOME
+    home: GeoPoint = HOME
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -62,7 +60,7 @@ class AutopilotSettings:
 
 @dataclass(slots=True)
 class Counters:
-    """What the autopilot has done so far."""
+    """The counters of the autopilot."""
 
     frames_sent: int = 0
     bytes_sent: int = 0
@@ -74,10 +72,7 @@ class Counters:
 
 
 class Autopilot:
-    """One simulated copter. Times are seconds on a clock of the caller's.
-
-    Equal input at equal times gives equal frames.
-    """
+    """One simulated copter. Times are monotonic seconds. Equal input at equal times returns equal frames."""
 
     def __init__(
         self,
@@ -91,7 +86,7 @@ class Autopilot:
         self.counters = Counters()
         self.split = SplitCounters()
         self.vehicle = Vehicle(self.settings.home)
-        self.parameters = Parameters(self.settings.system_id)
+        self.parameters = ParameterTable(self.settings.system_id)
         self.missions = Missions(self.send, self._missions_changed)
         self.pilot = MissionPilot(self.vehicle, self.missions)
         self.streams = Streams(
@@ -112,7 +107,7 @@ class Autopilot:
         self._out: list[bytes] = []
         self._parameters_to_send: deque[int] = deque()
         self._parameter_due_at = started_at
-        # By (system, component), the latest last: when a ground station's heartbeat was heard.
+        # The last heartbeat of each ground station, by (system, component), the latest last.
         self._stations: OrderedDict[tuple[int, int], float] = OrderedDict()
         self._gcs_lost = False
         self._handlers: dict[str, Callable[[Message, float], None]] = {
@@ -153,24 +148,24 @@ class Autopilot:
 
     @property
     def stations(self) -> list[tuple[int, int]]:
-        """The ground stations heard: system and component ids."""
+        """The known ground stations: system and component IDs."""
         return list(self._stations)
 
     def advance(self, now: float) -> list[bytes]:
-        """Let time pass: fly on, and say what is due."""
+        """Move the vehicle, and return the frames that are due."""
         was_armed, was = self.vehicle.armed, self.vehicle.landed
         self.vehicle.step(now - self._moved_at)
         self._moved_at = now
         if was is not Landed.ON_GROUND and self.vehicle.landed is Landed.ON_GROUND:
-            self.tell("landed")
+            self.emit("landed")
         if was_armed and not self.vehicle.armed:
-            self.tell("disarmed")
+            self.emit("disarmed")
         mode = self.vehicle.mode
         for sequence in self.pilot.advance():
-            self.tell("mission_item_reached", sequence=sequence)
+            self.emit("mission_item_reached", sequence=sequence)
             self.send(mavlink.MAVLink_mission_item_reached_message(sequence))
         if self.vehicle.mode is not mode:
-            self.tell("mode_changed", mode=self.vehicle.mode.name)
+            self.emit("mode_changed", mode=self.vehicle.mode.name)
         self._watch_stations(now)
         self.missions.advance(now)
         while self._parameters_to_send and self._parameter_due_at <= now:
@@ -201,8 +196,8 @@ class Autopilot:
             self.send(message)
         return message is not None
 
-    def tell(self, event: str, **fields: object) -> None:
-        """Report what happened to the vehicle."""
+    def emit(self, event: str, **fields: object) -> None:
+        """Report an event of the vehicle."""
         self.counters.events[event] += 1
         if self._on_event:
             self._on_event(event, fields)
@@ -215,7 +210,7 @@ class Autopilot:
         self.counters.frames_received += 1
         try:
             message = self._codec.decode(bytearray(frame))
-        except Exception:  # pymavlink raises MAVError, and whatever its constructors raise
+        except Exception:  # pymavlink raises MAVError, and its constructors raise others
             self.counters.undecodable += 1
             return
         ours = (self.settings.system_id, self.settings.component_id)
@@ -232,14 +227,14 @@ class Autopilot:
         """ArduPilot's ground station failsafe: silence for FS_GCS_TIMEOUT brings the copter home."""
         if not self._stations or self._gcs_lost:
             return
-        last_heard = next(reversed(self._stations.values()))
-        if now - last_heard < self.parameters["FS_GCS_TIMEOUT"]:
+        last_seen_at = next(reversed(self._stations.values()))
+        if now - last_seen_at < self.parameters["FS_GCS_TIMEOUT"]:
             return
         self._gcs_lost = True
-        self.tell("gcs_lost", after_s=round(now - last_heard, 3))
+        self.emit("gcs_lost", after_s=round(now - last_seen_at, 3))
         flying = self.vehicle.armed and self.vehicle.landed is not Landed.ON_GROUND
         if flying and self.parameters["FS_GCS_ENABLE"] and self.vehicle.mode not in (Mode.RTL, Mode.LAND):
-            self.tell("gcs_failsafe")
+            self.emit("gcs_failsafe")
             self.send(mavlink.MAVLink_statustext_message(mavlink.MAV_SEVERITY_WARNING, b"GCS Failsafe"))
             self.commands.set_mode(Mode.RTL)
 
@@ -249,14 +244,14 @@ class Autopilot:
         station = (message.get_srcSystem(), message.get_srcComponent())
         if station not in self._stations or self._gcs_lost:
             self._gcs_lost = False
-            self.tell("gcs_heard", system_id=station[0], component_id=station[1])
+            self.emit("gcs_connected", system_id=station[0], component_id=station[1])
         self._stations[station] = now
         self._stations.move_to_end(station)
         if len(self._stations) > MAX_STATIONS:
             self._stations.popitem(last=False)
 
     def _on_ping(self, message: Message, _now: float) -> None:
-        # A ping with a target is the answer to one.
+        # A ping with a target is an answer.
         if message.target_system == 0 and message.target_component == 0:
             source = message.get_srcSystem(), message.get_srcComponent()
             self.send(mavlink.MAVLink_ping_message(message.time_usec, message.seq, *source))
@@ -281,8 +276,8 @@ class Autopilot:
             return
         if self.parameters.set(message.param_id, message.param_value):
             self._apply_parameters()
-            self.tell("parameter_set", name=message.param_id, value=self.parameters[message.param_id])
-        # Refused or not, the answer is the value in force.
+            self.emit("parameter_set", name=message.param_id, value=self.parameters[message.param_id])
+        # The answer is the current value, whether changed or not.
         self._send_parameter(index)
 
     def _send_parameter(self, index: int) -> None:
@@ -294,7 +289,7 @@ class Autopilot:
         )
 
     def _apply_parameters(self) -> None:
-        """Those that the model heeds; ArduPilot has centimetres here."""
+        """Apply the parameters that the vehicle uses; ArduPilot's unit is centimetres."""
         speeds, parameters = self.vehicle.speeds, self.parameters
         speeds.travel_m_s = _between(parameters["WPNAV_SPEED"] / 100, 0.2, 20)
         speeds.climb_m_s = _between(parameters["WPNAV_SPEED_UP"] / 100, 0.1, 10)
@@ -323,7 +318,7 @@ class Autopilot:
 
     def _on_set_mode(self, message: Message, _now: float) -> None:
         result = self.commands.set_mode(message.custom_mode)
-        self._acknowledge(message, mavlink.MAVLINK_MSG_ID_SET_MODE, result)  # so does ArduPilot
+        self._acknowledge(message, mavlink.MAVLINK_MSG_ID_SET_MODE, result)  # as ArduPilot does
 
     def _on_request_data_stream(self, message: Message, now: float) -> None:
         rate = message.req_message_rate if message.start_stop else 0
@@ -342,7 +337,7 @@ class Autopilot:
             self.vehicle.go_to(point_of(self.vehicle, frame, message.lat_int, message.lon_int, message.alt))
 
     def _on_file_transfer(self, message: Message, _now: float) -> None:
-        """There are no files: the refusal makes a ground station turn to the parameter protocol at once."""
+        """Refuse, because there are no files: a ground station then uses the parameter protocol immediately."""
         request = bytes(message.payload)
         if request[3] >= 128:
             return  # an answer, not a request
@@ -359,7 +354,7 @@ class Autopilot:
         if kind == PLAN:
             self.parameters.preset("MIS_TOTAL", items)
             self.pilot.restart()
-        self.tell("mission_received", kind=kind, items=items, system_id=partner[0])
+        self.emit("mission_received", kind=kind, items=items, system_id=partner[0])
 
 
 def _between(value: float, lowest: float, highest: float) -> float:
@@ -367,5 +362,5 @@ def _between(value: float, lowest: float, highest: float) -> float:
 
 
 def _degrees_e7(degrees: float) -> int:
-    """Degrees of a COMMAND_LONG in 1e-7 degrees; 0 (here) for what is no place."""
+    """Degrees of a COMMAND_LONG in 1e-7 degrees; 0, the current position, if they are out of range."""
     return round(degrees * 1e7) if abs(degrees) <= 180 else 0

@@ -1,4 +1,4 @@
-"""``uavlinkd demo --attack``: the man in the middle between the drones of the demo, one attack after the other."""
+"""``uavlinkd demo --attack``: a man in the middle between the drones of the demo runs one attack after the other."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from typing import Any
 
 import structlog
 
-from uavlinkd.system.addresses import Address
 from uavlinkd.core.constants import LATE_AFTER_S, LATE_STEP_S
 from uavlinkd.lab.mitm.attack import AttackObject
 from uavlinkd.lab.mitm.attacks import ATTACKS, AttackSpec, parse_attack
 from uavlinkd.lab.mitm.proxy import Proxy
 from uavlinkd.lab.mitm.proxy_settings import MitmLink, MitmPeer, ProxySettings
+from uavlinkd.system.addresses import Address
 
 ALL = "all"
 ATTACKED_LINK: dict[str, object] = {
@@ -24,15 +24,15 @@ ATTACKED_LINK: dict[str, object] = {
     "reject_after_s": 10.0,
     "retry_max_s": 1.0,
 }
-"""New keys all the time, with a group's share in each handshake: there is something of everything to attack."""
+"""Frequent rekeys with a group's share in each handshake, so that every attack finds a target."""
 
 _LOAD = "flood-initiations,rate_per_s=600"
 _NEEDS_LOAD = ("replay-cookie", "stolen-cookie")
-"""Cookies are asked for under load only."""
+"""These attacks need cookies, which daemons require only under load."""
 _NEEDS_MORE_PEERS = ("misroute",)
-_TAKES_AWAY = ("drop", "drop-heartbeats", "blackout", "hold", "truncate", "tamper-tag")
-_TOLD_S = LATE_AFTER_S + 2 * LATE_STEP_S + 0.2
-"""What is missing is known when it can come no more."""
+_WITHHOLDS = ("drop", "drop-heartbeats", "blackout", "hold", "truncate", "tamper-tag")
+_DETECTION_S = LATE_AFTER_S + 2 * LATE_STEP_S + 0.2
+"""A drone counts a missing envelope when it is too late to arrive."""
 _OPTIONS = {
     "replay-cookie": ",copies=3",
     "cross-initiations": "",
@@ -44,7 +44,7 @@ _OPTIONS = {
 
 @dataclass(frozen=True, slots=True)
 class AttackResult:
-    """One attack of the demo: how often it struck, and what the drones counted meanwhile."""
+    """One attack of the demo: the number of its interventions, and the drones' counters meanwhile."""
 
     name: str
     interventions: int
@@ -53,7 +53,7 @@ class AttackResult:
 
 @dataclass(slots=True)
 class _Now:
-    """The attack that goes on."""
+    """The running attack."""
 
     spec: AttackSpec
     drops: Counter[str]
@@ -73,71 +73,73 @@ class AttackCourse:
 
     def __init__(self, text: str) -> None:
         names = [name for name in ATTACKS if name not in _NEEDS_MORE_PEERS] if text == ALL else [text]
-        self.specs = [parse_attack(each + (_OPTIONS.get(each, "") if text == ALL else "")) for each in names]
+        self.specs = [parse_attack(name + (_OPTIONS.get(name, "") if text == ALL else "")) for name in names]
         self.is_recovered = False
         self._results: list[AttackResult] = []
         self._now: _Now | None = None
         self._proxy: Proxy | None = None
 
     async def stand_between(self, ports: Mapping[str, int], public_keys: Mapping[str, bytes]) -> dict[str, int]:
-        """Open the addresses between two drones; by drone, the port where the other is to find it.
+        """Start the proxy between two drones. Return, by drone, the port where the other reaches it.
 
         Raises:
-            AttackError: an attack cannot be made between two peers.
+            AttackError: an attack needs more than two peers.
         """
         (one, other), anywhere = tuple(ports), Address("127.0.0.1", 0)
         peers = tuple(MitmPeer(name, Address("127.0.0.1", ports[name]), public_keys[name]) for name in ports)
         proxy = Proxy(ProxySettings(peers, (MitmLink((one, other), (anywhere, anywhere)),)), [])
-        proxy.log = structlog.wrap_logger(structlog.ReturnLogger(), processors=[_say_nothing])
+        proxy.log = structlog.wrap_logger(structlog.ReturnLogger(), processors=[_discard])
         for spec in self.specs:
-            spec.make(proxy.surroundings)
+            spec.make(proxy.context)
         await proxy.start()
         self._proxy = proxy
-        return {one: proxy.faces[other, one][1], other: proxy.faces[one, other][1]}
+        return {one: proxy.listeners[other, one][1], other: proxy.listeners[one, other][1]}
 
     async def leave(self) -> None:
-        """Close everything."""
+        """Stop the proxy."""
         if self._proxy is not None:
             await self._proxy.stop()
 
     def begin(self, number: int, drops: Counter[str]) -> None:
-        """Attack."""
+        """Start an attack."""
         assert self._proxy is not None
         spec, now = self.specs[number], monotonic()
         self._now = _Now(spec, drops, self._counts())
         helpers = [parse_attack(_LOAD)] if spec.name in _NEEDS_LOAD or "cookie" in str(spec.options) else []
-        made: list[AttackObject] = [each.make(self._proxy.surroundings, number, now) for each in (*helpers, spec)]
+        made: list[AttackObject] = [one.make(self._proxy.context, number, now) for one in (*helpers, spec)]
         self._proxy.change_attacks(made)
 
     def end(self) -> float:
-        """Let everything pass. For so many seconds more the drones may find out what was done."""
+        """End the attack. Return the seconds that the drones need to detect it."""
         assert self._proxy is not None
         assert self._now is not None
         self._proxy.change_attacks([])
-        return _TOLD_S if self._now.spec.name in _TAKES_AWAY else 0.0
+        return _DETECTION_S if self._now.spec.name in _WITHHOLDS else 0.0
 
     def finish(self) -> None:
-        """What they have noticed by now is the result."""
+        """Store the result of the attack."""
         if self._now is not None:
-            self._results.append(AttackResult(str(self._now.spec), self._strikes(self._now), dict(self._now.noticed)))
+            self._results.append(
+                AttackResult(str(self._now.spec), self._interventions(self._now), dict(self._now.noticed))
+            )
             self._now = None
 
     def look(self, drops: Counter[str]) -> None:
-        """What the drones have counted by now."""
+        """Update the drones' counters."""
         if self._now is not None:
             self._now.noticed = drops - self._now.drops
 
     def results(self) -> list[AttackResult]:
-        """Of all that was tried."""
+        """The results of all finished attacks."""
         return self._results
 
     @property
     def current(self) -> tuple[AttackSpec, int, dict[str, int]] | None:
-        """The attack that goes on, how often it has struck, and what the drones counted; None between two."""
+        """The running attack, the number of its interventions, and the drones' counters; None between attacks."""
         now = self._now
-        return None if now is None else (now.spec, self._strikes(now), dict(now.noticed))
+        return None if now is None else (now.spec, self._interventions(now), dict(now.noticed))
 
-    def _strikes(self, now: _Now) -> int:
+    def _interventions(self, now: _Now) -> int:
         return self._counts()[now.spec.name] - now.counts[now.spec.name]
 
     def _counts(self) -> Counter[str]:
@@ -148,5 +150,5 @@ class AttackCourse:
         return counts
 
 
-def _say_nothing(_logger: Any, _name: str, _event: Any) -> Any:
+def _discard(_logger: Any, _name: str, _event: Any) -> Any:
     raise structlog.DropEvent

@@ -1,41 +1,37 @@
-"""A daemon as a process of its own, with its files in a folder: for the demo and the evaluation."""
+"""A daemon in its own process, with its files in a folder, for the demo and the evaluation."""
 
 from __future__ import annotations
 
 import asyncio
 import json
+import os
 import signal
-import socket
+import sys
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from pathlib import Path
-from random import SystemRandom
 from typing import Any
 
-from uavlinkd.checker import interpreter
-from uavlinkd.ops.control import ControlError, ask
 from uavlinkd.config.keys import decode_key, generate_private_key, public_key_text, write_secret_file
+from uavlinkd.lab.child_processes import end_with_parent
+from uavlinkd.ops.control import ControlError, ask
 
-STOP_S = 5.0
-"""How long a daemon may take to end when it is asked to."""
-
-
-_UNASSIGNED = 10240, 32768
-"""The ports below Linux's default for net.ipv4.ip_local_port_range."""
+STOP_S = 60.0
+"""How long a daemon may take to stop after SIGTERM: much longer than needed, for busy machines."""
 
 
 class DroneError(Exception):
-    """A daemon that does not do its work. The message is for a person."""
+    """A daemon failed. The message is for the operator."""
 
 
 class DroneProcess:
-    """One drone's daemon. Configure it, then start it; it may be killed and started again.
+    """The daemon of one drone. Configure it, then start it; it may be killed and restarted.
 
     Args:
         name: its name here and for its peers.
-        folder: for its files; made here.
-        port: where peers reach it, on loopback.
-        endpoint_port: where its autopilot sends to.
+        folder: for its files; created here.
+        port: the port for peers, on loopback.
+        endpoint_port: the port for its autopilot, on loopback.
     """
 
     def __init__(self, name: str, folder: Path, port: int, endpoint_port: int) -> None:
@@ -54,12 +50,12 @@ class DroneProcess:
 
     @property
     def private_key(self) -> bytes:
-        """What an attacker has who captured this drone."""
+        """The private key, as an attacker has it after capturing this drone."""
         return decode_key(self._private)
 
     @property
     def pid(self) -> int:
-        """Of the process."""
+        """The process ID."""
         assert self._process is not None
         return self._process.pid
 
@@ -79,7 +75,7 @@ class DroneProcess:
         (self.folder / "drone.toml").write_text("\n".join(lines).lstrip(), encoding="utf-8")
 
     def as_peer(self, address: str, psk_file: str, **settings: object) -> dict[str, object]:
-        """What another drone's configuration says of this one: it is trusted, unless ``settings`` say otherwise."""
+        """The ``[[peer]]`` section for this drone in another drone's configuration, with ``settings``."""
         return {
             "name": self.name,
             "public_key": self.public_key,
@@ -91,21 +87,23 @@ class DroneProcess:
         }
 
     def share_psk(self, psk: str, file: str) -> None:
-        """Write a key that is shared with a peer."""
+        """Write a pre-shared key."""
         write_secret_file(self.folder / file, psk)
 
     async def start(self) -> None:
-        """Start the process. Its log goes on where one before it ended."""
+        """Start the process. Its log is appended to the log of the process before."""
         with self.log.open("ab") as log:
             self._process = await asyncio.create_subprocess_exec(
-                *(*interpreter(), "-m", "uavlinkd", "run", "--config", str(self.folder / "drone.toml")),
+                *end_with_parent(
+                    *_interpreter(), "-m", "uavlinkd", "run", "--config", str(self.folder / "drone.toml")
+                ),
                 stdin=asyncio.subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
             )
 
     async def stop(self, number: signal.Signals = signal.SIGTERM) -> None:
-        """End the process, gently first."""
+        """Stop the process: first with a signal, then by killing it."""
         if self._process is None or self._process.returncode is not None:
             return
         self._process.send_signal(number)
@@ -116,44 +114,39 @@ class DroneProcess:
             await self._process.wait()
 
     async def ask(self) -> dict[str, Any]:
-        """Ask the daemon how it is; empty, or what it said last, while it does not listen yet.
+        """Request the daemon's status. While it does not listen, return the last status, or an empty one.
 
         Raises:
-            DroneError: when the process has ended.
+            DroneError: the process has ended.
         """
         if self._process is not None and self._process.returncode is not None:
-            said = "\n".join(self.last_lines(5))
-            raise DroneError(f"the daemon of {self.name} ended with status {self._process.returncode}:\n{said}")
+            lines = "\n".join(self.last_lines(5))
+            raise DroneError(f"the daemon of {self.name} ended with status {self._process.returncode}:\n{lines}")
         with suppress(ControlError):  # not listening yet
             self.status = await asyncio.to_thread(ask, self.socket, "status")
         return self.status
 
     @property
     def peer_statuses(self) -> list[dict[str, Any]]:
-        """What it says of its peers; empty before it has answered."""
+        """The status of its peers; empty before the first answer."""
         return list(self.status.get("peers", {}).values())
 
     def is_ready(self) -> bool:
-        """Whether its links are up and its autopilot is there."""
-        programs = self.status.get("endpoints", {}).get("autopilot", {}).get("programs", {})
-        return bool(programs) and all(each["state"] == "up" for each in self.peer_statuses)
+        """Whether its links are up and its autopilot is connected."""
+        clients = self.status.get("endpoints", {}).get("autopilot", {}).get("clients", {})
+        return bool(clients) and all(peer["state"] == "up" for peer in self.peer_statuses)
 
     def last_lines(self, count: int) -> list[str]:
-        """The end of its log."""
+        """The last lines of its log."""
         return self.log.read_text(errors="replace").splitlines()[-count:]
 
 
-def free_udp_ports(count: int) -> list[int]:
-    """Unused ports of loopback, outside the range from which the system assigns ports.
+def _interpreter() -> tuple[str, ...]:
+    """The command of this Python interpreter, with ``-P`` unless this process imports from the current folder too.
 
-    A daemon binds its port some time after this choice. Until then the system could assign it to another process.
+    Without ``-P``, the daemon would import a file in the current folder that has the name of a module.
     """
-    ports: list[int] = []
-    rng = SystemRandom()
-    with ExitStack() as stack:
-        while len(ports) < count:
-            sock = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-            with suppress(OSError):
-                sock.bind(("127.0.0.1", rng.randrange(*_UNASSIGNED)))
-                ports.append(sock.getsockname()[1])
-    return ports
+    here = {""}
+    with suppress(OSError):  # the current folder was deleted
+        here.add(os.getcwd())
+    return (sys.executable,) if sys.path[0] in here else (sys.executable, "-P")

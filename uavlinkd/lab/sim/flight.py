@@ -1,42 +1,42 @@
-"""The simulated autopilot on a link: sockets and the clock around ``Autopilot``."""
+"""The simulated autopilot on a MAVLink connection: sockets and a clock around ``Autopilot``."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Any, Self
 
 from uavlinkd.lab.sim.autopilot import Autopilot, AutopilotSettings, Event
-from uavlinkd.lab.sim.links import Address, Changes, Link, LinkError, OnFrame, open_link
+from uavlinkd.lab.sim.links import ConnectionOwner, LinkError, OnFrame, open_connection
 
 
 @dataclass(frozen=True, slots=True)
 class FlightReport:
-    """What a simulated flight came to."""
+    """The result of a simulated flight."""
 
     seconds: float
     frames_sent: int
     bytes_sent: int
     frames_received: int
     bytes_received: int
-    bad_bytes: int  # received, and in no frame
-    unheard: int  # frames made while nobody was there to send them to
+    bad_bytes: int  # received outside frames
+    frames_unsent: int  # without a receiver
     commands: int
     stations: list[tuple[int, int]] = field(default_factory=list)
     events: dict[str, int] = field(default_factory=dict)
 
 
-class Flight:
+class Flight(ConnectionOwner):
     """One simulated autopilot at a MAVLink URL, as an asynchronous context.
 
-    ``on_sent`` is called with each frame that goes out, once however many hear it; ``on_received`` with each genuine
-    frame that comes in; both as on the wire. ``on_event`` is called with a name and facts: armed, disarmed,
-    takeoff_started, landed, mode_changed, parameter_set, mission_received, mission_item_reached, gcs_heard, gcs_lost,
-    gcs_failsafe.
+    ``on_sent`` is called once with each sent frame, for any number of receivers; ``on_received`` with each genuine
+    received frame; both as on the wire. ``on_event`` is called with a name and fields: armed, disarmed,
+    takeoff_started, landed, mode_changed, parameter_set, mission_received, mission_item_reached, gcs_connected,
+    gcs_lost, gcs_failsafe.
     """
 
     def __init__(
@@ -48,7 +48,7 @@ class Flight:
         on_received: OnFrame | None = None,
         on_event: Event | None = None,
     ) -> None:
-        self._asked_url = url
+        super().__init__(url)
         self._on_sent = on_sent
         self._on_received = on_received
         self._loop = asyncio.get_running_loop()
@@ -59,32 +59,13 @@ class Flight:
             unix_epoch_us=time.time_ns() // 1000,
             on_event=on_event,
         )
-        self._link: Link | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._deadline = self._started_at
-        self._changes = Changes()
-        self._frames_sent = self._bytes_sent = self._bytes_received = self._unheard = 0
+        self._frames_sent = self._bytes_sent = self._bytes_received = self._frames_unsent = 0
         self._failure: asyncio.Future[None] = self._loop.create_future()
 
-    @property
-    def link(self) -> Link:
-        """The open link."""
-        if self._link is None:
-            raise RuntimeError("the flight has not begun")
-        return self._link
-
-    @property
-    def url(self) -> str:
-        """Where it is, with the port that the system chose for port 0."""
-        return str(self.link.url)
-
-    @property
-    def address(self) -> Address:
-        """Host and port of ``url``."""
-        return self.link.url.host, self.link.url.port
-
     def report(self) -> FlightReport:
-        """What there is to say so far."""
+        """The counters so far."""
         counters = self.autopilot.counters
         return FlightReport(
             seconds=self._loop.time() - self._started_at,
@@ -93,22 +74,14 @@ class Flight:
             frames_received=counters.frames_received,
             bytes_received=self._bytes_received,
             bad_bytes=self.link.split.garbage_bytes,
-            unheard=self._unheard,
+            frames_unsent=self._frames_unsent,
             commands=counters.commands.total(),
             stations=self.autopilot.stations,
             events=dict(counters.events),
         )
 
-    async def until(self, condition: Callable[[], bool], timeout_s: float = 5.0) -> None:
-        """Wait for a condition on the flight; it is looked at whenever something happened.
-
-        Raises:
-            TimeoutError: It does not hold after so many seconds.
-        """
-        await self._changes.until(condition, timeout_s)
-
     async def run(self, seconds: float | None = None, stop: asyncio.Event | None = None) -> None:
-        """Fly on for so many seconds, or until ``stop`` is set; with neither, until cancelled.
+        """Fly for ``seconds``, until ``stop`` is set, or until cancelled.
 
         Raises:
             LinkError: The other end closed a TCP connection.
@@ -127,7 +100,7 @@ class Flight:
             raise LinkError(f"{self.url}: the other end closed the connection")
 
     async def __aenter__(self) -> Self:
-        self._link = await open_link(self._asked_url, self._receive)
+        self._link = await open_connection(self._asked_url, self._receive)
         self._on_timer()
         return self
 
@@ -151,7 +124,7 @@ class Flight:
 
     def _on_timer(self) -> None:
         with self._failing():
-            # asyncio may fire up to one clock tick early; the autopilot must not see that.
+            # asyncio may fire up to one clock tick early. The autopilot gets the exact time.
             now = max(self._loop.time(), self._deadline)
             self._transmit(self.autopilot.advance(now))
             self._deadline = self.autopilot.next_due_at
@@ -160,7 +133,7 @@ class Flight:
 
     @contextlib.contextmanager
     def _failing(self) -> Iterator[None]:
-        """A fault of ours, or of a hook, ends the flight where it is awaited, not in the loop's log."""
+        """Raise an exception of a callback in ``run``, not in the event loop's log."""
         try:
             yield
         except Exception as error:
@@ -170,7 +143,7 @@ class Flight:
     def _transmit(self, frames: list[bytes]) -> None:
         for frame in frames:
             if not self.link.send(frame):
-                self._unheard += 1
+                self._frames_unsent += 1
                 continue
             self._frames_sent += 1
             self._bytes_sent += len(frame)
@@ -188,12 +161,10 @@ async def fly(
     on_received: OnFrame | None = None,
     on_event: Event | None = None,
 ) -> FlightReport:
-    """Fly a simulated copter at a MAVLink URL for so many seconds, or until ``stop`` is set.
-
-    With neither, until cancelled.
+    """Fly a simulated copter at a MAVLink URL for ``seconds``, until ``stop`` is set, or until cancelled.
 
     Raises:
-        LinkError: The link cannot be opened, or the other end closed it.
+        LinkError: The connection cannot be opened, or the other end closed it.
     """
     async with Flight(url, settings, on_sent=on_sent, on_received=on_received, on_event=on_event) as flight:
         await flight.run(seconds, stop)

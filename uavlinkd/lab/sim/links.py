@@ -1,6 +1,6 @@
-"""A MAVLink link of the simulator's own: UDP or TCP by its URL, whole frames in and out.
+"""MAVLink connections of the simulator: UDP or TCP by URL, complete frames in and out.
 
-The daemon's endpoints are not used here, so that a fault of theirs cannot hide in the tool that is to show it.
+They do not use the daemon's endpoints: a bug there would remain hidden if the test tool had it too.
 """
 
 from __future__ import annotations
@@ -16,30 +16,31 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Final, Self
 
-from uavlinkd.mavlink.frames import SplitCounters, StreamSplitter, split_datagram
+from uavlinkd.mavlink.frames import SplitCounters, split_datagram
+from uavlinkd.mavlink.stream_splitter import StreamSplitter
 
 KINDS: Final = ("udpin", "udpout", "tcp", "tcpin")
-ALIASES: Final = {"tcpout": "tcp", "udp": "udpin"}
-# Who has not been heard for so long is no longer sent to.
+ALIASES: Final = {"tcpout": "tcp"}
+# A UDP client silent for longer receives no more frames.
 FORGET_AFTER_S: Final = 60.0
-MAX_CORRESPONDENTS: Final = 16
-# A TCP client that reads more slowly than it is written to loses frames beyond this.
+MAX_CLIENTS: Final = 16
+# A TCP client with more unread bytes loses frames.
 MAX_UNSENT_BYTES: Final = 1 << 20
 RECEIVE_BUFFER_BYTES: Final = 1 << 21
 
-Address = tuple[str, int]
+SocketAddress = tuple[str, int]
 OnFrame = Callable[[bytes], None]
 
 _URL = re.compile(r"(?P<kind>[a-z]+):(?://)?(?P<host>\[[^\]]*\]|[^:\[\]/]*):(?P<port>\d{1,5})/?")
 
 
 class LinkError(Exception):
-    """A link that cannot be opened. Its text is one line for the operator."""
+    """The connection cannot be opened. The text is one line for the operator."""
 
 
 @dataclass(frozen=True, slots=True)
 class LinkURL:
-    """Where a link goes: ``udpin`` and ``tcpin`` listen there, ``udpout`` and ``tcp`` send there."""
+    """The address of a connection: ``udpin`` and ``tcpin`` listen there, ``udpout`` and ``tcp`` send there."""
 
     kind: str
     host: str
@@ -51,32 +52,36 @@ class LinkURL:
 
 
 def parse_url(text: str) -> LinkURL:
-    """Read ``udpin:HOST:PORT``, ``udpout:``, ``tcp:`` or ``tcpin:``, with or without ``//`` before the host.
+    """Parse ``udpin:HOST:PORT``, ``udpout:``, ``tcp:`` or ``tcpin:``, with or without ``//`` before the host.
 
-    ``udp:`` is ``udpin:``, as for MAVProxy. No host is every address of this machine.
+    An empty host means all addresses of this machine. ``udp:`` is refused: some software listens there, and other
+    software sends there.
 
     Raises:
-        LinkError: What is wrong with it.
+        LinkError: The URL is invalid.
     """
     match = _URL.fullmatch(text)
     if match is None:
-        raise LinkError(f"{text!r} is no MAVLink URL: it must read KIND:HOST:PORT, KIND one of {', '.join(KINDS)}")
+        raise LinkError(f"{text!r} is not a MAVLink URL: write KIND:HOST:PORT, with KIND one of {', '.join(KINDS)}")
     kind = ALIASES.get(match["kind"], match["kind"])
+    if kind == "udp":
+        place = text.partition(":")[2].removeprefix("//")
+        raise LinkError(f"{text!r}: write udpin:{place} to listen there, or udpout:{place} to send there")
     if kind not in KINDS:
-        raise LinkError(f"{text!r}: {match['kind']} is none of {', '.join(KINDS)}")
+        raise LinkError(f"{text!r}: {match['kind']} is not one of {', '.join(KINDS)}")
     host, port = match["host"].strip("[]"), int(match["port"])
     if port > 65535 or (port == 0 and kind in ("udpout", "tcp")):
-        raise LinkError(f"{text!r}: {port} is no port to send to" if port == 0 else f"{text!r}: no port {port}")
+        raise LinkError(f"{text!r}: the port must be {0 if kind in ('udpin', 'tcpin') else 1} to 65535")
     if not host and kind in ("udpout", "tcp"):
-        raise LinkError(f"{text!r} names no host to send to")
+        raise LinkError(f"{text!r}: the host is missing")
     return LinkURL(kind, host or "0.0.0.0", port)
 
 
-class Link:
-    """An open link. ``on_frame`` is called with each genuine frame that comes in, as it was on the wire.
+class MavlinkConnection:
+    """An open connection. ``on_frame`` is called with each genuine received frame, as on the wire.
 
-    A frame sent goes to everyone who is there: the other end of ``udpout`` and ``tcp``, who sent a genuine frame to
-    ``udpin`` within a minute, who is connected to ``tcpin``.
+    A sent frame goes to all receivers: the other end of ``udpout`` and ``tcp``, the clients of ``udpin`` that sent a
+    genuine frame within a minute, the clients of ``tcpin``.
     """
 
     def __init__(self, url: LinkURL, on_frame: OnFrame) -> None:
@@ -88,21 +93,21 @@ class Link:
         self._udp: asyncio.DatagramTransport | None = None
         self._server: asyncio.Server | None = None
         self._streams: set[asyncio.Transport] = set()
-        # By address, the latest last: when it was heard.
-        self._heard: OrderedDict[Address, float] = OrderedDict()
-        self.joined = asyncio.Event()  # somebody is, or was, there to send to
-        self.lost = asyncio.Event()  # the other end of ``tcp`` has gone
-        self.refused = asyncio.Event()  # a datagram came to where nobody listens, or not yet
+        # When each client last sent a frame, the latest last.
+        self._clients: OrderedDict[SocketAddress, float] = OrderedDict()
+        self.joined = asyncio.Event()  # there is, or was, a receiver
+        self.lost = asyncio.Event()  # the other end of ``tcp`` closed the connection
+        self.refused = asyncio.Event()  # a datagram was sent to a closed port
 
     @property
-    def correspondents(self) -> int:
-        """How many are sent to."""
+    def receivers(self) -> int:
+        """The number of receivers."""
         if self._udp is not None:
-            return len(self._heard) if self.url.kind == "udpin" else 1
+            return len(self._clients) if self.url.kind == "udpin" else 1
         return len(self._streams)
 
     def send(self, frame: bytes) -> bool:
-        """Send to everyone who is there; False if there is nobody."""
+        """Send to all receivers; False if there is no receiver."""
         if self._udp is not None:
             return self._send_datagram(self._udp, frame)
         for transport in self._streams:
@@ -113,14 +118,14 @@ class Link:
         return bool(self._streams)
 
     async def close(self) -> None:
-        """Close the sockets. What a TCP correspondent was sent still goes out."""
+        """Close the sockets. Frames already sent to a TCP receiver are still written."""
         if self._udp is not None:
             self._udp.close()
         if self._server is not None:
             self._server.close()
         for transport in list(self._streams):
             transport.close()
-        # The transports close their sockets in the loop's next round.
+        # The transports close their sockets in the next iteration of the loop.
         await asyncio.sleep(0)
 
     def _send_datagram(self, transport: asyncio.DatagramTransport, frame: bytes) -> bool:
@@ -128,11 +133,11 @@ class Link:
             transport.sendto(frame)
             return True
         now = self._loop.time()
-        while self._heard and now - next(iter(self._heard.values())) > FORGET_AFTER_S:
-            self._heard.popitem(last=False)
-        for address in self._heard:
+        while self._clients and now - next(iter(self._clients.values())) > FORGET_AFTER_S:
+            self._clients.popitem(last=False)
+        for address in self._clients:
             transport.sendto(frame, address)
-        return bool(self._heard)
+        return bool(self._clients)
 
     async def _open(self) -> None:
         url = self.url
@@ -156,22 +161,22 @@ class Link:
             sockets = self._server.sockets if self._server else [self._udp.get_extra_info("socket")]  # type: ignore[union-attr]
             self.url = LinkURL(url.kind, url.host, sockets[0].getsockname()[1])
 
-    def _datagram(self, data: bytes, address: Address) -> None:
+    def _datagram(self, data: bytes, address: SocketAddress) -> None:
         frames = split_datagram(data, self.split)
         if not frames:
-            return  # whoever sends no MAVLink is sent none
+            return  # a sender without MAVLink frames is not a client
         if self.url.kind == "udpin":
-            self._heard[address] = self._loop.time()
-            self._heard.move_to_end(address)
+            self._clients[address] = self._loop.time()
+            self._clients.move_to_end(address)
             self.joined.set()
-            if len(self._heard) > MAX_CORRESPONDENTS:
-                self._heard.popitem(last=False)
+            if len(self._clients) > MAX_CLIENTS:
+                self._clients.popitem(last=False)
         for frame in frames:
             self._on_frame(frame.raw)
 
 
 class _Datagrams(asyncio.DatagramProtocol):
-    def __init__(self, link: Link) -> None:
+    def __init__(self, link: MavlinkConnection) -> None:
         self._link = link
 
     def datagram_received(self, data: bytes, addr: tuple[str | int, ...]) -> None:
@@ -182,14 +187,14 @@ class _Datagrams(asyncio.DatagramProtocol):
 
 
 class _Stream(asyncio.Protocol):
-    def __init__(self, link: Link) -> None:
+    def __init__(self, link: MavlinkConnection) -> None:
         self._link = link
         self._splitter = StreamSplitter(link.split)
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         assert isinstance(transport, asyncio.Transport)
         self._transport = transport
-        if len(self._link._streams) >= MAX_CORRESPONDENTS:
+        if len(self._link._streams) >= MAX_CLIENTS:
             transport.abort()
         else:
             self._link._streams.add(transport)
@@ -205,13 +210,13 @@ class _Stream(asyncio.Protocol):
             self._link._on_frame(frame.raw)
 
 
-async def open_link(url: str | LinkURL, on_frame: OnFrame) -> Link:
-    """Open a link.
+async def open_connection(url: str | LinkURL, on_frame: OnFrame) -> MavlinkConnection:
+    """Open a connection.
 
     Raises:
-        LinkError: The URL is not one, or the system refuses it (address in use, no such host, nobody listens).
+        LinkError: The URL is invalid, or the system refuses it (address in use, unknown host, connection refused).
     """
-    link = Link(parse_url(url) if isinstance(url, str) else url, on_frame)
+    link = MavlinkConnection(parse_url(url) if isinstance(url, str) else url, on_frame)
     try:
         await link._open()
     except OSError as error:
@@ -220,14 +225,14 @@ async def open_link(url: str | LinkURL, on_frame: OnFrame) -> Link:
     return link
 
 
-class Changes:
-    """Lets tasks wait until a condition holds, without looking at it again and again."""
+class ChangeNotifier:
+    """Lets tasks wait for a condition without polling."""
 
     def __init__(self) -> None:
         self._waiting: list[tuple[Callable[[], bool], asyncio.Future[None]]] = []
 
     def notify(self) -> None:
-        """Something has changed: whose condition holds now goes on."""
+        """Resume the tasks whose conditions hold now."""
         for condition, future in self._waiting:
             if not future.done() and condition():
                 future.set_result(None)
@@ -236,7 +241,7 @@ class Changes:
         """Wait for a condition.
 
         Raises:
-            TimeoutError: It does not hold after so many seconds.
+            TimeoutError: The condition does not hold after ``timeout_s``.
         """
         if condition():
             return
@@ -249,49 +254,56 @@ class Changes:
             self._waiting.remove(entry)
 
 
-class Collector:
-    """A correspondent that keeps every frame it gets, as it was on the wire; for tests and the demo.
-
-    Memory grows with what arrives: it is for runs of minutes.
-    """
+class ConnectionOwner:
+    """Opens a connection when its asynchronous context begins."""
 
     def __init__(self, url: str) -> None:
-        self.frames: list[bytes] = []
         self._asked_url = url
-        self._changes = Changes()
-        self._link: Link | None = None
+        self._changes = ChangeNotifier()
+        self._link: MavlinkConnection | None = None
 
     @property
-    def link(self) -> Link:
-        """The open link."""
+    def link(self) -> MavlinkConnection:
+        """The open connection."""
         if self._link is None:
-            raise RuntimeError("the collector is not open")
+            raise RuntimeError("the connection is not open")
         return self._link
 
     @property
     def url(self) -> str:
-        """Where it is, with the port that the system chose for port 0."""
+        """The URL, with the actual port in place of port 0."""
         return str(self.link.url)
 
     @property
-    def address(self) -> Address:
+    def address(self) -> SocketAddress:
         """Host and port of ``url``."""
         return self.link.url.host, self.link.url.port
 
-    def send(self, frame: bytes) -> bool:
-        """Send to everyone heard, or to the other end; False if there is nobody."""
-        return self.link.send(frame)
-
-    async def until(self, condition: Callable[[], bool], timeout_s: float = 5.0) -> None:
-        """Wait for a condition on what has come.
+    async def until(self, condition: Callable[[], bool], timeout_s: float = 240.0) -> None:
+        """Wait for a condition, which is checked after each event.
 
         Raises:
-            TimeoutError: It does not hold after so many seconds.
+            TimeoutError: The condition does not hold after ``timeout_s``.
         """
         await self._changes.until(condition, timeout_s)
 
+
+class Collector(ConnectionOwner):
+    """A connection that stores each received frame, as on the wire, for tests.
+
+    Memory grows with the frames: use it for some minutes.
+    """
+
+    def __init__(self, url: str) -> None:
+        super().__init__(url)
+        self.frames: list[bytes] = []
+
+    def send(self, frame: bytes) -> bool:
+        """Send to all receivers; False if there is no receiver."""
+        return self.link.send(frame)
+
     async def __aenter__(self) -> Self:
-        self._link = await open_link(self._asked_url, self._collect)
+        self._link = await open_connection(self._asked_url, self._collect)
         return self
 
     async def __aexit__(
@@ -305,6 +317,6 @@ class Collector:
 
 
 def _widen(transport: asyncio.DatagramTransport) -> None:
-    """A receive buffer for bursts, as large as the system allows."""
+    """Enlarge the receive buffer for bursts, as far as the system allows."""
     with contextlib.suppress(OSError):
         transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)

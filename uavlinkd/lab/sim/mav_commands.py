@@ -1,33 +1,32 @@
-"""What the simulated copter does when told to: MAV_CMD in, MAV_RESULT out."""
+"""The commands of the simulated copter: MAV_CMD in, MAV_RESULT out."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final, Protocol
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from uavlinkd.lab.sim.pilot import point_of
-from uavlinkd.lab.sim.vehicle import Landed, Mode
-
-if TYPE_CHECKING:
-    from uavlinkd.lab.sim.autopilot import Autopilot
+from uavlinkd.lab.sim.message_rates import Streams
+from uavlinkd.lab.sim.mission import Missions
+from uavlinkd.lab.sim.pilot import MissionPilot, point_of
+from uavlinkd.lab.sim.vehicle import Landed, Mode, Vehicle
 
 ACCEPTED: Final[int] = mavlink.MAV_RESULT_ACCEPTED
 DENIED: Final[int] = mavlink.MAV_RESULT_DENIED
 FAILED: Final[int] = mavlink.MAV_RESULT_FAILED
 UNSUPPORTED: Final[int] = mavlink.MAV_RESULT_UNSUPPORTED
 
-# Param 2 of MAV_CMD_COMPONENT_ARM_DISARM that overrides the checks.
+# Value of param 2 of MAV_CMD_COMPONENT_ARM_DISARM that overrides the checks.
 FORCE: Final = 21196
 MAX_ALTITUDE_M: Final = 1000.0
 
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """A COMMAND_LONG or COMMAND_INT, in one form: x and y in 1e-7 degrees."""
+    """A COMMAND_LONG or COMMAND_INT; x and y in 1e-7 degrees."""
 
     number: int
     parameters: tuple[float, float, float, float]
@@ -37,10 +36,28 @@ class Command:
     z: float
 
 
-class Commands:
-    """Carries out commands on one autopilot."""
+class Commanded(Protocol):
+    """The parts of an autopilot that commands use."""
 
-    def __init__(self, autopilot: Autopilot) -> None:
+    vehicle: Vehicle
+    missions: Missions
+    pilot: MissionPilot
+    streams: Streams
+
+    def send(self, message: mavlink.MAVLink_message) -> None:
+        """Send a message."""
+
+    def send_by_number(self, number: int, now: float) -> bool:
+        """Send the message with this id; False if the autopilot does not send such messages."""
+
+    def emit(self, event: str, **fields: object) -> None:
+        """Report an event of the vehicle."""
+
+
+class Commands:
+    """Executes commands on one autopilot."""
+
+    def __init__(self, autopilot: Commanded) -> None:
         self._autopilot = autopilot
         self._actions: dict[int, Callable[[Command, float], int]] = {
             mavlink.MAV_CMD_COMPONENT_ARM_DISARM: self._arm_or_disarm,
@@ -54,21 +71,21 @@ class Commands:
             mavlink.MAV_CMD_MISSION_START: self._start_mission,
             mavlink.MAV_CMD_DO_SET_MISSION_CURRENT: self._set_current,
             mavlink.MAV_CMD_SET_MESSAGE_INTERVAL: self._set_interval,
-            mavlink.MAV_CMD_GET_MESSAGE_INTERVAL: self._tell_interval,
+            mavlink.MAV_CMD_GET_MESSAGE_INTERVAL: self._send_interval,
             mavlink.MAV_CMD_REQUEST_MESSAGE: self._send_message,
             mavlink.MAV_CMD_GET_HOME_POSITION: self._send_home,
             mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: self._send_version,
         }
 
     def run(self, command: Command, now: float) -> int:
-        """Carry out a command; the MAV_RESULT to acknowledge it with. Total: any parameters give a result."""
+        """Execute a command and return its MAV_RESULT. Accepts any parameters."""
         action = self._actions.get(command.number)
         if action is None:
             return UNSUPPORTED
         try:
             return action(command, now)
         except (ValueError, OverflowError):
-            return DENIED  # NaN or infinity where a number is needed
+            return DENIED  # a parameter is NaN or infinity
 
     def set_mode(self, number: int) -> int:
         """Change the flight mode, by its custom_mode number."""
@@ -82,7 +99,7 @@ class Commands:
         if autopilot.vehicle.mode is not mode:
             autopilot.vehicle.set_mode(mode)
             autopilot.pilot.restart()
-            autopilot.tell("mode_changed", mode=mode.name)
+            autopilot.emit("mode_changed", mode=mode.name)
         return ACCEPTED
 
     def _arm_or_disarm(self, command: Command, _now: float) -> int:
@@ -92,26 +109,26 @@ class Commands:
             if not vehicle.armed:
                 vehicle.arm()
                 self._autopilot.pilot.restart()
-                self._autopilot.tell("armed")
+                self._autopilot.emit("armed")
             return ACCEPTED
         if wanted != 0:
             return DENIED
         if vehicle.armed and vehicle.landed is not Landed.ON_GROUND and not forced:
-            return FAILED  # in the air only by force
+            return FAILED  # in the air only with FORCE
         if vehicle.armed:
             vehicle.disarm()
-            self._autopilot.tell("disarmed")
+            self._autopilot.emit("disarmed")
         return ACCEPTED
 
     def _take_off(self, command: Command, _now: float) -> int:
         vehicle = self._autopilot.vehicle
         altitude_m = point_of(vehicle, command.frame, 0, 0, command.z).up
         if not 0 < altitude_m <= MAX_ALTITUDE_M:
-            return DENIED  # so is NaN
+            return DENIED  # also for NaN
         if not vehicle.armed or vehicle.mode is not Mode.GUIDED:
             return FAILED
         vehicle.take_off(altitude_m)
-        self._autopilot.tell("takeoff_started", altitude_m=altitude_m)
+        self._autopilot.emit("takeoff_started", altitude_m=altitude_m)
         return ACCEPTED
 
     def _reposition(self, command: Command, _now: float) -> int:
@@ -150,7 +167,7 @@ class Commands:
         rate = None if interval_us == 0 else 0.0 if interval_us < 0 else 1e6 / max(interval_us, 1.0)
         return ACCEPTED if self._autopilot.streams.set_rate(message, rate, now) else FAILED
 
-    def _tell_interval(self, command: Command, _now: float) -> int:
+    def _send_interval(self, command: Command, _now: float) -> int:
         message = int(command.parameters[0])
         rate = self._autopilot.streams.rate_hz(message)
         if rate is None:

@@ -1,4 +1,4 @@
-"""Which messages are sent by themselves, how often, and when the next is due."""
+"""The periodic messages: which are sent, at which rate, and when the next is due."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from typing import Final
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 MAX_RATE_HZ: Final = 1000.0
-# Messages later than this are left out: after a pause there is no burst of what is out of date.
+# Messages later than this are skipped, so that a pause is not followed by a burst of outdated messages.
 MAX_LATE_S: Final = 0.25
 
-# What REQUEST_DATA_STREAM means, as ArduCopter groups it (those of its messages that are simulated).
+# The groups of REQUEST_DATA_STREAM, as in ArduCopter (only simulated messages).
 GROUPS: Final[dict[int, tuple[int, ...]]] = {
     mavlink.MAV_DATA_STREAM_RAW_SENSORS: (mavlink.MAVLINK_MSG_ID_RAW_IMU, mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE),
     mavlink.MAV_DATA_STREAM_EXTENDED_STATUS: (
@@ -29,7 +29,7 @@ GROUPS: Final[dict[int, tuple[int, ...]]] = {
 
 
 def default_rates(attitude_rate_hz: float, position_rate_hz: float) -> dict[int, float]:
-    """Messages a second before any ground station asks for something else. 0: only on request."""
+    """Messages per second until a ground station requests other rates. 0: only on request."""
     return {
         mavlink.MAVLINK_MSG_ID_HEARTBEAT: 1.0,
         mavlink.MAVLINK_MSG_ID_ATTITUDE: attitude_rate_hz,
@@ -50,7 +50,7 @@ def default_rates(attitude_rate_hz: float, position_rate_hz: float) -> dict[int,
 
 
 class Streams:
-    """A timetable of messages. Times are seconds on the caller's clock."""
+    """The schedule of periodic messages. Times are monotonic seconds."""
 
     def __init__(self, rates: dict[int, float], now: float) -> None:
         self._default = dict(rates)
@@ -59,13 +59,13 @@ class Streams:
         self.next_due_at = min(self._due_at.values())
 
     def rate_hz(self, message: int) -> float | None:
-        """How often a message goes out; None if it cannot be sent by itself."""
+        """The rate of a message; None if it is not a periodic message."""
         return self._rate.get(message)
 
     def set_rate(self, message: int, rate_hz: float | None, now: float) -> bool:
-        """Change how often; 0 stops it, None restores the default. False for a message that is not in the timetable.
+        """Change a rate; 0 stops the message, None restores the default. False if it is not a periodic message.
 
-        The heartbeat keeps its rate: a vehicle without one is lost to every ground station.
+        The heartbeat keeps its rate: without it, ground stations lose the vehicle.
         """
         if message not in self._rate or message == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
             return False
@@ -79,16 +79,16 @@ class Streams:
         return True
 
     def set_group(self, group: int, rate_hz: float, now: float) -> bool:
-        """Change a MAV_DATA_STREAM, or all of them. False if there is none such."""
+        """Change the rates of a MAV_DATA_STREAM, or of all of them. False if it is unknown."""
         groups = list(GROUPS) if group == mavlink.MAV_DATA_STREAM_ALL else [group]
-        if not all(each in GROUPS for each in groups):
+        if not GROUPS.keys() >= set(groups):
             return False
-        for message in (message for each in groups for message in GROUPS[each]):
+        for message in (message for number in groups for message in GROUPS[number]):
             self.set_rate(message, rate_hz, now)
         return True
 
     def take_due(self, now: float) -> list[int]:
-        """The messages to send now, in the order they were due; each is put off by its interval."""
+        """The messages to send now, in the order they were due. Schedules their next times."""
         if now < self.next_due_at:
             return []
         due: list[tuple[float, int]] = []

@@ -1,4 +1,4 @@
-"""The mission protocol on the vehicle's side: one upload at a time, any number of downloads.
+"""The mission protocol of the vehicle: one upload at a time, any number of downloads.
 
 Source of the exchange: https://mavlink.io/en/services/mission.html
 """
@@ -12,9 +12,9 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-# Bounds the memory that a ground station can fill.
+# A bound on memory.
 MAX_ITEMS: Final = 1000
-# mavlink.io recommends 250 ms between items and 5 retries; a radio link with some loss needs this much.
+# mavlink.io recommends 250 ms and 5 retries; a lossy radio link needs more.
 REQUEST_AGAIN_AFTER_S: Final = 0.5
 MAX_REQUESTS_AGAIN: Final = 10
 
@@ -53,7 +53,7 @@ class _Upload:
 class Missions:
     """The plan, the fence and the rally points, and their transfer.
 
-    ``send`` is called with each message to send; ``changed`` with the kind once a new list is in force.
+    ``send`` is called with each message to send, ``changed`` with the kind of each new list.
     """
 
     def __init__(self, send: Send, changed: Callable[[int, Partner], None]) -> None:
@@ -66,7 +66,7 @@ class Missions:
 
     @property
     def plan(self) -> list[Item]:
-        """The mission items in force."""
+        """The current mission items."""
         return self._stored[PLAN]
 
     def items(self, kind: int) -> list[Item]:
@@ -75,11 +75,11 @@ class Missions:
 
     @property
     def next_due_at(self) -> float:
-        """When ``advance`` has something to do; infinity if never."""
+        """The time of the next call of ``advance``; infinity if none is needed."""
         return self._upload.asked_at + REQUEST_AGAIN_AFTER_S if self._upload else math.inf
 
     def advance(self, now: float) -> None:
-        """Ask again for an item that did not come, and give up in the end."""
+        """Request a missing item again, and cancel the upload after the last retry."""
         upload = self._upload
         if upload is None or now < self.next_due_at:
             return
@@ -97,8 +97,8 @@ class Missions:
         kind = int(getattr(message, "mission_type", PLAN))
         name = message.get_type()
         if name == "MISSION_CLEAR_ALL" and kind == mavlink.MAV_MISSION_TYPE_ALL:
-            for each in KINDS:
-                self._store(each, [], partner)
+            for stored_kind in KINDS:
+                self._store(stored_kind, [], partner)
             self._acknowledge(partner, kind, mavlink.MAV_MISSION_ACCEPTED)
             return
         if kind not in self._stored:
@@ -111,27 +111,27 @@ class Missions:
                     mavlink.MAVLink_mission_count_message(*partner, count=len(self._stored[kind]), mission_type=kind)
                 )
             case "MISSION_REQUEST_INT" | "MISSION_REQUEST":
-                self._give(partner, kind, message.seq, as_float=name == "MISSION_REQUEST")
+                self._send_item(partner, kind, message.seq, as_float=name == "MISSION_REQUEST")
             case "MISSION_COUNT":
                 self._begin(partner, kind, message.count, now)
             case "MISSION_ITEM_INT" | "MISSION_ITEM":
-                self._take(partner, kind, message, now)
+                self._receive_item(partner, kind, message, now)
             case "MISSION_CLEAR_ALL":
                 self._store(kind, [], partner)
                 self._acknowledge(partner, kind, mavlink.MAV_MISSION_ACCEPTED)
             case "MISSION_ACK":
-                # The ground station gave up its upload; the end of a download needs no answer.
+                # The ground station cancelled its upload. The end of a download needs no answer.
                 if self._upload and self._upload.partner == partner and message.type:
                     self._upload = None
 
     def set_current(self, sequence: int) -> bool:
-        """Make an item the current one; False if there is none such."""
+        """Change the current item; False if it does not exist."""
         if not 0 <= sequence < max(len(self.plan), 1):
             return False
         self.current = sequence
         return True
 
-    def _give(self, partner: Partner, kind: int, sequence: int, *, as_float: bool) -> None:
+    def _send_item(self, partner: Partner, kind: int, sequence: int, *, as_float: bool) -> None:
         items = self._stored[kind]
         if sequence >= len(items):
             self._acknowledge(partner, kind, mavlink.MAV_MISSION_INVALID_SEQUENCE)
@@ -159,17 +159,17 @@ class Missions:
             self._upload = _Upload(partner, kind, count, [], now)
             self._ask(self._upload, now)
 
-    def _take(self, partner: Partner, kind: int, message: Message, now: float) -> None:
+    def _receive_item(self, partner: Partner, kind: int, message: Message, now: float) -> None:
         upload = self._upload
         is_finite = all(map(math.isfinite, (message.x, message.y, message.z)))
         if upload is None or upload.partner != partner or upload.kind != kind:
-            # The last acknowledgement was lost, or nobody asked: an answer ends the other side's waiting.
+            # The last acknowledgement was lost: acknowledge again, so that the ground station stops waiting.
             is_last = is_finite and message.seq + 1 == len(self._stored[kind])
             if is_last and _item(message) == self._stored[kind][-1]:
                 self._acknowledge(partner, kind, mavlink.MAV_MISSION_ACCEPTED)
             return
         if message.seq != len(upload.items):
-            return  # a repetition, or one of those that overtook: the wanted one has been asked for
+            return  # repeated or reordered; the expected item is already requested
         if not is_finite:
             self._upload = None
             self._acknowledge(partner, kind, mavlink.MAV_MISSION_INVALID)
@@ -202,13 +202,13 @@ class Missions:
 
 
 def _item(message: Message) -> Item:
-    """What an item message says. MISSION_ITEM has degrees (or metres) where MISSION_ITEM_INT has integers."""
+    """The item of a message. MISSION_ITEM has degrees or metres, MISSION_ITEM_INT scaled integers."""
     x, y = message.x, message.y
     if message.get_type() == "MISSION_ITEM":
         scale = _scale(message.frame)
         x, y = (max(-(2**31), min(2**31 - 1, round(value * scale))) for value in (x, y))
     four = (message.param1, message.param2, message.param3, message.param4)
-    # Which item is current is the vehicle's to say.
+    # The vehicle decides which item is current.
     return Item(message.frame, message.command, 0, message.autocontinue, four, x, y, message.z)
 
 
@@ -218,7 +218,7 @@ def _to_float(item: Item) -> tuple[float, float]:
 
 
 def _scale(frame: int) -> float:
-    """Integers in a message for one degree, or for one metre in a local frame."""
+    """The integer in a message for one degree, or for one metre in a local frame."""
     return 1e4 if frame in LOCAL_FRAMES else 1e7
 
 

@@ -1,4 +1,4 @@
-"""The parameters of the simulated copter: ArduPilot's names, types and manners."""
+"""The parameters of the simulated copter, with ArduPilot's names, types and behaviour."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from enum import IntEnum
 from typing import Final
 
 
-class Kind(IntEnum):
-    """MAV_PARAM_TYPE, those that ArduPilot uses. Values travel as a float32 number, whatever the kind."""
+class ParameterType(IntEnum):
+    """The types of MAV_PARAM_TYPE that ArduPilot uses. Values of all types are sent as float32."""
 
     INT8 = 2
     INT16 = 4
@@ -21,29 +21,29 @@ class Kind(IntEnum):
 LARGEST_FLOAT32: Final = (2 - 2**-23) * 2.0**127
 
 _RANGES: Final = {
-    Kind.INT8: (-(2**7), 2**7 - 1),
-    Kind.INT16: (-(2**15), 2**15 - 1),
-    Kind.INT32: (-(2**31), 2**31 - 1),
+    ParameterType.INT8: (-(2**7), 2**7 - 1),
+    ParameterType.INT16: (-(2**15), 2**15 - 1),
+    ParameterType.INT32: (-(2**31), 2**31 - 1),
 }
 
 
 def _float32(value: float) -> float:
-    """The nearest number that travels unchanged."""
+    """The nearest float32 value."""
     return float(struct.unpack("<f", struct.pack("<f", value))[0])
 
 
 @dataclass(slots=True)
 class Parameter:
-    """One parameter. The value is what a float32 can hold."""
+    """One parameter. The value is a float32."""
 
     name: str
-    kind: Kind
+    kind: ParameterType
     value: float
     read_only: bool = False
 
 
 def _defaults(system_id: int) -> list[Parameter]:
-    i8, i16, i32, real = Kind.INT8, Kind.INT16, Kind.INT32, Kind.REAL32
+    i8, i16, i32, real = ParameterType.INT8, ParameterType.INT16, ParameterType.INT32, ParameterType.REAL32
     return [
         Parameter("FORMAT_VERSION", i16, 120, read_only=True),
         Parameter("SYSID_THISMAV", i16, system_id, read_only=True),
@@ -94,8 +94,8 @@ def _defaults(system_id: int) -> list[Parameter]:
     ]
 
 
-class Parameters:
-    """The table, in its order. Names are at most 16 ASCII letters."""
+class ParameterTable:
+    """All parameters, in order. Names have at most 16 ASCII letters."""
 
     def __init__(self, system_id: int) -> None:
         self.table = _defaults(system_id)
@@ -110,24 +110,24 @@ class Parameters:
         return self.table[self._index[name]].value
 
     def index_of(self, name: str) -> int | None:
-        """Where a name stands, None if nowhere."""
+        """The index of a name; None if it is unknown."""
         return self._index.get(name)
 
     def at(self, index: int) -> Parameter | None:
-        """The parameter at an index, None outside the table."""
+        """The parameter at an index; None outside the table."""
         return self.table[index] if 0 <= index < len(self.table) else None
 
     def set(self, name: str, value: float) -> bool:
-        """Store a value as its kind holds it. False, and nothing is changed, if that is not possible.
+        """Store a value. False, without a change, if the value or the name is refused.
 
-        An integer kind takes the nearest integer, as ArduPilot does. NaN, infinity, what the kind cannot hold, a
-        read-only and an unknown name are refused.
+        As in ArduPilot, integer types round to the nearest integer. NaN, infinity, values out of range, read-only
+        and unknown names are refused.
         """
         index = self._index.get(name)
         if index is None or self.table[index].read_only or not math.isfinite(value):
             return False
         parameter = self.table[index]
-        if parameter.kind is Kind.REAL32:
+        if parameter.kind is ParameterType.REAL32:
             if abs(value) > LARGEST_FLOAT32:
                 return False
             parameter.value = _float32(value)
@@ -140,5 +140,5 @@ class Parameters:
         return True
 
     def preset(self, name: str, value: float) -> None:
-        """Write a value that the vehicle itself keeps, such as MIS_TOTAL."""
+        """Write a value that the vehicle maintains, such as MIS_TOTAL."""
         self.table[self._index[name]].value = value

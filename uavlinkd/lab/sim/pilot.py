@@ -7,10 +7,10 @@ from typing import Final
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from uavlinkd.lab.sim.mission import LOCAL_FRAMES, Item, Missions
-from uavlinkd.lab.sim.vehicle import Axes, Landed, Mode, Place, Vehicle
+from uavlinkd.lab.sim.vehicle import Axes, GeoPoint, Landed, Mode, Vehicle
 
 ABSOLUTE_FRAMES: Final = (mavlink.MAV_FRAME_GLOBAL, mavlink.MAV_FRAME_GLOBAL_INT)
-# What a copter does for these is: be there.
+# A copter flies to each of these.
 WAYPOINTS: Final = (
     mavlink.MAV_CMD_NAV_WAYPOINT,
     mavlink.MAV_CMD_NAV_SPLINE_WAYPOINT,
@@ -20,18 +20,18 @@ WAYPOINTS: Final = (
 
 
 def point_of(vehicle: Vehicle, frame: int, x: int, y: int, z: float) -> Axes:
-    """Where an item or a command points, relative to home. An x and y of zero is the place where the vehicle is."""
+    """The target of an item or a command, relative to home. Zero x and y mean the vehicle's position."""
     if frame in LOCAL_FRAMES:
         up = z if frame == mavlink.MAV_FRAME_LOCAL_ENU else -z
         return Axes(x / 1e4, y / 1e4, up)
     altitude = z if frame in ABSOLUTE_FRAMES else vehicle.home.altitude_m + z
     if x == 0 and y == 0:
         return Axes(vehicle.position.north, vehicle.position.east, altitude - vehicle.home.altitude_m)
-    return vehicle.point_of(Place(x / 1e7, y / 1e7, altitude))
+    return vehicle.point_of(GeoPoint(x / 1e7, y / 1e7, altitude))
 
 
 class MissionPilot:
-    """Follows the plan while the mode is AUTO. Item 0 is home, as ArduPilot has it, and is not flown to."""
+    """Follows the plan while the mode is AUTO. As in ArduPilot, item 0 is home and not a waypoint."""
 
     def __init__(self, vehicle: Vehicle, missions: Missions) -> None:
         self._vehicle = vehicle
@@ -39,14 +39,14 @@ class MissionPilot:
         self._begun: int | None = None
 
     def restart(self) -> None:
-        """Take up the current item anew: the mode, the plan or the current item has changed."""
+        """Start the current item again, after a change of the mode, the plan or the current item."""
         self._begun = None
 
     def advance(self) -> list[int]:
-        """Fly on; the items reached."""
+        """Continue the mission, and return the reached items."""
         vehicle, missions = self._vehicle, self._missions
         reached: list[int] = []
-        # A plan of nothing but skipped items ends this loop at its last one.
+        # If all items are skipped, the loop ends at the last one.
         while vehicle.armed and vehicle.mode is Mode.AUTO and missions.plan:
             sequence = missions.current
             if self._begun != sequence:
@@ -80,7 +80,7 @@ class MissionPilot:
     def _is_done(self, sequence: int, item: Item) -> bool:
         if sequence == 0 or item.command not in (*WAYPOINTS, mavlink.MAV_CMD_NAV_TAKEOFF, mavlink.MAV_CMD_NAV_LAND):
             return True
-        # Without a take-off before it, a waypoint waits on the ground for ever, as ArduCopter does.
+        # As in ArduCopter, a waypoint without a take-off before it never starts.
         if item.command == mavlink.MAV_CMD_NAV_LAND:
             return self._vehicle.landed is Landed.ON_GROUND
         return self._vehicle.landed is not Landed.ON_GROUND and self._vehicle.has_arrived()

@@ -1,4 +1,4 @@
-"""What the simulated copter says of itself: one function a message."""
+"""The telemetry of the simulated copter: one function per message."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ CELL_UNKNOWN_MV: Final = 0xFFFF
 
 
 class Telemetry:
-    """Makes messages out of the vehicle's state. Sensor noise comes from the seed alone."""
+    """Creates messages from the vehicle's state. The seed determines the sensor noise."""
 
     def __init__(self, vehicle: Vehicle, missions: Missions, *, seed: int, identity: int, unix_epoch_us: int) -> None:
         self._vehicle = vehicle
         self._missions = missions
-        self._random = Random(seed)  # noqa: S311 - noise of a simulated sensor, to be the same with the same seed
+        self._random = Random(seed)  # noqa: S311  seeded noise of a simulated sensor
         self._unix_epoch_us = unix_epoch_us
         self._identity = identity
         self._messages: dict[int, Callable[[float], Message]] = {
@@ -70,7 +70,7 @@ class Telemetry:
         }
 
     def message(self, number: int, up_s: float) -> Message | None:
-        """The message of that number, ``up_s`` seconds after power-on; None if the vehicle has none such."""
+        """The message with this ID, ``up_s`` seconds after power-on; None if the vehicle does not have it."""
         make = self._messages.get(number)
         return make(up_s) if make else None
 
@@ -259,7 +259,7 @@ class Telemetry:
 
 
 def _ms(up_s: float) -> int:
-    """time_boot_ms: 32 bits that wrap after 49 days."""
+    """The field time_boot_ms: 32 bits, which wrap after 49 days."""
     return round(1000 * up_s) & 0xFFFF_FFFF
 
 

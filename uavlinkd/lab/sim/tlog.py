@@ -10,7 +10,7 @@ from typing import Final
 from uavlinkd.mavlink.frames import MAVLINK1, MAVLINK2, SplitCounters, split_datagram
 
 STAMP_BYTES: Final = 8
-# A stamp past this is no stamp: 1 January 2100, in microseconds since 1970.
+# The latest valid timestamp: 1 January 2100, in microseconds since 1970.
 LATEST_STAMP_US: Final = 4_102_444_800_000_000
 SIGNED: Final = 0x01
 
@@ -18,7 +18,7 @@ _START = re.compile(bytes([ord("["), MAVLINK1, MAVLINK2, ord("]")]))
 
 
 class TlogError(ValueError):
-    """A log that cannot be read. ``offset`` is the first byte that is wrong."""
+    """The log cannot be read. ``offset`` is the first wrong byte."""
 
     def __init__(self, text: str, offset: int) -> None:
         super().__init__(f"{text} at byte {offset}")
@@ -26,26 +26,26 @@ class TlogError(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class Record:
-    """One frame as it was on the wire, and when it was logged (microseconds since 1970)."""
+class TlogRecord:
+    """One frame as on the wire, and the time when it was logged (microseconds since 1970)."""
 
     time_us: int
     frame: bytes
 
     @property
     def system_id(self) -> int:
-        """Who sent the frame."""
+        """The system that sent the frame."""
         return self.frame[3] if self.frame[0] == MAVLINK1 else self.frame[5]
 
 
 @dataclass(slots=True)
 class Tlog:
-    """What a log holds, and what in it could not be read."""
+    """The records of a log, and counters of its unreadable parts."""
 
-    records: list[Record] = field(default_factory=list)
-    skipped_bytes: int = 0  # in no record, with those after the last whole one
-    resyncs: int = 0  # how often records followed on bytes that are none
-    truncated_bytes: int = 0  # after the last whole record, as when power failed
+    records: list[TlogRecord] = field(default_factory=list)
+    skipped_bytes: int = 0  # outside records, including those after the last complete record
+    resyncs: int = 0  # how often records followed skipped bytes
+    truncated_bytes: int = 0  # after the last complete record, for example after a power failure
     first_fault_offset: int | None = None
 
     @property
@@ -55,7 +55,7 @@ class Tlog:
 
 
 def parse_tlog(data: bytes, *, strict: bool = False) -> Tlog:
-    """Read a log. Total: any bytes give a log or an error.
+    """Parse a log. Accepts any bytes.
 
     ::
 
@@ -63,12 +63,12 @@ def parse_tlog(data: bytes, *, strict: bool = False) -> Tlog:
         0      8    microseconds since 1970, big-endian
         8      n    one MAVLink frame, version 1 or 2, signed or not
 
-    The length is the frame's own. A record counts when another one starts where it ends, or the log ends there, or
-    its frame is genuine; so frames of messages that nobody here knows are read, and a flipped bit costs one record.
-    Where there is none, bytes are skipped up to the next: a log is worth replaying for what is left of it.
+    The frame contains its length. A record is valid if another one follows it, the log ends after it, or its frame is
+    genuine. So frames of unknown messages are read, and a flipped bit costs one record. Bytes outside records are
+    skipped, so that the rest of a damaged log can be played.
 
     Raises:
-        TlogError: There is no record in it; with ``strict``, also at the first byte that is not as it should be.
+        TlogError: There is no record; with ``strict``, also at the first byte outside a record.
     """
     log = Tlog()
     position, size = 0, len(data)
@@ -76,7 +76,7 @@ def parse_tlog(data: bytes, *, strict: bool = False) -> Tlog:
         end = _record_end(data, position, searching=False)
         if end is None:
             if strict:
-                raise TlogError("no record", position)
+                raise TlogError("there is no record", position)
             start = position
             position = _next_record(data, position + 1)
             log.skipped_bytes += position - start
@@ -88,33 +88,33 @@ def parse_tlog(data: bytes, *, strict: bool = False) -> Tlog:
                 log.truncated_bytes = position - start
             continue
         stamp = int.from_bytes(data[position : position + STAMP_BYTES])
-        log.records.append(Record(stamp, data[position + STAMP_BYTES : end]))
+        log.records.append(TlogRecord(stamp, data[position + STAMP_BYTES : end]))
         position = end
     if not log.records:
-        raise TlogError("no MAVLink frame with a time before it", 0)
+        raise TlogError("there is no MAVLink frame with a timestamp", 0)
     return log
 
 
 def read_tlog(path: str | Path) -> Tlog:
-    """Read a log file, as ``parse_tlog`` does.
+    """Read a log file with ``parse_tlog``.
 
     Raises:
         OSError: The file cannot be read.
-        TlogError: There is no record in it.
+        TlogError: There is no record.
     """
     try:
         return parse_tlog(Path(path).read_bytes())
     except TlogError as error:
-        raise TlogError(f"{path}: no MAVLink frame with a time before it", error.offset) from None
+        raise TlogError(f"{path}: there is no MAVLink frame with a timestamp", error.offset) from None
 
 
 def _next_record(data: bytes, position: int) -> int:
-    """Where the next record after garbage starts; the end if there is none."""
+    """The position of the next record after garbage, or the end of the log."""
     while position < len(data):
-        found = _START.search(data, position + STAMP_BYTES)
-        if found is None:
+        match = _START.search(data, position + STAMP_BYTES)
+        if match is None:
             return len(data)
-        position = found.start() - STAMP_BYTES
+        position = match.start() - STAMP_BYTES
         if _record_end(data, position, searching=True) is not None:
             return position
         position += 1
@@ -122,7 +122,7 @@ def _next_record(data: bytes, position: int) -> int:
 
 
 def _record_end(data: bytes, position: int, *, searching: bool) -> int | None:
-    """Where the record at a position ends; None if there is none. In a search, only a genuine frame will do."""
+    """The end of the record at ``position``; None if there is no record. A search accepts only genuine frames."""
     end = _plausible_end(data, position)
     if end is None:
         return None
@@ -133,7 +133,7 @@ def _record_end(data: bytes, position: int, *, searching: bool) -> int | None:
 
 
 def _plausible_end(data: bytes, position: int) -> int | None:
-    """Where a stamp and a frame at a position would end; None if they would not fit or look wrong."""
+    """The end of a timestamp and frame at ``position``; None if they are invalid or exceed the log."""
     frame = position + STAMP_BYTES
     if len(data) < frame + 3 or int.from_bytes(data[position:frame]) > LATEST_STAMP_US:
         return None
@@ -147,6 +147,6 @@ def _plausible_end(data: bytes, position: int) -> int | None:
 
 
 def _is_genuine(frame: bytes) -> bool:
-    """Whether its checksum fits."""
-    found = split_datagram(frame, SplitCounters())
-    return len(found) == 1 and found[0].raw == frame
+    """Whether the checksum is valid."""
+    frames = split_datagram(frame, SplitCounters())
+    return len(frames) == 1 and frames[0].raw == frame

@@ -1,35 +1,33 @@
-"""Plays a recorded flight to a MAVLink URL: each frame byte for byte, at the pace of the log or another."""
+"""Plays a recorded flight to a MAVLink URL: each frame byte for byte, at a multiple of the recorded speed."""
 
 from __future__ import annotations
 
 import asyncio
 import math
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from uavlinkd.lab.sim.links import Link, LinkError, OnFrame, open_link
-from uavlinkd.lab.sim.tlog import Record, Tlog, TlogError, parse_tlog, read_tlog
+from uavlinkd.lab.sim.links import LinkError, MavlinkConnection, OnFrame, open_connection
+from uavlinkd.lab.sim.tlog import Tlog, read_tlog
 
-__all__ = ["Record", "ReplayReport", "Tlog", "TlogError", "parse_tlog", "read_tlog", "replay"]
-
-# Within what a local socket takes without loss.
+# A local socket receives this rate without loss.
 MAX_FRAMES_PER_S: Final = 5000.0
-# Frames nearer than this to their time go out at once: a sleep of the loop is no finer.
+# Frames due within this time are sent immediately: it is the resolution of the loop's timer.
 TICK_S: Final = 0.002
 
 
 @dataclass(slots=True)
-class ReplayReport:
-    """What a replay came to."""
+class PlaybackReport:
+    """The result of a playback."""
 
     frames_sent: int = 0
     bytes_sent: int = 0
-    frames_left_out: int = 0  # of systems that were not asked for
-    frames_unsent: int = 0  # nobody was there any more
-    skipped_bytes: int = 0  # of the log, in no record
+    frames_left_out: int = 0  # of systems that were not selected
+    frames_unsent: int = 0  # without a receiver
+    skipped_bytes: int = 0  # of the log, outside records
     frames_received: int = 0
     log_seconds: float = 0.0  # from the first record sent to the last one
     seconds: float = 0.0
@@ -37,7 +35,7 @@ class ReplayReport:
     by_system: Counter[int] = field(default_factory=Counter)
 
 
-async def replay(
+async def play_tlog(
     source: str | Path | Tlog,
     url: str,
     *,
@@ -48,29 +46,33 @@ async def replay(
     stop: asyncio.Event | None = None,
     on_sent: OnFrame | None = None,
     on_received: OnFrame | None = None,
-) -> ReplayReport:
-    """Play a log, ``speed`` times as fast as it was recorded, but never faster than ``max_frames_per_s``.
+    on_open: Callable[[MavlinkConnection, PlaybackReport], None] | None = None,
+) -> PlaybackReport:
+    """Play a log, ``speed`` times as fast as it was recorded, but at most ``max_frames_per_s``.
 
-    At speed 0 or infinity that limit alone is the pace. Only frames of ``system_ids``, if any are given. It ends with
-    the log, after ``seconds``, or when ``stop`` is set. A listening URL waits for its first correspondent before it
-    starts. A stamp that goes back, as where logs were joined, makes no pause.
+    At speed 0 or infinity, only that limit applies. With ``system_ids``, play only the frames of these systems. The
+    playback ends with the log, after ``seconds``, or on ``stop``. A listening URL waits for its first client.
+    ``on_open`` is called with the open connection and the counters, which then grow.
+    A decreasing timestamp, as in joined logs, causes no pause.
 
     Raises:
         OSError, TlogError: The log cannot be read.
-        LinkError: The link cannot be opened, or the other end closed it.
-        ValueError: A speed or a limit that is none.
+        LinkError: The connection cannot be opened, or the other end closed it.
+        ValueError: The speed is negative, or the limit is not positive.
     """
     if not speed >= 0 or not max_frames_per_s > 0:
-        raise ValueError(f"speed {speed} and frames a second {max_frames_per_s} must be positive")
+        raise ValueError(f"speed {speed} and frames per second {max_frames_per_s} must be positive")
     log = source if isinstance(source, Tlog) else await asyncio.to_thread(read_tlog, source)
-    report = ReplayReport(skipped_bytes=log.skipped_bytes)
+    report = PlaybackReport(skipped_bytes=log.skipped_bytes)
 
     def receive(frame: bytes) -> None:
         report.frames_received += 1
         if on_received:
             on_received(frame)
 
-    link = await open_link(url, receive)
+    link = await open_connection(url, receive)
+    if on_open:
+        on_open(link, report)
     try:
         ends = [asyncio.ensure_future(event.wait()) for event in (stop or asyncio.Event(), link.lost)]
         playing = asyncio.ensure_future(
@@ -93,8 +95,8 @@ async def replay(
 
 async def _play(
     log: Tlog,
-    link: Link,
-    report: ReplayReport,
+    link: MavlinkConnection,
+    report: PlaybackReport,
     speed: float,
     max_frames_per_s: float,
     system_ids: Collection[int] | None,
@@ -115,7 +117,7 @@ async def _play(
         due_at = max(by_log, due_at)
         if due_at - loop.time() > TICK_S:
             await asyncio.sleep(due_at - loop.time())
-        # A pace that cannot be kept is not made up for in a burst beyond the limit.
+        # After a delay, do not catch up in a burst beyond the limit.
         due_at = max(due_at, loop.time() - TICK_S) + 1 / max_frames_per_s
         if link.send(record.frame):
             report.frames_sent += 1

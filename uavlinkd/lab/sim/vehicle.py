@@ -1,4 +1,4 @@
-"""How the simulated copter moves: speeds and accelerations, no aerodynamics."""
+"""The motion of the simulated copter: speeds and accelerations, without aerodynamics."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Final
 
-# A step longer than this is cut into several, so a stalled process does not make the copter jump through the ground.
+# A longer step is divided, so that the copter does not jump through the ground after the process stalls.
 MAX_STEP_S: Final = 0.1
-# After a longer silence the model does not catch up: the process was suspended, and the copter with it.
+# After a longer pause the model does not catch up: the process was suspended.
 MAX_CATCH_UP_S: Final = 5.0
 
 ACCELERATION_M_S2: Final = 2.5
@@ -45,7 +45,7 @@ class Landed(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class GeoPoint:
     """A point on the globe: degrees (WGS 84) and metres above mean sea level."""
 
     latitude_deg: float
@@ -55,7 +55,7 @@ class Place:
 
 @dataclass(slots=True)
 class Axes:
-    """A vector north, east and up: metres from home, or metres a second."""
+    """A vector north, east and up: metres from home, or metres per second."""
 
     north: float = 0.0
     east: float = 0.0
@@ -64,7 +64,7 @@ class Axes:
 
 @dataclass(slots=True)
 class Speeds:
-    """What the pilot of the model may ask for, metres a second."""
+    """The speed limits of the vehicle."""
 
     climb_m_s: float = 2.5
     descend_m_s: float = 1.5
@@ -74,13 +74,13 @@ class Speeds:
 
 @dataclass(slots=True)
 class Vehicle:
-    """Where the copter is, where it is going, and what it reports of itself.
+    """The state of the copter: position, target, attitude, battery.
 
-    It is driven by ``arm``, ``disarm``, ``take_off``, ``go_to``, ``set_mode`` and moved by ``step``. Positions are
+    ``arm``, ``disarm``, ``take_off``, ``go_to`` and ``set_mode`` control it, and ``step`` moves it. Positions are
     relative to home, where it starts on the ground.
     """
 
-    home: Place
+    home: GeoPoint
     speeds: Speeds = field(default_factory=Speeds)
     return_altitude_m: float = 15.0
     mode: Mode = Mode.STABILIZE
@@ -100,8 +100,8 @@ class Vehicle:
         return self.position.up
 
     @property
-    def place(self) -> Place:
-        """Where it is on the globe."""
+    def place(self) -> GeoPoint:
+        """The position on the globe."""
         return self.place_of(self.position)
 
     @property
@@ -111,28 +111,28 @@ class Vehicle:
 
     @property
     def current_a(self) -> float:
-        """What the battery gives at this moment."""
+        """The current of the battery."""
         return HOVER_CURRENT_A if self.armed and self.landed is not Landed.ON_GROUND else IDLE_CURRENT_A
 
     @property
     def battery_percent(self) -> int:
-        """What is left, 0 to 100."""
+        """The remaining charge, 0 to 100."""
         return max(0, round(100 * (1 - self.used_mah / BATTERY_CAPACITY_MAH)))
 
     @property
     def battery_v(self) -> float:
-        """Of a pack of four cells."""
+        """The voltage of a battery with four cells."""
         return 4 * (3.5 + 0.7 * self.battery_percent / 100)
 
-    def place_of(self, point: Axes) -> Place:
+    def place_of(self, point: Axes) -> GeoPoint:
         """A point relative to home, on the globe."""
         per_degree = math.radians(1) * EARTH_RADIUS_M
         latitude = self.home.latitude_deg + point.north / per_degree
         longitude = self.home.longitude_deg + point.east / (per_degree * self._meridians_close())
-        return Place(latitude, (longitude + 180) % 360 - 180, self.home.altitude_m + point.up)
+        return GeoPoint(latitude, (longitude + 180) % 360 - 180, self.home.altitude_m + point.up)
 
-    def point_of(self, place: Place) -> Axes:
-        """A place on the globe, relative to home."""
+    def point_of(self, place: GeoPoint) -> Axes:
+        """A point on the globe, relative to home."""
         per_degree = math.radians(1) * EARTH_RADIUS_M
         east_deg = (place.longitude_deg - self.home.longitude_deg + 180) % 360 - 180
         return Axes(
@@ -142,17 +142,17 @@ class Vehicle:
         )
 
     def arm(self) -> None:
-        """Start the motors. Home of the climb is where it stands."""
+        """Start the motors."""
         self.armed = True
         self.target = Axes(self.position.north, self.position.east, self.position.up)
 
     def disarm(self) -> None:
-        """Stop the motors; in the air the copter drops to the ground."""
+        """Stop the motors; in the air, the copter drops to the ground."""
         self.armed = False
         self._touch_down()
 
     def set_mode(self, mode: Mode) -> None:
-        """Change the flight mode: LAND comes down here, RTL at home, the others hold this position."""
+        """Change the flight mode: LAND lands here, RTL at home, the others hold the position."""
         self.mode = mode
         if self.landed is Landed.ON_GROUND:
             return
@@ -167,13 +167,13 @@ class Vehicle:
             self.landed = Landed.IN_AIR
 
     def take_off(self, altitude_m: float) -> None:
-        """Climb straight up to metres above home. Only when armed."""
+        """Climb vertically to an altitude above home. Only when armed."""
         self.target = Axes(self.position.north, self.position.east, altitude_m)
         if self.landed is Landed.ON_GROUND:
             self.landed = Landed.TAKEOFF
 
     def land(self) -> None:
-        """Come straight down; on the ground the motors stop. Only when in the air."""
+        """Descend vertically; on the ground, the motors stop. Only when in the air."""
         self.target = Axes(self.position.north, self.position.east, 0.0)
         self.landed = Landed.LANDING
 
@@ -182,14 +182,14 @@ class Vehicle:
         self.target = Axes(point.north, point.east, max(point.up, 0.5))
 
     def has_arrived(self, within_m: float = 1.0) -> bool:
-        """Whether the target is this near."""
+        """Whether the target is within this distance."""
         return math.dist(
             (self.position.north, self.position.east, self.position.up),
             (self.target.north, self.target.east, self.target.up),
         ) <= max(within_m, 0.1)
 
     def step(self, duration_s: float) -> None:
-        """Move for so many seconds."""
+        """Simulate ``duration_s`` seconds."""
         left = min(max(duration_s, 0.0), MAX_CATCH_UP_S)
         while left > 0:
             step_s = min(left, MAX_STEP_S)
@@ -218,13 +218,13 @@ class Vehicle:
         self.position.up = max(self.position.up, 0.0)
 
     def _wanted_velocity(self) -> Axes:
-        """Straight at the target, slowing so as to stop there."""
+        """The velocity towards the target, decelerating to stop there."""
         north, east = self.target.north - self.position.north, self.target.east - self.position.east
         distance = math.hypot(north, east)
-        # The 0.8 leaves room for the step in which the braking is noticed.
+        # The factor 0.8 allows for the length of a step.
         speed = min(self.speeds.travel_m_s, 0.8 * math.sqrt(2 * ACCELERATION_M_S2 * distance), 2 * distance)
         if self.landed is Landed.LANDING:
-            vertical = -self.speeds.land_m_s  # to the very ground: a landing does not end in a hover
+            vertical = -self.speeds.land_m_s  # until the ground, without a hover above it
         else:
             up = self.target.up - self.position.up
             vertical = max(-self.speeds.descend_m_s, min(self.speeds.climb_m_s, 1.5 * up))
@@ -242,7 +242,7 @@ class Vehicle:
         self.velocity.up += max(-most, min(most, wanted.up - self.velocity.up))
 
     def _lean(self, before: Axes, step_s: float) -> None:
-        """Attitude from acceleration, heading from the way it flies."""
+        """Compute the attitude from the acceleration, and the heading from the course."""
         forward_n = (self.velocity.north - before.north) / step_s
         forward_e = (self.velocity.east - before.east) / step_s
         ahead = forward_n * math.cos(self.yaw_rad) + forward_e * math.sin(self.yaw_rad)
@@ -263,5 +263,5 @@ class Vehicle:
         self.landed = Landed.ON_GROUND
 
     def _meridians_close(self) -> float:
-        # Not zero at a pole, where a longitude means nothing anyway.
+        # Not zero at a pole, where longitude is undefined.
         return max(math.cos(math.radians(self.home.latitude_deg)), 1e-6)

@@ -1,4 +1,4 @@
-"""Every attack by its name, and attacks from the text or the table that asks for them."""
+"""The list of all attacks, and parsers for the text or table that selects one."""
 
 from __future__ import annotations
 
@@ -11,35 +11,27 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from uavlinkd.lab.mitm.attack import Attack, AttackError, Options, Surroundings, describe_options
-from uavlinkd.lab.mitm.attacks import (
-    floods,
-    forgery,
-    key_exchange as handshake,
-    replays as replay,
-    roaming,
-    stretch,
-    withholding as traffic,
-)
+from uavlinkd.lab.mitm.attack import Attack, AttackContext, AttackError, Options, describe_options
+from uavlinkd.lab.mitm.attacks import floods, forgery, key_exchange, replays, roaming, stretch, withholding
 
 _ALL: tuple[type[Attack[Any]], ...] = (
-    handshake.TamperKey,
-    handshake.ReplaceKey,
-    handshake.RandomKey,
-    handshake.SuiteDowngrade,
-    handshake.InvalidElement,
-    handshake.CorruptShare,
-    handshake.AlterIndices,
-    handshake.AlterMacs,
-    handshake.SpliceHandshake,
-    replay.ReplayInitiation,
-    replay.ReplayResponse,
-    replay.ReplayCookie,
-    replay.StolenCookie,
-    replay.ReplayData,
-    replay.Duplicate,
-    replay.Reflect,
-    replay.Misroute,
+    key_exchange.TamperKey,
+    key_exchange.ReplaceKey,
+    key_exchange.RandomKey,
+    key_exchange.SuiteDowngrade,
+    key_exchange.InvalidElement,
+    key_exchange.CorruptShare,
+    key_exchange.AlterIndices,
+    key_exchange.AlterMacs,
+    key_exchange.SpliceHandshake,
+    replays.ReplayInitiation,
+    replays.ReplayResponse,
+    replays.ReplayCookie,
+    replays.StolenCookie,
+    replays.ReplayData,
+    replays.Duplicate,
+    replays.Reflect,
+    replays.Misroute,
     forgery.BitFlip,
     forgery.Truncate,
     forgery.Extend,
@@ -59,47 +51,47 @@ _ALL: tuple[type[Attack[Any]], ...] = (
     floods.ForgeCookie,
     roaming.Roam,
     roaming.Wander,
-    traffic.DropAny,
-    traffic.DropMessage,
-    traffic.DropHeartbeats,
-    traffic.BlockRekey,
-    traffic.Blackout,
-    traffic.Hold,
-    traffic.Cross,
-    traffic.Reorder,
+    withholding.DropAny,
+    withholding.DropMessage,
+    withholding.DropHeartbeats,
+    withholding.BlockRekey,
+    withholding.Blackout,
+    withholding.Hold,
+    withholding.Cross,
+    withholding.Reorder,
     stretch.Stretch,
     stretch.StretchOneWay,
 )
 
-ATTACKS: Mapping[str, type[Attack[Any]]] = MappingProxyType({each.name: each for each in _ALL})
+ATTACKS: Mapping[str, type[Attack[Any]]] = MappingProxyType({attack.name: attack for attack in _ALL})
 """By name, in the order of the list."""
 
 
 @dataclass(frozen=True, slots=True)
 class AttackSpec:
-    """An attack that was asked for, its parameters checked."""
+    """A selected attack and its validated parameters."""
 
     name: str
     options: Options
 
     def __str__(self) -> str:
-        given = self.options.model_dump(exclude_unset=True)
-        return ",".join([self.name, *(f"{key}={value}" for key, value in given.items())])
+        options = self.options.model_dump(exclude_unset=True)
+        return ",".join([self.name, *(f"{key}={value}" for key, value in options.items())])
 
-    def make(self, surroundings: Surroundings, seed: int | str = 0, now: float = 0.0) -> Attack[Any]:
-        """The attack. The same seed makes the same one.
+    def make(self, context: AttackContext, seed: int | str = 0, now: float = 0.0) -> Attack[Any]:
+        """Create the attack. Equal seeds create equal attacks.
 
         Raises:
-            AttackError: these surroundings are not what it needs: another peer, a public key.
+            AttackError: the attack needs another peer or a public key.
         """
-        return ATTACKS[self.name](self.options, surroundings, Random(f"{self.name} {seed}"), now)  # noqa: S311  luck, no secret
+        return ATTACKS[self.name](self.options, context, Random(f"{self.name} {seed}"), now)  # noqa: S311  not a secret
 
 
 def parse_attack(text: str) -> AttackSpec:
-    """``NAME`` or ``NAME,key=value,key=value``, as on the command line.
+    """Parse ``NAME`` or ``NAME,key=value,key=value``, as on the command line.
 
     Raises:
-        AttackError: with what to write instead.
+        AttackError: unknown attack or wrong parameters. The message says what to write instead.
     """
     name, *pairs = text.split(",")
     values: dict[str, str] = {}
@@ -115,26 +107,26 @@ def parse_attack(text: str) -> AttackSpec:
 
 
 def attack_from_table(table: Mapping[str, Any]) -> AttackSpec:
-    """A table with ``name`` and parameters, as in a configuration file.
+    """Read a table with ``name`` and parameters, as in a configuration file.
 
     Raises:
-        AttackError: with what to write instead.
+        AttackError: unknown attack or wrong parameters. The message says what to write instead.
     """
     values = dict(table)
     name = values.pop("name", None)
     if not isinstance(name, str):
-        raise AttackError('an attack has a name: write name = "replay-data"')
+        raise AttackError('the attack has no name: write, for example, name = "replay-data"')
     model = _attack(name).options_model
     return _spec(name, lambda: model.model_validate(values, strict=False))
 
 
 def _attack(name: str) -> type[Attack[Any]]:
-    found = ATTACKS.get(name.strip())
-    if found is None:
+    attack = ATTACKS.get(name.strip())
+    if attack is None:
         close = get_close_matches(name.strip(), ATTACKS, n=1)
-        meant = f": did you mean {close[0]}?" if close else ": see uavlink-mitm --list"
-        raise AttackError(f"there is no such attack{meant}")
-    return found
+        hint = f"did you mean {close[0]}?" if close else f"the attacks are {', '.join(ATTACKS)}"
+        raise AttackError(f"there is no such attack: {hint}")
+    return attack
 
 
 def _spec(name: str, read: Any) -> AttackSpec:
@@ -154,7 +146,7 @@ def _problem(attack: type[Attack[Any]], location: tuple[int | str, ...], kind: s
 
 
 def list_attacks() -> str:
-    """Every attack with its parameters, as text for a terminal."""
+    """All attacks and their parameters, as text for a terminal."""
     lines: list[str] = []
     for attack in _ALL:
         lines.append(attack.name)

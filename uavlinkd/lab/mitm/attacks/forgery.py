@@ -1,4 +1,4 @@
-"""Attacks on datagrams and envelopes: bits flipped, lengths changed, parts joined, counters and frames forged."""
+"""Attacks that alter or forge datagrams: flipped bits, changed lengths, joined parts, forged counters and frames."""
 
 from __future__ import annotations
 
@@ -10,67 +10,68 @@ from pydantic import Field
 
 from uavlinkd.core import constants as c
 from uavlinkd.core import wire
-from uavlinkd.lab.mitm.anatomy import HANDSHAKE, Kind, envelope_of, kind_of, mavlink_frame, with_mac1
+from uavlinkd.lab.mitm.anatomy import HANDSHAKE, DatagramKind, envelope_of, kind_of, mavlink_frame, with_mac1
 from uavlinkd.lab.mitm.attack import (
+    KINDS,
     STRANGERS,
     Action,
     Alteration,
-    Kinds,
+    AttackContext,
+    Direction,
+    KindFilter,
     Options,
-    Surroundings,
     Timed,
     TimedOptions,
-    Way,
-    is_of,
+    matches_kind,
 )
 
 
 class ForgeryOptions(Options):
-    """Which datagrams, and whether the genuine one passes too."""
+    """The parameters of alterations."""
 
-    kinds: Kinds = Field("envelope", description="any, handshake, initiation, response, cookie or envelope")
-    beside: bool = Field(False, description="let the genuine datagram pass too, behind the altered one")
+    kinds: KindFilter = Field("envelope", description=KINDS)
+    beside: bool = Field(False, description="also pass the genuine datagram, after the altered one")
 
 
 class Forgery(Alteration[ForgeryOptions]):
-    """A change of datagrams of the kinds that the parameter names."""
+    """An alteration of datagrams of the kinds in ``kinds``."""
 
     options_model: ClassVar[type[Options]] = ForgeryOptions
 
     def is_target(self, datagram: bytes) -> bool:
-        """Those that have a byte to change."""
-        return bool(datagram) and is_of(self.options.kinds, datagram)
+        """Datagrams of these kinds that are not empty."""
+        return bool(datagram) and matches_kind(self.options.kinds, datagram)
 
 
 class InTurn(Forgery):
-    """A change that goes through all places or lengths, one after the other, for each kind by itself."""
+    """An alteration that tries all positions or lengths in turn, for each kind separately."""
 
-    def __init__(self, options: ForgeryOptions, surroundings: Surroundings, chance: Random, now: float) -> None:
-        super().__init__(options, surroundings, chance, now)
-        self._turns: Counter[Kind] = Counter()
+    def __init__(self, options: ForgeryOptions, context: AttackContext, rng: Random, now: float) -> None:
+        super().__init__(options, context, rng, now)
+        self._turns: Counter[DatagramKind] = Counter()
 
     def turn(self, datagram: bytes) -> int:
-        """0, 1, 2 and so on, for each kind of datagram."""
+        """Count 0, 1, 2 and so on, for each kind of datagram."""
         kind = kind_of(datagram)
         self._turns[kind] += 1
         return self._turns[kind] - 1
 
 
 class BitFlipOptions(ForgeryOptions):
-    """Of ``bit-flip``."""
+    """The parameters of ``bit-flip``."""
 
-    repair_mac1: bool = Field(False, description="make mac1 fit again, where the receiver's public key is known")
+    repair_mac1: bool = Field(False, description="compute a valid mac1, if the receiver's public key is known")
 
 
 class BitFlip(InTurn):
-    """Flips one bit, at every position in turn."""
+    """Flips one bit, at all positions in turn."""
 
     name = "bit-flip"
     catalogue = ("H18", "D6")
     options_model = BitFlipOptions
     options: BitFlipOptions
 
-    def alter(self, datagram: bytes, way: Way) -> tuple[bytes, str]:
+    def alter(self, datagram: bytes, direction: Direction) -> tuple[bytes, str]:
         """The next bit: the first of each byte, then the second of each, and so on."""
         turn = self.turn(datagram)
         at, bit = turn % len(datagram), turn // len(datagram) % 8
@@ -79,78 +80,78 @@ class BitFlip(InTurn):
         changed = bytes(altered)
         is_behind_macs = at >= len(datagram) - wire.MACS_BYTES
         if self.options.repair_mac1 and kind_of(changed) in HANDSHAKE and not is_behind_macs:
-            changed = with_mac1(changed, self.surroundings.public_keys.get(way.receiver))
+            changed = with_mac1(changed, self.context.public_keys.get(direction.receiver))
         return changed, f"bit {bit} of byte {at}"
 
 
 class Truncate(InTurn):
-    """Cuts datagrams short, by one byte, by two, and so on, down to nothing."""
+    """Truncates datagrams by one byte, two bytes, and so on, until they are empty."""
 
     name = "truncate"
     catalogue = ("H18", "D7", "D15")
 
-    def alter(self, datagram: bytes, way: Way) -> tuple[bytes, str]:
+    def alter(self, datagram: bytes, direction: Direction) -> tuple[bytes, str]:
         """The next length."""
         cut = self.turn(datagram) % len(datagram) + 1
         return datagram[:-cut], f"{cut} bytes cut off"
 
 
 class ExtendOptions(ForgeryOptions):
-    """Of ``extend``."""
+    """The parameters of ``extend``."""
 
-    at_most: int = Field(64, ge=1, le=1400, description="bytes put behind")
+    at_most: int = Field(64, ge=1, le=1400, description="maximum number of appended bytes")
 
 
 class Extend(InTurn):
-    """Puts bytes behind datagrams: one, two, and so on."""
+    """Appends bytes to datagrams: one, two, and so on."""
 
     name = "extend"
     catalogue = ("H18", "D8", "D15")
     options_model = ExtendOptions
     options: ExtendOptions
 
-    def alter(self, datagram: bytes, way: Way) -> tuple[bytes, str]:
+    def alter(self, datagram: bytes, direction: Direction) -> tuple[bytes, str]:
         """The next length."""
         more = self.turn(datagram) % self.options.at_most + 1
-        return datagram + self.chance.randbytes(more), f"{more} bytes put behind"
+        return datagram + self.rng.randbytes(more), f"{more} bytes appended"
 
 
 class SpliceOptions(ForgeryOptions):
-    """Of ``splice``."""
+    """The parameters of ``splice``."""
 
     join: Literal["all", "body", "header", "tag", "both"] = Field(
         "all",
-        description="what of the envelope before goes into this one: its body with its tag, its header, its tag, or"
-        " all of it behind; all: each in its turn",
+        description="the part of the envelope before that replaces this one's: body and tag, header, tag; both: this"
+        " one is appended to the one before; all: each in turn",
     )
 
 
 class Splice(InTurn):
-    """Joins parts of two envelopes: header of one with the body of another, tags swapped, two in one."""
+    """Joins parts of two envelopes: header and body of different ones, swapped tags, two in one datagram."""
 
     name = "splice"
     catalogue = ("D6", "D8")
     options_model = SpliceOptions
     options: SpliceOptions
 
-    def __init__(self, options: SpliceOptions, surroundings: Surroundings, chance: Random, now: float) -> None:
-        super().__init__(options, surroundings, chance, now)
-        self._last: dict[Way, bytes] = {}
+    def __init__(self, options: SpliceOptions, context: AttackContext, rng: Random, now: float) -> None:
+        super().__init__(options, context, rng, now)
+        self._last: dict[Direction, bytes] = {}
         self._before: bytes | None = None
 
-    def observe(self, datagram: bytes, way: Way, now: float) -> None:
-        """Keep the last envelope of each way."""
+    def observe(self, datagram: bytes, direction: Direction, now: float) -> None:
+        """Record the last envelope of each direction."""
         self._before = None
         if envelope_of(datagram) is not None:
-            self._before = self._last.get(way)
-            self._last[way] = datagram
+            self._before = self._last.get(direction)
+            self._last[direction] = datagram
 
     def is_target(self, datagram: bytes) -> bool:
-        """There was another envelope before."""
+        """Envelopes that follow a different envelope."""
         return envelope_of(datagram) is not None and self._before is not None and self._before != datagram
 
-    def alter(self, datagram: bytes, way: Way) -> tuple[bytes, str]:
-        """The next way to join them."""
+    def alter(self, datagram: bytes, direction: Direction) -> tuple[bytes, str]:
+        """The next kind of join."""
         before, this = self._before, envelope_of(datagram)
         assert before is not None
         assert this is not None
@@ -164,7 +165,7 @@ class Splice(InTurn):
             case "header":
                 spliced = before[: other.header_bytes] + datagram[this.header_bytes :]
             case "tag":
-                # The shortest tag: where tags are longer, their last bytes come from elsewhere all the same.
+                # The length of the shortest tag. Of a longer tag, this replaces the last bytes.
                 spliced = datagram[: -wire.TAG_LENGTHS[0]] + before[-wire.TAG_LENGTHS[0] :]
             case _:
                 spliced = datagram + before
@@ -172,16 +173,16 @@ class Splice(InTurn):
 
 
 class CounterOptions(ForgeryOptions):
-    """Of ``counter-jump``: the genuine envelope passes, so that a moved window would show."""
+    """The parameters of ``counter-jump``. The genuine envelope passes too: a moved replay window would show."""
 
-    beside: bool = Field(True, description="let the genuine datagram pass too, behind the altered one")
+    beside: bool = Field(True, description="also pass the genuine datagram, after the altered one")
     to: Literal["random", "last", "ahead", "back"] = Field(
-        "random", description="any counter, the last there is (2^32-2), a little ahead, or one that was used"
+        "random", description="any counter, the last valid one (2^32-2), a little ahead, or a used one"
     )
 
 
 class CounterJump(Forgery):
-    """Alters the counter of envelopes: to the last one, far ahead, a little ahead, or back."""
+    """Alters the counter of envelopes: to the last valid one, far ahead, a little ahead, or back."""
 
     name = "counter-jump"
     catalogue = ("D5", "D17")
@@ -189,11 +190,11 @@ class CounterJump(Forgery):
     options: CounterOptions
 
     def is_target(self, datagram: bytes) -> bool:
-        """Envelopes with a whole header."""
+        """Envelopes with a complete header."""
         return envelope_of(datagram) is not None
 
-    def alter(self, datagram: bytes, way: Way) -> tuple[bytes, str]:
-        """Another counter, in the form that it is written in."""
+    def alter(self, datagram: bytes, direction: Direction) -> tuple[bytes, str]:
+        """Replace the counter, in the encoding that fits it."""
         envelope = envelope_of(datagram)
         assert envelope is not None
         old = envelope.counter
@@ -201,11 +202,11 @@ class CounterJump(Forgery):
             case "last":
                 new = c.SESSION_ENVELOPE_LIMIT - 1
             case "ahead":
-                new = old + self.chance.randrange(1, 1000)
+                new = old + self.rng.randrange(1, 1000)
             case "back":
-                new = old - self.chance.randrange(1, 100)
+                new = old - self.rng.randrange(1, 100)
             case _:
-                new = self.chance.randrange(c.SESSION_ENVELOPE_LIMIT)
+                new = self.rng.randrange(c.SESSION_ENVELOPE_LIMIT)
         new %= c.SESSION_ENVELOPE_LIMIT
         if new == old:
             new = old ^ 1
@@ -214,36 +215,36 @@ class CounterJump(Forgery):
 
 
 class AlterFrame(Forgery):
-    """Alters the payload of envelopes, and leaves header and tag."""
+    """Alters the payload of envelopes, but not the header and the tag."""
 
     name = "alter-frame"
     catalogue = ("D6",)
 
     def is_target(self, datagram: bytes) -> bool:
-        """Envelopes with a payload, whatever the length of their tag."""
+        """Envelopes with a payload, for any length of the tag."""
         envelope = envelope_of(datagram)
         return envelope is not None and len(datagram) > envelope.header_bytes + wire.TAG_LENGTHS[-1]
 
-    def alter(self, datagram: bytes, way: Way) -> tuple[bytes, str]:
-        """One byte of it."""
+    def alter(self, datagram: bytes, direction: Direction) -> tuple[bytes, str]:
+        """Alter one byte."""
         envelope = envelope_of(datagram)
         assert envelope is not None
-        at = self.chance.randrange(envelope.header_bytes, len(datagram) - wire.TAG_LENGTHS[-1])
+        at = self.rng.randrange(envelope.header_bytes, len(datagram) - wire.TAG_LENGTHS[-1])
         altered = bytearray(datagram)
-        altered[at] ^= self.chance.randrange(1, 256)
+        altered[at] ^= self.rng.randrange(1, 256)
         return bytes(altered), f"byte {at} of envelope {envelope.counter}"
 
 
 class TagOptions(ForgeryOptions):
-    """Of ``tamper-tag``."""
+    """The parameters of ``tamper-tag``."""
 
     tag: Literal["all", "zero", "random", "short", "long", "none"] = Field(
-        "all", description="zeros, random bytes, cut to 8 bytes, grown to 32, or none at all; all: each in its turn"
+        "all", description="zeros, random bytes, 8 bytes, 32 bytes, or without a tag; all: each in turn"
     )
 
 
 class TamperTag(InTurn):
-    """Alters the tag of envelopes: zeros, random bytes, another length, none at all."""
+    """Alters the tag of envelopes: zeros, random bytes, another length, or no tag."""
 
     name = "tamper-tag"
     catalogue = ("D6", "D7")
@@ -251,12 +252,12 @@ class TamperTag(InTurn):
     options: TagOptions
 
     def is_target(self, datagram: bytes) -> bool:
-        """Envelopes with room for a tag of the usual length."""
+        """Envelopes with at least 16 bytes after the header."""
         envelope = envelope_of(datagram)
         return envelope is not None and len(datagram) >= envelope.header_bytes + 16
 
-    def alter(self, datagram: bytes, way: Way) -> tuple[bytes, str]:
-        """The next change of it, as if it were of the default length, 16 bytes."""
+    def alter(self, datagram: bytes, direction: Direction) -> tuple[bytes, str]:
+        """The next change, for a tag of the default length of 16 bytes."""
         tags = ["zero", "random", "short", "long", "none"] if self.options.tag == "all" else [self.options.tag]
         kind = tags[self.turn(datagram) % len(tags)]
         head, tag = datagram[:-16], datagram[-16:]
@@ -266,16 +267,16 @@ class TamperTag(InTurn):
             case "short":
                 altered = head + tag[:8]
             case "long":
-                altered = datagram + self.chance.randbytes(16)
+                altered = datagram + self.rng.randbytes(16)
             case "none":
                 altered = head
             case _:
-                first = self.chance.randrange(1, 256) ^ tag[0]
-                altered = head + bytes((first,)) + self.chance.randbytes(15)
+                first = self.rng.randrange(1, 256) ^ tag[0]
+                altered = head + bytes((first,)) + self.rng.randbytes(15)
         return altered, f"tag {kind}"
 
 
-# Frames of the attacker's own.
+# Injected frames.
 
 _COMMANDS: tuple[tuple[str, bytes], ...] = (
     # HEARTBEAT 0: custom mode u32, type 6 (ground station), autopilot 8, base mode, status 4, version 3.
@@ -286,29 +287,29 @@ _COMMANDS: tuple[tuple[str, bytes], ...] = (
     # SET_MODE 11: custom mode u32, target system, base mode.
     ("SET_MODE", mavlink_frame(11, bytes((6, 0, 0, 0, 1, 1)), 89)),
 )
-"""Name and frame: what somebody who wants the drone down would send."""
+"""Name and frame, for an attacker that wants to bring the drone down."""
 
 
 class OriginOptions(TimedOptions):
-    """From where."""
+    """The parameters of injected frames."""
 
     origin: Literal["sender", "stranger", "both"] = Field(
-        "both", description="under a peer's address, from addresses of the attacker's own, or by turns"
+        "both", description="source: a peer's address, strangers, or both in turn"
     )
-    sources: int = Field(16, ge=1, le=STRANGERS, description="how many addresses of its own")
+    sources: int = Field(16, ge=1, le=STRANGERS, description="number of strangers that send")
 
 
 class FromAnywhere(Timed[OriginOptions]):
-    """Sends by itself, under a peer's address or from its own."""
+    """An attack that injects datagrams from a peer's address or from strangers."""
 
     options_model: ClassVar[type[Options]] = OriginOptions
 
     def origin(self) -> int | None:
-        """A stranger, or None for the peer's address."""
-        # By turns along each way: these are taken in turn too, and there is an even number of them.
-        is_turn = self.shots // len(self.ways) % 2 == 1
+        """The source: a stranger, or None for the peer's address."""
+        # Alternate per direction, because directions alternate too and their number is even.
+        is_turn = self.sent_count // len(self.directions) % 2 == 1
         is_stranger = self.options.origin == "stranger" or (self.options.origin == "both" and is_turn)
-        return self.chance.randrange(self.options.sources) if is_stranger else None
+        return self.rng.randrange(self.options.sources) if is_stranger else None
 
 
 class RawMavlink(FromAnywhere):
@@ -317,50 +318,50 @@ class RawMavlink(FromAnywhere):
     name = "raw-mavlink"
     catalogue = ("D12",)
 
-    def shoot(self, now: float) -> list[Action]:
-        """The next frame, along the next way."""
-        name, frame = _COMMANDS[self.shots // (2 * len(self.ways)) % len(_COMMANDS)]
-        return self.inject(frame, self.ways[self.shots % len(self.ways)], now, name, self.origin())
+    def send_next(self, now: float) -> list[Action]:
+        """Inject the next frame in the next direction."""
+        name, frame = _COMMANDS[self.sent_count // (2 * len(self.directions)) % len(_COMMANDS)]
+        return self.inject(frame, self.directions[self.sent_count % len(self.directions)], now, name, self.origin())
 
 
 class ForgeData(FromAnywhere):
-    """Sends envelopes of its own making: the right session index, the next counter, a command, a random tag."""
+    """Injects forged envelopes: valid session index, a coming counter, a command, a random tag."""
 
     name = "forge-data"
     catalogue: ClassVar[tuple[str, ...]] = ("D5", "D6", "D16")
 
-    def __init__(self, options: OriginOptions, surroundings: Surroundings, chance: Random, now: float) -> None:
-        super().__init__(options, surroundings, chance, now)
-        self._newest: dict[Way, tuple[int, int]] = {}
+    def __init__(self, options: OriginOptions, context: AttackContext, rng: Random, now: float) -> None:
+        super().__init__(options, context, rng, now)
+        self._newest: dict[Direction, tuple[int, int]] = {}
 
-    def observe(self, datagram: bytes, way: Way, now: float) -> None:
-        """The session in use, and how far its counter is."""
+    def observe(self, datagram: bytes, direction: Direction, now: float) -> None:
+        """Record the session in use and its counter."""
         envelope = envelope_of(datagram)
         if envelope is not None:
-            self._newest[way] = envelope.receiver_index, envelope.counter
+            self._newest[direction] = envelope.receiver_index, envelope.counter
 
-    def shoot(self, now: float) -> list[Action]:
-        """One envelope, along the next way on which there is a session."""
-        ways = [way for way in self.ways if way in self._newest]
-        if not ways:
+    def send_next(self, now: float) -> list[Action]:
+        """Inject one envelope in the next direction that has a session."""
+        directions = [direction for direction in self.directions if direction in self._newest]
+        if not directions:
             return []
-        way = ways[self.shots % len(ways)]
-        index, counter = self._newest[way]
-        counter = (counter + self.chance.randrange(1, 64)) % c.SESSION_ENVELOPE_LIMIT
-        name, frame = _COMMANDS[self.chance.randrange(len(_COMMANDS))]
-        datagram = wire.envelope_header(index, counter) + frame + self.chance.randbytes(16)
-        return self.inject(datagram, way, now, f"{name} as envelope {counter}", self.origin())
+        direction = directions[self.sent_count % len(directions)]
+        index, counter = self._newest[direction]
+        counter = (counter + self.rng.randrange(1, 64)) % c.SESSION_ENVELOPE_LIMIT
+        name, frame = _COMMANDS[self.rng.randrange(len(_COMMANDS))]
+        datagram = wire.envelope_header(index, counter) + frame + self.rng.randbytes(16)
+        return self.inject(datagram, direction, now, f"{name} as envelope {counter}", self.origin())
 
 
 class FloodEnvelopesOptions(OriginOptions):
-    """The same, faster."""
+    """The defaults are a higher rate and more strangers."""
 
-    rate_per_s: float = Field(1000.0, gt=0, le=100_000, description="datagrams a second")
-    sources: int = Field(64, ge=1, le=STRANGERS, description="how many addresses of its own")
+    rate_per_s: float = Field(1000.0, gt=0, le=100_000, description="datagrams per second")
+    sources: int = Field(64, ge=1, le=STRANGERS, description="number of strangers that send")
 
 
 class FloodEnvelopes(ForgeData):
-    """Floods with envelopes that look right and have a bad tag."""
+    """Floods with envelopes that are valid except for the tag."""
 
     name = "flood-envelopes"
     catalogue = ("D16",)

@@ -1,6 +1,6 @@
-"""Attacks that send again what was seen: now, later, after new keys, after a restart; there, back, or elsewhere.
+"""Replays: now, later, after a rekey or a restart; to the receiver, back to the sender, or to another peer.
 
-Nothing is altered: every datagram was authentic once.
+The datagrams are unaltered, so each was authentic once.
 """
 
 from __future__ import annotations
@@ -12,174 +12,173 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from uavlinkd.lab.mitm.anatomy import Kind, has_cookie, kind_of
+from uavlinkd.lab.mitm.anatomy import DatagramKind, has_cookie, kind_of
 from uavlinkd.lab.mitm.attack import (
+    CATCH_UP_LIMIT,
+    KINDS,
     NEVER,
-    SHOTS_AT_ONCE,
     STRANGERS,
     Action,
     Attack,
+    AttackContext,
     AttackError,
-    Kinds,
+    Direction,
+    KindFilter,
+    Operation,
     Options,
     Send,
-    Surroundings,
-    Way,
-    What,
-    is_of,
+    matches_kind,
 )
 
 RECORD_LIMIT = 4096
-"""Datagrams kept for later; the oldest are forgotten first."""
+"""Datagrams recorded for a later replay; the oldest are discarded first."""
 SETTLE_S = 0.5
-"""After new keys or a restart: the link is up again, and looks as it always did."""
+"""The delay after a rekey or a restart, so that the link is up again before the replay."""
 
 
 class ReplayOptions(Options):
-    """When, how often, and from where."""
+    """The parameters of all replays."""
 
     when: Literal["now", "later", "rekey", "restart"] = Field(
         "now",
-        description="now; later: after delay_s; rekey: when a later handshake went through; restart: when an"
-        " end of its way was silent for silence_s and then initiates",
+        description="now; later: after delay_s; rekey: after the next handshake; restart: after a peer was silent"
+        " for silence_s and then initiates",
     )
-    delay_s: float = Field(10.0, ge=0, description="for when=later: seconds")
-    silence_s: float = Field(
-        0.3, gt=0, description="for when=restart: how long nothing came from a peer that is down"
-    )
-    rate_per_s: float = Field(200.0, gt=0, le=100_000, description="for rekey and restart: replays a second")
-    copies: int = Field(1, ge=1, le=1000, description="how often each is replayed")
+    delay_s: float = Field(10.0, ge=0, description="for when=later: seconds until the replay")
+    silence_s: float = Field(0.3, gt=0, description="for when=restart: seconds of silence that mean a restart")
+    rate_per_s: float = Field(200.0, gt=0, le=100_000, description="for rekey and restart: replays per second")
+    copies: int = Field(1, ge=1, le=1000, description="number of replays of each datagram")
     origin: Literal["sender", "stranger"] = Field(
-        "sender", description="under the address of its sender, or from an address of the attacker's own"
+        "sender", description="source of the replay: the sender's address, or a stranger's"
     )
 
 
 class Replay(Attack[ReplayOptions]):
-    """What all replays share. A subclass says what is recorded and where it goes."""
+    """The base class of replays. A subclass selects the datagrams and the target."""
 
-    what: ClassVar[What] = What.REPLAYED
+    operation: ClassVar[Operation] = Operation.REPLAYED
     options_model: ClassVar[type[Options]] = ReplayOptions
 
-    def __init__(self, options: ReplayOptions, surroundings: Surroundings, chance: Random, now: float) -> None:
-        super().__init__(options, surroundings, chance, now)
-        self.recorded: deque[tuple[bytes, Way]] = deque(maxlen=RECORD_LIMIT)
-        """What waits for its occasion."""
-        self._scheduled: list[tuple[float, int, bytes, Way]] = []
+    def __init__(self, options: ReplayOptions, context: AttackContext, rng: Random, now: float) -> None:
+        super().__init__(options, context, rng, now)
+        self.recorded: deque[tuple[bytes, Direction]] = deque(maxlen=RECORD_LIMIT)
+        """Datagrams that wait for a rekey or a restart."""
+        self._scheduled: list[tuple[float, int, bytes, Direction]] = []
         self._number = 0
-        self._heard_at: dict[str, float] = {}
+        self._last_seen_at: dict[str, float] = {}
 
     def is_target(self, datagram: bytes) -> bool:
-        """Whether to record it."""
+        """Whether to replay this datagram."""
         raise NotImplementedError
 
-    def target(self, way: Way) -> Way:
-        """Along which way it is sent again."""
-        return way
+    def target(self, direction: Direction) -> Direction:
+        """The direction of the replay."""
+        return direction
 
-    def meet(self, datagram: bytes, way: Way, now: float) -> list[Action]:
-        """Let it pass, and keep it."""
-        actions: list[Action] = [Send(datagram, way)]
-        if self.is_target(datagram) and self.strikes_now():
+    def intercept(self, datagram: bytes, direction: Direction, now: float) -> list[Action]:
+        """Pass the datagram and replay or record it."""
+        actions: list[Action] = [Send(datagram, direction)]
+        if self.is_target(datagram) and self.should_attack():
             match self.options.when:
                 case "now":
-                    actions += self._replay(datagram, way, now)
+                    actions += self._replay(datagram, direction, now)
                 case "later":
-                    self._schedule(now + self.options.delay_s, datagram, way)
+                    self._schedule(now + self.options.delay_s, datagram, direction)
                 case _:
-                    self.recorded.append((datagram, way))
+                    self.recorded.append((datagram, direction))
         return actions
 
-    def on_datagram(self, datagram: bytes, way: Way, now: float) -> list[Action]:
-        """See also what goes the way that is not attacked: it tells of new keys and restarts."""
-        self._look_for_occasion(datagram, way, now)
-        return super().on_datagram(datagram, way, now)
+    def on_datagram(self, datagram: bytes, direction: Direction, now: float) -> list[Action]:
+        """Watch both directions for a rekey or a restart, also if only one is attacked."""
+        self._watch_for_trigger(datagram, direction, now)
+        return super().on_datagram(datagram, direction, now)
 
     def due(self, now: float) -> list[Action]:
-        """The replays whose time has come. What was recorded in time is replayed also after the attack's end."""
+        """Send the replays that are due. Scheduled replays continue after the end of the attack."""
         actions: list[Action] = []
-        for _ in range(SHOTS_AT_ONCE):
+        for _ in range(CATCH_UP_LIMIT):
             if not self._scheduled or self._scheduled[0][0] > now:
                 break
-            _, _, datagram, way = heapq.heappop(self._scheduled)
-            actions += self._replay(datagram, way, now)
+            _, _, datagram, direction = heapq.heappop(self._scheduled)
+            actions += self._replay(datagram, direction, now)
         return actions
 
     def next_deadline(self) -> float:
-        """The next replay."""
+        """The time of the next replay."""
         return self._scheduled[0][0] if self._scheduled else NEVER
 
-    def _replay(self, datagram: bytes, way: Way, now: float) -> list[Action]:
-        target = self.target(way)
+    def _replay(self, datagram: bytes, direction: Direction, now: float) -> list[Action]:
+        target = self.target(direction)
         actions: list[Action] = []
         for _ in range(self.options.copies):
-            stranger = None if self.options.origin == "sender" else self.chance.randrange(STRANGERS)
-            detail = f"recorded on {way}" + ("" if stranger is None else f", from stranger {stranger}")
+            stranger = None if self.options.origin == "sender" else self.rng.randrange(STRANGERS)
+            detail = f"recorded on {direction}" + ("" if stranger is None else f", from stranger {stranger}")
             actions.append(Send(datagram, target, stranger))
-            actions.append(self.note(self.what, datagram, target, now, detail, own=self.options.when != "now"))
+            actions.append(self.note(self.operation, datagram, target, now, detail, own=self.options.when != "now"))
         return actions
 
-    def _schedule(self, at: float, datagram: bytes, way: Way) -> None:
+    def _schedule(self, at: float, datagram: bytes, direction: Direction) -> None:
         if len(self._scheduled) < RECORD_LIMIT:
             self._number += 1
-            heapq.heappush(self._scheduled, (at, self._number, datagram, way))
+            heapq.heappush(self._scheduled, (at, self._number, datagram, direction))
 
-    def _look_for_occasion(self, datagram: bytes, way: Way, now: float) -> None:
+    def _watch_for_trigger(self, datagram: bytes, direction: Direction, now: float) -> None:
         kind = kind_of(datagram)
-        was_heard_at = self._heard_at.get(way.sender, NEVER)
-        self._heard_at[way.sender] = now
+        last_seen_at = self._last_seen_at.get(direction.sender, NEVER)
+        self._last_seen_at[direction.sender] = now
         match self.options.when:
-            case "rekey" if kind is Kind.RESPONSE:
-                occasions = [each for each in self.recorded if each[1] in (way, way.back)]
-            case "restart" if kind is Kind.INITIATION and now - was_heard_at >= self.options.silence_s:
-                occasions = [each for each in self.recorded if way.sender in each[1]]
+            case "rekey" if kind is DatagramKind.RESPONSE:
+                triggered = [item for item in self.recorded if item[1] in (direction, direction.reverse)]
+            case "restart" if kind is DatagramKind.INITIATION and now - last_seen_at >= self.options.silence_s:
+                triggered = [item for item in self.recorded if direction.sender in item[1]]
             case _:
                 return
-        for number, each in enumerate(occasions):
-            self.recorded.remove(each)
-            self._schedule(now + SETTLE_S + number / self.options.rate_per_s, *each)
+        for number, item in enumerate(triggered):
+            self.recorded.remove(item)
+            self._schedule(now + SETTLE_S + number / self.options.rate_per_s, *item)
 
 
 class ReplayInitiation(Replay):
-    """Sends initiations again."""
+    """Replays initiations."""
 
     name = "replay-initiation"
     catalogue = ("H3",)
 
     def is_target(self, datagram: bytes) -> bool:
         """Initiations."""
-        return kind_of(datagram) is Kind.INITIATION
+        return kind_of(datagram) is DatagramKind.INITIATION
 
 
 class ReplayResponse(Replay):
-    """Sends responses again."""
+    """Replays responses."""
 
     name = "replay-response"
     catalogue = ("H3",)
 
     def is_target(self, datagram: bytes) -> bool:
         """Responses."""
-        return kind_of(datagram) is Kind.RESPONSE
+        return kind_of(datagram) is DatagramKind.RESPONSE
 
 
 class ReplayCookie(Replay):
-    """Sends cookie replies again."""
+    """Replays cookie replies."""
 
     name = "replay-cookie"
     catalogue = ("H19",)
 
     def is_target(self, datagram: bytes) -> bool:
         """Cookie replies."""
-        return kind_of(datagram) is Kind.COOKIE
+        return kind_of(datagram) is DatagramKind.COOKIE
 
 
 class StolenCookieOptions(ReplayOptions):
-    """From elsewhere, that is the point."""
+    """The default origin is a stranger."""
 
     origin: Literal["sender", "stranger"] = Field("stranger", description="see replay-initiation")
 
 
 class StolenCookie(Replay):
-    """Sends handshake messages that carry a cookie's mac2 again, from another address."""
+    """Replays handshake messages with a mac2 from another address, to use the cookie of their sender."""
 
     name = "stolen-cookie"
     catalogue = ("H12", "H19")
@@ -191,31 +190,31 @@ class StolenCookie(Replay):
 
 
 class ReplayData(Replay):
-    """Sends envelopes again."""
+    """Replays envelopes."""
 
     name = "replay-data"
     catalogue = ("D1", "D2")
 
     def is_target(self, datagram: bytes) -> bool:
         """Envelopes."""
-        return kind_of(datagram) is Kind.ENVELOPE
+        return kind_of(datagram) is DatagramKind.ENVELOPE
 
 
-class KindsOptions(ReplayOptions):
-    """Which datagrams."""
+class FilteredReplayOptions(ReplayOptions):
+    """The parameters of a replay of selectable kinds."""
 
-    kinds: Kinds = Field("any", description="any, handshake, initiation, response, cookie or envelope")
+    kinds: KindFilter = Field("any", description=KINDS)
 
 
 class AnyReplay(Replay):
-    """A replay of any kind of datagram."""
+    """A replay of the kinds in ``kinds``."""
 
-    options_model = KindsOptions
-    options: KindsOptions
+    options_model = FilteredReplayOptions
+    options: FilteredReplayOptions
 
     def is_target(self, datagram: bytes) -> bool:
-        """Those that the parameter names."""
-        return bool(datagram) and is_of(self.options.kinds, datagram)
+        """Datagrams of these kinds."""
+        return bool(datagram) and matches_kind(self.options.kinds, datagram)
 
 
 class Duplicate(AnyReplay):
@@ -226,35 +225,35 @@ class Duplicate(AnyReplay):
 
 
 class Reflect(AnyReplay):
-    """Sends datagrams back to their sender, as if they came from the other peer."""
+    """Sends datagrams back to their sender, with the other peer's address."""
 
     name = "reflect"
     catalogue = ("H4", "D3")
-    what = What.REFLECTED
+    operation = Operation.REFLECTED
 
-    def target(self, way: Way) -> Way:
-        """Back."""
-        return way.back
+    def target(self, direction: Direction) -> Direction:
+        """The opposite direction."""
+        return direction.reverse
 
 
 class Misroute(AnyReplay):
-    """Sends datagrams to another peer than they were meant for; it takes three peers."""
+    """Sends datagrams to a peer that is not their receiver; needs three peers."""
 
     name = "misroute"
     catalogue = ("H5", "D2")
-    what = What.MISROUTED
+    operation = Operation.MISROUTED
 
-    def __init__(self, options: KindsOptions, surroundings: Surroundings, chance: Random, now: float) -> None:
-        super().__init__(options, surroundings, chance, now)
-        self._others: dict[Way, tuple[Way, ...]] = {}
-        for way in self.ways:
-            elsewhere = [each for each in surroundings.ways if each.receiver not in way]
-            # Where it can be, under the true sender's address: nothing but the keys tells that it is the wrong one.
-            of_sender = [each for each in elsewhere if each.sender == way.sender]
-            self._others[way] = tuple(of_sender or elsewhere)
+    def __init__(self, options: FilteredReplayOptions, context: AttackContext, rng: Random, now: float) -> None:
+        super().__init__(options, context, rng, now)
+        self._others: dict[Direction, tuple[Direction, ...]] = {}
+        for direction in self.directions:
+            elsewhere = [other for other in context.directions if other.receiver not in direction]
+            # Prefer the true sender's address: then only the keys show that the datagram is misrouted.
+            of_sender = [other for other in elsewhere if other.sender == direction.sender]
+            self._others[direction] = tuple(of_sender or elsewhere)
         if not all(self._others.values()):
-            raise AttackError("misroute needs three peers at least: configure another link")
+            raise AttackError("misroute needs at least three peers: configure another link")
 
-    def target(self, way: Way) -> Way:
-        """To somebody else."""
-        return self.chance.choice(self._others[way])
+    def target(self, direction: Direction) -> Direction:
+        """A random direction to another peer."""
+        return self.rng.choice(self._others[direction])

@@ -1,4 +1,4 @@
-"""Attacks on the addresses of peers: authentic datagrams that come from somewhere else."""
+"""Attacks on roaming: authentic datagrams from a stranger's address."""
 
 from __future__ import annotations
 
@@ -7,87 +7,101 @@ from typing import Literal
 
 from pydantic import Field
 
-from uavlinkd.lab.mitm.attack import STRANGERS, Action, Attack, Kinds, Options, Send, Surroundings, Way, What, is_of
+from uavlinkd.lab.mitm.attack import (
+    KINDS,
+    STRANGERS,
+    Action,
+    Attack,
+    AttackContext,
+    Direction,
+    KindFilter,
+    Operation,
+    Options,
+    Send,
+    matches_kind,
+)
 
 
 class RoamOptions(Options):
-    """Whose address, and whether answers are carried back."""
+    """The parameters of ``roam``."""
 
-    kinds: Kinds = Field("envelope", description="any, handshake, initiation, response, cookie or envelope")
+    kinds: KindFilter = Field("envelope", description=KINDS)
     mode: Literal["race", "instead", "relay"] = Field(
         "race",
-        description="race: first from a third address, then the genuine way; instead: only from there; relay: only"
-        " from there, and what comes back to it is carried to the sender",
+        description="race: from a stranger first, then from the genuine address; instead: only from the stranger;"
+        " relay: only from the stranger, and the answers are relayed to the sender",
     )
-    stranger: int = Field(0, ge=0, lt=STRANGERS, description="which of the addresses of its own")
+    stranger: int = Field(0, ge=0, lt=STRANGERS, description="number of the stranger")
 
 
 class Roam(Attack[RoamOptions]):
-    """Forwards authentic datagrams from a third address, so that the traffic moves there, then stops."""
+    """Forwards datagrams from a stranger's address, so that the peer moves the traffic there."""
 
     name = "roam"
     catalogue = ("H20", "D2")
     options_model = RoamOptions
 
-    def meet(self, datagram: bytes, way: Way, now: float) -> list[Action]:
-        """From the third address."""
-        if not is_of(self.options.kinds, datagram) or not self.strikes_now():
-            return [Send(datagram, way)]
-        stranger = self._stranger(way)
-        note = self.note(What.FORWARDED, datagram, way, now, f"from stranger {stranger}")
-        actions: list[Action] = [Send(datagram, way, stranger), note]
+    def intercept(self, datagram: bytes, direction: Direction, now: float) -> list[Action]:
+        """Forward the datagram from the stranger."""
+        if not matches_kind(self.options.kinds, datagram) or not self.should_attack():
+            return [Send(datagram, direction)]
+        stranger = self._stranger(direction)
+        note = self.note(Operation.FORWARDED, datagram, direction, now, f"from stranger {stranger}")
+        actions: list[Action] = [Send(datagram, direction, stranger), note]
         if self.options.mode == "race":
-            actions.append(Send(datagram, way))
+            actions.append(Send(datagram, direction))
         return actions
 
     def on_answer(self, datagram: bytes, peer: str, stranger: int, now: float) -> list[Action]:
-        """The peer took the third address for the other peer's."""
-        way = next((each for each in self.ways if each.receiver == peer and self._stranger(each) == stranger), None)
-        if way is None:
+        """The peer believes that the stranger's address is the other peer's."""
+        for direction in self.directions:
+            if direction.receiver == peer and self._stranger(direction) == stranger:
+                break
+        else:
             return []
-        note = self.note(What.ANSWERED, datagram, way.back, now, f"to stranger {stranger}", own=True)
+        note = self.note(Operation.ANSWERED, datagram, direction.reverse, now, f"to stranger {stranger}", own=True)
         if self.options.mode != "relay" or not self.is_on(now):
             return [note]
-        # The other end hears it from a third address too: a way that works, as long as it is kept up.
-        return [Send(datagram, way.back, self._stranger(way.back)), note]
+        # The other peer gets the answer from a stranger too. This path works while the attack relays.
+        return [Send(datagram, direction.reverse, self._stranger(direction.reverse)), note]
 
-    def _stranger(self, way: Way) -> int:
-        """One address for each way, so that it is known whose answers come there."""
-        return (self.options.stranger + self.surroundings.ways.index(way)) % STRANGERS
+    def _stranger(self, direction: Direction) -> int:
+        """One stranger per direction, so that its answers belong to one direction."""
+        return (self.options.stranger + self.context.directions.index(direction)) % STRANGERS
 
 
 class WanderOptions(Options):
-    """How many addresses."""
+    """The parameters of ``wander``."""
 
-    kinds: Kinds = Field("any", description="any, handshake, initiation, response, cookie or envelope")
-    sources: int = Field(64, ge=2, le=STRANGERS, description="how many addresses of its own")
-    every: int = Field(1, ge=1, description="another address after so many datagrams")
+    kinds: KindFilter = Field("any", description=KINDS)
+    sources: int = Field(64, ge=2, le=STRANGERS, description="number of strangers")
+    every: int = Field(1, ge=1, description="number of datagrams until the address changes")
 
 
 class Wander(Attack[WanderOptions]):
-    """Forwards every datagram from another address than the last, as a NAT gone mad, and carries answers back."""
+    """Forwards each datagram from another stranger, like a broken NAT, and relays the answers."""
 
     name = "wander"
     catalogue = ("H20",)
     options_model = WanderOptions
 
-    def __init__(self, options: WanderOptions, surroundings: Surroundings, chance: Random, now: float) -> None:
-        super().__init__(options, surroundings, chance, now)
-        self._way_of: dict[tuple[str, int], Way] = {}
+    def __init__(self, options: WanderOptions, context: AttackContext, rng: Random, now: float) -> None:
+        super().__init__(options, context, rng, now)
+        self._direction_of: dict[tuple[str, int], Direction] = {}
 
-    def meet(self, datagram: bytes, way: Way, now: float) -> list[Action]:
-        """From the next address."""
-        if not is_of(self.options.kinds, datagram) or not self.strikes_now():
-            return [Send(datagram, way)]
-        stranger = self.strikes // self.options.every % self.options.sources
-        self._way_of[way.receiver, stranger] = way  # bounded: peers times strangers
-        note = self.note(What.FORWARDED, datagram, way, now, f"from stranger {stranger}")
-        return [Send(datagram, way, stranger), note]
+    def intercept(self, datagram: bytes, direction: Direction, now: float) -> list[Action]:
+        """Forward the datagram from the next stranger."""
+        if not matches_kind(self.options.kinds, datagram) or not self.should_attack():
+            return [Send(datagram, direction)]
+        stranger = self.attempts // self.options.every % self.options.sources
+        self._direction_of[direction.receiver, stranger] = direction  # at most peers times strangers
+        note = self.note(Operation.FORWARDED, datagram, direction, now, f"from stranger {stranger}")
+        return [Send(datagram, direction, stranger), note]
 
     def on_answer(self, datagram: bytes, peer: str, stranger: int, now: float) -> list[Action]:
-        """Carry it back along the way that it answers."""
-        way = self._way_of.get((peer, stranger))
-        if way is None:
+        """Relay the answer to the sender of the forwarded datagram."""
+        direction = self._direction_of.get((peer, stranger))
+        if direction is None:
             return []
-        note = self.note(What.ANSWERED, datagram, way.back, now, f"to stranger {stranger}", own=True)
-        return [Send(datagram, way.back), note] if self.is_on(now) else [note]
+        note = self.note(Operation.ANSWERED, datagram, direction.reverse, now, f"to stranger {stranger}", own=True)
+        return [Send(datagram, direction.reverse), note] if self.is_on(now) else [note]

@@ -1,4 +1,4 @@
-"""Attacks that stretch time: envelopes arrive in the order sent, each a little later than the one before."""
+"""Attacks that stretch time: envelopes arrive in order, and the delay grows with each."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import ClassVar, Literal
 from pydantic import Field
 
 from uavlinkd.core import wire
-from uavlinkd.lab.mitm.anatomy import HANDSHAKE, Kind, envelope_of, kind_of
-from uavlinkd.lab.mitm.attack import NEVER, Action, Attack, Options, Send, Surroundings, Way, What
+from uavlinkd.lab.mitm.anatomy import HANDSHAKE, DatagramKind, envelope_of, kind_of
+from uavlinkd.lab.mitm.attack import NEVER, Action, Attack, AttackContext, Direction, Operation, Options, Send
 from uavlinkd.lab.mitm.attacks.withholding import HELD_LIMIT
 
 _ECHO_BYTES = frozenset(
@@ -21,78 +21,81 @@ _ECHO_BYTES = frozenset(
 
 
 class StretchOptions(Options):
-    """How slowly, and whether new keys can be made meanwhile."""
+    """The parameters of ``stretch``."""
 
-    interval_s: float = Field(1.8, gt=0, description="lets one envelope pass every so many seconds")
-    block_handshakes: bool = Field(True, description="drops the handshake messages of both directions")
+    interval_s: float = Field(1.8, gt=0, description="seconds between two envelopes")
+    block_handshakes: bool = Field(True, description="drop the handshake messages of both directions")
 
 
 class Stretch(Attack[StretchOptions]):
-    """Delays envelopes in the order sent: one passes every 1.8 s, so each is older than the one before."""
+    """Delays envelopes in order: one passes every 1.8 s, so the delay grows with each."""
 
     name = "stretch"
     catalogue: ClassVar[tuple[str, ...]] = ("D9",)
     options_model: ClassVar[type[Options]] = StretchOptions
 
-    def __init__(self, options: StretchOptions, surroundings: Surroundings, chance: Random, now: float) -> None:
-        super().__init__(options, surroundings, chance, now)
-        self._held: dict[Way, deque[tuple[int, bytes]]] = {way: deque() for way in self.stretched()}
-        self._next_at: dict[Way, float] = {}
+    def __init__(self, options: StretchOptions, context: AttackContext, rng: Random, now: float) -> None:
+        super().__init__(options, context, rng, now)
+        self._held: dict[Direction, deque[tuple[int, bytes]]] = {direction: deque() for direction in self.stretched()}
+        self._next_at: dict[Direction, float] = {}
 
-    def stretched(self) -> tuple[Way, ...]:
+    def stretched(self) -> tuple[Direction, ...]:
         """The directions in which envelopes are delayed."""
-        return self.ways
+        return self.directions
 
-    def on_datagram(self, datagram: bytes, way: Way, now: float) -> list[Action]:
-        """Handshake messages are dropped in both directions, also where ``way`` names only one."""
+    def on_datagram(self, datagram: bytes, direction: Direction, now: float) -> list[Action]:
+        """Drop handshake messages of both directions, also if ``direction`` selects only one."""
         self.seen += 1
-        if not self.is_on(now) or not {way, way.back} & set(self.ways):
-            return [Send(datagram, way)]
+        if not self.is_on(now) or not {direction, direction.reverse} & set(self.directions):
+            return [Send(datagram, direction)]
         if kind_of(datagram) in HANDSHAKE and self.options.block_handshakes:
-            return self._drop(datagram, way, now, "a handshake message")
-        return self.meet(datagram, way, now)
+            return self._drop(datagram, direction, now, "a handshake message")
+        return self.intercept(datagram, direction, now)
 
-    def meet(self, datagram: bytes, way: Way, now: float) -> list[Action]:
-        """Put an envelope into the queue."""
-        held = self._held.get(way)
-        if held is None or kind_of(datagram) is not Kind.ENVELOPE:
-            return [Send(datagram, way)]
+    def intercept(self, datagram: bytes, direction: Direction, now: float) -> list[Action]:
+        """Queue an envelope."""
+        held = self._held.get(direction)
+        if held is None or kind_of(datagram) is not DatagramKind.ENVELOPE:
+            return [Send(datagram, direction)]
         if len(held) >= HELD_LIMIT:
-            return self._drop(datagram, way, now, "the queue is full")
-        if not self.strikes_now():
-            return [Send(datagram, way)]
+            return self._drop(datagram, direction, now, "the queue is full")
+        if not self.should_attack():
+            return [Send(datagram, direction)]
         held.append((self.seen, datagram))
-        self._next_at.setdefault(way, now + self.options.interval_s)
-        return [self.note(What.HELD, datagram, way, now, f"{len(held)} wait")]
+        self._next_at.setdefault(direction, now + self.options.interval_s)
+        return [self.note(Operation.HELD, datagram, direction, now, f"{len(held)} wait")]
 
     def due(self, now: float) -> list[Action]:
-        """Let the oldest envelope of each queue pass."""
+        """Release the oldest envelope of each queue that is due."""
         actions: list[Action] = []
-        for way, next_at in list(self._next_at.items()):
+        for direction, next_at in list(self._next_at.items()):
             if next_at > now:
                 continue
-            number, datagram = self._held[way].popleft()
+            number, datagram = self._held[direction].popleft()
             detail = f"was number {number}"
-            actions += [Send(datagram, way), self.note(What.RELEASED, datagram, way, now, detail, own=True)]
-            if self._held[way]:
-                self._next_at[way] = next_at + self.options.interval_s
+            actions += [
+                Send(datagram, direction),
+                self.note(Operation.RELEASED, datagram, direction, now, detail, own=True),
+            ]
+            if self._held[direction]:
+                self._next_at[direction] = next_at + self.options.interval_s
             else:
-                del self._next_at[way]
+                del self._next_at[direction]
         return actions
 
     def next_deadline(self) -> float:
-        """The next release."""
+        """The time of the next release."""
         return min(self._next_at.values(), default=NEVER)
 
-    def _drop(self, datagram: bytes, way: Way, now: float, why: str) -> list[Action]:
-        return [self.note(What.DROPPED, datagram, way, now, why)]
+    def _drop(self, datagram: bytes, direction: Direction, now: float, why: str) -> list[Action]:
+        return [self.note(Operation.DROPPED, datagram, direction, now, why)]
 
 
 class StretchOneWayOptions(StretchOptions):
-    """What of the other direction is dropped."""
+    """The parameters of ``stretch-one-way``."""
 
     back: Literal["echoes", "all"] = Field(
-        "echoes", description="drops the echo records (by their length), or all datagrams, of the other direction"
+        "echoes", description="dropped in the other direction: echo records (recognised by length), or all datagrams"
     )
 
 
@@ -104,18 +107,18 @@ class StretchOneWay(Stretch):
     options_model = StretchOneWayOptions
     options: StretchOneWayOptions
 
-    def stretched(self) -> tuple[Way, ...]:
-        """One direction: the first of those that ``way`` names."""
-        return self.ways[:1]
+    def stretched(self) -> tuple[Direction, ...]:
+        """The first of the directions that ``direction`` selects."""
+        return self.directions[:1]
 
-    def meet(self, datagram: bytes, way: Way, now: float) -> list[Action]:
-        """Drop what would prove that the delayed frames are old."""
-        if way.back in self._held and (self.options.back == "all" or _may_be_echo(datagram)):
-            return self._drop(datagram, way, now, "the direction of the answers")
-        return super().meet(datagram, way, now)
+    def intercept(self, datagram: bytes, direction: Direction, now: float) -> list[Action]:
+        """Drop the echoes that would show the age of the delayed frames."""
+        if direction.reverse in self._held and (self.options.back == "all" or _may_be_echo(datagram)):
+            return self._drop(datagram, direction, now, "the direction of the answers")
+        return super().intercept(datagram, direction, now)
 
 
 def _may_be_echo(datagram: bytes) -> bool:
-    """Whether an envelope has the length of an echo record: that shows in encrypted ones too."""
+    """Whether an envelope, encrypted or not, has the length of an echo record."""
     envelope = envelope_of(datagram)
     return envelope is not None and len(datagram) - envelope.header_bytes in _ECHO_BYTES

@@ -1,0 +1,162 @@
+"""Processes and folders of the laboratory end with their parent, however that ends."""
+
+from __future__ import annotations
+
+import ast
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from tests.daemon.test_demo import is_running
+from tests.imports import sources
+from tests.waiting import until
+from uavlinkd.lab.child_processes import end_with_parent, interrupted_by_signals, private_folder
+
+SLEEP = "import time; print(flush=True); time.sleep(600)"
+PARENT = f"""
+import json, subprocess, sys, time
+from uavlinkd.lab.child_processes import end_with_parent, private_folder
+with private_folder("keys-") as folder:
+    (folder / "drone.key").write_text("secret")
+    child = subprocess.Popen(end_with_parent(sys.executable, "-c", {SLEEP!r}), stdout=subprocess.PIPE)
+    child.stdout.readline()
+    print(json.dumps([child.pid, str(folder)]), flush=True)
+    time.sleep(600)
+"""
+INTERRUPTED = """
+import asyncio, signal, sys, time
+from uavlinkd.lab.child_processes import interrupted_by_signals
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # the tests may run under nohup
+async def wait():
+    try:
+        print("waiting", flush=True)
+        await asyncio.sleep(600)
+    finally:
+        print("cleaned up")
+with interrupted_by_signals():
+    if sys.argv[1] == "loop":
+        asyncio.run(wait())
+    else:
+        try:
+            print("waiting", flush=True)
+            time.sleep(600)
+        finally:
+            print("cleaned up")
+"""
+
+
+def started() -> subprocess.Popen[bytes]:
+    """A process with a child and a folder."""
+    return subprocess.Popen([sys.executable, "-c", PARENT], stdout=subprocess.PIPE)
+
+
+async def test_nothing_outlives_a_killed_parent() -> None:
+    """SIGKILL gives the parent no time: the kernel ends the child, and another process removes the folder."""
+    with started() as parent:
+        assert parent.stdout is not None
+        pid, name = json.loads(parent.stdout.readline())
+        folder = Path(name)
+        assert is_running(pid)
+        assert (folder / "drone.key").exists()
+        parent.kill()
+        await until(lambda: not is_running(pid))
+        await until(lambda: not folder.exists())
+
+
+async def test_folder_is_removed_although_a_process_still_writes() -> None:
+    """A daemon may create files while its folder is removed."""
+    with started() as parent:
+        assert parent.stdout is not None
+        _, name = json.loads(parent.stdout.readline())
+        ended = threading.Event()
+
+        def write() -> None:
+            while not ended.wait(0.01):
+                try:
+                    (Path(name) / "more").write_text("")
+                except OSError:
+                    return
+
+        writer = threading.Thread(target=write)
+        writer.start()
+        parent.kill()
+        try:
+            await until(lambda: not Path(name).exists())
+        finally:
+            ended.set()
+            writer.join()
+
+
+def test_child_of_a_parent_that_has_ended_does_not_start() -> None:
+    """If the parent ends before the child has asked the kernel for the signal, the kernel sends none."""
+    command = [*end_with_parent(sys.executable, "-c", "print('started')")]
+    command[command.index(str(os.getpid()))] = "1"  # another parent than it finds
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode != 0
+    assert done.stdout == ""
+    assert "the parent has ended" in done.stderr
+
+
+def test_the_command_keeps_its_process_and_its_status() -> None:
+    """It replaces the process that asked for the signal."""
+    code = "import os, sys; print(os.getpid()); sys.exit(7)"
+    process = subprocess.Popen(end_with_parent(sys.executable, "-c", code), stdout=subprocess.PIPE, text=True)
+    out, _ = process.communicate()
+    assert (out.split(), process.returncode) == ([str(process.pid)], 7)
+
+
+def test_folder_is_private_and_removed_at_the_end() -> None:
+    """Also after an exception."""
+    folders = []
+
+    def fail() -> None:
+        with private_folder("keys-") as folder:
+            folders.append(folder)
+            assert folder.stat().st_mode & 0o777 == 0o700
+            (folder / "drone.key").write_text("secret")
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail()
+    assert not folders[0].exists()
+
+
+@pytest.mark.parametrize("where", ["loop", "no loop"])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("interrupts", ["handled", "ignored"])
+def test_a_signal_lets_a_command_clean_up(number: signal.Signals, where: str, interrupts: str) -> None:
+    """Then the command ends by that signal. A shell starts commands in the background with SIGINT ignored."""
+    ignored = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)\n" if interrupts == "ignored" else ""
+    command = [sys.executable, "-c", ignored + INTERRUPTED, where]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "waiting\n"
+        process.send_signal(number)
+        out, _ = process.communicate()
+    assert (out, process.returncode) == ("cleaned up\n", -number)
+
+
+def test_every_process_of_the_laboratory_ends_with_its_parent() -> None:
+    """The evaluations start processes in many places."""
+    unbound = []
+    for name, source in sources("lab/"):
+        calls = [ast.unparse(node) for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Call)]
+        starts = [call for call in calls if call.startswith(("subprocess.Popen(", "asyncio.create_subprocess_"))]
+        unbound += [name for call in starts if "end_with_parent(" not in call]
+    assert unbound == ["lab/child_processes.py"]
+
+
+def test_an_ignored_hang_up_remains_ignored() -> None:
+    """As after ``nohup``."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with interrupted_by_signals():
+            signal.raise_signal(signal.SIGHUP)
+    finally:
+        signal.signal(signal.SIGHUP, before)
