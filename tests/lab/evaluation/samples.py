@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from uavlinkd.lab.evaluation.timing_queries import Findings
 from uavlinkd.lab.evaluation.records import Record, Status, Value
+from uavlinkd.lab.evaluation.timing_queries import Findings
 
 RUN: dict[str, Value] = {
     "cpu": "a test",
@@ -26,7 +26,7 @@ def handshake(suite: str, length: int, total_s: float) -> Record:
     """One handshake of daemons."""
     point: dict[str, Value] = {"suite": suite, "mac_key_bits": length, "confidential": False}
     wire = {"bytes_there": 700, "bytes_back": 600, "datagrams_there": 3, "datagrams_back": 2}
-    cpu = {"cpu_caller_s": 0.002, "cpu_answerer_s": 0.004, "joules": None}
+    cpu = {"cpu_initiator_s": 0.002, "cpu_responder_s": 0.004, "joules": None}
     return Record("handshake", point, {"total_s": total_s, **cpu, **wire})
 
 
@@ -39,10 +39,10 @@ def core(suite: str, length: int, initiate_s: float) -> Record:
 def frames(latencies_ms: list[float], *, relay: bool = False) -> Record:
     """A link's frames."""
     point: dict[str, Value] = {"suite": "x25519", "mac_key_bits": 256, "confidential": False, "relay": relay}
-    amount = len(latencies_ms)
-    cpu = {"cpu_caller_s": 0.0001 * amount, "cpu_answerer_s": 0.0003 * amount}
-    latencies = [each / 1000 for each in latencies_ms]
-    return Record("frames", point, {"sent": amount, "delivered": amount, **cpu, "latency_s": latencies})
+    count = len(latencies_ms)
+    cpu = {"cpu_initiator_s": 0.0001 * count, "cpu_responder_s": 0.0003 * count}
+    latencies = [milliseconds / 1000 for milliseconds in latencies_ms]
+    return Record("frames", point, {"sent": count, "delivered": count, **cpu, "latency_s": latencies})
 
 
 def tag(length: int, states: str, tag_s: float) -> Record:

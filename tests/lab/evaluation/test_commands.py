@@ -10,9 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from tests.daemon.harness import need
+from tests.needs import need
+from uavlinkd.cli import main
 from uavlinkd.lab.evaluation.commands import add_report_parser, add_timing_parser
-from uavlinkd.lab.evaluation.timing import Settings
+from uavlinkd.lab.evaluation.timing import TimingSettings
 
 
 def parse(*arguments: str) -> argparse.Namespace:
@@ -26,7 +27,7 @@ def parse(*arguments: str) -> argparse.Namespace:
 
 def test_defaults_are_those_of_the_settings() -> None:
     """Written twice, because the settings' module is too heavy to import for a parser."""
-    options, settings = parse("timing", "--out", "x"), Settings()
+    options, settings = parse("timing", "--out", "x"), TimingSettings()
     assert (options.repeats, options.limit, options.seed) == (settings.repeats, settings.limit_s, settings.seed)
     assert (options.watts_per_core, options.quick, options.paper) == (settings.watts_per_core, False, False)
 
@@ -68,8 +69,16 @@ def test_without_matplotlib_the_report_says_what_to_install(
     assert "'.[evaluation]'" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("name", ["timing", "tampering", "report", "captured-member"])
+def test_help_says_what_to_install_before_the_command(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """A reader learns of matplotlib before a run fails for lack of it. One evaluation has no figures."""
+    with pytest.raises(SystemExit):
+        main(["evaluate", name, "--help"])
+    assert ("'.[evaluation]'" in capsys.readouterr().out) == (name != "captured-member")
+
+
 def test_the_parsers_and_the_measurements_import_nothing_of_the_figures() -> None:
-    """The parsers load nothing heavy at all; the measurements run without matplotlib."""
+    """The parsers import no large modules; the measurements run without matplotlib."""
     script = (
         "import sys; import uavlinkd.lab.evaluation.commands\n"
         "heavy = {'matplotlib', 'rich', 'cryptography', 'asyncio', 'pydantic'} & set(sys.modules)\n"

@@ -4,22 +4,26 @@ from __future__ import annotations
 
 import pytest
 
-from uavlinkd.lab.evaluation.energy import BOARDS, DEFAULT_WATTS_PER_CORE, estimated_joules
+from tests.lab.evaluation.samples import a_run
+from uavlinkd.lab.evaluation.energy import BOARDS, DEFAULT_WATTS_PER_CORE, frames_joules, handshake_joules
 
 
 def test_the_default_is_what_a_raspberry_pi_4_draws() -> None:
-    """Within a tenth of the figure that it is said to come from."""
+    """Within a tenth of the figure of its source."""
     (board,) = [board for board in BOARDS if board.name == "Raspberry Pi 4"]
     assert pytest.approx(board.watts_per_core, rel=0.1) == DEFAULT_WATTS_PER_CORE
 
 
 def test_every_board_has_a_source_and_draws_more_when_busy() -> None:
-    """A figure that nobody can check is none."""
+    """A reader can check each figure."""
     for board in BOARDS:
         assert board.watts_per_core > 0
         assert board.source
 
 
-def test_joules_are_seconds_by_watts() -> None:
-    """3 ms at 0.9 W."""
-    assert estimated_joules(0.003, 0.9) == pytest.approx(0.0027)
+def test_energy_is_the_processor_time_of_both_ends_by_the_power_of_a_core() -> None:
+    """6 ms for a handshake and 0.4 ms per frame, at 0.5 W; None without a measurement."""
+    findings = a_run()
+    assert handshake_joules(findings, "x25519") == pytest.approx(0.003)
+    assert frames_joules(findings, suite="x25519") == pytest.approx(0.2)
+    assert handshake_joules(findings, "mlkem1024") is None

@@ -13,11 +13,13 @@ import pytest
 if not os.environ.get("CI"):  # there it must be
     pytest.importorskip("matplotlib", reason="the figures need matplotlib")
 
+import numpy as np
+from matplotlib.container import ErrorbarContainer
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from matplotlib.transforms import Bbox
 
-from tests.lab.evaluation.samples import FAILED, RUN, a_run
+from tests.lab.evaluation.samples import FAILED, RUN, a_run, not_finished, paper
 from uavlinkd.lab.evaluation import figures
 from uavlinkd.lab.evaluation.timing_queries import Findings
 
@@ -51,9 +53,24 @@ def test_every_axis_has_a_label_with_its_unit(draw: Draw) -> None:
             assert shared or re.search(r"\(\S+\)|exchanges", label) or re.search(r"\d [mµn]?s\b", ticks), label
 
 
+def test_the_limit_is_beside_the_median() -> None:
+    """If most exchanges reached the limit, the median is the limit: neither mark covers the other."""
+    late = [not_finished(2048, 256), not_finished(2048, 256)]
+    figure = drawn(figures.draw_comparison, Findings(RUN, [paper(2048, 256, 5.0), *late]))
+    (axes,) = figure.axes
+    (limits,) = [part for part in axes.collections if "gave up here" in str(part.get_label())]
+    (bars,) = [part for part in axes.containers if str(part.get_label()).startswith("the paper's method: median")]
+    assert isinstance(bars, ErrorbarContainer)
+    median = np.asarray(bars.lines[0].get_xydata())[0]
+    limit = np.asarray(limits.get_offsets())[0]
+    assert limit[1] == median[1]
+    points = axes.transData.transform(np.array([limit, median])) * 72 / figure.dpi
+    assert abs(points[0][0] - points[1][0]) > 7, "the marks are up to 8 points wide"
+
+
 @pytest.mark.parametrize("draw", DRAW, ids=lambda draw: draw.__name__)
 def test_no_text_covers_another(draw: Draw) -> None:
-    """Titles, labels, ticks and legends, as they are laid out; nor is any outside the figure."""
+    """Titles, labels, ticks and legends do not overlap, and are inside the figure."""
     figure = drawn(draw, a_run(FAILED))
     boxes: list[tuple[str, Bbox]] = []
     for text in texts_of(figure):
@@ -98,11 +115,11 @@ def test_what_did_not_finish_is_in_the_figures() -> None:
     comparison = drawn(figures.draw_comparison, a_run())
     (legend,) = [axes.get_legend() for axes in comparison.axes]
     assert legend is not None
-    assert any("not finished" in each.get_text() for each in legend.get_texts())
+    assert any("not finished" in text.get_text() for text in legend.get_texts())
     for draw in (figures.draw_scatter, figures.draw_histogram):
         legend = drawn(draw, a_run()).axes[0].get_legend()
         assert legend is not None
-        assert any("1 of 1 not finished" in each.get_text() for each in legend.get_texts())
+        assert any("1 of 1 not finished" in label.get_text() for label in legend.get_texts())
 
 
 def test_a_run_without_measurements_has_no_figures() -> None:

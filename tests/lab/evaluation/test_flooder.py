@@ -1,4 +1,4 @@
-"""The process that floods: what it sends is what a daemon would have to look at, from as many hosts as asked for."""
+"""The flooding process sends valid initiations from as many addresses as requested."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from collections.abc import Iterator
 
 import pytest
 
+from uavlinkd.config.keys import encode_key
 from uavlinkd.core.cookie import MacKeys
 from uavlinkd.core.crypto import KeyPair
 from uavlinkd.core.limits import source_of
 from uavlinkd.lab.evaluation.flooder import flood, host_of, main
-from uavlinkd.config.keys import encode_key
-from uavlinkd.lab.mitm.anatomy import Kind, kind_of
+from uavlinkd.lab.mitm.anatomy import DatagramKind, kind_of
 
 KEY = KeyPair(b"\x07" * 32).public
 
@@ -30,26 +30,26 @@ def target() -> Iterator[socket.socket]:
 
 def arrived(sock: socket.socket) -> list[tuple[bytes, str]]:
     """What waits there, and from which hosts."""
-    found: list[tuple[bytes, str]] = []
+    result: list[tuple[bytes, str]] = []
     while True:
         try:
             datagram, (host, _) = sock.recvfrom(2048)
         except BlockingIOError:
-            return found
-        found.append((datagram, host))
+            return result
+        result.append((datagram, host))
 
 
 def test_every_initiation_is_sound_up_to_its_mac1_and_none_is_like_another(target: socket.socket) -> None:
     """They cost the daemon all that a stranger with its public key can make them cost."""
     sent = flood(target.getsockname()[1], KEY, 1000.0, 0.3, 8)
-    found = arrived(target)
-    assert len(found) == sent
+    result = arrived(target)
+    assert len(result) == sent
     assert 20 < sent <= 301
-    for datagram, _ in found:
-        assert kind_of(datagram) is Kind.INITIATION
+    for datagram, _ in result:
+        assert kind_of(datagram) is DatagramKind.INITIATION
         MacKeys(KEY).check_mac1(datagram)
-    assert len({datagram for datagram, _ in found}) == sent
-    assert {source_of(host) for _, host in found} == {host_of(number) for number in range(8)}
+    assert len({datagram for datagram, _ in result}) == sent
+    assert {source_of(host) for _, host in result} == {host_of(number) for number in range(8)}
 
 
 def test_it_waits_for_its_line_and_tells_its_number(

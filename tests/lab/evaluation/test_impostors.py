@@ -6,23 +6,25 @@ import os
 
 import pytest
 
+from uavlinkd.core import constants as c
 from uavlinkd.core.cookie import MacKeys
 from uavlinkd.core.crypto import KeyPair, Secret
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Deliver, Transmit
+from uavlinkd.core.path import Path
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.settings import PeerSettings
 from uavlinkd.core.suites import X25519
 from uavlinkd.lab.evaluation.impostors import Achieved, Disguise, Impostor, SealedCookies, StolenIdentity
 from uavlinkd.lab.evaluation.ledger import numbered_frame
-from uavlinkd.lab.mitm.attack import Action, Send, Way
+from uavlinkd.lab.mitm.attack import Action, Direction, Send
 
 A, B, C = (KeyPair(bytes((number,)) * 32) for number in (1, 2, 3))
 PRIVATE_A = Secret(b"\1" * 32)
 PSK, PSK_C = b"p" * 32, b"c" * 32
 OWN = KeyPair(b"\x66" * 32)
-FACE = (0, "10.0.0.9", 5790)
+FACE = Path(0, ("10.0.0.9", 5790))
 FRAME = numbered_frame(2, 0)
 STEP_S = 0.01
 
@@ -46,13 +48,15 @@ class Victim:
                 action = waiting.pop(0)
                 if not isinstance(action, Send):
                     continue
-                assert action.way == Way("b", "a")
+                assert action.direction == Direction("b", "a")
                 for output in self.node.receive(action.datagram, FACE, now):
                     match output:
                         case Transmit(datagram, path):
                             assert path == FACE
-                            met = impostor.on_datagram(datagram, Way("a", "b"), now)
-                            waiting += [each for each in met if not (isinstance(each, Send) and each.way[0] == "a")]
+                            met = impostor.on_datagram(datagram, Direction("a", "b"), now)
+                            waiting += [
+                                send for send in met if not (isinstance(send, Send) and send.direction[0] == "a")
+                            ]
                         case Deliver():
                             self.delivered.append(output)
         return impostor.achieved["a"]
@@ -60,14 +64,14 @@ class Victim:
     @property
     def drops(self) -> set[DropReason]:
         """All reasons counted."""
-        found = set(self.node.drops)
+        result = set(self.node.drops)
         for peer in self.node.peers.values():
-            found |= set(peer.traffic.drops)
-        return found
+            result |= set(peer.traffic.drops)
+        return result
 
 
 def impostor(identity: KeyPair, psk: bytes | None) -> Impostor:
-    """Goes to a as b."""
+    """Initiate to a as b."""
     return Impostor("impostor", [Disguise("a", A.public, "b", identity, psk)], (X25519,), 0.0, frames=(FRAME,))
 
 
@@ -102,68 +106,83 @@ def test_the_victims_own_key_gives_answers_and_no_session() -> None:
 
 
 def test_a_captured_drone_is_itself() -> None:
-    """With all keys of c there is a session, as c: what comes over it is c's, and judged as that."""
+    """With all keys of c, the attacker has a session as c, and a judges its frames as those of c."""
     victim = Victim()
     achieved = victim.suffer(impostor(C, PSK_C), 1.0)
     assert achieved.sessions == 1
     assert achieved.frames_sent > 0
-    assert {each.peer for each in victim.delivered} == {"c"}
+    assert {output.peer.name for output in victim.delivered} == {"c"}
+
+
+def test_a_captured_drone_floods_only_its_own_claims() -> None:
+    """Invented refusals fill the bounded table of c; nothing is claimed for b, and no frame is refused by them."""
+    victim = Victim()
+    itself = [Disguise("a", A.public, "b", C, PSK_C)]
+    attack = Impostor("impostor", itself, (X25519,), 0.0, frames=(FRAME,), claims=True)
+    achieved = victim.suffer(attack, 1.0)
+    claims = victim.node.peers["c"].refusal_claims.recent()
+    assert len(claims) == c.REFUSALS_KEPT
+    assert attack._claimed > c.REFUSALS_KEPT
+    assert victim.node.peers["b"].refusal_claims.recent() == []
+    assert len(victim.delivered) >= achieved.frames_sent - 1  # the last one may still be underway
 
 
 def test_the_right_keys_succeed() -> None:
-    """The impostor is no straw man: with b's own keys it is b."""
+    """The impostor works: with b's own keys it is b."""
     victim = Victim()
     achieved = victim.suffer(impostor(B, PSK), 1.0)
     assert achieved.sessions == 1
-    assert {each.peer for each in victim.delivered} == {"b"}
+    assert {output.peer.name for output in victim.delivered} == {"b"}
     assert not victim.node.drops
 
 
 class TakesAnyKey(dict[tuple[bytes, bytes], Peer]):
-    """A table of peers that leaves out the check of the static key: whoever shakes hands is the first of them."""
+    """A table of peers without the check of the static key: every initiator is its first peer."""
 
     def get(self, keys: tuple[bytes, bytes], _default: object = None) -> Peer:
-        """Not by the key. The answer is made out to who asked."""
+        """Ignore the key, and answer with the initiator's key."""
         peer = next(iter(self.values()))
-        peer.caller._mac_keys = MacKeys(keys[1])
+        peer.initiator._mac_keys = MacKeys(keys[1])
         return peer
 
 
 def test_a_victim_without_the_static_key_check_takes_an_impostor_for_its_peer() -> None:
-    """The same keys of its own that got no answer above get a session, and frames in as b: the check is what held."""
+    """The same keys, refused above, get a session and deliver frames as b: the check made the difference."""
     victim = Victim()
     victim.node._by_keys = TakesAnyKey(victim.node._by_keys)
     achieved = victim.suffer(impostor(OWN, PSK), 1.0)
     assert achieved.sessions == 1
     assert achieved.frames_sent > 0
-    assert {(each.peer, each.payload[:10]) for each in victim.delivered} == {("b", FRAME[:10])}
+    assert {(output.peer.name, output.payload[:10]) for output in victim.delivered} == {("b", FRAME[:10])}
     assert DropReason.UNKNOWN_PEER not in victim.drops
 
 
 def test_the_relay_lets_nothing_genuine_pass() -> None:
-    """In full it stands for the other side; beside the traffic it does not."""
+    """A full relay replaces the other side; otherwise genuine datagrams pass."""
     genuine = b"\x40" + bytes(40)
     for relays in (True, False):
         middle = Impostor("x", [Disguise("a", A.public, "b", OWN)], (X25519,), 0.0, relays=relays)
-        passes = Send(genuine, Way("a", "b")) in middle.on_datagram(genuine, Way("a", "b"), 0.0)
+        passes = Send(genuine, Direction("a", "b")) in middle.on_datagram(genuine, Direction("a", "b"), 0.0)
         assert passes is not relays
         # What concerns others goes its way.
-        assert middle.on_datagram(genuine, Way("b", "c"), 0.0) == [Send(genuine, Way("b", "c"))]
+        assert middle.on_datagram(genuine, Direction("b", "c"), 0.0) == [Send(genuine, Direction("b", "c"))]
 
 
 def test_sealed_cookies_open_and_change_nothing() -> None:
     """A peer takes such a cookie, initiates with it, and is answered as without."""
     victim = Victim()
-    victim.node.set_addresses("b", [FACE], 0.0)
+    victim.node.set_paths(victim.node.peers["b"], [FACE], 0.0)
     cookies = SealedCookies({"b": B.public}, 0.0)
-    (sent,) = [each for each in victim.node.handle_timeout(0.0) if isinstance(each, Transmit)]
-    actions = [each for each in cookies.on_datagram(sent.datagram, Way("a", "b"), 0.0) if isinstance(each, Send)]
-    assert actions[0] == Send(sent.datagram, Way("a", "b"))
-    assert actions[1].way == Way("b", "a")
+    (sent,) = [output for output in victim.node.handle_timeout(0.0) if isinstance(output, Transmit)]
+    actions = [
+        action for action in cookies.on_datagram(sent.datagram, Direction("a", "b"), 0.0) if isinstance(action, Send)
+    ]
+    assert actions[0] == Send(sent.datagram, Direction("a", "b"))
+    assert actions[1].direction == Direction("b", "a")
     victim.node.receive(actions[1].datagram, FACE, 0.01)
     assert victim.drops == set()
-    (again,) = [each for each in victim.node.handle_timeout(1.0) if isinstance(each, Transmit)]
+    (again,) = [output for output in victim.node.handle_timeout(1.0) if isinstance(output, Transmit)]
     assert again.datagram[-16:] != bytes(16)
     other = Node(Secret(b"\2" * 32), os.urandom, 0.0)
     other.add_peer(PeerSettings("a", A.public, Secret(PSK)), 0.0)
-    assert [type(each) for each in other.receive(again.datagram, FACE, 1.0)] == [Transmit]
+    assert [type(output) for output in other.receive(again.datagram, FACE, 1.0)] == [Transmit]

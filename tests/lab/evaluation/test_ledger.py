@@ -1,4 +1,4 @@
-"""The books: every frame that may not come out is seen, and of what kind it is."""
+"""The ledger detects every false frame and its kind."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def test_frames_are_genuine_and_all_different() -> None:
     assert [frame.raw for frame in split_datagram(b"".join(frames), SplitCounters())] == frames
 
 
-def test_what_comes_as_sent_is_no_fault(ledger: Ledger) -> None:
+def test_unaltered_frames_are_not_faults(ledger: Ledger) -> None:
     """And counts as delivered."""
     ledger.on_received("b", numbered_frame(1, 0), 1.5)
     assert not ledger.faults
@@ -33,7 +33,7 @@ def test_what_comes_as_sent_is_no_fault(ledger: Ledger) -> None:
 
 
 def test_what_comes_long_after_it_was_sent_is_stale(ledger: Ledger) -> None:
-    """As it was sent, and yet an attack that succeeded: somebody kept it."""
+    """Unaltered, but late: an attacker held it."""
     ledger.on_received("b", numbered_frame(1, 0), 1.0 + STALE_S)
     assert not ledger.faults
     ledger.on_received("a", numbered_frame(2, 0), 1.1 + STALE_S)
@@ -44,7 +44,7 @@ def test_what_comes_long_after_it_was_sent_is_stale(ledger: Ledger) -> None:
     ("receiver", "frame", "fault"),
     [
         ("b", numbered_frame(1, 1), Fault.FALSE),  # never sent
-        ("b", numbered_frame(7, 0), Fault.FALSE),  # nobody's
+        ("b", numbered_frame(7, 0), Fault.FALSE),  # an unknown sender
         ("b", numbered_frame(1, 0)[:-3] + b"\x00\x00\x00", Fault.FALSE),
         ("b", b"\xfd", Fault.FALSE),
         ("b", b"", None),

@@ -1,4 +1,4 @@
-"""What the machine tells of itself and of its processes."""
+"""The facts about the machine and its processes."""
 
 from __future__ import annotations
 
@@ -63,8 +63,8 @@ def test_energy_is_summed_over_packages_alone(tmp_path: Path) -> None:
     zones = [zone(tmp_path, number, name, 100) for number, name in names.items()]
     meter = EnergyMeter(tmp_path)
     meter.start()
-    for each in zones:
-        (each / "energy_uj").write_text("500100\n")
+    for item in zones:
+        (item / "energy_uj").write_text("500100\n")
     assert meter.joules() == pytest.approx(1.0)
 
 
@@ -78,7 +78,7 @@ def test_an_energy_counter_may_go_round(tmp_path: Path) -> None:
 
 
 def test_a_machine_that_does_not_tell_gives_no_joules(tmp_path: Path) -> None:
-    """None, never a zero."""
+    """The result is None, never zero."""
     meter = EnergyMeter(tmp_path)
     meter.start()
     assert meter.joules() is None

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from uavlinkd.lab.evaluation.captured_member import Attack, attacks, set_mode
+from uavlinkd.lab.evaluation.captured_member import MemberAttack, attacks, set_mode
 from uavlinkd.lab.evaluation.every_offset import forbidden_frames, frames_at_every_offset
 from uavlinkd.lab.evaluation.hidden_frames import Carrier, frame
-from uavlinkd.lab.evaluation.member_trial import NAME, Outcome, Results, as_trial, run_attacks
+from uavlinkd.lab.evaluation.member_trial import NAME, MemberResult, Results, as_trial, run_attacks
 from uavlinkd.lab.evaluation.tampering_records import Verdict
 from uavlinkd.mavlink.policy.compilation import compile_policy
 
@@ -19,7 +19,7 @@ CATALOGUE = [attack for attack in attacks(412, 8, 412, 8) if attack.name != AFTE
 
 
 @pytest.mark.parametrize("attack", CATALOGUE, ids=lambda attack: attack.name)
-def test_the_judge_finds_the_frame_that_an_attack_hides(attack: Attack) -> None:
+def test_the_judge_finds_the_frame_that_an_attack_hides(attack: MemberAttack) -> None:
     """In the attack's frames, one behind the other."""
     at, delivered = 0, []
     for member, raw in attack.frames:
@@ -40,8 +40,8 @@ def test_the_judge_lets_a_source_hide_what_it_may_send() -> None:
 def test_the_search_reads_both_versions_at_every_offset() -> None:
     """Cut frames are not found."""
     one, two = set_mode(255), set_mode(255, version=1)
-    found = list(frames_at_every_offset(b"\xfd\xfe" + one + b"\0" + two + two[:-1]))
-    assert found == [(2, one), (3 + len(one), two)]
+    result = list(frames_at_every_offset(b"\xfd\xfe" + one + b"\0" + two + two[:-1]))
+    assert result == [(2, one), (3 + len(one), two)]
 
 
 async def test_a_real_daemon_delivers_no_hidden_frame(tmp_path: Path) -> None:
@@ -59,8 +59,8 @@ async def test_a_real_daemon_delivers_no_hidden_frame(tmp_path: Path) -> None:
 
 
 def test_a_hidden_frame_that_is_delivered_is_a_success_of_the_attacker() -> None:
-    """The row says which attack it was."""
-    results = Results([Outcome("two members", 2, 2, 0, (b"x",))], last_wait_s=0.1)
+    """The row names the attack."""
+    results = Results([MemberResult("two members", 2, 2, 0, (b"x",))], last_wait_s=0.1)
     trial = as_trial(results, 0.0, 1.0, 0)
     assert trial.verdict is Verdict.SUCCEEDED
     assert trial.notes.endswith(": two members")

@@ -1,4 +1,4 @@
-"""The man in the middle of the evaluation, as a process and in this one: the same to those who use it."""
+"""The man in the middle of the evaluation has the same interface as a process and in this one."""
 
 from __future__ import annotations
 
@@ -50,10 +50,10 @@ async def passed(ends: dict[str, socket.socket], middle: MiddleProcess | MiddleH
     return await asyncio.wait_for(asyncio.get_running_loop().sock_recv(ends["b"], 2048), 20)
 
 
-async def test_it_does_what_it_is_told_and_counts_it(
+async def test_attacks_are_started_and_counted(
     middle: MiddleProcess | MiddleHere, ends: dict[str, socket.socket]
 ) -> None:
-    """Nothing at first, then the attack, then nothing again."""
+    """The counters grow only during the attack."""
     assert await passed(ends, middle) == ENVELOPE
     assert (await middle.statistics()).counts == {}
     await middle.attack(["alter-frame"])
@@ -78,7 +78,7 @@ async def test_knowing_the_public_keys_it_can_make_mac1(
     """A flood that takes the keys is made."""
     await passed(ends, middle)
     await middle.attack(["flood-initiations,rate_per_s=100"])
-    async with asyncio.timeout(20):
+    async with asyncio.timeout(240):
         while not (await middle.statistics()).of(["flood-initiations"]):  # noqa: ASYNC110  sockets set no event
             await asyncio.sleep(0.01)
 

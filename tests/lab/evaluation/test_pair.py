@@ -23,7 +23,7 @@ def test_a_link_without_a_relay_carries_frames() -> None:
     with Pair(LinkChoice(X25519), with_relay=False) as pair:
         pair.wait_until_linked()
         assert all(seconds > 0 for seconds in pair.cpu_s())
-        processes = [daemon._process for daemon in (pair.caller, pair.answerer)]
+        processes = [daemon._process for daemon in (pair.initiator, pair.responder)]
     assert all(process is not None and process.poll() is not None for process in processes)
 
 

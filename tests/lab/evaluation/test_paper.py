@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from tests.waiting import PATIENCE_S
 from uavlinkd.core.kem import ffdhe_prime
 from uavlinkd.lab.evaluation import paper
 
@@ -23,8 +24,8 @@ def ends() -> Iterator[tuple[socket.socket, socket.socket]]:
     with socket.socket(type=socket.SOCK_DGRAM) as initiator, socket.socket(type=socket.SOCK_DGRAM) as responder:
         responder.bind(("127.0.0.1", 0))
         initiator.connect(responder.getsockname())
-        for each in (initiator, responder):
-            each.settimeout(20)
+        for sock in (initiator, responder):
+            sock.settimeout(240)
         yield initiator, responder
 
 
@@ -32,12 +33,12 @@ def exchange(
     ends: tuple[socket.socket, socket.socket], bits: int, mac_bits: int, *, standard: bool = False
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Run one; what each end tells."""
-    told: dict[str, Any] = {}
-    responder = threading.Thread(target=lambda: told.update(paper.respond(ends[1])))
+    reported: dict[str, Any] = {}
+    responder = threading.Thread(target=lambda: reported.update(paper.respond(ends[1])))
     responder.start()
     initiated = paper.initiate(ends[0], bits, mac_bits, b"data" * 70, standard=standard)
     responder.join()
-    return initiated, told
+    return initiated, reported
 
 
 @pytest.mark.parametrize(("bits", "standard"), [(64, False), (256, False), (512, False), (2048, True)])
@@ -46,27 +47,27 @@ def test_both_ends_reach_the_same_key(
     ends: tuple[socket.socket, socket.socket], bits: int, standard: bool, mac_bits: int
 ) -> None:
     """The tag verifies, for groups made here, made by OpenSSL, and standard ones."""
-    initiated, told = exchange(ends, bits, mac_bits, standard=standard)
-    assert told["verified"] is True
-    assert told["verified_at"] > initiated["started_at"]
+    initiated, reported = exchange(ends, bits, mac_bits, standard=standard)
+    assert reported["verified"] is True
+    assert reported["verified_at"] > initiated["started_at"]
     assert initiated["datagrams"] == 3
 
 
 def test_an_altered_tag_does_not_verify(ends: tuple[socket.socket, socket.socket]) -> None:
     """The responder does compare."""
-    told: dict[str, Any] = {}
-    responder = threading.Thread(target=lambda: told.update(paper.respond(ends[1])))
+    reported: dict[str, Any] = {}
+    responder = threading.Thread(target=lambda: reported.update(paper.respond(ends[1])))
     responder.start()
     key = paper.make_key(paper.load_parameters(ffdhe_prime(2048)))
     ends[0].send(paper._pack(ffdhe_prime(2048), 512, key.public))
     ends[0].recv(65536)
     ends[0].send(b"data" + bytes(paper.TAG_BYTES))
     responder.join()
-    assert told["verified"] is False
+    assert reported["verified"] is False
 
 
 def test_a_standard_group_is_the_published_one() -> None:
-    """Nothing is made."""
+    """The group is not generated."""
     assert paper.prime_of(paper.make_parameters(2048, standard=True)) == ffdhe_prime(2048)
 
 
@@ -76,7 +77,7 @@ def test_made_parameters_differ_each_time() -> None:
 
 
 def test_a_mac_key_has_the_length_asked_for() -> None:
-    """In bits, whatever the length of the secret."""
+    """In bits, for any length of the secret."""
     assert [len(paper.mac_key(b"secret", bits)) for bits in (512, 1024, 2048)] == [64, 128, 256]
 
 
@@ -87,12 +88,12 @@ def test_integers_on_the_wire_come_back() -> None:
 
 
 def test_an_end_ends_with_its_input() -> None:
-    """A process whose master has gone does not stay."""
+    """The process ends with its parent."""
     done = subprocess.run(
         [sys.executable, "-m", "uavlinkd.lab.evaluation.paper", "responder"],
         stdin=subprocess.DEVNULL,
         capture_output=True,
-        timeout=30,
+        timeout=PATIENCE_S,
         check=True,
     )
     assert done.stdout.startswith(b'{"port"')

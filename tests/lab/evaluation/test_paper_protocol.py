@@ -39,11 +39,11 @@ def test_data_is_opened_under_its_key_alone() -> None:
 
 
 Outcome = tuple[Counter[Fault], Counter[str]]
-"""What came out falsely, and what the ends noticed."""
+"""The false frames, and the counters of the ends."""
 
 
 async def attacked(tmp_path: Path, attack: AttackObject, is_enough: Callable[[Outcome], bool]) -> Outcome:
-    """What this leads to while it stands in the way: for three exchanges at least, and until it is enough."""
+    """The result of an attack during at least three exchanges."""
     stage = PaperStage(NAMES, MiddleHere(NAMES, tmp_path / "mitm.jsonl", 1), rate_hz=100.0)
     async with stage:
         await stage.middle.attack([], [attack])
@@ -93,7 +93,7 @@ async def test_without_an_attack_everything_comes_out(tmp_path: Path) -> None:
         await until(
             lambda: (
                 stage.ledger.count(begin, stage.ledger.mark())[0] > 20
-                and all(end.exchanges >= each + 3 for end, each in zip(stage.ends.values(), before, strict=True))
+                and all(end.exchanges >= count + 3 for end, count in zip(stage.ends.values(), before, strict=True))
             )
         )
         end = stage.ledger.mark()

@@ -1,4 +1,4 @@
-"""Records survive being written and read, and nothing is left out."""
+"""Records can be written and read without loss."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from uavlinkd.lab.evaluation.records import RecordsError, RecordWriter, read_rec
 
 
 def test_what_is_read_is_what_was_written(tmp_path: Path) -> None:
-    """Facts, points, numbers, lists, status and reason come back as they were."""
+    """Facts, points, numbers, lists, status and reason are unchanged."""
     written = [handshake("x25519", 256, 0.0041), FAILED, frames([1.5, 2.5])]
     with RecordWriter(tmp_path / "new", "timing", RUN) as writer:
         for record in written:
@@ -29,7 +29,7 @@ def test_a_run_that_is_interrupted_leaves_what_it_measured(tmp_path: Path) -> No
 
 
 def test_the_csv_has_a_row_for_every_record_and_the_facts_in_each(tmp_path: Path) -> None:
-    """A failed record is a row too, with its reason; lists stay out."""
+    """A failed record is a row too, with its reason; lists are omitted."""
     with RecordWriter(tmp_path, "timing", RUN) as writer:
         for record in (handshake("x25519", 256, 0.5), FAILED, frames([1.0])):
             writer.add(record)
@@ -47,7 +47,7 @@ def test_the_csv_has_a_row_for_every_record_and_the_facts_in_each(tmp_path: Path
     ["", "{}\n", "not json\n", '{"run": {}}\n{"kind": "x"}\n', '{"run": {}}\n[]\n', '{"run": 5}\n',
      '{"run": {}}\n{"kind": "x", "status": "great", "reason": "", "point": {}, "values": {}}\n'],
 )  # fmt: skip
-def test_what_is_no_record_is_refused_with_the_file_named(tmp_path: Path, content: str) -> None:
+def test_malformed_records_are_refused_with_the_file(tmp_path: Path, content: str) -> None:
     """Anything else than records raises one error that a person can read."""
     path = tmp_path / "timing.jsonl"
     path.write_text(content, encoding="utf-8")

@@ -20,7 +20,7 @@ from uavlinkd.lab.evaluation.report import write_page, write_report
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Records, and nothing else."""
+    """A folder with records only."""
     with RecordWriter(tmp_path, "timing", RUN) as writer:
         for record in a_run(FAILED).records:
             writer.add(record)
@@ -28,15 +28,40 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_the_report_needs_no_other_file(folder: Path) -> None:
-    """Every figure is in it; nothing is fetched from anywhere."""
+    """It contains every figure and loads no other file."""
     html = write_report(folder).read_text(encoding="utf-8")
     sources = re.findall(r'(?:src|href)="([^"]{0,30})', html)
     assert len(sources) == 5
     assert all(source.startswith("data:image/svg+xml;base64,") for source in sources)
 
 
+def test_the_report_names_the_paper(folder: Path) -> None:
+    """Its readers may not know it."""
+    assert "Ouadah and Merazka, Securing UAV Communication" in write_report(folder).read_text(encoding="utf-8")
+
+
+def test_code_in_a_paragraph_has_no_backticks_in_html(folder: Path) -> None:
+    """They are the mark of Markdown."""
+    html = write_report(folder).read_text(encoding="utf-8")
+    assert "<code>--watts-per-core</code>" in html
+    assert "`" not in html
+    assert "`--watts-per-core`" in (folder / "report.md").read_text(encoding="utf-8")
+
+
+def test_wide_tables_become_lists_on_a_phone(folder: Path) -> None:
+    """A phone shows four columns. In a wider table each cell has the name of its column, which CSS shows there."""
+    html = write_report(folder).read_text(encoding="utf-8")
+    assert '<meta name="viewport" content="width=device-width">' in html
+    assert html.count('<div class="figure"><img ') == html.count("<img "), "a figure keeps its size, and scrolls"
+    for kind, head, rows in re.findall(r"<table( class=\"wide\")?><tr>(.*?)</tr>(.*?)</table>", html, re.DOTALL):
+        columns = re.findall(r"<th>(.*?)</th>", head)
+        assert bool(kind) == (len(columns) > 4)
+        for row in re.findall(r"<tr>(.*?)</tr>", rows):
+            assert re.findall(r'<td data-label="(.*?)"', row) == columns
+
+
 def test_a_failed_point_is_in_the_report_with_its_reason_as_text(folder: Path) -> None:
-    """Escaped: a reason may hold what a daemon wrote."""
+    """The reason is escaped: it may contain text of a daemon."""
     html = write_report(folder).read_text(encoding="utf-8")
     assert "no session &lt;within&gt; 20 s" in html
     assert "<within>" not in html
@@ -83,7 +108,7 @@ def test_the_markdown_names_the_figures_that_are_beside_it(folder: Path) -> None
 
 
 def test_a_page_has_its_figures_in_a_folder_beside_it(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
-    """Every link leads somewhere; else it is the report."""
+    """Every link has a target; the rest equals the report."""
     page = write_page(folder, tmp_path_factory.mktemp("docs") / "RESULTS.md")
     write_report(folder)
     text = page.read_text(encoding="utf-8")

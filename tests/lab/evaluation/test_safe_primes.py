@@ -42,6 +42,6 @@ def test_a_safe_prime_has_its_length_and_2_generates_its_large_subgroup(bits: in
 
 
 def test_a_group_of_a_few_bits_is_refused() -> None:
-    """There is nothing to measure."""
-    with pytest.raises(ValueError, match="no group"):
+    """Such a group is too small to measure."""
+    with pytest.raises(ValueError, match="at least 16 bits"):
         generate_safe_prime(8)

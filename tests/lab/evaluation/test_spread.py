@@ -12,24 +12,24 @@ from uavlinkd.lab.evaluation.spread import duration, spread
 @given(st.lists(st.floats(1e-9, 1e6), min_size=1))
 def test_a_spread_is_in_order(values: list[float]) -> None:
     """Least, first quartile, median, third quartile, most."""
-    each = spread(values)
-    tolerance = 1e-9 * each.most
-    assert each.least == min(values)
-    assert each.most == max(values)
-    assert each.least <= each.low + tolerance <= each.median + 2 * tolerance
-    assert each.median <= each.high + tolerance <= each.most + 2 * tolerance
+    times = spread(values)
+    tolerance = 1e-9 * times.most
+    assert times.least == min(values)
+    assert times.most == max(values)
+    assert times.least <= times.low + tolerance <= times.median + 2 * tolerance
+    assert times.median <= times.high + tolerance <= times.most + 2 * tolerance
 
 
 def test_a_spread_of_known_values() -> None:
     """By hand."""
-    each = spread([4.0, 1.0, 3.0, 2.0, 5.0])
-    assert (each.count, each.low, each.median, each.high, each.ratio) == (5, 2.0, 3.0, 4.0, 5.0)
+    times = spread([4.0, 1.0, 3.0, 2.0, 5.0])
+    assert (times.count, times.low, times.median, times.high, times.ratio) == (5, 2.0, 3.0, 4.0, 5.0)
 
 
 def test_a_single_measurement_is_its_own_spread() -> None:
-    """No quartiles can be had of one, and none are made up."""
-    each = spread([2.0])
-    assert (each.least, each.low, each.median, each.high, each.most) == (2.0,) * 5
+    """A single value has no quartiles."""
+    times = spread([2.0])
+    assert (times.least, times.low, times.median, times.high, times.most) == (2.0,) * 5
 
 
 def test_nothing_has_no_median() -> None:

@@ -14,7 +14,7 @@ from uavlinkd.cli import main
     "flags", [["--attempts-data", "0"], ["--attempts-handshake", "-1"], ["--attempts-data", "x"], []]
 )
 def test_impossible_flags_are_refused(tmp_path: Path, flags: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    """Numbers are 1 or more, and --out is needed; status 2, nothing started."""
+    """Numbers must be 1 or more, and --out is required; status 2 before a start."""
     out = ["--out", str(tmp_path / "out")] if flags else []
     with pytest.raises(SystemExit) as raised:
         main(["evaluate", "tampering", *out, *flags])
@@ -34,7 +34,9 @@ def test_without_matplotlib_one_line_says_what_to_install(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Before minutes are spent on a run without figures."""
-    for name in [each for each in sys.modules if each.startswith(("matplotlib", "uavlinkd.lab.evaluation.tampering_"))]:
+    for name in [
+        module for module in sys.modules if module.startswith(("matplotlib", "uavlinkd.lab.evaluation.tampering_"))
+    ]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     assert main(["evaluate", "tampering", "--quick", "--out", str(tmp_path)]) == 1

@@ -14,7 +14,7 @@ from uavlinkd.lab.evaluation.tampering_records import (
     PAPER,
     RECOVERY_LIMIT_S,
     RELAY,
-    Flood,
+    FloodSamples,
     Run,
     TamperingRecordsError,
     Trial,
@@ -100,7 +100,7 @@ def test_all_is_well_only_if_nothing_succeeds_and_the_relay_does() -> None:
 
 def test_records_come_back_as_they_were(tmp_path: Path) -> None:
     """Trials, floods and the facts of the run."""
-    flood = Flood(100.0, 1.0, 2.0, [0.5], {"a": [0.1]}, {"a": [1]}, [1.0], [1.0], 100)
+    flood = FloodSamples(100.0, 1.0, 2.0, [0.5], {"a": [0.1]}, {"a": [1]}, [1.0], [1.0], 100)
     lines = [TRIAL.to_json(), a_relay().to_json(), flood.to_json(), json.dumps({"run": {"seed": 1}})]
     file = tmp_path / "tampering.jsonl"
     file.write_text("\n".join(lines))
@@ -109,7 +109,7 @@ def test_records_come_back_as_they_were(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("line", ["", "x", "[]", "{}", '{"run": 1}', '{"flood": {}}'])
-def test_what_is_no_record_is_said_so(tmp_path: Path, line: str) -> None:
+def test_malformed_records_are_refused(tmp_path: Path, line: str) -> None:
     """With the number of the line."""
     file = tmp_path / "tampering.jsonl"
     file.write_text(TRIAL.to_json() + "\n" + line + "\n")

@@ -1,4 +1,4 @@
-"""The report of the tampering evaluation: made of records alone, and honest about them."""
+"""The report of the tampering evaluation, made from its records."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 from tests.lab.evaluation.test_tampering_records import TRIAL, a_relay
 from uavlinkd.cli import main
-from uavlinkd.lab.evaluation.tampering_records import Flood, TamperingRecordsError, Trial
+from uavlinkd.lab.evaluation.tampering_records import FloodSamples, TamperingRecordsError, Trial
 from uavlinkd.lab.evaluation.tampering_report import write_tampering_report
 
 RELAY = replace(a_relay(), achieved={"frames_read": 7, "frames_altered": 3})
@@ -24,7 +24,7 @@ OURS = replace(
     noticed={"drone0": {"unknown_peer": 9}},
 )
 AT = [0.25 * number for number in range(1, 13)]
-FLOOD = Flood(
+FLOOD = FloodSamples(
     500.0,
     1.0,
     2.0,
@@ -38,57 +38,88 @@ FLOOD = Flood(
 
 
 def report(folder: Path, *trials: Trial, **facts: object) -> str:
-    """The HTML of these."""
+    """The Markdown report of these trials."""
     lines = [json.dumps({"run": {"seed": 1, **facts}}), *(trial.to_json() for trial in trials), FLOOD.to_json()]
     (folder / "tampering.jsonl").write_text("\n".join(lines))
-    html = write_tampering_report(folder)
-    assert html == folder / "tampering.html"
-    return html.read_text()
+    assert write_tampering_report(folder) == folder / "tampering.html"
+    return (folder / "tampering.md").read_text()
 
 
-def test_what_was_sent_is_told_from_what_was_kept_back(tmp_path: Path) -> None:
-    """Of a dropped datagram nothing could be accepted: it is no attempt that was refused."""
+def test_summary_counts_dropped_datagrams_separately(tmp_path: Path) -> None:
+    """A dropped datagram is an attempt, but it could not be accepted."""
     drops = replace(
         TRIAL, attack="drop, half", attempts=40, interventions={"drop: dropped": 40}, frames_delivered=160
     )
-    html = report(tmp_path, TRIAL, drops, RELAY)
-    assert "made 140 attempts: 100 datagrams were forged" in html
-    assert "and 40 genuine ones were dropped or held back" in html
+    text = report(tmp_path, TRIAL, drops, RELAY)
+    assert "| attempts | 140 |" in text
+    assert "| of these, genuine datagrams dropped or held back | 40 | 0 |" in text
 
 
-def test_recovery_is_that_of_attacks_that_cost_something(tmp_path: Path) -> None:
-    """After the others the next frame comes when it was to come anyway."""
+def test_names_with_commas_remain_apart(tmp_path: Path) -> None:
+    """Many attacks have a comma in their name."""
+    ours = [replace(TRIAL, attack=name, faults={"replayed": 1}) for name in ("roam, racing", "replay-data")]
+    assert "| successful attacks | roam, racing; replay-data | two-sided-relay |" in report(tmp_path, *ours, RELAY)
+
+
+def test_the_report_names_the_paper(tmp_path: Path) -> None:
+    """At its beginning, before the tables that compare with it."""
+    text = report(tmp_path, TRIAL, RELAY)
+    assert text.index("Ouadah and Merazka, Securing UAV Communication") < text.index("| attempts |")
+
+
+@pytest.mark.parametrize(
+    ("facts", "command", "attempts"),
+    [
+        ({"quick": True}, "--seed 1 --quick`", "60 for an attack on data, 5 on the handshake (uavlinkd) and 60 for"),
+        ({"attempts_data": 400}, "--attempts-data 400 --attempts-handshake 200`", "40 for an attack on data, 20 on"),
+    ],
+)
+def test_the_report_has_the_command_and_numbers_of_its_run(
+    tmp_path: Path, facts: dict[str, object], command: str, attempts: str
+) -> None:
+    """A quick run makes few attempts, whatever the other options are."""
+    text = report(tmp_path, TRIAL, RELAY, **{"attempts_data": 10_000, "attempts_handshake": 200, **facts})
+    assert command in text
+    assert attempts in text
+    assert "| attempts data |" not in text
+    assert "<code>uavlinkd evaluate tampering --out DIR" in (tmp_path / "tampering.html").read_text()
+
+
+def test_recovery_depends_on_lost_frames(tmp_path: Path) -> None:
+    """Attacks with lost frames have their own median."""
     slow = replace(TRIAL, attack="drop, half", frames_delivered=150, recovery_s=0.5)
-    html = report(tmp_path, TRIAL, slow, RELAY)
-    assert "of the 1 attacks that cost genuine frames median 500 ms" in html
-    assert "After the other 1, which cost none, median 10 ms" in html
+    text = report(tmp_path, TRIAL, slow, RELAY)
+    assert "| attacks with lost genuine frames | 1 | 500 ms | 500 ms |" in text
+    assert "| attacks without | 1 | 10 ms | 10 ms |" in text
 
 
-def test_quiet_times_and_timers_of_each_stage_are_shown(tmp_path: Path) -> None:
-    """What a reader needs to weigh "detected" and the times."""
+def test_counters_without_an_attack_and_timers_are_shown(tmp_path: Path) -> None:
+    """The reader needs both to judge "detected" and the times."""
     control = {"data": {"late": 0.3}, "paper": {}}
-    html = report(tmp_path, TRIAL, RELAY, control=control, links={"data": {"rekey_after_s": 2.0}})
-    assert "rekey_after_s = 2.0" in html
-    assert "0.3 late" in html
-    assert "the defaults" in html
-    assert "Where nothing is attacked" not in report(tmp_path, TRIAL, RELAY)
+    text = report(tmp_path, TRIAL, RELAY, control=control, links={"data": {"rekey_after_s": 2.0}})
+    assert "| data | rekey_after_s = 2.0 | 0.3 late |" in text
+    assert "| paper | the defaults | - |" in text
+    assert "Without an attack" not in report(tmp_path, TRIAL, RELAY)
 
 
-def test_it_says_what_came_of_it(tmp_path: Path) -> None:
-    """In words, in tables and in figures that can be drawn."""
-    html = report(tmp_path, TRIAL, OURS, RELAY)
-    assert "Nothing succeeded." in html
-    assert "had 3 altered frames accepted" in html
-    assert "500 initiations from a process of their own" in html
+def test_report_has_tables_and_figures(tmp_path: Path) -> None:
+    """The figures can be parsed, and text from a trial is escaped in HTML."""
+    text = report(tmp_path, TRIAL, OURS, RELAY)
+    html = (tmp_path / "tampering.html").read_text()
+    assert "| successful attacks | none | two-sided-relay |" in text
+    assert "| two-sided relay on the paper's protocol |" in text
+    assert "| 7 | 3 |" in text
+    assert "| 500 | 500 | drone0 | 99.0 % |" in text
+    assert "| drone0 | 10 % | 10 % | 40.0 MiB | 0.0 MiB |" in text
     assert "&lt;keys&gt;" in html
     assert "<keys>" not in html
     for name in ("recovery", "accepted", "flood-500"):
         ET.parse(tmp_path / f"{name}.svg")
-        assert f"({name}.svg)" in (tmp_path / "tampering.md").read_text()
+        assert f"({name}.svg)" in text
 
 
 def test_the_report_command_makes_it_again_and_as_a_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """``evaluate report`` sees which evaluation the records are of; a page has its figures beside it."""
+    """``evaluate report`` recognises the evaluation; a page has its figures in a folder beside it."""
     report(tmp_path, TRIAL, OURS, RELAY)
     (tmp_path / "tampering.html").unlink()
     page = tmp_path / "docs" / "RESULTS.md"
@@ -100,21 +131,20 @@ def test_the_report_command_makes_it_again_and_as_a_page(tmp_path: Path, capsys:
 
 
 def test_equal_records_give_equal_bytes(tmp_path: Path) -> None:
-    """So a report can be made again."""
+    """The report is reproducible."""
     assert report(tmp_path, TRIAL, OURS, RELAY) == report(tmp_path, TRIAL, OURS, RELAY)
 
 
 @pytest.mark.parametrize(
     "bad", [replace(TRIAL, faults={"replayed": 2}), replace(TRIAL, attempts=0), replace(TRIAL, recovery_s=None)]
 )
-def test_what_is_wrong_stands_at_the_top(tmp_path: Path, bad: Trial) -> None:
-    """A report of a run with a hole in it does not look like the others."""
-    html = report(tmp_path, bad, OURS, RELAY)
-    assert "NOT AS IT MUST BE" in html
-    assert "Nothing succeeded." not in html
+def test_problems_are_at_the_top(tmp_path: Path, bad: Trial) -> None:
+    """A report of an unsuccessful run is easy to recognise."""
+    assert "Not as expected" not in report(tmp_path, TRIAL, OURS, RELAY)
+    assert "Not as expected" in report(tmp_path, bad, OURS, RELAY).split("## ")[1]
 
 
 def test_without_records_there_is_no_report(tmp_path: Path) -> None:
-    """And one sentence says so."""
+    """The error names the reason."""
     with pytest.raises(TamperingRecordsError, match="No such file"):
         write_tampering_report(tmp_path)

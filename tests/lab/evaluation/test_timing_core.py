@@ -12,7 +12,7 @@ from uavlinkd.lab.evaluation.timing_core import measure_core
 @pytest.mark.parametrize("number", SUITES)
 @pytest.mark.parametrize("confidential", [False, True])
 def test_every_suite_carries_a_frame_between_two_nodes(number: int, confidential: bool) -> None:
-    """The steps are the whole, and the frame came out."""
+    """The steps add up to the total, and the frame was delivered."""
     record = measure_core(LinkChoice(SUITES[number], 1024, confidential))
     steps = [record.number(f"{name}_s") for name in ("initiate", "respond", "finish", "confirm", "frame")]
     assert record.is_ok

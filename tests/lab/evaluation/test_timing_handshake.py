@@ -10,7 +10,7 @@ from uavlinkd.core.suites import SUITES_BY_NAME, X25519
 from uavlinkd.core.wire import initiation_bytes, response_bytes
 from uavlinkd.lab.evaluation import timing_handshake
 from uavlinkd.lab.evaluation.machine import EnergyMeter
-from uavlinkd.lab.evaluation.pair import Daemon, LinkChoice, PairError
+from uavlinkd.lab.evaluation.pair import DaemonProcess, LinkChoice, PairError
 from uavlinkd.lab.evaluation.records import Status
 from uavlinkd.lab.evaluation.timing_handshake import measure_handshake, measure_rekeys
 
@@ -25,25 +25,25 @@ def test_a_handshake_is_timed_and_counted_whole(tmp_path: Path) -> None:
     assert record.number("response_s") + record.number("frame_s") < record.number("total_s") < 20
     assert record.number("bytes_there") > initiation_bytes(suite)
     assert record.number("bytes_back") >= response_bytes(suite)
-    assert record.number("cpu_caller_s") > 0
-    assert record.number("cpu_answerer_s") > 0
+    assert record.number("cpu_initiator_s") > 0
+    assert record.number("cpu_responder_s") > 0
     assert record.values["joules"] is None
 
 
 def test_a_handshake_that_fails_is_recorded_with_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     """A point that fails is a record, not an exception that ends the run."""
 
-    def refuse(self: Daemon) -> bool:
-        raise PairError("caller ended with status 1")
+    def refuse(self: DaemonProcess) -> bool:
+        raise PairError("initiator ended with status 1")
 
-    monkeypatch.setattr(Daemon, "is_ready", refuse)
+    monkeypatch.setattr(DaemonProcess, "is_ready", refuse)
     failed = [measure_handshake(LinkChoice(X25519), EnergyMeter()), *measure_rekeys(LinkChoice(X25519), 3)]
-    assert [(each.kind, each.status) for each in failed] == [("handshake", Status.FAILED), ("rekey", Status.FAILED)]
-    assert {each.reason for each in failed} == {"caller ended with status 1"}
+    assert [(note.kind, note.status) for note in failed] == [("handshake", Status.FAILED), ("rekey", Status.FAILED)]
+    assert {record.reason for record in failed} == {"initiator ended with status 1"}
 
 
 def test_rekeys_replace_the_keys_of_running_daemons() -> None:
-    """As many as asked for, each by a handshake of its own."""
+    """The requested number of rekeys, each with its own handshake."""
     records = measure_rekeys(LinkChoice(X25519), 2)
     assert [record.is_ok for record in records] == [True, True], records
     for record in records:
@@ -51,10 +51,10 @@ def test_rekeys_replace_the_keys_of_running_daemons() -> None:
 
 
 def test_no_session_in_time_is_an_error_that_tells_what_was_tried(monkeypatch: pytest.MonkeyPatch) -> None:
-    """How often the caller called, and what the other end discarded."""
+    """The number of initiations, and the responder's dropped datagrams."""
     monkeypatch.setattr(timing_handshake, "HANDSHAKE_LIMIT_S", 0.5)
     monkeypatch.setattr(timing_handshake, "ENVELOPES", ())  # as if no envelope ever came
     record = measure_handshake(LinkChoice(X25519), EnergyMeter())
     assert record.status is Status.FAILED
     assert "no session within 0.5 s, after" in record.reason
-    assert "answerer dropped" in record.reason
+    assert "responder dropped" in record.reason

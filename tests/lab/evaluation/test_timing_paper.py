@@ -1,4 +1,4 @@
-"""The paper's grid, and what becomes of a point that does not come to an end."""
+"""The paper's grid, and the record of a point that does not finish."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ def point(dh_bits: Value, group: str = "made") -> dict[str, Value]:
 
 def test_the_grid_is_the_papers() -> None:
     """Five sizes by three lengths of key; and the two sizes that are standard, the same way."""
-    made = [(each["dh_bits"], each["mac_key_bits"]) for each in paper_points() if each["group"] == "made"]
+    made = [(point["dh_bits"], point["mac_key_bits"]) for point in paper_points() if point["group"] == "made"]
     assert made == [(bits, length) for bits in (256, 512, 1024, 2048, 4096) for length in (512, 1024, 2048)]
-    standard = {each["dh_bits"] for each in paper_points() if each["group"] == "standard"}
+    standard = {grid_point["dh_bits"] for grid_point in paper_points() if grid_point["group"] == "standard"}
     assert standard == {2048, 4096}
 
 
 def test_the_whole_is_about_the_sum_of_its_steps(ends: PaperEnds) -> None:
-    """Nothing is forgotten between two processes that share a clock; the last step overlaps with the verifying."""
+    """The steps add up to the total of both processes; only the last overlaps with the check."""
     record = ends.measure(point(512), limit_s=60)
     steps = sum(record.number(name) for name in ("parameters_s", "key_pair_s", "exchange_s"))
     assert record.is_ok
@@ -45,18 +45,18 @@ def test_the_whole_is_about_the_sum_of_its_steps(ends: PaperEnds) -> None:
 
 
 def test_an_exchange_that_takes_too_long_is_recorded_and_the_next_one_works(ends: PaperEnds) -> None:
-    """It is given up at the limit, with the limit in the record, and ends no other."""
+    """It stops at the limit, with the limit in the record, and does not affect others."""
     waits: list[float] = []
     late = ends.measure(point(4096), limit_s=0.6, on_wait=lambda: waits.append(time.monotonic()))
     assert (late.status, late.reason) == (Status.NOT_FINISHED, "not finished in 0.6 s")
-    assert waits, "the progress bar was never told"
+    assert waits, "the progress bar was never updated"
     assert ends.measure(point(256), limit_s=60).is_ok
 
 
 def test_an_end_that_fails_is_recorded_and_the_next_one_works(
     ends: PaperEnds, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """There is no standard group of 512 bits: the process ends, and the record says so."""
+    """RFC 7919 has no group of 512 bits: the process ends, and the record has the reason."""
     failed = ends.measure(point(512, "standard"), limit_s=20)
     assert failed.status is Status.FAILED
     assert "ended with status 1" in failed.reason
@@ -76,7 +76,7 @@ FAILURES = {
 def test_an_end_that_does_not_begin_leaves_no_process(
     ends: PaperEnds, monkeypatch: pytest.MonkeyPatch, role: str, failure: str
 ) -> None:
-    """Neither its own nor the other end's, and the next exchange works."""
+    """Both processes stop, and the next exchange works."""
     code, reason = FAILURES[failure]
     genuine = subprocess.Popen
     started: list[subprocess.Popen[bytes]] = []
@@ -95,5 +95,5 @@ def test_an_end_that_does_not_begin_leaves_no_process(
     assert not failed.is_ok
     assert reason in failed.reason
     assert len(started) == (1 if role == "initiator" else 2)
-    assert all(each.returncode is not None for each in started)
+    assert all(process.returncode is not None for process in started)
     assert ends.measure(point(256), limit_s=60).is_ok

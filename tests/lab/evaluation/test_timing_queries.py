@@ -24,7 +24,7 @@ def test_made_and_standard_groups_are_kept_apart() -> None:
 
 
 def test_what_failed_has_no_numbers_and_is_not_forgotten() -> None:
-    """A failed record adds nothing to a median, and is among the problems."""
+    """A failed record does not affect a median, and is among the problems."""
     findings = a_run(FAILED, handshake("mlkem768", 512, 0.005))
     assert findings.daemon_times("mlkem768") == [0.005]
     assert findings.problems() == [FAILED]

@@ -1,1 +1,1 @@
-"""The evaluations: runs give records, records alone give figures and a report. The daemon imports nothing of it."""
+"""The evaluation of timing and of attacks: measurements as records, and reports made from them."""

@@ -1,8 +1,7 @@
 """Attacks of a captured member: frames that policy passes, in which a receiver finds one that policy refuses.
 
-The attacker has the keys of one member (or of two), so its envelopes are genuine. Every frame that it sends passes
-policy by itself. The receiver reads the same bytes by another dialect, or loses its place, and then accepts a frame
-that was hidden in them.
+The attacker has the keys of one or two members, so its envelopes are genuine. The policy permits each of its frames.
+The receiver reads the same bytes with another dialect, or loses synchronisation, and then accepts a hidden frame.
 """
 
 from __future__ import annotations
@@ -31,20 +30,20 @@ _OPERATOR: Final = {"role": "operator", "system_ids": [GROUND], "deny_in": ["MAV
 _ANYTHING: Final[Mapping[str, object]] = {"role": "all", "system_ids": "all"}
 
 
-class Attack(NamedTuple):
+class MemberAttack(NamedTuple):
     """One attempt."""
 
     name: str
     members: tuple[Mapping[str, object], ...]
     """The policy of each captured member, as the victim's daemon has it."""
     frames: tuple[tuple[int, bytes], ...]
-    """What they send in turn: which member, and the frame."""
+    """The index of the member, and the frame, in the order of sending."""
     goal: bytes
     """The hidden frame as a receiver accepts it."""
 
     @property
     def stream(self) -> bytes:
-        """What reaches the receiver if nothing is refused and nothing added."""
+        """The receiver's bytes, if the daemon neither refuses nor adds bytes."""
         return b"".join(raw for _, raw in self.frames)
 
 
@@ -61,7 +60,7 @@ def set_mode(system: int, version: int = 2) -> bytes:
 
 
 def setup_signing(system: int) -> bytes:
-    """SETUP_SIGNING with a key of the attacker's."""
+    """SETUP_SIGNING with a key of the attacker."""
     return frame(_ID["SETUP_SIGNING"], pack("<QBB", 1, VICTIM, 1) + b"K" * 32, system, 190)
 
 
@@ -90,14 +89,14 @@ _SHIFTS: Final = bytes((0xFD, 8, 0, 0, 0, 0, 0, 0xFF, 0xFF, 0xFF))
 
 def signed_unknown(
     name: str, policy: Mapping[str, object], system: int, lacking: int, carrier: int, goal: bytes
-) -> Attack:
+) -> MemberAttack:
     """A signed frame of a message that the receiver lacks shifts it into the next frame's payload."""
     return _two(name, policy, goal, Carrier(lacking, bytearray(6), system, signature=_signature()), carrier, system)
 
 
 def checksum_start(
     name: str, policy: Mapping[str, object], system: int, lacking: int, carrier: int, goal: bytes
-) -> Attack:
+) -> MemberAttack:
     """The last byte of a checksum that the receiver rejects is a start byte: the next frame's header is lost."""
     first = Carrier(lacking, bytearray(6), system, checksum_ends_in=0xFD)
     return _two(name, policy, goal, first, carrier, system)
@@ -107,19 +106,21 @@ def _signature() -> bytearray:
     return bytearray(_SHIFTS.rjust(13, b"\0"))
 
 
-def _two(name: str, policy: Mapping[str, object], goal: bytes, first: Carrier, carrier: int, system: int) -> Attack:
+def _two(
+    name: str, policy: Mapping[str, object], goal: bytes, first: Carrier, carrier: int, system: int
+) -> MemberAttack:
     second = Carrier(carrier, bytearray(max(20, len(goal))), system)
     frames = hide([first, second], goal, first.size + second.payload_at)
-    return Attack(name, (policy,), tuple((0, raw) for raw in frames), goal)
+    return MemberAttack(name, (policy,), tuple((0, raw) for raw in frames), goal)
 
 
-def within(name: str, policy: Mapping[str, object], carrier: Carrier, goal: bytes, at: int = 0) -> Attack:
-    """A whole frame inside a payload, for a receiver that does not know where frames begin."""
+def within(name: str, policy: Mapping[str, object], carrier: Carrier, goal: bytes, at: int = 0) -> MemberAttack:
+    """A complete frame inside a payload, for a receiver without synchronisation."""
     raw = hide([carrier], goal, carrier.payload_at + at)
-    return Attack(name, (policy,), ((0, raw[0]),), goal)
+    return MemberAttack(name, (policy,), ((0, raw[0]),), goal)
 
 
-def legal_lengths(lacking: int) -> Attack:
+def legal_lengths(lacking: int) -> MemberAttack:
     """The same as `signed_unknown`, in frames no longer than defined: the hidden one begins in the signature."""
     goal = terminate(version=1)
     first = Carrier(lacking, bytearray(6), TABLET, signature=bytearray(13))
@@ -127,10 +128,10 @@ def legal_lengths(lacking: int) -> Attack:
     frames = hide([first, second], goal, first.size - 13)
     at = first.size - 13
     hidden = b"".join(frames)[at : at + len(goal)]
-    return Attack("observer: legal lengths", (_OBSERVER,), tuple((0, raw) for raw in frames), hidden)
+    return MemberAttack("observer: legal lengths", (_OBSERVER,), tuple((0, raw) for raw in frames), hidden)
 
 
-def two_members(version: int) -> Attack:
+def two_members(version: int) -> MemberAttack:
     """The hidden frame begins in one member's frame and ends in the other's."""
     goal = terminate(version=version)
     first = Carrier(_ID["HOME_POSITION"], bytearray(60), MEMBER)
@@ -138,16 +139,18 @@ def two_members(version: int) -> Attack:
     at = first.size - 2 - 17  # its header and its first parameter
     frames = hide([first, second], goal, at)
     hidden = b"".join(frames)[at : at + len(goal)]
-    return Attack(f"two members, MAVLink {version}", (_MEMBER, _OTHER), ((0, frames[0]), (1, frames[1])), hidden)
+    return MemberAttack(
+        f"two members, MAVLink {version}", (_MEMBER, _OTHER), ((0, frames[0]), (1, frames[1])), hidden
+    )
 
 
-def restart_in_mavlink1(lacking: int) -> Attack:
-    """A rejected MAVLink 1 frame ends in 0xFD: the C library goes on there in MAVLink 1.
+def restart_in_mavlink1(lacking: int) -> MemberAttack:
+    """A rejected MAVLink 1 frame ends in 0xFD: the C library continues there in MAVLink 1.
 
     It reads the next frame's start byte as a length, its length as a sequence number, and so on.
     """
     first = Carrier(lacking, bytearray(MESSAGES[lacking][2]), MEMBER, version=1, checksum_ends_in=0xFD)
-    # Sequence number and component are what it takes for system and message.
+    # The receiver interprets sequence number and component as system and message.
     second = Carrier(_ID["STATUSTEXT"], bytearray(51), MEMBER, _ID["COMMAND_LONG"], version=1, seq=GROUND)
     third = Carrier(_ID["FILE_TRANSFER_PROTOCOL"], bytearray(254), MEMBER)
     at = first.size - 1
@@ -156,20 +159,20 @@ def restart_in_mavlink1(lacking: int) -> Attack:
     wanted[6 : 6 + 33] = terminate(version=1)[6:-2]
     frames = hide([first, second, third], bytes(wanted), at)
     hidden = bytes((MAVLINK1,)) + b"".join(frames)[at + 1 : at + len(wanted)]
-    return Attack("vehicle: restart in MAVLink 1", (_VEHICLE,), tuple((0, raw) for raw in frames), hidden)
+    return MemberAttack("vehicle: restart in MAVLink 1", (_VEHICLE,), tuple((0, raw) for raw in frames), hidden)
 
 
-def read_as_mavlink1() -> Attack:
-    """A MAVLink 2 frame that is a MAVLink 1 frame, too, for a receiver that goes on in MAVLink 1 at its start byte.
+def read_as_mavlink1() -> MemberAttack:
+    """A MAVLink 2 frame that is also a MAVLink 1 frame, for a receiver that continues in MAVLink 1 at its start byte.
 
-    Such a receiver lost bytes inside a MAVLink 1 frame, whose last byte it then took to be this start byte.
+    Such a receiver lost bytes of a MAVLink 1 frame and interpreted this start byte as the last byte of that frame.
     """
     carrier = Carrier(_ID["HOME_POSITION"], bytearray(60), MEMBER, _ID["COMMAND_LONG"], compat=GROUND)
     # Length, 0, 255, sequence number, system: the message's number is its sender's system, 2 (SYSTEM_TIME).
     raw = hide([carrier], bytes((MAVLINK1, 60, 0, GROUND, 0, MEMBER)) + bytes(62), 0, MESSAGES[MEMBER][1])[0]
     hidden = bytes((MAVLINK1,)) + raw[1:68]
     lost = heartbeat_of(MEMBER)
-    return Attack("swarm-member: read as MAVLink 1 after a loss", (_MEMBER,), ((0, lost), (0, raw)), hidden)
+    return MemberAttack("swarm-member: read as MAVLink 1 after a loss", (_MEMBER,), ((0, lost), (0, raw)), hidden)
 
 
 def heartbeat_of(system: int) -> bytes:
@@ -179,7 +182,7 @@ def heartbeat_of(system: int) -> bytes:
 
 def attacks(
     lacking_observer: int, lacking_vehicle: int, lacking_operator: int, lacking_mavlink1: int
-) -> list[Attack]:
+) -> list[MemberAttack]:
     """Every attack, against a receiver that lacks these messages of the three roles.
 
     ``lacking_mavlink1``: a message of a vehicle that MAVLink 1 can number.

@@ -1,4 +1,4 @@
-"""Whether a measured time depends on something: a permutation test on ranks."""
+"""A permutation test on ranks: does a measured time depend on a parameter?"""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ PERMUTATIONS = 2000
 
 
 def p_value(samples: Sequence[Sequence[float]], permutations: int = PERMUTATIONS) -> float:
-    """How often chance alone would set samples as far apart as these are, or further.
+    """The probability that random samples differ as much as these, or more.
 
-    The statistic is Kruskal and Wallis's: by ranks, so that a few very long times decide nothing. Its distribution is
-    found by shuffling, so that small samples are judged rightly. The same samples always give the same value.
+    The statistic is that of Kruskal and Wallis. It uses ranks, so that a few very long times have no large effect.
+    Its distribution is computed by shuffling, which is exact for small samples. Equal samples return equal values.
     """
     ends = list(accumulate((len(sample) for sample in samples), initial=0))
     ranks = _ranks([value for sample in samples for value in sample])
     seen = _between(ranks, ends)
-    chance = random.Random(0)  # noqa: S311  of a test, not of a key
+    rng = random.Random(0)  # noqa: S311  not a key
     as_far = 0
     for _ in range(permutations):
-        chance.shuffle(ranks)
+        rng.shuffle(ranks)
         as_far += _between(ranks, ends) >= seen - 1e-9
     return (as_far + 1) / (permutations + 1)
 
 
 def _ranks(values: Sequence[float]) -> list[float]:
-    """From 1; equal values share the mean of theirs."""
+    """The ranks from 1; equal values share the mean of their ranks."""
     ordered = sorted(values)
     first: dict[float, int] = {}
     count: dict[float, int] = {}

@@ -1,15 +1,19 @@
-"""From processor time to energy: an estimate, by what one busy core draws; and where that figure comes from."""
+"""Estimates energy from processor time and the power of a busy core, with figures of typical boards."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from uavlinkd.lab.evaluation.records import Value
+    from uavlinkd.lab.evaluation.timing_queries import Findings
 
 DEFAULT_WATTS_PER_CORE = 0.9
-"""A Raspberry Pi 4's, rounded: see below. Joules scale with it."""
+"""Of a Raspberry Pi 4, rounded: see below."""
 
 
 class Board(NamedTuple):
-    """What a board drew, measured by others: idle, and with ``cores`` busy, in watts."""
+    """The power of a board, measured by others: idle, and with ``cores`` busy cores, in watts."""
 
     name: str
     idle_w: float
@@ -19,7 +23,7 @@ class Board(NamedTuple):
 
     @property
     def watts_per_core(self) -> float:
-        """What one busy core adds."""
+        """The additional power of one busy core."""
         return (self.busy_w - self.idle_w) / self.cores
 
 
@@ -47,9 +51,26 @@ BOARDS = (
         "J. Geerling, pidramble.com/wiki/benchmarks/power-consumption: 540 mA idle, 1280 mA under stress, at 5 V",
     ),
 )
-"""For choosing ``--watts-per-core``. The first core costs more than the next: it wakes what all share."""
+"""To choose ``--watts-per-core``. The first busy core adds more than the others: it wakes shared parts."""
 
 
-def estimated_joules(cpu_s: float, watts_per_core: float) -> float:
-    """What a core draws in that much processor time."""
-    return cpu_s * watts_per_core
+def handshake_joules(findings: Findings, suite: str) -> float | None:
+    """The estimate for a handshake, both daemons together."""
+    return _joules(findings, "handshake", 1.0, suite=suite)
+
+
+def frames_joules(findings: Findings, **point: Value) -> float | None:
+    """The estimate for 1,000 frames, both daemons together."""
+    records = [record for record in findings.of("frames", relay=False, **point) if record.is_ok]
+    if not records:
+        return None
+    return _joules(findings, "frames", 1000.0 / records[0].number("sent"), relay=False, **point)
+
+
+def _joules(findings: Findings, kind: str, factor: float, **point: Value) -> float | None:
+    initiator = findings.spread(kind, "cpu_initiator_s", **point)
+    responder = findings.spread(kind, "cpu_responder_s", **point)
+    watts = findings.run.get("watts_per_core")
+    if initiator is None or responder is None or not isinstance(watts, int | float):
+        return None
+    return factor * (initiator.median + responder.median) * float(watts)

@@ -1,7 +1,7 @@
-"""A plain search for MAVLink frames at every offset of a stream: the evaluation's judge of what a client was sent.
+"""A search for MAVLink frames at every offset of a stream. It judges the bytes that a client received.
 
-It shares nothing with the daemon's filter but the tables of messages and the policies. MAVLink's own parsers judge in
-`tests/mavlink/parsers`, where there is a C compiler.
+It shares only the message tables and the policies with the daemon's filter. `tests/mavlink/parsers` uses MAVLink's
+own parsers, which need a C compiler.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from uavlinkd.mavlink.policy.gate import Gate
 
 
 def frames_at_every_offset(stream: bytes) -> Iterator[tuple[int, bytes]]:
-    """Where each valid frame begins, and the frame without its signature. MAVLink 1 may begin with 0xFD, too."""
+    """The offset of each valid frame, and the frame without its signature. MAVLink 1 may begin with 0xFD too."""
     for at, byte in enumerate(stream):
         if byte in (MAVLINK1, MAVLINK2):
             raw = _frame(bytes((MAVLINK1,)) + stream[at + 1 : at + 263], 6)
@@ -30,7 +30,7 @@ def frames_at_every_offset(stream: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def _frame(data: bytes, header_bytes: int) -> bytes:
-    """The frame at the start of these bytes; none: empty."""
+    """The frame at the start of these bytes; empty if there is no valid frame."""
     end = header_bytes + data[1] + 2 if len(data) > header_bytes else len(data) + 1
     if end > len(data):
         return b""
@@ -42,12 +42,12 @@ def _frame(data: bytes, header_bytes: int) -> bytes:
 
 
 def forbidden_frames(stream: bytes, delivered: Sequence[tuple[int, bytes, Gate]]) -> list[bytes]:
-    """The frames in a stream that policy refuses from a source of their bytes.
+    """The frames in a stream that a policy of one of their sources refuses.
 
-    ``delivered``: offset and bytes of each frame that the daemon delivered, and what its source may send.
+    ``delivered``: offset and bytes of each frame that the daemon delivered, and the policy of its source.
     """
     starts = {at: raw for at, raw, _ in delivered}
-    found = []
+    forbidden = []
     for at, raw in frames_at_every_offset(stream):
         if starts.get(at, b"").startswith(raw) or _is_unreachable(stream, at, raw):
             continue
@@ -55,12 +55,12 @@ def forbidden_frames(stream: bytes, delivered: Sequence[tuple[int, bytes, Gate]]
         whole = raw + bytes(SIGNATURE_BYTES) if raw[0] == MAVLINK2 and raw[2] else raw
         frame = parse_frame(whole)
         if frame is None or not all(gate.permits(frame) for gate in gates):
-            found.append(raw)
-    return found
+            forbidden.append(raw)
+    return forbidden
 
 
 def _is_unreachable(stream: bytes, at: int, raw: bytes) -> bool:
-    """Whether no MAVLink 1 frame, valid or not, ends with the 0xFD that a MAVLink 1 frame begins with."""
+    """Whether a MAVLink 1 frame begins with a 0xFD that is not the end of another MAVLink 1 frame, valid or not."""
     if raw[0] != MAVLINK1 or stream[at] != MAVLINK2:
         return False
     first = max(0, at - 262)

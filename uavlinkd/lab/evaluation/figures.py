@@ -1,7 +1,7 @@
-"""The figures of the timing, drawn from records alone: the same records give the same bytes.
+"""The figures of the timing evaluation, drawn from its records. Equal records produce equal bytes.
 
-Times of the paper's method are seconds and those of uavlinkd milliseconds, so each has axes of its own where the
-axis is linear, as the paper's is; the third figure has both on one logarithmic axis.
+The paper's method takes seconds and uavlinkd milliseconds. So each has its own axes where they are linear, as in the
+paper; the third figure has both on one logarithmic axis.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator
 
-from uavlinkd.lab.evaluation.timing_queries import DAEMON_SIZES, Findings, percentile
 from uavlinkd.lab.evaluation.records import Status, Value
 from uavlinkd.lab.evaluation.spread import duration, spread
+from uavlinkd.lab.evaluation.timing_queries import DAEMON_SIZES, Findings, percentile
 
 WIDE = (9.6, 4.6)
 """Inches."""
 _COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#d55e00", "#56b4e9", "#7f7f7f", "#000000")
-"""Okabe and Ito's, told apart by colour-blind readers too."""
+"""The palette of Okabe and Ito, for colour-blind readers too."""
 _MARKERS = "osD^vP*X"
-_STYLE: dict[Any, Any] = {
+STYLE: dict[Any, Any] = {
     "svg.hashsalt": "uavlinkd",
     "font.size": 10,
     "axes.grid": True,
@@ -39,7 +39,7 @@ _STYLE: dict[Any, Any] = {
 
 
 def all_figures(findings: Findings) -> dict[str, bytes]:
-    """Every figure that the records have something for, as SVG, by its name."""
+    """Every figure for which there are records, as SVG, by name."""
     draw: dict[str, Callable[[Findings, Figure], bool]] = {
         "scatter": draw_scatter,
         "histogram": draw_histogram,
@@ -48,15 +48,16 @@ def all_figures(findings: Findings) -> dict[str, bytes]:
         "tags": draw_tags,
     }
     figures = {}
-    with mpl.rc_context(_STYLE):
-        for name, each in draw.items():
+    with mpl.rc_context(STYLE):
+        for name, draw_figure in draw.items():
             figure = Figure(figsize=WIDE, layout="constrained")
-            if each(findings, figure):
-                figures[name] = _svg(figure)
+            if draw_figure(findings, figure):
+                figures[name] = to_svg(figure)
     return figures
 
 
-def _svg(figure: Figure) -> bytes:
+def to_svg(figure: Figure) -> bytes:
+    """The figure as SVG, without its date."""
     out = io.BytesIO()
     figure.savefig(out, format="svg", metadata={"Date": None})
     return out.getvalue()
@@ -133,11 +134,11 @@ def draw_scatter(findings: Findings, figure: Figure) -> bool:
 
 
 def draw_histogram(findings: Findings, figure: Figure) -> bool:
-    """The paper's Fig. 7, for both methods: how many exchanges took how long, in bins equal on a logarithmic axis."""
+    """The paper's Fig. 7, for both methods: a histogram of the times with logarithmic bins."""
     panels = _two_panels(figure)
     drawn = False
     for axes, series in zip(panels, (_paper_series(findings), _daemon_series(findings)), strict=True):
-        named = [(name, [time for each in times.values() for time in each]) for name, times in series]
+        named = [(name, [time for time_ in times.values() for time in time_]) for name, times in series]
         everything = [time for _, times in named for time in times]
         if everything:
             drawn = True
@@ -170,7 +171,7 @@ def _bins(least: float, most: float, bins_a_decade: int = 10) -> list[float]:
 
 
 def _time_axis(axes: Axes, which: str, times: Sequence[float]) -> None:
-    """A logarithmic axis with ticks that read as durations, and room enough that there are two of them."""
+    """A logarithmic axis with durations as ticks, wide enough for two of them."""
     low, high = min(times) / 1.3, max(times) * 1.3
     marks = (1.0, 2.0, 5.0) if high / low < 200 else (1.0,)
     exponents = range(math.floor(math.log10(low)) - 1, math.ceil(math.log10(high)) + 1)
@@ -184,11 +185,14 @@ def _time_axis(axes: Axes, which: str, times: Sequence[float]) -> None:
 
 
 def _legends(panels: Sequence[Axes]) -> None:
-    """Below each panel, where no point can be."""
+    """Put the legends below the panels, outside the points."""
     for axes in panels:
         handles, _ = axes.get_legend_handles_labels()
         if handles:
             axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=3)
+
+
+_LIMIT_SHIFT = -0.34
 
 
 def draw_comparison(findings: Findings, figure: Figure) -> bool:
@@ -216,26 +220,26 @@ def draw_comparison(findings: Findings, figure: Figure) -> bool:
     ]
     everything: list[float] = []
     for number, (label, marker, times) in enumerate(series):
-        shown = {name: spread(each) for name, each in times.items() if each}
-        everything += [time for each in times.values() for time in each]
+        shown = {name: spread(values) for name, values in times.items() if values}
+        everything += [time for time_ in times.values() for time in time_]
         axes.errorbar(
             [places[name] + (number - 1) * 0.16 for name in shown],
-            [each.median for each in shown.values()],
+            [part.median for part in shown.values()],
             yerr=[
-                [each.median - each.low for each in shown.values()],
-                [each.high - each.median for each in shown.values()],
+                [part.median - part.low for part in shown.values()],
+                [part.high - part.median for part in shown.values()],
             ],
             fmt=marker,
             capsize=3,
             color=_COLOURS[number],
             label=f"{label}: median and middle half",
         )
-    late = [each for each in findings.of("paper", group="made") if each.status is Status.NOT_FINISHED]
+    late = [record for record in findings.of("paper", group="made") if record.status is Status.NOT_FINISHED]
     if late:
-        limits = {str(each.point["dh_bits"]): each.number("limit_s") for each in late}
+        limits = {str(record.point["dh_bits"]): record.number("limit_s") for record in late}
         everything += limits.values()
         axes.scatter(
-            [places[name] - 0.16 for name in limits],
+            [places[name] + _LIMIT_SHIFT for name in limits],  # beside the median, which may be the limit too
             list(limits.values()),
             marker="^",
             s=60,
@@ -256,12 +260,12 @@ def draw_comparison(findings: Findings, figure: Figure) -> bool:
 
 
 def _if_any(findings: Findings, bits: int) -> list[float]:
-    """The paper's method, with the limit for what was given up; nothing where all was."""
+    """The paper's method, with the limit for unfinished exchanges; empty if all are unfinished."""
     return findings.paper_at_least("made", bits) if findings.paper_times("made", bits) else []
 
 
 def latency_links(findings: Findings) -> list[tuple[str, list[float]]]:
-    """The links of which latencies are shown, each with a name for a reader."""
+    """The links in the figure of latencies, with their names."""
     links = [
         (
             "authenticated, HMAC key of 256 bits",
@@ -274,7 +278,7 @@ def latency_links(findings: Findings) -> list[tuple[str, list[float]]]:
 
 
 def draw_latency(findings: Findings, figure: Figure) -> bool:
-    """How late frames come on an established link."""
+    """The latency of frames on an established link."""
     axes = figure.subplots()
     links = latency_links(findings)
     everything = [time for _, times in links for time in times]
@@ -293,14 +297,14 @@ def draw_latency(findings: Findings, figure: Figure) -> bool:
             f"{duration(percentile(times, 0.99))} ({len(times)} frames)",
         )
     _time_axis(axes, "x", everything)
-    axes.set_xlabel("time of a frame from program to program, through both daemons")
+    axes.set_xlabel("time of a frame from client to client, through both daemons")
     axes.set_ylabel("frames (%)")
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=1)
     return True
 
 
 def draw_tags(findings: Findings, figure: Figure) -> bool:
-    """What a tag costs by the length of its key, with the states prepared and from the key each time."""
+    """The time of a tag by the length of its key, with prepared states and from the key."""
     lengths, messages = findings.values("mac", "mac_key_bits"), findings.values("mac", "message_bytes")
     if not messages:
         return False
@@ -309,7 +313,7 @@ def draw_tags(findings: Findings, figure: Figure) -> bool:
     for axes, message_bytes in zip(panels, messages, strict=True):
         axes.set_title(f"message of {message_bytes} bytes", loc="left")
         for number, states in enumerate(("prepared", "from the key")):
-            found = {
+            medians = {
                 place: times.median * 1e6
                 for place, bits in enumerate(lengths)
                 if (
@@ -319,8 +323,8 @@ def draw_tags(findings: Findings, figure: Figure) -> bool:
                 )
             }
             axes.bar(
-                [place + (number - 0.5) * 0.4 for place in found],
-                list(found.values()),
+                [place + (number - 0.5) * 0.4 for place in medians],
+                list(medians.values()),
                 width=0.38,
                 color=_COLOURS[number],
                 label={
@@ -328,7 +332,7 @@ def draw_tags(findings: Findings, figure: Figure) -> bool:
                     "from the key": "from the key each time",
                 }[states],
             )
-            drawn |= bool(found)
+            drawn |= bool(medians)
         axes.set_xticks(range(len(lengths)), [str(bits) for bits in lengths])
         axes.grid(visible=False, axis="x")
         axes.set_xlabel("HMAC key (bits)")

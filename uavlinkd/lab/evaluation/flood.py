@@ -1,6 +1,6 @@
-"""What spoofed initiations cost a daemon: processor time and memory, sampled while genuine frames flow.
+"""The cost of spoofed initiations for a daemon: processor time and memory, sampled while genuine frames flow.
 
-The flood is another process and goes straight to the daemon's port, past the man in the middle, who carries frames.
+The flood comes from another process directly to the daemon's port. The genuine frames pass the man in the middle.
 """
 
 from __future__ import annotations
@@ -13,26 +13,27 @@ from dataclasses import replace
 from pathlib import Path
 from time import monotonic
 
+from uavlinkd.lab.child_processes import end_with_parent
 from uavlinkd.lab.evaluation.machine import cpu_seconds
 from uavlinkd.lab.evaluation.stage import DaemonStage
-from uavlinkd.lab.evaluation.tampering_records import Flood
+from uavlinkd.lab.evaluation.tampering_records import FloodSamples
 
 SAMPLE_S = 0.25
 
 
 SOURCES = 256
-"""Hosts that the initiations seem to come from."""
+"""Source addresses of the initiations."""
 
 
-async def run_floods(stage: DaemonStage, rates: Sequence[float], phase_s: float) -> list[Flood]:
-    """Each rate in its turn: quiet, the first drone flooded, quiet again, for ``phase_s``, twice that, and once."""
+async def run_floods(stage: DaemonStage, rates: Sequence[float], phase_s: float) -> list[FloodSamples]:
+    """For each rate: ``phase_s`` without, twice that with, and ``phase_s`` without a flood of the first drone."""
     return [await _run_flood(stage, rate, phase_s) for rate in rates]
 
 
-async def _run_flood(stage: DaemonStage, rate: float, phase_s: float) -> Flood:
+async def _run_flood(stage: DaemonStage, rate: float, phase_s: float) -> FloodSamples:
     names, target = stage.names, stage.drones[stage.names[0]]
     flooder = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-m", "uavlinkd.lab.evaluation.flooder"),
+        *end_with_parent(sys.executable, "-m", "uavlinkd.lab.evaluation.flooder"),
         *(str(target.port), target.public_key, f"{rate:g}", f"{2 * phase_s:g}", str(SOURCES)),
         stdin=asyncio.subprocess.PIPE,
         stdout=asyncio.subprocess.PIPE,
@@ -42,7 +43,9 @@ async def _run_flood(stage: DaemonStage, rate: float, phase_s: float) -> Flood:
         assert flooder.stdout is not None
         await flooder.stdout.readline()  # it is ready
         begin_at = monotonic()
-        flood = Flood(rate, phase_s, 3 * phase_s, [], {n: [] for n in names}, {n: [] for n in names}, [], [], 0)
+        flood = FloodSamples(
+            rate, phase_s, 3 * phase_s, [], {n: [] for n in names}, {n: [] for n in names}, [], [], 0
+        )
         last_at, cpu = begin_at, {name: cpu_seconds(stage.drones[name].pid) for name in names}
         sent, delivered = sum(stage.ledger.mark().values()), stage.ledger.delivered_total()
         begin_s: float | None = None
@@ -72,5 +75,5 @@ async def _run_flood(stage: DaemonStage, rate: float, phase_s: float) -> Flood:
 
 
 def _resident_bytes(pid: int) -> int:
-    """Memory of a process that is in RAM (proc(5), ``statm``)."""
+    """The resident memory of a process (proc(5), ``statm``)."""
     return int(Path(f"/proc/{pid}/statm").read_bytes().split()[1]) * os.sysconf("SC_PAGE_SIZE")

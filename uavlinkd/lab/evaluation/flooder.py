@@ -1,9 +1,9 @@
-"""Spoofed initiations from many hosts of the loopback network, straight to a daemon's port: a process of its own.
+"""Sends spoofed initiations from many addresses of the loopback network directly to a daemon's port.
 
-So what is measured at the daemon is the daemon: nothing that carries genuine frames is busy with the flood.
+It is a separate process, so that the processes with genuine frames are not busy with the flood.
 
-``python -m uavlinkd.lab.evaluation.flooder PORT PUBLIC_KEY RATE SECONDS SOURCES`` says ``ready``, waits for a line,
-floods, and tells how many it sent.
+``python -m uavlinkd.lab.evaluation.flooder PORT PUBLIC_KEY RATE SECONDS SOURCES`` prints ``ready``, waits for a line,
+sends the flood, and prints the number of sent initiations.
 """
 
 from __future__ import annotations
@@ -14,20 +14,20 @@ from collections.abc import Sequence
 from time import monotonic, sleep
 
 from uavlinkd.config.keys import decode_key
-from uavlinkd.lab.mitm.attack import Send, Surroundings, Way
+from uavlinkd.lab.mitm.attack import AttackContext, Direction, Send
 from uavlinkd.lab.mitm.attacks import parse_attack
 
 _TICK_S = 0.002
-_TARGET, _NOBODY = "target", "nobody"
+_TARGET, _SENDER = "target", "sender"
 
 
 def host_of(source: int) -> str:
-    """An address of this machine for each source: all of 127.0.0.0/8 is (RFC 1122, section 3.2.1.3)."""
+    """The address of a source: all of 127.0.0.0/8 belongs to this machine (RFC 1122, section 3.2.1.3)."""
     return f"127.66.{source // 250}.{source % 250 + 1}"
 
 
 def flood(port: int, public_key: bytes, rate_per_s: float, seconds: float, sources: int) -> int:
-    """Initiations with a valid ``mac1`` and nothing behind it to a port of 127.0.0.1. How many were sent."""
+    """Send random initiations with a valid ``mac1`` to a port of 127.0.0.1. Return how many were sent."""
     sockets = []
     for number in range(sources):
         sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -35,10 +35,10 @@ def flood(port: int, public_key: bytes, rate_per_s: float, seconds: float, sourc
         sock.bind((host_of(number), 0))
         sockets.append(sock)
     try:
-        surroundings = Surroundings((Way(_NOBODY, _TARGET),), {_TARGET: public_key})
+        context = AttackContext((Direction(_SENDER, _TARGET),), {_TARGET: public_key})
         text = f"flood-initiations,rate_per_s={rate_per_s:g},sources={sources}"
         begin = monotonic()
-        attack = parse_attack(text).make(surroundings, 0, begin)
+        attack = parse_attack(text).make(context, 0, begin)
         sent = 0
         while (now := monotonic()) < begin + seconds:
             for action in attack.due(now):
@@ -54,13 +54,13 @@ def flood(port: int, public_key: bytes, rate_per_s: float, seconds: float, sourc
 def _send(sock: socket.socket, datagram: bytes, port: int) -> bool:
     try:
         sock.sendto(datagram, ("127.0.0.1", port))
-    except OSError:  # its buffer is full: not sent
+    except OSError:  # the send buffer is full
         return False
     return True
 
 
 def main(arguments: Sequence[str]) -> int:
-    """The process. Exit status 0."""
+    """Run the process and return its exit status."""
     port, public_key, rate_per_s, seconds, sources = arguments
     print("ready", flush=True)
     sys.stdin.readline()

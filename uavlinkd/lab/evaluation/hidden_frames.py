@@ -1,7 +1,7 @@
 """Builds frames that hide another frame: in payloads, signatures and checksums, and across several frames.
 
-A receiver that loses its place between two frames continues inside one of them. What it accepts there was never
-checked by a policy, because the daemon reads frames one after another.
+A receiver that loses synchronisation between two frames continues inside one of them. No policy checks what it
+accepts there, because the daemon reads frames one after another.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ class Carrier:
     seq: int = 0
     compat: int = 0
     signature: bytearray = field(default_factory=bytearray)
-    """13 bytes, or empty: not signed."""
+    """13 bytes, or empty if the frame is not signed."""
     extra: int | None = None
-    """CRC_EXTRA; None: the definition's."""
+    """CRC_EXTRA; None for that of the definition."""
     checksum_ends_in: int | None = None
-    """The checksum's last byte; the last two bytes of the payload are chosen for it."""
+    """The last byte of the checksum; the last two bytes of the payload are computed for it."""
     member: int = 0
-    """Which of several attackers sends it."""
+    """The index of the attacker that sends it."""
 
     @property
     def payload_at(self) -> int:
@@ -46,11 +46,11 @@ class Carrier:
 
     @property
     def size(self) -> int:
-        """Bytes of the whole frame."""
+        """Length of the frame in bytes."""
         return self.payload_at + len(self.payload) + 2 + len(self.signature)
 
     def build(self) -> bytes:
-        """The frame, with the checksum that fits."""
+        """The frame with a valid checksum."""
         header = self._header()
         extra = bytes((crc_extra(self.msgid) if self.extra is None else self.extra,))
         if self.checksum_ends_in is not None and len(self.payload) >= 2:
@@ -85,11 +85,11 @@ def frame(
 
 
 def hide(carriers: Sequence[Carrier], hidden: bytes, at: int, extra: int | None = None) -> list[bytes]:
-    """Write ``hidden`` over the bytes at ``at`` of the stream that the carriers make, and return their frames.
+    """Write ``hidden`` at offset ``at`` of the carriers' stream, and return the carriers' frames.
 
-    Only bytes that the carriers' senders choose are written. The hidden frame's header and payload have whatever
-    stands at the other positions, and its checksum is made to fit. ``extra`` is its CRC_EXTRA; None: its
-    definition's. The result holds a valid hidden frame if its header and its checksum are at free positions.
+    Only bytes that the senders can choose are written; the other bytes of the hidden frame stay as they are. Its
+    checksum is computed for the result. ``extra`` is its CRC_EXTRA; None for that of the definition. The hidden frame
+    is valid if its header and its checksum are at bytes that the senders can choose.
     """
     checksum_at = at + len(hidden) - 2
     if extra is None:
@@ -103,7 +103,7 @@ def hide(carriers: Sequence[Carrier], hidden: bytes, at: int, extra: int | None 
             if first < last:
                 _write(carrier, name, first - begin - offset, hidden[first - at : last - at])
         if begin <= checksum_at < begin + carrier.size:
-            done = stream + carrier.build()  # all before the checksum is final
+            done = stream + carrier.build()  # all bytes before the checksum are final
             fits = mcrf4xx(bytes(done[at + 1 : checksum_at]) + bytes((extra,))).to_bytes(2, "little")
             for name, offset, count in _free(carrier):
                 place = checksum_at - begin - offset
@@ -115,7 +115,7 @@ def hide(carriers: Sequence[Carrier], hidden: bytes, at: int, extra: int | None 
 
 
 def msgid_of(raw: bytes) -> int:
-    """The message id in a frame's header."""
+    """The message ID in a frame's header."""
     return raw[5] if raw[0] == MAVLINK1 else int.from_bytes(raw[7:10], "little")
 
 

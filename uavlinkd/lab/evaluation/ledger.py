@@ -1,7 +1,6 @@
-"""Every frame of the local programs, numbered: what was sent, what came out, and what came out that may not.
+"""The numbered frames of all clients: which were sent, which were delivered, and which should not have been.
 
-A frame is made from its sender and its number alone, so nothing has to be kept to know whether one that arrives is
-as it was sent: it is made again and compared.
+Sender and number determine a frame. To check a received frame, it is computed again and compared.
 """
 
 from __future__ import annotations
@@ -12,14 +11,14 @@ from collections import Counter
 from collections.abc import Iterable
 from enum import StrEnum
 
-from uavlinkd.mavlink.frames import SplitCounters, split_datagram
 from uavlinkd.lab.mitm.anatomy import mavlink_frame
+from uavlinkd.mavlink.frames import SplitCounters, split_datagram
 
 _ATTITUDE, _ATTITUDE_CRC_EXTRA = 30, 39
 _HEARTBEAT, _HEARTBEAT_CRC_EXTRA = 0, 50
 _HEARTBEAT_EVERY = 20
 STALE_S = 8.0
-"""Older than that nothing may come out; far beyond what a busy machine makes of a second."""
+"""The maximum age of a delivered frame, with a large margin for busy machines."""
 _NUMBER = struct.Struct("<I")
 _HEADER_BYTES = 10
 # Roll, pitch and yaw in radians, and their rates; type, autopilot, base mode, status, version.
@@ -28,18 +27,20 @@ _COPTER = bytes((2, 3, 81, 4, 3))
 
 
 class Fault(StrEnum):
-    """What must not come out at a local program."""
+    """What must not be delivered to a client."""
 
     FALSE = "forged or altered"
     REPLAYED = "replayed"
     REFLECTED = "reflected"
     MISROUTED = "misrouted"
     STALE = "stale"
-    """As it was sent, long after it was sent."""
+    """Unaltered, but older than :data:`STALE_S`."""
+    FALSELY_CLAIMED = "claimed as refused, and never refused"
+    """Not delivered either: a drone shows a claim that its peer did not make."""
 
 
 def numbered_frame(system: int, number: int) -> bytes:
-    """An ATTITUDE, now and then a HEARTBEAT: no two of a system are the same."""
+    """An ATTITUDE, or regularly a HEARTBEAT; each of a system is unique."""
     payload = _NUMBER.pack(number)
     if number % _HEARTBEAT_EVERY == 0:
         return mavlink_frame(_HEARTBEAT, payload + _COPTER, _HEARTBEAT_CRC_EXTRA, system, number)
@@ -47,11 +48,11 @@ def numbered_frame(system: int, number: int) -> bytes:
 
 
 class Ledger:
-    """The books of one link or more. Systems are numbered as the names stand, from 1.
+    """The frames of one or more links. The system IDs are the positions of the names, from 1.
 
     Args:
         names: the drones.
-        audience: whose frames come out at whom; every other's by default.
+        audience: the receivers of each drone's frames; by default all others.
     """
 
     def __init__(self, names: Iterable[str], audience: dict[str, set[str]] | None = None) -> None:
@@ -61,8 +62,8 @@ class Ledger:
         self.split = SplitCounters()
         self.sent_at = {name: array("d") for name in self.names}
         """When each frame of a drone was sent, by its number."""
-        self._ways = [(sender, to) for sender in self.names for to in sorted(self.audience[sender])]
-        self._delivered = {way: bytearray() for way in self._ways}
+        self._directions = [(sender, to) for sender in self.names for to in sorted(self.audience[sender])]
+        self._delivered = {direction: bytearray() for direction in self._directions}
         self._newest: dict[tuple[str, str], tuple[float, float]] = {}
 
     def next_frame(self, sender: str, now: float) -> bytes:
@@ -74,7 +75,7 @@ class Ledger:
         return numbered_frame(self.names.index(sender) + 1, len(times) - 1)
 
     def on_received(self, receiver: str, datagram: bytes, now: float) -> None:
-        """What came out at a drone's local program."""
+        """The client of a drone received a datagram."""
         frames = split_datagram(datagram, self.split)
         if sum(len(frame.raw) for frame in frames) != len(datagram):
             self.faults[Fault.FALSE] += 1
@@ -102,27 +103,25 @@ class Ledger:
                 self._newest[sender, receiver] = (sent_at, now)
                 self._note_recovery(sender, receiver, sent_at, now)
 
-    # The time between two marks, and what became of it.
-
     def mark(self) -> dict[str, int]:
-        """How many frames each drone has sent by now."""
+        """The number of frames that each drone has sent."""
         return {name: len(times) for name, times in self.sent_at.items()}
 
     def count(self, begin: dict[str, int], end: dict[str, int]) -> tuple[int, int]:
-        """Frames sent between two marks, for each who should get them, and how many of these came out."""
+        """Frames sent between two marks, counted per receiver, and how many were delivered."""
         sent = delivered = 0
-        for sender, to in self._ways:
+        for sender, to in self._directions:
             part = self._delivered[sender, to][begin[sender] : end[sender]]
             sent += len(part)
             delivered += sum(part)
         return sent, delivered
 
     def delivered_total(self) -> int:
-        """All that came out as they should."""
-        return sum(sum(each) for each in self._delivered.values())
+        """The number of correctly delivered frames."""
+        return sum(sum(flags) for flags in self._delivered.values())
 
     def await_recovery(self, since: float) -> None:
-        """From now on, note when frames sent after ``since`` come out."""
+        """Measure when frames sent after ``since`` are delivered."""
         self._since = since
         self._recovered: dict[tuple[str, str], float] = {}
 
@@ -135,5 +134,5 @@ class Ledger:
 
     @property
     def recovery_s(self) -> float | None:
-        """Seconds until frames came out again everywhere; None as long as they do not."""
-        return max(self._recovered.values()) if len(self._recovered) == len(self._ways) else None
+        """Seconds until every receiver got frames again; None before that."""
+        return max(self._recovered.values()) if len(self._recovered) == len(self._directions) else None

@@ -1,4 +1,4 @@
-"""The measuring process: one thread, one selector, no event loop that could be late."""
+"""The measuring process: one thread and one selector, without an event loop that could be late."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from uavlinkd.core import wire
 
 DATAGRAM_BYTES = 65536
 FRAME_OVERHEAD_BYTES = 12
-"""Of an unsigned MAVLink 2 frame, beside its payload, whose length is its second byte."""
+"""Bytes of an unsigned MAVLink 2 frame in addition to its payload. The second byte is the payload's length."""
 ENVELOPES = (wire.SHORT_ENVELOPE, wire.LONG_ENVELOPE)
 
 
 def udp_socket() -> socket.socket:
-    """On loopback, on a port of the system's choice."""
+    """A UDP socket on loopback, on a free port."""
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     sock.bind(("127.0.0.1", 0))
     sock.setblocking(False)
@@ -26,21 +26,21 @@ def udp_socket() -> socket.socket:
 
 
 class Loop:
-    """Calls back when a socket can be read."""
+    """Calls functions when sockets are readable."""
 
     def __init__(self) -> None:
         self._selector = selectors.DefaultSelector()
 
     def add(self, sock: socket.socket, on_readable: Callable[[], None]) -> None:
-        """From now on."""
+        """Call ``on_readable`` when the socket is readable."""
         self._selector.register(sock, selectors.EVENT_READ, on_readable)
 
     def remove(self, sock: socket.socket) -> None:
-        """Not any more."""
+        """Stop watching the socket."""
         self._selector.unregister(sock)
 
     def until(self, condition: Callable[[], bool], limit_s: float) -> bool:
-        """Serve the sockets until the condition holds, or the limit passes; whether it holds."""
+        """Serve the sockets until the condition holds or the limit passes. Return whether it holds."""
         end = time.monotonic() + limit_s
         while not condition():
             left = end - time.monotonic()
@@ -51,17 +51,17 @@ class Loop:
         return True
 
     def rest(self, seconds: float) -> None:
-        """Serve the sockets for so long."""
+        """Serve the sockets for ``seconds``."""
         self.until(lambda: False, seconds)
 
     def close(self) -> None:
-        """Forget the sockets."""
+        """Close the selector."""
         self._selector.close()
 
 
 @dataclass(slots=True)
 class Seen:
-    """What passed a relay since it was opened: how much each way, and when each kind passed for the first time."""
+    """The datagrams of one direction since a relay was opened, and when each kind passed first."""
 
     datagrams: int = 0
     bytes: int = 0
@@ -70,37 +70,37 @@ class Seen:
 
 
 class Relay:
-    """The network between a caller and the daemon it calls: passes everything on while open, nothing while closed.
+    """The network between the two daemons: forwards all datagrams while open, and drops them while closed.
 
-    A moment is taken as a datagram arrives, before it is passed on.
+    The time of a datagram is that of its arrival, before it is forwarded.
     """
 
     def __init__(self, loop: Loop, target: tuple[str, int]) -> None:
         self._loop = loop
         self._target = target
-        self._caller: tuple[str, int] | None = None
+        self._initiator: tuple[str, int] | None = None
         self._front, self._back = udp_socket(), udp_socket()
         loop.add(self._front, self._on_front)
         loop.add(self._back, self._on_back)
         self.is_open = False
         self.turned_away = 0
-        """Datagrams that came from the caller while closed."""
+        """Datagrams of the initiator while closed."""
         self.there, self.back = Seen(), Seen()
-        """From the caller, and to it."""
+        """From the initiator, and to it."""
 
     @property
     def address(self) -> tuple[str, int]:
-        """Where the caller has to call."""
+        """The address for the initiator."""
         host, port = self._front.getsockname()
         return host, port
 
     def open(self) -> None:
-        """Let through from now on, and count from zero."""
+        """Open the relay and reset the counters."""
         self.there, self.back = Seen(), Seen()
         self.is_open = True
 
     def _on_front(self) -> None:
-        datagram, self._caller = self._front.recvfrom(DATAGRAM_BYTES)
+        datagram, self._initiator = self._front.recvfrom(DATAGRAM_BYTES)
         if not self.is_open:
             self.turned_away += 1
             return
@@ -109,9 +109,9 @@ class Relay:
 
     def _on_back(self) -> None:
         datagram = self._back.recv(DATAGRAM_BYTES)
-        if self.is_open and self._caller is not None:
+        if self.is_open and self._initiator is not None:
             _count(self.back, datagram)
-            self._front.sendto(datagram, self._caller)
+            self._front.sendto(datagram, self._initiator)
 
     def close(self) -> None:
         """Close both sockets."""
@@ -130,9 +130,9 @@ def _count(seen: Seen, datagram: bytes) -> None:
 
 
 class Sink:
-    """A program at the far end of a link: which MAVLink 2 frames came, and when each did first.
+    """The client at the other end of a link: the received MAVLink 2 frames, and when each arrived first.
 
-    A daemon that is late puts several frames into one datagram.
+    A delayed daemon sends several frames in one datagram.
     """
 
     def __init__(self, loop: Loop) -> None:
@@ -143,7 +143,7 @@ class Sink:
 
     @property
     def port(self) -> int:
-        """Of its socket, on loopback."""
+        """The port of its socket, on loopback."""
         return int(self._sock.getsockname()[1])
 
     def _on_readable(self) -> None:

@@ -1,4 +1,4 @@
-"""The machine under the measurement: what it is, what a process used of it, what the processor says it drew."""
+"""Facts about the machine of a measurement, processor time of processes, energy counters of the processor."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from uavlinkd import __version__
 from uavlinkd.lab.evaluation.records import Value
 
 RAPL_FOLDER = Path("/sys/class/powercap")
-"""Where Linux shows the energy counters of the processor (Intel's and AMD's RAPL), if it lets us see them."""
+"""Linux's folder of the processor's energy counters (RAPL of Intel and AMD), if they are readable."""
 
 
 def machine_facts() -> dict[str, Value]:
-    """What a reader needs to compare numbers: processor, cores, system, versions, and how busy it was before."""
+    """The facts for comparing results: processor, cores, system, versions, and the load before the run."""
     return {
         "cpu": _cpu_name(),
         "cores": os.cpu_count(),
@@ -33,7 +33,7 @@ def machine_facts() -> dict[str, Value]:
 
 
 def load() -> float | None:
-    """Processes that wanted a core in the last minute, on average; None where the system does not count."""
+    """The load average of the last minute; None if the system does not provide it."""
     return round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None
 
 
@@ -47,9 +47,13 @@ def _cpu_name() -> str:
 
 
 def _commit() -> str | None:
-    """Which code was measured: git's name for it, with "changed" where files differ; None outside of a checkout."""
+    """The measured commit, with "changed" if files differ from it; None outside a checkout."""
     questions = (
-        ("ls-files", "--error-unmatch", __file__),  # a checkout of this project, and not one around an installation
+        (
+            "ls-files",
+            "--error-unmatch",
+            __file__,
+        ),  # a checkout of this project, not one that contains an installation
         ("rev-parse", "--short", "HEAD"),
         ("status", "--porcelain", "--", ".."),
     )
@@ -57,7 +61,7 @@ def _commit() -> str | None:
     for question in questions:
         git = ("git", "-C", str(Path(__file__).parent), *question)
         try:
-            done = subprocess.run(git, capture_output=True, text=True, check=True, timeout=10)  # noqa: S603  our words
+            done = subprocess.run(git, capture_output=True, text=True, check=True, timeout=10)  # noqa: S603  constants
         except (OSError, subprocess.SubprocessError):
             return None
         answers.append(done.stdout.strip())
@@ -73,32 +77,32 @@ def _version_of(package: str) -> str | None:
 
 
 def _openssl_version() -> str:
-    """The OpenSSL that ``cryptography`` brings, which does the arithmetic; not that of Python's ``ssl``."""
-    from uavlinkd.lab.evaluation.paper import openssl_version  # noqa: PLC0415  where the library may be imported
+    """The OpenSSL inside ``cryptography``, which computes; not that of Python's ``ssl``."""
+    from uavlinkd.lab.evaluation.paper import openssl_version  # noqa: PLC0415  only there the library may be imported
 
     return openssl_version()
 
 
 class CpuTimeError(Exception):
-    """The time that a process used cannot be read: it has ended, or this is no Linux."""
+    """The processor time of a process cannot be read: it has ended, or the system is not Linux."""
 
 
 def cpu_seconds(pid: int) -> float:
-    """Processor time that a process used so far, all its threads.
+    """The processor time of all threads of a process.
 
-    From the scheduler's accounts in nanoseconds (``/proc/PID/task/*/schedstat``); where the kernel keeps none, from
-    ``/proc/PID/stat``, whose steps are 10 ms.
+    It comes from the scheduler, in nanoseconds (``/proc/PID/task/*/schedstat``), or if the kernel does not provide
+    that, from ``/proc/PID/stat`` in steps of 10 ms.
 
     Raises:
         CpuTimeError: it cannot be read.
     """
     threads = Path(f"/proc/{pid}/task")
     try:
-        return sum(int((each / "schedstat").read_bytes().split()[0]) for each in threads.iterdir()) / 1e9
+        return sum(int((thread / "schedstat").read_bytes().split()[0]) for thread in threads.iterdir()) / 1e9
     except (OSError, IndexError, ValueError):
         pass
     try:
-        # Behind the name, which may hold anything: fields 14 and 15 of proc(5).
+        # After the name, which may have any characters: fields 14 and 15 of proc(5).
         fields = Path(f"/proc/{pid}/stat").read_bytes().rpartition(b")")[2].split()
         return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
     except (OSError, IndexError, ValueError) as error:
@@ -106,20 +110,20 @@ def cpu_seconds(pid: int) -> float:
 
 
 class EnergyMeter:
-    """The processor packages' own energy counters, where they can be read. They count everything that runs."""
+    """The energy counters of the processor packages, if they are readable. They count everything that runs."""
 
     def __init__(self, folder: Path = RAPL_FOLDER) -> None:
-        # intel-rapl:0 is a package; intel-rapl:0:1 a part of it, and psys the whole machine with all packages.
-        zones = [each for each in sorted(folder.glob("*-rapl:*")) if _name(each).startswith("package")]
-        self._zones = [each for each in zones if _microjoules(each / "energy_uj") is not None]
+        # intel-rapl:0 is a package, intel-rapl:0:1 a part of it, and psys the machine with all packages.
+        zones = [zone for zone in sorted(folder.glob("*-rapl:*")) if _name(zone).startswith("package")]
+        self._zones = [zone for zone in zones if _microjoules(zone / "energy_uj") is not None]
         self._before: list[int | None] = []
 
     def start(self) -> None:
-        """From now on."""
-        self._before = [_microjoules(each / "energy_uj") for each in self._zones]
+        """Start measuring."""
+        self._before = [_microjoules(zone / "energy_uj") for zone in self._zones]
 
     def joules(self) -> float | None:
-        """Since :meth:`start`; None where the machine does not tell."""
+        """The energy since :meth:`start`; None without counters."""
         if not self._zones:
             return None
         total = 0
@@ -127,7 +131,7 @@ class EnergyMeter:
             now = _microjoules(zone / "energy_uj")
             if now is None or before is None:
                 return None
-            if now < before:  # the counter went round
+            if now < before:  # the counter overflowed
                 now += (_microjoules(zone / "max_energy_range_uj") or 0) + 1
             total += now - before
         return total / 1e6

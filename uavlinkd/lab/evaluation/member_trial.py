@@ -1,7 +1,7 @@
-"""A captured member against a real daemon: allowed frames that hide forbidden ones, and what a client was sent.
+"""A captured member against a real daemon: allowed frames hide forbidden ones. Does a client receive one?
 
-The attackers are peers with keys of their own and the policies of the attacks. A client at the daemon's UDP endpoint
-keeps every byte. The judge is :mod:`.every_offset`.
+The attackers are peers with their own keys and the policies of the attacks. A client at the daemon's UDP endpoint
+records every byte. :mod:`.every_offset` judges them.
 """
 
 from __future__ import annotations
@@ -18,30 +18,32 @@ from pathlib import Path
 from time import monotonic
 from typing import Any, Final, Self, cast
 
+from uavlinkd.config.keys import decode_key, generate_private_key, generate_psk, public_key_text
 from uavlinkd.core.crypto import Secret
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Output, Transmit
+from uavlinkd.core.path import Path as PeerPath
 from uavlinkd.core.settings import PeerSettings
-from uavlinkd.lab.evaluation.captured_member import Attack, attacks, heartbeat_of
+from uavlinkd.lab.evaluation.captured_member import MemberAttack, attacks, heartbeat_of
 from uavlinkd.lab.evaluation.every_offset import forbidden_frames
 from uavlinkd.lab.evaluation.hidden_frames import frame
 from uavlinkd.lab.evaluation.stage import StageError
 from uavlinkd.lab.evaluation.tampering_plan import KEYS
 from uavlinkd.lab.evaluation.tampering_records import OURS, Trial
-from uavlinkd.config.keys import decode_key, generate_private_key, generate_psk, public_key_text
+from uavlinkd.lab.sim.drone_process import DroneProcess
+from uavlinkd.lab.sim.loopback_ports import free_ports
 from uavlinkd.mavlink.dialect import ids_by_name
-from uavlinkd.mavlink.policy.gate import Gate
 from uavlinkd.mavlink.policy.compilation import compile_policy
-from uavlinkd.lab.sim.drone_process import DroneProcess, free_udp_ports
+from uavlinkd.mavlink.policy.gate import Gate
 
 NAME: Final = "captured member"
 VICTIM: Final = "drone0"
 WITNESS: Final = "witness"
 WITNESS_SYSTEM: Final = 77
-PATIENCE_S: Final = 30.0
+PATIENCE_S: Final = 120.0
 _TICK_S: Final = 0.01
 
-# Messages that pymavlink's largest dialect lacks: what it accepts, receivers of smaller ones do as well.
+# Messages that pymavlink's largest dialect lacks. Receivers with smaller dialects lack them too.
 _ATTACKS: Final = attacks(
     ids_by_name()["REQUEST_EVENT"],
     ids_by_name()["LINK_NODE_STATUS"],
@@ -51,56 +53,58 @@ _ATTACKS: Final = attacks(
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
-    """What became of one attack."""
+class MemberResult:
+    """The result of one attack."""
 
     attack: str
     sent: int
     delivered: int
     separators: int
-    """Bytes that the daemon put between frames."""
+    """Bytes that the daemon inserted between frames."""
     forbidden: tuple[bytes, ...]
-    """Frames that a parser could find in the client's stream and that policy refuses."""
+    """Frames in the client's stream that a parser could accept and the policy refuses."""
 
 
 @dataclass(slots=True)
 class Results:
-    """What became of all of them."""
+    """The results of all attacks."""
 
-    outcomes: list[Outcome] = field(default_factory=list)
+    outcomes: list[MemberResult] = field(default_factory=list)
     refused: Counter[str] = field(default_factory=Counter)
     """Frames that the daemon did not deliver, by reason."""
     sessions: int = 0
     witness_sent: int = 0
     witness_delivered: int = 0
     last_wait_s: float = 0.0
-    """From the last attack's end until a frame of another peer came out."""
+    """From the end of the last attack until a frame of another peer was delivered."""
 
 
 class _Member(asyncio.DatagramProtocol):
-    """A peer's keys in an attacker's hands: its envelopes are genuine."""
+    """An attacker with the keys of a peer: its envelopes are genuine."""
 
     def __init__(self, private_key: str, victim: DroneProcess, psk: str) -> None:
         now = monotonic()
         self._node = Node(Secret(decode_key(private_key)), os.urandom, now)
-        self._node.add_peer(PeerSettings(VICTIM, decode_key(victim.public_key), Secret(decode_key(psk))), now)
+        self._peer = self._node.add_peer(
+            PeerSettings(VICTIM, decode_key(victim.public_key), Secret(decode_key(psk))), now
+        )
         self._victim = victim
         self._transport: asyncio.DatagramTransport
         self._ticking: asyncio.Task[None] | None = None
 
     @property
     def is_up(self) -> bool:
-        """Whether the victim has answered on a session."""
-        return self._node.peers[VICTIM].is_up
+        """Whether the victim has confirmed a session."""
+        return self._peer.is_up
 
-    def say(self, raw: bytes) -> None:
-        """One frame in an envelope of its own."""
-        self._perform(self._node.send(VICTIM, [raw], monotonic()))
+    def send(self, raw: bytes) -> None:
+        """Send one frame in its own envelope."""
+        self._perform(self._node.send(self._peer, [raw], monotonic()))
 
     async def __aenter__(self) -> Self:
         loop = asyncio.get_running_loop()
         await loop.create_datagram_endpoint(lambda: self, local_addr=("127.0.0.1", 0))
-        self._node.set_addresses(VICTIM, [(0, "127.0.0.1", self._victim.port)], monotonic())
+        self._node.set_paths(self._peer, [PeerPath(0, ("127.0.0.1", self._victim.port))], monotonic())
         self._ticking = asyncio.create_task(self._tick())
         return self
 
@@ -115,7 +119,7 @@ class _Member(asyncio.DatagramProtocol):
         self._transport = cast("asyncio.DatagramTransport", transport)
 
     def datagram_received(self, data: bytes, addr: tuple[str | Any, int]) -> None:
-        self._perform(self._node.receive(data, (0, addr[0], addr[1]), monotonic()))
+        self._perform(self._node.receive(data, PeerPath(0, (addr[0], addr[1])), monotonic()))
 
     async def _tick(self) -> None:
         while True:
@@ -129,7 +133,7 @@ class _Member(asyncio.DatagramProtocol):
 
 
 class _Client:
-    """A client at the daemon's endpoint that keeps every byte."""
+    """A client at the daemon's endpoint that records every byte."""
 
     def __init__(self, endpoint_port: int) -> None:
         self.received = bytearray()
@@ -138,11 +142,11 @@ class _Client:
         self._sock.connect(("127.0.0.1", endpoint_port))
 
     def greet(self) -> None:
-        """Be there, as an autopilot is."""
+        """Send a heartbeat like an autopilot."""
         self._sock.send(heartbeat_of(1))
 
     def read(self) -> None:
-        """Take what has come."""
+        """Read the received bytes."""
         try:
             while True:
                 self.received += self._sock.recv(1 << 16)
@@ -155,14 +159,15 @@ class _Client:
 
 
 async def run_attacks(folder: Path) -> Results:
-    """Try every attack of the catalogue once, in a folder for the daemon's files.
+    """Try every attack once. ``folder`` is for the daemon's files.
 
     Raises:
-        StageError, DroneError: the daemon does not work at all.
+        StageError, DroneError: the daemon failed.
     """
-    port, endpoint_port = free_udp_ports(2)
+    port, endpoint_port = free_ports(2)
     victim = DroneProcess(VICTIM, folder / VICTIM, port, endpoint_port)
-    policies: dict[str, Mapping[str, object]] = {_key(policy): policy for each in _ATTACKS for policy in each.members}
+    members_of_all = [policy for attack in _ATTACKS for policy in attack.members]
+    policies: dict[str, Mapping[str, object]] = {_key(policy): policy for policy in members_of_all}
     policies[WITNESS] = {"role": "swarm-member", "system_ids": [WITNESS_SYSTEM]}
     members: dict[str, _Member] = {}
     peers = []
@@ -188,48 +193,48 @@ async def run_attacks(folder: Path) -> Results:
         for number, attack in enumerate(_ATTACKS):
             results.outcomes.append(await _try(attack, number, members, gates, client, results))
         status = await victim.ask()
-    for each in status["peers"].values():
-        results.sessions += each["handshakes"]
-        for reasons in each["refused"]["in"].values():
+    for item in status["peers"].values():
+        results.sessions += item["handshakes"]
+        for reasons in item["refused"]["in"].values():
             results.refused.update(reasons)
     return results
 
 
 async def _try(
-    attack: Attack,
+    attack: MemberAttack,
     number: int,
     members: Mapping[str, _Member],
     gates: Mapping[str, Gate],
     client: _Client,
     results: Results,
-) -> Outcome:
+) -> MemberResult:
     client.received.clear()
     keys = [_key(policy) for policy in attack.members]
     for member, raw in attack.frames:
-        members[keys[member]].say(raw)
+        members[keys[member]].send(raw)
     stream = bytes(client.received[: await _witness(number, members[WITNESS], client, results)])
     return _look(attack, stream, [gates[key] for key in keys])
 
 
 async def _witness(number: int, witness: _Member, client: _Client, results: Results) -> int:
-    """Another peer's frame behind the attack's: when it has come out, so has all before it. Returns its offset."""
+    """Send another peer's frame after the attack's, and wait for it. Return its offset in the client's bytes."""
     began = monotonic()
     marker = frame(ids_by_name()["ATTITUDE"], number.to_bytes(4, "little") + bytes(23) + b"\1", WITNESS_SYSTEM)
     results.witness_sent += 1
-    witness.say(marker)
+    witness.send(marker)
 
     async def has_come() -> bool:
         client.read()
         return marker in client.received
 
-    await _until(has_come, "a frame of another peer did not come out")
+    await _until(has_come, "a frame of another peer was not delivered")
     results.witness_delivered += 1
     results.last_wait_s = monotonic() - began
     return client.received.index(marker)
 
 
-def _look(attack: Attack, stream: bytes, gates: list[Gate]) -> Outcome:
-    """Find the attack's frames in what the client was sent, and then those that nobody may send."""
+def _look(attack: MemberAttack, stream: bytes, gates: list[Gate]) -> MemberResult:
+    """Find the attack's frames in the client's stream, then the forbidden frames."""
     delivered = []
     at = 0
     for member, raw in attack.frames:
@@ -239,7 +244,7 @@ def _look(attack: Attack, stream: bytes, gates: list[Gate]) -> Outcome:
             at = begin + len(raw)
     carried = sum(len(raw) for _, raw, _ in delivered)
     forbidden = tuple(forbidden_frames(stream, delivered))
-    return Outcome(attack.name, len(attack.frames), len(delivered), len(stream) - carried, forbidden)
+    return MemberResult(attack.name, len(attack.frames), len(delivered), len(stream) - carried, forbidden)
 
 
 async def _is_linked(victim: DroneProcess, members: Mapping[str, _Member]) -> bool:
@@ -260,7 +265,7 @@ def _key(policy: Mapping[str, object]) -> str:
 
 
 def as_trial(results: Results, begin_s: float, duration_s: float, seed: int) -> Trial:
-    """A row of the tampering evaluation."""
+    """The results as a trial of the tampering evaluation."""
     sent = sum(outcome.sent for outcome in results.outcomes)
     forbidden = sum(len(outcome.forbidden) for outcome in results.outcomes)
     names = ", ".join(outcome.attack for outcome in results.outcomes if outcome.forbidden)

@@ -1,6 +1,6 @@
-"""The man in the middle between the two ends of an evaluation: ``uavlink-mitm`` as a process, or in this one.
+"""The man in the middle of an evaluation: ``uavlink-mitm`` as a process, or a proxy in this process.
 
-In this process it can be given attackers that hold keys, which ``uavlink-mitm`` never has.
+In this process, it can run attackers that have keys, unlike ``uavlink-mitm``.
 """
 
 from __future__ import annotations
@@ -19,41 +19,42 @@ from typing import Any, Protocol
 
 import structlog
 
-from uavlinkd.system.addresses import Address
-from uavlinkd.ops.control import ControlError, ask
 from uavlinkd.config.keys import encode_key
-from uavlinkd.lab.mitm.attack import AttackObject, Surroundings
+from uavlinkd.lab.child_processes import end_with_parent
+from uavlinkd.lab.mitm.attack import AttackContext, AttackObject
 from uavlinkd.lab.mitm.attacks import parse_attack
 from uavlinkd.lab.mitm.proxy import Proxy
 from uavlinkd.lab.mitm.proxy_settings import MitmLink, MitmPeer, ProxySettings
-from uavlinkd.lab.sim.drone_process import free_udp_ports
+from uavlinkd.lab.sim.loopback_ports import free_ports
+from uavlinkd.ops.control import ControlError, ask
+from uavlinkd.system.addresses import Address
 
 HOST = "127.0.0.1"
-START_S = 60.0
+START_S = 120.0
 
 
 class MiddleError(Exception):
-    """The man in the middle does not do what it was told. The message is for a person."""
+    """The man in the middle failed. The message is for the operator."""
 
 
 @dataclass(frozen=True, slots=True)
 class Interventions:
-    """What it did so far, as its statistics say."""
+    """The counters of the man in the middle."""
 
     counts: Mapping[str, int] = field(default_factory=dict)
-    """By "attack: what"."""
+    """By "attack: operation"."""
     bytes_to_strangers: int = 0
-    """What was sent back to addresses of the attacker's own."""
+    """Bytes that the peers sent to strangers."""
     amplified: Mapping[str, int] = field(default_factory=dict)
-    """By "peer to address of the attacker's own": bytes that came back beyond what lately went there."""
+    """By "peer to stranger": bytes that the stranger received beyond those it recently sent."""
 
     def of(self, names: Sequence[str]) -> dict[str, int]:
-        """Of these attacks."""
+        """The counters of these attacks."""
         return {key: count for key, count in self.counts.items() if key.partition(":")[0] in names}
 
 
 def interventions(statistics: Mapping[str, Any]) -> Interventions:
-    """From the statistics of a :class:`Proxy`."""
+    """Read the counters from the statistics of a :class:`Proxy`."""
     strangers = statistics["strangers"]
     return Interventions(
         dict(statistics["interventions"]), int(strangers["bytes_back"]), dict(strangers["amplified"])
@@ -61,28 +62,28 @@ def interventions(statistics: Mapping[str, Any]) -> Interventions:
 
 
 class Middle(Protocol):
-    """One of the two below."""
+    """The interface of both."""
 
     @property
     def ports(self) -> Mapping[tuple[str, str], int]:
-        """By peer and by whom it reaches there."""
+        """The port where the first peer reaches the second."""
 
     async def start(self, addresses: Mapping[str, int], public_keys: Mapping[str, bytes]) -> None:
-        """Stand between peers, whose ports these are."""
+        """Start between peers with these ports."""
 
     async def attack(self, specs: Sequence[str], objects: Sequence[AttackObject] = ()) -> None:
-        """Do this from now on, and nothing of before."""
+        """Replace the attacks."""
 
     async def statistics(self) -> Interventions:
-        """What it did so far."""
+        """The counters so far."""
 
     async def stop(self) -> None:
-        """Leave."""
+        """Stop."""
 
 
-def _faces(names: Sequence[str]) -> dict[tuple[str, str], int]:
+def _listen_ports(names: Sequence[str]) -> dict[tuple[str, str], int]:
     pairs = [(one, other) for one in names for other in names if one != other]
-    return dict(zip(pairs, free_udp_ports(len(pairs)), strict=True))
+    return dict(zip(pairs, free_ports(len(pairs)), strict=True))
 
 
 def _pairs(names: Sequence[str]) -> list[tuple[str, str]]:
@@ -90,10 +91,10 @@ def _pairs(names: Sequence[str]) -> list[tuple[str, str]]:
 
 
 class MiddleProcess:
-    """``uavlink-mitm``, controlled by its socket. It writes every intervention to ``log``."""
+    """``uavlink-mitm`` as a process, controlled by its socket. It writes every intervention to ``log``."""
 
     def __init__(self, names: Sequence[str], folder: Path, log: Path, seed: int) -> None:
-        self.ports = _faces(names)
+        self.ports = _listen_ports(names)
         self._names = tuple(names)
         self._socket = folder / "mitm.sock"
         self._log = log
@@ -101,10 +102,10 @@ class MiddleProcess:
         self._process: asyncio.subprocess.Process | None = None
 
     async def start(self, addresses: Mapping[str, int], public_keys: Mapping[str, bytes]) -> None:
-        """Start the process, and wait until it answers.
+        """Start the process, and wait for its answer.
 
         Raises:
-            MiddleError: it does not.
+            MiddleError: it does not answer.
         """
         flags = ["--seed", str(self._seed), "--log", str(self._log), "--control-socket", str(self._socket)]
         for name, port in addresses.items():
@@ -114,7 +115,7 @@ class MiddleProcess:
             here, there = self.ports[one, other], self.ports[other, one]
             flags += ["--link", f"{one}@{HOST}:{here},{other}@{HOST}:{there}"]
         self._process = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-m", "uavlinkd.lab.mitm", *flags),
+            *end_with_parent(sys.executable, "-m", "uavlinkd.lab.mitm", *flags),
             stdin=asyncio.subprocess.DEVNULL,
             stdout=asyncio.subprocess.DEVNULL,
             stderr=asyncio.subprocess.DEVNULL,
@@ -131,10 +132,10 @@ class MiddleProcess:
                 return
 
     async def attack(self, specs: Sequence[str], objects: Sequence[AttackObject] = ()) -> None:
-        """Do this from now on.
+        """Replace the attacks.
 
         Raises:
-            MiddleError: it is refused.
+            MiddleError: the attacks are refused.
         """
         assert not objects, "attackers with keys stay out of uavlink-mitm"
         answer = await self._ask("attack " + (" ".join(specs) or "none"))
@@ -142,14 +143,14 @@ class MiddleProcess:
             raise MiddleError(f"{' '.join(specs)}: {answer['refused']}")
 
     async def statistics(self) -> Interventions:
-        """What it did so far."""
+        """The counters so far."""
         return interventions(await self._ask("statistics"))
 
     async def _ask(self, request: str) -> dict[str, Any]:
         return await asyncio.to_thread(ask, self._socket, request)
 
     async def stop(self) -> None:
-        """End the process."""
+        """Stop the process."""
         if self._process is not None and self._process.returncode is None:
             self._process.send_signal(signal.SIGTERM)
             with suppress(TimeoutError):
@@ -163,7 +164,7 @@ class MiddleHere:
     """A :class:`Proxy` in this process."""
 
     def __init__(self, names: Sequence[str], log: Path | None, seed: int) -> None:
-        self.ports = _faces(names)
+        self.ports = _listen_ports(names)
         self._names = tuple(names)
         self._log = log
         self._seed = seed
@@ -171,17 +172,17 @@ class MiddleHere:
 
     @property
     def proxy(self) -> Proxy:
-        """Once it has started."""
+        """The running proxy."""
         assert self._proxy is not None
         return self._proxy
 
     @property
-    def surroundings(self) -> Surroundings:
-        """What attacks know."""
-        return self.proxy.surroundings
+    def context(self) -> AttackContext:
+        """The context of the attacks."""
+        return self.proxy.context
 
     async def start(self, addresses: Mapping[str, int], public_keys: Mapping[str, bytes]) -> None:
-        """Stand between peers."""
+        """Start between peers."""
         peers = tuple(MitmPeer(name, Address(HOST, port), public_keys.get(name)) for name, port in addresses.items())
         links = tuple(
             MitmLink(pair, (Address(HOST, self.ports[pair]), Address(HOST, self.ports[pair[::-1]])))
@@ -193,27 +194,27 @@ class MiddleHere:
         self._proxy = proxy
 
     async def attack(self, specs: Sequence[str], objects: Sequence[AttackObject] = ()) -> None:
-        """Do this from now on."""
+        """Replace the attacks."""
         now = monotonic()
         made = [
-            parse_attack(text).make(self.surroundings, f"{self._seed} {position}", now)
+            parse_attack(text).make(self.context, f"{self._seed} {position}", now)
             for position, text in enumerate(specs)
         ]
         self.proxy.change_attacks([*made, *objects])
 
     async def statistics(self) -> Interventions:
-        """What it did so far."""
+        """The counters so far."""
         return interventions(json.loads(json.dumps(self.proxy.statistics())))
 
     async def stop(self) -> None:
-        """Leave."""
+        """Stop."""
         if self._proxy is not None:
             await self._proxy.stop()
             self._proxy = None
 
 
 def silent_log() -> Any:
-    """A logger that says nothing: what the proxy does is told elsewhere."""
+    """A logger without output: the proxy's journal has its interventions."""
     return structlog.wrap_logger(structlog.ReturnLogger(), processors=[_drop_event])
 
 

@@ -1,7 +1,7 @@
-"""Two real daemons, each a process of its own, and everything around them that a measurement needs.
+"""Two real daemons, each in its own process, with the clients and the relay of a measurement.
 
-The caller is configured to call the other; between them stands a relay which is closed at first, or nothing. At the
-caller's endpoint frames go in, at the other's they come out.
+Only the initiator knows the other's address. Between them is a relay, which is closed at first, or nothing. Frames
+enter at the initiator's endpoint and leave at the responder's.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ import socket
 import struct
 import subprocess
 import sys
-import tempfile
 import time
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -20,26 +19,27 @@ from typing import Self
 
 from fastcrc.crc16 import mcrf4xx
 
-from uavlinkd.ops.control import ControlError, ask
+from uavlinkd.config.keys import generate_private_key, generate_psk, public_key_text, write_secret_file
 from uavlinkd.core.suites import Suite
+from uavlinkd.lab.child_processes import end_with_parent, private_folder
 from uavlinkd.lab.evaluation.loop import Loop, Relay, Sink
 from uavlinkd.lab.evaluation.machine import cpu_seconds
-from uavlinkd.config.keys import generate_private_key, generate_psk, public_key_text, write_secret_file
+from uavlinkd.lab.sim.loopback_ports import free_ports
 from uavlinkd.mavlink import dialect
-from uavlinkd.lab.sim.drone_process import free_udp_ports
+from uavlinkd.ops.control import ControlError, ask
 
-START_S = 20.0
-"""How long a daemon may take to start: half a second, and much more on a busy or small machine."""
+START_S = 120.0
+"""How long a daemon may take to start: about 0.5 s, and much more on a busy or small machine."""
 _LOOK_S = 0.01
 
 
 class PairError(Exception):
-    """The daemons did not do what is measured. The message is for a person."""
+    """The daemons failed. The message is for the operator."""
 
 
 @dataclass(frozen=True, slots=True)
 class LinkChoice:
-    """What a pair is configured with."""
+    """The link settings of a pair."""
 
     suite: Suite
     mac_key_bits: int = 256
@@ -47,8 +47,8 @@ class LinkChoice:
     rekey_after_s: float = 120.0
 
 
-class Daemon:
-    """One daemon's folder, configuration and process."""
+class DaemonProcess:
+    """The folder, configuration and process of a daemon."""
 
     def __init__(self, name: str, folder: Path, port: int) -> None:
         self.name = name
@@ -61,8 +61,8 @@ class Daemon:
         self._log = folder / "daemon.log"
         self._process: subprocess.Popen[bytes] | None = None
 
-    def configure(self, choice: LinkChoice, endpoint: str, peer: Daemon, psk: str, calls: str) -> None:
-        """Write the configuration; ``calls`` is the address of the peer, or empty."""
+    def configure(self, choice: LinkChoice, endpoint: str, peer: DaemonProcess, psk: str, address: str) -> None:
+        """Write the configuration; ``address`` is the peer's, or empty."""
         write_secret_file(self.folder / "pair.psk", psk)
         (self.folder / "daemon.toml").write_text(
             f"""\
@@ -78,13 +78,13 @@ confidential = {str(choice.confidential).lower()}
 rekey_after_s = {choice.rekey_after_s}
 
 [[endpoint]]
-name = "program"
+name = "client"
 url = "{endpoint}"
 
 [[peer]]
 name = "{peer.name}"
 public_key = "{peer.public_key}"
-addresses = [{f'"{calls}"' if calls else ""}]
+addresses = [{f'"{address}"' if address else ""}]
 psk_file = "pair.psk"
 role = "all"
 system_ids = "all"
@@ -95,23 +95,25 @@ system_ids = "all"
     def start(self) -> None:
         """Start the process."""
         with self._log.open("wb") as log:
-            self._process = subprocess.Popen(  # noqa: S603  ourselves, no shell
-                (sys.executable, "-m", "uavlinkd", "run", "--config", str(self.folder / "daemon.toml")),
+            self._process = subprocess.Popen(  # noqa: S603  constant command
+                end_with_parent(
+                    sys.executable, "-m", "uavlinkd", "run", "--config", str(self.folder / "daemon.toml")
+                ),
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
             )
 
     def is_ready(self) -> bool:
-        """Whether it answers.
+        """Whether it answers a status request.
 
         Raises:
-            PairError: it has ended instead.
+            PairError: the process has ended.
         """
         assert self._process is not None
         if self._process.poll() is not None:
-            said = " / ".join(self._log.read_text(errors="replace").splitlines()[-3:])
-            raise PairError(f"{self.name} ended with status {self._process.returncode}: {said}")
+            lines = " / ".join(self._log.read_text(errors="replace").splitlines()[-3:])
+            raise PairError(f"{self.name} ended with status {self._process.returncode}: {lines}")
         try:
             ask(self.folder / "control.sock", "status")
         except ControlError:
@@ -124,7 +126,7 @@ system_ids = "all"
         return cpu_seconds(self._process.pid)
 
     def drops(self) -> str:
-        """What it discarded, for the reason of a failure."""
+        """Its counters of dropped datagrams, to explain a failure."""
         try:
             status = ask(self.folder / "control.sock", "status")
         except ControlError as error:
@@ -135,25 +137,27 @@ system_ids = "all"
         return f"{self.name} dropped " + (", ".join(f"{n} {why}" for why, n in counts.items()) or "nothing")
 
     def kill(self) -> None:
-        """End it at once: it has nothing to keep, and its goodbye would be traffic."""
+        """Kill the process: it has no state to save, and a close message would be traffic."""
         if self._process is not None:
             self._process.kill()
             self._process.wait()
 
 
 class Pair:
-    """A caller and an answerer. As a context: both run, the answerer is ready, the caller has called (a closed relay)
-    or is about to be linked (no relay).
+    """An initiator and a responder. Entering the context starts both.
+
+    Then the responder is ready, and the initiator has sent an initiation to the closed relay or, without a relay, is
+    about to link.
     """
 
     def __init__(self, choice: LinkChoice, *, with_relay: bool) -> None:
         self.loop = Loop()
         self._stack = ExitStack()
         self._stack.callback(self.loop.close)
-        folder = self._stack.enter_context(tempfile.TemporaryDirectory(prefix="uavlinkd-"))
-        ports = free_udp_ports(3)
-        self.caller = Daemon("caller", Path(folder) / "a", ports[0])
-        self.answerer = Daemon("answerer", Path(folder) / "b", ports[1])
+        folder = self._stack.enter_context(private_folder("uavlinkd-"))
+        ports = free_ports(3)
+        self.initiator = DaemonProcess("initiator", folder / "a", ports[0])
+        self.responder = DaemonProcess("responder", folder / "b", ports[1])
         self.sink = Sink(self.loop)
         self._stack.callback(self.sink.close)
         self.relay: Relay | None = None
@@ -163,50 +167,50 @@ class Pair:
             self._stack.callback(self.relay.close)
             to = self.relay.address
         self._into = ("127.0.0.1", ports[2])
-        self._program = self._stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+        self._client = self._stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
         psk = generate_psk()
-        self.caller.configure(choice, f"udpin:127.0.0.1:{ports[2]}", self.answerer, psk, f"{to[0]}:{to[1]}")
-        self.answerer.configure(choice, f"udpout:127.0.0.1:{self.sink.port}", self.caller, psk, "")
+        self.initiator.configure(choice, f"udpin:127.0.0.1:{ports[2]}", self.responder, psk, f"{to[0]}:{to[1]}")
+        self.responder.configure(choice, f"udpout:127.0.0.1:{self.sink.port}", self.initiator, psk, "")
         self._number = 0
 
     def send_frame(self) -> tuple[bytes, float]:
-        """Send a fresh frame into the caller's endpoint; the frame, and when."""
+        """Send a new frame to the initiator's endpoint. Return the frame and the time."""
         self._number += 1
         frame = numbered_frame(self._number)
         now = time.monotonic()
-        self._program.sendto(frame, self._into)
+        self._client.sendto(frame, self._into)
         return frame, now
 
     def cpu_s(self) -> tuple[float, float]:
-        """Processor time so far, of the caller and of the answerer."""
-        return self.caller.cpu_s(), self.answerer.cpu_s()
+        """Processor time so far, of the initiator and of the responder."""
+        return self.initiator.cpu_s(), self.responder.cpu_s()
 
     def wait_until_linked(self, limit_s: float = START_S) -> None:
-        """Send frames until one comes out.
+        """Send frames until one is delivered.
 
         Raises:
-            PairError: none does.
+            PairError: no frame was delivered in time.
         """
         until = time.monotonic() + limit_s
         while time.monotonic() < until:
             frame, _ = self.send_frame()
-            if self.loop.until(lambda: frame in self.sink.arrived, 0.1):  # noqa: B023  called in this turn only
+            if self.loop.until(lambda: frame in self.sink.arrived, 0.1):  # noqa: B023  called in this iteration only
                 return
-        raise PairError(f"no link within {limit_s:g} s: {self.answerer.drops()}")
+        raise PairError(f"no link within {limit_s:g} s: {self.responder.drops()}")
 
     def __enter__(self) -> Self:
         try:
-            for daemon in (self.answerer, self.caller):
+            for daemon in (self.responder, self.initiator):
                 daemon.start()
                 self._stack.callback(daemon.kill)
-            for daemon in (self.answerer, self.caller):
+            for daemon in (self.responder, self.initiator):
                 self._until_ready(daemon)
         except BaseException:
             self._stack.close()
             raise
         return self
 
-    def _until_ready(self, daemon: Daemon) -> None:
+    def _until_ready(self, daemon: DaemonProcess) -> None:
         until = time.monotonic() + START_S
         while not daemon.is_ready():
             if time.monotonic() >= until:
@@ -220,7 +224,7 @@ class Pair:
 
 
 def numbered_frame(number: int) -> bytes:
-    """An ATTITUDE, the commonest frame of a flying drone, 40 bytes long: no two of a link are the same."""
+    """An ATTITUDE of 40 bytes, the most frequent frame of a flying drone; each of a link is unique."""
     payload = struct.pack("<I6f", number, *_ATTITUDE)
     inner = struct.pack("<BBBBBBHB", len(payload), 0, 0, number % 256, 1, 1, _ATTITUDE_ID, 0) + payload
     facts = dialect.facts(_ATTITUDE_ID)

@@ -1,20 +1,20 @@
-"""The paper's method, to be measured: bare Diffie-Hellman, then HMAC of data, between two processes over UDP.
+"""The paper's method, for measurements: bare Diffie-Hellman, then HMAC of data, between two processes over UDP.
 
-Nothing here protects anybody: nobody's public key is authenticated (``evaluation`` is where that is shown). One
-exchange, as the paper times it from start to finish:
+It is insecure: public keys are not authenticated (``evaluate tampering`` shows the result). One exchange, as the
+paper times it:
 
     initiator                                        responder
-    make parameters: a safe prime, generator 2
-    make a key pair      -- parameters, public -->   make a key pair
+    generate parameters: a safe prime, generator 2
+    generate a key pair  -- parameters, public -->   generate a key pair
     compute the secret   <------- public --------    compute the secret
     HMAC of the data     ----- data and tag ----->   HMAC again, compare: the end
 
-This module imports ``cryptography``, beside ``core/crypto.py``: the paper has a library generate parameters, and the
-core, whose groups are standard ones, has no use for that. Groups below 512 bits, which OpenSSL refuses, are made and
-used on Python's integers: their times show the order of magnitude, not what OpenSSL would need.
+This module imports ``cryptography``, besides ``core/crypto.py``: in the paper a library generates parameters, and the
+core has only standard groups. Groups below 512 bits, which OpenSSL refuses, use Python's integers: their times show
+the order of magnitude, not those of OpenSSL.
 
-``python -m uavlinkd.lab.evaluation.paper initiator|responder`` is one end: a JSON line on standard input asks for an
-exchange, a JSON line on standard output tells of it.
+``python -m uavlinkd.lab.evaluation.paper initiator|responder`` is one end: a JSON line on standard input requests an
+exchange, and a JSON line on standard output has its result.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ from uavlinkd.lab.evaluation.safe_primes import generate_safe_prime
 
 GENERATOR = 2
 OPENSSL_LEAST_BITS = 512
-"""What ``dh.generate_parameters`` refuses to go below."""
+"""The smallest group that ``dh.generate_parameters`` accepts."""
 TAG_BYTES = 32
 _LABEL = b"evaluation of the paper: HMAC key"
 _WAIT_S = 30.0
-"""How long an end waits for a datagram of the other, once an exchange has begun."""
+"""How long an end waits for a datagram of the other during an exchange."""
 _DATAGRAM_BYTES = 65536
 
 
@@ -52,7 +52,7 @@ def openssl_version() -> str:
 
 
 class LibraryKey:
-    """A key pair of OpenSSL's."""
+    """A key pair of OpenSSL."""
 
     def __init__(self, parameters: dh.DHParameters) -> None:
         self._parameters = parameters.parameter_numbers()
@@ -60,12 +60,12 @@ class LibraryKey:
         self.public = self._private.public_key().public_numbers().y
 
     def secret(self, other: int) -> bytes:
-        """Shared with the holder of ``other``."""
+        """The secret shared with the owner of the public key ``other``."""
         return self._private.exchange(dh.DHPublicNumbers(other, self._parameters).public_key())
 
 
 class IntegerKey:
-    """A key pair on Python's integers. Not in constant time: for a measurement only."""
+    """A key pair with Python's integers. Not constant-time: for measurements only."""
 
     def __init__(self, prime: int) -> None:
         self._prime = prime
@@ -73,16 +73,16 @@ class IntegerKey:
         self.public = pow(GENERATOR, self._exponent, prime)
 
     def secret(self, other: int) -> bytes:
-        """Shared with the holder of ``other``."""
+        """The secret shared with the owner of the public key ``other``."""
         return pow(other, self._exponent, self._prime).to_bytes((self._prime.bit_length() + 7) // 8, "big")
 
 
 Parameters: TypeAlias = "dh.DHParameters | int"
-"""OpenSSL's, or the bare prime of a group too small for it."""
+"""Parameters of OpenSSL, or the prime of a group that is too small for it."""
 
 
 def make_parameters(bits: int, *, standard: bool) -> Parameters:
-    """The group of RFC 7919 where ``standard``, else a safe prime made on the spot."""
+    """The group of RFC 7919 if ``standard``, otherwise a new safe prime."""
     if standard:
         return load_parameters(ffdhe_prime(bits))
     if bits < OPENSSL_LEAST_BITS:
@@ -91,7 +91,7 @@ def make_parameters(bits: int, *, standard: bool) -> Parameters:
 
 
 def load_parameters(prime: int) -> Parameters:
-    """The parameters that came from the other end."""
+    """The parameters received from the other end."""
     if prime.bit_length() < OPENSSL_LEAST_BITS:
         return prime
     return dh.DHParameterNumbers(prime, GENERATOR).parameters()
@@ -103,16 +103,16 @@ def prime_of(parameters: Parameters) -> int:
 
 
 def make_key(parameters: Parameters) -> LibraryKey | IntegerKey:
-    """A fresh key pair."""
+    """A new key pair."""
     return IntegerKey(parameters) if isinstance(parameters, int) else LibraryKey(parameters)
 
 
 def mac_key(secret: bytes, bits: int) -> bytes:
-    """An HMAC key of that length of the shared secret, whose own length is that of the group."""
+    """An HMAC key of ``bits`` bits, derived from the shared secret."""
     return hkdf_expand(sha256(secret), _LABEL, bits // 8)
 
 
-# One end. Integers travel as u16 length and big-endian bytes.
+# One end. Integers are sent as u16 length and big-endian bytes.
 
 
 def _pack(*numbers: int) -> bytes:
@@ -130,7 +130,7 @@ def _unpack(data: bytes) -> list[int]:
 
 
 def initiate(sock: socket.socket, bits: int, mac_bits: int, data: bytes, *, standard: bool) -> dict[str, float]:
-    """The initiator's part of one exchange; seconds of each step, and when it began (monotonic)."""
+    """The initiator's part of one exchange. Return the seconds of each step, and the start time (monotonic)."""
     cpu_before = time.process_time()
     moments = [time.monotonic()]
 
@@ -157,7 +157,7 @@ def initiate(sock: socket.socket, bits: int, mac_bits: int, data: bytes, *, stan
 
 
 def respond(sock: socket.socket) -> dict[str, float | bool]:
-    """The responder's part; whether the tag verified, and when that was known (monotonic)."""
+    """The responder's part of one exchange. Return whether the tag is valid, and when (monotonic)."""
     hello, initiator = sock.recvfrom(_DATAGRAM_BYTES)
     cpu_before = time.process_time()
     prime, mac_bits, public = _unpack(hello)
@@ -176,21 +176,21 @@ def respond(sock: socket.socket) -> dict[str, float | bool]:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """One end, as a process."""
-    # cryptography 50 announces that FFDH goes away some day; pyproject.toml bounds the version.
+    """Run one end as a process."""
+    # cryptography 50 deprecates FFDH; pyproject.toml bounds the version.
     warnings.filterwarnings("ignore", message="Diffie-Hellman over finite fields")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         sock.bind(("127.0.0.1", 0))
         _say({"port": sock.getsockname()[1]})
         for line in sys.stdin:
-            asked = json.loads(line)
+            request = json.loads(line)
             if arguments == ["responder"]:
                 _say(respond(sock))
                 continue
-            sock.connect(("127.0.0.1", asked["port"]))
+            sock.connect(("127.0.0.1", request["port"]))
             sock.settimeout(_WAIT_S)
-            data = bytes.fromhex(asked["data"])
-            _say(initiate(sock, asked["bits"], asked["mac_bits"], data, standard=asked["standard"]))
+            data = bytes.fromhex(request["data"])
+            _say(initiate(sock, request["bits"], request["mac_bits"], data, standard=request["standard"]))
     return 0
 
 

@@ -1,4 +1,4 @@
-"""Attacks on the paper's key exchange: public keys altered and replaced as in the paper, and the full relay.
+"""Attacks on the paper's key exchange: altered and replaced public keys, as in the paper, and a full relay.
 
 The attacks on data are those of :mod:`uavlinkd.lab.mitm.attacks`, the same for both protocols.
 """
@@ -10,37 +10,37 @@ from random import Random
 
 from uavlinkd.core.kem import ffdhe_prime
 from uavlinkd.lab.evaluation import paper_protocol as paper
-from uavlinkd.lab.mitm.anatomy import Kind, kind_of, mavlink_frame
-from uavlinkd.lab.mitm.attack import NEVER, Action, Intervention, Send, Way, What
+from uavlinkd.lab.mitm.anatomy import DatagramKind, kind_of, mavlink_frame
+from uavlinkd.lab.mitm.attack import Action, Direction, Intervention, Operation, PassiveAttack, Send
 
 _PRIME = ffdhe_prime(paper.GROUP_BITS)
 ELEMENTS = {"zero": 0, "one": 1, "p-1": _PRIME - 1, "p": _PRIME, "p+1": _PRIME + 1}
 _CRC_EXTRA = {0: 50, 30: 39}
-"""Of HEARTBEAT and ATTITUDE, which is all that the local programs send."""
+"""Of HEARTBEAT and ATTITUDE, the only messages of the clients."""
 
 Change = Callable[[bytes, Random], tuple[bytes, str]]
 
 
-def tamper(public: bytes, chance: Random) -> tuple[bytes, str]:
-    """Four bytes of the key altered."""
-    at = chance.randrange(len(public) - 4)
-    part = bytes(byte ^ chance.randrange(1, 256) for byte in public[at : at + 4])
+def tamper(public: bytes, rng: Random) -> tuple[bytes, str]:
+    """Alter four bytes of the key."""
+    at = rng.randrange(len(public) - 4)
+    part = bytes(byte ^ rng.randrange(1, 256) for byte in public[at : at + 4])
     return public[:at] + part + public[at + 4 :], f"bytes {at} to {at + 3} of the public key altered"
 
 
-def replace(public: bytes, chance: Random) -> tuple[bytes, str]:
-    """Another key, of the attacker's own."""
+def replace(public: bytes, rng: Random) -> tuple[bytes, str]:
+    """Replace the key by the attacker's."""
     return paper.PaperKey().public, "public key replaced"
 
 
-def tamper_or_replace(public: bytes, chance: Random) -> tuple[bytes, str]:
-    """By chance one of the two."""
-    return tamper(public, chance) if chance.random() < 0.5 else replace(public, chance)
+def tamper_or_replace(public: bytes, rng: Random) -> tuple[bytes, str]:
+    """Alter or replace the key at random."""
+    return tamper(public, rng) if rng.random() < 0.5 else replace(public, rng)
 
 
-def invalid(public: bytes, chance: Random) -> tuple[bytes, str]:
-    """A number that is no honest public key."""
-    name = chance.choice(sorted(ELEMENTS))
+def invalid(public: bytes, rng: Random) -> tuple[bytes, str]:
+    """Replace the key by an invalid one."""
+    name = rng.choice(sorted(ELEMENTS))
     return ELEMENTS[name].to_bytes(paper.KEY_BYTES, "big"), f"public key is {name}"
 
 
@@ -52,89 +52,81 @@ CHANGES: dict[str, Change] = {
 }
 
 
-class AlterKeys:
-    """Changes the public keys in the paper's exchange. An :class:`~uavlinkd.lab.mitm.attack.AttackObject`."""
+class AlterKeys(PassiveAttack):
+    """Changes the public keys in the paper's exchange."""
 
-    def __init__(self, name: str, chance: Random) -> None:
+    def __init__(self, name: str, rng: Random) -> None:
         self.name = name
         self._change = CHANGES[name]
-        self._chance = chance
+        self._rng = rng
         self._seen = 0
 
-    def on_datagram(self, datagram: bytes, way: Way, now: float) -> list[Action]:
-        """Change it, if it is a public key."""
+    def on_datagram(self, datagram: bytes, direction: Direction, now: float) -> list[Action]:
+        """Change the datagram if it is a public key."""
         self._seen += 1
         if not paper.is_key(datagram):
-            return [Send(datagram, way)]
-        public, detail = self._change(datagram[1:], self._chance)
-        note = Intervention(now, self.name, What.ALTERED, way, self._seen, kind_of(datagram), len(datagram), detail)
-        return [Send(datagram[:1] + public, way), note]
-
-    def on_answer(self, datagram: bytes, peer: str, stranger: int, now: float) -> list[Action]:
-        """It has no addresses of its own."""
-        return []
-
-    def due(self, now: float) -> list[Action]:
-        """It sends nothing by itself."""
-        return []
-
-    def next_deadline(self) -> float:
-        """Never."""
-        return NEVER
+            return [Send(datagram, direction)]
+        public, detail = self._change(datagram[1:], self._rng)
+        note = Intervention(
+            now, self.name, Operation.ALTERED, direction, self._seen, kind_of(datagram), len(datagram), detail
+        )
+        return [Send(datagram[:1] + public, direction), note]
 
 
-class PaperRelay:
-    """The man in the middle in full: an exchange of his own with each side, every HMAC made again, frames altered.
+class PaperRelay(PassiveAttack):
+    """A full relay: a key exchange with each side, a new HMAC for each frame.
 
-    Every second frame is altered. Nobody notices: each side shares a key, with him.
+    It alters every second frame. The drones cannot detect it, because each shares its key with the attacker.
     """
 
     name = "two-sided-relay"
 
     def __init__(self) -> None:
-        self._waiting: dict[Way, paper.PaperKey] = {}
+        self._waiting: dict[Direction, paper.PaperKey] = {}
         self._keys: dict[str, list[bytes]] = {}
-        """By the peer that shares them, the newest first."""
+        """The keys shared with each peer, the newest first."""
         self.exchanges = 0
         self.read = 0
         self.altered = 0
 
-    def on_datagram(self, datagram: bytes, way: Way, now: float) -> list[Action]:
-        """Answer for the other side, or open, alter and seal again."""
+    def on_datagram(self, datagram: bytes, direction: Direction, now: float) -> list[Action]:
+        """Answer a key in place of the other side; open, alter and seal data."""
         if paper.is_key(datagram):
-            return self._exchange(datagram[0], datagram[1:], way, now)
+            return self._exchange(datagram[0], datagram[1:], direction, now)
         if paper.is_data(datagram):
-            return self._pass_on(datagram, way, now)
-        return [Send(datagram, way)]
+            return self._pass_on(datagram, direction, now)
+        return [Send(datagram, direction)]
 
-    def _exchange(self, kind: int, public: bytes, way: Way, now: float) -> list[Action]:
-        own = paper.PaperKey() if kind == paper.HELLO else self._waiting.pop(way, None)
+    def _exchange(self, kind: int, public: bytes, direction: Direction, now: float) -> list[Action]:
+        own = paper.PaperKey() if kind == paper.HELLO else self._waiting.pop(direction, None)
         if own is None:
             return []
         try:
             key = own.mac_key(public)
         except ValueError:
             return []
-        self._keys[way.sender] = [key, *self._keys.get(way.sender, [])[:1]]
+        self._keys[direction.sender] = [key, *self._keys.get(direction.sender, [])[:1]]
         self.exchanges += 1
         if kind == paper.ANSWER:
-            return [self._note(way, now, "keys exchanged with the responder", b"\2")]
-        other = self._waiting[way.back] = paper.PaperKey()
+            return [self._note(direction, now, "keys exchanged with the responder", b"\2")]
+        other = self._waiting[direction.reverse] = paper.PaperKey()
         return [
-            Send(bytes((paper.ANSWER,)) + own.public, way.back),
-            Send(bytes((paper.HELLO,)) + other.public, way),
-            self._note(way, now, "keys exchanged with the initiator", b"\1"),
+            Send(bytes((paper.ANSWER,)) + own.public, direction.reverse),
+            Send(bytes((paper.HELLO,)) + other.public, direction),
+            self._note(direction, now, "keys exchanged with the initiator", b"\1"),
         ]
 
-    def _pass_on(self, datagram: bytes, way: Way, now: float) -> list[Action]:
-        ours = self._keys.get(way.receiver)
+    def _pass_on(self, datagram: bytes, direction: Direction, now: float) -> list[Action]:
+        ours = self._keys.get(direction.receiver)
         opened = [
-            frame for key in self._keys.get(way.sender, []) if (frame := paper.unseal(key, datagram)) is not None
+            frame
+            for key in self._keys.get(direction.sender, [])
+            if (frame := paper.unseal(key, datagram)) is not None
         ]
         if not opened:
-            return [Send(datagram, way)]  # from before he came
+            return [Send(datagram, direction)]  # from before the attack
         if not ours:
-            return []  # he shares no key with the receiver yet: as if it had been lost
+            return []  # there is no key with the receiver yet, so the frame is lost
         frame = opened[0]
         self.read += 1
         if self.read % 2:
@@ -142,29 +134,17 @@ class PaperRelay:
             self.altered += 1
         size = paper.header_bytes(datagram)
         number = int.from_bytes(datagram[3:size], "big")
-        note = self._note(way, now, "frame altered" if self.read % 2 else "frame read", datagram)
-        return [Send(paper.seal(ours[0], number, frame), way), note]
+        note = self._note(direction, now, "frame altered" if self.read % 2 else "frame read", datagram)
+        return [Send(paper.seal(ours[0], number, frame), direction), note]
 
-    def _note(self, way: Way, now: float, detail: str, datagram: bytes) -> Intervention:
+    def _note(self, direction: Direction, now: float, detail: str, datagram: bytes) -> Intervention:
         kind = kind_of(datagram)
-        number = 0 if kind is not Kind.ENVELOPE else self.read
-        return Intervention(now, self.name, What.ALTERED, way, number, kind, len(datagram), detail)
-
-    def on_answer(self, datagram: bytes, peer: str, stranger: int, now: float) -> list[Action]:
-        """It has no addresses of its own."""
-        return []
-
-    def due(self, now: float) -> list[Action]:
-        """It sends nothing by itself."""
-        return []
-
-    def next_deadline(self) -> float:
-        """Never."""
-        return NEVER
+        number = 0 if kind is not DatagramKind.ENVELOPE else self.read
+        return Intervention(now, self.name, Operation.ALTERED, direction, number, kind, len(datagram), detail)
 
 
 def _altered(frame: bytes) -> bytes:
-    """The frame with its last field changed, and a checksum that fits."""
+    """The frame with another value of its last field, and a valid checksum."""
     message_id = int.from_bytes(frame[7:10], "little")
     payload = bytearray(frame[10 : 10 + frame[1]])
     payload[-2] ^= 0x40

@@ -1,8 +1,8 @@
-"""The paper's protocol, two ends that speak it over UDP: for comparison alone, it protects nobody.
+"""The paper's protocol between two ends over UDP. It is insecure and only for comparison.
 
-As the paper describes it: each end makes a Diffie-Hellman key pair, the public keys are exchanged over UDP as they
-are, the key of an HMAC is derived from the shared secret, and data travel with their HMAC, which the receiver
-computes again and compares. There are no identities, no counters, and one key for both directions.
+As the paper describes it, each end generates a Diffie-Hellman key pair and sends its public key over UDP. An HMAC key
+is derived from the shared secret. Data is sent with its HMAC, which the receiver computes again and compares. There
+are no identities, no counters, and one key for both directions.
 
 ::
 
@@ -10,11 +10,11 @@ computes again and compares. There are no identities, no counters, and one key f
     2 | public key 256                          the answer
     0x40 or 0x41 | 1 u16 | number u16/u32 | frame | HMAC-SHA256 over all before it 32
 
-The header of a datagram with data is that of our envelopes, so that the same attacks can be run against both. It
-stands under the HMAC too; its number is not looked at.
+The header of a datagram with data is that of our envelopes, so that the same attacks work against both. The HMAC
+covers it, but its number is not checked.
 
-New keys are made each :data:`RENEW_S`, so that attacks on the exchange have something to attack. The receiver goes on
-taking the key before the newest, so that an exchange loses no frame.
+The keys change every :data:`RENEW_S`, so that attacks on the exchange have a target. The receiver also accepts the
+key before the newest, so that an exchange loses no frame.
 """
 
 from __future__ import annotations
@@ -40,35 +40,35 @@ RENEW_S = 0.25
 _DATAGRAM_BYTES = 65536
 _DATAGRAMS_PER_WAKE_UP = 128
 
-Tell = Callable[[str, str], None]
-"""What happened, and the explanation for a person."""
+Report = Callable[[str, str], None]
+"""An event, and its explanation for the operator."""
 
 VERIFIED = "hmac_verified"
 MEANINGS = {
-    VERIFIED: "data whose HMAC fits",
-    "hmac_mismatch": "data whose HMAC does not fit: altered on the way, or made with another key",
-    "bad_public_key": "a public key that no honest end sends",
-    "unexpected_key": "a public key in answer to nothing",
-    "malformed": "a datagram that is no message of this protocol",
+    VERIFIED: "data with a valid HMAC",
+    "hmac_mismatch": "data with an invalid HMAC: altered by an attacker, or made with another key",
+    "bad_public_key": "an invalid public key",
+    "unexpected_key": "a public key that was not requested",
+    "malformed": "a datagram that is not a message of this protocol",
 }
 
 
 class PaperKey:
-    """A key pair in RFC 7919's ffdhe2048, and what follows from another's public key."""
+    """A key pair in RFC 7919's ffdhe2048."""
 
     def __init__(self) -> None:
         with _ffdh():
-            made = make_key(parameters())
-        assert isinstance(made, LibraryKey)
-        self._key = made
+            key = make_key(parameters())
+        assert isinstance(key, LibraryKey)
+        self._key = key
 
     @property
     def public(self) -> bytes:
-        """As it travels."""
+        """The public key as sent."""
         return self._key.public.to_bytes(KEY_BYTES, "big")
 
     def mac_key(self, public: bytes) -> bytes:
-        """The key of the HMAC shared with the holder of ``public``.
+        """The HMAC key shared with the owner of ``public``.
 
         Raises:
             ValueError: the library refuses the key.
@@ -79,7 +79,7 @@ class PaperKey:
 
 @contextmanager
 def _ffdh() -> Iterator[None]:
-    """cryptography 50 announces that FFDH goes away some day; pyproject.toml bounds the version."""
+    """Ignore that cryptography 50 deprecates FFDH; pyproject.toml bounds the version."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Diffie-Hellman over finite fields")
         yield
@@ -102,7 +102,7 @@ def seal(key: bytes, number: int, frame: bytes) -> bytes:
 
 
 def unseal(key: bytes, datagram: bytes) -> bytes | None:
-    """The frame in a datagram with data; None where the HMAC does not fit."""
+    """The frame in a datagram with data; None if the HMAC is invalid."""
     signed, tag = datagram[:-TAG_BYTES], datagram[-TAG_BYTES:]
     if not hmac.compare_digest(hmac_sha256(key, signed), tag):
         return None
@@ -110,7 +110,7 @@ def unseal(key: bytes, datagram: bytes) -> bytes | None:
 
 
 def header_bytes(datagram: bytes) -> int:
-    """Of a datagram with data."""
+    """The length of the header of a datagram with data."""
     return wire.SHORT_HEADER_BYTES if datagram[0] == wire.SHORT_ENVELOPE else wire.LONG_HEADER_BYTES
 
 
@@ -128,20 +128,20 @@ def is_data(datagram: bytes) -> bool:
 
 
 class PaperEnd:
-    """One end, on a socket of its own in the running event loop.
+    """One end, with its own socket in the running event loop.
 
     Args:
-        on_frame: called with each frame whose HMAC fits.
-        tell: called when something happens that a person would want to see.
+        on_frame: called with each frame that has a valid HMAC.
+        report: called with each event for the operator.
     """
 
-    def __init__(self, name: str, *, is_initiator: bool, on_frame: Callable[[bytes], None], tell: Tell) -> None:
+    def __init__(self, name: str, *, is_initiator: bool, on_frame: Callable[[bytes], None], report: Report) -> None:
         self.name = name
         self.counters: Counter[str] = Counter()
         self.exchanges = 0
         self._is_initiator = is_initiator
         self._on_frame = on_frame
-        self._tell = tell
+        self._report = report
         self._keys: list[bytes] = []  # of the HMAC, the newest first
         self._waiting: PaperKey | None = None
         self._number = 0
@@ -155,11 +155,11 @@ class PaperEnd:
 
     @property
     def port(self) -> int:
-        """Where the other end reaches it."""
+        """The port for the other end."""
         return int(self._sock.getsockname()[1])
 
     def start(self, to: tuple[str, int]) -> None:
-        """Speak with whoever is there."""
+        """Exchange keys and data with this address."""
         self._to = to
         if self._is_initiator:
             self._renew()
@@ -172,7 +172,7 @@ class PaperEnd:
         self._sock.close()
 
     def send(self, frame: bytes) -> None:
-        """Send a frame with its HMAC; before there is a key it is lost."""
+        """Send a frame with its HMAC; without a key it is lost."""
         if self._keys:
             self._send(seal(self._keys[0], self._number, frame))
             self._number += 1
@@ -195,7 +195,7 @@ class PaperEnd:
                 datagram = self._sock.recv(_DATAGRAM_BYTES)
             except BlockingIOError:
                 return
-            except OSError:  # an earlier datagram found nobody
+            except OSError:  # an earlier datagram was refused
                 continue
             self._receive(datagram)
 
@@ -227,11 +227,11 @@ class PaperEnd:
         for key in self._keys:
             frame = unseal(key, datagram)
             if frame is not None:
-                self._tell(VERIFIED, MEANINGS[VERIFIED])
+                self._report(VERIFIED, MEANINGS[VERIFIED])
                 self._on_frame(frame)
                 return
         self._count("hmac_mismatch")
 
     def _count(self, reason: str, meaning: str = "") -> None:
         self.counters[reason] += 1
-        self._tell(reason, meaning or MEANINGS[reason])
+        self._report(reason, meaning or MEANINGS[reason])

@@ -1,7 +1,7 @@
-"""What a run leaves behind: one JSON line a measurement, and the same as CSV.
+"""The records of a run: one JSON line per measurement, and the same as CSV.
 
-The first line says on what machine, with which versions and which seed. A measurement that failed, did not finish in
-time or was not asked for is a record too, with the reason: nothing is left out.
+The first line has the machine, the versions and the seed. A measurement that failed, did not finish in time or was
+not requested is a record too, with the reason.
 """
 
 from __future__ import annotations
@@ -18,41 +18,41 @@ from typing import IO, Any, Self, TypeVar
 T = TypeVar("T")
 
 Value = str | int | float | bool | None | list[float]
-"""What a record holds. Durations are seconds, sizes bytes or bits, as the name says."""
+"""A value in a record. Durations are in seconds, sizes in bytes or bits, as the name says."""
 
 
 class Status(StrEnum):
-    """What became of a measurement."""
+    """The result of a measurement."""
 
     OK = "ok"
     FAILED = "failed"
     NOT_FINISHED = "not finished"
     """The time limit passed."""
     SKIPPED = "skipped"
-    """It was not asked for."""
+    """It was not requested."""
 
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """One measurement: of what ``kind``, at which ``point`` of the grid, and the ``values`` that were measured."""
+    """One measurement: its ``kind``, the ``point`` of the grid, and the measured ``values``."""
 
     kind: str
     point: Mapping[str, Value]
     values: Mapping[str, Value] = field(default_factory=dict)
     status: Status = Status.OK
     reason: str = ""
-    """Why there are no values; empty where there are."""
+    """The reason for missing values; empty if there are values."""
 
     @property
     def is_ok(self) -> bool:
-        """Whether it was measured."""
+        """Whether the measurement succeeded."""
         return self.status is Status.OK
 
     def number(self, name: str) -> float:
         """A measured number.
 
         Raises:
-            KeyError: the record has none of that name.
+            KeyError: the record has no such number.
         """
         value = self.values[name]
         if isinstance(value, int | float):
@@ -61,13 +61,13 @@ class Record:
 
 
 class RecordsError(Exception):
-    """Records that cannot be read. The message is for a person."""
+    """The records cannot be read. The message is for the operator."""
 
 
 class RecordWriter:
-    """Appends records to ``NAME.jsonl`` as they come, and writes ``NAME.csv`` when all are there.
+    """Appends records to ``NAME.jsonl``, and writes ``NAME.csv`` at the end.
 
-    Each line is flushed: a run that is interrupted leaves what it has measured.
+    Each line is flushed, so that an interrupted run keeps its records.
     """
 
     def __init__(self, folder: Path, name: str, run: Mapping[str, Value]) -> None:
@@ -76,11 +76,11 @@ class RecordWriter:
         self._file: IO[str] = (folder / f"{name}.jsonl").open("w", encoding="utf-8")
         self._run = run
         self.records: list[Record] = []
-        """All so far."""
+        """All records so far."""
         self._line({"run": dict(run)})
 
     def add(self, record: Record) -> None:
-        """Write one."""
+        """Write a record."""
         self.records.append(record)
         line = {"kind": record.kind, "status": record.status.value, "reason": record.reason}
         self._line({**line, "point": dict(record.point), "values": dict(record.values)})
@@ -104,9 +104,9 @@ class RecordWriter:
 
 
 def write_csv(path: Path, run: Mapping[str, Value], records: Iterable[Record]) -> None:
-    """One row a record: its kind, status and reason, its point, its numbers, and the facts of the run.
+    """Write one row per record: kind, status, reason, point, numbers, and the facts of the run.
 
-    Lists (the latency of each frame) are in the JSON lines alone.
+    Lists (the latency of each frame) are only in the JSON lines.
     """
     rows = [
         {
@@ -131,14 +131,14 @@ def read_records(path: Path) -> tuple[dict[str, Value], list[Record]]:
     """The facts of a run, and its records.
 
     Raises:
-        RecordsError: there are none, or a line is no record.
+        RecordsError: there are no records, or a line is malformed.
     """
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except OSError as error:
         raise RecordsError(f"{path}: {error.strerror}") from None
     except UnicodeDecodeError:
-        raise RecordsError(f"{path}: is no text") from None
+        raise RecordsError(f"{path}: is not text") from None
     if not lines:
         raise RecordsError(f"{path}: is empty")
     return _parse(path, 1, lines[0], _run_facts), [
@@ -150,7 +150,7 @@ def _parse(path: Path, number: int, line: str, read: Callable[[Any], T]) -> T:
     try:
         return read(json.loads(line))
     except (ValueError, KeyError, TypeError, AttributeError):
-        raise RecordsError(f"{path}: line {number} is no record of an evaluation") from None
+        raise RecordsError(f"{path}: line {number} is not a record of an evaluation") from None
 
 
 def _run_facts(content: Any) -> dict[str, Value]:

@@ -1,29 +1,24 @@
-"""The report: one HTML file with all in it, and the same as Markdown beside its figures. Made from records alone."""
+"""The report of the timing evaluation, in HTML and Markdown: tables and figures, made from the records only."""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Sequence
 from pathlib import Path
 
-from uavlinkd.core.suites import SUITES_BY_NAME
-from uavlinkd.lab.evaluation import prose
+from uavlinkd.lab.evaluation import report_tables as tables
 from uavlinkd.lab.evaluation.figures import all_figures
-from uavlinkd.lab.evaluation.timing_queries import DAEMON_SIZES, Findings
-from uavlinkd.lab.evaluation.page import Section, Table, to_html, to_markdown
-from uavlinkd.lab.evaluation.records import Status, read_records
-from uavlinkd.lab.evaluation.spread import duration, spread
+from uavlinkd.lab.evaluation.page import THE_PAPER, ReportSection, to_html, to_markdown
+from uavlinkd.lab.evaluation.records import read_records
+from uavlinkd.lab.evaluation.timing_queries import Findings
 
 NAME = "timing"
 TITLE = "How long a link takes: the paper's method and uavlinkd's"
-_NOTHING = "-"
 
 
 def write_report(folder: Path) -> Path:
-    """Draw the figures and write the report from the records in ``folder``; where the HTML is.
+    """Draw the figures and write the report from the records in ``folder``. Return the path of the HTML.
 
     Raises:
-        RecordsError: there are no records, or what is there is none.
+        RecordsError: there are no records, or they cannot be read.
     """
     findings = Findings(*read_records(folder / f"{NAME}.jsonl"))
     figures = _write_figures(findings, folder)
@@ -38,7 +33,7 @@ def write_page(folder: Path, page: Path) -> Path:
     """Write the Markdown to ``page``, for a repository, with the figures in the folder ``results`` beside it.
 
     Raises:
-        RecordsError: as :func:`write_report`.
+        RecordsError: see :func:`write_report`.
     """
     findings = Findings(*read_records(folder / f"{NAME}.jsonl"))
     beside = page.parent / "results"
@@ -55,32 +50,80 @@ def _write_figures(findings: Findings, folder: Path) -> dict[str, bytes]:
     return figures
 
 
-def make_sections(findings: Findings) -> list[Section]:
-    """All that the report says."""
-    comparison = [*prose.on_the_machine(findings), *prose.on_comparison(findings)]
+def make_sections(findings: Findings) -> list[ReportSection]:
+    """All sections of the report."""
     return [
-        Section("At equal size of the group", "comparison", comparison, _comparison(findings)),
-        Section("Time over the length of the HMAC key (the paper's Fig. 6)", "scatter", prose.on_scatter(findings)),
-        Section("How many took how long (the paper's Fig. 7)", "histogram", prose.on_histogram(findings)),
-        Section("Does the length of the HMAC key matter?", "tags", prose.on_tags(findings), _by_mac_key(findings)),
-        Section("The suites", "", prose.on_suites(findings), _suites(findings)),
-        Section("Inside a handshake: the core alone", "", _ON_CORE, _core(findings)),
-        Section("Frames on an established link", "latency", prose.on_latency(findings), _frames(findings)),
-        Section("Energy", "", prose.on_energy(findings)),
-        Section("The paper's grid", "", _ON_PAPER, _paper(findings)),
-        Section("Not measured", "", _on_gaps(findings), _gaps(findings)),
-        Section("Where and how", "", _on_run(findings), _run(findings)),
+        ReportSection("At equal size of the group", "comparison", _ON_COMPARISON, [tables.comparison(findings)]),
+        ReportSection(
+            "Time over the length of the HMAC key (the paper's Fig. 6)",
+            "scatter",
+            _ON_SCATTER,
+            [tables.dependence(findings)],
+        ),
+        ReportSection(
+            "Distribution of the times (the paper's Fig. 7)", "histogram", _ON_HISTOGRAM, [tables.extremes(findings)]
+        ),
+        ReportSection(
+            "Does the length of the HMAC key matter?",
+            "tags",
+            _ON_TAGS,
+            [tables.tag_times(findings), tables.by_mac_key(findings)],
+        ),
+        ReportSection("The suites", "", _ON_SUITES, [tables.suites(findings)]),
+        ReportSection("Inside a handshake: the core alone", "", _ON_CORE, [tables.core_steps(findings)]),
+        ReportSection(
+            "Frames on an established link",
+            "latency",
+            _ON_LATENCY,
+            [tables.latencies(findings), tables.relay_delay(findings), tables.frames(findings)],
+        ),
+        ReportSection("Energy", "", _ON_ENERGY, [tables.energy(findings), tables.boards()]),
+        ReportSection("The paper's grid", "", _ON_PAPER, [tables.paper_grid(findings)]),
+        ReportSection("Not measured", "", _on_gaps(findings), tables.gaps(findings)),
+        ReportSection("Run", "", _on_run(findings), [tables.run_facts(findings)]),
     ]
 
 
-_ON_CORE = [
-    "Two nodes in one process, datagrams handed over without a socket: cryptography and protocol, no transport. "
-    "Medians."
+_ON_COMPARISON = [
+    THE_PAPER,
+    "The paper's method searches a new safe prime for each exchange; the fourth column is the share of that search. "
+    "RFC 7919's groups need no search. A precomputation for a group that many share (Logjam) is feasible up to 1024 "
+    "bits and far out of reach from 2048 bits. An exchange that reached the time limit counts as the limit.",
+    "Times include other load on the machine: see the load in the last section.",
+]
+_ON_SCATTER = [
+    "Each point is one exchange. The table is a permutation test on ranks: does the time depend on the length of the "
+    "key within a group? The level is 5 % for all groups together (Bonferroni)."
+]
+_ON_HISTOGRAM = ["The widest group is the one with the largest ratio of its longest to its shortest exchange."]
+_ON_TAGS = [
+    "Time of one tag, least of the batches. `prepared`: the hash states of a session, as uavlinkd keeps them. "
+    "`from the key`: the states are computed for each tag. The last three columns are the changes from 256 to 512, "
+    "from 512 to 520 and from 520 to 2048 bits.",
+    "HMAC pads a key to the hash's block of 512 bits and hashes a longer key first (RFC 2104). A longer key costs "
+    "the extra blocks and is no stronger than its hash of 256 bits.",
+]
+_ON_SUITES = [
+    "Each handshake is between two new processes with new static, pre-shared and ephemeral keys; each rekey is "
+    "between running processes with new ephemeral keys. The time starts before the initiation is computed (measured "
+    "in the core) and ends when the other daemon delivers the first frame (measured at the relay). Starting the "
+    "processes takes about 0.5 s and is not included."
+]
+_ON_CORE = ["Two nodes in one process, without sockets: cryptography and protocol, no transport. Medians."]
+_ON_LATENCY = [
+    "From client to client through both daemons, one frame at a time. The measurement of handshakes uses a counting "
+    "relay, which four datagrams of a handshake pass (initiation, response, confirmation, frame). Its delay is not "
+    "subtracted."
+]
+_ON_ENERGY = [
+    "Energy is an estimate: processor time of both daemons on this machine, multiplied by the power of a busy core "
+    "(`--watts-per-core`). For a slower board, scale the processor time too, or measure there. The second table has "
+    "the power of typical boards, measured by others."
 ]
 _ON_PAPER = [
-    "Parameters of 512 bits and more are OpenSSL's (`dh.generate_parameters`). OpenSSL makes none below 512: those "
-    "of 256 bits are made, and used, on Python's integers (Miller-Rabin), and show an order of magnitude. "
-    "HMAC-SHA256 over 280 bytes, under a key of the given length expanded from the shared secret, between two "
+    "OpenSSL generates the parameters of 512 bits and more (`dh.generate_parameters`) and refuses smaller ones. "
+    "Those of 256 bits are generated and used with Python's integers (Miller-Rabin) and show the order of magnitude. "
+    "HMAC-SHA256 over 280 bytes with a key of the given length, derived from the shared secret, between two "
     "processes over UDP on loopback."
 ]
 
@@ -91,195 +134,13 @@ def _on_run(findings: Findings) -> list[str]:
     options += " --paper" if run.get("paper") else ""
     options += f" --watts-per-core {run.get('watts_per_core')} --seed {run.get('seed')}"
     return [
-        f"Made by `uavlinkd evaluate timing --out DIR {options}`. The seed fixes the order and the data, never a "
-        "key. `uavlinkd evaluate report DIR` writes this again, from the records alone."
+        f"Made by `uavlinkd evaluate timing --out DIR {options}`. The seed determines the order and the data, but no "
+        "key. `uavlinkd evaluate report DIR` writes this report again from the records."
     ]
-
-
-def _cell(times: Sequence[float]) -> str:
-    return prose.with_spread(spread(times)) if times else _NOTHING
-
-
-def _median(findings: Findings, kind: str, name: str, suite: str) -> str:
-    found = findings.spread(kind, name, suite=suite)
-    return duration(found.median) if found else _NOTHING
-
-
-def _state(findings: Findings, **point: int | str) -> str:
-    """Why there is no number at a point of the paper's grid."""
-    records = findings.of("paper", **point)
-    reasons = Counter(f"{each.status.value}: {each.reason}" for each in records if not each.is_ok)
-    return "; ".join(f"{reason} ({amount})" for reason, amount in reasons.items()) or _NOTHING
-
-
-def _comparison(findings: Findings) -> Table:
-    by_size = {bits: suite for suite, bits in DAEMON_SIZES.items()}
-    sizes = sorted({*(int(str(b)) for b in findings.values("paper", "dh_bits")), *by_size})
-    rows = []
-    for bits in sizes:
-        theirs, suite = findings.paper_times("made", bits), by_size.get(bits)
-        ours = findings.daemon_times(suite) if suite else []
-        with_late = findings.paper_at_least("made", bits)
-        late = len(with_late) - len(theirs)
-        factor = _NOTHING
-        if with_late and ours:
-            factor = f"{'at least ' if late else ''}{spread(with_late).median / spread(ours).median:.0f}"
-        rows.append(
-            [
-                str(bits),
-                _cell(with_late) + prose.not_finished(late)
-                if theirs
-                else _state(findings, group="made", dh_bits=bits),
-                _cell(findings.paper_times("standard", bits)),
-                _cell(ours) if suite else "refused: too small",
-                factor,
-            ]
-        )
-    head = ["bits", "the paper's method", "the same in RFC 7919's group", "uavlinkd, ffdhe of that size", "factor"]
-    return Table(head, rows)
-
-
-def _paper(findings: Findings) -> Table:
-    rows = []
-    for group in ("made", "standard"):
-        for bits in findings.values("paper", "dh_bits"):
-            for length in findings.values("paper", "mac_key_bits"):
-                if not findings.of("paper", group=group, dh_bits=bits, mac_key_bits=length):
-                    continue
-                times = findings.paper_times(group, bits, length)
-                with_late = findings.paper_at_least(group, bits, length)
-                made = findings.spread("paper", "parameters_s", group=group, dh_bits=bits, mac_key_bits=length)
-                gap = _state(findings, group=group, dh_bits=int(str(bits)), mac_key_bits=int(str(length)))
-                rows.append(
-                    [
-                        "made" if group == "made" else "RFC 7919",
-                        str(bits),
-                        str(length),
-                        _cell(with_late) if times else gap,
-                        duration(made.median) if made else _NOTHING,
-                        gap if times else "",
-                    ]
-                )
-    head = [
-        "group",
-        "bits",
-        "HMAC key (bits)",
-        "start to verified (the limit for what did not finish)",
-        "making parameters, median",
-        "not finished, failed",
-    ]
-    return Table(head, rows)
-
-
-def _suites(findings: Findings) -> Table:
-    rows = []
-    for suite in findings.suites():
-        handshakes = [each for each in findings.of("handshake", suite=suite) if each.is_ok]
-        wire = Counter(
-            tuple(
-                int(each.number(name)) for name in ("bytes_there", "bytes_back", "datagrams_there", "datagrams_back")
-            )
-            for each in handshakes
-        ).most_common(1)
-        there, back, datagrams_there, datagrams_back = wire[0][0] if wire else (0, 0, 0, 0)
-        joules = prose.handshake_joules(findings, suite)
-        frames = prose.frames_joules(findings, suite=suite, mac_key_bits=256, confidential=False)
-        rows.append(
-            [
-                suite,
-                _cell(findings.daemon_times(suite)),
-                _cell(findings.rekey_times(suite)),
-                _median(findings, "handshake", "cpu_caller_s", suite),
-                _median(findings, "handshake", "cpu_answerer_s", suite),
-                f"{there} + {back}" if wire else _NOTHING,
-                f"{datagrams_there} + {datagrams_back}" if wire else _NOTHING,
-                f"{1e3 * joules:.2f} mJ" if joules is not None else _NOTHING,
-                f"{1e3 * frames:.0f} mJ" if frames is not None else _NOTHING,
-            ]
-        )
-    head = [
-        "suite",
-        "handshake, all HMAC keys",
-        "rekey",
-        "CPU, caller",
-        "CPU, answerer",
-        "bytes there + back, first frame included",
-        "datagrams",
-        "energy of a handshake (estimate)",
-        "energy of 1,000 frames (estimate)",
-    ]
-    return Table(head, rows)
-
-
-def _by_mac_key(findings: Findings) -> Table:
-    lengths = findings.values("handshake", "mac_key_bits")
-    rows = [
-        [suite, *(_cell(findings.daemon_times(suite, length)) for length in lengths)] for suite in findings.suites()
-    ]
-    return Table(["handshake", *(f"HMAC key of {length} bits" for length in lengths)], rows)
-
-
-def _core(findings: Findings) -> Table:
-    steps = {
-        "initiate_s": "make the initiation",
-        "respond_s": "answer it",
-        "finish_s": "take the answer",
-        "confirm_s": "take the confirmation",
-        "frame_s": "seal and open a frame",
-        "total_s": "all",
-    }
-    suites = [name for name in SUITES_BY_NAME if findings.of("core", suite=name)]
-    rows = [[suite, *(_median(findings, "core", step, suite) for step in steps)] for suite in suites]
-    return Table(["suite", *steps.values()], rows)
-
-
-def _frames(findings: Findings) -> Table:
-    rows = []
-    for record in findings.records:
-        if record.kind != "frames" or not record.is_ok:
-            continue
-        point = dict(record.point)
-        latencies = findings.latencies(**point)
-        per_frame = [record.number(name) / record.number("sent") for name in ("cpu_caller_s", "cpu_answerer_s")]
-        rows.append(
-            [
-                str(point["suite"]),
-                "confidential" if point["confidential"] else f"{point['mac_key_bits']} bits",
-                "yes" if point["relay"] else "no",
-                f"{record.number('delivered'):.0f} of {record.number('sent'):.0f}",
-                _cell(latencies),
-                duration(per_frame[0]),
-                duration(per_frame[1]),
-            ]
-        )
-    return Table(["suite", "HMAC key", "relay", "delivered", "latency", "CPU a frame, caller", "CPU, answerer"], rows)
 
 
 def _on_gaps(findings: Findings) -> list[str]:
     failed, other = len(findings.problems()), len(findings.unfinished()) - len(findings.problems())
     ended = bool(findings.of("end"))
-    text = f"{failed} measurements failed; {other} did not finish in time or were not asked for. Each is a record."
-    return [text if ended else text + " The run was interrupted: what would have followed is missing."]
-
-
-def _gaps(findings: Findings) -> Table | None:
-    counts = Counter(
-        (each.status, each.kind, ", ".join(f"{k} {v}" for k, v in each.point.items()), each.reason)
-        for each in findings.unfinished()
-    )
-    order = {Status.FAILED: 0, Status.NOT_FINISHED: 1, Status.SKIPPED: 2, Status.OK: 3}
-    rows = [
-        [status.value, kind, point, reason, str(amount)]
-        for (status, kind, point, reason), amount in sorted(counts.items(), key=lambda each: order[each[0][0]])
-    ]
-    return Table(["what became of it", "kind", "point", "reason", "times"], rows) if rows else None
-
-
-def _run(findings: Findings) -> Table:
-    rows = [
-        [name.replace("_", " "), _NOTHING if value is None else str(value)] for name, value in findings.run.items()
-    ]
-    end = findings.of("end")
-    if end:
-        rows.append(["elapsed s", f"{end[0].number('elapsed_s'):.0f}"])
-    return Table(["", ""], rows)
+    text = f"{failed} measurements failed; {other} did not finish in time or were not requested."
+    return [text if ended else text + " The run was interrupted."]

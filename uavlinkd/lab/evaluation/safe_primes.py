@@ -1,6 +1,6 @@
-"""Safe primes on Python's integers, for groups that OpenSSL refuses to make: below 512 bits.
+"""Safe primes with Python's integers, for groups below 512 bits, which OpenSSL refuses.
 
-Such a group protects nothing. It is here because the paper measured one.
+Such a group is insecure. It is here because the paper measured one.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import secrets
 
 _ROUNDS = 40
-"""Of Miller-Rabin: a composite passes with a chance below 4^-40."""
+"""Rounds of Miller-Rabin: a composite passes with a probability below 4^-40."""
 _SIEVE_BELOW = 8000
 
 
@@ -49,16 +49,16 @@ def is_probable_prime(number: int, rounds: int = _ROUNDS) -> bool:
 def generate_safe_prime(bits: int) -> int:
     """A random prime p of ``bits`` bits where (p-1)/2 is prime too and 2 generates the subgroup of that order.
 
-    p = 7 mod 8 makes 2 a square (RFC 3526's groups are so too). ``bits`` is 16 or more.
+    p = 7 mod 8 makes 2 a square, as in RFC 3526's groups. ``bits`` is 16 or more.
     """
     if bits < 16:
-        raise ValueError("a safe prime of fewer than 16 bits is no group to measure")
+        raise ValueError("a safe prime must have at least 16 bits")
     while True:
-        # (p-1)/2 is 3 mod 4; the two highest bits are set, as OpenSSL does, so the length is certain.
+        # (p-1)/2 is 3 mod 4; the two highest bits are set, as in OpenSSL, so the length is exact.
         half = secrets.randbits(bits - 1) | 3 << (bits - 3) | 3
         if any(half % prime == 0 or (2 * half + 1) % prime == 0 for prime in _SMALL_PRIMES if prime < half):
             continue
-        # One round each throws out nearly every candidate before the expensive rounds.
+        # One round excludes nearly every candidate before the expensive rounds.
         quickly = is_probable_prime(half, 1) and is_probable_prime(2 * half + 1, 1)
         if quickly and is_probable_prime(half) and is_probable_prime(2 * half + 1):
             return 2 * half + 1

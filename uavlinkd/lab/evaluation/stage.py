@@ -1,7 +1,7 @@
-"""Where attacks are tried: drones with their local programs, the man in the middle between them, and the books.
+"""The stages of attacks: drones with their clients, the man in the middle between them, and a ledger of the frames.
 
 :class:`DaemonStage` has real daemons, each a process; :class:`PaperStage` two ends of the paper's protocol. Both
-carry numbered frames all the time, each way.
+continuously carry numbered frames in both directions.
 """
 
 from __future__ import annotations
@@ -20,51 +20,52 @@ from pathlib import Path
 from time import monotonic
 from typing import Any, Self
 
+from uavlinkd.config.keys import decode_key, generate_psk
 from uavlinkd.lab.evaluation.ledger import Ledger
 from uavlinkd.lab.evaluation.middle import Middle, MiddleHere, MiddleProcess
 from uavlinkd.lab.evaluation.paper_protocol import VERIFIED, PaperEnd
-from uavlinkd.config.keys import decode_key, generate_psk
-from uavlinkd.ops.log import DISTURBANCES
-from uavlinkd.lab.sim.drone_process import DroneProcess, free_udp_ports
+from uavlinkd.lab.sim.drone_process import DroneProcess
+from uavlinkd.lab.sim.loopback_ports import free_ports
+from uavlinkd.ops.link_problems import LinkProblem
 
-LINK_UP_S = 60.0
-"""Half a second on a quiet machine."""
+LINK_UP_S = 120.0
+"""How long linking may take; 0.5 s on a quiet machine."""
 _LOOK_S = 0.01
 _DATAGRAM_BYTES = 65536
-_TELL_EVERY_S = 1.0
+_LOG_INTERVAL_S = 1.0
 _TICK_S = 0.001
 _MOST_A_TICK = 20
-"""Frames that are made up for after a pause of this process; the rest is never sent."""
+"""Frames that are sent at once after a pause of this process; the rest is never sent."""
 
 
 class StageError(Exception):
-    """The drones did not link. The message is for a person."""
+    """The drones did not link. The message is for the operator."""
 
 
 @dataclass(frozen=True, slots=True)
 class Notice:
-    """What one drone noticed, so far or in a while: counters by reason, and figures of its link."""
+    """The counters of one drone, by reason, and figures of its link."""
 
     drops: Counter[str] = field(default_factory=Counter)
     figures: Counter[str] = field(default_factory=Counter)
 
     def since(self, before: Notice) -> Notice:
-        """What came since then. Counters that began anew count from zero."""
+        """The difference to an earlier notice. Counters that were reset count from zero."""
         return Notice(self.drops - before.drops, self.figures - before.figures)
 
     def plus(self, other: Notice) -> Notice:
-        """Both together."""
+        """The sum of both."""
         return Notice(self.drops + other.drops, self.figures + other.figures)
 
 
 class Stage(ABC):
-    """What both have in common: traffic, the middle, the drones' logs.
+    """The base class of stages: traffic, the man in the middle, the drones' logs.
 
     Args:
         names: of the drones.
-        middle: between them.
-        ledger: the books; a drone's program speaks if it has an audience there.
-        rate_hz: frames a second from each program that speaks.
+        middle: the man in the middle between them.
+        ledger: of the frames. A drone's client sends frames if it has receivers there.
+        rate_hz: frames per second of each sending client.
     """
 
     system = ""
@@ -75,6 +76,8 @@ class Stage(ABC):
         self.ledger = ledger
         self.rate_hz = rate_hz
         self.speakers = tuple(name for name in names if ledger.audience[name])
+        self.unwritten: dict[str, set[str]] = {name: set() for name in names}
+        """By drone: what a killed daemon counted. It logs its totals when it stops."""
         self._traffic: asyncio.Task[None] | None = None
 
     async def __aenter__(self) -> Self:
@@ -118,35 +121,35 @@ class Stage(ABC):
 
     @abstractmethod
     async def open(self) -> None:
-        """Start everything but the traffic."""
+        """Start all parts except the traffic."""
 
     @abstractmethod
     async def close(self) -> None:
-        """End everything but the traffic."""
+        """Stop all parts except the traffic."""
 
     @abstractmethod
     def send(self, name: str, frame: bytes) -> None:
-        """A drone's local program says something."""
+        """A drone's client sends a frame."""
 
     @abstractmethod
     async def notices(self) -> dict[str, Notice]:
-        """What each drone noticed so far."""
+        """The counters of each drone so far."""
 
     @abstractmethod
     async def restart(self, name: str) -> None:
-        """A power failure of one drone, and its start; when it answers again."""
+        """Simulate a power failure of one drone. Return when it answers again."""
 
     @abstractmethod
     def logs(self) -> dict[str, list[dict[str, Any]]]:
-        """Each drone's log so far: its lines, parsed."""
+        """The parsed log lines of each drone so far."""
 
 
 class DaemonStage(Stage):
-    """Real daemons. Each pair is linked through the middle, with a PSK.
+    """Real daemons. Each pair is linked through the man in the middle, with a PSK.
 
     Args:
         link: the ``[link]`` section of every daemon.
-        silent: drones whose program says nothing and is told nothing, and who may speak as themselves alone.
+        silent: drones whose client neither sends nor receives frames, and that may send only as themselves.
     """
 
     system = "uavlinkd"
@@ -164,7 +167,7 @@ class DaemonStage(Stage):
         speakers = [name for name in names if name not in silent]
         audience = {name: set(speakers) - {name} if name in speakers else set() for name in names}
         super().__init__(names, middle, Ledger(names, audience), rate_hz)
-        ports = free_udp_ports(2 * len(names))
+        ports = free_ports(2 * len(names))
         self.drones = {
             name: DroneProcess(name, folder / name, ports[2 * number], ports[2 * number + 1])
             for number, name in enumerate(names)
@@ -172,21 +175,21 @@ class DaemonStage(Stage):
         self.psks: dict[frozenset[str], str] = {}
         self._link = link
         self._silent = frozenset(silent)
-        self._programs: dict[str, socket.socket] = {}
+        self._clients: dict[str, socket.socket] = {}
         self._before: dict[str, Notice] = {name: Notice() for name in names}
 
     @property
     def public_keys(self) -> dict[str, bytes]:
-        """Of the drones."""
+        """The public keys of the drones."""
         return {name: decode_key(drone.public_key) for name, drone in self.drones.items()}
 
     async def open(self) -> None:
-        """Configure and start the daemons, the middle, and a program at each."""
+        """Configure and start the daemons, the man in the middle, and a client of each daemon."""
         self._configure()
         await self.middle.start({name: drone.port for name, drone in self.drones.items()}, self.public_keys)
         loop = asyncio.get_running_loop()
         for name in self.names:
-            sock = self._programs[name] = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            sock = self._clients[name] = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
             sock.setblocking(False)
             sock.bind(("127.0.0.1", 0))
             loop.add_reader(sock, self._on_readable, name, sock)
@@ -204,14 +207,18 @@ class DaemonStage(Stage):
                 psk = self.psks.setdefault(pair, generate_psk())
                 file = f"{other}.psk"
                 self.drones[one].share_psk(psk, file)
-                rules: dict[str, object] = {}
-                if self._silent:
-                    rules["system_ids"] = [self.names.index(other) + 1]
-                if pair & self._silent:
-                    rules["deny_out"] = ["ATTITUDE", "HEARTBEAT"]
                 address = f"127.0.0.1:{self.middle.ports[one, other]}"
-                peers.append(self.drones[other].as_peer(address, file, **rules))
+                peers.append(self.drones[other].as_peer(address, file, **self.rules(one, other)))
             self.drones[one].configure(self._link, peers)
+
+    def rules(self, one: str, other: str) -> dict[str, object]:
+        """The policy of one drone for another."""
+        rules: dict[str, object] = {}
+        if self._silent:
+            rules["system_ids"] = [self.names.index(other) + 1]
+        if {one, other} & self._silent:
+            rules["deny_out"] = ["ATTITUDE", "HEARTBEAT"]
+        return rules
 
     async def _until_up(self, *names: str) -> None:
         begin = monotonic()
@@ -219,26 +226,26 @@ class DaemonStage(Stage):
         while waiting:
             for drone in list(waiting):
                 await drone.ask()
-                if drone.peer_statuses and all(each["state"] == "up" for each in drone.peer_statuses):
+                if drone.peer_statuses and all(status["state"] == "up" for status in drone.peer_statuses):
                     waiting.remove(drone)
             if monotonic() > begin + LINK_UP_S:
-                said = "\n".join(line for drone in waiting for line in drone.last_lines(3))
-                raise StageError(f"the daemons did not link within {LINK_UP_S:g} s; they said:\n{said}")
+                lines = "\n".join(line for drone in waiting for line in drone.last_lines(3))
+                raise StageError(f"the daemons did not link within {LINK_UP_S:g} s; their last log lines:\n{lines}")
             await asyncio.sleep(_LOOK_S)
 
     async def close(self) -> None:
-        """End all processes."""
+        """Stop all processes."""
         await asyncio.gather(*(drone.stop() for drone in self.drones.values()))
         await self.middle.stop()
         loop = asyncio.get_running_loop()
-        for sock in self._programs.values():
+        for sock in self._clients.values():
             loop.remove_reader(sock)
             sock.close()
 
     def send(self, name: str, frame: bytes) -> None:
-        """To the daemon's endpoint."""
+        """Send a frame to the daemon's endpoint."""
         with suppress(OSError):  # its daemon is being restarted
-            self._programs[name].sendto(frame, ("127.0.0.1", self.drones[name].endpoint_port))
+            self._clients[name].sendto(frame, ("127.0.0.1", self.drones[name].endpoint_port))
 
     def _on_readable(self, name: str, sock: socket.socket) -> None:
         now = monotonic()
@@ -252,18 +259,17 @@ class DaemonStage(Stage):
             self.ledger.on_received(name, datagram, now)
 
     async def notices(self) -> dict[str, Notice]:
-        """From each daemon's status; what it said before a restart counts too."""
-        told = {}
-        for name, drone in self.drones.items():
-            told[name] = self._before[name].plus(_notice(await drone.ask()))
-        return told
+        """The counters of each daemon's status, with those before a restart."""
+        return {name: self._before[name].plus(_notice(await drone.ask())) for name, drone in self.drones.items()}
 
     async def restart(self, name: str) -> None:
-        """Kill the daemon and start it again."""
+        """Kill the daemon and restart it."""
         drone = self.drones[name]
-        self._before[name] = self._before[name].plus(_notice(await drone.ask()))
+        notice = _notice(await drone.ask())
+        self._before[name] = self._before[name].plus(notice)
+        self.unwritten[name] |= set(notice.drops)
         await drone.stop(signal.SIGKILL)
-        await asyncio.sleep(0.4)  # as long as replays take for a restart
+        await asyncio.sleep(0.4)  # long enough for replay attacks to detect the restart
         drone.status = {}
         await drone.start()
         begin = monotonic()
@@ -273,7 +279,7 @@ class DaemonStage(Stage):
             await asyncio.sleep(_LOOK_S)
 
     def logs(self) -> dict[str, list[dict[str, Any]]]:
-        """Their JSON lines; what is none is a line too."""
+        """The parsed JSON lines, and other lines as events."""
         return {
             name: [_parsed(line) for line in drone.last_lines(1 << 20)] if drone.log.exists() else []
             for name, drone in self.drones.items()
@@ -282,10 +288,10 @@ class DaemonStage(Stage):
 
 def _parsed(line: str) -> dict[str, Any]:
     try:
-        found = json.loads(line)
+        fields = json.loads(line)
     except ValueError:
         return {"event": line}
-    return found if isinstance(found, dict) else {"event": line}
+    return fields if isinstance(fields, dict) else {"event": line}
 
 
 def _notice(status: Mapping[str, Any]) -> Notice:
@@ -295,7 +301,7 @@ def _notice(status: Mapping[str, Any]) -> Notice:
         drops.update(peer["drops"])
         figures["handshakes"] += peer["handshakes"]
         figures["envelopes_received"] += peer["envelopes_received"]
-        drops.update({sign: peer[sign] for sign in DISTURBANCES if peer[sign]})
+        drops.update({sign: peer[sign] for sign in LinkProblem if peer[sign]})
         for reasons in peer["refused"]["in"].values():
             for reason, count in reasons.items():
                 drops[f"refused_{reason}"] += count
@@ -311,53 +317,53 @@ class PaperStage(Stage):
         super().__init__(names, middle, Ledger(names), rate_hz)
         self.ends: dict[str, PaperEnd] = {}
         self._lines: dict[str, list[dict[str, Any]]] = {name: [] for name in names}
-        self._told: Counter[tuple[str, str]] = Counter()
+        self._reported: Counter[tuple[str, str]] = Counter()
         self._quiet_until: dict[tuple[str, str], float] = {}
 
     async def open(self) -> None:
-        """Both ends, and the middle."""
+        """Start both ends and the man in the middle."""
         for number, name in enumerate(self.names):
             self.ends[name] = PaperEnd(
                 name,
                 is_initiator=number == 0,
                 on_frame=lambda frame, name=name: self.ledger.on_received(name, frame, monotonic()),  # type: ignore[misc]
-                tell=lambda reason, meaning, name=name: self._tell(name, reason, meaning),  # type: ignore[misc]
+                report=lambda reason, meaning, name=name: self._report(name, reason, meaning),  # type: ignore[misc]
             )
         await self.middle.start({name: end.port for name, end in self.ends.items()}, {})
         for one, other in (self.names, self.names[::-1]):
             self.ends[one].start(("127.0.0.1", self.middle.ports[one, other]))
 
     async def close(self) -> None:
-        """End."""
+        """Stop."""
         for end in self.ends.values():
             end.close()
         await self.middle.stop()
 
     def send(self, name: str, frame: bytes) -> None:
-        """The end sends it."""
+        """Send a frame with its HMAC."""
         self.ends[name].send(frame)
 
     async def notices(self) -> dict[str, Notice]:
-        """Its counters."""
+        """The counters of both ends."""
         return {
             name: Notice(Counter(end.counters), Counter(exchanges=end.exchanges)) for name, end in self.ends.items()
         }
 
     async def restart(self, name: str) -> None:
-        """Nothing of it is kept anyway: new keys come each moment."""
+        """Do nothing: an end has no state that a restart would lose, and its keys change continually."""
 
     def logs(self) -> dict[str, list[dict[str, Any]]]:
-        """What they told."""
+        """The reported events of both ends."""
         return self._lines
 
-    def _tell(self, name: str, reason: str, meaning: str) -> None:
-        # As few lines as the daemon's: one when it begins, then one a second.
-        self._told[name, reason] += 1
+    def _report(self, name: str, reason: str, meaning: str) -> None:
+        # As in the daemon's log: one line immediately, then one per second.
+        self._reported[name, reason] += 1
         now = monotonic()
         if now < self._quiet_until.get((name, reason), now):
             return
-        self._quiet_until[name, reason] = now + _TELL_EVERY_S
+        self._quiet_until[name, reason] = now + _LOG_INTERVAL_S
         event = "data_verified" if reason == VERIFIED else "tampering_detected"
         stamp = datetime.now(UTC).isoformat().replace("+00:00", "Z")
-        facts = {"reason": reason, "count": self._told[name, reason], "meaning": meaning, "timestamp": stamp}
+        facts = {"reason": reason, "count": self._reported[name, reason], "meaning": meaning, "timestamp": stamp}
         self._lines[name].append({"event": event, **facts})

@@ -1,32 +1,33 @@
 """``uavlinkd evaluate tampering``: every attack against the paper's protocol and against real daemons.
 
-Several stages run beside one another, each with daemons and a man in the middle of its own; on each the attacks
-follow one another, while numbered frames go both ways all the time.
+Several stages run concurrently, each with its own daemons and man in the middle. On each stage the attacks run one
+after another, while numbered frames flow continuously in both directions.
 """
 
 from __future__ import annotations
 
 import asyncio
 import json
-import tempfile
 from collections.abc import Awaitable, Callable, Mapping, Sequence
+from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from random import Random
 from time import monotonic
-from typing import Any
 
+from uavlinkd.lab.child_processes import private_folder
 from uavlinkd.lab.evaluation import tampering_plan as plans
 from uavlinkd.lab.evaluation.flood import run_floods
 from uavlinkd.lab.evaluation.machine import load, machine_facts
 from uavlinkd.lab.evaluation.member_trial import as_trial, run_attacks
 from uavlinkd.lab.evaluation.middle import MiddleHere, MiddleProcess
 from uavlinkd.lab.evaluation.paper_attacks import CHANGES, AlterKeys
+from uavlinkd.lab.evaluation.refusing_stage import RefusingStage
 from uavlinkd.lab.evaluation.stage import DaemonStage, PaperStage, Stage
-from uavlinkd.lab.evaluation.tampering_bench import Bench, Recorder, Settings, Show
+from uavlinkd.lab.evaluation.tampering_bench import Bench, Show, TamperingSettings, TrialRecorder
 from uavlinkd.lab.evaluation.tampering_keys import key_attacks, run_impostor, run_paper_relay, run_sealed_cookies
 from uavlinkd.lab.evaluation.tampering_log import write_logs
-from uavlinkd.lab.evaluation.tampering_plan import Plan
+from uavlinkd.lab.evaluation.tampering_plan import TrialPlan
 from uavlinkd.lab.evaluation.tampering_records import OURS, PAPER, RELAY, Run, Verdict
 
 NAME = "tampering"
@@ -47,35 +48,38 @@ PLAIN_LINK: dict[str, object] = {}
 class Evaluation:
     """One run, with its results in ``out``."""
 
-    def __init__(self, out: Path, settings: Settings, show: Show) -> None:
+    def __init__(self, out: Path, settings: TamperingSettings, show: Show) -> None:
         self.out = out
         self.settings = settings
         self._show = show
         self._benches: list[tuple[str, Bench]] = []
         self._unlogged: list[str] = []
-        self._links: dict[str, Mapping[str, object]] = {}  # of each stage: what differs from the defaults of [link]
+        self._links: dict[
+            str, Mapping[str, object]
+        ] = {}  # of each stage: the differences from the defaults of [link]
 
     async def run(self) -> Run:
-        """Try everything, and write records and logs.
+        """Run all attacks, and write records and logs.
 
         Raises:
-            StageError, MiddleError, DroneError: the drones or the man in the middle do not work at all.
+            StageError, MiddleError, DroneError: the drones or the man in the middle failed.
             OSError: the results cannot be written.
         """
         self.out.mkdir(parents=True, exist_ok=True)
         with (
             (self.out / f"{NAME}.jsonl").open("w", encoding="utf-8") as file,
-            tempfile.TemporaryDirectory(prefix="uavlinkd-") as folder,
+            private_folder("uavlinkd-") as folder,
         ):
-            recorder = Recorder(file, self._show)
-            self._folder = Path(folder)
-            facts = {**machine_facts(), **_settings_facts(self.settings), "began": datetime.now(UTC).isoformat()}
+            recorder = TrialRecorder(file, self._show)
+            self._folder = folder
+            facts = {**machine_facts(), **asdict(self.settings), "began": datetime.now(UTC).isoformat()}
             recorder.run.facts = dict(facts)
             try:
                 async with asyncio.TaskGroup() as group:
-                    for lane in (self._handshakes, self._data, self._with_keys, self._captured_member, self._paper):
+                    lanes = (self._handshakes, self._data, self._with_keys, self._captured_member, self._paper)
+                    for lane in (*lanes, self._reports):
                         group.create_task(lane(recorder))
-            except ExceptionGroup as failed:  # the first says it all: the others were ended because of it
+            except ExceptionGroup as failed:  # the first is the cause: the others were cancelled
                 raise failed.exceptions[0] from None
             rates = (500.0,) if self.settings.quick else (200.0, 1000.0, 2000.0)
             phase_s = 0.5 if self.settings.quick else 5.0
@@ -111,18 +115,18 @@ class Evaluation:
         folder.mkdir()
         log = self._log(label)
         seed = self.settings.seed
-        is_here = here or self.settings.quick  # a process more takes a second to start
+        is_here = here or self.settings.quick  # another process takes a second to start
         middle = MiddleHere(names, log, seed) if is_here else MiddleProcess(names, folder, log, seed)
         return DaemonStage(names, folder, middle, link, rate_hz=rate_hz, silent=silent)
 
     def _log(self, label: str) -> Path:
-        """Of a man in the middle, without what one of an earlier run wrote."""
+        """The log file of a man in the middle, without the lines of an earlier run."""
         path = self.out / f"mitm-{label}.jsonl"
         path.unlink(missing_ok=True)
         return path
 
     async def _try(
-        self, label: str, stage: Stage, recorder: Recorder, work: Callable[[Bench], Awaitable[None]]
+        self, label: str, stage: Stage, recorder: TrialRecorder, work: Callable[[Bench], Awaitable[None]]
     ) -> None:
         bench = Bench(stage, recorder, self.settings)
         self._benches.append((label, bench))
@@ -131,12 +135,13 @@ class Evaluation:
             await work(bench)
             counted = {name: set(+notice.drops) for name, notice in (await stage.notices()).items()}
         for name, lines in stage.logs().items():
-            told = {str(line.get("reason")) for line in lines}
-            told |= {sign for line in lines if line.get("event") == "link_disturbed" for sign in line}
-            missing = {reason for reason in counted[name] if reason.removeprefix("refused_") not in told}
-            self._unlogged += [f"{label}: {name}: {reason}" for reason in sorted(missing)]
+            logged = {str(line.get(field)) for line in lines for field in ("reason", "problem")}
+            # Everyday drops and problems have no line of their own, but are counted when the daemon stops.
+            logged |= {reason for line in lines for reason in line.get("counted", ())}
+            missing = {reason for reason in counted[name] if reason.removeprefix("refused_") not in logged}
+            self._unlogged += [f"{label}: {name}: {reason}" for reason in sorted(missing - stage.unwritten[name])]
 
-    async def _handshakes(self, recorder: Recorder) -> None:
+    async def _handshakes(self, recorder: TrialRecorder) -> None:
         rows = self._chosen(plans.HANDSHAKE_PLANS)
 
         async def half(number: int) -> None:
@@ -149,7 +154,7 @@ class Evaluation:
 
         await asyncio.gather(half(0), half(1))
 
-    async def _data(self, recorder: Recorder) -> None:
+    async def _data(self, recorder: TrialRecorder) -> None:
         rows = [*plans.STALE_PLANS, *plans.DATA_PLANS, *plans.FLOOD_PLANS, *plans.LAST_PLANS]
 
         async def work(bench: Bench) -> None:
@@ -159,10 +164,10 @@ class Evaluation:
         stage = self._stage("data", PAIR, DATA_LINK, rate_hz=self.settings.rate_hz)
         await self._try("data", stage, recorder, work)
 
-    def _chosen(self, rows: Sequence[Plan]) -> list[Plan]:
+    def _chosen(self, rows: Sequence[TrialPlan]) -> list[TrialPlan]:
         return [plan for plan in rows if not (self.settings.quick and plan.is_variant)]
 
-    async def _with_keys(self, recorder: Recorder) -> None:
+    async def _with_keys(self, recorder: TrialRecorder) -> None:
         stage = self._stage("keys", TRIO, KEYS_LINK, rate_hz=self.settings.rate_hz / 2, silent=TRIO[2:], here=True)
 
         async def work(bench: Bench) -> None:
@@ -176,14 +181,27 @@ class Evaluation:
 
         await self._try("keys", stage, recorder, work)
 
-    async def _captured_member(self, recorder: Recorder) -> None:
+    async def _reports(self, recorder: TrialRecorder) -> None:
+        folder = self._folder / "reports"
+        folder.mkdir()
+        self._links["reports"] = PLAIN_LINK
+        middle = MiddleHere(PAIR, self._log("reports"), self.settings.seed)
+        stage = RefusingStage(PAIR, folder, middle, PLAIN_LINK, rate_hz=50.0)
+
+        async def work(bench: Bench) -> None:
+            for plan in self._chosen(plans.REPORT_PLANS):
+                await bench.run(plan)
+
+        await self._try("reports", stage, recorder, work)
+
+    async def _captured_member(self, recorder: TrialRecorder) -> None:
         begin_s, began = monotonic() - recorder.began_at, monotonic()
         folder = self._folder / "member"
         folder.mkdir()
         results = await run_attacks(folder)
         recorder.add(as_trial(results, begin_s, monotonic() - began, self.settings.seed))
 
-    async def _paper(self, recorder: Recorder) -> None:
+    async def _paper(self, recorder: TrialRecorder) -> None:
         settings = self.settings
         stage = PaperStage(PAIR, MiddleHere(PAIR, self._log("paper"), settings.seed), rate_hz=settings.paper_rate_hz)
         rows = (
@@ -200,9 +218,9 @@ class Evaluation:
                 if plan.paper is None:
                     continue
                 if plan.paper in CHANGES:
-                    chance = Random(f"{plan.paper} {settings.seed}")  # noqa: S311  luck, no secret
+                    rng = Random(f"{plan.paper} {settings.seed}")  # noqa: S311  not a secret
                     name = plan.paper
-                    await bench.run(plan, phases=(), objects=lambda n=name, c=chance: [AlterKeys(n, c)])  # type: ignore[misc]
+                    await bench.run(plan, phases=(), objects=lambda n=name, c=rng: [AlterKeys(n, c)])  # type: ignore[misc]
                 else:
                     await bench.run(plan, phases=(plan.paper,))
             await run_paper_relay(bench)
@@ -210,25 +228,15 @@ class Evaluation:
         await self._try("paper", stage, recorder, work)
 
 
-def _settings_facts(settings: Settings) -> dict[str, Any]:
-    return {
-        "quick": settings.quick,
-        "attempts_data": settings.attempts_data,
-        "attempts_handshake": settings.attempts_handshake,
-        "seed": settings.seed,
-    }
-
-
 def problems(run: Run) -> list[str]:
-    """What is not as it must be; nothing if all is well."""
-    found = [
-        f"{trial.attack}: {trial.verdict.value}: {'; '.join(trial.successes) or 'it never reached the wire'}"
+    """The deviations from the expected results."""
+    lines = [
+        f"{trial.attack}: {trial.verdict.value}: {'; '.join(trial.successes) or 'it never reached the network'}"
         for trial in run.of(OURS)
         if trial.verdict in (Verdict.SUCCEEDED, Verdict.BROKEN)
     ]
-    found += [f"{trial.attack} on the paper's protocol: broken" for trial in run.of(PAPER) if trial.attempts == 0]
+    lines += [f"{trial.attack} on the paper's protocol: broken" for trial in run.of(PAPER) if trial.attempts == 0]
     relay = [trial for trial in run.of(PAPER) if trial.attack == RELAY]
     if not relay or relay[0].verdict is not Verdict.SUCCEEDED or not relay[0].faults:
-        found.append("the two-sided relay did not succeed against the paper's protocol: it is no relay")
-    found += [f"counted and never logged: {each}" for each in run.facts.get("unlogged", [])]
-    return found
+        lines.append("the two-sided relay did not succeed against the paper's protocol: the relay does not work")
+    return lines + [f"counted and never logged: {item}" for item in run.facts.get("unlogged", [])]

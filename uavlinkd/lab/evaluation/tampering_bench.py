@@ -1,37 +1,37 @@
-"""One attack at a time: told to the man in the middle, watched from both ends, and written down."""
+"""Runs one attack at a time: starts it in the man in the middle, observes the drones, and records the trial."""
 
 from __future__ import annotations
 
 import asyncio
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from datetime import UTC, datetime
 from time import monotonic
 from typing import Any, TextIO
 
 from uavlinkd.core.constants import LATE_AFTER_S, LATE_STEP_S
 from uavlinkd.lab.evaluation.stage import Stage
-from uavlinkd.lab.evaluation.tampering_plan import HANDSHAKE, KEYS, Plan, with_target
+from uavlinkd.lab.evaluation.tampering_plan import HANDSHAKE, KEYS, TrialPlan, with_target
 from uavlinkd.lab.evaluation.tampering_records import PAPER, Run, Trial
 from uavlinkd.lab.mitm.attack import AttackObject
 
-GIVE_UP_S = 5.0
-"""How long frames are waited for after an attack."""
+GIVE_UP_S, QUICK_GIVE_UP_S = 5.0, 120.0
+"""How long to wait for frames after an attack. A quick run may share its machine with much else."""
 QUICK_AFTER_S = 1.2
-"""The longest that a quick run goes on after the last attempt: it has few to wait for."""
+"""How long a quick run continues at most after the last attempt."""
 CONTROL_S, QUICK_CONTROL_S = 10.0, 1.0
-"""How long nothing is attacked, for comparison, before the first attack."""
+"""The duration of the control without an attack, before the first attack."""
 _LOOK_S = 0.02
 _SETTLE_S = 0.08
-"""After the recovery: what is on its way arrives."""
-_TOLD_S = LATE_AFTER_S + 2 * LATE_STEP_S + 0.1
-"""The same where envelopes may be missing: a daemon calls them so when they can come no more."""
+"""After the recovery, for datagrams in flight."""
+_DETECTION_S = LATE_AFTER_S + 2 * LATE_STEP_S + 0.1
+"""The same if envelopes may be missing: a daemon counts them when they are too late to arrive."""
 
 
 @dataclass(frozen=True, slots=True)
-class Settings:
-    """How much of everything."""
+class TamperingSettings:
+    """The extent of the evaluation."""
 
     quick: bool = False
     attempts_data: int = 10_000
@@ -40,33 +40,40 @@ class Settings:
 
     @property
     def rate_hz(self) -> float:
-        """Frames a second of each program on a stage for attacks on data."""
+        """Frames per second of each client on a stage for attacks on data."""
         return 100.0 if self.quick else 500.0
 
     @property
     def paper_rate_hz(self) -> float:
-        """The same on the stage of the paper's protocol, whose ends share a process with everything here."""
+        """The same on the stage of the paper's protocol, whose ends run in this process."""
         return 100.0 if self.quick else 250.0
 
     def target(self, group: str, system: str) -> int:
-        """Attempts of an attack: on the paper's protocol fewer will do, which shows its faults at once."""
+        """The number of attempts of an attack. On the paper's protocol a tenth is sufficient."""
         if self.quick:
             return 5 if group in (HANDSHAKE, KEYS) else 60
         wanted = self.attempts_handshake if group in (HANDSHAKE, KEYS) else self.attempts_data
         return max(1, wanted // 10) if system == PAPER else wanted
 
     def most_s(self, group: str) -> float:
-        """How long an attack may take for that."""
+        """The maximum duration of an attack."""
         if self.quick:
             return 8.0
         return 300.0 if group in (HANDSHAKE, KEYS) else 60.0
 
 
+def run_settings(facts: Mapping[str, Any]) -> TamperingSettings:
+    """The settings of a run, from its facts. Without facts: the defaults."""
+    return TamperingSettings(
+        **{field.name: facts[field.name] for field in fields(TamperingSettings) if field.name in facts}
+    )
+
+
 Show = Callable[[Trial], None]
 
 
-class Recorder:
-    """Writes each trial as it ends."""
+class TrialRecorder:
+    """Writes each trial when it ends."""
 
     def __init__(self, file: TextIO, show: Show) -> None:
         self.run = Run()
@@ -75,64 +82,64 @@ class Recorder:
         self._show = show
 
     def add(self, trial: Trial) -> None:
-        """One more."""
+        """Add a trial."""
         self.run.trials.append(trial)
         self.write(trial.to_json())
         self._show(trial)
 
     def write(self, line: str) -> None:
-        """A line of the records."""
+        """Write a line of the records."""
         self._file.write(line + "\n")
         self._file.flush()
 
 
 @dataclass(slots=True)
 class Marker:
-    """A moment for the readable logs."""
+    """A marker in the readable logs."""
 
     at: datetime
     text: str
 
 
 class Bench:
-    """Tries attacks on one stage, one after the other."""
+    """Runs attacks on one stage, one after the other."""
 
-    def __init__(self, stage: Stage, recorder: Recorder, settings: Settings) -> None:
+    def __init__(self, stage: Stage, recorder: TrialRecorder, settings: TamperingSettings) -> None:
         self.stage = stage
         self.markers: list[Marker] = []
         self.control: dict[str, float] = {}
-        """What the drones count a second where nothing is attacked, as :meth:`run_control` found."""
+        """The drones' counters per second without an attack, from :meth:`run_control`."""
         self._recorder = recorder
         self._settings = settings
 
     async def run(
         self,
-        plan: Plan,
+        plan: TrialPlan,
         *,
         phases: Sequence[str] | None = None,
         objects: Callable[[], Sequence[AttackObject]] | None = None,
         sessions: Callable[[], int] = lambda: 0,
         achieved: Callable[[], dict[str, Any]] = dict,
     ) -> Trial:
-        """Try one. ``phases`` in place of the plan's, or attackers with keys."""
+        """Run one attack. ``phases`` and ``objects`` (attackers with keys) replace the phases of the plan."""
         stage, ledger, settings = self.stage, self.stage.ledger, self._settings
         target = settings.target(plan.group, stage.system) if plan.targeted else 0
-        told = tuple(with_target(phase, target) for phase in (plan.phases if phases is None else phases))
-        names = [phase.split()[0].split(",")[0] for phase in told]
+        commands = tuple(with_target(phase, target) for phase in (plan.phases if phases is None else phases))
+        names = [phase.split()[0].split(",")[0] for phase in commands]
         notices, noticed_at = await stage.notices(), monotonic()
         lines = {name: len(log) for name, log in stage.logs().items()}
         stats = await stage.middle.statistics()
         faults, begin, begin_at = Counter(ledger.faults), ledger.mark(), monotonic()
-        self._mark(f"attack begins: {plan.attack} {'; then '.join(told)}")
+        self._mark(f"attack begins: {plan.attack} {'; then '.join(commands)}")
         most_s = max(settings.most_s(plan.group), plan.least_s)
-        for position in range(max(1, len(told))):
+        for position in range(max(1, len(commands))):
             if objects is not None:
                 made = objects()
-                names = [each.name for each in made]
+                names = [attack.name for attack in made]
                 await stage.middle.attack([], made)
             else:
-                await stage.middle.attack(told[position].split())
-            wanted = target * (position + 1) // max(1, len(told))
+                await stage.middle.attack(commands[position].split())
+            wanted = target * (position + 1) // max(1, len(commands))
             restart_at = begin_at + 0.3 * plan.least_s if plan.restarts else None
             phase_at, least_at = monotonic(), begin_at + plan.least_s
             while True:
@@ -156,11 +163,13 @@ class Bench:
         ended_at = monotonic()
         self._mark(f"attack ended: {plan.attack}")
         ledger.await_recovery(ended_at)
-        while ledger.recovery_s is None and monotonic() < ended_at + GIVE_UP_S:  # noqa: ASYNC110  sockets, not tasks
+        give_up_at = ended_at + (QUICK_GIVE_UP_S if settings.quick else GIVE_UP_S)
+        while ledger.recovery_s is None and monotonic() < give_up_at:  # noqa: ASYNC110  sockets, not tasks
             await asyncio.sleep(_LOOK_S / 4)
         recovery_s = ledger.recovery_s
-        tells_late = plan.takes_away and stage.system != PAPER  # the paper's drones tell at once, or never
-        await asyncio.sleep(_TOLD_S if tells_late or not settings.quick else _SETTLE_S)
+        logs_late = plan.takes_away and stage.system != PAPER  # the paper's drones log immediately
+        settle_s = _DETECTION_S if logs_late or not settings.quick else _SETTLE_S
+        await asyncio.sleep(max(settle_s, plan.noticed_after_s if stage.system != PAPER else 0.0))
         after_stats, after = await stage.middle.statistics(), await stage.notices()
         done_counts = _difference(after_stats.of(names), stats.of(names))
         sent, delivered = ledger.count(begin, end)
@@ -169,7 +178,7 @@ class Bench:
             attack=plan.attack,
             group=plan.group,
             seed=settings.seed,
-            parameters=told or tuple(names),
+            parameters=commands or tuple(names),
             begin_s=round(begin_at - self._recorder.began_at, 3),
             duration_s=round(ended_at - begin_at, 3),
             attempts=_attempts(after_stats.of(names), stats.of(names)),
@@ -194,7 +203,7 @@ class Bench:
         return trial
 
     async def run_control(self) -> None:
-        """See what the drones count while the man in the middle lets everything pass."""
+        """Measure the drones' counters while the man in the middle passes all datagrams."""
         duration_s = QUICK_CONTROL_S if self._settings.quick else CONTROL_S
         before = await self.stage.notices()
         await asyncio.sleep(duration_s)
@@ -218,12 +227,12 @@ def _difference(now: Mapping[str, int], before: Mapping[str, int]) -> dict[str, 
 
 
 def _events(stage: Stage, seen: dict[str, int]) -> dict[str, dict[str, int]]:
-    """Lines of each drone's log since then, by event and reason."""
-    found = {}
+    """The new lines of each drone's log, counted by event and reason."""
+    events = {}
     for name, lines in stage.logs().items():
         counts = Counter(_event_name(line) for line in lines[seen.get(name, 0) :])
-        found[name] = dict(counts)
-    return found
+        events[name] = dict(counts)
+    return events
 
 
 def _event_name(line: dict[str, Any]) -> str:

@@ -1,54 +1,36 @@
-"""The figures of the tampering evaluation, drawn from its records alone: the same records give the same bytes."""
+"""The figures of the tampering evaluation, drawn from its records. Equal records produce equal bytes."""
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
-from typing import Any
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from uavlinkd.lab.evaluation.tampering_records import RECOVERY_LIMIT_S, Flood, Run, Trial
+from uavlinkd.lab.evaluation.figures import STYLE, to_svg
+from uavlinkd.lab.evaluation.tampering_records import RECOVERY_LIMIT_S, FloodSamples, Run, Trial
 
 _BLUE, _ORANGE, _GREEN, _RED, _GREY = "#0072b2", "#e69f00", "#009e73", "#d55e00", "#7f7f7f"
-"""Okabe and Ito's, told apart by colour-blind readers too."""
-_STYLE: dict[Any, Any] = {
-    "svg.hashsalt": "uavlinkd",
-    "font.size": 10,
-    "axes.grid": True,
-    "grid.color": "#dddddd",
-    "axes.axisbelow": True,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "legend.frameon": False,
-    "legend.fontsize": 9,
-}
+"""The palette of Okabe and Ito, for colour-blind readers too."""
 _NEVER_S = 5.0
-"""Where a link stands that did not come back while it was waited for."""
+"""The place of a link that did not recover in time."""
 
 
 def tampering_figures(run: Run) -> dict[str, bytes]:
-    """Every figure that the records have something for, as SVG, by its name."""
+    """Every figure for which there are records, as SVG, by name."""
     figures: dict[str, bytes] = {}
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         if run.of("uavlinkd"):
-            figures["recovery"] = _svg(draw_recovery(run.of("uavlinkd")))
-            figures["accepted"] = _svg(draw_accepted(run))
+            figures["recovery"] = to_svg(draw_recovery(run.of("uavlinkd")))
+            figures["accepted"] = to_svg(draw_accepted(run))
         for flood in run.floods:
-            figures[f"flood-{flood.rate_per_s:g}"] = _svg(draw_flood(flood))
+            figures[f"flood-{flood.rate_per_s:g}"] = to_svg(draw_flood(flood))
     return figures
 
 
-def _svg(figure: Figure) -> bytes:
-    out = io.BytesIO()
-    figure.savefig(out, format="svg", metadata={"Date": None})
-    return out.getvalue()
-
-
 def draw_recovery(trials: Sequence[Trial]) -> Figure:
-    """How long after each attack's end until frames had come out again at both ends."""
+    """The time from each attack's end until both clients received frames again."""
     rows = sorted(trials, key=_recovery_s, reverse=True)
     figure = Figure(figsize=(9.6, 0.5 + 0.19 * len(rows)), layout="constrained")
     axes = figure.subplots()
@@ -64,7 +46,7 @@ def draw_recovery(trials: Sequence[Trial]) -> Figure:
     axes.set_xscale("log")
     axes.set_xlim(3e-4, 10)
     axes.set_xticks([0.001, 0.01, 0.1, 1, 10], ["1 ms", "10 ms", "0.1 s", "1 s", "10 s"])
-    axes.set_xlabel("from the attack's end until frames sent after it had come out at both ends")
+    axes.set_xlabel("from the attack's end until both clients received frames sent after it")
     axes.grid(visible=False, axis="y")
     return figure
 
@@ -74,7 +56,7 @@ def _recovery_s(trial: Trial) -> float:
 
 
 def draw_accepted(run: Run) -> Figure:
-    """What came out at local programs and may not, for each system."""
+    """The false frames that clients received, for each system."""
     paper = {trial.attack: sum(trial.faults.values()) for trial in run.of("paper")}
     ours = {trial.attack: sum(trial.faults.values()) for trial in run.of("uavlinkd")}
     rows = [name for name, count in paper.items() if count or ours.get(name)]
@@ -97,8 +79,8 @@ def draw_accepted(run: Run) -> Figure:
     return figure
 
 
-def draw_flood(flood: Flood) -> Figure:
-    """Processor, memory and the genuine frames before, under and after spoofed initiations."""
+def draw_flood(flood: FloodSamples) -> Figure:
+    """Processor time, memory and genuine frames before, during and after spoofed initiations."""
     figure = Figure(figsize=(9.6, 6.0), layout="constrained")
     top, middle, bottom = figure.subplots(3, 1, sharex=True)
     styles = ((_BLUE, "-"), (_GREEN, "--"), (_GREY, ":"))
@@ -111,7 +93,7 @@ def draw_flood(flood: Flood) -> Figure:
     middle.set_ylim(0, 1.2 * max(max(sizes) for sizes in flood.memory_bytes.values()) / 2**20)
     bottom.plot(flood.at_s, flood.sent_hz, "-", color=_GREY, label="sent")
     bottom.plot(flood.at_s, flood.delivered_hz, "--", color=_BLUE, label="delivered")
-    bottom.set_ylabel("frames a second")
+    bottom.set_ylabel("frames per second")
     bottom.set_xlabel("s")
     for axes in (top, middle, bottom):
         axes.axvspan(flood.begin_s, flood.end_s, color="#fde9d9", zorder=0)
@@ -122,7 +104,7 @@ def draw_flood(flood: Flood) -> Figure:
     return figure
 
 
-def _label_flood(axes: Axes, flood: Flood) -> None:
+def _label_flood(axes: Axes, flood: FloodSamples) -> None:
     axes.set_title(
         f"shaded: {flood.initiations:,} initiations from 256 hosts to {next(iter(flood.cpu_share))}, valid mac1",
         loc="left",

@@ -1,4 +1,4 @@
-"""Trials of attackers with keys (own, stolen, a captured drone's), and of the relay against the paper's protocol."""
+"""Trials of attackers with keys (own, stolen, of a captured drone), and of the relay against the paper's protocol."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Callable
 from time import monotonic
 from typing import Any
 
+from uavlinkd.config.keys import decode_key
 from uavlinkd.core.crypto import KeyPair
 from uavlinkd.core.suites import X25519
 from uavlinkd.lab.evaluation.impostors import Disguise, Impostor, SealedCookies, StolenIdentity
@@ -14,9 +15,8 @@ from uavlinkd.lab.evaluation.ledger import numbered_frame
 from uavlinkd.lab.evaluation.paper_attacks import PaperRelay
 from uavlinkd.lab.evaluation.stage import DaemonStage
 from uavlinkd.lab.evaluation.tampering_bench import Bench
-from uavlinkd.lab.evaluation.tampering_plan import HANDSHAKE, KEYS, Plan
+from uavlinkd.lab.evaluation.tampering_plan import HANDSHAKE, KEYS, TrialPlan
 from uavlinkd.lab.evaluation.tampering_records import RELAY
-from uavlinkd.config.keys import decode_key
 from uavlinkd.lab.mitm.attack import AttackObject
 
 AS_ITSELF = "captured drone, as itself"
@@ -24,8 +24,8 @@ AS_ITSELF = "captured drone, as itself"
 Make = Callable[[float], Impostor]
 
 
-def key_attacks(stage: DaemonStage) -> list[tuple[Plan, Make]]:
-    """What an attacker with keys of its own, or stolen ones, tries on the first two drones of three."""
+def key_attacks(stage: DaemonStage) -> list[tuple[TrialPlan, Make]]:
+    """The attacks with own or stolen keys on the first two drones of three."""
     (a, b, c), keys, suites = stage.names, stage.public_keys, (X25519,)
     private = {name: drone.private_key for name, drone in stage.drones.items()}
     psk = {pair: decode_key(text) for pair, text in stage.psks.items()}
@@ -39,8 +39,8 @@ def key_attacks(stage: DaemonStage) -> list[tuple[Plan, Make]]:
     thief = StolenIdentity(keys[b], own, KeyPair(private[a]))
     captured = KeyPair(private[c])
     tries: list[tuple[str, list[Disguise], bool, str]] = [
-        (RELAY, [disguise(a, b, own), disguise(b, a, own)], True, "handshakes with keys of its own, with both sides"),
-        ("impostor, unknown key", [disguise(a, b, own), disguise(b, a, own)], False, "beside the genuine traffic"),
+        (RELAY, [disguise(a, b, own), disguise(b, a, own)], True, "handshakes with its own keys, with both sides"),
+        ("impostor, unknown key", [disguise(a, b, own), disguise(b, a, own)], False, "genuine traffic continues"),
         (
             "impostor, stolen PSK",
             [disguise(a, b, own, pair), disguise(b, a, own, pair)],
@@ -63,26 +63,27 @@ def key_attacks(stage: DaemonStage) -> list[tuple[Plan, Make]]:
             AS_ITSELF,
             [disguise(a, b, captured, with_c)],
             False,
-            f"holds all keys of {c}, has a session as {c}, and says on it what only {b} may say",
+            f"holds all keys of {c}, has a session as {c}, sends frames that only {b} may send, and reports invented"
+            " refusals",
         ),
     ]
-    found: list[tuple[Plan, Make]] = []
+    attacks: list[tuple[TrialPlan, Make]] = []
     for name, disguises, relays, notes in tries:
-        plan = Plan(name, KEYS, (), restarts=relays, least_s=2.0 if relays else 0.5, notes=notes)
+        plan = TrialPlan(name, KEYS, (), restarts=relays, least_s=2.0 if relays else 0.5, notes=notes)
         frames = of_b if name == AS_ITSELF else ()
-        found.append(
+        attacks.append(
             (
                 plan,
                 lambda now, name=name, disguises=disguises, relays=relays, frames=frames: Impostor(  # type: ignore[misc]
-                    name, disguises, suites, now, relays=relays, frames=frames
+                    name, disguises, suites, now, relays=relays, frames=frames, claims=bool(frames)
                 ),
             )
         )
-    return found
+    return attacks
 
 
-async def run_impostor(bench: Bench, plan: Plan, make: Make) -> None:
-    """One of them, with what it achieved."""
+async def run_impostor(bench: Bench, plan: TrialPlan, make: Make) -> None:
+    """Run one of them, and record its results."""
     impostor: list[Impostor] = []
 
     def objects() -> list[AttackObject]:
@@ -90,33 +91,31 @@ async def run_impostor(bench: Bench, plan: Plan, make: Make) -> None:
         return [impostor[0]]
 
     def sessions() -> int:
-        # Under its own name a captured drone is who it is: what matters is what it may say.
+        # As itself, a captured drone has a genuine session: only its frames matter.
         if plan.attack == AS_ITSELF:
             return 0
-        return sum(each.sessions for each in impostor[0].achieved.values())
+        return sum(victim.sessions for victim in impostor[0].achieved.values())
 
     def achieved() -> dict[str, Any]:
         return {
             victim: {
-                "initiations": each.initiations,
-                "answers": each.answers,
-                "sessions": each.sessions,
-                "frames_read": each.frames_read,
-                "frames_sent": each.frames_sent,
-                "own_drops": dict(each.drops),
+                "initiations": results.initiations,
+                "answers": results.answers,
+                "sessions": results.sessions,
+                "frames_read": results.frames_read,
+                "frames_sent": results.frames_sent,
+                "own_drops": dict(results.drops),
             }
-            for victim, each in impostor[0].achieved.items()
+            for victim, results in impostor[0].achieved.items()
         }
 
     await bench.run(plan, objects=objects, sessions=sessions, achieved=achieved)
 
 
 async def run_paper_relay(bench: Bench) -> None:
-    """The full relay between the two ends of the paper's protocol."""
+    """Run the full relay between the two ends of the paper's protocol."""
     relay = PaperRelay()
-    plan = Plan(
-        RELAY, KEYS, (), least_s=1.0, notes="exchanges of its own with both sides; every second frame altered"
-    )
+    plan = TrialPlan(RELAY, KEYS, (), least_s=1.0, notes="a key exchange with each side; every second frame altered")
     await bench.run(
         plan,
         objects=lambda: [relay],
@@ -126,6 +125,6 @@ async def run_paper_relay(bench: Bench) -> None:
 
 
 async def run_sealed_cookies(bench: Bench, public_keys: dict[str, bytes]) -> None:
-    """Cookies that open, of somebody who knows the public keys."""
-    plan = Plan("sealed-cookies", HANDSHAKE, (), least_s=1.0)
+    """Run the attacker with the public keys that sends valid cookie replies."""
+    plan = TrialPlan("sealed-cookies", HANDSHAKE, (), least_s=1.0)
     await bench.run(plan, objects=lambda: [SealedCookies(public_keys, monotonic())])

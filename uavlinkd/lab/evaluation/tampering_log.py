@@ -1,4 +1,4 @@
-"""A log a drone that a person can read: what it said, between lines that say what was done to it."""
+"""A readable log per drone: its log lines, between markers of the attacks."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ _STAMPS = ("timestamp", "event", "level", "daemon")
 
 
 def write_logs(out: Path, benches: Sequence[tuple[str, Bench]]) -> None:
-    """``SYSTEM-DRONE.log`` for each system and drone, all stages in the order of time."""
+    """Write ``SYSTEM-DRONE.log`` for each system and drone, with all stages in the order of time."""
     lines: dict[str, list[tuple[str, str]]] = {}
     for label, bench in benches:
         marks = [(_stamp(mark.at), f"[{label}] === {mark.text}") for mark in bench.markers]
-        for name, said in bench.stage.logs().items():
+        for name, log in bench.stage.logs().items():
             rows = lines.setdefault(f"{bench.stage.system}-{name}", [])
             rows += marks
-            rows += _rows(label, said)
+            rows += _rows(label, log)
     for file, rows in lines.items():
         rows.sort(key=lambda row: row[0])
         text = "".join(f"{at[11:26]}  {row}\n" for at, row in rows)
         (out / f"{file}.log").write_text(text, encoding="utf-8")
 
 
-def _rows(label: str, said: Iterable[dict[str, Any]]) -> list[tuple[str, str]]:
+def _rows(label: str, log: Iterable[dict[str, Any]]) -> list[tuple[str, str]]:
     rows = []
     at = ""
-    for line in said:
-        at = str(line.get("timestamp", at))  # what is no line of the log stands behind the one before it
+    for line in log:
+        at = str(line.get("timestamp", at))  # a line without a timestamp follows the line before it
         facts = " ".join(f"{key}={_shown(value)}" for key, value in line.items() if key not in _STAMPS)
         rows.append((at, f"[{label}] {line.get('event', '')} {facts}".rstrip()))
     return rows

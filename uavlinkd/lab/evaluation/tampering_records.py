@@ -1,7 +1,7 @@
-"""What a trial of an attack came to, and the verdict on it: made of evidence alone.
+"""The records of trials, with a verdict derived from the evidence.
 
-One JSON line a trial. Trials of attacks on single datagrams hold thousands of attempts; each intervention stands in
-the log of the man in the middle.
+One JSON line per trial. A trial may have thousands of attempts; the log of the man in the middle has each
+intervention.
 """
 
 from __future__ import annotations
@@ -13,35 +13,36 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-from uavlinkd.lab.mitm.attack import What
+from uavlinkd.lab.mitm.attack import Operation
 
 PAPER, OURS = "paper", "uavlinkd"
 """The systems."""
 RELAY = "two-sided-relay"
-"""The attack that must succeed against the one, and not against the other."""
+"""The attack that must succeed against the paper's protocol and fail against uavlinkd."""
 RECOVERY_LIMIT_S = 2.0
-"""A link that does not carry frames again by then, without help, was broken by the attack."""
+"""If a link does not recover by itself within this time, the attack succeeded."""
+NOT_IN_TIME = "the link did not recover in time"
 
 
-_WITHHELD = (What.DROPPED, What.HELD, What.REORDERED)
+_WITHHELD = (Operation.DROPPED, Operation.HELD, Operation.REORDERED)
 
 
 class Verdict(StrEnum):
-    """What became of an attack."""
+    """The result of an attack."""
 
     SUCCEEDED = "succeeded"
-    """Something forged, altered, replayed, reflected or misrouted came out at a local program; or the attacker shares
-    keys with a drone; or a drone answered where it must be silent, or amplified; or the link stayed down."""
+    """A forged, altered, replayed, reflected or misrouted frame was delivered; or the attacker shares keys with a
+    drone; or a drone answered where it must be silent, or amplified; or the link did not recover."""
     DETECTED = "detected"
-    """Nothing of that, and the drones noticed: counters with a name, beyond what they count where nothing is
-    attacked, and a line in the log."""
+    """The attack did not succeed, and the drones noticed it: a counter beyond its rate without an attack, and a line
+    in the log."""
     BLOCKED = "blocked"
-    """Nothing of that, but frames were missing or late while it lasted, for which no datagram is to blame: an
-    attacker who drops and delays is not refused, he is outlasted."""
+    """The attack did not succeed, but frames were lost or late meanwhile. Dropping and delaying shows no datagram
+    that a drone could refuse."""
     HARMLESS = "harmless"
-    """Nothing of that: every frame came out, and there was nothing to notice."""
+    """The attack did not succeed, all frames were delivered, and there was nothing to notice."""
     BROKEN = "broken"
-    """No attack: it never reached the wire."""
+    """The attack never reached the network."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,87 +55,87 @@ class Trial:
     group: str
     seed: int
     parameters: tuple[str, ...]
-    """What the man in the middle was told, one phase after the other."""
+    """The line of attacks for the man in the middle, per phase."""
     begin_s: float
     """Since the run began."""
     duration_s: float
     attempts: int
-    """Datagrams forged, altered, replayed, held back and so on. While a drone was down some met nobody."""
+    """Datagrams forged, altered, replayed, held back and so on, including those for a stopped drone."""
     interventions: Mapping[str, int]
-    """By "attack: what"."""
+    """By "attack: operation"."""
     target: int
-    """So many attempts were wanted; 0 where time was."""
+    """The requested number of attempts; 0 if the duration was limited."""
     faults: Mapping[str, int]
-    """What came out at local programs and may not, by kind."""
+    """False frames delivered to clients, by kind."""
     sessions: int
-    """Keys that the attacker shares with a drone that takes it for another."""
+    """Sessions of the attacker with a drone that believes it to be another."""
     achieved: Mapping[str, Any]
-    """Of attackers with keys: initiations, answers, what they could read."""
+    """Of attackers with keys: initiations, answers, frames read."""
     bytes_to_strangers: int
     must_be_silent: bool
     amplified: tuple[str, ...]
     frames_sent: int
-    """While the attack lasted, for each who was to get them."""
+    """During the attack, counted per receiver."""
     frames_delivered: int
     noticed: Mapping[str, Mapping[str, int]]
-    """By drone: counters that grew, of drops and of what disturbed its links."""
+    """By drone: counters of drops and link problems that grew."""
     events: Mapping[str, Mapping[str, int]]
-    """By drone: what its log says happened meanwhile."""
+    """By drone: events in its log meanwhile."""
     recovery_s: float | None
-    """From the attack's end until frames sent after it had come out everywhere; None: not within five seconds."""
+    """From the attack's end until all receivers got frames sent after it; None: not within 5 s."""
     notes: str = ""
     observed_s: float = 0.0
-    """How long the drones' counters were watched: longer than the attack lasted."""
+    """How long the drones' counters were observed: longer than the attack."""
     control: Mapping[str, float] = field(default_factory=dict)
-    """What the drones of this stage count a second, all together, where nothing is attacked."""
+    """The counters of all drones of this stage per second without an attack."""
 
     @property
     def withheld(self) -> int:
-        """Of the attempts: genuine datagrams that were dropped or held, of which nothing could be accepted."""
+        """The attempts that dropped or held a genuine datagram, so that it could not be accepted."""
         return sum(n for key, n in self.interventions.items() if key.rpartition(" ")[2] in _WITHHELD)
 
     @property
     def frames_lost(self) -> int:
-        """Sent while the attack lasted, and never delivered."""
+        """Frames sent during the attack and never delivered."""
         return self.frames_sent - self.frames_delivered
 
     @property
     def is_noticed(self) -> bool:
-        """Whether a person can find out: an event that attacks cause, or counts beyond those of quiet times."""
-        told = any(events.get(each) for events in self.events.values() for each in ("peer_lost", "path_changed"))
-        return told or any(count > self._usual(reason) for reason, count in self.reasons.items())
+        """Whether an operator can notice it: an event that attacks cause, or a counter beyond its usual rate."""
+        is_logged = any(events.get("peer_lost") or events.get("path_changed") for events in self.events.values())
+        return is_logged or any(count > self._usual(reason) for reason, count in self.reasons.items())
 
     def _usual(self, reason: str) -> float:
-        """As many as may well be counted in that time without an attack."""
+        """The maximum count that is usual without an attack."""
         rate = self.control.get(reason, 0.0)
         return 2 + 2 * rate * self.observed_s if rate else 0.0
 
     @property
     def reasons(self) -> dict[str, int]:
-        """The counters of all drones together."""
+        """The sums of all drones' counters."""
         total: dict[str, int] = {}
         for counts in self.noticed.values():
             for reason, count in counts.items():
                 total[reason] = total.get(reason, 0) + count
-        return dict(sorted(total.items(), key=lambda each: -each[1]))
+        return dict(sorted(total.items(), key=lambda pair: -pair[1]))
 
     @property
     def successes(self) -> list[str]:
-        """In what the attacker succeeded, in words; nothing if not."""
-        found = [f"{count} frames {kind}" for kind, count in self.faults.items() if count]
+        """The successes of the attacker, as text."""
+        successes = [f"{count} frames {kind}" for kind, count in self.faults.items() if count]
         if self.sessions:
-            found.append(f"{self.sessions} key exchanges with the drones")
+            successes.append(f"{self.sessions} key exchanges with the drones")
         if self.must_be_silent and self.bytes_to_strangers:
-            found.append(f"{self.bytes_to_strangers} bytes of answers to a stranger")
+            successes.append(f"{self.bytes_to_strangers} bytes of answers to a stranger")
         if self.amplified:
-            found.append(f"amplified: {', '.join(self.amplified)}")
+            successes.append(f"amplified: {', '.join(self.amplified)}")
         if self.recovery_s is None or self.recovery_s > RECOVERY_LIMIT_S:
-            found.append("the link did not come back in time")
-        return found
+            successes.append(NOT_IN_TIME)
+        return successes
 
     @property
     def verdict(self) -> Verdict:
-        """From the evidence above."""
+        """The verdict, derived from the evidence."""
         if self.attempts == 0:
             return Verdict.BROKEN
         if self.successes:
@@ -150,21 +151,21 @@ class Trial:
 
 
 @dataclass(frozen=True, slots=True)
-class Flood:
-    """A drone's load under spoofed initiations, sampled. Times in seconds since the first sample."""
+class FloodSamples:
+    """Samples of the drones' load under spoofed initiations. Times are seconds since the first sample."""
 
     rate_per_s: float
     begin_s: float
     end_s: float
-    """When the flood began and ended."""
+    """The start and end of the flood."""
     at_s: list[float]
     cpu_share: dict[str, list[float]]
-    """Of one core, by daemon, since the sample before."""
+    """Share of one core since the last sample, by daemon."""
     memory_bytes: dict[str, list[int]]
-    """Resident."""
+    """Resident memory, by daemon."""
     sent_hz: list[float]
     delivered_hz: list[float]
-    """Frames a second of the genuine link, both directions."""
+    """Genuine frames per second, both directions."""
     initiations: int
 
     def to_json(self) -> str:
@@ -174,49 +175,49 @@ class Flood:
 
 @dataclass(slots=True)
 class Run:
-    """All of a run."""
+    """The facts, trials and floods of a run."""
 
     facts: dict[str, Any] = field(default_factory=dict)
     trials: list[Trial] = field(default_factory=list)
-    floods: list[Flood] = field(default_factory=list)
+    floods: list[FloodSamples] = field(default_factory=list)
 
     def of(self, system: str) -> list[Trial]:
-        """Those against one system."""
+        """The trials against one system."""
         return [trial for trial in self.trials if trial.system == system]
 
 
 class TamperingRecordsError(Exception):
-    """Records that cannot be read. The message is for a person."""
+    """The records cannot be read. The message is for the operator."""
 
 
 def read_run(path: Path) -> Run:
-    """The records of a run.
+    """Read the records of a run.
 
     Raises:
-        TamperingRecordsError: there are none, or a line is no record.
+        TamperingRecordsError: there are no records, or a line is malformed.
     """
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except OSError as error:
         raise TamperingRecordsError(f"{path}: {error.strerror}") from None
     except UnicodeDecodeError:
-        raise TamperingRecordsError(f"{path}: is no text") from None
+        raise TamperingRecordsError(f"{path}: is not text") from None
     run = Run()
     for number, line in enumerate(lines, 1):
         try:
-            found = json.loads(line)
-            if "run" in found:
-                run.facts = dict(found["run"])
-            elif "flood" in found:
-                run.floods.append(Flood(**found["flood"]))
+            fields = json.loads(line)
+            if "run" in fields:
+                run.facts = dict(fields["run"])
+            elif "flood" in fields:
+                run.floods.append(FloodSamples(**fields["flood"]))
             else:
-                run.trials.append(_trial(found))
+                run.trials.append(_trial(fields))
         except (ValueError, TypeError, KeyError, AttributeError):
-            raise TamperingRecordsError(f"{path}: line {number} is no record of an evaluation") from None
+            raise TamperingRecordsError(f"{path}: line {number} is not a record of an evaluation") from None
     return run
 
 
-def _trial(found: dict[str, Any]) -> Trial:
+def _trial(fields: dict[str, Any]) -> Trial:
     for derived in ("frames_lost", "verdict", "successes"):
-        found.pop(derived)
-    return Trial(**{**found, "parameters": tuple(found["parameters"]), "amplified": tuple(found["amplified"])})
+        fields.pop(derived)
+    return Trial(**{**fields, "parameters": tuple(fields["parameters"]), "amplified": tuple(fields["amplified"])})

@@ -1,20 +1,30 @@
-"""The report of the tampering evaluation: one HTML file with all in it, and the same as Markdown."""
+"""The report of the tampering evaluation, in HTML and Markdown."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from html import escape
 from pathlib import Path
 from statistics import median
 
-from uavlinkd.lab.evaluation.page import Section, Table, to_html, to_markdown
+from uavlinkd.lab.evaluation.page import THE_PAPER, ReportSection, Table, to_html, to_markdown
 from uavlinkd.lab.evaluation.spread import duration
 from uavlinkd.lab.evaluation.tampering import NAME, problems
+from uavlinkd.lab.evaluation.tampering_bench import run_settings
 from uavlinkd.lab.evaluation.tampering_figures import tampering_figures
 from uavlinkd.lab.evaluation.tampering_plan import DATA, HANDSHAKE, KEYS
-from uavlinkd.lab.evaluation.tampering_records import RECOVERY_LIMIT_S, RELAY, Flood, Run, Trial, Verdict, read_run
+from uavlinkd.lab.evaluation.tampering_records import (
+    OURS,
+    PAPER,
+    RECOVERY_LIMIT_S,
+    RELAY,
+    FloodSamples,
+    Run,
+    Trial,
+    Verdict,
+    read_run,
+)
 
-TITLE = "What a man in the middle achieves: the paper's protocol and uavlinkd"
+TITLE = "Attacks by a man in the middle: the paper's protocol and uavlinkd"
 _NOTHING = "-"
 _COLOURS = {
     Verdict.SUCCEEDED: "#f4c7b8",
@@ -24,24 +34,23 @@ _COLOURS = {
     Verdict.BROKEN: "#f0c000",
 }
 _MEANINGS = {
-    Verdict.SUCCEEDED: "something forged, altered, replayed, reflected or misrouted came out at a local program, or "
-    "the attacker shares keys with a drone that takes it for another, or a drone answered where it must be silent, "
-    "or "
-    f"the link did not carry frames again within {RECOVERY_LIMIT_S:g} s after the attack",
-    Verdict.DETECTED: "none of that, and the drones noticed: a counter with a name, beyond what they count where "
-    "nothing is attacked, and a line in the log. A bad radio drops and delays too: such rows are seen as loss",
-    Verdict.BLOCKED: "none of that, but frames were missing or late while it lasted: who drops and delays shows no "
-    "datagram that could be refused, but achieves no more than that",
-    Verdict.HARMLESS: "none of that: every frame came out, and there was nothing to notice",
-    Verdict.BROKEN: "no attack: it never reached the wire",
+    Verdict.SUCCEEDED: "a forged, altered, replayed, reflected or misrouted frame was delivered, or the attacker has "
+    "session keys with a drone that believes it to be another, or a drone answered where it must be silent, or the "
+    f"link did not carry frames again within {RECOVERY_LIMIT_S:g} s after the attack",
+    Verdict.DETECTED: "the attack did not succeed, and the drones noticed it: a counter grew more than without an "
+    "attack, and the log has a line. A bad radio also drops and delays frames: such attacks look like loss",
+    Verdict.BLOCKED: "the attack did not succeed, but frames were lost or late meanwhile. An attacker that drops or "
+    "delays frames shows no datagram to refuse",
+    Verdict.HARMLESS: "the attack did not succeed, every frame was delivered, and there was nothing to notice",
+    Verdict.BROKEN: "the attack never reached the network",
 }
 
 
 def write_tampering_report(folder: Path) -> Path:
-    """Draw the figures and write the report from the records in ``folder``; where the HTML is.
+    """Draw the figures and write the report from the records in ``folder``. Return the path of the HTML.
 
     Raises:
-        TamperingRecordsError: there are no records, or what is there is none.
+        TamperingRecordsError: there are no records, or they cannot be read.
     """
     run = read_run(folder / f"{NAME}.jsonl")
     figures = tampering_figures(run)
@@ -50,20 +59,20 @@ def write_tampering_report(folder: Path) -> Path:
     sections = make_sections(run, list(figures))
     (folder / f"{NAME}.md").write_text(to_markdown(TITLE, sections, figures), encoding="utf-8")
     html = folder / f"{NAME}.html"
-    html.write_text(to_html(TITLE, sections, figures, _cell), encoding="utf-8")
+    html.write_text(to_html(TITLE, sections, figures, _style), encoding="utf-8")
     return html
 
 
 def has_tampering(folder: Path) -> bool:
-    """Whether the records in ``folder`` are those of this evaluation."""
+    """Whether ``folder`` has records of this evaluation."""
     return (folder / f"{NAME}.jsonl").exists()
 
 
 def write_tampering_page(folder: Path, page: Path) -> Path:
-    """The report as a Markdown page elsewhere, its figures in ``results/`` beside it.
+    """Write the report as a Markdown page, with the figures in the folder ``results`` beside it.
 
     Raises:
-        TamperingRecordsError: there are no records, or what is there is none.
+        TamperingRecordsError: there are no records, or they cannot be read.
     """
     run = read_run(folder / f"{NAME}.jsonl")
     figures = tampering_figures(run)
@@ -75,65 +84,71 @@ def write_tampering_page(folder: Path, page: Path) -> Path:
     return page
 
 
-def make_sections(run: Run, figures: Sequence[str]) -> list[Section]:
-    """All that the report says."""
+def make_sections(run: Run, figures: Sequence[str]) -> list[ReportSection]:
+    """All sections of the report."""
     floods = [
-        Section(
-            f"{flood.rate_per_s:,.0f} spoofed initiations a second", f"flood-{flood.rate_per_s:g}", _on_flood(flood)
+        ReportSection(
+            f"{flood.rate_per_s:,.0f} spoofed initiations per second",
+            f"flood-{flood.rate_per_s:g}",
+            _ON_FLOOD,
+            _flood(flood),
         )
         for flood in run.floods
     ]
+    control = [ReportSection("Without an attack", "", _ON_CONTROL, [_control(run)])] if "control" in run.facts else []
     return [
-        Section("In short", "", _in_short(run)),
-        Section("Every attack, both systems", "", _legend(), _table(run)),
-        Section("What was accepted", "accepted" if "accepted" in figures else "", _ON_ACCEPTED),
-        Section("How soon the link is back", "recovery", _on_recovery(run)),
+        ReportSection("Summary", "", [THE_PAPER, *_problems(run)], [_summary(run), *_relay(run)]),
+        ReportSection("Every attack, both systems", "", _legend(), [_table(run)]),
+        ReportSection("Accepted frames", "accepted" if "accepted" in figures else "", _ON_ACCEPTED),
+        ReportSection("Recovery of the link", "recovery", _ON_RECOVERY, [_recoveries(run)]),
         *floods,
-        Section("Attackers with keys", "", _ON_KEYS, _keys(run)),
-        Section("What the drones noticed", "", _ON_NOTICED, _noticed(run)),
-        *([Section("Where nothing is attacked", "", _ON_CONTROL, _control(run))] if "control" in run.facts else []),
-        Section("The paper's protocol", "", _ON_PAPER),
-        Section("What is tried elsewhere", "", [], Table(["attack", "where"], _ELSEWHERE)),
-        Section("Where and how", "", _ON_RUN, _facts(run)),
+        ReportSection("Attackers with keys", "", _ON_KEYS, [_keys(run)]),
+        ReportSection("What the drones noticed", "", _ON_NOTICED, [_noticed(run)]),
+        *control,
+        ReportSection("The paper's protocol", "", _ON_PAPER),
+        ReportSection("Attacks tested elsewhere", "", [], [Table(["attack", "where"], _ELSEWHERE)]),
+        ReportSection("Run", "", _on_run(run), [_facts(run)]),
     ]
 
 
 _ON_ACCEPTED = [
-    "Frames that came out at a drone's local program and were not sent to it by the other's, or came out twice. Each "
-    "frame of the run is unique and is compared byte for byte."
+    "Frames that a drone delivered to its client although the other client had not sent them, or that it delivered "
+    "twice. Each frame of the run is unique and compared byte for byte."
+]
+_ON_RECOVERY = [
+    "Time from the end of an attack until both clients received frames sent after it, without help. At 50 frames per "
+    "second, the next frame may be 20 ms away. Attacks on handshakes ran with short rekey intervals and retries (see "
+    "below), except those with a restarted peer."
+]
+_ON_FLOOD = [
+    "A separate process sends the initiations directly to the port of the first drone. The genuine frames pass the "
+    "man in the middle. Delivered: the share of the genuine frames sent since the flood began."
 ]
 _ON_KEYS = [
-    "The man in the middle proper holds no key. These attackers do: keys of their own, or stolen ones. Each runs the "
-    "protocol's own code, so it makes no mistakes. Answers of a drone are responses to initiations; a session is "
-    "what "
-    "would let the attacker speak. The captured member sends frames that its role allows and that hide forbidden "
-    "ones; a search at every offset of what the client was sent judges, by every CRC_EXTRA that the daemon knows. "
-    "The captured drone has a session as itself, and says on it what only another may "
-    "say."
+    "uavlink-mitm holds no keys. These attackers do: their own, or stolen ones. They run the protocol's own code. "
+    "Answers are the drone's responses to initiations; with a session, the attacker could send frames. The captured "
+    "member sends frames that its role allows and that hide forbidden ones. The judge searches the bytes that the "
+    "client received for frames at every offset, with every CRC_EXTRA that the daemon knows. The captured drone has "
+    "a session as itself, and sends frames that only another drone may send."
 ]
 _ON_NOTICED = [
-    "The drop counters that grew, of all drones together, as `uavlinkd status` shows them; the log has a line for "
-    "each "
-    "(uavlinkd-drone0.log and so on, beside this file). Missing: envelopes that did not arrive, as status counts "
-    "them."
+    "The counters of all drones that grew, as in `uavlinkd status`. The log has a line for each (uavlinkd-drone0.log "
+    "and so on, in the same folder)."
 ]
 _ON_CONTROL = [
-    "What the drones of each stage count a second, all together, while the man in the middle lets everything pass: "
-    "new keys each second or two leave some too. An attack is detected where more than twice that came, and two, or "
-    "something else."
+    "The counters of all drones per second while uavlink-mitm passes all datagrams. Frequent rekeys cause some. An "
+    "attack counts as detected if a counter grew by more than twice this rate plus two, or another counter grew."
 ]
 _ON_PAPER = [
-    "The paper: Ouadah and Merazka, Securing UAV Communication: Authentication and Integrity, 2024 (arXiv "
-    "2410.09085). Two drones exchange bare Diffie-Hellman public keys over UDP and authenticate data by an HMAC "
-    "under the shared secret. What it leaves open was settled here, and some rows follow from that: new keys are "
-    "made each 0.25 s, so that attacks on the exchange have something to attack, and the key before the newest is "
-    "taken on, so that what was held longer is refused; each datagram has the header of our envelopes, under the "
-    "HMAC, whose number is not looked at, so that what is replayed or doubled is accepted; an address is not looked "
-    "at either."
+    f"{THE_PAPER} Two drones exchange bare Diffie-Hellman public keys over UDP and authenticate data with an HMAC "
+    "under the shared secret. Where the paper is silent, we decided: the keys change every 0.25 s, so that attacks "
+    "on the exchange have a target. The key before the newest stays valid, and older ones are refused. A datagram "
+    "has the header of our envelopes, covered by the HMAC. Its number and the sender's address are not checked, so "
+    "replayed and duplicated datagrams are accepted."
 ]
 _ELSEWHERE = [
-    ["a clock set to 1970 or 2106, or that jumps", "tests/daemon/test_reboot.py, tests/faults, tests/network"],
-    ["a network gone for 60 s between containers", "tests/compose"],
+    ["a clock that is set to 1970 or 2106, or jumps", "tests/faults, tests/network"],
+    ["a network outage of 60 s between containers", "tests/compose"],
     [
         "a captured member's hidden frames against MAVLink's own parsers, 10,000,000 generated streams",
         "tests/mavlink/parsers",
@@ -142,49 +157,67 @@ _ELSEWHERE = [
         "a peer's frames beyond its policy: other systems, commands, SETUP_SIGNING, MAVLink 1",
         "tests/mavlink, tests/daemon",
     ],
-    ["a hostile program at the local port", "tests/daemon/test_hostile_local.py"],
-    ["recordings, and later a stolen key; a quantum computer", "tests/formal"],
-    ["a copy of a running daemon's memory that runs on", "out of scope: uavlinkd/core/README.md, section 1"],
-]
-_ON_RUN = [
-    "Reproduce with `uavlinkd evaluate tampering --out DIR`. The seed fixes what the man in the middle chooses, not "
-    "keys. "
-    "Real daemons, each a process, with uavlink-mitm between them on loopback; frames numbered both ways all the "
-    "time. "
-    "Several stages ran beside one another on the machine, so times are those of a busy one."
+    ["a hostile client at the local port", "tests/daemon/test_hostile_local.py"],
+    ["recorded traffic and a key stolen later; a quantum computer", "tests/formal"],
+    ["a running copy of a daemon's memory", "out of scope: uavlinkd/core/README.md, section 1"],
 ]
 
 
-def _in_short(run: Run) -> list[str]:
-    found = problems(run)
-    ours, paper = run.of("uavlinkd"), run.of("paper")
-    accepted = sum(sum(trial.faults.values()) for trial in ours)
-    attempts = sum(trial.attempts for trial in ours)
-    relay = next((trial for trial in paper if trial.attack == RELAY), None)
-    withheld = sum(trial.withheld for trial in ours)
-    text = [
-        f"Against uavlinkd {len(ours)} attacks made {attempts:,} attempts: {attempts - withheld:,} datagrams were "
-        "forged, altered, replayed, reflected, misrouted or sent from elsewhere, and "
-        f"{withheld:,} genuine ones were dropped or held back. Frames accepted that were forged, altered, "
-        f"replayed, reflected or misrouted: {accepted}. "
-        + ("Nothing succeeded." if not found else "NOT AS IT MUST BE: " + "; ".join(found) + ".")
+def _on_run(run: Run) -> list[str]:
+    settings = run_settings(run.facts)
+    options = f"--seed {settings.seed}"
+    if settings.quick:
+        options += " --quick"
+    else:
+        options += f" --attempts-data {settings.attempts_data} --attempts-handshake {settings.attempts_handshake}"
+    counts = " and ".join(
+        f"{settings.target(DATA, system):,} for an attack on data, {settings.target(HANDSHAKE, system):,} on the "
+        f"handshake ({name})"
+        for system, name in ((OURS, "uavlinkd"), (PAPER, "the paper's protocol"))
+    )
+    return [
+        f"Made by `uavlinkd evaluate tampering --out DIR {options}`. The seed determines the choices of "
+        "uavlink-mitm, but no keys. Each daemon is a process, with uavlink-mitm between them on loopback, and "
+        "numbered frames in both directions. Several stages ran at once, so the times are those of a busy machine.",
+        f"Attempts that each attack aims at: {counts}. An attack whose time is over makes fewer.",
     ]
-    if relay is not None:
-        text.append(
-            f"Against the paper's protocol the two-sided relay made {relay.sessions} key exchanges with the drones, "
-            "read "
-            f"{relay.achieved.get('frames_read', 0)} frames, and had {relay.faults.get('forged or altered', 0)} "
-            "altered "
-            "frames accepted, each with an HMAC that fits. The paper's own two attacks, a public key tampered with "
-            "or "
-            "replaced, are detected there, because then the two sides have different keys; whoever makes an "
-            "exchange of "
-            "his own with each side is not."
-        )
-    succeeded = [trial.attack for trial in paper if trial.verdict is Verdict.SUCCEEDED]
-    if succeeded:
-        text.append(f"What succeeds against the paper's protocol: {', '.join(succeeded)}.")
-    return text
+
+
+def _problems(run: Run) -> list[str]:
+    return [f"Not as expected: {problem}." for problem in problems(run)]
+
+
+def _summary(run: Run) -> Table:
+    columns = []
+    for trials in (run.of("uavlinkd"), run.of("paper")):
+        attempts, withheld = sum(trial.attempts for trial in trials), sum(trial.withheld for trial in trials)
+        accepted = sum(sum(trial.faults.values()) for trial in trials)
+        succeeded = [trial.attack for trial in trials if trial.verdict is Verdict.SUCCEEDED]
+        counts = [f"{count:,}" for count in (len(trials), attempts, withheld, accepted)]
+        columns.append([*counts, "; ".join(succeeded) or "none"])
+    names = [
+        "attacks",
+        "attempts",
+        "of these, genuine datagrams dropped or held back",
+        "false frames accepted",
+        "successful attacks",
+    ]
+    return Table(["", "uavlinkd", "the paper's protocol"], list(zip(names, *columns, strict=True)))
+
+
+def _relay(run: Run) -> list[Table]:
+    """The attack that the paper does not consider: a key exchange with each side."""
+    rows = [
+        [
+            "two-sided relay on the paper's protocol",
+            str(trial.sessions),
+            str(trial.achieved.get("frames_read", 0)),
+            str(trial.faults.get("forged or altered", 0)),
+        ]
+        for trial in run.of("paper")
+        if trial.attack == RELAY
+    ]
+    return [Table(["attack", "key exchanges with the drones", "frames read", "altered frames accepted"], rows)]
 
 
 def _legend() -> list[str]:
@@ -195,14 +228,14 @@ def _table(run: Run) -> Table:
     paper = {trial.attack: trial for trial in run.of("paper")}
     order = {HANDSHAKE: 0, KEYS: 1, DATA: 2}
     rows = []
-    for trial in sorted(run.of("uavlinkd"), key=lambda each: (order.get(each.group, 3), each.attack)):
-        theirs = paper.get(trial.attack)
+    for trial in sorted(run.of("uavlinkd"), key=lambda trial: (order.get(trial.group, 3), trial.attack)):
+        other = paper.get(trial.attack)
         rows.append(
             [
                 trial.attack,
                 trial.group,
-                _verdict(theirs) if theirs else _NOTHING,
-                f"{theirs.attempts:,}" if theirs else _NOTHING,
+                _verdict(other) if other else _NOTHING,
+                f"{other.attempts:,}" if other else _NOTHING,
                 trial.verdict.value,
                 f"{trial.attempts:,}",
                 str(sum(trial.faults.values())),
@@ -214,12 +247,12 @@ def _table(run: Run) -> Table:
         "attack",
         "kind",
         "the paper's protocol",
-        "attempts",
+        "attempts on it",
         "uavlinkd",
-        "attempts",
+        "attempts on uavlinkd",
         "false frames accepted",
-        "genuine frames lost meanwhile",
-        "back after",
+        "genuine frames lost",
+        "recovery",
     ]
     return Table(head, rows)
 
@@ -234,54 +267,39 @@ def _recovery(trial: Trial) -> str:
     return "not in 5 s" if trial.recovery_s is None else duration(trial.recovery_s)
 
 
-def _on_recovery(run: Run) -> list[str]:
+def _recoveries(run: Run) -> Table:
     costly: list[float] = []
     others: list[float] = []
     for trial in run.of("uavlinkd"):
         if trial.recovery_s is not None:
             (costly if trial.frames_lost else others).append(trial.recovery_s)
-    if not costly:
-        return []
-    text = (
-        "From the end of an attack until frames sent after it had come out at both ends, without anyone's help: of "
-        f"the {len(costly)} attacks that cost genuine frames median {duration(median(costly))}, longest "
-        f"{duration(max(costly))}."
-    )
-    if others:
-        text += (
-            f" After the other {len(others)}, which cost none, median {duration(median(others))}, longest "
-            f"{duration(max(others))}: on stages with 50 frames a second the next one may be 20 ms away."
-        )
-    return [
-        f"{text} Attacks on handshakes had new keys each second and quick retries (below), but for those with a peer "
-        "that was restarted."
+    rows = [
+        [name, str(len(times)), duration(median(times)), duration(max(times))]
+        for name, times in (("attacks with lost genuine frames", costly), ("attacks without", others))
+        if times
     ]
+    return Table(["", "count", "median", "longest"], rows)
 
 
-def _on_flood(flood: Flood) -> list[str]:
-    inside = [i for i, at in enumerate(flood.at_s) if flood.begin_s + 0.3 <= at < flood.end_s]
+def _flood(flood: FloodSamples) -> list[Table]:
+    under = [i for i, at in enumerate(flood.at_s) if flood.begin_s + 0.3 <= at < flood.end_s]
     before = [i for i, at in enumerate(flood.at_s) if at < flood.begin_s]
-    if not inside or not before:
+    if not under or not before:
         return []
-    flooded = next(iter(flood.cpu_share))
-    rate = flood.initiations / (flood.end_s - flood.begin_s)
-    parts = [
-        f"{flood.initiations:,} initiations from a process of their own, {rate:,.0f} a second, went straight to the "
-        f"port of {flooded}; the genuine frames went through the man in the middle, who had no part in it"
-    ]
-    for name, shares in flood.cpu_share.items():
-        quiet, busy = (median([shares[i] for i in part]) for part in (before, inside))
-        sizes = flood.memory_bytes[name]
-        base, grown = sizes[before[-1]] / 2**20, (max(sizes) - sizes[before[-1]]) / 2**20
-        parts.append(
-            f"{name} used {100 * quiet:.0f} % of a core before and {100 * busy:.0f} % under it; "
-            f"to its {base:.1f} MiB of memory came {grown:.1f}"
-        )
-    # To the end of the samples: what was on its way in the last of the flood comes out after it.
+    # Until the last sample: frames sent at the end of the flood arrive after it.
     since = [i for i, at in enumerate(flood.at_s) if at >= flood.begin_s]
     sent, delivered = sum(flood.sent_hz[i] for i in since), sum(flood.delivered_hz[i] for i in since)
     share = min(100.0, 100 * delivered / sent) if sent else 0.0
-    return [f"{'. '.join(parts)}. Of the genuine frames since its beginning {share:.1f} % came out."]
+    rate = flood.initiations / (flood.end_s - flood.begin_s)
+    rows = []
+    for name, shares in flood.cpu_share.items():
+        cpu = [f"{100 * median([shares[i] for i in part]):.0f} %" for part in (before, under)]
+        sizes = flood.memory_bytes[name]
+        base = sizes[before[-1]]
+        rows.append([name, *cpu, f"{base / 2**20:.1f} MiB", f"{(max(sizes) - base) / 2**20:.1f} MiB"])
+    head = ["drone", "CPU before, of a core", "CPU under the flood", "memory before", "memory added"]
+    facts = [f"{flood.initiations:,}", f"{rate:,.0f}", next(iter(flood.cpu_share)), f"{share:.1f} %"]
+    return [Table(["initiations", "per second", "target", "genuine frames delivered"], [facts]), Table(head, rows)]
 
 
 def _keys(run: Run) -> Table:
@@ -302,15 +320,15 @@ def _keys(run: Run) -> Table:
                 ]
             )
             continue
-        each = list(trial.achieved.values())
+        victims = list(trial.achieved.values())
         rows.append(
             [
                 trial.attack,
                 trial.notes,
-                str(sum(one["initiations"] for one in each)),
-                str(sum(one["answers"] for one in each)),
-                str(sum(one["sessions"] for one in each)),
-                str(sum(one["frames_read"] for one in each)),
+                str(sum(victim["initiations"] for victim in victims)),
+                str(sum(victim["answers"] for victim in victims)),
+                str(sum(victim["sessions"] for victim in victims)),
+                str(sum(victim["frames_read"] for victim in victims)),
                 str(sum(trial.faults.values())),
             ]
         )
@@ -323,8 +341,8 @@ def _noticed(run: Run) -> Table:
     for trial in run.of("uavlinkd"):
         reasons = ", ".join(f"{count:,} {reason}" for reason, count in trial.reasons.items())
         events = sorted({name for counts in trial.events.values() for name in counts})
-        told = ", ".join(name for name in events if "dropped" not in name)
-        rows.append([trial.attack, reasons or _NOTHING, told or _NOTHING])
+        logged = ", ".join(name for name in events if "dropped" not in name)
+        rows.append([trial.attack, reasons or _NOTHING, logged or _NOTHING])
     return Table(["attack", "counted", "also in the log"], rows)
 
 
@@ -334,19 +352,19 @@ def _control(run: Run) -> Table:
         link = ", ".join(f"{key} = {value}" for key, value in run.facts["links"].get(stage, {}).items())
         counts = ", ".join(f"{n:g} {reason}" for reason, n in rates.items())
         rows.append([stage, link or "the defaults", counts or _NOTHING])
-    return Table(["stage", "its [link]", "counted a second"], rows)
+    return Table(["stage", "its [link]", "counted per second"], rows)
 
 
 def _facts(run: Run) -> Table:
     rows = [
         [name.replace("_", " "), _NOTHING if value in (None, []) else str(value)]
         for name, value in run.facts.items()
-        if name not in ("control", "links")
+        if name not in ("control", "links", "quick", "attempts_data", "attempts_handshake", "seed")
     ]
     return Table(["", ""], rows)
 
 
-def _cell(text: str) -> str:
-    verdict = next((each for each in Verdict if text.partition(":")[0] == each.value), None)
-    colour = f' style="background: {_COLOURS[verdict]}"' if verdict else ""
-    return f"<td{colour}>{escape(text)}</td>"
+def _style(text: str) -> str:
+    """A verdict has a colour."""
+    verdict = next((item for item in Verdict if text.partition(":")[0] == item.value), None)
+    return f"background: {_COLOURS[verdict]}" if verdict else ""

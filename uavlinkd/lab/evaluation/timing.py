@@ -1,4 +1,4 @@
-"""``uavlinkd evaluate timing``: what is measured, in which order, and how often."""
+"""``uavlinkd evaluate timing``: the measurements, their order and their repetitions."""
 
 from __future__ import annotations
 
@@ -28,21 +28,21 @@ from uavlinkd.lab.evaluation.timing_paper import DH_BITS, PAPER_LIMIT_S, PaperEn
 T = TypeVar("T")
 
 NAME = "timing"
-"""Of the files of records: ``timing.jsonl`` and ``timing.csv``."""
+"""The name of the record files ``timing.jsonl`` and ``timing.csv``."""
 MAC_KEY_BITS = (256, 512, 1024, 2048)
-"""What a configuration may ask for."""
+"""The lengths that a configuration may have."""
 FULL_REPEATS = 30
 _ONLY_WITH_PAPER = DH_BITS[-1]
 _NOT_IN_QUICK = "not in a quick run"
 
 
 @dataclass(frozen=True, slots=True)
-class Settings:
-    """What was asked for.
+class TimingSettings:
+    """The options of the evaluation.
 
-    ``repeats``: of each point. ``quick``: a few points, once. ``paper``: also the paper's largest group, each
-    point once. ``limit_s``: the patience with one exchange of the paper's method. ``seed``: of the order of the
-    measurements and of the data in them; keys come from the system. ``watts_per_core``: for the estimate of energy.
+    ``repeats``: of each point. ``quick``: some points, once. ``paper``: also the paper's largest group, each
+    point once. ``limit_s``: the time limit of one exchange of the paper's method. ``seed``: of the order of the
+    measurements and of their data; keys come from the system. ``watts_per_core``: for the estimate of energy.
     """
 
     repeats: int = FULL_REPEATS
@@ -54,27 +54,27 @@ class Settings:
 
     @property
     def patience_s(self) -> float:
-        """With one exchange of the paper's method."""
+        """The time limit of one exchange of the paper's method."""
         return min(self.limit_s, 2.0) if self.quick else self.limit_s
 
     @property
     def rekeys(self) -> int:
-        """Of each suite; each takes a second, the shortest age that a configuration takes."""
+        """The number of rekeys of each suite; each takes 1 s, the shortest configurable interval."""
         return 1 if self.quick else min(self.repeats, 10)
 
     @property
     def frames(self) -> int:
-        """On each link."""
+        """The number of frames on each link."""
         return 100 if self.quick else 1000
 
     @property
     def tags(self) -> int:
-        """In each batch of the measurement of tags."""
+        """The number of tags in each batch."""
         return 500 if self.quick else 20000
 
 
-def run_timing(folder: Path, settings: Settings, console: Console | None = None) -> list[Record]:
-    """Measure everything, write the records to ``folder`` as they come, and return them."""
+def run_timing(folder: Path, settings: TimingSettings, console: Console | None = None) -> list[Record]:
+    """Run all measurements, write the records to ``folder``, and return them."""
     started = time.monotonic()
     facts: dict[str, Value] = {
         **machine_facts(),
@@ -99,20 +99,20 @@ def run_timing(folder: Path, settings: Settings, console: Console | None = None)
 
 
 class _Bar:
-    """One progress bar. Drawn between measurements, never during one: a thread that draws would be in their times."""
+    """One progress bar. It is drawn between measurements: a drawing thread would affect their times."""
 
     def __init__(self, progress: Progress, task: TaskID) -> None:
         self._progress = progress
         self._task = task
 
     def show(self, text: str = "") -> None:
-        """What is being measured now."""
+        """Show the current measurement."""
         if text:
             self._progress.update(self._task, point=text)
         self._progress.refresh()
 
     def advance(self, steps: int = 1) -> None:
-        """Done."""
+        """Count finished measurements."""
         self._progress.update(self._task, advance=steps)
         self._progress.refresh()
 
@@ -131,11 +131,11 @@ def _bars(console: Console | None) -> Iterator[Callable[[str, int], _Bar]]:
 
 
 class _Run:
-    def __init__(self, settings: Settings, writer: RecordWriter, start_bar: Callable[[str, int], _Bar]) -> None:
+    def __init__(self, settings: TimingSettings, writer: RecordWriter, start_bar: Callable[[str, int], _Bar]) -> None:
         self._settings = settings
         self._writer = writer
         self._start_bar = start_bar
-        self._random = random.Random(settings.seed)  # noqa: S311  of an order, not of keys
+        self._random = random.Random(settings.seed)  # noqa: S311  not for keys
         self._meter = EnergyMeter()
         self._repeats = 1 if settings.quick else settings.repeats
 
@@ -147,7 +147,7 @@ class _Run:
     def core(self) -> None:
         work = self._shuffled(_grid(), self._repeats)
         bar = self._start_bar("handshakes, core", len(work))
-        measure_core(LinkChoice(X25519))  # the first use of anything is slow
+        measure_core(LinkChoice(X25519))  # the first use is slow
         for choice in work:
             self._writer.add(measure_core(choice))
         bar.advance(len(work))
@@ -157,7 +157,7 @@ class _Run:
         links += [LinkChoice(X25519, bits) for bits in MAC_KEY_BITS if bits != 256]
         links += [LinkChoice(X25519, confidential=True)]
         work = [(choice, False) for choice in links] + [(LinkChoice(X25519), True)]
-        chosen = [each for each in work if not self._settings.quick or each[0] == LinkChoice(X25519)]
+        chosen = [link for link in work if not self._settings.quick or link[0] == LinkChoice(X25519)]
         bar = self._start_bar("frames", len(chosen))
         for choice, with_relay in work:
             if (choice, with_relay) not in chosen:
@@ -180,44 +180,44 @@ class _Run:
             bar.advance(self._settings.rekeys)
 
     def exchanges(self) -> None:
-        """The handshakes of daemons and the paper's method, in turns: a busy machine must not favour one of them."""
+        """Measure the daemons and the paper's method in random order, so that load affects both equally."""
         grid = list(_grid())
-        chosen = [each for each in grid if not self._settings.quick or _is_quick(each)]
+        chosen = [choice for choice in grid if not self._settings.quick or _is_quick(choice)]
         for choice in grid:
             if choice not in chosen:
                 self._skip("handshake", point_of(choice), _NOT_IN_QUICK)
         points, last = self._paper_points()
         often: list[LinkChoice | dict[str, Value]] = [*chosen, *points]
         work = [*self._shuffled(often, self._repeats), *last]
-        of_daemons = sum(isinstance(each, LinkChoice) for each in work)
+        of_daemons = sum(isinstance(point, LinkChoice) for point in work)
         bar = self._start_bar("handshakes, daemons", of_daemons)
         paper_bar = self._start_bar("the paper's method", len(work) - of_daemons)
         with PaperEnds(self._settings.seed) as ends:
-            for each in work:
-                if isinstance(each, LinkChoice):
-                    bar.show(f"{each.suite.name}, HMAC key of {each.mac_key_bits} bits")
-                    self._writer.add(measure_handshake(each, self._meter))
+            for point in work:
+                if isinstance(point, LinkChoice):
+                    bar.show(f"{point.suite.name}, HMAC key of {point.mac_key_bits} bits")
+                    self._writer.add(measure_handshake(point, self._meter))
                     bar.advance()
                 else:
-                    paper_bar.show(f"{each['group']} group of {each['dh_bits']} bits")
-                    self._writer.add(ends.measure(each, self._settings.patience_s, paper_bar.show))
+                    paper_bar.show(f"{point['group']} group of {point['dh_bits']} bits")
+                    self._writer.add(ends.measure(point, self._settings.patience_s, paper_bar.show))
                     paper_bar.advance()
 
     def _paper_points(self) -> tuple[list[dict[str, Value]], list[dict[str, Value]]]:
-        """What is measured so often, and what once and last, because each takes up to the limit."""
-        asked: list[dict[str, Value]] = []
+        """The points that are repeated, and those that run once and last, because each takes up to the limit."""
+        often: list[dict[str, Value]] = []
         last: list[dict[str, Value]] = []
         for point in paper_points():
             if not (point["dh_bits"] == _ONLY_WITH_PAPER and point["group"] == "made"):
-                asked.append(point)
+                often.append(point)
             elif self._settings.paper:
                 last.append(point)
             else:
-                self._skip("paper", point, "runs only when asked for (--paper)")
-        return asked, last
+                self._skip("paper", point, "runs only with --paper")
+        return often, last
 
     def _shuffled(self, points: Iterable[T], repeats: int) -> list[T]:
-        """Every point so often, in any order: a machine that is busy for a while is busy for all of them."""
+        """Every point ``repeats`` times in random order, so that load affects all points equally."""
         work = [point for point in points for _ in range(repeats)]
         self._random.shuffle(work)
         return work

@@ -1,8 +1,8 @@
-"""Frames on an established link of two real daemons: how late each one comes, and what they cost.
+"""Times frames on an established link of two real daemons: latency and processor time.
 
-Each frame goes in alone, at a steady rate that leaves the link idle in between: the latency is that of a single
-frame, from the ``sendto`` of a program to the arrival at another through both daemons, and its cost an upper bound.
-Under load, frames share wake-ups and envelopes, and each costs less.
+Frames are sent one by one, at a rate that leaves the link idle between them. The latency is that of a single frame,
+from the ``sendto`` of a client to the arrival at another through both daemons, and the cost is an upper bound. Under
+load, frames share wake-ups and envelopes, so each costs less.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from uavlinkd.lab.evaluation.records import Record, Status, Value
 from uavlinkd.lab.evaluation.timing_handshake import point_of
 
 FRAMES_PER_S = 250.0
-"""About what a flying PX4 sends in its default mode, twice over."""
+"""About twice the rate of a flying PX4 in its default mode."""
 _LAST_S = 2.0
-"""How long the last frame may be on its way."""
+"""How long the last frame may take."""
 
 
 def measure_frames(choice: LinkChoice, count: int, meter: EnergyMeter, *, with_relay: bool = False) -> Record:
-    """So many frames one way over one link; the latency of each that arrived."""
+    """Send ``count`` frames in one direction over one link, and record the latency of each delivered frame."""
     point = {**point_of(choice), "relay": with_relay}
     try:
         with Pair(choice, with_relay=with_relay) as pair:
@@ -53,8 +53,8 @@ def _time_frames(pair: Pair, count: int, meter: EnergyMeter) -> dict[str, Value]
         "sent": count,
         "delivered": len(latencies),
         "frames_per_s": FRAMES_PER_S,
-        "cpu_caller_s": cpu_after[0] - cpu_before[0],
-        "cpu_answerer_s": cpu_after[1] - cpu_before[1],
+        "cpu_initiator_s": cpu_after[0] - cpu_before[0],
+        "cpu_responder_s": cpu_after[1] - cpu_before[1],
         "joules": joules,
         "latency_s": latencies,
     }

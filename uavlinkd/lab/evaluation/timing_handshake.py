@@ -1,11 +1,10 @@
-"""Times handshakes and rekeys of real daemons, over UDP on loopback, through a relay that counts.
+"""Times handshakes and rekeys of real daemons, over UDP on loopback, through a counting relay.
 
-The caller has started, called once and been turned away, and waits to call again; both processes are idle. Then the
-relay opens. The clock starts when the next initiation reaches the relay and stops when the first frame, sent into
-the caller's endpoint as soon as the caller has confirmed, comes out at the other's. So the start of the processes
-(about half a second of Python) is not in the time; what the caller computes before its initiation is in its
-processor time alone. The relay delays each of the four datagrams; records of frames with and without it say by
-how much.
+First, the initiator has sent an initiation to the closed relay and waits for its retry; both processes are idle. Then
+the relay opens. The time starts when the next initiation reaches the relay. It ends when the responder delivers the
+first frame, which is sent when the initiator has confirmed. So the start of the processes (about 0.5 s) is not
+included, and the computation before the initiation is only in the initiator's processor time. The relay delays each
+of the four datagrams; the records of frames with and without it show by how much.
 """
 
 from __future__ import annotations
@@ -19,15 +18,15 @@ from uavlinkd.lab.evaluation.pair import LinkChoice, Pair, PairError
 from uavlinkd.lab.evaluation.records import Record, Status, Value
 
 HANDSHAKE_LIMIT_S = 20.0
-"""Some retries: a handshake that takes longer has failed."""
+"""Enough for some retries: a handshake that takes longer has failed."""
 REKEY_AFTER_S = 1.0
-"""The shortest that a configuration may ask for."""
+"""The shortest configurable interval."""
 _SETTLE_S = 0.01
-"""After the frame: until both processes are idle again, so that their processor time is whole."""
+"""The delay after the frame until both processes are idle, so that their processor time is complete."""
 
 
 def measure_handshake(choice: LinkChoice, meter: EnergyMeter) -> Record:
-    """One handshake between two fresh processes with fresh keys."""
+    """Measure one handshake between two new processes with new keys."""
     point = point_of(choice)
     try:
         with Pair(choice, with_relay=True) as pair:
@@ -37,7 +36,7 @@ def measure_handshake(choice: LinkChoice, meter: EnergyMeter) -> Record:
 
 
 def point_of(choice: LinkChoice) -> dict[str, Value]:
-    """Where in the grid this is."""
+    """The point of the grid."""
     return {"suite": choice.suite.name, "mac_key_bits": choice.mac_key_bits, "confidential": choice.confidential}
 
 
@@ -49,7 +48,7 @@ def _relay_of(pair: Pair) -> Relay:
 def _time_handshake(pair: Pair, meter: EnergyMeter) -> dict[str, Value]:
     relay = _relay_of(pair)
     if not pair.loop.until(lambda: relay.turned_away > 0, HANDSHAKE_LIMIT_S):
-        raise PairError("the caller did not call")
+        raise PairError("the initiator did not send an initiation")
     cpu_before = pair.cpu_s()
     meter.start()
     relay.open()
@@ -59,11 +58,11 @@ def _time_handshake(pair: Pair, meter: EnergyMeter) -> dict[str, Value]:
     def is_delivered() -> bool:
         return any(frame in pair.sink.arrived for frame, _ in sent)
 
-    # A frame that comes before the caller's session does is dropped there: another follows.
+    # A frame that arrives before the initiator has a session is dropped: another follows.
     until = time.monotonic() + HANDSHAKE_LIMIT_S
     while not pair.loop.until(is_delivered, 0.25):
         if time.monotonic() >= until:
-            raise PairError(f"no frame came out: {pair.answerer.drops()}")
+            raise PairError(f"no frame was delivered: {pair.responder.drops()}")
         sent.append(pair.send_frame())
     delivered_at = min(pair.sink.arrived[frame] for frame, _ in sent if frame in pair.sink.arrived)
     pair.loop.rest(_SETTLE_S)
@@ -78,8 +77,8 @@ def _time_handshake(pair: Pair, meter: EnergyMeter) -> dict[str, Value]:
         "response_s": back.first_at[wire.RESPONSE] - started_at,
         "confirmation_s": confirmed_at - back.first_at[wire.RESPONSE],
         "frame_s": delivered_at - sent[0][1],
-        "cpu_caller_s": cpu_after[0] - cpu_before[0],
-        "cpu_answerer_s": cpu_after[1] - cpu_before[1],
+        "cpu_initiator_s": cpu_after[0] - cpu_before[0],
+        "cpu_responder_s": cpu_after[1] - cpu_before[1],
         "joules": joules,
         "initiations": there.kinds[wire.INITIATION],
         "frames_sent": len(sent),
@@ -91,20 +90,20 @@ def _time_handshake(pair: Pair, meter: EnergyMeter) -> dict[str, Value]:
 
 
 def _until_confirmed(pair: Pair, relay: Relay) -> None:
-    """Until the caller's first envelope passes: its session is made, and the other's is as soon as that arrives.
+    """Wait for the initiator's first envelope: it confirms the session of both.
 
     Raises:
-        PairError: it does not come.
+        PairError: there is no envelope in time.
     """
     if not pair.loop.until(lambda: any(kind in relay.there.kinds for kind in ENVELOPES), HANDSHAKE_LIMIT_S):
         raise PairError(
             f"no session within {HANDSHAKE_LIMIT_S:g} s, after {relay.there.kinds[wire.INITIATION]} initiations: "
-            + pair.answerer.drops()
+            + pair.responder.drops()
         )
 
 
 def measure_rekeys(choice: LinkChoice, count: int) -> list[Record]:
-    """So many rekeys of one pair, triggered by the age of the keys: the processes are warm, the keys fresh each time.
+    """Measure ``count`` rekeys of one running pair, triggered by the age of the keys.
 
     The time is from the initiation to the first envelope under the new keys, both at the relay.
     """
@@ -127,13 +126,13 @@ def _time_rekey(pair: Pair, relay: Relay) -> dict[str, Value]:
     cpu_before = pair.cpu_s()
     relay.open()
     for kind, message, seen in (
-        (wire.INITIATION, "ask for new keys", relay.there),
-        (wire.RESPONSE, "answer", relay.back),
+        (wire.INITIATION, "initiation", relay.there),
+        (wire.RESPONSE, "response", relay.back),
     ):
-        if not pair.loop.until(lambda: kind in seen.kinds, HANDSHAKE_LIMIT_S):  # noqa: B023  called in this turn only
-            raise PairError(f"nobody did {message} within {HANDSHAKE_LIMIT_S:g} s")
+        if not pair.loop.until(lambda: kind in seen.kinds, HANDSHAKE_LIMIT_S):  # noqa: B023  called in this iteration only
+            raise PairError(f"there was no {message} within {HANDSHAKE_LIMIT_S:g} s")
     started_at, answered_at = relay.there.first_at[wire.INITIATION], relay.back.first_at[wire.RESPONSE]
-    # Envelopes under the old keys may have passed before: count anew from the response on.
+    # Envelopes under the old keys may have passed before: reset the counters at the response.
     initiations = relay.there.kinds[wire.INITIATION]
     relay.open()
     _until_confirmed(pair, relay)
@@ -143,7 +142,7 @@ def _time_rekey(pair: Pair, relay: Relay) -> dict[str, Value]:
     return {
         "total_s": confirmed_at - started_at,
         "response_s": answered_at - started_at,
-        "cpu_caller_s": cpu_after[0] - cpu_before[0],
-        "cpu_answerer_s": cpu_after[1] - cpu_before[1],
+        "cpu_initiator_s": cpu_after[0] - cpu_before[0],
+        "cpu_responder_s": cpu_after[1] - cpu_before[1],
         "initiations": initiations,
     }

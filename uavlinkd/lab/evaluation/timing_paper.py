@@ -1,4 +1,4 @@
-"""Times the paper's method over its grid: both ends as processes, and a limit on the patience with them."""
+"""Times the paper's method over its grid, with both ends as processes and a time limit."""
 
 from __future__ import annotations
 
@@ -13,32 +13,33 @@ from contextlib import ExitStack, closing
 from types import TracebackType
 from typing import Any, Self
 
+from uavlinkd.lab.child_processes import end_with_parent
 from uavlinkd.lab.evaluation.records import Record, Status, Value
 
 DH_BITS = (256, 512, 1024, 2048, 4096)
-"""The paper's sizes; its text once has 2028 for 2048."""
+"""The paper's sizes; its text has 2028 for 2048 in one place."""
 MAC_KEY_BITS = (512, 1024, 2048)
 STANDARD_BITS = (2048, 4096)
-"""Of the paper's sizes those that RFC 7919 has a group for."""
+"""The sizes of the paper for which RFC 7919 has a group."""
 DATA_BYTES = 280
 """The largest MAVLink 2 frame."""
 PAPER_LIMIT_S = 600.0
-"""The paper gave up after ten minutes."""
+"""The time limit of the paper: ten minutes."""
 
 _ANSWER_S = 60.0
 _LOOK_S = 0.2
 
 
 class PaperError(Exception):
-    """An end failed."""
+    """An end of the exchange failed."""
 
 
 class End:
-    """One end as a process, which answers lines with lines."""
+    """One end as a process that answers each line with a line."""
 
     def __init__(self, role: str) -> None:
-        self._process = subprocess.Popen(  # noqa: S603  our own module, no shell
-            (sys.executable, "-m", "uavlinkd.lab.evaluation.paper", role),
+        self._process = subprocess.Popen(  # noqa: S603  constant command
+            end_with_parent(sys.executable, "-m", "uavlinkd.lab.evaluation.paper", role),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
         )
@@ -64,7 +65,7 @@ class End:
         """Wait for a line.
 
         Raises:
-            TimeoutError: none within the limit.
+            TimeoutError: there is no line within the limit.
             PaperError: the process has ended.
         """
         until = time.monotonic() + limit_s
@@ -80,7 +81,7 @@ class End:
         return answer
 
     def close(self) -> None:
-        """End it, whatever it does."""
+        """Kill the process."""
         self._process.kill()
         self._process.wait()
         self._selector.close()
@@ -90,10 +91,10 @@ class End:
 
 
 class PaperEnds:
-    """Both ends. They live through many exchanges, each with new parameters and keys, until one takes too long."""
+    """Both ends. They run many exchanges, each with new parameters and keys, until one takes too long."""
 
     def __init__(self, seed: int) -> None:
-        self._random = random.Random(seed)  # noqa: S311  of the data; keys come from the system
+        self._random = random.Random(seed)  # noqa: S311  data, not keys
         self._ends: tuple[End, End] | None = None
 
     def measure(
@@ -102,7 +103,7 @@ class PaperEnds:
         limit_s: float,
         on_wait: Callable[[], None] = lambda: None,
     ) -> Record:
-        """One exchange at a point of the grid (``dh_bits``, ``mac_key_bits``, ``group``)."""
+        """Measure one exchange at a point of the grid (``dh_bits``, ``mac_key_bits``, ``group``)."""
         try:
             values = self._exchange(point, limit_s, on_wait)
         except TimeoutError:
@@ -118,7 +119,7 @@ class PaperEnds:
 
     def _exchange(self, point: dict[str, Value], limit_s: float, on_wait: Callable[[], None]) -> dict[str, Value]:
         if self._ends is None:
-            with ExitStack() as stack:  # where the second one fails, the first has to be ended too
+            with ExitStack() as stack:  # if the second one fails, the first has to be stopped too
                 ends = [stack.enter_context(closing(End(role))) for role in ("initiator", "responder")]
                 self._ends = ends[0], ends[1]
                 stack.pop_all()
@@ -135,12 +136,12 @@ class PaperEnds:
         )
         values = initiator.answer(limit_s, on_wait)
         values |= responder.answer(_ANSWER_S)
-        # Both ends read the same monotonic clock: that of the machine.
+        # Both ends have the same monotonic clock.
         values["total_s"] = values.pop("verified_at") - values.pop("started_at")
         return values
 
     def close(self) -> None:
-        """End both processes."""
+        """Stop both processes."""
         for end in self._ends or ():
             end.close()
         self._ends = None
@@ -155,7 +156,7 @@ class PaperEnds:
 
 
 def paper_points() -> list[dict[str, Value]]:
-    """The paper's grid, then the same method in standard groups, which need no parameters to be made."""
+    """The paper's grid, then the same method in standard groups, which need no generated parameters."""
     made: list[dict[str, Value]] = [
         {"dh_bits": bits, "mac_key_bits": mac_bits, "group": "made"} for bits in DH_BITS for mac_bits in MAC_KEY_BITS
     ]

@@ -1,4 +1,4 @@
-"""What the records of the timing say: medians and spreads by point, for the figures, the tables and the prose."""
+"""Queries on the records of the timing evaluation, for figures and tables."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ DAEMON_SIZES = {"ffdhe2048": 2048, "ffdhe3072": 3072, "ffdhe4096": 4096, "ffdhe6
 
 @dataclass(frozen=True, slots=True)
 class Findings:
-    """One run: its facts, and its records."""
+    """The facts and the records of one run."""
 
     run: dict[str, Value]
     records: Sequence[Record]
 
     def of(self, kind: str, **point: Value) -> list[Record]:
-        """The records of a kind at a point; what the point does not name may be anything."""
+        """The records of a kind at a point; coordinates that the point does not have match any value."""
         return [
             record
             for record in self.records
@@ -29,80 +29,77 @@ class Findings:
         ]
 
     def numbers(self, kind: str, name: str, **point: Value) -> list[float]:
-        """A measured number of each record that was measured."""
-        return [
-            each.number(name) for each in self.of(kind, **point) if each.is_ok and each.values.get(name) is not None
-        ]
+        """One measured number of each successful record."""
+        records = [record for record in self.of(kind, **point) if record.is_ok]
+        return [record.number(name) for record in records if record.values.get(name) is not None]
 
     def spread(self, kind: str, name: str, **point: Value) -> Spread | None:
-        """Of these numbers; None without any."""
+        """The spread of these numbers; None without any."""
         numbers = self.numbers(kind, name, **point)
         return spread(numbers) if numbers else None
 
     def values(self, kind: str, name: str) -> list[Value]:
-        """What a coordinate of the point has been, in the order of the records' numbers or names."""
-        found = {record.point[name] for record in self.records if record.kind == kind and name in record.point}
-        return sorted((each for each in found if not isinstance(each, list)), key=lambda v: (isinstance(v, str), v))
+        """The values of a coordinate, sorted."""
+        values = {record.point[name] for record in self.records if record.kind == kind and name in record.point}
+        return sorted((v for v in values if not isinstance(v, list)), key=lambda v: (isinstance(v, str), v))
 
     # The paper's method, and uavlinkd's.
 
     def paper_times(self, group: str, dh_bits: Value, mac_key_bits: Value | None = None) -> list[float]:
-        """Seconds of each exchange of the paper's method, from the making of parameters to the verified tag."""
+        """Seconds of each exchange of the paper's method, from the generation of parameters to the verified tag."""
         point = {"group": group, "dh_bits": dh_bits}
         if mac_key_bits is not None:
             point["mac_key_bits"] = mac_key_bits
         return self.numbers("paper", "total_s", **point)
 
     def paper_at_least(self, group: str, dh_bits: Value, mac_key_bits: Value | None = None) -> list[float]:
-        """The same, and the limit for each exchange that was given up there: a median of those alone which came to an
-        end would be too small.
-        """
+        """The same, with the limit for each unfinished exchange: without them, the median would be too small."""
         point = {"group": group, "dh_bits": dh_bits}
         if mac_key_bits is not None:
             point["mac_key_bits"] = mac_key_bits
-        late = [each for each in self.of("paper", **point) if each.status is Status.NOT_FINISHED]
-        return self.paper_times(group, dh_bits, mac_key_bits) + [each.number("limit_s") for each in late]
+        late = [record for record in self.of("paper", **point) if record.status is Status.NOT_FINISHED]
+        return self.paper_times(group, dh_bits, mac_key_bits) + [record.number("limit_s") for record in late]
 
     def daemon_times(self, suite: str, mac_key_bits: Value | None = None) -> list[float]:
-        """Seconds of each handshake, from before the initiation is made to the first frame delivered.
+        """Seconds of each handshake, from before the initiation is computed to the first delivered frame.
 
-        The relay sees the initiation when it is made: what making it takes is added, as measured in the core.
+        The relay sees the initiation after that computation, so its time, measured in the core, is added.
         """
         point: dict[str, Value] = {"suite": suite}
         if mac_key_bits is not None:
             point["mac_key_bits"] = mac_key_bits
         made = self.spread("core", "initiate_s", **point)
-        return [(made.median if made else 0.0) + each for each in self.numbers("handshake", "total_s", **point)]
+        return [(made.median if made else 0.0) + number for number in self.numbers("handshake", "total_s", **point)]
 
     def rekey_times(self, suite: str) -> list[float]:
-        """Seconds of each rekey, from before the initiation is made to the first envelope under the new keys."""
+        """Seconds of each rekey, from before the initiation is computed to the first envelope under the new keys."""
         made = self.spread("core", "initiate_s", suite=suite)
-        return [(made.median if made else 0.0) + each for each in self.numbers("rekey", "total_s", suite=suite)]
+        return [(made.median if made else 0.0) + number for number in self.numbers("rekey", "total_s", suite=suite)]
 
     def suites(self) -> list[str]:
-        """Those of which there are records, in the order of their numbers on the wire."""
-        found = set(self.values("handshake", "suite"))
-        return [name for name in SUITES_BY_NAME if name in found]
+        """The measured suites, in the order of their numbers in messages."""
+        measured = set(self.values("handshake", "suite"))
+        return [name for name in SUITES_BY_NAME if name in measured]
 
     def unfinished(self) -> list[Record]:
-        """All that was not measured, whatever the reason."""
+        """The records without a measurement, for any reason."""
         return [record for record in self.records if not record.is_ok]
 
     def problems(self) -> list[Record]:
-        """What failed. Points that nobody asked for, or that took too long, did not."""
+        """The failed measurements, without skipped and unfinished ones."""
         return [record for record in self.records if record.status is Status.FAILED]
 
     def latencies(self, **point: Value) -> list[float]:
-        """Of every frame, on links at that point."""
-        found: list[float] = []
+        """The latency of every frame on the links at a point."""
+        latencies: list[float] = []
         for record in self.of("frames", **point):
             values = record.values.get("latency_s")
             if record.is_ok and isinstance(values, list):
-                found += values
-        return found
+                latencies += values
+        return latencies
 
 
 def percentile(values: Iterable[float], share: float) -> float:
-    """The least value that at least ``share`` (0 to 1) of the values do not exceed."""
+    """The smallest value that at least ``share`` (0 to 1) of the values do not exceed."""
     ordered = sorted(values)
     return ordered[min(len(ordered) - 1, max(0, -int(-share * len(ordered) // 1) - 1))]
