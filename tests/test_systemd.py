@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.daemon.harness import need
+from tests.needs import need
 from uavlinkd.link.daemon import HOUSEKEEPING_S
 
 UNITS = Path(__file__).parents[1] / "systemd"
@@ -27,13 +27,13 @@ def analyze(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
 
 
 def settings(name: str) -> dict[str, list[str]]:
-    """What a unit says, by key, with %i in place of what it stands for."""
-    found: defaultdict[str, list[str]] = defaultdict(list)
+    """The settings of a unit by key, with %i replaced."""
+    result: defaultdict[str, list[str]] = defaultdict(list)
     for line in (UNITS / name).read_text().splitlines():
         if line and not line.startswith(("#", "[")):
             key, _, value = line.partition("=")
-            found[key].append(value)
-    return found
+            result[key].append(value)
+    return result
 
 
 def test_there_is_a_unit_for_each_purpose() -> None:
@@ -48,10 +48,10 @@ def test_unit_has_nothing_wrong(tmp_path: Path, name: str) -> None:
     units.mkdir(parents=True)
     instance = name.replace("@", "@drone0")
     shutil.copy(UNITS / name, units / instance)
-    for program in ("opt/uavlinkd/bin/uavlinkd", "opt/uavlinkd/bin/uavlink-mitm", "bin/sh"):
-        (tmp_path / program).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / program).write_text("#!/bin/sh\n")
-        (tmp_path / program).chmod(0o755)
+    for executable in ("opt/uavlinkd/bin/uavlinkd", "opt/uavlinkd/bin/uavlink-mitm", "bin/sh"):
+        (tmp_path / executable).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / executable).write_text("#!/bin/sh\n")
+        (tmp_path / executable).chmod(0o755)
     for target in ("sysinit", "basic", "multi-user", "shutdown"):
         (units / f"{target}.target").write_text("[Unit]\nDescription=there\n")
     done = analyze("verify", "--man=no", f"--root={tmp_path}", instance)
@@ -79,8 +79,8 @@ def test_unit_is_hardened(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["uavlinkd.service", "uavlinkd@.service"])
-def test_drone_is_never_given_up(name: str) -> None:
-    """Restarted for ever, quickly, by a watchdog that hears of the loop; and started without a network."""
+def test_daemon_is_restarted_indefinitely(name: str) -> None:
+    """Restarted indefinitely and quickly, by a watchdog of the event loop; and started without a network."""
     unit = settings(name)
     assert unit["Type"] == ["notify"]
     assert unit["NotifyAccess"] == ["main"]
@@ -88,7 +88,7 @@ def test_drone_is_never_given_up(name: str) -> None:
     assert unit["RestartSec"] == ["250ms"]
     watchdog = re.fullmatch(r"(\d+)s", unit["WatchdogSec"][0])
     assert watchdog is not None
-    assert int(watchdog[1]) / 2 > 2 * HOUSEKEEPING_S  # it is told in time though the timer is coarse
+    assert int(watchdog[1]) / 2 > 2 * HOUSEKEEPING_S  # notified in time although the timer is coarse
     assert not {"Requires", "BindsTo"} & set(unit)
     drivers = ["modprobe@cdc_acm.service modprobe@usbserial.service"]  # of those in DeviceAllow that are modules
     assert (unit["After"], unit["Wants"]) == (drivers, drivers)
@@ -102,8 +102,8 @@ def test_keys_are_handed_over_and_serial_ports_allowed(name: str) -> None:
     assert (unit["DynamicUser"], unit["SupplementaryGroups"], unit["UMask"]) == (["yes"], ["dialout"], ["0077"])
     assert unit["LoadCredential"][0].startswith("keys:/etc/uavlinkd/")
     assert unit["DevicePolicy"] == ["closed"]
-    assert all(re.fullmatch(r"char-tty[A-Z]+ rw", each) for each in unit["DeviceAllow"])
-    assert not any("KEY" in each.upper() for each in unit["Environment"])
+    assert all(re.fullmatch(r"char-tty[A-Z]+ rw", device) for device in unit["DeviceAllow"])
+    assert not any("KEY" in variable.upper() for variable in unit["Environment"])
 
 
 def test_instances_are_apart_and_otherwise_alike() -> None:
