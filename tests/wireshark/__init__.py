@@ -1,0 +1,1 @@
+"""The Wireshark dissector, run by tshark on captures of the core's own datagrams."""

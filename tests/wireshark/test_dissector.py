@@ -1,0 +1,170 @@
+"""What tshark shows with ``configs/wireshark/uavlink.lua``."""
+
+from __future__ import annotations
+
+import os
+import random
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from pymavlink.generator import mavgen
+
+from tests.core.harness import PLAIN
+from tests.needs import need
+from tests.wireshark.captures import CONFIDENTIAL, Sent, conversation, cookie_reply, with_tag, write
+from uavlinkd.core.suites import SUITES, Suite
+from uavlinkd.core.wire import TAG_LENGTHS
+
+SCRIPT = Path(__file__).parents[2] / "configs/wireshark/uavlink.lua"
+ROOT = Path(os.environ.get("UAVLINKD_TSHARK_ROOT", "/"))
+"""The root folder of the system whose tshark runs: this one, or that of another Debian release."""
+FIELDS = (
+    *("type", "suite", "counter", "record", "tag_bytes", "mode", "frame.msgid", "frame.system", "token", "fresh"),
+    *("refused.msgid", "refused.command", "refused.reason", "refused.total"),
+)
+RECORDS = ["1", "2", "3", "4", "6", "5"]
+
+
+@pytest.fixture
+def folder() -> Iterator[Path]:
+    """A folder that another user may read, with the script in it."""
+    need((ROOT / "usr/bin/tshark").exists(), "tshark")
+    with tempfile.TemporaryDirectory(dir=ROOT / "tmp") as name:
+        folder = Path(name)
+        folder.chmod(0o755)
+        shutil.copy(SCRIPT, folder)
+        yield folder
+
+
+def inside(path: Path) -> str:
+    """The path as a process in :data:`ROOT` sees it."""
+    return f"/{path.relative_to(ROOT)}"
+
+
+def tshark(folder: Path, capture: Path, *options: str) -> str:
+    """What tshark prints of a capture. Two passes, so that later packets help to infer the tag of earlier ones."""
+    as_other = []
+    if os.getuid() == 0:  # as root, tshark ignores scripts; only root may change the root folder
+        as_other = ["setpriv", "--reuid=65534", "--regid=65534", "--clear-groups"]
+        if len(ROOT.parts) > 1:
+            as_other = ["chroot", "--userspec=65534:65534", str(ROOT)]
+    scripts = [option for script in sorted(folder.glob("*.lua")) for option in ("-X", f"lua_script:{inside(script)}")]
+    done = subprocess.run(
+        [*as_other, "/usr/bin/tshark", "-2", "-n", "-r", inside(capture), *scripts, *options],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={"PATH": os.environ["PATH"], "HOME": inside(folder), "LC_ALL": "C.UTF-8"},
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Lua" not in done.stderr, done.stderr
+    assert "Lua Error" not in done.stdout
+    return done.stdout
+
+
+def rows(folder: Path, packets: list[Sent], *options: str, port: int = 5790) -> list[dict[str, str]]:
+    """The fields of each packet that have a value."""
+    capture = write(folder / "capture.pcap", packets, port)
+    columns = [option for field in FIELDS for option in ("-e", f"uavlink.{field}")]
+    lines = tshark(folder, capture, "-T", "fields", "-E", "separator=|", *columns, *options).splitlines()
+    return [{field: value for field, value in zip(FIELDS, line.split("|"), strict=True) if value} for line in lines]
+
+
+@pytest.mark.parametrize("tag_bytes", TAG_LENGTHS)
+def test_envelopes_with_every_tag_length(folder: Path, tag_bytes: int) -> None:
+    """Counters, frames and control records are readable without a key, and the tag's length is inferred."""
+    packets = rows(folder, conversation(with_tag(tag_bytes)))
+
+    assert [packet["type"] for packet in packets] == ["0x01", "0x02", *["0x40"] * 10, "0x41"]
+    envelopes = packets[2:]
+    assert [int(envelope["counter"]) for envelope in envelopes] == [*range(10), 2**16]
+    assert {envelope["tag_bytes"] for envelope in envelopes} == {str(tag_bytes)}
+    assert {envelope["mode"] for envelope in envelopes} == {"authenticated (inferred)"}
+    assert [envelope.get("frame.msgid", "") for envelope in envelopes][1:3] == ["0", "0,0"]
+    assert envelopes[1]["frame.system"] == "1"
+    assert [envelope["record"] for envelope in envelopes if "record" in envelope][-6:] == RECORDS
+    assert envelopes[4]["token"] == "01020304"
+    assert envelopes[5]["fresh"] == "9"
+    report = envelopes[8]
+    shown = [report[f"refused.{field}"] for field in ("msgid", "command", "reason", "total")]
+    assert shown == ["76,0", "400,0", "4,1", "3,70000"]
+
+
+@pytest.mark.parametrize("suite", SUITES.values(), ids=lambda suite: suite.name)
+def test_handshakes_on_any_port(folder: Path, suite: Suite) -> None:
+    """A handshake message of any suite shows the protocol, and the envelopes that follow are read too."""
+    packets = rows(folder, conversation(replace(PLAIN, suites=(suite,))), port=40000)
+
+    assert [packet.get("type") for packet in packets[:3]] == ["0x01", "0x02", "0x40"]
+    assert packets[0]["suite"] == packets[1]["suite"] == str(suite.number)
+    assert packets[-1]["type"] == "0x41"
+
+
+def test_cookie_reply(folder: Path) -> None:
+    """It has a nonce and an encrypted cookie."""
+    capture = write(folder / "capture.pcap", cookie_reply())
+    text = tshark(folder, capture, "-V")
+    assert "Cookie Reply to 0x" in text
+    assert "Encrypted cookie: " in text
+    assert "(no cookie)" in text  # the initiation
+
+
+def test_confidential_envelopes(folder: Path) -> None:
+    """Nothing is readable but index and counter, and the dissector says that it infers the mode."""
+    envelopes = rows(folder, conversation(CONFIDENTIAL))[2:]
+    modes = [envelope["mode"] for envelope in envelopes]
+    assert modes.count("confidential (inferred)") >= len(modes) - 1  # an empty payload fits every mode
+    assert not any("frame.msgid" in envelope or "record" in envelope for envelope in envelopes)
+
+    chosen = rows(folder, conversation(CONFIDENTIAL), "-o", "uavlink.tag:confidential")[2:]
+    assert {envelope["mode"] for envelope in chosen} == {"confidential"}
+
+
+def test_preference_sets_the_tag_length(folder: Path) -> None:
+    """A wrong choice shows too: the frames then end elsewhere."""
+    right = rows(folder, conversation(with_tag(8)), "-o", "uavlink.tag:8 bytes")[3]
+    assert (right["tag_bytes"], right["mode"], right["frame.msgid"]) == ("8", "authenticated", "0")
+    wrong = rows(folder, conversation(with_tag(16)), "-o", "uavlink.tag:32 bytes")[3]
+    assert wrong["tag_bytes"] == "32"
+    assert "frame.msgid" not in wrong
+
+
+def test_port_preference(folder: Path) -> None:
+    """Envelopes without a handshake in the capture are read on the port of the preference only."""
+    envelopes = conversation()[3:5]
+    assert not any(rows(folder, envelopes, port=40001))
+    assert all(rows(folder, envelopes, "-o", "uavlink.port:40001", port=40001))
+
+
+def test_frames_reach_the_mavlink_dissector(folder: Path) -> None:
+    """The dissector that pymavlink generates shows the fields of the frames, also of two in one envelope."""
+    xml = Path(mavgen.__file__).parents[1] / "dialects/v20/minimal.xml"
+    options = mavgen.Opts(str(folder / "mavlink"), wire_protocol="2.0", language="WLua", validate=False)
+    assert mavgen.mavgen(options, [str(xml)])
+    assert (folder / "mavlink.lua").exists()
+
+    capture = write(folder / "capture.pcap", conversation())
+    text = tshark(folder, capture, "-V")
+    assert text.count("Payload: HEARTBEAT") >= 3
+    assert "Envelope to 0x" in text
+
+
+def test_mutated_packets_raise_no_error(folder: Path) -> None:
+    """Any bytes are dissected without a Lua error."""
+    rng = random.Random(17)
+    packets = [*conversation(), *conversation(CONFIDENTIAL), *cookie_reply()]
+    mutated = []
+    for _ in range(3000):
+        from_a, datagram = rng.choice(packets)
+        changed = bytearray(datagram[: rng.randrange(len(datagram) + 1)] if rng.random() < 0.5 else datagram)
+        for _ in range(rng.randrange(4)):
+            if changed:
+                changed[rng.randrange(len(changed))] = rng.randrange(256)
+        mutated.append(Sent(from_a, bytes(changed)))
+    text = tshark(folder, write(folder / "capture.pcap", mutated), "-V")
+    assert "Malformed uavlink message" in text
