@@ -1,8 +1,10 @@
-"""The stage on which daemons play, for every test of this folder."""
+"""Fixtures of the tests with real daemons."""
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
+import tempfile
+from collections.abc import AsyncIterator, Iterator
+from pathlib import Path
 
 import pytest
 
@@ -11,6 +13,13 @@ from tests.daemon.harness import Stage
 
 @pytest.fixture
 async def stage() -> AsyncIterator[Stage]:
-    """Ends the daemons of a test, and looks for tracebacks and secrets in all that they said."""
+    """Ends the daemons of a test, and searches their output for tracebacks and secrets."""
     async with Stage() as stage:
         yield stage
+
+
+@pytest.fixture
+def short_folder() -> Iterator[Path]:
+    """An empty folder whose path is short: that of a Unix socket in it has at most 107 bytes."""
+    with tempfile.TemporaryDirectory(prefix="demo-") as folder:
+        yield Path(folder)

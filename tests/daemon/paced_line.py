@@ -19,7 +19,8 @@ from time import monotonic
 
 from uavlinkd.cli import main
 from uavlinkd.endpoints import serial
-from uavlinkd.mavlink.frames import Frame, StreamSplitter
+from uavlinkd.mavlink.frames import Frame
+from uavlinkd.mavlink.stream_splitter import StreamSplitter
 
 
 class Line:
@@ -58,7 +59,7 @@ class Line:
         self._free_at = begins_at + len(data) / self.bytes_s
         for at in range(len(data)):
             ends_at = begins_at + (at + 1) / self.bytes_s
-            self.arrivals += [(ends_at, each) for each in self._splitter.feed(data[at : at + 1], ends_at)]
+            self.arrivals += [(ends_at, frame) for frame in self._splitter.feed(data[at : at + 1], ends_at)]
 
 
 if __name__ == "__main__":

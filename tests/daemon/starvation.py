@@ -14,8 +14,10 @@ from contextlib import AsyncExitStack, redirect_stdout
 from time import monotonic
 
 from tests.daemon.fleet import AN_OPERATOR, Rogue, a_member
-from tests.daemon.harness import DaemonProcess, Stage, free_port
+from tests.daemon.harness import Stage
+from tests.daemon.losses import lost_to_waiting
 from tests.daemon.paced_line import Line
+from tests.daemon.process import DaemonProcess
 from tests.endpoints.starvation import (
     BAUD,
     CAPTURED,
@@ -31,6 +33,7 @@ from tests.endpoints.starvation import (
     summary,
 )
 from tests.limited_cpu import limited_cpu, why_no_limit
+from uavlinkd.lab.sim.loopback_ports import free_port
 
 DURATION_S = 10.0
 FRAMES_PER_ENVELOPE = 20
@@ -43,7 +46,7 @@ POLICIES: Mapping[str, Mapping[str, object]] = {"the role's own rates": {}, "wit
 class PacedDaemon(DaemonProcess):
     """A daemon whose serial ports have a line rate."""
 
-    def _program(self) -> tuple[str, str]:
+    def _executable(self) -> tuple[str, str]:
         return ("-m", "tests.daemon.paced_line")
 
 
@@ -78,7 +81,7 @@ async def starve(
         if cpu_share is not None:
             victim.launcher = stack.enter_context(limited_cpu(cpu_share)).launcher
         await victim.start()
-        await victim.until(lambda status: bool(status["endpoints"]["autopilot"]["programs"]))
+        await victim.until(lambda status: bool(status["endpoints"]["autopilot"]["clients"]))
         rogue = await stack.enter_async_context(Rogue(captured, victim, psks["captured"]))
         boss = await stack.enter_async_context(Rogue(operator, victim, psks["operator"]))
 
@@ -93,11 +96,14 @@ async def starve(
         for number in range(HEARTBEATS):
             loop.call_at(began + (number + 0.51) * duration_s / HEARTBEATS, say, heartbeat(number))
         for first in range(0, len(flood), FRAMES_PER_ENVELOPE):
-            rogue.say(b"".join(flood[first : first + FRAMES_PER_ENVELOPE]))
+            envelope = flood[first : first + FRAMES_PER_ENVELOPE]
+            sent_at.update(dict.fromkeys(envelope, monotonic()))
+            rogue.say(b"".join(envelope))
             await asyncio.sleep(began + (first + FRAMES_PER_ENVELOPE) / per_s - loop.time())
         await asyncio.sleep(began + duration_s + 1.5 - loop.time())
+        lost = await lost_to_waiting(victim, operator)
         assert await victim.stop() == 0
-    return summary(line.arrivals, sent_at, line.bytes_s, 0)
+    return summary(line.arrivals, sent_at, line.bytes_s, 0)._replace(lost_to_waiting=lost)
 
 
 async def measure() -> None:

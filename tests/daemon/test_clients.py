@@ -9,12 +9,16 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
 
+import pytest
+
 from tests.daemon.fleet import Cable, drone_and_ground, held_back
-from tests.daemon.harness import DaemonProcess, Stage, free_port
+from tests.daemon.harness import Stage
+from tests.daemon.process import DaemonProcess
 from tests.lab.sim import scenarios
 from tests.lab.sim.scenarios import Seen
 from uavlinkd.lab.sim.autopilot import AutopilotSettings
 from uavlinkd.lab.sim.flight import Flight
+from uavlinkd.lab.sim.loopback_ports import free_port
 
 SYSTEM = 3
 
@@ -31,32 +35,29 @@ async def flying(
     ground.add_endpoint("station", ground_url)
     await stage.start(drone, ground)
     async with Flight(flight_url, AutopilotSettings(system_id=SYSTEM)) as flight:
-        await drone.until(lambda status: bool(status["endpoints"]["autopilot"]["programs"]))
+        await drone.until(lambda status: bool(status["endpoints"]["autopilot"]["clients"]))
         yield flight, drone, ground
 
 
 async def check(
-    flight: Flight,
-    drone: DaemonProcess,
-    ground: DaemonProcess,
-    fly: Callable[[], Awaitable[Seen]],
+    flight: Flight, drone: DaemonProcess, ground: DaemonProcess, fly: Callable[[], Awaitable[Seen]]
 ) -> None:
-    """Fly; the station saw all there is, the vehicle did it all once, and nothing was lost or refused on the way."""
+    """Fly; the station saw all there is, the vehicle did it all once, and nothing was lost or refused."""
     before = {parameter.name: parameter.value for parameter in flight.autopilot.parameters.table}
     seen = await fly()
     scenarios.check(seen, system_id=SYSTEM, parameters=before)
     scenarios.check_flown(flight)
     for daemon, peer in ((drone, "ground"), (ground, f"drone{SYSTEM}")):
         status = await daemon.status()
-        told = status["peers"][peer]
-        assert told["session"]["lost_in"] == 0
+        reported = status["peers"][peer]
+        assert reported["session"]["lost_in"] == 0
         assert held_back(status, "peers", peer) == held_back(status, "peers", peer, "out") == {}
         if daemon is drone:
-            assert told["frames_received"] > 15, "it went another way"
-            arrived = told["frames_received"]
+            assert reported["frames_received"] > 15, "it went another way"
+            arrived = reported["frames_received"]
             await flight.until(lambda arrived=arrived: flight.report().frames_received >= arrived)  # type: ignore[misc]
         else:
-            assert told["frames_received"] > 200, "it went another way"
+            assert reported["frames_received"] > 200, "it went another way"
 
 
 async def test_mavutil_flies_through_a_serial_port(stage: Stage) -> None:
@@ -74,19 +75,6 @@ async def test_mavutil_flies_through_a_serial_port(stage: Stage) -> None:
             await check(flight, drone, ground, lambda: scenarios.fly_with_mavutil(stations_end))
 
 
-async def test_mavutil_flies_where_it_listens(stage: Stage) -> None:
-    """mavutil listens on UDP, the autopilot calls: connect, parameters, mission, arm, up, down."""
-    scenarios.need("pymavlink.mavutil")
-    into, station = free_port(), free_port()
-    async with flying(
-        stage,
-        drone_url=f"udpin:127.0.0.1:{into}",
-        flight_url=f"udpout:127.0.0.1:{into}",
-        ground_url=f"udpout:127.0.0.1:{station}",
-    ) as (flight, drone, ground):
-        await check(flight, drone, ground, lambda: scenarios.fly_with_mavutil(f"udpin:127.0.0.1:{station}"))
-
-
 async def test_mavproxy_flies_through_tcp(stage: Stage, tmp_path: Path) -> None:
     """MAVProxy as a TCP client, the autopilot called on UDP: connect, parameters, mission, arm, up, down."""
     scenarios.need("MAVProxy")
@@ -101,14 +89,29 @@ async def test_mavproxy_flies_through_tcp(stage: Stage, tmp_path: Path) -> None:
         await check(flight, drone, ground, lambda: scenarios.fly_with_mavproxy(url, tmp_path, flight))
 
 
-async def test_mavsdk_flies_through_udp(stage: Stage) -> None:
-    """MAVSDK on UDP, the autopilot a TCP client: connect, parameters, mission, arm, up, down."""
-    scenarios.need("mavsdk.asyncio")
-    vehicle, station = free_port(), free_port()
-    async with flying(
-        stage,
-        drone_url=f"tcpin:127.0.0.1:{vehicle}",
-        flight_url=f"tcp:127.0.0.1:{vehicle}",
-        ground_url=f"udpin:127.0.0.1:{station}",
-    ) as (flight, drone, ground):
-        await check(flight, drone, ground, lambda: scenarios.fly_with_mavsdk(f"udpout:127.0.0.1:{station}"))
+@pytest.mark.parametrize(
+    ("client", "drone_url", "flight_url", "ground_url", "station_url", "fly"),
+    [
+        ("pymavlink.mavutil", "udpin", "udpout", "udpout", "udpin", scenarios.fly_with_mavutil),
+        ("mavsdk.asyncio", "tcpin", "tcp", "udpin", "udpout", scenarios.fly_with_mavsdk),
+    ],
+)
+async def test_client_flies_through_udp(
+    stage: Stage,
+    client: str,
+    drone_url: str,
+    flight_url: str,
+    ground_url: str,
+    station_url: str,
+    fly: Callable[[str], Awaitable[Seen]],
+) -> None:
+    """A client that listens or calls on UDP: connect, parameters, mission, arm, up, down."""
+    scenarios.need(client)
+    air, ground_at = f"127.0.0.1:{free_port()}", f"127.0.0.1:{free_port()}"
+    urls = {
+        "drone_url": f"{drone_url}:{air}",
+        "flight_url": f"{flight_url}:{air}",
+        "ground_url": f"{ground_url}:{ground_at}",
+    }
+    async with flying(stage, **urls) as (flight, drone, ground):
+        await check(flight, drone, ground, lambda: fly(f"{station_url}:{ground_at}"))

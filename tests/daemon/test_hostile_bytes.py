@@ -1,35 +1,40 @@
-"""What a daemon does with bytes that are nothing, from programs beside it and from strangers on the network."""
+"""Invalid bytes at a daemon, from local clients and from strangers on the network."""
 
 from __future__ import annotations
 
 import os
+from collections import Counter
 
 import pytest
 
-from tests.daemon.harness import DaemonProcess, Program, Stage, Status, frame, heartbeat, secret_forms
+from tests.daemon.frames import frame, heartbeat
+from tests.daemon.harness import Stage, secret_forms
+from tests.daemon.process import DaemonProcess, Status
+from tests.daemon.udp import Client
+from uavlinkd.config.keys import decode_key, generate_private_key, generate_psk
 from uavlinkd.core.crypto import Secret
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Transmit
+from uavlinkd.core.path import Path
 from uavlinkd.core.settings import PeerSettings
-from uavlinkd.config.keys import decode_key, generate_private_key, generate_psk
 
 LARGEST_DATAGRAM = 65507
 BOOT_TEXT = b"\r\n\r\nInit ArduCopter V4.5.7 (2a3dc4b7)\n\nFree RAM: 190392\nload_all took 6480us\n"
 
 
-def dropped_of_nobody(status: Status) -> int:
+def dropped_of_no_peer(status: Status) -> int:
     """Datagrams that were discarded and that no peer can be held to."""
     return sum(status["drops"].values())
 
 
-async def linked_with_programs(stage: Stage) -> tuple[DaemonProcess, DaemonProcess, Program, Program]:
-    """Two linked daemons with a program at each end, each known to its daemon."""
+async def linked_with_clients(stage: Stage) -> tuple[DaemonProcess, DaemonProcess, Client, Client]:
+    """Two linked daemons with a client at each end, each known to its daemon."""
     a, b = stage.pair()
     into = a.add_endpoint("autopilot")
-    ground = await stage.program()
+    ground = await stage.client()
     b.add_endpoint("ground", f"udpout:{ground}")
     await stage.start(a, b)
-    autopilot = await stage.program()
+    autopilot = await stage.client()
     autopilot.send(frame(0), into)
     await ground.until(lambda: ground.received == frame(0))
     ground.clear()
@@ -51,37 +56,34 @@ AT_AN_ENDPOINT = {
     ),
     # The rest of it is awaited in what comes next, where it is not.
     "a cut frame": (frame(1) + frame(2)[:-3], frame(1), len(frame(2)) - 3, {"truncated": 1, "bad_crc": 1}),
-    "64 KiB of frames": (
-        b"".join(map(frame, range(1000, 2500))),
-        b"".join(map(frame, range(1000, 2500))),
-        0,
-        {},
-    ),
+    "64 KiB of frames": (b"".join(map(frame, range(1000, 2500))), b"".join(map(frame, range(1000, 2500))), 0, {}),
     "64 KiB of zeros": (bytes(LARGEST_DATAGRAM), b"", LARGEST_DATAGRAM, {"not_mavlink": 1}),
 }
 
 
-@pytest.mark.parametrize("case", AT_AN_ENDPOINT)
-async def test_what_is_no_mavlink_stays_out_and_is_counted(stage: Stage, case: str) -> None:
-    """Whatever a datagram of a local program holds, its genuine frames cross and the rest is counted."""
-    datagram, crosses, garbage_bytes, faults = AT_AN_ENDPOINT[case]
-    assert len(datagram) <= LARGEST_DATAGRAM
-    a, _, autopilot, ground = await linked_with_programs(stage)
+async def test_only_genuine_frames_of_a_client_cross_and_the_rest_is_counted(stage: Stage) -> None:
+    """Any datagram of a local client, one after the other; a frame of its own ends each case."""
+    a, _, autopilot, ground = await linked_with_clients(stage)
     into = sockaddr_of_endpoint(a)
-    autopilot.send(datagram, into)
-    last = frame(9999)
-    autopilot.send(last, into)
-    await ground.until(lambda: len(ground.received) >= len(crosses + last))
-    assert ground.received == crosses + last
-    counted = (await a.status())["endpoints"]["autopilot"]
-    assert counted["garbage_bytes"] == garbage_bytes
-    assert counted["faults"] == faults
+    expected, garbage_bytes, faults = b"", 0, Counter[str]()
+    for number, (datagram, crosses, garbage, counted) in enumerate(AT_AN_ENDPOINT.values()):
+        assert len(datagram) <= LARGEST_DATAGRAM
+        last = frame(9000 + number)
+        autopilot.send(datagram, into)
+        autopilot.send(last, into)
+        expected += crosses + last
+        garbage_bytes += garbage
+        faults.update(counted)
+        await ground.until(lambda: len(ground.received) >= len(expected))  # noqa: B023  awaited at once
+        assert ground.received == expected
+        endpoint = (await a.status())["endpoints"]["autopilot"]
+        assert (endpoint["garbage_bytes"], endpoint["faults"]) == (garbage_bytes, faults)
 
 
 @pytest.mark.long
 async def test_a_flood_of_noise_at_an_endpoint_does_not_reach_the_peer(stage: Stage) -> None:
     """Thousands of random datagrams between frames: frames alone cross."""
-    a, _, autopilot, ground = await linked_with_programs(stage)
+    a, _, autopilot, ground = await linked_with_clients(stage)
     into = sockaddr_of_endpoint(a)
     expected = b""
     for number in range(200):
@@ -94,7 +96,7 @@ async def test_a_flood_of_noise_at_an_endpoint_does_not_reach_the_peer(stage: St
 
 
 def from_a_stranger(public_key: str) -> dict[str, bytes]:
-    """What somebody without a key of ours may send to the port for peers."""
+    """Datagrams that a sender without a valid key can send to the port for peers."""
     sent = {
         "nothing": b"",
         "one byte": b"\x40",
@@ -111,23 +113,24 @@ def from_a_stranger(public_key: str) -> dict[str, bytes]:
     # The strongest stranger knows our public key and makes a faultless initiation with a key of its own.
     stranger = Node(Secret(decode_key(generate_private_key())), os.urandom, 0.0)
     psk = Secret(decode_key(generate_psk()))
-    stranger.add_peer(PeerSettings("daemon", decode_key(public_key), psk), 0.0)
-    stranger.set_addresses("daemon", [(0, "127.0.0.1", 1)], 0.0)
-    (initiation,) = [each for each in stranger.handle_timeout(0.0) if isinstance(each, Transmit)]
+    daemon = stranger.add_peer(PeerSettings("daemon", decode_key(public_key), psk), 0.0)
+    stranger.set_paths(daemon, [Path(0, ("127.0.0.1", 1))], 0.0)
+    (initiation,) = [output for output in stranger.handle_timeout(0.0) if isinstance(output, Transmit)]
     return {**sent, "genuine initiation of another identity": initiation.datagram}
 
 
 async def test_a_stranger_gets_no_answer(stage: Stage) -> None:
     """Nothing that a stranger sends to the port for peers is answered; each datagram is counted under a reason."""
-    a, _, autopilot, ground = await linked_with_programs(stage)
-    stranger = await stage.program()
-    before = dropped_of_nobody(await a.status())
+    a, _, autopilot, ground = await linked_with_clients(stage)
+    stranger = await stage.client()
+    earlier = await a.status()  # an initiation that was repeated may have been answered twice
+    before = dropped_of_no_peer(earlier)
     sent = from_a_stranger(a.public_key)
     for number, (what, datagram) in enumerate(sent.items(), before + 1):
         stranger.send(datagram, a.sockaddr)
-        status = await a.until(lambda status: dropped_of_nobody(status) >= number)  # noqa: B023  awaited at once
-        assert dropped_of_nobody(status) == number, what
-    assert status["drops"] == {
+        status = await a.until(lambda status: dropped_of_no_peer(status) >= number)  # noqa: B023  awaited at once
+        assert dropped_of_no_peer(status) == number, what
+    assert Counter(status["drops"]) - Counter(earlier["drops"]) == {
         "malformed": 3,
         "raw_mavlink": 2,
         "unknown_index": 3,
@@ -140,46 +143,25 @@ async def test_a_stranger_gets_no_answer(stage: Stage) -> None:
     autopilot.send(frame(5), sockaddr_of_endpoint(a))
     await ground.until(lambda: ground.received == frame(5))
     reasons = {line["reason"] for line in a.events("datagrams_dropped")}
-    assert reasons >= {"malformed", "raw_mavlink", "unknown_index", "bad_mac1", "unknown_peer"}
+    assert reasons >= {"malformed", "raw_mavlink", "bad_mac1", "unknown_peer"}
 
 
 async def test_strangers_cannot_speak_through_a_udpout_endpoint(stage: Stage) -> None:
     """What does not come from the address of a ``udpout`` endpoint is not carried, and counted."""
     a, b = stage.pair()
-    autopilot, stranger = await stage.program(), await stage.program()
+    autopilot, stranger = await stage.client(), await stage.client()
     a.add_endpoint("autopilot", f"udpout:{autopilot}")
     into = b.add_endpoint("ground")
     await stage.start(a, b)
-    ground = await stage.program()
+    ground = await stage.client()
     ground.send(heartbeat(255), into)
-    await autopilot.until_heard(heartbeat(255))
+    await autopilot.until_received(heartbeat(255))
     here = autopilot.sources[-1]
     stranger.send(frame(1), ("127.0.0.1", here[1]))
     autopilot.send(frame(2), ("127.0.0.1", here[1]))
     await ground.until(lambda: ground.received == frame(2))
     assert (await a.status())["endpoints"]["autopilot"]["failures"]["stranger"] == 1
     assert stranger.datagrams == []
-
-
-async def test_a_flood_at_the_port_for_peers_does_not_stop_the_frames(stage: Stage) -> None:
-    """Frames cross while strangers send garbage, and the log tells it in a few lines."""
-    a, b, autopilot, ground = await linked_with_programs(stage)
-    into = sockaddr_of_endpoint(a)
-    stranger = await stage.program()
-    before = dropped_of_nobody(await b.status())  # one, where both called at the same moment
-    expected = b""
-    for number in range(100):
-        for _ in range(20):
-            stranger.send(os.urandom(147), b.sockaddr)
-            stranger.send(b"\x01\x00" + os.urandom(145), b.sockaddr)
-        autopilot.send(frame(number), into)
-        expected += frame(number)
-        await ground.until(lambda: len(ground.received) >= len(expected))  # noqa: B023  awaited at once
-    assert ground.received == expected
-    status = await b.until(lambda status: dropped_of_nobody(status) >= before + 4000)
-    assert dropped_of_nobody(status) == before + 4000
-    assert stranger.datagrams == []
-    assert len(b.events("datagrams_dropped")) < 40
 
 
 def test_the_harness_knows_a_secret_when_it_sees_one() -> None:

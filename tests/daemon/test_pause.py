@@ -12,8 +12,14 @@ from contextlib import suppress
 
 import pytest
 
-from tests.daemon.harness import PATIENCE_S, DaemonProcess, Program, Stage, frame, free_port
+from tests.daemon.frames import frame
+from tests.daemon.harness import Stage
+from tests.daemon.process import DaemonProcess
+from tests.daemon.udp import Client
 from tests.limited_cpu import limited_cpu
+from tests.waiting import PATIENCE_S, Stopwatch
+from uavlinkd.lab.sim.loopback_ports import free_port
+from uavlinkd.mavlink.stream_splitter import MAX_GAP_S
 from uavlinkd.system.stall import STALL_S
 
 PAUSED_S = STALL_S + 0.5
@@ -21,11 +27,11 @@ FRESH = 10_000
 """Frames from this number on are sent after the pause."""
 
 
-async def until_fresh(send: Callable[[bytes], object], sink: Program, system: int = 1) -> None:
+async def until_fresh(send: Callable[[bytes], object], sink: Client, system: int = 1) -> None:
     """Send new frames until one arrives."""
     number = FRESH
     async with asyncio.timeout(PATIENCE_S):
-        while not any(frame(each, system) in sink.received for each in range(FRESH, number)):
+        while not any(frame(fresh, system) in sink.received for fresh in range(FRESH, number)):
             send(frame(number, system))
             number += 1
             await asyncio.sleep(0.05)
@@ -49,12 +55,12 @@ async def test_what_waited_while_a_daemon_was_stopped_is_not_delivered(paused: s
     """After a SIGSTOP of some seconds only what is sent from then on arrives. The rest is counted as stale."""
     a, b = stage.pair()
     into = a.add_endpoint("autopilot")
-    sink = await stage.program()
+    sink = await stage.client()
     b.add_endpoint("ground", f"udpout:{sink}")
     await stage.start(a, b)
-    source = await stage.program()
+    source = await stage.client()
     source.send(frame(1), into)
-    await sink.until_heard(frame(1))
+    await sink.until_received(frame(1))
 
     stopped = a if paused == "sender" else b
     await stop(stopped)
@@ -62,7 +68,7 @@ async def test_what_waited_while_a_daemon_was_stopped_is_not_delivered(paused: s
         source.send(frame(number), into)
         await asyncio.sleep(PAUSED_S / 40)
     await stopped.send_signal(signal.SIGCONT)
-    await stopped.until_logged("daemon_stood_still")
+    await stopped.until_logged("daemon_paused")
     await until_fresh(lambda data: source.send(data, into), sink)
 
     late = [number for number in range(2, 42) if frame(number) in sink.received]
@@ -72,18 +78,18 @@ async def test_what_waited_while_a_daemon_was_stopped_is_not_delivered(paused: s
 
 
 async def test_slow_computer_does_not_deliver_a_long_backlog() -> None:
-    """At a fortieth of a core it takes a second to read a full socket: the last datagram is as old as the first."""
+    """At a fiftieth of a core it takes a second to read a full socket: the last datagram is as old as the first."""
     backlog = range(2, 2000)
-    with limited_cpu(0.025) as limit:
+    with limited_cpu(0.02) as limit:
         async with Stage() as stage:
             a, b = stage.pair()
             into = a.add_endpoint("autopilot")
-            sink = await stage.program()
+            sink = await stage.client()
             b.add_endpoint("ground", f"udpout:{sink}")
             await stage.start(a, b)
-            source = await stage.program()
+            source = await stage.client()
             source.send(frame(1), into)
-            await sink.until_heard(frame(1))
+            await sink.until_received(frame(1))
 
             await stop(a)
             for number in backlog:
@@ -91,7 +97,7 @@ async def test_slow_computer_does_not_deliver_a_long_backlog() -> None:
             await asyncio.sleep(PAUSED_S)
             limit.add(a.pid)
             await a.send_signal(signal.SIGCONT)
-            await a.until_logged("daemon_stood_still")
+            await a.until_logged("daemon_paused")
             await until_fresh(lambda data: source.send(data, into), sink)
             limit.release(a.pid)
 
@@ -109,38 +115,40 @@ async def test_each_kind_of_endpoint_drops_what_waited(stage: Stage) -> None:
     device = a.folder / "ttyACM0"
     device.symlink_to(os.ttyname(slave))
     a.add_endpoint("serial", f"serial:{device}:57600")
-    sink = await stage.program()
+    sink = await stage.client()
     b.add_endpoint("ground", f"udpout:{sink}")
     await stage.start(a, b)
-    source = await stage.program()
-    client = socket.create_connection(tcp)
-    await a.until(lambda status: all(status["endpoints"][name]["programs"] for name in ("tcp", "serial")))
-    send: dict[int, Callable[[bytes], object]] = {
-        1: lambda data: source.send(data, udp),
-        2: client.send,
-        3: lambda data: os.write(master, data),
-    }
-    for system, write in send.items():
-        await until_fresh(write, sink, system)
-    sink.clear()
+    source = await stage.client()
+    with socket.create_connection(tcp) as client:
+        await a.until(lambda status: all(status["endpoints"][name]["clients"] for name in ("tcp", "serial")))
+        send: dict[int, Callable[[bytes], object]] = {
+            1: lambda data: source.send(data, udp),
+            2: client.send,
+            3: lambda data: os.write(master, data),
+        }
+        for system, write in send.items():
+            await until_fresh(write, sink, system)
+        sink.clear()
 
-    await stop(a)
-    for system, write in send.items():
-        write(frame(1, system) + frame(2, system))
-        if system != 1:
-            write(frame(3, system)[:9])
-    await asyncio.sleep(PAUSED_S)
-    await a.send_signal(signal.SIGCONT)
-    await a.until(lambda status: status["stale"] == {"udp": 2, "tcp": 2, "serial": 2})
-    for system, write in send.items():
-        if system != 1:
-            write(frame(3, system)[9:])
-        await until_fresh(write, sink, system)
-    late = [(system, number) for system in send for number in (1, 2, 3) if frame(number, system) in sink.received]
-    assert late == []
-    status = await a.until(lambda status: all(status["stale"][name] >= 3 for name in ("tcp", "serial")))
-    assert [status["endpoints"][name]["garbage_bytes"] for name in ("tcp", "serial")] == [0, 0]
-    client.close()
-    with suppress(OSError):
-        os.close(slave)
-    os.close(master)
+        await stop(a)
+        for system, write in send.items():
+            write(frame(1, system) + frame(2, system))
+            if system != 1:
+                write(frame(3, system)[:9])
+        await asyncio.sleep(PAUSED_S)
+        await a.send_signal(signal.SIGCONT)
+        watch = Stopwatch()
+        await a.until(lambda status: status["stale"] == {"udp": 2, "tcp": 2, "serial": 2})
+        for system in (3, 2):
+            send[system](frame(3, system)[9:])
+        is_in_time = watch.elapsed_s < MAX_GAP_S  # later, a serial device counts as silent inside a frame
+        for system, write in send.items():
+            await until_fresh(write, sink, system)
+        late = [(system, number) for system in send for number in (1, 2, 3) if frame(number, system) in sink.received]
+        assert late == []
+        status = await a.until(lambda status: all(status["stale"][name] >= 3 for name in ("tcp", "serial")))
+        if is_in_time:
+            assert [status["endpoints"][name]["garbage_bytes"] for name in ("tcp", "serial")] == [0, 0]
+        with suppress(OSError):
+            os.close(slave)
+        os.close(master)

@@ -12,26 +12,31 @@ from pathlib import Path
 
 import pytest
 
-from tests.daemon.harness import DaemonProcess, Stage, frame, free_port, secret_forms
+from tests.daemon.frames import frame
+from tests.daemon.harness import Stage, secret_forms
+from tests.daemon.process import DaemonProcess
+from tests.waiting import PATIENCE_S
 from uavlinkd.config import keys
+from uavlinkd.lab.child_processes import end_with_parent
+from uavlinkd.lab.sim.loopback_ports import free_port
 
 KEY = b64encode(bytes(range(130, 162))).decode()
 """With + and / in it; so the other spelling of base64 differs."""
 
 
-def told(said: bytes, secrets: list[str]) -> list[str]:
+def reported(said: bytes, secrets: list[str]) -> list[str]:
     """Forms of secrets in some output, as bytes or as text."""
-    found = [form for secret in secrets for form in secret_forms(secret) if form.encode() in said]
-    return found + [secret for secret in secrets if keys.decode_key(secret)[:12] in said]
+    leaked = [form for secret in secrets for form in secret_forms(secret) if form.encode() in said]
+    return leaked + [secret for secret in secrets if keys.decode_key(secret)[:12] in said]
 
 
 def test_search_finds_what_is_there() -> None:
     """In each form, whole or in part."""
     raw = keys.decode_key(KEY)
     for said in (KEY.encode(), raw, raw[:20], raw.hex().encode(), raw.hex().upper().encode(), repr(raw).encode()):
-        assert told(b"before " + said + b" after", [KEY])
-    assert told(KEY.replace("+", "-").replace("/", "_").rstrip("=").encode(), [KEY])
-    assert not told(b"nothing of it", [KEY])
+        assert reported(b"before " + said + b" after", [KEY])
+    assert reported(KEY.replace("+", "-").replace("/", "_").rstrip("=").encode(), [KEY])
+    assert not reported(b"nothing of it", [KEY])
 
 
 @pytest.mark.long
@@ -44,8 +49,8 @@ async def test_nothing_that_a_daemon_gives_away_holds_a_key(stage: Stage) -> Non
         daemon.config["metrics"] = {"listen": f"127.0.0.1:{free_port()}"}
     into = a.add_endpoint("autopilot")
     await stage.start(a, b)
-    program = await stage.program()
-    program.send(frame(1), into)
+    client = await stage.client()
+    client.send(frame(1), into)
     for daemon in (a, b):
         await daemon.until(lambda status: status["recording"]["frames"] == 1)
     output = []
@@ -59,13 +64,13 @@ async def test_nothing_that_a_daemon_gives_away_holds_a_key(stage: Stage) -> Non
         for command in (["check"], ["status", "--json"], ["status"], ["peer", "list"], ["reload"]):
             output.append(await asyncio.to_thread(run, daemon, *command))
     assert all(output), "something said nothing"
-    assert told(b"\n".join(output), stage.secrets) == []
+    assert reported(b"\n".join(output), stage.secrets) == []
 
 
 def run(daemon: DaemonProcess, *command: str) -> bytes:
     """What a command on a daemon's configuration prints; a space, if nothing."""
     line = [sys.executable, "-m", "uavlinkd", *command, "--config", str(daemon.config_file)]
-    done = subprocess.run(line, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=30, check=False)
+    done = subprocess.run(line, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=PATIENCE_S, check=False)
     return done.stdout + b" "
 
 
@@ -119,7 +124,7 @@ MISTAKES = {
 @pytest.mark.long
 @pytest.mark.parametrize("command", ["check", "run"])
 def test_a_key_in_the_wrong_place_is_not_repeated(command: str, tmp_path: Path) -> None:
-    """Whatever is wrong is told, and the key that was put there is not, in either command."""
+    """Both commands report the problem, and never the planted key."""
     keys.write_secret_file(tmp_path / "daemon.key", keys.generate_private_key())
     keys.write_secret_file(tmp_path / "drone1.psk", keys.generate_psk())
     good = GOOD.replace("PUBLIC", keys.public_key_text(keys.generate_private_key()))
@@ -133,12 +138,14 @@ def test_a_key_in_the_wrong_place_is_not_repeated(command: str, tmp_path: Path) 
         path.write_text(text.replace(old, new, 1))
         if command == "check" or number % 5 == 0:  # they read the file by the same code
             line = [sys.executable, "-m", "uavlinkd", command, "--config", str(path)]
-            running[where] = subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+            running[where] = subprocess.Popen(
+                end_with_parent(*line), stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+            )
         if len(running) % 3 == 0:
-            for each in running.values():
-                each.wait(30)
+            for process in running.values():
+                process.wait(30)
     for where, process in running.items():
-        said, _ = process.communicate(timeout=30)
+        said, _ = process.communicate(timeout=PATIENCE_S)
         assert process.returncode == 2, (where, said)
         assert said.strip(), where
-        assert told(said, [KEY]) == [], (where, said)
+        assert reported(said, [KEY]) == [], (where, said)

@@ -15,11 +15,15 @@ from urllib.request import urlopen
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from tests.daemon.fleet import command_long
-from tests.daemon.harness import Program, Sockaddr, Stage, free_port, heartbeat, need
+from tests.daemon.frames import command_long, heartbeat
+from tests.daemon.harness import Stage
+from tests.daemon.udp import Client, Sockaddr
+from tests.needs import need
 from tests.ops.test_monitoring import ALERTS, DASHBOARD, expressions
+from tests.waiting import PATIENCE_S
+from uavlinkd.lab.child_processes import end_with_parent
+from uavlinkd.lab.sim.loopback_ports import free_port
 
-PATIENCE_S = 60.0
 WINDOW = "5s"
 """In place of Grafana's $__rate_interval: many scrapes."""
 
@@ -32,11 +36,11 @@ class Prometheus:
 
     def get(self, path: str, **query: str) -> Any:
         """What its API answers to a question that it takes."""
-        with urlopen(f"{self._base}{path}?{urlencode(query)}", timeout=10) as answer:
+        with urlopen(f"{self._base}{path}?{urlencode(query)}", timeout=240) as answer:
             body = answer.read()
-        found = json.loads(body) if body.startswith(b"{") else {"status": "success", "data": body.decode()}
-        assert found["status"] == "success"
-        return found["data"]
+        response = json.loads(body) if body.startswith(b"{") else {"status": "success", "data": body.decode()}
+        assert response["status"] == "success"
+        return response["data"]
 
     def is_ready(self) -> bool:
         """Whether it answers questions."""
@@ -53,8 +57,8 @@ class Prometheus:
 @asynccontextmanager
 async def prometheus(stage: Stage, targets: list[str]) -> AsyncIterator[Prometheus]:
     """One with the alerts loaded, from its start to its end."""
-    program = shutil.which("prometheus")
-    need(program is not None, "prometheus, of Debian's package of that name")
+    client = shutil.which("prometheus")
+    need(client is not None, "prometheus, of Debian's package of that name")
     folder = stage.folder / "prometheus"
     folder.mkdir()
     config = folder / "prometheus.yml"
@@ -64,7 +68,7 @@ async def prometheus(stage: Stage, targets: list[str]) -> AsyncIterator[Promethe
     port = free_port()
     with (folder / "log").open("wb") as log:
         process = await asyncio.create_subprocess_exec(
-            *(str(program), f"--config.file={config}", f"--storage.tsdb.path={folder / 'data'}"),
+            *end_with_parent(str(client), f"--config.file={config}", f"--storage.tsdb.path={folder / 'data'}"),
             *(f"--web.listen-address=127.0.0.1:{port}", "--log.level=warn"),
             stdout=log,
             stderr=subprocess.STDOUT,
@@ -82,15 +86,15 @@ async def prometheus(stage: Stage, targets: list[str]) -> AsyncIterator[Promethe
         await process.wait()
 
 
-async def make_trouble(program: Program, into: Sockaddr, peers: Sockaddr) -> None:
-    """Traffic, more than a slow radio takes; what a policy refuses; datagrams that are none of the protocol."""
+async def cause_drops(client: Client, into: Sockaddr, peers: Sockaddr) -> None:
+    """Traffic above a slow radio's rate, frames that a policy refuses, and invalid datagrams."""
     number = 0
     while True:
         for component in range(1, 30):
-            program.send(heartbeat(1, component), into)
+            client.send(heartbeat(1, component), into)
         for command in (mavlink.MAV_CMD_COMPONENT_ARM_DISARM, mavlink.MAV_CMD_NAV_TAKEOFF):
-            program.send(command_long(command, 2, seq=number), into)
-        program.send(b"\x99nothing", peers)
+            client.send(command_long(command, 2, seq=number), into)
+        client.send(b"\x99nothing", peers)
         number += 1
         await asyncio.sleep(0.02)
 
@@ -105,16 +109,16 @@ async def test_dashboard_and_alerts_find_what_they_ask_for(stage: Stage) -> None
         peer |= {"role": "swarm-member", "system_ids": [1, 2]}  # to which no command goes
         daemon.config["metrics"] = {"listen": f"127.0.0.1:{free_port()}"}
     await stage.start(a, b)
-    program = await stage.program()
-    trouble = asyncio.create_task(make_trouble(program, into, a.sockaddr))
+    client = await stage.client()
+    dropping = asyncio.create_task(cause_drops(client, into, a.sockaddr))
     try:
-        async with prometheus(stage, [each.config["metrics"]["listen"] for each in (a, b)]) as server:
-            wanted = [each.replace("[1m]", f"[{WINDOW}]") for each in expressions()]
+        async with prometheus(stage, [daemon.config["metrics"]["listen"] for daemon in (a, b)]) as server:
+            wanted = [expression.replace("[1m]", f"[{WINDOW}]") for expression in expressions()]
             wanted += ["uavlinkd_build_info", 'uavlinkd_peer_up{instance=~".*"}']  # of the variables
             missing = wanted
             async with asyncio.timeout(PATIENCE_S):
                 while missing:
-                    missing = [each for each in missing if not await asyncio.to_thread(server.finds, each)]
+                    missing = [query for query in missing if not await asyncio.to_thread(server.finds, query)]
                     await asyncio.sleep(0.2)
             groups = (await asyncio.to_thread(server.get, "/api/v1/rules"))["groups"]
             rules = [rule for group in groups for rule in group["rules"]]
@@ -122,7 +126,7 @@ async def test_dashboard_and_alerts_find_what_they_ask_for(stage: Stage) -> None
     except TimeoutError:
         raise AssertionError(f"nothing is found by: {missing}") from None
     finally:
-        trouble.cancel()
+        dropping.cancel()
     assert len(wanted) > len(DASHBOARD["panels"])
     assert len(rules) == ALERTS.read_text().count("- alert:")
     assert {rule["health"] for rule in rules} <= {"ok", "unknown"}  # unknown: not yet evaluated

@@ -8,30 +8,40 @@ import resource
 import signal
 import sys
 from pathlib import Path
+from time import monotonic
 
 import pytest
 
-from tests.daemon.harness import DaemonProcess, Program, Sockaddr, Stage, assert_same, frame, heartbeat, to_toml
+from tests.daemon.frames import frame, heartbeat
+from tests.daemon.harness import Stage
+from tests.daemon.process import DaemonProcess
+from tests.daemon.toml import to_toml
+from tests.daemon.udp import Client, Sockaddr, assert_same
+from tests.waiting import PATIENCE_S
 from uavlinkd.config import keys
+from uavlinkd.core.constants import REKEY_AFTER_S
 from uavlinkd.ops.control import ask
 
 COUNT = 200
-"""Frames each way between two reloads, and during each."""
+"""Frames in each direction between two reloads, and during each."""
+IN_FLIGHT = 100
+"""In each direction. Sockets have room for so many while a daemon waits for a processor."""
 
 
 async def reload(daemon: DaemonProcess) -> list[str]:
     """Have it read what is in ``daemon.config`` now; the problems that it found."""
     daemon.write_config()
-    problems: list[str] = (await asyncio.to_thread(ask, daemon.folder / "control.sock", "reload", 30.0))["problems"]
+    answer = await asyncio.to_thread(ask, daemon.folder / "control.sock", "reload", PATIENCE_S)
+    problems: list[str] = answer["problems"]
     return problems
 
 
-async def program_at(stage: Stage, daemon: DaemonProcess, endpoint: str, into: Sockaddr) -> Program:
-    """A program that the daemon knows at this endpoint."""
-    program = await stage.program()
-    program.send(heartbeat(), into)
-    await daemon.until(lambda status: str(program) in status["endpoints"][endpoint]["programs"])
-    return program
+async def client_at(stage: Stage, daemon: DaemonProcess, endpoint: str, into: Sockaddr) -> Client:
+    """A client that the daemon knows at this endpoint."""
+    client = await stage.client()
+    client.send(heartbeat(), into)
+    await daemon.until(lambda status: str(client) in status["endpoints"][endpoint]["clients"])
+    return client
 
 
 def url_of(at: Sockaddr) -> str:
@@ -39,16 +49,19 @@ def url_of(at: Sockaddr) -> str:
     return f"udpin:{at[0]}:{at[1]}"
 
 
-async def talk(a: Program, into_a: Sockaddr, b: Program, into_b: Sockaddr, stop: asyncio.Event) -> list[list[bytes]]:
-    """Numbered frames both ways in a steady rhythm, until told to stop; what each said."""
+async def talk(a: Client, into_a: Sockaddr, b: Client, into_b: Sockaddr, stop: asyncio.Event) -> list[list[bytes]]:
+    """Numbered frames in both directions in a steady rhythm, until cancelled; returns the sent frames."""
     said: list[list[bytes]] = [[], []]
     number = 0
     while not stop.is_set() or number < COUNT:
-        for which, (program, into) in enumerate(((a, into_a), (b, into_b))):
+        for which, (client, into) in enumerate(((a, into_a), (b, into_b))):
             said[which].append(frame(number, which + 1))
-            program.send(said[which][-1], into)
+            client.send(said[which][-1], into)
         number += 1
         await asyncio.sleep(0.001)
+        if number > IN_FLIGHT:
+            for frames, sink in zip(said, (b, a), strict=True):
+                await sink.until_received(frames[-IN_FLIGHT])
     return said
 
 
@@ -62,10 +75,10 @@ async def test_untouched_peers_lose_no_frame(stage: Stage) -> None:
     a.config["peer"] = with_c[:1]
     await stage.start(a, b)
     await c.start()
-    at_a, at_b = await program_at(stage, a, "one", into_a), await program_at(stage, b, "one", into_b)
+    at_a, at_b = await client_at(stage, a, "one", into_a), await client_at(stage, b, "one", into_b)
     at_a.clear()
     at_b.clear()
-    before = (await b.status())["peers"][a.name]
+    before, began = (await b.status())["peers"][a.name], monotonic()
     stop = asyncio.Event()
     talking = asyncio.create_task(talk(at_a, into_a, at_b, into_b, stop))
 
@@ -89,14 +102,15 @@ async def test_untouched_peers_lose_no_frame(stage: Stage) -> None:
     stop.set()
     said_by_a, said_by_b = await talking
     assert len(said_by_a) >= COUNT
-    await at_b.until_heard(said_by_a[-1])
-    await at_a.until_heard(said_by_b[-1])
+    await at_b.until_received(said_by_a[-1])
+    await at_a.until_received(said_by_b[-1])
     assert_same(at_b.received, b"".join(said_by_a))
-    heard = bytes(at_a.received)
-    assert_same(heard, b"".join(said_by_b))
+    received = bytes(at_a.received)
+    assert_same(received, b"".join(said_by_b))
     after = (await b.status())["peers"][a.name]
-    assert after["handshakes"] == before["handshakes"]
-    print(f"{len(said_by_a)} frames each way during {len(a.events('configuration_reloaded'))} reloads, none lost")
+    # On a slow machine the keys may be due for their regular change.
+    assert after["handshakes"] - before["handshakes"] <= (monotonic() - began) / REKEY_AFTER_S
+    print(f"{len(said_by_a)} frames each during {len(a.events('configuration_reloaded'))} reloads, none lost")
 
 
 async def test_a_peer_that_is_taken_out_is_cut_off_at_once(stage: Stage) -> None:
@@ -104,9 +118,9 @@ async def test_a_peer_that_is_taken_out_is_cut_off_at_once(stage: Stage) -> None
     a, b = stage.pair()
     into_a, into_b = a.add_endpoint("one"), b.add_endpoint("one")
     await stage.start(a, b)
-    at_a, at_b = await program_at(stage, a, "one", into_a), await program_at(stage, b, "one", into_b)
+    at_a, at_b = await client_at(stage, a, "one", into_a), await client_at(stage, b, "one", into_b)
     at_b.send(frame(1), into_b)
-    await at_a.until_heard(frame(1))
+    await at_a.until_received(frame(1))
     peers, a.config["peer"] = a.config["peer"], []
     assert await reload(a) == []
     at_a.clear()
@@ -125,20 +139,20 @@ async def test_a_peer_that_is_taken_out_is_cut_off_at_once(stage: Stage) -> None
 
 
 async def test_endpoints_swap_ports_and_change_names(stage: Stage) -> None:
-    """A socket whose address stays is handed over: what programs sent meanwhile is not lost."""
+    """A socket whose address stays is handed over: what clients sent meanwhile is not lost."""
     a, b = stage.pair()
     first, second = a.add_endpoint("first"), a.add_endpoint("second")
     listener = a.add_endpoint("tcp", f"tcpin:127.0.0.1:{first[1]}")
     into_b = b.add_endpoint("one")
     await stage.start(a, b)
-    at_b = await program_at(stage, b, "one", into_b)
+    at_b = await client_at(stage, b, "one", into_b)
     one, two, _ = a.config["endpoint"]
     one["url"], two["url"] = two["url"], one["url"]
     assert await reload(a) == []
-    at_first = await program_at(stage, a, "second", first)
-    at_second = await program_at(stage, a, "first", second)
-    for each in a.config["endpoint"]:
-        each["name"] += "-of-old"
+    at_first = await client_at(stage, a, "second", first)
+    at_second = await client_at(stage, a, "first", second)
+    for table in a.config["endpoint"]:
+        table["name"] += "-of-old"
     at_b.clear()
     reloading = asyncio.create_task(reload(a))
     said: list[bytes] = []
@@ -148,24 +162,24 @@ async def test_endpoints_swap_ports_and_change_names(stage: Stage) -> None:
         await asyncio.sleep(0.002)
     assert await reloading == []
     at_first.send(last := frame(len(said)), first)
-    await at_b.until_heard(last)
+    await at_b.until_received(last)
     assert_same(at_b.received, b"".join([*said, last]))
-    status = await a.until(lambda status: str(at_first) in status["endpoints"]["second-of-old"]["programs"])
+    status = await a.until(lambda status: str(at_first) in status["endpoints"]["second-of-old"]["clients"])
     assert set(status["endpoints"]) == {"first-of-old", "second-of-old", "tcp-of-old"}
     _, writer = await asyncio.open_connection(*listener)
     writer.write(heartbeat())
-    await a.until(lambda status: len(status["endpoints"]["tcp-of-old"]["programs"]) == 1)
+    await a.until(lambda status: len(status["endpoints"]["tcp-of-old"]["clients"]) == 1)
     writer.close()
     at_second.send(other := frame(len(said) + 1), second)
-    await at_b.until_heard(other)
+    await at_b.until_received(other)
 
 
 async def test_an_endpoint_that_cannot_be_opened_refuses_the_whole_file(stage: Stage) -> None:
-    """The file, the key and what to do are told; the endpoint that could be opened is closed again."""
+    """The message names the file, the key and the remedy; the endpoint that could be opened is closed again."""
     a, b = stage.pair()
     into_a = a.add_endpoint("one")
     await stage.start(a, b)
-    taken = await stage.program()
+    taken = await stage.client()
     free = a.add_endpoint("two")
     a.add_endpoint("three", url_of(taken.address))
     problems = await reload(a)
@@ -173,8 +187,8 @@ async def test_an_endpoint_that_cannot_be_opened_refuses_the_whole_file(stage: S
     assert problems[0].startswith(f"{a.config_file}: endpoint.url (three): cannot listen on {taken}: Address already")
     assert "write another port; if it is this daemon, restart it" in problems[0]
     assert set((await a.status())["endpoints"]) == {"one"}
-    await stage.program(*free)  # nobody listens there
-    await program_at(stage, a, "one", into_a)
+    await stage.client(*free)  # a port in use
+    await client_at(stage, a, "one", into_a)
 
 
 async def test_reloads_are_made_one_after_the_other(stage: Stage) -> None:
@@ -188,12 +202,12 @@ async def test_reloads_are_made_one_after_the_other(stage: Stage) -> None:
     first = asyncio.create_task(asyncio.to_thread(ask, socket, "reload", 0.5, lambda: None))
     await write_to(a.config_file, to_toml({**a.config, "peer": []}), before_the_end=a)
     second = asyncio.create_task(asyncio.to_thread(ask, socket, "reload", 0.5, lambda: None))
-    assert await first == {"problems": []}
+    assert await first == {"problems": [], "name": a.name}
     assert (await a.status())["peers"] == {}
     await write_to(a.config_file, to_toml({**a.config, "peer": peers}))
-    assert await second == {"problems": []}
+    assert await second == {"problems": [], "name": a.name}
     await a.until_linked()
-    assert [each.get("peers_removed") for each in a.events("configuration_reloaded")] == [[b.name], None]
+    assert [event.get("peers_removed") for event in a.events("configuration_reloaded")] == [[b.name], None]
     a.config_file.unlink()
 
 
@@ -225,11 +239,11 @@ async def test_many_hangups_are_no_more_than_two_reloads_at_a_time(stage: Stage)
     assert await reload(a) == []  # its turn comes after all the others
     await a.until_linked()
     assert await a.stop() == 0  # every line has been read then
-    assert [each.get("peers_removed") for each in a.events("configuration_reloaded")] == [[b.name], None, None]
+    assert [event.get("peers_removed") for event in a.events("configuration_reloaded")] == [[b.name], None, None]
 
 
 async def test_the_end_may_come_during_a_reload(stage: Stage) -> None:
-    """Clean and soon, with no word of the process that reads the file."""
+    """The daemon ends at once and cleanly, while a thread still waits for the file."""
     a, b = stage.pair()
     await stage.start(a, b)
     a.config_file.unlink()
@@ -260,7 +274,7 @@ socket.getaddrinfo, os.open = getaddrinfo, open_file
 
 @pytest.mark.parametrize("where", ["peer", "udpout", "tcp", "serial"])
 async def test_the_end_does_not_wait_for_a_name_server_or_a_device(stage: Stage, where: str) -> None:
-    """A name that nobody answers for, or a device that does not open, holds up neither the other peer nor the end."""
+    """A name that does not resolve, or a device that does not open, holds up neither the other peer nor the end."""
     a, b = stage.pair()
     if where == "peer":
         a.config["peer"].append({**a.config["peer"][0], "name": "far", "addresses": ["far.test:5790"]})
@@ -289,28 +303,11 @@ async def test_a_key_that_was_ours_may_become_a_peers(stage: Stage) -> None:
     a.config["peer"].append(heir)
     assert await reload(a) == []
     assert set((await a.status())["peers"]) == {b.name, "heir"}
-    await program_at(stage, a, "one", into_a)
-
-
-async def test_a_previous_key_that_is_taken_out_ends_what_stands_by_it(stage: Stage) -> None:
-    """A peer that knows only our key before is linked by it, and cut off when the operator ends the change."""
-    a, b = stage.pair()
-    previous = keys.generate_private_key()
-    keys.write_secret_file(a.folder / "previous.key", previous)
-    a.config["previous_private_key_file"] = "previous.key"
-    b.config["peer"][0]["public_key"] = keys.public_key_text(previous)
-    await stage.start(a, b)
-    del a.config["previous_private_key_file"]
-    assert await reload(a) == []
-    peer = (await a.status())["peers"][b.name]
-    assert (peer["state"], peer["session"], peer["accepts_previous_key"]) == ("waiting", None, False)
-    # It calls on, by a key that nobody here has any more.
-    status = await a.until(lambda status: bool(status["drops"].get("bad_mac1")))
-    assert status["peers"][b.name]["state"] == "waiting"
+    await client_at(stage, a, "one", into_a)
 
 
 async def test_a_reload_that_cannot_read_is_refused_and_a_later_one_is_not(stage: Stage) -> None:
-    """Without a process to read the file the old one stays in force, and the daemon says that it is ready again."""
+    """Without a free descriptor the file cannot be read: the old configuration stays, and a later reload works."""
     a, b = stage.pair()
     into_a = a.add_endpoint("one")
     await stage.start(a, b)
@@ -319,7 +316,7 @@ async def test_a_reload_that_cannot_read_is_refused_and_a_later_one_is_not(stage
     resource.prlimit(a.pid, resource.RLIMIT_NOFILE, (highest + 2, limits[1]))  # the question itself takes one
     problems = await reload(a)
     assert len(problems) == 1
-    assert "cannot be read now" in problems[0]
+    assert "cannot be read: Too many open files" in problems[0]
     resource.prlimit(a.pid, resource.RLIMIT_NOFILE, limits)
     assert await reload(a) == []
-    await program_at(stage, a, "one", into_a)
+    await client_at(stage, a, "one", into_a)

@@ -9,7 +9,8 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 
 import pytest
 
-from tests.daemon.harness import DaemonProcess, Stage
+from tests.daemon.harness import Stage
+from tests.daemon.process import DaemonProcess
 from tests.waiting import until
 
 WATCHDOG_S = 2.0
@@ -19,7 +20,7 @@ class Manager(asyncio.DatagramProtocol):
     """What a service manager hears, in order."""
 
     def __init__(self) -> None:
-        self.heard: list[str] = []
+        self.received: list[str] = []
         self._transport: asyncio.BaseTransport
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -32,11 +33,11 @@ class Manager(asyncio.DatagramProtocol):
 
     def datagram_received(self, data: bytes, addr: object) -> None:
         """One message."""
-        self.heard.append(data.decode())
+        self.received.append(data.decode())
 
     def count(self, message: str) -> int:
         """How often it was said."""
-        return self.heard.count(message)
+        return self.received.count(message)
 
     async def until_said(self, message: str, times: int = 1) -> None:
         """Wait for it."""
@@ -67,15 +68,15 @@ async def supervised() -> AsyncIterator[Supervised]:
 
 
 async def test_ready_means_that_everything_is_bound(stage: Stage, supervised: Supervised) -> None:
-    """When the manager hears it, the daemon answers; and its end is told before it."""
+    """When the manager receives it, the daemon answers; and the daemon announces its end."""
     a, b = stage.pair()
     (manager, _) = await supervised(a, b)
     await manager.until_said("READY=1")
     await a.status()
-    assert manager.heard[0] == "READY=1"
+    assert manager.received[0] == "READY=1"
     await manager.until_said("STATUS=1 of 1 peers up")
     await a.stop()
-    assert manager.heard[-1] == "STOPPING=1"
+    assert manager.received[-1] == "STOPPING=1"
 
 
 async def test_a_daemon_that_cannot_start_is_never_ready(stage: Stage, supervised: Supervised) -> None:
@@ -86,7 +87,7 @@ async def test_a_daemon_that_cannot_start_is_never_ready(stage: Stage, supervise
     await a.ready()
     (_, manager) = await supervised(b)
     assert await b.ended() == 1
-    assert manager.heard == []
+    assert manager.received == []
 
 
 async def test_peers_that_go_are_seen_in_the_status(stage: Stage, supervised: Supervised) -> None:
@@ -98,14 +99,14 @@ async def test_peers_that_go_are_seen_in_the_status(stage: Stage, supervised: Su
     await manager.until_said("STATUS=0 of 1 peers up")
 
 
-async def test_reload_is_told_and_a_refused_one_too(stage: Stage, supervised: Supervised) -> None:
+async def test_reload_is_reported_and_a_refused_one_too(stage: Stage, supervised: Supervised) -> None:
     """Reloading, ready; where the new file is wrong, the status says so until a good one comes."""
     a, b = stage.pair()
     (manager, _) = await supervised(a, b)
     await manager.until_said("STATUS=1 of 1 peers up")
     await a.send_signal(signal.SIGHUP)
     await manager.until_said("READY=1", 2)
-    reloading = [each for each in manager.heard if each.startswith("RELOADING=1\nMONOTONIC_USEC=")]
+    reloading = [message for message in manager.received if message.startswith("RELOADING=1\nMONOTONIC_USEC=")]
     assert len(reloading) == 1
     good = a.config_file.read_text()
     a.config_file.write_text(f"colour = 1\n{good}")
@@ -121,6 +122,7 @@ async def test_watchdog_hears_of_a_loop_that_turns_and_of_no_other(stage: Stage,
     a, b = stage.pair()
     (manager, _) = await supervised(a, b)
     await manager.until_said("WATCHDOG=1", 2)
+    await b.until_linked()
     await a.send_signal(signal.SIGSTOP)
     await asyncio.sleep(0)  # what was sent before is here
     said = manager.count("WATCHDOG=1")
