@@ -1,1 +1,1 @@
-"""What a frame costs: uavlinkd beside what else carries MAVLink between two hosts, measured in one run."""
+"""The cost of a frame: uavlinkd and others that carry MAVLink between two hosts, measured in one run."""

@@ -51,7 +51,7 @@ def _report(arguments: Sequence[str]) -> int:
 
 
 def _measure(arguments: Sequence[str]) -> int:
-    contenders = {each.name: each for each in all_contenders()}
+    contenders = {contender.name: contender for contender in all_contenders()}
     names = [*contenders, *SCALES]
     parser = argparse.ArgumentParser(prog="python -m tests.bench", description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("bench-results"), help="where records, table and figure go")
@@ -83,16 +83,18 @@ def _measure(arguments: Sequence[str]) -> int:
         print(f"cannot measure: {reason}", file=sys.stderr)
         return FAILED
     wanted = options.only or names
-    chosen = [each for name, each in contenders.items() if name in wanted]
+    chosen = [contender for name, contender in contenders.items() if name in wanted]
     if options.against is not None:
-        others = {each.name: each.of(options.against) for each in chosen if isinstance(each, Uavlinkd)}
+        others = {
+            contender.name: contender.of(options.against) for contender in chosen if isinstance(contender, Uavlinkd)
+        }
         if not others:
             parser.error("--against compares uavlinkd, which --only leaves out")
-        reasons = {reason for each in others.values() if (reason := each.why_not())}
+        reasons = {reason for contender in others.values() if (reason := contender.why_not())}
         if reasons:
             print(f"cannot measure: {'; '.join(sorted(reasons))}", file=sys.stderr)
             return FAILED
-        chosen = [one for each in chosen for one in (each, others.get(each.name)) if one is not None]
+        chosen = [one for contender in chosen for one in (contender, others.get(contender.name)) if one is not None]
     scales = [name for name in SCALES if name in wanted]
     return _run(plan, options.out, chosen, scales, _command(options))
 
@@ -130,7 +132,9 @@ def _run(plan: Plan, out: Path, contenders: Sequence[Contender], scales: Sequenc
 
 def _facts(plan: Plan, frames: FrameSet, contenders: Sequence[Contender]) -> dict[str, Value]:
     limit = Path("/proc/sys/net/core/rmem_max")
-    versions = {f"version_{each.name}": each.version() for each in contenders if each.why_not() is None}
+    versions = {
+        f"version_{contender.name}": contender.version() for contender in contenders if contender.why_not() is None
+    }
     return {
         "frames": frames.source,
         "frames_distinct": len(set(frames.frames)),
@@ -146,6 +150,6 @@ def _facts(plan: Plan, frames: FrameSet, contenders: Sequence[Contender]) -> dic
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
-    for each in _ENDING:  # what was begun is to be cleared away in peace
-        signal.signal(each, signal.SIG_IGN)
+    for ending in _ENDING:  # do not interrupt the cleanup
+        signal.signal(ending, signal.SIG_IGN)
     raise KeyboardInterrupt

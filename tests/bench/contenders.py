@@ -1,4 +1,4 @@
-"""What is measured: how each is started on both hosts, and where its frames go in."""
+"""The contenders: how each starts on both hosts, and where its frames enter."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.bench.namespaces import Cable, Host
 from tests.bench.traffic import REPOSITORY, SINK_PORT
 
 INTO_PORT: Final = 14550
-"""Where the left side takes frames, on loopback."""
+"""Where the left side receives frames, on loopback."""
 LINK_PORT: Final = 5790
 """Where the right side listens on the cable."""
 INTO: Final = ("127.0.0.1", INTO_PORT)
@@ -26,12 +26,12 @@ LOCAL_SINK: Final = f"127.0.0.1:{SINK_PORT}"
 
 
 class NotMeasuredError(Exception):
-    """Why a contender is not: what it needs is not there, or it does not work here. For a person."""
+    """The reason why a contender cannot run here, for a person."""
 
 
 @dataclass(slots=True)
 class Running:
-    """A contender at work: its processes by side, and where frames are sent to."""
+    """A running contender: its processes by side, and the destination of frames."""
 
     left: list[subprocess.Popen[bytes]]
     right: list[subprocess.Popen[bytes]]
@@ -39,18 +39,18 @@ class Running:
 
 
 class Contender(ABC):
-    """One way from a program on the left to a program on the right."""
+    """A path from a client on the left to a client on the right."""
 
     def __init__(self, name: str, about: str) -> None:
         self.name = name
         self.about = about
 
     def why_not(self) -> str | None:
-        """Why it cannot be measured here; None where it can."""
+        """The reason why it cannot be measured here, or None."""
         return None
 
     def version(self) -> str | None:
-        """Of the program, where it has one of its own."""
+        """The version of its executable, if it has one of its own."""
         return None
 
     @abstractmethod
@@ -83,41 +83,41 @@ class Relay(Contender):
 
 
 class Direct(Contender):
-    """Nothing at all: the generator sends straight to the sink, over the cable. What plain UDP takes."""
+    """No relay: the generator sends directly to the sink, over the cable. The cost of plain UDP."""
 
     def __init__(self) -> None:
-        super().__init__("plain-udp", "no program between: generator, cable, sink")
+        super().__init__("plain-udp", "no relay: generator, cable, sink")
 
     def start(self, cable: Cable, folder: Path) -> Running:
         return Running([], [], (cable.right.address, SINK_PORT))
 
 
 def needs_module(name: str) -> str | None:
-    """Why what takes this Python package cannot be measured."""
+    """The reason why contenders that need this Python package cannot be measured, or None."""
     return None if find_spec(name) else f"the Python package {name} is not installed"
 
 
-def needs_program(*names: str) -> str | None:
-    """Why what takes these programs cannot be measured."""
+def needs_command(*names: str) -> str | None:
+    """The reason why contenders that need these commands cannot be measured, or None."""
     missing = [name for name in names if shutil.which(name) is None]
     return f"not installed: {', '.join(missing)}" if missing else None
 
 
-def program_version(*command: str) -> str | None:
-    """What a program says its version is; None where it does not say."""
+def command_version(*command: str) -> str | None:
+    """The version that a command prints, or None."""
     shown = subprocess.run(command, capture_output=True, text=True, check=False)
-    found = re.search(r"\d+(?:\.\d+)+", shown.stdout + shown.stderr)
-    return found[0] if found else None
+    match = re.search(r"\d+(?:\.\d+)+", shown.stdout + shown.stderr)
+    return match[0] if match else None
 
 
 def last_words(folder: Path) -> str:
-    """The last line of each log, for the one who looks for the reason."""
+    """The last line of each log, for a person who looks for the reason."""
     ends = [path.read_text(errors="replace").strip().rpartition("\n")[2] for path in sorted(folder.rglob("*.log"))]
     return "".join(f"; it said: {end[:300]}" for end in ends if end)
 
 
 def until(condition: Callable[[], bool], what: str, timeout_s: float = 20.0) -> None:
-    """Wait for it.
+    """Wait for a condition.
 
     Raises:
         NotMeasuredError: it does not happen.
@@ -130,9 +130,9 @@ def until(condition: Callable[[], bool], what: str, timeout_s: float = 20.0) -> 
 
 
 def all_contenders() -> Sequence[Contender]:
-    """Every one that is known, the baselines first."""
+    """All contenders, the baselines first."""
     from tests.bench.daemons import DAEMONS
-    from tests.bench.routers import PROGRAMS
+    from tests.bench.routers import ROUTERS
     from tests.bench.tunnels import TUNNELS
 
     return (
@@ -143,5 +143,5 @@ def all_contenders() -> Sequence[Contender]:
         Relay("asyncio", "empty relay: asyncio, DatagramProtocol"),
         *DAEMONS,
         *TUNNELS,
-        *PROGRAMS,
+        *ROUTERS,
     )

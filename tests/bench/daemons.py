@@ -1,4 +1,4 @@
-"""uavlinkd, in the ways in which it is used: a vehicle's daemon on the left, its ground station's on the right."""
+"""uavlinkd in its modes: a vehicle's daemon on the left, its ground station's on the right."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import Final
 from tests.bench.contenders import INTO_PORT, LINK_PORT, LOCAL_SINK, Contender, Running, needs_module, until
 from tests.bench.frames import SYSTEM
 from tests.bench.namespaces import Cable, Host
-from tests.daemon.harness import WITHOUT_UVLOOP
+from tests.daemon.process import WITHOUT_UVLOOP
 from tests.policies import TRUSTED
 from uavlinkd.config import keys
 from uavlinkd.ops.control import ControlError, ask
@@ -109,7 +109,11 @@ class Uavlinkd(Contender):
 
     def _knows(self, policy: Mapping[str, object]) -> bool:
         """Whether there is such a policy. A checkout from before a word was needed passes everything without one."""
-        asks = f"from uavlinkd.mavlink.policy.compilation import compile_policy; compile_policy({policy!r})"
+        asks = (
+            "try: from uavlinkd.mavlink.policy.compilation import compile_policy\n"
+            "except ImportError: from uavlinkd.mavlink.policy import compile_policy\n"
+            f"compile_policy({policy!r})"
+        )
         return subprocess.run([self._python, "-c", asks], capture_output=True, check=False).returncode == 0
 
 
@@ -125,14 +129,14 @@ def configuration(name: str, *, peers: Sequence[str], endpoint: str, link: str =
     return (
         f'name = "{name}"\nprivate_key_file = "{name}.key"\nlisten = ["0.0.0.0:{LINK_PORT}"]\n'
         f'control_socket = "{name}.sock"\n\n[link]\n{link}\n'
-        f'[[endpoint]]\nname = "program"\nurl = "{endpoint}"\n{"".join(peers)}'
+        f'[[endpoint]]\nname = "client"\nurl = "{endpoint}"\n{"".join(peers)}'
     )
 
 
 def daemon_command(config: Path, *, python: Path = Path(sys.executable), uvloop: bool = True) -> list[str]:
     """How a daemon is run."""
-    program = ["-m", "uavlinkd"] if uvloop else ["-c", WITHOUT_UVLOOP]
-    return [str(python), *program, "run", "--config", str(config)]
+    command = ["-m", "uavlinkd"] if uvloop else ["-c", WITHOUT_UVLOOP]
+    return [str(python), *command, "run", "--config", str(config)]
 
 
 def start_daemon(
@@ -153,7 +157,7 @@ def peers_up(control_socket: Path) -> int:
     if not control_socket.exists() or not os.access(control_socket, os.W_OK):
         return -1
     with suppress(ControlError, OSError, LookupError):
-        return sum(each["state"] == "up" for each in ask(control_socket, "status", timeout_s=2.0)["peers"].values())
+        return sum(peer["state"] == "up" for peer in ask(control_socket, "status", timeout_s=2.0)["peers"].values())
     return -1
 
 

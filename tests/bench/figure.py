@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 from collections.abc import Callable, Collection, Sequence
 from statistics import median
-from typing import Any
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
@@ -13,21 +12,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from tests.bench.findings import BASELINE, LOSES, Findings
+from uavlinkd.lab.evaluation.figures import STYLE
 from uavlinkd.lab.evaluation.spread import duration
 
 _COLOURS = ("#0072b2", "#d55e00", "#009e73")
 _MARKERS = "osD"
-_STYLE: dict[Any, Any] = {
-    "svg.hashsalt": "uavlinkd",
-    "font.size": 10,
-    "axes.grid": True,
-    "grid.color": "#dddddd",
-    "axes.axisbelow": True,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "legend.frameon": False,
-    "legend.fontsize": 9,
-}
 _APART = 0.22
 
 Values = Callable[[str], Sequence[float]]
@@ -36,7 +25,7 @@ Values = Callable[[str], Sequence[float]]
 
 def draw(findings: Findings, form: str = "svg") -> bytes:
     """The figure, as SVG or PNG."""
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         names = findings.contenders
         figure = Figure(figsize=(10.5, 2.8 + 0.62 * len(names)), layout="constrained")
         panels: Sequence[Axes] = figure.subplots(2, 2, sharey=True).flatten()
@@ -53,16 +42,16 @@ def draw(findings: Findings, form: str = "svg") -> bytes:
                 if base:
                     axes.axvline(base, color=_COLOURS[number], linewidth=0.8, linestyle=":")
         panels[2].set_title("highest rate without loss", loc="left")
-        each = [
+        points = [
             (
                 f"{count} frame{'s' if count > 1 else ''} a datagram",
                 _of(findings, "highest", "highest", per_datagram=count),
             )
             for count in sorted({int(str(one.point["per_datagram"])) for one in findings.of("highest")})
         ]
-        _dots(panels[2], names, each)
+        _dots(panels[2], names, points)
         panels[2].set_xlabel("frames/s")
-        panels[3].set_title("one way, program to program, at 1,000 frames/s", loc="left")
+        panels[3].set_title("one way, client to client, at 1,000 frames/s", loc="left")
         late = (("p50", 0.5), ("p99", 0.99), ("p99.9", 0.999))
         _dots(panels[3], names, [(label, _late(findings, part)) for label, part in late])
         panels[3].set_xlabel("time")
@@ -91,25 +80,22 @@ def _late(findings: Findings, part: float) -> Values:
 
 
 def _dots(
-    axes: Axes,
-    names: Sequence[str],
-    series: Sequence[tuple[str, Values]],
-    hollow: Collection[str] = (),
+    axes: Axes, names: Sequence[str], series: Sequence[tuple[str, Values]], hollow: Collection[str] = ()
 ) -> None:
     """A row a contender, a mark a series: the median, and a line from the least to the most of the rounds."""
     shown: list[float] = []
     for number, (label, values) in enumerate(series):
         shift = (number - (len(series) - 1) / 2) * _APART
         for row, name in enumerate(names):
-            found = [each for each in values(name) if each > 0]
-            if not found:
+            positive = [value for value in values(name) if value > 0]
+            if not positive:
                 continue
-            shown += found
+            shown += positive
             colour = _COLOURS[number]
-            axes.plot([min(found), max(found)], [row + shift] * 2, color=colour, linewidth=1.2)
+            axes.plot([min(positive), max(positive)], [row + shift] * 2, color=colour, linewidth=1.2)
             face = "white" if name in hollow else colour
             axes.plot(
-                median(found), row + shift, _MARKERS[number], color=colour, markerfacecolor=face, markersize=5.5
+                median(positive), row + shift, _MARKERS[number], color=colour, markerfacecolor=face, markersize=5.5
             )
         axes.plot([], [], _MARKERS[number], color=_COLOURS[number], label=label)
     if not shown:

@@ -16,9 +16,9 @@ from typing import Final
 
 from fastcrc.crc16 import mcrf4xx
 
+from uavlinkd.lab.sim.tlog import parse_tlog
 from uavlinkd.mavlink.dialect_table import MESSAGES
 from uavlinkd.mavlink.policy.compilation import compile_policy
-from uavlinkd.lab.sim.tlog import parse_tlog
 
 MAVLINK2: Final = 0xFD
 PROBE_EVERY: Final = 20
@@ -58,7 +58,7 @@ def load_frames(flight: Path = FLIGHT) -> FrameSet:
     """The vehicle's frames of the recorded flight; where it is not there, those of the simulated autopilot.
 
     Without what a ground station's daemon would not take from a vehicle, what the dialect does not have, and what is
-    for one system alone: routers drop that as long as they have not heard the other.
+    for one system alone: routers drop that until they have received a frame of the other.
     """
     said: Iterable[bytes] = _simulated()
     source = "a flight of `uavlinkd sim`, as no recorded one is there"

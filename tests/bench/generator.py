@@ -21,7 +21,7 @@ from typing import Final, NamedTuple
 from tests.bench.frames import is_probe, read_frames, stamp
 
 PR_SET_TIMERSLACK: Final = 29
-"""Of prctl(2): by how much the kernel may let a sleep last longer. 50 us unless told."""
+"""Of prctl(2): by how much the kernel may let a sleep last longer. the default is 50 us."""
 BUFFER_BYTES: Final = 1 << 20
 START_NS: Final = 1_000_000
 """The first deadline is so far off."""

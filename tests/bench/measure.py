@@ -1,4 +1,4 @@
-"""One contender at work: what a frame costs at a given rate, and the highest rate that comes through whole."""
+"""One running contender: the cost of a frame at a given rate, and the highest rate without loss."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from uavlinkd.lab.evaluation.machine import CpuTimeError, cpu_seconds
 from uavlinkd.lab.evaluation.records import Value
 
 NO_LOSS: Final = 0.001
-"""Up to this part lost, a rate counts as come through: one hiccup of the machine is not the contender's limit."""
+"""Up to this share of loss, a rate passes: one pause of the machine is not the contender's limit."""
 KEPT_PACE: Final = 0.97
-"""Of the rate asked for. Where the generator does not reach it, the machine is used up."""
+"""Share of the requested rate. If the generator does not reach it, the machine is the limit."""
 MOST_BEHIND_S: Final = 0.1
-"""Where more than this waits in buffers at a try's end, they would overflow in a longer one."""
+"""If more than this waits in buffers at the end of an attempt, they would overflow in a longer one."""
 LOWEST_RATE: Final = 500
 HIGHEST_RATE: Final = 2_000_000
 CLOSE_ENOUGH: Final = 1.05
-"""The search ends when the lowest rate that failed is within this of the highest that passed."""
+"""The search ends when the lowest failed rate is within this of the highest passed rate."""
 TRIES: Final = 2
-"""A rate passes if one of so many tries does: others use the machine too."""
+"""A rate passes if one of so many attempts does: other processes use the machine too."""
 EVEN_S: Final = 0.02
-"""Where one of a hundred datagrams left later than this, the machine stood still: what was measured is no even flow,
+"""If one of a hundred datagrams left later than this, the machine paused: the flow was uneven,
 and is measured again."""
 DISTURBED_MOST: Final = 3
-"""Then it is taken as it is."""
+"""Then the measurement is used as it is."""
 WARM_UP: Final = (1000, 0.5)
 """Frames a second, and seconds."""
 
@@ -44,7 +44,7 @@ class Used:
 
 @dataclass(frozen=True, slots=True)
 class Bench:
-    """Where a contender is measured."""
+    """The environment of a measurement."""
 
     cable: Cable
     traffic: Traffic
@@ -62,8 +62,8 @@ def used(running: Running) -> Used:
         if process.poll() is not None:
             raise NotMeasuredError(f"it ended with status {process.returncode}")
     try:
-        left = sum(cpu_seconds(each.pid) for each in running.left)
-        return Used(left, sum(cpu_seconds(each.pid) for each in running.right))
+        left = sum(cpu_seconds(process.pid) for process in running.left)
+        return Used(left, sum(cpu_seconds(process.pid) for process in running.right))
     except CpuTimeError as error:
         raise NotMeasuredError(f"it has ended: {error}") from None
 
@@ -118,8 +118,8 @@ def at_rate(bench: Bench, running: Running, rate: float, seconds: float, per_dat
         "wire_packets": crossed.packets,
         "wire_bytes": crossed.bytes,
         "wire_bytes_per_frame": crossed.bytes / flow.received,
-        "rss_left": sum(resident_bytes(each.pid) for each in running.left),
-        "rss_right": sum(resident_bytes(each.pid) for each in running.right),
+        "rss_left": sum(resident_bytes(process.pid) for process in running.left),
+        "rss_right": sum(resident_bytes(process.pid) for process in running.right),
     }
 
 
@@ -135,7 +135,7 @@ def flow_values(flow: Flow) -> dict[str, Value]:
         "rate": flow.rate,
         "loss": flow.loss,
         "behind_s": flow.behind_s,
-        "latencies_s": [round(each, 7) for each in flow.latencies_s],
+        "latencies_s": [round(latency, 7) for latency in flow.latencies_s],
         **flow.evenness,
     }
 

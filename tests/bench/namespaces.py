@@ -22,8 +22,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, Final, Self
 
+from uavlinkd.lab.child_processes import end_with_parent
+
 ETHERNET_BYTES: Final = 14
-"""The header that veth counts with each packet, and that is none of IP's bytes."""
+"""The Ethernet header, which veth counts with each packet, and which is not part of IP's bytes."""
 LEFT_ADDRESS: Final = "10.213.0.1"
 RIGHT_ADDRESS: Final = "10.213.0.2"
 END_S: Final = 5.0
@@ -39,18 +41,18 @@ class NamespaceError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Counted:
-    """What crossed the cable, both ways: packets, and their bytes from the IP header on."""
+    """Traffic on the cable in both directions: packets, and their bytes from the IP header on."""
 
     packets: int
     bytes: int
 
     def since(self, before: Counted) -> Counted:
-        """What has crossed since then."""
+        """The traffic since then."""
         return Counted(self.packets - before.packets, self.bytes - before.bytes)
 
 
 def why_not() -> str | None:
-    """Why namespaces cannot be made by this user on this machine; None where they can."""
+    """The reason why this user cannot make namespaces on this machine, or None."""
     if os.geteuid():
         return "network namespaces take root: run it as root"
     if shutil.which("ip") is None:
@@ -62,15 +64,15 @@ def why_not() -> str | None:
 
 
 def remove_leftovers() -> None:
-    """End what still works in the namespaces of runs that were killed, and remove them."""
+    """End the processes in the namespaces of killed runs, and remove them."""
     for line in _ip("netns", "list").splitlines():
-        found = _NAME.fullmatch(line.split()[0]) if line.split() else None
-        if found and not Path("/proc", found[1]).exists():
-            _remove(found[0])
+        match = _NAME.fullmatch(line.split()[0]) if line.split() else None
+        if match and not Path("/proc", match[1]).exists():
+            _remove(match[0])
 
 
 def _remove(name: str) -> None:
-    """A namespace, and what works in it: also what was being started when the run was interrupted."""
+    """A namespace, with its processes: also one that was starting when the run was interrupted."""
     for pid in _ip("netns", "pids", name, check=False).split():
         with suppress(ProcessLookupError):
             os.kill(int(pid), signal.SIGKILL)
@@ -97,11 +99,11 @@ class Host:
         environ: Mapping[str, str] | None = None,
         pipes: bool = False,
     ) -> subprocess.Popen[bytes]:
-        """Start a program here, in a session of its own. ``pipes``: its standard input and output are ours."""
+        """Start a command here, in a session of its own. ``pipes``: its standard input and output are pipes."""
         out: IO[bytes] | int = log.open("ab") if log is not None else subprocess.DEVNULL
         try:
             process = subprocess.Popen(
-                ["ip", "netns", "exec", self.name, *command],
+                end_with_parent("ip", "netns", "exec", self.name, *command),
                 cwd=folder,
                 env={**os.environ, **(environ or {})},
                 stdin=subprocess.PIPE if pipes else subprocess.DEVNULL,
@@ -116,7 +118,7 @@ class Host:
         return process
 
     def run(self, *command: str) -> str:
-        """Run a program here to its end; what it printed.
+        """Run a command here to its end; returns its output.
 
         Raises:
             NamespaceError: it failed.
@@ -124,7 +126,7 @@ class Host:
         return _run("ip", "netns", "exec", self.name, *command)
 
     def end(self, *processes: subprocess.Popen[bytes]) -> None:
-        """End these; all that were started here where none is named."""
+        """End these processes; by default all that were started here."""
         ended = processes or tuple(self._processes)
         for process in ended:
             if process.poll() is None:
@@ -140,24 +142,24 @@ class Host:
                 if stream is not None:
                     with suppress(OSError):  # what it did not read any more
                         stream.close()
-        self._processes = [each for each in self._processes if each not in ended]
+        self._processes = [process for process in self._processes if process not in ended]
 
     def end_all_but(self, kept: Collection[subprocess.Popen[bytes]]) -> None:
-        """End all that were started here but these."""
-        gone = [each for each in self._processes if each not in kept]
+        """End all processes that were started here but these."""
+        gone = [process for process in self._processes if process not in kept]
         if gone:
             self.end(*gone)
 
 
 class CableKind(StrEnum):
-    """What becomes of datagrams that a program sends in one call (UDP_SEGMENT)."""
+    """How the cable handles datagrams that are sent in one call (UDP_SEGMENT)."""
 
     PLAIN = "plain"
-    """The kernel cuts them up before the cable, as it does before a real one; they arrive one by one."""
+    """The kernel splits them before the cable, as before a real one; they arrive one by one."""
     CARD = "card"
-    """The same, and they are merged on receipt for a program that asks (UDP_GRO), as network cards' drivers do it."""
+    """The same, and they are merged on receipt on request (UDP_GRO), as by drivers of network cards."""
     WHOLE = "whole"
-    """They cross in one piece, as between virtual machines on one host; their bytes are counted too low then."""
+    """They cross in one piece, as between virtual machines on one host; their bytes are then counted too low."""
 
 
 class Cable:
@@ -202,18 +204,18 @@ class Cable:
             _ip("-n", host.name, "link", "set", host.device, "up")
 
     def close(self) -> None:
-        """End what runs there, and remove both."""
+        """End the processes there, and remove both."""
         for host in (self.left, self.right):
             host.end()
         for host in (self.left, self.right):
             _remove(host.name)
 
     def counted(self) -> Counted:
-        """What crossed so far."""
+        """The traffic so far."""
         shown = json.loads(_ip("-n", self.left.name, "-s", "-j", "link", "show", self.left.device))
         ways = [shown[0]["stats64"][way] for way in ("tx", "rx")]
         packets = sum(way["packets"] for way in ways)
-        # Where packets are merged on receipt veth counts them there, without their Ethernet headers.
+        # If packets are merged on receipt, veth counts them there, without their Ethernet headers.
         headers = 0 if self.kind is CableKind.CARD else packets * ETHERNET_BYTES
         return Counted(packets, sum(way["bytes"] for way in ways) - headers)
 

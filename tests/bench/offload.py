@@ -1,8 +1,8 @@
-"""Makes a veth do what the drivers of network cards do: merge datagrams on receipt, for who asks (UDP_GRO).
+"""Makes a veth behave like the drivers of network cards: merge datagrams on receipt, on request (UDP_GRO).
 
 ``offload DEVICE``, run in the device's namespace. veth hands packets to its receive queue, where they are merged,
 only if the sending end claims no segmentation offload for TCP, so that is switched off. See ethtool(8): it is done by
-its ioctl, as the program is not everywhere.
+its ioctl, as the command is not installed everywhere.
 """
 
 from __future__ import annotations

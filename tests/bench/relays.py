@@ -1,4 +1,4 @@
-"""Empty relays: what takes a datagram from one socket and sends it from another, in four ways, and does no more.
+"""Empty relays: each receives from one socket and sends from another, in four ways, and does nothing else.
 
 They are what a figure is compared with: nothing that carries frames in Python can do less with them.
 ``relays KIND PORT HOST PORT``: from this port on all addresses to that address.
@@ -16,7 +16,7 @@ Address = tuple[str, int]
 
 DATAGRAMS_PER_WAKE_UP: Final = 128
 BUFFER_BYTES: Final = 1 << 20
-"""As uavlinkd asks for; the kernel may give less (net.core.rmem_max)."""
+"""As uavlinkd requests; the kernel may allow less (net.core.rmem_max)."""
 RECEIVE_BYTES: Final = 65536
 
 
@@ -38,13 +38,13 @@ def relay_blocking(port: int, to: Address) -> None:
     while True:
         try:
             send(receive(RECEIVE_BYTES))
-        except OSError:  # nobody listens there yet
+        except OSError:  # no listener yet
             continue
 
 
 class _Out(asyncio.DatagramProtocol):
     def error_received(self, exc: Exception) -> None:
-        """Nobody listens there yet."""
+        """No listener yet."""
 
 
 class _Into(asyncio.DatagramProtocol):
@@ -66,7 +66,7 @@ async def relay_protocol(port: int, to: Address) -> None:
 
 
 async def relay_add_reader(port: int, to: Address) -> None:
-    """asyncio's loop wakes us up, and the socket is drained."""
+    """asyncio's loop wakes the relay, which drains the socket."""
     into, out = bound(port, blocking=False), bound(0, blocking=False)
     out.connect(to)
     receive, send = into.recv, out.send
@@ -79,7 +79,7 @@ async def relay_add_reader(port: int, to: Address) -> None:
                 return
             try:
                 send(datagram)
-            except OSError:  # nobody listens there yet, or a full queue
+            except OSError:  # no listener yet, or a full queue
                 continue
 
     asyncio.get_running_loop().add_reader(into, drain)

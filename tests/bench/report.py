@@ -17,26 +17,26 @@ FIGURE: Final = "costs.svg"
 RATES: Final = (1_000, 10_000)
 _MEASURED: Final = """\
 Two network namespaces with a veth cable between them; generator → contender → cable → contender → sink. Every
-contender is started anew in every round, one after another, another one first each time. Medians over the rounds; in
+contender is restarted in every round, one after another, another one first each time. Medians over the rounds; in
 brackets the ratio to the uvloop relay of the same run. Absolute figures hold for this machine alone, and for what
 else it did.
 
 - *CPU*: processor time of all threads of the contender's process on that side, as the scheduler accounts it in
   nanoseconds, divided by the frames that arrived. One frame a datagram. Work that the kernel does for a packet is on
-  the account of who sends it, so part of the way through the cable is with the sending side.
+  the account of its sender, so part of the way through the cable is with the sending side.
 - *loss* at 10,000/s; *highest*: frames a second at which at most 0.1 % is lost, found by doubling and then halving
   until 5 % remain between what passed and what did not. A try lasts a second, after which no more than 0.1 s of
   traffic may wait in buffers; a rate passes if one of two tries does. Generator and sink share the cores with the
   contender: it is what the whole machine does, and `plain-udp` says what it does with none.
 - *latency*: of each 20th frame, from just before the generator's send to just after the sink's receive; p50 and p99
   are medians of the rounds', p99.9 is of all rounds' frames together.
-- *bytes*: all that crossed the cable both ways, with IP's and UDP's headers, without Ethernet's (14 bytes), over the
-  frames that arrived. *memory*: resident (VmRSS), after the 1,000/s.
+- *bytes*: everything that crossed the cable in both directions, with IP's and UDP's headers, without Ethernet's
+  (14 bytes), over the frames that arrived. *memory*: resident (VmRSS), after the 1,000/s.
 """
 
 
 def write_report(folder: Path, name: str, page: Path | None = None) -> str:
-    """Write the page (``RESULTS.md`` in the folder unless named) and the figure beside it; the page's text.
+    """Write the page (by default ``RESULTS.md`` in the folder) and the figure beside it; returns the page's text.
 
     Raises:
         RecordsError: there are no records in the folder.
@@ -50,7 +50,7 @@ def write_report(folder: Path, name: str, page: Path | None = None) -> str:
 
 
 def _draw(findings: Findings, path: Path) -> bool:
-    """Whether there is a figure: matplotlib is an extra, and nothing may have been measured."""
+    """Whether there is a figure: matplotlib is optional, and there may be no measurement."""
     if not findings.contenders:
         return False
     try:
@@ -90,8 +90,8 @@ def page_text(findings: Findings, figure: str | None) -> str:
 
 def _checks(findings: Findings) -> str:
     rows = [
-        (each.what, _unit(each.figure, each.unit), _unit(each.limit, each.unit), each.verdict)
-        for each in all_checks(findings)
+        (check.what, _unit(check.figure, check.unit), _unit(check.limit, check.unit), check.verdict)
+        for check in all_checks(findings)
     ]
     return _table(("", "measured", "limit", ""), rows)
 
@@ -107,7 +107,7 @@ def _costs(findings: Findings) -> str:
                 cells.append("-" if not cpu else f"{cpu:.1f} µs" + (f" ({ratio:.2f})" if ratio else ""))
         loss = findings.loss(name, RATES[1])
         cells.append("-" if loss is None else f"{loss:.1%}" if loss > LOSES else "none")
-        cells += [_count(findings.highest(name, each)) for each in (1, 8)]
+        cells += [_count(findings.highest(name, count)) for count in (1, 8)]
         rows.append(cells)
     return _table((*heads, "loss", "highest", "highest, 8 a datagram"), rows)
 
@@ -138,7 +138,7 @@ def _rest(findings: Findings) -> str:
                 findings.latency_s(name, rate, 0.99),
                 findings.pooled_latency_s(name, rate, 0.999),
             )
-            cells += [_micro(each) for each in late]
+            cells += [_micro(latency) for latency in late]
         cells += [_mega(findings.median("rate", f"rss_{side}", contender=name, rate=RATES[0])) for side in SIDES]
         for rate in RATES:
             size = findings.median("rate", "wire_bytes_per_frame", contender=name, rate=rate)
@@ -149,17 +149,19 @@ def _rest(findings: Findings) -> str:
 
 def _alone(findings: Findings) -> str:
     rows = []
-    for peers, rate in dict.fromkeys((each.point["peers"], each.point["rate_each"]) for each in findings.of("peers")):
+    for peers, rate in dict.fromkeys(
+        (record.point["peers"], record.point["rate_each"]) for record in findings.of("peers")
+    ):
         cpu = findings.median("peers", "cpu_right_us", peers=peers, rate_each=rate)
         lost = findings.numbers("peers", "loss", peers=peers, rate_each=rate)
         what = f"{peers} peers of {_plain(rate)} frames/s each into one daemon"
         rows.append((what, f"{cpu:.1f} µs of CPU a frame, {max(lost):.2%} lost at most" if cpu else "-"))
     resident: dict[int, float] = {}
-    for count in dict.fromkeys(int(str(each.point["peers"])) for each in findings.of("memory")):
-        found = findings.median("memory", "rss", peers=count)
-        if found is not None:
-            resident[count] = found
-            rows.append((f"memory with {count} peer{'s' if count > 1 else ''}", _mega(found)))
+    for count in dict.fromkeys(int(str(record.point["peers"])) for record in findings.of("memory")):
+        rss = findings.median("memory", "rss", peers=count)
+        if rss is not None:
+            resident[count] = rss
+            rows.append((f"memory with {count} peer{'s' if count > 1 else ''}", _mega(rss)))
     if len(resident) > 1:
         least, most = min(resident), max(resident)
         each_peer = (resident[most] - resident[least]) / (most - least)
@@ -174,12 +176,12 @@ def _alone(findings: Findings) -> str:
 
 
 def _evenness(findings: Findings) -> str:
-    late = [each.number("late_p99_s") for each in findings.of("rate")]
-    most = [each.number("late_most_s") for each in findings.of("rate")]
+    late = [record.number("late_p99_s") for record in findings.of("rate")]
+    most = [record.number("late_most_s") for record in findings.of("rate")]
     if not late:
         return ""
-    together = max(each.number("together_most") for each in findings.of("rate"))
-    disturbed = sum(each > EVEN_S for each in late)
+    together = max(record.number("together_most") for record in findings.of("rate"))
+    disturbed = sum(latency > EVEN_S for latency in late)
     return (
         "How evenly the generator sent, at fixed rates: 99 of 100 datagrams left within"
         f" {median(late) * 1e6:.0f} µs of their time in the middle measurement,"

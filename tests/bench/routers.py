@@ -1,4 +1,4 @@
-"""Programs that know MAVLink: mavlink-router, MAVProxy, and what people write with pymavlink to sign frames."""
+"""MAVLink routers: mavlink-router, MAVProxy, and a typical script that signs frames with pymavlink."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ from tests.bench.contenders import (
     LINK_PORT,
     Contender,
     Running,
+    command_version,
+    needs_command,
     needs_module,
-    needs_program,
-    program_version,
 )
 from tests.bench.namespaces import Cable, Host
 from tests.bench.traffic import REPOSITORY, SINK_PORT
 
 
 class MavlinkRouter(Contender):
-    """mavlink-router on both hosts. No package of it is in Debian: it is measured where somebody built it."""
+    """mavlink-router on both hosts. Debian has no package of it: it is measured if it was built locally."""
 
     def __init__(self) -> None:
         super().__init__("mavlink-router", "mavlink-router, without security")
 
     def why_not(self) -> str | None:
-        return needs_program("mavlink-routerd")
+        return needs_command("mavlink-routerd")
 
     def version(self) -> str | None:
-        return program_version("mavlink-routerd", "--version")
+        return command_version("mavlink-routerd", "--version")
 
     def start(self, cable: Cable, folder: Path) -> Running:
         right = self._side(cable.right, folder / "right", ("0.0.0.0", LINK_PORT), ("127.0.0.1", SINK_PORT))
@@ -73,10 +73,10 @@ class Mavproxy(Contender):
     @staticmethod
     def _side(host: Host, folder: Path, into: str, out: str) -> subprocess.Popen[bytes]:
         folder.mkdir()
-        program = Path(sys.executable).with_name("mavproxy.py")
+        script = Path(sys.executable).with_name("mavproxy.py")
         options = ("--daemon", "--non-interactive", "--streamrate=-1", "--default-modules=", "--mav20")
         return host.start(
-            [sys.executable, str(program), f"--master=udpin:{into}", f"--out=udpout:{out}", *options],
+            [sys.executable, str(script), f"--master=udpin:{into}", f"--out=udpout:{out}", *options],
             folder=folder,
             log=folder / "mavproxy.log",
             environ={"HOME": str(folder)},
@@ -84,7 +84,7 @@ class Mavproxy(Contender):
 
 
 class PymavlinkSigning(Contender):
-    """The relays of :mod:`tests.bench.signing`: the left one signs, the right one takes only what is signed."""
+    """The relays of :mod:`tests.bench.signing`: the left one signs, the right one accepts only signed frames."""
 
     def __init__(self) -> None:
         super().__init__("pymavlink-signing", "a pymavlink relay that signs, and one that verifies")
@@ -110,4 +110,4 @@ class PymavlinkSigning(Contender):
         return host.start(command, folder=REPOSITORY, log=log, environ={"MAVLINK20": "1"})
 
 
-PROGRAMS: Final = (MavlinkRouter(), Mavproxy(), PymavlinkSigning())
+ROUTERS: Final = (MavlinkRouter(), Mavproxy(), PymavlinkSigning())

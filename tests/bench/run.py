@@ -1,4 +1,4 @@
-"""A run: the contenders in turn, round by round, and what is written down of each."""
+"""A run: the contenders in turn, round by round, with their records."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """How much is measured. Times in seconds."""
+    """The extent of the measurements. Times in seconds."""
 
     rounds: int = 5
     rates: tuple[int, ...] = (1_000, 10_000)
@@ -46,7 +46,7 @@ PATIENCE = 20
 """A contender has so many times 0.6 s to carry its first frame."""
 QUICK = Plan(rounds=1, seconds=(2.0, 2.0), step_s=0.0, peers_s=2.0)
 SCALES = ("peers", "memory", "start")
-"""What is measured of uavlinkd alone."""
+"""Measurements of uavlinkd alone."""
 
 
 @contextmanager
@@ -61,7 +61,7 @@ def laboratory(frames: FrameSet, kind: CableKind = CableKind.PLAIN) -> Iterator[
 
 @contextmanager
 def at_work(contender: Contender, bench: Bench) -> Iterator[Running]:
-    """A contender, started and carrying frames.
+    """Start a contender and wait until it carries frames.
 
     Raises:
         NotMeasuredError: it does not.
@@ -82,7 +82,7 @@ def at_work(contender: Contender, bench: Bench) -> Iterator[Running]:
 
 
 class Run:
-    """Measures, and writes down what it finds."""
+    """Measures, and writes records."""
 
     def __init__(self, plan: Plan, bench: Bench, writer: RecordWriter, say: Say) -> None:
         self._plan = plan
@@ -91,8 +91,8 @@ class Run:
         self._say = say
 
     def all(self, contenders: Sequence[Contender], scales: Sequence[str]) -> None:
-        """All of them in each round. A contender that is not installed is said to be once, and left out then."""
-        left = {each.name: each for each in contenders}
+        """Measure all of them in each round. A contender that is not installed is reported once and left out."""
+        left = {contender.name: contender for contender in contenders}
         for number in range(self._plan.rounds):
             for name in rotated(list(left), number):
                 self._say(f"round {number + 1} of {self._plan.rounds}: {name}")
@@ -101,7 +101,7 @@ class Run:
             self._scales(scales, number)
 
     def _contender(self, contender: Contender, number: int) -> bool:
-        """Measure one; whether it is to be tried in the next round."""
+        """Measure one; returns whether to try it in the next round."""
         try:
             with at_work(contender, self._bench) as running:
                 self._measure(contender.name, number, running)
@@ -135,30 +135,23 @@ class Run:
                 self.record("highest", point, partial(highest_rate, bench, running, plan.step_s, per_datagram))
 
     def record(self, kind: str, point: Mapping[str, Value], measure: Callable[[], Mapping[str, Value]]) -> None:
-        """Measure, and write it down, or why it was not measured."""
+        """Measure and record, or record the reason of a failure."""
         try:
             values = measure()
         except NotMeasuredError as error:
             self._failed(kind, point, str(error))
             return
         self._writer.add(Record(kind, point, values))
-        self._say("  " + ", ".join(f"{name} {_short(value)}" for name, value in values.items() if name in _TOLD))
+        self._say("  " + ", ".join(f"{name} {_short(value)}" for name, value in values.items() if name in _SHOWN))
 
     def _failed(self, kind: str, point: Mapping[str, Value], reason: str) -> None:
         self._writer.add(Record(kind, point, status=Status.FAILED, reason=reason))
         self._say(f"  not measured: {reason}")
 
 
-_TOLD = (
-    "rate",
-    "loss",
-    "cpu_left_us",
-    "cpu_right_us",
-    "wire_bytes_per_frame",
-    "highest",
-    "late_p99_s",
-    "ready_s",
-    "rss",
+_SHOWN = (
+    *("rate", "loss", "cpu_left_us", "cpu_right_us", "wire_bytes_per_frame", "highest", "late_p99_s"),
+    *("ready_s", "rss"),
 )
 
 

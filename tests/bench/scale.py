@@ -1,4 +1,4 @@
-"""uavlinkd alone: with many peers, its memory, and how long it takes to start."""
+"""uavlinkd alone: with many peers, its memory, and the duration of its start."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ from uavlinkd.lab.evaluation.machine import cpu_seconds
 from uavlinkd.lab.evaluation.records import Value
 
 SINK_PORT: Final = 14601
-"""Of the sink that counts the frames of all systems."""
+"""Port of the sink that counts the frames of all systems."""
 LINKED_S: Final = 120.0
 READY_S: Final = 30.0
-NOBODY: Final = "127.0.0.1:9"
-"""Where no one listens."""
+NO_LISTENER: Final = "127.0.0.1:9"
+"""An address without a listener."""
 LOOK_EVERY_S: Final = 0.5
 WARM_UP_S: Final = 1.0
 
 
 @contextmanager
 def hub(bench: Bench, peers: int) -> Iterator[tuple[Bench, Running]]:
-    """A daemon on the right with so many peers, linked, all of them on the left; and how to send by them.
+    """A daemon on the right with so many linked peers, all of them on the left; and how to send through them.
 
     Raises:
         NotMeasuredError: they are not linked in time, or one of the processes ended.
@@ -47,8 +47,8 @@ def hub(bench: Bench, peers: int) -> Iterator[tuple[Bench, Running]]:
         own = keys.generate_private_key()
         keys.write_secret_file(folder / "hub.key", own + "\n")
         sections = [
-            peer(f"drone{system}", keys.public_key_text(each), {"role": "vehicle", "system_ids": [system]})
-            for system, each in enumerate(private, 1)
+            peer(f"drone{system}", keys.public_key_text(key), {"role": "vehicle", "system_ids": [system]})
+            for system, key in enumerate(private, 1)
         ]
         (folder / "hub.toml").write_text(
             configuration("hub", peers=sections, endpoint=f"udpout:127.0.0.1:{SINK_PORT}")
@@ -81,21 +81,21 @@ def hub(bench: Bench, peers: int) -> Iterator[tuple[Bench, Running]]:
 
 
 def with_peers(bench: Bench, peers: int, rate_each: float, seconds: float) -> dict[str, Value]:
-    """What a frame costs a daemon with so many peers, each sending so many frames a second."""
+    """CPU time per frame of a daemon with so many peers, each sending so many frames a second."""
     with hub(bench, peers) as (inside, running):
         inside.traffic.flow(running.target, rate_each * peers, WARM_UP_S)
         return _of_right(at_rate(inside, running, rate_each * peers, seconds))
 
 
 def memory(bench: Bench, peers: int) -> dict[str, Value]:
-    """What is resident of a daemon with so many linked peers, after traffic of each."""
+    """Resident memory of a daemon with so many linked peers, after traffic of each."""
     with hub(bench, peers) as (inside, running):
         inside.traffic.flow(running.target, 50.0 * peers, 2.0)
         return {"rss": resident_bytes(running.right[0].pid)}
 
 
 def start() -> dict[str, Value]:
-    """How long a daemon takes from exec to saying that it is ready (sd_notify), and what it has in memory then.
+    """Time of a daemon from exec to its ready notification (sd_notify), and its memory then.
 
     Raises:
         NotMeasuredError: it does not say so.
@@ -107,8 +107,10 @@ def start() -> dict[str, Value]:
         config = folder / "drone.toml"
         text = configuration(
             "drone",
-            peers=[peer("ground", keys.public_key_text(other), {"role": "operator", "system_ids": [255]}, NOBODY)],
-            endpoint=f"udpout:{NOBODY}",
+            peers=[
+                peer("ground", keys.public_key_text(other), {"role": "operator", "system_ids": [255]}, NO_LISTENER)
+            ],
+            endpoint=f"udpout:{NO_LISTENER}",
         )
         config.write_text(text.replace(f'listen = ["0.0.0.0:{LINK_PORT}"]\n', ""))
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notified, (folder / "log").open("wb") as log:

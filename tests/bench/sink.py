@@ -1,8 +1,8 @@
 """Counts the frames that arrive, and how long those took that carry the time: a process whose work is not counted.
 
-``count`` on standard input is answered by how many frames came since it was last told to ``reset``; ``take`` by that
-and the latencies. Frames are told apart by their headers' lengths, any number in a datagram; those of other systems
-(what a program says for itself) are none of ours.
+``count`` on standard input is answered by the number of frames since the last ``reset``, ``take`` by this number and
+the latencies. The lengths in their headers separate frames, any number in a datagram. Frames of other systems, which
+a router sends for itself, do not count.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ _TIME = struct.Struct("<Q")
 
 
 class Count:
-    """What came."""
+    """The frames received."""
 
     def __init__(self, system: int) -> None:
         self._system = system  # 0: any
         self.reset()
 
     def reset(self) -> None:
-        """Begin anew."""
+        """Start from zero."""
         self.frames = self.others = self.garbage = self.datagrams = 0
         self.latencies_ns: list[int] = []
 
     def add(self, datagram: bytes, now_ns: int) -> None:
-        """Walk the frames of a datagram."""
+        """Count the frames of a datagram."""
         self.datagrams += 1
         offset, size = 0, len(datagram)
         while offset < size:
@@ -59,7 +59,7 @@ class Count:
             offset += length
 
     def facts(self) -> dict[str, Any]:
-        """As numbers."""
+        """The counts as numbers."""
         return {name: getattr(self, name) for name in ("frames", "others", "garbage", "datagrams")}
 
 

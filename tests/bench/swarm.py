@@ -25,19 +25,20 @@ from tests.bench.generator import BUFFER_BYTES, PR_SET_TIMERSLACK, Pace, Sent
 from uavlinkd.core.crypto import Secret
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Output, Transmit
+from uavlinkd.core.path import Path as PeerPath
 from uavlinkd.core.settings import PeerSettings
 
 DAEMON: Final = "daemon"
 FRAMES_EACH: Final = 20 * PROBE_EVERY
 CARE_EVERY_S: Final = 0.01
-"""How often what the daemon says is read, and timers are looked at."""
+"""Interval for reading the daemon's datagrams and checking timers."""
 CALLING_MOST: Final = 2
 SETTLE_S: Final = 1.0
 RECEIVE_BYTES: Final = 65536
 
 
 class Member:
-    """One peer: a node that knows the daemon alone."""
+    """One peer: a node that knows only the daemon."""
 
     def __init__(self, private_key: bytes, system: int, daemon: tuple[str, int], public_key: bytes) -> None:
         self.sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -45,25 +46,25 @@ class Member:
         self.sock.setblocking(False)
         self.sock.connect(daemon)
         self.system = system
-        self._path = (0, *daemon)
+        self._path = PeerPath(0, daemon)
         now = time.monotonic()
         self._node = Node(Secret(private_key), os.urandom, now)
-        self._node.add_peer(PeerSettings(DAEMON, public_key), now)
+        self._peer = self._node.add_peer(PeerSettings(DAEMON, public_key), now)
         self._frames: list[bytearray] = []
         self._next = 0
 
     def call(self) -> None:
-        """Call the daemon, until it answers."""
-        self._node.set_addresses(DAEMON, [self._path], time.monotonic())
+        """Initiate to the daemon until it answers."""
+        self._node.set_paths(self._peer, [self._path], time.monotonic())
 
     @property
     def is_up(self) -> bool:
         """Whether it is linked."""
-        return self._node.peers[DAEMON].is_up
+        return self._peer.is_up
 
     def take(self, frames: Iterable[bytes]) -> None:
-        """What it is going to say."""
-        self._frames = [bytearray(said_by(each, self.system)) for each in frames]
+        """The next frames to send."""
+        self._frames = [bytearray(said_by(frame, self.system)) for frame in frames]
 
     def send(self) -> None:
         """Its next frame."""
@@ -71,19 +72,19 @@ class Member:
         self._next = (self._next + 1) % len(self._frames)
         if is_probe(frame):
             stamp(frame, 0, time.monotonic_ns())
-        self._perform(self._node.send(DAEMON, [bytes(frame)], time.monotonic()))
+        self._perform(self._node.send(self._peer, [bytes(frame)], time.monotonic()))
 
     def hear(self) -> None:
-        """Read what the daemon said."""
+        """Read the daemon's datagrams."""
         while True:
             try:
                 datagram = self.sock.recv(RECEIVE_BYTES)
-            except OSError:  # nothing more; or nobody listened there yet
+            except OSError:  # no more datagrams; or the daemon did not listen yet
                 return
             self._perform(self._node.receive(datagram, self._path, time.monotonic()))
 
     def be_in_time(self, now: float) -> None:
-        """What is due."""
+        """Process the due timers."""
         if self._node.next_deadline() <= now:
             self._perform(self._node.handle_timeout(now))
 
@@ -97,12 +98,12 @@ class Member:
 
 
 class Swarm:
-    """All of them."""
+    """All members."""
 
     def __init__(self, members: Sequence[Member], frames: Sequence[bytes]) -> None:
         self._members = members
         self._epoll = select.epoll()
-        self._by_descriptor = {each.sock.fileno(): each for each in members}
+        self._by_descriptor = {member.sock.fileno(): member for member in members}
         for descriptor in self._by_descriptor:
             self._epoll.register(descriptor, select.EPOLLIN)
         for number, member in enumerate(members):
@@ -110,22 +111,22 @@ class Swarm:
             member.take(frames[first : first + FRAMES_EACH])
 
     def care(self, wait_s: float = 0.0) -> None:
-        """Read what came, and do what is due."""
+        """Read datagrams, and process due timers."""
         for descriptor, _ in self._epoll.poll(wait_s, len(self._members)):
             self._by_descriptor[descriptor].hear()
         now = time.monotonic()
-        for each in self._members:
-            each.be_in_time(now)
+        for member in self._members:
+            member.be_in_time(now)
 
     def link(self, patience_s: float) -> int:
-        """Link one after the other, a few at a time, and let it settle; how many were not linked in time.
+        """Link one after the other, a few at a time, and wait; returns how many did not link in time.
 
         All at once they would meet the daemon's limits against floods, and try again while frames are counted.
         """
         deadline = time.monotonic() + patience_s
         waiting, calling = list(reversed(self._members)), list[Member]()
         while (waiting or calling) and time.monotonic() < deadline:
-            calling = [each for each in calling if not each.is_up]
+            calling = [member for member in calling if not member.is_up]
             while waiting and len(calling) < CALLING_MOST:
                 calling.append(waiting.pop())
                 calling[-1].call()
@@ -133,10 +134,10 @@ class Swarm:
         settled = time.monotonic() + SETTLE_S
         while time.monotonic() < settled:
             self.care(CARE_EVERY_S)
-        return sum(not each.is_up for each in self._members)
+        return sum(not member.is_up for member in self._members)
 
     def send_evenly(self, per_s: float, seconds: float) -> Sent:
-        """So many frames a second in all, each member in turn."""
+        """Send so many frames a second in total, each member in turn."""
         members, size = self._members, len(self._members)
         count = max(1, round(per_s * seconds))
         pace = Pace(per_s)
@@ -151,7 +152,7 @@ class Swarm:
 
 
 def main() -> None:
-    """Link, say so, and take orders; between them the links are kept up."""
+    """Link, report it, and execute orders; between them keep the links up."""
     ctypes.CDLL(None).prctl(PR_SET_TIMERSLACK, 1, 0, 0, 0)
     plan: dict[str, Any] = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
     daemon, public_key = (plan["host"], plan["port"]), b64decode(plan["public_key"])

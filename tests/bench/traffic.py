@@ -1,4 +1,4 @@
-"""The generator and the sink, as seen from the bench: one order, one flow, what became of it."""
+"""The generator and the sink, as seen from the bench: one order, one flow, and its result."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.bench.namespaces import Host
 REPOSITORY: Final = Path(__file__).parents[2]
 SINK_PORT: Final = 14600
 SETTLED_S: Final = 0.25
-"""When nothing more has come for this long, nothing will."""
+"""After this time without a frame, the flow has ended."""
 POLL_S: Final = 0.03
 
 
@@ -25,29 +25,29 @@ class TrafficError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Flow:
-    """What was sent, what came of it. Times in seconds."""
+    """What was sent and received. Times in seconds."""
 
     sent: int
     received: int
     others: int
     garbage: int
     datagrams: int
-    """Those that the frames came in."""
+    """Datagrams with these frames."""
     seconds: float
     arrived: int
-    """Of the frames, those that had come when the last was sent."""
+    """Frames received when the last one was sent."""
     latencies_s: tuple[float, ...]
     evenness: dict[str, float]
-    """How late the generator was, and how much it sent in one go."""
+    """The generator's lateness, and the most datagrams that it sent at once."""
 
     @property
     def loss(self) -> float:
-        """The part that did not come; what came twice makes it negative."""
+        """The share of frames that were lost; duplicates make it negative."""
         return 1 - self.received / self.sent
 
     @property
     def behind_s(self) -> float:
-        """For how long the last frames still waited somewhere, at the rate at which they were sent."""
+        """How long the last frames waited in buffers, at the rate of sending."""
         return (self.received - self.arrived) / self.rate
 
     def is_even(self, late_s: float) -> bool:
@@ -56,12 +56,12 @@ class Flow:
 
     @property
     def rate(self) -> float:
-        """Frames a second that were really sent."""
+        """The real rate of sending, in frames a second."""
         return self.sent / self.seconds
 
 
 class Worker:
-    """A process of ours that answers each line with one of JSON."""
+    """A process of the bench that answers each line with a line of JSON."""
 
     def __init__(self, host: Host, module: str, *arguments: str) -> None:
         command = [sys.executable, "-m", f"tests.bench.{module}", *arguments]
@@ -95,16 +95,16 @@ class Worker:
 
 
 class Traffic:
-    """Who sends on the left, and a sink on the right."""
+    """A sender on the left, and a sink on the right."""
 
     def __init__(self, sender: Worker, sink: Worker) -> None:
         self._sender = sender
         self._sink = sink
         self.processes = (sink.process, sender.process)
-        """Not those of any contender."""
+        """Processes of the bench, not of a contender."""
 
     def flow(self, target: tuple[str, int], rate: float, seconds: float, per_datagram: int = 1) -> Flow:
-        """So many frames a second to this address; ends when all came, or nothing more comes."""
+        """Send so many frames a second to this address; ends when all have arrived, or no more arrive."""
         self._sink.ask("reset")
         order = {"host": target[0], "port": target[1], "rate": rate, "seconds": seconds}
         sent = self._sender.ask(json.dumps({**order, "per_datagram": per_datagram}))
@@ -122,16 +122,16 @@ class Traffic:
             datagrams=came["datagrams"],
             seconds=sent["seconds"],
             arrived=arrived,
-            latencies_s=tuple(each / 1e9 for each in came["latencies_ns"]),
+            latencies_s=tuple(latency / 1e9 for latency in came["latencies_ns"]),
             evenness=evenness,
         )
 
     def count(self) -> int:
-        """Frames that came since the last flow began."""
+        """Frames received since the last flow began."""
         return int(self._sink.ask("count")["frames"])
 
     def settle(self, expected: int) -> int:
-        """Wait until so many came, or nothing more does; how many did."""
+        """Wait until so many frames have arrived, or no more arrive; returns their number."""
         before, still_since = -1, time.monotonic()
         while (came := self.count()) < expected:
             if came != before:

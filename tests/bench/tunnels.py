@@ -14,8 +14,8 @@ from tests.bench.contenders import (
     Contender,
     NotMeasuredError,
     Running,
-    needs_program,
-    program_version,
+    command_version,
+    needs_command,
     until,
 )
 from tests.bench.namespaces import Cable, Host
@@ -29,12 +29,12 @@ TUN: Final = Path("/dev/net/tun")
 class Tunnel(Contender):
     """A VPN between the two hosts."""
 
-    def __init__(self, name: str, about: str, *programs: str) -> None:
+    def __init__(self, name: str, about: str, *commands: str) -> None:
         super().__init__(name, about)
-        self._programs = programs
+        self._commands = commands
 
     def why_not(self) -> str | None:
-        return needs_program(*self._programs) or _why_no_tun()
+        return needs_command(*self._commands) or _why_no_tun()
 
     def start(self, cable: Cable, folder: Path) -> Running:
         try:
@@ -63,11 +63,11 @@ class WireguardGo(Tunnel):
         super().__init__("wireguard-go", "WireGuard in user space", "wireguard-go", "wg")
 
     def version(self) -> str | None:
-        return program_version("wireguard-go", "--version")
+        return command_version("wireguard-go", "--version")
 
     def _start(self, cable: Cable, folder: Path) -> tuple[subprocess.Popen[bytes], subprocess.Popen[bytes]]:
         private = [_output("wg", "genkey") for _ in range(2)]
-        public = [_output("wg", "pubkey", given=each) for each in private]
+        public = [_output("wg", "pubkey", given=key) for key in private]
         left = self._side(cable.left, folder, private[0], public[1], RIGHT_TUNNEL, cable.right.address)
         right = self._side(cable.right, folder, private[1], public[0], LEFT_TUNNEL, cable.left.address)
         return left, right
@@ -100,7 +100,7 @@ class Nebula(Tunnel):
         super().__init__("nebula", "Nebula: an overlay with certificates", "nebula", "nebula-cert")
 
     def version(self) -> str | None:
-        return program_version("nebula", "-version")
+        return command_version("nebula", "-version")
 
     def _start(self, cable: Cable, folder: Path) -> tuple[subprocess.Popen[bytes], subprocess.Popen[bytes]]:
         _command(folder, "nebula-cert", "ca", "-name", "bench")
@@ -133,7 +133,7 @@ class Openvpn(Tunnel):
         super().__init__("openvpn", "OpenVPN: UDP, TLS, AES-256-GCM, in user space", "openvpn")
 
     def version(self) -> str | None:
-        return program_version("openvpn", "--version")
+        return command_version("openvpn", "--version")
 
     def _start(self, cable: Cable, folder: Path) -> tuple[subprocess.Popen[bytes], subprocess.Popen[bytes]]:
         prints = {side: _certificate(folder, side) for side in ("left", "right")}

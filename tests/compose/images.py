@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 
 HERE = Path(__file__).parent
 PROJECT = HERE.parent.parent
 PUBLIC_BASE = "python:3.11-slim"
-LOCAL_BASE = "uavlinkd-test-base:bookworm"
+LOCAL_BASES = "uavlinkd-test-base"
+LOCAL_BASE = f"{LOCAL_BASES}:bookworm"
 IMAGE = "uavlinkd-test"
 
 
@@ -34,7 +38,7 @@ def why_not() -> str | None:
 
 
 def compose_command() -> list[str] | None:
-    """Compose as a plugin of docker, or as the program that it was before."""
+    """Compose as a plugin of docker, or as a separate command."""
     for command in (["docker", "compose"], ["docker-compose"]):
         if shutil.which(command[0]) and not _try(*command, "version"):
             return command
@@ -48,7 +52,19 @@ def build() -> str:
     Raises:
         subprocess.CalledProcessError: a step failed; its output was printed.
     """
-    base = base_image()
+    with _one_at_a_time():
+        return _build(base_image())
+
+
+@contextmanager
+def _one_at_a_time(kind: str = "") -> Iterator[None]:
+    """Wait until no other process of the tests builds an image of this kind."""
+    with (Path(tempfile.gettempdir()) / f"uavlinkd-test-images{kind}.lock").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def _build(base: str) -> str:
     with tempfile.TemporaryDirectory(prefix="uavlinkd-image-") as folder:
         context = Path(folder)
         for name in ("Dockerfile", ".dockerignore"):
@@ -84,13 +100,31 @@ def base_image() -> str:
         return LOCAL_BASE
     if has_image(PUBLIC_BASE) or pull(PUBLIC_BASE):
         return PUBLIC_BASE
+    return debian("bookworm")
+
+
+def debian(codename: str) -> str:
+    """An image of a Debian release with Python and systemd, made from Debian's packages; its name.
+
+    Raises:
+        subprocess.CalledProcessError: debootstrap failed; its output was printed.
+    """
+    with _one_at_a_time(f"-{codename}"):
+        image = f"{LOCAL_BASES}:{codename}"
+        if not has_image(image):
+            _make_debian(codename, image)
+        return image
+
+
+def _make_debian(codename: str, image: str) -> None:
     with tempfile.TemporaryDirectory(prefix="uavlinkd-base-") as folder:
         root = Path(folder) / "root"
-        _run("debootstrap", "--variant=minbase", "--include=python3,python3-venv,systemd", "bookworm", root)
-        leave_out = [f"--exclude=./{each}" for each in ("var/cache/apt/*", "var/lib/apt/lists/*", "usr/share/doc/*")]
+        _run("debootstrap", "--variant=minbase", "--include=python3,python3-venv,systemd", codename, root)
+        leave_out = [
+            f"--exclude=./{pattern}" for pattern in ("var/cache/apt/*", "var/lib/apt/lists/*", "usr/share/doc/*")
+        ]
         with subprocess.Popen(["tar", "-C", root, *leave_out, "-c", "."], stdout=subprocess.PIPE) as tar:
-            subprocess.run(["docker", "import", "-", LOCAL_BASE], stdin=tar.stdout, check=True, capture_output=True)
-    return LOCAL_BASE
+            subprocess.run(["docker", "import", "-", image], stdin=tar.stdout, check=True, capture_output=True)
 
 
 def has_image(name: str) -> bool:

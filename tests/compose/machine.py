@@ -1,4 +1,4 @@
-"""A machine with systemd: a container in which it is the first process, with the units and the program in place."""
+"""A machine with systemd: a container in which it is the first process, with the units and uavlinkd installed."""
 
 from __future__ import annotations
 
@@ -12,22 +12,21 @@ from types import TracebackType
 from typing import Self
 
 from tests.compose import images
+from tests.waiting import PATIENCE_S
 
 IMAGE = "uavlinkd-test-systemd"
-PATIENCE_S = 60.0
 _DOCKERFILE = """
-FROM {program}
+FROM {image}
 USER root
-{install}
+{steps}
 COPY start-systemd /sbin/
-COPY *.service /etc/systemd/system/
-COPY mitm.toml /etc/uavlinkd/
 ENV container=docker
 HEALTHCHECK NONE
 STOPSIGNAL SIGRTMIN+3
 ENTRYPOINT []
 CMD ["/sbin/start-systemd"]
 """
+_UNITS = "COPY *.service /etc/systemd/system/\nCOPY mitm.toml /etc/uavlinkd/\n"
 _INSTALL = "RUN apt-get update -qq && apt-get install -qq -y --no-install-recommends systemd"
 
 
@@ -37,17 +36,31 @@ def build() -> str:
     Raises:
         subprocess.CalledProcessError: a step failed.
     """
-    program = images.build()
+    image = images.build()
     # The base that the tests made has systemd. One that was pulled has a network to install it from.
     install = "" if images.base_image() == images.LOCAL_BASE else _INSTALL
+    units = (images.PROJECT / "systemd").glob("*.service")
+    return _build(IMAGE, image, _UNITS + install, images.PROJECT / "configs" / "mitm.toml", *units)
+
+
+def build_clean(codename: str) -> str:
+    """The image of a Debian release without uavlinkd, and without what only a build needs; its name.
+
+    Raises:
+        subprocess.CalledProcessError: a step failed.
+    """
+    packages = "$(dpkg-query --show --showformat='${Package}\\n' | grep -E '^python3.*-(venv|whl)$')"
+    return _build(f"{IMAGE}:{codename}", images.debian(codename), f"RUN dpkg --purge {packages}")
+
+
+def _build(name: str, image: str, steps: str, *files: Path) -> str:
     with tempfile.TemporaryDirectory(prefix="uavlinkd-machine-") as folder:
         context = Path(folder)
-        units = (images.PROJECT / "systemd").glob("*.service")
-        for path in [images.HERE / "start-systemd", images.PROJECT / "configs" / "mitm.toml", *units]:
+        for path in [images.HERE / "start-systemd", *files]:
             shutil.copy(path, context)
-        (context / "Dockerfile").write_text(_DOCKERFILE.format(program=program, install=install))
-        _call("docker", "build", "--quiet", "--tag", IMAGE, folder)
-    return IMAGE
+        (context / "Dockerfile").write_text(_DOCKERFILE.format(image=image, steps=steps))
+        _call("docker", "build", "--quiet", "--tag", name, folder)
+    return name
 
 
 class Machine:
@@ -75,7 +88,7 @@ class Machine:
         _call("docker", "rm", "--force", self._id)
 
     def run(self, script: str) -> subprocess.CompletedProcess[str]:
-        """Run a shell script in it, whatever comes of that."""
+        """Run a shell script in it, with any exit status."""
         return subprocess.run(
             ["docker", "exec", "--interactive", self._id, "bash", "-eu"],
             input=script,
@@ -90,10 +103,18 @@ class Machine:
         assert done.returncode == 0, done.stdout + done.stderr
         return done.stdout
 
+    def put(self, path: Path, target: str) -> None:
+        """Copy a file into it, not below ``/run`` or ``/tmp``."""
+        _call("docker", "cp", str(path), f"{self._id}:{target}")
+
+    @property
+    def pid(self) -> int:
+        """Of its first process, as this machine counts."""
+        return int(_call("docker", "inspect", "--format", "{{.State.Pid}}", self._id))
+
     def add_address(self, address: str) -> None:
         """Give its loopback interface an address, from outside."""
-        pid = _call("docker", "inspect", "--format", "{{.State.Pid}}", self._id).strip()
-        _call("nsenter", f"--target={pid}", "--net", "ip", "address", "add", address, "dev", "lo")
+        _call("nsenter", f"--target={self.pid}", "--net", "ip", "address", "add", address, "dev", "lo")
 
     def facts(self, unit: str) -> dict[str, str]:
         """All properties of a unit, as they were at one moment."""

@@ -10,7 +10,7 @@ from collections.abc import Awaitable, Callable
 from tests.compose.cluster import Cluster, Conversation, until
 
 BACK_S = 2.0
-"""A link is up again so long after its host can be reached."""
+"""From the end of an outage until the link is up, on an idle machine."""
 OUTAGE_S = float(os.environ.get("UAVLINKD_OUTAGE_S", "0"))
 """How long a host is cut from the network at least; 60 is the full test. Every outage lasts until all others have
 noticed it."""
@@ -19,22 +19,19 @@ VICTIM = "drone3"
 OTHERS = ("drone1", "drone2", "ground-station")
 
 
-async def check_frames(cluster: Cluster, amount: int = 200) -> None:
+async def check_frames(cluster: Cluster, count: int = 200) -> None:
     """Each vehicle's frames reach all others once."""
     conversation = Conversation(cluster, cluster.names)
     try:
         await conversation.open()
-        await conversation.say_many(amount)
+        await conversation.say_many(count)
         await conversation.check()
     finally:
         conversation.close()
 
 
 async def check_outage(
-    cluster: Cluster,
-    begin: Callable[[], Awaitable[None]],
-    end: Callable[[], Awaitable[None]],
-    lasting_s: float = 0.0,
+    cluster: Cluster, begin: Callable[[], Awaitable[None]], end: Callable[[], Awaitable[None]], lasting_s: float = 0.0
 ) -> float:
     """An outage of the victim: the others' frames all pass meanwhile, and its links are back in time.
 

@@ -13,17 +13,19 @@ import pytest
 import pytest_asyncio
 
 from tests.compose import images, outages
-from tests.compose.cluster import PATIENCE_S, Cluster, Conversation, run, until
-from tests.daemon.harness import need
+from tests.compose.cluster import Cluster, Conversation, run, until
+from tests.needs import need
+from uavlinkd.fleet import operations
+from uavlinkd.fleet.manifest import FleetSettings
 from uavlinkd.ops.control import ControlError, ask
-from uavlinkd.fleet import operations as work
-from uavlinkd.fleet.manifest import Settings
 
 pytestmark = pytest.mark.asyncio(loop_scope="module")
 
 USER = 10001
 """Of the daemons in the image."""
-SUBNET, MITM_SUBNET = "10.13.0.0/24", "10.13.1.0/24"
+NETWORK = f"10.{64 + os.getpid() % 128}"
+"""The first half of the addresses. Another checkout may test on the same machine."""
+SUBNET, MITM_SUBNET = f"{NETWORK}.0.0/24", f"{NETWORK}.1.0/24"
 
 
 class Containers(Cluster):
@@ -51,14 +53,14 @@ class Containers(Cluster):
 
     async def open(self) -> None:
         """Make the fleet, and start everything."""
-        settings = Settings(
+        settings = FleetSettings(
             address_plan="{name}:5790",
             psk=True,
             control_socket="/run/uavlinkd/control.sock",
             ground_station_url="udpin:127.0.0.1:14550",
         )
         fleet = self._folder / "fleet"
-        work.init(fleet, settings, 3, 1, 0)
+        operations.init(fleet, settings, 3, 1, 0)
         if self._mitm:
             _replace(fleet / "drone1" / "drone1.toml", '"ground-station:5790"', '"mitm:5801"')
             _replace(fleet / "ground-station" / "ground-station.toml", '"drone1:5790"', '"mitm:5802"')
@@ -83,9 +85,9 @@ class Containers(Cluster):
     async def container(self, service: str) -> str:
         """The container's id, running or not."""
         filters = (f"com.docker.compose.project={self._project}", f"com.docker.compose.service={service}")
-        found = await run("docker", "ps", "-aq", *(f"--filter=label={each}" for each in filters))
-        assert len(found.split()) == 1, f"{service} has the containers: {found}"
-        return found.strip()
+        containers = await run("docker", "ps", "-aq", *(f"--filter=label={label}" for label in filters))
+        assert len(containers.split()) == 1, f"{service} has the containers: {containers}"
+        return containers.strip()
 
     async def inspect(self, service: str, what: str) -> str:
         """A fact about a service's container, as a template names it."""
@@ -122,7 +124,7 @@ class Containers(Cluster):
         await run("docker", "network", "disconnect", f"{self._project}_air", await self.container(name))
 
     async def join(self, name: str, *, elsewhere: bool = False) -> None:
-        address = ["--ip", "10.13.0.77"] if elsewhere else []
+        address = ["--ip", f"{NETWORK}.0.77"] if elsewhere else []
         await run(
             *("docker", "network", "connect", "--alias", name, *address),
             *(f"{self._project}_air", await self.container(name)),
@@ -192,7 +194,7 @@ async def cluster(containers: Containers) -> Containers:
 
 
 async def test_frames_reach_all_others_once(cluster: Containers) -> None:
-    """What each vehicle's program says comes to each other's once, byte for byte; the autopilots beside them fly."""
+    """What each vehicle's client says comes to each other's once, byte for byte; the autopilots beside them fly."""
     await outages.check_frames(cluster)
 
     def from_endpoint(name: str) -> int:
@@ -207,10 +209,10 @@ async def test_frames_reach_all_others_once(cluster: Containers) -> None:
 
 
 async def test_containers_are_healthy_confined_and_unprivileged(cluster: Containers) -> None:
-    """The health check passes on live links; the daemon is no root, and its root file system is read-only."""
+    """The health check passes on live links; the daemon is not root, and its root file system is read-only."""
 
     drone = await cluster.container("drone1")
-    await until(lambda: cluster.health(drone) == "healthy", "drone1 is healthy", 3 * PATIENCE_S)
+    await until(lambda: cluster.health(drone) == "healthy", "drone1 is healthy")
     assert (await run("docker", "exec", drone, "id", "-u")).strip() == str(USER)
     for path in ("/x", "/tmp/x", "/etc/uavlinkd/x", "/opt/uavlinkd/x"):
         assert "Read-only file system" in await run("docker", "exec", drone, "touch", path, check=False)
@@ -218,8 +220,9 @@ async def test_containers_are_healthy_confined_and_unprivileged(cluster: Contain
     assert int(capabilities.split()[1], 16) == 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("outage", outages.OUTAGES.values(), ids=outages.OUTAGES)
-async def test_outage_ends_in_time_and_disturbs_nobody(
+async def test_outage_ends_in_time_and_disturbs_no_other_link(
     cluster: Containers, outage: Callable[[Cluster], Awaitable[float]]
 ) -> None:
     """A container that was gone is linked again two seconds after it can be reached; the others lose no frame."""
@@ -234,10 +237,11 @@ ATTACKS = (
 """On the data of a link that is up: some lose genuine frames, none may add one."""
 
 
+@pytest.mark.long
 async def test_man_in_the_middle_gets_nothing_accepted(image: str, tmp_path: Path) -> None:
-    """Through a set of attacks between drone1 and the ground station, every frame is heard at most once and as sent.
+    """Through a set of attacks between drone1 and the ground station, every frame arrives at most once and unaltered.
 
-    Then he lets everything pass, and everything is heard.
+    Then it passes everything, and everything arrives.
     """
     async with opened(Containers(tmp_path, image, mitm=True)) as cluster:
         conversation = Conversation(cluster, ("drone1", "ground-station"))

@@ -16,9 +16,10 @@ import pytest_asyncio
 
 from tests.compose import images, outages
 from tests.compose.cluster import SYSTEM_IDS, Cluster, run, until
-from tests.daemon.harness import need
-from uavlinkd.fleet import operations as work
-from uavlinkd.fleet.manifest import Settings
+from tests.needs import need
+from uavlinkd.fleet import operations
+from uavlinkd.fleet.manifest import FleetSettings
+from uavlinkd.lab.child_processes import end_with_parent
 
 pytestmark = pytest.mark.asyncio(loop_scope="module")
 
@@ -37,7 +38,9 @@ class Namespaces(Cluster):
 
     async def open(self) -> None:
         """Make the network, and start everything."""
-        work.init(self._folder / "fleet", Settings(psk=True, ground_station_url="udpin:127.0.0.1:14550"), 3, 1, 0)
+        operations.init(
+            self._folder / "fleet", FleetSettings(psk=True, ground_station_url="udpin:127.0.0.1:14550"), 3, 1, 0
+        )
         air = self._prefix + "air"
         await run("ip", "netns", "add", air)
         await run("ip", "-n", air, "link", "add", "air", "type", "bridge")
@@ -72,7 +75,9 @@ class Namespaces(Cluster):
     async def _run(self, name: str, *arguments: str) -> asyncio.subprocess.Process:
         with (self._folder / f"{name}.log").open("ab") as log:
             return await asyncio.create_subprocess_exec(
-                *("ip", "netns", "exec", self._prefix + name, sys.executable, "-m", "uavlinkd", *arguments),
+                *end_with_parent(
+                    "ip", "netns", "exec", self._prefix + name, sys.executable, "-m", "uavlinkd", *arguments
+                ),
                 stdin=asyncio.subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
@@ -149,12 +154,12 @@ async def cluster(namespaces: Namespaces) -> Namespaces:
 
 
 async def test_frames_reach_all_others_once(cluster: Namespaces) -> None:
-    """What each vehicle's program says comes to each other's once, byte for byte."""
+    """What each vehicle's client says comes to each other's once, byte for byte."""
     await outages.check_frames(cluster)
 
 
 @pytest.mark.parametrize("outage", outages.OUTAGES.values(), ids=outages.OUTAGES)
-async def test_outage_ends_in_time_and_disturbs_nobody(
+async def test_outage_ends_in_time_and_disturbs_no_other_link(
     cluster: Namespaces, outage: Callable[[Cluster], Awaitable[float]]
 ) -> None:
     """A host that was gone is linked again two seconds after it can be reached; the others lose no frame."""

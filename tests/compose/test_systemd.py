@@ -11,12 +11,10 @@ import pytest
 
 from tests.compose import images
 from tests.compose.machine import Machine, build
-from tests.daemon.harness import need
+from tests.needs import need
 
-WATCHDOG_S, ABORT_S = 6.0, 1.0
+WATCHDOG_S = 6.0
 """Of the unit."""
-START_S = 20.0
-"""A start takes a fraction of this, on a machine that has something else to do."""
 
 _CONFIGURE = """
 uavlinkd=/opt/uavlinkd/bin/uavlinkd
@@ -71,7 +69,7 @@ def is_linked(machine: Machine) -> bool:
     """Whether both say so to systemd, and run."""
     return all(
         (facts["ActiveState"], facts["StatusText"]) == ("active", "1 of 1 peers up")
-        for facts in (machine.facts(f"uavlinkd@{each}") for each in "ab")
+        for facts in (machine.facts(f"uavlinkd@{instance}") for instance in "ab")
     )
 
 
@@ -90,10 +88,10 @@ def test_keys_come_from_systemd_to_a_user_without_a_name_of_its_own(machine: Mac
         assert int(fields["Uid"].split()[0]) >= 61184  # systemd's range for users of the moment
         assert fields["CapEff"] == fields["CapBnd"] == "0" * 16
         assert (fields["NoNewPrivs"], fields["Seccomp"]) == ("1", "2")
-        found = machine.say(f"nsenter --target {pid} --mount ls /run/credentials/uavlinkd@{name}.service").split()
-        assert found == [f"keys_{name}.key"]
+        names = machine.say(f"nsenter --target {pid} --mount ls /run/credentials/uavlinkd@{name}.service").split()
+        assert names == [f"keys_{name}.key"]
         assert machine.say("stat --format=%a:%U /etc/uavlinkd/a /etc/uavlinkd/b").split() == ["700:root"] * 2
-        assert other not in found
+        assert other not in names
 
 
 def test_status_is_for_root_alone(machine: Machine) -> None:
@@ -109,11 +107,12 @@ def test_a_stopped_loop_is_restarted(machine: Machine) -> None:
     machine.say(f"kill -STOP {before}")
     took_s = machine.until(lambda: is_back(machine, before))
     print(f"running again {took_s:.1f} s after its loop stood still")
-    assert WATCHDOG_S / 2 - 1 < took_s < WATCHDOG_S + ABORT_S + START_S
+    assert took_s > WATCHDOG_S / 2 - 1
     assert "Failed with result 'watchdog'" in machine.say("journalctl --no-pager --unit=uavlinkd@a --output=cat")
     machine.until(lambda: is_linked(machine))
 
 
+@pytest.mark.long
 def test_a_killed_daemon_is_restarted_each_time(machine: Machine) -> None:
     """More often in a row than systemd's own limit would let it."""
     for _ in range(6):
@@ -123,7 +122,7 @@ def test_a_killed_daemon_is_restarted_each_time(machine: Machine) -> None:
     machine.until(lambda: is_linked(machine))
 
 
-def test_reload_is_heard_and_a_bad_file_refused(machine: Machine) -> None:
+def test_reload_works_and_an_invalid_file_is_refused(machine: Machine) -> None:
     """The same process goes on; the status says that a file was refused."""
     before = machine.show("uavlinkd@b", "MainPID")
     machine.say(
@@ -155,11 +154,12 @@ def test_serial_port_of_the_group_is_opened(machine: Machine) -> None:
     )
     port = machine.say("cat /root/port").strip()
     log = "journalctl --no-pager --unit=uavlinkd@a --output=cat"
-    machine.until(lambda: f'"endpoint": "radio", "program": "{port}"' in machine.say(log))
+    machine.until(lambda: f'"endpoint": "radio", "client": "{port}"' in machine.say(log))
     machine.say("cp /root/a.toml /etc/uavlinkd/; systemctl restart uavlinkd@a")
     machine.until(lambda: is_linked(machine))
 
 
+@pytest.mark.long
 def test_keys_may_be_encrypted(machine: Machine) -> None:
     """As the unit says: with the machine's own key, and the plain ones away."""
     machine.say(
@@ -177,8 +177,9 @@ def test_keys_may_be_encrypted(machine: Machine) -> None:
     machine.until(lambda: is_linked(machine))
 
 
+@pytest.mark.long
 def test_man_in_the_middle_runs_confined(machine: Machine) -> None:
-    """uavlink-mitm.service with the example's configuration, told where the two are: it attacks, and they stay up."""
+    """uavlink-mitm.service with the example's configuration and the two addresses: it attacks, and they stay up."""
     machine.say(
         """
         sed -i -e '/^public_key/d' \\
@@ -200,7 +201,7 @@ def test_man_in_the_middle_runs_confined(machine: Machine) -> None:
         answer: dict[str, Any] = json.loads(machine.say(ask))
         return answer
 
-    machine.until(lambda: any(each.startswith("replay-data") for each in asked("statistics")["interventions"]))
+    machine.until(lambda: any(name.startswith("replay-data") for name in asked("statistics")["interventions"]))
     assert is_linked(machine)
     facts = machine.facts("uavlink-mitm")
     fields = machine.say(f"cat /proc/{facts['MainPID']}/status")
@@ -216,7 +217,7 @@ def test_man_in_the_middle_runs_confined(machine: Machine) -> None:
 
 
 def test_the_end_is_clean(machine: Machine) -> None:
-    """The peer is told, the exit status is 0, and nothing is left in /run."""
+    """The peer is notified, the exit status is 0, and nothing is left in /run."""
     machine.say("systemctl stop uavlinkd@a")
     assert machine.show("uavlinkd@a", "Result") == "success"
     machine.until(lambda: machine.show("uavlinkd@b", "StatusText") == "0 of 1 peers up")

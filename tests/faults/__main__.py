@@ -1,4 +1,4 @@
-"""``python -m tests.faults [NAME …]``: have each fault happen to real daemons, and print what came of it.
+"""``python -m tests.faults [NAME …]``: cause each fault for real daemons, and print the result.
 
 A table in Markdown. Exit status 0 only if the daemons were back in time from each. UAVLINKD_FAULT_S says how long a
 fault lasts (4 s). Most take root.
@@ -31,12 +31,14 @@ def main() -> int:
     said = io.StringIO()
     with contextlib.redirect_stdout(said):
         outcomes = asyncio.run(happen(chosen))
-    failed = [each for each in outcomes.values() if not isinstance(each, Outcome) or each.recovered_s > BACK_S]
+    failed = [
+        outcome for outcome in outcomes.values() if not isinstance(outcome, Outcome) or outcome.recovered_s > BACK_S
+    ]
     if failed and not options.markdown:
         print(said.getvalue())
-        for each in failed:
-            if isinstance(each, BaseException):
-                traceback.print_exception(each)
+        for failure in failed:
+            if isinstance(failure, BaseException):
+                traceback.print_exception(failure)
     print(f"Each fault lasted {fault_seconds()} s.\n\n{markdown(outcomes)}")
     return 1 if failed else 0
 

@@ -9,7 +9,8 @@ from types import TracebackType
 from typing import Self
 
 from tests.compose.cluster import run
-from tests.daemon.harness import DaemonProcess, Stage
+from tests.daemon.harness import Stage
+from tests.daemon.process import DaemonProcess
 from tests.faults.talk import Talk, prepare
 
 PORT = 5790
@@ -25,8 +26,8 @@ class Cable:
         self.hosts = (f"{name}-a", f"{name}-b")
         other = "drone1" if victim == "drone0" else "drone0"
         self.victim, self.other = (
-            stage.daemon(each, [f"{address}:{PORT}"])
-            for each, address in zip((victim, other), ADDRESSES, strict=True)
+            stage.daemon(name, [f"{address}:{PORT}"])
+            for name, address in zip((victim, other), ADDRESSES, strict=True)
         )
         stage.introduce(self.victim, self.other)
         self._stage = stage

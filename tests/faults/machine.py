@@ -16,11 +16,15 @@ from time import monotonic, sleep
 from typing import Any
 
 from tests.daemon.fleet import Rogue
-from tests.daemon.harness import DaemonProcess, Sockaddr, Stage, Status, frame, free_port, open_socket
-from tests.daemon.test_reboot import faked_clock
+from tests.daemon.frames import frame
+from tests.daemon.harness import Stage
+from tests.daemon.process import DaemonProcess, Status
+from tests.daemon.udp import Sockaddr, open_socket
 from tests.faults.network import FAULT_S
-from tests.faults.talk import NOBODY, Log, Outcome, Talk, grew, prepare, told
-from tests.waiting import until
+from tests.faults.talk import UNCOUNTED, Log, Outcome, Talk, grew, prepare, reported
+from tests.needs import need
+from tests.waiting import Stopwatch, until
+from uavlinkd.lab.sim.loopback_ports import free_port
 
 SUSPENDED_S = float(os.environ.get("UAVLINKD_SIGSTOP_S", FAULT_S))
 """How long a process is stopped; 30 in CI."""
@@ -48,19 +52,19 @@ async def descriptors(stage: Stage) -> Outcome:
     await talk.start()  # with the first frame, a recording is to begin
     began = monotonic()
     await asyncio.sleep(FAULT_S)
-    ended = monotonic()
+    ended, watch = monotonic(), Stopwatch()
     for scene in scenes:
         scene.relieve()
     await asyncio.gather(*(scene.back() for scene in scenes))
-    recovered_s = monotonic() - ended
-    assert talk.lost(began, ended) == 0, "the link does without new descriptors"
+    recovered_s, lines = watch.calm_s, max(log.count for log in logs)  # later ones are of clients that leave
+    await talk.check_lost_none(began, ended, a, b)  # the link does without new descriptors
     talk.stop()
-    did = [await scene.told() for scene in scenes]
-    return Outcome(f"the link lost no frame; {did[0]}", recovered_s, max(log.amount for log in logs))
+    did = [await scene.reported() for scene in scenes]
+    return Outcome(f"the link lost no frame; {did[0]}", recovered_s, lines)
 
 
 class _Exhausted:
-    """A daemon with no descriptor left, and who wants one of it."""
+    """A daemon without free descriptors, and clients that need one."""
 
     def __init__(self, daemon: DaemonProcess) -> None:
         self.daemon = daemon
@@ -88,7 +92,7 @@ class _Exhausted:
         self._device.symlink_to(os.ttyname(self._ends[1]))
 
     def _descriptors(self) -> set[int]:
-        return {int(each) for each in os.listdir(f"/proc/{self.daemon.pid}/fd")}
+        return {int(name) for name in os.listdir(f"/proc/{self.daemon.pid}/fd")}
 
     def _connect(self) -> socket.socket:
         return socket.create_connection(self._tcp)
@@ -104,14 +108,14 @@ class _Exhausted:
     def _is_back(self, status: Status) -> bool:
         recording = status["recording"]
         return (
-            len(status["endpoints"]["tcp"]["programs"]) == len(self._clients)
-            and bool(status["endpoints"]["serial"]["programs"])
+            len(status["endpoints"]["tcp"]["clients"]) == len(self._clients)
+            and bool(status["endpoints"]["serial"]["clients"])
             and recording["is_recording"]
             and "EMFILE" in recording["failures"]
         )
 
-    async def told(self) -> str:
-        """What it counted; and nobody is left behind."""
+    async def reported(self) -> str:
+        """Its counters; afterwards all clients are connected."""
         status = await self.daemon.status()
         counts = {
             "TCP": status["endpoints"]["tcp"]["failures"],
@@ -124,15 +128,15 @@ class _Exhausted:
             os.close(end)
         for failures in counts.values():
             assert failures.get("EMFILE"), counts
-        return "; ".join(f"{what}: {told({'EMFILE': each['EMFILE']})}" for what, each in counts.items())
+        return "; ".join(f"{what}: {reported({'EMFILE': count['EMFILE']})}" for what, count in counts.items())
 
 
 # Disks.
 
 
-def on_small_disk(folder: Path, program: str = 'exec "$@"') -> tuple[str, ...]:
-    """A launcher with a disk of 256 KiB in place of a folder, which nobody else sees."""
-    script = f"mount -t tmpfs -o size=256k none '{folder}' && {program}"
+def on_small_disk(folder: Path, command: str = 'exec "$@"') -> tuple[str, ...]:
+    """A launcher with a disk of 256 KiB instead of a folder, visible only to it."""
+    script = f"mount -t tmpfs -o size=256k none '{folder}' && {command}"
     return ("unshare", "--mount", "sh", "-c", script, "sh")
 
 
@@ -161,18 +165,20 @@ async def recording_disk_full(stage: Stage) -> Outcome:
     await a.until(lambda status: not status["recording"]["is_recording"])
     await asyncio.sleep(FAULT_S)
     during = await a.status()
-    ended = monotonic()
+    ended, watch = monotonic(), Stopwatch()
     filler.unlink()
     frames = during["recording"]["frames"]
     await a.until(lambda status: status["recording"]["is_recording"] and status["recording"]["frames"] > frames)
-    recovered_s = monotonic() - ended
-    assert talk.lost(began, ended) == 0
+    recovered_s = watch.calm_s
+    await talk.check_lost_none(began, ended, a, b)
     talk.stop()
     lost = during["recording"]["frames_lost"] - before["recording"]["frames_lost"]
     failures = grew(before, during, "recording", "failures")
     assert set(failures) == {"ENOSPC"}
     assert len(a.events("recording_stopped")) == 1
-    return Outcome(f"the link lost no frame; {lost} frames not recorded, {told(failures)}", recovered_s, log.amount)
+    return Outcome(
+        f"the link lost no frame; {lost} frames not recorded, {reported(failures)}", recovered_s, log.count
+    )
 
 
 async def log_disk_full(stage: Stage) -> Outcome:
@@ -197,31 +203,39 @@ async def log_disk_full(stage: Stage) -> Outcome:
     await talk.back(monotonic())
     calm = monotonic()
     await asyncio.sleep(max(0.5, began + FAULT_S - monotonic()))
-    ended = monotonic()
+    ended, watch = monotonic(), Stopwatch()
     assert (inside / "log").stat().st_size == size
     filler.unlink()
     _newcomer(into_other)
     await until(lambda: "lines_lost_before" in (inside / "log").read_text())
-    recovered_s = max(monotonic() - ended, await talk.back(ended))
-    assert talk.lost(calm, ended) == 0
+    recovered_s = max(watch.calm_s, await talk.back(ended))
+    await talk.check_lost_none(calm, ended, a, b)
     talk.stop()
     lines = (inside / "log").read_bytes()[size:].decode().splitlines()
-    (told_of,) = (json.loads(line) for line in lines if "lines_lost_before" in line)
+    (reported_loss,) = (json.loads(line) for line in lines if "lines_lost_before" in line)
     return Outcome(
         "the link goes on, is lost and comes back as with a log; the first line that fits again has"
-        f" lines_lost_before = {told_of['lines_lost_before']}",
+        f" lines_lost_before = {reported_loss['lines_lost_before']}",
         recovered_s,
         len([line for line in lines if line]),
     )
 
 
 def _newcomer(into: Sockaddr) -> None:
-    """A program that says something once: a line in the log."""
+    """A client that says something once: a line in the log."""
     with open_socket("127.0.0.1") as sock:
-        sock.sendto(frame(0, NOBODY), into)
+        sock.sendto(frame(0, UNCOUNTED), into)
 
 
 # Clocks.
+
+
+def faked_clock(at: str) -> dict[str, str]:
+    """The environment in which a process believes that it is another time; its monotonic clock is genuine."""
+    folders = [Path("/usr/lib"), Path("/usr/lib64"), Path("/usr/local/lib")]
+    libraries = [library for folder in folders for library in sorted(folder.glob("**/faketime/libfaketime.so.1"))]
+    need(bool(libraries), "libfaketime (Debian: faketime)")
+    return {"LD_PRELOAD": str(libraries[0]), "FAKETIME": f"@{at}", "FAKETIME_DONT_FAKE_MONOTONIC": "1", "TZ": "UTC"}
 
 
 async def clock_jumps(stage: Stage) -> Outcome:
@@ -232,6 +246,7 @@ async def clock_jumps(stage: Stage) -> Outcome:
     clock = a.folder / "clock"
     clock.write_text("+0")
     a.config["recording"] = {"folder": "recordings", "min_free_bytes": 100_000}
+    a.config["log"] = {"level": "debug"}  # rekeys are logged
     talk = prepare(a, b)
     environ |= {"FAKETIME_TIMESTAMP_FILE": str(clock), "FAKETIME_NO_CACHE": "1"}
     a.environ = environ
@@ -248,24 +263,23 @@ async def clock_jumps(stage: Stage) -> Outcome:
         await until(lambda years=years: _has_keys_of(a, years))  # type: ignore[misc]
         await until(lambda files=files: len(list(recordings.iterdir())) == files)  # type: ignore[misc]
     ended = monotonic()
-    await talk.back(ended)  # so that all before it has come too
-    assert talk.lost(began, ended) == 0
+    await talk.check_lost_none(began, ended, a, b)
     assert not a.events("peer_lost")
     status = await a.status()
     assert status["recording"]["frames_lost"] == 0
     talk.stop()
     return Outcome(
-        "no frame lost, new keys made meanwhile; three recordings, one for each time", recovered_s, log.amount
+        "no frame lost, new keys made meanwhile; three recordings, one for each time", recovered_s, log.count
     )
 
 
 def _has_keys_of(daemon: DaemonProcess, years: int) -> bool:
     """Whether keys were made at a time so far from now, by the daemon's clock."""
     days = [
-        (datetime.fromisoformat(each["timestamp"]) - datetime.now(UTC)).days
-        for each in daemon.events("session_established")
+        (datetime.fromisoformat(event["timestamp"]) - datetime.now(UTC)).days
+        for event in daemon.events("session_established")
     ]
-    return any(abs(each - 365 * years) < 2 for each in days)
+    return any(abs(day - 365 * years) < 2 for day in days)
 
 
 # The name service.
@@ -308,10 +322,10 @@ async def name_service_silent(stage: Stage) -> Outcome:
 
 
 def _free_host() -> str:
-    """An address of loopback on whose port for names nobody listens."""
-    chance = random.SystemRandom()
+    """An address of loopback without a name server."""
+    rng = random.SystemRandom()
     while True:
-        host = f"127.{chance.randrange(1, 255)}.{chance.randrange(1, 255)}.53"
+        host = f"127.{rng.randrange(1, 255)}.{rng.randrange(1, 255)}.53"
         with suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
             sock.bind((host, 53))
             return host
@@ -341,15 +355,18 @@ async def _name_service(stage: Stage, *, is_silent: bool) -> Outcome:
     if not is_silent:
         await loop.create_datagram_endpoint(lambda: server, local_addr=(host, 53))
     server.is_silent = False
-    ended = monotonic()
+    ended, watch = monotonic(), Stopwatch()
     await a.until_linked()
     await talk.start()
-    recovered_s = await talk.back(ended)
+    await talk.back(ended)
+    recovered_s = watch.calm_s
     talk.stop()
     server.close()
     failed = a.events("name_not_resolved")
     assert len(failed) == (1 if not is_silent else len(failed)) <= 1
-    return Outcome("peer waiting; name_not_resolved told once" if failed else "peer waiting", recovered_s, log.amount)
+    return Outcome(
+        "peer waiting; name_not_resolved reported once" if failed else "peer waiting", recovered_s, log.count
+    )
 
 
 # The scheduler.
@@ -364,19 +381,24 @@ async def suspended(stage: Stage) -> Outcome:
     await a.send_signal(signal.SIGSTOP)
     began = monotonic()
     await asyncio.sleep(SUSPENDED_S)
+    waiting, sent = monotonic(), len(talk.voices[1].sent_at)
+    # What the other daemon passes on later is new to this one.
+    await b.until(lambda status: status["endpoints"]["talk"]["frames_received"] >= sent)
     ended = monotonic()
     await a.send_signal(signal.SIGCONT)
     recovered_s = await talk.back(ended)
     for speaker, hearer in (talk.voices, talk.voices[::-1]):
-        old = {n for n, at in speaker.sent_at.items() if began + 0.1 < at < ended}
-        assert not [n for n in old if speaker.frame(n) in hearer.heard_at], "what had waited came as if it were new"
+        old = {n for n, at in speaker.sent_at.items() if began + 0.1 < at < waiting}
+        assert not [n for n in old if speaker.frame(n) in hearer.received_at], (
+            "what had waited came as if it were new"
+        )
     talk.check_no_copies()
     talk.stop()
-    await a.until_logged("daemon_stood_still")
+    await a.until_logged("daemon_paused")
     await a.until_logged("frames_dropped", reason="stale")
     dropped = sum((await a.status())["stale"].values())  # the log's counts come in portions
     return Outcome(
-        f"daemon_stood_still told; {dropped} frames that had waited dropped as stale", recovered_s, log.amount
+        f"daemon_paused reported; {dropped} frames that had waited dropped as stale", recovered_s, log.count
     )
 
 
@@ -384,7 +406,7 @@ async def suspended(stage: Stage) -> Outcome:
 
 
 async def garbage_with_valid_keys(stage: Stage) -> Outcome:
-    """A peer's own keys seal thousands of records and frames that are none; another peer talks meanwhile."""
+    """A peer's own keys seal thousands of records and invalid frames; another peer talks meanwhile."""
     a, b = stage.pair()
     captured = stage.daemon("captured")
     psk = stage.psk()
@@ -392,7 +414,7 @@ async def garbage_with_valid_keys(stage: Stage) -> Outcome:
     talk = prepare(a, b)
     await stage.start(b, a, linked=False)
     await talk.start()
-    chance = random.Random(8)
+    rng = random.Random(8)
     genuine = frame(1 << 21, 7)
     began = monotonic()
     before, log = await a.status(), Log(a)
@@ -400,14 +422,14 @@ async def garbage_with_valid_keys(stage: Stage) -> Outcome:
         while monotonic() < began + FAULT_S:
             for _ in range(50):
                 if rogue.is_up:
-                    with suppress(AssertionError):  # it said goodbye in its own name: there are no keys for a moment
-                        rogue.say(garbage(chance, genuine))
+                    with suppress(AssertionError):  # it sent a close itself: there are no keys for a moment
+                        rogue.say(garbage(rng, genuine))
             await asyncio.sleep(0.02)
         ended = monotonic()
         recovered_s = await talk.back(ended)
         await rogue.until(lambda: rogue.is_up)
     after = await a.status()
-    assert talk.lost(began, ended) == 0
+    await talk.check_lost_none(began, ended, a, b)
     talk.check_no_copies()
     talk.stop()
     drops = grew(before, after, "peers", "captured", "drops")
@@ -415,20 +437,22 @@ async def garbage_with_valid_keys(stage: Stage) -> Outcome:
     assert drops.get("bad_control", 0) > 100
     assert malformed
     return Outcome(
-        f"the other peer lost no frame; dropped: {told(drops)}; malformed: {told(malformed)}", recovered_s, log.amount
+        f"the other peer lost no frame; dropped: {reported(drops)}; malformed: {reported(malformed)}",
+        recovered_s,
+        log.count,
     )
 
 
-def garbage(chance: random.Random, genuine: bytes) -> bytes:
-    """A payload that is none: noise, records with a right first byte, frames cut or altered."""
-    noise = chance.randbytes(chance.randrange(1, 400))
-    at = chance.randrange(len(genuine))
-    return chance.choice(
+def garbage(rng: random.Random, genuine: bytes) -> bytes:
+    """An invalid payload: noise, records with a right first byte, frames cut or altered."""
+    noise = rng.randbytes(rng.randrange(1, 400))
+    at = rng.randrange(len(genuine))
+    return rng.choice(
         (
             noise,
-            bytes((chance.randrange(8),)) + noise[: chance.randrange(40)],
+            bytes((rng.randrange(8),)) + noise[: rng.randrange(40)],
             genuine[: at + 1],
-            genuine[:at] + bytes((genuine[at] ^ 1 << chance.randrange(8),)) + genuine[at + 1 :],
+            genuine[:at] + bytes((genuine[at] ^ 1 << rng.randrange(8),)) + genuine[at + 1 :],
             genuine + noise,
         )
     )

@@ -1,4 +1,4 @@
-"""All faults, several at a time, and the table of what came of them."""
+"""All faults, several at a time, and the table of their results."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 from tests.compose.test_namespaces import can_make_namespaces
-from tests.daemon.harness import DaemonProcess, Stage
+from tests.daemon.harness import Stage
+from tests.daemon.process import DaemonProcess
 from tests.faults import machine, network
 from tests.faults.talk import Outcome
 
@@ -68,7 +69,7 @@ def why_not() -> str | None:
 
 
 async def happen(names: Iterable[str]) -> dict[str, Outcome | BaseException]:
-    """Have these faults happen, each to daemons of its own; what came of each."""
+    """Cause these faults, each for daemons of its own; returns the result of each."""
     turns, starting = asyncio.Semaphore(AT_ONCE), asyncio.Lock()
 
     async def one(name: str) -> Outcome:

@@ -1,4 +1,4 @@
-"""Two programs that talk through two daemons while something goes wrong, and what that cost them."""
+"""Two clients that exchange frames through two daemons during a fault, and their losses."""
 
 from __future__ import annotations
 
@@ -11,12 +11,15 @@ from time import monotonic
 from typing import Any
 
 from tests.compose.cluster import socket_in
-from tests.daemon.harness import PATIENCE_S, DaemonProcess, Sockaddr, Status, frame, open_socket
-from tests.waiting import until
+from tests.daemon.frames import frame
+from tests.daemon.losses import lost_to_waiting
+from tests.daemon.process import DaemonProcess, Status
+from tests.daemon.udp import Sockaddr, open_socket
+from tests.waiting import PATIENCE_S, Stopwatch, until
 
 EVERY_S = 0.02
-NOBODY = 99
-"""The system of frames that nobody keeps account of."""
+UNCOUNTED = 99
+"""The system of frames that are not counted."""
 _SYSTEM_AT = 5
 
 
@@ -33,11 +36,11 @@ class Outcome:
 
 
 class Voice:
-    """One program: says numbered frames in a steady rhythm, and notes when each of the other's comes."""
+    """One client: says numbered frames in a steady rhythm, and notes when each of the other's comes."""
 
     def __init__(self, sock: socket.socket, into: Sockaddr, system: int, hears: int) -> None:
         self.sent_at: dict[int, float] = {}
-        self.heard_at: dict[bytes, float] = {}
+        self.received_at: dict[bytes, float] = {}
         self.copies = 0
         self._sock = sock
         self._into = into
@@ -56,7 +59,7 @@ class Voice:
             while True:
                 number = len(self.sent_at)
                 self.sent_at[number] = monotonic()
-                with suppress(OSError):  # the daemon's port may be gone for a moment: nobody hears it
+                with suppress(OSError):  # the daemon's port may be gone for a moment: the frame is lost
                     self._sock.sendto(self.frame(number), self._into)
                 await asyncio.sleep(EVERY_S)
         finally:
@@ -66,7 +69,7 @@ class Voice:
     def shout(self) -> None:
         """Say much, out of turn, that counts for nothing."""
         with suppress(OSError):
-            self._sock.sendto(frame(0, NOBODY) * 8, self._into)
+            self._sock.sendto(frame(0, UNCOUNTED) * 8, self._into)
 
     def _on_readable(self) -> None:
         now = monotonic()
@@ -74,14 +77,14 @@ class Voice:
             while True:
                 data = self._sock.recv(65536)
                 for start in range(0, len(data), len(self.frame(0))):
-                    each = data[start : start + len(self.frame(0))]
-                    if each[_SYSTEM_AT] == self._hears:  # the rest is nothing that is kept account of
-                        self.copies += each in self.heard_at
-                        self.heard_at.setdefault(each, now)
+                    raw = data[start : start + len(self.frame(0))]
+                    if raw[_SYSTEM_AT] == self._hears:  # the rest is nothing that is kept account of
+                        self.copies += raw in self.received_at
+                        self.received_at.setdefault(raw, now)
 
 
 class Talk:
-    """Between the programs of two daemons, which need an endpoint for it each: :func:`prepare` adds them."""
+    """Between the clients of two daemons, which need an endpoint for it each: :func:`prepare` adds them."""
 
     def __init__(self, voices: tuple[Voice, Voice]) -> None:
         self.voices = voices
@@ -90,7 +93,7 @@ class Talk:
     async def start(self) -> None:
         """Begin, and wait until each hears the other."""
         self._tasks = [asyncio.create_task(voice.speak()) for voice in self.voices]
-        await until(lambda: all(voice.heard_at for voice in self.voices))
+        await until(lambda: all(voice.received_at for voice in self.voices))
 
     def stop(self) -> None:
         """Fall silent."""
@@ -98,38 +101,53 @@ class Talk:
             task.cancel()
 
     async def back(self, since: float) -> float:
-        """Wait until each has heard what the other said after a moment; how long after it that was, in seconds."""
+        """Wait until each has received a frame that the other sent after this time, which is now or just was.
+
+        Returns:
+            Seconds from then, without those in which the machine was busy.
+        """
+        watch = Stopwatch()
         async with asyncio.timeout(PATIENCE_S):
-            while (found := self._back(since)) is None:  # noqa: ASYNC110  two sockets, any of which may bring it
+            while (back_s := self._back(since)) is None:  # noqa: ASYNC110  two sockets, any of which may bring it
                 await asyncio.sleep(0.005)
-        return found
+        return max(0.0, back_s - watch.contended_s)
 
     def _back(self, since: float) -> float | None:
         latest = 0.0
         for speaker, hearer in (self.voices, self.voices[::-1]):
             after = [number for number, at in speaker.sent_at.items() if at >= since]
-            heard = [hearer.heard_at[each] for each in map(speaker.frame, after) if each in hearer.heard_at]
-            if not heard:
+            received = [hearer.received_at[raw] for raw in map(speaker.frame, after) if raw in hearer.received_at]
+            if not received:
                 return None
-            latest = max(latest, *(at - since for at in (min(heard),)))
+            latest = max(latest, *(at - since for at in (min(received),)))
         return latest
 
     def lost(self, since: float, before: float) -> int:
-        """How many frames said in between were not heard."""
+        """The number of frames sent in between that were not received."""
         return sum(
-            speaker.frame(number) not in hearer.heard_at
+            speaker.frame(number) not in hearer.received_at
             for speaker, hearer in (self.voices, self.voices[::-1])
             for number, at in speaker.sent_at.items()
             if since <= at < before
         )
 
+    async def check_lost_none(self, since: float, before: float, a: DaemonProcess, b: DaemonProcess) -> None:
+        """Assert that the daemons lost no frame sent in between, once a later one has arrived in each direction.
+
+        Frames that were lost because a daemon had to wait for a processor are not lost by the link.
+        """
+        await self.back(before)
+        lost = self.lost(since, before)
+        dropped = await lost_to_waiting(a, b) + await lost_to_waiting(b, a)
+        assert lost <= dropped, f"{lost} frames lost, {dropped} of them explained"
+
     def check_no_copies(self) -> None:
-        """Nothing was heard twice."""
+        """No frame was received twice."""
         assert [voice.copies for voice in self.voices] == [0, 0]
 
 
 def prepare(a: DaemonProcess, b: DaemonProcess, namespaces: tuple[Path | None, Path | None] = (None, None)) -> Talk:
-    """Give each an endpoint, in its network namespace, and a program there."""
+    """Give each an endpoint, in its network namespace, and a client there."""
     voices = [
         Voice(
             open_socket("127.0.0.1") if namespace is None else socket_in(namespace),
@@ -153,7 +171,7 @@ class Log:
         self._begin = len(self.daemon.lines)
 
     @property
-    def amount(self) -> int:
+    def count(self) -> int:
         """How many lines."""
         return len(self.daemon.lines) - self._begin
 
@@ -162,11 +180,11 @@ def grew(before: Status, after: Status, *path: str) -> dict[str, int]:
     """Which counters rose, and by how much."""
     old: Any = before
     new: Any = after
-    for each in path:
-        old, new = old[each], new[each]
+    for key in path:
+        old, new = old[key], new[key]
     return {name: total - old.get(name, 0) for name, total in new.items() if total > old.get(name, 0)}
 
 
-def told(counts: dict[str, int]) -> str:
+def reported(counts: dict[str, int]) -> str:
     """For the table."""
-    return ", ".join(f"{name} {amount}" for name, amount in sorted(counts.items())) or "nothing"
+    return ", ".join(f"{name} {count}" for name, count in sorted(counts.items())) or "nothing"

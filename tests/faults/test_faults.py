@@ -6,12 +6,12 @@ import asyncio
 
 import pytest
 
-from tests.daemon.harness import need
 from tests.faults.machine import LINES_AT_MOST
 from tests.faults.network import FAULT_S
 from tests.faults.run import BACK_S, FAULTS, happen, markdown, why_not
 from tests.faults.talk import Outcome
-from uavlinkd.link.event_log import LINES_BURST, LINES_PER_S
+from tests.needs import need
+from uavlinkd.link.conditions import LINES_BURST, LINES_PER_S
 
 Outcomes = dict[str, Outcome | BaseException]
 
@@ -26,12 +26,22 @@ def outcomes(request: pytest.FixtureRequest) -> Outcomes:
     }
     reason = why_not()
     possible = [name for name in FAULTS if name in asked and not (reason and FAULTS[name].takes_root)]
-    found = asyncio.run(happen(possible))
-    print(markdown(found))
-    return found
+    outcomes = asyncio.run(happen(possible))
+    print(markdown(outcomes))
+    return outcomes
 
 
-@pytest.mark.parametrize("fault", FAULTS)
+SHORT = ("suspended", "descriptors", "interface_down", "recording_disk_full", "garbage")
+"""Faults of each kind. The others are as long, and run in CI."""
+
+
+CLIENTS_LINES = 6
+"""Lines of the clients that connect after the daemon has descriptors again, and of the problems that end then."""
+
+
+@pytest.mark.parametrize(
+    "fault", [pytest.param(fault, marks=() if fault in SHORT else pytest.mark.long) for fault in FAULTS]
+)
 def test_daemon_withstands_it_and_is_back_in_time(fault: str, outcomes: Outcomes) -> None:
     """It keeps running and keeps its log short; the measured time from the fault's end is within the bound."""
     need(fault in outcomes, why_not() or "nothing")
@@ -40,6 +50,7 @@ def test_daemon_withstands_it_and_is_back_in_time(fault: str, outcomes: Outcomes
         raise outcome
     print(outcome)
     assert outcome.recovered_s < BACK_S
-    # Whoever has valid keys can cause a line a handshake, up to what the log grants one peer.
+    # A sender with valid keys can cause a line a handshake, up to what the log grants one peer.
     of_peer = LINES_BURST + FAULT_S * LINES_PER_S if fault == "garbage" else 0
-    assert outcome.lines <= LINES_AT_MOST + FAULT_S / 5 + of_peer
+    of_clients = CLIENTS_LINES if fault == "descriptors" else 0
+    assert outcome.lines <= LINES_AT_MOST + FAULT_S / 5 + of_peer + of_clients

@@ -1,4 +1,4 @@
-"""Attackers in the simulated network: they hold no key and control what they are given to control."""
+"""Attackers in the simulated network: they hold no key, and control only their part of the network."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from uavlinkd.core.suites import X25519
 
 
 class Recorder:
-    """Writes down every datagram that any drone sends, with where it came from and where it went."""
+    """Records every datagram that any drone sends, with its source and destination."""
 
     def __init__(self, network: Network, keep: int | None = None) -> None:
         self.recorded: list[tuple[bytes, Address, Address]] = []
@@ -25,13 +25,13 @@ class Recorder:
         network.listeners.append(self)
 
     def overhear(self, datagram: bytes, source: Address, destination: Address) -> None:
-        """Write it down."""
+        """Record it."""
         self.recorded.append((datagram, source, destination))
         if self._keep is not None and len(self.recorded) >= 2 * self._keep:
             del self.recorded[: -self._keep]
 
     def receive(self, datagram: bytes, source: Address, destination: Address) -> None:
-        """Nothing is sent to a recorder."""
+        """A recorder has no address."""
 
 
 class Racer:
@@ -43,7 +43,7 @@ class Racer:
     def __init__(self, network: Network, address: Address, victim: Drone, other: Drone, *, relays: bool) -> None:
         self.address = address
         self.attracted: list[bytes] = []
-        """What drones sent to its address."""
+        """Datagrams of drones to its address."""
         self.is_active = True
         self._network = network
         self._victim = victim
@@ -53,12 +53,12 @@ class Racer:
         network.attackers[address] = self
 
     def overhear(self, datagram: bytes, source: Address, destination: Address) -> None:
-        """Be there first, from another address."""
+        """Forward it from another address, before the original arrives."""
         if self.is_active and source in self._victim.addresses and destination in self._other.addresses:
             self._network.inject(datagram, self.address, destination)
 
     def receive(self, datagram: bytes, source: Address, destination: Address) -> None:
-        """A drone believes that the victim is here."""
+        """Whether a drone sends to this address as the victim's."""
         self.attracted.append(datagram)
         if self.is_active and self._relays:
             to = self._other if source in self._victim.addresses else self._victim
@@ -69,7 +69,7 @@ class Flooder:
     """Sends one drone whatever may cost it work or memory, from many addresses and under those of its peers.
 
     One that knows the drone's public key makes initiations with a sound ``mac1``, some of them whole handshakes of a
-    key that nobody has configured, and proves its addresses with the cookies that it is given.
+    key that is not configured, and proves its addresses with the cookies that it is given.
     """
 
     def __init__(self, network: Network, victim: Drone, lot: Random, *, sources: int, knows_key: bool) -> None:
@@ -85,16 +85,16 @@ class Flooder:
         network.attackers.update(dict.fromkeys(self._addresses, self))
 
     def flood(self, per_s: float, until: float) -> None:
-        """So many datagrams a second from now on."""
+        """Send so many datagrams a second from now on."""
         self._send_one()
         if self._network.now + 1 / per_s < until:
             self._network.at(self._network.now + 1 / per_s, lambda: self.flood(per_s, until))
 
     def overhear(self, datagram: bytes, source: Address, destination: Address) -> None:
-        """It sees nothing but what is sent to it."""
+        """It sees only datagrams to its addresses."""
 
     def receive(self, datagram: bytes, source: Address, destination: Address) -> None:
-        """A cookie, if anything."""
+        """Use the cookie in it, if there is one."""
         assert self._macs is not None, f"{source} answers a stranger"
         with suppress(Drop):  # for one that has been followed by another from there
             self.cookies[destination] = self._macs.open_cookie(

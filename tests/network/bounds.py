@@ -1,4 +1,4 @@
-"""Everything in a node that grows with what others send, beside the limit that the specification gives it."""
+"""Every table in a node that grows with the datagrams of others, with its limit in the specification."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from uavlinkd.core import constants as c
 from uavlinkd.core.node import Node
 
 Sizes = Counter[str]
-"""How much is in each table. Those of one peer or session by the fullest one."""
+"""The size of each table. For tables of a peer or session, the largest one."""
 
 LIMITS: dict[str, int] = {
     "pending initiations of a peer": c.PENDING_PER_PEER,
@@ -20,6 +20,8 @@ LIMITS: dict[str, int] = {
     "sources of group work": c.SOURCES_TRACKED,
     "known addresses with shares": c.SOURCES_TRACKED,
     "echo requests that wait for an answer": 64,
+    "refusals counted for a peer": c.REFUSALS_KEPT,
+    "claims of a peer": c.REFUSALS_KEPT,
     "bytes held on a session": c.HELD_BYTES,
     "steps of the past of a session": int(c.LATE_AFTER_S / c.LATE_STEP_S) + 3,
     "indices in use or quarantine": 2**16 - 1,
@@ -30,11 +32,11 @@ def measure(node: Node) -> Sizes:
     """The size of every table."""
     peers = node.peers.values()
     sessions = [session for peer in peers for session in peer.sessions.confirmed]
-    lately = [each for session in sessions for each in (session._heard_lately, session._sent_lately)]
+    histories = [part for session in sessions for part in (session._received_history, session._sent_history)]
     indices, admission = node._indices, node._admission
     return Counter(
         {
-            "pending initiations of a peer": max((len(peer.caller.pending) for peer in peers), default=0),
+            "pending initiations of a peer": max((len(peer.initiator.pending) for peer in peers), default=0),
             "unconfirmed sessions of a peer": max((len(peer.sessions.unconfirmed) for peer in peers), default=0),
             "confirmed sessions of a peer": max((len(peer.sessions.confirmed) for peer in peers), default=0),
             "remembered initiations of a peer": max((len(peer.remembered) for peer in peers), default=0),
@@ -42,33 +44,33 @@ def measure(node: Node) -> Sizes:
             "networks that get cookies": len(admission._prefixes._buckets),
             "sources of group work": len(admission._group._sources._buckets),
             "known addresses with shares": max(len(admission._known._buckets), len(admission._known_read._buckets)),
-            "echo requests that wait for an answer": max((len(peer._age._questions) for peer in peers), default=0),
-            "bytes held on a session": max((session.doubt._held_bytes for session in sessions), default=0),
-            "steps of the past of a session": max((len(each._steps) for each in lately), default=0),
+            "echo requests that wait for an answer": max((len(peer.echo_requests) for peer in peers), default=0),
+            "refusals counted for a peer": max((len(peer.own_refusals._totals) for peer in peers), default=0),
+            "claims of a peer": max((len(peer.refusal_claims.recent()) for peer in peers), default=0),
+            "bytes held on a session": max((session.held.size for session in sessions), default=0),
+            "steps of the past of a session": max((len(part._steps) for part in histories), default=0),
             "indices in use or quarantine": len(indices.owners) + len(indices._quarantine),
         }
     )
 
 
 def check(node: Node) -> Sizes:
-    """No table is larger than it may be, none has more than the others account for, no removed peer is in any.
+    """Every table is within its limit, the tables agree, and a removed peer is in none of them.
 
-    The sizes, where that holds.
+    Returns the sizes.
     """
     sizes = measure(node)
     for table, size in sizes.items():
         assert size <= LIMITS[table], f"{table}: {size} are more than {LIMITS[table]}"
     peers = node.peers.values()
     owners = node._indices.owners
-    held = sum(len(p.caller.pending) + len(p.sessions.unconfirmed) + len(p.sessions.confirmed) for p in peers)
+    held = sum(len(p.initiator.pending) + len(p.sessions.unconfirmed) + len(p.sessions.confirmed) for p in peers)
     assert len(owners) == held, f"{len(owners)} indices are owned, {held} by a peer"
-    assert all(node.peers.get(owner.peer.name) is owner.peer for owner in owners.values()), (
-        "a removed peer owns an index"
-    )
+    assert all(node.peers.get(peer.name) is peer for peer, _ in owners.values()), "a removed peer owns an index"
     assert not owners.keys() & node._indices._quarantine.keys(), "an index in quarantine is in use"
     assert len(node._remembered) == sum(len(peer.remembered) for peer in peers)
     assert len(node._by_keys) == len(node.peers)
     assert all(node.peers.get(peer.name) is peer for peer in node._by_address.values())
-    assert node._last_seen == {peer.path[1:] for peer in peers if peer.path is not None}
-    assert len(node._by_address) <= sum(len(peer.caller.addresses) for peer in peers)
+    assert node._last_seen == Counter(peer.path.address for peer in peers if peer.path is not None)
+    assert len(node._by_address) <= sum(len(peer.initiator.paths) for peer in peers)
     return sizes

@@ -1,11 +1,11 @@
-"""``python -m tests.network``: histories until so much virtual time is through, and what came of them.
+"""``python -m tests.network``: histories for a given virtual time, and their result.
 
     python -m tests.network                          an hour of virtual time or more
     python -m tests.network --minutes 100000 --processes 4 --first-seed 1000
-    python -m tests.network --seed 1234              one history again, told in full
-    python -m tests.network --handshakes 10000       and how long handshakes take at 30 % loss each way
+        python -m tests.network --seed 1234              one history again, with details
+        python -m tests.network --handshakes 10000       and the time of handshakes at 30 % loss in each direction
 
-Exit code 1: something that must hold did not. The seed is named.
+Exit code 1: a property did not hold. The output names the seed.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from tests.network import handshakes
 from tests.network.bounds import LIMITS
 from tests.network.histories import UP_WITHIN_S, Played, play
 
-_TOLD_EVERY_S = 30.0
+_REPORT_INTERVAL_S = 30.0
 _AT_ONCE = 4
-"""Histories that a process is given at a time."""
+"""Histories per batch of a process."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Play, tell, and judge."""
+    """Play the histories and print the result."""
     options = _parser().parse_args(arguments)
     if options.seed is not None:
         return _again(options.seed)
@@ -61,7 +61,7 @@ def _again(seed: int) -> int:
 
 def _play(options: argparse.Namespace) -> tuple[Played, float]:
     total, began = Played(), time.monotonic()
-    told_at = began
+    reported_at = began
     for played in _histories(options.first_seed, options.processes):
         total.add(played)
         for seed, what in played.violations:
@@ -69,8 +69,8 @@ def _play(options: argparse.Namespace) -> tuple[Played, float]:
         now = time.monotonic()
         minutes = sum(total.virtual_s.values()) / 60
         is_over = minutes >= options.minutes or now - began >= options.seconds
-        if now - told_at >= _TOLD_EVERY_S:
-            told_at = now
+        if now - reported_at >= _REPORT_INTERVAL_S:
+            reported_at = now
             histories = sum(total.histories.values())
             print(f"{now - began:6.0f} s: {histories} histories, {minutes:,.0f} virtual minutes", flush=True)
         if is_over:
@@ -93,13 +93,16 @@ def _handshakes(tries: int) -> bool:
     for mode in handshakes.MODES:
         times = [handshakes.handshake_time(mode, 0.3, seed) for seed in range(tries)]
         wrong = handshakes.broken(times)
-        print(f"30 % loss each way, {mode}: {tries:,} handshakes took (s) {handshakes.distribution(times)} {wrong}")
+        print(
+            f"30 % loss in each direction, {mode}: {tries:,} handshakes took (s) "
+            f" {handshakes.distribution(times)} {wrong}"
+        )
         is_sound &= not wrong
     return is_sound
 
 
 def table(total: Played, wall_s: float) -> list[str]:
-    """What was played and what was seen, a line each."""
+    """The result as a table, one line for each figure."""
     minutes = sum(total.virtual_s.values()) / 60
     rate = minutes / total.cpu_s if total.cpu_s else 0.0
     kinds = [f"{kind}: {n:,} of {total.virtual_s[kind] / 60:,.0f} min" for kind, n in sorted(total.histories.items())]
@@ -112,7 +115,7 @@ def table(total: Played, wall_s: float) -> list[str]:
         "frames delivered": f"{total.delivered:,}",
         "datagrams": f"{total.datagrams:,}, the attackers' too",
         "sessions made": f"{total.sessions:,}, counted at each end",
-        **{f"  {name}": f"{amount:,}" for name, amount in sorted(total.events.items())},
+        **{f"  {name}": f"{count:,}" for name, count in sorted(total.events.items())},
         "judged": f"{total.judged:,} times, {total.pairs:,} pairs",
         "worst until all up": f"{total.worst_up_s:.2f} s, bound {UP_WITHIN_S:.0f} s",
         "oldest frame": f"{total.oldest_s:.2f} s when it came out",

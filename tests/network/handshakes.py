@@ -1,4 +1,4 @@
-"""How long a handshake takes over a link that loses datagrams at random, each way."""
+"""The time of a handshake over a link that loses datagrams at random in each direction."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from tests.network.network import Network, share_a_session
 from uavlinkd.lab.mitm.radio import RadioSettings
 
 MODES = ("both know", "one knows")
-"""Who has a configured address of the other, and so calls."""
+"""The ends with a configured address of the other, which initiate."""
 SHARES = (0.5, 0.9, 0.99, 0.999, 1.0)
 
 
 def handshake_time(mode: str, loss: float, seed: int) -> float:
-    """From the start of both ends to a session that both send on. The same for the same arguments."""
+    """Seconds from the start of both ends to a session that both send on. The same for the same arguments."""
     with Network(f"loss {mode} {loss} {seed}", RadioSettings(loss=loss, delay_s=0.05)) as network:
         a, b = network.add("a"), network.add("b")
         a.knows(b, b.addresses)
@@ -25,14 +25,14 @@ def handshake_time(mode: str, loss: float, seed: int) -> float:
 
 
 def distribution(times: list[float]) -> dict[str, float]:
-    """Within how many seconds which share of the handshakes was through."""
+    """The time within which each share of the handshakes completed."""
     times = sorted(times)
     return {f"{share:.1%}": round(times[int(share * (len(times) - 1))], 2) for share in SHARES}
 
 
 def broken(times: list[float]) -> str:
-    """What of the bound does not hold: 99 % within 3 s, all within 10 s. Empty where all does."""
-    in_time = sum(each <= 3 for each in times) / len(times)
+    """The violation of the bound, if any: 99 % within 3 s, all within 10 s."""
+    in_time = sum(time_s <= 3 for time_s in times) / len(times)
     if in_time < 0.99:
         return f"only {in_time:.2%} within 3 s"
     return f"one took {max(times):.1f} s" if max(times) > 10 else ""

@@ -1,9 +1,9 @@
-"""Histories drawn by lot: a fleet, what befalls it, and what must hold during it and after.
+"""Random histories: a fleet, its faults, and the properties that must hold during and after them.
 
-A history is a number of chapters. In each one misfortunes come by lot; then the network is made usable and stays so:
-every pair must be up within :data:`UP_WITHIN_S`, and from then on nothing may be lost. What holds at every moment,
-the network checks: frames come out as sent, once, none of a peer that was removed or from before a restart; tables
-stay within their limits. The same seed gives the same history.
+A history is a number of chapters. In each one, random faults happen. Then the network works again and stays usable:
+every pair must be up within :data:`UP_WITHIN_S`, and from then on nothing may be lost. The network checks some
+properties all the time: frames are delivered unaltered and once, none of a removed peer or from before a restart;
+tables stay within their limits. The same seed makes the same history.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from uavlinkd.core.settings import Link, Timers
 from uavlinkd.lab.mitm.radio import Bursts, RadioSettings
 
 UP_WITHIN_S = 3.0
-"""After the last misfortune: frames both ways between every two drones that know each other, on one session."""
+"""After the last fault: frames in both directions between all drones that know each other, on one session."""
 OLDEST_S = 5.5
-"""No frame is older than this when it comes out: section 11 of the specification."""
+"""No delivered frame is older than this: section 11 of the specification."""
 USABLE = RadioSettings(delay_s=0.05)
 CLOCKS = {"zero": 0.0, "1970": 1.0, "2038": 2.0**31 - 1, "2106": 2.0**32 - 1, "after 2106": 2.0**32 + 0.25}
 _JUDGED_S = 2.0
@@ -35,7 +35,7 @@ _KEPT = 2000
 
 @dataclass
 class Played:
-    """What came of a history, or of many."""
+    """The result of a history, or of many."""
 
     histories: Counter[str] = field(default_factory=Counter)
     """By kind."""
@@ -49,44 +49,44 @@ class Played:
     """As each end counts them."""
     datagrams: int = 0
     events: Counter[str] = field(default_factory=Counter)
-    """Misfortunes by name."""
+    """Faults by name."""
     judged: int = 0
-    """How often all pairs had to come up."""
+    """Number of checks that all pairs were up."""
     pairs: int = 0
-    """Pairs that had to."""
+    """Pairs in these checks."""
     worst_up_s: float = 0.0
     oldest_s: float = 0.0
     largest: Sizes = field(default_factory=Counter)
     cpu_s: float = 0.0
     violations: list[tuple[int, str]] = field(default_factory=list)
-    """Seed, and what was seen."""
+    """Seed and description."""
 
     def add(self, other: Played) -> None:
-        """Count another's histories with these."""
+        """Add the result of another history."""
         for kind, virtual_s in other.virtual_s.items():
             self.virtual_s[kind] = self.virtual_s.get(kind, 0.0) + virtual_s
         self.largest |= other.largest
         for name in ("worst_up_s", "oldest_s"):
             setattr(self, name, max(getattr(self, name), getattr(other, name)))
-        for each in fields(self):
-            if each.name not in ("virtual_s", "largest", "worst_up_s", "oldest_s"):
-                setattr(self, each.name, getattr(self, each.name) + getattr(other, each.name))
+        for figure in fields(self):
+            if figure.name not in ("virtual_s", "largest", "worst_up_s", "oldest_s"):
+                setattr(self, figure.name, getattr(self, figure.name) + getattr(other, figure.name))
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What kind of history it is."""
+    """The parameters of a kind of history."""
 
     name: str
     nodes: tuple[int, int]
-    """At least, at most."""
+    """Minimum and maximum."""
     chapters: tuple[int, int]
     quiet_s: tuple[float, float]
-    """A chapter begins with so much time in which nothing befalls it,"""
-    trouble_s: tuple[float, float]
-    """and ends with so much in which misfortunes do,"""
+    """The time without faults at the start of a chapter,"""
+    faults_s: tuple[float, float]
+    """the time with faults at its end,"""
     misfortunes: tuple[int, int]
-    """so many."""
+    """and their number."""
     intervals_s: tuple[float, ...]
     """Between two frames of a flow."""
     rekeys_s: tuple[float, ...]
@@ -102,7 +102,7 @@ _WEIGHTS = (4, 1, 6)
 
 
 def play(seed: int, plan: Plan | None = None) -> Played:
-    """Play one history; what broke is in :attr:`Played.violations`."""
+    """Play one history; :attr:`Played.violations` has its violations."""
     lot = Random(f"history {seed}")
     plan = plan or lot.choices(PLANS, _WEIGHTS)[0]
     began = time.process_time()
@@ -119,7 +119,7 @@ def play(seed: int, plan: Plan | None = None) -> Played:
 
 
 class History:
-    """One fleet and its fate."""
+    """One fleet and its history."""
 
     def __init__(self, seed: int, plan: Plan, lot: Random) -> None:
         self.network = Network(f"history {seed}", USABLE)
@@ -144,7 +144,7 @@ class History:
             ("cuts healed", self.network.cuts.clear),
             ("restart", self._restart),
             ("off for a while", self._off),
-            ("goodbye", self._goodbye),
+            ("close", self._close),
             ("move", self._move),
             ("clock ahead", self._jump),
             ("peer removed", self._remove),
@@ -159,7 +159,7 @@ class History:
     def _drone(self, number: int) -> Drone:
         clock = self.lot.choice(tuple(CLOCKS.values()))
         first = f"10.0.0.{number + 1}", 5790
-        # In a mesh each has an address that stays, on a second socket: two that both moved could not meet else.
+        # In a mesh each has a fixed address too, on a second socket: otherwise two that both moved could not meet.
         addresses = (first, (f"10.1.0.{number + 1}", 5790)) if self.is_mesh else (first,)
         return self.network.add(f"d{number}", *addresses, clock=clock)
 
@@ -177,7 +177,7 @@ class History:
                 a.knows(b, lot.choice((b.addresses, b.addresses[1:])), link)
                 b.knows(a, lot.choice((a.addresses, a.addresses[1:])), link)
             else:
-                # The first one stays where it is. An address that a drone has left is of no use, and no harm.
+                # The first one is fixed. An address that a drone has left is neither useful nor harmful.
                 b.knows(a, a.addresses, link)
                 a.knows(b, lot.choice(((), b.addresses)), link)
                 b.is_behind_nat = lot.random() < 0.3
@@ -185,17 +185,19 @@ class History:
             drone.start()
         for a, b in self.pairs:
             self.network.talk(a, b, lot.choice(plan.intervals_s))
+            self.network.refusals(a, b, plan.intervals_s[-1])
+            self.network.refusals(b, a, plan.intervals_s[-1])
 
-    # Its fate.
+    # Its faults.
 
     def play(self) -> None:
-        """All chapters."""
+        """Play all chapters."""
         network, lot = self.network, self.lot
         self._begin()
         self._judge()
         for _ in range(lot.randint(*self.plan.chapters)):
             network.run(lot.uniform(*self.plan.quiet_s))
-            end = network.now + lot.uniform(*self.plan.trouble_s)
+            end = network.now + lot.uniform(*self.plan.faults_s)
             for _ in range(lot.randint(*self.plan.misfortunes)):
                 network.at(lot.uniform(network.now, end), partial(self._befall, end))
             network.run(end - network.now)
@@ -244,7 +246,7 @@ class History:
         drone.stop()
         self._start_later(drone)
 
-    def _goodbye(self) -> None:
+    def _close(self) -> None:
         drone = self.lot.choice(self.drones)
         if drone.node is not None:
             self.network.perform(drone, drone.node.close(drone.local_now))
@@ -266,7 +268,7 @@ class History:
             drone.move(address)
 
     def _jump(self) -> None:
-        """A machine that slept: its clock, which never goes back, is suddenly later."""
+        """A machine that slept: its clock, which never runs backwards, is suddenly later."""
         drone = self.lot.choice(self.drones)
         drone.clock += self.lot.choice((0.3, 3.0, 100.0, 5000.0))
 
@@ -293,7 +295,7 @@ class History:
         duration_s = lot.choice((1.0, 3.0, 8.0))
         flooder.flood(lot.choice((50.0, 200.0, 400.0)), min(self.network.now + duration_s, self._until))
 
-    # What must hold after it.
+    # Checks at the end of a chapter.
 
     def _make_usable(self) -> None:
         self.network.note("the network is usable")
@@ -334,7 +336,7 @@ class History:
                 assert flow.oldest_s <= OLDEST_S, f"{flow.sender} to {flow.receiver}: {flow.oldest_s:.2f} s old"
 
     def account(self, played: Played) -> None:
-        """Put into numbers what was played."""
+        """Count the result."""
         network, kind = self.network, self.plan.name
         played.histories[kind] += 1
         played.virtual_s[kind] = network.now

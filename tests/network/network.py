@@ -1,7 +1,7 @@
 """A simulated network in virtual time: real nodes, emulated radios, NATs, restarts and attackers.
 
 Everything follows from one seed. Time jumps from event to event: the next arrival, deadline or scheduled action.
-Frames are numbered, so that what comes out can be held against what went in at every delivery.
+Frames are numbered, so that each delivery is checked against what was sent.
 """
 
 from __future__ import annotations
@@ -18,12 +18,15 @@ from typing import Protocol, Self
 
 from tests.network.bounds import Sizes, check
 from uavlinkd.core import wire
+from uavlinkd.core.constants import REFUSALS_KEPT
 from uavlinkd.core.cookie import MacKeys
 from uavlinkd.core.crypto import Secret, x25519_public_key
 from uavlinkd.core.drops import Drop
 from uavlinkd.core.node import Node
-from uavlinkd.core.outputs import Deliver, Dropped, Output, Path, SessionEstablished, Transmit
+from uavlinkd.core.outputs import Deliver, Dropped, Output, SessionEstablished, Transmit
+from uavlinkd.core.path import Path
 from uavlinkd.core.peer import Peer
+from uavlinkd.core.refusals import Refused
 from uavlinkd.core.session import Session
 from uavlinkd.core.settings import Link, PeerSettings, Screen, hold_all
 from uavlinkd.lab.mitm.radio import Radio, RadioSettings
@@ -35,28 +38,28 @@ _HANDSHAKE = (wire.INITIATION, wire.RESPONSE)
 _FRAME_START = b"\xfd"
 _FLOW_SHOWN = 60
 _STEPS_AT_ONE_MOMENT = 20_000
-"""More events than this without time passing is a node that asks to be woken for ever."""
+"""More events than this at one moment mean that a node asks to be woken indefinitely."""
 _CHECK_BOUNDS_EVERY = 16
-"""So many events, at one drone after another."""
+"""The number of events at one drone after which the next drone has its turn."""
 
 
 @dataclass
 class Flow:
-    """Frames from one drone to another: what was sent, what came out."""
+    """Frames from one drone to another, sent and delivered."""
 
     sender: str
     receiver: str
     sent_at: list[float] = field(default_factory=list)
     """By number."""
     delivered: dict[int, float] = field(default_factory=dict)
-    """When each number came out, in the order of coming out."""
+    """The time of each delivery by number, in order of delivery."""
     last: int = -1
     overtaken: int = 0
-    """Frames that came out after one with a greater number."""
+    """Frames that were delivered after one with a greater number."""
     refused_before: float = 0.0
-    """Nothing that was sent before may come out: the receiver has lost its keys since, or removed the sender."""
+    """Frames sent earlier must not be delivered: since then the receiver lost its keys, or removed the sender."""
     oldest_s: float = 0.0
-    """The greatest age of a frame that came out."""
+    """The greatest age of a delivered frame."""
 
     def frame(self, now: float) -> bytes:
         """The next frame: a start byte, sender, receiver, number."""
@@ -70,13 +73,13 @@ class Flow:
         return _FRAME_START + name + number.to_bytes(8, "big")
 
     def deliver(self, frame: bytes, now: float) -> None:
-        """Hold a frame that came out against what was sent."""
+        """Compare a delivered frame with the sent one."""
         number = int.from_bytes(frame[-8:], "big")
         assert number < len(self.sent_at), f"{self.sender} never sent {frame!r} to {self.receiver}"
         assert frame == self.bytes_of(number), f"altered: {frame!r}"
         assert number not in self.delivered, f"delivered twice: {frame!r}, first at {self.delivered[number]:.3f}"
         sent_at = self.sent_at[number]
-        assert sent_at >= self.refused_before, f"{frame!r} of {sent_at:.3f} was not to come out any more"
+        assert sent_at >= self.refused_before, f"{frame!r} of {sent_at:.3f} must not be delivered any more"
         self.oldest_s = max(self.oldest_s, now - sent_at)
         self.delivered[number] = now
         if number < self.last:
@@ -84,93 +87,94 @@ class Flow:
         self.last = max(self.last, number)
 
     def lost(self, since: float = 0.0, until: float = math.inf) -> list[int]:
-        """The numbers sent in this time that never came out."""
+        """The numbers sent in this time that were never delivered."""
         first, end = bisect_left(self.sent_at, since), bisect_left(self.sent_at, until)
         return [number for number in range(first, end) if number not in self.delivered]
 
     def first_delivery(self, since: float) -> float:
-        """When the first frame that was sent at ``since`` or later came out."""
+        """The time of the first delivery of a frame that was sent at ``since`` or later."""
         return min((at for n, at in self.delivered.items() if self.sent_at[n] >= since), default=math.inf)
 
 
 class Drone:
-    """A daemon in the simulated network. A restart gives it a new :class:`Node` and keeps the key alone."""
+    """A daemon in the simulated network. A restart creates a new :class:`Node` and keeps only the key."""
 
     def __init__(self, network: Network, name: str, addresses: Sequence[Address], clock: float) -> None:
         self.name = name
         self.addresses = list(addresses)
-        """By the number of its socket; an address may change at any time, which the node is not told."""
+        """By the number of the socket; an address may change at any time without notice to the node."""
         self.clock = clock
-        """What its clock showed when the network's showed zero."""
+        """Its clock at the network's time zero."""
         self.is_behind_nat = False
-        """Only whom it has sent to since its address is what it is can reach it."""
+        """Only destinations of its datagrams since the last change of its address can reach it."""
         self.outputs: list[tuple[float, Output]] = []
-        """Everything but datagrams and frames, with the network's time."""
+        """All outputs but datagrams and frames, with the network's time."""
         self.drops: Counter[str] = Counter()
         self.contacted: set[tuple[Address, Address]] = set()
-        self.private_key = network.chance.randbytes(32)
+        self.private_key = network.rng.randbytes(32)
         self.public_key = x25519_public_key(self.private_key)
         self.acquaintances: dict[str, tuple[PeerSettings, tuple[Path, ...]]] = {}
         self.removed: dict[str, tuple[PeerSettings, tuple[Path, ...]]] = {}
-        """Peers that were taken out of the configuration, and can be put back."""
+        """Peers that were removed from the configuration, and can be added again."""
+        self.reported: set[tuple[str, Refused]] = set()
+        """The refusals that it has ever reported, and to whom."""
         self.largest: Sizes = Counter()
-        """The most that each table of its nodes ever held."""
+        """The maximum size of each table of its nodes."""
         self.node: Node | None = None
         """None while it is off."""
         self._network = network
 
     def knows(self, other: Drone, addresses: Iterable[Address] = (), link: Link | None = None) -> None:
-        """Configure a peer, and where it is said to be."""
+        """Configure a peer and its addresses."""
         settings = PeerSettings(other.name, other.public_key, link=link or Link())
-        self.acquaintances[other.name] = settings, tuple((0, host, port) for host, port in addresses)
+        self.acquaintances[other.name] = settings, tuple(Path(0, address) for address in addresses)
 
     def remove(self, other: Drone) -> None:
-        """Take a peer out of the configuration: from now on it is a stranger."""
+        """Remove a peer from the configuration: from now on it is a stranger."""
         self.removed[other.name] = self.acquaintances.pop(other.name)
         self._network.note(f"{self.name} removes {other.name}")
         self._network.flow(other, self).refused_before = math.inf
         if self.node is not None:
-            self._network.perform(self, self.node.remove_peer(other.name, self.local_now))
+            self._network.perform(self, self.node.remove_peer(self.peer(other), self.local_now))
             assert other.name not in self.node.peers
 
     def restore(self, other: Drone) -> None:
-        """Put a removed peer back. What it sent so far stays refused."""
+        """Add a removed peer again. The frames that it sent so far stay refused."""
         settings, paths = self.acquaintances[other.name] = self.removed.pop(other.name)
         self._network.note(f"{self.name} has {other.name} back")
         self._network.flow(other, self).refused_before = self._network.now
         if self.node is not None:
-            self.node.add_peer(settings, self.local_now)
-            self.node.set_addresses(settings.name, paths, self.local_now)
+            peer = self.node.add_peer(settings, self.local_now)
+            self.node.set_paths(peer, paths, self.local_now)
 
     def start(self, clock: float | None = None) -> None:
-        """A new node without state; ``clock`` is what its clock shows now."""
+        """A new node without state; ``clock`` is the present time of its clock."""
         for flow in self._network.flows.values():
             if flow.receiver == self.name and flow.sender in self.acquaintances:
                 flow.refused_before = self._network.now
         if clock is not None:
             self.clock = clock - self._network.now
         now = self.local_now
-        entropy = Random(self._network.chance.randbytes(16))
+        entropy = Random(self._network.rng.randbytes(16))
         self.node = Node(Secret(self.private_key), entropy.randbytes, now, screen=self._network.screen)
         for settings, paths in self.acquaintances.values():
-            self.node.add_peer(settings, now)
-            self.node.set_addresses(settings.name, paths, now)
+            self.node.set_paths(self.node.add_peer(settings, now), paths, now)
         self._network.note(f"{self.name} starts, its clock at {now:.3f}")
 
     def stop(self) -> None:
-        """Power off, without goodbye."""
+        """Power off, without a close record."""
         self.node = None
         self._network.note(f"{self.name} is off")
 
     def move(self, *addresses: Address) -> None:
-        """Other addresses from now on: another network, or the NAT has forgotten us."""
+        """Use other addresses from now on: another network, or a NAT that forgot its mapping."""
         self.addresses = list(addresses)
         self.contacted.clear()
         self._network.note(f"{self.name} is at {addresses}")
 
     @property
     def local_now(self) -> float:
-        """What its clock shows."""
+        """The time of its clock."""
         return self._network.now + self.clock
 
     def peer(self, other: Drone) -> Peer:
@@ -187,12 +191,16 @@ class Drone:
         return ((at, output) for at, output in self.outputs if isinstance(output, SessionEstablished))
 
     def check_bounds(self) -> None:
-        """What others can make a node remember is bounded."""
+        """The memory that others can use in a node is bounded."""
         if self.node is not None:
             self.largest |= check(self.node)
+            for name, peer in self.node.peers.items():
+                for claim in peer.refusal_claims.recent():
+                    reported = self._network.drones[name].reported
+                    assert (self.name, claim.refused) in reported, f"{name} never reported {claim} to {self.name}"
 
-    def check_is_no_call(self, datagram: bytes) -> None:
-        """A removed peer is a stranger: no handshake message is for its key."""
+    def check_no_initiation(self, datagram: bytes) -> None:
+        """A removed peer is a stranger: no handshake message has its key."""
         for settings, _ in self.removed.values():
             try:
                 MacKeys(settings.public_key).check_mac1(datagram)
@@ -202,7 +210,7 @@ class Drone:
 
 
 class Attacker(Protocol):
-    """Sees every datagram as it is sent, and those that are sent to addresses of its own."""
+    """Sees every datagram when it is sent, and those that are sent to its own addresses."""
 
     def overhear(self, datagram: bytes, source: Address, destination: Address) -> None:
         """A datagram was sent by a drone."""
@@ -217,23 +225,23 @@ class Network:
     def __init__(self, seed: int | str, radio: RadioSettings | None = None) -> None:
         self.seed = seed
         self.now = 0.0
-        self.chance = Random(f"network {seed}")
+        self.rng = Random(f"network {seed}")
         self.radio = radio or RadioSettings()
-        """Of every pair of addresses that has none of its own in :attr:`radios_of`."""
+        """For every pair of addresses without an entry in :attr:`radios_of`."""
         self.radios_of: dict[tuple[Address, Address], RadioSettings] = {}
         self.drones: dict[str, Drone] = {}
         self.flows: dict[tuple[str, str], Flow] = {}
         self.attackers: dict[Address, Attacker] = {}
         self.listeners: list[Attacker] = []
         self.cuts: set[tuple[str, str]] = set()
-        """Names of sender and receiver between which nothing passes."""
+        """Names of sender and receiver between which all datagrams are lost."""
         self.steps = 0
         self.datagrams = 0
-        """Put on their way, by whomever."""
+        """Number of datagrams sent, by any sender."""
         self.screen: Screen = hold_all
-        """Which frames may be delivered while freshness is unverified; of the nodes that are started from now on."""
+        """The frames that may be delivered while freshness is unverified, for nodes that start from now on."""
         self.checks_bounds = True
-        """Whether the tables of the nodes are looked at; not where a check was taken out of them on purpose."""
+        """Whether the tables of the nodes are checked; not where a test has removed a check on purpose."""
         self._radios: dict[tuple[Address, Address], Radio] = {}
         self._arrivals: list[tuple[float, int, Address, Address]] = []
         self._actions: list[tuple[float, int, Callable[[], None]]] = []
@@ -257,7 +265,7 @@ class Network:
     # Set-up.
 
     def add(self, name: str, *addresses: Address, clock: float = 0.0) -> Drone:
-        """A drone, not started yet. Without an address given it gets one of its own."""
+        """Add a drone, without starting it. By default it has an address of its own."""
         at = addresses or ((f"10.0.0.{len(self.drones) + 1}", 5790),)
         drone = self.drones[name] = Drone(self, name, at, clock)
         self._in_turn.append(drone)
@@ -273,7 +281,7 @@ class Network:
         return a, b
 
     def at(self, moment: float, action: Callable[[], None]) -> None:
-        """Do something at a moment of the network's time."""
+        """Call a function at a moment of the network's time."""
         self._number += 1
         heapq.heappush(self._actions, (moment, self._number, action))
 
@@ -283,7 +291,7 @@ class Network:
         return self.flows.setdefault(key, Flow(*key))
 
     def traffic(self, sender: Drone, receiver: Drone, interval_s: float, until: float = math.inf) -> Flow:
-        """A frame each ``interval_s`` from now on, while the sender is on and has the receiver for a peer.
+        """Send a frame every ``interval_s`` from now on, while the sender is on and has the receiver as a peer.
 
         Both directions need a call.
         """
@@ -292,19 +300,36 @@ class Network:
         def tick() -> None:
             if sender.node is not None and receiver.name in sender.node.peers:
                 frame = flow.frame(self.now)
-                self.perform(sender, sender.node.send(receiver.name, [frame], sender.local_now))
+                self.perform(sender, sender.node.send(sender.peer(receiver), [frame], sender.local_now))
             if self.now + interval_s < until:
                 self.at(self.now + interval_s, tick)
 
-        self.at(self.now + self.chance.random() * interval_s, tick)
+        self.at(self.now + self.rng.random() * interval_s, tick)
         return flow
 
+    def refusals(self, reporter: Drone, receiver: Drone, interval_s: float = 1.0) -> None:
+        """One drone refuses frames of another, of more kinds than it counts, and reports that from now on."""
+        rng = Random(f"refusals {self.seed} {reporter.name} {receiver.name}")
+        totals: Counter[tuple[int, int, int]] = Counter()
+
+        def tick() -> None:
+            if reporter.node is not None and receiver.name in reporter.node.peers:
+                kind = rng.randrange(2 * REFUSALS_KEPT), rng.choice((0, 22, 400)), rng.randint(1, 10)
+                totals[kind] += 1
+                refused = Refused(*kind, totals[kind])
+                reporter.reported.add((receiver.name, refused))
+                peer = reporter.peer(receiver)
+                self.perform(reporter, reporter.node.report_refusals(peer, [refused], reporter.local_now))
+            self.at(self.now + interval_s, tick)
+
+        self.at(self.now + rng.random() * interval_s, tick)
+
     def talk(self, a: Drone, b: Drone, interval_s: float = 0.05, until: float = math.inf) -> tuple[Flow, Flow]:
-        """Traffic both ways."""
+        """Traffic in both directions."""
         return self.traffic(a, b, interval_s, until), self.traffic(b, a, interval_s, until)
 
     def cut(self, a: Drone, b: Drone) -> None:
-        """Nothing passes between two drones from now on, either way."""
+        """Drop everything between two drones from now on, in both directions."""
         self.cuts |= {(a.name, b.name), (b.name, a.name)}
 
     def inject(self, datagram: bytes, source: Address, destination: Address) -> None:
@@ -312,20 +337,20 @@ class Network:
         self._send(datagram, source, destination)
 
     def note(self, text: str) -> None:
-        """One line of the flow that is shown when a test fails."""
+        """Add a line to the log that a failed test prints."""
         self._notes.append(f"{self.now:10.4f}  {text}")
 
     # Time.
 
     def run(self, duration_s: float) -> None:
-        """Let time pass."""
+        """Run for a time."""
         end = self.now + duration_s
         while (moment := self._next_event()) <= end:
             self._step(moment)
         self.now = end
 
     def run_until(self, condition: Callable[[], bool], within_s: float) -> float:
-        """Let time pass until a condition holds, and tell how long that took.
+        """Run until a condition holds, and return the duration.
 
         Raises:
             AssertionError: where it does not within ``within_s``.
@@ -338,9 +363,9 @@ class Network:
         return self.now - begin
 
     def step(self) -> None:
-        """Jump to the next event and do what is due at it."""
+        """Jump to the next event and process it."""
         moment = self._next_event()
-        assert moment < math.inf, "nothing will ever happen again"
+        assert moment < math.inf, "there is no further event"
         self._step(moment)
 
     def _step(self, moment: float) -> None:
@@ -361,7 +386,7 @@ class Network:
         else:
             for drone in self.drones.values():
                 if drone.node is not None and drone.node.next_deadline() - drone.clock <= self.now:
-                    # A clock far from zero rounds: the node must not be woken before its own deadline.
+                    # A clock far from zero rounds: do not wake the node before its own deadline.
                     local_now = max(drone.local_now, drone.node.next_deadline())
                     self.perform(drone, drone.node.handle_timeout(local_now))
         if self.checks_bounds and self.steps % _CHECK_BOUNDS_EVERY == 0:
@@ -380,28 +405,28 @@ class Network:
     # Datagrams.
 
     def perform(self, drone: Drone, outputs: list[Output]) -> None:
-        """Do what a node asks for."""
+        """Process the outputs of a node."""
         for output in outputs:
             match output:
-                case Transmit(datagram, (socket, host, port)):
+                case Transmit(datagram, path):
                     if drone.removed and datagram[0] in _HANDSHAKE:
-                        drone.check_is_no_call(datagram)
-                    source = drone.addresses[socket]
-                    drone.contacted.add((source, (host, port)))
+                        drone.check_no_initiation(datagram)
+                    source, destination = drone.addresses[path.socket], (path.host, path.address[1])
+                    drone.contacted.add((source, destination))
                     for listener in self.listeners:
-                        listener.overhear(datagram, source, (host, port))
-                    self._send(datagram, source, (host, port))
+                        listener.overhear(datagram, source, destination)
+                    self._send(datagram, source, destination)
                 case Deliver(peer, payload):
-                    assert peer in drone.acquaintances, f"{drone.name} has removed {peer}"
-                    flow = self.flow(self.drones[peer], drone)
+                    assert peer.name in drone.acquaintances, f"{drone.name} has removed {peer.name}"
+                    flow = self.flow(self.drones[peer.name], drone)
                     assert payload
                     assert len(payload) % FRAME_BYTES == 0
                     for begin in range(0, len(payload), FRAME_BYTES):
                         flow.deliver(payload[begin : begin + FRAME_BYTES], self.now)
-                case Dropped(reason, amount=amount):
-                    drone.drops[reason] += amount
+                case Dropped(reason, number=number):
+                    drone.drops[reason] += number
                 case event:
-                    assert event.peer not in drone.removed, event
+                    assert event.peer.name not in drone.removed, event
                     drone.outputs.append((self.now, event))
                     self.note(f"{drone.name} {event}")
 
@@ -417,12 +442,12 @@ class Network:
         key = source, destination
         radio = self._radios.get(key)
         if radio is None:
-            chance = Random(f"radio {self.seed} {key}")
-            radio = self._radios[key] = Radio(self.radios_of.get(key, self.radio), chance, self.now)
+            rng = Random(f"radio {self.seed} {key}")
+            radio = self._radios[key] = Radio(self.radios_of.get(key, self.radio), rng, self.now)
         return radio
 
     def set_radio(self, settings: RadioSettings) -> None:
-        """Other radios everywhere from now on; what is on its way stays on its way."""
+        """Change all radios from now on; datagrams in flight keep their delay."""
         self.radio = settings
         for radio in self._radios.values():
             radio.settings = settings
@@ -444,7 +469,7 @@ class Network:
                 continue
             if self._are_cut_off(source, drone):
                 continue
-            path = (drone.addresses.index(destination), *source)
+            path = Path(drone.addresses.index(destination), source)
             self.perform(drone, drone.node.receive(datagram, path, drone.local_now))
 
     def _are_cut_off(self, source: Address, receiver: Drone) -> bool:
@@ -462,9 +487,9 @@ class Network:
 
 
 def every_second_may_be_old(payload: bytes) -> tuple[bytes, bytes]:
-    """A screen: frames with an odd number are reports, the others must be new."""
+    """A classifier: frames with an odd number are reports, the others must be new."""
     frames = [payload[at : at + FRAME_BYTES] for at in range(0, len(payload), FRAME_BYTES)]
-    return tuple(b"".join(each for each in frames if each[-1] % 2 == parity) for parity in (1, 0))  # type: ignore[return-value]
+    return tuple(b"".join(part for part in frames if part[-1] % 2 == parity) for parity in (1, 0))  # type: ignore[return-value]
 
 
 def share_a_session(a: Drone, b: Drone) -> bool:
@@ -480,7 +505,7 @@ def share_a_session(a: Drone, b: Drone) -> bool:
 
 
 def session_name(a: Drone, b: Drone) -> tuple[int, int, int]:
-    """What tells the session that ``a`` sends on from all others: generation and both indices."""
+    """What identifies the session that ``a`` sends on: generation and both indices."""
     session = a.session(b)
     assert session is not None
     return session.parameters.generation, session.local_index, session.remote_index

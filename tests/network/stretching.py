@@ -14,7 +14,7 @@ from tests.network.network import Drone, Flow, Network, every_second_may_be_old
 from uavlinkd.lab.mitm.attacks import parse_attack
 from uavlinkd.lab.mitm.radio import RadioSettings
 
-ONE_EVERY_1_8_S = "way=a>b,interval_s=1.8"
+ONE_EVERY_1_8_S = "direction=a>b,interval_s=1.8"
 ATTACKS = {
     "handshakes blocked": f"stretch,{ONE_EVERY_1_8_S}",
     "answers dropped": f"stretch-one-way,{ONE_EVERY_1_8_S}",
@@ -45,16 +45,12 @@ def stretched(attack: str, seconds: float, *, answers: bool = True, interval_s: 
     """What came out at b while an attacker delays what a sends; without ``answers`` b only listens."""
     with Network(f"stretched {attack} {answers}", RadioSettings(delay_s=0.02)) as network:
         network.screen = every_second_may_be_old
-        a, b = network.add("a"), network.add("b", clock=1e6)
-        middle = Middle(network, a, b)
-        middle.introduce()
-        a.start()
-        b.start()
+        middle, a, b = Middle.between(network)
         flow = network.traffic(a, b, interval_s)
         if answers:
             network.traffic(b, a, interval_s)
         network.run(3)
-        middle.attack(parse_attack(attack).make(middle.surroundings, 1, network.now))
+        middle.attack(parse_attack(attack).make(middle.context, 1, network.now))
         network.run(seconds)
         return flow, b
 
@@ -67,8 +63,8 @@ def main() -> None:
                 pace_s: oldest(stretched(text.replace("1.8", str(pace_s)), SESSION_S, answers=answers)[0])
                 for pace_s in PACES_S
             }
-            must_be_new = max(each.must_be_new for each in at_pace.values())
-            may_be_old = max(each.may_be_old for each in at_pace.values())
+            must_be_new = max(item.must_be_new for item in at_pace.values())
+            may_be_old = max(item.may_be_old for item in at_pace.values())
             slowest = at_pace[PACES_S[-1]]
             print(
                 f"{name}, receiver {'talks' if answers else 'listens'}:"

@@ -1,4 +1,4 @@
-"""Links that carry nothing for a while."""
+"""Links that lose everything for a while."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from tests.network.network import Address, Network, share_a_session
 from uavlinkd.core.outputs import PeerLost
-from uavlinkd.lab.mitm.radio import Bursts, RadioSettings
+from uavlinkd.lab.mitm.radio import RadioSettings
 
 BACK_WITHIN_S = 2.0
 STALE: tuple[Address, ...] = (("192.0.2.1", 5790), ("192.0.2.2", 5790), ("192.0.2.3", 5790))
@@ -20,7 +20,7 @@ STALE: tuple[Address, ...] = (("192.0.2.1", 5790), ("192.0.2.2", 5790), ("192.0.
     ("blackout_s", "interval_s"), [(1, 0.02), (1, 0.25), (3, 0.02), (3, 0.25), (10, 0.02), (60, 0.25), (200, 0.25)]
 )
 def test_frames_cross_within_two_seconds_of_a_blackout(blackout_s: float, interval_s: float, stale: int) -> None:
-    """Nothing passes for a second, or for longer than keys live: two seconds after it frames cross both ways."""
+    """Everything is lost for a second, or for longer than keys live: 2 s later frames cross in both directions."""
     name = f"blackout {blackout_s} {interval_s} {stale}"
     for seed in range(3):
         with Network(f"{name} {seed}", RadioSettings(delay_s=0.1)) as network:
@@ -31,7 +31,7 @@ def test_frames_cross_within_two_seconds_of_a_blackout(blackout_s: float, interv
             b.start()
             flows = network.talk(a, b, interval_s)
             network.run_until(partial(share_a_session, a, b), within_s=3)
-            network.run(5 + network.chance.random())
+            network.run(5 + network.rng.random())
             network.cut(a, b)
             begin = network.now
             network.run(blackout_s)
@@ -58,7 +58,7 @@ def all_may_be_old(payload: bytes) -> tuple[bytes, bytes]:
 
 
 def test_one_way_blackout_is_survived() -> None:
-    """Where one direction is gone the other carries reports; within two seconds of its return frames cross both."""
+    """The remaining direction carries reports; within two seconds of the other's return frames cross in both."""
     for seed in range(20):
         with Network(f"one way {seed}", RadioSettings(delay_s=0.05)) as network:
             network.screen = all_may_be_old
@@ -68,7 +68,7 @@ def test_one_way_blackout_is_survived() -> None:
             network.run(2)
             begin = network.now
             network.cuts.add(("a", "b"))
-            network.run(network.chance.uniform(0.5, 30))
+            network.run(network.rng.uniform(0.5, 30))
             end = network.now
             assert flows[0].first_delivery(begin) == math.inf
             assert not flows[1].lost(begin, end - 0.1)
@@ -76,22 +76,3 @@ def test_one_way_blackout_is_survived() -> None:
             network.run(BACK_WITHIN_S)
             for flow in flows:
                 assert flow.first_delivery(end) < network.now, f"{flow.sender} to {flow.receiver}"
-
-
-def test_burst_losses_do_not_end_a_link() -> None:
-    """Half a minute of bursts that swallow a third of all datagrams, a second at a time: frames flow in between."""
-    bursts = Bursts(to_bad=0.025, to_good=0.05)
-    for seed in range(10):
-        with Network(f"bursts {seed}", RadioSettings(delay_s=0.05, bursts=bursts)) as network:
-            a, b = network.pair()
-            flows = network.talk(a, b)
-            network.run(30)
-            for flow in flows:
-                assert 0.35 * len(flow.sent_at) < len(flow.delivered) < 0.95 * len(flow.sent_at)
-            network.set_radio(RadioSettings(delay_s=0.05))
-            network.run(BACK_WITHIN_S)
-            begin = network.now
-            network.run(3)
-            assert share_a_session(a, b)
-            for flow in flows:
-                assert not flow.lost(begin, network.now - 0.1)

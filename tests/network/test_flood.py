@@ -38,7 +38,7 @@ def test_a_known_peer_starts_during_a_flood_from_ten_thousand_networks(suite: st
 
 
 def test_a_peer_that_restarts_where_it_was_last_seen_gets_its_session() -> None:
-    """No address of it is configured: the place that it proved before the flood counts."""
+    """It has no configured address: the address that it proved before the flood counts."""
     with Network("flood, restart", RADIO) as network:
         a, b = network.add("a"), network.add("b")
         a.knows(b, ())

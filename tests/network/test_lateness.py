@@ -1,4 +1,4 @@
-"""Somebody holds authentic datagrams and lets them go later: nothing stale comes out, honest links lose nothing."""
+"""An attacker delays authentic datagrams: no stale frame is delivered, and honest links lose nothing."""
 
 from __future__ import annotations
 
@@ -8,52 +8,42 @@ from functools import partial
 import pytest
 
 from tests.lab.mitm.middle import Middle
-from tests.network.network import Drone, Flow, Network, every_second_may_be_old, share_a_session
+from tests.network.network import Flow, Network, every_second_may_be_old, share_a_session
 from uavlinkd.core import constants as c
 from uavlinkd.core.settings import Link, Timers
 from uavlinkd.lab.mitm.attacks import parse_attack
 from uavlinkd.lab.mitm.radio import RadioSettings
 
 OVERTAKEN_S = c.LATE_AFTER_S + 2 * c.LATE_STEP_S
-"""No frame comes out this long after it was sent where others came through all the time,"""
-VOUCHED_S = c.LATE_AFTER_S + 2 * c.LATE_STEP_S + c.DOUBT_S
-"""nor this long after it where the peer had to vouch for it,"""
+"""The maximum age of a delivered frame if later ones arrived all the time,"""
+VOUCHED_S = c.LATE_AFTER_S + 2 * c.LATE_STEP_S + c.HOLD_S
+"""if the peer had to confirm it,"""
 EVER_S = VOUCHED_S + c.LATE_AFTER_S
-"""nor this long ever, whatever is mixed: vouched for, then overtaken for no longer than may be."""
-VERIFIED_S = c.LATE_AFTER_S + c.DOUBT_S
-"""So long after the request an answer verifies what comes in order."""
+"""and in any combination: confirmed, then overtaken for the longest time."""
+VERIFIED_S = c.LATE_AFTER_S + c.HOLD_S
+"""How long after its request an answer verifies the frames that follow in order."""
 SEEDS = int(os.environ.get("UAVLINKD_CHAOS_SEEDS", "12"))
-"""How many drawn histories of holds are played."""
+"""Number of random histories of delays."""
 REKEYS = Link(timers=Timers(rekey_after_s=1.0, reject_after_s=20.0))
 PLAIN = Link()
 
 
-def middle_of(network: Network, link: Link = PLAIN) -> tuple[Middle, Drone, Drone]:
-    """Two drones and the man between them."""
-    a, b = network.add("a"), network.add("b", clock=1e6)
-    middle = Middle(network, a, b)
-    middle.introduce(link)
-    a.start()
-    b.start()
-    return middle, a, b
-
-
 def ages(flow: Flow) -> list[float]:
-    """How old each frame was when it came out."""
+    """The age of each delivered frame."""
     return [at - flow.sent_at[number] for number, at in flow.delivered.items()]
 
 
 @pytest.mark.parametrize("link", [PLAIN, REKEYS], ids=["one session", "rekeys"])
 @pytest.mark.parametrize("hold_s", [1.0, 3.0, 10.0, 30.0])
-def test_envelopes_that_others_overtook_come_out_in_time_or_never(hold_s: float, link: Link) -> None:
-    """A fifth of all is held: what comes within two seconds is delivered, what comes later is refused as delayed."""
+def test_overtaken_envelopes_are_delivered_in_time_or_never(hold_s: float, link: Link) -> None:
+    """A fifth of all is held: up to two seconds late it is delivered, later it is refused as delayed."""
     with Network(f"hold some {hold_s}", RadioSettings(delay_s=0.02)) as network:
-        middle, a, b = middle_of(network, link)
+        middle, a, b = Middle.between(network, link)
         flows = network.talk(a, b)
         network.run(2)
         begin = network.now
         text = f"hold,share=0.2,hold_s={hold_s},seconds=8"
-        middle.attack(parse_attack(text).make(middle.surroundings, 1, begin))
+        middle.attack(parse_attack(text).make(middle.context, 1, begin))
         network.run(8 + hold_s + 3)
         for flow in flows:
             assert max(ages(flow)) < OVERTAKEN_S
@@ -61,22 +51,22 @@ def test_envelopes_that_others_overtook_come_out_in_time_or_never(hold_s: float,
             assert bool(lost) == (hold_s > c.LATE_AFTER_S)
             assert len(lost) < 0.4 * 8 / 0.05
         if hold_s > OVERTAKEN_S:
-            # Of sessions that are over and empty the peer is asked; what it says is the same.
-            assert min(each.drops["delayed"] + each.drops["late"] for each in (a, b)) > 10
+            # For empty, ended sessions the peer is asked; its answer is the same.
+            assert min(drone.drops["delayed"] + drone.drops["late"] for drone in (a, b)) > 10
         assert share_a_session(a, b)
 
 
 @pytest.mark.parametrize("interval_s", [0.02, 0.3, 1.0])
 @pytest.mark.parametrize("hold_s", [2.5, 5.0, 20.0])
-def test_a_blackout_that_was_kept_and_let_go_delivers_nothing_stale(hold_s: float, interval_s: float) -> None:
-    """Everything is held for a while and let go at once: only what was sent lately comes out; the link goes on."""
+def test_a_recorded_blackout_delivers_nothing_stale(hold_s: float, interval_s: float) -> None:
+    """Everything is held and released at once: only recent frames are delivered, and the link continues."""
     with Network(f"hold all {hold_s} {interval_s}", RadioSettings(delay_s=0.02)) as network:
-        middle, a, b = middle_of(network)
+        middle, a, b = Middle.between(network)
         flows = network.talk(a, b, interval_s)
         network.run(3)
         begin = network.now
         text = f"hold,kinds=any,hold_s={hold_s},seconds={hold_s}"
-        middle.attack(parse_attack(text).make(middle.surroundings, 1, begin))
+        middle.attack(parse_attack(text).make(middle.context, 1, begin))
         network.run(hold_s)
         freed = network.now
         network.run(hold_s + 5)
@@ -89,11 +79,11 @@ def test_a_blackout_that_was_kept_and_let_go_delivers_nothing_stale(hold_s: floa
 
 
 @pytest.mark.parametrize("seed", range(SEEDS))
-def test_whatever_is_held_nothing_old_comes_out(seed: int) -> None:
-    """Holds of all lengths and shares drawn by lot, one upon the other, over changes of keys and restarts."""
+def test_no_combination_of_delays_delivers_stale_frames(seed: int) -> None:
+    """Random delays of all lengths and shares, one after the other, over changes of keys and restarts."""
     with Network(f"held by lot {seed}", RadioSettings(delay_s=0.03, loss=0.1, reordering=0.1)) as network:
-        middle, a, b = middle_of(network, REKEYS if seed % 2 else PLAIN)
-        lot = network.chance
+        middle, a, b = Middle.between(network, REKEYS if seed % 2 else PLAIN)
+        lot = network.rng
         flows = network.talk(a, b, lot.choice((0.05, 0.4, 1.5, 4.0)))
         for round_number in range(8):
             specs = [
@@ -101,9 +91,7 @@ def test_whatever_is_held_nothing_old_comes_out(seed: int) -> None:
                 f",hold_s={lot.uniform(0.5, 12):.2f},seconds={lot.uniform(0.5, 4):.2f}"
                 for _ in range(2)
             ]
-            middle.attack(
-                *(parse_attack(each).make(middle.surroundings, round_number, network.now) for each in specs)
-            )
+            middle.attack(*(parse_attack(spec).make(middle.context, round_number, network.now) for spec in specs))
             network.run(lot.uniform(3, 14))
             if lot.random() < 0.2:
                 b.start(0.0)
@@ -117,13 +105,13 @@ def test_whatever_is_held_nothing_old_comes_out(seed: int) -> None:
 
 @pytest.mark.parametrize("reorder", ["reorder,depth=8", "reorder,depth=40,patience_s=0.9"])
 def test_reordering_within_two_seconds_loses_nothing(reorder: str) -> None:
-    """However wild: what comes within two seconds is in time."""
+    """In any order: a delay of up to two seconds is in time."""
     with Network(f"reorder {reorder}", RadioSettings(delay_s=0.02)) as network:
-        middle, a, b = middle_of(network)
+        middle, a, b = Middle.between(network)
         flows = network.talk(a, b, 0.02)
         network.run(2)
         begin = network.now
-        middle.attack(parse_attack(f"{reorder},seconds=10").make(middle.surroundings, 1, begin))
+        middle.attack(parse_attack(f"{reorder},seconds=10").make(middle.context, 1, begin))
         network.run(15)
         for flow, receiver, sender in ((flows[0], b, a), (flows[1], a, b)):
             assert flow.overtaken > 50
@@ -135,8 +123,8 @@ def test_reordering_within_two_seconds_loses_nothing(reorder: str) -> None:
 
 @pytest.mark.parametrize("delay_s", [0.005, 0.2, 0.45])
 @pytest.mark.parametrize("interval_s", [1.9, 2.1, 4.0, 9.0])
-def test_honest_slow_talkers_lose_nothing(interval_s: float, delay_s: float) -> None:
-    """A frame now and then, silence between: each comes out, after one round trip more where it must be asked."""
+def test_honest_links_with_rare_frames_lose_nothing(interval_s: float, delay_s: float) -> None:
+    """Rare frames with silence between them: each is delivered, after another round trip if the sender is asked."""
     with Network(f"slow talk {interval_s} {delay_s}", RadioSettings(delay_s=delay_s, jitter_s=0.01)) as network:
         a, b = network.pair()
         network.run_until(partial(share_a_session, a, b), within_s=5)
@@ -150,7 +138,7 @@ def test_honest_slow_talkers_lose_nothing(interval_s: float, delay_s: float) -> 
 
 
 def test_a_one_way_link_that_never_fell_silent_keeps_delivering_reports() -> None:
-    """No answer comes through the other direction: reports need none, and what must be new is dropped."""
+    """The other direction carries no answer: reports need none, and frames that must be new are dropped."""
     with Network("one way", RadioSettings(delay_s=0.05)) as network:
         network.screen = every_second_may_be_old
         a, b = network.pair()
@@ -164,7 +152,7 @@ def test_a_one_way_link_that_never_fell_silent_keeps_delivering_reports() -> Non
 
 
 def test_losses_cost_a_question_and_seldom_a_frame() -> None:
-    """A third of all is lost each way and frames come each two seconds: most of what arrives is delivered."""
+    """A third is lost in each direction, with a frame every two seconds: most arriving frames are delivered."""
     with Network("losses", RadioSettings(delay_s=0.02, loss=0.3)) as network:
         a, b = network.pair()
         network.run(3)

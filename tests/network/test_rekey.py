@@ -19,13 +19,13 @@ def _want_new_keys(drone: Drone, other: Drone) -> None:
     assert drone.node is not None
     assert session is not None
     session.created_at -= 1000.0
-    drone.node.set_addresses(other.name, drone.peer(other).caller.addresses, drone.local_now)  # looks at its timers
+    drone.node.set_paths(drone.peer(other), drone.peer(other).initiator.paths, drone.local_now)  # looks at its timers
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.02, 0.3])
 @pytest.mark.parametrize("at_once", [False, True], ids=["in turn", "both at once"])
 def test_rekeying_at_full_traffic_loses_and_reorders_nothing(delay_s: float, at_once: bool) -> None:
-    """500 frames a second each way, new keys every two seconds or less: no frame lost, none overtaken."""
+    """500 frames a second in each direction, new keys every two seconds or less: no loss, no reordering."""
     with Network(f"rekey {delay_s} {at_once}", RadioSettings(delay_s=delay_s)) as network:
         a, b = network.pair(EVERY_2_S)
         network.run_until(lambda: share_a_session(a, b), within_s=3)
@@ -42,14 +42,14 @@ def test_rekeying_at_full_traffic_loses_and_reorders_nothing(delay_s: float, at_
         for drone in (a, b):
             times = {round(at, 1) for at, _ in drone.established() if at > begin}
             assert len(times) >= 6
-            # Over a round trip longer than the first retry, a second response comes when the first was enough, and
-            # an echo request about a session when two others took its place.
+            # With a round trip longer than the first retry, a second response arrives after the first one, and
+            # an echo request about a session that two others have replaced.
             assert set(drone.drops) <= ({"unexpected_response", "late"} if delay_s == 0.3 else set()), drone.drops
             assert drone.drops["late"] <= 2
 
 
 def test_rekeying_both_at_once_makes_sessions_of_both_and_one_is_used() -> None:
-    """Where both ends initiate in the same instant both handshakes are finished, and both ends send on one."""
+    """If both ends initiate at the same instant, both handshakes complete, and both ends send on one session."""
     with Network("crossed rekey", RadioSettings(delay_s=0.05)) as network:
         a, b = network.pair()
         network.talk(a, b, interval_s=0.002)
@@ -64,7 +64,7 @@ def test_rekeying_both_at_once_makes_sessions_of_both_and_one_is_used() -> None:
 
 
 def test_rekeying_over_a_lossy_link_loses_only_what_the_link_lost() -> None:
-    """New keys every two seconds over a link that loses a fifth and reorders: every frame let through comes out."""
+    """New keys every two seconds over a link that loses a fifth and reorders: every passing frame is delivered."""
     settings = RadioSettings(delay_s=0.05, jitter_s=0.02)
     for seed in range(4):
         with Network(f"lossy rekey {seed}", settings) as network:

@@ -1,4 +1,4 @@
-"""An attacker that recorded everything and sends it again, at any time, to anyone, under any address."""
+"""An attacker that recorded everything replays it, at any time, to any drone, from any address."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ FAST_REKEY = Link(timers=Timers(rekey_after_s=1.0, reject_after_s=6.0))
 
 
 def _storm(network: Network, recorder: Recorder, per_s: float, duration_s: float) -> None:
-    """Replay at random for a while: as it was, to another drone, back to its sender, or from elsewhere."""
+    """Replay at random for a while: unchanged, to another drone, back to its sender, or from another address."""
     drones = list(network.drones.values())
-    chance = network.chance
+    rng = network.rng
 
     def replay() -> None:
-        datagram, source, destination = chance.choice(recorder.recorded)
-        match chance.randrange(5):
+        datagram, source, destination = rng.choice(recorder.recorded)
+        match rng.randrange(5):
             case 0:
                 source, destination = destination, source
             case 1:
-                destination = chance.choice(drones).addresses[0]
+                destination = rng.choice(drones).addresses[0]
             case 2:
-                source = ("198.51.100.1", 1024 + chance.randrange(60000))
+                source = ("198.51.100.1", 1024 + rng.randrange(60000))
             case 3:
-                source, destination = chance.choice(drones).addresses[0], chance.choice(drones).addresses[0]
+                source, destination = rng.choice(drones).addresses[0], rng.choice(drones).addresses[0]
         network.inject(datagram, source, destination)
 
     for number in range(int(per_s * duration_s)):
@@ -71,7 +71,7 @@ def test_replay_storm_delivers_nothing_twice_and_leaves_the_links_as_they_are(se
 
 @pytest.mark.parametrize("knows", ["both", "restarted", "other"])
 def test_link_comes_back_after_a_restart_amid_a_replay_storm(knows: str) -> None:
-    """The restarted drone remembers no initiation; old ones by the hundred do not keep it from its link."""
+    """The restarted drone remembers no initiation; hundreds of old ones do not block its link."""
     for seed in range(3):
         with Network(f"storm and restart {knows} {seed}", RadioSettings(delay_s=0.02)) as network:
             a, b = network.add("a"), network.add("b")
@@ -82,7 +82,7 @@ def test_link_comes_back_after_a_restart_amid_a_replay_storm(knows: str) -> None
             network.talk(a, b)
             recorder = Recorder(network)
             network.run(30)
-            initiations = [each for each in recorder.recorded if each[0][0] == 1]
+            initiations = [datagram for datagram in recorder.recorded if datagram[0][0] == 1]
             assert len(initiations) >= 15
             begin = network.now
             a.start(0.0)
@@ -95,7 +95,7 @@ def test_link_comes_back_after_a_restart_amid_a_replay_storm(knows: str) -> None
 
 
 def test_replays_from_before_a_restart_start_no_handshake_on_a_living_link() -> None:
-    """Envelopes of forgotten sessions, sent again from the peer's own address, are no reason for new keys."""
+    """Envelopes of forgotten sessions, replayed from the peer's own address, do not cause new keys."""
     with Network("old envelopes", RadioSettings(delay_s=0.02)) as network:
         a, b = network.pair()
         network.talk(a, b)
@@ -119,7 +119,7 @@ def test_replays_from_before_a_restart_start_no_handshake_on_a_living_link() -> 
 
 
 def test_link_comes_up_amid_a_storm_that_uses_up_all_answers() -> None:
-    """A drone starts while its old initiations are replayed at its peer by the hundred: it is linked within 3 s."""
+    """A drone starts while hundreds of its old initiations are replayed to its peer: it links within 3 s."""
     for seed in range(2):
         with Network(f"storm first {seed}", RadioSettings(delay_s=0.05)) as network:
             a, b = network.add("a"), network.add("b")
@@ -140,7 +140,7 @@ def test_link_comes_up_amid_a_storm_that_uses_up_all_answers() -> None:
             for number, datagram in enumerate(old):
                 network.at(begin + number / 50, partial(network.inject, datagram, MISCHIEF, a.addresses[0]))
             network.run(3)
-            # Asked for a cookie, or, in more of them than one network is sent, not even that.
+            # Asked for a cookie, or above the limit of one network, without an answer.
             assert a.drops["cookie_required"] + a.drops["rate_limited"] > 50
             b.start(0.0)
             network.run_until(partial(share_a_session, a, b), within_s=3)

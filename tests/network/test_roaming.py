@@ -1,4 +1,4 @@
-"""Addresses that change under traffic, honestly and by mischief."""
+"""Addresses that change under traffic, honestly and by attackers."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import pytest
 from tests.network.attackers import Racer
 from tests.network.network import Address, Drone, Flow, Network, share_a_session
 from uavlinkd.core.outputs import PathChanged
+from uavlinkd.core.path import Path
 from uavlinkd.lab.mitm.radio import RadioSettings
 
 BACK_WITHIN_S = 3.0
@@ -32,12 +33,12 @@ def _flows(network: Network, a: Drone, b: Drone) -> tuple[Flow, Flow]:
 def _path_to(drone: Drone, other: Drone) -> Address:
     path = drone.peer(other).path
     assert path is not None
-    return path[1], path[2]
+    return path.host, path.address[1]
 
 
 @pytest.mark.parametrize("delay_s", [0.01, 0.1, 0.3])
 def test_traffic_follows_an_address_change_within_a_round_trip(delay_s: float) -> None:
-    """After the mover's next frame, its question and its answer, traffic goes to the new address; no new keys."""
+    """After the mover's next frame, the challenge and the response, traffic goes to the new address; no new keys."""
     for seed in range(5):
         with Network(f"moves {delay_s} {seed}", RadioSettings(delay_s=delay_s)) as network:
             a, b = _linked(network, b_knows=False)
@@ -47,7 +48,9 @@ def test_traffic_follows_an_address_change_within_a_round_trip(delay_s: float) -
             network.run(0.06 + 3 * delay_s)
             assert _path_to(b, a) == a.addresses[0]
             assert b.peer(a).traffic.handshakes == handshakes
-            assert [event for at, event in b.outputs if at > begin] == [PathChanged("a", (0, *a.addresses[0]))]
+            assert [event for at, event in b.outputs if at > begin] == [
+                PathChanged(b.peer(a), Path(0, a.addresses[0]))
+            ]
             back = network.now
             network.run(2)
             for flow in _flows(network, a, b):
@@ -57,7 +60,7 @@ def test_traffic_follows_an_address_change_within_a_round_trip(delay_s: float) -
 
 @pytest.mark.parametrize("loss", [0.0, 0.3])
 def test_nat_rebinding_under_traffic_is_followed(loss: float) -> None:
-    """A NAT that forgets its mapping every five seconds: each time both ways work again within three seconds."""
+    """A NAT that forgets its mapping every five seconds: both directions work again within three seconds."""
     for seed in range(4):
         with Network(f"nat {loss} {seed}", RadioSettings(delay_s=0.05, loss=loss)) as network:
             a, b = _linked(network, b_knows=False)
@@ -93,7 +96,7 @@ def test_both_ends_may_move_at_once_while_one_keeps_an_address() -> None:
 
 
 def test_forwarding_from_a_third_address_does_not_attract_traffic() -> None:
-    """Every datagram arrives first from an address that answers nothing: it gets questions, and no frame ever."""
+    """Every datagram arrives first from an address that never answers: it gets challenges, and no frame."""
     for seed in range(5):
         with Network(f"mischief {seed}", RadioSettings(delay_s=0.02)) as network:
             a, b = _linked(network)
@@ -107,31 +110,3 @@ def test_forwarding_from_a_third_address_does_not_attract_traffic() -> None:
             assert len(racer.attracted) <= 10 * 4 + 1
             for flow in _flows(network, a, b):
                 assert not flow.lost(begin, network.now - 0.1)
-
-
-@pytest.mark.parametrize("b_knows", [True, False])
-@pytest.mark.parametrize("both_ways", [True, False])
-def test_traffic_recovers_when_a_relaying_third_address_stops(both_ways: bool, b_knows: bool) -> None:
-    """An attacker that is the faster way gets the traffic; it stops, and frames cross again within three seconds."""
-    for seed in range(5):
-        with Network(f"relay {both_ways} {b_knows} {seed}", RadioSettings(delay_s=0.05)) as network:
-            a, b = _linked(network, b_knows=b_knows)
-            racers = [Racer(network, MISCHIEF, a, b, relays=True)]
-            if both_ways:
-                racers.append(Racer(network, ("198.51.100.67", 6667), b, a, relays=True))
-            for racer in racers:
-                for drone in (a, b):
-                    network.radios_of[racer.address, drone.addresses[0]] = RadioSettings(delay_s=0.001)
-                    network.radios_of[drone.addresses[0], racer.address] = RadioSettings(delay_s=0.001)
-            network.run(5)
-            assert _path_to(b, a) in {racer.address for racer in racers}
-            for racer in racers:
-                racer.is_active = False
-            stopped = network.now
-            network.run(BACK_WITHIN_S)
-            back = network.now
-            network.run(3)
-            for flow in _flows(network, a, b):
-                assert flow.first_delivery(stopped) < back
-                assert not flow.lost(back, network.now - 0.1)
-            assert _path_to(b, a) == a.addresses[0]

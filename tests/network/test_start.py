@@ -1,4 +1,4 @@
-"""Links that come up: both ends at once over every kind of bad network, many drones at once, heavy loss."""
+"""Starting links: both ends together over every kind of bad network, many drones together, heavy loss."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from tests.network.handshakes import MODES, broken, distribution, handshake_time
 from tests.network.network import Address, Drone, Network, session_name, share_a_session
 from uavlinkd.lab.mitm.radio import RadioSettings
 
-NOBODY: tuple[Address, ...] = (("192.0.2.1", 5790), ("192.0.2.2", 14550))
-"""Stale addresses: nobody answers there."""
+STALE: tuple[Address, ...] = (("192.0.2.1", 5790), ("192.0.2.2", 14550))
+"""Stale addresses without a drone."""
 TRIES = int(os.environ.get("UAVLINKD_HANDSHAKE_TRIES", "300"))
-"""How many handshakes the loss figures rest on."""
+"""Number of handshakes for the loss figures."""
 
 
 def _crossing(network: Network) -> tuple[Drone, Drone]:
-    """Two drones started at the same instant, what they know of each other and the network drawn by lot.
+    """Two drones started at the same instant, with random addresses of each other and a random network.
 
-    At least one knows a good address of the other: else nothing can happen.
+    At least one knows a valid address of the other: otherwise they cannot meet.
     """
     lot = Random(f"crossing {network.seed}")
     network.set_radio(
@@ -39,7 +39,7 @@ def _crossing(network: Network) -> tuple[Drone, Drone]:
     knowing = lot.choice(((True, True), (True, True), (True, False), (False, True)))
     for drone, other, knows in zip(drones, reversed(drones), knowing, strict=True):
         known = lot.sample(other.addresses, lot.randint(1, len(other.addresses))) if knows else []
-        stale = list(lot.choice(((), NOBODY[:1], NOBODY)))
+        stale = list(lot.choice(((), STALE[:1], STALE)))
         mixed = known + stale
         lot.shuffle(mixed)
         drone.knows(other, mixed)
@@ -50,7 +50,7 @@ def _crossing(network: Network) -> tuple[Drone, Drone]:
 
 @pytest.mark.parametrize("seeds", [range(begin, begin + 25) for begin in range(0, 200, 25)], ids=str)
 def test_two_ends_started_at_once_settle_on_the_same_session(seeds: range) -> None:
-    """Whatever crosses on the way and whichever address is stale, both ends settle on one session and stay there."""
+    """With any crossing messages and stale addresses, both ends settle on one session and stay there."""
     for seed in seeds:
         with Network(f"crossing {seed}") as network:
             a, b = _crossing(network)
@@ -70,8 +70,8 @@ def test_two_ends_started_at_once_settle_on_the_same_session(seeds: range) -> No
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_handshake_over_30_percent_loss_each_way(mode: str) -> None:
-    """With 30 % random loss each way both ends share a session within 3 s in 99 % of tries, within 10 s in all."""
+def test_handshake_over_30_percent_loss_in_each_direction(mode: str) -> None:
+    """With 30 % random loss in each direction both ends share a session within 3 s in 99 % of cases, 10 s in all."""
     times = [handshake_time(mode, 0.3, seed) for seed in range(TRIES)]
     print(f"{mode}: {len(times)} handshakes took (s): {distribution(times)}")
     assert not broken(times), distribution(times)
@@ -81,7 +81,7 @@ def test_handshake_over_30_percent_loss_each_way(mode: str) -> None:
     ("size", "loss", "bound_s"), [(5, 0.0, 1), (10, 0.0, 1), (5, 0.6, 30), (10, 0.3, 10), (10, 0.6, 30)]
 )
 def test_every_pair_of_a_mesh_comes_up(size: int, loss: float, bound_s: float) -> None:
-    """Many drones started at once, each knowing all others: every pair has a session within a bound."""
+    """Many drones started together, each knowing all others: every pair has a session within a bound."""
     with Network(f"mesh {size} {loss}", RadioSettings(loss=loss, delay_s=0.03, jitter_s=0.02)) as network:
         drones = [network.add(f"d{number}") for number in range(size)]
         pairs = [(a, b) for a in drones for b in drones if a.name < b.name]

@@ -17,6 +17,7 @@ from dataclasses import asdict, dataclass
 from time import monotonic
 from unittest.mock import patch
 
+from tests.kernel_queues import memory_of, receive_queue
 from uavlinkd.core import constants as c
 from uavlinkd.core import handshake, wire
 from uavlinkd.core.cookie import MacKeys, mac1_of
@@ -25,6 +26,7 @@ from uavlinkd.core.drops import Drop
 from uavlinkd.core.kem import FfdheGroup
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Transmit
+from uavlinkd.core.path import Path
 from uavlinkd.core.session import Session
 from uavlinkd.core.settings import Link, PeerSettings
 from uavlinkd.core.suites import SUITES_BY_NAME, X25519
@@ -38,7 +40,7 @@ _TICK_S = 0.002
 
 @dataclass(frozen=True)
 class Target:
-    """Where the daemon is, what the attacker holds, and how fast it sends."""
+    """The address of the daemon, the attacker's keys, and its rate."""
 
     port: int
     public_key: str
@@ -48,6 +50,9 @@ class Target:
     per_s: float
     suite: str = "x25519"
     envelope_bytes: int = c.DEFAULT_ENVELOPE_LIMIT
+    queue_bytes: int | None = None
+    """How much of the daemon's receive buffer the attacker fills. Without a limit the kernel drops datagrams of other
+    peers while the daemon waits for a processor."""
 
     def to_json(self) -> str:
         """One line."""
@@ -55,17 +60,39 @@ class Target:
 
     @property
     def address(self) -> tuple[str, int]:
-        """Of the daemon."""
+        """The public key of the daemon."""
         return "127.0.0.1", self.port
 
     def settings(self) -> PeerSettings:
-        """The daemon as the captured peer knows it."""
+        """The daemon as a peer of the captured one."""
         link = Link(suites=(SUITES_BY_NAME[self.suite],))
         return PeerSettings("victim", b64decode(self.public_key), Secret(b64decode(self.psk)), link)
 
 
+class _Room:
+    """The room that an attacker has in the daemon's receive buffer."""
+
+    def __init__(self) -> None:
+        self._left: float = 0
+
+    def take(self, size: int, target: Target) -> bool:
+        """Whether a datagram of ``size`` bytes may be sent."""
+        if target.queue_bytes is None:
+            return True
+        memory = memory_of(size)
+        if memory > self._left:
+            self._left = target.queue_bytes - receive_queue(target.port).waiting_bytes
+        if memory > self._left:
+            return False
+        self._left -= memory
+        return True
+
+
+_room = _Room()
+
+
 def _ticks(per_s: float) -> Iterator[int]:
-    """How many datagrams are due, each time that some are; until standard input ends."""
+    """Yield the number of datagrams that are due, until standard input ends."""
     began, sent = monotonic(), 0
     while not select.select([sys.stdin], [], [], _TICK_S)[0]:
         due = int((monotonic() - began) * per_s) - sent
@@ -82,7 +109,7 @@ def _socket(host: str) -> socket.socket:
 
 
 def initiations(target: Target) -> None:
-    """Sound initiations of the captured peer, all different, from four hosts that answer with their cookies.
+    """Honest initiations of the captured peer, all different, from four hosts that answer with their cookies.
 
     The daemon cannot tell them from recorded ones that it reads for the first time.
     """
@@ -131,26 +158,27 @@ def envelopes(target: Target) -> None:
 
 
 def starts(target: Target) -> None:
-    """Genuine envelopes of file transfer whose bytes are all start bytes: the dearest to search for hidden frames."""
+    """Genuine envelopes of file transfer with start bytes only: the most expensive search for hidden frames."""
     _insider(target, _frames_of_starts(target.envelope_bytes), STARTS_FRAME_BYTES)
 
 
 def _insider(target: Target, filling: bytes, frame_bytes: int) -> None:
     sock = _socket("127.0.0.1")
     node = Node(Secret(b64decode(target.captured_key)), os.urandom, monotonic())
-    node.add_peer(target.settings(), monotonic())
-    node.set_addresses("victim", [(0, *target.address)], monotonic())
+    victim = node.add_peer(target.settings(), monotonic())
+    node.set_paths(victim, [Path(0, target.address)], monotonic())
     for due in _ticks(target.per_s):
         outputs = node.handle_timeout(monotonic()) if monotonic() >= node.next_deadline() else []
         for answer in _received(sock):
-            outputs += node.receive(answer, (0, *target.address), monotonic())
+            outputs += node.receive(answer, Path(0, target.address), monotonic())
         for output in outputs:
             if isinstance(output, Transmit):
                 _send(sock, output.datagram, target)
-        session = node.peers["victim"].sessions.current
+        session = victim.sessions.current
         if session is not None:
             for _ in range(due):
-                _send(sock, _fill(session, filling, frame_bytes, target.envelope_bytes), target)
+                if not _send(sock, _fill(session, filling, frame_bytes, target.envelope_bytes), target):
+                    break
 
 
 def _fill(session: Session, filling: bytes, frame_bytes: int, size: int) -> bytes:
@@ -183,9 +211,13 @@ def _shortest_frames(size: int) -> bytes:
     return b"".join(frames)
 
 
-def _send(sock: socket.socket, datagram: bytes, target: Target) -> None:
-    with suppress(OSError):  # no room: as if the network had lost it
+def _send(sock: socket.socket, datagram: bytes, target: Target) -> bool:
+    """Send a datagram. Returns whether the daemon's receive buffer had room for it."""
+    if not _room.take(len(datagram), target):
+        return False
+    with suppress(OSError):  # no room in the attacker's own buffer: as if the network had lost it
         sock.sendto(datagram, target.address)
+    return True
 
 
 def _received(sock: socket.socket) -> Iterator[bytes]:
@@ -194,7 +226,7 @@ def _received(sock: socket.socket) -> Iterator[bytes]:
             yield sock.recv(65536)
 
 
-ATTACKS = {each.__name__: each for each in (initiations, spoofed, envelopes, starts)}
+ATTACKS = {item.__name__: item for item in (initiations, spoofed, envelopes, starts)}
 
 if __name__ == "__main__":
     ATTACKS[sys.argv[1]](Target(**json.loads(sys.stdin.readline())))

@@ -1,4 +1,4 @@
-"""``python -m tests.pressure``: attacks real daemons on loopback and prints what their other peers notice."""
+"""``python -m tests.pressure``: attacks real daemons on loopback and prints the effect on their other peers."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from tests.limited_cpu import limited_cpu
 from tests.pressure.scene import HEADER, Plan, Seen, watch
 
 PLANS = {
-    each.name: each
-    for each in (
+    plan.name: plan
+    for plan in (
         Plan("insider initiations", "initiations", 80, suite="ffdhe8192", with_latecomer=True),
         Plan("spoofed initiations", "spoofed", 10_000, with_latecomer=True),
         Plan("64 kB envelopes", "envelopes", 40, envelope_bytes=64_000),
@@ -24,10 +24,12 @@ PLANS = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the attacks that were named, or all of them."""
+    """Run the named attacks, or all of them."""
     parser = argparse.ArgumentParser(prog="python -m tests.pressure", description=__doc__)
     parser.add_argument("plans", nargs="*", metavar="PLAN", help=f"of: {', '.join(PLANS)}")
-    parser.add_argument("--seconds", type=float, default=4.0, help="of frames both ways during each attack")
+    parser.add_argument(
+        "--seconds", type=float, default=4.0, help="duration of the frames in both directions during each attack"
+    )
     parser.add_argument("--share", type=float, help="the part of one core that the daemon gets")
     options = parser.parse_args(arguments)
     if unknown := set(options.plans) - set(PLANS):

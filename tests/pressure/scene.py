@@ -1,27 +1,39 @@
-"""A daemon, an honest peer with traffic both ways, an attacker; what the honest peer and the operator notice."""
+"""A daemon, an honest peer with traffic in both directions, an attacker; the effect on the peer and the operator."""
 
 from __future__ import annotations
 
 import asyncio
-import os
 import sys
 from collections import Counter
 from contextlib import suppress
 from dataclasses import dataclass, field
-from pathlib import Path
 from statistics import quantiles
 from time import monotonic
 
-from tests.daemon.harness import PATIENCE_S, DaemonProcess, Program, Sockaddr, Stage, Status, frame
+from tests.daemon.frames import frame
+from tests.daemon.harness import Stage
+from tests.daemon.losses import lost_to_waiting
+from tests.daemon.process import DaemonProcess, Status
+from tests.daemon.udp import Client, Sockaddr
+from tests.kernel_queues import cpu_s
 from tests.pressure.attacks import Target
+from tests.waiting import PATIENCE_S
+from uavlinkd.lab.child_processes import end_with_parent
 
 INTERVAL_S = 0.05
-"""Between two frames of one direction."""
+"""Time between two frames of one direction."""
 LEAD_S = 1.0
-"""So long the attack has lasted when the first frame is sent."""
+"""Duration of the attack before the first frame is sent."""
 ALLOWED_S = 5.0
-"""A frame or an answer that takes longer does not count as arrived."""
-_TICKS_PER_S = os.sysconf("SC_CLK_TCK")
+"""In the percentiles a lost frame counts as this."""
+FAIR_CPU_S = 0.1
+"""An attacked daemon spends at most this CPU time on others before it handles a frame: thirty turns. A daemon without
+turns would handle the whole queue first, which takes several times that."""
+FAIR_SHARE = 0.25
+"""The least share of the frames of which this is to be seen. While another process does not run, frames wait too."""
+MORE_S = 30.0
+ROUNDS = 8
+"""How many times ``ALLOWED_S`` the measurement waits for frames that nothing explains as lost."""
 
 
 @dataclass(frozen=True)
@@ -34,34 +46,45 @@ class Plan:
     suite: str = "x25519"
     envelope_bytes: int = 1232
     role: str = "swarm-member"
-    """Of the captured peer."""
+    """Role of the captured peer."""
     with_latecomer: bool = False
     """Whether another peer, at its configured address, starts during the attack."""
+    queue_bytes: int | None = None
+    """How much of the daemon's receive buffer the attacker fills; None: it sends whether there is room or not."""
 
 
 @dataclass
 class Seen:
-    """What was measured. Latencies are seconds; those of frames that never came are left out."""
+    """The measurement. Latencies are without lost frames."""
 
     plan: Plan
     sent: int = 0
     latencies_s: list[float] = field(default_factory=list)
+    soon: int = 0
+    """Frames for which the attacked daemon used less than ``FAIR_CPU_S`` while they travelled."""
     status_s: list[float] = field(default_factory=list)
     unanswered: int = 0
     linked_after_s: float | None = None
     cpu_share: float = 0.0
-    """CPU time of the daemon, by the time that passed."""
+    """CPU time of the daemon, as a share of the elapsed time."""
     drops: Counter[str] = field(default_factory=Counter)
+    lost_to_waiting: int = 0
+    """Honest frames that the kernel or the daemons dropped because a process had to wait for a processor."""
+
+    @property
+    def lost(self) -> int:
+        """Honest frames that did not arrive."""
+        return self.sent - len(self.latencies_s)
 
     def percentile_s(self, percent: int) -> float:
-        """Of the latencies."""
-        # What is still under way when the measurement ends took longer than any that arrived.
-        latencies_s = [*self.latencies_s, *[ALLOWED_S] * (self.sent - len(self.latencies_s))]
+        """A percentile of the latencies, with ``ALLOWED_S`` for lost frames."""
+        # A frame in flight at the end of the measurement took longer than any that arrived.
+        latencies_s = [*self.latencies_s, *[ALLOWED_S] * self.lost]
         return quantiles(latencies_s, n=100, method="inclusive")[percent - 1]
 
     def line(self) -> str:
         """A row of a Markdown table."""
-        p50, p95 = (f"{self.percentile_s(each) * 1e3:.0f} ms" for each in (50, 95))
+        p50, p95 = (f"{self.percentile_s(latency) * 1e3:.0f} ms" for latency in (50, 95))
         status = f"{max(self.status_s) * 1e3:.0f} ms" if not self.unanswered else f"{self.unanswered} unanswered"
         linked = (
             ""
@@ -70,16 +93,10 @@ class Seen:
             if self.linked_after_s is None
             else f"{self.linked_after_s:.2f} s"
         )
-        worst = ", ".join(f"{name} {amount}" for name, amount in self.drops.most_common(3))
+        worst = ", ".join(f"{name} {count}" for name, count in self.drops.most_common(3))
         cells = (
-            self.plan.name,
-            f"{len(self.latencies_s)} of {self.sent}",
-            p50,
-            p95,
-            status,
-            linked,
-            f"{self.cpu_share:.0%}",
-            worst,
+            *(self.plan.name, f"{len(self.latencies_s)} of {self.sent}", p50, p95, status, linked),
+            *(f"{self.cpu_share:.0%}", worst),
         )
         return f"| {' | '.join(cells)} |"
 
@@ -91,48 +108,49 @@ HEADER = (
 
 
 async def watch(stage: Stage, plan: Plan, seconds: float, launcher: tuple[str, ...] = ()) -> Seen:
-    """Attack a daemon for ``seconds``, while 20 frames a second go each way between it and an honest peer."""
+    """Attack a daemon for ``seconds``, while it and an honest peer exchange 20 frames a second in each direction."""
     victim, honest, captured, late = (stage.daemon(name) for name in ("victim2", "honest4", "captured", "late6"))
     victim.launcher = launcher
     stage.introduce(victim, honest)
     psk, late_psk = stage.psk(), stage.psk()
     victim.add_peer(captured, [], psk, suites=[plan.suite], role=plan.role, system_ids=[2])
-    # The daemon offers what costs it nothing: the answer to the peer's own initiation is what this is about.
+    # The daemon itself offers a cheap suite: the test is about its answer to the peer's own initiation.
     victim.add_peer(late, [late.address], late_psk, suites=list(dict.fromkeys(["x25519", plan.suite])))
     late.add_peer(victim, [victim.address], late_psk, suites=[plan.suite])
-    programs = await stage.program(), await stage.program()
-    ways = victim.add_endpoint("program"), honest.add_endpoint("program")
+    clients = await stage.client(), await stage.client()
+    ways = victim.add_endpoint("client"), honest.add_endpoint("client")
     await stage.start(victim, honest, linked=False)
     await honest.until_linked()
-    for number, (program, way) in enumerate(zip(programs, ways, strict=True)):
-        program.send(frame(0, number + 1), way)
-        await (victim, honest)[number].until(lambda status: bool(status["endpoints"]["program"]["programs"]))
+    for number, (client, way) in enumerate(zip(clients, ways, strict=True)):
+        client.send(frame(0, number + 1), way)
+        await (victim, honest)[number].until(lambda status: bool(status["endpoints"]["client"]["clients"]))
     seen = Seen(plan)
-    target = Target(
-        victim.sockaddr[1], victim.public_key, captured.private_key, psk, plan.per_s, plan.suite, plan.envelope_bytes
-    )
+    keys = victim.public_key, captured.private_key, psk
+    target = Target(victim.sockaddr[1], *keys, plan.per_s, plan.suite, plan.envelope_bytes, plan.queue_bytes)
     attacker = await asyncio.create_subprocess_exec(
-        sys.executable, "-m", "tests.pressure.attacks", plan.attack, stdin=asyncio.subprocess.PIPE
+        *end_with_parent(sys.executable, "-m", "tests.pressure.attacks", plan.attack), stdin=asyncio.subprocess.PIPE
     )
     assert attacker.stdin is not None
     try:
         attacker.stdin.write(target.to_json().encode() + b"\n")
         await victim.until(lambda status: _is_attacked(status, plan))
         await asyncio.sleep(LEAD_S)
-        before, cpu_s, began = await victim.status(), _cpu_s(victim.pid), monotonic()
+        before, cpu_before_s, began = await victim.status(), cpu_s(victim.pid), monotonic()
+        network = _Network(victim, honest)
+        await network.begin()
         tasks = [
             asyncio.create_task(
-                _talk(programs[number], ways[number], programs[1 - number], number + 1, seconds, seen)
+                _talk(clients[number], ways[number], clients[1 - number], number + 1, seconds, seen, network)
             )
             for number in range(2)
         ]
         tasks.append(asyncio.create_task(_ask(victim, seconds, seen)))
         if plan.with_latecomer:
             tasks.append(asyncio.create_task(_link(late, victim, seconds, seen)))
-        await asyncio.sleep(seconds)
-        seen.cpu_share = (_cpu_s(victim.pid) - cpu_s) / (monotonic() - began)
         await asyncio.gather(*tasks)
+        seen.cpu_share = (cpu_s(victim.pid) - cpu_before_s) / (monotonic() - began)
         seen.drops = _drops(await victim.status()) - _drops(before)
+        seen.lost_to_waiting = await network.lost_to_waiting()
     finally:
         attacker.stdin.close()
         await attacker.wait()
@@ -151,39 +169,72 @@ def _drops(status: Status) -> Counter[str]:
     return counts
 
 
-async def _talk(source: Program, into: Sockaddr, sink: Program, system: int, seconds: float, seen: Seen) -> None:
-    arrived: dict[bytes, float] = {}
-    sent: dict[bytes, float] = {}
-    heard = len(sink.datagrams)
+class _Network:
+    """What the kernel and the pauses of two daemons cost their frames."""
+
+    def __init__(self, victim: DaemonProcess, honest: DaemonProcess) -> None:
+        self.victim, self._honest = victim, honest
+        self._before = 0
+
+    async def begin(self) -> None:
+        """Count from now on."""
+        self._before = await self.lost_to_waiting()
+
+    async def lost_to_waiting(self) -> int:
+        """Frames that were lost because a process had to wait for a processor."""
+        return (
+            await lost_to_waiting(self.victim, self._honest)
+            + await lost_to_waiting(self._honest, self.victim)
+            - self._before
+        )
+
+
+async def _talk(
+    source: Client, into: Sockaddr, sink: Client, system: int, seconds: float, seen: Seen, network: _Network
+) -> None:
+    arrived: dict[bytes, tuple[float, float]] = {}
+    sent: dict[bytes, tuple[float, float]] = {}
+    received = len(sink.datagrams)
     end = monotonic() + seconds
 
     def note() -> bool:
-        nonlocal heard
-        now = monotonic()
-        for datagram in sink.datagrams[heard:]:
-            for each in sent:
-                if each not in arrived and each in datagram:
-                    arrived[each] = now
-        heard = len(sink.datagrams)
+        nonlocal received
+        now = monotonic(), cpu_s(network.victim.pid)
+        for datagram in sink.datagrams[received:]:
+            for sent_frame in sent:
+                if sent_frame not in arrived and sent_frame in datagram:
+                    arrived[sent_frame] = now
+        received = len(sink.datagrams)
         return len(arrived) == len(sent)
 
-    noting = asyncio.create_task(_forever(sink, note))
+    noting = asyncio.create_task(_until_cancelled(sink, note))
     number, due = 0, monotonic()
-    while due < end:
+    # A pause of one of the processes may delay each frame of a short time. Then more are sent.
+    while due < end or (due < end + MORE_S and _soon(sent, arrived) < FAIR_SHARE * number):
         number += 1
-        each = frame(number, system)
-        sent[each] = monotonic()
-        source.send(each, into)
+        sent_frame = frame(number, system)
+        sent[sent_frame] = monotonic(), cpu_s(network.victim.pid)
+        source.send(sent_frame, into)
         due += INTERVAL_S
         await asyncio.sleep(max(0.0, due - monotonic()))
-    with suppress(TimeoutError):
-        await sink.until(note, ALLOWED_S)
+    for _ in range(ROUNDS):
+        with suppress(TimeoutError):
+            await sink.until(note, ALLOWED_S)
+            break
+        # They will not arrive any more if the kernel, or a daemon after a pause, dropped them.
+        if len(sent) - len(arrived) <= await network.lost_to_waiting():
+            break
     noting.cancel()
     seen.sent += len(sent)
-    seen.latencies_s += [arrived[each] - sent[each] for each in arrived]
+    seen.soon += _soon(sent, arrived)
+    seen.latencies_s += [at - sent[sent_frame][0] for sent_frame, (at, _) in arrived.items()]
 
 
-async def _forever(sink: Program, note: object) -> None:
+def _soon(sent: dict[bytes, tuple[float, float]], arrived: dict[bytes, tuple[float, float]]) -> int:
+    return sum(cpu_at_s - sent[sent_frame][1] < FAIR_CPU_S for sent_frame, (_, cpu_at_s) in arrived.items())
+
+
+async def _until_cancelled(sink: Client, note: object) -> None:
     assert callable(note)
     await sink.until(lambda: note() and False, 1e6)
 
@@ -193,7 +244,7 @@ async def _ask(victim: DaemonProcess, seconds: float, seen: Seen) -> None:
     while monotonic() < end:
         began = monotonic()
         try:
-            await asyncio.wait_for(victim.status(), ALLOWED_S)
+            await victim.status()
         except (TimeoutError, OSError):
             seen.unanswered += 1
         else:
@@ -208,8 +259,3 @@ async def _link(late: DaemonProcess, victim: DaemonProcess, seconds: float, seen
     with suppress(AssertionError):
         await late.until_linked(max(seconds, PATIENCE_S))
         seen.linked_after_s = monotonic() - began
-
-
-def _cpu_s(pid: int) -> float:
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / _TICKS_PER_S

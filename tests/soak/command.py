@@ -1,8 +1,8 @@
 """A soak: real daemons over an emulated radio that loses, delays and pauses, with new keys every few seconds.
 
-Two drones and a ground station talk for as long as asked. Into the folder go a line of JSON a sample (samples.jsonl),
-a figure (soak.png) and a verdict (summary.json). Exit status 0 only if the verdict is good. ``python -m tests.soak
-report DIR`` makes figure and verdict of what is in DIR so far, also while the run goes on.
+Two drones and a ground station exchange frames for the given time. The folder gets one line of JSON per sample
+(samples.jsonl), a figure (soak.png) and a verdict (summary.json). Exit status 0 only if the verdict is good. ``python
+-m tests.soak report DIR`` makes figure and verdict of the samples so far, also during the run.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ SAMPLES_AT_MOST = 1500
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Exit status: 0 the verdict is good, 1 it is not, 2 the command line is wrong."""
+    """Exit status 0: the verdict is good. 1: it is not. 2: invalid command line."""
     given = sys.argv[1:] if arguments is None else list(arguments)
     if given[:1] == ["report"]:
         parser = argparse.ArgumentParser(prog="python -m tests.soak report", description="The verdict so far.")
-        parser.add_argument("folder", type=Path, help="what --out named")
+        parser.add_argument("folder", type=Path, help="the folder of --out")
         return report(parser.parse_args(given[1:]).folder)
     parser = argparse.ArgumentParser(prog="python -m tests.soak", description=__doc__)
-    parser.add_argument("--minutes", type=float, required=True, help="how long they talk")
-    parser.add_argument("--rate", type=float, default=50.0, help="frames a second from each program (50)")
+    parser.add_argument("--minutes", type=float, required=True, help="duration of the run")
+    parser.add_argument("--rate", type=float, default=50.0, help="frames a second from each client (50)")
     parser.add_argument("--rekey-s", type=float, default=2.0, help="seconds between new keys (2)")
-    parser.add_argument("--seed", type=int, default=0, help="of the radio's luck")
+    parser.add_argument("--seed", type=int, default=0, help="of the radio's losses")
     parser.add_argument("--out", type=Path, required=True, help="folder for the results")
     options = parser.parse_args(given)
     if not (options.minutes > 0 and 0 < options.rate <= 1000 and options.rekey_s >= 1):
@@ -50,7 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def report(folder: Path) -> int:
-    """Write figure and verdict of what was measured so far."""
+    """Write figure and verdict of the samples so far."""
     samples = read_samples(folder)
     if not samples:
         print(f"nothing has been measured yet in {folder}", file=sys.stderr)

@@ -11,39 +11,31 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from tests.soak.judge import Sample
+from uavlinkd.lab.evaluation.figures import STYLE
 
-_STYLE: dict[Any, Any] = {
-    "font.size": 9,
-    "axes.grid": True,
-    "grid.color": "#dddddd",
-    "axes.axisbelow": True,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "legend.frameon": False,
-    "legend.fontsize": 8,
-}
+_STYLE: dict[Any, Any] = {**STYLE, "font.size": 9, "legend.fontsize": 8}
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#999999")
 
 
 def draw(samples: Sequence[Sample]) -> bytes:
-    """As PNG."""
-    minutes = [each["at_s"] / 60 for each in samples]
+    """The figure as PNG."""
+    minutes = [sample["at_s"] / 60 for sample in samples]
     with mpl.rc_context(_STYLE):
         figure = Figure(figsize=(10, 8), layout="constrained")
         memory, descriptors, latency, loss = figure.subplots(4, 1, sharex=True)
         for colour, name in zip(_COLOURS, samples[-1]["processes"], strict=False):
-            of = [each["processes"][name] for each in samples]
-            memory.plot(minutes, [each["rss_kb"] / 1024 for each in of], color=colour, label=name)
-            descriptors.step(minutes, [each["fds"] for each in of], color=colour, label=name, where="post")
+            of = [sample["processes"][name] for sample in samples]
+            memory.plot(minutes, [process["rss_kb"] / 1024 for process in of], color=colour, label=name)
+            descriptors.step(minutes, [process["fds"] for process in of], color=colour, label=name, where="post")
         for colour, name in zip(_COLOURS, samples[-1]["flows"], strict=False):
-            flows = [each["flows"][name] for each in samples]
+            flows = [sample["flows"][name] for sample in samples]
             for part, line in (("p50_s", "-"), ("p99_s", ":")):
-                values = [float("nan") if each[part] is None else 1000 * each[part] for each in flows]
+                values = [float("nan") if flow[part] is None else 1000 * flow[part] for flow in flows]
                 latency.plot(minutes, values, line, color=colour, label=f"{name}, {part[:3]}")
             _loss(loss, minutes, flows, colour, name)
         daemons = [
-            sum(flow[what] for flow in each["flows"].values() for what in ("daemon_lost", "not_sent", "duplicated"))
-            for each in samples
+            sum(flow[what] for flow in sample["flows"].values() for what in ("daemon_lost", "not_sent", "duplicated"))
+            for sample in samples
         ]
         loss.step(minutes, daemons, color="black", linewidth=2, label="lost or doubled by a daemon", where="post")
         for axes, label in (
@@ -62,4 +54,4 @@ def draw(samples: Sequence[Sample]) -> bytes:
 
 
 def _loss(axes: Axes, minutes: Sequence[float], flows: Sequence[dict[str, Any]], colour: str, name: str) -> None:
-    axes.plot(minutes, [each["radio_lost"] for each in flows], color=colour, label=f"{name}, lost by the radio")
+    axes.plot(minutes, [flow["radio_lost"] for flow in flows], color=colour, label=f"{name}, lost by the radio")

@@ -1,4 +1,4 @@
-"""What becomes of each numbered frame on its way from one program to another, with the radio in between.
+"""The fate of each numbered frame from one client to another, with the radio in between.
 
 Two taps stand around the radio, and the links are readable (authenticated, not confidential). So each frame is known
 to have gone into the radio or not, and to have come out of it or not: what a daemon lost cannot hide behind what the
@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 SETTLED_S = 5.0
-"""A frame that has not come so long after it was sent does not come any more: nothing that old may."""
+"""A frame that has not arrived after this time never arrives: no frame may be that old."""
 _NAME = b"soak-frame"  # ten letters, so that no frame is shortened for its zeros at the end
 _FRAME = re.compile(rb"\xfd\x12..(.)(.)(.)...(....)(....)" + _NAME, re.DOTALL)
 
@@ -26,69 +26,69 @@ def frame(number: int, system: int) -> bytes:
 
 
 def numbers_in(data: bytes, system: int) -> list[int]:
-    """The numbers of the frames of one system in a datagram, in their order."""
-    return [int.from_bytes(found[5], "little") for found in _FRAME.finditer(data) if found[2][0] == system]
+    """The numbers of the frames of one system in a datagram, in order."""
+    return [int.from_bytes(match[5], "little") for match in _FRAME.finditer(data) if match[2][0] == system]
 
 
 @dataclass(slots=True)
 class Way:
-    """One frame's."""
+    """The progress of one frame."""
 
     sent_at: float
     entered: bool = False
-    """It was seen before the radio."""
+    """The tap before the radio saw it."""
     left_as: int | None = None
-    """It was seen behind the radio; the how-manieth of all."""
+    """Its position in the order behind the radio, if the tap there saw it."""
     latency_s: float | None = None
-    """It was delivered, so long after it was sent."""
+    """Time from sending to delivery, if it was delivered."""
 
 
 @dataclass(slots=True)
 class Flow:
-    """From one program to another. Counts only grow; once settled, a frame is in one of the second to fifth."""
+    """Frames from one client to another. Counts only grow; a settled frame is in one of the second to fifth."""
 
     sent: int = 0
     delivered: int = 0
     radio_lost: int = 0
-    """Went into the radio and did not come out."""
+    """Entered the radio and did not leave it."""
     daemon_lost: int = 0
-    """Came out of the radio and was not delivered: the receiving daemon's doing."""
+    """Left the radio and was not delivered: lost by the receiving daemon."""
     not_sent: int = 0
-    """Was given to a daemon and never seen before the radio: the sending daemon's doing."""
+    """Sent to a daemon and never seen before the radio: lost by the sending daemon."""
     duplicated: int = 0
-    """Delivered once more than once."""
+    """Delivered more than once."""
     out_of_order: int = 0
-    """Delivered after a later one. The radio's jitter does that;"""
+    """Delivered after a later one, which the radio's jitter causes;"""
     reordered: int = 0
-    """and these came out of the radio in order, so a daemon did it."""
+    """of these, frames that left the radio in order, so that a daemon reordered them."""
     invented: int = 0
     """Delivered without having been sent, or after it was settled."""
     latencies_s: list[float] = field(default_factory=list)
-    """Since they were last taken."""
+    """Latencies since the last call of :meth:`take_latencies`."""
     _ways: dict[int, Way] = field(default_factory=dict)
     _left: int = 0
     _latest: int = -1
     _latest_left: int = -1
 
     def on_sent(self, number: int, now: float) -> None:
-        """The program gave it to its daemon. Numbers rise."""
+        """The client sent it to its daemon. Numbers rise."""
         self._ways[number] = Way(now)
         self.sent += 1
 
     def on_entered(self, number: int) -> None:
-        """It was seen before the radio."""
+        """The tap before the radio saw it."""
         if number in self._ways:
             self._ways[number].entered = True
 
     def on_left(self, number: int) -> None:
-        """It was seen behind the radio, the first time or again."""
+        """The tap behind the radio saw it, for the first time or again."""
         way = self._ways.get(number)
         if way is not None and way.left_as is None:
             self._left += 1
             way.left_as = self._left
 
     def on_delivered(self, number: int, now: float) -> None:
-        """The other program got it."""
+        """The other client received it."""
         way = self._ways.get(number)
         if way is None or way.left_as is None:
             self.invented += 1
@@ -104,7 +104,7 @@ class Flow:
         self._latest_left = max(self._latest_left, way.left_as)
 
     def settle(self, now: float) -> None:
-        """Count what has become of the frames that were sent long enough ago, and forget them."""
+        """Count the fates of the frames that were sent long enough ago, and forget them."""
         while self._ways:
             number, way = next(iter(self._ways.items()))
             if now - way.sent_at < SETTLED_S:
@@ -120,12 +120,12 @@ class Flow:
                 self.not_sent += 1
 
     def take_latencies(self) -> list[float]:
-        """Those of the frames that were delivered since the last call."""
+        """The latencies of the frames that were delivered since the last call."""
         taken, self.latencies_s = self.latencies_s, []
         return taken
 
     def counts(self) -> dict[str, int]:
-        """What is settled, for a record."""
+        """The counts of settled frames, for a record."""
         names = ("delivered", "radio_lost", "daemon_lost", "not_sent", "duplicated", "out_of_order", "reordered")
         counts: dict[str, int] = {name: getattr(self, name) for name in names}
         settled = self.delivered + self.radio_lost + self.daemon_lost + self.not_sent

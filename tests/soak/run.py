@@ -1,12 +1,12 @@
-"""The run: two drones and a ground station, each pair linked through the emulated radio, and what is measured.
+"""The run: two drones and a ground station, each pair linked through the emulated radio, and the measurements.
 
 ::
 
-    program ─ drone0 ─ tap ─┐              ┌─ tap ─┐
-                            ├ uavlink-mitm ┤       ├ ground ─ program
-    program ─ drone1 ─ tap ─┘              └─ tap ─┘
+    client ─ drone0 ─ tap ─┐              ┌─ tap ─┐
+                           ├ uavlink-mitm ┤       ├ ground ─ client
+    client ─ drone1 ─ tap ─┘              └─ tap ─┘
 
-Every daemon and the radio are processes of their own; the programs and the taps are here.
+Every daemon and the radio are separate processes; the clients and the taps are in this one.
 """
 
 from __future__ import annotations
@@ -24,18 +24,15 @@ from time import monotonic
 from typing import Any, TextIO
 
 from tests.daemon.fleet import beat
-from tests.daemon.harness import (
-    PATIENCE_S,
-    DaemonProcess,
-    End,
-    Relay,
-    Sockaddr,
-    Stage,
-    free_port,
-    open_socket,
-    to_toml,
-)
+from tests.daemon.harness import Stage
+from tests.daemon.process import DaemonProcess
+from tests.daemon.relay import End, Relay
+from tests.daemon.toml import to_toml
+from tests.daemon.udp import Sockaddr, open_socket
 from tests.soak.flows import SETTLED_S, Flow, frame, numbers_in
+from tests.waiting import PATIENCE_S
+from uavlinkd.lab.child_processes import end_with_parent
+from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.ops.control import ControlError, ask
 
 DRONES = ("drone0", "drone1")
@@ -57,37 +54,37 @@ RADIO_NAME = "radio"
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What is to be done."""
+    """The parameters of a run."""
 
     seconds: float
     rate: float = 50.0
-    """Frames a second, from each program."""
+    """Frames a second, from each client."""
     rekey_s: float = 2.0
     every_s: float = 5.0
-    """Between two samples."""
+    """Time between two samples."""
     seed: int = 0
 
 
 class Speaker(asyncio.DatagramProtocol):
-    """A program at a daemon's endpoint: says numbered frames, and notes which of the others' it hears."""
+    """A client at a daemon's endpoint: sends numbered frames, and counts those of others that it receives."""
 
     def __init__(self, name: str, into: Sockaddr) -> None:
         self.name = name
         self.flows: dict[str, Flow] = {}
-        """To whom it speaks, by name."""
-        self.heard: dict[int, Flow] = {}
-        """From whom it hears, by system."""
+        """Flows to others, by name."""
+        self.received: dict[int, Flow] = {}
+        """Flows from others, by system."""
         self.sock = open_socket("127.0.0.1")
         self._into = into
         self._number = 0
         self._transport: asyncio.BaseTransport
 
     async def open(self) -> None:
-        """Listen."""
+        """Open the socket."""
         await asyncio.get_running_loop().create_datagram_endpoint(lambda: self, sock=self.sock)
 
     def greet(self) -> None:
-        """Say something without a number, so that the daemon knows where its program is."""
+        """Send a frame without a number, so that the daemon learns the client's address."""
         self.sock.sendto(frame(2**30, SYSTEMS[self.name]), self._into)
 
     def say(self) -> None:
@@ -103,7 +100,7 @@ class Speaker(asyncio.DatagramProtocol):
 
     def datagram_received(self, data: bytes, addr: tuple[str | Any, int]) -> None:
         now = monotonic()
-        for system, flow in self.heard.items():
+        for system, flow in self.received.items():
             for number in numbers_in(data, system):
                 if number < 2**30:
                     flow.on_delivered(number, now)
@@ -114,7 +111,7 @@ class Speaker(asyncio.DatagramProtocol):
 
 
 class Link:
-    """A drone and the ground station, with a tap at either side of the radio between them."""
+    """A drone and the ground station, with a tap on either side of the radio between them."""
 
     def __init__(self, drone: str, near: Relay, far: Relay, there: Flow, back: Flow) -> None:
         self.drone = drone
@@ -153,7 +150,7 @@ class Link:
 
 
 class Soak:
-    """Everything that runs. :meth:`sample` says how it does."""
+    """All processes of a run. :meth:`sample` measures them."""
 
     def __init__(self, stage: Stage, plan: Plan) -> None:
         self.stage = stage
@@ -167,34 +164,34 @@ class Soak:
 
     @property
     def radio_socket(self) -> Path:
-        """Where the radio is asked for its statistics."""
+        """The radio's control socket, for its statistics."""
         return self.stage.folder / "radio.sock"
 
     async def open(self) -> None:
-        """Start everything, and wait until all are linked and every program is known."""
+        """Start everything, and wait until all are linked and every client is known."""
         link = {"rekey_after_s": self.plan.rekey_s, "reject_after_s": self.plan.rekey_s + 30.0}
         for name in (*DRONES, GROUND):
             daemon = self.daemons[name] = self.stage.daemon(name)
             daemon.config["link"] = dict(link)
-            self.speakers[name] = Speaker(name, daemon.add_endpoint("program"))
+            self.speakers[name] = Speaker(name, daemon.add_endpoint("client"))
             await self.speakers[name].open()
         radio: dict[str, Any] = {"seed": self.plan.seed, "control_socket": "radio.sock", "peer": [], "link": []}
         for drone in DRONES:
             await self._link(drone, radio)
-        radio["radio"] = [{"way": "both", **RADIO}]
+        radio["radio"] = [{"direction": "both", **RADIO}]
         await self._start_radio(radio)
         await self.stage.start(*self.daemons.values())
         for name, speaker in self.speakers.items():
             speaker.greet()
-            await self.daemons[name].until(lambda status: bool(status["endpoints"]["program"]["programs"]))
+            await self.daemons[name].until(lambda status: bool(status["endpoints"]["client"]["clients"]))
 
     async def _link(self, drone: str, radio: dict[str, Any]) -> None:
         near, far = await self.stage.relay(), await self.stage.relay()
         there, back = self.flows[f"{drone}>{GROUND}"], self.flows[f"{GROUND}>{drone}"]
         link = Link(drone, near, far, there, back)
         self.links.append(link)
-        self.speakers[drone].flows[GROUND] = self.speakers[GROUND].heard[SYSTEMS[drone]] = there
-        self.speakers[GROUND].flows[drone] = self.speakers[drone].heard[SYSTEMS[GROUND]] = back
+        self.speakers[drone].flows[GROUND] = self.speakers[GROUND].received[SYSTEMS[drone]] = there
+        self.speakers[GROUND].flows[drone] = self.speakers[drone].received[SYSTEMS[GROUND]] = back
         faces = [("127.0.0.1", free_port()) for _ in range(2)]
         near.attach(End.A, self.daemons[drone].sockaddr)
         near.attach(End.B, faces[0])
@@ -213,7 +210,7 @@ class Soak:
         path = self.stage.folder / "radio.toml"
         path.write_text(to_toml(config))
         self._radio = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-m", "uavlinkd.lab.mitm", "--config", str(path)),
+            *end_with_parent(sys.executable, "-m", "uavlinkd.lab.mitm", "--config", str(path)),
             stdin=asyncio.subprocess.DEVNULL,
             stdout=asyncio.subprocess.DEVNULL,
             stderr=asyncio.subprocess.DEVNULL,
@@ -229,7 +226,7 @@ class Soak:
         return await asyncio.to_thread(ask, self.radio_socket, "statistics")
 
     async def close(self) -> None:
-        """End the radio; the stage ends the rest."""
+        """Stop the radio; the stage stops the rest."""
         if self._radio is not None and self._radio.returncode is None:
             self._radio.terminate()
             await self._radio.wait()
@@ -237,7 +234,7 @@ class Soak:
             speaker.close()
 
     async def run(self, on_sample: Callable[[dict[str, Any]], None]) -> None:
-        """Speak for as long as planned; then wait until every frame has come or does not."""
+        """Send frames for the planned time; then wait until every frame has arrived or is lost."""
         self._began_at = began = monotonic()
         speaking = [
             asyncio.create_task(beat(lambda _, speaker=speaker: speaker.say(), 1 / self.plan.rate))  # type: ignore[misc]
@@ -247,20 +244,20 @@ class Soak:
             while monotonic() < began + self.plan.seconds:
                 await asyncio.sleep(self.plan.every_s)
                 on_sample(await self.sample())
-                for each in speaking:
-                    if each.done():
-                        each.result()
+                for task in speaking:
+                    if task.done():
+                        task.result()
         finally:
-            for each in speaking:
-                each.cancel()
+            for task in speaking:
+                task.cancel()
         await asyncio.sleep(SETTLED_S)
         on_sample(await self.sample(at_rest=True))
 
     async def sample(self, *, at_rest: bool = False) -> dict[str, Any]:
-        """How it does now; plain data. ``at_rest``: nothing is on its way."""
+        """Measure now, as plain data. ``at_rest``: wait until no frame is in flight."""
         processes = {
             name: _process(pid) for name, pid in self._pids()
-        }  # before anybody asks: that takes a descriptor
+        }  # before the status requests: they use a descriptor
         now = monotonic()
         flows: dict[str, dict[str, Any]] = {}
         for name, flow in self.flows.items():
@@ -272,7 +269,7 @@ class Soak:
             daemon.statuses.clear()  # hours of them would fill the memory
         taps = self._taps()
         radio = await self._ask_radio()
-        while at_rest:  # new keys go on being made: wait for a moment in which nothing is on its way
+        while at_rest:  # rekeying continues: wait for a moment without datagrams in flight
             taps = self._taps()
             await asyncio.sleep(2 * (RADIO["delay_s"] + RADIO["jitter_s"]))
             radio = await self._ask_radio()
@@ -285,15 +282,15 @@ class Soak:
             "flows": flows,
             "taps": taps,
             "radio": radio["radios"],
-            "radio_troubles": radio["troubles"],
+            "radio_errors": radio["errors"],
             "peers": {
                 f"{name}: {peer}": {
-                    "generation": found["session"]["generation"] if found["session"] else None,
-                    "state": found["state"],
-                    "drops": found["drops"],
+                    "generation": link["session"]["generation"] if link["session"] else None,
+                    "state": link["state"],
+                    "drops": link["drops"],
                 }
                 for name, status in statuses.items()
-                for peer, found in status["peers"].items()
+                for peer, link in status["peers"].items()
             },
             "lost_peers": {
                 name: sum('"event": "peer_lost"' in line for line in daemon.lines)
@@ -317,7 +314,7 @@ class Soak:
 
 @asynccontextmanager
 async def soaking(plan: Plan) -> Any:
-    """A soak that is ready to :meth:`Soak.run`; the stage looks for tracebacks and secrets at the end."""
+    """A soak that is ready to :meth:`Soak.run`; the stage checks for tracebacks and secrets at the end."""
     async with Stage() as stage:
         soak = Soak(stage, plan)
         try:
@@ -328,7 +325,7 @@ async def soaking(plan: Plan) -> Any:
 
 
 async def record(plan: Plan, samples: TextIO, say: Callable[[str], None]) -> None:
-    """A whole run, one line of JSON a sample."""
+    """A whole run, one line of JSON per sample."""
 
     def on_sample(sample: dict[str, Any]) -> None:
         samples.write(json.dumps(sample) + "\n")

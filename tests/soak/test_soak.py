@@ -1,4 +1,4 @@
-"""The soak itself: a short one holds, and each thing that may go wrong in a long one would be told."""
+"""The soak itself: a short one passes, and the verdict reports each problem of a long one."""
 
 from __future__ import annotations
 
@@ -17,12 +17,13 @@ from tests.soak.judge import JUDGED_FROM_S, SAMPLES, judge, read_samples, slope
 from tests.soak.run import Plan, record
 
 SECONDS = 14.0
-"""With start and rest some 20: long enough for an outage and two changes of keys."""
+"""With start and end about 20 s: long enough for an outage and two changes of keys."""
 _PNG = b"\x89PNG\r\n\x1a\n"
 
 
+@pytest.mark.long
 async def test_a_short_soak_loses_nothing_but_what_the_radio_dropped(tmp_path: Path) -> None:
-    """Every frame that came out of the radio is delivered once, in the radio's order, over new keys and an outage."""
+    """Every frame that left the radio is delivered once, in the radio's order, over new keys and an outage."""
     samples = io.StringIO()
     await record(Plan(SECONDS, rekey_s=5.0, every_s=2.0), samples, print)
     (tmp_path / SAMPLES).write_text(samples.getvalue())
@@ -38,8 +39,8 @@ async def test_a_short_soak_loses_nothing_but_what_the_radio_dropped(tmp_path: P
     assert (tmp_path / FIGURE).read_bytes().startswith(_PNG)
 
 
-def test_numbers_are_found_among_other_bytes() -> None:
-    """Of the system asked for, several in an envelope, in their order."""
+def test_numbers_are_read_among_other_bytes() -> None:
+    """Frames of the given system, several in an envelope, in order."""
     envelope = b"\x40\x01\xfd" + frame(7, 1) + frame(0xFD12, 2) + frame(9, 1) + bytes(16)
     assert numbers_in(envelope, 1) == [7, 9]
     assert numbers_in(envelope, 2) == [0xFD12]
@@ -83,18 +84,18 @@ FATES: dict[str, Callable[[Flow], None]] = {
 
 
 @pytest.mark.parametrize("fate", FATES)
-def test_each_fate_is_counted_as_what_it_is(fate: str) -> None:
-    """Once it is settled, and not before."""
+def test_each_fate_is_counted(fate: str) -> None:
+    """When it is settled, not before."""
     flow = Flow()
     FATES[fate](flow)
     flow.settle(SETTLED_S - 0.001)
     assert flow.counts()["sent"] == 0
     flow.settle(SETTLED_S)
-    assert {name: amount for name, amount in flow.counts().items() if amount} == {"sent": 1, fate: 1}
+    assert {name: count for name, count in flow.counts().items() if count} == {"sent": 1, fate: 1}
 
 
-def test_copies_strangers_and_disorder_are_counted() -> None:
-    """A second delivery, one of nothing that was sent, one that overtook by the radio or by a daemon."""
+def test_duplicated_invented_and_reordered_frames_are_counted() -> None:
+    """A second delivery, one that was never sent, one that the radio or a daemon reordered."""
     flow = Flow()
     for number in (1, 2, 3):
         _sent(flow, number)
@@ -125,7 +126,7 @@ def _sample(at_s: float, *, at_rest: bool = False) -> dict[str, Any]:
         "flows": {"drone0>ground": {**flow.counts(), "p50_s": 0.04, "p99_s": 0.05}},
         "taps": {"drone0>ground": {"entered": 10, "left": 9}},
         "radio": {"drone0>ground": {"sent": 10, "lost": 1, "lost_in_outage": 1, "duplicated": 1}},
-        "radio_troubles": {},
+        "radio_errors": {},
         "peers": {"drone0: ground": {"generation": 3, "state": "up", "drops": {}}},
         "lost_peers": {"drone0": 0},
     }
@@ -136,8 +137,8 @@ def _good_run() -> list[dict[str, Any]]:
     return [*hour, _sample(3605.0, at_rest=True)]
 
 
-def test_a_good_run_is_judged_good() -> None:
-    """So that the faults below are told for themselves."""
+def test_a_run_without_faults_passes() -> None:
+    """So that each fault below is the only one."""
     assert judge(_good_run())["verdict"] == "good"
 
 
@@ -153,8 +154,8 @@ def _descriptor(samples: list[dict[str, Any]]) -> None:
 def _last(*path: str, value: object) -> Callable[[list[dict[str, Any]]], None]:
     def change(samples: list[dict[str, Any]]) -> None:
         place = samples[-1]
-        for each in path[:-1]:
-            place = place[each]
+        for key in path[:-1]:
+            place = place[key]
         place[path[-1]] = value
 
     return change
@@ -169,33 +170,33 @@ def _last(*path: str, value: object) -> Callable[[list[dict[str, Any]]], None]:
         (_last("flows", "drone0>ground", "not_sent", value=1), "never given to the radio"),
         (_last("flows", "drone0>ground", "duplicated", value=1), "delivered twice"),
         (_last("flows", "drone0>ground", "reordered", value=1), "out of order"),
-        (_last("flows", "drone0>ground", "invented", value=1), "nobody had sent"),
+        (_last("flows", "drone0>ground", "invented", value=1), "without having been sent"),
         (_last("flows", "drone0>ground", "delivered", value=0), "nothing was delivered"),
         (_last("taps", "drone0>ground", "left", value=8), "the taps saw"),
         (_last("lost_peers", "drone0", value=1), "lost a peer"),
-        (_last("radio_troubles", value={"Connection refused": 1}), "troubles"),
+        (_last("radio_errors", value={"Connection refused": 1}), "the radio had errors"),
         (_last("peers", "drone0: ground", "generation", value=0), "no new keys"),
     ],
 )
-def test_each_fault_of_a_long_run_is_told(harm: Callable[[list[dict[str, Any]]], None], problem: str) -> None:
-    """One thing wrong, one problem."""
+def test_each_fault_of_a_long_run_is_reported(harm: Callable[[list[dict[str, Any]]], None], problem: str) -> None:
+    """One fault, one problem."""
     samples = copy.deepcopy(_good_run())
     harm(samples)
-    (told,) = judge(samples)["problems"]
-    assert problem in told
+    (reported,) = judge(samples)["problems"]
+    assert problem in reported
 
 
 def test_memory_of_a_short_run_is_not_judged() -> None:
-    """Caches fill at first; the summary says that nothing was judged rather than that it was flat."""
+    """Caches fill at first; the summary reports that memory was not judged, rather than flat."""
     samples = [_sample(at_s) for at_s in (100.0, 200.0, JUDGED_FROM_S - 1)]
     _leak(samples)
     assert judge(samples)["memory"]["drone0"]["is_flat"] is None
 
 
-def test_a_line_that_is_cut_off_is_left_out(tmp_path: Path) -> None:
-    """A run that was killed can be reported."""
+def test_an_incomplete_last_line_is_ignored(tmp_path: Path) -> None:
+    """The samples of a killed run can be reported."""
     (tmp_path / SAMPLES).write_text('{"at_s": 1}\n{"at_s": 2}\n{"at')
-    assert [each["at_s"] for each in read_samples(tmp_path)] == [1, 2]
+    assert [sample["at_s"] for sample in read_samples(tmp_path)] == [1, 2]
 
 
 def test_slope_is_that_of_the_line() -> None:
