@@ -1,11 +1,11 @@
-"""The symbolic models of the protocol: put together, run by ProVerif, read.
+"""The symbolic models of the protocol: assembled, run by ProVerif, and read.
 
 A model is a ``.pv`` file beside this one: queries and the process. Its header names the ingredients of
-``uavlink.pvl`` that it uses, and each query is preceded by what ProVerif must say about it. By hand::
+``uavlink.pvl`` that it uses. A comment before each query is ProVerif's expected result. By hand::
 
     python -m tests.formal.models              every model: one line for each query, as ProVerif printed it
     python -m tests.formal.models forward kem  those whose name contains one of these
-    python -m tests.formal.models --text NAME  the complete text of a model, to be read or given to ProVerif
+    python -m tests.formal.models --text NAME  the complete text of a model, to read or to pass to ProVerif
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _RESULT = re.compile(r"^ *RESULT (?!\((?:but|even) ).*?(is true|is false|cannot 
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """What ProVerif said about one model."""
+    """ProVerif's result for one model."""
 
     results: tuple[str, ...]
     """One for each query in the order of the file: ``true``, ``false``, ``cannot be proved``."""
@@ -42,7 +42,7 @@ class Run:
 
 
 def proverif() -> str | None:
-    """The program: environment variable ``PROVERIF``, else on the PATH."""
+    """The ProVerif executable: environment variable ``PROVERIF``, else on the PATH."""
     return os.environ.get("PROVERIF") or shutil.which("proverif")
 
 
@@ -52,23 +52,23 @@ def models() -> list[Path]:
 
 
 def expected(model: Path) -> tuple[str, ...]:
-    """What the model says that ProVerif will say, query by query."""
+    """The expected result of each query, which the model contains."""
     return tuple(_EXPECT.findall(model.read_text()))
 
 
 def ingredients(model: Path) -> frozenset[str] | None:
-    """The ingredients of the protocol that the model uses; None where it stands alone."""
+    """The ingredients of the protocol that the model uses; None if it is complete in itself."""
     uses = _USES.search(model.read_text())
     return frozenset(uses[1].split()) if uses else None
 
 
 def known_ingredients() -> frozenset[str]:
-    """Those that the protocol's text names."""
+    """The ingredients that the protocol's text names."""
     return frozenset(name for _, name in _MARKED.findall(PROTOCOL.read_text()))
 
 
 def select(uses: frozenset[str]) -> str:
-    """The protocol with these ingredients and no others."""
+    """The protocol with only these ingredients."""
     return "".join(
         line
         for line in PROTOCOL.read_text().splitlines(keepends=True)
@@ -83,23 +83,23 @@ def assemble(model: Path) -> str:
 
 
 def results(output: str) -> tuple[str, ...]:
-    """``true``, ``false`` or ``cannot be proved`` for each query, from what ProVerif printed."""
+    """``true``, ``false`` or ``cannot be proved`` for each query, from ProVerif's output."""
     return tuple(match[1].removeprefix("is ") for match in _RESULT.finditer(output))
 
 
-def run(model: Path, program: str, limit_s: float = LIMIT_S) -> Run:
-    """Let ProVerif judge a model.
+def run(model: Path, executable: str, limit_s: float = LIMIT_S) -> Run:
+    """Run ProVerif on a model.
 
     Raises:
         subprocess.TimeoutExpired: after ``limit_s`` seconds.
-        ValueError: ProVerif refused the model; its words.
+        ValueError: ProVerif refused the model; its message.
     """
     with TemporaryDirectory() as folder:
         file = Path(folder) / model.name
         file.write_text(assemble(model))
         before = _children_cpu_s()
         done = subprocess.run(
-            [program, str(file)],
+            [executable, str(file)],
             capture_output=True,
             text=True,
             timeout=limit_s,
@@ -119,12 +119,12 @@ def _children_cpu_s() -> float:
 
 
 def main(arguments: list[str]) -> int:
-    """Print what is asked for; 1 where a result is not the expected one."""
+    """Print the requested results; returns 1 if one is not as expected."""
     if arguments[:1] == ["--text"]:
         sys.stdout.write(assemble(FOLDER / f"{arguments[1]}.pv"))
         return 0
-    program = proverif()
-    if program is None:
+    executable = proverif()
+    if executable is None:
         sys.stderr.write("proverif is not on the PATH; or set PROVERIF\n")
         return 2
     is_good = True
@@ -133,7 +133,7 @@ def main(arguments: list[str]) -> int:
             continue
         started = time.monotonic()
         try:
-            done = run(model, program)
+            done = run(model, executable)
         except (subprocess.TimeoutExpired, ValueError) as error:
             sys.stdout.write(f"{model.stem}: {error}\n")
             is_good = False

@@ -1,4 +1,4 @@
-"""The symbolic models say of the protocol what README.md says, wherever ProVerif is there to be asked."""
+"""The symbolic models confirm the results in README.md, if ProVerif is installed."""
 
 from __future__ import annotations
 
@@ -18,40 +18,40 @@ _each_model = pytest.mark.parametrize("model", models.models(), ids=lambda model
 
 
 @_each_model
-def test_proverif_says_what_the_model_expects(model: Path) -> None:
-    """Each query has exactly the result that stands above it: true is proved, false comes with an attack."""
-    program = models.proverif()
-    if program is None:  # in CI too: neither Debian nor PyPI has it, so .ci/run cannot bring it
+def test_proverif_returns_the_expected_results(model: Path) -> None:
+    """Each query has exactly the result in the comment above it: true is proved, false comes with an attack."""
+    executable = models.proverif()
+    if executable is None:  # in CI too: neither Debian nor PyPI has it, so .ci/run cannot bring it
         pytest.skip("no ProVerif: put proverif on the PATH, or its path into PROVERIF")
-    done = models.run(model, program, _LIMIT_S)
+    done = models.run(model, executable, _LIMIT_S)
     assert done.results == models.expected(model), "\n".join(done.lines)
 
 
 @_each_model
 def test_every_query_states_its_result(model: Path) -> None:
-    """No query is without an expectation, so none can turn unnoticed."""
+    """Every query has an expected result, so that none can change unnoticed."""
     queries = re.findall(r"^query\b", model.read_text(), re.MULTILINE)
     assert 0 < len(queries) == len(models.expected(model))
 
 
 @_each_model
 def test_model_uses_ingredients_that_exist(model: Path) -> None:
-    """A misspelt ingredient would silently leave out what it names."""
+    """A misspelt ingredient would silently omit what it names."""
     uses = models.ingredients(model)
     assert uses is None or (uses and uses <= models.known_ingredients())
 
 
 @_each_model
 def test_readme_lists_every_result(model: Path) -> None:
-    """The page shows each model with as many results as it has queries, and the same ones."""
+    """The page lists for each model as many results as it has queries, and the same ones."""
     page = (models.FOLDER / "README.md").read_text()
     block = re.search(rf"^{model.stem}: .*\n((?:    RESULT .*\n)+)", page, re.MULTILINE)
     assert block is not None
     assert models.results(block[1]) == models.expected(model)
 
 
-def test_ingredients_without_which_an_attack_is_found_are_in_every_other_model() -> None:
-    """What the models ``without_*`` leave out one at a time, no other model leaves out."""
+def test_ingredients_that_prevent_an_attack_are_in_every_other_model() -> None:
+    """No other model omits what the models ``without_*`` omit one at a time."""
     needed = {"es", "ee", "se", "ss", "indices", "confirmation"}
     for model in models.models():
         uses = models.ingredients(model)
@@ -79,7 +79,7 @@ _TOKEN_OF = {
 @pytest.mark.parametrize("role", ["Initiator", "Responder"])
 @pytest.mark.parametrize("pattern", [noise.IK_PSK2, noise.IK_HFS_PSK2], ids=lambda pattern: pattern.name)
 def test_model_mixes_keys_in_the_order_of_the_code(pattern: noise.Pattern, role: str) -> None:
-    """Both roles of the model put into the chaining key what the code's pattern puts there, in its order."""
+    """Both roles of the model mix the inputs of the code's pattern into the chaining key, in its order."""
     kem = {"kem"} if Token.EKEM1 in pattern.response else set()
     text = models.select(frozenset({"es", "ss", "ee", "se"} | kem))
     body = text[text.index(f"let {role}(") :].partition("split_1")[0]
@@ -93,7 +93,7 @@ def test_model_mixes_keys_in_the_order_of_the_code(pattern: noise.Pattern, role:
     assert in_model == [token.value for token in pattern.initiation + pattern.response if token not in silent]
 
 
-def test_protocol_stands_as_proverif_reads_it_without_any_ingredient_in_a_comment() -> None:
-    """Every marked line is either there or not: none is left with its mark misread as a plain comment."""
+def test_no_ingredient_is_left_in_a_comment() -> None:
+    """Every marked line is either included or not: no mark is misread as a plain comment."""
     for line in models.PROTOCOL.read_text().splitlines():
         assert ("(*+" in line or "(*-" in line) == bool(re.match(r"\(\*[+-]\w+\*\) ", line)), line

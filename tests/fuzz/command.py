@@ -1,13 +1,13 @@
-"""``python -m tests.fuzz``: the targets, each in a process of its own, for as long as is asked.
+"""``python -m tests.fuzz``: run the targets, each in its own process, for the given time.
 
     python -m tests.fuzz --list
     python -m tests.fuzz                             every target, a minute each
     python -m tests.fuzz session sealed --seconds 600
     python -m tests.fuzz idle --runs 1000000 --engine seeded --seed 7
-    python -m tests.fuzz --keep                      and merge what was found into the kept corpus
+        python -m tests.fuzz --keep                      and merge new inputs into the kept corpus
     python -m tests.fuzz --coverage                  the lines and branches that the kept corpus reaches
 
-Exit code 1: something escaped. The input is kept in a file that is named, and ``--replay FILE`` runs it again.
+Exit code 1: a script escaped. The command names the file with its input, and ``--replay FILE`` runs it again.
 """
 
 from __future__ import annotations
@@ -29,23 +29,24 @@ from tests.fuzz import corpus
 from tests.fuzz.engine import Target
 from tests.fuzz.registry import TARGETS
 from tests.fuzz.worker import PROGRESS
+from uavlinkd.lab.child_processes import end_with_parent
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 GRACE_S: Final = 60.0
-"""A process that goes on for so long after its time is ended, and counts as an escape: it hangs."""
+"""Time after the end of a run until its process is killed. Then it hangs, which counts as an escape."""
 _COVERAGE = re.compile(r"cov: (\d+) ft: (\d+)")
 
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """What came of one target."""
+    """The result of one target."""
 
     name: str
     executions: int
     inputs: int
     distinct: int
     core_s: float
-    """Processor time: what the machine's other work cannot stretch."""
+    """Processor time, which other work of the machine does not change."""
     edges: int | None
     features: int | None
     escape: Path | None
@@ -53,9 +54,9 @@ class Result:
 
     @property
     def line(self) -> str:
-        """For the table."""
+        """One row of the table."""
         rate = self.inputs / self.core_s if self.core_s else 0.0
-        shown = ["-" if each is None else f"{each:,}" for each in (self.edges, self.features)]
+        shown = ["-" if count is None else f"{count:,}" for count in (self.edges, self.features)]
         return (
             f"{self.name:<11} {self.executions:>12,} {self.inputs:>14,} {self.distinct:>14,} {self.core_s:>8.0f} "
             f"{rate:>10,.0f} {shown[0]:>7} {shown[1]:>9}  {'ESCAPE' if self.escape else 'none'}"
@@ -69,7 +70,7 @@ HEADING: Final = (
 
 
 def has_atheris() -> bool:
-    """Whether coverage can guide."""
+    """Whether atheris is installed: then coverage guides the run."""
     return find_spec("atheris") is not None
 
 
@@ -85,7 +86,7 @@ def fuzz(
     keeps: bool = False,
     plant: str | None = None,
 ) -> Result:
-    """Fuzz one target in a process of its own, from the kept corpus and what is in ``folder``."""
+    """Fuzz one target in its own process, from the kept corpus and the inputs in ``folder``."""
     with tempfile.TemporaryDirectory(prefix=f"uavlinkd-fuzz-{target.name}-") as scratch:
         work = Path(scratch) / "corpus"
         kept = [*target.seeds(), *corpus.load(target.name), *(corpus.load(target.name, folder) if folder else ())]
@@ -99,11 +100,13 @@ def fuzz(
         spent = _spent_by_children()
         with log_path.open("wb") as log:
             process = subprocess.Popen(
-                [sys.executable, "-m", "tests.fuzz.worker", target.name, engine, str(board), *arguments],
+                end_with_parent(
+                    sys.executable, "-m", "tests.fuzz.worker", target.name, engine, str(board), *arguments
+                ),
                 cwd=ROOT,
                 stdout=log,
                 stderr=subprocess.STDOUT,
-                # libFuzzer ends a process without its leave: what it left behind goes with the scratch folder.
+                # libFuzzer ends the process without cleanup: its files are deleted with the scratch folder.
                 env={**os.environ, "PYTHONHASHSEED": "0", "TMPDIR": scratch},
             )
             try:
@@ -114,8 +117,8 @@ def fuzz(
         core_s = _spent_by_children() - spent
         executions, inputs, distinct = PROGRESS.unpack(board.read_bytes())
         text = log_path.read_text(errors="replace")
-        found = _COVERAGE.findall(text)
-        edges, features = map(int, found[-1]) if found else (None, None)
+        coverage = _COVERAGE.findall(text)
+        edges, features = map(int, coverage[-1]) if coverage else (None, None)
         escape = None
         if code:
             crashes = [*Path(scratch).glob("crash-*"), *Path(scratch).glob("timeout-*"), *Path(scratch).glob("oom-*")]
@@ -141,13 +144,8 @@ def _arguments(
     if engine != "atheris":
         return [str(seed), "-" if seconds is None else str(seconds), "-" if runs is None else str(runs), str(work)]
     options = [
-        f"-seed={seed}",
-        f"-max_len={target.max_bytes}",
-        "-len_control=0",
-        "-timeout=30",
-        "-rss_limit_mb=2048",
-        f"-artifact_prefix={scratch}/",
-        "-print_final_stats=1",
+        *(f"-seed={seed}", f"-max_len={target.max_bytes}", "-len_control=0", "-timeout=30", "-rss_limit_mb=2048"),
+        *(f"-artifact_prefix={scratch}/", "-print_final_stats=1"),
     ]
     if seconds is not None:
         options.append(f"-max_total_time={int(seconds)}")
@@ -162,7 +160,7 @@ def _arguments(
 
 
 def coverage_of(names: Sequence[str]) -> str:
-    """Lines and branches that the seeds and the kept corpora of these targets reach, in a table."""
+    """A table of the lines and branches that the seeds and the kept corpora of these targets reach."""
     with tempfile.TemporaryDirectory(prefix="uavlinkd-fuzz-coverage-") as scratch:
         board = Path(scratch) / "progress"
         board.write_bytes(bytes(PROGRESS.size))
@@ -187,19 +185,23 @@ _RELEVANT: Final = [
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command."""
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description="Fuzz the entry points of uavlinkd.")
-    parser.add_argument("targets", nargs="*", metavar="TARGET", help="all, unless some are named")
-    parser.add_argument("--list", action="store_true", help="the targets, and what each stands for")
-    parser.add_argument("--seconds", type=float, help="for each target; 60 unless --runs is given")
+    parser.add_argument("targets", nargs="*", metavar="TARGET", help="default: all")
+    parser.add_argument("--list", action="store_true", help="list the targets with their descriptions")
+    parser.add_argument("--seconds", type=float, help="for each target; default 60, or none with --runs")
     parser.add_argument("--runs", type=int, help="scripts of each target")
-    parser.add_argument("--engine", choices=("atheris", "seeded"), help="atheris where it is installed")
+    parser.add_argument("--engine", choices=("atheris", "seeded"), help="default: atheris if it is installed")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--corpus", type=Path, help="a folder of corpora, read beside the kept ones and written to")
-    parser.add_argument("--keep", action="store_true", help="merge what was found into the kept corpus")
-    parser.add_argument("--escapes", type=Path, default=Path(), help="where what escapes is kept")
+    parser.add_argument(
+        "--corpus", type=Path, help="a folder of corpora to read, in addition to the kept ones, and to write"
+    )
+    parser.add_argument("--keep", action="store_true", help="merge new inputs into the kept corpus")
+    parser.add_argument("--escapes", type=Path, default=Path(), help="folder for inputs that escape")
     parser.add_argument("--replay", type=Path, metavar="FILE", help="run one input of one target, in this process")
-    parser.add_argument("--coverage", action="store_true", help="lines and branches that the kept corpus reaches")
+    parser.add_argument(
+        "--coverage", action="store_true", help="show the lines and branches that the kept corpus reaches"
+    )
     given = parser.parse_args(arguments)
-    if unknown := [each for each in given.targets if each not in TARGETS]:
+    if unknown := [name for name in given.targets if name not in TARGETS]:
         parser.error(f"no target {', '.join(unknown)}: see --list")
     targets = [TARGETS[name] for name in given.targets or TARGETS]
     if given.list:
@@ -207,7 +209,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(f"{target.name:<11} {target.about} ({len(corpus.load(target.name))} inputs kept)")
         return 0
     if given.coverage:
-        print(coverage_of([each.name for each in targets]))
+        print(coverage_of([target.name for target in targets]))
         return 0
     if given.replay is not None:
         for target in targets:
@@ -232,10 +234,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(result.line, flush=True)
         if result.escape is not None:
             print(f"\n{_tail(result.log)}\n\nagain: python -m tests.fuzz {target.name} --replay {result.escape}\n")
-    total = sum(each.inputs for each in results)
-    spent = sum(each.core_s for each in results)
+    total = sum(result.inputs for result in results)
+    spent = sum(result.core_s for result in results)
     print(f"{total:,} inputs in {spent:,.0f} core-seconds, {total / spent if spent else 0:,.0f} a second")
-    return 1 if any(each.escape for each in results) else 0
+    return 1 if any(result.escape for result in results) else 0
 
 
 def _tail(log: str) -> str:

@@ -1,4 +1,4 @@
-"""The kept corpus: a text file a target, one input a line in base64. What a hunt finds is merged into it."""
+"""The kept corpus: one text file for each target, one input per line in base64. New inputs can be merged into it."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ import uavlinkd
 
 KEPT: Final = Path(__file__).parent / "corpus"
 MAX_FILE_BYTES: Final = 20_000
-"""Of one target's file: the smallest inputs are kept, so all stay under 400 kB."""
+"""Limit of one target's file: the smallest inputs are kept, so all files are below 400 kB."""
 
 
 def path_of(name: str, folder: Path = KEPT) -> Path:
-    """A target's file."""
+    """The file of a target."""
     return folder / f"{name}.txt"
 
 
 def load(name: str, folder: Path = KEPT) -> list[bytes]:
-    """A target's inputs; none where there is no file."""
+    """The inputs of a target; none without a file."""
     path = path_of(name, folder)
     return [base64.b64decode(line, validate=True) for line in path.read_text().split()] if path.exists() else []
 
 
 def save(name: str, inputs: Iterable[bytes], folder: Path = KEPT) -> int:
-    """Keep these instead, the smallest first, as many as fit; how many were kept."""
+    """Replace the kept inputs, the smallest first, as many as fit; returns their number."""
     lines: list[str] = []
     size = 0
-    for data in sorted({each for each in inputs if each}, key=lambda each: (len(each), each)):
+    for data in sorted({data for data in inputs if data}, key=lambda data: (len(data), data)):
         line = base64.b64encode(data).decode() + "\n"
         size += len(line)
         if size > MAX_FILE_BYTES:
@@ -43,11 +43,11 @@ def save(name: str, inputs: Iterable[bytes], folder: Path = KEPT) -> int:
 
 
 def minimised(run: Callable[[bytes], None], inputs: Iterable[bytes]) -> list[bytes]:
-    """Of these, the smallest first, each that goes from a line of the product to another as none before it did."""
+    """The inputs, smallest first, that reach a new pair of consecutive lines of the package."""
     package = str(Path(uavlinkd.__file__).parent)
     known: set[tuple[str, int, int]] = set()
     kept = []
-    for data in sorted(inputs, key=lambda each: (len(each), each)):
+    for data in sorted(inputs, key=lambda data: (len(data), data)):
         steps: set[tuple[str, int, int]] = set()
 
         def enter(frame: FrameType, event: str, argument: Any, steps: set[tuple[str, int, int]] = steps) -> Any:
@@ -76,12 +76,12 @@ def minimised(run: Callable[[bytes], None], inputs: Iterable[bytes]) -> list[byt
 
 
 def unpack(inputs: Iterable[bytes], folder: Path) -> None:
-    """A file an input, as libFuzzer wants them."""
+    """Write each input to a file, as libFuzzer expects."""
     folder.mkdir(parents=True, exist_ok=True)
     for number, data in enumerate(inputs):
         (folder / f"{number:05d}").write_bytes(data)
 
 
 def packed(folder: Path) -> list[bytes]:
-    """What libFuzzer left in a folder."""
+    """The inputs that libFuzzer wrote to a folder."""
     return [path.read_bytes() for path in sorted(folder.iterdir()) if path.is_file()]

@@ -1,7 +1,11 @@
-"""What a fuzz target is, how it reads its bytes, and a hunt by a seeded generator that needs no fuzzer at all.
+"""Fuzz targets, how they read their bytes, and a mutator with a seed.
 
-A target is a function of bytes: the same bytes, the same run. It asserts what must hold for any of them, and says by
-:data:`TALLY` how many inputs it has offered to the entry point: one fuzzer's input is a script of many datagrams.
+A target is a function of bytes: the same bytes cause the same run. It asserts properties that hold for any bytes.
+:data:`TALLY` counts the inputs that it offered to the entry point: one input of a fuzzer is a script of many
+datagrams.
+
+The mutator is our own although Atheris (libFuzzer) has one: Atheris has wheels for x86-64 only, and every test run
+needs the same inputs from the same seed.
 """
 
 from __future__ import annotations
@@ -13,14 +17,14 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 Run = Callable[[bytes], None]
-"""Runs one script. Raises where a property does not hold; returns nothing."""
+"""Runs one script. Raises if a property does not hold; returns nothing."""
 
 SAMPLE: Final = 256
-"""One input in so many is remembered by its hash, to tell how many were different from one another."""
+"""One of so many inputs is remembered by its hash, to estimate the number of different inputs."""
 
 
 class Tally:
-    """How many inputs went to an entry point, and about how many of them were different."""
+    """The number of inputs to an entry point, and an estimate of the number of different ones."""
 
     __slots__ = ("_sampled", "offered")
 
@@ -29,7 +33,7 @@ class Tally:
         self._sampled: set[int] = set()
 
     def add(self, data: bytes) -> None:
-        """One more."""
+        """Count one more."""
         self.offered += 1
         number = hash(data)
         if number % SAMPLE == 0:
@@ -37,38 +41,38 @@ class Tally:
 
     @property
     def distinct(self) -> int:
-        """How many different ones, to within a few per cent once there are many."""
+        """The number of different inputs, within a few per cent for large numbers."""
         return min(self.offered, len(self._sampled) * SAMPLE)
 
     def clear(self) -> None:
-        """Begin anew."""
+        """Start from zero."""
         self.offered = 0
         self._sampled.clear()
 
 
 TALLY: Final = Tally()
-"""Of this process, which runs one target."""
+"""The tally of this process, which runs one target."""
 
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """One entry point, and what is asserted of it."""
+    """One entry point, and the assertions about it."""
 
     name: str
     about: str
     make: Callable[[], Run]
-    """Sets the stage; what it returns is called for each input."""
+    """Creates the stage; returns a function that runs one input."""
     seeds: Callable[[], list[bytes]]
-    """Inputs to begin with, beside the kept corpus."""
+    """Inputs to start with, in addition to the kept corpus."""
     max_bytes: int = 2048
     words: tuple[bytes, ...] = ()
-    """What is worth inserting."""
+    """Words to insert."""
     is_text: bool = False
-    """Whether arbitrary bytes are refused at the door: then only variations of what is known are tried."""
+    """Whether arbitrary bytes are refused immediately: then only variations of known inputs are tried."""
 
 
 class Script:
-    """Bytes read as numbers and pieces. Total: past the end everything is zero."""
+    """Bytes read as numbers and pieces. It never fails: behind the end every byte is zero."""
 
     __slots__ = ("at", "data", "size")
 
@@ -98,91 +102,91 @@ class Script:
         self.at = at + 4
         return int.from_bytes(self.data[at : at + 4], "big")
 
-    def take(self, amount: int) -> bytes:
-        """So many bytes, or as many as are left."""
+    def take(self, size: int) -> bytes:
+        """The next ``size`` bytes, or as many as are left."""
         at = self.at
-        self.at = at + amount
-        return self.data[at : at + amount]
+        self.at = at + size
+        return self.data[at : at + size]
 
 
 # A hunt without a fuzzer.
 
 
 def variations(seeds: Sequence[bytes], seed: int, target: Target) -> Iterator[bytes]:
-    """Endless inputs, the same for the same seed: variations of the seeds; where any bytes are a script, new ones.
+    """Yield inputs indefinitely, the same for the same seed: mutated seeds, and random bytes unless a target is text.
 
-    No coverage guides them, so they cost less than a fuzzer's, and need nothing.
+    No coverage guides them, so they cost less than those of a fuzzer.
     """
-    chance = random.Random(seed)
-    known = [each for each in seeds if each] or [b"\0"]
+    rng = random.Random(seed)
+    known = [seed_input for seed_input in seeds if seed_input] or [b"\0"]
     while True:
-        if not target.is_text and chance.random() < 0.8:
-            yield chance.randbytes(chance.choice((target.max_bytes, chance.randint(1, target.max_bytes))))
+        if not target.is_text and rng.random() < 0.8:
+            yield rng.randbytes(rng.choice((target.max_bytes, rng.randint(1, target.max_bytes))))
             continue
-        data = bytearray(chance.choice(known))
-        for _ in range(1 << chance.randrange(3 if target.is_text else 5)):
-            (_vary_text if target.is_text else _vary)(data, known, chance, target.words)
+        data = bytearray(rng.choice(known))
+        for _ in range(1 << rng.randrange(3 if target.is_text else 5)):
+            (_vary_text if target.is_text else _vary)(data, known, rng, target.words)
         yield bytes(data[: target.max_bytes])
 
 
-def _vary(data: bytearray, known: Sequence[bytes], chance: random.Random, words: tuple[bytes, ...]) -> None:
+def _vary(data: bytearray, known: Sequence[bytes], rng: random.Random, words: tuple[bytes, ...]) -> None:
     size = len(data)
-    at = chance.randrange(size + 1)
-    match chance.randrange(8):
+    at = rng.randrange(size + 1)
+    match rng.randrange(8):
         case 0 if at < size:
-            data[at] ^= 1 << chance.randrange(8)
+            data[at] ^= 1 << rng.randrange(8)
         case 1 if at < size:
-            data[at] = chance.choice((0, 1, 0x7F, 0x80, 0xFF, chance.randrange(256)))
+            data[at] = rng.choice((0, 1, 0x7F, 0x80, 0xFF, rng.randrange(256)))
         case 2:
-            data[at:at] = chance.randbytes(chance.randint(1, 16))
+            data[at:at] = rng.randbytes(rng.randint(1, 16))
         case 3:
-            del data[at : at + chance.randint(1, 16)]
+            del data[at : at + rng.randint(1, 16)]
         case 4:
-            length = chance.randint(1, 32)
-            to = chance.randrange(size + 1)
+            length = rng.randint(1, 32)
+            to = rng.randrange(size + 1)
             data[to:to] = data[at : at + length]
         case 5:
-            other = chance.choice(known)
-            start = chance.randrange(len(other))
-            data[at : at + chance.randint(0, 32)] = other[start : start + chance.randint(1, 64)]
+            other = rng.choice(known)
+            start = rng.randrange(len(other))
+            data[at : at + rng.randint(0, 32)] = other[start : start + rng.randint(1, 64)]
         case 6 if words:
-            data[at : at + chance.randint(0, 8)] = chance.choice(words)
+            data[at : at + rng.randint(0, 8)] = rng.choice(words)
         case _:
-            data[at : at + 4] = chance.randbytes(4)
+            data[at : at + 4] = rng.randbytes(4)
 
 
-def _vary_text(data: bytearray, known: Sequence[bytes], chance: random.Random, words: tuple[bytes, ...]) -> None:
-    """By lines, values and printable characters: most of what comes is still text of its kind."""
+def _vary_text(data: bytearray, known: Sequence[bytes], rng: random.Random, words: tuple[bytes, ...]) -> None:
+    """Vary lines, values and printable characters: most results are still text of the same kind."""
     lines = bytes(data).split(b"\n")
-    number = chance.randrange(len(lines))
+    number = rng.randrange(len(lines))
     line = lines[number]
-    at = chance.randrange(len(line) + 1)
-    match chance.randrange(7):
+    at = rng.randrange(len(line) + 1)
+    match rng.randrange(7):
         case 0:
             del lines[number]
         case 1:
-            lines.insert(chance.randrange(len(lines) + 1), line)
+            lines.insert(rng.randrange(len(lines) + 1), line)
         case 2:
-            lines.insert(number, chance.choice(chance.choice(known).split(b"\n")))
+            lines.insert(number, rng.choice(rng.choice(known).split(b"\n")))
         case 3 if b"=" in line:
-            lines[number] = line.partition(b"=")[0] + b"= " + chance.choice(words)
+            lines[number] = line.partition(b"=")[0] + b"= " + rng.choice(words)
         case 4:
-            lines[number] = line[:at] + chance.choice(words) + line[at:]
+            lines[number] = line[:at] + rng.choice(words) + line[at:]
         case 5:
-            lines[number] = line[:at] + line[at + chance.randint(1, 4) :]
+            lines[number] = line[:at] + line[at + rng.randint(1, 4) :]
         case _:
-            lines[number] = line[:at] + bytes((chance.randrange(0x20, 0x7F),)) + line[at + 1 :]
+            lines[number] = line[:at] + bytes((rng.randrange(0x20, 0x7F),)) + line[at + 1 :]
     data[:] = b"\n".join(lines)
 
 
 class Hunt(NamedTuple):
-    """How a hunt went."""
+    """The result of a hunt."""
 
     executions: int
     seconds: float
     escape: Exception | None = None
     script: bytes = b""
-    """The one that escaped."""
+    """The script that escaped."""
 
 
 def hunt(
@@ -194,7 +198,7 @@ def hunt(
     seconds: float | None = None,
     on_progress: Callable[[int], None] = lambda executions: None,
 ) -> Hunt:
-    """Run the seeds, then variations of them, until something escapes, or so many were run, or time is up."""
+    """Run the seeds and then variations of them until a script escapes, or the runs or the time are used up."""
     run = target.make()
     started = time.monotonic()
     known = [*target.seeds(), *seeds]

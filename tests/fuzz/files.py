@@ -1,4 +1,4 @@
-"""Files, and datagrams as the attacker's own tools take them apart: each reader raises its own error alone."""
+"""Files, and datagrams as the attacker's own tools parse them: each reader raises only its own error."""
 
 from __future__ import annotations
 
@@ -13,91 +13,38 @@ from tests.core.harness import FRAME, PLAIN
 from tests.fuzz.engine import TALLY, Run, Script
 from tests.fuzz.stages import initiator, session
 from uavlinkd.config import Config, ConfigError
+from uavlinkd.config.keys import KeyFileError, decode_key, encode_key, read_secret_file
 from uavlinkd.config.load import load_config
-from uavlinkd.config.reader import _taken_over, handed_over
 from uavlinkd.core import wire
 from uavlinkd.core.suites import SUITES
+from uavlinkd.fleet.errors import FleetError
 from uavlinkd.fleet.manifest import FILE_NAME, read_manifest, write_manifest
-from uavlinkd.fleet.plan import FleetError
-from uavlinkd.config.keys import KeyFileError, decode_key, encode_key, read_secret_file
 from uavlinkd.lab.mitm import anatomy
 from uavlinkd.lab.mitm.proxy_settings import ProxySettings, SettingsError, load_proxy_settings
 from uavlinkd.lab.sim.tlog import TlogError, parse_tlog
 
 SECRET: Final = encode_key(bytes(range(7, 39)))
-"""A private key; a person may paste it where it does not belong."""
+"""A private key, which a person may paste into the wrong place."""
 PUBLIC: Final = "Ya1BcyCMNCoxhVU/dI5z9wlfOD9PHricYw/gaSC3swU="
 CONFIGS: Final = Path(__file__).resolve().parents[2] / "configs"
 WORDS: Final = tuple(
-    each.encode()
-    for each in (
-        *(
-            "[link]\n",
-            "[[peer]]\n",
-            "\n[peer]\n",
-            "\n[endpoint]\n",
-            "[[endpoint]]\n",
-            "[routing]\n",
-            "[metrics]\n",
-            "[recording]\n",
-            "[log]\n",
-            "[peer]\n",
-            "[endpoint]\n",
-        ),
+    word.encode()
+    for word in (
+        *("[link]\n", "[[peer]]\n", "\n[peer]\n", "\n[endpoint]\n", "[[endpoint]]\n", "[routing]\n", "[metrics]\n"),
+        *("[recording]\n", "[log]\n", "[peer]\n", "[endpoint]\n"),
         *("name = ", "public_key = ", "addresses = ", "url = ", "suites = ", "system_ids = ", "role = ", "listen = "),
-        *(
-            "psk_file = ",
-            "tag_bits = ",
-            "rate_in = {",
-            "allow_in = [",
-            "deny_out = [",
-            "keepalive_s = ",
-            "budget_bits_s = ",
-        ),
-        *(
-            "true",
-            "nan",
-            "inf",
-            "-1",
-            "1e999",
-            "9" * 40,
-            '"',
-            "'''",
-            "[[",
-            "{",
-            "}",
-            "]",
-            "\n",
-            ",",
-            "=",
-            "\\u0000",
-            "\0",
-        ),
-        *(
-            "1979-05-27T07:32:00Z",
-            "udpin:",
-            "udpout:[::]:1",
-            "serial:/dev/x:1",
-            "tcpin:",
-            "[fe80::1%x]:1",
-            f'"{SECRET}"',
-        ),
-        *(
-            "[[member]]\n",
-            'kind = "drone"',
-            "{name}",
-            "{n:1000}",
-            "{n.real}",
-            "[[attack]]\n",
-            "[[radio]]\n",
-            "[[link]]\n",
-        ),
+        *("psk_file = ", "tag_bits = ", "rate_in = {", "allow_in = [", "deny_out = [", "keepalive_s = "),
+        *("budget_bits_s = ", "true", "nan", "inf", "-1", "1e999", "9" * 40, '"', "'''", "[[", "{", "}", "]"),
+        *("\n", ","),
+        *("=", "\\u0000", "\0", "1979-05-27T07:32:00Z", "udpin:", "udpout:[::]:1", "serial:/dev/x:1", "tcpin:"),
+        *("[fe80::1%x]:1", f'"{SECRET}"', "[[member]]\n", 'kind = "drone"', "{name}", "{n:1000}", "{n.real}"),
+        *("[[attack]]\n", "[[radio]]\n", "[[link]]\n"),
     )
 )
 
 
 def _folder() -> Path:
-    """A folder with the files that the configurations name; it goes away with the process."""
+    """A folder with the files that the configurations name; it is deleted with the process."""
     folder = tempfile.TemporaryDirectory(prefix="uavlinkd-fuzz-")
     atexit.register(folder.cleanup)
     path = Path(folder.name)
@@ -110,7 +57,7 @@ def _folder() -> Path:
 
 
 def make_config() -> Run:
-    """The daemon's configuration: itself, or a ConfigError that repeats no key and says what to do."""
+    """The daemon's configuration: a valid one, or a ConfigError that repeats no key and names a remedy."""
     folder = _folder()
     file = folder / "fuzz.toml"
 
@@ -120,17 +67,16 @@ def make_config() -> Run:
         try:
             config = load_config(file, {})
         except ConfigError as error:
-            problems, told = error.problems, str(error)
+            problems, message = error.problems, str(error)
         else:
-            problems, told = (), ""
-        assert SECRET not in told, "a key is repeated"
-        assert all(each.message for each in problems), "a problem without a word"
-        if told:
+            problems, message = (), ""
+        assert SECRET not in message, "a key is repeated"
+        assert all(problem.message for problem in problems), "a problem without a message"
+        if message:
             return
         assert tomllib.loads(data.decode("utf-8-sig"))
         assert isinstance(config, Config)
         assert SECRET not in repr(config), "a key can be read"
-        assert _taken_over(handed_over(config), file) == config, "not the same on the other side of the pipe"
         for peer in config.peers:
             peer.make_policy()
 
@@ -138,7 +84,7 @@ def make_config() -> Run:
 
 
 def make_mitm() -> Run:
-    """The man in the middle's settings."""
+    """The settings of the man in the middle."""
     file = _folder() / "fuzz.toml"
 
     def run(data: bytes) -> None:
@@ -151,7 +97,7 @@ def make_mitm() -> Run:
 
 
 def make_manifest() -> Run:
-    """The fleet's manifest: what is read is written and read again the same."""
+    """The fleet's manifest: writing and reading it again returns the same."""
     folder = _folder()
 
     def run(data: bytes) -> None:
@@ -168,7 +114,7 @@ def make_manifest() -> Run:
 
 
 def make_key() -> Run:
-    """A key file: 32 bytes in their one spelling, or a KeyFileError that does not repeat it."""
+    """A key file: 32 bytes in their only spelling, or a KeyFileError that does not repeat them."""
     file = _folder() / "drone0.key"
 
     def run(data: bytes) -> None:
@@ -176,10 +122,10 @@ def make_key() -> Run:
         file.write_bytes(data)
         text = data.decode("ascii", errors="replace")
         try:
-            secret, told = read_secret_file(file), ""
+            secret, message = read_secret_file(file), ""
         except KeyFileError as error:
-            secret, told = None, str(error)
-        assert len(text.strip()) < 8 or text.strip() not in told, "a key is repeated"
+            secret, message = None, str(error)
+        assert len(text.strip()) < 8 or text.strip() not in message, "a key is repeated"
         if secret is None:
             return
         assert encode_key(secret.reveal()) == text.strip(), "a key with two spellings"
@@ -189,7 +135,7 @@ def make_key() -> Run:
 
 
 def make_tlog() -> Run:
-    """A recorded flight: records that stand in it, in their order, or a TlogError; strict is never more lenient."""
+    """A recorded flight: records that are in the file, in order, or a TlogError; strict is never more lenient."""
 
     def run(data: bytes) -> None:
         TALLY.add(data)
@@ -197,7 +143,7 @@ def make_tlog() -> Run:
             log = parse_tlog(data)
         except TlogError:
             return
-        whole = [each.time_us.to_bytes(8, "big") + each.frame for each in log.records]
+        whole = [record.time_us.to_bytes(8, "big") + record.frame for record in log.records]
         position = 0
         for record in whole:
             position = data.find(record, position) + len(record)
@@ -206,7 +152,7 @@ def make_tlog() -> Run:
         try:
             strict = parse_tlog(data, strict=True)
         except TlogError:
-            assert log.skipped_bytes, "strict refuses what has no fault"
+            assert log.skipped_bytes, "strict refuses a log without faults"
         else:
             assert strict == log
 
@@ -214,7 +160,7 @@ def make_tlog() -> Run:
 
 
 def make_anatomy() -> Run:
-    """What the man in the middle sees in a datagram: parts that are all of it; nothing raises."""
+    """The parts of a datagram in the man in the middle: together they are the datagram; no exception."""
 
     def run(data: bytes) -> None:
         script = Script(data)
@@ -229,11 +175,11 @@ def make_anatomy() -> Run:
             TALLY.add(datagram)
             parts = anatomy.parts_of(datagram)
             if parts is not None:
-                assert parts.join() == datagram, "parts that are not the whole"
+                assert parts.join() == datagram, "the parts differ from the datagram"
                 assert len(parts.ephemeral) == 32
             anatomy.has_cookie(datagram)
             envelope = anatomy.envelope_of(datagram)
-            assert (envelope is not None) <= (anatomy.kind_of(datagram) is anatomy.Kind.ENVELOPE)
+            assert (envelope is not None) <= (anatomy.kind_of(datagram) is anatomy.DatagramKind.ENVELOPE)
             assert len(anatomy.message_ids(datagram)) * 8 <= len(datagram)
             changed = anatomy.with_mac1(datagram, bytes(32))
             assert len(changed) == len(datagram)
@@ -243,7 +189,7 @@ def make_anatomy() -> Run:
 
 
 def config_seeds() -> list[bytes]:
-    """Every configuration that comes with the package."""
+    """The configurations in the repository."""
     small = [
         'name = "a"\nprivate_key_file = "drone0.key"\nlisten = ["0.0.0.0:1"]\n',
         f'[[peer]]\nname = "b"\npublic_key = "{PUBLIC}"\nrole = "all"\nsystem_ids = [1]\n',
@@ -251,19 +197,19 @@ def config_seeds() -> list[bytes]:
         '[[endpoint]]\nname = "e"\nurl = "tcpin:127.0.0.1:2"\n',
     ]
     whole = "".join((small[0], small[1], small[3]))
-    found = [path.read_bytes() for path in sorted(CONFIGS.glob("*.toml")) if path.name != "mitm.toml"]
-    return [*(each.encode() for each in (*small, whole)), *found, b"a = " + b"[" * 4000]
+    shipped = [path.read_bytes() for path in sorted(CONFIGS.glob("*.toml")) if path.name != "mitm.toml"]
+    return [*(text.encode() for text in (*small, whole)), *shipped, b"a = " + b"[" * 4000]
 
 
 def mitm_seeds() -> list[bytes]:
-    """The one that comes with the package."""
+    """The settings in the repository."""
     small = [
         '[[peer]]\nname = "a"\n[[peer]]\nname = "b"\n[[link]]\nbetween = ["a", "b"]\n'
         'listen = ["0.0.0.0:1", "0.0.0.0:2"]\n',
         '[[attack]]\nname = "replay-data"\nlimit = 5\n',
         '[[radio]]\nway = "both"\nloss = 0.5\n',
     ]
-    return [*(each.encode() for each in (*small, "".join(small))), (CONFIGS / "mitm.toml").read_bytes()]
+    return [*(text.encode() for text in (*small, "".join(small))), (CONFIGS / "mitm.toml").read_bytes()]
 
 
 def manifest_seeds() -> list[bytes]:
@@ -277,12 +223,12 @@ def manifest_seeds() -> list[bytes]:
 
 
 def key_seeds() -> list[bytes]:
-    """Keys, and what is nearly one."""
-    return [each.encode() for each in (SECRET, SECRET + "\n", f"  {SECRET}\r\n", SECRET[:-1], "A" * 43 + "=", PUBLIC)]
+    """Keys, and texts that are nearly keys."""
+    return [text.encode() for text in (SECRET, SECRET + "\n", f"  {SECRET}\r\n", SECRET[:-1], "A" * 43 + "=", PUBLIC)]
 
 
 def tlog_seeds() -> list[bytes]:
-    """Records whole, broken and cut."""
+    """Complete, broken and truncated records."""
     record = (1_700_000_000_000_000).to_bytes(8, "big") + FRAME
     v1 = record[:8] + b"\xfe\x09\x01\x01\x01\x00" + bytes(11)
     return [record * 3, record + v1 + record, record + b"junk" + record * 2, record * 2 + record[:12], b""]
@@ -291,4 +237,6 @@ def tlog_seeds() -> list[bytes]:
 def anatomy_seeds() -> list[bytes]:
     """Datagrams of each kind."""
     known = [*initiator(PLAIN).templates, *session(PLAIN).templates]
-    return [b"".join((len(each) & 0x1FE).to_bytes(2, "big") + each[: len(each) & 0x1FE] for each in known)]
+    return [
+        b"".join((len(datagram) & 0x1FE).to_bytes(2, "big") + datagram[: len(datagram) & 0x1FE] for datagram in known)
+    ]

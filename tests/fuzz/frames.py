@@ -1,4 +1,4 @@
-"""MAVLink from programs and peers: the splitters, then policy, router and switch behind them."""
+"""MAVLink from clients and peers: the splitters, then policy, router and switch behind them."""
 
 from __future__ import annotations
 
@@ -10,38 +10,30 @@ from typing import Final
 from fastcrc.crc16 import mcrf4xx
 
 from tests.fuzz.engine import TALLY, Run, Script
-from tests.link.test_switch import Program, policy
+from tests.link.test_switch import Client, policy
 from uavlinkd.link import switch as switching
-from uavlinkd.mavlink import frames as splitting
-from uavlinkd.mavlink.policy import gate as gates
-from uavlinkd.mavlink import routing
+from uavlinkd.link.switch import Port, Switch
+from uavlinkd.mavlink import headers, routing
 from uavlinkd.mavlink.dialect import SETUP_SIGNING
 from uavlinkd.mavlink.dialect_table import MESSAGES
-from uavlinkd.mavlink.frames import (
-    MAVLINK1,
-    MAX_FRAME_BYTES,
-    Frame,
-    Header,
-    SplitCounters,
-    StreamSplitter,
-    split_datagram,
-    split_payload,
-)
-from uavlinkd.mavlink.policy.gate import Refusal
+from uavlinkd.mavlink.frames import MAVLINK1, MAX_FRAME_BYTES, Frame, SplitCounters, split_datagram, split_payload
+from uavlinkd.mavlink.headers import Header
+from uavlinkd.mavlink.policy import gate as gates
 from uavlinkd.mavlink.policy.compilation import Policy
+from uavlinkd.mavlink.policy.gate import Refusal
 from uavlinkd.mavlink.routing import Router
-from uavlinkd.link.switch import Port, Switch
+from uavlinkd.mavlink.stream_splitter import StreamSplitter
 
 KNOWN: Final = (0, 4, 11, 20, 23, 30, 33, 39, 44, 73, 75, 76, 77, 110, 253, 256)
-"""Messages that frames are made of: telemetry, parameters, missions, commands, files, SETUP_SIGNING."""
+"""Messages of the frames: telemetry, parameters, missions, commands, files, SETUP_SIGNING."""
 UNKNOWN: Final = (60_000, 250, 16_777_215)
 
 LAST_STEPS: Final = {mcrf4xx(bytes((extra,)), 0) for extra in range(256)}
-"""What one more byte can do to the low byte of a checksum."""
+"""The effects of one more byte on the low byte of a checksum."""
 
 
 def made(script: Script) -> bytes:
-    """A frame, or what is nearly one: its checksum is right unless the script says otherwise."""
+    """A frame, or bytes that are nearly one: its checksum is right unless the script changes it."""
     how = script.byte()
     msgid = KNOWN[how & 15] if how & 0xC0 else UNKNOWN[how % 3]
     system, component = script.byte(), script.byte()
@@ -64,7 +56,7 @@ def made(script: Script) -> bytes:
 
 
 def check_frame(frame: Frame) -> None:
-    """A frame is what its own bytes say, read here anew; where its message is known its checksum is right."""
+    """A frame's header matches its bytes, parsed here again; the checksum of a known message is right."""
     raw, header = frame
     if raw[0] == MAVLINK1:
         length, msgid, body_at = 8 + raw[1], raw[5], 6
@@ -81,31 +73,32 @@ def check_frame(frame: Frame) -> None:
     if header.is_known:
         assert mcrf4xx(raw[1:checksum_at] + bytes((MESSAGES[msgid][1],))) == wanted, "a bad checksum"
     else:
-        assert mcrf4xx(raw[1:checksum_at]) >> 8 ^ wanted in LAST_STEPS, "no checksum, whatever the definition"
+        assert mcrf4xx(raw[1:checksum_at]) >> 8 ^ wanted in LAST_STEPS, "no checksum of any definition"
 
 
 def facts_of(frame: Frame) -> tuple[object, ...]:
-    """A frame, to be compared: headers are compared by identity, and are forgotten now and then."""
+    """A frame's facts, for comparison: headers are compared by identity, and the cache forgets them now and then."""
     header = frame.header
     return frame.raw, header.is_known, header.target_system, header.target_component, header.command
 
 
-def check_split(data: bytes, found: list[Frame], counters: SplitCounters, held: int = 0) -> None:
-    """What was found stands in the data, in its order; every byte is in a frame, garbage, or held."""
+def check_split(data: bytes, result: list[Frame], counters: SplitCounters, held: int = 0) -> None:
+    """The frames are in the data, in order; every byte is in a frame, garbage, or held."""
     position = 0
-    for frame in found:
+    for frame in result:
         at = data.find(frame.raw, position)
         assert at >= 0, "a frame that was not sent"
         position = at + len(frame.raw)
         check_frame(frame)
-    size = sum(len(each.raw) for each in found)
+    size = sum(len(frame.raw) for frame in result)
     assert size + counters.garbage_bytes + held == len(data), "bytes are unaccounted for"
-    assert counters.frames == len(found), "frames are unaccounted for"
-    assert len(splitting._messages) <= splitting.MAX_REMEMBERED, "too many headers are remembered"
+    assert counters.frames == len(result), "frames are unaccounted for"
+    assert len(headers.sender_messages) <= headers.MAX_SENDER_MESSAGES, "too many headers are remembered"
+    assert len(headers.targeted_headers) <= headers.MAX_TARGETED_HEADERS, "too many headers are remembered"
 
 
 def _stream(script: Script) -> bytes:
-    """Frames, pieces of frames and noise, one after another."""
+    """Frames, pieces of frames and noise, in a row."""
     parts = []
     while script:
         match script.byte() & 3:
@@ -120,35 +113,35 @@ def _stream(script: Script) -> bytes:
 
 
 def make_stream() -> Run:
-    """A byte stream, cut into chunks anywhere: the same frames as whole, whatever the cuts."""
+    """A byte stream, cut into chunks anywhere: the same frames for any cuts."""
 
     def run(data: bytes) -> None:
         cuts, rest = data[:16], data[16:]
         stream = _stream(Script(rest[1:])) if rest[:1] < b"\xc0" else rest[1:]
         splitter = StreamSplitter()
-        found: list[Frame] = []
+        result: list[Frame] = []
         position, number = 0, 0
         while position < len(stream):
             size = 1 + (cuts[number % len(cuts)] if cuts else 64)
             chunk = stream[position : position + size]
             TALLY.add(chunk)
-            found += splitter.feed(chunk, 0.0)
+            result += splitter.feed(chunk, 0.0)
             assert splitter.pending_bytes < MAX_FRAME_BYTES, "more is held than a frame"
             position += size
             number += 1
-        check_split(stream, found, splitter.counters, splitter.pending_bytes)
-        found += splitter.end()
-        check_split(stream, found, splitter.counters)
+        check_split(stream, result, splitter.counters, splitter.pending_bytes)
+        result += splitter.end()
+        check_split(stream, result, splitter.counters)
         whole = StreamSplitter()
         uncut = [*whole.feed(stream, 0.0), *whole.end()]
-        assert list(map(facts_of, found)) == list(map(facts_of, uncut)), "the cuts change what is found"
+        assert list(map(facts_of, result)) == list(map(facts_of, uncut)), "the cuts change what is found"
         assert splitter.counters == whole.counters
 
     return run
 
 
 def make_datagrams() -> Run:
-    """A local program's datagram, and the same bytes as the payload of an envelope."""
+    """A local client's datagram, and the same bytes as the payload of an envelope."""
 
     def run(data: bytes) -> None:
         script = Script(data)
@@ -164,9 +157,9 @@ def make_datagrams() -> Run:
             frames = split_payload(datagram, counters)
             check_split(datagram, frames, counters)
             again = SplitCounters()
-            whole = b"".join(each.raw for each in frames)
+            whole = b"".join(frame.raw for frame in frames)
             found_again = split_payload(whole, again)
-            assert list(map(facts_of, found_again)) == list(map(facts_of, frames)), "what was found is lost"
+            assert list(map(facts_of, found_again)) == list(map(facts_of, frames)), "frames are lost"
             assert again.garbage_bytes == 0
 
     return run
@@ -186,7 +179,7 @@ POLICIES: Final[tuple[dict[str, object], ...]] = (
     {"system_ids": [7], "role": "observer"},
 )
 _CLAIMS: Final = (None, {1, 2, 4, 5}, {1, 2, 3}, None, {6}, {7})
-"""The systems that each policy lets speak."""
+"""The systems that each policy allows."""
 
 
 _BOUNDS = (
@@ -198,7 +191,7 @@ _BOUNDS = (
 
 @contextmanager
 def small_tables() -> Iterator[None]:
-    """Tables that hold eight: a script reaches the end of each, and sees whether it is one."""
+    """Tables with eight entries: a script reaches the end of each, and shows whether it is bounded."""
     before = [(module, name, getattr(module, name)) for module, names in _BOUNDS for name in names]
     for module, name, _ in before:
         setattr(module, name, 8)
@@ -210,7 +203,7 @@ def small_tables() -> Iterator[None]:
 
 
 def make_switch() -> Run:
-    """Six programs, each with a policy, at one switch: who may not speak is not heard, and nothing comes back."""
+    """Six clients, each with a policy, at one switch: no frame passes that a policy refuses, and none comes back."""
 
     @small_tables()
     def run(data: bytes) -> None:
@@ -218,14 +211,14 @@ def make_switch() -> Run:
         refused: Counter[Refusal] = Counter()
         router = Router[Port]()
 
-        def count(who: str, header: Header, refusal: Refusal, now: float, *, to_them: bool) -> None:
+        def count(name: str, header: Header, refusal: Refusal, now: float, *, to_them: bool) -> None:
             refused[refusal] += 1
 
         switch = Switch(router, count)
-        programs = [Program(str(number)) for number in range(len(POLICIES))]
-        policies = [policy(**each) for each in POLICIES]
-        for program, each in zip(programs, policies, strict=True):
-            switch.add(program.port, each)
+        clients = [Client(str(number)) for number in range(len(POLICIES))]
+        policies = [policy(**rules) for rules in POLICIES]
+        for client, rules in zip(clients, policies, strict=True):
+            switch.add(client.port, rules)
         now = 0.0
         while script:
             what = script.byte()
@@ -233,48 +226,48 @@ def make_switch() -> Run:
                 now += (what & 15) ** 2
                 switch.router.refresh(now)
                 continue
-            number = what % len(programs)
+            number = what % len(clients)
             raw = b"".join(made(script) for _ in range(1 + (what >> 6)))
             TALLY.add(raw)
             frames = split_datagram(raw, SplitCounters())
-            switch.forward(programs[number].port, frames, now)
-            _check_told(programs, number, frames)
+            switch.forward(clients[number].port, frames, now)
+            _check_received(clients, number, frames)
         _check_tables(router, switch, policies)
 
     return run
 
 
-def _check_told(programs: list[Program], source: int, frames: list[Frame]) -> None:
-    """Nobody was told more than was sent, its sender nothing; no system that it may not speak as, nor keys."""
-    sent = Counter(each.raw for each in frames)
-    by_raw = {each.raw: each.header for each in frames}
-    assert not programs[source].told, "a frame went back to where it came from"
-    for program in programs:
-        for raw, amount in Counter(program.told).items():
-            assert amount <= sent[raw], "told more often than sent"
+def _check_received(clients: list[Client], source: int, frames: list[Frame]) -> None:
+    """No client received a frame more often than it was sent, nor a frame of a forbidden system, nor keys."""
+    sent = Counter(frame.raw for frame in frames)
+    by_raw = {frame.raw: frame.header for frame in frames}
+    assert not clients[source].received, "a frame went back to where it came from"
+    for client in clients:
+        for raw, count in Counter(client.received).items():
+            assert count <= sent[raw], "received more often than sent"
             header = by_raw[raw]
             claims = _CLAIMS[source]
-            assert claims is None or header.system in claims, "somebody spoke as another system"
+            assert claims is None or header.system in claims, "a port sent as another system"
             assert header.msgid != SETUP_SIGNING, "a signing key was passed on"
-        program.told.clear()
+        client.received.clear()
 
 
 def _check_tables(router: Router[Port], switch: Switch, policies: list[Policy]) -> None:
-    for heard in router._heard_at.values():
-        assert len(heard) <= routing.MAX_ADDRESSES_PER_PORT, "too many addresses"
+    for received_at in router._received_at.values():
+        assert len(received_at) <= routing.MAX_ADDRESSES_PER_PORT, "too many addresses"
     assert len(router._seen) <= routing.MAX_FRAMES_REMEMBERED
     assert len(router._decisions) <= routing.MAX_DECISIONS
     for flows in switch._flows.values():
         assert len(flows) <= switching.MAX_FLOWS
-    for each in policies:
-        for gate in (each.incoming, each.outgoing):
-            assert len(gate.refused) <= gates.MAX_COUNTED + len(Refusal), "too much is counted by itself"
+    for client_policy in policies:
+        for gate in (client_policy.incoming, client_policy.outgoing):
+            assert len(gate.refused) <= gates.MAX_COUNTED + len(Refusal), "too many separate counters"
             assert len(gate._decisions) <= gates.MAX_DECISIONS
             assert len(gate._buckets) <= gates.MAX_BUCKETS
 
 
 def make_gate() -> Run:
-    """One policy asked about any frames: what it lets pass at any rate it lets pass; its memory is bounded."""
+    """One policy with any frames: a frame that passes at any rate always passes; its memory is bounded."""
     wanted = POLICIES
 
     @small_tables()
@@ -290,7 +283,7 @@ def make_gate() -> Run:
             for frame in split_datagram(raw, SplitCounters()):
                 always = gate.always_passes(frame.header)
                 refusal = gate.check(frame, now)
-                assert not (always and refusal), "what always passes was refused"
+                assert not (always and refusal), "a frame that always passes was refused"
                 claims = _CLAIMS[number]
                 assert refusal or claims is None or frame.header.system in claims, "spoke as another system"
                 assert refusal or frame.header.msgid != SETUP_SIGNING, "a signing key may pass"
@@ -302,7 +295,7 @@ def make_gate() -> Run:
 
 
 def seeds() -> list[bytes]:
-    """Frames of each kind, whole, broken and cut."""
+    """Frames of each kind, complete, broken and truncated."""
     one = b"".join(
         bytes((2, how, system, 1, 9)) + bytes(range(9)) for how in range(0, 256, 7) for system in (1, 2, 6)
     )

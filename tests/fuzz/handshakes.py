@@ -1,8 +1,9 @@
 """Handshake messages that are sealed with the right keys, around any header, parameters and key share.
 
-To bravo, as an initiator whom it knows or not; to alpha, as the responder that it calls. What says other things in
-clear than inside, or asks for what the protocol does not have, is refused by its own reason. What is accepted gives
-keys to both ends. Tables stay within their bounds; afterwards an honest handshake completes.
+They go to bravo from a known or unknown initiator, and to alpha from the responder of its initiation. A message whose
+clear part differs from its sealed part, or that requests something outside the protocol, is refused with its own
+reason. After an accepted message both ends have keys. Tables stay within their bounds; afterwards an honest handshake
+completes.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from typing import Final
 
 from tests.core.harness import AT_A, AT_B, ELSEWHERE, KEY_A, KEY_B, KEY_C, Pair, datagrams, of, only, with_macs
 from tests.fuzz.engine import TALLY, Run, Script
-from tests.fuzz.stages import GROUPS, LINKS, NOW, Chance, copier, pair_of
+from tests.fuzz.stages import GROUPS, LINKS, NOW, SeededEntropy, copier, pair_of
 from uavlinkd.core import constants as c
 from uavlinkd.core import handshake, noise, wire
 from uavlinkd.core.admission import Admission
@@ -25,23 +26,23 @@ from uavlinkd.core.outputs import Dropped, Output, SessionEstablished, Transmit
 
 LINK: Final = replace(LINKS[0], suites=GROUPS)
 KEY_D: Final = KeyPair(bytes((4,)) * 32)
-CALLERS: Final = (KEY_A, KEY_A, KEY_C, KEY_D)
-"""Two whom bravo knows, and one whom it does not."""
+INITIATORS: Final = (KEY_A, KEY_A, KEY_C, KEY_D)
+"""Two initiators that bravo knows, and one that it does not know."""
 OFTEN: Final = (GROUPS[0], GROUPS[0], GROUPS[0], GROUPS[1])
 _REFUSALS = (DropReason.MALFORMED, DropReason.HEADER_MISMATCH, DropReason.BAD_PARAMETERS)
 
 
 def write(
-    state: HandshakeState, tokens: tuple[Token, ...], payload: bytes, share: bytes | None, chance: Chance
+    state: HandshakeState, tokens: tuple[Token, ...], payload: bytes, share: bytes | None, entropy: SeededEntropy
 ) -> tuple[HandshakeState, bytes]:
-    """WriteMessage; ``share``: these bytes in place of an honest share or ciphertext, and nobody knows the secret."""
+    """WriteMessage; ``share``: these bytes instead of an honest share or ciphertext. Then no secret is common."""
     if share is None or not state.suite.has_group:
-        return state.write(tokens, payload, chance)
+        return state.write(tokens, payload, entropy)
     message = b""
     for token in tokens:
         symmetric = state.symmetric
         if token is Token.E:
-            e = KeyPair(chance(c.KEY_BYTES))
+            e = KeyPair(entropy(c.KEY_BYTES))
             message += e.public
             state = replace(state, e=e, symmetric=state._mix_ephemeral(e.public))
         elif token in (Token.S, Token.E1, Token.EKEM1):
@@ -55,7 +56,7 @@ def write(
 
 
 def _payload(script: Script, header: bytes) -> bytes:
-    """What is sealed: the header and parameters, most of them as they should be."""
+    """The sealed header and parameters, most of them valid."""
     how = script.byte()
     parameters = bytearray(
         wire.Parameters(
@@ -80,7 +81,7 @@ def _payload(script: Script, header: bytes) -> bytes:
 
 
 def _share(script: Script, size: int) -> bytes | None:
-    """An honest share (None), or one that is any bytes: also the values that no group takes."""
+    """An honest share (None), or any bytes, including values that every group refuses."""
     how = script.byte()
     match how & 7:
         case 0:
@@ -94,7 +95,7 @@ def _share(script: Script, size: int) -> bytes | None:
 
 
 def expected(payload: bytes, header: bytes) -> DropReason | None:
-    """Why an authentic payload behind this header must be refused, by its bytes alone."""
+    """The reason to refuse an authentic payload behind this header, by its bytes alone."""
     if header[2:4] == bytes(2):
         return DropReason.MALFORMED  # sender index 0
     if payload[: len(header) - 1] != header[1:]:
@@ -108,8 +109,8 @@ def expected(payload: bytes, header: bytes) -> DropReason | None:
 
 
 def _refill(pair: Pair, now: float) -> None:
-    """A budget that does not run out: what is behind it is looked for here."""
-    for pending in pair.a.peer.caller.pending.values():
+    """An unlimited budget: the targets test the code behind it."""
+    for pending in pair.a.peer.initiator.pending.values():
         pending.__post_init__()
     for node in (pair.a.node, pair.b.node):
         node._admission = Admission(node._is_known, now)
@@ -124,22 +125,22 @@ def _refused(outputs: list[Output]) -> DropReason:
     return dropped.reason
 
 
-def call(pair: Pair, script: Script, chance: Chance) -> None:
+def call(pair: Pair, script: Script, entropy: SeededEntropy) -> None:
     """An initiation to bravo."""
     what = script.byte()
-    caller, suite = CALLERS[what & 3], OFTEN[what >> 2 & 3] if what & 0x30 else GROUPS[2]
+    initiator, suite = INITIATORS[what & 3], OFTEN[what >> 2 & 3] if what & 0x30 else GROUPS[2]
     header = wire.initiation_header(suite, script.word())
     payload = _payload(script, header)
     share = _share(script, suite.share_bytes)
-    start = noise.initiator(handshake.pattern_of(suite), suite, wire.prologue(suite), caller, KEY_B.public)
-    state, message = write(start, start.pattern.initiation, payload, share, chance)
+    start = noise.initiator(handshake.pattern_of(suite), suite, wire.prologue(suite), initiator, KEY_B.public)
+    state, message = write(start, start.pattern.initiation, payload, share, entropy)
     datagram = with_macs(header + message, KEY_B.public)
     path = (AT_A, ELSEWHERE)[what >> 6 & 1]
     TALLY.add(datagram)
     outputs = pair.b.node.receive(datagram, path, NOW)
     if reason := expected(payload, header):
         assert _refused(outputs) is reason, f"{reason} was not the reason: {outputs}"
-    elif caller is KEY_D:
+    elif initiator is KEY_D:
         assert _refused(outputs) is DropReason.UNKNOWN_PEER
     elif type(outputs[0]) is Dropped:
         assert share is not None, f"an honest share was refused: {outputs}"
@@ -148,13 +149,13 @@ def call(pair: Pair, script: Script, chance: Chance) -> None:
         (sent,) = outputs
         assert isinstance(sent, Transmit), f"more than an answer: {outputs}"
         assert sent.path == path, "the answer went elsewhere"
-        assert len(sent.datagram) <= len(datagram), "an answer longer than its question"
+        assert len(sent.datagram) <= len(datagram), "a response longer than its initiation"
         if share is None:
             _check_answer(state, wire.parse_parameters(payload[len(header) - 1 :]), sent.datagram)
 
 
 def _check_answer(state: HandshakeState, asked: wire.Parameters, datagram: bytes) -> None:
-    """The caller can read the answer, and what is agreed is no weaker than either end asked."""
+    """The initiator can read the response, and the agreed parameters are at least as strong as both requests."""
     initiated = handshake.Initiated(state, asked, b"")
     agreed = handshake.receive_response(initiated, wire.parse_response(datagram)).parameters
     ours = handshake.parameters_of(LINK, 0)
@@ -165,8 +166,8 @@ def _check_answer(state: HandshakeState, asked: wire.Parameters, datagram: bytes
     assert agreed.max_envelope <= min(asked.max_envelope, ours.max_envelope)
 
 
-def answer(pair: Pair, script: Script, initiation: bytes, chance: Chance) -> bool:
-    """A response to alpha, from who has bravo's key; whether it made a session."""
+def answer(pair: Pair, script: Script, initiation: bytes, entropy: SeededEntropy) -> bool:
+    """Send a response to alpha, with bravo's key; returns whether it made a session."""
     received = handshake.receive_initiation(KEY_B, wire.parse_initiation(initiation))
     suite = received.initiation.suite
     what = script.byte()
@@ -174,9 +175,9 @@ def answer(pair: Pair, script: Script, initiation: bytes, chance: Chance) -> boo
     payload = _payload(script, header)
     share = _share(script, suite.ciphertext_bytes)
     pattern = handshake.pattern_of(suite)
-    _, message = write(received.state.with_psk(noise.NO_PSK), pattern.response, payload, share, chance)
+    _, message = write(received.state.with_psk(noise.NO_PSK), pattern.response, payload, share, entropy)
     datagram = with_macs(header + message, KEY_A.public)
-    if what & 7 == 7 and pair.a.peer.caller.pending:  # one that nobody can have sealed
+    if what & 7 == 7 and pair.a.peer.initiator.pending:  # with an invalid tag
         datagram = datagram[:-33] + bytes((datagram[-33] ^ 1,)) + datagram[-32:]
         datagram = with_macs(datagram[: -wire.MACS_BYTES], KEY_A.public)
     TALLY.add(datagram)
@@ -186,7 +187,7 @@ def answer(pair: Pair, script: Script, initiation: bytes, chance: Chance) -> boo
         if reason in _REFUSALS:
             assert expected(payload, header) is reason
         return False
-    assert expected(payload, header) is None, f"accepted what is none: {outputs}"
+    assert expected(payload, header) is None, f"accepted an invalid response: {outputs}"
     assert what & 7 != 7, f"accepted an altered response: {outputs}"
     assert len(of(outputs, SessionEstablished)) == 1
     return True
@@ -197,15 +198,15 @@ def _check_bounds(pair: Pair) -> None:
         owned = 0
         for peer in side.node.peers.values():
             assert len(peer.sessions.unconfirmed) <= c.UNCONFIRMED_PER_PEER, "too many unconfirmed sessions"
-            owned += len(peer.sessions.unconfirmed) + len(peer.caller.pending) + len(peer.sessions.confirmed)
-        assert len(side.node._indices.owners) == owned, "an index that nobody owns"
+            owned += len(peer.sessions.unconfirmed) + len(peer.initiator.pending) + len(peer.sessions.confirmed)
+        assert len(side.node._indices.owners) == owned, "an index without an owner"
 
 
 def make() -> Run:
     """Both roles, in each kind of group."""
     pairs = []
     for suite in GROUPS:
-        pair = pair_of(replace(LINK, suites=(suite, *(each for each in GROUPS if each is not suite))))
+        pair = pair_of(replace(LINK, suites=(suite, *(group for group in GROUPS if group is not suite))))
         pairs.append((copier(pair), pair.initiation(NOW)))
         pairs[-1] = copier(pair), pairs[-1][1]
 
@@ -214,14 +215,14 @@ def make() -> Run:
         first = script.byte()
         copy, initiation = pairs[(0, 0, 0, 0, 0, 1, 1, 2)[first & 7]]
         pair = copy()
-        chance = Chance(5)
+        entropy = SeededEntropy(5)
         if first & 8:
-            while script and not answer(pair, script, initiation, chance):
+            while script and not answer(pair, script, initiation, entropy):
                 _refill(pair, NOW)
         else:
             while script:
                 _refill(pair, NOW)
-                call(pair, script, chance)
+                call(pair, script, entropy)
                 _check_bounds(pair)
         _check_sequel(pair, initiation)
 
@@ -229,7 +230,7 @@ def make() -> Run:
 
 
 def _check_sequel(pair: Pair, initiation: bytes) -> None:
-    """Alpha's own initiation is answered; where alpha has no session by then, the answer completes the handshake."""
+    """Bravo answers alpha's own initiation; if alpha has no session by then, the response completes the handshake."""
     _check_bounds(pair)
     _refill(pair, NOW)
     response = only(datagrams(pair.b.receive(initiation, NOW)))
@@ -239,10 +240,10 @@ def _check_sequel(pair: Pair, initiation: bytes) -> None:
 
 
 def seeds() -> list[bytes]:
-    """Callers, suites, parameters and shares of each kind."""
+    """Initiators, suites, parameters and shares of each kind."""
     calls = b"".join(
-        bytes((caller | 0x10, 1, 2, how, generation, 0, 0, 0, share, 9, 9))
-        for caller in range(16)
+        bytes((initiator | 0x10, 1, 2, how, generation, 0, 0, 0, share, 9, 9))
+        for initiator in range(16)
         for how, generation in ((0, 0), (0x3F, 255), (0x40, 3), (0x80, 7))
         for share in (3, 2)
     )

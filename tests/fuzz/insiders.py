@@ -1,27 +1,30 @@
-"""What lies behind the tag: a configured peer that holds its keys, and says what it likes.
+"""The code behind the tag: a configured peer with its keys that sends anything.
 
-The peer makes handshakes as it likes, seals any payload under any counter on any of its sessions, sends recorded
-envelopes again, from several addresses, and lets time pass. After each datagram: what is delivered was sealed by the
-peer, as often at most; an address that proved nothing gets no more bytes than it sent; tables stay within their
-bounds. Afterwards an honest handshake gives a link that works.
+The peer makes any handshake, seals any payload under any counter on any of its sessions, replays recorded envelopes
+from several addresses, and lets time pass. After each datagram these properties hold. The peer sealed each delivered
+frame, at least as often as it was delivered. An unproven address gets no more bytes than it sent. Tables stay within
+their bounds. Afterwards an honest handshake makes a link that works.
 """
 
 from __future__ import annotations
 
 from collections import Counter
+from random import Random
 from typing import Final
 
-from tests.core.harness import AT_A, ELSEWHERE, FRAME, KEY_A, KEY_B, Pair, of
+from tests.core.harness import AT_A, ELSEWHERE, FRAME, KEY_A, KEY_B, Pair, of, unsealed
 from tests.fuzz.engine import TALLY, Run, Script
-from tests.fuzz.stages import LINKS, NOW, Chance, copier, pair_of
+from tests.fuzz.stages import LINKS, NOW, SeededEntropy, copier, pair_of
 from uavlinkd.core import constants as c
 from uavlinkd.core import handshake, wire
 from uavlinkd.core.cookie import MacKeys
-from uavlinkd.core.outputs import Deliver, Dropped, Output, Path, Transmit
+from uavlinkd.core.outputs import Deliver, Dropped, Output, Transmit
+from uavlinkd.core.path import Path
+from uavlinkd.core.refusals import RefusalReport, Refused
 from uavlinkd.core.session import Session
 from uavlinkd.core.settings import Link, PeerSettings, Timers
 
-PATHS: Final = (AT_A, AT_A, ELSEWHERE, (0, "2001:db8::9", 5))
+PATHS: Final = (AT_A, AT_A, ELSEWHERE, Path(0, ("2001:db8::9", 5, 0, 0)))
 CHECKS_THE_SEQUEL: Final = 0xE0
 _LIVELY = Timers()
 
@@ -41,13 +44,13 @@ class Insider:
         self.recorded: list[bytes] = []
         self.tokens: list[bytes] = [bytes(8)]
         self.echoes: list[int] = [0]
-        self._chance = Chance(77)
+        self._random_state = SeededEntropy(77)
         self._to_bravo = MacKeys(KEY_B.public)
 
-    # What it does.
+    # The peer's actions.
 
     def step(self, script: Script) -> None:
-        """One thing that a script says."""
+        """One action of a script."""
         what = script.byte()
         match what & 15:
             case 0 | 1 | 2:
@@ -64,7 +67,9 @@ class Insider:
                 if self.recorded:
                     self._offer(self.recorded[script.word() % len(self.recorded)], what)
             case 9:
-                self._take(self.node.send("alpha", [FRAME] * (script.byte() & 7), self.now), None)
+                self._take(self.node.send(self.peer, [FRAME] * (script.byte() & 7), self.now), None)
+                refused = Refused(script.byte(), 0, 2, script.long())
+                self._take(self.node.report_refusals(self.peer, [refused], self.now), None)
             case 10:
                 self.call(script.byte(), what, self.link)
             case 11:
@@ -76,26 +81,24 @@ class Insider:
                 self._offer(self._seal(self._record(script), script, what | 0x80), what)
 
     def call(self, generation: int, what: int, link: Link) -> Session | None:
-        """A sound handshake; the session if there was an answer."""
+        """An honest handshake; the session if there was an answer."""
         bravo = PeerSettings("bravo", KEY_B.public, None, link)
-        index = 1 + int.from_bytes(self._chance(2), "big") % 65535
-        initiated = handshake.initiate(KEY_A, bravo, index, generation, self._chance)
+        index = 1 + int.from_bytes(self._random_state(2), "big") % 65535
+        initiated = handshake.initiate(KEY_A, bravo, index, generation, self._random_state)
         outputs = self._offer(self._to_bravo.add_macs(initiated.message, None), what)
         for sent in of(outputs, Transmit):
             if sent.datagram[0] != wire.RESPONSE:
                 continue
             response = wire.parse_response(sent.datagram)
             keys = handshake.receive_response(initiated, response)
-            session = Session(
-                self.pair.a.peer, response.suite, keys, index, self.now, c.REJECT_AFTER_S, is_initiator=True
-            )
+            session = Session(response.suite, keys, index, self.now, c.REJECT_AFTER_S, is_initiator=True)
             self.sessions.append(session)
             del self.sessions[:-8]
             return session
         return None
 
     def _record(self, script: Script) -> bytes:
-        """A control record that is one, or nearly."""
+        """A valid or nearly valid control record."""
         which = script.byte()
         token = self.echoes[which >> 4 & 3 & (len(self.echoes) - 1)]
         match which & 7:
@@ -113,11 +116,17 @@ class Insider:
                 return wire.PathResponse(script.take(8).ljust(8, b"\0")).encode()
             case 6:
                 return wire.Close().encode()
+            case 7 if which & 8:
+                entries = tuple(
+                    Refused(script.word() << 8 | script.byte(), script.word(), script.byte(), script.long())
+                    for _ in range(1 + (script.byte() & 15))
+                )
+                return RefusalReport(entries).encode()
             case _:
                 return bytes((script.byte() % wire.FRAMES_FROM,)) + script.take(script.byte() & 31)
 
     def _seal(self, payload: bytes, script: Script, what: int) -> bytes:
-        """An envelope around anything; sometimes on an older session, or under a counter of its choice."""
+        """An envelope around any bytes; sometimes on an older session, or with a counter of its choice."""
         session = self.sessions[-1]
         if what & 0x80:
             how = script.byte()
@@ -136,7 +145,7 @@ class Insider:
         return datagram
 
     def _pass(self, seconds: float) -> None:
-        """Time goes by, and the victim's timers run."""
+        """Time passes, and the victim's timers run."""
         until = self.now + seconds
         for _ in range(12):
             due = self.node.next_deadline()
@@ -147,15 +156,19 @@ class Insider:
         self.now = until
         self._take(self.node.handle_timeout(self.now), None)
 
-    # What must hold.
+    # Properties.
 
     def _offer(self, datagram: bytes, what: int) -> list[Output]:
         path = PATHS[what >> 5 & 3]
         TALLY.add(datagram)
         before = self.peer.path
         outputs = self.node.receive(datagram, path, self.now)
-        unproven = [each.datagram for each in of(outputs, Transmit) if each.path not in (before, self.peer.path)]
-        assert all(each.path in (path, before, self.peer.path) for each in of(outputs, Transmit)), "sent elsewhere"
+        unproven = [
+            output.datagram for output in of(outputs, Transmit) if output.path not in (before, self.peer.path)
+        ]
+        assert all(output.path in (path, before, self.peer.path) for output in of(outputs, Transmit)), (
+            "sent elsewhere"
+        )
         assert sum(map(len, unproven)) <= len(datagram), "more bytes to an unproven address than came from there"
         self._take(outputs, path)
         return outputs
@@ -166,7 +179,7 @@ class Insider:
             if type(out) is Transmit:
                 self._see(out)
             elif type(out) is Deliver:
-                assert out.peer == "alpha", "delivered in another's name"
+                assert out.peer is self.peer, "delivered for another peer"
                 assert out.payload[0] >= wire.FRAMES_FROM, "a control record was delivered"
                 self.delivered[out.payload] += 1
                 assert self.delivered[out.payload] <= self.sealed[out.payload], "delivered more often than sent"
@@ -175,13 +188,13 @@ class Insider:
         assert refused <= (path is not None), f"one datagram, {refused} drops"
 
     def _see(self, sent: Transmit) -> None:
-        """Learn from what the victim says what an honest peer would learn."""
+        """Read from the victim's outputs what an honest peer would read."""
         if sent.datagram[0] not in (wire.SHORT_ENVELOPE, wire.LONG_ENVELOPE):
             return
-        index, counter, header_bytes = wire.parse_envelope_header(sent.datagram)
+        index, _, _ = wire.parse_envelope_header(sent.datagram)
         for session in self.sessions:
             if session.local_index == index:
-                payload = session._receive.open(sent.datagram, header_bytes, counter)
+                payload = unsealed(session, sent.datagram)
                 if payload and payload[0] < wire.FRAMES_FROM:
                     self._learn(wire.parse_control(payload))
 
@@ -195,18 +208,20 @@ class Insider:
         peer, sessions = self.peer, self.peer.sessions
         assert len(sessions.confirmed) <= c.USABLE_PER_PEER, "too many sessions"
         assert len(sessions.unconfirmed) <= c.UNCONFIRMED_PER_PEER, "too many unconfirmed sessions"
-        assert len(peer.caller.pending) <= c.PENDING_PER_PEER, "too many initiations"
-        owned = len(sessions.confirmed) + len(sessions.unconfirmed) + len(peer.caller.pending)
-        assert len(self.node._indices.owners) == owned, "an index that nobody owns"
+        assert len(peer.initiator.pending) <= c.PENDING_PER_PEER, "too many initiations"
+        owned = len(sessions.confirmed) + len(sessions.unconfirmed) + len(peer.initiator.pending)
+        assert len(self.node._indices.owners) == owned, "an index without an owner"
         assert len(peer.remembered) == len(self.node._remembered) <= c.REMEMBERED_INITIATIONS
-        assert len(peer._age._questions) <= 64, "too many echo requests"
+        assert len(peer.echo_requests) <= 64, "too many echo requests"
+        assert len(peer.refusal_claims.recent()) <= c.REFUSALS_KEPT, "too many claims"
+        assert len(peer.own_refusals._totals) <= c.REFUSALS_KEPT, "too many refusals"
         for session in sessions.confirmed:
-            doubt = session.doubt
-            assert doubt._held_bytes <= c.HELD_BYTES or len(doubt._held) == 1, "too much is held"
-            assert len(session._heard_lately._steps) <= 16, "too many steps"
+            held = session.held
+            assert held.size <= c.HELD_BYTES or len(held._frames) == 1, "too much is held"
+            assert len(session._received_history._steps) <= 16, "too many steps"
 
     def check_sequel(self) -> None:
-        """Whatever it did: after a while an honest handshake gives a link that carries frames both ways."""
+        """After any script, an honest handshake later makes a link that carries frames in both directions."""
         self._pass(c.REJECT_AFTER_S)
         session = self.call(0, 0, self.link)
         assert session is not None, "no answer to an honest handshake"
@@ -217,11 +232,11 @@ class Insider:
             before = self.delivered[FRAME]
             self._offer(session.seal(payload, self.now), 0)
         assert self.delivered[FRAME] == before + 1, "a frame on a new session was not delivered"
-        outputs = self.node.send("alpha", [FRAME], self.now)
-        (envelope,) = (each.datagram for each in of(outputs, Transmit))
-        index, counter, header_bytes = wire.parse_envelope_header(envelope)
+        outputs = self.node.send(self.peer, [FRAME], self.now)
+        (envelope,) = (output.datagram for output in of(outputs, Transmit))
+        index, _, _ = wire.parse_envelope_header(envelope)
         assert index == session.local_index
-        assert session._receive.open(envelope, header_bytes, counter) == FRAME, "a frame that cannot be opened"
+        assert unsealed(session, envelope) == FRAME, "a frame that cannot be opened"
 
 
 def make_sealed() -> Run:
@@ -244,7 +259,7 @@ def make_sealed() -> Run:
 
 
 def sealed_seeds() -> list[bytes]:
-    """Each kind of step; doubts, closes and roaming among them."""
+    """Each kind of step, including doubts, closes and roaming."""
     every = b"".join(
         bytes((kind | path << 5, record, 1, 2, 3, 4, 5))
         for path in range(3)
@@ -254,6 +269,8 @@ def sealed_seeds() -> list[bytes]:
     doubt = bytes((6, 200, 3, 5, 1, 2, 3, 4, 5, 4, 0x31, 0, 0, 0, 6, 30, 4, 0x31, 255, 255, 255))
     calls = bytes((10, 0) * 8 + (6, 64) + (10, 0) * 4 + (6, 64)) + bytes((10, 0) * 4 + (6, 64)) * 3
     roaming = bytes((12 | 0x40, 5, 4 | 0x40, 4, 9, 3, 12, 9, 2, 10, 1, 12, 4, 6, 7, 255))
+    reports = b"".join(bytes((4, 15, 15)) + Random(number).randbytes(160) for number in range(8))
     parts = [every[at : at + len(every) // 4] for at in range(0, len(every), len(every) // 4)]
-    found = [bytes((CHECKS_THE_SEQUEL | link,)) + part for link, part in enumerate(parts)]
-    return [*found, bytes((CHECKS_THE_SEQUEL,)) + doubt * 6 + roaming * 4, bytes((0,)) + calls, bytes((1,)) + doubt]
+    shares = [bytes((CHECKS_THE_SEQUEL | link,)) + part for link, part in enumerate(parts)]
+    shares.append(bytes((CHECKS_THE_SEQUEL,)) + reports)
+    return [*shares, bytes((CHECKS_THE_SEQUEL,)) + doubt * 6 + roaming * 4, bytes((0,)) + calls, bytes((1,)) + doubt]

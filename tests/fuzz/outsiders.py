@@ -1,9 +1,9 @@
-"""Datagrams from who holds no key of the two peers: to a node before a handshake, during one, and on a session.
+"""Datagrams of a sender without keys of the two peers: to a node before a handshake, during one, and on a session.
 
-The attacker has recorded what went by. It sends that, altered, and anything else, from any address; where it knows
-the victim's public key it repairs ``mac1``, and proves its address with the cookies that it gets. For every datagram:
-nothing is emitted, but a cookie to who repaired ``mac1``; exactly one drop is counted. After all of them the node is
-as it was, and what it waited for still works.
+The attacker has recorded the traffic. It sends altered copies, and any other bytes, from any address. If it knows
+the victim's public key, it repairs ``mac1`` and proves its address with the cookies that it gets. For every
+datagram the node counts exactly one drop, and sends only a cookie to a sender with a valid ``mac1``. Afterwards the
+node is unchanged, and what it waited for still works.
 """
 
 from __future__ import annotations
@@ -34,15 +34,17 @@ from uavlinkd.core.cookie import MacKeys, mac1_of
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.limits import TokenBucket
 from uavlinkd.core.node import Node
-from uavlinkd.core.outputs import Dropped, Output, Path, SessionEstablished, Transmit
+from uavlinkd.core.outputs import Dropped, Output, SessionEstablished, Transmit
+from uavlinkd.core.path import Path
 from uavlinkd.core.suites import SUITES, SUITES_BY_NAME
 
 CHECKS_THE_SEQUEL: Final = 0xF0
-"""In a script's first byte, all of them: afterwards the genuine datagram comes, and the link must work."""
+"""Set in a script's first byte. Then the genuine datagram follows at the end, and the link must work."""
 BUDGET: Final = 8
 """Handshake messages of a script that reach a key exchange."""
 _SPENT = ONLY_COUNTED | {"_cookied", "_sources"}
-_SPENT_WITH_COOKIES = _SPENT | {"_taken_cookies", "has_cookie", "retry_at", "cookies_taken", "deadline", "_deadline"}
+_DEADLINES = {"deadlines", "next_at", "scheduled_at", "_heap", "_pushed"}
+_SPENT_WITH_COOKIES = _SPENT | {"_received_cookies", "has_cookie", "retry_at", "cookies_taken", *_DEADLINES}
 _KINDS = (*range(1, 4), 0x40, 0x41, 0xFD, 0xFE, 0)
 _HANDSHAKE_SIZES = tuple(
     size(suite) for suite in SUITES.values() for size in (wire.initiation_bytes, wire.response_bytes)
@@ -52,27 +54,27 @@ _REPAIRED = (wire.INITIATION, wire.RESPONSE)
 
 
 class Outsider:
-    """Runs scripts against one stage, which is as before after each."""
+    """Runs scripts against one stage, which each script leaves unchanged."""
 
     def __init__(self, stage: Stage) -> None:
         self._stage = stage
         self._node = stage.victim.node
-        self._receivers = tuple(MacKeys(each) for each in stage.public_keys)
-        self._cookies: dict[Path, bytes] = {}  # that the victim gave, to whoever asked from there
-        self._chance = 0
-        # As they are, these are no forgeries. mac2 means nothing until the node is under load.
+        self._receivers = tuple(MacKeys(key) for key in stage.public_keys)
+        self._cookies: dict[Path, bytes] = {}  # from the victim, by the path of the request
+        self._random_state = 0
+        # Unaltered, these are genuine. mac2 has no effect until the node is under load.
         self._genuine = {*(stage.genuine, *stage.others)}
-        self._genuine |= {each[: -c.MAC_BYTES] for each in self._genuine if each[0] in _REPAIRED}
+        self._genuine |= {datagram[: -c.MAC_BYTES] for datagram in self._genuine if datagram[0] in _REPAIRED}
         self._copy = copier(stage.pair)
         self._take_pictures()
 
     def run(self, script: Script, *, checks_the_sequel: bool) -> None:
-        """Offer every datagram of a script, then look at what is left."""
+        """Send every datagram of a script, then check the node."""
         stage = self._stage
         receive, genuine, sources, cookies = self._node.receive, self._genuine, stage.sources, stage.cookies
         reasons: list[DropReason] = []
         cookies_taken = 0
-        self._chance = zlib.crc32(script.data)
+        self._random_state = zlib.crc32(script.data)
         self._cookies.clear()
         now = stage.now
         self._reset()
@@ -90,7 +92,7 @@ class Outsider:
             elif not outputs and datagram in cookies:
                 cookies_taken += 1
             else:
-                assert is_repaired, f"a stranger who knows no key got {outputs}"
+                assert is_repaired, f"a stranger without a key got {outputs}"
                 reasons.append(self._judge_cookie(outputs, datagram, path))
         counted = Counter(self._node.drops)
         for peer in self._node.peers.values():
@@ -108,7 +110,7 @@ class Outsider:
             self._restore()
 
     def _datagram(self, script: Script, how: int, cookie: bytes | None) -> tuple[bytes, bool]:
-        """The next datagram, and whether its sender made it with the victim's public key."""
+        """The next datagram, and whether its sender used the victim's public key."""
         match how & 7:
             case 0 | 1 | 2 | 3 as kind:
                 return self._altered(script, cookie, is_varied=kind > 0)
@@ -122,17 +124,17 @@ class Outsider:
                 return script.take(script.byte() & 63), False
 
     def _altered(self, script: Script, cookie: bytes | None, *, is_varied: bool) -> tuple[bytes, bool]:
-        """One of the recorded datagrams with a few bytes changed, cut or longer, with its macs made right or not.
+        """One of the recorded datagrams with a few bytes changed, truncated or longer, with valid macs or not.
 
-        ``is_varied``: one byte more, chosen by the whole script, so that a script with one change in it does not
-        offer the same datagrams again but for one.
+        ``is_varied``: changes one more byte, chosen by the whole script, so that a script with one change changes all
+        its other datagrams too.
         """
         templates = self._stage.templates
         what = script.byte()
         altered = bytearray(templates[(what >> 4) % len(templates)])
         if is_varied:
-            self._chance = (self._chance * 1103515245 + 12345) & 0xFFFFFFFF
-            altered[(self._chance >> 8) % len(altered)] ^= 1 + (self._chance >> 24) % 255
+            self._random_state = (self._random_state * 1103515245 + 12345) & 0xFFFFFFFF
+            altered[(self._random_state >> 8) % len(altered)] ^= 1 + (self._random_state >> 24) % 255
         for _ in range(1 + (what & 3)):
             if altered:
                 altered[script.word() % len(altered)] ^= script.byte()
@@ -148,7 +150,7 @@ class Outsider:
         return datagram, False
 
     def _of_right_length(self, script: Script) -> bytes:
-        """A handshake message or cookie of which nothing but the length is right."""
+        """A handshake message or cookie of which only the length is right."""
         what = script.byte()
         kind = 1 + what % 3
         if kind == wire.COOKIE:
@@ -158,7 +160,7 @@ class Outsider:
         return (bytes((kind, suite.number)) + script.take(script.byte() & 31)).ljust(size, b"\7")[:size]
 
     def _judge_cookie(self, outputs: Sequence[Output], datagram: bytes, path: Path) -> DropReason:
-        """The only answer that who knows the public key may get: a cookie, to itself, no longer than the question."""
+        """The only answer to a sender that knows the public key: a cookie, to itself, no longer than its message."""
         assert len(outputs) == 2, f"more than a cookie: {outputs}"
         sent, dropped = outputs
         assert isinstance(sent, Transmit), f"more than a cookie: {outputs}"
@@ -166,16 +168,16 @@ class Outsider:
         assert dropped.reason is DropReason.COOKIE_REQUIRED
         assert sent.datagram[0] == wire.COOKIE
         assert sent.path == path, "a cookie went elsewhere"
-        assert len(sent.datagram) <= len(datagram), "an answer longer than its question"
+        assert len(sent.datagram) <= len(datagram), "an answer longer than its message"
         reply, mac1 = wire.parse_cookie_reply(sent.datagram), mac1_of(datagram)
         for receiver in self._receivers:
             with suppress(Drop):
                 self._cookies[path] = receiver.open_cookie(reply, mac1)
                 return dropped.reason
-        raise AssertionError("a cookie that nobody can open")
+        raise AssertionError("a cookie that does not open")
 
     def _check_sequel(self, now: float) -> None:
-        """What the victim waits for comes, at last: it completes, and frames cross both ways."""
+        """The expected datagram arrives at last: it completes, and frames cross in both directions."""
         stage = self._stage
         victim, other = stage.victim, stage.other
         _refill(victim.node, now)
@@ -187,11 +189,11 @@ class Outsider:
         assert stage.pair.carries(now), "the link does not carry frames any more"
 
     def _reset(self) -> None:
-        """What a run may spend and count."""
+        """Save what a run may spend and count."""
         _refill(self._node, self._stage.now)
 
     def _restore(self) -> None:
-        """The stage as it was."""
+        """Restore the stage."""
         self._stage.pair = self._copy()
         self._node = self._stage.victim.node
         self._take_pictures()
@@ -203,7 +205,7 @@ class Outsider:
 
 
 def _refill(node: Node, now: float) -> None:
-    """Budgets as at the beginning, and no drops. Small ones, so that scripts come to where cookies are asked for."""
+    """Full budgets, and no drops. The budgets are small, so that scripts reach requests for cookies."""
     node._admission._initiations = TokenBucket(1.0, BUDGET, now)
     node._admission._responses = TokenBucket(1.0, BUDGET, now)
     node.drops.clear()
@@ -212,7 +214,7 @@ def _refill(node: Node, now: float) -> None:
 
 
 def _make(stages: Callable[[], Sequence[Stage]]) -> Run:
-    outsiders = [Outsider(each) for each in stages()]
+    outsiders = [Outsider(stage) for stage in stages()]
 
     def run(data: bytes) -> None:
         script = Script(data)
@@ -236,13 +238,13 @@ def make_idle() -> Run:
 
 
 def make_initiator() -> Run:
-    """While an initiation of its own waits for the response."""
+    """While its initiation waits for the response."""
     links = (LINKS[0], with_suite(LINKS[0], SUITES_BY_NAME["mlkem768"]))
     return _make(lambda: [*(initiator(link) for link in links), initiator(LINKS[0], PSK)])
 
 
 def make_responder() -> Run:
-    """While an answer of its own waits to be confirmed."""
+    """While its response waits for confirmation."""
     return _make(lambda: [responder(LINKS[0]), responder(LINKS[3]), responder(LINKS[0], PSK)])
 
 
@@ -252,16 +254,16 @@ def make_session() -> Run:
 
 
 def seeds() -> list[bytes]:
-    """Some of each kind: every recorded datagram with a byte changed here and there."""
-    found = []
+    """Some of each kind: every recorded datagram with a byte changed in different places."""
+    result = []
     for stage in range(5):
         steps = bytearray((CHECKS_THE_SEQUEL | stage,))
         for template in range(8):
             for place in (0, 1, 3, 5, 8, 20, 60, 118):
                 how, what = (place & 3) << 4 | place & 1, template << 4 | (8 if place & 1 else 0)
                 steps += bytes((how, what, 0, place, 1 << (place & 7)))
-        found.append(bytes(steps))
+        result.append(bytes(steps))
     kinds = b"".join(
         bytes((how, kind, size)) + bytes(range(size)) for how in (4, 5, 6, 7) for kind in range(8) for size in (0, 40)
     )
-    return [*found, b"\xf0" + kinds, b"\x01" + kinds]
+    return [*result, b"\xf0" + kinds, b"\x01" + kinds]

@@ -1,7 +1,7 @@
-"""Bugs of every class, planted on purpose: a fuzz run that finds none of them proves nothing.
+"""Planted faults of every class: a fuzz run proves something only if it finds them.
 
-Each changes one thing of the product, in this process, and says which target must find it. ``put`` plants it and
-returns what takes it out again.
+Each changes one thing of the package, in this process, and names the target that must find it. ``put`` plants it and
+returns a function that removes it.
 """
 
 from __future__ import annotations
@@ -13,36 +13,50 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
-from uavlinkd.config import keys
-from uavlinkd.ops import control, metrics_server
 from uavlinkd.config import checks as config_checks
+from uavlinkd.config import keys
 from uavlinkd.config import load as config_load
-from uavlinkd.core import initiator as caller, cookie, freshness, handshake, peer, replay, session, sessions, wire
+from uavlinkd.core import constants as c
+from uavlinkd.core import (
+    cookie,
+    handshake,
+    initiator,
+    receive,
+    refusals,
+    replay,
+    send,
+    session,
+    sessions,
+    verification,
+    wire,
+)
 from uavlinkd.core import node as core_node
-from uavlinkd.core.drops import Drop
+from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.outputs import Deliver, Transmit
-from uavlinkd.mavlink import frames, routing
-from uavlinkd.mavlink.policy import gate
 from uavlinkd.lab.mitm import anatomy
 from uavlinkd.lab.mitm import proxy_settings as mitm_settings
 from uavlinkd.lab.sim import tlog
+from uavlinkd.mavlink import frames, routing, stream_splitter
+from uavlinkd.mavlink.headers import Header
+from uavlinkd.mavlink.policy import gate
+from uavlinkd.ops import control, metrics_server
 
 Undo = Callable[[], None]
 
 
 @dataclass(frozen=True, slots=True)
 class Plant:
-    """One bug."""
+    """One fault."""
 
     target: str
     about: str
     place: Any
     name: str
     wrong: Callable[[Any], Any]
-    """Gives the wrong thing for the right one."""
+    """Returns a faulty replacement for the original."""
 
     def put(self) -> Undo:
-        """Plant it; call the result to take it out."""
+        """Plant it; call the result to remove it."""
         right = self.place.__dict__[self.name]
         setattr(self.place, self.name, self.wrong(right))
         return lambda: setattr(self.place, self.name, right)
@@ -80,16 +94,18 @@ def _counts_twice(right: Any) -> Any:
 
 def _marks_first(right: Any) -> Any:
     def open_(self: Any, datagram: bytes, header_bytes: int, counter: int, now: float) -> Any:
-        self.window.check(counter)
-        payload = self._receive.open(datagram, header_bytes, counter)
-        self.window.mark(counter)  # also where the tag was bad
-        return right(self, datagram, header_bytes, counter, now) if payload is None else payload
+        try:
+            return right(self, datagram, header_bytes, counter, now)
+        except Drop as drop:
+            if drop.reason is DropReason.BAD_TAG:
+                self.window.mark(counter)
+            raise
 
     return open_
 
 
 def _without_tag(right: Any) -> Any:
-    return lambda self, datagram, header_bytes, counter: datagram[header_bytes : -self.tag_bytes]
+    return lambda computed, received: True
 
 
 def _wedged_by_a_bad_response(right: Any) -> Any:
@@ -104,11 +120,11 @@ def _wedged_by_a_bad_response(right: Any) -> Any:
 
 
 def _remembers_strangers(right: Any) -> Any:
-    def _hint(self: Any, path: Any, now: float, out: Any) -> Any:
-        self._by_address.setdefault((path[1], path[2]), None)
-        return right(self, path, now, out)
+    def receive_stray(self: Any, datagram: bytes, index: int, path: Any, now: float) -> Any:
+        self._by_address.setdefault(path.address, None)
+        return right(self, datagram, index, path, now)
 
-    return _hint
+    return receive_stray
 
 
 def _delivers_held_twice(right: Any) -> Any:
@@ -120,72 +136,72 @@ def _delivers_held_twice(right: Any) -> Any:
 
 
 def _delivers_control(right: Any) -> Any:
-    def receive_control(self: Any, session_: Any, control_: Any, path: Any, now: float, out: Any) -> Any:
-        if isinstance(control_, wire.PathResponse):
-            out.append(Deliver(self.name, control_.encode()))
-        return right(self, session_, control_, path, now, out)
+    def receive_control(peer: Any, session_: Any, payload: bytes, path: Any, now: float, *, is_new: bool) -> Any:
+        is_response = payload[0] == wire.PATH_RESPONSE and len(payload) == 1 + c.PATH_TOKEN_BYTES
+        delivered = [Deliver(peer, payload)] if is_response else []
+        return delivered + right(peer, session_, payload, path, now, is_new=is_new)
 
     return receive_control
 
 
 def _trusts_paths(right: Any) -> Any:
-    def challenge_path(self: Any, session_: Any, path: Any, size: int, now: float, out: Any) -> Any:
-        self._seal(session_, bytes((wire.ECHO_REQUEST,)) + bytes(60), path, now, out)
+    def challenge(peer: Any, session_: Any, path: Any, size: int, now: float) -> Any:
+        return send.seal(peer, session_, bytes((wire.ECHO_REQUEST,)) + bytes(60), path, now)
 
-    return challenge_path
+    return challenge
 
 
 def _bad_crc_passes(right: Any) -> Any:
-    def frame_at(data: bytes, position: int, size: int, *, is_expected: bool) -> Any:
-        found = right(data, position, size, is_expected=is_expected)
-        if found is frames.FrameFault.BAD_CRC and is_expected:
-            end = position + frames._length_of_frame(data, position)
-            msgid = (
-                data[position + 5]
-                if data[position] == 0xFE
-                else int.from_bytes(data[position + 7 : position + 10], "little")
-            )
-            at = 3 if data[position] == 0xFE else 5
-            return frames.Frame(
-                data[position:end],
-                frames.Header(
-                    msgid, data[position + at], data[position + at + 1], is_mavlink1=data[position] == 0xFE
-                ),
-            )
-        return found
+    def parse_frames(data: bytes, position: int, result: Any, counters: Any, *, is_expected: bool) -> Any:
+        at, fault = right(data, position, result, counters, is_expected=is_expected)
+        if fault is not frames.FrameFault.BAD_CRC or not (is_expected or at > position):
+            return at, fault
+        raw = data[at : at + frames._length_of_frame(data, at)]
+        is_mavlink1 = raw[0] == 0xFE
+        msgid = raw[5] if is_mavlink1 else int.from_bytes(raw[7:10], "little")
+        system, component = raw[3:5] if is_mavlink1 else raw[5:7]
+        result.append(frames.Frame(raw, Header(msgid, system, component, is_mavlink1=is_mavlink1)))
+        counters.frames += 1
+        return parse_frames(data, at + len(raw), result, counters, is_expected=True)
 
-    return frame_at
+    return parse_frames
 
 
 def _holds_everything(right: Any) -> Any:
-    def scan(self: Any, data: bytes, found: Any, *, is_final: bool) -> Any:
+    def scan(self: Any, data: bytes, result: Any, *, is_final: bool) -> Any:
         if not is_final and len(data) > 600:
             self._rest = data
             return None
-        return right(self, data, found, is_final=is_final)
+        return right(self, data, result, is_final=is_final)
 
     return scan
+
+
+def _keeps_every_claim(_: Any) -> Any:
+    def note(claims: refusals.RefusalClaims, report: refusals.RefusalReport, now: float) -> None:
+        claims._claims.update({refused[:3]: refusals.Claim(refused, now) for refused in report.entries})
+
+    return note
 
 
 def _waits_beside_all(right: Any) -> Any:
     def wait(self: Any, unconfirmed: Any) -> None:
         index = unconfirmed.session.local_index
         self.unconfirmed[index] = unconfirmed
-        self._indices.owners[index] = unconfirmed.session
 
     return wait
 
 
-def _learns_for_ever(right: Any) -> Any:
+def _learns_indefinitely(right: Any) -> Any:
     def learn(self: Any, port: Any, address: Any) -> None:
-        self._heard_at[port].setdefault(address, 0.0)
+        self._received_at[port].setdefault(address, 0.0)
         self._ports_of.setdefault(address[0], {}).setdefault(address[1], set()).add(port)
         self._forget_decisions()
 
     return learn
 
 
-def _remembers_for_ever(right: Any) -> Any:
+def _remembers_indefinitely(right: Any) -> Any:
     def remember(self: Any, key: int, verdict: Any) -> Any:
         self._decisions[key] = verdict
         return verdict
@@ -195,7 +211,9 @@ def _remembers_for_ever(right: Any) -> Any:
 
 def _blind_look_up(right: Any) -> Any:
     def names(problems: Any, sections: Any) -> Any:
-        assert len({each.good["name"] for each in sections}) >= 0  # a KeyError where a name is missing or wrong
+        assert (
+            len({section.valid["name"] for section in sections}) >= 0
+        )  # a KeyError where a name is missing or wrong
         return right(problems, sections)
 
     return names
@@ -210,11 +228,11 @@ def _back_to_sender(right: Any) -> Any:
 
 
 def _raises(error: Exception, of: Callable[[Any], bool]) -> Callable[[Any], Any]:
-    """Raises where the first argument that is bytes, text or a mapping has something about it."""
+    """Raises if the first argument that is bytes, text or a mapping meets a condition."""
 
     def wrong(right: Any) -> Any:
         def planted(*arguments: Any, **named: Any) -> Any:
-            if any(of(each) for each in arguments if isinstance(each, bytes | str | dict)):
+            if any(of(argument) for argument in arguments if isinstance(argument, bytes | str | dict)):
                 raise error
             return right(*arguments, **named)
 
@@ -227,15 +245,13 @@ PLANTS: Final = {
     "answers strangers": Plant(
         "idle", "a bare MAVLink frame is answered", core_node.Node, "receive", _answers_strangers
     ),
-    "index error": Plant(
-        "session", "a length that nobody thought of", core_node.Node, "receive", _index_error_at(43)
-    ),
+    "index error": Plant("session", "an unexpected length", core_node.Node, "receive", _index_error_at(43)),
     "two reasons": Plant("initiator", "a drop that is counted twice", core_node.Node, "receive", _counts_twice),
     "no mac1": Plant(
-        "idle", "mac1 is not looked at", cookie.MacKeys, "check_mac1", lambda _: lambda self, datagram: None
+        "idle", "mac1 is not checked", cookie.MacKeys, "check_mac1", lambda _: lambda self, datagram: None
     ),
-    "tag off": Plant("session", "any tag will do", session.Authenticated, "open", _without_tag),
-    "tag off, confirmation": Plant("responder", "any tag confirms", session.Authenticated, "open", _without_tag),
+    "tag off": Plant("session", "any tag is accepted", session, "equal", _without_tag),
+    "tag off, confirmation": Plant("responder", "any tag confirms", session, "equal", _without_tag),
     "marked before the tag": Plant("session", "forgeries use up counters", session.Session, "open", _marks_first),
     "replay window off": Plant(
         "sealed", "an envelope is accepted twice", replay.ReplayWindow, "check", lambda _: lambda self, counter: None
@@ -243,19 +259,26 @@ PLANTS: Final = {
     "wedged": Plant(
         "initiator",
         "a forged response ends the handshake",
-        caller.Caller,
+        initiator.Initiator,
         "receive_response",
         _wedged_by_a_bad_response,
     ),
-    "a table of strangers": Plant("idle", "unbounded memory", core_node.Node, "_hint", _remembers_strangers),
+    "a table of strangers": Plant("idle", "unbounded memory", core_node.Node, "_receive_stray", _remembers_strangers),
     "unbounded sessions": Plant(
-        "sealed", "unconfirmed sessions pile up", sessions.Sessions, "wait", _waits_beside_all
+        "sealed", "unconfirmed sessions accumulate", sessions.Sessions, "wait", _waits_beside_all
     ),
-    "delivered twice": Plant("sealed", "what waited comes twice", freshness.Doubt, "end", _delivers_held_twice),
+    "unbounded claims": Plant(
+        "sealed", "claims of refusals accumulate", refusals.RefusalClaims, "note", _keeps_every_claim
+    ),
+    "delivered twice": Plant(
+        "sealed", "held frames are delivered twice", verification.HeldFrames, "release", _delivers_held_twice
+    ),
     "control delivered": Plant(
-        "sealed", "a record passes for a frame", peer.Peer, "_receive_control", _delivers_control
+        "sealed", "a record passes for a frame", receive, "_receive_control", _delivers_control
     ),
-    "amplifies": Plant("sealed", "more to an unproven place than came", peer.Peer, "_challenge_path", _trusts_paths),
+    "amplifies": Plant(
+        "sealed", "more bytes to an unproven address than received", receive, "challenge", _trusts_paths
+    ),
     "header not compared": Plant(
         "handshakes",
         "the header in clear may lie",
@@ -264,9 +287,9 @@ PLANTS: Final = {
         lambda _: lambda payload, header: wire.parse_parameters(payload[len(header) - 1 :]),
     ),
     "any parameters": Plant("handshakes", "a tag of any length", wire, "TAG_LENGTHS", lambda _: range(256)),
-    "bad checksum": Plant("stream", "a frame with a bad checksum passes", frames, "_frame_at", _bad_crc_passes),
+    "bad checksum": Plant("stream", "a frame with a bad checksum passes", frames, "parse_frames", _bad_crc_passes),
     "unbounded buffer": Plant(
-        "stream", "more is held than a frame", frames.StreamSplitter, "_scan", _holds_everything
+        "stream", "more is held than a frame", stream_splitter.StreamSplitter, "_find", _holds_everything
     ),
     "a byte lost": Plant(
         "frames",
@@ -277,24 +300,24 @@ PLANTS: Final = {
     ),
     "foreign system": Plant(
         "gate",
-        "system 3 may be spoken as by all",
+        "every client may send as system 3",
         gate.Gate,
         "_verdict",
         lambda right: lambda self, header: None if header.system == 3 else right(self, header),
     ),
     "back to its sender": Plant("switch", "a frame comes back", routing.Router, "_decide", _back_to_sender),
-    "unbounded routes": Plant("switch", "addresses pile up", routing.Router, "_learn", _learns_for_ever),
-    "unbounded counts": Plant("gate", "message ids pile up", gate.Gate, "_remember", _remembers_for_ever),
+    "unbounded routes": Plant("switch", "addresses accumulate", routing.Router, "_learn", _learns_indefinitely),
+    "unbounded counts": Plant("gate", "message ids accumulate", gate.Gate, "_remember", _remembers_indefinitely),
     "control escapes": Plant(
         "control",
         "text that is not ASCII ends it",
         control.ControlServer,
         "_respond",
-        _raises(KeyError(), lambda each: max(each, default=0) > 127),
+        _raises(KeyError(), lambda request: max(request, default=0) > 127),
     ),
     "metrics to anyone": Plant(
         "metrics",
-        "a response to what is no request",
+        "a response to an invalid request",
         metrics_server,
         "_REQUEST_LINE",
         lambda _: re.compile(rb"(\S*) (/[!-~]*).*"),
@@ -306,26 +329,22 @@ PLANTS: Final = {
         "config",
         "a message that quotes the file",
         config_load,
-        "_toml_problem",
+        "syntax_problem",
         lambda right: lambda path, text, error: right(path, text, error)._replace(message=text),
     ),
     "mitm settings": Plant(
         "mitm",
-        "a limit that nobody tried",
+        "an unusual limit",
         mitm_settings,
         "attack_from_table",
-        _raises(TypeError(), lambda each: isinstance(each, dict) and each.get("limit", 5) != 5),
+        _raises(TypeError(), lambda table: isinstance(table, dict) and table.get("limit", 5) != 5),
     ),
     "manifest": Plant(
-        "manifest",
-        "text that is not UTF-8",
-        tomllib,
-        "loads",
-        _raises(AttributeError(), lambda each: "{" in each),
+        "manifest", "text that is not UTF-8", tomllib, "loads", _raises(AttributeError(), lambda text: "{" in text)
     ),
     "two spellings of a key": Plant(
         "key",
-        "loose bits at the end",
+        "unused bits at the end",
         keys,
         "decode_key",
         lambda _: lambda text: base64.b64decode(text.strip().ljust(44, "="))[:32],

@@ -1,4 +1,4 @@
-"""Every fuzz target by its name: the entry points that take bytes or files from anybody."""
+"""Every fuzz target by its name: the entry points for bytes or files of other senders."""
 
 from __future__ import annotations
 
@@ -36,15 +36,15 @@ TARGETS: Final = {
         ),
         Target(
             "handshakes",
-            "handshake messages sealed correctly around anything, to both roles",
+            "handshake messages sealed correctly around any content, to both roles",
             handshakes.make,
             handshakes.seeds,
             512,
         ),
         Target(
-            "stream", "a program's MAVLink on a serial port or TCP, cut anywhere", frames.make_stream, frames.seeds
+            "stream", "a client's MAVLink on a serial port or TCP, cut anywhere", frames.make_stream, frames.seeds
         ),
-        Target("frames", "a program's datagrams, and a peer's payloads", frames.make_datagrams, frames.seeds),
+        Target("frames", "a client's datagrams, and a peer's payloads", frames.make_datagrams, frames.seeds),
         Target("gate", "frames at a policy", frames.make_gate, frames.seeds),
         Target(
             "switch", "frames from six ports through policies, router and switch", frames.make_switch, frames.seeds
@@ -81,8 +81,6 @@ TARGETS: Final = {
         Target("manifest", "a fleet's manifest", files.make_manifest, files.manifest_seeds, 4096, files.WORDS, True),
         Target("key", "a key file", files.make_key, files.key_seeds, 300),
         Target("tlog", "a recorded flight", files.make_tlog, files.tlog_seeds),
-        Target(
-            "anatomy", "a datagram as the man in the middle takes it apart", files.make_anatomy, files.anatomy_seeds
-        ),
+        Target("anatomy", "a datagram as the man in the middle parses it", files.make_anatomy, files.anatomy_seeds),
     )
 }

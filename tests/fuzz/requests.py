@@ -1,4 +1,4 @@
-"""What asks the daemon: the control socket's lines and Prometheus's HTTP, through the servers' own coroutines."""
+"""Requests to the daemon: the control socket's lines and Prometheus's HTTP, through the servers' own coroutines."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from functools import cache
 from pathlib import Path
 
 from tests.fuzz.engine import TALLY, Run
-from uavlinkd.system.addresses import Address
 from uavlinkd.ops.control import MAX_REQUEST_BYTES, ControlServer
 from uavlinkd.ops.metrics_server import MetricsServer
+from uavlinkd.system.addresses import Address
 
 KNOWN = ("status", "reload")
 _STATUSES = {200, 400, 404, 405, 421, 431}
 
 
 class Connection(asyncio.Transport):
-    """The server's end of a connection; what it writes is kept."""
+    """The server's end of a connection; it records the written bytes."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         super().__init__()
@@ -30,28 +30,28 @@ class Connection(asyncio.Transport):
         self.writer = asyncio.StreamWriter(self, protocol, self.reader, loop)
 
     def write(self, data: bytes | bytearray | memoryview) -> None:
-        """Keep it."""
+        """Record the bytes."""
         self.written += data
 
     def write_eof(self) -> None:
-        """Nothing more comes."""
+        """No more bytes follow."""
 
     def is_closing(self) -> bool:
         """Whether the server has closed it."""
         return self.is_closed
 
     def pause_reading(self) -> None:
-        """Nothing is read here."""
+        """Not needed here."""
 
     def resume_reading(self) -> None:
-        """Nothing is read here."""
+        """Not needed here."""
 
     def close(self) -> None:
-        """The server is done."""
+        """The server has finished."""
         self.is_closed = True
 
     def abort(self) -> None:
-        """The server gives up."""
+        """The server closes the connection early."""
         self.is_aborted = True
 
 
@@ -63,7 +63,7 @@ def _loop() -> asyncio.AbstractEventLoop:
 
 
 def _reader(data: bytes, limit: int, loop: asyncio.AbstractEventLoop) -> asyncio.StreamReader:
-    """The bytes, and then nothing more."""
+    """The bytes, and then the end of the stream."""
     reader = asyncio.StreamReader(limit=limit, loop=loop)
     reader.feed_data(data)
     reader.feed_eof()
@@ -71,7 +71,7 @@ def _reader(data: bytes, limit: int, loop: asyncio.AbstractEventLoop) -> asyncio
 
 
 def make_control() -> Run:
-    """One connection a script: it gets one line of JSON, and is closed; only what is known is asked."""
+    """One connection per script: the server answers one line of JSON and closes it; only known requests are asked."""
     loop = _loop()
     asked: list[str] = []
 
@@ -87,7 +87,7 @@ def make_control() -> Run:
         connection = Connection(loop)
         loop.run_until_complete(server._serve(_reader(data, MAX_REQUEST_BYTES, loop), connection.writer))
         assert connection.is_closed, "the connection was left open"
-        assert server._connections == 0, "a connection is counted that is gone"
+        assert server._connections == 0, "a closed connection is counted"
         line = data.partition(b"\n")[0]
         assert connection.written.endswith(b"\n")
         reply = json.loads(connection.written)
@@ -103,7 +103,7 @@ def make_control() -> Run:
 
 
 def make_metrics() -> Run:
-    """One connection a script: a well-formed answer or none; the content only to a request for it."""
+    """One connection per script: one well-formed answer or none; the content only for a request of it."""
     loop = _loop()
     server = MetricsServer(Address("127.0.0.1", 9000), lambda: b"metric 1\n", "text/plain")
 
@@ -112,7 +112,7 @@ def make_metrics() -> Run:
         connection = Connection(loop)
         loop.run_until_complete(server._serve(_reader(data, 8192, loop), connection.writer))
         assert connection.is_closed, "the connection was left open"
-        assert server._connections == 0, "a connection is counted that is gone"
+        assert not server._connections, "a closed connection is counted"
         if not connection.written:
             assert connection.is_aborted
             assert b"\r\n\r\n" not in data[:8192], "a request was not answered"
@@ -121,16 +121,16 @@ def make_metrics() -> Run:
         version, status, *_ = head.split(b" ")
         assert version == b"HTTP/1.1"
         assert int(status) in _STATUSES
-        assert head.count(b"\r\n") <= 7, "a header that was not written here"
+        assert head.count(b"\r\n") <= 7, "an injected header"
         if b"metric 1" in body:
-            assert data.startswith((b"GET /metrics ", b"GET /metrics?")), "content without being asked"
+            assert data.startswith((b"GET /metrics ", b"GET /metrics?")), "content without a request"
             assert int(status) == 200
 
     return run
 
 
 def control_seeds() -> list[bytes]:
-    """Requests that are known, and some that are not."""
+    """Known and unknown requests."""
     return [
         b"status\n",
         b"reload\n",
@@ -145,7 +145,7 @@ def control_seeds() -> list[bytes]:
 
 
 def metrics_seeds() -> list[bytes]:
-    """Requests as Prometheus makes them, and some that it does not."""
+    """Requests as Prometheus sends them, and some others."""
     return [
         b"GET /metrics HTTP/1.1\r\nHost: 127.0.0.1:9000\r\nAccept: */*\r\n\r\n",
         b"GET /metrics?x=1 HTTP/1.0\r\n\r\n",

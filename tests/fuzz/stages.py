@@ -1,4 +1,4 @@
-"""Nodes in the states in which datagrams find them, set up once and copied cheaply."""
+"""Nodes in the states in which they receive datagrams, created once and copied cheaply."""
 
 from __future__ import annotations
 
@@ -30,21 +30,20 @@ from uavlinkd.core.cookie import MacKeys, mac1_of
 from uavlinkd.core.crypto import AeadKey, KeyPair, MacKey, Secret
 from uavlinkd.core.node import Node
 from uavlinkd.core.noise import HandshakeState
-from uavlinkd.core.outputs import Path
-from uavlinkd.core.session import Authenticated, Confidential
+from uavlinkd.core.path import Path
 from uavlinkd.core.settings import Link, PeerSettings
 from uavlinkd.core.suites import SUITES_BY_NAME, Suite
 
 T = TypeVar("T")
 
 NOW: Final = 100.0
-"""When the scripts begin."""
+"""The time when the scripts start."""
 PSK: Final = Secret(bytes(range(32)))
 GROUPS: Final = tuple(SUITES_BY_NAME[name] for name in ("x25519", "mlkem768", "ffdhe2048"))
 
 
-class Chance:
-    """Entropy that is the same each time, and small enough to be copied."""
+class SeededEntropy:
+    """Reproducible entropy, small enough to be copied."""
 
     __slots__ = ("_drawn", "_seed")
 
@@ -53,64 +52,61 @@ class Chance:
         self._drawn = 0
 
     def __call__(self, size: int, /) -> bytes:
-        """As many bytes."""
+        """The next ``size`` bytes."""
         self._drawn += 1
         return hashlib.shake_128(self._seed + self._drawn.to_bytes(8, "big")).digest(size)
 
 
-_IMMUTABLE = (
-    *(KeyPair, MacKey, AeadKey, Secret, MacKeys, HandshakeState, Authenticated, Confidential),
-    *(PeerSettings, Link, Suite),
-)
-"""What a copy may share with the original. Most of these hold keys of OpenSSL's, which cannot be copied."""
+_IMMUTABLE = (*(KeyPair, MacKey, AeadKey, Secret, MacKeys, HandshakeState), *(PeerSettings, Link, Suite))
+"""Types that a copy shares with the original. Most contain keys of OpenSSL, which cannot be copied."""
 _NO_DATA = (type, ModuleType, FunctionType, BuiltinFunctionType, str, bytes, int, float)
 
 
 def copier(thing: T) -> Callable[[], T]:
-    """A function that gives deep copies of this, as it is now."""
+    """A function that returns deep copies of an object in its present state."""
     shared: dict[int, Any] = {}
     seen: set[int] = set()
     todo: list[Any] = [thing]
     while todo:
-        each = todo.pop()
-        if id(each) in seen or isinstance(each, _NO_DATA):
+        item = todo.pop()
+        if id(item) in seen or isinstance(item, _NO_DATA):
             continue
-        seen.add(id(each))
-        if isinstance(each, _IMMUTABLE):
-            shared[id(each)] = each
+        seen.add(id(item))
+        if isinstance(item, _IMMUTABLE):
+            shared[id(item)] = item
         else:
-            todo += gc.get_referents(each)
+            todo += gc.get_referents(item)
     original = copy.deepcopy(thing, dict(shared))
     return lambda: copy.deepcopy(original, dict(shared))
 
 
 @dataclass
 class Stage:
-    """A node that waits for what comes, and what an attacker has recorded of what went by."""
+    """A node that waits for datagrams, and the traffic that an attacker has recorded."""
 
     pair: Pair
     is_alpha: bool
-    """Whether alpha is the victim; else bravo."""
+    """Whether alpha is the victim; otherwise bravo is."""
     genuine: bytes
-    """What the victim waits for: the one datagram that may change anything."""
+    """The one datagram that the victim waits for, and that may change its state."""
     templates: tuple[bytes, ...]
     others: tuple[bytes, ...] = ()
-    """More that is genuine: as it is, it is no forgery."""
+    """Other genuine datagrams: unaltered, they are not forgeries."""
     now: float = NOW
-    sources: tuple[Path, ...] = (ELSEWHERE, AT_A, AT_B, (1, "2001:db8::7", 9))
+    sources: tuple[Path, ...] = (ELSEWHERE, AT_A, AT_B, Path(1, ("2001:db8::7", 9, 0, 0)))
     cookies: tuple[bytes, ...] = ()
-    """Cookie replies that fit: whoever sees the datagrams of two whose public keys it knows can make them."""
+    """Matching cookie replies: an attacker that sees the datagrams and knows both public keys can make them."""
     public_keys: tuple[bytes, ...] = ()
-    """The victim's: by these ``mac1`` is made right."""
+    """The victim's public keys, which make ``mac1`` valid."""
 
     def __post_init__(self) -> None:
-        """An envelope of no session comes from the peer's address: the victim calls, and not again for a second."""
+        """An envelope of no session arrives from the peer's address: the victim initiates, then waits a second."""
         self.public_keys = self.public_keys or (self.victim.node.public_key,)
         self.victim.receive(wire.envelope_header(UNUSED_INDEX, 0) + bytes(36), self.now)
 
     @property
     def victim(self) -> Side:
-        """The side that is fuzzed."""
+        """The side under test."""
         return self.pair.a if self.is_alpha else self.pair.b
 
     @property
@@ -120,7 +116,7 @@ class Stage:
 
 
 def pair_of(link_a: Link = PLAIN, link_b: Link | None = None, seed: int = 1, psk: Secret | None = None) -> Pair:
-    """Alpha and bravo, who calls alpha too; bravo also knows charlie, who has no address."""
+    """Alpha and bravo, which initiates too; bravo also knows charlie, which has no address."""
     pair = Pair(link_a=link_a, link_b=link_b or link_a, psk_a=psk, psk_b=psk, seed=seed, now=NOW)
     _make_small(pair, seed)
     pair.b.node.add_peer(PeerSettings("charlie", KEY_C.public, None, link_a), NOW)
@@ -129,12 +125,12 @@ def pair_of(link_a: Link = PLAIN, link_b: Link | None = None, seed: int = 1, psk
 
 def _make_small(pair: Pair, seed: int) -> None:
     for number, side in enumerate((pair.a, pair.b)):
-        chance = Chance(seed + number)
+        entropy = SeededEntropy(seed + number)
         node = side.node
-        # The generator of the harness is a large thing to copy.
-        node._entropy = node._cookies._entropy = node._indices._entropy = chance
+        # The generator of the harness would make copies slow.
+        node._entropy = node._cookies._entropy = node._indices._entropy = entropy
         for peer in node.peers.values():
-            peer._entropy = peer.caller._entropy = peer._challenger._entropy = chance
+            peer.entropy = peer.initiator._entropy = peer.challenger._entropy = entropy
 
 
 def _cookie_for(message: bytes, receiver: bytes, index: int) -> bytes:
@@ -143,17 +139,17 @@ def _cookie_for(message: bytes, receiver: bytes, index: int) -> bytes:
 
 
 def idle(link: Link, psk: Secret | None = None) -> Stage:
-    """Bravo has heard nothing from anybody."""
+    """Bravo has received nothing."""
     pair = pair_of(link, psk=psk)
     initiation = pair.initiation(NOW)
     return Stage(pair, False, initiation, (initiation,))
 
 
 def idle_in_key_change(link: Link) -> Stage:
-    """Bravo has a new key, and takes its former one as well; alpha, who calls, knows the former."""
+    """Bravo has a new key, and accepts its previous one as well; alpha, which initiates, knows the previous one."""
     pair = pair_of(link)
     alpha = pair.b.peer.settings
-    node = pair.b.node = Node(Secret(bytes([7]) * 32), Chance(2), NOW, Secret(PRIVATE_B))
+    node = pair.b.node = Node(Secret(bytes([7]) * 32), SeededEntropy(2), NOW, Secret(PRIVATE_B))
     node.add_peer(alpha, NOW, by_previous_key=True)
     node.add_peer(replace(alpha, name="alpha by the new key"), NOW)
     _make_small(pair, 1)
@@ -163,11 +159,11 @@ def idle_in_key_change(link: Link) -> Stage:
 
 
 def initiator(link: Link, psk: Secret | None = None) -> Stage:
-    """Alpha has sent an initiation and waits for the response; bravo, who calls too, has sent one as well."""
+    """Alpha has sent an initiation and waits for the response; bravo, which initiates too, has sent one as well."""
     pair = pair_of(link, psk=psk)
     initiation = pair.initiation(NOW)
     response = only(datagrams(pair.b.receive(initiation, NOW)))
-    pair.b.knows_the_way(NOW)
+    pair.b.configure_path(NOW)
     crossing = only(datagrams(pair.b.timeout(NOW), wire.INITIATION))
     index = int.from_bytes(initiation[2:4], "big")
     cookie = _cookie_for(initiation, pair.b.node.public_key, index)
@@ -188,7 +184,7 @@ def responder(link: Link, psk: Secret | None = None) -> Stage:
 
 
 def session(link: Link, counter: int = 0) -> Stage:
-    """Alpha and bravo are linked, frames have crossed; more of alpha's are on their way."""
+    """Alpha and bravo are linked, frames have crossed, and more of alpha's are in flight."""
     pair = pair_of(link)
     initiation = pair.initiation(NOW)
     response = only(datagrams(pair.b.receive(initiation, NOW)))
@@ -198,8 +194,8 @@ def session(link: Link, counter: int = 0) -> Stage:
         side.timeout(NOW)
     pair.a.session.send_counter = max(counter, pair.a.session.send_counter)
     past = [pair.a.envelope(NOW) for _ in range(3)]
-    for each in past:
-        pair.b.receive(each, NOW)
+    for envelope in past:
+        pair.b.receive(envelope, NOW)
     coming = [pair.a.envelope(NOW), pair.a.envelope(NOW, b""), pair.a.envelope(NOW, wire.Close().encode())]
     pair.a.session.send_counter -= 2  # the last two are never sent, so the next one is not beyond them
     answer = pair.b.envelope(NOW)
@@ -207,15 +203,10 @@ def session(link: Link, counter: int = 0) -> Stage:
     return Stage(pair, False, coming[0], templates, tuple(coming[1:]))
 
 
-LINKS: Final = (
-    quiet(),
-    quiet(tag_bytes=8),
-    quiet(tag_bytes=32, mac_key_bits=1024),
-    quiet(confidential=True),
-)
+LINKS: Final = (quiet(), quiet(tag_bytes=8), quiet(tag_bytes=32, mac_key_bits=1024), quiet(confidential=True))
 """Kinds of sessions."""
 
 
 def with_suite(link: Link, suite: Suite) -> Link:
-    """The same link, with an extra exchange."""
+    """The same link, with an additional exchange."""
     return replace(link, suites=(suite,))

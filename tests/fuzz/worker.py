@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Final
 
 PROGRESS: Final = struct.Struct("<QQQ")
-"""Scripts run, inputs offered, and about how many of them were different."""
+"""Scripts run, inputs sent, and an estimate of the different ones."""
 ESCAPED: Final = 77
 """Exit code, as libFuzzer's."""
 
@@ -31,7 +31,7 @@ def _plant(name: str) -> None:
 
 
 def fuzz_with_atheris(name: str, board: mmap.mmap, arguments: list[str], plant: str | None) -> None:
-    """Hand the target over to libFuzzer. Does not return."""
+    """Run the target in libFuzzer. Does not return."""
     import atheris
 
     with atheris.instrument_imports(include=["uavlinkd"]):
@@ -75,7 +75,7 @@ def fuzz_seeded(name: str, board: mmap.mmap, arguments: list[str]) -> None:
 
 
 def replay(name: str) -> int:
-    """Run a target's seeds and its kept corpus; how many there are.
+    """Run a target's seeds and its kept corpus; returns their number.
 
     Raises:
         Exception: what escaped.
@@ -92,7 +92,7 @@ def replay(name: str) -> int:
 
 
 def main() -> None:
-    """What the command starts."""
+    """The entry point of the process."""
     name, engine, progress, *arguments = sys.argv[1:]
     board = _board(progress)
     plant = None

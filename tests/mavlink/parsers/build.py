@@ -1,4 +1,4 @@
-"""Builds receivers from MAVLink's C library, for the time of the test run."""
+"""Builds receivers from MAVLink's C library for the test run."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ _FLAGS = ("-std=c11", "-O2", "-shared", "-fPIC", "-w", "-DMAVLINK_COMM_NUM_BUFFE
 
 
 class BuildError(Exception):
-    """A receiver cannot be built: the text says why."""
+    """A receiver cannot be built; the text is the reason."""
 
 
 def compiler() -> str | None:
-    """The C compiler's path; None: there is not one."""
+    """The C compiler's path, or None."""
     return shutil.which("cc")
 
 
 @cache
 def build_folder() -> Path:
-    """Where this process builds; removed at its end."""
+    """The build folder of this process, which is removed at its end."""
     folder = tempfile.TemporaryDirectory(prefix="mavlink-receivers-")
     _kept.append(folder)
     return Path(folder.name)
@@ -71,7 +71,7 @@ def build(dialect: str, library: str) -> Path:
 
 @cache
 def _generate(dialect: str, version: str) -> Path:
-    """The headers of a dialect, generated from the definitions that pymavlink brings along."""
+    """The headers of a dialect, generated from the definitions in pymavlink."""
     definitions = Path(pymavlink.generator.__file__).parent.parent / "dialects" / "v20" / f"{dialect}.xml"
     folder = build_folder() / f"{dialect}-{version}"
     command = (sys.executable, "-m", "pymavlink.tools.mavgen", "--lang=C", f"--wire-protocol={version}")

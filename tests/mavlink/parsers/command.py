@@ -21,7 +21,7 @@ _CHUNK = 100_000
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Exit status: 0 no forbidden frame was accepted, 1 some was, or steps are missing, 2 wrong command line."""
+    """Exit status 0: no forbidden frame was accepted. 1: one was, or steps are missing. 2: invalid command line."""
     parser = argparse.ArgumentParser(prog="python -m tests.mavlink.parsers", description=__doc__)
     parser.add_argument("--streams", type=int, default=10_000, help="how many streams to try (10000)")
     parser.add_argument("--seed", type=int, default=0, help="of the generated streams")

@@ -10,7 +10,7 @@ from tests.mavlink.parsers.build import compiler
 @pytest.fixture(scope="session", autouse=True)
 def cc() -> str:
     """The C compiler."""
-    found = compiler()
-    if found is None:
+    path = compiler()
+    if path is None:
         pytest.skip("needs a C compiler (cc) to build MAVLink's parsers")
-    return found
+    return path

@@ -1,4 +1,4 @@
-"""Streams made for the purpose: frames that role tables allow, with frames in them that they do not allow."""
+"""Generated streams: frames that role tables pass, containing frames that they refuse."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from tests.mavlink.parsers.build import PRIVATE_EXTRAS
 from uavlinkd.lab.evaluation.captured_member import GOALS, command_long, heartbeat_of, set_mode
 from uavlinkd.lab.evaluation.hidden_frames import SIGNATURE_BYTES, Carrier, crc_extra, frame, hide, msgid_of
 from uavlinkd.mavlink.dialect_table import COMMANDS, MESSAGES, OTHER_EXTRAS
-from uavlinkd.mavlink.policy.gate import Refusal
 from uavlinkd.mavlink.policy.compilation import compile_policy
+from uavlinkd.mavlink.policy.gate import Refusal
 
 EVERYTHING: Final[Mapping[str, object]] = {"role": "all", "system_ids": "all"}
 CAST: Final[Mapping[str, Mapping[str, object]]] = {
@@ -25,13 +25,10 @@ CAST: Final[Mapping[str, Mapping[str, object]]] = {
     "private dialect": {"role": "swarm-member", "system_ids": [7], "allow_in": [54321, 150]},
     "everything": EVERYTHING,
 }
-"""The sources of a client's frames: their policies, as the daemon has them."""
+"""The sources of a client's frames, with the policies that the daemon has for them."""
 LETS_UNKNOWN_PASS: Final = frozenset({"private dialect"})
-"""Of these every CRC_EXTRA counts."""
-CLIENTS: Final[Sequence[Mapping[str, object]]] = (
-    {},
-    {"deny_out": ["HEARTBEAT", "MAV_CMD_COMPONENT_ARM_DISARM"]},
-)
+"""For these every CRC_EXTRA counts."""
+CLIENTS: Final[Sequence[Mapping[str, object]]] = ({}, {"deny_out": ["HEARTBEAT", "MAV_CMD_COMPONENT_ARM_DISARM"]})
 """The policies of the endpoints."""
 STARTS: Final = (0xFD, 0xFE)
 _MOST_FRAMES: Final = 6
@@ -47,7 +44,7 @@ class Part(NamedTuple):
 
 
 class Recipe(NamedTuple):
-    """What is sent to one client, in turn."""
+    """The frames to one client, in order."""
 
     client: int
     parts: tuple[Part, ...]
@@ -73,30 +70,30 @@ def _sender(name: str) -> _Sender:
 
 @cache
 def _goals() -> tuple[tuple[bytes, int], ...]:
-    """Frames that most roles forbid, each with its CRC_EXTRA: by its definition, others', and 0 for unknown ones."""
+    """Frames that most roles forbid, with a CRC_EXTRA of their definition, of others, or 0 for unknown ones."""
     frames = [make() for make in GOALS.values()]
     frames += [set_mode(255, version=1), heartbeat_of(9), set_mode(2), command_long("NAV_LAND", 2, version=1)]
     frames += [frame(23, bytes(20) + b"abc", system, version=version) for system in (2, 255) for version in (1, 2)]
     frames += [frame(30, bytes(28), 99), frame(33, bytes(28), 1), frame(39, bytes(38), 2), frame(150, bytes(40), 9)]
-    found = [(raw, crc_extra(msgid_of(raw))) for raw in frames]
-    found += [(frame(msgid, bytes(4), 2, extra=0), 0) for msgid in (54321, 9000, 226)]
-    found += [(frame(msgid, bytes(4), 1, version=1, extra=0), 0) for msgid in (3, 96, 252)]
-    found += [(raw, 0) for raw, _ in found[:6]]
+    result = [(raw, crc_extra(msgid_of(raw))) for raw in frames]
+    result += [(frame(msgid, bytes(4), 2, extra=0), 0) for msgid in (54321, 9000, 226)]
+    result += [(frame(msgid, bytes(4), 1, version=1, extra=0), 0) for msgid in (3, 96, 252)]
+    result += [(raw, 0) for raw, _ in result[:6]]
     for msgid, extras in OTHER_EXTRAS.items():
         size = MESSAGES[msgid][3] if msgid in MESSAGES else 8
-        found += [(frame(msgid, bytes(size), 9, version=v), extras[0]) for v in ((1, 2) if msgid < 256 else (2,))]
-    found += [(frame(msgid, bytes(8), 9), extra) for msgid, extra in PRIVATE_EXTRAS.items()]
-    return tuple(found)
+        result += [(frame(msgid, bytes(size), 9, version=v), extras[0]) for v in ((1, 2) if msgid < 256 else (2,))]
+    result += [(frame(msgid, bytes(8), 9), extra) for msgid, extra in PRIVATE_EXTRAS.items()]
+    return tuple(result)
 
 
 class Generator:
-    """Endless recipes from a seed."""
+    """An endless generator of recipes, from a seed."""
 
     def __init__(self, seed: int) -> None:
         self._rng = random.Random(seed)
 
     def recipe(self) -> Recipe:
-        """The next one."""
+        """The next recipe."""
         rng = self._rng
         names = rng.sample(tuple(CAST), rng.choice((1, 1, 2, 2, 3)))
         count = rng.randint(1, _MOST_FRAMES)
@@ -108,44 +105,44 @@ class Generator:
 
     def _carrier(self, sender: _Sender) -> tuple[Carrier, str]:
         rng = self._rng
-        chance = rng.random
-        version = 1 if sender.allowed_1 and chance() < 0.25 else 2
+        draw = rng.random
+        version = 1 if sender.allowed_1 and draw() < 0.25 else 2
         allowed = sender.allowed_1 if version == 1 else sender.allowed
-        msgid = allowed[int(chance() * len(allowed))]
+        msgid = allowed[int(draw() * len(allowed))]
         _, _, shortest, longest, *_ = MESSAGES[msgid]
         if version == 1:
             size = shortest
-        elif chance() < 0.6:
+        elif draw() < 0.6:
             size = longest
         else:  # zeros at the end are cut
-            size = 1 + int(chance() * longest)
-        kind = chance()
+            size = 1 + int(draw() * longest)
+        kind = draw()
         if kind < 0.4:
             payload = bytearray(size)
         elif kind < 0.8:
             payload = bytearray(rng.randbytes(size))
         else:
             payload = bytearray(rng.choices((0xFD, 0xFE, 0, 1, 9, 255), k=size))
-        if msgid in _WITH_COMMAND and size > 29 and chance() < 0.8:
+        if msgid in _WITH_COMMAND and size > 29 and draw() < 0.8:
             payload[28:30] = _ALLOWED_COMMAND
-        ends_in = STARTS[chance() < 0.5] if chance() < 0.3 else None
+        ends_in = STARTS[draw() < 0.5] if draw() < 0.3 else None
         return (
             Carrier(
                 msgid,
                 payload,
-                sender.systems[int(chance() * len(sender.systems))],
+                sender.systems[int(draw() * len(sender.systems))],
                 self._byte(1),
                 version,
                 seq=self._byte(0),
-                compat=self._byte(0) if chance() < 0.2 else 0,
-                signature=bytearray(rng.randbytes(13)) if version == 2 and chance() < 0.3 else bytearray(),
+                compat=self._byte(0) if draw() < 0.2 else 0,
+                signature=bytearray(rng.randbytes(13)) if version == 2 and draw() < 0.3 else bytearray(),
                 checksum_ends_in=ends_in,
             ),
             sender.name,
         )
 
     def _byte(self, usual: int) -> int:
-        """A header's byte that its sender chooses."""
+        """A header byte that the sender chooses."""
         kind = self._rng.random()
         return usual if kind < 0.5 else STARTS[kind < 0.6] if kind < 0.7 else int(self._rng.random() * 256)
 

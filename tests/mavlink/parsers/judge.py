@@ -1,4 +1,4 @@
-"""The judge: whether what a receiver accepted is what policy lets pass, whatever the daemon's filter thinks.
+"""The judge: whether policy passes the frames that a receiver accepts, independent of the daemon's filter.
 
 It knows the policies and the sender of each byte, and nothing of hidden frames.
 """
@@ -15,17 +15,17 @@ from fastcrc.crc16 import mcrf4xx
 from tests.mavlink.parsers.generate import CAST, CLIENTS, LETS_UNKNOWN_PASS, Recipe
 from tests.mavlink.parsers.receivers import Accepted, Batch, Delivery, Receiver
 from uavlinkd.lab.evaluation.hidden_frames import SIGNATURE_BYTES, crc_extra, msgid_of
-from uavlinkd.mavlink.policy.delivery import DeliveredStream, Source
 from uavlinkd.mavlink.dialect_table import OTHER_EXTRAS
 from uavlinkd.mavlink.frames import MAVLINK2, Frame, SplitCounters, parse_frame, split_payload
-from uavlinkd.mavlink.policy.gate import Gate
 from uavlinkd.mavlink.policy.compilation import compile_policy
+from uavlinkd.mavlink.policy.delivery import DeliveredStream, Source
+from uavlinkd.mavlink.policy.gate import Gate
 
 _LONG_S = 1e6  # between two frames: rates are not looked at
 
 
 class Stream(NamedTuple):
-    """What one client read, and whose bytes those are."""
+    """The bytes that one client read, and the source of each."""
 
     delivery: Delivery
     authors: Sequence[tuple[int, str | None]]  # up to which offset whose; None: separator bytes
@@ -43,7 +43,7 @@ def filtered(outgoing: Gate) -> Admit:
 
 
 def unfiltered(outgoing: Gate) -> Admit:
-    """Policy alone."""
+    """Policy without the filter."""
     return lambda frame, source, now: frame.raw
 
 
@@ -62,7 +62,7 @@ class Deliverer:
         self._outgoing = [compile_policy(data, is_local=True).outgoing for data in CLIENTS]
 
     def deliver(self, recipe: Recipe) -> Stream:
-        """What the client reads."""
+        """The stream that the client reads."""
         outgoing = self._outgoing[recipe.client]
         admit = self.make(outgoing)
         sources = {part.sender: Source(part.sender, self._gates[part.sender]) for part in recipe.parts}
@@ -103,29 +103,38 @@ class Breach(NamedTuple):
 
 @dataclass
 class Verdicts:
-    """What became of the frames that receivers accepted beyond the delivered ones."""
+    """The verdicts on the frames that receivers accepted in addition to the delivered ones."""
 
     harmless: int = 0
     spanning: int = 0
     spanning_forbidden: int = 0
     private: int = 0
-    """Forbidden frames by a private definition, from sources without unknown messages in their lists: the limit."""
+    """Forbidden frames by a private definition, from sources without unknown messages in their lists: a limit."""
     breaches: list[Breach] = field(default_factory=list)
     truncated: int = 0
-    """Accepted frames that were not looked at, because there were too many."""
+    """Accepted frames that were not judged, because there were too many."""
 
 
 def is_private(raw: bytes) -> bool:
     """Whether a frame's checksum fits no CRC_EXTRA of a public definition, and not the 0 of receivers without one."""
     msgid = msgid_of(raw)
     extras = {0, crc_extra(msgid), *OTHER_EXTRAS.get(msgid, ())}
-    end = len(raw) - (SIGNATURE_BYTES if raw[0] == MAVLINK2 and raw[2] else 0)
+    end = _checked_bytes(raw)
     fitting = {mcrf4xx(raw[1 : end - 2] + bytes((extra,))).to_bytes(2, "little") for extra in extras}
     return raw[end - 2 : end] not in fitting
 
 
+def _checked_bytes(raw: bytes) -> int:
+    """Bytes of a frame up to the end of its checksum.
+
+    The sender of these bytes made the frame. The signature may be another sender's bytes: without a key a receiver
+    ignores them, and with a key no sender can choose them.
+    """
+    return len(raw) - (SIGNATURE_BYTES if raw[0] == MAVLINK2 and raw[2] else 0)
+
+
 class Judge:
-    """Knows policies of its own, compiled from the same data."""
+    """Has policies of its own, compiled from the same data."""
 
     def __init__(
         self, cast: Mapping[str, Mapping[str, object]] = CAST, clients: Sequence[Mapping[str, object]] = CLIENTS
@@ -135,7 +144,7 @@ class Judge:
         self._now = 0.0
 
     def is_forbidden(self, raw: bytes, senders: Iterable[str], client: int = 0) -> bool:
-        """Whether policy refuses this frame from any sender of its bytes, or keeps it from the client."""
+        """Whether policy refuses this frame from any sender of its bytes, or refuses it to the client."""
         counters = SplitCounters()
         frames = split_payload(raw, counters)
         if len(frames) != 1:
@@ -147,12 +156,12 @@ class Judge:
         return any(refusal is not None for refusal in refusals)
 
     def examine(
-        self, receiver: Receiver, streams: Sequence[Stream], found: Sequence[Accepted], into: Verdicts
+        self, receiver: Receiver, streams: Sequence[Stream], accepted_frames: Sequence[Accepted], into: Verdicts
     ) -> None:
-        """Sort what a receiver accepted into verdicts."""
-        for accepted in found:
+        """Sort the frames that a receiver accepted into verdicts."""
+        for accepted in accepted_frames:
             stream = streams[accepted.stream]
-            end = accepted.start + len(accepted.raw) + (accepted.lost if accepted.spans else 0)
+            end = accepted.start + _checked_bytes(accepted.raw) + (accepted.lost if accepted.spans else 0)
             senders = _authors(stream.authors, accepted.start, end)
             is_forbidden = self.is_forbidden(accepted.raw, senders, stream.client)
             if accepted.spans:
@@ -167,13 +176,13 @@ class Judge:
 
 
 def _authors(authors: Sequence[tuple[int, str | None]], start: int, end: int) -> tuple[str, ...]:
-    found = []
+    senders = []
     begin = 0
     for until, sender in authors:
         if sender is not None and begin < end and start < until:
-            found.append(sender)
+            senders.append(sender)
         begin = until
-    return tuple(dict.fromkeys(found))
+    return tuple(dict.fromkeys(senders))
 
 
 def judge_all(
@@ -185,16 +194,16 @@ def judge_all(
     losses: int = 1,
     seed: int = 1,
 ) -> Verdicts:
-    """Give the streams to every receiver, from every offset and after losses."""
+    """Pass the streams to every receiver, from every offset and after losses."""
     verdicts = Verdicts()
     batch = Batch([stream.delivery for stream in streams])
     for receiver in receivers:
-        total, found = receiver.judge(batch, every_offset=every_offset, losses=losses, seed=seed)
-        verdicts.truncated += total - len(found)
-        judge.examine(receiver, streams, found, verdicts)
+        total, accepted = receiver.judge(batch, every_offset=every_offset, losses=losses, seed=seed)
+        verdicts.truncated += total - len(accepted)
+        judge.examine(receiver, streams, accepted, verdicts)
     return verdicts
 
 
 def by_message(breaches: Iterable[Breach]) -> Counter[str]:
-    """How many of them each receiver accepted."""
+    """The number of breaches of each receiver."""
     return Counter(breach.receiver for breach in breaches)

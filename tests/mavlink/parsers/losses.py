@@ -1,11 +1,11 @@
-"""What remains: frames that span lost bytes. How often a receiver accepts a forbidden one.
+"""The remaining risk: frames that span lost bytes. Measures how often a receiver accepts a forbidden one.
 
 ``python -m tests.mavlink.parsers.losses`` measures it for honest telemetry and random losses of 1 to 300 bytes, and
-for a captured swarm member that knows the length of the loss, and not where it begins.
+for a captured swarm member that knows the length of the loss, but not its place.
 
-The attacker fills its payloads with the second to last byte of a forbidden frame, so many bytes behind the start of
-each of its frames as will be lost. Bytes lost right behind a start byte then join it to the rest. Without the loss no
-start byte is before that rest, so it is not a hidden frame.
+The attacker fills its payloads with a forbidden frame without its first byte. The distance to the start of each of
+its frames is the length of the loss. Bytes lost directly behind a start byte then join this byte to the payload.
+Without the loss no start byte precedes it, so it is not a hidden frame.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Share(NamedTuple):
     losses: int
     forbidden: int
     elsewhere: int
-    """Forbidden frames that span no loss: there must not be one."""
+    """Forbidden frames that span no loss: there must not be any."""
 
 
 def of_honest_telemetry(streams: int, losses: int, seed: int) -> Share:
@@ -47,7 +47,7 @@ def of_honest_telemetry(streams: int, losses: int, seed: int) -> Share:
     forbidden = elsewhere = 0
     for _ in range(streams):
         chosen = rng.choices(numbers, k=_FRAMES)
-        parts = tuple(Part("member", build(each, rng.randbytes(MESSAGES[each][3]), 2)) for each in chosen)
+        parts = tuple(Part("member", build(frame, rng.randbytes(MESSAGES[frame][3]), 2)) for frame in chosen)
         stream = deliverer.deliver(Recipe(0, parts))
         verdicts = judge_all([stream], [receiver], judge, every_offset=False, losses=losses, seed=rng.getrandbits(60))
         forbidden += verdicts.spanning_forbidden
@@ -56,7 +56,7 @@ def of_honest_telemetry(streams: int, losses: int, seed: int) -> Share:
 
 
 def prepared(lost: int) -> Stream | None:
-    """What a member sends that knows how many bytes will be lost; None if this way offers nothing."""
+    """The stream of a member that knows the number of lost bytes; None if this attack needs another number."""
     for payload in range(_SHORTEST, _LONGEST + 1):
         size = payload + 12
         phase = lost % size - 10  # of the rest's start in a payload
@@ -74,7 +74,7 @@ def prepared(lost: int) -> Stream | None:
 
 
 def of_attacker(lost: int) -> Share:
-    """A loss of so many bytes at each offset of what the attacker sends."""
+    """Apply the loss at each offset of the attacker's stream."""
     stream = prepared(lost)
     if stream is None:
         return Share(1, 0, 0)
@@ -92,15 +92,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     per_stream = 2000
     honest = of_honest_telemetry(max(1, options.losses // per_stream), per_stream, options.seed)
     print(f"honest telemetry: {honest.forbidden} forbidden frames after {honest.losses:,} random losses")
-    found = {lost: of_attacker(lost) for lost in range(1, LONGEST_LOSS + 1)}
-    shares = {lost: share.forbidden / share.losses for lost, share in found.items()}
+    result = {lost: of_attacker(lost) for lost in range(1, LONGEST_LOSS + 1)}
+    shares = {lost: share.forbidden / share.losses for lost, share in result.items()}
     best = max(shares, key=lambda lost: shares[lost])
     print(
         f"attacker that knows the length: {100 * mean(shares.values()):.1f} % of the offsets on average, "
         f"{100 * shares[best]:.1f} % at best (a loss of {best} bytes); "
         f"lengths without success: {sum(not share for share in shares.values())} of {LONGEST_LOSS}"
     )
-    elsewhere = honest.elsewhere + sum(share.elsewhere for share in found.values())
+    elsewhere = honest.elsewhere + sum(share.elsewhere for share in result.values())
     print(f"forbidden frames that span no loss: {elsewhere}")
     return 1 if elsewhere else 0
 

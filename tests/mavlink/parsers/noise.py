@@ -1,4 +1,4 @@
-"""Random telemetry: how many honest frames are refused because their bytes hold a forbidden frame by chance.
+"""Random telemetry: how many honest frames are refused because their bytes accidentally contain a forbidden frame.
 
 ``python -m tests.mavlink.parsers.noise --bytes 100000000`` measures it.
 """
@@ -13,25 +13,20 @@ from concurrent.futures import ProcessPoolExecutor
 from typing import NamedTuple
 
 from uavlinkd.lab.evaluation.hidden_frames import frame as build
-from uavlinkd.mavlink.policy.delivery import DeliveredStream, Source
 from uavlinkd.mavlink.dialect import ids_by_name
 from uavlinkd.mavlink.dialect_table import MESSAGES
 from uavlinkd.mavlink.frames import parse_frame
 from uavlinkd.mavlink.policy.compilation import compile_policy
+from uavlinkd.mavlink.policy.delivery import DeliveredStream, Source
 
 TELEMETRY = (
-    "ATTITUDE",
-    "ATTITUDE_QUATERNION",
-    "GLOBAL_POSITION_INT",
-    "LOCAL_POSITION_NED",
-    "HOME_POSITION",
-    "VFR_HUD",
+    *("ATTITUDE", "ATTITUDE_QUATERNION", "GLOBAL_POSITION_INT", "LOCAL_POSITION_NED", "HOME_POSITION", "VFR_HUD"),
 )
 _CHUNK = 5_000_000
 
 
 class Noise(NamedTuple):
-    """What became of the frames."""
+    """The result: frames, bytes and refusals."""
 
     frames: int
     frame_bytes: int
@@ -39,7 +34,7 @@ class Noise(NamedTuple):
 
 
 def false_refusals(count: int, seed: int, allow_in: Sequence[object] = ()) -> Noise:
-    """Deliver random telemetry of a swarm member, at least so many bytes; ``allow_in``: what it may send beside."""
+    """Deliver at least so many bytes of random telemetry of a swarm member; ``allow_in``: what else it may send."""
     rng = random.Random(seed)
     policy = {"role": "swarm-member", "system_ids": [1], "allow_in": list(allow_in)}
     source, stream = Source("member", compile_policy(policy).incoming), DeliveredStream()
@@ -74,8 +69,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             pool.submit(false_refusals, size, options.seed * 100_000 + number, allow_in)
             for number, size in enumerate(sizes)
         ]
-        found = [future.result() for future in begun]
-    frames, total, refused = (sum(column) for column in zip(*found, strict=True))
+        result = [future.result() for future in begun]
+    frames, total, refused = (sum(column) for column in zip(*result, strict=True))
     print(f"{frames:,} frames, {total:,} bytes: {refused:,} refused, one in {frames / max(1, refused):,.0f} frames")
     return 0
 

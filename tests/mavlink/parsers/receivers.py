@@ -1,4 +1,4 @@
-"""Receivers made of MAVLink's C library: which frames each accepts in a stream, from where it may begin or resume."""
+"""Receivers made of MAVLink's C library: which frames each accepts in a stream, from any start and after losses."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ class Options(NamedTuple):
     mavlink1: bool = True
     """Whether 0xFE starts a frame."""
     signs: bool = False
-    """Whether it checks signatures, by :data:`KEY`; of unsigned frames it then takes RADIO_STATUS alone."""
+    """Whether it checks signatures, by :data:`KEY`; of unsigned frames it then accepts only RADIO_STATUS."""
     takes_unsigned: bool = False
-    """With ``signs``: takes every unsigned frame."""
+    """With ``signs``: accepts every unsigned frame."""
 
     @property
     def bits(self) -> int:
-        """As receiver.c wants them."""
+        """The form for receiver.c."""
         return self.resumes | (not self.mavlink1) << 1 | self.signs << 2 | self.takes_unsigned << 3
 
 
@@ -86,7 +86,7 @@ class Delivery(NamedTuple):
 
 
 class Batch:
-    """Deliveries, in the form that receiver.c wants."""
+    """Deliveries in the form for receiver.c."""
 
     def __init__(self, deliveries: Sequence[Delivery]) -> None:
         self.count = len(deliveries)
@@ -112,7 +112,7 @@ class Receiver:
 
     @property
     def name(self) -> str:
-        """For people: ``common parse_char``, with what else is special."""
+        """A name for people: ``common parse_char``, with the other options."""
         parts = [self.dialect, "parse_char" if self.options.resumes else "frame_char_buffer"]
         parts += ["library of MAVLink 1"] if self.library == "1.0" else []
         parts += ["CRC_EXTRA 0 for unknown messages"] if self.library == "2.0-unknown" else []
@@ -131,7 +131,7 @@ class Receiver:
         ``losses``: random losses for each stream; EVERY_LOSS: every loss at every offset; ``-1 - n``: every loss of
         ``n`` bytes.
         """
-        found = (_Accepted * _ROOM)()
+        record = (_Accepted * _ROOM)()
         total = _load(self.dialect, self.library).judge(
             batch.data,
             batch.begins,
@@ -141,30 +141,30 @@ class Receiver:
             int(every_offset),
             losses,
             ctypes.c_uint64(seed or 1),
-            found,
+            record,
             _ROOM,
             ctypes.byref(self.counts),
         )
-        return total, [self._read(batch, found[k]) for k in range(min(total, _ROOM))]
+        return total, [self._read(batch, record[k]) for k in range(min(total, _ROOM))]
 
     def accepts(self, stream: bytes, frames: Sequence[tuple[int, int]] = ()) -> list[bytes]:
         """The frames that it accepts when it reads a stream from its start, without those that were delivered."""
-        return [each.raw for each in self.judge(Batch([Delivery(stream, frames)]))[1]]
+        return [accepted.raw for accepted in self.judge(Batch([Delivery(stream, frames)]))[1]]
 
-    def _read(self, batch: Batch, found: _Accepted) -> Accepted:
-        begin = batch.begins[found.stream] + found.start
-        raw = batch.data[begin : begin + found.length]
-        if found.start < found.lost_at < found.start + found.length:
-            lost_at = batch.begins[found.stream] + found.lost_at
-            raw = batch.data[begin:lost_at] + batch.data[lost_at + found.lost :]
-            raw = raw[: found.length]
-        if found.mavlink1 and raw[0] == 0xFD:
+    def _read(self, batch: Batch, result: _Accepted) -> Accepted:
+        begin = batch.begins[result.stream] + result.start
+        raw = batch.data[begin : begin + result.length]
+        if result.start < result.lost_at < result.start + result.length:
+            lost_at = batch.begins[result.stream] + result.lost_at
+            raw = batch.data[begin:lost_at] + batch.data[lost_at + result.lost :]
+            raw = raw[: result.length]
+        if result.mavlink1 and raw[0] == 0xFD:
             raw = b"\xfe" + raw[1:]
-        return Accepted(found.stream, found.start, raw, found.lost_at, found.lost, bool(found.spans))
+        return Accepted(result.stream, result.start, raw, result.lost_at, result.lost, bool(result.spans))
 
     @property
     def steps(self) -> dict[tuple[str, str], int]:
-        """How often the parser went from one state to another."""
+        """The number of transitions of the parser from one state to another."""
         names = STATES_1 if self.library == "1.0" else STATES_2
         rows = self.counts.steps
         return {
@@ -192,6 +192,6 @@ def all_receivers(dialects: Sequence[str] = DIALECTS) -> list[Receiver]:
         for mavlink1 in (True, False)
     ]
     either = [Options(resumes=True), Options(resumes=False)]
-    kinds = [("2.0", each) for each in of_library_2]
-    kinds += [(library, each) for library in ("2.0-unknown", "2.0-other", "1.0") for each in either]
+    kinds = [("2.0", dialect) for dialect in of_library_2]
+    kinds += [(library, option) for library in ("2.0-unknown", "2.0-other", "1.0") for option in either]
     return [Receiver(dialect, library, options) for dialect in dialects for library, options in kinds]

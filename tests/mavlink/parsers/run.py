@@ -1,4 +1,4 @@
-"""A run of the property: so many generated streams, through policy and filter, to every receiver."""
+"""A run of the property: generated streams, through policy and filter, to every receiver."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.mavlink.parsers.receivers import EVERY_LOSS, STATES_2, Receiver, all_
 
 BATCH = 250
 EXHAUSTIVE_EVERY = 40
-"""Of so many batches one has a stream that is read after every loss."""
+"""One batch of so many has a stream that is read after every loss."""
 MOST_BREACHES = 50
 
 _UNSIGNED_STEPS = [(STATES_2[k], STATES_2[k + 1]) for k in range(1, 12)]
@@ -70,7 +70,7 @@ _STEPS_1 = frozenset(
 
 @dataclass
 class Result:
-    """What a run found."""
+    """The result of a run."""
 
     streams: int = 0
     stream_bytes: int = 0
@@ -87,11 +87,11 @@ class Result:
 
     @property
     def missing_steps(self) -> dict[str, set[tuple[str, str]]]:
-        """Steps of each library's parser that no stream took."""
+        """Steps of each library's parser that no stream covered."""
         return {"1.0": set(_STEPS_1 - self.steps["1.0"]), "2.0": set(_STEPS_2 - self.steps["2.0"])}
 
     def add(self, other: Result) -> None:
-        """Add what another run found."""
+        """Add the result of another run."""
         for name in ("streams", "stream_bytes", "admitted", "refused", "separators", "parses", "losses", "accepted"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
         ours, theirs = self.verdicts, other.verdicts
@@ -104,7 +104,7 @@ class Result:
         self.seconds = max(self.seconds, other.seconds)
 
     def lines(self) -> list[str]:
-        """For people."""
+        """The result as text."""
         verdicts = self.verdicts
         covered = sum(map(len, self.steps.values()))
         missing = [f"{a} to {b}" for steps in self.missing_steps.values() for a, b in sorted(steps)]
@@ -138,7 +138,7 @@ def run(
     stops_at: int | None = None,
     progress: Callable[[Result], None] = lambda result: None,
 ) -> Result:
-    """Try so many streams.
+    """Run so many streams.
 
     ``share``: one in so many receivers reads a batch, in turn. ``stops_at``: stop after so many forbidden frames.
     """
@@ -150,13 +150,13 @@ def run(
     while result.streams < streams:
         batch = [deliverer.deliver(generator.recipe()) for _ in range(min(BATCH, streams - result.streams))]
         chosen = receivers[number % share :: share]
-        found = judge_all(batch, chosen, judge, seed=seed * 1_000_003 + number)
-        one = Result(verdicts=found)
+        verdicts = judge_all(batch, chosen, judge, seed=seed * 1_000_003 + number)
+        one = Result(verdicts=verdicts)
         if number % EXHAUSTIVE_EVERY == EXHAUSTIVE_EVERY - 1:
             every = judge_all(batch[:1], chosen, judge, every_offset=False, losses=EVERY_LOSS)
             one.breaches_by_receiver.update(breach.receiver for breach in every.breaches)
             one.add(Result(verdicts=every))
-        one.breaches_by_receiver.update(breach.receiver for breach in found.breaches)
+        one.breaches_by_receiver.update(breach.receiver for breach in verdicts.breaches)
         one.streams = len(batch)
         one.stream_bytes = sum(len(stream.delivery.stream) for stream in batch)
         one.separators = sum(author is None for stream in batch for _, author in stream.authors)

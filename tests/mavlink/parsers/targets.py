@@ -9,10 +9,10 @@ from functools import cache
 from tests.mavlink.parsers.generate import Part, Recipe
 from tests.mavlink.parsers.judge import Deliverer, Judge, MakeStream, Stream, filtered
 from tests.mavlink.parsers.receivers import Delivery
-from uavlinkd.lab.evaluation.captured_member import Attack, attacks
+from uavlinkd.lab.evaluation.captured_member import MemberAttack, attacks
 from uavlinkd.mavlink.dialect_table import MESSAGES
-from uavlinkd.mavlink.policy.gate import Refusal
 from uavlinkd.mavlink.policy.compilation import compile_policy
+from uavlinkd.mavlink.policy.gate import Refusal
 
 
 @cache
@@ -30,7 +30,7 @@ def lacking(dialect: str, role: str, *, numbered: bool = False) -> int:
 
 
 @cache
-def attacks_on(dialect: str) -> tuple[Attack, ...]:
+def attacks_on(dialect: str) -> tuple[MemberAttack, ...]:
     """Every attack against receivers of this dialect."""
     return tuple(
         attacks(
@@ -42,15 +42,15 @@ def attacks_on(dialect: str) -> tuple[Attack, ...]:
     )
 
 
-def deliver(attack: Attack, make: MakeStream = filtered, times: int = 1) -> tuple[Stream, Deliverer]:
-    """What a client reads of an attack that is repeated so many times."""
+def deliver(attack: MemberAttack, make: MakeStream = filtered, times: int = 1) -> tuple[Stream, Deliverer]:
+    """The stream of an attack that is repeated so many times."""
     deliverer = Deliverer(make, cast=cast_of(attack))
     parts = tuple(Part(f"member {member}", raw) for member, raw in attack.frames) * times
     return deliverer.deliver(Recipe(0, parts)), deliverer
 
 
-def concatenated(attack: Attack, times: int = 1) -> Stream:
-    """What a client reads where the frames are delivered as they are, as before there was a filter."""
+def concatenated(attack: MemberAttack, times: int = 1) -> Stream:
+    """The stream without the filter, as the daemon delivered it before."""
     stream = bytearray()
     authors: list[tuple[int, str | None]] = []
     frames = []
@@ -61,11 +61,11 @@ def concatenated(attack: Attack, times: int = 1) -> Stream:
     return Stream(Delivery(bytes(stream), frames), authors, 0)
 
 
-def cast_of(attack: Attack) -> dict[str, Mapping[str, object]]:
-    """Its members' policies, by the names that :func:`deliver` gives them."""
+def cast_of(attack: MemberAttack) -> dict[str, Mapping[str, object]]:
+    """The policies of its members, by the names in :func:`deliver`."""
     return {f"member {number}": policy for number, policy in enumerate(attack.members)}
 
 
-def judge_of(attack: Attack) -> Judge:
-    """A judge who knows its members' policies."""
+def judge_of(attack: MemberAttack) -> Judge:
+    """A judge with its members' policies."""
     return Judge(cast_of(attack))

@@ -8,28 +8,19 @@ from tests.mavlink.parsers.build import DIALECTS
 from tests.mavlink.parsers.judge import judge_all
 from tests.mavlink.parsers.receivers import EVERY_LOSS, Batch, Receiver, all_receivers
 from tests.mavlink.parsers.targets import attacks_on, concatenated, deliver, judge_of
-from uavlinkd.lab.evaluation.captured_member import Attack
+from uavlinkd.lab.evaluation.captured_member import MemberAttack
 
-# Receivers that accept the hidden frame where the frames are simply concatenated, from the stream's first byte on.
+# Receivers that accept the hidden frame in simply concatenated frames, from the stream's first byte on.
 _RESUMES = frozenset(
     {
-        "parse_char",
-        "parse_char, MAVLink 2 only",
-        "parse_char, signing, unsigned too",
+        *("parse_char", "parse_char, MAVLink 2 only", "parse_char, signing, unsigned too"),
         "parse_char, MAVLink 2 only, signing, unsigned too",
-        "parse_char, CRC_EXTRA 0 for unknown messages",
-        "parse_char, other definitions",
+        *("parse_char, CRC_EXTRA 0 for unknown messages", "parse_char, other definitions"),
     }
 )
-_MAVLINK1_TOO = frozenset(each for each in _RESUMES if "MAVLink 2 only" not in each)
+_MAVLINK1_TOO = frozenset(item for item in _RESUMES if "MAVLink 2 only" not in item)
 _OF_MAVLINK1 = frozenset({"parse_char, library of MAVLink 1", "frame_char_buffer, library of MAVLink 1"})
-_GOALS = (
-    "flight termination",
-    "forced arming",
-    "SETUP_SIGNING",
-    "SET_MODE",
-    "a ground station's HEARTBEAT",
-)
+_GOALS = ("flight termination", "forced arming", "SETUP_SIGNING", "SET_MODE", "a ground station's HEARTBEAT")
 BEFORE: dict[str, frozenset[str]] = {
     **{f"observer: {goal}, {how}": _RESUMES for goal in _GOALS for how in ("signed", "checksum")},
     "observer: legal lengths": _MAVLINK1_TOO | _OF_MAVLINK1,
@@ -46,7 +37,7 @@ BEFORE: dict[str, frozenset[str]] = {
     "two members, MAVLink 1": _OF_MAVLINK1,
     "two members, MAVLink 2": frozenset(),
 }
-# Of 300 random losses of 1 to 300 bytes: after at least so many `mavlink_parse_char` accepts the hidden frame.
+# Of 300 random losses of 1 to 300 bytes, the least number after which `mavlink_parse_char` accepts the hidden frame.
 AFTER_LOSSES = {
     "swarm-member: command after a loss": 30,
     "swarm-member: command after a loss, ATTITUDE of 255 bytes": 150,
@@ -55,11 +46,11 @@ AFTER_LOSSES = {
 }
 REPEATED = 20
 SHORT = "common"
-EACH_DIALECT = {each: pytest.param(each, marks=() if each == SHORT else pytest.mark.long) for each in DIALECTS}
-LARGE = [EACH_DIALECT[each] for each in ("common", "ardupilotmega", "all")]
+EACH_DIALECT = {item: pytest.param(item, marks=() if item == SHORT else pytest.mark.long) for item in DIALECTS}
+LARGE = [EACH_DIALECT[item] for item in ("common", "ardupilotmega", "all")]
 
 
-def named(dialect: str, name: str) -> Attack:
+def named(dialect: str, name: str) -> MemberAttack:
     """The attack of this name against this dialect."""
     return next(attack for attack in attacks_on(dialect) if attack.name == name)
 
@@ -70,35 +61,35 @@ def suffix(receiver: Receiver) -> str:
 
 
 def test_every_attack_is_in_the_table() -> None:
-    """The table of this test is the catalogue's."""
+    """The table of this test has the attacks of the catalogue."""
     assert sorted(attack.name for attack in attacks_on("common")) == sorted(BEFORE)
 
 
 @pytest.mark.parametrize("name", BEFORE)
 @pytest.mark.parametrize("dialect", LARGE)
-def test_concatenated_frames_let_it_through(dialect: str, name: str) -> None:
+def test_attack_succeeds_with_concatenated_frames(dialect: str, name: str) -> None:
     """Without the filter exactly these receivers accept the forbidden frame."""
     attack = named(dialect, name)
     stream = concatenated(attack).delivery
-    reached = {suffix(each) for each in all_receivers([dialect]) if attack.goal in each.accepts(*stream)}
+    reached = {suffix(item) for item in all_receivers([dialect]) if attack.goal in item.accepts(*stream)}
     assert reached == BEFORE[name]
 
 
 @pytest.mark.parametrize("how", ["signed", "checksum"])
 def test_concatenated_frames_reach_a_receiver_of_the_smallest_dialect(how: str) -> None:
-    """`minimal` knows HEARTBEAT alone: a ground station's gets through."""
+    """`minimal` has only HEARTBEAT: a ground station's is accepted."""
     attack = named("minimal", f"observer: a ground station's HEARTBEAT, {how}")
     stream = concatenated(attack).delivery
-    assert {suffix(each) for each in all_receivers(["minimal"]) if attack.goal in each.accepts(*stream)} == _RESUMES
+    assert {suffix(item) for item in all_receivers(["minimal"]) if attack.goal in item.accepts(*stream)} == _RESUMES
 
 
 @pytest.mark.parametrize("name", AFTER_LOSSES)
-def test_concatenated_frames_let_it_through_after_a_loss(name: str) -> None:
-    """Without the filter so many of 300 random losses make the receiver accept the forbidden frame."""
+def test_attack_succeeds_with_concatenated_frames_after_a_loss(name: str) -> None:
+    """Without the filter the receiver accepts the forbidden frame after so many of 300 random losses."""
     attack = named("common", name)
     batch = Batch([concatenated(attack, REPEATED).delivery])
-    _, found = Receiver("common", "2.0").judge(batch, losses=300)
-    reached = {(each.lost_at, each.lost) for each in found if each.raw == attack.goal and each.lost_at >= 0}
+    _, accepted = Receiver("common", "2.0").judge(batch, losses=300)
+    reached = {(item.lost_at, item.lost) for item in accepted if item.raw == attack.goal and item.lost_at >= 0}
     assert len(reached) >= AFTER_LOSSES[name]
 
 

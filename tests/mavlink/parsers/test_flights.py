@@ -9,28 +9,28 @@ from pathlib import Path
 import pytest
 
 from tests.mavlink.parsers.noise import false_refusals
-from uavlinkd.mavlink.policy.delivery import DeliveredStream, Source
+from uavlinkd.lab.sim.tlog import TlogRecord, read_tlog
 from uavlinkd.mavlink.dialect import name_of
 from uavlinkd.mavlink.frames import Frame, SplitCounters, split_payload
 from uavlinkd.mavlink.policy.compilation import compile_policy
-from uavlinkd.lab.sim.tlog import Record, read_tlog
+from uavlinkd.mavlink.policy.delivery import DeliveredStream, Source
 
 FLIGHTS = ("arducopter_sitl_flight.tlog", "ardusub_dive.tlog", "copter_flight_mavlink1.tlog")
 GROUND = 255
-# What the roles leave out on purpose: a companion's positions for its own autopilot, and a message that the dialect
-# defines otherwise.
+# What the roles refuse on purpose: a companion's positions for its own autopilot, and a message that the dialect
+# defines differently.
 LEFT_OUT: dict[str, dict[tuple[str, str], int]] = {
     "ardusub_dive.tlog": {("GPS_INPUT", "message_not_allowed"): 1011},
     "copter_flight_mavlink1.tlog": {("RESOURCE_REQUEST", "unknown_message"): 1314},
 }
 
 
-def parsed(records: Sequence[Record]) -> list[tuple[float, Frame]]:
-    """When each frame was logged, in seconds, and the frame. Broken ones are left out."""
-    found = []
+def parsed(records: Sequence[TlogRecord]) -> list[tuple[float, Frame]]:
+    """The log time of each frame, in seconds, and the frame, without broken ones."""
+    result = []
     for record in records:
-        found += [(record.time_us / 1e6, frame) for frame in split_payload(record.frame, SplitCounters())]
-    return found
+        result += [(record.time_us / 1e6, frame) for frame in split_payload(record.frame, SplitCounters())]
+    return result
 
 
 @pytest.mark.parametrize("name", FLIGHTS)
@@ -56,7 +56,7 @@ def test_recorded_flight_passes(shared_data: Path, name: str) -> None:
 
 
 def test_random_telemetry_passes() -> None:
-    """A frame of random floats is refused by chance, less than once in a million."""
+    """A frame of random floats is refused accidentally, less than once in a million."""
     result = false_refusals(300_000, seed=1)
     assert result.refused <= 1
     assert result.frame_bytes >= 300_000

@@ -1,4 +1,4 @@
-"""The parsers of pymavlink and MAVSDK: what they accept of a filtered stream is what policy passed."""
+"""The parsers of pymavlink and MAVSDK accept of a filtered stream only what policy passed."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from typing import Any
 
 import pytest
 
+from tests.lab.sim import scenarios
 from tests.mavlink.parsers.build import DIALECTS
 from tests.mavlink.parsers.generate import CAST, Generator
 from tests.mavlink.parsers.judge import Deliverer, Judge, Stream, unfiltered
 from tests.mavlink.parsers.targets import attacks_on, concatenated, deliver, lacking
-from tests.lab.sim import scenarios
 from tests.waiting import PATIENCE_S
-from uavlinkd.lab.evaluation.captured_member import Attack, signed_unknown, within
+from uavlinkd.lab.evaluation.captured_member import MemberAttack, signed_unknown, within
 from uavlinkd.lab.evaluation.hidden_frames import Carrier, frame, msgid_of
 from uavlinkd.mavlink.dialect import ids_by_name, name_of
 
@@ -31,27 +31,27 @@ def pymavlink_accepts(dialect: str, stream: bytes) -> list[bytes]:
     module = importlib.import_module(f"pymavlink.dialects.v20.{dialect}")
     parser = module.MAVLink(None)
     parser.robust_parsing = True
-    found = parser.parse_buffer(stream) or []
-    return [bytes(message.get_msgbuf()) for message in found if message.get_msgId() >= 0]
+    accepted = parser.parse_buffer(stream) or []
+    return [bytes(message.get_msgbuf()) for message in accepted if message.get_msgId() >= 0]
 
 
 def breaches(dialect: str, stream: Stream, judge: Judge) -> list[bytes]:
-    """Forbidden frames that pymavlink accepts from some offset on."""
+    """Forbidden frames that pymavlink accepts from any offset on."""
     delivery = stream.delivery
     delivered = {delivery.stream[start:end] for start, end in delivery.frames}
     senders = tuple({author for _, author in stream.authors if author is not None})
-    found = []
+    accepted = []
     offsets = {0, *(at for at, byte in enumerate(delivery.stream) if byte in (0xFD, 0xFE))}
     for offset in offsets:
         for raw in pymavlink_accepts(dialect, delivery.stream[offset:]):
             if raw not in delivered and judge.is_forbidden(raw, senders, stream.client):
-                found.append(raw)
-    return found
+                accepted.append(raw)
+    return accepted
 
 
 @pytest.mark.parametrize("dialect", DIALECTS)
 def test_pymavlink_accepts_what_policy_passed(dialect: str) -> None:
-    """From every start byte on. Senders are one, so that each of its frames has the same policy."""
+    """From every start byte on. All senders count together, so that each of the frames has the same policy."""
     generator, deliverer, judge = Generator(21), Deliverer(), Judge()
     for _ in range(STREAMS):
         recipe = generator.recipe()
@@ -60,14 +60,14 @@ def test_pymavlink_accepts_what_policy_passed(dialect: str) -> None:
 
 
 def test_pymavlink_accepts_forbidden_frames_without_the_filter() -> None:
-    """The same streams, as policy alone lets them through."""
+    """The same streams with policy only."""
     generator, deliverer, judge = Generator(21), Deliverer(unfiltered), Judge()
     streams = [deliverer.deliver(generator.recipe()) for _ in range(STREAMS)]
     assert sum(bool(breaches("common", stream, judge)) for stream in streams) > 3
 
 
 class MavsdkReceiver:
-    """MAVSDK reads bytes that it is handed, and reports each message that it accepts."""
+    """MAVSDK reads the given bytes, and reports each message that it accepts."""
 
     def __init__(self, sdk: Any, direct: Callable[[Any], Any]) -> None:
         self._sdk = sdk
@@ -88,21 +88,21 @@ class MavsdkReceiver:
         self._accepted.put((message.message_name, message.system_id, message.fields_json))
 
     def accepts(self, stream: bytes) -> set[tuple[str, int]]:
-        """The messages that it accepts: their names and systems. It keeps its state: filler ends what is open."""
+        """The names and systems of the messages that it accepts. It keeps its state: filler bytes end open frames."""
         self._number += 1
         self._sdk.pass_received_raw_bytes(stream + b"U" * 300)
         self._sdk.pass_received_raw_bytes(heartbeat(MARKER_SYSTEM, self._number))
-        found: set[tuple[str, int]] = set()
+        accepted: set[tuple[str, int]] = set()
         while True:
             name, system, fields = self._accepted.get(timeout=PATIENCE_S)
             if system == MARKER_SYSTEM and f'"custom_mode":{self._number},' in fields:
-                return found
+                return accepted
             if system != MARKER_SYSTEM:
-                found.add((name, system))
+                accepted.add((name, system))
 
 
 def heartbeat(system: int, number: int) -> bytes:
-    """A vehicle's HEARTBEAT with a number, by which MAVSDK knows the system."""
+    """A numbered HEARTBEAT of a vehicle, by which MAVSDK knows the system."""
     return frame(0, number.to_bytes(4, "little") + bytes((2, 3, 0, 4, 3)), system)
 
 
@@ -128,10 +128,10 @@ def meaning(raw: bytes) -> tuple[str, int]:
 
 
 TO_ALL = frame(76, bytes(28) + (400).to_bytes(2, "little") + bytes(3), 255)
-"""COMMAND_LONG to every system: MAVSDK does not report what is for others."""
+"""COMMAND_LONG to every system: MAVSDK does not report messages to others."""
 
 
-def smuggled() -> list[Attack]:
+def smuggled() -> list[MemberAttack]:
     """The command in a payload, of a member; and where a signed message of an observer shifts a receiver to it."""
     member, observer = CAST["member"], CAST["observer"]
     home = Carrier(ids_by_name()["HOME_POSITION"], bytearray(60), 2)
@@ -153,7 +153,7 @@ def test_mavsdk_accepts_what_policy_passed(mavsdk: MavsdkReceiver) -> None:
 
 
 def test_mavsdk_accepts_forbidden_frames_without_the_filter(mavsdk: MavsdkReceiver) -> None:
-    """Where its reading begins at the hidden frame."""
+    """If it starts to read at the hidden frame."""
     for attack in smuggled():
         stream = concatenated(attack).delivery.stream
         assert meaning(TO_ALL) in mavsdk.accepts(stream[stream.index(TO_ALL) :])

@@ -1,4 +1,4 @@
-"""Each clause of the invariant, left out: the run then finds forbidden frames that a real parser accepts."""
+"""Each clause of the rule is removed: the run then finds forbidden frames that a real parser accepts."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import pytest
 from tests.mavlink.parsers.generate import EVERYTHING
 from tests.mavlink.parsers.judge import Admit, MakeStream, filtered
 from tests.mavlink.parsers.run import Result, run
-from uavlinkd.mavlink.policy import hidden
-from uavlinkd.mavlink.policy.delivery import DeliveredStream, Source
 from uavlinkd.mavlink.dialect_table import MESSAGES, OTHER_EXTRAS
 from uavlinkd.mavlink.frames import MAVLINK1, MAVLINK2, Frame
-from uavlinkd.mavlink.policy.gate import Gate
+from uavlinkd.mavlink.policy import hidden
 from uavlinkd.mavlink.policy.compilation import compile_policy
+from uavlinkd.mavlink.policy.delivery import DeliveredStream, Source
+from uavlinkd.mavlink.policy.gate import Gate
 
 pytestmark = pytest.mark.long
 
@@ -39,7 +39,7 @@ def without_starts(is_kept: Callable[[int, bool], bool]) -> Plant:
 
 
 def without_restarts(patch: pytest.MonkeyPatch) -> MakeStream:
-    """As if no parser went on in MAVLink 1 at the last byte of a rejected frame."""
+    """As if no parser continued in MAVLink 1 at the last byte of a rejected frame."""
     patch.setattr(hidden, "restart", lambda data, start, end: None)
     return filtered
 
@@ -86,7 +86,7 @@ class Forgetful(DeliveredStream):
     """Looks for hidden frames within a frame, and not across two."""
 
     def admit(self, frame: Frame, source: Source, now: float) -> bytes:
-        """Begin anew with each frame."""
+        """Start again with each frame."""
         self.__init__(self.outgoing)  # type: ignore[misc]
         return super().admit(frame, source, now)
 
@@ -97,7 +97,7 @@ class ShortMemory(DeliveredStream):
     _previous: tuple[Frame, Source] | None = None
 
     def admit(self, frame: Frame, source: Source, now: float) -> bytes:
-        """Begin anew with the frame before this one."""
+        """Start again with the frame before this one."""
         two = DeliveredStream(self.outgoing)
         if self._previous is not None:
             two.admit(*self._previous, now)
@@ -109,15 +109,15 @@ class Unseparated(DeliveredStream):
     """Delivers frames of different sources without separator bytes."""
 
     def admit(self, frame: Frame, source: Source, now: float) -> bytes:
-        """Refuse as always; leave out the bytes before the frame."""
+        """Refuse as always, but leave out the bytes before the frame."""
         return super().admit(frame, source, now)[-len(frame.raw) :]
 
 
 class TrustsSignatures(DeliveredStream):
-    """Does not look into signatures."""
+    """Does not search signatures."""
 
     def admit(self, frame: Frame, source: Source, now: float) -> bytes:
-        """Look at a signature of zeros in place of the frame's own."""
+        """Search a signature of zeros instead of the frame's own."""
         raw = frame.raw
         if raw[0] != MAVLINK2 or not raw[2]:
             return super().admit(frame, source, now)
@@ -126,10 +126,10 @@ class TrustsSignatures(DeliveredStream):
 
 
 class TrustsChecksums(DeliveredStream):
-    """Does not take a checksum's bytes for start bytes."""
+    """Does not accept a checksum's bytes as start bytes."""
 
     def admit(self, frame: Frame, source: Source, now: float) -> bytes:
-        """Look at a frame without a start byte in its checksum."""
+        """Search a frame without a start byte in its checksum."""
         raw = bytearray(frame.raw)
         end = len(raw) - (13 if raw[0] == MAVLINK2 and raw[2] else 0)
         raw[end - 2 : end] = bytes(0 if byte in (MAVLINK1, MAVLINK2) else byte for byte in raw[end - 2 : end])
@@ -138,7 +138,7 @@ class TrustsChecksums(DeliveredStream):
 
 
 class AsksTheLast(DeliveredStream):
-    """Asks the policy of a hidden frame's last source alone."""
+    """Asks only the policy of a hidden frame's last source."""
 
     def admit(self, frame: Frame, source: Source, now: float) -> bytes:
         """All bytes so far count as this source's."""
@@ -147,14 +147,14 @@ class AsksTheLast(DeliveredStream):
 
 
 class AsksNobodyForTheClient(DeliveredStream):
-    """Does not ask what the client may get."""
+    """Does not check the client's policy."""
 
     def __init__(self, outgoing: Gate | None = None) -> None:
         super().__init__(None)
 
 
 class AsksNoSource(DeliveredStream):
-    """Does not ask what the source may send."""
+    """Does not check the source's policy."""
 
     def admit(self, frame: Frame, source: Source, now: float) -> bytes:
         """As if its source might send everything."""

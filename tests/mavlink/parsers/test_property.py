@@ -11,7 +11,7 @@ STREAMS = 6000
 
 
 def test_no_receiver_accepts_what_policy_forbids() -> None:
-    """From any offset and after a random loss; the streams take every step of the parsers."""
+    """From any offset and after a random loss; the streams cover every step of the parsers."""
     result = run(STREAMS, seed=15, share=4)
     assert not result.breaches_by_receiver, "\n".join(result.lines())
     assert not any(result.missing_steps.values()), result.missing_steps
@@ -27,8 +27,8 @@ def test_streams_are_dangerous() -> None:
     assert sum(result.breaches_by_receiver.values()) > 100
 
 
-def test_every_offset_finds_what_reading_from_each_offset_finds() -> None:
-    """The short way, one attempt at each start byte, is the same as reading the stream's rest from everywhere."""
+def test_one_attempt_at_each_start_byte_is_enough() -> None:
+    """The result is the same as that of reading the stream's rest from every offset."""
     generator, deliverer = Generator(4), Deliverer(unfiltered)
     receiver = Receiver("common", "2.0", Options(resumes=False))
     for _ in range(60):
@@ -37,9 +37,9 @@ def test_every_offset_finds_what_reading_from_each_offset_finds() -> None:
         plain: set[tuple[int, bytes]] = set()
         for offset in range(len(delivery.stream)):
             later = [(a - offset, b - offset) for a, b in delivery.frames if a >= offset]
-            _, found = receiver.judge(Batch([Delivery(delivery.stream[offset:], later)]))
-            plain |= {(each.start + offset, each.raw) for each in found}
-        assert {(each.start, each.raw) for each in short} == plain
+            _, accepted = receiver.judge(Batch([Delivery(delivery.stream[offset:], later)]))
+            plain |= {(frame.start + offset, frame.raw) for frame in accepted}
+        assert {(frame.start, frame.raw) for frame in short} == plain
 
 
 def test_same_seed_makes_the_same_streams() -> None:
