@@ -23,9 +23,9 @@ from time import monotonic, sleep
 import pytest
 
 PERIOD_US = 10_000
-"""The kernel grants the share anew this often. With its default of 100 ms it would stop a process for 80 ms at a time
+"""The kernel renews the share this often. With its default of 100 ms it would stop a process for 80 ms at a time
 at a fifth of a core. A slow computer does not do that."""
-END_S = 5.0
+END_S = 60.0
 """How long the group's processes may take to end after SIGKILL."""
 
 _numbers = count()

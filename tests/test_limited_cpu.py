@@ -7,6 +7,7 @@ import subprocess
 import sys
 
 from tests.limited_cpu import limited_cpu
+from uavlinkd.lab.child_processes import end_with_parent
 
 SHARE = 0.2
 BURN = """
@@ -31,7 +32,7 @@ def test_processes_of_the_group_end_with_it() -> None:
     """A process that the test left running is killed, and the group is removed."""
     with limited_cpu(SHARE) as limit:
         command = [*limit.launcher, sys.executable, "-c", "import time; time.sleep(600)"]
-        process = subprocess.Popen(command)
+        process = subprocess.Popen(end_with_parent(*command))
         while not (limit.folder / "cgroup.procs").read_text():  # the shell joins before it becomes Python
             assert process.poll() is None
     assert process.wait() == -signal.SIGKILL

@@ -1,0 +1,86 @@
+"""The source files of the package and their imports, found by parsing: no source is executed."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator, Mapping
+from functools import cache
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import uavlinkd
+
+PACKAGE = Path(uavlinkd.__file__).parent
+
+
+def sources(*folders: str) -> Iterator[tuple[str, str]]:
+    """The path below the package and the text of every source file; of these folders only, if any are given."""
+    for path in sorted(PACKAGE.rglob("*.py")):
+        name = path.relative_to(PACKAGE).as_posix()
+        if not folders or name.startswith(folders):
+            yield name, path.read_text()
+
+
+def imports(name: str, source: str) -> set[str]:
+    """The full names of all modules that a source imports, also inside functions and for type checking only.
+
+    ``from a import b`` counts as ``a`` and as ``a.b``, because b may be a module.
+    """
+    return {
+        module for base, alias in _statements(name, source) for module in (base, f"{base}.{alias}" if alias else base)
+    }
+
+
+def roots(name: str, source: str) -> set[str]:
+    """The top-level packages that a source imports."""
+    return {module.split(".")[0] for module in imports(name, source)}
+
+
+def is_inside(module: str, package: str) -> bool:
+    """Whether a module is this package or a part of it."""
+    return module == package or module.startswith(package + ".")
+
+
+@cache
+def graph() -> Mapping[str, frozenset[str]]:
+    """The modules of the package, each with those that it imports.
+
+    ``from a import b`` leads to ``a.b`` if that is a module, and else to ``a``.
+    """
+    texts = {_module(name): (name, source) for name, source in sources()}
+    edges: dict[str, frozenset[str]] = {}
+    for module, (name, source) in texts.items():
+        named = {
+            f"{base}.{alias}" if f"{base}.{alias}" in texts else base for base, alias in _statements(name, source)
+        }
+        edges[module] = frozenset(named & texts.keys() - {module})
+    return edges
+
+
+def circle(edges: Mapping[str, frozenset[str]]) -> list[str]:
+    """Modules that import each other in a circle; the first is also the last. The list is empty without a circle."""
+    try:
+        TopologicalSorter(edges).prepare()
+    except CycleError as error:
+        modules: list[str] = error.args[1]
+        return modules
+    return []
+
+
+def _module(name: str) -> str:
+    """``core/node.py`` is ``uavlinkd.core.node``, ``core/__init__.py`` is ``uavlinkd.core``."""
+    return f"uavlinkd/{name}".removesuffix(".py").removesuffix("/__init__").replace("/", ".")
+
+
+def _statements(name: str, source: str) -> Iterator[tuple[str, str]]:
+    """Each import: ``from a import b`` is ("a", "b"), ``import a`` is ("a", ""). A call counts as ``importlib``."""
+    package = ["uavlinkd", *name.split("/")[:-1]]
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            yield from ((alias.name, "") for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            above = package[: len(package) - node.level + 1] if node.level else []
+            base = ".".join([*above, *([node.module] if node.module else [])])
+            yield from ((base, alias.name) for alias in node.names)
+        elif isinstance(node, ast.Call) and ast.unparse(node.func) in ("__import__", "importlib.import_module"):
+            yield "importlib", ""
