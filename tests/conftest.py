@@ -23,6 +23,8 @@ WORKERS_PER_CORE = 2
 """Most tests wait for daemons, clients and containers."""
 SLOWEST = ("packages", "compose", "faults", "soak", "evaluation", "bench", "fleet", "pressure", "daemon", "network")
 """Folders, the slowest tests first."""
+ALONE = ("pressure", "faults", "soak", "daemon", "link")
+"""Folders whose tests measure delays, losses and processor time of real daemons: marked ``alone``."""
 
 
 def pytest_configure() -> None:
@@ -38,7 +40,10 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Start the slowest files first, so that no worker starts one at the end. A file runs on one worker."""
+    """Mark what runs alone. Start the slowest files first, so that no worker starts one at the end."""
+    for item in items:
+        if any(folder in item.path.parts for folder in ALONE):
+            item.add_marker("alone")
     items.sort(
         key=lambda item: next((n for n, folder in enumerate(SLOWEST) if folder in item.path.parts), len(SLOWEST))
     )
