@@ -157,5 +157,6 @@ async def test_ground_station_sees_the_refused_command() -> None:
 
         (finding,) = [entry for entry in status["findings"] if entry["cause"] == Cause.REFUSED_THERE]
         assert finding["remedy"].startswith(
-            "set SYSID_THISMAV or MAV_SYS_ID of the client here to an id in system_ids for ground in drone1's file"
+            "set SYSID_THISMAV, MAV_SYSID or MAV_SYS_ID of the client here to an id in system_ids for ground"
+            " in drone1's file"
         )

@@ -93,8 +93,8 @@ def _print_result(options: argparse.Namespace, result: Result) -> None:
     if result.changed:
         _print(f"\nChanged in {options.out}: {changed}. Carry each to its owner so that no other person can read it.")
         _print(
-            "Set SYSID_THISMAV or MAV_SYS_ID of each autopilot, and the id of each ground control station, to the id"
-            " above: peers refuse frames with another id."
+            "Set SYSID_THISMAV, MAV_SYSID or MAV_SYS_ID of each autopilot, and the id of each ground control station,"
+            " to the id above: peers refuse frames with another id."
         )
         # The units make this folder.
         is_service = result.fleet.settings.control_socket.startswith("/run/uavlinkd/{name}/")

@@ -60,7 +60,7 @@ def _refused_there(daemon: Diagnosed, link: PeerLink, now: float) -> Iterator[Fi
         foreign = {claim.refused.reason == CODES[Refusal.FOREIGN_SYSTEM] for claim in refused_there.recent(link, now)}
         if True in foreign:
             remedies.append(
-                "set SYSID_THISMAV or MAV_SYS_ID of the client here to an id in system_ids for"
+                "set SYSID_THISMAV, MAV_SYSID or MAV_SYS_ID of the client here to an id in system_ids for"
                 f" {here} in {link.name}'s file, or add the id there"
             )
         if False in foreign:

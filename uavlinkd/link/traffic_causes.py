@@ -184,7 +184,7 @@ def _foreign(link: PeerLink, systems: Mapping[int, int], owners: SystemOwners, c
     ids = listed(map(str, allowed)) if isinstance(allowed, list | tuple) else str(allowed)
     which = "all its frames are" if cause is Cause.FOREIGN_SYSTEM else "some of its frames are"
     text = f"{which} of system {seen}; its system_ids here are {ids}"
-    own = f"set SYSID_THISMAV (ArduPilot) or MAV_SYS_ID (PX4) of its autopilot to {ids}"
+    own = f"set SYSID_THISMAV or MAV_SYSID (ArduPilot), or MAV_SYS_ID (PX4), of its autopilot to {ids}"
     if owned := _owned(owners, systems, link):  # never advise to trust one peer as another
         whose = listed(f"{system} is {owner}'s" for system, owner in owned.items())
         return finding(cause, Subject.PEER, name, text, f"{own}: {whose}")
