@@ -131,12 +131,14 @@ def _parser() -> argparse.ArgumentParser:
 
 def _add_evaluations(parser: argparse.ArgumentParser) -> None:
     from uavlinkd.lab.evaluation.commands import add_report_parser, add_timing_parser
+    from uavlinkd.lab.evaluation.flight_commands import add_flight_parser
     from uavlinkd.lab.evaluation.tampering_commands import add_member_parser, add_tampering_parser
 
     evaluations = parser.add_subparsers(title="evaluations", metavar="WHAT", required=True)
     add_timing_parser(evaluations)
     add_tampering_parser(evaluations)
     add_member_parser(evaluations)
+    add_flight_parser(evaluations)
     add_report_parser(evaluations)
 
 

@@ -110,6 +110,11 @@ def _report(options: argparse.Namespace) -> int:
     from uavlinkd.lab.evaluation.records import RecordsError  # noqa: PLC0415
 
     try:
+        from uavlinkd.lab.evaluation.flight_report import (  # noqa: PLC0415
+            has_flight,
+            write_flight_page,
+            write_flight_report,
+        )
         from uavlinkd.lab.evaluation.report import write_page, write_report  # noqa: PLC0415
         from uavlinkd.lab.evaluation.tampering_records import TamperingRecordsError  # noqa: PLC0415
         from uavlinkd.lab.evaluation.tampering_report import (  # noqa: PLC0415
@@ -121,8 +126,11 @@ def _report(options: argparse.Namespace) -> int:
         if error.name is None or error.name.partition(".")[0] != "matplotlib":
             raise
         return fail(NEEDS_EXTRA)
-    is_tampering = has_tampering(options.folder)
-    report, page = (write_tampering_report, write_tampering_page) if is_tampering else (write_report, write_page)
+    report, page = write_report, write_page
+    if has_tampering(options.folder):
+        report, page = write_tampering_report, write_tampering_page
+    elif has_flight(options.folder):
+        report, page = write_flight_report, write_flight_page
     try:
         print(report(options.folder))
         if options.page is not None:

@@ -76,12 +76,17 @@ class AlterKeys(PassiveAttack):
 class PaperRelay(PassiveAttack):
     """A full relay: a key exchange with each side, a new HMAC for each frame.
 
-    It alters every second frame. The drones cannot detect it, because each shares its key with the attacker.
+    By default it alters every second frame. The drones cannot detect it, because each shares its key with the
+    attacker.
+
+    Args:
+        change: returns what to send in place of each frame.
     """
 
     name = "two-sided-relay"
 
-    def __init__(self) -> None:
+    def __init__(self, change: Callable[[bytes], bytes] | None = None) -> None:
+        self._change = change or self._alter_every_second
         self._waiting: dict[Direction, paper.PaperKey] = {}
         self._keys: dict[str, list[bytes]] = {}
         """The keys shared with each peer, the newest first."""
@@ -127,15 +132,17 @@ class PaperRelay(PassiveAttack):
             return [Send(datagram, direction)]  # from before the attack
         if not ours:
             return []  # there is no key with the receiver yet, so the frame is lost
-        frame = opened[0]
         self.read += 1
-        if self.read % 2:
-            frame = _altered(frame)
-            self.altered += 1
+        frame = self._change(opened[0])
+        is_altered = frame != opened[0]
+        self.altered += is_altered
         size = paper.header_bytes(datagram)
         number = int.from_bytes(datagram[3:size], "big")
-        note = self._note(direction, now, "frame altered" if self.read % 2 else "frame read", datagram)
+        note = self._note(direction, now, "frame altered" if is_altered else "frame read", datagram)
         return [Send(paper.seal(ours[0], number, frame), direction), note]
+
+    def _alter_every_second(self, frame: bytes) -> bytes:
+        return _altered(frame) if self.read % 2 else frame
 
     def _note(self, direction: Direction, now: float, detail: str, datagram: bytes) -> Intervention:
         kind = kind_of(datagram)

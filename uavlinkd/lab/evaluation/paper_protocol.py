@@ -13,8 +13,8 @@ are no identities, no counters, and one key for both directions.
 The header of a datagram with data is that of our envelopes, so that the same attacks work against both. The HMAC
 covers it, but its number is not checked.
 
-The keys change every :data:`RENEW_S`, so that attacks on the exchange have a target. The receiver also accepts the
-key before the newest, so that an exchange loses no frame.
+The keys change every :data:`RENEW_S`, so that attacks on the exchange have a target, or on request only. The receiver
+also accepts the key before the newest, so that an exchange loses no frame.
 """
 
 from __future__ import annotations
@@ -133,15 +133,25 @@ class PaperEnd:
     Args:
         on_frame: called with each frame that has a valid HMAC.
         report: called with each event for the operator.
+        renew_s: seconds between two exchanges; None for one exchange, and others by :meth:`renew`.
     """
 
-    def __init__(self, name: str, *, is_initiator: bool, on_frame: Callable[[bytes], None], report: Report) -> None:
+    def __init__(
+        self,
+        name: str,
+        *,
+        is_initiator: bool,
+        on_frame: Callable[[bytes], None],
+        report: Report,
+        renew_s: float | None = RENEW_S,
+    ) -> None:
         self.name = name
         self.counters: Counter[str] = Counter()
         self.exchanges = 0
         self._is_initiator = is_initiator
         self._on_frame = on_frame
         self._report = report
+        self._renew_s = renew_s
         self._keys: list[bytes] = []  # of the HMAC, the newest first
         self._waiting: PaperKey | None = None
         self._number = 0
@@ -162,7 +172,14 @@ class PaperEnd:
         """Exchange keys and data with this address."""
         self._to = to
         if self._is_initiator:
-            self._renew()
+            self.renew()
+
+    def renew(self) -> None:
+        """Start an exchange, as the initiator."""
+        self._waiting = PaperKey()
+        self._send(bytes((HELLO,)) + self._waiting.public)
+        if self._renew_s is not None:
+            self._timer = self._loop.call_at(self._loop.time() + self._renew_s, self.renew)
 
     def close(self) -> None:
         """Stop."""
@@ -183,11 +200,6 @@ class PaperEnd:
             self._sock.sendto(datagram, self._to)
         except OSError as error:
             self._count("send_failed", error.strerror or str(error))
-
-    def _renew(self) -> None:
-        self._waiting = PaperKey()
-        self._send(bytes((HELLO,)) + self._waiting.public)
-        self._timer = self._loop.call_at(self._loop.time() + RENEW_S, self._renew)
 
     def _on_readable(self) -> None:
         for _ in range(_DATAGRAMS_PER_WAKE_UP):

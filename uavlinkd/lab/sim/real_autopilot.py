@@ -172,7 +172,8 @@ class RealAutopilot:
             *("--sysid", str(settings.system_id)),
             *("--base-port", str(base), "--rc-in-port", str(radio_in)),
             *("--sim-port-in", str(simulator_in), "--sim-port-out", str(simulator_out)),
-            *("--serial0", f"udpclient:127.0.0.1:{settings.udp_port}", "--serial1", "none:1", "--serial2", "none:2"),
+            *("--serial0", f"udpclient:127.0.0.1:{settings.udp_port}"),
+            *(text for number in (1, 2, 5, 6, 7, 8) for text in (f"--serial{number}", "none")),
         )
 
     def _px4(self) -> tuple[Sequence[str], Mapping[str, str]]:

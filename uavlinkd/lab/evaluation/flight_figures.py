@@ -1,0 +1,122 @@
+"""The figure of the flight evaluation, drawn from its records. Equal records produce equal bytes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import matplotlib as mpl
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from uavlinkd.lab.evaluation.figures import STYLE, to_svg
+from uavlinkd.lab.evaluation.flight_findings import FlightFindings
+from uavlinkd.lab.evaluation.flight_plan import ATTACKS, LINK_NAMES, PAIR, LinkKind, Phase
+from uavlinkd.lab.evaluation.records import Record
+
+SIZE: Final = (11.0, 9.6)
+"""Inches."""
+_PHASE_COLOURS: Final = {
+    Phase.QUIET: "#7f7f7f",
+    Phase.REPLAY: "#d55e00",
+    Phase.ALTER: "#e69f00",
+    Phase.HOLD: "#0072b2",
+    Phase.KEYS: "#cc79a7",
+    Phase.DROP: "#000000",
+}
+"""From the palette of Okabe and Ito, for colour-blind readers too."""
+_LEADER: Final = PAIR[0]
+_FLOWN: Final = "#a9d8f3"
+_STATE_COLOURS: Final = {"link down": "#000000", "freshness unverified": "#0072b2"}
+_STATE_M: Final = -0.07
+"""Where the reported states are, in parts of the axes' height."""
+
+
+def flight_figures(findings: FlightFindings) -> dict[str, bytes]:
+    """The figure as SVG, by name; none without samples."""
+    if not findings.of("sample"):
+        return {}
+    with mpl.rc_context(STYLE):
+        return {"flight": to_svg(draw_flight(findings))}
+
+
+def draw_flight(findings: FlightFindings) -> Figure:
+    """Above, the path flown and the positions believed over each link; below, the error of the latter over time."""
+    figure = Figure(figsize=SIZE, layout="constrained")
+    halves = figure.add_gridspec(2, 1, height_ratios=(1.0, 1.25))
+    upper, lower = figure.add_subfigure(halves[0]), figure.add_subfigure(halves[1])
+    maps: Sequence[Axes] = upper.subplots(1, len(LinkKind), sharex=True, sharey=True)
+    for axes, link in zip(maps, LinkKind, strict=True):
+        _draw_map(axes, findings.of("sample", link=link, aircraft=_LEADER))
+        axes.set_title(LINK_NAMES[link], loc="left")
+        axes.set_xlabel("east (m)")
+    maps[0].set_ylabel("north (m)")
+    handles = [Line2D([], [], color=_FLOWN, linewidth=4, label="flown")]
+    handles += [
+        Line2D([], [], color=colour, marker="o", linestyle="none", markersize=4, label=f"believed, {phase}")
+        for phase, colour in _PHASE_COLOURS.items()
+    ]
+    upper.legend(handles=handles, loc="outside lower center", ncols=4)
+    rows: Sequence[Axes] = lower.subplots(len(LinkKind), 1, sharex=True, sharey=True)
+    for axes, link in zip(rows, LinkKind, strict=True):
+        _draw_errors(axes, findings, link)
+    rows[1].set_ylabel("distance between believed and flown position (m)")
+    rows[-1].set_xlabel("time since take-off (s)")
+    states = [Patch(color=colour, label=f"uavlinkd reports: {state}") for state, colour in _STATE_COLOURS.items()]
+    lower.legend(handles=states, loc="outside lower center", ncols=2)
+    return figure
+
+
+def _draw_map(axes: Axes, samples: Sequence[Record]) -> None:
+    flown = [(sample.number("flown_east_m"), sample.number("flown_north_m")) for sample in samples]
+    believed = [(sample.number("believed_east_m"), sample.number("believed_north_m")) for sample in samples]
+    colours = [_PHASE_COLOURS[Phase(str(sample.point["phase"]))] for sample in samples]
+    # Thin lines from each believed position to the one flown at that time.
+    axes.add_collection(
+        LineCollection(list(zip(flown, believed, strict=True)), colors=colours, linewidths=0.4, alpha=0.35, zorder=1)
+    )
+    axes.plot([east for east, _ in flown], [north for _, north in flown], color=_FLOWN, linewidth=4, zorder=2)
+    axes.scatter(
+        [east for east, _ in believed],
+        [north for _, north in believed],
+        s=5,
+        color=colours,
+        linewidths=0,
+        zorder=3,
+    )
+    axes.set_aspect("equal", adjustable="box")
+
+
+def _draw_errors(axes: Axes, findings: FlightFindings, link: LinkKind) -> None:
+    spans = findings.spans
+    for span in spans:
+        if span.phase in ATTACKS:
+            axes.axvspan(span.begin_s, span.end_s, color=_PHASE_COLOURS[span.phase], alpha=0.13, linewidth=0)
+            if link is LinkKind.PLAIN:
+                middle = (span.begin_s + span.end_s) / 2
+                axes.text(
+                    middle,
+                    1.02,
+                    span.phase,
+                    transform=axes.get_xaxis_transform(),
+                    ha="center",
+                    va="bottom",
+                    fontsize=9,
+                )
+    samples = findings.of("sample", link=link, aircraft=_LEADER)
+    axes.scatter(
+        [sample.number("at_s") for sample in samples],
+        [sample.number("error_m") for sample in samples],
+        s=4,
+        color=[_PHASE_COLOURS[Phase(str(sample.point["phase"]))] for sample in samples],
+        linewidths=0,
+    )
+    axes.set_title(LINK_NAMES[link], loc="left", y=0.72, x=0.01, fontsize=10)
+    axes.set_ylim(bottom=0)
+    if spans:
+        axes.set_xlim(spans[0].begin_s, spans[-1].end_s)
+    for state, begin_s, end_s in findings.states(link):
+        axes.axvspan(begin_s, end_s, ymin=0.0, ymax=0.05, color=_STATE_COLOURS[state], linewidth=0)
