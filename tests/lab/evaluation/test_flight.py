@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import io
 import json
 import os
 import sys
 from dataclasses import replace
 from importlib.util import find_spec
+from itertools import combinations
 from pathlib import Path
 from random import Random
 
@@ -240,6 +242,7 @@ def test_summary_has_errors_and_accepted_frames() -> None:
     assert (facts["plain_altered_accepted"], facts["ours_altered_accepted"]) == (40, 0)
     assert (facts["paper_max_error_m"], facts["ours_max_error_m"]) == (30.0, 0.5)
     assert facts["paper_max_error_m_quiet"] == 0.5
+    assert (facts["paper_max_unnoticed_error_m"], facts["ours_max_unnoticed_error_m"]) == (30.0, 0.5)
     assert (facts["duration_s"], facts["paper_key_exchange_s"], facts["aircraft"]) == (12.0, 0.06, "our simulator")
     json.dumps(facts, allow_nan=False)
 
@@ -279,10 +282,63 @@ def test_deviation_is_a_problem(link: LinkKind, phase: Phase, name: str, value: 
     assert problem in line
 
 
+def test_unreported_attack_is_a_problem() -> None:
+    """A daemon must report soon that nothing arrives. A phase of a quick run is too short for this."""
+    records = [record for record in some_records() if record.kind != "state"]
+    assert flight_problems(FlightFindings(RUN, records)) == []
+    longer = [
+        replace(record, values={**record.values, "end_s": record.number("begin_s") + 15.0})
+        if record.point.get("phase") == Phase.DROP and record.kind == "phase"
+        else record
+        for record in records
+    ]
+    (line,) = flight_problems(FlightFindings(RUN, longer))
+    assert 'did not report within 10 s of "drop"' in line
+    down = Record("state", {"link": "uavlinkd"}, {"at_s": 12.0, "state": "link down"})
+    ended = Record("end", {}, {"duration_s": 30.0, "load_after": 1.0})
+    assert flight_problems(FlightFindings(RUN, [*longer[:-1], down, ended])) == []
+
+
+def test_error_is_unnoticed_until_a_state_is_reported() -> None:
+    """Samples while the daemon reports that the link is down do not count; without reports, all count."""
+    records = [
+        replace(record, values={**record.values, "error_m": 80.0})
+        if record.kind == "sample" and record.number("at_s") >= 10.5
+        else record
+        for record in some_records()
+    ]
+    findings = FlightFindings(RUN, records)
+    assert findings.unnoticed_error_m(LinkKind.OURS) == 0.5
+    assert findings.unnoticed_error_m(LinkKind.PAPER) == 80.0
+
+
 def test_interrupted_run_is_a_problem() -> None:
     """Its records end early."""
     (line,) = flight_problems(FlightFindings(RUN, some_records()[:-1]))
     assert "interrupted" in line
+
+
+def test_no_text_of_the_figure_covers_another() -> None:
+    """Titles, labels, ticks and legends; every axis has a label with its unit, on the outer panels."""
+    need(find_spec("matplotlib") is not None, "matplotlib, for the figures")
+    from matplotlib.transforms import Bbox
+
+    from tests.lab.evaluation.test_figures import shown, texts_of
+    from uavlinkd.lab.evaluation.flight_figures import draw_flight
+
+    figure = draw_flight(FlightFindings(RUN, some_records()))
+    figure.savefig(io.BytesIO(), format="png")
+    boxes = [
+        (text.get_text(), text.get_window_extent())
+        for text in texts_of(figure)
+        if text.get_visible() and text.get_text().strip() and shown(text, figure)
+    ]
+    assert {"east (m)", "north (m)", "time since take-off (s)", "uavlinkd reports: link down"} <= {
+        t for t, _ in boxes
+    }
+    for (one, first), (other, second) in combinations(boxes, 2):
+        overlap = Bbox.intersection(first.shrunk(0.95, 0.95), second.shrunk(0.95, 0.95))
+        assert overlap is None or overlap.width * overlap.height < 1, f"{one!r} and {other!r} overlap"
 
 
 def test_report_is_made_again_from_the_records(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -29,14 +29,11 @@ from uavlinkd.lab.evaluation.flight_plan import (
     Phase,
 )
 from uavlinkd.lab.evaluation.flight_positions import (
-    GLOBAL_POSITION_INT,
-    HEARTBEAT,
     Flown,
     Origin,
     Provenance,
     Receiver,
     link_note,
-    message_id,
     samples,
 )
 from uavlinkd.lab.evaluation.machine import load, machine_facts
@@ -229,13 +226,12 @@ class FlightEvaluation:
             await asyncio.sleep(_NOTICE_S)
 
     def _on_frame(self, name: str, frame: bytes) -> None:
-        if message_id(frame) not in (HEARTBEAT, GLOBAL_POSITION_INT) or not self._began_at:
+        place = self._origin.place_in(frame)
+        if place is None or not self._began_at:
             return
         now = self._now()
-        self._sent[name].setdefault(frame, now)
-        place = self._origin.place_in(frame)
-        if place is not None:
-            self._flown[name].add(now, place)
+        self._sent[name][frame] = now
+        self._flown[name].add(now, place)
         for link in self._links:
             link.send(name, frame)
 

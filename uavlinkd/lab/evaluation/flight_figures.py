@@ -17,7 +17,7 @@ from uavlinkd.lab.evaluation.flight_findings import FlightFindings
 from uavlinkd.lab.evaluation.flight_plan import ATTACKS, LINK_NAMES, PAIR, LinkKind, Phase
 from uavlinkd.lab.evaluation.records import Record
 
-SIZE: Final = (11.0, 9.6)
+SIZE: Final = (11.0, 9.0)
 """Inches."""
 _PHASE_COLOURS: Final = {
     Phase.QUIET: "#7f7f7f",
@@ -30,9 +30,7 @@ _PHASE_COLOURS: Final = {
 """From the palette of Okabe and Ito, for colour-blind readers too."""
 _LEADER: Final = PAIR[0]
 _FLOWN: Final = "#a9d8f3"
-_STATE_COLOURS: Final = {"link down": "#000000", "freshness unverified": "#0072b2"}
-_STATE_M: Final = -0.07
-"""Where the reported states are, in parts of the axes' height."""
+_STATE_COLOURS: Final = {"link down": "#009e73", "freshness unverified": "#0072b2"}
 
 
 def flight_figures(findings: FlightFindings) -> dict[str, bytes]:
@@ -46,7 +44,7 @@ def flight_figures(findings: FlightFindings) -> dict[str, bytes]:
 def draw_flight(findings: FlightFindings) -> Figure:
     """Above, the path flown and the positions believed over each link; below, the error of the latter over time."""
     figure = Figure(figsize=SIZE, layout="constrained")
-    halves = figure.add_gridspec(2, 1, height_ratios=(1.0, 1.25))
+    halves = figure.add_gridspec(2, 1, height_ratios=(3.5, 5.5))
     upper, lower = figure.add_subfigure(halves[0]), figure.add_subfigure(halves[1])
     maps: Sequence[Axes] = upper.subplots(1, len(LinkKind), sharex=True, sharey=True)
     for axes, link in zip(maps, LinkKind, strict=True):
@@ -65,8 +63,14 @@ def draw_flight(findings: FlightFindings) -> Figure:
         _draw_errors(axes, findings, link)
     rows[1].set_ylabel("distance between believed and flown position (m)")
     rows[-1].set_xlabel("time since take-off (s)")
-    states = [Patch(color=colour, label=f"uavlinkd reports: {state}") for state, colour in _STATE_COLOURS.items()]
-    lower.legend(handles=states, loc="outside lower center", ncols=2)
+    reported = {state for state, _, _ in findings.states(LinkKind.OURS)}
+    states = [
+        Patch(color=colour, label=f"uavlinkd reports: {state}")
+        for state, colour in _STATE_COLOURS.items()
+        if state in reported
+    ]
+    if states:
+        lower.legend(handles=states, loc="outside lower center", ncols=2)
     return figure
 
 
@@ -114,7 +118,7 @@ def _draw_errors(axes: Axes, findings: FlightFindings, link: LinkKind) -> None:
         color=[_PHASE_COLOURS[Phase(str(sample.point["phase"]))] for sample in samples],
         linewidths=0,
     )
-    axes.set_title(LINK_NAMES[link], loc="left", y=0.72, x=0.01, fontsize=10)
+    axes.text(1.01, 0.5, LINK_NAMES[link], transform=axes.transAxes, rotation=270, ha="left", va="center")
     axes.set_ylim(bottom=0)
     if spans:
         axes.set_xlim(spans[0].begin_s, spans[-1].end_s)

@@ -12,6 +12,10 @@ from uavlinkd.lab.evaluation.flight_plan import NAME, LinkKind, Phase
 from uavlinkd.lab.evaluation.flight_positions import Provenance
 from uavlinkd.lab.evaluation.records import Record, Value, read_records
 
+_DELIVERED = (Phase.QUIET, Phase.REPLAY, Phase.ALTER, Phase.KEYS)
+"""In these phases, frames must arrive: the attacker passes some of them in time."""
+_REPORTED_WITHIN_S = 10.0
+"""Within this time a daemon must report that its link is down or its freshness unverified."""
 _FALSE = (Provenance.REPLAYED, Provenance.ALTERED)
 
 
@@ -81,6 +85,20 @@ class FlightFindings:
         """What the ends of a link counted in a phase."""
         return "; ".join(str(record.values["noticed"]) for record in self.of("phase", link=link, phase=phase))
 
+    def is_reported(self, at: float) -> bool:
+        """Whether a daemon reports at this time that its link is not well."""
+        return any(begin_s <= at < end_s for _, begin_s, end_s in self.states(LinkKind.OURS))
+
+    def unnoticed_error_m(self, link: LinkKind) -> float | None:
+        """The largest error while no end reports that the link is not well."""
+        states = self.states(link)
+        errors = [
+            sample.number("error_m")
+            for sample in self.of("sample", link=link)
+            if not any(begin_s <= sample.number("at_s") < end_s for _, begin_s, end_s in states)
+        ]
+        return max(errors, default=None)
+
     def states(self, link: LinkKind) -> list[tuple[str, float, float]]:
         """The reported states of a link that are not well, with begin and end in seconds."""
         changes = [(str(record.values["state"]), record.number("at_s")) for record in self.of("state", link=link)]
@@ -108,6 +126,7 @@ def summary(findings: FlightFindings) -> dict[str, Value]:
         facts |= {f"{name}_{kind.value}_accepted": findings.count(link, kind.value) for kind in _FALSE}
         spread = findings.spread(link)
         facts[f"{name}_max_error_m"] = None if spread is None else spread.max_error_m
+        facts[f"{name}_max_unnoticed_error_m"] = findings.unnoticed_error_m(link)
         for phase in Phase:
             spread = findings.spread(link, phase)
             facts[f"{name}_max_error_m_{phase.name.lower()}"] = None if spread is None else spread.max_error_m
@@ -133,9 +152,17 @@ def flight_problems(findings: FlightFindings) -> list[str]:
     for link, phase, kind in expected:
         if not findings.count(link, kind, phase):
             lines.append(f'the attack "{phase}" had no effect on {link}: the attack does not work')
-    for phase in Phase:
-        if phase is not Phase.DROP and not findings.count(LinkKind.OURS, Provenance.GENUINE, phase):
+    for phase in _DELIVERED:
+        if not findings.count(LinkKind.OURS, Provenance.GENUINE, phase):
             lines.append(f'uavlinkd delivered no frame during "{phase}"')
+    for span in findings.spans:
+        is_long = span.end_s - span.begin_s > _REPORTED_WITHIN_S
+        if (
+            span.phase not in (*_DELIVERED,)
+            and is_long
+            and not findings.is_reported(span.begin_s + _REPORTED_WITHIN_S)
+        ):
+            lines.append(f'uavlinkd did not report within {_REPORTED_WITHIN_S:g} s of "{span.phase}"')
     if not findings.of("end"):
         lines.append("the run was interrupted")
     return lines

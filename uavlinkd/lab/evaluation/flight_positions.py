@@ -16,7 +16,6 @@ from uavlinkd.lab.sim.vehicle import EARTH_RADIUS_M
 from uavlinkd.mavlink import dialect
 from uavlinkd.mavlink.status_text import COMPONENT
 
-HEARTBEAT: Final = 0
 GLOBAL_POSITION_INT: Final = 33
 STATUSTEXT: Final = 253
 _PLACE = struct.Struct("<ii")
@@ -143,7 +142,7 @@ class Receiver:
     """What one aircraft receives of the other over one link: the origin of each frame, and the beliefs.
 
     Args:
-        sent: when the other aircraft first sent each frame; it grows.
+        sent: when the other aircraft sent each frame; it grows. The time in a position makes each frame unique.
     """
 
     def __init__(self, origin: Origin, sent: dict[bytes, float]) -> None:

@@ -76,7 +76,9 @@ def _on_figure(findings: FlightFindings) -> list[str]:
         "The figure shows the first aircraft, as the second one believes it to be. A thin line joins each believed "
         "position to the one flown at that time. A receiver believes the last position that its link delivered.",
         "All links carried the same flight at the same time. Positions are sent ten times a second: without an "
-        "attack, the error is the distance flown in up to 0.1 s.",
+        "attack, the error is the distance flown in up to 0.1 s. The largest error is that of an attacker who drops "
+        "everything. The last column leaves out the time in which a daemon reports that its link is down, or that it "
+        "cannot verify that frames are new. The other ends report nothing.",
     ]
 
 
@@ -84,11 +86,13 @@ def _overview(findings: FlightFindings) -> Table:
     rows = []
     for link in LinkKind:
         spread = findings.spread(link)
+        unnoticed = findings.unnoticed_error_m(link)
         errors = ["-"] * 2 if spread is None else [_metres(spread.median_error_m), _metres(spread.max_error_m)]
+        errors.append("-" if unnoticed is None else _metres(unnoticed))
         accepted = [f"{findings.count(link, kind):,}" for kind in Provenance]
         rows.append([LINK_NAMES[link], f"{findings.count(link, 'sent'):,}", *accepted, *errors])
-    head = ["link", "frames sent", "accepted: genuine", "replayed", "altered", "median error", "largest error"]
-    return Table(head, rows)
+    head = ["link", "positions sent", "accepted: genuine", "replayed", "altered", "median error", "largest error"]
+    return Table([*head, "largest error that no end reported"], rows)
 
 
 _ON_ATTACKS = [
@@ -164,9 +168,9 @@ def _exchanges(findings: FlightFindings) -> Table:
 
 
 _ON_STATES = [
-    "The ends of the paper's protocol and plain MAVLink cannot tell that positions are old or missing. A daemon says "
-    "when its link is down, and when no answer shows that frames are new; reports then still pass. Its ground "
-    "station gets a text."
+    "Counters of both ends, by attack. A daemon drops frames that are too late (`doubtful`, `delayed`). It reports "
+    "that its link is down, or that no answer shows that frames are new; in the latter case positions still pass. "
+    "The ends of the paper's protocol and of plain MAVLink cannot tell that a position is old or missing."
 ]
 
 

@@ -94,9 +94,9 @@ class GroundPilot:
         Raises:
             PilotError: the copter refused, or did not climb.
         """
-        await self._until(lambda: self.place is not None, "it did not report its position")
         message = mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT
         await self._command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message, 1e6 / position_rate_hz)
+        await self._until(lambda: self.place is not None, "it did not report its position")
         await self._command(mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
         while not self._is_armed:
             if not self._is_px4:  # PX4 changes the mode by itself
