@@ -21,7 +21,7 @@ from uavlinkd.core import wire
 from uavlinkd.lab.child_processes import end_with_parent
 from uavlinkd.lab.evaluation.flight_attacks import DisplaceOptions, DisplacePositions, Drift, ExchangeWatch
 from uavlinkd.lab.evaluation.flight_findings import FlightFindings, flight_problems, read_flight, summary
-from uavlinkd.lab.evaluation.flight_plan import ATTACKS, NAME, FlightSettings, LinkKind, Phase
+from uavlinkd.lab.evaluation.flight_plan import ATTACKS, NAME, AttackPhase, FlightSettings, LinkKind
 from uavlinkd.lab.evaluation.flight_positions import (
     Belief,
     Flown,
@@ -185,7 +185,7 @@ def test_plan_tries_each_attack_with_a_pause_before_it() -> None:
     for settings in (FlightSettings(), FlightSettings(quick=True)):
         phases = settings.phases()
         assert [phase for phase, _ in phases[1::2]] == list(ATTACKS)
-        assert {phase for phase, _ in phases[::2]} == {Phase.QUIET}
+        assert {phase for phase, _ in phases[::2]} == {AttackPhase.QUIET}
         assert phases[0][1] == settings.replay_delay_s
 
 
@@ -196,15 +196,15 @@ def some_records() -> list[Record]:
     """Records of a short run in which all is as expected."""
     records = [Record("exchange", {"link": "paper"}, {"first_position_s": 0.2, "began_s": 0.1, "took_s": 0.06})]
     for link in LinkKind:
-        for number, phase in enumerate(Phase):
+        for number, phase in enumerate(AttackPhase):
             begin_s = 2.0 * number
             weak = link is not LinkKind.OURS
             counts: dict[str, Value] = {
                 "sent": 40,
                 "interventions": 20,
-                "genuine": 0 if phase is Phase.DROP else 40,
-                "replayed": 40 if weak and phase is Phase.REPLAY else 0,
-                "altered": 20 if weak and phase in (Phase.ALTER, Phase.KEYS) else 0,
+                "genuine": 0 if phase is AttackPhase.DROP else 40,
+                "replayed": 40 if weak and phase is AttackPhase.REPLAY else 0,
+                "altered": 20 if weak and phase in (AttackPhase.ALTER, AttackPhase.KEYS) else 0,
                 "noticed": "" if weak else "20 bad_tag",
                 "begin_s": begin_s,
                 "end_s": begin_s + 2.0,
@@ -212,7 +212,7 @@ def some_records() -> list[Record]:
             records.append(Record("phase", {"link": link.value, "phase": phase.value}, counts))
             for tick in range(20):
                 at = begin_s + tick / 10
-                error = 30.0 if weak and phase is not Phase.QUIET else 0.5
+                error = 30.0 if weak and phase is not AttackPhase.QUIET else 0.5
                 values: dict[str, Value] = {
                     "at_s": at,
                     "flown_east_m": 8 * at,
@@ -259,15 +259,15 @@ def test_reported_states_have_begin_and_end() -> None:
 @pytest.mark.parametrize(
     ("link", "phase", "name", "value", "problem"),
     [
-        (LinkKind.OURS, Phase.REPLAY, "replayed", 1, "accepted 1 replayed"),
-        (LinkKind.OURS, Phase.KEYS, "altered", 2, "accepted 2 altered"),
-        (LinkKind.OURS, Phase.ALTER, "genuine", 0, "delivered no frame"),
-        (LinkKind.PAPER, Phase.REPLAY, "replayed", 0, "no effect on paper"),
-        (LinkKind.PAPER, Phase.KEYS, "altered", 0, "no effect on paper"),
-        (LinkKind.PLAIN, Phase.ALTER, "altered", 0, "no effect on plain"),
+        (LinkKind.OURS, AttackPhase.REPLAY, "replayed", 1, "accepted 1 replayed"),
+        (LinkKind.OURS, AttackPhase.KEYS, "altered", 2, "accepted 2 altered"),
+        (LinkKind.OURS, AttackPhase.ALTER, "genuine", 0, "delivered no frame"),
+        (LinkKind.PAPER, AttackPhase.REPLAY, "replayed", 0, "no effect on paper"),
+        (LinkKind.PAPER, AttackPhase.KEYS, "altered", 0, "no effect on paper"),
+        (LinkKind.PLAIN, AttackPhase.ALTER, "altered", 0, "no effect on plain"),
     ],
 )
-def test_deviation_is_a_problem(link: LinkKind, phase: Phase, name: str, value: int, problem: str) -> None:
+def test_deviation_is_a_problem(link: LinkKind, phase: AttackPhase, name: str, value: int, problem: str) -> None:
     """An accepted false frame, a link that is cut by more than drops, or an attack without effect."""
     records = some_records()
     assert flight_problems(FlightFindings(RUN, records)) == []
@@ -288,7 +288,7 @@ def test_unreported_attack_is_a_problem() -> None:
     assert flight_problems(FlightFindings(RUN, records)) == []
     longer = [
         replace(record, values={**record.values, "end_s": record.number("begin_s") + 15.0})
-        if record.point.get("phase") == Phase.DROP and record.kind == "phase"
+        if record.point.get("phase") == AttackPhase.DROP and record.kind == "phase"
         else record
         for record in records
     ]
@@ -395,8 +395,8 @@ async def test_quick_run(tmp_path: Path) -> None:
         assert findings.of("sample", link=link, aircraft="drone1")
     for exchange in findings.of("exchange", link=LinkKind.OURS):
         assert exchange.number("began_s") > 0, "the keys are exchanged after take-off"
-    assert "replayed" in findings.noticed(LinkKind.OURS, Phase.REPLAY)
-    assert "bad_tag" in findings.noticed(LinkKind.OURS, Phase.ALTER)
+    assert "replayed" in findings.noticed(LinkKind.OURS, AttackPhase.REPLAY)
+    assert "bad_tag" in findings.noticed(LinkKind.OURS, AttackPhase.ALTER)
     assert (tmp_path / "flight.html").read_text().count("data:image/svg+xml;base64,") == 1
     interventions = [json.loads(line) for line in (tmp_path / "mitm-flight-uavlinkd.jsonl").read_text().splitlines()]
     attacks = {line["attack"] for line in interventions if line["event"] == "intervention"}

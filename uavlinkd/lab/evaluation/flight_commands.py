@@ -36,9 +36,9 @@ def _flight(options: argparse.Namespace) -> int:
     import asyncio  # noqa: PLC0415  nothing heavy is imported before the command runs
 
     from uavlinkd.lab.child_processes import interrupted_by_signals  # noqa: PLC0415
-    from uavlinkd.lab.evaluation.flight import FlightError, FlightEvaluation  # noqa: PLC0415
     from uavlinkd.lab.evaluation.flight_findings import flight_problems, read_flight, summary  # noqa: PLC0415
     from uavlinkd.lab.evaluation.flight_plan import FlightSettings  # noqa: PLC0415
+    from uavlinkd.lab.evaluation.flight_run import FlightError, FlightEvaluation  # noqa: PLC0415
     from uavlinkd.lab.evaluation.records import RecordsError  # noqa: PLC0415
     from uavlinkd.lab.sim.aircraft import AircraftChoice, choice_of  # noqa: PLC0415
     from uavlinkd.lab.sim.drone_process import DroneError  # noqa: PLC0415

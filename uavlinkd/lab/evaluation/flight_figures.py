@@ -14,18 +14,18 @@ from matplotlib.patches import Patch
 
 from uavlinkd.lab.evaluation.figures import STYLE, to_svg
 from uavlinkd.lab.evaluation.flight_findings import FlightFindings
-from uavlinkd.lab.evaluation.flight_plan import ATTACKS, LINK_NAMES, PAIR, LinkKind, Phase
+from uavlinkd.lab.evaluation.flight_plan import ATTACKS, LINK_NAMES, PAIR, AttackPhase, LinkKind
 from uavlinkd.lab.evaluation.records import Record
 
 SIZE: Final = (11.0, 9.0)
 """Inches."""
 _PHASE_COLOURS: Final = {
-    Phase.QUIET: "#7f7f7f",
-    Phase.REPLAY: "#d55e00",
-    Phase.ALTER: "#e69f00",
-    Phase.HOLD: "#0072b2",
-    Phase.KEYS: "#cc79a7",
-    Phase.DROP: "#000000",
+    AttackPhase.QUIET: "#7f7f7f",
+    AttackPhase.REPLAY: "#d55e00",
+    AttackPhase.ALTER: "#e69f00",
+    AttackPhase.HOLD: "#0072b2",
+    AttackPhase.KEYS: "#cc79a7",
+    AttackPhase.DROP: "#000000",
 }
 """From the palette of Okabe and Ito, for colour-blind readers too."""
 _LEADER: Final = PAIR[0]
@@ -77,7 +77,7 @@ def draw_flight(findings: FlightFindings) -> Figure:
 def _draw_map(axes: Axes, samples: Sequence[Record]) -> None:
     flown = [(sample.number("flown_east_m"), sample.number("flown_north_m")) for sample in samples]
     believed = [(sample.number("believed_east_m"), sample.number("believed_north_m")) for sample in samples]
-    colours = [_PHASE_COLOURS[Phase(str(sample.point["phase"]))] for sample in samples]
+    colours = [_PHASE_COLOURS[AttackPhase(str(sample.point["phase"]))] for sample in samples]
     # Thin lines from each believed position to the one flown at that time.
     axes.add_collection(
         LineCollection(list(zip(flown, believed, strict=True)), colors=colours, linewidths=0.4, alpha=0.35, zorder=1)
@@ -115,7 +115,7 @@ def _draw_errors(axes: Axes, findings: FlightFindings, link: LinkKind) -> None:
         [sample.number("at_s") for sample in samples],
         [sample.number("error_m") for sample in samples],
         s=4,
-        color=[_PHASE_COLOURS[Phase(str(sample.point["phase"]))] for sample in samples],
+        color=[_PHASE_COLOURS[AttackPhase(str(sample.point["phase"]))] for sample in samples],
         linewidths=0,
     )
     axes.text(1.01, 0.5, LINK_NAMES[link], transform=axes.transAxes, rotation=270, ha="left", va="center")

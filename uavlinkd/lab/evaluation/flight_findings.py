@@ -8,11 +8,11 @@ from itertools import pairwise
 from pathlib import Path
 from statistics import median
 
-from uavlinkd.lab.evaluation.flight_plan import NAME, LinkKind, Phase
+from uavlinkd.lab.evaluation.flight_plan import NAME, AttackPhase, LinkKind
 from uavlinkd.lab.evaluation.flight_positions import Provenance
 from uavlinkd.lab.evaluation.records import Record, Value, read_records
 
-_DELIVERED = (Phase.QUIET, Phase.REPLAY, Phase.ALTER, Phase.KEYS)
+_DELIVERED = (AttackPhase.QUIET, AttackPhase.REPLAY, AttackPhase.ALTER, AttackPhase.KEYS)
 """In these phases, frames must arrive: the attacker passes some of them in time."""
 _REPORTED_WITHIN_S = 10.0
 """Within this time a daemon must report that its link is down or its freshness unverified."""
@@ -23,7 +23,7 @@ _FALSE = (Provenance.REPLAYED, Provenance.ALTERED)
 class PhaseSpan:
     """One phase of the flight, in seconds after take-off."""
 
-    phase: Phase
+    phase: AttackPhase
     begin_s: float
     end_s: float
 
@@ -49,7 +49,7 @@ class FlightFindings:
     def spans(self) -> list[PhaseSpan]:
         """Every phase, in order."""
         return [
-            PhaseSpan(Phase(str(record.point["phase"])), record.number("begin_s"), record.number("end_s"))
+            PhaseSpan(AttackPhase(str(record.point["phase"])), record.number("begin_s"), record.number("end_s"))
             for record in self.of("phase", link=LinkKind.OURS)
         ]
 
@@ -67,7 +67,7 @@ class FlightFindings:
             if record.kind == kind and all(record.point.get(name) == value for name, value in point.items())
         ]
 
-    def spread(self, link: LinkKind, phase: Phase | None = None) -> Spread | None:
+    def spread(self, link: LinkKind, phase: AttackPhase | None = None) -> Spread | None:
         """The errors in one phase, or in the whole flight; None without samples."""
         chosen = self.of("sample", link=link) if phase is None else self.of("sample", link=link, phase=phase)
         if not chosen:
@@ -76,12 +76,12 @@ class FlightFindings:
         ages = [sample.number("age_s") for sample in chosen]
         return Spread(median(errors), max(errors), median(ages), max(ages))
 
-    def count(self, link: LinkKind, name: str, phase: Phase | None = None) -> int:
+    def count(self, link: LinkKind, name: str, phase: AttackPhase | None = None) -> int:
         """The sum of a counter over the phases."""
         chosen = self.of("phase", link=link) if phase is None else self.of("phase", link=link, phase=phase)
         return round(sum(record.number(name) for record in chosen))
 
-    def noticed(self, link: LinkKind, phase: Phase) -> str:
+    def noticed(self, link: LinkKind, phase: AttackPhase) -> str:
         """What the ends of a link counted in a phase."""
         return "; ".join(str(record.values["noticed"]) for record in self.of("phase", link=link, phase=phase))
 
@@ -127,7 +127,7 @@ def summary(findings: FlightFindings) -> dict[str, Value]:
         spread = findings.spread(link)
         facts[f"{name}_max_error_m"] = None if spread is None else spread.max_error_m
         facts[f"{name}_max_unnoticed_error_m"] = findings.unnoticed_error_m(link)
-        for phase in Phase:
+        for phase in AttackPhase:
             spread = findings.spread(link, phase)
             facts[f"{name}_max_error_m_{phase.name.lower()}"] = None if spread is None else spread.max_error_m
         for exchange in findings.of("exchange", link=link):
@@ -143,11 +143,11 @@ def flight_problems(findings: FlightFindings) -> list[str]:
         for kind in _FALSE
         if (count := findings.count(LinkKind.OURS, kind))
     ]
-    expected: Iterable[tuple[LinkKind, Phase, Provenance]] = (
-        (LinkKind.PLAIN, Phase.ALTER, Provenance.ALTERED),
-        (LinkKind.PLAIN, Phase.REPLAY, Provenance.REPLAYED),
-        (LinkKind.PAPER, Phase.REPLAY, Provenance.REPLAYED),
-        (LinkKind.PAPER, Phase.KEYS, Provenance.ALTERED),
+    expected: Iterable[tuple[LinkKind, AttackPhase, Provenance]] = (
+        (LinkKind.PLAIN, AttackPhase.ALTER, Provenance.ALTERED),
+        (LinkKind.PLAIN, AttackPhase.REPLAY, Provenance.REPLAYED),
+        (LinkKind.PAPER, AttackPhase.REPLAY, Provenance.REPLAYED),
+        (LinkKind.PAPER, AttackPhase.KEYS, Provenance.ALTERED),
     )
     for link, phase, kind in expected:
         if not findings.count(link, kind, phase):

@@ -22,9 +22,9 @@ from uavlinkd.lab.evaluation.flight_plan import (
     ALTERED_SHARE,
     PAIR,
     SYSTEM_IDS,
+    AttackPhase,
     FlightSettings,
     LinkKind,
-    Phase,
 )
 from uavlinkd.lab.evaluation.middle import HOST, MiddleHere
 from uavlinkd.lab.evaluation.paper_attacks import PaperRelay
@@ -79,18 +79,18 @@ class PositionLink(ABC):
         """What both ends noticed so far."""
         return LinkNotice()
 
-    async def attack(self, phase: Phase) -> None:
+    async def attack(self, phase: AttackPhase) -> None:
         """Begin a phase. The attacks of the phase before end; what they hold is lost."""
-        specs: dict[Phase, str] = {
-            Phase.REPLAY: f"duplicate,when=later,delay_s={self.settings.replay_delay_s:g}",
-            Phase.HOLD: f"hold,kinds=any,hold_s={self.settings.hold_s:g}",
-            Phase.DROP: "drop",
+        specs: dict[AttackPhase, str] = {
+            AttackPhase.REPLAY: f"duplicate,when=later,delay_s={self.settings.replay_delay_s:g}",
+            AttackPhase.HOLD: f"hold,kinds=any,hold_s={self.settings.hold_s:g}",
+            AttackPhase.DROP: "drop",
         }
         if phase in specs:
             await self.middle.attack([specs[phase]])
-        elif phase is Phase.ALTER:
+        elif phase is AttackPhase.ALTER:
             await self.middle.attack([], [self.displacement()])
-        elif phase is Phase.KEYS:
+        elif phase is AttackPhase.KEYS:
             await self.replace_keys()
         else:
             await self.middle.attack([])
@@ -204,10 +204,10 @@ class PaperLink(PositionLink):
             counts.update({reason: count for reason, count in end.counters.items() if reason != VERIFIED})
         return LinkNotice(counts)
 
-    async def attack(self, phase: Phase) -> None:
+    async def attack(self, phase: AttackPhase) -> None:
         """After an attack on an exchange, exchange keys again: otherwise no frame would be accepted any more."""
         await super().attack(phase)
-        if self._is_relayed and phase is not Phase.KEYS:
+        if self._is_relayed and phase is not AttackPhase.KEYS:
             self._is_relayed = False
             self._ends[PAIR[0]].renew()
 

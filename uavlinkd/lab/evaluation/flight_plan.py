@@ -29,7 +29,7 @@ LINK_NAMES: Final = {
 }
 
 
-class Phase(StrEnum):
+class AttackPhase(StrEnum):
     """What the attacker does."""
 
     QUIET = "no attack"
@@ -41,14 +41,14 @@ class Phase(StrEnum):
 
 
 MEANINGS: Final = {
-    Phase.QUIET: "the attacker passes everything",
-    Phase.REPLAY: "after each datagram, the attacker sends the one from some seconds earlier again",
-    Phase.ALTER: "the attacker moves the position in half of the datagrams, and repairs the checksum",
-    Phase.HOLD: "the attacker passes each datagram some seconds later",
-    Phase.KEYS: "the attacker replaces the public keys of an exchange, and moves positions",
-    Phase.DROP: "the attacker drops everything",
+    AttackPhase.QUIET: "the attacker passes everything",
+    AttackPhase.REPLAY: "after each datagram, the attacker sends the one from some seconds earlier again",
+    AttackPhase.ALTER: "the attacker moves the position in half of the datagrams, and repairs the checksum",
+    AttackPhase.HOLD: "the attacker passes each datagram some seconds later",
+    AttackPhase.KEYS: "the attacker replaces the public keys of an exchange, and moves positions",
+    AttackPhase.DROP: "the attacker drops everything",
 }
-ATTACKS: Final = tuple(phase for phase in Phase if phase is not Phase.QUIET)
+ATTACKS: Final = tuple(phase for phase in AttackPhase if phase is not AttackPhase.QUIET)
 
 POSITION_RATE_HZ: Final = 10.0
 SAMPLE_S: Final = 0.1
@@ -99,11 +99,11 @@ class FlightSettings:
         """Half of the width of the first aircraft's path."""
         return 50.0 if self.quick else 120.0
 
-    def phases(self) -> list[tuple[Phase, float]]:
+    def phases(self) -> list[tuple[AttackPhase, float]]:
         """Each phase with its duration in seconds. The first one lasts until the attacker has enough to replay."""
-        phases = [(Phase.QUIET, self.replay_delay_s)]
+        phases = [(AttackPhase.QUIET, self.replay_delay_s)]
         for attack in ATTACKS:
-            phases += [(attack, self.attack_s), (Phase.QUIET, self.quiet_s)]
+            phases += [(attack, self.attack_s), (AttackPhase.QUIET, self.quiet_s)]
         return phases
 
     def paths(self) -> dict[str, list[Axes]]:

@@ -168,7 +168,7 @@ class Receiver:
 
 
 @dataclass(frozen=True, slots=True)
-class Sample:
+class PositionSample:
     """What was flown and what was believed at one time."""
 
     at: float
@@ -188,11 +188,11 @@ class Sample:
 
 def samples(
     flown: Flown, beliefs: Sequence[Belief], begin_s: float, end_s: float, interval_s: float
-) -> Iterator[Sample]:
+) -> Iterator[PositionSample]:
     """One sample each ``interval_s``, from the first belief on."""
     times = [belief.accepted_at for belief in beliefs]
     for number in range(int((end_s - begin_s) / interval_s)):
         at = begin_s + number * interval_s
         last = bisect_right(times, at) - 1
         if last >= 0:
-            yield Sample(at, flown.at(at), beliefs[last])
+            yield PositionSample(at, flown.at(at), beliefs[last])

@@ -6,7 +6,15 @@ from pathlib import Path
 
 from uavlinkd.lab.evaluation.flight_figures import flight_figures
 from uavlinkd.lab.evaluation.flight_findings import FlightFindings, flight_problems, read_flight
-from uavlinkd.lab.evaluation.flight_plan import ATTACKS, LINK_NAMES, MEANINGS, NAME, FlightSettings, LinkKind, Phase
+from uavlinkd.lab.evaluation.flight_plan import (
+    ATTACKS,
+    LINK_NAMES,
+    MEANINGS,
+    NAME,
+    AttackPhase,
+    FlightSettings,
+    LinkKind,
+)
 from uavlinkd.lab.evaluation.flight_positions import Provenance
 from uavlinkd.lab.evaluation.page import THE_PAPER, ReportSection, Table, to_html, to_markdown
 from uavlinkd.lab.evaluation.spread import duration
@@ -106,8 +114,8 @@ _ON_ATTACKS = [
 def _meanings(findings: FlightFindings) -> Table:
     settings = _settings(findings)
     details = {
-        Phase.REPLAY: f"{settings.replay_delay_s:.0f} s earlier",
-        Phase.HOLD: f"{settings.hold_s:g} s later",
+        AttackPhase.REPLAY: f"{settings.replay_delay_s:.0f} s earlier",
+        AttackPhase.HOLD: f"{settings.hold_s:g} s later",
     }
     rows = [[phase, MEANINGS[phase], details.get(phase, "-")] for phase in ATTACKS]
     return Table(["attack", "what the attacker does", "here"], rows)
@@ -115,7 +123,7 @@ def _meanings(findings: FlightFindings) -> Table:
 
 def _by_phase(findings: FlightFindings) -> Table:
     rows = []
-    for phase in Phase:
+    for phase in AttackPhase:
         for link in LinkKind:
             spread = findings.spread(link, phase)
             if spread is None:

@@ -24,9 +24,9 @@ from uavlinkd.lab.evaluation.flight_plan import (
     POSITION_RATE_HZ,
     SAMPLE_S,
     SYSTEM_IDS,
+    AttackPhase,
     FlightSettings,
     LinkKind,
-    Phase,
 )
 from uavlinkd.lab.evaluation.flight_positions import (
     Flown,
@@ -69,7 +69,7 @@ class FlightEvaluation:
         }
         self._links: list[PositionLink] = []
         self._began_at = 0.0
-        self._phases: list[tuple[Phase, float, float]] = []
+        self._phases: list[tuple[AttackPhase, float, float]] = []
 
     async def run(self) -> None:
         """Fly, and write the records.
@@ -134,7 +134,7 @@ class FlightEvaluation:
         try:
             for number, (phase, duration_s) in enumerate(self.settings.phases()):
                 # The attacker records for the replay during the first phase, which is otherwise quiet.
-                attack = Phase.REPLAY if number == 0 else phase
+                attack = AttackPhase.REPLAY if number == 0 else phase
                 await self._run_phase(phase, attack, duration_s, writer)
         finally:
             noticing.cancel()
@@ -184,12 +184,14 @@ class FlightEvaluation:
             self._show(f"{link.kind}: keys exchanged in flight in {1e3 * (data_at - key_at):.1f} ms")
         return Record("exchange", {"link": link.kind.value}, values)
 
-    async def _run_phase(self, phase: Phase, attack: Phase, duration_s: float, writer: RecordWriter) -> None:
+    async def _run_phase(
+        self, phase: AttackPhase, attack: AttackPhase, duration_s: float, writer: RecordWriter
+    ) -> None:
         before = [(await link.notice(), await link.interventions()) for link in self._links]
         begin_s = self._now()
         self._show(f"{begin_s:6.1f} s  {phase}")
         # The replay that was recorded in the first phase goes on.
-        if phase is not Phase.REPLAY:
+        if phase is not AttackPhase.REPLAY:
             for link in self._links:
                 await link.attack(attack)
         await asyncio.sleep(max(0.0, begin_s + duration_s - self._now()))
@@ -240,12 +242,12 @@ class FlightEvaluation:
         for kind, receivers in self._receivers.items():
             for name, receiver in receivers.items():
                 flown = self._flown[_other(name)]
-                before = Phase.QUIET
+                before = AttackPhase.QUIET
                 for phase, begin_s, end_s in self._phases:
                     for sample in samples(flown, receiver.beliefs, begin_s, end_s, SAMPLE_S):
                         # An attack has an effect until a position is accepted after its end.
                         is_over = sample.belief.accepted_at >= begin_s
-                        cause = before if phase is Phase.QUIET and not is_over else phase
+                        cause = before if phase is AttackPhase.QUIET and not is_over else phase
                         point = {"link": kind.value, "aircraft": _other(name), "phase": cause.value}
                         values: dict[str, Value] = {
                             "at_s": round(sample.at, 3),
