@@ -12,6 +12,7 @@ import pytest
 MAY_BE_MISSING = (
     "no ProVerif",
     "no recorded flights",
+    "no autopilot simulator",
     "needs a writable cgroup",
     "needs an interface with a link-local IPv6 address",
     "this machine does not know its own name",

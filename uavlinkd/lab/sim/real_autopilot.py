@@ -11,7 +11,7 @@ import os
 import signal
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
 from time import monotonic
@@ -64,6 +64,9 @@ class RealAutopilotSettings:
         binary: ``arducopter``, or ``bin/px4`` of a build.
         udp_port: a port of loopback. The autopilot sends its MAVLink there, and accepts MAVLink from there.
         instance: PX4 allows one process per instance on a machine, and derives ports from it.
+        parameters: of ArduCopter, in addition to those of a newly built copter, for its first start.
+        maintenance_port: a second port of loopback where ArduCopter sends MAVLink, as by USB. It accepts unsigned
+            frames there, and at ``udp_port`` signed frames only, once it has a signing key.
     """
 
     firmware: Firmware
@@ -72,6 +75,8 @@ class RealAutopilotSettings:
     home: GeoPoint
     system_id: int = 1
     instance: int = 0
+    parameters: Mapping[str, float] = field(default_factory=dict)
+    maintenance_port: int | None = None
 
 
 def binary_of(firmware: Firmware, environ: Mapping[str, str] = os.environ) -> Path | None:
@@ -90,7 +95,10 @@ def binary_of(firmware: Firmware, environ: Mapping[str, str] = os.environ) -> Pa
 
 
 class RealAutopilot:
-    """The process of one autopilot, as an asynchronous context. ``folder`` is created for its files."""
+    """The process of one autopilot, as an asynchronous context. ``folder`` is created for its files.
+
+    After :meth:`stop` it can be started again, with the files of its last run.
+    """
 
     def __init__(self, settings: RealAutopilotSettings, folder: Path) -> None:
         self.settings = settings
@@ -105,7 +113,7 @@ class RealAutopilot:
         Raises:
             RealAutopilotError: it ended, or did not start in time.
         """
-        self.folder.mkdir(parents=True)
+        self.folder.mkdir(parents=True, exist_ok=True)
         is_px4 = self.settings.firmware is Firmware.PX4
         command, variables = self._px4() if is_px4 else (self._ardupilot(), {})
         with self.log.open("wb") as log:
@@ -119,17 +127,19 @@ class RealAutopilot:
             )
         if is_px4:
             await self._until_logged(_PX4_STARTED)
+            # The start script derives the system id from the instance.
+            await self._ask_px4("param", "set", "MAV_SYS_ID", str(self.settings.system_id))
             # In place of the links that its start script opens, which have fixed ports.
             await self._ask_px4("mavlink", "stop-all")
             (local_port,) = free_ports(1)
             ports = ("-u", str(local_port), "-o", str(self.settings.udp_port), "-t", "127.0.0.1")
             await self._ask_px4("mavlink", "start", *ports, "-m", "onboard", "-r", str(_PX4_BYTES_PER_S))
 
-    async def stop(self) -> None:
+    async def stop(self, number: signal.Signals = signal.SIGTERM) -> None:
         """Stop the process: first with a signal, then by killing it."""
         if self._process is None or self._process.returncode is not None:
             return
-        self._process.send_signal(signal.SIGTERM)
+        self._process.send_signal(number)
         with suppress(TimeoutError):
             await asyncio.wait_for(self._process.wait(), STOP_S)
         if self._process.returncode is None:
@@ -163,8 +173,12 @@ class RealAutopilot:
 
     def _ardupilot(self) -> Sequence[str]:
         defaults = self.folder / "defaults.parm"
-        defaults.write_text("".join(f"{name} {value}\n" for name, value in _COPTER_PARAMETERS.items()))
         settings, home = self.settings, self.settings.home
+        parameters = {**_COPTER_PARAMETERS, **settings.parameters}
+        defaults.write_text("".join(f"{name} {value}\n" for name, value in parameters.items()))
+        serial = dict.fromkeys((0, 1, 2, 5, 6, 7, 8), "none")
+        ports = (settings.maintenance_port, settings.udp_port) if settings.maintenance_port else (settings.udp_port,)
+        serial |= {number: f"udpclient:127.0.0.1:{port}" for number, port in enumerate(ports)}
         base, radio_in, simulator_in, simulator_out = free_ports(4)
         return (
             *(str(settings.binary), "--model", "quad", "--speedup", "1", "--defaults", str(defaults)),
@@ -172,8 +186,7 @@ class RealAutopilot:
             *("--sysid", str(settings.system_id)),
             *("--base-port", str(base), "--rc-in-port", str(radio_in)),
             *("--sim-port-in", str(simulator_in), "--sim-port-out", str(simulator_out)),
-            *("--serial0", f"udpclient:127.0.0.1:{settings.udp_port}"),
-            *(text for number in (1, 2, 5, 6, 7, 8) for text in (f"--serial{number}", "none")),
+            *(text for number, to in serial.items() for text in (f"--serial{number}", to)),
         )
 
     def _px4(self) -> tuple[Sequence[str], Mapping[str, str]]:
@@ -181,7 +194,6 @@ class RealAutopilot:
         variables = {
             "PX4_SIM_MODEL": "sihsim_quadx",
             "PX4_SIMULATOR": "sihsim",
-            "PX4_PARAM_MAV_SYS_ID": str(settings.system_id),
             "PX4_PARAM_SIH_LOC_LAT0": str(home.latitude_deg),
             "PX4_PARAM_SIH_LOC_LON0": str(home.longitude_deg),
             "PX4_PARAM_SIH_LOC_H0": str(home.altitude_m),

@@ -1,0 +1,79 @@
+"""The emulated radio between the two ends: ``uavlink-mitm`` in its own process."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from tests.daemon.toml import to_toml
+from tests.daemon.udp import Sockaddr, shown
+from tests.waiting import PATIENCE_S
+from uavlinkd.lab.child_processes import end_with_parent
+from uavlinkd.lab.sim.loopback_ports import free_port
+from uavlinkd.ops.control import ControlError, ask
+
+
+class Radio:
+    """A radio for several links. Add links with :meth:`connect`, then :meth:`start`."""
+
+    def __init__(self, folder: Path, impairments: Mapping[str, object], seed: int = 0) -> None:
+        self._folder = folder
+        self._config: dict[str, Any] = {"seed": seed, "control_socket": "radio.sock", "peer": [], "link": []}
+        self._config["radio"] = [{"direction": "both", **impairments}] if impairments else []
+        self._process: asyncio.subprocess.Process | None = None
+
+    def connect(self, name: str, near: Sockaddr | None, far: Sockaddr) -> tuple[Sockaddr, Sockaddr]:
+        """Add a link from ``near`` (None: learned from its datagrams) to ``far``.
+
+        Returns the address at which near reaches far, and the address at which far reaches near.
+        """
+        faces: Sequence[Sockaddr] = [("127.0.0.1", free_port()) for _ in range(2)]
+        peer = {"name": name} if near is None else {"name": name, "address": shown(near)}
+        self._config["peer"] += [peer, {"name": f"{name}-ground", "address": shown(far)}]
+        self._config["link"].append({"between": [name, f"{name}-ground"], "listen": [shown(face) for face in faces]})
+        return faces[0], faces[1]
+
+    async def start(self) -> None:
+        """Start the process, and wait until it answers."""
+        path = self._folder / "radio.toml"
+        path.write_text(to_toml({key: value for key, value in self._config.items() if value != []}))
+        self._process = await asyncio.create_subprocess_exec(
+            *end_with_parent(sys.executable, "-m", "uavlinkd.lab.mitm", "--config", str(path)),
+            stdin=asyncio.subprocess.DEVNULL,
+            stdout=asyncio.subprocess.DEVNULL,
+            stderr=asyncio.subprocess.DEVNULL,
+        )
+        async with asyncio.timeout(PATIENCE_S):
+            while True:
+                with suppress(ControlError):
+                    await self.ask("statistics")
+                    return
+                await asyncio.sleep(0.02)
+
+    async def ask(self, request: str) -> dict[str, Any]:
+        """Send a request to the control socket.
+
+        Raises:
+            ControlError: there is no answer.
+        """
+        answer = await asyncio.to_thread(ask, self._folder / "radio.sock", request)
+        assert "refused" not in answer, answer
+        return answer
+
+    async def cut(self) -> None:
+        """Drop every datagram in both directions."""
+        await self.ask("attack drop")
+
+    async def restore(self) -> None:
+        """End :meth:`cut`."""
+        await self.ask("attack none")
+
+    async def stop(self) -> None:
+        """End the process."""
+        if self._process is not None and self._process.returncode is None:
+            self._process.terminate()
+            await self._process.wait()

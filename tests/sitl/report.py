@@ -1,0 +1,253 @@
+"""RESULTS.md from the records of flights: only what was measured, and the names of what was not flown."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from tests.sitl.conditions import BY_NAME
+from tests.sitl.scenarios import KINDS, Record, runs
+
+Cells = Sequence[object]
+FLOWN_KINDS = tuple(kind for kind in KINDS if kind != "own")
+
+
+def report(records: list[Record]) -> str:
+    """The page."""
+    passed = [record for record in records if record.error is None]
+    sections = [
+        "# Real autopilots at the ends of real daemons",
+        "Made by `python -m tests.sitl`, see [README.md](README.md). The simulators ran on the same machine, at the"
+        " speed of real time, beside other work. *direct*: the same without daemons.",
+        _section("Flown", ("autopilot", "version", "runs", "passed"), _flown(records)),
+        _section(
+            "Frames on the clean link",
+            (
+                *("scenario", "autopilot", "frames down / up", "lost / altered / duplicated / reordered"),
+                *("frames/s", "latency p50 / p99 down", "p50 direct", "CPU drone / ground"),
+            ),
+            _frames(passed),
+            "Frames are compared byte for byte at the autopilot and at the station. CPU is a share of one core.",
+        ),
+        _section(
+            "Parameters, and a mission of 100 items",
+            (
+                *("autopilot", "condition", "parameters", "all parameters", "direct"),
+                *("mission up", "direct", "mission down", "direct", "requests repeated", "direct"),
+            ),
+            _tables(passed),
+        ),
+        _section(
+            "Flights: arm, take off, two guided waypoints, a mission of three waypoints, return",
+            ("autopilot", "condition", "", "to the second waypoint", "mission", "return", "lost down / up"),
+            _flights(passed),
+        ),
+        _section(
+            "Log, and 1 MB by MAVFTP",
+            ("autopilot", "", "log", "log", "read", "write"),
+            _files(passed),
+            "Equal byte for byte to the files in the simulator's folder.",
+        ),
+        _section(
+            "Signing",
+            (
+                *("autopilot", "", "signed frames down / up", "unsigned down", "bad signatures"),
+                *("SETUP_SIGNING withheld", "unsigned request ignored"),
+            ),
+            _signing(passed),
+            "From parameters to a flight, all signed. The key was set on the autopilot's maintenance port.",
+        ),
+        _section(
+            "Two vehicles, one station",
+            ("autopilot", "", "parameters of each", "downloaded together in", "lost down / up"),
+            _two(passed),
+        ),
+        _section(
+            "Follow-me between two swarm members",
+            ("autopilot", "", "leader flew", "until the follower was there", "distance", "messages from the leader"),
+            _follow(passed),
+        ),
+        _section(
+            "Outages, with the autopilot's failsafe after 5 s without its ground station",
+            (
+                *("autopilot", "", "outage", "first frame down / up after it", "failsafe"),
+                *("after the last heartbeat", "under control again"),
+            ),
+            _outages(passed),
+            "The first frame up is the station's heartbeat, once per second.",
+        ),
+        _section(
+            "Restarts",
+            ("autopilot", "", "what", "absent", "first frame down / up after the start"),
+            _restarts(passed),
+            "Daemons in the air, with the failsafe on: it did not trip. The simulator on the ground: it has a new"
+            " source port, and its time counts from its first frame.",
+        ),
+        _section(
+            "Failed",
+            ("scenario", "autopilot", "condition", "", "reason"),
+            [[*_name(record), (record.error or "").replace("|", "/")[:300]] for record in records if record.error],
+        ),
+        _section("Not flown", ("scenario", "autopilot", "conditions", ""), _not_flown(records)),
+    ]
+    return "\n\n".join(section for section in sections if section) + "\n"
+
+
+def _section(title: str, head: Cells, rows: Iterable[Cells], about: str = "") -> str:
+    lines = ["| " + " | ".join(map(str, row)) + " |" for row in rows]
+    if not lines:
+        return ""
+    table = ["| " + " | ".join(map(str, head)) + " |", "|" + "---|" * len(head), *lines]
+    return "\n\n".join(part for part in (f"## {title}", about, "\n".join(table)) if part)
+
+
+def _name(record: Record) -> list[str]:
+    return [record.scenario, record.kind, record.condition, _how(record)]
+
+
+def _how(record: Record) -> str:
+    return "daemons" if record.with_daemons else "direct"
+
+
+def _flown(records: list[Record]) -> Iterable[Cells]:
+    for kind in FLOWN_KINDS:
+        of_kind = [record for record in records if record.kind == kind]
+        if of_kind:
+            versions = sorted({record.version for record in of_kind if record.version})
+            yield KINDS[kind].name, ", ".join(versions), len(of_kind), sum(r.error is None for r in of_kind)
+
+
+def _not_flown(records: list[Record]) -> Iterable[Cells]:
+    flown = {tuple(_name(record)) for record in records}
+    missing: dict[tuple[str, str, str], list[str]] = {}
+    for run in runs(FLOWN_KINDS):
+        how = "daemons" if run.with_daemons else "direct"
+        if (run.scenario, run.kind, run.condition, how) not in flown:
+            missing.setdefault((run.scenario, run.kind, how), []).append(run.condition)
+    return [(scenario, kind, ", ".join(names), how) for (scenario, kind, how), names in missing.items()]
+
+
+def _of(records: list[Record], scenario: str) -> list[Record]:
+    order = list(BY_NAME)
+    chosen = [record for record in records if record.scenario == scenario]
+    return sorted(chosen, key=lambda r: (r.kind, order.index(r.condition), not r.with_daemons))
+
+
+def _twin(records: list[Record], record: Record) -> dict[str, Any]:
+    """The figures of the same run without daemons; empty if it was not flown."""
+    key = (record.scenario, record.kind, record.condition, False)
+    return next((r.figures for r in records if (r.scenario, r.kind, r.condition, r.with_daemons) == key), {})
+
+
+def _with(figures: dict[str, Any], name: str, unit: str = " s") -> str:
+    value = figures.get(name)
+    return "-" if value is None else f"{value:,}{unit}"
+
+
+def _frames(records: list[Record]) -> Iterable[Cells]:
+    for record in records:
+        frames = record.figures.get("frames")
+        if not frames or record.condition != "clean" or not record.with_daemons:
+            continue
+        down, up, cpu = frames["down"], frames["up"], frames["cpu_percent"]
+        drones = [f"{share} %" for name, share in cpu.items() if name != "ground"]
+        direct = _twin(records, record).get("frames", {}).get("down", {}).get("p50_ms")
+        faults = [down[key] + up[key] for key in ("lost", "altered", "duplicated", "reordered")]
+        yield (
+            *(record.scenario, record.kind, f"{down['sent']:,} / {up['sent']:,}", " / ".join(map(str, faults))),
+            *(
+                frames["frames_s"],
+                f"{down['p50_ms']} / {down['p99_ms']} ms",
+                "-" if direct is None else f"{direct} ms",
+            ),
+            f"{', '.join(drones)} / {cpu['ground']} %",
+        )
+
+
+def _tables(records: list[Record]) -> Iterable[Cells]:
+    for record in _of(records, "parameters-mission"):
+        if record.with_daemons:
+            own, direct = record.figures, _twin(records, record)
+            pairs = [
+                _with(figures, name)
+                for name in ("parameters_s", "mission_up_s", "mission_down_s")
+                for figures in (own, direct)
+            ]
+            repeated = [sum(f["retries"].values()) if f else "-" for f in (own, direct)]
+            yield record.kind, record.condition, own["parameters"], *pairs, *repeated
+
+
+def _flights(records: list[Record]) -> Iterable[Cells]:
+    for record in _of(records, "flight"):
+        f = record.figures
+        yield (
+            *(record.kind, record.condition, _how(record)),
+            *(_with(f, name) for name in ("guided_s", "mission_s", "return_s")),
+            _lost(record),
+        )
+
+
+def _lost(record: Record) -> str:
+    frames = record.figures["frames"]
+    return " / ".join(f"{frames[way]['lost']:,} of {frames[way]['sent']:,}" for way in ("down", "up"))
+
+
+def _files(records: list[Record]) -> Iterable[Cells]:
+    for record in _of(records, "log-file"):
+        f = record.figures
+        yield (
+            *(record.kind, _how(record), _with(f, "log_bytes", " bytes"), _with(f, "log_kb_s", " kB/s")),
+            *(_with(f, name, " kB/s") for name in ("ftp_read_kb_s", "ftp_write_kb_s")),
+        )
+
+
+def _signing(records: list[Record]) -> Iterable[Cells]:
+    for record in _of(records, "signing"):
+        f = record.figures
+        yield (
+            *(record.kind, _how(record), f"{f['signed_down']:,} / {f['signed_up']:,}", f["unsigned_down"]),
+            *(f["bad_signatures"], f["setup_signing_withheld"], "yes" if f["unsigned_request_ignored"] else "no"),
+        )
+
+
+def _two(records: list[Record]) -> Iterable[Cells]:
+    for record in _of(records, "two-vehicles"):
+        f = record.figures
+        yield (
+            *(record.kind, _how(record), ", ".join(map(str, f["parameters"]))),
+            *(f"{max(f['parameters_s'])} s", _lost(record)),
+        )
+
+
+def _follow(records: list[Record]) -> Iterable[Cells]:
+    for record in _of(records, "follow-me"):
+        f = record.figures
+        names = f["messages_from_leader"]
+        shown = ", ".join(names) if record.with_daemons else f"{len(names)} kinds"
+        yield (
+            *(record.kind, _how(record), f"{f['lead_m']:g} m", f"{f['seconds']} s"),
+            *(f"{f['distance_m'][0]} to {f['distance_m'][1]} m, {f['final_distance_m']} m at the end",),
+            f"{f['frames_from_leader']:,}: {shown}",
+        )
+
+
+def _outages(records: list[Record]) -> Iterable[Cells]:
+    for record in _of(records, "outages"):
+        for o in record.figures["outages"]:
+            yield (
+                *(
+                    record.kind,
+                    _how(record),
+                    f"{o['seconds']:g} s",
+                    f"{o['frames_back_s']} / {o['station_back_s']} s",
+                ),
+                *("tripped" if o["failsafe"] else "did not trip", _with(o, "failsafe_after_s")),
+                f"{o['control_after_s']} s",
+            )
+
+
+def _restarts(records: list[Record]) -> Iterable[Cells]:
+    for record in _of(records, "restarts"):
+        for r in record.figures["restarts"]:
+            back = f"{r['down_back_s']} / {r['up_back_s']} s"
+            yield record.kind, _how(record), r["what"], _with(r, "absent_s"), back

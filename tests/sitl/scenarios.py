@@ -1,0 +1,167 @@
+"""The list of scenarios, and running one of them: a record of what was flown, how, and with which result."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import monotonic
+from typing import Any
+
+from pymavlink.dialects.v20 import all as mavlink
+
+from tests.sitl.conditions import BY_NAME, CLEAN
+from tests.sitl.flights import flight, follow_me, outages, restarts, two_vehicles
+from tests.sitl.pilots import COPTER, OWN, PX4, Kind, Pilot
+from tests.sitl.simulators import OwnSimulator, RealSimulator, Simulator
+from tests.sitl.station import RequestError, Station
+from tests.sitl.transfers import Figures, log_and_file, parameters_and_mission, signing
+from tests.sitl.world import World, flying
+from uavlinkd.lab.sim.loopback_ports import free_port
+from uavlinkd.lab.sim.real_autopilot import Firmware
+
+KINDS: Mapping[str, Kind] = {"ardupilot": COPTER, "px4": PX4, "own": OWN}
+ALL_CONDITIONS = tuple(BY_NAME)
+
+Scene = Callable[[World, list[Pilot]], Awaitable[Figures]]
+
+
+@dataclass(frozen=True, slots=True)
+class Scenario:
+    """What is flown, with which vehicles, and under which conditions."""
+
+    name: str
+    scene: Scene
+    kinds: tuple[str, ...] = ("ardupilot", "px4")
+    conditions: tuple[str, ...] = (CLEAN.name,)
+    vehicles: int = 1
+    can_cut: bool = False
+    swarm: bool = False
+    has_maintenance_port: bool = False
+
+
+def _alone(scene: Callable[[World, Pilot], Awaitable[Figures]]) -> Scene:
+    return lambda world, pilots: scene(world, pilots[0])
+
+
+SCENARIOS = (
+    Scenario("parameters-mission", _alone(parameters_and_mission), conditions=ALL_CONDITIONS),
+    Scenario("flight", _alone(flight), conditions=("clean", "loss10", "loss30", "slow", "delay")),
+    Scenario("log-file", _alone(log_and_file)),
+    Scenario(
+        "signing",
+        lambda world, pilots: signing(world, pilots[0], world.maintain),
+        kinds=("ardupilot",),
+        has_maintenance_port=True,
+    ),
+    Scenario("two-vehicles", two_vehicles, vehicles=2),
+    Scenario(
+        "follow-me",
+        lambda world, pilots: follow_me(world, *pilots),
+        kinds=("ardupilot",),
+        vehicles=2,
+        swarm=True,
+    ),
+    Scenario("outages", _alone(outages), can_cut=True),
+    Scenario("restarts", _alone(restarts)),
+)
+SCENARIO_BY_NAME = {scenario.name: scenario for scenario in SCENARIOS}
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """One scenario under one condition."""
+
+    scenario: str
+    kind: str
+    condition: str = CLEAN.name
+    with_daemons: bool = True
+
+    def __str__(self) -> str:
+        daemons = "daemons" if self.with_daemons else "direct"
+        return f"{self.scenario}-{self.kind}-{self.condition}-{daemons}"
+
+
+@dataclass(slots=True)
+class Record:
+    """The result of a run. ``error`` is None if all assertions held."""
+
+    scenario: str
+    kind: str
+    condition: str
+    with_daemons: bool
+    version: str = ""
+    seconds: float = 0.0
+    error: str | None = None
+    figures: dict[str, Any] = field(default_factory=dict)
+
+
+def runs(kinds: tuple[str, ...]) -> list[Run]:
+    """Every scenario under each of its conditions, with and without daemons."""
+    return [
+        Run(scenario.name, kind, condition, with_daemons)
+        for kind in kinds
+        for scenario in SCENARIOS
+        if kind in scenario.kinds
+        for condition in scenario.conditions
+        for with_daemons in (True, False)
+        if with_daemons or not BY_NAME[condition].needs_daemons
+    ]
+
+
+async def fly(run: Run) -> Record:
+    """Fly a scenario; a failure is in the record."""
+    record = Record(run.scenario, run.kind, run.condition, run.with_daemons)
+    began = monotonic()
+    try:
+        with tempfile.TemporaryDirectory(prefix="sitl-") as folder:
+            await _fly(run, record, Path(folder))
+    except (AssertionError, TimeoutError, RequestError) as error:
+        record.error = f"{type(error).__name__}: {error}"
+    record.seconds = round(monotonic() - began, 1)
+    return record
+
+
+async def _fly(run: Run, record: Record, folder: Path) -> None:
+    scenario, kind = SCENARIO_BY_NAME[run.scenario], KINDS[run.kind]
+    maintenance_port = free_port() if scenario.has_maintenance_port else None
+    systems = range(1, scenario.vehicles + 1)
+    simulators = [
+        _simulator(run.kind, kind, system, folder / str(system), swarm=scenario.swarm, port=maintenance_port)
+        for system in systems
+    ]
+    async with flying(
+        simulators,
+        condition=BY_NAME[run.condition],
+        with_daemons=run.with_daemons,
+        can_cut=scenario.can_cut,
+        swarm=scenario.swarm,
+        maintenance_port=maintenance_port,
+    ) as world:
+        pilots = [Pilot(world.station, system, kind) for system in systems]
+        record.version = await version(world.station, 1)
+        record.figures = await scenario.scene(world, pilots)
+
+
+def _simulator(name: str, kind: Kind, system: int, folder: Path, *, swarm: bool, port: int | None) -> Simulator:
+    if kind is OWN:
+        folder.mkdir()
+        return OwnSimulator(system, folder)
+    parameters = kind.follows if swarm and system > 1 else {}
+    return RealSimulator(Firmware(name), system, folder, parameters=parameters, maintenance_port=port)
+
+
+async def version(station: Station, system: int) -> str:
+    """The version that the autopilot reports, with the first digits of its commit."""
+    with station.inbox(system, "AUTOPILOT_VERSION") as inbox:
+        for _ in range(20):
+            await station.command(system, mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
+            answer = await inbox.next(2.0)
+            if answer is not None:
+                number = answer.flight_sw_version
+                commit = bytes(answer.flight_custom_version).rstrip(b"\0").decode("ascii", "replace")
+                kind = "-dev" if number & 255 < mavlink.FIRMWARE_VERSION_TYPE_ALPHA else ""
+                name = f"{number >> 24}.{number >> 16 & 255}.{number >> 8 & 255}{kind}"
+                return f"{name} {commit}" if commit.isalnum() else name
+    return "unknown"

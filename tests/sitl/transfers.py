@@ -1,0 +1,179 @@
+"""Scenarios on the ground: parameters, a mission of 100 items, a log, a file by MAVFTP, signing."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from time import monotonic
+from typing import Any
+
+from pymavlink.dialects.v20 import all as mavlink
+
+from tests.sitl.files import Ftp, download_log, list_logs
+from tests.sitl.pilots import Pilot
+from tests.sitl.station import AUTOPILOT
+from tests.sitl.tables import download_mission, download_parameters, upload_mission
+from tests.sitl.world import World
+
+Figures = dict[str, Any]
+
+ITEMS = 100
+FILE_BYTES = 1_000_000
+SIGNING_SINCE_S = 1_420_070_400
+"""The clock of MAVLink's signatures starts in 2015."""
+
+
+async def timed(action: Awaitable[Any]) -> tuple[float, Any]:
+    """The seconds that an action took, and its result."""
+    began = monotonic()
+    result = await action
+    return round(monotonic() - began, 3), result
+
+
+async def counted(world: World, act: Callable[[], Awaitable[Figures]]) -> Figures:
+    """Perform an action while frames are counted. On a clean link no frame may be lost or altered.
+
+    Raises:
+        AssertionError: one was.
+    """
+    measurement = await world.measure()
+    retries = +world.station.retries
+    figures = await act()
+    figures["retries"] = dict(world.station.retries - retries)
+    figures["frames"] = await measurement.end()
+    if not world.condition.radio:
+        assert figures["frames"]["exact"], figures["frames"]
+    return figures
+
+
+async def parameters_and_mission(world: World, pilot: Pilot) -> Figures:
+    """Download all parameters, send a mission of 100 items, and read it back."""
+    station, system = world.station, pilot.system
+    await pilot.request_streams()
+
+    async def act() -> Figures:
+        parameters_s, parameters = await timed(download_parameters(station, system))
+        start = pilot.place
+        items = pilot.mission(*(start.moved(number % 10, number // 10, 20.0) for number in range(ITEMS)))[:ITEMS]
+        up_s, _ = await timed(upload_mission(station, system, items))
+        down_s, back = await timed(download_mission(station, system))
+        first = 1 if pilot.kind.has_home_item else 0  # the vehicle replaces item 0 by its home position
+        assert len(back) == ITEMS
+        differing = [pair for pair in list(zip(items, back, strict=True))[first:] if not pair[0].matches(pair[1])]
+        assert not differing, differing[:2]
+        return {
+            "parameters": len(parameters),
+            "parameters_s": parameters_s,
+            "mission_up_s": up_s,
+            "mission_down_s": down_s,
+        }
+
+    return await counted(world, act)
+
+
+async def log_and_file(world: World, pilot: Pilot) -> Figures:
+    """Download a log, and a file of 1 MB by MAVFTP: equal byte for byte to the simulator's files."""
+    station, system, folder = world.station, pilot.system, world.vehicles[0].simulator.folder
+    content = os.urandom(FILE_BYTES)
+    await asyncio.to_thread((folder / "uavlinkd.bin").write_bytes, content)
+    await pilot.request_streams()
+    await pilot.take_off()  # the log begins when the motors start
+    await pilot.return_and_land()
+
+    async def act() -> Figures:
+        log = max(await list_logs(station, system), key=lambda log: log.size_bytes)
+        log_s, data = await timed(download_log(station, system, log))
+        assert await asyncio.to_thread(holds, folder, data), "no file of the simulator begins with this log"
+        ftp = Ftp(station, system)
+        read_s, back = await timed(ftp.read("uavlinkd.bin"))
+        assert back == content, "the file differs"
+        write_s, _ = await timed(ftp.write("uavlinkd.up", content))
+        assert await asyncio.to_thread((folder / "uavlinkd.up").read_bytes) == content, "the written file differs"
+        return {
+            "log_bytes": len(data),
+            "log_s": log_s,
+            "log_kb_s": round(len(data) / log_s / 1000, 1),
+            "file_bytes": len(back),
+            "ftp_read_s": read_s,
+            "ftp_read_kb_s": round(len(back) / read_s / 1000, 1),
+            "ftp_write_s": write_s,
+            "ftp_write_kb_s": round(len(back) / write_s / 1000, 1),
+        }
+
+    return await counted(world, act)
+
+
+def holds(folder: Path, data: bytes) -> bool:
+    """Whether a log file in a folder begins with these bytes. A file that is being written may be longer."""
+    for path in folder.rglob("*"):
+        if path.suffix.lower() in (".bin", ".ulg") and path.is_file() and path.stat().st_size >= len(data):
+            with path.open("rb") as file:
+                if file.read(len(data)) == data:
+                    return True
+    return False
+
+
+async def signing(world: World, pilot: Pilot, maintenance: Callable[[bytes], Awaitable[None]]) -> Figures:
+    """Give the vehicle a signing key on its maintenance port, then exchange signed frames only.
+
+    The daemons withhold SETUP_SIGNING, and pass signed frames unaltered: the vehicle ignores an unsigned command.
+    """
+    station, system = world.station, pilot.system
+    await pilot.request_streams()
+    key, clock = os.urandom(32), int((asyncio.get_running_loop().time() + SIGNING_SINCE_S) * 1e5)
+    setup = mavlink.MAVLink_setup_signing_message(system, AUTOPILOT, list(key), clock)
+
+    async def refused() -> Figures:
+        station.send(setup)
+        await asyncio.sleep(2.0)
+        return {}
+
+    before = await counted(world, refused)
+    withheld = sum(n for what, n in before["frames"]["withheld"].items() if what.startswith("SETUP_SIGNING"))
+    assert not world.daemons or withheld == 1, before
+    await maintenance(bytes(setup.pack(mavlink.MAVLink(None, station.system, 190))))
+    seen = len(station.received)
+    await station.until(
+        lambda: any(is_signed(passing.frame) for passing in station.received[seen:]), 30.0, "a signed frame"
+    )
+    ignored = await is_ignored(world, system)
+    station.sign_with(key, clock + 1000)
+
+    async def act() -> Figures:
+        begin = len(station.received), len(world.vehicles[0].tap.to_autopilot)
+        seconds, parameters = await timed(download_parameters(station, system))
+        place = pilot.place
+        items = pilot.mission(*(place.moved(number, 0.0, 20.0) for number in range(20)))
+        await upload_mission(station, system, items)
+        await pilot.take_off()
+        await pilot.return_and_land()
+        received = station.received[begin[0] :]
+        sent = world.vehicles[0].tap.to_autopilot[begin[1] :]
+        return {
+            "parameters": len(parameters),
+            "parameters_s": seconds,
+            "signed_down": sum(is_signed(passing.frame) for passing in received),
+            "unsigned_down": sum(not is_signed(passing.frame) for passing in received),
+            "signed_up": sum(is_signed(passing.frame) for passing in sent),
+            "bad_signatures": station.bad_signatures,
+        }
+
+    figures = await counted(world, act)
+    assert figures["bad_signatures"] == 0, figures
+    assert figures["unsigned_down"] == 0, figures
+    assert ignored, "the vehicle accepted an unsigned request"
+    return figures | {"setup_signing_withheld": withheld, "unsigned_request_ignored": ignored}
+
+
+async def is_ignored(world: World, system: int) -> bool:
+    """Whether the vehicle leaves an unsigned request unanswered for 3 s."""
+    with world.station.inbox(system, "PARAM_VALUE") as inbox:
+        world.station.send(mavlink.MAVLink_param_request_read_message(system, AUTOPILOT, b"", 0))
+        return await inbox.next(3.0) is None
+
+
+def is_signed(frame: bytes) -> bool:
+    """Whether a frame has a signature."""
+    return frame[0] == 0xFD and bool(frame[2] & 1)

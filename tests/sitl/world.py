@@ -1,0 +1,253 @@
+"""The vehicles, daemons, radio and ground station of one flight, connected.
+
+::
+
+    with daemons:     autopilot ─ tap ─ uavlinkd ─ radio ─ uavlinkd ─ station
+    without daemons:  autopilot ─ tap ─ radio ─ station
+
+The taps, the station and our own simulator are in this process, all others are processes of their own. The radio is
+left out where nothing has to be impaired.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import Counter
+from collections.abc import AsyncIterator, Sequence
+from contextlib import AsyncExitStack, asynccontextmanager
+from dataclasses import dataclass, field
+from time import monotonic
+
+from tests.daemon.fleet import AN_OPERATOR, a_member, a_vehicle
+from tests.daemon.frames import sender_of
+from tests.daemon.harness import Stage
+from tests.daemon.process import DaemonProcess, Status
+from tests.daemon.udp import shown
+from tests.kernel_queues import cpu_s
+from tests.sitl.conditions import CLEAN, Condition
+from tests.sitl.ledger import SETTLED_S, Comparison, compare
+from tests.sitl.radio import Radio
+from tests.sitl.simulators import Simulator
+from tests.sitl.station import Station
+from tests.sitl.taps import Tap
+
+GROUND, AUTOPILOT_ENDPOINT = "ground", "autopilot"
+LINK_S = 120.0
+"""How long a simulator may take to send its first heartbeat."""
+
+
+@dataclass(slots=True)
+class Vehicle:
+    """An autopilot, its tap, and its daemon if there is one."""
+
+    system: int
+    tap: Tap
+    simulator: Simulator
+    daemon: DaemonProcess | None = None
+
+
+@dataclass(slots=True)
+class World:
+    """Everything that a flight consists of."""
+
+    stage: Stage
+    condition: Condition
+    station: Station
+    vehicles: list[Vehicle] = field(default_factory=list)
+    ground: DaemonProcess | None = None
+    radio: Radio | None = None
+    maintenance: Tap | None = None
+    """The other end of the autopilot's second port."""
+
+    @property
+    def daemons(self) -> list[DaemonProcess]:
+        """All daemons; empty in a flight without daemons."""
+        return [daemon for daemon in (self.ground, *(vehicle.daemon for vehicle in self.vehicles)) if daemon]
+
+    async def until_connected(self) -> None:
+        """Wait until the station receives each vehicle, and each vehicle's tap receives the station."""
+        for vehicle in self.vehicles:
+            await self.station.until(
+                lambda system=vehicle.system: self.station.mode(system) is not None,  # type: ignore[misc]
+                LINK_S,
+                f"a heartbeat of vehicle {vehicle.system}",
+            )
+
+    async def maintain(self, frame: bytes) -> None:
+        """Send a frame to the autopilot on its second port."""
+        assert self.maintenance is not None
+        await self.maintenance.send(frame)
+
+    async def measure(self) -> Measurement:
+        """Begin to count frames and CPU time."""
+        measurement = Measurement(self)
+        await measurement.begin()
+        return measurement
+
+
+class Measurement:
+    """Counts frames at both ends, and the CPU time of the daemons, from :meth:`begin` to :meth:`end`."""
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+        self._statuses: dict[str, Status] = {}
+        self._cpu_s: dict[str, float] = {}
+
+    async def begin(self) -> None:
+        """Count from now on."""
+        self._statuses = {daemon.name: await daemon.status() for daemon in self._world.daemons}
+        self._cpu_s = {daemon.name: cpu_s(daemon.pid) for daemon in self._world.daemons}
+        self._stray_bytes = sum(vehicle.tap.stray_bytes for vehicle in self._world.vehicles)
+        self._begin = monotonic()
+
+    async def end(self) -> dict[str, object]:
+        """Count until now, and wait until each frame has arrived or is lost; the figures."""
+        world, end = self._world, monotonic()
+        seconds = end - self._begin
+        used = {daemon.name: cpu_s(daemon.pid) - self._cpu_s[daemon.name] for daemon in world.daemons}
+        await asyncio.sleep(2 * SETTLED_S)
+        withheld: Counter[tuple[str, str]] = Counter()
+        for daemon in world.daemons:
+            withheld += refused_between(self._statuses[daemon.name], await daemon.status())
+        by_message: Counter[str] = Counter()
+        for (message, _), count in withheld.items():
+            by_message[message] += count
+        down, up = self._compare(end)
+        down, up = down.without(by_message), up.without(by_message)
+        return {
+            "seconds": round(seconds, 2),
+            "down": down.figures(),
+            "up": up.figures(),
+            "frames_s": round((down.sent + up.sent) / seconds, 1),
+            "withheld": {f"{message}: {reason}": count for (message, reason), count in withheld.items()},
+            "cpu_percent": {name: round(100 * s / seconds, 2) for name, s in used.items()},
+            "exact": down.is_exact and up.is_exact,
+            "stray_bytes": sum(vehicle.tap.stray_bytes for vehicle in world.vehicles) - self._stray_bytes,
+        }
+
+    def _compare(self, end: float) -> tuple[Comparison, Comparison]:
+        world = self._world
+        down, up = Comparison(), Comparison()
+        for vehicle in world.vehicles:
+            system, station = vehicle.system, world.station
+            received = [passing for passing in station.received if sender_of(passing.frame) == system]
+            add(down, compare(vehicle.tap.from_autopilot, received, self._begin, end))
+            sent = [passing for passing in station.sent if passing.target in (0, system)]
+            arrived = [passing for passing in vehicle.tap.to_autopilot if sender_of(passing.frame) == station.system]
+            add(up, compare(sent, arrived, self._begin, end))
+        return down, up
+
+
+def add(total: Comparison, other: Comparison) -> None:
+    """Add the counts of another comparison."""
+    total.sent += other.sent
+    total.arrived += other.arrived
+    total.missing += other.missing
+    total.foreign += other.foreign
+    total.duplicated += other.duplicated
+    total.reordered += other.reordered
+    total.latencies_s += other.latencies_s
+
+
+def refused_between(before: Status, after: Status) -> Counter[tuple[str, str]]:
+    """The frames that a daemon withheld from the ground station's link since, by message and reason."""
+    counts: Counter[tuple[str, str]] = Counter()
+    for status, sign in ((before, -1), (after, 1)):
+        for name, part in (*status["peers"].items(), *status["endpoints"].items()):
+            if status["name"] != GROUND and name not in (GROUND, AUTOPILOT_ENDPOINT):
+                continue  # what another vehicle may not receive does not concern the ground station
+            for messages in part["refused"].values():
+                for message, reasons in messages.items():
+                    for reason, count in reasons.items():
+                        counts[message, reason] += sign * count
+    return +counts
+
+
+@asynccontextmanager
+async def flying(
+    simulators: Sequence[Simulator],
+    *,
+    condition: Condition = CLEAN,
+    with_daemons: bool = True,
+    can_cut: bool = False,
+    swarm: bool = False,
+    maintenance_port: int | None = None,
+) -> AsyncIterator[World]:
+    """Start everything, and wait until the station receives each vehicle.
+
+    Args:
+        simulators: one for each vehicle, not yet started.
+        can_cut: whether the radio must be there, to be cut.
+        swarm: whether the vehicles are peers of each other, as swarm members.
+        maintenance_port: where a simulator sends MAVLink on a second port.
+    """
+    assert with_daemons or not condition.needs_daemons
+    async with AsyncExitStack() as stack:
+        stage = await stack.enter_async_context(Stage())
+        station = await stack.enter_async_context(Station())
+        world = World(stage, condition, station)
+        if condition.radio or can_cut:
+            world.radio = Radio(stage.folder, condition.radio)
+            stack.push_async_callback(world.radio.stop)
+        if maintenance_port is not None:
+            world.maintenance = Tap()
+            await world.maintenance.open(maintenance_port)
+            stack.callback(world.maintenance.close)
+        for simulator in simulators:
+            tap = Tap()
+            await tap.open()
+            stack.callback(tap.close)
+            world.vehicles.append(Vehicle(simulator.system, tap, simulator))
+        if with_daemons:
+            await _start_daemons(world, swarm=swarm)
+        else:
+            await _connect_directly(world, swarm=swarm)
+        for vehicle in world.vehicles:
+            stack.push_async_callback(vehicle.simulator.stop)
+            await vehicle.simulator.start(vehicle.tap.address)
+        await world.until_connected()
+        yield world
+
+
+async def _start_daemons(world: World, *, swarm: bool) -> None:
+    stage = world.stage
+    ground = world.ground = stage.daemon(GROUND)
+    ground.add_endpoint("station", f"udpout:{shown(world.station.address)}")
+    for vehicle in world.vehicles:
+        drone = vehicle.daemon = stage.daemon(f"drone{vehicle.system}")
+        vehicle.tap.onward = drone.add_endpoint(AUTOPILOT_ENDPOINT)
+        to_ground, to_drone = (
+            world.radio.connect(drone.name, drone.sockaddr, ground.sockaddr)
+            if world.radio
+            else (ground.sockaddr, drone.sockaddr)
+        )
+        psk = stage.psk()
+        drone.add_peer(ground, [shown(to_ground)], psk, **AN_OPERATOR)
+        ground.add_peer(drone, [shown(to_drone)], psk, **a_vehicle(vehicle.system))
+    for one, other in _pairs(world.vehicles) if swarm else ():
+        assert one.daemon is not None
+        assert other.daemon is not None
+        psk = stage.psk()
+        one.daemon.add_peer(other.daemon, [other.daemon.address], psk, **a_member(other.system))
+        other.daemon.add_peer(one.daemon, [one.daemon.address], psk, **a_member(one.system))
+    for daemon in world.daemons:
+        daemon.config["link"].update(world.condition.link)
+    if world.radio:
+        await world.radio.start()
+    await stage.start(*world.daemons)
+
+
+async def _connect_directly(world: World, *, swarm: bool) -> None:
+    for vehicle in world.vehicles:
+        vehicle.tap.onward = world.station.address
+        if world.radio:
+            vehicle.tap.onward, _ = world.radio.connect(f"drone{vehicle.system}", None, world.station.address)
+    if world.radio:
+        await world.radio.start()
+    for one, other in _pairs(world.vehicles) if swarm else ():
+        one.tap.listeners.append(other.tap)
+        other.tap.listeners.append(one.tap)
+
+
+def _pairs(vehicles: Sequence[Vehicle]) -> list[tuple[Vehicle, Vehicle]]:
+    return [(one, other) for number, one in enumerate(vehicles) for other in vehicles[number + 1 :]]
