@@ -1,0 +1,80 @@
+"""``python -m tests.sitl.roles``: frames that roles pass, to autopilots on the ground and in the air.
+
+The environment names the autopilots' binaries: ``UAVLINKD_ARDUPILOT``, ``UAVLINKD_PX4``. Exit status 0: no frame
+changed an autopilot. 1: one did, or datagrams were lost. 2: invalid command line.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+from tests.sitl.roles_frames import ROLES_TESTED
+from tests.sitl.roles_scene import MakeVehicle, SceneResult, run_scene
+from tests.sitl.roles_vehicles import ArduCopter, Px4, SimulatedVehicle
+
+OK, FAILED = 0, 1
+PLACES: Final = {"ground": False, "air": True}
+
+
+def available(environ: Mapping[str, str] = os.environ, speedup: float = 5) -> dict[str, MakeVehicle]:
+    """The autopilots that this machine has, by name."""
+    makers: dict[str, MakeVehicle] = {"sim": SimulatedVehicle}
+    if ardupilot := environ.get("UAVLINKD_ARDUPILOT"):
+        makers["ardupilot"] = lambda folder: ArduCopter(folder, Path(ardupilot).resolve(), speedup=speedup)
+    if px4 := environ.get("UAVLINKD_PX4"):
+        makers["px4"] = lambda folder: Px4(folder, Path(px4).resolve(), speedup=speedup)
+    return makers
+
+
+def lines(name: str, result: SceneResult) -> list[str]:
+    """The result of one scene for people."""
+    rows = [
+        f"{name}, {result.title}: {result.frames:,} frames in {result.seconds:.0f} s of its time, "
+        f"{result.lost} datagrams lost, {result.repeated_barriers} barriers repeated",
+        f"  by message: {', '.join(f'{message} {count:,}' for message, count in sorted(result.by_message.items()))}",
+        f"  {result.parameters:,} parameters; farthest from its place {result.farthest_m:.2f} m",
+        f"  changed in quiet too: {', '.join((*result.changed_by_itself, *result.changed_in_quiet)) or '-'}",
+        f"  sent to the attacker: {', '.join(f'{m} {n:,}' for m, n in result.answers.most_common(25))}",
+        *(f"  text {count:,} times: {text}" for text, count in result.texts.most_common(25)),
+        *(f"  CHANGED {change}" for change in result.changes),
+        *(f"  by {culprit.hex(' ')}" for culprit in result.culprits[:20]),
+    ]
+    return rows if result.changes else [*rows, "  nothing else changed"]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the scenes of the command line, and print each result."""
+    parser = argparse.ArgumentParser(prog="python -m tests.sitl.roles", description=__doc__)
+    parser.add_argument("--frames", type=int, default=1_000_000, help="for each autopilot, over all scenes (1000000)")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--speedup", type=float, default=5, help="of the autopilots' simulators (5)")
+    parser.add_argument("--autopilot", action="append", choices=("sim", "ardupilot", "px4"), help="all but sim")
+    parser.add_argument("--role", action="append", choices=ROLES_TESTED, help="both")
+    parser.add_argument("--place", action="append", choices=tuple(PLACES), help="both")
+    options = parser.parse_args(arguments)
+    makers = available(speedup=options.speedup)
+    names = options.autopilot or [name for name in makers if name != "sim"]
+    if missing := set(names) - makers.keys() or not names:
+        parser.error(f"set UAVLINKD_ARDUPILOT and UAVLINKD_PX4 to the binaries; missing: {missing}")
+    roles, places = options.role or ROLES_TESTED, options.place or tuple(PLACES)
+    share = -(-options.frames // (len(roles) * len(places)))
+    is_ok = True
+    for name in names:
+        for number, (role, place) in enumerate((role, place) for role in roles for place in places):
+            result = run_scene(makers[name], role, share, options.seed + number, is_flying=PLACES[place], write=_say)
+            print("\n".join(lines(name, result)), flush=True)
+            is_ok = is_ok and not result.changes and not result.lost
+    return OK if is_ok else FAILED
+
+
+def _say(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
