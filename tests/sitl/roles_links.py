@@ -23,6 +23,10 @@ DATAGRAM_BYTES: Final = 1000
 _UDP_QUEUES = Path("/proc/net/udp")
 
 
+class LinkClosedError(Exception):
+    """The autopilot closed a connection: it has ended."""
+
+
 class Link:
     """One connection. Either side of UDP may send first: this side learns the address of the other."""
 
@@ -68,9 +72,12 @@ class Link:
         frames: list[Frame] = []
         with suppress(BlockingIOError, ConnectionRefusedError):
             while True:
-                data, peer = self._sock.recvfrom(65536)
+                try:
+                    data, peer = self._sock.recvfrom(65536)
+                except ConnectionResetError as error:
+                    raise LinkClosedError from error
                 if not data and self._is_tcp:
-                    raise ConnectionResetError("the autopilot closed the connection")
+                    raise LinkClosedError
                 if not self._is_tcp:
                     self._peer = peer
                 frames += self._splitter.feed(data, monotonic())
@@ -118,6 +125,8 @@ class Link:
                 # What it sends must be read meanwhile: it may wait for room in its own output.
                 self.read()
                 select.select([], [self._sock], [], 0.01)
+            except (BrokenPipeError, ConnectionResetError) as error:
+                raise LinkClosedError from error
 
 
 def listening(port: int, sender: tuple[int, int]) -> Link:

@@ -13,8 +13,8 @@ from typing import Any, Final, NamedTuple, Self
 from pymavlink.dialects.v20 import all as mavlink
 
 from tests.sitl.roles_frames import RoleFrames
-from tests.sitl.roles_judge import Judge, changed_parameters, differences
-from tests.sitl.roles_links import dropped_datagrams
+from tests.sitl.roles_judge import Judge, Snapshot, changed_parameters, differences
+from tests.sitl.roles_links import LinkClosedError, dropped_datagrams
 from tests.sitl.roles_station import Station, StationError
 from tests.sitl.roles_vehicles import Vehicle
 from uavlinkd.lab.sim.autopilot import HOME
@@ -66,13 +66,14 @@ class Trial:
         self._make = make
         self._is_flying = is_flying
         self._exits = ExitStack()
+        self.vehicle: Vehicle
         self.station: Station
         self.judge: Judge
 
     def __enter__(self) -> Self:
         with ExitStack() as exits:
             folder = Path(exits.enter_context(tempfile.TemporaryDirectory(prefix="uavlinkd-roles-")))
-            vehicle = self._make(folder / "autopilot")
+            vehicle = self.vehicle = self._make(folder / "autopilot")
             self.station = exits.enter_context(vehicle)
             for plan, items in plans().items():
                 with suppress(StationError):  # the project's simulator has missions only
@@ -80,6 +81,7 @@ class Trial:
             if self._is_flying:
                 vehicle.take_off(self.station)
             else:
+                self.station.until(lambda: "LOCAL_POSITION_NED" in self.station.seen.number, "a local position")
                 self.station.pass_time(vehicle.settle_s)
             self.judge = Judge(self.station)
             self.judge.begin()
@@ -90,14 +92,27 @@ class Trial:
         self._exits.close()
 
     def send(self, frames: Sequence[bytes]) -> int:
-        """Send frames until the judge reports a change; how many were sent."""
+        """Send frames until the judge reports a change, or the autopilot ends; how many were sent."""
         station = self.station
         for begin in range(0, len(frames), BATCH):
-            station.attacker.send(frames[begin : begin + BATCH])
-            station.wait_for_attacker()
+            try:
+                station.attacker.send(frames[begin : begin + BATCH])
+                station.wait_for_attacker()
+            except LinkClosedError:
+                self.judge.changes.append(self.vehicle.why_ended())
             if self.judge.changes:
                 return min(begin + BATCH, len(frames))
         return len(frames)
+
+    def snapshot_after(self, before: Snapshot, *, with_rates: bool) -> Snapshot:
+        """The state after frames; that before, if the autopilot ended: then it has none."""
+        if self.judge.changes:
+            return before
+        try:
+            return self.judge.snapshot(with_rates=with_rates)
+        except LinkClosedError:
+            self.judge.changes.append(self.vehicle.why_ended())
+        return before
 
 
 def run_scene(
@@ -118,7 +133,7 @@ def run_scene(
         while result.frames < frames and not judge.changes:
             chunks.append([generator.draw() for _ in range(min(CHUNK, frames - result.frames))])
             result.frames += trial.send(chunks[-1])
-            snapshots.append(judge.snapshot(with_rates=result.frames == frames))
+            snapshots.append(trial.snapshot_after(snapshots[0], with_rates=result.frames == frames))
             write(f"{result.title}: {result.frames:,} frames, {station.time_s - began_s:.0f} s of its time")
         result.seconds = station.time_s - began_s
         result.by_message = generator.counts.by_message
@@ -132,19 +147,25 @@ def run_scene(
     calm = run_quiet(make, result.seconds, is_flying=is_flying)
     result.changed_by_itself = tuple(sorted(calm.parameters))
     result.changed_in_quiet = calm.changes
-    result.changes = (*watched, *differences(snapshots[0], snapshots[-1], calm.parameters))
+    changes = (*watched, *differences(snapshots[0], snapshots[-1], calm.parameters))
+    in_quiet = {_subject(change) for change in calm.changes}
+    result.changes = tuple(change for change in changes if _subject(change) not in in_quiet)
     if result.changes:
         write("\n".join([f"{result.title}: CHANGED", *result.changes]))
         culprit_chunk = next(
             (
                 chunk
                 for chunk, before, after in zip(chunks, snapshots, snapshots[1:], strict=False)
-                if differences(before, replace(after, rates=before.rates), calm.parameters)
+                if differences(replace(before, rates={}), replace(after, rates={}), calm.parameters)
             ),
             chunks[-1],
         )
         result.culprits = tuple(find_culprits(make, culprit_chunk, calm.parameters, is_flying=is_flying, write=write))
     return result
+
+
+def _subject(change: str) -> str:
+    return change.partition(":")[0]
 
 
 class Calm(NamedTuple):
@@ -174,7 +195,7 @@ def find_culprits(
         with Trial(make, is_flying=is_flying) as trial:
             before = trial.judge.snapshot(with_rates=True)
             trial.send(some)
-            after = trial.judge.snapshot(with_rates=True)
+            after = trial.snapshot_after(before, with_rates=True)
             is_changed = bool(trial.judge.changes or differences(before, after, own))
         write(f"{len(some):,} frames {'repeat the change' if is_changed else 'change nothing'}")
         return is_changed

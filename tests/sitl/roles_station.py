@@ -18,6 +18,8 @@ from uavlinkd.mavlink.frames import Frame
 
 ARMED: Final = mavlink.MAV_MODE_FLAG_SAFETY_ARMED
 HEARTBEAT_EVERY_S: Final = 0.2  # more often than 1/s: the simulator's time is faster
+ANSWER_S: Final = 2.0
+"""Between the answer to a request for a message and the message itself. Some autopilots accept, and send nothing."""
 PLANS: Final = (
     mavlink.MAV_MISSION_TYPE_MISSION,
     mavlink.MAV_MISSION_TYPE_FENCE,
@@ -53,6 +55,8 @@ class Station:
         self.attacker = attacker
         self.vehicle = vehicle
         self.seen = Seen()
+        self.check: Callable[[], None] = lambda: None
+        """Raises an exception if the autopilot has ended."""
         self.on_message: Callable[[Any], None] = lambda message: None
         """Receives each decoded message of the autopilot."""
         self.sent_to_attacker: Counter[str] = Counter()
@@ -74,6 +78,7 @@ class Station:
 
     def poll(self, timeout_s: float = 0.05) -> None:
         """Read what has arrived on both links, or wait for it."""
+        self.check()
         if monotonic() >= self._beat_at:
             self._beat_at = monotonic() + HEARTBEAT_EVERY_S
             self.send(
@@ -144,13 +149,15 @@ class Station:
         return int(self.seen.latest["COMMAND_ACK"].result)
 
     def request(self, name: str, number: int) -> Any | None:
-        """The current message of this name; None if the autopilot does not have it."""
+        """The current message of this name; None if the autopilot does not have it, or does not send it now."""
         self.seen.latest.pop(name, None)
         result = self.command(_ASK, number)
         if result != mavlink.MAV_RESULT_ACCEPTED:
             return None
-        self.until(lambda: name in self.seen.latest, name, lambda: self._ask(number))
-        return self.seen.latest[name]
+        until = monotonic() + ANSWER_S
+        while name not in self.seen.latest and monotonic() < until:
+            self.poll()
+        return self.seen.latest.get(name)
 
     def read_parameters(self) -> dict[str, bytes]:
         """Every parameter with the bytes of its value."""
@@ -226,9 +233,6 @@ class Station:
         result = seen.latest["MISSION_ACK"].type
         if result != mavlink.MAV_MISSION_ACCEPTED:
             raise StationError(f"the autopilot refuses plan {plan}: {result}")
-
-    def _ask(self, number: int) -> None:
-        self.send(mavlink.MAVLink_command_long_message(self.vehicle, 1, _ASK, 0, number, 0, 0, 0, 0, 0, 0))
 
     def _ask_for_parameters(self) -> None:
         self.send(mavlink.MAVLink_param_request_list_message(self.vehicle, 1))

@@ -14,7 +14,7 @@ from typing import Final
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from tests.sitl.roles_links import Link, connected, listening, speaking
+from tests.sitl.roles_links import Link, LinkClosedError, connected, listening, speaking
 from tests.sitl.roles_station import ARMED, Station, StationError
 from tests.waiting import PATIENCE_S
 from uavlinkd.lab.child_processes import end_with_parent
@@ -33,6 +33,8 @@ _COPTER_PARAMETERS: Final[Mapping[str, float]] = {
     **{f"INS_ACC{number}SCAL_{axis}": 1.001 for number in ("", "2") for axis in "XYZ"},
     **{f"COMPASS_OFS{number}_{axis}": 5 for number in ("", "2", "3") for axis in "XYZ"},
     "FS_THR_ENABLE": 0,  # there is no radio control
+    # SITL ends itself where a number that is not finite becomes an integer. A flight controller goes on.
+    "SIM_FLOAT_EXCEPT": 0,
     **{f"SR{port}_{group}": 4 for port in (0, 1) for group in ("POSITION", "EXTRA1", "EXTRA2", "EXT_STAT")},
     **{f"MAV{port}_{group}": 4 for port in (1, 2) for group in ("POSITION", "EXTRA1", "EXTRA2", "EXT_STAT")},
 }
@@ -59,6 +61,7 @@ class Vehicle(ABC):
             own, attacker = self._open()
             self._links += [own, attacker]
             station = Station(own, attacker)
+            station.check = self.check
             station.until(lambda: own.is_known and attacker.is_known, "both links")
             station.until(lambda: "GLOBAL_POSITION_INT" in station.seen.latest, "a position")
         except BaseException:
@@ -68,6 +71,22 @@ class Vehicle(ABC):
 
     def __exit__(self, *_: object) -> None:
         self._end()
+
+    def check(self) -> None:
+        """Raise if the autopilot's process has ended.
+
+        Raises:
+            LinkClosedError: it has.
+        """
+        if any(process.poll() is not None for process in self._processes):
+            raise LinkClosedError
+
+    def why_ended(self) -> str:
+        """The status of the process that ended, and its last output."""
+        statuses = [process.wait(STOP_S) for process in self._processes]
+        lines = (self.folder / "autopilot.log").read_text(errors="replace").splitlines()
+        last = [line for line in lines if line.strip()][-4:]
+        return f"the autopilot ended with status {statuses[0]}: {' | '.join(last)}"
 
     @abstractmethod
     def _open(self) -> tuple[Link, Link]:
@@ -160,10 +179,10 @@ class Px4(Vehicle):
             "PX4_SIM_MODEL": "sihsim_quadx",
             "PX4_SIMULATOR": "sihsim",
             "PX4_SIM_SPEED_FACTOR": f"{self._speedup:g}",
-            "PX4_PARAM_MAV_SYS_ID": "1",
-            "PX4_PARAM_SIH_LOC_LAT0": str(HOME.latitude_deg),
-            "PX4_PARAM_SIH_LOC_LON0": str(HOME.longitude_deg),
-            "PX4_PARAM_SIH_LOC_H0": str(HOME.altitude_m),
+            "PX4_HOME_LAT": str(HOME.latitude_deg),
+            "PX4_HOME_LON": str(HOME.longitude_deg),
+            "PX4_HOME_ALT": str(HOME.altitude_m),
+            "PX4_PARAM_SDLOG_MODE": "-1",
             "PX4_PARAM_COM_RC_IN_MODE": "4",  # there is no radio control
         }
         etc = self._binary.parents[1] / "etc"
@@ -175,6 +194,7 @@ class Px4(Vehicle):
                 raise StationError(f"PX4 did not start: {log.read_text(errors='replace')[-500:]}")
             sleep(0.1)
         self._shell("mavlink", "stop-all")
+        self._shell("param", "set", "MAV_SYS_ID", "1")  # the start script derives it from the instance
         links = []
         for mode, sender, local in zip(("onboard", "normal"), (STATION, self.attacker), free_ports(2), strict=True):
             port = free_port()
