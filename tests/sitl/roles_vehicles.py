@@ -15,7 +15,7 @@ from typing import Final
 from pymavlink.dialects.v20 import all as mavlink
 
 from tests.sitl.roles_links import Link, LinkClosedError, connected, listening, speaking
-from tests.sitl.roles_station import ARMED, Station, StationError
+from tests.sitl.roles_station import Station, StationError
 from tests.waiting import PATIENCE_S
 from uavlinkd.lab.child_processes import end_with_parent
 from uavlinkd.lab.sim.autopilot import HOME
@@ -33,6 +33,7 @@ _COPTER_PARAMETERS: Final[Mapping[str, float]] = {
     **{f"INS_ACC{number}SCAL_{axis}": 1.001 for number in ("", "2") for axis in "XYZ"},
     **{f"COMPASS_OFS{number}_{axis}": 5 for number in ("", "2", "3") for axis in "XYZ"},
     "FS_THR_ENABLE": 0,  # there is no radio control
+    "DISARM_DELAY": 0,
     # SITL ends itself where a number that is not finite becomes an integer. A flight controller goes on.
     "SIM_FLOAT_EXCEPT": 0,
     **{f"SR{port}_{group}": 4 for port in (0, 1) for group in ("POSITION", "EXTRA1", "EXTRA2", "EXT_STAT")},
@@ -85,7 +86,7 @@ class Vehicle(ABC):
         """The status of the process that ended, and its last output."""
         statuses = [process.wait(STOP_S) for process in self._processes]
         lines = (self.folder / "autopilot.log").read_text(errors="replace").splitlines()
-        last = [line for line in lines if line.strip()][-4:]
+        last = [line for line in lines if line.strip()][-8:]
         return f"the autopilot ended with status {statuses[0]}: {' | '.join(last)}"
 
     @abstractmethod
@@ -196,11 +197,12 @@ class Px4(Vehicle):
         self._shell("mavlink", "stop-all")
         self._shell("param", "set", "MAV_SYS_ID", "1")  # the start script derives it from the instance
         links = []
-        for mode, sender, local in zip(("onboard", "normal"), (STATION, self.attacker), free_ports(2), strict=True):
+        modes: Sequence[tuple[str, ...]] = (("-m", "onboard"), ())  # without one, as for a ground station
+        for mode, sender, local in zip(modes, (STATION, self.attacker), free_ports(2), strict=True):
             port = free_port()
             links.append(listening(port, sender))
             ports = ("-u", str(local), "-o", str(port), "-t", "127.0.0.1")
-            self._shell("mavlink", "start", "-x", "-f", *ports, "-m", mode, "-r", "1000000")
+            self._shell("mavlink", "start", "-x", "-f", *ports, *mode, "-r", "1000000")
         return links[0], links[1]
 
     def take_off(self, station: Station) -> None:
@@ -227,9 +229,14 @@ class Px4(Vehicle):
 def _take_off_guided(station: Station) -> None:
     accepted = mavlink.MAV_RESULT_ACCEPTED
     _repeat(station, lambda: station.command(mavlink.MAV_CMD_DO_SET_MODE, 1, _GUIDED) == accepted)
-    _repeat(station, lambda: station.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1) == accepted)
-    station.until(lambda: bool(station.seen.latest["HEARTBEAT"].base_mode & ARMED), "it to be armed")
-    _repeat(station, lambda: station.command(mavlink.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, HEIGHT_M) == accepted)
+    # One after the other without a pause: it disarms itself if it does not take off soon.
+    _repeat(
+        station,
+        lambda: (
+            station.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1) == accepted
+            and station.command(mavlink.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, HEIGHT_M) == accepted
+        ),
+    )
     position = station.seen.latest
     station.until(lambda: position["GLOBAL_POSITION_INT"].relative_alt > 950 * HEIGHT_M, "the vehicle to be up")
     station.pass_time(10)
