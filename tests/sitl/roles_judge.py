@@ -93,7 +93,7 @@ class Judge:
         """Messages a second of the autopilot's time, on both links."""
         station = self.station
         station.wait_for_attacker()
-        station.pass_time(RATE_WINDOW_S / 2)  # answers to what was sent before are no streams
+        station.pass_time(RATE_WINDOW_S / 2)  # answers to what was sent before end meanwhile
         began_s, own, attacker = station.time_s, station.seen.number.copy(), station.sent_to_attacker.copy()
         station.pass_time(RATE_WINDOW_S)
         seconds = station.time_s - began_s
