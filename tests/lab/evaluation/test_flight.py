@@ -30,7 +30,6 @@ from uavlinkd.lab.evaluation.flight_positions import (
     Provenance,
     Receiver,
     displace,
-    link_note,
     samples,
 )
 from uavlinkd.lab.evaluation.records import Record, RecordWriter, Value
@@ -173,13 +172,6 @@ def test_watch_notes_first_key_and_first_data_after_it() -> None:
     assert (watch.key_at, watch.data_at) == (2.0, 3.0)
 
 
-def test_note_of_the_daemon_is_not_a_frame_of_the_peer() -> None:
-    """It has the daemon's component ID; a text of the vehicle has not."""
-    text = mavlink.MAVLink_statustext_message(3, b"link to drone1 is down")
-    assert link_note(bytes(text.pack(mavlink.MAVLink(None, 2, 240)))) == "link to drone1 is down"
-    assert link_note(bytes(text.pack(mavlink.MAVLink(None, 2, 1)))) is None
-
-
 def test_plan_tries_each_attack_with_a_pause_before_it() -> None:
     """The first phase is as long as the age of what is replayed: the attacker records meanwhile."""
     for settings in (FlightSettings(), FlightSettings(quick=True)):
@@ -228,7 +220,6 @@ def some_records() -> list[Record]:
     records += [
         Record("state", {"link": "uavlinkd"}, {"at_s": 10.5, "state": "link down"}),
         Record("state", {"link": "uavlinkd"}, {"at_s": 12.0, "state": ""}),
-        Record("note", {"link": "uavlinkd", "aircraft": "drone1"}, {"at_s": 10.6, "text": "link down"}),
         Record("end", {}, {"duration_s": 12.0, "load_after": 1.0}),
     ]
     return records

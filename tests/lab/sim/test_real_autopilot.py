@@ -40,6 +40,9 @@ async def test_process_that_ends_is_reported_with_its_output(firmware: Firmware,
     binary.parent.mkdir()
     binary.write_text("#!/bin/sh\necho no such model\nexit 3\n")
     binary.chmod(0o700)
+    script = tmp_path / "etc" / "init.d-posix" / "rcS"
+    script.parent.mkdir(parents=True)
+    script.write_text("param set MAV_SYS_ID $((px4_instance+1))\n")
     settings = RealAutopilotSettings(firmware=firmware, binary=binary, udp_port=14550, home=HOME)
     autopilot = RealAutopilot(settings, tmp_path / "flight")
     with pytest.raises(RealAutopilotError, match=r"status 3:\nno such model"):

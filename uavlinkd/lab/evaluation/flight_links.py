@@ -32,6 +32,7 @@ from uavlinkd.lab.evaluation.paper_protocol import VERIFIED, PaperEnd
 from uavlinkd.lab.mitm.attack import AttackObject
 from uavlinkd.lab.sim.drone_process import DroneProcess
 from uavlinkd.lab.sim.loopback_ports import free_ports
+from uavlinkd.mavlink.frames import SplitCounters, split_datagram
 from uavlinkd.ops.link_problems import LinkProblem
 
 OnDelivered = Callable[[str, bytes], None]
@@ -114,6 +115,7 @@ class _Clients:
 
     def __init__(self, on_delivered: OnDelivered) -> None:
         self._deliver = on_delivered
+        self._split = SplitCounters()
         self._loop = asyncio.get_running_loop()
         self._sockets: dict[str, socket.socket] = {}
         for name in PAIR:
@@ -140,7 +142,9 @@ class _Clients:
 
     def _on_readable(self, name: str, sock: socket.socket) -> None:
         with suppress(OSError):
-            self._deliver(name, sock.recv(_DATAGRAM_BYTES))
+            # A daemon may deliver several frames in one datagram.
+            for frame in split_datagram(sock.recv(_DATAGRAM_BYTES), self._split):
+                self._deliver(name, frame.raw)
 
 
 class PlainLink(PositionLink):

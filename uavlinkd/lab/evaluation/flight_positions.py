@@ -14,14 +14,11 @@ from fastcrc.crc16 import mcrf4xx
 
 from uavlinkd.lab.sim.vehicle import EARTH_RADIUS_M
 from uavlinkd.mavlink import dialect
-from uavlinkd.mavlink.status_text import COMPONENT
 
 GLOBAL_POSITION_INT: Final = 33
-STATUSTEXT: Final = 253
 _PLACE = struct.Struct("<ii")
 _PLACE_AT: Final = 4
 """Latitude and longitude in 1e-7 degrees, after the time of 4 bytes."""
-_COMPONENT_AT: Final = 6
 _HEADER_BYTES: Final = 10
 _CHECKSUM_BYTES: Final = 2
 _E7_PER_M: Final = 1e7 / (math.radians(1) * EARTH_RADIUS_M)
@@ -83,13 +80,6 @@ def displace(frame: bytes, east_m: float, north_m: float) -> bytes:
     _PLACE.pack_into(payload, _PLACE_AT, *moved)
     inner = bytes((len(payload),)) + frame[2:_HEADER_BYTES] + payload
     return frame[:1] + inner + struct.pack("<H", mcrf4xx(inner + bytes((facts.crc_extra,))))
-
-
-def link_note(frame: bytes) -> str | None:
-    """The text of a daemon to its own ground station about a link; None for any other frame."""
-    if message_id(frame) != STATUSTEXT or frame[_COMPONENT_AT] != COMPONENT:
-        return None
-    return frame[_HEADER_BYTES + 1 : _HEADER_BYTES + frame[1]].decode("ascii", errors="replace")
 
 
 class Provenance(StrEnum):

@@ -195,11 +195,7 @@ def _states(findings: FlightFindings) -> Table:
         [f"{begin_s:.1f} s", state, f"{end_s - begin_s:.1f} s"]
         for state, begin_s, end_s in findings.states(LinkKind.OURS)
     ]
-    rows += [
-        [f"{record.number('at_s'):.1f} s", f"text at {record.point['aircraft']}: {record.values['text']}", "-"]
-        for record in findings.of("note")
-    ]
-    return Table(["time", "report", "lasted"], sorted(rows, key=lambda row: float(row[0].split()[0])))
+    return Table(["time", "report", "lasted"], rows)
 
 
 def _settings(findings: FlightFindings) -> FlightSettings:

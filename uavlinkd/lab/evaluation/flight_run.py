@@ -33,7 +33,6 @@ from uavlinkd.lab.evaluation.flight_positions import (
     Origin,
     Provenance,
     Receiver,
-    link_note,
     samples,
 )
 from uavlinkd.lab.evaluation.machine import load, machine_facts
@@ -127,7 +126,7 @@ class FlightEvaluation:
             await asyncio.gather(*following, attacking, return_exceptions=True)
 
     async def _exchange_and_attack(self, stack: AsyncExitStack, folder: Path, writer: RecordWriter) -> None:
-        await self._open_links(stack, folder, writer)
+        await self._open_links(stack, folder)
         for link in self._links:
             writer.add(self._exchange(link))
         noticing = asyncio.create_task(self._watch_states(writer))
@@ -140,20 +139,12 @@ class FlightEvaluation:
             noticing.cancel()
             await asyncio.gather(noticing, return_exceptions=True)
 
-    async def _open_links(self, stack: AsyncExitStack, folder: Path, writer: RecordWriter) -> None:
+    async def _open_links(self, stack: AsyncExitStack, folder: Path) -> None:
         def log(kind: LinkKind) -> Path:
             return self.out / f"mitm-{NAME}-{kind}.jsonl"
 
         def deliver(kind: LinkKind) -> Callable[[str, bytes], None]:
-            def on_delivered(name: str, frame: bytes) -> None:
-                note = link_note(frame) if kind is LinkKind.OURS else None
-                if note is None:
-                    self._receivers[kind][name].accept(frame, self._now())
-                else:
-                    values: dict[str, Value] = {"at_s": round(self._now(), 3), "text": note}
-                    writer.add(Record("note", {"link": kind.value, "aircraft": name}, values))
-
-            return on_delivered
+            return lambda name, frame: self._receivers[kind][name].accept(frame, self._now())
 
         settings = self.settings
         links: tuple[PositionLink, ...] = (

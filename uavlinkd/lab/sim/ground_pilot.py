@@ -180,12 +180,11 @@ class GroundPilot:
 
 
 def _version(message: Message, *, is_px4: bool) -> str:
-    number = message.flight_sw_version
-    commit = bytes(message.flight_custom_version).split(b"\0")[0]
-    # ArduPilot writes the commit as text, PX4 as a number.
-    text = commit.decode("ascii", errors="replace") if not is_px4 else bytes(commit[::-1]).hex()
+    number, commit = message.flight_sw_version, bytes(message.flight_custom_version)
+    # ArduPilot writes the commit as text, PX4 as a number of 64 bits.
+    text = f"{int.from_bytes(commit, 'little'):016x}" if is_px4 else commit.rstrip(b"\0").decode("ascii", "replace")
     name = "PX4" if is_px4 else "ArduCopter"
-    return f"{name} {number >> 24}.{number >> 16 & 255}.{number >> 8 & 255} ({text})"
+    return f"{name} {number >> 24}.{number >> 16 & 255}.{number >> 8 & 255} ({text[:8]})"
 
 
 _M_PER_DEGREE: Final = math.radians(1) * EARTH_RADIUS_M

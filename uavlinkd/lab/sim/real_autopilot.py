@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import asyncio
 import os
+import re
+import shutil
 import signal
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -127,8 +129,6 @@ class RealAutopilot:
             )
         if is_px4:
             await self._until_logged(_PX4_STARTED)
-            # The start script derives the system id from the instance.
-            await self._ask_px4("param", "set", "MAV_SYS_ID", str(self.settings.system_id))
             # In place of the links that its start script opens, which have fixed ports.
             await self._ask_px4("mavlink", "stop-all")
             (local_port,) = free_ports(1)
@@ -194,12 +194,18 @@ class RealAutopilot:
         variables = {
             "PX4_SIM_MODEL": "sihsim_quadx",
             "PX4_SIMULATOR": "sihsim",
-            "PX4_PARAM_SIH_LOC_LAT0": str(home.latitude_deg),
-            "PX4_PARAM_SIH_LOC_LON0": str(home.longitude_deg),
-            "PX4_PARAM_SIH_LOC_H0": str(home.altitude_m),
+            "PX4_PARAM_MAV_SYS_ID": str(settings.system_id),
+            "PX4_HOME_LAT": str(home.latitude_deg),
+            "PX4_HOME_LON": str(home.longitude_deg),
+            "PX4_HOME_ALT": str(home.altitude_m),
             "PX4_PARAM_COM_RC_IN_MODE": "4",  # there is no radio control
+            "PX4_PARAM_SDLOG_MODE": "-1",  # no flight log on disk
         }
-        etc = settings.binary.parents[1] / "etc"
+        etc = self.folder / "etc"
+        shutil.copytree(settings.binary.parents[1] / "etc", etc, dirs_exist_ok=True)
+        # Its start script would derive the system ID from the instance.
+        script = etc / "init.d-posix" / "rcS"
+        script.write_text(re.sub(r"^param set MAV_SYS_ID .*$", "", script.read_text(), flags=re.MULTILINE))
         return (str(settings.binary), "-d", "-i", str(settings.instance), str(etc)), variables
 
     async def _ask_px4(self, command: str, *arguments: str) -> None:
