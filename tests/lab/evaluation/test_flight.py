@@ -16,11 +16,13 @@ from random import Random
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from tests import waiting
 from tests.needs import need
 from uavlinkd.core import wire
 from uavlinkd.lab.child_processes import end_with_parent
 from uavlinkd.lab.evaluation.flight_attacks import DisplaceOptions, DisplacePositions, Drift, ExchangeWatch
 from uavlinkd.lab.evaluation.flight_findings import FlightFindings, flight_problems, read_flight, summary
+from uavlinkd.lab.evaluation.flight_links import PaperLink
 from uavlinkd.lab.evaluation.flight_plan import ATTACKS, NAME, AttackPhase, FlightSettings, LinkKind
 from uavlinkd.lab.evaluation.flight_positions import (
     Belief,
@@ -162,14 +164,21 @@ def test_drift_grows_up_to_its_limit() -> None:
     assert other.distance_m(origin) == pytest.approx(4.0, abs=0.02)
 
 
-def test_watch_notes_first_key_and_first_data_after_it() -> None:
-    """Data before the exchange does not count."""
+def test_watch_notes_the_exchange_that_was_answered() -> None:
+    """Neither data before the exchange counts, nor a first message that was sent again."""
     watch = ExchangeWatch()
-    envelope = wire.envelope_header(1, 0) + heartbeat() + bytes(32)
-    for now, datagram in ((1.0, envelope), (2.0, bytes((1,)) + bytes(256)), (3.0, envelope), (4.0, envelope)):
-        assert watch.on_datagram(datagram, THERE, now) == [Send(datagram, THERE)]
+    envelope, key = wire.envelope_header(1, 0) + heartbeat() + bytes(32), bytes(256)
+    for now, datagram, direction in (
+        (1.0, envelope, THERE),
+        (2.0, b"\1" + key, THERE),
+        (3.0, b"\1" + key, THERE),
+        (3.5, b"\2" + key, THERE.reverse),
+        (4.0, envelope, THERE),
+        (5.0, envelope, THERE),
+    ):
+        assert watch.on_datagram(datagram, direction, now) == [Send(datagram, direction)]
 
-    assert (watch.key_at, watch.data_at) == (2.0, 3.0)
+    assert (watch.key_at, watch.data_at) == (3.0, 4.0)
 
 
 def test_plan_tries_each_attack_with_a_pause_before_it() -> None:
@@ -392,3 +401,38 @@ async def test_quick_run(tmp_path: Path) -> None:
     interventions = [json.loads(line) for line in (tmp_path / "mitm-flight-uavlinkd.jsonl").read_text().splitlines()]
     attacks = {line["attack"] for line in interventions if line["event"] == "intervention"}
     assert attacks >= {"duplicate", "displace-positions", "hold", "drop"}
+
+
+async def test_papers_link_exchanges_keys_once_and_again_around_a_relay(tmp_path: Path) -> None:
+    """A relay between both ends alters positions; after it, the ends have a key of their own again."""
+    delivered: list[bytes] = []
+    link = PaperLink(
+        FlightSettings(quick=True), tmp_path / "mitm.jsonl", lambda _name, frame: delivered.append(frame)
+    )
+    await link.open()
+    try:
+        frames = iter(position(*HERE, time_ms=number) for number in range(1_000_000))
+
+        async def until_delivered(is_genuine: bool) -> None:
+            sent: set[bytes] = set()
+
+            def arrived() -> bool:
+                frame = next(frames)
+                sent.add(frame)
+                link.send("drone0", frame)
+                return bool(delivered) and (delivered[-1] in sent) == is_genuine
+
+            delivered.clear()
+            await waiting.until(arrived)
+
+        await until_delivered(is_genuine=True)
+        exchange = link.watch.key_at
+        assert exchange is not None
+        await link.attack(AttackPhase.KEYS)
+        await until_delivered(is_genuine=False)
+        await link.attack(AttackPhase.QUIET)
+        await until_delivered(is_genuine=True)
+        assert link.watch.key_at == exchange
+        assert not (await link.notice()).counts.keys() - {"hmac_mismatch"}
+    finally:
+        await link.close()

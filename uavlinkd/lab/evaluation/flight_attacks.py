@@ -82,19 +82,26 @@ def _frames_at(datagram: bytes) -> list[int]:
 
 
 class ExchangeWatch(PassiveAttack):
-    """Passes everything, and notes when the first key was sent and the first data after it."""
+    """Passes everything, and notes the first exchange of keys that led to data."""
 
     name = "watch"
 
     def __init__(self) -> None:
         self.key_at: float | None = None
+        """When the initiator sent the key that was answered first."""
         self.data_at: float | None = None
+        """When the first data after the answer was sent."""
+        self._asked_at: dict[Direction, float] = {}
 
     def on_datagram(self, datagram: bytes, direction: Direction, now: float) -> list[Action]:
         """Note the time."""
         kind = kind_of(datagram)
-        if paper.is_key(datagram) or kind in HANDSHAKE:
-            self.key_at = self.key_at or now
-        elif kind is DatagramKind.ENVELOPE and self.key_at is not None:
+        if self.key_at is None:
+            # A first message without an answer is from before the other end had started.
+            if datagram[:1] == bytes((paper.ANSWER,)):
+                self.key_at = self._asked_at.get(direction.reverse)
+            elif paper.is_key(datagram) or kind in HANDSHAKE:
+                self._asked_at[direction] = now
+        elif kind is DatagramKind.ENVELOPE:
             self.data_at = self.data_at or now
         return [Send(datagram, direction)]

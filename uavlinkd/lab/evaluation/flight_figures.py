@@ -28,6 +28,9 @@ _PHASE_COLOURS: Final = {
     AttackPhase.DROP: "#000000",
 }
 """From the palette of Okabe and Ito, for colour-blind readers too."""
+_POINT_EVERY: Final = 2
+_LINE_EVERY: Final = 3
+"""So many samples for each point, and points for each thin line."""
 _LEADER: Final = PAIR[0]
 _FLOWN: Final = "#a9d8f3"
 _STATE_COLOURS: Final = {"link down": "#009e73", "freshness unverified": "#0072b2"}
@@ -35,7 +38,7 @@ _STATE_COLOURS: Final = {"link down": "#009e73", "freshness unverified": "#0072b
 
 def flight_figures(findings: FlightFindings) -> dict[str, bytes]:
     """The figure as SVG, by name; none without samples."""
-    if not findings.of("sample"):
+    if not findings.of("sample", aircraft=_LEADER):
         return {}
     with mpl.rc_context(STYLE):
         return {"flight": to_svg(draw_flight(findings))}
@@ -54,13 +57,14 @@ def draw_flight(findings: FlightFindings) -> Figure:
     maps[0].set_ylabel("north (m)")
     handles = [Line2D([], [], color=_FLOWN, linewidth=4, label="flown")]
     handles += [
-        Line2D([], [], color=colour, marker="o", linestyle="none", markersize=4, label=f"believed, {phase}")
+        Line2D([], [], color=colour, marker=".", linestyle="none", markersize=8, label=f"believed, {phase}")
         for phase, colour in _PHASE_COLOURS.items()
     ]
     upper.legend(handles=handles, loc="outside lower center", ncols=4)
     rows: Sequence[Axes] = lower.subplots(len(LinkKind), 1, sharex=True, sharey=True)
     for axes, link in zip(rows, LinkKind, strict=True):
         _draw_errors(axes, findings, link)
+    rows[0].set_ylim(0, 1.05 * max(sample.number("error_m") for sample in findings.of("sample", aircraft=_LEADER)))
     rows[1].set_ylabel("distance between believed and flown position (m)")
     rows[-1].set_xlabel("time since take-off (s)")
     reported = {state for state, _, _ in findings.states(LinkKind.OURS)}
@@ -76,22 +80,20 @@ def draw_flight(findings: FlightFindings) -> Figure:
 
 def _draw_map(axes: Axes, samples: Sequence[Record]) -> None:
     flown = [(sample.number("flown_east_m"), sample.number("flown_north_m")) for sample in samples]
-    believed = [(sample.number("believed_east_m"), sample.number("believed_north_m")) for sample in samples]
-    colours = [_PHASE_COLOURS[AttackPhase(str(sample.point["phase"]))] for sample in samples]
-    # Thin lines from each believed position to the one flown at that time.
-    axes.add_collection(
-        LineCollection(list(zip(flown, believed, strict=True)), colors=colours, linewidths=0.4, alpha=0.35, zorder=1)
-    )
     axes.plot([east for east, _ in flown], [north for _, north in flown], color=_FLOWN, linewidth=4, zorder=2)
-    axes.scatter(
-        [east for east, _ in believed],
-        [north for _, north in believed],
-        s=5,
-        color=colours,
-        linewidths=0,
-        zorder=3,
-    )
+    for phase, colour in _PHASE_COLOURS.items():
+        chosen = [sample for sample in samples[::_POINT_EVERY] if sample.point["phase"] == phase]
+        believed = [(sample.number("believed_east_m"), sample.number("believed_north_m")) for sample in chosen]
+        places = [(sample.number("flown_east_m"), sample.number("flown_north_m")) for sample in chosen]
+        lines = list(zip(places, believed, strict=True))[::_LINE_EVERY]
+        axes.add_collection(LineCollection(lines, colors=colour, linewidths=0.5, alpha=0.35, zorder=1))
+        _draw_points(axes, believed, colour)
     axes.set_aspect("equal", adjustable="box")
+
+
+def _draw_points(axes: Axes, points: Sequence[tuple[float, float]], colour: str) -> None:
+    # Not scatter(), which writes a style for each point: the SVG would be three times as large.
+    axes.plot([x for x, _ in points], [y for _, y in points], ".", color=colour, markersize=3, zorder=3)
 
 
 def _draw_errors(axes: Axes, findings: FlightFindings, link: LinkKind) -> None:
@@ -111,15 +113,10 @@ def _draw_errors(axes: Axes, findings: FlightFindings, link: LinkKind) -> None:
                     fontsize=9,
                 )
     samples = findings.of("sample", link=link, aircraft=_LEADER)
-    axes.scatter(
-        [sample.number("at_s") for sample in samples],
-        [sample.number("error_m") for sample in samples],
-        s=4,
-        color=[_PHASE_COLOURS[AttackPhase(str(sample.point["phase"]))] for sample in samples],
-        linewidths=0,
-    )
+    for phase, colour in _PHASE_COLOURS.items():
+        chosen = [sample for sample in samples[::_POINT_EVERY] if sample.point["phase"] == phase]
+        _draw_points(axes, [(sample.number("at_s"), sample.number("error_m")) for sample in chosen], colour)
     axes.text(1.01, 0.5, LINK_NAMES[link], transform=axes.transAxes, rotation=270, ha="left", va="center")
-    axes.set_ylim(bottom=0)
     if spans:
         axes.set_xlim(spans[0].begin_s, spans[-1].end_s)
     for state, begin_s, end_s in findings.states(link):

@@ -268,7 +268,8 @@ class DaemonLink(PositionLink):
         counts = Counter[str]()
         states = []
         for drone in self._drones.values():
-            await drone.ask()
+            status = await drone.ask()
+            counts.update(status.get("drops", {}))
             for peer in drone.peer_statuses:
                 counts.update(peer["drops"])
                 counts.update({problem.value: peer[problem] for problem in LinkProblem if peer[problem]})

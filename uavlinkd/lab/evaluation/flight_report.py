@@ -84,9 +84,10 @@ def _on_figure(findings: FlightFindings) -> list[str]:
         "The figure shows the first aircraft, as the second one believes it to be. A thin line joins each believed "
         "position to the one flown at that time. A receiver believes the last position that its link delivered.",
         "All links carried the same flight at the same time. Positions are sent ten times a second: without an "
-        "attack, the error is the distance flown in up to 0.1 s. The largest error is that of an attacker who drops "
-        "everything. The last column leaves out the time in which a daemon reports that its link is down, or that it "
-        "cannot verify that frames are new. The other ends report nothing.",
+        "attack, the error is the distance flown in up to 0.1 s. An attacker that drops everything causes a large "
+        "error on every link. The daemons also drop what arrives too late. The last column leaves out the time in "
+        "which a daemon reports that its link is down, or that it cannot verify that frames are new. The other ends "
+        "report nothing.",
     ]
 
 
@@ -151,10 +152,10 @@ def _by_phase(findings: FlightFindings) -> Table:
 
 
 _ON_KEYS = [
-    "Both aircraft fly when the exchange begins. Its duration is the time from the first public key to the first "
-    "data, at the man in the middle. uavlinkd's processes start in flight too, before their first key. The paper's "
-    "ends exchange keys once, and again when the attack on the exchange begins and when it ends. The daemons repeat "
-    "their handshake on their own."
+    "Both aircraft fly when the exchange begins. Its duration is the time from the public key that was answered to "
+    "the first data, at the man in the middle. uavlinkd's processes start in flight too. The paper's ends exchange "
+    "keys once, and again when the attack on the exchange begins and when it ends. The daemons repeat their "
+    "handshake on their own."
 ]
 
 
