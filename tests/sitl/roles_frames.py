@@ -23,7 +23,7 @@ from uavlinkd.mavlink.dialect_table import COMMANDS, MESSAGES
 from uavlinkd.mavlink.frames import parse_frame
 from uavlinkd.mavlink.policy.compilation import compile_policy
 from uavlinkd.mavlink.policy.delivery import DeliveredStream, Source
-from uavlinkd.mavlink.policy.gate import HEARTBEAT, MAV_TYPE_GCS, Condition, Refusal
+from uavlinkd.mavlink.policy.gate import HEARTBEAT, MAV_TYPE_GCS, REQUEST_MESSAGE, Condition, Refusal
 
 ROLES_TESTED: Final = ("observer", "swarm-member")
 SYSTEMS: Final[Mapping[str, Sequence[int]]] = {"observer": (200, 254), "swarm-member": (2, 3)}
@@ -33,8 +33,6 @@ STATION: Final = 255
 INTERVAL_S: Final = 0.25
 """Between two frames on the gate's clock: no role has a rate below 5/s."""
 
-_HAND_WRITTEN: Final = {412: ("<HHBB", ("first_sequence", "last_sequence", "target_system", "target_component"))}
-"""REQUEST_EVENT, which pymavlink does not have (https://mavlink.io/en/messages/common.html#REQUEST_EVENT)."""
 _FLOATS: Final = (
     *(0.0, -0.0, 1.0, -1.0, 0.5, 2.0, 100.0, 360.0, 1e-40, 3.4e38, -3.4e38, 2147483648.0, -2147483648.0, 16777217.0),
     *(float("nan"), float("inf"), float("-inf")),
@@ -64,9 +62,6 @@ class FieldOf(NamedTuple):
 @cache
 def fields_of(msgid: int) -> tuple[FieldOf, ...]:
     """The fields of a message in the order of the payload."""
-    if msgid in _HAND_WRITTEN:
-        kinds, names = _HAND_WRITTEN[msgid]
-        return tuple(FieldOf(name, kind, 1) for name, kind in zip(names, kinds[1:], strict=True))
     message: Any = mavlink.mavlink_map[msgid]
     kinds = message.native_format.decode()[1:]
     arrays = zip(message.ordered_fieldnames, kinds, message.array_lengths, strict=True)
@@ -79,6 +74,8 @@ class FrameCounts:
 
     passed: int = 0
     by_message: Counter[str] = field(default_factory=Counter)
+    refused_requests: int = 0
+    """Requests of messages that may not go to this role, or of numbers that are not one. They were not sent."""
     hidden: int = 0
     """Frames of random bytes that the stream's filter refused. They were not sent."""
 
@@ -136,6 +133,9 @@ class RoleFrames:
             assert frame is not None, raw.hex(" ")
             self._now += INTERVAL_S
             refusal = self._gate.check(frame, self._now)
+            if refusal is Refusal.COMMAND_NOT_ALLOWED and frame.header.command == REQUEST_MESSAGE:
+                self.counts.refused_requests += 1
+                continue
             assert refusal is None, (refusal, raw.hex(" "))
             delivered = self._stream.admit(frame, self._source, self._now)
             if delivered:

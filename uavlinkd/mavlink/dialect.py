@@ -157,10 +157,8 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
         "SET_MAG_OFFSETS OSD_PARAM_CONFIG OSD_PARAM_CONFIG_REPLY OSD_PARAM_SHOW_CONFIG "
         "OSD_PARAM_SHOW_CONFIG_REPLY"
     ),
-    # Requests for parameters only.
-    "parameter-reads": _names(
-        "PARAM_REQUEST_READ PARAM_REQUEST_LIST PARAM_EXT_REQUEST_READ PARAM_EXT_REQUEST_LIST OSD_PARAM_SHOW_CONFIG"
-    ),
+    # Requests for parameters only. Not OSD_PARAM_SHOW_CONFIG: one for screen 5 ends ArduCopter 4.7.
+    "parameter-reads": _names("PARAM_REQUEST_READ PARAM_REQUEST_LIST PARAM_EXT_REQUEST_READ PARAM_EXT_REQUEST_LIST"),
     # Missions, fences, rally points, home and origin, in both directions.
     "mission": _names(
         "MISSION_REQUEST_PARTIAL_LIST MISSION_WRITE_PARTIAL_LIST MISSION_ITEM MISSION_REQUEST "

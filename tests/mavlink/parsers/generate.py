@@ -19,7 +19,7 @@ CAST: Final[Mapping[str, Mapping[str, object]]] = {
     "member": {"role": "swarm-member", "system_ids": [2]},
     "other member": {"role": "swarm-member", "system_ids": [3]},
     "vehicle": {"role": "vehicle", "system_ids": [2]},
-    "observer": {"role": "observer", "system_ids": [200]},
+    "observer": {"role": "observer", "system_ids": [200], "allow_in": ["REQUEST_EVENT"]},
     "operator": {"role": "operator", "system_ids": [255], "deny_in": ["MAV_CMD_DO_FLIGHTTERMINATION"]},
     "operator without MAVLink 1": {"role": "operator", "system_ids": [255], "mavlink1": False},
     "private dialect": {"role": "swarm-member", "system_ids": [7], "allow_in": [54321, 150]},

@@ -561,11 +561,11 @@ FROM_PX4 = [
 
 
 def test_px4_messages_pass_in_both_directions() -> None:
-    """PX4's events and metadata reach operator and observer, who may request events; members send none."""
+    """PX4's events and metadata reach operator and observer. Only the operator may request events again."""
     vehicle = {"role": "vehicle", "system_ids": [1]}
     others = [compiled({"role": role, "system_ids": [1]}) for role in ("operator", "observer")]
     reporting = [incoming(vehicle), *(other.outgoing for other in others)]
-    asked = [compiled(vehicle).outgoing, *(other.incoming for other in others)]
+    asked = [compiled(vehicle).outgoing, others[0].incoming]
     member = incoming({"role": "swarm-member", "system_ids": [1]})
     for gate in reporting:
         assert not [name for name in FROM_PX4 if gate.check(blank(*ids(name)), 0.0)]
@@ -573,7 +573,8 @@ def test_px4_messages_pass_in_both_directions() -> None:
     for gate in asked:
         assert gate.check(blank(*ids("REQUEST_EVENT")), 0.0) is None
         assert gate.check(blank(*ids("EVENT")), 0.0) is Refusal.MESSAGE_NOT_ALLOWED
-    operator, observer = asked[1:]
+    operator, observer = (other.incoming for other in others)
+    assert observer.check(blank(*ids("REQUEST_EVENT")), 0.0) is Refusal.MESSAGE_NOT_ALLOWED
     for name in ("COMMAND_CANCEL", "PLAY_TUNE_V2", "TIMESYNC"):
         assert operator.check(blank(*ids(name)), 0.0) is None
         assert observer.check(blank(*ids(name)), 0.0) is Refusal.MESSAGE_NOT_ALLOWED

@@ -25,7 +25,7 @@ _ID: Final = ids_by_name()
 _MEMBER: Final = {"role": "swarm-member", "system_ids": [MEMBER]}
 _OTHER: Final = {"role": "swarm-member", "system_ids": [OTHER_MEMBER]}
 _VEHICLE: Final = {"role": "vehicle", "system_ids": [MEMBER]}
-_OBSERVER: Final = {"role": "observer", "system_ids": [TABLET]}
+_OBSERVER: Final = {"role": "observer", "system_ids": [TABLET], "allow_in": ["REQUEST_EVENT"]}
 _OPERATOR: Final = {"role": "operator", "system_ids": [GROUND], "deny_in": ["MAV_CMD_DO_FLIGHTTERMINATION"]}
 _ANYTHING: Final[Mapping[str, object]] = {"role": "all", "system_ids": "all"}
 

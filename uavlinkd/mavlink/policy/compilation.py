@@ -28,7 +28,8 @@ The entries of a list add to those of the role. A denied entry is denied even if
 ``files-read``           a group that allows only the reading requests of FILE_TRANSFER_PROTOCOL (READING_OPCODES)
 ``30``                   a message by its number, for messages that the dialect does not know
 ``MAV_CMD_NAV_TAKEOFF``  a command by its name; ``command:22`` by its number. An allowed command passes in
-                         COMMAND_LONG and COMMAND_INT. A denied command is refused in all messages that carry
+                         COMMAND_LONG and COMMAND_INT. By an allowed MAV_CMD_REQUEST_MESSAGE it may request only
+                         messages that may go to it. A denied command is refused in all messages that carry
                          commands, including mission items and cancellations. So are messages and commands with the
                          same effect: SET_MODE is MAV_CMD_DO_SET_MODE, a mission item to fly to now is
                          MAV_CMD_DO_REPOSITION, and MAV_CMD_DO_AUX_FUNCTION can arm (`settings.DONE_BY`).
@@ -80,14 +81,6 @@ class Policy:
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
-        self.incoming = Gate(
-            settings.rules_in,
-            settings.rates_in,
-            is_incoming=True,
-            systems=settings.systems,
-            mavlink1=settings.mavlink1,
-            ground_station=settings.ground_station,
-        )
         self.outgoing = Gate(
             settings.rules_out,
             settings.rates_out,
@@ -95,6 +88,15 @@ class Policy:
             systems=None,
             mavlink1=settings.mavlink1,
             ground_station=True,
+        )
+        self.incoming = Gate(
+            settings.rules_in,
+            settings.rates_in,
+            is_incoming=True,
+            systems=settings.systems,
+            mavlink1=settings.mavlink1,
+            ground_station=settings.ground_station,
+            outgoing=self.outgoing,
         )
         # Sentences for the operator, the most severe first.
         self.warnings = tuple(_warnings(settings, self.incoming, self.outgoing))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from uavlinkd.mavlink.dialect_table import COMMANDS, MESSAGES
 from uavlinkd.mavlink.egress.kinds import FlowKey, flow_key, kind_of
 from uavlinkd.mavlink.frames import Frame
 from uavlinkd.mavlink.headers import Header
-from uavlinkd.mavlink.policy.settings import FILE_TRANSFER, READING_OPCODES, Rules
+from uavlinkd.mavlink.policy.settings import FILE_TRANSFER, MAX_MSGID, READING_OPCODES, Rules
 
 ANY_OTHER: Final = -1  # stands for every message beyond those that are counted by themselves
 # Limits of one policy in one direction:
@@ -30,6 +31,10 @@ MAV_TYPE_GCS: Final = 6
 NAMED_COMMANDS: Final = frozenset(COMMANDS.values())
 COMMAND_CARRIERS: Final = frozenset(msgid for msgid, row in MESSAGES.items() if row[6] is not None)
 DIRECT_COMMANDS: Final = frozenset(dialect.ids_by_name()[name] for name in ("COMMAND_LONG", "COMMAND_INT"))
+
+# A request for one message, by its number in the first parameter, a float at the payload's start. Some autopilots do
+# more than answer: PX4 adds parameters to its list if it is asked for UAVIONIX_ADSB_OUT_CFG.
+REQUEST_MESSAGE: Final = COMMANDS["MAV_CMD_REQUEST_MESSAGE"]
 
 # Messages that do what a command does.
 SAME_AS_COMMAND: Final[Mapping[int, int]] = {
@@ -106,7 +111,7 @@ _Buckets = dict[FlowKey, tuple[float, float]]
 class Condition:
     """What a frame of one message must still meet."""
 
-    only_commands: frozenset[int] | None = None  # None: any
+    only_commands: frozenset[int] | None = None  # None: any; else it may request only messages that may go to it
     never_commands: frozenset[int] = frozenset()
     never_current: frozenset[int] = frozenset()  # values of a mission item's field
     only_reads_files: bool = False
@@ -128,6 +133,7 @@ class Gate:
         "_is_incoming",
         "_mavlink1",
         "_of_systems",
+        "_outgoing",
         "_passes_unknown",
         "_rates",
         "_rules",
@@ -147,8 +153,10 @@ class Gate:
         systems: frozenset[int] | None,
         mavlink1: bool,
         ground_station: bool,
+        outgoing: Gate | None = None,
     ) -> None:
         self._rules = rules
+        self._outgoing = outgoing  # of an incoming gate: the other direction
         self._rates = rates
         self._is_incoming = is_incoming
         self._systems = systems
@@ -310,6 +318,10 @@ class Gate:
     def _breach(self, condition: Condition, frame: Frame) -> Refusal | None:
         if not condition.takes_command(frame.header.command):
             return Refusal.COMMAND_NOT_ALLOWED
+        if condition.only_commands is not None and frame.header.command == REQUEST_MESSAGE:
+            refusal = self._of_requested(frame)
+            if refusal is not None:
+                return refusal
         if condition.never_current and _payload_byte(frame, CURRENT_IN_MISSION_ITEM) in condition.never_current:
             return Refusal.COMMAND_NOT_ALLOWED
         if condition.only_reads_files and _payload_byte(frame, OPCODE_IN_FILE_TRANSFER) not in READING_OPCODES:
@@ -317,6 +329,16 @@ class Gate:
         if condition.refuses_ground_station and claims_to_be_ground_station(frame):
             return Refusal.GROUND_STATION_NOT_ALLOWED
         return None
+
+    def _of_requested(self, frame: Frame) -> Refusal | None:
+        """Whether the sender may request this message: one that may go to it, by a valid number."""
+        (number,) = _FLOAT.unpack(bytes(_payload_byte(frame, at) for at in range(_FLOAT.size)))
+        if not 0 <= number <= MAX_MSGID or number != int(number):  # neither is true of NaN
+            return Refusal.COMMAND_NOT_ALLOWED
+        if self._outgoing is None:
+            return None
+        verdict = self._outgoing.decide(int(number), is_known=int(number) in MESSAGES)
+        return Refusal.COMMAND_NOT_ALLOWED if isinstance(verdict, Refusal) else None
 
     def _takes_token(self, frame: Frame, per_second: float, now: float, to: int) -> bool:
         header = frame.header
@@ -329,6 +351,7 @@ class Gate:
 
 
 _UNCONDITIONAL = Condition()
+_FLOAT: Final = struct.Struct("<f")
 
 
 def _take(limits: tuple[tuple[_Buckets, FlowKey, int], ...], per_second: float, now: float) -> bool:

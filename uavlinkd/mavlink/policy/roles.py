@@ -41,9 +41,10 @@ _FROM_OPERATOR: Final = (
     *("rtk", "terrain", "camera", "gimbal", "signals", "traffic", "transponder", "identification", "STATUSTEXT"),
     *("CHANGE_OPERATOR_CONTROL", "CHANGE_OPERATOR_CONTROL_ACK"),
 )
-# Requests that change nothing in the vehicle. No HEARTBEAT: it would suppress the failsafe for a lost operator.
+# Requests that change nothing in the vehicle. No HEARTBEAT: it would suppress the failsafe for a lost operator. No
+# REQUEST_EVENT: PX4 answers one with up to 65,536 frames, which keep all other messages from the link.
 _FROM_OBSERVER: Final = (
-    *("parameter-reads", "mission-reads", "PING", "REQUEST_EVENT"),
+    *("parameter-reads", "mission-reads", "PING"),
     *("MAV_CMD_REQUEST_MESSAGE", "MAV_CMD_REQUEST_PROTOCOL_VERSION", "MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES"),
     *("MAV_CMD_REQUEST_CAMERA_INFORMATION", "MAV_CMD_REQUEST_STORAGE_INFORMATION"),
 )
@@ -61,7 +62,6 @@ _OBSERVER_RATES: Final = MappingProxyType(
     {
         "parameter-reads": 50.0,
         "mission-reads": 50.0,
-        "REQUEST_EVENT": 50.0,
         "PING": 10.0,
         "COMMAND_LONG": 10.0,
         "COMMAND_INT": 10.0,
