@@ -107,8 +107,9 @@ def _overview(findings: FlightFindings) -> Table:
 _ON_ATTACKS = [
     "Error and age of the believed positions of both aircraft, ten samples a second. The age is the time since the "
     "aircraft sent the position; of an altered one, since it was accepted. An attacker on the path can always drop "
-    "or delay frames. Then the receiver of every link believes an old position. Samples after an attack count for it "
-    "until the first position after its end is accepted."
+    "or delay frames. Then the receiver of every link believes an old position: also uavlinkd's, if the delay is "
+    "shorter than a few seconds. Samples after an attack count for it until the first position after its end is "
+    "accepted."
 ]
 
 
@@ -208,7 +209,8 @@ def _on_run(findings: FlightFindings) -> list[str]:
     quick = " --quick" if settings.quick else ""
     return [
         f"Made by `uavlinkd evaluate flight --out DIR{quick} --seed {settings.seed}`. `uavlinkd evaluate report DIR` "
-        "writes this report again from the records. The seed determines the attacker's choices, but no key."
+        "writes this report again from the records. The seed determines the attacker's choices, but no key. For real "
+        "aircraft, `UAVLINKD_ARDUPILOT` or `UAVLINKD_PX4` names the binary of a simulator."
     ]
 
 

@@ -19,6 +19,8 @@ from uavlinkd.lab.sim.real_autopilot import Firmware, RealAutopilot, RealAutopil
 from uavlinkd.lab.sim.vehicle import GeoPoint
 
 OUR_SIMULATOR = "our simulator"
+_PX4_INSTANCES = 10_000
+"""PX4 adds the instance to port numbers up to 19,450."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +97,7 @@ class Aircraft:
                 udp_port=port,
                 home=self._home,
                 system_id=self._system_id,
-                instance=self._system_id,
+                instance=port % _PX4_INSTANCES,  # another run on this machine has another port
             ),
             self._folder,
         )
