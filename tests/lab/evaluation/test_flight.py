@@ -222,6 +222,7 @@ def some_records() -> list[Record]:
                     "believed_north_m": error,
                     "error_m": error,
                     "age_s": error / 8,
+                    "accepted_at_s": at,
                     "provenance": "genuine",
                 }
                 point = {"link": link.value, "aircraft": "drone0", "phase": phase.value}
@@ -300,16 +301,15 @@ def test_unreported_attack_is_a_problem() -> None:
 
 
 def test_error_is_unnoticed_until_a_state_is_reported() -> None:
-    """Samples while the daemon reports that the link is down do not count; without reports, all count."""
-    records = [
-        replace(record, values={**record.values, "error_m": 80.0})
-        if record.kind == "sample" and record.number("at_s") >= 10.5
-        else record
-        for record in some_records()
-    ]
+    """A position counts until the daemon reports that the link is down, and a later position after that."""
+    records = some_records()
+    for at, accepted_at, error in ((10.4, 10.0, 4.0), (10.6, 10.0, 80.0), (12.1, 10.0, 90.0), (12.2, 12.1, 5.0)):
+        values: dict[str, Value] = {"at_s": at, "accepted_at_s": accepted_at, "error_m": error}
+        point = {"aircraft": "drone1", "phase": AttackPhase.DROP.value}
+        records += [Record("sample", {"link": link.value, **point}, values) for link in LinkKind]
     findings = FlightFindings(RUN, records)
-    assert findings.unnoticed_error_m(LinkKind.OURS) == 0.5
-    assert findings.unnoticed_error_m(LinkKind.PAPER) == 80.0
+    assert findings.unnoticed_error_m(LinkKind.OURS) == 5.0
+    assert findings.unnoticed_error_m(LinkKind.PAPER) == 90.0
 
 
 def test_interrupted_run_is_a_problem() -> None:

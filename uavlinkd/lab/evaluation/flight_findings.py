@@ -90,12 +90,15 @@ class FlightFindings:
         return any(begin_s <= at < end_s for _, begin_s, end_s in self.states(LinkKind.OURS))
 
     def unnoticed_error_m(self, link: LinkKind) -> float | None:
-        """The largest error while no end reports that the link is not well."""
+        """The largest error of believed positions, without those after which an end reported a problem."""
         states = self.states(link)
         errors = [
             sample.number("error_m")
             for sample in self.of("sample", link=link)
-            if not any(begin_s <= sample.number("at_s") < end_s for _, begin_s, end_s in states)
+            if not any(
+                begin_s <= sample.number("at_s") and sample.number("accepted_at_s") < end_s
+                for _, begin_s, end_s in states
+            )
         ]
         return max(errors, default=None)
 

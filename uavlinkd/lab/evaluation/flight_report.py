@@ -85,9 +85,9 @@ def _on_figure(findings: FlightFindings) -> list[str]:
         "position to the one flown at that time. A receiver believes the last position that its link delivered.",
         "All links carried the same flight at the same time. Positions are sent ten times a second: without an "
         "attack, the error is the distance flown in up to 0.1 s. An attacker that drops everything causes a large "
-        "error on every link. The daemons also drop what arrives too late. The last column leaves out the time in "
-        "which a daemon reports that its link is down, or that it cannot verify that frames are new. The other ends "
-        "report nothing.",
+        "error on every link. The daemons also drop what arrives too late. The last column leaves out a position "
+        "from the moment when a daemon reports that its link is down, or that it cannot verify that frames are new. "
+        "The other ends report nothing.",
     ]
 
 

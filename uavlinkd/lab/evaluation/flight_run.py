@@ -248,6 +248,7 @@ class FlightEvaluation:
                             "believed_north_m": round(sample.belief.place.north_m, 2),
                             "error_m": round(sample.error_m, 2),
                             "age_s": round(sample.age_s, 3),
+                            "accepted_at_s": round(sample.belief.accepted_at, 3),
                             "provenance": sample.belief.provenance.value,
                         }
                         records.append(Record("sample", point, values))
