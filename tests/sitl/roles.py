@@ -25,9 +25,9 @@ def available(environ: Mapping[str, str] = os.environ, speedup: float = 5) -> di
     """The autopilots that this machine has, by name."""
     makers: dict[str, MakeVehicle] = {"sim": SimulatedVehicle}
     if ardupilot := environ.get("UAVLINKD_ARDUPILOT"):
-        makers["ardupilot"] = lambda folder: ArduCopter(folder, Path(ardupilot).resolve(), speedup=speedup)
+        makers["ardupilot"] = lambda folder, attach: ArduCopter(folder, Path(ardupilot).resolve(), attach, speedup)
     if px4 := environ.get("UAVLINKD_PX4"):
-        makers["px4"] = lambda folder: Px4(folder, Path(px4).resolve(), speedup=speedup)
+        makers["px4"] = lambda folder, attach: Px4(folder, Path(px4).resolve(), attach, speedup)
     return makers
 
 

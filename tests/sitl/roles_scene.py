@@ -12,18 +12,21 @@ from typing import Any, Final, NamedTuple, Self
 
 from pymavlink.dialects.v20 import all as mavlink
 
+from tests.sitl.roles_daemons import DaemonPair
 from tests.sitl.roles_frames import RoleFrames
 from tests.sitl.roles_judge import Judge, Snapshot, changed_parameters, differences
 from tests.sitl.roles_links import LinkClosedError, dropped_datagrams
 from tests.sitl.roles_station import Station, StationError
-from tests.sitl.roles_vehicles import Vehicle
+from tests.sitl.roles_vehicles import Attach, Vehicle, attach_directly
 from uavlinkd.lab.sim.autopilot import HOME
 
 BATCH: Final = 100
 """Frames between two barriers: what fits into the queues of the kernel and of the autopilot."""
+DAEMONS_BATCH: Final = 20
+"""The same through daemons, which have smaller queues."""
 CHUNK: Final = 50_000
 """Frames between two whole snapshots."""
-MakeVehicle = Callable[[Path], Vehicle]
+MakeVehicle = Callable[[Path, Attach], Vehicle]
 Say = Callable[[str], None]
 _RELATIVE: Final = mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT
 
@@ -62,8 +65,9 @@ class SceneResult:
 class Trial:
     """One autopilot with a mission, a fence and rally points; in the air, if asked for."""
 
-    def __init__(self, make: MakeVehicle, *, is_flying: bool) -> None:
+    def __init__(self, make: MakeVehicle, attach: Attach = attach_directly, *, is_flying: bool) -> None:
         self._make = make
+        self._attach = attach
         self._is_flying = is_flying
         self._exits = ExitStack()
         self.vehicle: Vehicle
@@ -73,7 +77,7 @@ class Trial:
     def __enter__(self) -> Self:
         with ExitStack() as exits:
             folder = Path(exits.enter_context(tempfile.TemporaryDirectory(prefix="uavlinkd-roles-")))
-            vehicle = self.vehicle = self._make(folder / "autopilot")
+            vehicle = self.vehicle = self._make(folder / "autopilot", self._attach)
             self.station = exits.enter_context(vehicle)
             for plan, items in plans().items():
                 with suppress(StationError):  # the project's simulator has missions only
@@ -91,17 +95,17 @@ class Trial:
     def __exit__(self, *_: object) -> None:
         self._exits.close()
 
-    def send(self, frames: Sequence[bytes]) -> int:
+    def send(self, frames: Sequence[bytes], batch: int = BATCH) -> int:
         """Send frames until the judge reports a change, or the autopilot ends; how many were sent."""
         station = self.station
-        for begin in range(0, len(frames), BATCH):
+        for begin in range(0, len(frames), batch):
             try:
-                station.attacker.send(frames[begin : begin + BATCH])
+                station.attacker.send(frames[begin : begin + batch])
                 station.wait_for_attacker()
             except LinkClosedError:
                 self.judge.changes.append(self.vehicle.why_ended())
             if self.judge.changes:
-                return min(begin + BATCH, len(frames))
+                return min(begin + batch, len(frames))
         return len(frames)
 
     def snapshot_after(self, before: Snapshot, *, with_rates: bool) -> Snapshot:
@@ -166,6 +170,34 @@ def run_scene(
 
 def _subject(change: str) -> str:
     return change.partition(":")[0]
+
+
+class DaemonsResult(NamedTuple):
+    """The result of frames through two daemons."""
+
+    sent: int
+    seconds: float
+    changes: tuple[str, ...]
+    refused: Mapping[str, Any]
+    endpoint: Mapping[str, Any]
+
+
+def run_through_daemons(make: MakeVehicle, role: str, frames: int, seed: int, *, is_flying: bool) -> DaemonsResult:
+    """Send frames through two daemons, the victim's with this role for the sender, and compare before and after."""
+    generator = RoleFrames(role, seed)
+    own = run_quiet(make, 1, is_flying=is_flying).parameters
+    with (
+        DaemonPair(role, generator.systems) as daemons,
+        Trial(make, daemons.attach, is_flying=is_flying) as trial,
+    ):
+        before = trial.judge.snapshot()
+        began_s = trial.station.time_s
+        sent = trial.send([generator.draw() for _ in range(frames)], DAEMONS_BATCH)
+        after = trial.snapshot_after(before, with_rates=False)
+        changes = (*trial.judge.changes, *differences(before, after, own))
+        seconds = trial.station.time_s - began_s
+        daemons.stop()
+    return DaemonsResult(sent, seconds, changes, daemons.peer["refused"]["in"], daemons.endpoint)
 
 
 class Calm(NamedTuple):

@@ -41,18 +41,28 @@ _COPTER_PARAMETERS: Final[Mapping[str, float]] = {
 }
 
 
+Attach = Callable[[str], Link]
+
+
+def attach_directly(url: str) -> Link:
+    """A link to the autopilot, without daemons."""
+    kind, _, address = url.partition(":")
+    port = int(address.rpartition(":")[2])
+    return {"tcp": connected, "udpin": listening, "udpout": speaking}[kind](port, STATION)
+
+
 class Vehicle(ABC):
     """The process of one autopilot, as a context. ``folder`` is for its files.
 
-    ``attacker``: the system and component of the test's own frames on the attacker's link.
+    ``attach`` opens the attacker's link to an URL, as an endpoint of a daemon has it.
     """
 
     settle_s = 30.0
     """Until its estimate is steady, in seconds of its own time: home and origin move before."""
 
-    def __init__(self, folder: Path, attacker: tuple[int, int] = STATION) -> None:
+    def __init__(self, folder: Path, attach: Attach = attach_directly) -> None:
         self.folder = folder
-        self.attacker = attacker
+        self.attach = attach
         self._processes: list[subprocess.Popen[bytes]] = []
         self._links: list[Link] = []
 
@@ -132,7 +142,7 @@ class SimulatedVehicle(Vehicle):
     def _open(self) -> tuple[Link, Link]:
         port = free_port()
         self._run(sys.executable, "-m", "uavlinkd", "sim", "--url", f"udpin:127.0.0.1:{port}")
-        return speaking(port, STATION), speaking(port, self.attacker)
+        return speaking(port, STATION), self.attach(f"udpout:127.0.0.1:{port}")
 
     def take_off(self, station: Station) -> None:
         """In the mode GUIDED."""
@@ -142,8 +152,8 @@ class SimulatedVehicle(Vehicle):
 class ArduCopter(Vehicle):
     """ArduCopter in its own simulator."""
 
-    def __init__(self, folder: Path, binary: Path, attacker: tuple[int, int] = STATION, speedup: float = 5) -> None:
-        super().__init__(folder, attacker)
+    def __init__(self, folder: Path, binary: Path, attach: Attach = attach_directly, speedup: float = 5) -> None:
+        super().__init__(folder, attach)
         self._binary = binary
         self._speedup = speedup
 
@@ -159,7 +169,7 @@ class ArduCopter(Vehicle):
             *("--serial0", f"tcp:{own}:wait", "--serial1", f"tcp:{attacker}:nowait"),
             *("--serial2", "none:2"),
         )
-        return connected(own, STATION), connected(attacker, self.attacker)
+        return connected(own, STATION), self.attach(f"tcp:127.0.0.1:{attacker}")
 
     def take_off(self, station: Station) -> None:
         """In the mode GUIDED."""
@@ -169,8 +179,8 @@ class ArduCopter(Vehicle):
 class Px4(Vehicle):
     """PX4's quadcopter in SIH. The binary is in ``bin`` of its build folder."""
 
-    def __init__(self, folder: Path, binary: Path, attacker: tuple[int, int] = STATION, speedup: float = 5) -> None:
-        super().__init__(folder, attacker)
+    def __init__(self, folder: Path, binary: Path, attach: Attach = attach_directly, speedup: float = 5) -> None:
+        super().__init__(folder, attach)
         self._binary = binary
         self._speedup = speedup
         self._instance = 20 + os.getpid() % 200
@@ -196,14 +206,12 @@ class Px4(Vehicle):
             sleep(0.1)
         self._shell("mavlink", "stop-all")
         self._shell("param", "set", "MAV_SYS_ID", "1")  # the start script derives it from the instance
-        links = []
-        modes: Sequence[tuple[str, ...]] = (("-m", "onboard"), ())  # without one, as for a ground station
-        for mode, sender, local in zip(modes, (STATION, self.attacker), free_ports(2), strict=True):
-            port = free_port()
-            links.append(listening(port, sender))
-            ports = ("-u", str(local), "-o", str(port), "-t", "127.0.0.1")
-            self._shell("mavlink", "start", "-x", "-f", *ports, *mode, "-r", "1000000")
-        return links[0], links[1]
+        local, local_attacker = free_ports(2)
+        own, attacker = free_ports(2)
+        links = listening(own, STATION), self.attach(f"udpin:127.0.0.1:{attacker}")
+        self._start_link(local, own, "-m", "onboard")
+        self._start_link(local_attacker, attacker)  # in the mode for a ground station
+        return links
 
     def take_off(self, station: Station) -> None:
         """It holds its position at the height of MIS_TAKEOFF_ALT."""
@@ -217,6 +225,10 @@ class Px4(Vehicle):
         )
         station.until(lambda: station.seen.latest["HEARTBEAT"].custom_mode == _PX4_HOLD, "the mode HOLD")
         station.pass_time(10)
+
+    def _start_link(self, local: int, remote: int, *mode: str) -> None:
+        ports = ("-u", str(local), "-o", str(remote), "-t", "127.0.0.1")
+        self._shell("mavlink", "start", "-x", "-f", *ports, *mode, "-r", "1000000")
 
     def _shell(self, command: str, *arguments: str) -> None:
         client = self._binary.parent / f"px4-{command}"
