@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-import threading
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Future
-from contextlib import suppress
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, Final, Self
 
 from tests.daemon.harness import Stage
-from tests.daemon.process import DaemonProcess
 from tests.sitl.roles_links import Link, speaking
 from tests.waiting import PATIENCE_S
 from uavlinkd.mavlink.policy.roles import ROLES
@@ -34,41 +31,39 @@ class DaemonPair:
             "rate_in": dict.fromkeys(ROLES[role].rate_in, NO_LIMIT),
         }
         self._sender = (systems[0], 1)
-        self._loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(target=self._loop.run_forever, name="daemons", daemon=True)
+        self._threads = ThreadPoolExecutor(1, "daemons")
+        self._life: Future[None] | None = None
+        self._loop: asyncio.AbstractEventLoop
         self._end: asyncio.Event
-        self._victim: DaemonProcess
-        self._life: Future[None]
         self.peer: Mapping[str, Any] = {}
         """What the victim's `status` says of the captured member at the end."""
         self.endpoint: Mapping[str, Any] = {}
         """The same of the autopilot's endpoint."""
 
     def __enter__(self) -> Self:
-        self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        with suppress(AttributeError):  # no autopilot was attached
-            self.stop()
-        self._loop.call_soon_threadsafe(self._loop.stop)
-        self._thread.join(PATIENCE_S)
-        self._loop.close()
+        self.stop()
+        self._threads.shutdown()
 
     def attach(self, url: str) -> Link:
         """Start both daemons, the victim's with the autopilot at this URL; the attacker's link into the other one."""
         ready: Future[int] = Future()
-        self._life = asyncio.run_coroutine_threadsafe(self._live(url, ready), self._loop)
+        self._life = self._threads.submit(lambda: asyncio.run(self._live(url, ready)))
         self._life.add_done_callback(lambda life: _report_failure(life, ready))
         return speaking(ready.result(PATIENCE_S), self._sender)
 
     def stop(self) -> None:
         """Read the victim's `status`, and end both daemons."""
-        self._loop.call_soon_threadsafe(self._end.set)
+        if self._life is None:
+            return
+        if not self._life.done():
+            self._loop.call_soon_threadsafe(self._end.set)
         self._life.result(PATIENCE_S)
 
     async def _live(self, url: str, ready: Future[int]) -> None:
-        self._end = asyncio.Event()
+        self._loop, self._end = asyncio.get_running_loop(), asyncio.Event()
         async with Stage() as stage:
             victim, captured = stage.daemon("victim"), stage.daemon("captured")
             psk = stage.psk()

@@ -41,6 +41,8 @@ class Seen:
     """Messages by name."""
     number: Counter[str] = field(default_factory=Counter)
     """Frames of the autopilot by message."""
+    answers: dict[int, int] = field(default_factory=dict)
+    """The MAV_RESULT of commands, except that they are in progress."""
     parameters: dict[int, tuple[str, bytes]] = field(default_factory=dict)
     """By index: the name, and the bytes of the value."""
     parameter_count: int = 0
@@ -134,19 +136,15 @@ class Station:
 
     def command(self, number: int, *parameters: float) -> int:
         """Send a COMMAND_LONG until it is answered; the result is a MAV_RESULT."""
-        self.seen.latest.pop("COMMAND_ACK", None)
+        answers = self.seen.answers
+        answers.pop(number, None)
         seven = (*parameters, *(0.0 for _ in range(7 - len(parameters))))
-
-        def is_answered() -> bool:
-            answer = self.seen.latest.get("COMMAND_ACK")
-            return answer is not None and answer.command == number and answer.result != mavlink.MAV_RESULT_IN_PROGRESS
-
         self.until(
-            is_answered,
+            lambda: number in answers,
             f"the answer to command {number}",
             lambda: self.send(mavlink.MAVLink_command_long_message(self.vehicle, 1, number, 0, *seven)),
         )
-        return int(self.seen.latest["COMMAND_ACK"].result)
+        return answers[number]
 
     def request(self, name: str, number: int) -> Any | None:
         """The current message of this name; None if the autopilot does not have it, or does not send it now."""
@@ -263,6 +261,8 @@ class Station:
             if message.param_index < message.param_count:
                 value = one.raw[10:14].ljust(4, b"\0") if one.raw[0] == 0xFD else one.raw[6:10]
                 seen.parameters[message.param_index] = (message.param_id, value)
+        elif name == "COMMAND_ACK" and message.result != mavlink.MAV_RESULT_IN_PROGRESS:
+            seen.answers[message.command] = message.result
         elif name == "STATUSTEXT":
             seen.texts.append(message.text)
         self.on_message(message)

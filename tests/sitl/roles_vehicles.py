@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -193,10 +195,15 @@ class Px4(Vehicle):
             "PX4_HOME_LAT": str(HOME.latitude_deg),
             "PX4_HOME_LON": str(HOME.longitude_deg),
             "PX4_HOME_ALT": str(HOME.altitude_m),
-            "PX4_PARAM_SDLOG_MODE": "-1",
+            "PX4_PARAM_MAV_SYS_ID": "1",
+            "PX4_PARAM_SDLOG_MODE": "-1",  # no flight log on disk
             "PX4_PARAM_COM_RC_IN_MODE": "4",  # there is no radio control
         }
-        etc = self._binary.parents[1] / "etc"
+        etc = self.folder / "etc"
+        shutil.copytree(self._binary.parents[1] / "etc", etc)
+        # Its start script would derive the system id from the instance.
+        script = etc / "init.d-posix" / "rcS"
+        script.write_text(re.sub(r"^param set MAV_SYS_ID .*$", "", script.read_text(), flags=re.MULTILINE))
         self._run(str(self._binary), "-d", "-i", str(self._instance), str(etc), variables=variables)
         log = self.folder / "autopilot.log"
         until = monotonic() + PATIENCE_S
@@ -205,7 +212,6 @@ class Px4(Vehicle):
                 raise StationError(f"PX4 did not start: {log.read_text(errors='replace')[-500:]}")
             sleep(0.1)
         self._shell("mavlink", "stop-all")
-        self._shell("param", "set", "MAV_SYS_ID", "1")  # the start script derives it from the instance
         local, local_attacker = free_ports(2)
         own, attacker = free_ports(2)
         links = listening(own, STATION), self.attach(f"udpin:127.0.0.1:{attacker}")
@@ -239,6 +245,7 @@ class Px4(Vehicle):
 
 
 def _take_off_guided(station: Station) -> None:
+    station.until(lambda: "LOCAL_POSITION_NED" in station.seen.number, "a local position")
     accepted = mavlink.MAV_RESULT_ACCEPTED
     _repeat(station, lambda: station.command(mavlink.MAV_CMD_DO_SET_MODE, 1, _GUIDED) == accepted)
     # One after the other without a pause: it disarms itself if it does not take off soon.
