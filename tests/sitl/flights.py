@@ -7,9 +7,9 @@ import signal
 from bisect import bisect_right
 from time import monotonic
 
-from tests.daemon.frames import name_of, sender_of
+from tests.daemon.frames import sender_of
 from tests.daemon.process import DaemonProcess
-from tests.sitl.ledger import Passing
+from tests.sitl.ledger import Passing, name_of
 from tests.sitl.pilots import Mode, Pilot
 from tests.sitl.tables import download_parameters
 from tests.sitl.transfers import Figures, counted, timed
@@ -173,8 +173,13 @@ async def _restart_simulator(world: World, pilot: Pilot, vehicle: Vehicle) -> Fi
     world.station.latest.clear()
     began = monotonic()
     await vehicle.simulator.start(vehicle.tap.address)
-    await world.station.until(lambda: vehicle.tap.sources > before, BACK_S, "a new source port")
-    first_at = next(p.at for p in vehicle.tap.from_autopilot if p.at > began)
+    newest = vehicle.tap.from_autopilot[-1]
+    await world.station.until(
+        lambda: vehicle.tap.sources > before and vehicle.tap.from_autopilot[-1] is not newest,
+        BACK_S,
+        "a frame from a new source port",
+    )
+    first_at = vehicle.tap.from_autopilot[-1].at
     down_s, up_s = await frames_pass_again(world, vehicle, first_at)
     await pilot.request_streams()
     seconds, parameters = await timed(download_parameters(world.station, pilot.system))

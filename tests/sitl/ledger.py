@@ -6,7 +6,7 @@ from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from tests.daemon.frames import name_of
+from pymavlink.dialects.v20 import all as mavlink
 
 STX = (0xFE, 0xFD)
 SETTLED_S = 1.5
@@ -76,6 +76,13 @@ class Comparison:
 def percentile_ms(ordered: Sequence[float], share: float) -> float | None:
     """A percentile of ascending seconds, in milliseconds; None if there are no values."""
     return round(1000 * ordered[min(len(ordered) - 1, int(share * len(ordered)))], 2) if ordered else None
+
+
+def name_of(frame: bytes) -> str:
+    """The name of a frame's message, or its number if pymavlink does not know it."""
+    number = frame[5] if frame[0] == 0xFE else int.from_bytes(frame[7:10], "little")
+    known = mavlink.mavlink_map.get(number)
+    return str(number) if known is None else str(known.msgname)
 
 
 def split(data: bytes) -> tuple[list[bytes], int]:

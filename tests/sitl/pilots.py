@@ -44,7 +44,8 @@ class Kind:
     is_px4: bool = False
     has_home_item: bool = True
     """Item 0 of a mission is the home position."""
-    flies: bool = True
+    parameters: Mapping[str, float] = field(default_factory=dict)
+    """Parameters from the start."""
     failsafe: Mapping[str, float] = field(default_factory=dict)
     """Parameters that make the vehicle return 5 s after the last heartbeat of its ground station."""
     follows: Mapping[str, float] = field(default_factory=dict)
@@ -69,12 +70,12 @@ COPTER = Kind(
         "FOLL_OFS_Z": 0,
     },
 )
-ROVER = Kind("ArduRover", {Mode.GUIDED: 15, Mode.MISSION: 10, Mode.RETURN: 11}, flies=False)
 PX4 = Kind(
     "PX4",
     {Mode.GUIDED: _px4(3), Mode.MISSION: _px4(4), Mode.RETURN: _px4(5)},
     is_px4=True,
     has_home_item=False,
+    parameters={"SDLOG_MODE": 0},  # a log from arming to disarming
     failsafe={"NAV_DLL_ACT": 2, "COM_DL_LOSS_T": 5, "COM_FAIL_ACT_T": 0.0},
 )
 OWN = Kind("uavlinkd sim", _COPTER_MODES)
@@ -155,16 +156,16 @@ class Pilot:
         await station.until(self._is_ready, READY_S, "ready to arm")
         if not self.kind.is_px4:  # not before: it reads the switch of the radio control after its start
             await self.set_mode(Mode.GUIDED)
-        await station.must(system, mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1, timeout_s=READY_S)
-        await station.until(lambda: station.is_armed(system), LEG_S, "armed")
-        if not self.kind.flies:
-            return
         altitude_m, anywhere = height_m, 0.0
         if self.kind.is_px4:
             position = station.latest[system, "GLOBAL_POSITION_INT"]
             altitude_m, anywhere = position.alt / 1000 + height_m, math.nan
-        place = (anywhere, anywhere, anywhere, altitude_m)
-        await station.must(system, mavlink.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, *place)
+        arm = (mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0)
+        climb = (mavlink.MAV_CMD_NAV_TAKEOFF, 0.0, 0.0, 0.0, anywhere, anywhere, anywhere, altitude_m)
+        # PX4 arms in the mode of a take-off, ArduPilot takes off only once it is armed.
+        for command in (climb, arm) if self.kind.is_px4 else (arm, climb):
+            await station.must(system, *command, timeout_s=READY_S)
+        await station.until(lambda: station.is_armed(system), LEG_S, "armed")
         await station.until(lambda: self.place.z > 0.9 * height_m, LEG_S, f"{height_m} m above home")
 
     def _is_ready(self) -> bool:
@@ -217,6 +218,4 @@ class Pilot:
     async def return_and_land(self) -> None:
         """Fly home, land, and wait until the motors stop."""
         await self.set_mode(Mode.RETURN)
-        if not self.kind.flies:
-            await self.station.must(self.system, mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0)
         await self.station.until(lambda: not self.station.is_armed(self.system), LAND_S, "landed and disarmed")

@@ -148,7 +148,7 @@ class RoleFrames:
         rng = self._rng
         _, _, shortest, longest, *_ = MESSAGES[msgid]
         payload = bytearray(b"".join(self._packed(msgid, one) for one in fields_of(msgid)))
-        assert len(payload) == longest
+        payload += rng.randbytes(longest - len(payload))  # extensions that pymavlink lacks
         version = 1 if msgid < 256 and rng.random() < 0.3 else 2
         if version == 1:
             del payload[shortest:]

@@ -16,6 +16,9 @@ from uavlinkd.lab.child_processes import end_with_parent
 from uavlinkd.lab.sim.autopilot import HOME
 from uavlinkd.lab.sim.real_autopilot import Firmware, RealAutopilot, RealAutopilotSettings, binary_of
 
+FIRST_INSTANCE = 20 + 4 * (os.getpid() % 50)
+"""PX4's instances are numbered for the whole machine. Other processes may fly some at the same time."""
+
 
 class Simulator(Protocol):
     """An autopilot in its simulator. It keeps its files, so that a restart is like that of a real one."""
@@ -89,7 +92,7 @@ class RealSimulator:
                 udp_port=station[1],
                 home=home,
                 system_id=self.system,
-                instance=self.system,
+                instance=FIRST_INSTANCE + self.system,
                 parameters=self._parameters,
                 maintenance_port=self._maintenance_port,
             )

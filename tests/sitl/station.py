@@ -15,9 +15,9 @@ from typing import Any, Self
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from tests.daemon.frames import name_of, sender_of
+from tests.daemon.frames import sender_of
 from tests.daemon.udp import Sockaddr, open_socket
-from tests.sitl.ledger import Passing, split
+from tests.sitl.ledger import Passing, name_of, split
 
 SYSTEM = 255
 COMPONENT = 190

@@ -18,6 +18,8 @@ ITEM_RETRY_S = 1.0
 UPLOAD_SILENCE_S = 2.0
 """The vehicle requests an item again within about this time. After it, the station repeats its last message."""
 NO_INDEX = 65535
+SAME_FRAMES = {mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT: mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT}
+"""Names of one frame. Autopilots answer with the one or the other."""
 MISSION = mavlink.MAV_MISSION_TYPE_MISSION
 
 
@@ -34,7 +36,8 @@ class Item:
 
     def matches(self, other: Item) -> bool:
         """Whether an autopilot stored this item as the other: a parameter that it does not use may be NaN or 0."""
-        same = (self.command, self.frame, self.x, self.y) == (other.command, other.frame, other.x, other.y)
+        frames = [SAME_FRAMES.get(item.frame, item.frame) for item in (self, other)]
+        same = (self.command, frames[0], self.x, self.y) == (other.command, frames[1], other.x, other.y)
         pairs = [*zip(self.four, other.four, strict=True), (self.z, other.z)]
         return same and all(math.isnan(one) or math.isnan(two) or abs(one - two) < 0.01 for one, two in pairs)
 
@@ -102,6 +105,7 @@ async def upload_mission(station: Station, system: int, items: list[Item], timeo
     """
     deadline = monotonic() + timeout_s
     newest = count = mavlink.MAVLink_mission_count_message(system, AUTOPILOT, len(items), MISSION)
+    last: Any = None
     with station.inbox(system, "MISSION_REQUEST", "MISSION_REQUEST_INT", "MISSION_ACK") as inbox:
         station.send(newest)
         while monotonic() < deadline:
@@ -112,6 +116,9 @@ async def upload_mission(station: Station, system: int, items: list[Item], timeo
             elif answer.get_type() == "MISSION_ACK":
                 if answer.type == mavlink.MAV_MISSION_ACCEPTED and newest is not count:
                     return
+                if answer.type == mavlink.MAV_MISSION_ERROR and newest is last:
+                    station.retries["mission upload, lost acknowledgement"] += 1
+                    return  # the vehicle has the whole mission, and refuses the item that was repeated
                 if answer.type == mavlink.MAV_MISSION_OPERATION_CANCELLED:  # the vehicle waited too long: again
                     station.retries["mission upload, whole"] += 1
                     newest = count
@@ -120,6 +127,7 @@ async def upload_mission(station: Station, system: int, items: list[Item], timeo
                     raise RequestError(f"the mission was refused with {answer.type}; {station.texts[-5:]}")
             elif answer.seq < len(items):
                 newest = _as_message(system, answer.seq, items[answer.seq])
+                last = newest if answer.seq == len(items) - 1 else None
                 station.send(newest)
     raise RequestError(f"the mission was not acknowledged within {timeout_s:.0f} s")
 

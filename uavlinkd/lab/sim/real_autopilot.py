@@ -66,7 +66,7 @@ class RealAutopilotSettings:
         binary: ``arducopter``, or ``bin/px4`` of a build.
         udp_port: a port of loopback. The autopilot sends its MAVLink there, and accepts MAVLink from there.
         instance: PX4 allows one process per instance on a machine, and derives ports from it.
-        parameters: of ArduCopter, in addition to those of a newly built copter, for its first start.
+        parameters: in addition to those of a new vehicle. ArduCopter stores changes, PX4 has these at each start.
         maintenance_port: a second port of loopback where ArduCopter sends MAVLink, as by USB. It accepts unsigned
             frames there, and at ``udp_port`` signed frames only, once it has a signing key.
     """
@@ -133,7 +133,8 @@ class RealAutopilot:
             await self._ask_px4("mavlink", "stop-all")
             (local_port,) = free_ports(1)
             ports = ("-u", str(local_port), "-o", str(self.settings.udp_port), "-t", "127.0.0.1")
-            await self._ask_px4("mavlink", "start", *ports, "-m", "onboard", "-r", str(_PX4_BYTES_PER_S))
+            # -x: files can be transferred
+            await self._ask_px4("mavlink", "start", *ports, "-x", "-m", "onboard", "-r", str(_PX4_BYTES_PER_S))
 
     async def stop(self, number: signal.Signals = signal.SIGTERM) -> None:
         """Stop the process: first with a signal, then by killing it."""
@@ -200,6 +201,7 @@ class RealAutopilot:
             "PX4_HOME_ALT": str(home.altitude_m),
             "PX4_PARAM_COM_RC_IN_MODE": "4",  # there is no radio control
             "PX4_PARAM_SDLOG_MODE": "-1",  # no flight log on disk
+            **{f"PX4_PARAM_{name}": str(value) for name, value in settings.parameters.items()},
         }
         etc = self.folder / "etc"
         shutil.copytree(settings.binary.parents[1] / "etc", etc, dirs_exist_ok=True)
