@@ -57,12 +57,11 @@ class PositionLink(ABC):
 
     kind: LinkKind
 
-    def __init__(self, settings: FlightSettings, log: Path, on_delivered: OnDelivered) -> None:
+    def __init__(self, settings: FlightSettings, log: Path) -> None:
         log.unlink(missing_ok=True)  # of an earlier run
         self.settings = settings
         self.middle = MiddleHere(PAIR, log, settings.seed)
         self.watch = ExchangeWatch()
-        self.deliver = on_delivered
 
     @abstractmethod
     async def open(self) -> None:
@@ -152,9 +151,12 @@ class PlainLink(PositionLink):
 
     kind = LinkKind.PLAIN
 
+    def __init__(self, settings: FlightSettings, log: Path, on_delivered: OnDelivered) -> None:
+        super().__init__(settings, log)
+        self._clients = _Clients(on_delivered)
+
     async def open(self) -> None:
-        """Bind the sockets."""
-        self._clients = _Clients(self.deliver)
+        """Start the man in the middle."""
         await self.middle.start(self._clients.ports, {})
 
     async def close(self) -> None:
@@ -173,19 +175,22 @@ class PaperLink(PositionLink):
 
     kind = LinkKind.PAPER
 
-    async def open(self) -> None:
-        """Start both ends; the first one initiates."""
+    def __init__(self, settings: FlightSettings, log: Path, on_delivered: OnDelivered) -> None:
+        super().__init__(settings, log)
         self._is_relayed = False
         self._ends = {
             name: PaperEnd(
                 name,
                 is_initiator=name == PAIR[0],
-                on_frame=lambda frame, name=name: self.deliver(name, frame),  # type: ignore[misc]
+                on_frame=lambda frame, name=name: on_delivered(name, frame),  # type: ignore[misc]
                 report=lambda _reason, _meaning: None,
                 renew_s=None,
             )
             for name in PAIR
         }
+
+    async def open(self) -> None:
+        """Start both ends; the first one initiates."""
         await self.middle.start({name: end.port for name, end in self._ends.items()}, {})
         await self.middle.attack([], [self.watch])
         for one, other in (PAIR, PAIR[::-1]):
@@ -229,7 +234,8 @@ class DaemonLink(PositionLink):
     kind = LinkKind.OURS
 
     def __init__(self, settings: FlightSettings, log: Path, on_delivered: OnDelivered, folder: Path) -> None:
-        super().__init__(settings, log, on_delivered)
+        super().__init__(settings, log)
+        self._clients = _Clients(on_delivered)
         ports = free_ports(2 * len(PAIR))
         self._drones = {
             name: DroneProcess(name, folder / name, ports[2 * number], ports[2 * number + 1])
@@ -238,7 +244,6 @@ class DaemonLink(PositionLink):
 
     async def open(self) -> None:
         """Start both daemons, which then link."""
-        self._clients = _Clients(self.deliver)
         keys = {name: decode_key(drone.public_key) for name, drone in self._drones.items()}
         await self.middle.start({name: drone.port for name, drone in self._drones.items()}, keys)
         await self.middle.attack([], [self.watch])

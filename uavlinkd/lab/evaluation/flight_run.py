@@ -86,7 +86,7 @@ class FlightEvaluation:
                     for name in PAIR
                 }
                 self._show(f"{aircraft[PAIR[0]].name}: both aircraft take off")
-                await asyncio.gather(*(self._take_off(each_one) for each_one in aircraft.values()))
+                await asyncio.gather(*(self._take_off(one) for one in aircraft.values()))
                 self._began_at = monotonic()
                 facts["aircraft"] = aircraft[PAIR[0]].name
                 with RecordWriter(self.out, NAME, facts) as writer:
@@ -179,7 +179,7 @@ class FlightEvaluation:
         self, phase: AttackPhase, attack: AttackPhase, duration_s: float, writer: RecordWriter
     ) -> None:
         before = [(await link.notice(), await link.interventions()) for link in self._links]
-        begin_s = self._now()
+        begin_s = self._phases[-1][2] if self._phases else self._now()  # each accepted frame is in a phase
         self._show(f"{begin_s:6.1f} s  {phase}")
         # The replay that was recorded in the first phase goes on.
         if phase is not AttackPhase.REPLAY:
