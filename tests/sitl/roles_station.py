@@ -57,6 +57,8 @@ class Station:
         self.attacker = attacker
         self.vehicle = vehicle
         self.seen = Seen()
+        self.is_silent = False
+        """Whether it sends no HEARTBEAT, as a lost ground station."""
         self.check: Callable[[], None] = lambda: None
         """Raises an exception if the autopilot has ended."""
         self.on_message: Callable[[Any], None] = lambda message: None
@@ -81,7 +83,7 @@ class Station:
     def poll(self, timeout_s: float = 0.05) -> None:
         """Read what has arrived on both links, or wait for it."""
         self.check()
-        if monotonic() >= self._beat_at:
+        if not self.is_silent and monotonic() >= self._beat_at:
             self._beat_at = monotonic() + HEARTBEAT_EVERY_S
             self.send(
                 mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, 4, 3)

@@ -5,11 +5,14 @@ from __future__ import annotations
 import pytest
 
 from tests.sitl.roles import PLACES, available
-from tests.sitl.roles_frames import ROLES_TESTED
-from tests.sitl.roles_scene import DAEMONS_BATCH, run_scene, run_through_daemons
+from tests.sitl.roles_frames import ROLES_TESTED, RoleFrames
+from tests.sitl.roles_scene import DAEMONS_BATCH, Trial, run_scene, run_through_daemons
 
 FRAMES = 5000
 SEED = 11
+RTL = 6  # ArduCopter's number of the mode
+FAILSAFE_S = 60.0
+"""In the autopilot's time: FS_GCS_TIMEOUT is 5 s, and a busy machine delays what it reads."""
 REAL = [pytest.param(name, marks=pytest.mark.sitl) for name in ("ardupilot", "px4")]
 
 
@@ -35,3 +38,20 @@ def test_role_changes_no_autopilot_behind_daemons(name: str, role: str) -> None:
     assert result.refused == {}
     assert result.sent == FRAMES // 5
     assert result.endpoint["frames_sent"] >= result.sent + result.sent // DAEMONS_BATCH
+
+
+@pytest.mark.sitl
+@pytest.mark.parametrize("role", ROLES_TESTED)
+def test_copter_that_lost_its_ground_station_comes_home(role: str) -> None:
+    """Frames of other members do not suppress ArduPilot's failsafe."""
+    make = available().get("ardupilot") or pytest.skip("needs UAVLINKD_ARDUPILOT, the path of the simulator")
+    frames = RoleFrames(role, SEED)
+    with Trial(make, is_flying=True) as trial:
+        station = trial.station
+        station.is_silent = True
+        began_s = station.time_s
+        while station.seen.latest["HEARTBEAT"].custom_mode != RTL and station.time_s < began_s + FAILSAFE_S:
+            station.attacker.send([frames.draw() for _ in range(20)])
+            station.wait_for_attacker()
+        assert station.seen.latest["HEARTBEAT"].custom_mode == RTL
+        assert frames.counts.passed > 100

@@ -72,3 +72,13 @@ def test_what_may_go_out_may_be_requested() -> None:
     operator = compile_policy({"role": "operator", "system_ids": [200]}).incoming
     assert operator.permits(request(ADSB_OUT_CFG))
     assert operator.permits(request(float("nan")))
+
+
+def test_observer_requests_few_lists_of_parameters() -> None:
+    """ArduPilot slows its telemetry to a quarter while it sends them. Two at once pass, then one in 5 s."""
+    gate = compile_policy(OBSERVER).incoming
+    for name in ("PARAM_REQUEST_LIST", "PARAM_EXT_REQUEST_LIST"):
+        asked = parsed(frame(ids_by_name()[name], bytes((1, 1)), 200))
+        verdicts = [gate.check(asked, now) for now in (0.0, 0.1, 0.2, 4.9, 5.1, 5.2)]
+        limited = Refusal.RATE_LIMITED
+        assert verdicts == [None, None, limited, limited, None, limited]
