@@ -16,8 +16,6 @@ from tests.sitl.transfers import Figures, counted, timed
 from tests.sitl.world import Vehicle, World
 
 OUTAGES_S = (3.0, 6.0, 20.0)
-FAILSAFE_S = 5.0
-"""After this time without a heartbeat of the ground station the autopilots return."""
 LEG_M = 30.0
 LEAD_M = 60.0
 FOLLOW_OFFSET_M = 10.0
@@ -87,9 +85,10 @@ async def _outage(world: World, pilot: Pilot, seconds: float) -> Figures:
         "failsafe_after_s": None if tripped_at is None else round(tripped_at - heartbeats[-1], 1),
         "control_after_s": round(monotonic() - up_at, 1),
     }
-    assert figures["failsafe"] == (seconds > FAILSAFE_S), figures
+    limit_s = pilot.kind.failsafe_s
+    assert figures["failsafe"] == (seconds > limit_s), figures
     if tripped_at is not None:
-        assert FAILSAFE_S - 0.5 <= tripped_at - heartbeats[-1] <= FAILSAFE_S + 3.0, figures
+        assert limit_s - 0.5 <= tripped_at - heartbeats[-1] <= limit_s + 3.0, figures
     return figures
 
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import StrEnum
+from time import monotonic
 
 from pymavlink.dialects.v20 import all as mavlink
 
@@ -21,6 +23,7 @@ METRE = 1e7 / 111_319.5
 LEG_S = 120.0
 LAND_S = 300.0
 READY_S = 180.0
+MODE_S = 5.0
 PX4_AUTO = 4
 RELATIVE = mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT
 
@@ -47,7 +50,9 @@ class Kind:
     parameters: Mapping[str, float] = field(default_factory=dict)
     """Parameters from the start."""
     failsafe: Mapping[str, float] = field(default_factory=dict)
-    """Parameters that make the vehicle return 5 s after the last heartbeat of its ground station."""
+    """Parameters that make the vehicle return without its ground station."""
+    failsafe_s: float = 5.0
+    """The time from the last heartbeat until it returns."""
     follows: Mapping[str, float] = field(default_factory=dict)
     """Parameters that make it follow vehicle 1, 10 m south of it."""
 
@@ -77,6 +82,7 @@ PX4 = Kind(
     has_home_item=False,
     parameters={"SDLOG_MODE": 0},  # a log from arming to disarming
     failsafe={"NAV_DLL_ACT": 2, "COM_DL_LOSS_T": 5, "COM_FAIL_ACT_T": 0.0},
+    failsafe_s=7.5,  # it notices a lost heartbeat after 2.5 s, and waits 5 s more
 )
 OWN = Kind("uavlinkd sim", _COPTER_MODES)
 
@@ -147,8 +153,14 @@ class Pilot:
         """Change the mode, and wait until the heartbeat says so."""
         custom = self.kind.modes[mode]
         parameters = (PX4_AUTO, custom >> 24) if self.kind.is_px4 else (custom,)
-        await self.station.must(self.system, mavlink.MAV_CMD_DO_SET_MODE, 1, *parameters, timeout_s=timeout_s)
-        await self.station.until(lambda: self.station.mode(self.system) == custom, timeout_s, f"mode {mode}")
+        deadline = monotonic() + timeout_s
+        while monotonic() < deadline:
+            await self.station.must(self.system, mavlink.MAV_CMD_DO_SET_MODE, 1, *parameters, timeout_s=timeout_s)
+            # PX4 accepts the command, and may then report that the mission is not available yet.
+            with suppress(RequestError):
+                await self.station.until(lambda: self.station.mode(self.system) == custom, MODE_S, f"mode {mode}")
+                return
+        raise RequestError(f"mode {mode}: not within {timeout_s:.0f} s; texts: {self.station.texts[-5:]}")
 
     async def take_off(self, height_m: float = HEIGHT_M) -> None:
         """Arm as soon as the vehicle is ready, take off, and wait until it is there."""

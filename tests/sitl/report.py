@@ -68,13 +68,13 @@ def report(records: list[Record]) -> str:
             _follow(passed),
         ),
         _section(
-            "Outages, with the autopilot's failsafe after 5 s without its ground station",
+            "Outages, with the autopilot's failsafe for a lost ground station",
             (
                 *("autopilot", "", "outage", "first frame down / up after it", "failsafe"),
                 *("after the last heartbeat", "under control again"),
             ),
             _outages(passed),
-            "The first frame up is the station's heartbeat, once per second.",
+            "The failsafe is set to 5 s. The first frame up is the station's heartbeat, once per second.",
         ),
         _section(
             "Restarts",
