@@ -72,7 +72,7 @@ class FlightSettings:
     @property
     def quiet_s(self) -> float:
         """The pause after each attack."""
-        return 2.0 if self.quick else 8.0
+        return 1.0 if self.quick else 8.0
 
     @property
     def replay_delay_s(self) -> float:
