@@ -194,7 +194,8 @@ def run_through_daemons(make: MakeVehicle, role: str, frames: int, seed: int, *,
         began_s = trial.station.time_s
         sent = trial.send([generator.draw() for _ in range(frames)], DAEMONS_BATCH)
         after = trial.snapshot_after(before, with_rates=False)
-        changes = (*trial.judge.changes, *differences(before, after, own))
+        # A simulator that is faster than the machine's clock changes its own by that.
+        changes = (*trial.judge.changes, *differences(replace(before, clock_s=None), after, own))
         seconds = trial.station.time_s - began_s
         daemons.stop()
     return DaemonsResult(sent, seconds, changes, daemons.peer["refused"]["in"], daemons.endpoint)

@@ -37,6 +37,7 @@ _COPTER_PARAMETERS: Final[Mapping[str, float]] = {
     "FS_THR_ENABLE": 0,  # there is no radio control
     "DISARM_DELAY": 0,
     "FS_GCS_ENABLE": 1,
+    "FS_GCS_TIMEOUT": 30,  # its time passes faster: a busy station must not seem lost
     # SITL ends itself where a number that is not finite becomes an integer. A flight controller goes on.
     "SIM_FLOAT_EXCEPT": 0,
     **{f"SR{port}_{group}": 4 for port in (0, 1) for group in ("POSITION", "EXTRA1", "EXTRA2", "EXT_STAT")},

@@ -11,8 +11,8 @@ from tests.sitl.roles_scene import DAEMONS_BATCH, Trial, run_scene, run_through_
 FRAMES = 5000
 SEED = 11
 RTL = 6  # ArduCopter's number of the mode
-FAILSAFE_S = 60.0
-"""In the autopilot's time: FS_GCS_TIMEOUT is 5 s, and a busy machine delays what it reads."""
+FAILSAFE_S = 120.0
+"""In the autopilot's time: FS_GCS_TIMEOUT is 30 s, and a busy machine delays what it reads."""
 REAL = [pytest.param(name, marks=pytest.mark.sitl) for name in ("ardupilot", "px4")]
 
 
