@@ -59,8 +59,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     makers = available(speedup=options.speedup)
     names = options.autopilot or [name for name in makers if name != "sim"]
-    if missing := set(names) - makers.keys() or not names:
-        parser.error(f"set UAVLINKD_ARDUPILOT and UAVLINKD_PX4 to the binaries; missing: {missing}")
+    missing = [name for name in names if name not in makers]
+    if missing or not names:
+        parser.error(f"no binary for {', '.join(missing) or 'any autopilot'}: set UAVLINKD_ARDUPILOT or UAVLINKD_PX4")
     roles, places = options.role or ROLES_TESTED, options.place or tuple(PLACES)
     share = -(-options.frames // (len(roles) * len(places)))
     is_ok = True
