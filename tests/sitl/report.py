@@ -24,10 +24,17 @@ def report(records: list[Record]) -> str:
             "Frames on the clean link",
             (
                 *("scenario", "autopilot", "frames down / up", "lost / altered / duplicated / reordered"),
-                *("frames/s", "latency p50 / p99 down", "p50 direct", "CPU drone / ground"),
+                *(
+                    "withheld by the daemons",
+                    "frames/s",
+                    "latency p50 / p99 down",
+                    "p50 direct",
+                    "CPU drone / ground",
+                ),
             ),
             _frames(passed),
-            "Frames are compared byte for byte at the autopilot and at the station. CPU is a share of one core.",
+            "Frames are compared byte for byte at the autopilot and at the station, without those that the daemons"
+            " withheld by policy, with the reason. CPU is a share of one core.",
         ),
         _section(
             "Parameters, and a mission of 100 items",
@@ -156,6 +163,7 @@ def _frames(records: list[Record]) -> Iterable[Cells]:
         yield (
             *(record.scenario, record.kind, f"{down['sent']:,} / {up['sent']:,}", " / ".join(map(str, faults))),
             *(
+                ", ".join(f"{count} {what}" for what, count in frames["withheld"].items()) or "-",
                 frames["frames_s"],
                 f"{down['p50_ms']} / {down['p99_ms']} ms",
                 "-" if direct is None else f"{direct} ms",
