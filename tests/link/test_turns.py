@@ -5,7 +5,14 @@ from __future__ import annotations
 from itertools import islice
 
 from uavlinkd.core.path import Path
-from uavlinkd.link.turns import STARTS_OF_A_FRAME, WAITING_BYTES, WAITING_OVERHEAD_BYTES, Turns, cost_of
+from uavlinkd.link.turns import (
+    SHARED_BYTES,
+    STARTS_OF_A_FRAME,
+    WAITING_BYTES,
+    WAITING_OVERHEAD_BYTES,
+    Turns,
+    cost_of,
+)
 
 HERE = Path(0, ("192.0.2.1", 1))
 
@@ -23,9 +30,9 @@ def test_each_sender_has_one_turn_a_round() -> None:
 
 
 def test_what_one_sender_has_waiting_is_bounded() -> None:
-    """The oldest goes, with its path; another sender keeps all of its own."""
+    """The oldest goes, with its path; another sender keeps all of its own. Each has half of what they share."""
     turns = Turns()
-    size = WAITING_BYTES // 4 - WAITING_OVERHEAD_BYTES
+    size = SHARED_BYTES // 8 - WAITING_OVERHEAD_BYTES
     turns.put("quiet", b"quiet", HERE, 0)
     for number in range(4):
         assert turns.put("loud", bytes((number,)) * size, HERE, 0) == []
@@ -34,11 +41,21 @@ def test_what_one_sender_has_waiting_is_bounded() -> None:
     assert [[datagram[0] for datagram, _ in turn] for turn, _ in turns.round()] == [[ord("q")], [1, 2, 3, 4]]
 
 
+def test_many_senders_have_at_least_their_own_share() -> None:
+    """However many wait."""
+    turns = Turns()
+    for number in range(20):
+        turns.put(number, b"", HERE, 0)
+    size = WAITING_BYTES // 4 - WAITING_OVERHEAD_BYTES
+    pushed_out = [turns.put("loud", bytes(size), HERE, 0) for _ in range(5)]
+    assert [len(pushed) for pushed in pushed_out] == [0, 0, 0, 0, 1]
+
+
 def test_empty_datagrams_are_bounded_too() -> None:
     """They have no bytes of their own, and anyone can send them."""
     turns = Turns()
-    pushed_out = [turns.put(None, b"", HERE, 0) for _ in range(2 * WAITING_BYTES // WAITING_OVERHEAD_BYTES)]
-    assert sum(map(len, pushed_out)) == WAITING_BYTES // WAITING_OVERHEAD_BYTES
+    pushed_out = [turns.put(None, b"", HERE, 0) for _ in range(2 * SHARED_BYTES // WAITING_OVERHEAD_BYTES)]
+    assert sum(map(len, pushed_out)) == SHARED_BYTES // WAITING_OVERHEAD_BYTES
 
 
 def test_start_bytes_in_a_payload_cost_as_frames_do() -> None:
@@ -51,9 +68,12 @@ def test_start_bytes_in_a_payload_cost_as_frames_do() -> None:
 def test_the_largest_datagram_can_wait() -> None:
     """It pushes out the others of its sender, not itself."""
     turns = Turns()
+    rivals = SHARED_BYTES // WAITING_BYTES - 1
+    for number in range(rivals):
+        turns.put(number, b"", HERE, 0)
     turns.put("one", bytes(100), HERE, 0)
     assert turns.put("one", bytes(65507), HERE, 0) == [(bytes(100), HERE)]
-    assert [[len(datagram) for datagram, _ in turn] for turn, _ in turns.round()] == [[65507]]
+    assert [[len(datagram) for datagram, _ in turn] for turn, _ in turns.round()] == [[0]] * rivals + [[65507]]
 
 
 def test_what_a_turn_read_makes_room() -> None:

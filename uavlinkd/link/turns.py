@@ -20,7 +20,10 @@ STARTS_OF_A_FRAME = 4
 """So many start bytes in payloads cost as much as a frame: each may begin a hidden one
 (:mod:`uavlinkd.mavlink.policy.hidden`)."""
 WAITING_BYTES = 65536
-"""Of one sender's datagrams: the largest one fits, and a burst of fifty of the default size."""
+"""Of one sender's datagrams, at least: the largest one fits, and a burst of fifty of the default size."""
+SHARED_BYTES = 4 * WAITING_BYTES
+"""Divided among the senders that wait, if that is more. Without rivals, a fast log download survives 0.3 s in which
+this process does not run. A longer queue would delay the frames of a sender that always sends too much."""
 WAITING_OVERHEAD_BYTES = 64
 """Counted with each datagram, so that many small or empty ones are bounded too."""
 
@@ -49,7 +52,8 @@ class Turns:
         size = self._bytes.get(sender, 0) + _size(datagram)
         queue.append(((datagram, path), epoch))
         pushed_out: list[WaitingDatagram] = []
-        while size > WAITING_BYTES and len(queue) > 1:
+        share = max(WAITING_BYTES, SHARED_BYTES // len(self.queues))
+        while size > share and len(queue) > 1:
             pushed_out.append(queue.popleft()[0])
             size -= _size(pushed_out[-1][0])
         self._bytes[sender] = size
