@@ -9,6 +9,7 @@ from tests.sitl.roles_frames import ROLES_TESTED, RoleFrames
 from tests.sitl.roles_scene import DAEMONS_BATCH, Trial, run_scene, run_through_daemons
 
 FRAMES = 5000
+NO_SIMULATOR = "no autopilot simulator"
 SEED = 11
 RTL = 6  # ArduCopter's number of the mode
 FAILSAFE_S = 120.0
@@ -21,7 +22,7 @@ REAL = [pytest.param(name, marks=pytest.mark.sitl) for name in ("ardupilot", "px
 @pytest.mark.parametrize("name", REAL)
 def test_role_changes_no_autopilot(name: str, place: str, role: str) -> None:
     """Armed state, mode, parameters, mission, home, origin, targets, position, clock and stream rates stay."""
-    make = available().get(name) or pytest.skip(f"needs UAVLINKD_{name.upper()}, the path of the simulator")
+    make = available().get(name) or pytest.skip(f"{NO_SIMULATOR}: set UAVLINKD_{name.upper()}")
     result = run_scene(make, role, FRAMES, SEED, is_flying=PLACES[place])
     assert not result.changes, [*result.changes, *(raw.hex() for raw in result.culprits)]
     assert result.frames == FRAMES
@@ -32,7 +33,7 @@ def test_role_changes_no_autopilot(name: str, place: str, role: str) -> None:
 @pytest.mark.parametrize("name", [pytest.param("sim", marks=pytest.mark.long), *REAL])
 def test_role_changes_no_autopilot_behind_daemons(name: str, role: str) -> None:
     """The same through the daemons of the captured member and its victim, which deliver every frame."""
-    make = available().get(name) or pytest.skip(f"needs UAVLINKD_{name.upper()}, the path of the simulator")
+    make = available().get(name) or pytest.skip(f"{NO_SIMULATOR}: set UAVLINKD_{name.upper()}")
     result = run_through_daemons(make, role, FRAMES // 5, SEED, is_flying=False)
     assert not result.changes
     assert result.refused == {}
@@ -44,7 +45,7 @@ def test_role_changes_no_autopilot_behind_daemons(name: str, role: str) -> None:
 @pytest.mark.parametrize("role", ROLES_TESTED)
 def test_copter_that_lost_its_ground_station_comes_home(role: str) -> None:
     """Frames of other members do not suppress ArduPilot's failsafe."""
-    make = available().get("ardupilot") or pytest.skip("needs UAVLINKD_ARDUPILOT, the path of the simulator")
+    make = available().get("ardupilot") or pytest.skip(f"{NO_SIMULATOR}: set UAVLINKD_ARDUPILOT")
     frames = RoleFrames(role, SEED)
     with Trial(make, is_flying=True) as trial:
         station = trial.station

@@ -6,7 +6,7 @@ import importlib
 from collections.abc import Mapping
 from functools import cache
 
-from tests.mavlink.parsers.generate import Part, Recipe
+from tests.mavlink.parsers.generate import CAST, Part, Recipe
 from tests.mavlink.parsers.judge import Deliverer, Judge, MakeStream, Stream, filtered
 from tests.mavlink.parsers.receivers import Delivery
 from uavlinkd.lab.evaluation.captured_member import MemberAttack, attacks
@@ -16,10 +16,10 @@ from uavlinkd.mavlink.policy.gate import Refusal
 
 
 @cache
-def lacking(dialect: str, role: str, *, numbered: bool = False) -> int:
-    """A message that this role may send and the dialect lacks; with ``numbered`` one that MAVLink 1 can number."""
+def lacking(dialect: str, member: str, *, numbered: bool = False) -> int:
+    """A message that this member may send and the dialect lacks; with ``numbered`` one that MAVLink 1 can number."""
     known = importlib.import_module(f"pymavlink.dialects.v20.{dialect}").mavlink_map
-    gate = compile_policy({"role": role, "system_ids": [2]}).incoming
+    gate = compile_policy(CAST[member]).incoming
     return next(
         msgid
         for msgid in sorted(MESSAGES, reverse=True)

@@ -214,7 +214,7 @@ class RealAutopilot:
         """Run a command of PX4's shell, as the link of that name beside its binary does."""
         client = self.settings.binary.parent / f"px4-{command}"
         process = await asyncio.create_subprocess_exec(
-            *(str(client), "--instance", str(self.settings.instance), *arguments),
+            *end_with_parent(str(client), "--instance", str(self.settings.instance), *arguments),
             stdin=asyncio.subprocess.DEVNULL,
             stdout=asyncio.subprocess.PIPE,
             stderr=asyncio.subprocess.STDOUT,
