@@ -30,8 +30,8 @@ SYSTEMS: Final[Mapping[str, Sequence[int]]] = {"observer": (200, 254), "swarm-me
 """The `system_ids` of the peers: not the vehicle's, and not its ground station's."""
 VEHICLE: Final = 1
 STATION: Final = 255
-INTERVAL_S: Final = 5.0
-"""Between two frames on the gate's clock: no role has a rate below 0.2/s."""
+INTERVAL_S: Final = 20.0
+"""Between two frames on the gate's clock: no role has a rate below 0.05/s."""
 
 _FLOATS: Final = (
     *(0.0, -0.0, 1.0, -1.0, 0.5, 2.0, 100.0, 360.0, 1e-40, 3.4e38, -3.4e38, 2147483648.0, -2147483648.0, 16777217.0),

@@ -74,11 +74,25 @@ def test_what_may_go_out_may_be_requested() -> None:
     assert operator.permits(request(float("nan")))
 
 
-def test_observer_requests_few_lists_of_parameters() -> None:
-    """ArduPilot slows its telemetry to a quarter while it sends them. Two at once pass, then one in 5 s."""
+@pytest.mark.parametrize("name", ["PARAM_REQUEST_LIST", "PARAM_EXT_REQUEST_LIST"])
+def test_observer_requests_few_lists_of_parameters(name: str) -> None:
+    """ArduPilot slows its telemetry to a quarter while it sends one. Two at once pass, then one in 20 s."""
     gate = compile_policy(OBSERVER).incoming
-    for name in ("PARAM_REQUEST_LIST", "PARAM_EXT_REQUEST_LIST"):
-        asked = parsed(frame(ids_by_name()[name], bytes((1, 1)), 200))
-        verdicts = [gate.check(asked, now) for now in (0.0, 0.1, 0.2, 4.9, 5.1, 5.2)]
-        limited = Refusal.RATE_LIMITED
-        assert verdicts == [None, None, limited, limited, None, limited]
+    passed = [
+        now
+        for now in range(100)
+        for component in range(1, 201)
+        if gate.check(parsed(frame(ids_by_name()[name], bytes((1, 1)), 200, component=component)), now) is None
+    ]
+    assert passed == [0, 0, 20, 40, 60, 80]
+
+
+def test_request_needs_an_answer_that_may_pass() -> None:
+    """In both directions of lists. A list that allows requests but no answer has a warning."""
+    lists = {"system_ids": [1], "allow_in": ["telemetry"], "allow_out": ["MAV_CMD_REQUEST_MESSAGE"]}
+    policy = compile_policy(lists)
+    assert policy.outgoing.check(request(ids_by_name()["SYS_STATUS"]), 0.0) is None
+    assert policy.outgoing.check(request(ADSB_OUT_CFG), 0.0) is Refusal.COMMAND_NOT_ALLOWED
+    assert not any("MAV_CMD_REQUEST_MESSAGE" in warning for warning in policy.warnings)
+    (warning,) = compile_policy({**lists, "allow_in": []}).warnings
+    assert warning.startswith("allow_out has MAV_CMD_REQUEST_MESSAGE, but the other direction passes no message")

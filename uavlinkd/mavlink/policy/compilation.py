@@ -28,16 +28,17 @@ The entries of a list add to those of the role. A denied entry is denied even if
 ``files-read``           a group that allows only the reading requests of FILE_TRANSFER_PROTOCOL (READING_OPCODES)
 ``30``                   a message by its number, for messages that the dialect does not know
 ``MAV_CMD_NAV_TAKEOFF``  a command by its name; ``command:22`` by its number. An allowed command passes in
-                         COMMAND_LONG and COMMAND_INT. By an allowed MAV_CMD_REQUEST_MESSAGE it may request only
-                         messages that may go to it. A denied command is refused in all messages that carry
+                         COMMAND_LONG and COMMAND_INT. An allowed MAV_CMD_REQUEST_MESSAGE passes only for a message
+                         that may pass in the other direction. A denied command is refused in all messages that carry
                          commands, including mission items and cancellations. So are messages and commands with the
                          same effect: SET_MODE is MAV_CMD_DO_SET_MODE, a mission item to fly to now is
                          MAV_CMD_DO_REPOSITION, and MAV_CMD_DO_AUX_FUNCTION can arm (`settings.DONE_BY`).
 
 Each component has a rate of its own. An autopilot and its gimbal both send HEARTBEAT: with a common rate, the first
 sender of each second would silence the other for minutes. An incoming frame may name any component, so all components
-of a system together have SYSTEM_SHARE times the rate: invented components do not raise it further. Outgoing frames
-have passed another gate already, so there each flow to each client has the rate, as in the egress (`egress.kinds`).
+of a system together have SYSTEM_SHARE times the rate: invented components do not raise it further. Requests for the
+list of all parameters have one rate for all of them. Outgoing frames have passed another gate already, so there each
+flow to each client has the rate, as in the egress (`egress.kinds`).
 The rate of a group of repeated reports, such as `telemetry`, does not apply to its messages that are sent once or in
 parts: a missing line of text is never repeated. A rate for such a message by name applies.
 
@@ -57,7 +58,7 @@ from typing import Final, NamedTuple
 from uavlinkd.mavlink import dialect
 from uavlinkd.mavlink.dialect_table import MESSAGES
 from uavlinkd.mavlink.policy.alternatives import full_command_name, open_effects
-from uavlinkd.mavlink.policy.gate import SAME_AS_COMMAND, Condition, Gate, Refusal
+from uavlinkd.mavlink.policy.gate import REQUEST_MESSAGE, SAME_AS_COMMAND, Condition, Gate, Refusal
 from uavlinkd.mavlink.policy.settings import PolicyError, PolicyProblem, Rules, Settings, read_settings
 
 __all__ = ["Policy", "PolicyError", "PolicyProblem", "PolicyRow", "compile_policy"]
@@ -96,8 +97,8 @@ class Policy:
             systems=settings.systems,
             mavlink1=settings.mavlink1,
             ground_station=settings.ground_station,
-            outgoing=self.outgoing,
         )
+        self.incoming.opposite, self.outgoing.opposite = self.outgoing, self.incoming
         # Sentences for the operator, the most severe first.
         self.warnings = tuple(_warnings(settings, self.incoming, self.outgoing))
 
@@ -150,6 +151,12 @@ def _warnings(settings: Settings, incoming: Gate, outgoing: Gate) -> list[str]:
     for direction, rules, gate in (("in", settings.rules_in, incoming), ("out", settings.rules_out, outgoing)):
         if rules.denies_all:
             continue
+        opposite = outgoing if gate is incoming else incoming
+        if REQUEST_MESSAGE in rules.allowed_commands and opposite.passes_nothing:
+            warnings.append(
+                f"allow_{direction} has MAV_CMD_REQUEST_MESSAGE, but the other direction passes no message: every"
+                " request is refused; allow the answers there"
+            )
         # A denied message with the effect of a command counts as that command.
         same = {
             SAME_AS_COMMAND[msgid]: dialect.name_of(msgid)

@@ -32,6 +32,11 @@ NAMED_COMMANDS: Final = frozenset(COMMANDS.values())
 COMMAND_CARRIERS: Final = frozenset(msgid for msgid, row in MESSAGES.items() if row[6] is not None)
 DIRECT_COMMANDS: Final = frozenset(dialect.ids_by_name()[name] for name in ("COMMAND_LONG", "COMMAND_INT"))
 
+# An autopilot answers these with hundreds of frames: components of a system share one rate.
+REQUESTS_OF_LISTS: Final = frozenset(
+    dialect.ids_by_name()[name] for name in ("PARAM_REQUEST_LIST", "PARAM_EXT_REQUEST_LIST")
+)
+
 # A request for one message, by its number in the first parameter, a float at the payload's start. Some autopilots do
 # more than answer: PX4 adds parameters to its list if it is asked for UAVIONIX_ADSB_OUT_CFG.
 REQUEST_MESSAGE: Final = COMMANDS["MAV_CMD_REQUEST_MESSAGE"]
@@ -111,7 +116,8 @@ _Buckets = dict[FlowKey, tuple[float, float]]
 class Condition:
     """What a frame of one message must still meet."""
 
-    only_commands: frozenset[int] | None = None  # None: any; else it may request only messages that may go to it
+    # None: any. Else a message may be requested only if it may pass in the other direction.
+    only_commands: frozenset[int] | None = None
     never_commands: frozenset[int] = frozenset()
     never_current: frozenset[int] = frozenset()  # values of a mission item's field
     only_reads_files: bool = False
@@ -133,11 +139,11 @@ class Gate:
         "_is_incoming",
         "_mavlink1",
         "_of_systems",
-        "_outgoing",
         "_passes_unknown",
         "_rates",
         "_rules",
         "_systems",
+        "opposite",
         "refused",
         "refused_commands",
         "refused_systems",
@@ -153,10 +159,9 @@ class Gate:
         systems: frozenset[int] | None,
         mavlink1: bool,
         ground_station: bool,
-        outgoing: Gate | None = None,
     ) -> None:
         self._rules = rules
-        self._outgoing = outgoing  # of an incoming gate: the other direction
+        self.opposite: Gate | None = None  # the gate of the other direction, in which requested messages go
         self._rates = rates
         self._is_incoming = is_incoming
         self._systems = systems
@@ -331,13 +336,13 @@ class Gate:
         return None
 
     def _of_requested(self, frame: Frame) -> Refusal | None:
-        """Whether the sender may request this message: one that may go to it, by a valid number."""
+        """Whether this message may be requested: it may pass in the other direction, and its number is valid."""
         (number,) = _FLOAT.unpack(bytes(_payload_byte(frame, at) for at in range(_FLOAT.size)))
         if not 0 <= number <= MAX_MSGID or number != int(number):  # neither is true of NaN
             return Refusal.COMMAND_NOT_ALLOWED
-        if self._outgoing is None:
+        if self.opposite is None:
             return None
-        verdict = self._outgoing.decide(int(number), is_known=int(number) in MESSAGES)
+        verdict = self.opposite.decide(int(number), is_known=int(number) in MESSAGES)
         return Refusal.COMMAND_NOT_ALLOWED if isinstance(verdict, Refusal) else None
 
     def _takes_token(self, frame: Frame, per_second: float, now: float, to: int) -> bool:
@@ -347,7 +352,8 @@ class Gate:
             return _take(((self._buckets, flow, 1),), per_second, now)
         # A sender could choose another component for each frame, another target or instance too.
         one = (self._buckets, (header.msgid, header.system, header.component), 1)
-        return _take((one, (self._of_systems, (header.msgid, header.system), SYSTEM_SHARE)), per_second, now)
+        share = 1 if header.msgid in REQUESTS_OF_LISTS else SYSTEM_SHARE
+        return _take((one, (self._of_systems, (header.msgid, header.system), share)), per_second, now)
 
 
 _UNCONDITIONAL = Condition()

@@ -62,8 +62,8 @@ _OBSERVER_RATES: Final = MappingProxyType(
     {
         "parameter-reads": 50.0,
         # ArduPilot slows its telemetry on this link to a quarter while it sends the list, and begins it again.
-        "PARAM_REQUEST_LIST": 0.2,
-        "PARAM_EXT_REQUEST_LIST": 0.2,
+        "PARAM_REQUEST_LIST": 0.05,
+        "PARAM_EXT_REQUEST_LIST": 0.05,
         "mission-reads": 50.0,
         "PING": 10.0,
         "COMMAND_LONG": 10.0,
