@@ -20,7 +20,10 @@ if ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0):
 if os.getppid() != int(sys.argv[1]):
     sys.exit("the parent has ended")
 signal.signal(signal.SIGPIPE, signal.SIG_DFL)
-os.execvp(sys.argv[2], sys.argv[2:])
+try:
+    os.execvp(sys.argv[2], sys.argv[2:])
+except OSError as error:
+    sys.exit(f"{sys.argv[2]}: {error.strerror}")
 """
 """Asks the kernel for the signal, and becomes the command. The ``preexec_fn`` of :mod:`subprocess` may deadlock in a
 process with threads."""

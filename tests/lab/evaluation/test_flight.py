@@ -318,6 +318,17 @@ def test_interrupted_run_is_a_problem() -> None:
     assert "interrupted" in line
 
 
+@pytest.mark.parametrize("is_quick", [True, False])
+def test_report_says_what_a_quick_run_does_not_check(is_quick: bool) -> None:
+    """Its attacks are shorter than the time in which a daemon must report them."""
+    need(find_spec("matplotlib") is not None, "matplotlib, for the figures")
+    from uavlinkd.lab.evaluation.flight_report import make_sections
+
+    sections = make_sections(FlightFindings({**RUN, "quick": is_quick}, some_records()))
+    text = " ".join(paragraph for section in sections for paragraph in section.paragraphs)
+    assert ("does not check that the daemons report an attack within 10 s" in text) is is_quick
+
+
 def test_no_text_of_the_figure_covers_another() -> None:
     """Titles, labels, ticks and legends; every axis has a label with its unit, on the outer panels."""
     need(find_spec("matplotlib") is not None, "matplotlib, for the figures")

@@ -6,11 +6,13 @@ import asyncio
 from pathlib import Path
 
 import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from tests import waiting
-from uavlinkd.lab.sim.aircraft import OUR_SIMULATOR, Aircraft, AircraftChoice, choice_of
+from uavlinkd.lab.sim import ground_pilot
+from uavlinkd.lab.sim.aircraft import OUR_SIMULATOR, Aircraft, AircraftChoice, choice_of, unused_variables
 from uavlinkd.lab.sim.autopilot import HOME
-from uavlinkd.lab.sim.ground_pilot import GroundPilot, displaced, offset_of
+from uavlinkd.lab.sim.ground_pilot import GroundPilot, PilotError, displaced, offset_of
 from uavlinkd.lab.sim.real_autopilot import Firmware, RealAutopilotError
 from uavlinkd.lab.sim.vehicle import Axes, GeoPoint
 
@@ -30,6 +32,40 @@ async def test_our_simulator_takes_off_and_follows_a_path(tmp_path: Path) -> Non
 
     assert {frame[5] for frame in frames} == {7}
     assert not (tmp_path / "unused").exists()
+
+
+async def test_autopilot_that_ends_is_noticed_before_take_off(tmp_path: Path) -> None:
+    """The pilot stops waiting for it. The error has the exit status and the last output."""
+    binary = tmp_path / "arducopter"
+    binary.write_text("#!/bin/sh\necho no such model\nexit 3\n")
+    binary.chmod(0o700)
+    choice = AircraftChoice(Firmware.ARDUPILOT, binary)
+    async with Aircraft(choice, 1, HOME, tmp_path / "flight", list[bytes]().append) as aircraft:
+        with pytest.raises(RealAutopilotError, match=r"arducopter ended with status 3:\nno such model"):
+            await aircraft.pilot.take_off(3.0, 20.0)
+
+
+async def test_copter_that_does_not_arm_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also if it accepts the command to arm each time."""
+    monkeypatch.setattr(ground_pilot, "READY_S", 0.0)
+    monkeypatch.setattr(ground_pilot, "ANSWER_S", 0.0)
+    codec = mavlink.MAVLink(None, 7, 1)
+    commands: list[int] = []
+
+    def accept(frame: bytes) -> None:
+        command = mavlink.MAVLink(None).decode(bytearray(frame)).command
+        commands.append(command)
+        for message in (
+            mavlink.MAVLink_command_ack_message(command, mavlink.MAV_RESULT_ACCEPTED),
+            mavlink.MAVLink_global_position_int_message(0, 470_000_000, 80_000_000, 0, 0, 0, 0, 0, 0),
+        ):
+            pilot.receive(bytes(message.pack(codec)))
+
+    pilot = GroundPilot(7, accept, lambda: None)
+    with pytest.raises(PilotError, match="system ID 7: it did not arm"):
+        await pilot.take_off(3.0, 20.0)
+    assert mavlink.MAV_CMD_COMPONENT_ARM_DISARM in commands
+    assert mavlink.MAV_CMD_NAV_TAKEOFF not in commands
 
 
 def distance_m(pilot: GroundPilot, point: Axes) -> float:
@@ -57,5 +93,8 @@ def test_environment_chooses_the_autopilot(tmp_path: Path) -> None:
     assert choice_of({"UAVLINKD_PX4": str(binary)}) == AircraftChoice(Firmware.PX4, binary.resolve())
     both = {"UAVLINKD_PX4": str(binary), "UAVLINKD_ARDUPILOT": str(binary)}
     assert choice_of(both).firmware is Firmware.ARDUPILOT
+    assert unused_variables(choice_of(both), both) == ["UAVLINKD_PX4"]
+    assert unused_variables(AircraftChoice(), both) == ["UAVLINKD_ARDUPILOT", "UAVLINKD_PX4"]
+    assert unused_variables(choice_of({}), {"UAVLINKD_PX4": ""}) == []
     with pytest.raises(RealAutopilotError, match="UAVLINKD_ARDUPILOT"):
         choice_of({**both, "UAVLINKD_ARDUPILOT": str(tmp_path / "missing")})

@@ -43,6 +43,7 @@ async def test_process_that_ends_is_reported_with_its_output(firmware: Firmware,
     script = tmp_path / "etc" / "init.d-posix" / "rcS"
     script.parent.mkdir(parents=True)
     script.write_text("param set MAV_SYS_ID $((px4_instance+1))\n")
+    (binary.parent / "px4-mavlink").touch()
     settings = RealAutopilotSettings(firmware=firmware, binary=binary, udp_port=14550, home=HOME)
     autopilot = RealAutopilot(settings, tmp_path / "flight")
     with pytest.raises(RealAutopilotError, match=r"status 3:\nno such model"):
@@ -55,3 +56,34 @@ async def run_until_failure(autopilot: RealAutopilot) -> None:
         while True:
             autopilot.check()
             await asyncio.sleep(0.01)
+
+
+async def test_binary_in_a_wrong_format_is_reported(tmp_path: Path) -> None:
+    """The error says why it cannot be executed, such as a binary of another architecture."""
+    binary = tmp_path / "arducopter"
+    binary.write_bytes(bytes(100))
+    binary.chmod(0o700)
+    settings = RealAutopilotSettings(firmware=Firmware.ARDUPILOT, binary=binary, udp_port=14550, home=HOME)
+    with pytest.raises(RealAutopilotError, match=r"status 1:\n.*arducopter: Exec format error"):
+        await run_until_failure(RealAutopilot(settings, tmp_path / "flight"))
+
+
+@pytest.mark.parametrize("missing", ["../etc/init.d-posix/rcS", "px4-mavlink"])
+async def test_px4_outside_its_build_folder_is_refused(missing: str, tmp_path: Path) -> None:
+    """The error names what is missing. No other folder called ``etc`` is copied."""
+    binary = tmp_path / "bin" / "px4"
+    binary.parent.mkdir()
+    binary.write_text("#!/bin/sh\n")
+    binary.chmod(0o700)
+    script = tmp_path / "etc" / "init.d-posix" / "rcS"
+    script.parent.mkdir(parents=True)
+    for path in (script, binary.parent / "px4-mavlink"):
+        path.touch()
+    (binary.parent / missing).resolve().unlink()
+    settings = RealAutopilotSettings(firmware=Firmware.PX4, binary=binary, udp_port=14550, home=HOME)
+
+    with pytest.raises(RealAutopilotError) as caught:
+        await RealAutopilot(settings, tmp_path / "flight").start()
+
+    assert str(caught.value) == f"UAVLINKD_PX4: {binary} is not bin/px4 of a build folder (no {missing})"
+    assert not (tmp_path / "flight" / "etc").exists()

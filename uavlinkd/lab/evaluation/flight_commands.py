@@ -29,7 +29,9 @@ def add_flight_parser(commands: argparse._SubParsersAction[argparse.ArgumentPars
         default=0,
         help="seed of the attacks' choices, not of keys (default: %(default)s)",
     )
-    parser.epilog = "UAVLINKD_ARDUPILOT or UAVLINKD_PX4, the path of a simulator's binary, replaces our simulator."
+    parser.epilog = (
+        "Without --quick, UAVLINKD_ARDUPILOT or UAVLINKD_PX4, the path of a simulator's binary, replaces ours."
+    )
 
 
 def _flight(options: argparse.Namespace) -> int:
@@ -40,7 +42,7 @@ def _flight(options: argparse.Namespace) -> int:
     from uavlinkd.lab.evaluation.flight_plan import FlightSettings  # noqa: PLC0415
     from uavlinkd.lab.evaluation.flight_run import FlightError, FlightEvaluation  # noqa: PLC0415
     from uavlinkd.lab.evaluation.records import RecordsError  # noqa: PLC0415
-    from uavlinkd.lab.sim.aircraft import AircraftChoice, choice_of  # noqa: PLC0415
+    from uavlinkd.lab.sim.aircraft import AircraftChoice, choice_of, unused_variables  # noqa: PLC0415
     from uavlinkd.lab.sim.drone_process import DroneError  # noqa: PLC0415
     from uavlinkd.lab.sim.ground_pilot import PilotError  # noqa: PLC0415
     from uavlinkd.lab.sim.real_autopilot import RealAutopilotError  # noqa: PLC0415
@@ -54,6 +56,9 @@ def _flight(options: argparse.Namespace) -> int:
     settings = FlightSettings(options.quick, options.seed)
     try:
         choice = AircraftChoice() if options.quick else choice_of()
+        for variable in unused_variables(choice):
+            reason = "--quick flies our simulator" if options.quick else "UAVLINKD_ARDUPILOT comes first"
+            print(f"{variable} is not used: {reason}", file=sys.stderr)
         with interrupted_by_signals():
             asyncio.run(FlightEvaluation(options.out, settings, choice, _show).run())
         print(write_flight_report(options.out))

@@ -14,7 +14,7 @@ from uavlinkd.lab.evaluation.records import Record, Value, read_records
 
 _DELIVERED = (AttackPhase.QUIET, AttackPhase.REPLAY, AttackPhase.ALTER, AttackPhase.KEYS)
 """In these phases, frames must arrive: the attacker passes some of them in time."""
-_REPORTED_WITHIN_S = 10.0
+REPORTED_WITHIN_S = 10.0
 """Within this time a daemon must report that its link is down or its freshness unverified."""
 _FALSE = (Provenance.REPLAYED, Provenance.ALTERED)
 
@@ -159,13 +159,13 @@ def flight_problems(findings: FlightFindings) -> list[str]:
         if not findings.count(LinkKind.OURS, Provenance.GENUINE, phase):
             lines.append(f'uavlinkd delivered no frame during "{phase}"')
     for span in findings.spans:
-        is_long = span.end_s - span.begin_s > _REPORTED_WITHIN_S
+        is_long = span.end_s - span.begin_s > REPORTED_WITHIN_S
         if (
             span.phase not in (*_DELIVERED,)
             and is_long
-            and not findings.is_reported(span.begin_s + _REPORTED_WITHIN_S)
+            and not findings.is_reported(span.begin_s + REPORTED_WITHIN_S)
         ):
-            lines.append(f'uavlinkd did not report within {_REPORTED_WITHIN_S:g} s of "{span.phase}"')
+            lines.append(f'uavlinkd did not report within {REPORTED_WITHIN_S:g} s of "{span.phase}"')
     if not findings.of("end"):
         lines.append("the run was interrupted")
     return lines

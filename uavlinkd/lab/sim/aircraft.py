@@ -44,6 +44,15 @@ def choice_of(environ: Mapping[str, str] = os.environ) -> AircraftChoice:
     return AircraftChoice()
 
 
+def unused_variables(choice: AircraftChoice, environ: Mapping[str, str] = os.environ) -> list[str]:
+    """The environment variables that name a real autopilot other than the chosen one."""
+    return [
+        firmware.variable
+        for firmware in Firmware
+        if firmware is not choice.firmware and environ.get(firmware.variable)
+    ]
+
+
 class Aircraft:
     """One aircraft, as an asynchronous context. ``on_frame`` is called with each frame that it sends.
 
@@ -63,7 +72,8 @@ class Aircraft:
         self._on_frame = on_frame
         self._stack = AsyncExitStack()
         self._link: MavlinkConnection | None = None
-        self.pilot = GroundPilot(system_id, self._send)
+        self._real: RealAutopilot | None = None
+        self.pilot = GroundPilot(system_id, self._send, self._check)
 
     @property
     def name(self) -> str:
@@ -90,7 +100,7 @@ class Aircraft:
             settings = AutopilotSettings(system_id=self._system_id, home=self._home, seed=self._system_id)
             return Flight(f"udpout:127.0.0.1:{port}", settings)
         assert self._choice.binary is not None
-        return RealAutopilot(
+        self._real = RealAutopilot(
             RealAutopilotSettings(
                 firmware=self._choice.firmware,
                 binary=self._choice.binary,
@@ -101,6 +111,11 @@ class Aircraft:
             ),
             self._folder,
         )
+        return self._real
+
+    def _check(self) -> None:
+        if self._real is not None:
+            self._real.check()
 
     def _send(self, frame: bytes) -> bool:
         return self._link is not None and self._link.send(frame)

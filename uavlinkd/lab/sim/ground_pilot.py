@@ -39,9 +39,10 @@ class GroundPilot:
     Args:
         system_id: of the copter.
         send: sends a frame to it.
+        check: called repeatedly while the pilot waits. It raises if the copter's process has ended.
     """
 
-    def __init__(self, system_id: int, send: Callable[[bytes], object]) -> None:
+    def __init__(self, system_id: int, send: Callable[[bytes], object], check: Callable[[], object]) -> None:
         self.system_id = system_id
         self.place: GeoPoint | None = None
         """The last position received."""
@@ -50,6 +51,7 @@ class GroundPilot:
         self.version = ""
         """The autopilot and its version, when received."""
         self._send_frame = send
+        self._check = check
         self._codec = mavlink.MAVLink(None, *STATION)
         self._codec.robust_parsing = True
         self._is_px4 = False
@@ -98,14 +100,18 @@ class GroundPilot:
         await self._command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message, 1e6 / position_rate_hz)
         await self._until(lambda: self.place is not None, "it did not report its position")
         await self._command(mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
+        until = asyncio.get_running_loop().time() + READY_S
         while not self._is_armed:
             if not self._is_px4:  # PX4 changes the mode by itself
                 flag = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
                 await self._command(mavlink.MAV_CMD_DO_SET_MODE, flag, float(Mode.GUIDED))
             # Refused until the position estimate is good enough.
             await self._command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0)
-            with suppress(PilotError):
+            try:
                 await self._until(lambda: self._is_armed, "it did not arm", ANSWER_S)
+            except PilotError:
+                if asyncio.get_running_loop().time() > until:
+                    raise
         self.home = self.place
         assert self.home is not None
         target = altitude_m + (self.home.altitude_m if self._is_px4 else 0.0)
@@ -165,6 +171,7 @@ class GroundPilot:
     async def _until(self, condition: Callable[[], bool], failure: str, limit_s: float = READY_S) -> None:
         until = asyncio.get_running_loop().time() + limit_s
         while not condition():
+            self._check()
             if asyncio.get_running_loop().time() > until:
                 raise self._failure(failure)
             await asyncio.sleep(_LOOK_S)

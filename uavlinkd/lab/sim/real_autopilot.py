@@ -53,6 +53,11 @@ class Firmware(StrEnum):
     ARDUPILOT = "ardupilot"
     PX4 = "px4"
 
+    @property
+    def variable(self) -> str:
+        """The environment variable for the path of its binary."""
+        return f"UAVLINKD_{self.name}"
+
 
 class RealAutopilotError(Exception):
     """A real autopilot failed. The message is for the operator."""
@@ -87,7 +92,7 @@ def binary_of(firmware: Firmware, environ: Mapping[str, str] = os.environ) -> Pa
     Raises:
         RealAutopilotError: it names a file that cannot be executed.
     """
-    variable = f"UAVLINKD_{firmware.name}"
+    variable = firmware.variable
     text = environ.get(variable, "")
     if not text:
         return None
@@ -113,7 +118,8 @@ class RealAutopilot:
         """Start the process. It sends MAVLink soon after; its position estimate takes longer.
 
         Raises:
-            RealAutopilotError: it ended, or did not start in time.
+            RealAutopilotError: PX4's binary is not in a build folder, or PX4 ended or did not start in time.
+                ArduCopter may end at any time after this: see :meth:`check`.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         is_px4 = self.settings.firmware is Firmware.PX4
@@ -204,11 +210,20 @@ class RealAutopilot:
             **{f"PX4_PARAM_{name}": str(value) for name, value in settings.parameters.items()},
         }
         etc = self.folder / "etc"
-        shutil.copytree(settings.binary.parents[1] / "etc", etc, dirs_exist_ok=True)
+        shutil.copytree(self._px4_etc(), etc, dirs_exist_ok=True)
         # Its start script would derive the system ID from the instance.
         script = etc / "init.d-posix" / "rcS"
         script.write_text(re.sub(r"^param set MAV_SYS_ID .*$", "", script.read_text(), flags=re.MULTILINE))
         return (str(settings.binary), "-d", "-i", str(settings.instance), str(etc)), variables
+
+    def _px4_etc(self) -> Path:
+        """The folder ``etc`` of PX4's build folder."""
+        binary = self.settings.binary
+        for needed in ("../etc/init.d-posix/rcS", "px4-mavlink"):
+            if not (binary.parent / needed).is_file():
+                variable = self.settings.firmware.variable
+                raise RealAutopilotError(f"{variable}: {binary} is not bin/px4 of a build folder (no {needed})")
+        return binary.parent / "../etc"
 
     async def _ask_px4(self, command: str, *arguments: str) -> None:
         """Run a command of PX4's shell, as the link of that name beside its binary does."""
