@@ -10,24 +10,28 @@ import argparse
 import os
 import sys
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Final
 
 from tests.sitl.roles_frames import ROLES_TESTED
 from tests.sitl.roles_scene import MakeVehicle, SceneResult, run_scene
 from tests.sitl.roles_vehicles import ArduCopter, Px4, SimulatedVehicle
+from uavlinkd.lab.sim.real_autopilot import Firmware, RealAutopilotError, binary_of
 
 OK, FAILED = 0, 1
 PLACES: Final = {"ground": False, "air": True}
 
 
 def available(environ: Mapping[str, str] = os.environ, speedup: float = 5) -> dict[str, MakeVehicle]:
-    """The autopilots that this machine has, by name."""
+    """The autopilots that this machine has, by name.
+
+    Raises:
+        RealAutopilotError: a variable names a file that cannot be executed.
+    """
     makers: dict[str, MakeVehicle] = {"sim": SimulatedVehicle}
-    if ardupilot := environ.get("UAVLINKD_ARDUPILOT"):
-        makers["ardupilot"] = lambda folder, attach: ArduCopter(folder, Path(ardupilot).resolve(), attach, speedup)
-    if px4 := environ.get("UAVLINKD_PX4"):
-        makers["px4"] = lambda folder, attach: Px4(folder, Path(px4).resolve(), attach, speedup)
+    if ardupilot := binary_of(Firmware.ARDUPILOT, environ):
+        makers["ardupilot"] = lambda folder, attach: ArduCopter(folder, ardupilot, attach, speedup)
+    if px4 := binary_of(Firmware.PX4, environ):
+        makers["px4"] = lambda folder, attach: Px4(folder, px4, attach, speedup)
     return makers
 
 
@@ -57,7 +61,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--role", action="append", choices=ROLES_TESTED, help="both")
     parser.add_argument("--place", action="append", choices=tuple(PLACES), help="both")
     options = parser.parse_args(arguments)
-    makers = available(speedup=options.speedup)
+    try:
+        makers = available(speedup=options.speedup)
+    except RealAutopilotError as error:
+        parser.error(str(error))
     names = options.autopilot or [name for name in makers if name != "sim"]
     missing = [name for name in names if name not in makers]
     if missing or not names:

@@ -2,19 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import os
+from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.sitl.scenarios import Run, fly, runs
-from uavlinkd.lab.sim.real_autopilot import Firmware, binary_of
+from uavlinkd.lab.sim.real_autopilot import Firmware, RealAutopilotError, binary_of
 
 
-def flights() -> Iterator[Any]:
-    """Every run of each simulator that the environment names; a skip for each that it does not name."""
+def flights(environ: Mapping[str, str] = os.environ) -> Iterator[Any]:
+    """Every run of each simulator that the environment names; a skip for each that it does not name.
+
+    The error of a wrong name is a parameter: raised here, it would break the collection of all tests.
+    """
     for firmware in Firmware:
-        if binary_of(firmware) is not None:
+        try:
+            binary = binary_of(firmware, environ)
+        except RealAutopilotError as error:
+            yield pytest.param(error, id=firmware.value)
+            continue
+        if binary is not None:
             yield from (pytest.param(run, id=str(run)) for run in runs((firmware.value,)))
         else:
             reason = f"no autopilot simulator: set UAVLINKD_{firmware.name} to its binary"
@@ -23,7 +33,17 @@ def flights() -> Iterator[Any]:
 
 @pytest.mark.sitl
 @pytest.mark.parametrize("run", list(flights()))
-async def test_scenario(run: Run) -> None:
+async def test_scenario(run: Run | RealAutopilotError) -> None:
     """What was sent arrives, failsafes trip when they should and only then, and control returns."""
+    if isinstance(run, RealAutopilotError):
+        raise run
     record = await fly(run)
     assert record.error is None, record
+
+
+async def test_wrong_binary_fails_one_test(tmp_path: Path) -> None:
+    """The tests are collected all the same, and one fails with the variable's name."""
+    wrong, skipped = flights({"UAVLINKD_ARDUPILOT": str(tmp_path / "nothing")})
+    with pytest.raises(RealAutopilotError, match=r"UAVLINKD_ARDUPILOT: .* is not an executable file"):
+        await test_scenario(*wrong.values)
+    assert [mark.name for mark in skipped.marks] == ["skip"]
