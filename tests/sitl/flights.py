@@ -12,7 +12,7 @@ from tests.daemon.process import DaemonProcess
 from tests.sitl.ledger import Passing, name_of
 from tests.sitl.pilots import Mode, Pilot
 from tests.sitl.tables import download_parameters
-from tests.sitl.transfers import Figures, counted, timed
+from tests.sitl.transfers import Figures, FlightError, counted, timed
 from tests.sitl.world import Vehicle, World
 
 OUTAGES_S = (3.0, 6.0, 20.0)
@@ -86,9 +86,11 @@ async def _outage(world: World, pilot: Pilot, seconds: float) -> Figures:
         "control_after_s": round(monotonic() - up_at, 1),
     }
     limit_s = pilot.kind.failsafe_s
-    assert figures["failsafe"] == (seconds > limit_s), figures
-    if tripped_at is not None:
-        assert limit_s - 0.5 <= tripped_at - heartbeats[-1] <= limit_s + 3.0, figures
+    if figures["failsafe"] != (seconds > limit_s):
+        did = "tripped" if figures["failsafe"] else "did not trip"
+        raise FlightError(f"the failsafe {did} in an outage of {seconds:g} s", figures)
+    if tripped_at is not None and not limit_s - 0.5 <= tripped_at - heartbeats[-1] <= limit_s + 3.0:
+        raise FlightError(f"the failsafe tripped after {figures['failsafe_after_s']} s", figures)
     return figures
 
 

@@ -81,7 +81,7 @@ def report(records: list[Record]) -> str:
                 *("after the last heartbeat", "under control again"),
             ),
             _outages(passed),
-            "The failsafe is set to 5 s. The first frame up is the station's heartbeat, once per second.",
+            f"{failsafes()} The first frame up is the station's heartbeat, once per second.",
         ),
         _section(
             "Restarts",
@@ -98,6 +98,15 @@ def report(records: list[Record]) -> str:
         _section("Not flown", ("scenario", "autopilot", "conditions", ""), _not_flown(records)),
     ]
     return "\n\n".join(section for section in sections if section) + "\n"
+
+
+def failsafes() -> str:
+    """When the failsafe of each real autopilot trips."""
+    times = []
+    for kind in (KINDS[name] for name in FLOWN_KINDS):
+        reason = f": {kind.failsafe_reason}" if kind.failsafe_reason else ""
+        times.append(f"{kind.failsafe_s:g} s ({kind.name}{reason})")
+    return f"The failsafe trips after {', '.join(times)}."
 
 
 def _section(title: str, head: Cells, rows: Iterable[Cells], about: str = "") -> str:
@@ -117,7 +126,7 @@ def _how(record: Record) -> str:
 
 
 def _flown(records: list[Record]) -> Iterable[Cells]:
-    for kind in FLOWN_KINDS:
+    for kind in KINDS:
         of_kind = [record for record in records if record.kind == kind]
         if of_kind:
             versions = sorted({record.version for record in of_kind if record.version})

@@ -16,12 +16,13 @@ from tests.sitl.flights import flight, follow_me, outages, restarts, two_vehicle
 from tests.sitl.pilots import COPTER, OWN, PX4, Kind, Pilot
 from tests.sitl.simulators import OwnSimulator, RealSimulator, Simulator
 from tests.sitl.station import Station
-from tests.sitl.transfers import Figures, log_and_file, parameters_and_mission, signing
+from tests.sitl.transfers import Figures, FlightError, log_and_file, parameters_and_mission, signing
 from tests.sitl.world import World, flying
 from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.lab.sim.real_autopilot import Firmware
 
 KINDS: Mapping[str, Kind] = {"ardupilot": COPTER, "px4": PX4, "own": OWN}
+ALL_KINDS = tuple(KINDS)
 ALL_CONDITIONS = tuple(BY_NAME)
 
 Scene = Callable[[World, list[Pilot]], Awaitable[Figures]]
@@ -46,8 +47,8 @@ def _alone(scene: Callable[[World, Pilot], Awaitable[Figures]]) -> Scene:
 
 
 SCENARIOS = (
-    Scenario("parameters-mission", _alone(parameters_and_mission), conditions=ALL_CONDITIONS),
-    Scenario("flight", _alone(flight), conditions=("clean", "loss10", "loss30", "slow", "delay")),
+    Scenario("parameters-mission", _alone(parameters_and_mission), ALL_KINDS, ALL_CONDITIONS),
+    Scenario("flight", _alone(flight), ALL_KINDS, ("clean", "loss10", "loss30", "slow", "delay")),
     Scenario("log-file", _alone(log_and_file)),
     Scenario(
         "signing",
@@ -55,7 +56,7 @@ SCENARIOS = (
         kinds=("ardupilot",),
         has_maintenance_port=True,
     ),
-    Scenario("two-vehicles", two_vehicles, vehicles=2),
+    Scenario("two-vehicles", two_vehicles, ALL_KINDS, vehicles=2),
     Scenario(
         "follow-me",
         lambda world, pilots: follow_me(world, *pilots),
@@ -117,6 +118,8 @@ async def fly(run: Run) -> Record:
     try:
         with tempfile.TemporaryDirectory(prefix="sitl-") as folder:
             await _fly(run, record, Path(folder))
+    except FlightError as error:
+        record.error, record.figures = str(error), error.figures
     except Exception as error:  # the runs after this one are flown all the same
         record.error = f"{type(error).__name__}: {error}"
     record.seconds = round(monotonic() - began, 1)

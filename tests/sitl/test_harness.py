@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from tests.daemon.frames import frame
+from tests.sitl import scenarios
+from tests.sitl.files import Log
 from tests.sitl.ledger import Passing, compare, split
 from tests.sitl.report import report
 from tests.sitl.scenarios import Record, Run, fly
+from tests.sitl.transfers import LOG_BYTES, FlightError, check_log, differences, largest
 
 SENT = [Passing(10.0 + number / 10, frame(number)) for number in range(20)]
 
@@ -80,3 +85,48 @@ def test_report_names_what_was_not_flown() -> None:
     text = report([failed])
     assert "it fell" in text
     assert "log-file" in text.split("## Not flown")[1]
+
+
+def test_report_has_the_failsafe_of_each_autopilot() -> None:
+    """The time after which the scenario expects it, and why it is longer than the one that was set."""
+    outage = {"seconds": 20.0, "frames_back_s": 0.1, "station_back_s": 0.1, "failsafe": True, "control_after_s": 2.0}
+    text = report([Record("outages", "px4", "clean", True, figures={"outages": [outage]})])
+    assert (
+        "The failsafe trips after 5 s (ArduCopter), 7.5 s (PX4: it notices a lost heartbeat after 2.5 s,"
+        " then waits 5 s)."
+    ) in text
+
+
+def test_difference_is_one_short_sentence() -> None:
+    """Per direction, and only what is wrong."""
+    down = compare(SENT, arrived(*range(18)), 10.0, 12.0).figures()
+    up = compare(SENT, arrived(*range(20)), 10.0, 12.0).figures()
+    assert differences({"down": down, "up": up}) == "down: 2 of 20 frames lost"
+    assert differences({"down": up, "up": down | {"sent": 143_278, "lost": 2097, "altered": 1}}) == (
+        "up: 2,097 of 143,278 frames lost; up: 1 of 143,278 frames altered"
+    )
+
+
+async def test_failed_flight_keeps_its_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The record has the message and the figures apart."""
+
+    async def fail(*_: object) -> None:
+        raise FlightError("down: 1 of 2 frames lost", {"frames": {"exact": False}})
+
+    monkeypatch.setattr(scenarios, "_fly", fail)
+    record = await fly(Run("flight", "own"))
+    assert record.error == "down: 1 of 2 frames lost"
+    assert record.figures == {"frames": {"exact": False}}
+
+
+def test_log_of_a_flight_is_long(tmp_path: Path) -> None:
+    """A short log, a different one and a missing one are refused."""
+    data = bytes(range(256)) * (LOG_BYTES // 256 + 1)
+    (tmp_path / "1.BIN").write_bytes(data + b"newer")
+    check_log(tmp_path, data)
+    for wrong, message in ((b"", "the log has 0 bytes"), (data[:LOG_BYTES], "100,000 bytes"), (data[1:], "no file")):
+        with pytest.raises(AssertionError, match=message):
+            check_log(tmp_path, wrong)
+    assert largest([Log(1, 5), Log(2, 9), Log(3, 7)]).number == 2
+    with pytest.raises(AssertionError, match="the vehicle has no log"):
+        largest([])

@@ -11,7 +11,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from tests.sitl.files import Ftp, download_log, list_logs
+from tests.sitl.files import Ftp, Log, download_log, list_logs
 from tests.sitl.pilots import Pilot
 from tests.sitl.station import AUTOPILOT
 from tests.sitl.tables import download_mission, download_parameters, upload_mission
@@ -21,8 +21,18 @@ Figures = dict[str, Any]
 
 ITEMS = 100
 FILE_BYTES = 1_000_000
+LOG_BYTES = 100_000
+"""The log of a flight is longer."""
 SIGNING_SINCE_S = 1_420_070_400
 """The clock of MAVLink's signatures starts in 2015."""
+
+
+class FlightError(AssertionError):
+    """An assertion about a flight does not hold. The message is short; the figures are for the record."""
+
+    def __init__(self, message: str, figures: Figures) -> None:
+        super().__init__(message)
+        self.figures = figures
 
 
 async def timed(action: Awaitable[Any]) -> tuple[float, Any]:
@@ -36,16 +46,26 @@ async def counted(world: World, act: Callable[[], Awaitable[Figures]]) -> Figure
     """Perform an action while frames are counted. On a clean link no frame may be lost or altered.
 
     Raises:
-        AssertionError: one was.
+        FlightError: one was.
     """
     measurement = await world.measure()
     retries = +world.station.retries
     figures = await act()
     figures["retries"] = dict(world.station.retries - retries)
     figures["frames"] = await measurement.end()
-    if not world.condition.radio:
-        assert figures["frames"]["exact"], figures["frames"]
+    if not world.condition.radio and not figures["frames"]["exact"]:
+        raise FlightError(differences(figures["frames"]), figures)
     return figures
+
+
+def differences(frames: Figures) -> str:
+    """What happened to frames between the two ends, for people."""
+    return "; ".join(
+        f"{way}: {frames[way][fault]:,} of {frames[way]['sent']:,} frames {fault}"
+        for way in ("down", "up")
+        for fault in ("lost", "altered", "duplicated", "reordered")
+        if frames[way][fault]
+    )
 
 
 async def parameters_and_mission(world: World, pilot: Pilot) -> Figures:
@@ -83,9 +103,9 @@ async def log_and_file(world: World, pilot: Pilot) -> Figures:
     await pilot.return_and_land()
 
     async def act() -> Figures:
-        log = max(await list_logs(station, system), key=lambda log: log.size_bytes)
+        log = largest(await list_logs(station, system))
         log_s, data = await timed(download_log(station, system, log))
-        assert await asyncio.to_thread(holds, folder, data), "no file of the simulator begins with this log"
+        await asyncio.to_thread(check_log, folder, data)
         ftp = Ftp(station, system)
         read_s, back = await timed(ftp.read("uavlinkd.bin"))
         assert back == content, "the file differs"
@@ -103,6 +123,18 @@ async def log_and_file(world: World, pilot: Pilot) -> Figures:
         }
 
     return await counted(world, act)
+
+
+def largest(logs: list[Log]) -> Log:
+    """The largest log."""
+    assert logs, "the vehicle has no log"
+    return max(logs, key=lambda log: log.size_bytes)
+
+
+def check_log(folder: Path, data: bytes) -> None:
+    """Assert that a log is as long as that of a flight, and equals a file in a folder."""
+    assert len(data) > LOG_BYTES, f"the log has {len(data):,} bytes, that of a flight more than {LOG_BYTES:,}"
+    assert holds(folder, data), "no file of the simulator begins with this log"
 
 
 def holds(folder: Path, data: bytes) -> bool:
@@ -132,7 +164,8 @@ async def signing(world: World, pilot: Pilot, maintenance: Callable[[bytes], Awa
 
     before = await counted(world, refused)
     withheld = sum(n for what, n in before["frames"]["withheld"].items() if what.startswith("SETUP_SIGNING"))
-    assert not world.daemons or withheld == 1, before
+    if world.daemons and withheld != 1:
+        raise FlightError(f"the daemons withheld {withheld} SETUP_SIGNING, not 1", before)
     await maintenance(bytes(setup.pack(mavlink.MAVLink(None, station.system, 190))))
     seen = len(station.received)
     await station.until(
@@ -161,8 +194,9 @@ async def signing(world: World, pilot: Pilot, maintenance: Callable[[bytes], Awa
         }
 
     figures = await counted(world, act)
-    assert figures["bad_signatures"] == 0, figures
-    assert figures["unsigned_down"] == 0, figures
+    for wrong in ("bad_signatures", "unsigned_down"):
+        if figures[wrong]:
+            raise FlightError(f"{figures[wrong]:,} frames: {wrong}", figures)
     assert ignored, "the vehicle accepted an unsigned request"
     return figures | {"setup_signing_withheld": withheld, "unsigned_request_ignored": ignored}
 
