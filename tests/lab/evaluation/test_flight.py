@@ -352,6 +352,32 @@ def test_no_text_of_the_figure_covers_another() -> None:
         assert overlap is None or overlap.width * overlap.height < 1, f"{one!r} and {other!r} overlap"
 
 
+def test_figure_shows_every_point() -> None:
+    """Also the largest error, which only one link has."""
+    need(find_spec("matplotlib") is not None, "matplotlib, for the figures")
+    from numpy import asarray
+
+    from uavlinkd.lab.evaluation.flight_figures import draw_flight
+
+    records = [
+        replace(record, values={**record.values, "error_m": 90.0, "believed_north_m": 90.0})
+        if record.kind == "sample" and record.point["link"] == "paper" and record.point["phase"] == AttackPhase.KEYS
+        else record
+        for record in some_records()
+    ]
+    figure = draw_flight(FlightFindings(RUN, records))
+    figure.savefig(io.BytesIO(), format="png")
+    largest = []
+    for axes in figure.axes:
+        (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
+        points: list[tuple[float, float]] = [
+            (x, y) for line in axes.lines for x, y in asarray(line.get_xydata(), float).tolist()
+        ]
+        assert all(left <= x <= right and bottom <= y <= top for x, y in points)
+        largest.append(max(y for _, y in points))
+    assert largest == [30.0, 90.0, 0.5] * 2
+
+
 def test_report_is_made_again_from_the_records(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Figure, HTML, Markdown and page, and the same bytes each time."""
     need(find_spec("matplotlib") is not None, "matplotlib, for the figures")
@@ -375,7 +401,7 @@ def test_report_is_made_again_from_the_records(tmp_path: Path, capsys: pytest.Ca
 
 @pytest.mark.long
 async def test_quick_run(tmp_path: Path) -> None:
-    """uavlinkd accepts no false position, the paper's protocol does. Each link has records, the report a figure."""
+    """uavlinkd accepts no false position, the paper's protocol does. The error output names what it does not use."""
     need(find_spec("matplotlib") is not None, "matplotlib, for the figures")
     process = await asyncio.create_subprocess_exec(
         *end_with_parent(
@@ -383,7 +409,7 @@ async def test_quick_run(tmp_path: Path) -> None:
         ),
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.PIPE,
-        env={**os.environ, "UAVLINKD_ARDUPILOT": "/missing"},  # not used in a quick run
+        env={**os.environ, "UAVLINKD_ARDUPILOT": "/missing", "UAVLINKD_PX4": ""},
     )
     try:
         out, err = await asyncio.wait_for(process.communicate(), LIMIT_S)
@@ -391,7 +417,8 @@ async def test_quick_run(tmp_path: Path) -> None:
         if process.returncode is None:
             process.terminate()
             await process.wait()
-    assert (process.returncode, err.decode()) == (0, "")
+    unused = "UAVLINKD_ARDUPILOT is not used: --quick flies our simulator\n"
+    assert (process.returncode, err.decode()) == (0, unused)
 
     facts = json.loads(out.decode().splitlines()[-1])
     assert (facts["ours_replayed_accepted"], facts["ours_altered_accepted"]) == (0, 0)

@@ -161,8 +161,9 @@ class RealAutopilot:
         """
         if self._process is not None and self._process.returncode is not None:
             lines = "\n".join(self.log.read_text(errors="replace").splitlines()[-5:])
+            output = f":\n{lines}" if lines else ", without output"
             raise RealAutopilotError(
-                f"{self.settings.binary.name} ended with status {self._process.returncode}:\n{lines}"
+                f"{self.settings.binary.name} ended with status {self._process.returncode}{output}"
             )
 
     async def __aenter__(self) -> Self:
