@@ -119,8 +119,11 @@ def test_forty_restarts_of_a_client_do_not_add_work_per_frame(new_loop: NewLoop,
     async def run() -> None:
         async with Hub(host) as hub:
             sender, receiver = await hub.connect(), await hub.connect()
+            closed = set()  # the kernel may choose the same port again
             for _ in range(40):
-                (await hub.connect()).close()
+                client = await hub.connect()
+                closed.add(client.getsockname())
+                client.close()
                 await hub.send(sender, frame(0))
             await until(lambda: len(hub.endpoint.ports) == 2)
             received(receiver)
@@ -129,7 +132,7 @@ def test_forty_restarts_of_a_client_do_not_add_work_per_frame(new_loop: NewLoop,
                 await hub.send(sender, frame(1000 + number))
             assert hub.sock.sent == 100
             assert received(receiver) == [frame(1000 + number) for number in range(100)]
-            assert hub.endpoint.failures["ECONNREFUSED"] >= 40
+            assert hub.endpoint.failures["ECONNREFUSED"] >= len(closed) > 20
             assert set(hub.endpoint.failures) == {"ECONNREFUSED"}
 
     with asyncio.Runner(loop_factory=new_loop) as runner:
