@@ -45,6 +45,8 @@ class Kind:
     modes: Mapping[Mode, int]
     """The custom mode in HEARTBEAT."""
     is_px4: bool = False
+    flies: bool = True
+    """Whether it takes off and lands. Flown on the clean link only if not: the link is the same."""
     has_home_item: bool = True
     """Item 0 of a mission is the home position."""
     parameters: Mapping[str, float] = field(default_factory=dict)
@@ -88,6 +90,7 @@ PX4 = Kind(
     failsafe_reason="it notices a lost heartbeat after 2.5 s, then waits 5 s",
 )
 OWN = Kind("uavlinkd sim", _COPTER_MODES)
+ROVER = Kind("ArduRover", {Mode.GUIDED: 15, Mode.MISSION: 10, Mode.RETURN: 11}, flies=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,6 +127,7 @@ class Pilot:
         self.station = station
         self.system = system
         self.kind = kind
+        self._home: Place | None = None
 
     @property
     def place(self) -> Place:
@@ -166,7 +170,7 @@ class Pilot:
         raise RequestError(f"mode {mode}: not within {timeout_s:.0f} s; texts: {self.station.texts[-5:]}")
 
     async def take_off(self, height_m: float = HEIGHT_M) -> None:
-        """Arm as soon as the vehicle is ready, take off, and wait until it is there."""
+        """Arm as soon as the vehicle is ready, take off if it flies, and wait until it is there."""
         station, system = self.station, self.system
         await station.until(self._is_ready, READY_S, "ready to arm")
         if not self.kind.is_px4:  # not before: it reads the switch of the radio control after its start
@@ -178,10 +182,13 @@ class Pilot:
         arm = (mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0)
         climb = (mavlink.MAV_CMD_NAV_TAKEOFF, 0.0, 0.0, 0.0, anywhere, anywhere, anywhere, altitude_m)
         # PX4 arms in the mode of a take-off, ArduPilot takes off only once it is armed.
-        for command in (climb, arm) if self.kind.is_px4 else (arm, climb):
+        commands = (climb, arm) if self.kind.is_px4 else (arm, climb) if self.kind.flies else (arm,)
+        for command in commands:
             await station.must(system, *command, timeout_s=READY_S)
         await station.until(lambda: station.is_armed(system), LEG_S, "armed")
-        await station.until(lambda: self.place.z > 0.9 * height_m, LEG_S, f"{height_m} m above home")
+        self._home = self.place
+        if self.kind.flies:
+            await station.until(lambda: self.place.z > 0.9 * height_m, LEG_S, f"{height_m} m above home")
 
     def _is_ready(self) -> bool:
         """Whether the vehicle knows its position, and its checks before arming pass."""
@@ -231,6 +238,10 @@ class Pilot:
             await self.until_at(place)
 
     async def return_and_land(self) -> None:
-        """Fly home, land, and wait until the motors stop."""
+        """Return home, land if it flies, and wait until the motors stop. A rover is disarmed there."""
         await self.set_mode(Mode.RETURN)
+        if not self.kind.flies:
+            assert self._home is not None, "it did not start"
+            await self.until_at(self._home)
+            await self.station.must(self.system, mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0.0, timeout_s=READY_S)
         await self.station.until(lambda: not self.station.is_armed(self.system), LAND_S, "landed and disarmed")

@@ -103,7 +103,7 @@ def report(records: list[Record]) -> str:
 def failsafes() -> str:
     """When the failsafe of each real autopilot trips."""
     times = []
-    for kind in (KINDS[name] for name in FLOWN_KINDS):
+    for kind in (KINDS[name] for name in FLOWN_KINDS if KINDS[name].failsafe):
         reason = f": {kind.failsafe_reason}" if kind.failsafe_reason else ""
         times.append(f"{kind.failsafe_s:g} s ({kind.name}{reason})")
     return f"The failsafe trips after {', '.join(times)}."

@@ -23,6 +23,10 @@ _PX4_INSTANCES = 10_000
 """PX4 adds the instance to port numbers up to 19,450."""
 
 
+FLYING = (Firmware.ARDUPILOT, Firmware.PX4)
+"""The real autopilots that are aircraft."""
+
+
 @dataclass(frozen=True, slots=True)
 class AircraftChoice:
     """The autopilot of an aircraft: ours, or the binary of a real one."""
@@ -37,7 +41,7 @@ def choice_of(environ: Mapping[str, str] = os.environ) -> AircraftChoice:
     Raises:
         RealAutopilotError: the environment names a file that cannot be executed.
     """
-    for firmware in Firmware:
+    for firmware in FLYING:
         binary = binary_of(firmware, environ)
         if binary is not None:
             return AircraftChoice(firmware, binary)
@@ -47,9 +51,7 @@ def choice_of(environ: Mapping[str, str] = os.environ) -> AircraftChoice:
 def unused_variables(choice: AircraftChoice, environ: Mapping[str, str] = os.environ) -> list[str]:
     """The environment variables that name a real autopilot other than the chosen one."""
     return [
-        firmware.variable
-        for firmware in Firmware
-        if firmware is not choice.firmware and environ.get(firmware.variable)
+        firmware.variable for firmware in FLYING if firmware is not choice.firmware and environ.get(firmware.variable)
     ]
 
 

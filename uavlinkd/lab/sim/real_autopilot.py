@@ -1,6 +1,7 @@
-"""Real autopilots in their own simulators: ArduCopter (SITL) and PX4 (SIH), each a child process in its own folder.
+"""Real autopilots in their own simulators: ArduCopter, ArduRover (SITL), PX4 (SIH), each a process in its own folder.
 
-The binaries are not part of this project: ``UAVLINKD_ARDUPILOT`` and ``UAVLINKD_PX4`` are their paths. PX4's binary
+The binaries are not part of this project: ``UAVLINKD_ARDUPILOT``, ``UAVLINKD_ROVER`` and ``UAVLINKD_PX4`` are their
+paths. PX4's binary
 is in ``bin`` of its build folder, beside ``px4-mavlink``; ``etc`` of that folder has its start script.
 """
 
@@ -44,7 +45,7 @@ _COPTER_PARAMETERS = {
     },
     "FS_THR_ENABLE": 0,  # there is no radio control
 }
-"""What a newly built copter needs before its first flight."""
+"""What a newly built copter needs before its first flight, and a rover: its frame has the same number."""
 
 
 class Firmware(StrEnum):
@@ -52,11 +53,16 @@ class Firmware(StrEnum):
 
     ARDUPILOT = "ardupilot"
     PX4 = "px4"
+    ROVER = "rover"
 
     @property
     def variable(self) -> str:
         """The environment variable for the path of its binary."""
         return f"UAVLINKD_{self.name}"
+
+
+_MODELS = {Firmware.ARDUPILOT: "quad", Firmware.ROVER: "rover"}
+"""What ArduPilot's simulator simulates."""
 
 
 class RealAutopilotError(Exception):
@@ -68,7 +74,7 @@ class RealAutopilotSettings:
     """One autopilot.
 
     Args:
-        binary: ``arducopter``, or ``bin/px4`` of a build.
+        binary: ``arducopter``, ``ardurover``, or ``bin/px4`` of a build.
         udp_port: a port of loopback. The autopilot sends its MAVLink there, and accepts MAVLink from there.
         instance: PX4 allows one process per instance on a machine, and derives ports from it.
         parameters: in addition to those of a new vehicle. ArduCopter stores changes, PX4 has these at each start.
@@ -189,7 +195,15 @@ class RealAutopilot:
         serial |= {number: f"udpclient:127.0.0.1:{port}" for number, port in enumerate(ports)}
         base, radio_in, simulator_in, simulator_out = free_ports(4)
         return (
-            *(str(settings.binary), "--model", "quad", "--speedup", "1", "--defaults", str(defaults)),
+            *(
+                str(settings.binary),
+                "--model",
+                _MODELS[settings.firmware],
+                "--speedup",
+                "1",
+                "--defaults",
+                str(defaults),
+            ),
             *("--home", f"{home.latitude_deg},{home.longitude_deg},{home.altitude_m},0"),
             *("--sysid", str(settings.system_id)),
             *("--base-port", str(base), "--rc-in-port", str(radio_in)),
