@@ -1,8 +1,8 @@
 """Real autopilots in their own simulators: ArduCopter, ArduRover (SITL), PX4 (SIH), each a process in its own folder.
 
 The binaries are not part of this project: ``UAVLINKD_ARDUPILOT``, ``UAVLINKD_ROVER`` and ``UAVLINKD_PX4`` are their
-paths. PX4's binary
-is in ``bin`` of its build folder, beside ``px4-mavlink``; ``etc`` of that folder has its start script.
+paths. PX4's binary is in ``bin`` of its build folder, beside ``px4-mavlink``; ``etc`` of that folder has its start
+script.
 """
 
 from __future__ import annotations
