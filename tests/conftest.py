@@ -43,7 +43,7 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark what runs alone. Start the slowest files first, so that no worker starts one at the end."""
     for item in items:
-        if any(folder in item.path.parts for folder in ALONE):
+        if set(ALONE) & set(item.nodeid.partition("::")[0].split("/")):  # not by the path of the checkout
             item.add_marker("alone")
     items.sort(
         key=lambda item: next((n for n, folder in enumerate(SLOWEST) if folder in item.path.parts), len(SLOWEST))
