@@ -9,6 +9,7 @@ import socket
 import threading
 from collections import Counter
 from collections.abc import Callable
+from math import inf
 from typing import Any, NoReturn
 
 import pytest
@@ -41,6 +42,7 @@ def names(monkeypatch: pytest.MonkeyPatch) -> Names:
     monkeypatch.setattr(socket, "getaddrinfo", look_up)
     monkeypatch.setattr(resolver, "FIRST_WAIT_S", 0.001)
     monkeypatch.setattr(resolver, "LONGEST_WAIT_S", 0.002)
+    monkeypatch.setattr(resolver, "RELAXED_WAIT_S", 0.004)
     return known
 
 
@@ -79,10 +81,12 @@ class Following:
 
     def __init__(self, addresses: list[Address]) -> None:
         self.results: list[Resolved] = []
-        self.is_wanted = self.can_use = True
+        self.can_use = True
+        self.interval_s = 0.0
+        self.wake = asyncio.Event()
         self.asked = 0
         self._task = asyncio.create_task(
-            keep_resolving(addresses, self._ask, self._on_resolved, structlog.get_logger())
+            keep_resolving(addresses, self._ask, self._on_resolved, structlog.get_logger(), wake=self.wake)
         )
 
     async def until(self, condition: Callable[[], bool]) -> None:
@@ -99,16 +103,18 @@ class Following:
         self.results.append(resolved)
         return self.can_use
 
-    def _ask(self) -> bool:
+    def _ask(self) -> float:
         self.asked += 1
-        return self.is_wanted
+        return self.interval_s
 
 
 async def test_only_new_results_are_reported(names: Names) -> None:
     """The same result is not reported twice; a different one is."""
     names["drone1.test"] = ["10.0.0.1"]
     following = Following([Address("drone1.test", 5790)])
-    await following.until(lambda: following.asked > 3)
+    await following.until(lambda: bool(following.results))
+    asked = following.asked
+    await following.until(lambda: following.asked > asked + 3)
     assert following.results == [[(V4, ("10.0.0.1", 5790))]]
     names["drone1.test"] = ["10.0.0.2"]
     await following.until(lambda: len(following.results) == 2)
@@ -120,7 +126,7 @@ async def test_unused_result_is_reported_again(names: Names) -> None:
     """A socket that cannot be opened now may open later, so the same result is reported again."""
     names["drone1.test"] = ["10.0.0.1"]
     following = Following([Address("drone1.test", 5790)])
-    following.can_use = following.is_wanted = False
+    following.can_use, following.interval_s = False, inf
     await following.until(lambda: len(following.results) >= 3)
     following.can_use = True
     count = len(following.results)
@@ -134,22 +140,72 @@ async def test_names_of_an_answering_peer_are_not_resolved(names: Names) -> None
     """While the address in use works, its name is not looked up; when it stops working, it is."""
     names["drone1.test"] = ["10.0.0.1"]
     following = Following([Address("drone1.test", 5790)])
-    following.is_wanted = False
+    following.interval_s = inf
     await following.until(lambda: len(following.results) == 1)
     names["drone1.test"] = ["10.0.0.2"]
     asked = following.asked
     await following.until(lambda: following.asked > asked + 3)
     assert len(following.results) == 1
-    following.is_wanted = True
+    following.interval_s = 0.0
     await following.until(lambda: len(following.results) == 2)
     await following.stop()
+
+
+async def test_names_are_resolved_again_after_the_interval(names: Names) -> None:
+    """Also while every address answers."""
+    names["drone1.test"] = ["10.0.0.1"]
+    following = Following([Address("drone1.test", 5790)])
+    following.interval_s = 0.05
+    await following.until(lambda: len(following.results) == 1)
+    names["drone1.test"] = ["10.0.0.2"]
+    await following.until(lambda: len(following.results) == 2)
+    await following.stop()
+
+
+async def test_woken_task_resolves_at_once(names: Names) -> None:
+    """Its interval would never end."""
+    names["drone1.test"] = ["10.0.0.1"]
+    following = Following([Address("drone1.test", 5790)])
+    following.interval_s = inf
+    await following.until(lambda: len(following.results) == 1)
+    names["drone1.test"] = ["10.0.0.2"]
+    following.wake.set()
+    await following.until(lambda: len(following.results) == 2)
+    assert not following.wake.is_set()
+    await following.stop()
+
+
+def test_failing_name_that_is_not_urgent_is_resolved_less_and_less_often(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Up to a query each 30 s, as long as other addresses answer; each second as soon as none does."""
+    put: list[float] = []
+
+    class Unknown:
+        async def run(self, *_: object) -> NoReturn:
+            put.append(asyncio.get_running_loop().time())
+            raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
+
+    async def follow() -> None:
+        following = Following([Address("drone1.test", 5790)])
+        following.interval_s = 300.0
+        await asyncio.sleep(1000.0)
+        following.interval_s = resolver.LONGEST_WAIT_S
+        await asyncio.sleep(10.0)
+        await following.stop()
+
+    monkeypatch.setattr(resolver, "_THREADS", Unknown())
+    with asyncio.Runner(loop_factory=loop_of_no_time) as runner:
+        runner.run(follow())
+    gaps = [after - before for before, after in itertools.pairwise(put)]
+    assert gaps[:7] == pytest.approx([0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 30.0])
+    assert max(gaps) == pytest.approx(30.0)
+    assert gaps[-5:] == pytest.approx([1.0] * 5)
 
 
 async def test_name_that_appears_late_is_resolved(names: Names) -> None:
     """Names fail before the network is up. Each begin of a failure is logged once, and look-ups go on."""
     with capture_logs() as logs:
         following = Following([Address("drone1.test", 5790)])
-        following.is_wanted = False
+        following.interval_s = inf
         await following.until(lambda: bool(logs))
         await asyncio.sleep(0.02)
         names["drone1.test"] = ["10.0.0.1"]

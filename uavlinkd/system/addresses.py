@@ -42,6 +42,8 @@ class Address:
         return cls(numeric_host(sockaddr), sockaddr[1])
 
     def __str__(self) -> str:
+        if not self.port:  # of a line, which has no addresses
+            return self.host
         return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
 
     @property

@@ -9,6 +9,8 @@ from __future__ import annotations
 import asyncio
 import socket
 from collections.abc import Callable, Sequence
+from contextlib import suppress
+from math import inf
 from typing import Any
 
 from structlog.typing import FilteringBoundLogger
@@ -23,7 +25,11 @@ Query = asyncio.Task[tuple[Resolved, list[str]]]
 
 FIRST_WAIT_S = 0.5
 LONGEST_WAIT_S = 1.0
-"""Longest wait between look-ups. With up to six named peers, a link is up within 2 s of the name server's return."""
+"""Longest wait between look-ups while the addresses do not answer. With up to six named peers, a link is up within
+2 s of the name server's return."""
+RELAXED_WAIT_S = 30.0
+"""Longest wait between look-ups while a name fails whose addresses are not urgent: other addresses answer. A query
+per second would cost 17 MB a day on a metered network."""
 MAX_QUERIES = 5
 """Concurrent look-ups of one peer's names. The system repeats a query to a silent name server after 5 s and gives up
 after 10 s (resolv.conf(5)). Five look-ups, started 1 s apart, send one query per second."""
@@ -58,64 +64,103 @@ async def resolve(addresses: Sequence[Address]) -> tuple[Resolved, list[str]]:
     return resolved, failed
 
 
+def numeric(address: Address) -> Resolved:
+    """The socket address of a numeric address, without a query; empty if this machine lacks its family."""
+    try:
+        answers = _look_up(address, socket.AI_NUMERICHOST)
+    except (OSError, UnicodeError):
+        return []
+    return [(family, sockaddr) for family, _, _, _, sockaddr in answers]
+
+
 def _look_up(address: Address, flags: int) -> list[tuple[Any, ...]]:
     return socket.getaddrinfo(*address.sockaddr, type=socket.SOCK_DGRAM, flags=flags)
 
 
 async def keep_resolving(
     addresses: Sequence[Address],
-    is_wanted: Callable[[], bool],
+    interval_s: Callable[[], float],
     on_resolved: Callable[[Resolved], bool],
     log: FilteringBoundLogger,
     unresolved: set[str] | None = None,
+    wake: asyncio.Event | None = None,
 ) -> None:
-    """Resolve the names now, and again while ``is_wanted()``: the addresses so far do not answer.
+    """Resolve the names now and repeatedly. Runs until cancelled.
 
-    Runs until cancelled. ``on_resolved`` is called with each new result. If it returns False, it could not use the
-    result, and is called with it again later. A name is logged once each time that it begins to fail. ``unresolved``
-    always has the names that did not resolve at the last attempt.
+    ``interval_s`` returns the interval between look-ups as of now: :data:`LONGEST_WAIT_S` if the addresses so far do
+    not answer. Then the first intervals are shorter. While a name fails, the interval is at most
+    :data:`RELAXED_WAIT_S`. Set ``wake`` to have the names resolved at once.
+
+    ``on_resolved`` is called with each new result. If it returns False, it could not use the result, and is called
+    with it again later. A name is logged once each time that it begins to fail. ``unresolved`` always has the names
+    that did not resolve at the last attempt.
     """
     known: Resolved = []
     failing = set[str]() if unresolved is None else unresolved
-    wait_s = FIRST_WAIT_S
+    wake = asyncio.Event() if wake is None else wake
+    wait_s = 0.0
     queries: set[Query] = set()
     loop = asyncio.get_running_loop()
-    queried_at = loop.time()
+    queried_at = answered_at = -inf
     me = object()
     needs_threads = any(address.ip is None for address in addresses)
     try:
         while True:
-            if not known or failing or is_wanted():
-                if needs_threads:
-                    _active.add(me)
-                if len(queries) < _share():
-                    queried_at = loop.time()
-                    queries.add(asyncio.ensure_future(resolve(addresses)))
-                answered, queries = await asyncio.wait(
-                    queries, timeout=LONGEST_WAIT_S, return_when=asyncio.FIRST_COMPLETED
-                )
-                if not answered:
-                    continue
-                # While other queries are open, the next one starts a second after the newest of them.
-                rest_s = queried_at + LONGEST_WAIT_S - loop.time() if queries else wait_s
-                # A server that is back may answer several at once: use the result with the most addresses.
-                resolved, failed = max((query.result() for query in answered), key=lambda result: len(result[0]))
-                for name in set(failed) - failing:
-                    log.warning("name_not_resolved", host=name, meaning=meaning_of(NAME_NOT_RESOLVED))
-                failing.clear()
-                failing.update(failed)
-                if resolved and resolved != known and on_resolved(resolved):
-                    known = resolved
-                if not failed:
-                    _cancel(queries)
-                wait_s = min(2 * wait_s, LONGEST_WAIT_S)
+            asked_s, now = interval_s(), loop.time()
+            is_urgent, is_failing = asked_s <= LONGEST_WAIT_S, bool(failing) or not known
+            if needs_threads and (is_urgent or is_failing):
+                _active.add(me)
             else:
                 _active.discard(me)
-                wait_s = rest_s = FIRST_WAIT_S
-            await asyncio.sleep(rest_s)
+            if not is_urgent and not is_failing:
+                wait_s = 0.0
+            # While other queries are open, the next one starts a second after the newest of them.
+            due_at = queried_at + LONGEST_WAIT_S
+            if not queries:
+                due_at = answered_at + _interval_s(asked_s, wait_s, is_failing=is_failing)
+            may_query = not queries or (is_urgent and len(queries) < _share())
+            if may_query and (now >= due_at or wake.is_set()):
+                wake.clear()
+                queried_at = now
+                queries.add(asyncio.ensure_future(resolve(addresses)))
+                continue
+            if not queries:
+                await _rest(wake, min(due_at - now, FIRST_WAIT_S))
+                continue
+            answered, queries = await asyncio.wait(
+                queries,
+                timeout=due_at - now if may_query else LONGEST_WAIT_S,
+                return_when=asyncio.FIRST_COMPLETED,
+            )
+            if not answered:
+                continue
+            # A server that is back may answer several at once: use the result with the most addresses.
+            resolved, failed = max((query.result() for query in answered), key=lambda result: len(result[0]))
+            for name in set(failed) - failing:
+                log.warning("name_not_resolved", host=name, meaning=meaning_of(NAME_NOT_RESOLVED))
+            failing.clear()
+            failing.update(failed)
+            if resolved and resolved != known and on_resolved(resolved):
+                known = resolved
+            if not failed:
+                _cancel(queries)
+            answered_at, wait_s = loop.time(), max(FIRST_WAIT_S, min(2 * wait_s, RELAXED_WAIT_S))
     finally:
         _active.discard(me)
         _cancel(queries)
+
+
+def _interval_s(asked_s: float, wait_s: float, *, is_failing: bool) -> float:
+    """The interval until the next look-up. ``wait_s`` grows with each."""
+    if asked_s <= LONGEST_WAIT_S:
+        return min(wait_s, LONGEST_WAIT_S)
+    return min(asked_s, wait_s) if is_failing else asked_s
+
+
+async def _rest(wake: asyncio.Event, seconds: float) -> None:
+    with suppress(TimeoutError):
+        async with asyncio.timeout(seconds):
+            await wake.wait()
 
 
 def _cancel(queries: set[Query]) -> None:

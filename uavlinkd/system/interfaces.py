@@ -1,0 +1,115 @@
+"""The network interfaces of this machine: their numbers, states and addresses (Linux).
+
+It asks by ioctl(2) and reads a table of /proc. It does not use netlink: the service's sandbox permits no netlink
+sockets, and a netlink library would cost the daemon memory and start-up time for two questions per second.
+"""
+
+from __future__ import annotations
+
+import socket
+import struct
+from array import array
+from ipaddress import IPv6Address
+from pathlib import Path
+from typing import Final, NamedTuple
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    _CAN_ASK = False
+else:
+    _CAN_ASK = True
+
+# linux/sockios.h
+_SIOCGIFCONF: Final = 0x8912
+_SIOCGIFFLAGS: Final = 0x8913
+# linux/if.h
+_IFF_UP: Final = 0x1
+_IFF_LOOPBACK: Final = 0x8
+_IFF_POINTOPOINT: Final = 0x10
+_IFF_NOARP: Final = 0x80
+_NAME: Final = struct.Struct("16s")
+_REQUEST: Final = struct.Struct("16s24s" if struct.calcsize("P") == 8 else "16s16s")
+"""struct ifreq: the name of an interface, and a union."""
+_CONF: Final = struct.Struct("@iP")
+"""struct ifconf: length and address of a buffer."""
+_MOST_ADDRESSES: Final = 256
+# linux/if_addr.h: not usable as a source.
+_IFA_F_DADFAILED: Final = 0x08
+_IFA_F_TENTATIVE: Final = 0x40
+_IPV6_TABLE: Final = Path("/proc/self/net/if_inet6")
+"""Not /proc/net: the service sees only the folders of processes (ProcSubset=pid)."""
+
+
+class Interface(NamedTuple):
+    """An interface at one moment."""
+
+    ifindex: int
+    """Its number. An interface that was removed returns with another one."""
+    flags: int
+    hosts: tuple[str, ...]
+    """Its usable addresses, IPv4 first. A link-local IPv6 address has no zone here."""
+
+    @property
+    def is_up(self) -> bool:
+        """Whether an administrator or a network manager switched it on. Its cable may be unplugged."""
+        return bool(self.flags & _IFF_UP)
+
+    @property
+    def has_one_end(self) -> bool:
+        """Whether everything goes to the one other end: a modem, a tunnel."""
+        return bool(self.flags & (_IFF_POINTOPOINT | _IFF_NOARP)) and not self.flags & _IFF_LOOPBACK
+
+
+def find_interface(name: str) -> Interface | None:
+    """The interface of this name, if the machine has it now. None on systems other than Linux."""
+    if not _CAN_ASK:
+        return None
+    try:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+            index = socket.if_nametoindex(name)
+            request = _REQUEST.pack(name.encode(), b"")
+            (flags,) = struct.unpack_from("=H", fcntl.ioctl(sock, _SIOCGIFFLAGS, request), _NAME.size)
+            return Interface(index, flags, (*_ipv4(sock, name), *_ipv6(index)))
+    except OSError:
+        return None
+
+
+def interface_of(host: str) -> str | None:
+    """The name of the interface that has a numeric address, without a zone."""
+    for name in interface_names():
+        interface = find_interface(name)
+        if interface is not None and host in interface.hosts:
+            return name
+    return None
+
+
+def interface_names() -> list[str]:
+    """The names of all interfaces."""
+    return [name for _, name in socket.if_nameindex()]
+
+
+def _ipv4(sock: socket.socket, name: str) -> list[str]:
+    buffer = array("B", bytes(_MOST_ADDRESSES * _REQUEST.size))
+    start, length = buffer.buffer_info()
+    size, _ = _CONF.unpack(fcntl.ioctl(sock, _SIOCGIFCONF, _CONF.pack(length, start)))
+    hosts = []
+    for label, address in _REQUEST.iter_unpack(buffer[: size - size % _REQUEST.size].tobytes()):
+        # The label of a second address may be eth0:1. struct sockaddr_in: family, port, address.
+        if label.rstrip(b"\0").partition(b":")[0].decode() == name:
+            hosts.append(socket.inet_ntoa(address[4:8]))
+    return hosts
+
+
+def _ipv6(index: int) -> list[str]:
+    """Rows of the table: address, index, prefix length, scope, flags (hexadecimal), name."""
+    try:
+        rows = _IPV6_TABLE.read_text().splitlines()
+    except OSError:  # a kernel without IPv6
+        return []
+    hosts = []
+    for row in rows:
+        digits, number, _, _, flags, _ = row.split()
+        if int(number, 16) == index and not int(flags, 16) & (_IFA_F_TENTATIVE | _IFA_F_DADFAILED):
+            hosts.append(str(IPv6Address(bytes.fromhex(digits))))
+    return sorted(hosts)
