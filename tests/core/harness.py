@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
+import hmac
 import random
 from array import array
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, TypeVar
 
+from uavlinkd.core import constants as c
 from uavlinkd.core import wire
 from uavlinkd.core.cookie import MacKeys
 from uavlinkd.core.crypto import AeadKey, KeyPair, MacKey, Secret
@@ -16,6 +19,7 @@ from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Deliver, Dropped, Output, Transmit
 from uavlinkd.core.path import Path
 from uavlinkd.core.peer import Peer
+from uavlinkd.core.probe import Probe
 from uavlinkd.core.session import EnvelopeKey, Session
 from uavlinkd.core.settings import Link, PeerSettings, Timers
 from uavlinkd.core.suites import SUITES_BY_NAME
@@ -126,13 +130,16 @@ class Pair:
         return only(datagrams(self.a.timeout(now), wire.INITIATION))
 
     def establish(self, now: float = 0.0) -> Pair:
-        """Initiation, response, confirmation: afterwards both sides send on the session."""
-        response = only(datagrams(self.b.receive(self.initiation(now), now)))
-        confirmation = only(datagrams(self.a.receive(response, now)))
-        self.b.receive(confirmation, now)
+        """Initiation, response, confirmation and what follows: afterwards both sides send on the session."""
+        self.complete(self.initiation(now), now)
         self.a.timeout(now)
         self.b.timeout(now)
         return self
+
+    def complete(self, initiation: bytes, now: float) -> list[Output]:
+        """Let bravo answer this initiation of alpha, and either side what follows. Bravo's outputs after that."""
+        response = only(datagrams(self.b.receive(initiation, now), wire.RESPONSE))
+        return exchange(self.b, self.a, self.a.receive(response, now), now)
 
     def carries(self, now: float) -> bool:
         """Whether a frame gets through in both directions."""
@@ -225,12 +232,29 @@ def unsealed(session: Session, datagram: bytes) -> bytes | None:
     return unprotected(session._receive, session.tag_bytes, datagram, size, counter)
 
 
+def probe_in(side: Side, datagram: bytes) -> Probe:
+    """The probe in an envelope to a side, read with its keys and past its session."""
+    session = next(one for one in side.peer.sessions.confirmed if datagram[1:3] == one.local_index.to_bytes(2))
+    payload = unsealed(session, datagram)
+    assert payload is not None
+    record = wire.parse_control(payload)
+    assert isinstance(record, wire.ProbeAndFrames)
+    return record.probe
+
+
 def unprotected(key: EnvelopeKey, tag_bytes: int, datagram: bytes, header_bytes: int, counter: int) -> bytes | None:
     """The payload of an envelope; None if the tag does not verify."""
     if isinstance(key, AeadKey):
         return key.open(counter, datagram[header_bytes:], datagram[:header_bytes])
     covered = datagram[:-tag_bytes]
     return covered[header_bytes:] if key.tag(covered)[:tag_bytes] == datagram[-tag_bytes:] else None
+
+
+def initiation_of(version: int, receiver_public_key: bytes, length: int = 147) -> bytes:
+    """An initiation as another version of the protocol makes it: only its first byte and its macs are known here."""
+    covered = (b"\1" + bytes(range(256)) * (length // 256 + 1))[: length - 2 * c.MAC_BYTES]
+    key = hashlib.sha256(b"uavlink/%d mac1" % version + receiver_public_key).digest()
+    return covered + hmac.digest(key, covered, "sha256")[: c.MAC_BYTES] + bytes(c.MAC_BYTES)
 
 
 def exhaust(side: Side, now: float) -> None:
@@ -252,7 +276,7 @@ def quiet(**changes: Any) -> Link:
 
 ONLY_COUNTED = frozenset(
     ("drops", "_initiations", "_responses", "_read", "_known_read", "_cookie_replies", "_prefixes", "_known")
-) | {"_computed", "_entropy"}
+) | {"_versions", "_known_versions", "_computed", "_entropy"}
 """What a forgery may change."""
 _OPAQUE = (KeyPair, AeadKey, MacKey)
 

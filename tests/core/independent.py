@@ -1,8 +1,8 @@
 """A second implementation of the handshake and the envelopes, written from ``uavlinkd/core/README.md`` alone.
 
 It shares no code with the core: what the two agree on, the document says. It is as short as possible: it has no
-timers, no replay window and no paths, and the test sets the age of its envelopes. `handshake_vectors` makes whole
-handshakes with both of its roles.
+timers, no replay window and no set of paths, and the test sets the age of its envelopes. `handshake_vectors` makes
+whole handshakes with both of its roles.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from cryptography.hazmat.primitives.asymmetric.mlkem import (
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X25519PublicKey
 from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 
-VERSION = b"uavlink/1"
+VERSION = b"uavlink/2"
 
 Draw = Callable[[int], bytes]
 """So many random bytes."""
@@ -202,6 +202,37 @@ def echo_reply(request: bytes, fresh: int, received: int = 0, expected: int = 0)
     kind, token, _, _ = struct.unpack(">BIII", request)
     assert kind == 1
     return struct.pack(">BIIII", 2, token, received, expected, fresh)
+
+
+class Probe(NamedTuple):
+    """Section 15."""
+
+    question: int = 0
+    answer: int = 0
+    sent: int = 0
+    received: int = 0
+    lag_ms: int = 65535
+    frames: bytes = b""
+    padding: bytes = b""
+
+    def encode(self) -> bytes:
+        flags = 1 if self.frames else 2 if self.padding else 0
+        record = struct.pack(">BBIIIIH", 3, flags, *self[:5]) + (bytes(2) if self.question else b"")
+        return record + self.frames + self.padding
+
+
+def read_probe(payload: bytes) -> Probe:
+    """Section 15: a probe, and what follows it."""
+    kind, flags, question, answer, sent, received, lag_ms = struct.unpack(">BBIIIIH", payload[:20])
+    assert kind == 3
+    assert question or answer
+    rest = payload[20:]
+    if question:
+        assert rest[:2] == bytes(2)
+        rest = rest[2:]
+    assert bool(rest) == (flags in (1, 2))
+    frames, padding = (rest, b"") if flags == 1 else (b"", rest)
+    return Probe(question, answer, sent, received, lag_ms, frames, padding)
 
 
 def refusal_report(*entries: tuple[int, int, int, int]) -> bytes:

@@ -97,7 +97,7 @@ def test_each_frame_waits_for_a_second_of_its_own() -> None:
     assert held.is_request_due(6.0)
     held.asked(6.0)
     assert held.due_at == 6.25
-    assert held.release(0) == ([b"\xfd\x02"], 0)
+    assert held.release(0) == ([(2, b"\xfd\x02")], 0)
 
 
 def test_requests_are_remembered_while_a_reply_can_be_in_time() -> None:
@@ -176,7 +176,7 @@ def test_new_frames_come_out_in_the_order_of_arrival() -> None:
     held = HeldFrames()
     for counter in (4, 6, 5, 3, 7):
         assert held.add(counter, bytes([0xFD, counter]), 0.0) == 0
-    assert held.release(5) == ([b"\xfd\6", b"\xfd\5", b"\xfd\7"], 2)
+    assert held.release(5) == ([(6, b"\xfd\6"), (5, b"\xfd\5"), (7, b"\xfd\7")], 2)
     assert held.release(0) == ([], 0)
 
 
@@ -189,5 +189,5 @@ def test_what_is_held_is_bounded() -> None:
     left = (c.HELD_BYTES - c.MAX_ENVELOPE_LIMIT - c.HELD_OVERHEAD_BYTES) // (1 + c.HELD_OVERHEAD_BYTES)
     assert held.add(*entry(5000, c.MAX_ENVELOPE_LIMIT)) == kept - left
     assert held.add(*entry(5001, 1200)) == left + 1
-    assert held.release(0) == ([entry(5001, 1200)[1]], 0)
+    assert held.release(0) == ([(5001, entry(5001, 1200)[1])], 0)
     assert held.add(*entry(5002, 1200)) == 0

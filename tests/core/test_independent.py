@@ -12,7 +12,7 @@ from cryptography.hazmat.primitives.asymmetric.mlkem import MLKEM768PrivateKey
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
 
 from tests.core import independent
-from tests.core.independent import FFDHE2048, MLKEM768, MLKEM1024, X25519, Initiator, Parameters
+from tests.core.independent import FFDHE2048, MLKEM768, MLKEM1024, X25519, Initiator, Parameters, Probe, read_probe
 from tests.core.independent import Session as IndependentSession
 from uavlinkd.core import constants, kem, wire
 from uavlinkd.core.crypto import Secret
@@ -22,7 +22,7 @@ from uavlinkd.core.outputs import (
     Deliver,
     Dropped,
     Output,
-    PathChanged,
+    PathStateChanged,
     PeerClosed,
     PeerUp,
     SessionEstablished,
@@ -30,7 +30,7 @@ from uavlinkd.core.outputs import (
 )
 from uavlinkd.core.path import Path
 from uavlinkd.core.peer import Peer
-from uavlinkd.core.settings import Link, PeerSettings
+from uavlinkd.core.settings import Class, Link, PeerSettings
 from uavlinkd.core.suites import SUITES, SUITES_BY_NAME
 
 NAME, HERE, ELSEWHERE = "initiator", Path(0, ("192.0.2.1", 5790)), Path(0, ("198.51.100.7", 40000))
@@ -66,21 +66,32 @@ class Pair:
         return response.datagram
 
     def link(self, now: float = 1.0, parameters: Parameters | None = None) -> IndependentSession:
-        """A session that both ends have confirmed."""
+        """A session that both ends have confirmed, and the answer to the question that the Node asks then."""
         initiator = self.initiator(parameters)
         linked = initiator.read_response(self.respond(initiator.initiation(), now))
         was_up = self.peer.is_up
-        established, *up = self.node.receive(linked.seal(b""), HERE, now)
+        established, asked, *up = self.node.receive(linked.seal(b""), HERE, now)
         assert isinstance(established, SessionEstablished)
         assert established.generation == linked.parameters.generation
         assert up == ([] if was_up else [PeerUp(self.peer)])
+        question = probe_in(linked, asked)
+        assert (question.sent, question.answer) == (1, 0)
+        answer = Probe(answer=question.question, sent=2, received=1)
+        assert self.node.receive(linked.seal(answer.encode()), HERE, now) == []
         return linked
 
 
 def with_mac1(public_key: bytes, covered: bytes) -> bytes:
     """A handshake message as anyone can make it who knows the receiver's public key: mac1, no mac2."""
-    key = hashlib.sha256(b"uavlink/1 mac1" + public_key).digest()
+    key = hashlib.sha256(b"uavlink/2 mac1" + public_key).digest()
     return covered + hmac.digest(key, covered, "sha256")[:16] + bytes(16)
+
+
+def probe_in(session: IndependentSession, output: Output, path: Path = HERE) -> Probe:
+    """The probe that the Node sends along a path."""
+    assert isinstance(output, Transmit)
+    assert output.path == path
+    return read_probe(session.open(output.datagram))
 
 
 def dropped(reason: DropReason, *, peer: Peer | None = None, path: Path = HERE) -> list[Output]:
@@ -152,17 +163,18 @@ def test_counter_grows_into_the_long_form() -> None:
 
 
 def test_envelope_counts_once() -> None:
-    """The second copy of an envelope, and one from behind the window, are dropped under their names."""
+    """A copy of an envelope, and one from behind the window, are counted and not delivered."""
     pair = Pair()
     linked = pair.link()
     first = linked.seal(FRAME)
     assert pair.node.receive(first, HERE, 1.0) == [Deliver(pair.peer, FRAME)]
-    assert pair.node.receive(first, HERE, 1.0) == dropped(DropReason.REPLAYED, peer=pair.peer)
+    assert pair.node.receive(first, HERE, 1.0) == []
     edge, inside = linked.seal(FRAME), linked.seal(FRAME)
-    linked.counter = 2 + 2048
+    linked.counter += 8192 - 2
     assert pair.node.receive(linked.seal(FRAME), HERE, 1.0) == [Deliver(pair.peer, FRAME)]
-    assert pair.node.receive(edge, HERE, 1.0) == dropped(DropReason.TOO_OLD, peer=pair.peer)
+    assert pair.node.receive(edge, HERE, 1.0) == []
     assert pair.node.receive(inside, HERE, 1.0) == [Deliver(pair.peer, FRAME)]
+    assert pair.peer.traffic.drops == {DropReason.DUPLICATE: 2}
 
 
 @pytest.mark.parametrize("confidential", [False, True], ids=["authenticated", "confidential"])
@@ -255,11 +267,31 @@ def test_unlisted_suite_is_refused() -> None:
 
 
 def test_initiation_is_answered_once() -> None:
-    """An exact copy of an initiation is dropped."""
+    """An exact copy of an initiation gets no second response; once the session is confirmed it is a replay."""
     pair = Pair()
-    initiation = pair.initiator().initiation()
-    pair.respond(initiation, 1.0)
+    initiator = pair.initiator()
+    initiation = initiator.initiation()
+    linked = initiator.read_response(pair.respond(initiation, 1.0))
+    assert pair.node.receive(initiation, HERE, 1.0) == dropped(DropReason.DUPLICATE, peer=pair.peer)
+    pair.node.receive(linked.seal(b""), HERE, 1.0)
     assert pair.node.receive(initiation, HERE, 1.0) == dropped(DropReason.REPLAYED_INITIATION)
+
+
+def test_copy_along_another_path_gets_the_same_response() -> None:
+    """Section 9: whichever of the two arrives makes the session, and a question goes along both paths."""
+    pair = Pair()
+    initiator = pair.initiator()
+    initiation = initiator.initiation()
+    first = pair.respond(initiation, 1.0)
+    copy, counted = pair.node.receive(initiation, ELSEWHERE, 1.0)
+    assert copy == Transmit(first, ELSEWHERE, is_copy=True)
+    assert counted == Dropped(DropReason.DUPLICATE, pair.peer, ELSEWHERE)
+    linked = initiator.read_response(first)
+    established, *asked, up = pair.node.receive(linked.seal(b""), HERE, 1.0)
+    assert isinstance(established, SessionEstablished)
+    assert up == PeerUp(pair.peer)
+    questions = [probe_in(linked, out, path) for out, path in zip(asked, (HERE, ELSEWHERE), strict=True)]
+    assert len({question.question for question in questions}) == 2
 
 
 def test_restarted_initiator_outranks_its_past() -> None:
@@ -318,11 +350,11 @@ def test_echo_is_answered() -> None:
     """An echo reply repeats the token, tells what was received and expected, and the first counter used recently."""
     pair = Pair()
     linked = pair.link()
-    linked.counter = 5  # four were lost
+    linked.counter += 4  # four were lost
     request = bytes([1]) + bytes.fromhex("cafe0001") + bytes(8)
     (reply,) = pair.node.receive(linked.seal(request), HERE, 1.0)
     assert isinstance(reply, Transmit)
-    assert linked.open(reply.datagram) == bytes.fromhex("02cafe0001000000020000000600000000")
+    assert linked.open(reply.datagram) == bytes.fromhex("02cafe0001000000030000000700000000")
 
 
 def test_frames_after_a_silence_come_out_with_the_peers_word() -> None:
@@ -351,41 +383,62 @@ def test_fresh_is_of_the_session_that_was_asked_on() -> None:
     asked = 4.0  # frames 0, 1 and 2 were sent at 1, 2 and 3 s
     (reply,) = pair.node.receive(before.seal(independent.echo_request(0xCAFE0001)), HERE, asked)
     assert isinstance(reply, Transmit)
-    assert after.open(reply.datagram) == independent.echo_reply(independent.echo_request(0xCAFE0001), 1, 1, 1)
+    # The Node's question has counter 0 on each session, and the first frame counter 1.
+    assert after.open(reply.datagram) == independent.echo_reply(independent.echo_request(0xCAFE0001), 2, 2, 2)
 
 
-def test_traffic_moves_after_the_path_response() -> None:
-    """A frame from elsewhere is challenged there; traffic goes on as before until the response comes from there."""
+def test_another_address_is_asked_and_carries_traffic_after_its_answer() -> None:
+    """A frame from elsewhere causes a question there. The answer counts only if it comes from there."""
     pair = Pair()
     linked = pair.link()
-    challenge, deliver = pair.node.receive(linked.seal(FRAME), ELSEWHERE, 1.0)
+    asked, usable, deliver = pair.node.receive(linked.seal(FRAME + FRAME), ELSEWHERE, 1.0)
+    assert usable == PathStateChanged(pair.peer, HERE, True, "answered")  # reported once there are two
+    assert isinstance(deliver, Deliver)
+    assert deliver.payload == FRAME + FRAME
+    question = probe_in(linked, asked, ELSEWHERE)
+    assert question.question
+    assert (question.answer, question.sent, question.received) == (0, 1, 1)
+    answer = Probe(answer=question.question, sent=2, received=1).encode()
+    assert pair.node.receive(linked.seal(answer), HERE, 1.0) == dropped(DropReason.UNEXPECTED_ANSWER, peer=pair.peer)
+    assert pair.node.receive(linked.seal(answer), ELSEWHERE, 1.0) == [
+        PathStateChanged(pair.peer, ELSEWHERE, True, "answered")
+    ]
+    sent = pair.node.send(pair.peer, [FRAME], 1.0, Class.CRITICAL)
+    assert [out.path for out in sent if isinstance(out, Transmit)] == [HERE, ELSEWHERE]
+
+
+def test_question_is_answered() -> None:
+    """The answer goes where the question came from, repeats it, and is no longer than it."""
+    pair = Pair()
+    linked = pair.link()
+    question = linked.seal(Probe(question=0xCAFE0001, sent=3, received=1).encode())
+    (answer,) = pair.node.receive(question, HERE, 1.0)
+    assert probe_in(linked, answer) == Probe(answer=0xCAFE0001, sent=2, received=3)
+    assert isinstance(answer, Transmit)
+    assert len(answer.datagram) <= len(question)
+
+
+def test_frames_follow_a_probe() -> None:
+    """A probe in front of frames is answered, and the frames are delivered; padding is not."""
+    pair = Pair()
+    linked = pair.link()
+    answer, deliver = pair.node.receive(linked.seal(Probe(question=1, sent=3, frames=FRAME).encode()), HERE, 1.0)
+    assert probe_in(linked, answer).answer == 1
     assert deliver == Deliver(pair.peer, FRAME)
-    assert isinstance(challenge, Transmit)
-    assert challenge.path == ELSEWHERE
-    record = linked.open(challenge.datagram)
-    assert (record[0], len(record), record[9:]) == (3, 11, bytes(2))
-    (before,) = pair.node.send(pair.peer, [FRAME], 1.0)
-    assert isinstance(before, Transmit)
-    assert before.path == HERE
-    response = bytes([4]) + record[1:9]
-    assert pair.node.receive(linked.seal(response), HERE, 1.0) == dropped(
-        DropReason.BAD_PATH_RESPONSE, peer=pair.peer
-    )
-    assert pair.node.receive(linked.seal(response), ELSEWHERE, 1.0)[-1] == PathChanged(pair.peer, ELSEWHERE)
-    (after,) = pair.node.send(pair.peer, [FRAME], 1.0)
-    assert isinstance(after, Transmit)
-    assert after.path == ELSEWHERE
+    (answer,) = pair.node.receive(linked.seal(Probe(question=2, sent=4, padding=bytes(99)).encode()), HERE, 1.0)
+    assert probe_in(linked, answer).answer == 2
 
 
-def test_challenge_is_answered() -> None:
-    """A path response goes to where the challenge came from, with its token, and is no longer than it."""
+def test_node_reports_what_it_received() -> None:
+    """Of the datagrams that the independent end sent along the path, one in two is lost: the Node counts the rest."""
     pair = Pair()
     linked = pair.link()
-    challenge = linked.seal(bytes([3]) + b"token678" + bytes(2))
-    response = pair.node.receive(challenge, HERE, 1.0)[-1]
-    assert isinstance(response, Transmit)
-    assert linked.open(response.datagram) == bytes([4]) + b"token678"
-    assert len(response.datagram) <= len(challenge)
+    for _ in range(5):
+        linked.seal(FRAME)
+        pair.node.receive(linked.seal(FRAME), HERE, 1.0)
+    (answer,) = pair.node.receive(linked.seal(Probe(question=1, sent=13).encode()), HERE, 1.0)
+    assert probe_in(linked, answer).received == 2 + 5 + 1
+    assert pair.peer.paths.states[0].loss_in == 5 / 11
 
 
 def test_close_ends_the_session() -> None:
@@ -400,7 +453,7 @@ def test_close_ends_the_session() -> None:
     assert linked.open(closing.datagram) == bytes([5])
 
 
-@pytest.mark.parametrize("record", [b"\x00", b"\x06", bytes([5, 0]), bytes([1]) + bytes(11), b"\x03" + b"1" * 10])
+@pytest.mark.parametrize("record", [b"\x00", b"\x06", bytes([5, 0]), bytes([1]) + bytes(11), b"\x03" + b"1" * 21])
 def test_other_records_are_refused(record: bytes) -> None:
     """An authentic payload that is neither frames nor a record of the document is dropped and counted."""
     pair = Pair()

@@ -79,23 +79,15 @@ def test_peer_away_for_years_still_gets_initiations() -> None:
     assert 5.0 + c.RETRY_MAX_S <= pair.a.peer.initiator.retry_at < 7.0
 
 
-def test_addresses_are_tried_in_turn() -> None:
-    """Each configured address is tried, the likeliest first, round and round."""
+def test_each_try_goes_along_every_address() -> None:
+    """The likeliest first. The datagrams are equal, and only the first is not a copy."""
     pair = Pair()
     pair.a.node.set_paths(pair.a.peer, [ELSEWHERE, OTHER, AT_B], 0.0)
 
-    paths = [out.path for _, out in initiations(pair, 7)]
-    assert paths == [ELSEWHERE, OTHER, AT_B, ELSEWHERE, OTHER, AT_B, ELSEWHERE]
-
-
-def test_path_in_use_is_tried_first_and_once() -> None:
-    """The path in use is tried before the configured paths, and only once per round."""
-    pair = Pair()
-    pair.a.node.set_paths(pair.a.peer, [ELSEWHERE, AT_B], 0.0)
-
-    for path, candidates in ((AT_B, [AT_B, ELSEWHERE]), (OTHER, [OTHER, ELSEWHERE, AT_B]), (None, [ELSEWHERE, AT_B])):
-        pair.a.peer.path = path
-        assert pair.a.peer.candidates() == candidates
+    for now in (0.0, 0.5):
+        sent = of(pair.a.timeout(now), Transmit)
+        assert [(out.path, out.is_copy) for out in sent] == [(ELSEWHERE, False), (OTHER, True), (AT_B, True)]
+        assert len({out.datagram for out in sent}) == 1
 
 
 def test_no_initiation_without_an_address() -> None:
@@ -194,10 +186,11 @@ def test_cookies_of_two_paths_are_kept_apart() -> None:
     pair.a.node.set_paths(pair.a.peer, [AT_B, six], 0.0)
     jar = pair.b.node._cookies
     for now, initiation in initiations(pair, 2):
+        assert now == 0.0
         source = pair.a.at if initiation.path == AT_B else from_six
         index = wire.parse_initiation(initiation.datagram).sender_index
         assert not jar.has_valid_mac2(initiation.datagram, source, now)
-        assert pair.a.receive(jar.reply(initiation.datagram, index, source, now), now) == []
+        assert pair.a.receive(jar.reply(initiation.datagram, index, source, now), now, initiation.path) == []
     now = pair.a.node.next_deadline()
     for later, initiation in initiations(pair, 2, now):
         assert jar.has_valid_mac2(initiation.datagram, pair.a.at if initiation.path == AT_B else from_six, later)
@@ -206,19 +199,19 @@ def test_cookies_of_two_paths_are_kept_apart() -> None:
 def test_few_cookies_are_held() -> None:
     """Of a name with many addresses, each of which sends a cookie, only the newest few are held."""
     pair = Pair()
-    many = [Path(0, (f"198.51.100.{number}", 5790)) for number in range(2 * c.COOKIES_PER_PEER)]
-    pair.a.node.set_paths(pair.a.peer, many, 0.0)
+    many = [Path(number, (f"198.51.100.{number}", 5790)) for number in range(c.CONFIGURED_PATHS)]
     jar = pair.b.node._cookies
-    tried: list[Path] = []
-    now = 0.0
-    for _ in many:
-        now, initiation = initiations(pair, 1, now)[0]
-        index = wire.parse_initiation(initiation.datagram).sender_index
-        assert pair.a.receive(jar.reply(initiation.datagram, index, pair.a.at, now), now) == []
-        tried.append(initiation.path)
-        now = pair.a.node.next_deadline()
-    assert len(set(tried)) == len(many)
-    assert list(pair.a.peer.initiator._received_cookies) == tried[-c.COOKIES_PER_PEER :]
+    sent: dict[Path, Transmit] = {}
+    for number in range(c.CONFIGURED_PATHS + 1):  # the peer moves: its first address has another port now
+        paths = [Path(0, ("198.51.100.0", 5791)), *many[1:]] if number == c.CONFIGURED_PATHS else many
+        pair.a.node.set_paths(pair.a.peer, paths, 0.3 * number)
+        sent = {out.path: out for out in of(pair.a.timeout(0.3 * number), Transmit)}
+        path = paths[number % c.CONFIGURED_PATHS]
+        index = wire.parse_initiation(sent[path].datagram).sender_index
+        assert pair.a.receive(jar.reply(sent[path].datagram, index, pair.a.at, 0.0), 0.3 * number, path) == []
+    pair.a.node.set_paths(pair.a.peer, many, 3.0)
+    proven = [out.path for out in of(pair.a.timeout(3.0), Transmit) if out.datagram[-16:] != bytes(16)]
+    assert proven == many[1:]
 
 
 def test_cookies_do_not_shorten_the_first_wait() -> None:
@@ -292,7 +285,8 @@ def test_initiations_have_macs_for_their_receiver() -> None:
 def test_first_wait_is_short_again_when_the_peer_was_received_meanwhile() -> None:
     """Even if the peer is silent again before the next initiation would have been due."""
     pair = Pair(lively(retry_max_s=10.0, lost_after_s=1000.0), lively()).establish()
-    assert datagrams(pair.a.timeout(1.0), wire.INITIATION), "the confirmation was not answered"
+    pair.a.send(0.0)
+    assert datagrams(pair.a.timeout(1.0), wire.INITIATION), "the frame was not answered"
     pair.a.peer.initiator.attempts = 60
     assert datagrams(pair.a.timeout(1.5), wire.INITIATION)
     assert pair.a.peer.initiator.retry_at > 9.0

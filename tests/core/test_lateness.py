@@ -15,6 +15,7 @@ from tests.core.harness import (
     of,
     only,
     payloads,
+    probe_in,
     quiet,
     reasons,
     unsealed,
@@ -22,8 +23,9 @@ from tests.core.harness import (
 from uavlinkd.core import constants as c
 from uavlinkd.core import establish, wire
 from uavlinkd.core.drops import DropReason
-from uavlinkd.core.outputs import Dropped, PeerLost, PeerUp, Transmit
+from uavlinkd.core.outputs import Dropped, PeerLost, PeerUp
 from uavlinkd.core.path import Path
+from uavlinkd.core.probe import Probe
 from uavlinkd.core.session import Session
 from uavlinkd.core.suites import X25519
 
@@ -95,13 +97,18 @@ def test_delay_is_judged_at_the_moment_of_arrival_without_other_traffic(pair: Pa
     assert reasons(pair.b.receive(held, quiet_since + 1.9)) == [DropReason.DELAYED]
 
 
-def test_replayed_envelope_is_a_replay_however_late(pair: Pair) -> None:
-    """What was accepted before is called by that name."""
+def test_copy_is_a_duplicate_for_two_seconds_and_a_late_copy_after_that(pair: Pair) -> None:
+    """The window and the remembered counters tell it, whatever path it comes along. It is not delayed."""
     once = frame(pair.a, 1.0)
     assert payloads(pair.b.receive(once, 1.0)) == [numbered(0)]
-    talk(pair, 1.0, 8.0)
+    talk(pair, 1.0, 2.9)
+    assert pair.b.receive(once, 2.9) == []
+    assert pair.b.peer.traffic.drops == {DropReason.DUPLICATE: 1}
+    talk(pair, 3.0, 8.0)
 
-    assert reasons(pair.b.receive(once, 8.0)) == [DropReason.REPLAYED]
+    assert pair.b.receive(once, 8.0) == []
+    assert pair.b.peer.traffic.drops == {DropReason.DUPLICATE: 1, DropReason.LATE_COPY: 1}
+    assert reasons(pair.b.receive(once, 8.0, ELSEWHERE)) == [DropReason.REPLAYED]
 
 
 # After a silence the peer is asked.
@@ -193,11 +200,12 @@ def test_answer_from_before_the_silence_vouches_for_nothing(pair: Pair) -> None:
 
 
 def test_control_records_are_not_held_and_end_no_silence(pair: Pair) -> None:
-    """A challenge kept from before is answered; the frames behind it are asked about all the same."""
-    challenge = pair.a.envelope(1.0, wire.PathChallenge(bytes(8)).encode())
+    """A question kept from before is answered; the frames behind it are asked about all the same."""
+    question = pair.a.envelope(1.0, Probe(question=7, answer=0, sent=5, received=5).encode())
     kept = frame(pair.a, 1.0)
 
-    assert only(of(pair.b.receive(challenge, SILENT), Transmit))
+    (answer,) = datagrams(pair.b.receive(question, SILENT))
+    assert probe_in(pair.a, answer).answer == 7
     assert payloads(pair.b.receive(kept, SILENT)) == []
 
 
@@ -327,13 +335,13 @@ def test_missing_envelopes_are_those_that_can_come_no_more(pair: Pair) -> None:
         pair.b.receive(envelope, now)
     peer = pair.b.peer
     assert peer.missing(3.0) == 0
-    assert peer.missing(4.0) == 2
-    before = peer.missing(60.0)
-    assert before == 2
+    assert peer.missing(4.0) == 0  # it has asked along its path: whether it has others is not known yet
+    assert peer.missing(12.0) == 2
+    assert peer.missing(60.0) == 2
     frame(pair.a, 4.0)  # lost
     pair.crosses(pair.a, pair.b, 4.0)
     pair.b.receive(pair.a.envelope(4.0, wire.Close().encode()), 4.0)
-    assert peer.missing(4.0) == 3
+    assert peer.missing(60.0) == 3
     assert peer.traffic.out_of_order == 0
 
 
@@ -347,22 +355,21 @@ def test_reordered_envelopes_are_not_missing(pair: Pair) -> None:
     assert pair.b.peer.missing(60.0) == 0
 
 
-def test_unanswered_challenges_are_counted(pair: Pair) -> None:
-    """Each path on which a challenge expired without a response; an answered challenge is not counted."""
-    question = only(of(pair.b.receive(frame(pair.a, 1.0), 1.0, ELSEWHERE), Transmit))
-    answer = only(datagrams(pair.a.receive(question.datagram, 1.0)))
-    pair.b.receive(answer, 1.1, ELSEWHERE)
-    assert pair.b.peer.path == ELSEWHERE
+def test_addresses_that_answer_nothing_are_counted(pair: Pair) -> None:
+    """Each address from which an envelope came and no answer in five seconds; one that answered is not counted."""
+    question = only(datagrams(pair.b.receive(pair.a.envelope(1.0, FRAME + FRAME), 1.0, ELSEWHERE)))
+    pair.b.receive(only(datagrams(pair.a.receive(question, 1.0))), 1.1, ELSEWHERE)
     counted = pair.b.peer.traffic
 
     pair.b.receive(frame(pair.a, 1.5), 1.5, Path(0, ("203.0.113.1", 1)))
     pair.b.receive(frame(pair.a, 2.0), 2.0, Path(0, ("203.0.113.2", 1)))
-    assert counted.challenges_unanswered == 1
-    assert pair.b.node.next_deadline() <= 2.0 + c.CHALLENGE_LIFETIME_S
-    pair.b.timeout(2.0 + c.CHALLENGE_LIFETIME_S)
-    assert counted.challenges_unanswered == 2
-    pair.b.timeout(60.0)
-    assert counted.challenges_unanswered == 2
+    counts = dict[int, float]()
+    while (now := pair.b.node.next_deadline()) < 20.0:
+        pair.b.timeout(now)
+        counts.setdefault(counted.paths_unproven, now)
+    assert sorted(counts) == [0, 1, 2]
+    assert 1.5 + c.QUESTION_LIFETIME_S <= counts[1] <= 1.5 + c.QUESTION_LIFETIME_S + c.PROBE_DOWN_S
+    assert 2.0 + c.QUESTION_LIFETIME_S <= counts[2] <= 2.0 + c.QUESTION_LIFETIME_S + c.PROBE_DOWN_S
 
 
 # Sessions.

@@ -25,6 +25,7 @@ from tests.core.harness import (
     datagrams,
     exhaust,
     flipped,
+    initiation_of,
     of,
     only,
     payloads,
@@ -42,11 +43,14 @@ from uavlinkd.core.drops import DropReason
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Dropped, Output, SessionEstablished, Transmit
 from uavlinkd.core.path import Path
+from uavlinkd.core.probe import Probe
 from uavlinkd.core.settings import Link, PeerSettings
 from uavlinkd.core.suites import SUITES, SUITES_BY_NAME, Suite
 
 QUIET = quiet()
 STILL_VALID_S = 100.0
+LATER = 4.0
+"""More than two seconds after second 1."""
 ENTROPY = seeded(77)
 
 
@@ -105,6 +109,11 @@ def bad_mac1(pair: Pair, now: float) -> list[Output]:
     return pair.b.receive(flipped(made_initiation(), 40), now)
 
 
+def other_version(pair: Pair, now: float) -> list[Output]:
+    """An initiation of the version before this one."""
+    return pair.b.receive(initiation_of(c.PROTOCOL_VERSION - 1, pair.b.node.public_key), now)
+
+
 def cookie_required(pair: Pair, now: float) -> list[Output]:
     """An initiation under load."""
     exhaust(pair.b, now)
@@ -126,10 +135,24 @@ def rate_limited(pair: Pair, now: float) -> list[Output]:
 
 
 def replayed_initiation(pair: Pair, now: float) -> list[Output]:
-    """The same initiation again."""
+    """The same initiation again, after its session was not confirmed in time."""
+    initiation = made_initiation()
+    assert datagrams(pair.b.receive(initiation, now), wire.RESPONSE)
+    pair.b.peer.sessions.expire(now + c.UNCONFIRMED_LIFETIME_S)
+    return pair.b.receive(initiation, now)
+
+
+def duplicate(pair: Pair, now: float) -> list[Output]:
+    """The same initiation again, along the same path, while its session waits."""
     initiation = made_initiation()
     assert datagrams(pair.b.receive(initiation, now), wire.RESPONSE)
     return pair.b.receive(initiation, now)
+
+
+def wrong_network(pair: Pair, now: float) -> list[Output]:
+    """An envelope of this peer arrives along a line with another peer at its end."""
+    pair.b.node.set_point_to_point({1: []})
+    return pair.b.receive(pair.a.envelope(now), now, Path(1, ("serial", 0)))
 
 
 def invalid_key_share(pair: Pair, now: float) -> list[Output]:
@@ -247,18 +270,23 @@ def long_counter(pair: Pair, now: float) -> list[Output]:
 
 
 def replayed(pair: Pair, now: float) -> list[Output]:
-    """The same envelope again."""
+    """An envelope again three seconds later, from where the peer never was."""
+    return pair.b.receive(accepted_before(pair, now), LATER, ELSEWHERE)
+
+
+def late_copy(pair: Pair, now: float) -> list[Output]:
+    """The same along the path of the peer."""
+    return pair.b.receive(accepted_before(pair, now), LATER)
+
+
+def accepted_before(pair: Pair, now: float) -> bytes:
+    """An envelope that was accepted, and others since."""
     envelope = pair.a.envelope(now)
     assert payloads(pair.b.receive(envelope, now)) == [FRAME]
-    return pair.b.receive(envelope, now)
-
-
-def too_old(pair: Pair, now: float) -> list[Output]:
-    """An envelope that comes after two thousand others."""
-    envelope = pair.a.envelope(now)
-    pair.a.session.send_counter += c.REPLAY_WINDOW
-    assert payloads(pair.b.receive(pair.a.envelope(now), now)) == [FRAME]
-    return pair.b.receive(envelope, now)
+    while now < LATER:
+        now += 0.5
+        assert payloads(pair.b.receive(pair.a.envelope(now), now)) == [FRAME]
+    return envelope
 
 
 def delayed(pair: Pair, now: float) -> list[Output]:
@@ -278,9 +306,9 @@ def bad_control(pair: Pair, now: float) -> list[Output]:
     return pair.b.receive(pair.a.envelope(now, b"\x66"), now)
 
 
-def bad_path_response(pair: Pair, now: float) -> list[Output]:
-    """A path response without a challenge."""
-    return pair.b.receive(pair.a.envelope(now, wire.PathResponse(bytes(8)).encode()), now)
+def unexpected_answer(pair: Pair, now: float) -> list[Output]:
+    """An answer without a question."""
+    return pair.b.receive(pair.a.envelope(now, Probe(0, 7, 1, 1).encode()), now)
 
 
 def doubtful(pair: Pair, now: float) -> list[Output]:
@@ -307,9 +335,11 @@ PROVOKED: dict[DropReason, Callable[[Pair, float], list[Output]]] = {
     DropReason.RAW_MAVLINK: raw_mavlink,
     DropReason.UNEXPECTED_RESPONSE: unexpected_response,
     DropReason.BAD_MAC1: bad_mac1,
+    DropReason.OTHER_VERSION: other_version,
     DropReason.COOKIE_REQUIRED: cookie_required,
     DropReason.RATE_LIMITED: rate_limited,
     DropReason.REPLAYED_INITIATION: replayed_initiation,
+    DropReason.WRONG_NETWORK: wrong_network,
     DropReason.INVALID_KEY_SHARE: invalid_key_share,
     DropReason.BAD_HANDSHAKE: bad_handshake,
     DropReason.UNKNOWN_PEER: unknown_peer,
@@ -326,18 +356,21 @@ PROVOKED: dict[DropReason, Callable[[Pair, float], list[Output]]] = {
     DropReason.TOO_LONG: too_long,
     DropReason.SESSION_EXPIRED: session_expired,
     DropReason.LONG_COUNTER: long_counter,
+    DropReason.DUPLICATE: duplicate,
     DropReason.REPLAYED: replayed,
-    DropReason.TOO_OLD: too_old,
+    DropReason.LATE_COPY: late_copy,
     DropReason.DELAYED: delayed,
     DropReason.BAD_TAG: bad_tag,
     DropReason.BAD_CONTROL: bad_control,
-    DropReason.BAD_PATH_RESPONSE: bad_path_response,
+    DropReason.UNEXPECTED_ANSWER: unexpected_answer,
     DropReason.DOUBTFUL: doubtful,
     DropReason.NO_SESSION: no_session,
     DropReason.TOO_LARGE: too_large,
 }
 ANSWERED = {DropReason.COOKIE_REQUIRED}
 """The only reason for which anything is sent back."""
+COUNTED_ONLY = {DropReason.LATE_COPY}
+"""Copies of envelopes are ordinary: they are counted, and nothing is reported."""
 
 
 def test_every_reason_is_provoked() -> None:
@@ -353,11 +386,11 @@ def test_dropped_for_its_reason_and_nothing_else_changes(reason: DropReason) -> 
 
     outputs = PROVOKED[reason](pair, 1.0)
 
-    assert reasons(outputs) == [reason]
+    assert reasons(outputs) == ([] if reason in COUNTED_ONLY else [reason])
     assert bool(datagrams(outputs)) == (reason in ANSWERED)
     counted_now = sum((peer.traffic.drops for peer in pair.b.node.peers.values()), start=pair.b.node.drops)[reason]
     assert counted_now == counted + 1
-    assert pair.carries(1.0)
+    assert pair.carries(LATER)
     now, initiation = retried(pair, c.REKEY_AFTER_S)
     assert completes(pair, initiation, now)
 
@@ -609,11 +642,15 @@ def test_replayed_initiation_costs_no_key_exchange(monkeypatch: pytest.MonkeyPat
     assert len(exchanges) == 4
     exchanges.clear()
 
-    for replay in (initiation, initiation[:-1] + b"\1"):
-        for place in (AT_A, ELSEWHERE):
-            assert pair.b.receive(replay, 1.0, place) == [Dropped(DropReason.REPLAYED_INITIATION, None, place)]
+    replays = [(replay, place) for replay in (initiation, initiation[:-1] + b"\1") for place in (AT_A, ELSEWHERE)]
+    for replay, place in replays:
+        assert pair.b.receive(replay, 1.0, place)[-1] == Dropped(DropReason.DUPLICATE, pair.b.peer, place)
+    later = 1.0 + c.UNCONFIRMED_LIFETIME_S
+    pair.b.timeout(later)
+    for replay, place in replays:
+        assert pair.b.receive(replay, later, place) == [Dropped(DropReason.REPLAYED_INITIATION, None, place)]
     assert exchanges == []
-    assert pair.carries(1.0)
+    assert pair.carries(later)
 
 
 def test_stranger_costs_two_key_exchanges(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -649,7 +686,7 @@ def test_memory_for_initiations_is_bounded(monkeypatch: pytest.MonkeyPatch) -> N
     for initiation in made:
         assert datagrams(pair.b.receive(initiation, 1.0), wire.RESPONSE)
     for initiation in made[1:]:
-        assert reasons(pair.b.receive(initiation, 2.0)) == [DropReason.REPLAYED_INITIATION]
+        assert reasons(pair.b.receive(initiation, 2.0)) == [DropReason.DUPLICATE]
     assert datagrams(pair.b.receive(made[0], 2.0), wire.RESPONSE)
 
 
@@ -696,16 +733,14 @@ def test_answers_to_one_peer_are_bounded(is_up: bool) -> None:
 
 
 def test_bytes_to_other_addresses_are_counted_apart() -> None:
-    """Answers to replayed initiations, and challenges for envelopes from afar, take nothing from a link's budget."""
+    """Responses to replayed initiations take nothing from a link's budget."""
     pair = established()
     traffic = pair.b.peer.traffic
     before, elsewhere = (traffic.datagrams_sent, traffic.bytes_sent), traffic.bytes_elsewhere
 
     answer = only(datagrams(pair.b.receive(made_initiation(), 1.0, ELSEWHERE), wire.RESPONSE))
-    envelope = only(datagrams(pair.a.send(1.0, FRAME)))
-    challenge = only(datagrams(pair.b.receive(envelope, 1.0, ELSEWHERE)))
     assert (traffic.datagrams_sent, traffic.bytes_sent) == before
-    assert traffic.bytes_elsewhere - elsewhere == len(answer) + len(challenge)
+    assert traffic.bytes_elsewhere - elsewhere == len(answer)
 
     answer = only(datagrams(pair.b.receive(made_initiation(), 1.0), wire.RESPONSE))
     assert (traffic.datagrams_sent, traffic.bytes_sent) == (before[0] + 1, before[1] + len(answer))
@@ -1010,7 +1045,7 @@ def test_one_peer_cannot_flush_another_ones_memory(monkeypatch: pytest.MonkeyPat
     for number in range(10):
         node._remember(node.peers["noisy"], number.to_bytes(32, "big"))
 
-    assert reasons(pair.b.receive(first, 2.0)) == [DropReason.REPLAYED_INITIATION]
+    assert reasons(pair.b.receive(first, 2.0)) == [DropReason.DUPLICATE]
     remembered = len(node._remembered)
     node.remove_peer(node.peers["noisy"], 3.0)
     assert len(node._remembered) == remembered - 3
@@ -1022,12 +1057,8 @@ def test_all_sources_together_have_a_bound(monkeypatch: pytest.MonkeyPatch, know
 
     A peer at its configured address, or at its last known one, does not queue with the attacker.
     """
-    pair = established()
+    pair = established() if known_by == "its path" else Pair(link_a=QUIET, link_b=QUIET)
     node = pair.b.node
-    node.set_paths(pair.b.peer, [], 0.5)
-    if known_by == "its configured address":
-        node._note_path(pair.b.peer.path, None)
-        pair.b.peer.path = None
     monkeypatch.setattr(node._cookies, "has_valid_mac2", lambda *_: True)
     while node._admission._initiations.take(1.0):
         pass

@@ -253,7 +253,9 @@ def test_replayed_altered_and_forged_reports(confidential: bool) -> None:
     assert state_of(pair.a.node) == before
     pair.a.receive(datagram, 1.0, ELSEWHERE)
     assert claims(pair.a) == [ARM]
-    assert reasons(pair.a.receive(datagram, 1.0)) == [DropReason.REPLAYED]
+    assert pair.a.receive(datagram, 1.0) == []
+    assert pair.a.peer.traffic.drops[DropReason.DUPLICATE] == 1
+    assert claims(pair.a) == [ARM]
 
 
 def test_a_claim_changes_nothing_else() -> None:
@@ -297,3 +299,21 @@ def test_an_old_report_changes_nothing() -> None:
     pair.a.receive(only(report(pair.b, 2.6, ARM._replace(total=9))), 2.6)
     pair.a.receive(held_back, 1.0 + c.LATE_AFTER_S)
     assert claims(pair.a) == [ARM._replace(total=9)]
+
+
+@pytest.mark.parametrize(("arrives_after_s", "counts"), [(0.0, True), (2 * c.LATE_AFTER_S, False)])
+def test_after_a_silence_the_peer_is_asked_whether_a_report_is_new(arrives_after_s: float, counts: bool) -> None:
+    """On an idle link nearly every report comes so. The newest one of several is kept."""
+    pair, later = Pair().establish(), 3 * c.LATE_AFTER_S
+    newer = ARM._replace(total=ARM.total + 1)
+    first, second = (only(report(pair.b, later + after_s, entry)) for after_s, entry in ((0.0, ARM), (2.0, newer)))
+    now = later + 2.0 + arrives_after_s
+    if arrives_after_s:
+        pair.b.timeout(now)
+        pair.a.receive(pair.b.envelope(now), now)  # an empty one comes before: all below it is old
+    questions = datagrams(pair.a.receive(second, now)) + datagrams(pair.a.receive(first, now))
+    assert claims(pair.a) == []
+    answers = [answer for question in questions for answer in datagrams(pair.b.receive(question, now + 0.1))]
+    for answer in answers:
+        pair.a.receive(answer, now + 0.2)
+    assert claims(pair.a) == ([newer] if counts else [])

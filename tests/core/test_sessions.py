@@ -28,7 +28,8 @@ def session(index: int, generation: int = 1, *, initiator: bool = True, now: flo
 
 def unconfirmed(index: int, expires_at: float = 10.0, *, is_expected: bool = False) -> Unconfirmed:
     """A session that waits for its first envelope."""
-    return Unconfirmed(session(index, initiator=False), PATH, is_expected, bytes(16), expires_at)
+    waiting = session(index, initiator=False)
+    return Unconfirmed(waiting, bytes(16), 147, bytes(60), [PATH], is_expected, bytes(16), expires_at)
 
 
 @pytest.fixture

@@ -11,6 +11,7 @@ import pytest
 from uavlinkd.core import constants, wire
 from uavlinkd.core import constants as c
 from uavlinkd.core.drops import DropReason
+from uavlinkd.core.probe import Probe
 from uavlinkd.core.refusals import RefusalReport, Refused
 from uavlinkd.core.suites import SUITES
 
@@ -39,12 +40,10 @@ def number(cell: str) -> float:
     return (float(int(base) ** int(power)) if power else float(base)) - float(less or 0)
 
 
+TABLES = ("Liveness and keys", "Bounds on work and memory", "Shared numbers", "Numbers of paths")
 DOCUMENTED = {
     cells[0].strip("`"): number(cells[1])
-    for cells in rows(
-        section("14 Timers")
-        + "".join(section(title) for title in ("Liveness and keys", "Bounds on work and memory", "Shared numbers"))
-    )
+    for cells in rows(section("14 Timers") + "".join(section(title) for title in TABLES))
     if re.fullmatch(r"`[A-Z_]+`", cells[0])
 }
 DEFINED = {
@@ -122,11 +121,10 @@ def test_sizes_of_envelopes() -> None:
 def test_types_and_sizes_of_records() -> None:
     """Each control record has the number and length that the document draws."""
     drawn = re.findall(r"^    (\d) ([a-z ]+?)  +type.*?(\d+) bytes?$", section("12 Control"), re.MULTILINE)
-    records: dict[str, wire.Control] = {
+    records: dict[str, wire.Echo | Probe | wire.Close | RefusalReport] = {
         "echo request": wire.Echo(False, 1, 2, 3),
         "echo reply": wire.Echo(True, 1, 2, 3),
-        "path challenge": wire.PathChallenge(bytes(8)),
-        "path response": wire.PathResponse(bytes(8)),
+        "probe": Probe(question=1, answer=2, sent=3, received=4),
         "close": wire.Close(),
         "refusal report": RefusalReport((Refused(0xFFFFFF, 0xFFFF, 0xFF, 2**32 - 1),) * c.REFUSALS_PER_REPORT),
     }

@@ -58,6 +58,10 @@ class Admission:
         self._known_read = SourceLimiter(
             c.INITIATIONS_READ_PER_KNOWN_PER_S, c.INITIATIONS_READ_PER_KNOWN_BURST, c.SOURCES_TRACKED
         )
+        self._versions = TokenBucket(c.VERSION_CHECKS_PER_S, c.VERSION_CHECKS_BURST, now)
+        self._known_versions = SourceLimiter(
+            c.VERSION_CHECKS_PER_KNOWN_PER_S, c.VERSION_CHECKS_PER_KNOWN_BURST, c.SOURCES_TRACKED
+        )
         self._cookie_replies = TokenBucket(c.COOKIE_REPLIES_PER_S, c.COOKIE_REPLIES_PER_S, now)
         self._prefixes = SourceLimiter(
             c.COOKIE_REPLIES_PER_PREFIX_PER_S, c.COOKIE_REPLIES_PER_PREFIX_BURST, c.SOURCES_TRACKED
@@ -73,10 +77,12 @@ class Admission:
         Raises:
             Drop: ``RATE_LIMITED``.
         """
-        address = path.address
-        # Where a peer is known to be, a flood from elsewhere does not count.
-        if not (self._is_known(address) and self._known_read.take(address, now)) and not self._read.take(now):
+        if not self._take(self._known_read, self._read, path, now):
             raise Drop(DropReason.RATE_LIMITED)
+
+    def may_compare_versions(self, path: Path, now: float) -> bool:
+        """Whether an initiation from there that is not for us may be compared with other versions."""
+        return self._take(self._known_versions, self._versions, path, now)
 
     def admit_initiation(self, message: Message, now: float) -> None:
         """An initiation costs a key exchange.
@@ -112,7 +118,7 @@ class Admission:
             Drop: ``GROUP_BUDGET_SPENT``; ``COOKIE_REQUIRED`` or ``RATE_LIMITED`` where a cookie would help.
         """
         # An attacker can send a recorded initiation under the peer's own address: only a cookie proves an address.
-        is_there = message.path in peer.candidates()
+        is_there = peer.paths.find(message.path) is not None
         is_proven = is_there and message.has_cookie(now)
         if is_proven and peer.group_share.proven.take(now, suite.work):
             return
@@ -121,6 +127,10 @@ class Admission:
         if is_there and not is_proven:
             self._require_cookie(message, now)
         raise Drop(DropReason.GROUP_BUDGET_SPENT)
+
+    def _take(self, known: SourceLimiter, budget: TokenBucket, path: Path, now: float) -> bool:
+        """Where a peer is known to be, a flood from elsewhere does not count."""
+        return (self._is_known(path.place) and known.take(path.place, now)) or budget.take(now)
 
     def _admit(self, budget: TokenBucket, ceiling: TokenBucket, message: Message, now: float) -> None:
         """Until the budget is spent, each message; then those with a cookie, by their source's share."""
@@ -131,8 +141,8 @@ class Admission:
         # A sender with a cookie for a known address has its own rate limit: it does not queue with others of its host
         # or network, such as those behind one router, nor with the owner of many addresses, which the ceiling limits.
         path = message.path
-        is_known = self._is_known(path.address)
-        if not self._sources.take((ceiling, path.address if is_known else source_of(path.host)), now):
+        is_known = self._is_known(path.place)
+        if not self._sources.take((ceiling, path.place if is_known else source_of(path.host)), now):
             raise Drop(DropReason.RATE_LIMITED)
         if not is_known and not ceiling.take(now):
             raise Drop(DropReason.RATE_LIMITED)
@@ -144,7 +154,7 @@ class Admission:
             Drop: ``COOKIE_REQUIRED``, or ``RATE_LIMITED`` without a reply.
         """
         datagram, sender_index, path, cookies = message
-        is_due = self._is_known(path.address) and self._known.take(path.address, now)
+        is_due = self._is_known(path.place) and self._known.take(path.place, now)
         # The total is looked at first: a flood from many prefixes then costs no more than this.
         if not is_due and self._cookie_replies.has(now):
             is_due = self._prefixes.take(prefix_of(path.host), now) and self._cookie_replies.take(now)

@@ -13,8 +13,12 @@ NEVER = math.inf
 
 # Specification constants. Changing one makes another protocol.
 
-PROTOCOL_NAME = b"uavlink/1"
+PROTOCOL_VERSION = 2
+"""A change of the wire or of a label makes another version. Versions do not interoperate."""
+PROTOCOL_NAME = b"uavlink/%d" % PROTOCOL_VERSION
 """First part of the prologue and of every key label; the suite byte follows in the prologue."""
+LAST_KNOWN_VERSION = 8
+"""Every version up to this one has labels of this form, so that each version can name the others."""
 
 KEY_BYTES = 32
 """An X25519 key, a PSK, a ChaCha20-Poly1305 key, a SHA-256 hash."""
@@ -24,8 +28,8 @@ MAC_BYTES = 16
 """mac1, mac2 and a cookie."""
 COOKIE_NONCE_BYTES = 16
 """Random for each cookie reply: its key is derived from it, so it must not repeat."""
-PATH_TOKEN_BYTES = 8
-"""Of a path challenge, which a guess hits once in 2^64."""
+QUESTION_BYTES = 4
+"""The question of a probe. It is unpredictable, and answered inside an authentic envelope."""
 
 SESSION_ENVELOPE_LIMIT = 2**32 - 1
 """Envelopes that a session may seal in each direction. The counter after the last one fits an echo's 32 bits."""
@@ -60,6 +64,8 @@ tries in the first 3 s fail once in 800 links, all of two dozen in the first 10 
 RETRY_MAX_S = 1.5
 """Longest wait between tries, which never end. With the jitter it stays under 2 s, so a link that comes back after
 any outage carries frames within that; a try each 1.5 s costs a dead link about 1 kbit/s with x25519."""
+TRY_AIRTIMES = 4
+"""Tries along a network with a budget are so many times the airtime of an initiation and its response apart."""
 RETRY_JITTER = 0.25
 """Each wait is longer by up to this share, so that two ends do not stay in step."""
 KEEPALIVE_S = 10.0
@@ -70,6 +76,12 @@ HANDSHAKE_AFTER_S = 1.0
 """Sent, and received nothing for this long: the other end may have restarted, so initiate too."""
 LOST_AFTER_S = 3.0
 """Sent, and received nothing for this long: the peer is lost. Inside every autopilot's failsafe."""
+ECHO_ROUND_TRIPS = 2
+"""Round trips of the best path that the three waits above have at least,"""
+HANDSHAKE_ROUND_TRIPS = 4
+"""in their order,"""
+LOST_ROUND_TRIPS = 8
+"""however short they are configured."""
 PROBE_INTERVAL_S = 5.0
 """How often a link in use measures its round trip and reports its losses."""
 CLOSE_HOLDOFF_S = 1.0
@@ -116,6 +128,17 @@ INITIATIONS_READ_PER_KNOWN_PER_S = 50
 """The same from each address where a peer is known to be: twelve times what an honest initiator sends."""
 INITIATIONS_READ_PER_KNOWN_BURST = 50
 """So many at once, after a quiet while."""
+VERSION_CHECKS_PER_S = 10
+"""Initiations a second without a valid mac1 that are compared with the labels of other versions. A comparison costs
+at most fourteen HMACs: all together a fraction of a percent of what a flood of initiations may cost."""
+VERSION_CHECKS_BURST = 20
+"""So many at once, after a quiet while."""
+VERSION_CHECKS_PER_KNOWN_PER_S = 5
+"""The same from each address where a peer is known to be: more than a peer of another version sends."""
+VERSION_CHECKS_PER_KNOWN_BURST = 10
+"""So many at once, after a quiet while."""
+VERSION_CHECK_BYTES = 4096
+"""Longer messages are not compared: twice the longest initiation of this version, and room for certificates."""
 COOKIE_REPLIES_PER_PREFIX_PER_S = 10
 """Cookie replies a second to one network: an IPv4 /24 or an IPv6 /64. A forger of addresses may choose any of its
 hosts, and one radio often leads to all of them. With IPv4 and UDP headers 6.4 kbit/s."""
@@ -154,10 +177,116 @@ INDEX_QUARANTINE_S = 600.0
 """An index that carried a session is not used again for this long: a late envelope is late, not forged."""
 QUARANTINED_PER_PEER = 1024
 """Quarantined indices of one peer: a peer that makes more sessions cannot use up the indices of all others."""
-CHALLENGE_INTERVAL_S = 0.25
-"""A new path is challenged at most this often."""
-CHALLENGE_LIFETIME_S = 5.0
-"""How long a path challenge may be answered."""
+CONFIGURED_PATHS = 8
+"""Slots of a peer for configured paths."""
+PATHS_PER_HOST = 2
+"""Of these, so many along one socket to one host of the peer."""
+LEARNED_PATHS = 4
+"""Slots of a peer for addresses from which its envelopes came."""
+QUESTION_LIFETIME_S = 5.0
+"""How long a question may be answered."""
+FIRST_PATH_S = 10.0
+"""How long the path of a session's first envelope carries traffic without an answer, if it is not configured."""
+QUESTIONS_PER_PATH = 24
+"""Questions that wait along one path: one each quarter of a second until the oldest expires, and some more."""
+PROBE_FAST_S = 0.25
+"""Between questions along the path of the stream, if another one is usable, and along one that is suspect."""
+SETTLING_ANSWERS = 8
+"""A new path is asked fast until so many answers: RTTVAR begins at half of SRTT (RFC 6298), which is too much."""
+PROBE_BUDGET_SHARE = 0.05
+"""Probes use at most this part of the budget of a network."""
+PROBE_BYTES = 88
+"""A question and an answer in their envelopes, with the long header and a 16-byte tag."""
+ECHO_BYTES = 76
+"""The same of an echo request and its reply."""
+IP_BYTES = 48
+"""IPv6 and UDP: the most that an IP network adds to a datagram."""
+QUESTION_EARLY_S = 0.05
+"""A question joins an envelope of the stream if it is due within this time."""
+PROBE_STANDBY_S = 2.0
+"""Between questions along a path that stands by."""
+PROBE_DOWN_S = 1.0
+"""Between questions along a path that is down, or never answered."""
+PROBE_LONG_DOWN_S = 5.0
+"""The same after :data:`LONG_DOWN_S`."""
+FORMER_PATH_S = 30.0
+"""A repeat along a validated path that went down so recently is a late copy."""
+LONG_DOWN_S = 60.0
+"""A path that did not work for so long is asked less often."""
+PROBE_IDLE_S = 15.0
+"""Between questions along a metered path that is not needed, and along all paths while no frames are sent."""
+IDLE_AFTER_S = 10.0
+"""A link is idle if no frames were sent for this long."""
+STREAM_ENVELOPES = 4
+"""A path carries stream with more envelopes of it than so many within :data:`STREAM_ENDS_AFTER_S`: the two a second
+of a ground station are not worth four questions."""
+STREAM_ENDS_AFTER_S = 1.0
+"""A path carries stream until it carried none for this long."""
+FIRST_ANSWER_S = 1.0
+"""How long the first answer may take before its path is suspect (RFC 6298, section 2.1)."""
+LEAST_ANSWER_S = 0.1
+"""The same for later answers, at least."""
+DOWN_AFTER_S = 1.0
+"""A path is down if two questions in a row were not answered, the first for this long."""
+SUSPECT_ENVELOPES = 10
+"""Loss makes a path suspect only if so many envelopes were sent along it."""
+SUSPECT_LOSS = 0.2
+"""More lost than this share makes a path suspect."""
+SUSPECT_WINDOW_S = 1.0
+"""Of the envelopes of this time."""
+RECOVERED_ANSWERS = 3
+"""A path that was down is usable again after so many answers,"""
+RECOVERED_AFTER_S = 2.0
+"""and this long after the first of them."""
+BETTER_SHARE = 0.2
+"""A path becomes the best if its cost is lower by this share,"""
+BETTER_BY_S = 0.01
+"""and by this,"""
+BETTER_FOR_S = 2.0
+"""for this long."""
+HELD_BACK_MOST_S = 64.0
+"""A path that lost frames again soon after it became the best waits before it may be the best again: twice as long
+each time, at most this long. A path that was the best for this long does not wait."""
+LOSS_PENALTY_S = 2.0
+"""What all of a path's loss would add to its cost: 100 ms for each 5 %."""
+LOSS_WINDOW_S = 4.0
+"""The loss of a path is that of this time."""
+LOSS_POINTS = 64
+"""Reports that are kept for it."""
+TRANSMISSIONS = 5
+"""How often a critical envelope is sent along a path, repeats included, at most."""
+REPAIR_WINDOW_S = 10.0
+"""Whether to repeat depends on the loss of this time."""
+LAG_WINDOW_S = 1.0
+"""A report contains the median lag of the copies of this time."""
+LAG_SAMPLES = 64
+"""Copies whose lag is kept for a path."""
+LAG_VALID_S = 3.0
+"""How long a reported lag counts."""
+COPIES_AFTER_ANSWER_S = 10.0
+"""A path that answered a question this recently gets copies of critical frames even if it is down."""
+CRITICAL_ENVELOPE_LIMIT = 320
+"""The longest critical envelope while two paths work; one frame may be longer. Each path carries it."""
+SMALLER_LIMITS = (548, 320)
+"""Bytes of envelopes that a path may carry if it does not carry longer ones: 576 (RFC 791) less 28, and the least."""
+ENVELOPE_AIR_S = 0.25
+"""On a slow network, frames share an envelope up to the length that it carries in this time,"""
+SLOW_ENVELOPE_LEAST = 120
+"""and at least this many bytes: below it, envelopes are mostly overhead,"""
+SLOW_ENVELOPE_MOST = 500
+"""and at most this many: then framing on a line adds at most 5 bytes."""
+LINE_BYTES = 5
+"""What framing on a line adds to a datagram: two bytes of COBS, two of the CRC, a delimiter."""
+LIMIT_TESTS = 3
+"""Padded probes without an answer, while others are answered, that lower the limit of a path."""
+LIMIT_TEST_S = 1.0
+"""Between two of them."""
+REKEYS_ALONG_BEST = 2
+"""Tries at new keys that go along the best path alone while it works."""
+COPIES_OF_A_RESPONSE = 12
+"""Paths along which one response is sent: as many as there are slots."""
+METERED_RETRIES = ((60.0, 15.0), (600.0, 60.0))
+"""After so many seconds of tries without an answer, the seconds between two along metered paths."""
 LATE_STEP_S = 0.25
 """Counters of the past are remembered in such steps: what is late is so by up to one of them more."""
 HOLD_S = 1.0
@@ -176,13 +305,20 @@ REFUSALS_SENDS = 2
 """A changed count is in so many reports: at 30 % loss at least one of them arrives in 91 % of cases."""
 REFUSALS_KEPT = 64
 """Kinds of refused frames that are counted for one peer, and claims of it that are kept."""
+ECHO_BUDGET_SHARE = 0.05
+"""Periodic echo requests and their replies use at most this part of the budget of a network,"""
+HOLD_AIRTIMES = 8
+"""and frames wait for the answer so many times as long as its request and its reply take there; at least `HOLD_S`,
+at most `LATE_AFTER_S`."""
+ASK_AIRTIMES = 2
+"""The peer is asked again after so many times as long, at least `HOLD_ASK_S`."""
 HELD_BYTES = 65536
 """Of frames that wait so, on one session: the largest envelope fits; a second of a fast link does too."""
 HELD_OVERHEAD_BYTES = 64
 """Counted with each of them, so that many small ones are bounded too."""
 
-REPLAY_WINDOW = 2048
-"""Envelopes that may overtake one another: four seconds of PX4's busiest mode, one frame each."""
+REPLAY_WINDOW = 8192
+"""Envelopes that may overtake one another: 0.8 s at 10,000 a second, for paths that differ by half of that."""
 MIN_ENVELOPE_LIMIT = 320
 """Smallest limit on an envelope: the largest MAVLink frame is 280 bytes, header and tag at most 39."""
 MAX_ENVELOPE_LIMIT = 65000

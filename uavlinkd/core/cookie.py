@@ -15,13 +15,24 @@ from uavlinkd.core.path import Path
 _NO_COOKIE = bytes(c.MAC_BYTES)
 
 
+def mac1_key(public_key: bytes, protocol_name: bytes) -> bytes:
+    """The key of mac1 in messages to the holder of ``public_key``, in one version of the protocol."""
+    return sha256(protocol_name + b" mac1" + public_key)
+
+
+def fits_mac1(key: bytes, datagram: bytes) -> bool:
+    """Whether the mac1 of a handshake message was made with this key."""
+    covered = datagram[: -wire.MACS_BYTES]
+    return equal(hmac_sha256(key, covered)[: c.MAC_BYTES], mac1_of(datagram))
+
+
 class MacKeys:
     """The keys that follow from one static public key: anyone who knows it can make mac1 and open cookies."""
 
     __slots__ = ("_cookie", "_mac1")
 
     def __init__(self, public_key: bytes) -> None:
-        self._mac1 = sha256(c.PROTOCOL_NAME + b" mac1" + public_key)
+        self._mac1 = mac1_key(public_key, c.PROTOCOL_NAME)
         self._cookie = sha256(c.PROTOCOL_NAME + b" cookie" + public_key)
 
     def add_macs(self, message: bytes, cookie: bytes | None) -> bytes:
@@ -37,8 +48,7 @@ class MacKeys:
         Raises:
             Drop: ``BAD_MAC1``.
         """
-        covered = datagram[: -wire.MACS_BYTES]
-        if not equal(hmac_sha256(self._mac1, covered)[: c.MAC_BYTES], mac1_of(datagram)):
+        if not fits_mac1(self._mac1, datagram):
             raise Drop(DropReason.BAD_MAC1)
 
     def seal_cookie(self, cookie: bytes, nonce: bytes, mac1: bytes) -> bytes:
@@ -103,4 +113,4 @@ class CookieJar:
 
 
 def _cookie(secret: bytes, path: Path) -> bytes:
-    return hmac_sha256(secret, " ".join(map(str, path.address)).encode())[: c.MAC_BYTES]
+    return hmac_sha256(secret, " ".join(map(str, path.place)).encode())[: c.MAC_BYTES]

@@ -30,6 +30,10 @@ class DropReason(Reason):
     # Handshake.
     UNEXPECTED_RESPONSE = "unexpected_response", "the response belongs to no pending initiation of this daemon"
     BAD_MAC1 = "bad_mac1", "the sender does not know this daemon's public key, or the message was altered"
+    OTHER_VERSION = (
+        "other_version",
+        "the sender knows this daemon's public key, but uses another protocol version: update the older side",
+    )
     COOKIE_REQUIRED = (
         "cookie_required",
         "the daemon is under load, or a peer initiates too often: it sent a cookie, which the sender must return",
@@ -39,6 +43,10 @@ class DropReason(Reason):
         "handshake messages or cookie replies exceed the limit of one source, or of all sources together",
     )
     REPLAYED_INITIATION = "replayed_initiation", "the daemon read this initiation before: a sender replays it"
+    WRONG_NETWORK = (
+        "wrong_network",
+        "the datagram is of a peer that is not at the other end of this line or other point-to-point network",
+    )
     INVALID_KEY_SHARE = (
         "invalid_key_share",
         "the public value is outside its group, or leads to a secret that anyone knows",
@@ -72,17 +80,21 @@ class DropReason(Reason):
     TOO_LONG = "too_long", "the envelope is longer than both ends agreed"
     SESSION_EXPIRED = "session_expired", "the keys of the envelope are too old"
     LONG_COUNTER = "long_counter", "the envelope has a small counter in the long form"
+    DUPLICATE = (
+        "duplicate",
+        "a copy of an envelope or initiation that had just arrived: peers send copies along several paths",
+    )
+    LATE_COPY = "late_copy", "a copy of an older envelope came along a path of the peer, which is slow or was blocked"
     REPLAYED = (
         "replayed",
-        "the counter was accepted before: an attacker replays the envelope, or the network duplicated it",
+        "an older envelope came again, along no proven path of the peer: an attacker replays it",
     )
-    TOO_OLD = "too_old", "the counter is behind the replay window: the envelope was replayed or delayed"
     DELAYED = "delayed", "the peer sent the envelope too long ago: it was delayed on its path"
     BAD_TAG = "bad_tag", "the tag does not verify: the envelope was altered or forged"
     BAD_CONTROL = "bad_control", "the envelope is authentic, but its control record is invalid"
-    BAD_PATH_RESPONSE = (
-        "bad_path_response",
-        "the response belongs to no path challenge, came too late, or came along another path",
+    UNEXPECTED_ANSWER = (
+        "unexpected_answer",
+        "the answer belongs to no question that waits, or came along another path than the question",
     )
     DOUBTFUL = (
         "doubtful",
@@ -97,14 +109,19 @@ class DropReason(Reason):
     TOO_LARGE = "too_large", "an outgoing frame is larger than an envelope to the peer may be"
 
 
+Detail = bytes | str | int
+"""A fact about a dropped datagram; an empty string without one."""
+
+
 class Drop(Exception):  # noqa: N818  not an error of ours: the ordinary fate of a bad datagram
     """Raised inside the core for a bad datagram. ``Node.receive`` catches it, counts it and raises nothing."""
 
-    def __init__(self, reason: DropReason, detail: bytes | str = "") -> None:
+    def __init__(self, reason: DropReason, detail: Detail = "") -> None:
         super().__init__(reason)
         self.reason = reason
         self.detail = detail
-        """The public key that is not configured (bytes), or the name of the suite that the peer offered (str).
+        """The public key that is not configured (bytes), the name of the suite that the peer offered (str), or the
+        version of the protocol that the sender speaks (int).
 
         The log formats it when it writes a line, not for each drop.
         """

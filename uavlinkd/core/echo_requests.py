@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from uavlinkd.core import constants as c
+from uavlinkd.core.path_loss import NO_REPEATS, Repeats
 from uavlinkd.core.session import Session
 
 
@@ -15,6 +16,10 @@ class EchoRequest:
     session: Session | None
     """On which it was sent; None if that has ended."""
     sent_at: float
+    sent: int
+    """Envelopes of the session until then, the request included."""
+    repeats: Repeats
+    """Of them, along the best path."""
     is_answered: bool = False
 
 
@@ -33,11 +38,11 @@ class EchoRequests:
     def __len__(self) -> int:
         return len(self._by_token)
 
-    def add(self, session: Session, now: float) -> int:
+    def add(self, session: Session, now: float, sent: int = 0, repeats: Repeats = NO_REPEATS) -> int:
         """The token of a new request."""
         self._last += 1
         token = self._last % 2**32
-        self._by_token[token] = EchoRequest(session, now)
+        self._by_token[token] = EchoRequest(session, now, sent, repeats)
         return token
 
     def expire(self, now: float) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from uavlinkd.core import constants as c
-from uavlinkd.core import freshness, handshake, wire
+from uavlinkd.core import freshness, handshake, probing, wire
 from uavlinkd.core.cookie import mac1_of
 from uavlinkd.core.drops import Drop
 from uavlinkd.core.handshake import Keys, Received
@@ -14,6 +14,7 @@ from uavlinkd.core.peer import Peer
 from uavlinkd.core.send import ask_for_echo, seal, transmit
 from uavlinkd.core.session import Session
 from uavlinkd.core.sessions import Unconfirmed
+from uavlinkd.core.settings import Class
 from uavlinkd.core.suites import Suite
 from uavlinkd.core.timers import Timer
 
@@ -23,37 +24,52 @@ from uavlinkd.core.timers import Timer
 def initiate(peer: Peer, now: float) -> list[Output]:
     """Send the next initiation, and set when to repeat it. Without an address nothing is sent."""
     initiator = peer.initiator
-    if not (candidates := peer.candidates()):
+    is_silent = peer.unanswered_since is not None and now >= peer.unanswered_since + peer.handshake_after_s
+    is_answering = peer.is_up and not is_silent
+    unmetered, metered = peer.paths.handshake_paths(is_answering=is_answering)
+    if not unmetered and not metered:
         return []
     if peer.keys_wanted_at() > initiator.initiated_at:  # none was wanted between the last initiation and this one
         initiator.reset()
     if initiator.attempts and peer.is_up:
         peer.traffic.handshakes_unanswered += 1
-    path = initiator.next_path(candidates, now)
+    paths = unmetered + initiator.take_metered(metered, now)
+    if initiator.attempts < c.REKEYS_ALONG_BEST and is_answering and peer.paths.works:
+        paths = paths[:1]
+    paths, slow_at = initiator.take_slow(paths, now)
+    initiator.begin_try(now, is_metered=not unmetered, slow_at=slow_at)
     peer.set_initiate()
+    if not paths:
+        return []
     try:
         index = peer.indices.pick(now)
     except Drop as drop:  # every index is taken: as if the initiation had been lost
         return peer.drop(drop.reason, 1)
-    pending, datagram = initiator.initiate(index, path, peer.sessions.generation, now)
+    pending, datagrams = initiator.initiate(index, paths, peer.sessions.generation, now)
     peer.indices.owners[index] = peer, pending
     peer.timers.set(Timer.INITIATION_EXPIRY, initiator.next_expiry())
-    return transmit(peer, datagram, path)
+    return [sent for datagram, path in datagrams for sent in transmit(peer, datagram, path, is_copy=path != paths[0])]
 
 
-def receive_response(peer: Peer, pending: Pending, response: wire.Response, now: float) -> list[Output]:
-    """The response to an own initiation: the session is confirmed here, and the peer learns it at once.
+def receive_response(peer: Peer, pending: Pending, response: wire.Response, path: Path, now: float) -> list[Output]:
+    """The first response to an own initiation: the session is confirmed here, and the peer learns it at once.
 
     Raises:
         Drop: as :meth:`Initiator.receive_response`; then nothing was changed.
     """
     keys = peer.initiator.receive_response(pending, response)
     session = _session(peer, response.suite, keys, response.receiver_index, now, is_initiator=True)
-    events = adopt(peer, session, pending.path, now) + peer.note_received(now)
+    if path not in pending.paths:  # it was sent on from elsewhere, or our network changed
+        path = pending.paths[0]
+    events = adopt(peer, session, path, now) + peer.note_received(now)
     # The confirmation; any later envelope repeats it. It asks for an echo: so it is long enough to be challenged if a
     # relay sends it from elsewhere, and it gives the round trip at once. It goes out before the events: what those
     # end, such as a session by a previous key, must not end before the peer has this session.
-    return ask_for_echo(peer, session, pending.path, now) + events
+    if session is not peer.sessions.current:
+        state = peer.paths.find(path)
+        return ask_for_echo(peer, session, now, () if state is None else (state,)) + events
+    out = ask_for_echo(peer, session, now) + events
+    return out + probing.ask_everywhere(peer, session, now)
 
 
 def receive_cookie(peer: Peer, mac1: bytes, path: Path, reply: wire.CookieReply, now: float) -> None:
@@ -70,7 +86,7 @@ def receive_cookie(peer: Peer, mac1: bytes, path: Path, reply: wire.CookieReply,
 def receive_hint(peer: Peer, now: float) -> list[Output]:
     """An envelope for a session unknown here came from the peer's address: perhaps this daemon restarted."""
     silent_since = peer.unanswered_since
-    is_silent = silent_since is not None and now >= silent_since + peer.durations.echo_after_s
+    is_silent = silent_since is not None and now >= silent_since + peer.echo_after_s
     if peer.sessions.current is not None and not is_silent:
         return []  # the peer sends on a session of ours: the hint is false, and anyone can replay an old envelope
     if now < peer.hinted_at + c.HINTS_INTERVAL_S:
@@ -82,7 +98,7 @@ def receive_hint(peer: Peer, now: float) -> list[Output]:
 # The responder's side.
 
 
-def answer(peer: Peer, received: Received, path: Path, now: float) -> list[Output]:
+def answer(peer: Peer, received: Received, initiation: bytes, path: Path, now: float) -> list[Output]:
     """Answer an authentic initiation. The session waits, beside what is there, until it is confirmed.
 
     Raises:
@@ -90,21 +106,31 @@ def answer(peer: Peer, received: Received, path: Path, now: float) -> list[Outpu
     """
     suite = received.initiation.suite
     index = peer.indices.pick(now)
-    message, keys = handshake.respond(received, peer.settings, index, peer.sessions.generation, peer.entropy)
-    datagram = peer.initiator.add_macs(message, path, now)
+    response, keys = handshake.respond(received, peer.settings, index, peer.sessions.generation, peer.entropy)
+    datagram = peer.initiator.add_macs(response, path, now)
     session = _session(peer, suite, keys, index, now, is_initiator=False)
-    is_expected, expires_at = path in peer.candidates(), now + c.UNCONFIRMED_LIFETIME_S
-    peer.sessions.wait(Unconfirmed(session, path, is_expected, mac1_of(datagram), expires_at))
+    is_expected, expires_at = peer.paths.find(path) is not None, now + c.UNCONFIRMED_LIFETIME_S
+    macs = mac1_of(initiation), mac1_of(datagram)
+    waiting = Unconfirmed(session, macs[0], len(initiation), response, [path], is_expected, macs[1], expires_at)
+    peer.sessions.wait(waiting)
     peer.indices.owners[index] = peer, session
     peer.timers.set(Timer.SESSION_EXPIRY, peer.sessions.next_expiry())
     return transmit(peer, datagram, path)
+
+
+def answer_copy(peer: Peer, waiting: Unconfirmed, path: Path, now: float) -> list[Output]:
+    """A copy of an answered initiation came along another path: the same response goes back there, once."""
+    if path in waiting.paths or len(waiting.paths) >= c.COPIES_OF_A_RESPONSE:
+        return []
+    waiting.paths.append(path)
+    return transmit(peer, peer.initiator.add_macs(waiting.response, path, now), path, is_copy=True)
 
 
 # Both sides.
 
 
 def adopt(peer: Peer, session: Session, path: Path, now: float) -> list[Output]:
-    """A session is confirmed. If it has the highest rank, traffic goes on it now, along the path that made it."""
+    """A session is confirmed, by a datagram along this path. If it has the highest rank, traffic goes on it now."""
     is_rekey = peer.sessions.current is not None
     peer.indices.owners[session.local_index] = peer, session
     out = freshness.end(peer, peer.sessions.confirm(session, now))
@@ -113,14 +139,15 @@ def adopt(peer: Peer, session: Session, path: Path, now: float) -> list[Output]:
     peer.timers.stop(Timer.INITIATION_EXPIRY)
     peer.traffic.handshakes += 1
     if peer.sessions.current is session:
-        peer.path = path
         peer.established_at = now
         peer.traffic.reported = (0, 0)
-        peer.challenger.note_handshake(path)
         peer.timers.set(Timer.KEEPALIVE, peer.sent_at + peer.durations.keepalive_s)
         agreed = session.parameters
         facts = agreed.generation, session.suite.name, agreed.confidential, session.tag_bytes, session.is_initiator
         out.append(SessionEstablished(peer, *facts, is_rekey))
+        out += probing.begin_session(peer, session, path, now)
+    else:
+        probing.follow_paths(peer, now)
     peer.timers.set(Timer.SESSION_EXPIRY, peer.sessions.next_expiry())
     peer.set_initiate()
     return out
@@ -143,8 +170,8 @@ def receive_close(peer: Peer, session: Session, now: float) -> list[Output]:
 def close(peer: Peer, now: float) -> list[Output]:
     """Send a close on the current session and forget every key."""
     session, out = peer.sessions.current, list[Output]()
-    if session is not None and peer.path is not None and now < session.reject_at:
-        out += seal(peer, session, wire.Close().encode(), peer.path, now)
+    if session is not None and now < session.reject_at:
+        out += seal(peer, session, wire.Close().encode(), peer.paths.routes[Class.CRITICAL], now)
     out += freshness.end(peer, peer.sessions.clear(now))
     peer.initiator.cancel()
     peer.is_up = False

@@ -11,6 +11,7 @@ from uavlinkd.core.constants import NEVER
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.outputs import Deliver, FreshnessUnverified, FreshnessVerified, Output
 from uavlinkd.core.peer import Peer
+from uavlinkd.core.refusals import RefusalReport
 from uavlinkd.core.send import ask_for_echo
 from uavlinkd.core.session import Session
 
@@ -21,15 +22,15 @@ def deliver(peer: Peer, session: Session, counter: int, payload: bytes, now: flo
     verification = session.verification
     if now >= verification.ask_at and peer.sessions.is_in_use(session):
         verification.begin()
-        out += _ask(peer, session, now)
+        out += ask_for_echo(peer, session, now, peer.paths.echo_route)
     if now <= verification.until:
-        return [*out, Deliver(peer, payload)]
-    if peer.unverified_since is None and now > verification.until + c.HOLD_S:
+        return [*out, Deliver(peer, payload, session.order_of(counter))]
+    if peer.unverified_since is None and now > verification.until + session.held.pace.hold_s:
         peer.unverified_since = now
         out.append(FreshnessUnverified(peer))
     passing, waiting = peer.screen(payload)
     if passing:
-        out.append(Deliver(peer, passing))
+        out.append(Deliver(peer, passing, session.order_of(counter)))
     if waiting:
         out += hold(peer, session, counter, waiting, now)
     return out
@@ -45,7 +46,19 @@ def question(peer: Peer, session: Session, now: float) -> list[Output]:
     """Something came that may be old: ask the peer, unless the daemon asks already."""
     if session not in peer.sessions.confirmed:  # it ended as soon as it was confirmed
         return _drop_held(peer, session)
-    return _ask(peer, session, now) if session.held.begin(now) else []
+    return ask_for_echo(peer, session, now) if session.held.begin(now) else []
+
+
+def receive_report(
+    peer: Peer, session: Session, counter: int, report: RefusalReport, now: float, *, is_new: bool
+) -> list[Output]:
+    """Note a report. After a silence it waits for proof: older totals must not replace newer ones, nor look new."""
+    if is_new:
+        peer.refusal_claims.note(report, now)
+        return []
+    if session.unverified_report is None or session.unverified_report[0] < counter:
+        session.unverified_report = counter, report
+    return question(peer, session, now)
 
 
 def receive_answer(peer: Peer, echo: wire.Echo, now: float) -> list[Output]:
@@ -60,6 +73,8 @@ def receive_answer(peer: Peer, echo: wire.Echo, now: float) -> list[Output]:
         return []
     request.is_answered = True
     peer.round_trip_s = now - request.sent_at
+    peer.paths.note_echo(peer.round_trip_s, now)
+    peer.set_waits()
     session = request.session
     if session is None:
         return []
@@ -69,11 +84,14 @@ def receive_answer(peer: Peer, echo: wire.Echo, now: float) -> list[Output]:
     if peer.unverified_since is not None:
         out.append(FreshnessVerified(peer, now - peer.unverified_since))
         peer.unverified_since = None
-    if peer.round_trip_s <= c.HOLD_S:
+    if peer.round_trip_s <= session.held.pace.hold_s:
         session.trusted_until = now + c.LATE_AFTER_S
         out += peer.note_received(now)
+        waiting, session.unverified_report = session.unverified_report, None
+        if waiting is not None and waiting[0] >= echo.fresh:
+            peer.refusal_claims.note(waiting[1], now)
         new, late = session.held.release(echo.fresh)
-        out += [Deliver(peer, payload) for payload in new]
+        out += [Deliver(peer, payload, session.order_of(counter)) for counter, payload in new]
         out += peer.drop(DropReason.DELAYED, late)
     return out
 
@@ -86,12 +104,12 @@ def handle_timeout(peer: Peer, now: float) -> list[Output]:
         if now >= held.due_at:
             out += peer.drop(DropReason.DOUBTFUL, held.expire(now))
             if held.is_request_due(now):
-                out += _ask(peer, session, now)
+                out += ask_for_echo(peer, session, now)
         if now >= verification.due_at:
             if now > session.trusted_until:  # no frames arrive: the next one is asked about
                 verification.stop()
             else:
-                out += _ask(peer, session, now)
+                out += ask_for_echo(peer, session, now)
     peer.set_freshness()
     return out
 
@@ -104,11 +122,6 @@ def end(peer: Peer, sessions: list[Session]) -> list[Output]:
         peer.echo_requests.forget(session)
         peer.traffic.missing += session.missing(NEVER)
     return out
-
-
-def _ask(peer: Peer, session: Session, now: float) -> list[Output]:
-    assert peer.path is not None, "a session came along a path"
-    return ask_for_echo(peer, session, peer.path, now)
 
 
 def _refute(peer: Peer) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 from uavlinkd.core import constants as c
@@ -13,6 +14,7 @@ from uavlinkd.core.indices import Indices
 from uavlinkd.core.kem import OneCiphertext
 from uavlinkd.core.path import Path
 from uavlinkd.core.settings import PeerSettings
+from uavlinkd.core.socket_facts import SocketFacts
 
 
 @dataclass(slots=True)
@@ -22,10 +24,13 @@ class Pending:
     initiated: Initiated
     mac1: bytes
     """Of the initiation; a cookie reply refers to it."""
-    path: Path
+    paths: tuple[Path, ...]
+    """Where it was sent, the best first."""
     expires_at: float
-    has_cookie: bool = False
-    """Whether a cookie reply to it was accepted: a second one is not."""
+    is_slow: bool = False
+    """Whether it was sent along a slow network: its response may take as long as several tries along others."""
+    cookied: set[Path] = field(default_factory=set)
+    """Paths along which a cookie reply to it was accepted: a second one is not."""
     once: OneCiphertext | None = field(init=False, default=None)
     """The secret for its suite's group, which a response may use; None without a group."""
 
@@ -35,16 +40,20 @@ class Pending:
 
 
 class Initiator:
-    """Initiates to one peer, at growing intervals, at each of its addresses in turn, indefinitely.
+    """Initiates to one peer, at growing intervals, along all of its paths, indefinitely.
 
     Each try has fresh keys. Several stay answerable, so that a response over a slow path still finds its initiation.
     """
 
     def __init__(
-        self, settings: PeerSettings, identity: KeyPair, indices: Indices[object], entropy: Entropy, now: float
+        self,
+        settings: PeerSettings,
+        identity: KeyPair,
+        indices: Indices[object],
+        entropy: Entropy,
+        facts: SocketFacts,
+        now: float,
     ) -> None:
-        self.paths: tuple[Path, ...] = ()
-        """Where the configuration says that the peer is."""
         self.pending: dict[int, Pending] = {}
         """By our index, the oldest first."""
         self.retry_at = now
@@ -55,34 +64,92 @@ class Initiator:
         self._identity = identity
         self._indices = indices
         self._entropy = entropy
+        self._facts = facts
         self._mac_keys = MacKeys(settings.public_key)
         self.initiated_at = -c.NEVER
         """When the last initiation was sent."""
+        self._began_at = now  # the first of the tries since new keys were wanted
+        self._metered_at = -c.NEVER  # the next initiation along a metered path, of a peer that does not answer
+        self._metered_turn = -1
+        self._slow_at: dict[int, float] = {}  # by socket of a network with a budget: the next initiation there
         self._received_cookies: dict[Path, tuple[bytes, float]] = {}  # the peer's, and until when; the oldest first
 
-    def next_path(self, candidates: list[Path], now: float) -> Path:
-        """Where the next initiation goes. Schedules the one after it."""
-        path = candidates[self.attempts % len(candidates)]
+    def take_metered(self, paths: list[Path], now: float) -> list[Path]:
+        """Of metered paths those along which to initiate now: fewer the longer the peer does not answer."""
+        wait_s = self._metered_wait_s(now)
+        if not wait_s or not paths:
+            return paths
+        if now < self._metered_at:
+            return []
+        self._metered_at = now + wait_s
+        self._metered_turn += 1
+        return [paths[self._metered_turn % len(paths)]]
+
+    def take_slow(self, paths: list[Path], now: float) -> tuple[list[Path], float]:
+        """Of these paths those along which to initiate now, and when the next try is due if all of them are slow.
+
+        On a network with a budget the tries are :data:`c.TRY_AIRTIMES` airtimes apart, whatever other networks do.
+        """
+        taken: list[Path] = []
+        slow_at, is_free = c.NEVER, False
+        sockets: set[int] = set()
+        for path in paths:
+            interval_s = self._try_interval_s(path)
+            if not interval_s:
+                is_free = True
+                taken.append(path)
+                continue
+            if path.socket in sockets or now >= self._slow_at.get(path.socket, now):
+                sockets.add(path.socket)
+                self._slow_at[path.socket] = now + interval_s * self._jitter()
+                taken.append(path)
+            slow_at = min(slow_at, self._slow_at[path.socket])
+        return taken, now if is_free else slow_at
+
+    def _try_interval_s(self, path: Path) -> float:
+        """Between tries along a path; 0 if it carries the usual ones."""
+        interval_s = self._facts.try_interval_s(path, self._settings.link.suites[0])
+        return interval_s if interval_s > self._settings.link.timers.retry_min_s else 0.0
+
+    def _jitter(self) -> float:
+        return 1.0 + c.RETRY_JITTER * int.from_bytes(self._entropy(2), "big") / 2**16
+
+    def _metered_wait_s(self, now: float) -> float:
+        silent_s = now - self._began_at if self.attempts else 0.0
+        return max((wait_s for after_s, wait_s in c.METERED_RETRIES if silent_s >= after_s), default=0.0)
+
+    def begin_try(self, now: float, *, is_metered: bool = False, slow_at: float = 0.0) -> None:
+        """An initiation is to be sent now. Schedules the one after it. ``is_metered``: every path is metered.
+
+        ``slow_at``: see :meth:`take_slow`.
+        """
+        if not self.attempts:
+            self._began_at = now
         timers = self._settings.link.timers
         # Bounded before the power is taken: a peer may stay away for years.
         doublings = min(self.attempts // c.RETRIES_PER_WAIT, 32)
         wait = min(timers.retry_min_s * 2.0**doublings, timers.retry_max_s)
-        # Where there are several addresses, each has its turn as often as a single one would, down to the first wait.
-        wait = max(wait / len(candidates), timers.retry_min_s)
-        jitter = c.RETRY_JITTER * int.from_bytes(self._entropy(2), "big") / 2**16
         self.attempts += 1
         self.initiated_at = now
-        self.retry_at = now + wait * (1.0 + jitter)
-        return path
+        self.retry_at = max(now + wait * self._jitter(), slow_at)
+        if is_metered and self._metered_wait_s(now):
+            self.retry_at = max(self.retry_at, self._metered_at)
 
-    def initiate(self, index: int, path: Path, generation: int, now: float) -> tuple[Pending, bytes]:
-        """An initiation under this index, and its datagram."""
+    def initiate(
+        self, index: int, paths: Sequence[Path], generation: int, now: float
+    ) -> tuple[Pending, list[tuple[bytes, Path]]]:
+        """An initiation under this index, and its datagram for each path. They are equal up to mac1."""
         initiated = handshake.initiate(self._identity, self._settings, index, generation, self._entropy)
-        datagram = self.add_macs(initiated.message, path, now)
+        datagrams = [(self.add_macs(initiated.message, path, now), path) for path in paths]
+        mac1 = mac1_of(datagrams[0][0])
+        slowest_s = max(map(self._try_interval_s, paths))
+        expires_at = now + max(c.PENDING_LIFETIME_S, slowest_s)
         while len(self.pending) >= c.PENDING_PER_PEER:
-            self._forget(next(iter(self.pending)))
-        pending = self.pending[index] = Pending(initiated, mac1_of(datagram), path, now + c.PENDING_LIFETIME_S)
-        return pending, datagram
+            # Fast tries along one network must not push out the one that a slow network still carries.
+            fast = (old for old, waiting in self.pending.items() if not waiting.is_slow)
+            self._forget(next(fast, next(iter(self.pending))))
+        pending = self.pending[index] = Pending(initiated, mac1, tuple(paths), expires_at, slowest_s > 0)
+        return pending, datagrams
 
     def receive_response(self, pending: Pending, response: wire.Response) -> Keys:
         """The keys of the session that this response makes. Its index is not free: it is the session's now.
@@ -117,6 +184,12 @@ class Initiator:
         """A handshake message to the peer with its macs, under the cookie for this path while there is one."""
         cookie, held_until = self._received_cookies.get(path, (None, now))
         return self._mac_keys.add_macs(message, cookie if now < held_until else None)
+
+    def hurry(self, now: float) -> None:
+        """A network has appeared or changed: try at once, and often."""
+        self.attempts = 0
+        self._slow_at.clear()
+        self.retry_at = min(self.retry_at, now)
 
     def reset(self) -> None:
         """No new keys are wanted now: the next initiation is repeated after the shortest wait."""

@@ -8,13 +8,13 @@ sends; any exception is a fault of ours.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Hashable, Iterable, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 
 from uavlinkd.core import constants as c
 from uavlinkd.core import establish, handshake, wire
 from uavlinkd.core.admission import Admission, CookieRequired, Message
-from uavlinkd.core.cookie import CookieJar, MacKeys
-from uavlinkd.core.crypto import Entropy, KeyPair, Secret
+from uavlinkd.core.cookie import CookieJar, MacKeys, mac1_of
+from uavlinkd.core.crypto import Entropy, KeyPair, Secret, equal
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.indices import Indices
 from uavlinkd.core.initiator import Pending
@@ -23,13 +23,16 @@ from uavlinkd.core.path import Path, SocketAddress
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.receive import receive_envelope
 from uavlinkd.core.refusals import Refused
-from uavlinkd.core.send import report_refusals, send_frames
+from uavlinkd.core.send import note_repeat, recount, report_refusals, send_frames
 from uavlinkd.core.session import Session
-from uavlinkd.core.settings import PeerSettings, Screen, hold_all
+from uavlinkd.core.settings import Class, PeerSettings, Screen, hold_all
+from uavlinkd.core.socket_facts import SocketFacts
 from uavlinkd.core.timeouts import handle_timeout
 from uavlinkd.core.timers import Schedule
+from uavlinkd.core.versions import version_of
 
 _MAVLINK_STARTS = frozenset((0xFD, 0xFE))
+_NOT_OUR_VERSION = frozenset((DropReason.MALFORMED, DropReason.BAD_MAC1))
 
 
 class Node:
@@ -61,8 +64,9 @@ class Node:
         self._indices = Indices[tuple[Peer, Session | Pending]](entropy)
         self._by_keys: dict[tuple[bytes, bytes], Peer] = {}  # ours, theirs
         self._by_address: dict[SocketAddress, Peer] = {}
-        self._remembered: set[bytes] = set()  # ephemerals of authentic initiations, of every peer
+        self._remembered: dict[bytes, Peer] = {}  # by the ephemeral of an authentic initiation: its sender
         self._last_seen: Counter[SocketAddress] = Counter()  # where peers have proved to be, and how many
+        self._facts = SocketFacts()
         self._admission = Admission(self._is_known, now)
         self._schedule = Schedule[Peer]()
         self.peers: dict[str, Peer] = {}
@@ -97,8 +101,10 @@ class Node:
             raise ValueError(f"peer {settings.name} is there already")
         if settings.public_key in (self.public_key, None if previous is None else previous.public):
             raise ValueError(f"peer {settings.name} has this daemon's own key")
-        peer = Peer(settings, identity, self._indices, self._entropy, now, self._screen)
+        shared = self._screen, self._last_seen, self._facts
+        peer = Peer(settings, identity, self._indices, self._entropy, now, *shared)
         self.peers[settings.name] = self._by_keys[keys] = peer
+        self._facts.share_budgets(len(self.peers))
         return peer
 
     def forget_previous_key(self) -> None:
@@ -108,31 +114,90 @@ class Node:
     def remove_peer(self, peer: Peer, now: float) -> list[Output]:
         """Cut this peer off at once: its keys are forgotten, and nothing from it is accepted any more."""
         del self.peers[peer.name]
+        self._facts.share_budgets(len(self.peers))
         self._by_keys = {keys: other for keys, other in self._by_keys.items() if other is not peer}
         self._forget_addresses(peer)
-        self._remembered.difference_update(peer.remembered)
-        self._note_path(peer.path, None)
+        for ephemeral in peer.remembered:
+            self._remembered.pop(ephemeral, None)
         out = establish.close(peer, now)
+        peer.paths.clear()
         self._schedule.remove(peer)
         return out
 
     def set_paths(self, peer: Peer, paths: Iterable[Path], now: float) -> None:
-        """Where to initiate to this peer, the likeliest first. An authenticated path stays in use."""
+        """Where to initiate to this peer, the likeliest first. A path that works stays in use."""
         self._forget_addresses(peer)
-        peer.initiator.paths = tuple(paths)
-        for path in peer.initiator.paths:
-            self._by_address[path.address] = peer
+        peer.paths.configure(paths, now)
+        for path in peer.paths.configured:
+            self._by_address[path.place] = peer
+        self._revise_paths(peer, now)
+
+    def set_metered(self, sockets: Iterable[int], now: float) -> None:
+        """The sockets whose network is paid by the byte. A peer that does not answer is tried at once, and often."""
+        self._facts.metered = set(sockets)
+        for peer in self.peers.values():
+            peer.paths.set_metered()
+            peer.initiator.hurry(now)
+            self._revise_paths(peer, now)
+
+    def set_budgets(self, budgets: Mapping[int, float]) -> None:
+        """The bits a second that the networks of these sockets carry, of all peers together."""
+        self._facts.set_budgets(budgets)
+        self._facts.share_budgets(len(self.peers))
+
+    def set_envelope_limits(self, limits: Mapping[int, int]) -> None:
+        """The longest envelopes for the networks of these sockets, in bytes: :func:`.envelope_limit.limit_at`.
+
+        Frames share an envelope up to there; a longer one holds a single frame. The limits of other sockets end.
+        """
+        self._facts.envelope_limits = dict(limits)
+
+    def set_point_to_point(self, peers: Mapping[int, Iterable[Peer]]) -> None:
+        """The peers at the other end of these sockets: one daemon, which may have several pairs of keys.
+
+        Datagrams of other peers that arrive there are dropped, as ``wrong_network``. Other sockets may have any peer.
+        """
+        self._facts.set_point_to_point(peers)
+
+    def set_socket_state(self, socket: int, now: float, *, is_up: bool) -> None:
+        """The network behind a socket disappeared; or it appeared or changed, and its paths have to prove themselves.
+
+        The events come with the next :meth:`handle_timeout`, which is due at once.
+        """
+        for peer in self.peers.values():
+            peer.paths.set_socket_state(socket, now, is_up=is_up)
+            if is_up:
+                peer.initiator.hurry(now)
+            self._revise_paths(peer, now)
+
+    def _revise_paths(self, peer: Peer, now: float) -> None:
+        peer.paths.revise(now)
+        peer.set_paths_timer()
         peer.set_initiate()
         self._schedule.update(peer)
 
     # Inputs.
 
-    def send(self, peer: Peer, frames: Sequence[bytes], now: float) -> list[Output]:
-        """Send frames that are here together to a peer, in as few envelopes as hold them."""
-        out = send_frames(peer, frames, now)
+    def send(self, peer: Peer, frames: Sequence[bytes], now: float, cls: Class = Class.STREAM) -> list[Output]:
+        """Send frames of one class that are here together to a peer, in as few envelopes as hold them."""
+        out = send_frames(peer, frames, now, cls)
         if peer.timers.next_at < peer.timers.scheduled_at:
             self._schedule.update(peer)
         return out
+
+    def recount(self, peer: Peer, path: Path, datagrams: int, size: int) -> None:
+        """A copy that :meth:`send` returned waits or is dropped (-1 datagram), or is sent after it waited (1).
+
+        Otherwise the path would seem to lose what was never sent along it. ``size``: in bytes, with the same sign.
+        """
+        recount(peer, path, datagrams, size)
+
+    def note_repeat(self, peer: Peer, path: Path, number: int, size: int) -> None:
+        """A datagram of ``size`` bytes that :meth:`send` returned is sent along this path again.
+
+        ``number``: which transmission of the envelope it is along this path, 2 to :data:`c.TRANSMISSIONS`.
+        """
+        note_repeat(peer, path, number, size)
 
     def report_refusals(self, peer: Peer, changed: Iterable[Refused], now: float) -> list[Output]:
         """Report to the peer which of its frames are refused here: totals that changed since the last call."""
@@ -147,10 +212,9 @@ class Node:
             peer, session = self._indices.owners.get(index, (None, None))
             if peer is None or not isinstance(session, Session):
                 return self._receive_stray(datagram, index, path, now)
-            before = peer.path
+            if self._facts.peers_at:
+                self._check_network(peer, path)
             out = receive_envelope(peer, session, datagram, header_bytes, counter, path, now)
-            if peer.path is not before:
-                self._note_path(before, peer.path)
             if peer.timers.next_at < peer.timers.scheduled_at:
                 self._schedule.update(peer)
             return out
@@ -194,14 +258,14 @@ class Node:
     def claimed_sender(self, datagram: bytes, path: Path) -> Hashable:
         """The sender that a datagram claims to have. A busy shell lets senders take turns; nothing is authentic yet.
 
-        Of each peer the datagrams from where it is, and those from elsewhere, are two senders: a forger of its
+        Of each peer the datagrams from its paths, and those from elsewhere, are two senders: a forger of its
         envelopes has to forge its address too. So is each address where a peer is known to be, for datagrams that
         name no session. All others are one.
         """
         if datagram[:1] in wire.ENVELOPE_STARTS and (peer := self._claimed_peer(datagram)) is not None:
-            return peer, path == peer.path
-        address = path.address
-        return address if self._is_known(address) else None
+            state = peer.paths.find(path)
+            return peer, state is not None and state.is_proven
+        return path.place if self._is_known(path.place) else None
 
     def refuse(self, datagram: bytes, path: Path) -> Dropped:
         """Count a datagram that a busy shell does not hand over: its sender has more waiting than its share."""
@@ -213,7 +277,7 @@ class Node:
         if self._indices.is_quarantined(index, now):
             raise Drop(DropReason.LATE)
         out: list[Output] = []
-        if (peer := self._by_address.get(path.address)) is not None:
+        if (peer := self._by_address.get(path.place)) is not None:
             out += establish.receive_hint(peer, now)
             self._schedule.update(peer)
         return [*out, self._count(datagram, Drop(DropReason.UNKNOWN_INDEX), path)]
@@ -224,27 +288,35 @@ class Node:
         kind = datagram[0] if datagram else 0
         try:
             if kind == wire.INITIATION:
-                return self._receive_initiation(datagram, path, now)
+                try:
+                    return self._receive_initiation(datagram, path, now)
+                except Drop as drop:
+                    self._name_version(drop.reason, datagram, path, now)
+                    raise
             if kind == wire.RESPONSE:
                 return self._receive_response(datagram, path, now)
         except CookieRequired as drop:
             return [drop.reply, self._count(datagram, drop, path)]
         if kind == wire.COOKIE:
-            return self._receive_cookie(datagram, now)
+            return self._receive_cookie(datagram, path, now)
         raise Drop(DropReason.RAW_MAVLINK if kind in _MAVLINK_STARTS else DropReason.MALFORMED)
 
     def _receive_initiation(self, datagram: bytes, path: Path, now: float) -> list[Output]:
         initiation = wire.parse_initiation(datagram)
         self._admission.read(path, now)
         identity, cookies = self._addressed(datagram)
-        if initiation.ephemeral in self._remembered:  # before the budget: one recording must not use it up
-            raise Drop(DropReason.REPLAYED_INITIATION)
+        sender = self._remembered.get(initiation.ephemeral)
+        if sender is not None:  # before the budget: one recording must not use it up
+            self._check_network(sender, path)
+            return self._answer_copy(sender, datagram, path, now)
         message = Message(datagram, initiation.sender_index, path, cookies)
         self._admission.admit_initiation(message, now)
         received = handshake.receive_initiation(identity, initiation)
         peer = self._by_keys.get((identity.public, received.public_key))
         if peer is None:
             raise Drop(DropReason.UNKNOWN_PEER, received.public_key)
+        # Before it is remembered: otherwise a line could use up what this peer sends along its own network.
+        self._check_network(peer, path)
         self._remember(peer, initiation.ephemeral)
         try:
             out = self._answer(peer, received, message, now)
@@ -255,6 +327,19 @@ class Node:
         self._schedule.update(peer)
         return out
 
+    def _answer_copy(self, peer: Peer, datagram: bytes, path: Path, now: float) -> list[Output]:
+        """An initiation of this peer that was read before: it sends one along several paths.
+
+        Raises:
+            Drop: ``REPLAYED_INITIATION``, or ``DUPLICATE`` if the response went along this path already.
+        """
+        mac1 = mac1_of(datagram)
+        for waiting in peer.sessions.unconfirmed.values():
+            if equal(waiting.initiation_mac1, mac1):
+                out = establish.answer_copy(peer, waiting, path, now)
+                return [*out, peer.drop_datagram(DropReason.DUPLICATE, path)]
+        raise Drop(DropReason.REPLAYED_INITIATION)
+
     def _answer(self, peer: Peer, received: handshake.Received, message: Message, now: float) -> list[Output]:
         suite = received.initiation.suite
         self._admission.admit_answer(peer, message, now)
@@ -262,32 +347,33 @@ class Node:
             raise Drop(DropReason.SUITE_NOT_ACCEPTED, suite.name)
         if suite.has_group:
             self._admission.admit_group(peer, suite, message, now)
-        return establish.answer(peer, received, message.path, now)
+        return establish.answer(peer, received, message.datagram, message.path, now)
 
     def _receive_response(self, datagram: bytes, path: Path, now: float) -> list[Output]:
         response = wire.parse_response(datagram)
         peer, pending = self._indices.owners.get(response.receiver_index, (None, None))
         if peer is None or not isinstance(pending, Pending):
-            raise Drop(DropReason.UNEXPECTED_RESPONSE)
+            # The peer sends its response along several paths; the first one made the session.
+            is_copy = isinstance(pending, Session) and pending.remote_index == response.sender_index
+            raise Drop(DropReason.DUPLICATE if is_copy else DropReason.UNEXPECTED_RESPONSE)
+        self._check_network(peer, path)
         _, cookies = self._addressed(datagram)
         self._admission.admit_response(Message(datagram, response.sender_index, path, cookies), now)
-        before = peer.path
-        out = establish.receive_response(peer, pending, response, now)
-        self._note_path(before, peer.path)
+        out = establish.receive_response(peer, pending, response, path, now)
         self._schedule.update(peer)
         return out
 
-    def _receive_cookie(self, datagram: bytes, now: float) -> list[Output]:
+    def _receive_cookie(self, datagram: bytes, path: Path, now: float) -> list[Output]:
         reply = wire.parse_cookie_reply(datagram)
         peer, owner = self._indices.owners.get(reply.receiver_index, (None, None))
         if peer is None:
             raise Drop(DropReason.UNEXPECTED_COOKIE)
         asked = owner if isinstance(owner, Pending) else peer.sessions.unconfirmed.get(reply.receiver_index)
-        # One for each message: an observer of it can make more cookies, but has to be faster than the peer each time.
-        if asked is None or asked.has_cookie:
+        # One for each message and path: an observer can make more, but has to be faster than the peer each time.
+        if asked is None or path not in asked.paths or path in asked.cookied:
             raise Drop(DropReason.UNEXPECTED_COOKIE)
-        establish.receive_cookie(peer, asked.mac1, asked.path, reply, now)
-        asked.has_cookie = True
+        establish.receive_cookie(peer, asked.mac1, path, reply, now)
+        asked.cookied.add(path)
         self._schedule.update(peer)
         return []
 
@@ -306,32 +392,44 @@ class Node:
             return self._previous.identity, self._previous.cookies
         return self._identity, self._cookies
 
+    def _name_version(self, reason: DropReason, datagram: bytes, path: Path, now: float) -> None:
+        """Another version may have other lengths (malformed), and has another label of mac1.
+
+        Raises:
+            Drop: ``OTHER_VERSION``.
+        """
+        if reason not in _NOT_OUR_VERSION or not self._admission.may_compare_versions(path, now):
+            return
+        identities = [self._identity] + ([] if self._previous is None else [self._previous.identity])
+        if (version := version_of(datagram, (identity.public for identity in identities))) is not None:
+            raise Drop(DropReason.OTHER_VERSION, version)
+
     def _remember(self, peer: Peer, ephemeral: bytes) -> None:
         # A memory for each peer: no peer can make us forget what another sent.
-        self._remembered.add(ephemeral)
+        self._remembered[ephemeral] = peer
         peer.remembered.append(ephemeral)
         if len(peer.remembered) > c.REMEMBERED_INITIATIONS:
-            self._remembered.discard(peer.remembered.popleft())
+            self._remembered.pop(peer.remembered.popleft(), None)
 
     # Where peers are.
+
+    def _check_network(self, peer: Peer, path: Path) -> None:
+        """A datagram names this peer, or is of it.
+
+        Raises:
+            Drop: ``WRONG_NETWORK`` if it came along a network with another peer at its other end.
+        """
+        if not self._facts.leads_to(path.socket, peer):
+            raise Drop(DropReason.WRONG_NETWORK)
 
     def _is_known(self, address: SocketAddress) -> bool:
         """Whether a peer is configured at an address, or was last seen there."""
         return address in self._by_address or address in self._last_seen
 
-    def _note_path(self, before: Path | None, after: Path | None) -> None:
-        """The path to one peer has changed."""
-        if after is not None:
-            self._last_seen[after.address] += 1
-        if before is not None:
-            self._last_seen[before.address] -= 1
-            if not self._last_seen[before.address]:
-                del self._last_seen[before.address]
-
     def _forget_addresses(self, peer: Peer) -> None:
-        for path in peer.initiator.paths:
-            if self._by_address.get(path.address) is peer:
-                del self._by_address[path.address]
+        for path in peer.paths.configured:
+            if self._by_address.get(path.place) is peer:
+                del self._by_address[path.place]
 
     # Drops.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple, Protocol
 
-from uavlinkd.core.drops import DropReason
+from uavlinkd.core.drops import Detail, DropReason
 from uavlinkd.core.path import Path
 
 
@@ -21,6 +21,8 @@ class Transmit(NamedTuple):
 
     datagram: bytes
     path: Path
+    is_copy: bool = False
+    """Whether the same datagram goes along another path too, and this is not the first."""
 
 
 class Deliver(NamedTuple):
@@ -28,6 +30,8 @@ class Deliver(NamedTuple):
 
     peer: LinkedPeer
     payload: bytes
+    order: int = 0
+    """Grows in the order in which the peer sealed its envelopes, also from one session to the next."""
 
 
 class Dropped(NamedTuple):
@@ -40,7 +44,7 @@ class Dropped(NamedTuple):
     peer: LinkedPeer | None = None
     path: Path | None = None
     number: int = 1
-    detail: bytes | str = ""
+    detail: Detail = ""
 
 
 class PeerUp(NamedTuple):
@@ -75,10 +79,25 @@ class SessionEstablished(NamedTuple):
 
 
 class PathChanged(NamedTuple):
-    """The peer proved that it receives along ``path``; traffic goes there now."""
+    """Traffic goes along ``path`` now, and went along ``before``.
+
+    ``reason``: ``faster``, ``loss``, ``metered``, ``session`` (it was made there), or why the path before failed:
+    ``unanswered``, ``network``.
+    """
 
     peer: LinkedPeer
     path: Path
+    before: Path
+    reason: str
+
+
+class PathStateChanged(NamedTuple):
+    """A path became usable, or went down. ``reason``: ``answered``, ``unanswered`` or ``network``."""
+
+    peer: LinkedPeer
+    path: Path
+    is_usable: bool
+    reason: str
 
 
 class FreshnessUnverified(NamedTuple):
@@ -94,5 +113,14 @@ class FreshnessVerified(NamedTuple):
     unverified_s: float
 
 
-Event = PeerUp | PeerLost | PeerClosed | SessionEstablished | PathChanged | FreshnessUnverified | FreshnessVerified
+Event = (
+    PeerUp
+    | PeerLost
+    | PeerClosed
+    | SessionEstablished
+    | PathChanged
+    | PathStateChanged
+    | FreshnessUnverified
+    | FreshnessVerified
+)
 Output = Transmit | Deliver | Dropped | Event

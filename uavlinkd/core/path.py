@@ -7,6 +7,9 @@ from typing import NamedTuple
 SocketAddress = tuple[str, int] | tuple[str, int, int, int]
 """An Internet address as the kernel takes and gives it: host and port; for IPv6 also flow label and interface."""
 
+SERIAL_HOST = "serial"
+"""The host of the only path along a serial network: ``Path(socket, (SERIAL_HOST, 0))``."""
+
 
 class Path(NamedTuple):
     """A local socket and a peer's address there. The core compares paths, and sends along those that it was given."""
@@ -19,3 +22,13 @@ class Path(NamedTuple):
     def host(self) -> str:
         """The numeric host."""
         return self.address[0]
+
+    @property
+    def is_serial(self) -> bool:
+        """Whether it is a line, which has no addresses."""
+        return self.address[0] == SERIAL_HOST
+
+    @property
+    def place(self) -> SocketAddress:
+        """Where the peer is, whichever socket reaches it. Each line is a place of its own."""
+        return (SERIAL_HOST, self.socket) if self.is_serial else self.address

@@ -6,24 +6,26 @@ Functions change it, in modules by topic: :mod:`.send`, :mod:`.receive`, :mod:`.
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 
 from uavlinkd.core import constants as c
-from uavlinkd.core.challenge import Challenger
 from uavlinkd.core.constants import NEVER
 from uavlinkd.core.crypto import Entropy, KeyPair
-from uavlinkd.core.drops import DropReason
+from uavlinkd.core.drops import Detail, DropReason
 from uavlinkd.core.echo_requests import EchoRequests
 from uavlinkd.core.group_budget import GroupShare
 from uavlinkd.core.indices import Indices
 from uavlinkd.core.initiator import Initiator, Pending
 from uavlinkd.core.limits import TokenBucket
+from uavlinkd.core.missing import MissingEnvelopes
 from uavlinkd.core.outputs import Dropped, Output, PeerLost, PeerUp
-from uavlinkd.core.path import Path
+from uavlinkd.core.path import Path, SocketAddress
+from uavlinkd.core.paths import PathSet
 from uavlinkd.core.refusals import OwnRefusals, RefusalClaims
 from uavlinkd.core.session import Session
 from uavlinkd.core.sessions import Sessions
 from uavlinkd.core.settings import PeerSettings, Screen
+from uavlinkd.core.socket_facts import SocketFacts
 from uavlinkd.core.timers import Timer, TimerTable
 from uavlinkd.core.traffic import Traffic
 
@@ -39,12 +41,20 @@ class Peer:
         entropy: Entropy,
         now: float,
         screen: Screen,
+        known: Counter[SocketAddress],
+        facts: SocketFacts,
     ) -> None:
         self.settings = settings
         self.name = settings.name
         self.durations = timers = settings.link.timers
         self.silence_s = min(timers.echo_after_s, timers.handshake_after_s, timers.lost_after_s)
         """A silence is acted on after this, or later."""
+        self.echo_after_s, self.handshake_after_s, self.lost_after_s = (
+            timers.echo_after_s,
+            timers.handshake_after_s,
+            timers.lost_after_s,
+        )
+        """What a silence causes after each of them; longer on a slow path."""
         self.verify_interval_s = settings.link.verify_interval_s
         """Of the sessions that are made from now on."""
         self.indices = indices
@@ -53,9 +63,9 @@ class Peer:
         """Tells frames that may be old from those that must be new."""
         self.timers = TimerTable()
         self.traffic = Traffic()
-        self.initiator = Initiator(settings, identity, indices, entropy, now)
+        self.losses = MissingEnvelopes()
+        self.initiator = Initiator(settings, identity, indices, entropy, facts, now)
         self.sessions = Sessions(indices, self.name, has_smaller_key=identity.public < settings.public_key)
-        self.challenger = Challenger(entropy, self.traffic)
         self.echo_requests = EchoRequests()
         self.answers = TokenBucket(c.ANSWERS_PER_S, c.ANSWERS_BURST, now)
         """Responses that it may get without a cookie."""
@@ -66,8 +76,8 @@ class Peer:
         """Of the CPU time for the groups of its suites."""
         self.remembered: deque[bytes] = deque()
         """Ephemerals of its initiations, the oldest first."""
-        self.path: Path | None = None
-        """Where the peer has proved to be; traffic goes there."""
+        self.paths = PathSet(settings.link.redundancy, settings.link.idle_probe_s, known, facts)
+        """Where the peer is, or may be."""
         self.is_up = False
         self.established_at: float | None = None
         self.received_at: float | None = None
@@ -88,14 +98,18 @@ class Peer:
         self.refusal_claims = RefusalClaims()
         """What the peer says that it refuses of our frames. Nothing acts on it."""
 
-    def candidates(self) -> list[Path]:
-        """Where the peer may be: the path in use first, then its addresses."""
-        others = [path for path in self.initiator.paths if path != self.path]
-        return others if self.path is None else [self.path, *others]
+    @property
+    def path(self) -> Path | None:
+        """The best path: the stream goes there."""
+        return None if self.paths.best is None else self.paths.best.path
 
     def missing(self, now: float) -> int:
-        """Envelopes that the peer sent and that were not accepted, on all sessions so far; it only grows."""
-        return self.traffic.missing + sum(session.missing(now) for session in self.sessions.confirmed)
+        """Envelopes that the peer sent and that were not accepted, on all sessions so far; it only grows.
+
+        Probes along paths that are down do not count. Call it about once a second.
+        """
+        gaps = self.traffic.missing + sum(session.missing(now) for session in self.sessions.confirmed)
+        return self.losses.count(gaps, now)
 
     def sending_session(self) -> Session | None:
         """The current session, if it can still seal."""
@@ -111,7 +125,7 @@ class Peer:
         self.traffic.drops[reason] += count
         return [Dropped(reason, self, None, count)]
 
-    def drop_datagram(self, reason: DropReason, path: Path, detail: bytes | str = "") -> Dropped:
+    def drop_datagram(self, reason: DropReason, path: Path, detail: Detail = "") -> Dropped:
         """Count a datagram of this peer, or of a sender that claims to be this peer."""
         self.traffic.drops[reason] += 1
         return Dropped(reason, self, path, 1, detail)
@@ -123,6 +137,7 @@ class Peer:
         if self.is_up:
             return []
         self.is_up = True
+        self.set_paths_timer()
         return [PeerUp(self)]
 
     def note_lost(self, now: float) -> list[Output]:
@@ -136,7 +151,7 @@ class Peer:
 
     def keys_wanted_at(self) -> float:
         """When new keys are wanted: at once without a session; else by count, by age, or by silence."""
-        if not (self.path or self.initiator.paths):
+        if not self.paths.has_any:
             return NEVER
         session = self.sessions.current
         if session is None or session.send_counter >= c.REKEY_AFTER_ENVELOPES:
@@ -148,11 +163,27 @@ class Peer:
             wanted_at += c.RESPONDER_REKEY_SHARE * (durations.reject_after_s - durations.rekey_after_s)
         if self.unanswered_since is None:
             return wanted_at
-        return min(wanted_at, self.unanswered_since + durations.handshake_after_s)
+        return min(wanted_at, self.unanswered_since + self.handshake_after_s)
+
+    def set_waits(self) -> None:
+        """Set how long to wait for an answer: the durations of the configuration, longer on a slow path."""
+        durations, round_trip_s = self.durations, self.paths.round_trip_s
+        self.echo_after_s = max(durations.echo_after_s, c.ECHO_ROUND_TRIPS * round_trip_s)
+        self.handshake_after_s = max(durations.handshake_after_s, c.HANDSHAKE_ROUND_TRIPS * round_trip_s)
+        self.lost_after_s = max(durations.lost_after_s, c.LOST_ROUND_TRIPS * round_trip_s)
 
     def set_initiate(self) -> None:
         """Set when to initiate."""
         self.timers.set(Timer.INITIATE, max(self.initiator.retry_at, self.keys_wanted_at()))
+
+    def set_paths_timer(self) -> None:
+        """Set when paths are judged or questioned. A peer that is not up is looked for by handshakes instead."""
+        is_probed = self.is_up and self.sending_session() is not None
+        self.timers.set(Timer.PATHS, self.paths.next_at if is_probed else NEVER)
+
+    def new_question(self) -> int:
+        """An unpredictable question, which is not 0."""
+        return int.from_bytes(self.entropy(c.QUESTION_BYTES), "big") or 1
 
     def set_freshness(self) -> None:
         """Set when a session has to ask the peer again, or to drop frames that it holds."""

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from uavlinkd.core import constants as c
-from uavlinkd.core import freshness, wire
+from uavlinkd.core import freshness, probing, wire
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.establish import adopt, receive_close
-from uavlinkd.core.outputs import Deliver, Output, PathChanged
+from uavlinkd.core.outputs import Deliver, Output
 from uavlinkd.core.path import Path
+from uavlinkd.core.path_state import PathState
 from uavlinkd.core.peer import Peer
+from uavlinkd.core.probe import ANSWER_BYTES, PROBE, QUESTION_BYTES
 from uavlinkd.core.refusals import RefusalReport
-from uavlinkd.core.send import challenge, seal
+from uavlinkd.core.send import send_echo
 from uavlinkd.core.session import Session
 
-_CHALLENGE = bytes((wire.PATH_CHALLENGE,))  # it is answered: with an own challenge more bytes would go back than came
+_PROBE = bytes((PROBE,))
 
 
 def receive_envelope(
@@ -22,15 +24,32 @@ def receive_envelope(
     """Open an envelope and act on it.
 
     Raises:
-        Drop: as :meth:`Session.open`; then nothing was changed.
+        Drop: as :meth:`Session.open`, or ``REPLAYED``; then nothing was changed.
     """
     payload = session.open(datagram, header_bytes, counter, now)
     out: list[Output] = []
     sessions, traffic = peer.sessions, peer.traffic
+    state, size = peer.paths.by_path.get(path), len(datagram)
+    if payload is None:
+        return _receive_copy(peer, session, path, datagram, header_bytes, counter, now)
     traffic.envelopes_received += 1
-    traffic.bytes_received += len(datagram)
+    traffic.bytes_received += size
     if session.local_index in sessions.unconfirmed:
-        out += adopt(peer, session, sessions.unconfirmed[session.local_index].path, now)
+        waiting = sessions.unconfirmed[session.local_index]
+        out += adopt(peer, session, path, now)
+        if session is sessions.current:
+            out += probing.ask_everywhere(peer, session, now, waiting)
+        state = peer.paths.find(path)
+    is_candidate = state is None
+    if state is None:
+        state = probing.learn(peer, path, now)
+    state.datagrams_received += 1
+    state.bytes_received += size
+    state.received_at = now
+    if session is sessions.current:
+        state.received += 1
+    if session.arrivals is not None:
+        session.arrivals.note(counter, state.number, now)
 
     is_superseded = session is not sessions.current and sessions.is_superseded(session, now)
     is_new = now <= session.trusted_until and not is_superseded
@@ -45,47 +64,103 @@ def receive_envelope(
 
     if counter != session.window.highest:
         traffic.out_of_order += 1
-    elif path != peer.path and session is sessions.current and payload[:1] != _CHALLENGE:
-        out += challenge(peer, session, path, len(datagram), now)
-
+    if is_candidate and payload[:1] != _PROBE:
+        if session is sessions.current:
+            out += probing.ask(peer, session, state, now)
+        out += probing.update(peer, now)
     if not payload:
         return out
     if payload[0] < wire.FRAMES_FROM:
-        out += _receive_control(peer, session, payload, path, now, is_new=is_new)
-    elif is_superseded:
+        controlled, payload = _receive_control(
+            peer, session, counter, payload, state, now, is_new=is_new, is_superseded=is_superseded
+        )
+        out += controlled
+        if not payload:
+            return out
+    if is_superseded:
         out += peer.drop(DropReason.DELAYED, 1)
     elif not is_new:
         out += freshness.hold(peer, session, counter, payload, now)
     elif now < session.verification.look_at:
-        out.append(Deliver(peer, payload))
+        out.append(Deliver(peer, payload, 0 if session.arrivals is None else session.order_of(counter)))
     else:
         out += freshness.deliver(peer, session, counter, payload, now)
     return out
 
 
-def _receive_control(
-    peer: Peer, session: Session, payload: bytes, path: Path, now: float, *, is_new: bool
+def _receive_copy(
+    peer: Peer,
+    session: Session,
+    path: Path,
+    datagram: bytes,
+    header_bytes: int,
+    counter: int,
+    now: float,
 ) -> list[Output]:
+    """Count an authentic envelope that was accepted before. Of a recent one, learn how much later its path is.
+
+    A recent probe still asks and answers along this path: see :func:`probing.receive_copy`.
+
+    Raises:
+        Drop: ``REPLAYED``.
+    """
+    out: list[Output] = []
+    is_recent = session.is_recent(counter, now)
+    state = peer.paths.find(path)
+    if not is_recent and not (peer.paths.was_validated(path, now) if state is None else state.is_validated):
+        raise Drop(DropReason.REPLAYED)
+    if state is not None:
+        state.datagrams_received += 1
+        state.bytes_received += len(datagram)
+        state.duplicates += 1
+        if session.arrivals is not None:
+            is_known = session.window.holds(counter)
+            number, lag_s = session.arrivals.first(counter, now) if is_known else (0, 0.0)
+            # Twice along one path: the peer, the network or an attacker repeats it. It hides no loss. Below the
+            # window this end cannot tell, so such a copy does not count either.
+            if is_known and session.arrivals.note_copy(counter, state.number):
+                if session is peer.sessions.current:
+                    state.received += 1
+                    first = peer.paths.with_number(number)
+                    if is_recent and first is not None:
+                        first.note_copy(0.0, now)
+                        state.note_copy(lag_s, now)
+                if is_recent and len(datagram) - header_bytes - session.tag_bytes in (ANSWER_BYTES, QUESTION_BYTES):
+                    payload = session.reopen(datagram, header_bytes, counter)
+                    out = probing.receive_copy(peer, session, payload, state, now)
+    peer.traffic.drops[DropReason.DUPLICATE if is_recent else DropReason.LATE_COPY] += 1
+    return out
+
+
+def _receive_control(
+    peer: Peer,
+    session: Session,
+    counter: int,
+    payload: bytes,
+    state: PathState,
+    now: float,
+    *,
+    is_new: bool,
+    is_superseded: bool,
+) -> tuple[list[Output], bytes]:
+    """Act on a control record. Returns the frames behind it too."""
     try:
         control = wire.parse_control(payload)
     except Drop as drop:
-        return [peer.drop_datagram(drop.reason, path)]
+        return [peer.drop_datagram(drop.reason, state.path)], b""
     match control:
         case wire.Echo() as echo:
-            return _receive_echo(peer, session, echo, now)
-        case wire.PathChallenge(token):
-            # Back along the path that it came by: that is what it asks. The response is not longer.
-            return seal(peer, session, wire.PathResponse(token).encode(), path, now, is_answer=True)
-        case wire.PathResponse(token):
-            return _receive_path_response(peer, token, path, now)
+            return _receive_echo(peer, session, echo, now), b""
+        case wire.ProbeAndFrames(probe, frames):
+            return probing.receive_probe(peer, session, probe, state, now), frames
         case wire.Close():
-            return receive_close(peer, session, now)
+            return receive_close(peer, session, now), b""
         case RefusalReport():  # pragma: no branch  # the last kind there is
             if not session.parameters.features & c.FEATURE_REFUSALS:
-                return [peer.drop_datagram(DropReason.BAD_CONTROL, path)]
-            if is_new:  # older totals must not replace newer ones, nor look like a change of now
-                peer.refusal_claims.note(control, now)
-            return []
+                return [peer.drop_datagram(DropReason.BAD_CONTROL, state.path)], b""
+            if is_superseded:
+                return [], b""
+            return freshness.receive_report(peer, session, counter, control, now, is_new=is_new), b""
 
 
 def _receive_echo(peer: Peer, session: Session, echo: wire.Echo, now: float) -> list[Output]:
@@ -93,22 +168,15 @@ def _receive_echo(peer: Peer, session: Session, echo: wire.Echo, now: float) -> 
     if echo.received <= echo.expected <= session.send_counter:
         if session is peer.sessions.current:
             peer.traffic.reported = (echo.expected, echo.received)
-        if echo.expected > session.fresh(now, c.HOLD_S):
+            request = peer.echo_requests.find(echo.token) if echo.is_reply else None
+            if request is not None and request.session is session:
+                peer.paths.note_echo_counts(request.sent_at, request.sent, request.repeats, echo.received)
+        if echo.expected > session.fresh(now, session.held.pace.hold_s):
             session.verification.extend(now)
     if echo.is_reply:
         return freshness.receive_answer(peer, echo, now)
-    assert peer.path is not None, "a session came along a path"
     # On the session that sends, whichever session the request came on: otherwise a peer that never had our newest
     # session would go on receiving on an older one, and never initiate for what it misses.
     current = peer.sessions.current or session
     reply = wire.Echo(True, echo.token, current.received, current.expected, session.fresh(now))
-    return seal(peer, current, reply.encode(), peer.path, now, is_answer=True)
-
-
-def _receive_path_response(peer: Peer, token: bytes, path: Path, now: float) -> list[Output]:
-    if not peer.challenger.receive_response(token, path, now):
-        return [peer.drop_datagram(DropReason.BAD_PATH_RESPONSE, path)]
-    if path == peer.path:  # a handshake has moved the traffic already
-        return []
-    peer.path = path
-    return [PathChanged(peer, path)]
+    return send_echo(peer, current, reply, peer.paths.echo_route, now)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from array import array
 
 from uavlinkd.core.constants import REPLAY_WINDOW
-from uavlinkd.core.drops import Drop, DropReason
 
 
 class ReplayWindow:
@@ -14,8 +13,8 @@ class ReplayWindow:
     RFC 6479 keeps a ring of bit blocks and clears blocks as the window advances. Here a ring of slots
     remembers *which* counter came last at that place, so advancing, by one or by a billion, clears nothing.
 
-    Two steps, because nothing may be written before the tag is verified: :meth:`check`, verify, :meth:`mark`.
-    A counter above :attr:`highest` passes the check always.
+    Two steps, because nothing may be written before the tag is verified: :meth:`is_used`, verify, :meth:`mark`.
+    A counter above :attr:`highest` is never used.
     """
 
     __slots__ = ("_slots", "highest")
@@ -27,18 +26,17 @@ class ReplayWindow:
         # Slot 0 would claim to have seen counter 0; 1 belongs to another slot, so it claims nothing.
         self._slots[0] = 1
 
-    def check(self, counter: int) -> None:
-        """Raise where ``counter`` must not be accepted. Writes nothing.
+    def holds(self, counter: int) -> bool:
+        """Whether it is known of this counter, which is at most the highest, if it was accepted."""
+        return counter > self.highest - REPLAY_WINDOW
 
-        Raises:
-            Drop: ``TOO_OLD`` or ``REPLAYED``.
-        """
+    def is_used(self, counter: int) -> bool:
+        """Whether the counter must not be accepted: it was before, or is below the window. Writes nothing."""
         if counter <= self.highest - REPLAY_WINDOW:
-            raise Drop(DropReason.TOO_OLD)
-        if self._slots[counter % REPLAY_WINDOW] == counter:
-            raise Drop(DropReason.REPLAYED)
+            return True
+        return self._slots[counter % REPLAY_WINDOW] == counter
 
     def mark(self, counter: int) -> None:
-        """Remember an authentic counter that :meth:`check` let pass."""
+        """Remember an authentic counter that was not used."""
         self._slots[counter % REPLAY_WINDOW] = counter
         self.highest = max(self.highest, counter)

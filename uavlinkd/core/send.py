@@ -10,75 +10,147 @@ from uavlinkd.core.constants import NEVER
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.outputs import Output, Transmit
 from uavlinkd.core.path import Path
+from uavlinkd.core.path_loss import NO_REPEATS
+from uavlinkd.core.path_state import PathState
+from uavlinkd.core.paths import Route
 from uavlinkd.core.peer import Peer
+from uavlinkd.core.probe import QUESTION_BYTES
 from uavlinkd.core.refusals import Refused
 from uavlinkd.core.session import Session
+from uavlinkd.core.settings import Class
+from uavlinkd.core.socket_facts import FREE
 from uavlinkd.core.timers import Timer
 
 
-def send_frames(peer: Peer, frames: Sequence[bytes], now: float) -> list[Output]:
+def send_frames(peer: Peer, frames: Sequence[bytes], now: float, cls: Class) -> list[Output]:
     """Put frames that are here together into as few envelopes as hold them, in their order."""
-    session, path = peer.sessions.current, peer.path
-    if (
-        session is None
-        or path is None
-        or now >= session.reject_at
-        or session.send_counter >= c.SESSION_ENVELOPE_LIMIT
-    ):
+    session, paths = peer.sessions.current, peer.paths
+    route = paths.stream_route if cls is Class.STREAM else paths.routes[cls]
+    if not route or session is None or now >= session.reject_at or session.send_counter >= c.SESSION_ENVELOPE_LIMIT:
         return peer.drop(DropReason.NO_SESSION, len(frames))
     if peer.timers.deadlines[Timer.PROBE] == NEVER and peer.durations.probe_interval_s:
-        peer.timers.set(Timer.PROBE, now + peer.durations.probe_interval_s)
+        # On a slow network, a request about freshness measures the round trip too: it comes first if frames arrive.
+        least_s = (1 + c.VERIFY_REPEAT_SHARE) * paths.pace.interval_s
+        peer.timers.set(Timer.PROBE, now + max(peer.durations.probe_interval_s, least_s))
     limit = session.payload_limit
+    asks_at = NEVER
+    if paths.has_standby:
+        _note_activity(peer, cls, now)
+    if paths.is_multiple or paths.facts.envelope_limits:
+        limit = min(limit, session.payload_limit_of(paths.longest(cls)))
+    if paths.is_multiple and cls is not Class.CRITICAL and len(route) == 1:
+        asks_at = route[0].question_at - c.QUESTION_EARLY_S
     out: list[Output] = []
     batch: list[bytes] = []
     size = 0
     for frame in frames:
         if size + len(frame) > limit:
             if batch:
-                out += seal(peer, session, b"".join(batch), path, now)
+                out += seal(peer, session, b"".join(batch), route, now)
                 batch, size = [], 0
-            if len(frame) > limit:
+            if len(frame) > session.payload_limit:
                 out += peer.drop(DropReason.TOO_LARGE, 1)
                 continue
         batch.append(frame)
         size += len(frame)
     if batch:
-        out += seal(peer, session, b"".join(batch), path, now)
+        payload = b"".join(batch)
+        if now >= asks_at:
+            payload = _ask_too(peer, session, route[0], payload, limit, now)
+        out += seal(peer, session, payload, route, now)
     return out
 
 
+def _note_activity(peer: Peer, cls: Class, now: float) -> None:
+    """Frames are sent: an idle link, or a stream that begins, is probed more often from now on."""
+    paths = peer.paths
+    begins = paths.is_idle(now)
+    paths.active_at = now
+    if cls is not Class.CRITICAL:
+        begins = paths.note_stream(now) or begins
+    if begins:
+        paths.schedule(now)
+        peer.set_paths_timer()
+
+
+def _ask_too(peer: Peer, session: Session, state: PathState, frames: bytes, limit: int, now: float) -> bytes:
+    """The payload of a stream envelope: with the question in front that is due soon, if there is room for it."""
+    size = len(frames) + QUESTION_BYTES
+    if size > limit or not state.allows(session.envelope_bytes(size)):
+        return frames
+    record = state.make_probe(peer.new_question(), 0, now)
+    peer.paths.schedule(now)
+    peer.set_paths_timer()
+    return record.encode(frames)
+
+
 def seal(
-    peer: Peer, session: Session, payload: bytes, path: Path, now: float, *, is_answer: bool = False
+    peer: Peer, session: Session, payload: bytes, route: Route, now: float, *, is_answer: bool = False
 ) -> list[Output]:
-    """Send an envelope. It expects an answer, unless it is one: two ends must not answer each other endlessly."""
+    """Send an envelope along each path of a route, the same bytes.
+
+    It expects an answer, unless it is one: two ends must not answer each other endlessly.
+    """
     if session.send_counter >= c.SESSION_ENVELOPE_LIMIT:
         return peer.drop(DropReason.NO_SESSION, 1)
     datagram = session.seal(payload, now)
     peer.sent_at = now
     if peer.unanswered_since is None and not is_answer:
         peer.unanswered_since = now
-        peer.echo_at = now + peer.durations.echo_after_s
+        peer.echo_at = now + peer.echo_after_s
         if now + peer.silence_s < peer.timers.deadlines[Timer.SILENCE]:
             peer.timers.set(Timer.SILENCE, now + peer.silence_s)
     if session.send_counter == c.REKEY_AFTER_ENVELOPES:
         peer.set_initiate()
-    traffic = peer.traffic
+    traffic, size = peer.traffic, len(datagram)
     traffic.envelopes_sent += 1
-    if path is not peer.path:
-        return transmit(peer, datagram, path)
-    traffic.datagrams_sent += 1
-    traffic.bytes_sent += len(datagram)
-    return [Transmit(datagram, path)]
+    is_counted = session is peer.sessions.current
+    out: list[Output] = []
+    for state in route:
+        if (out and not peer.paths.carries(state, size)) or not (state.is_proven or state.allows(size)):
+            continue
+        state.sent += is_counted
+        state.datagrams_sent += 1
+        state.bytes_sent += size
+        traffic.datagrams_sent += 1
+        traffic.bytes_sent += size
+        out.append(Transmit(datagram, state.path, bool(out)))
+    return out
 
 
-def transmit(peer: Peer, datagram: bytes, path: Path) -> list[Output]:
-    """Send a datagram. Only what goes where the peer may be counts towards the budget of its link."""
-    if path in peer.candidates():
+def transmit(peer: Peer, datagram: bytes, path: Path, *, is_copy: bool = False) -> list[Output]:
+    """Send a handshake message. Only what goes where the peer may be counts towards the budget of its link."""
+    state = peer.paths.find(path)
+    if state is None:
+        peer.traffic.bytes_elsewhere += len(datagram)
+    else:
+        state.datagrams_sent += 1
+        state.bytes_sent += len(datagram)
         peer.traffic.datagrams_sent += 1
         peer.traffic.bytes_sent += len(datagram)
-    else:
-        peer.traffic.bytes_elsewhere += len(datagram)
-    return [Transmit(datagram, path)]
+    return [Transmit(datagram, path, is_copy)]
+
+
+def recount(peer: Peer, path: Path, datagrams: int, size: int) -> None:
+    """Count datagrams with so many bytes together as sent along a path after all, or as not sent (negative)."""
+    state = peer.paths.find(path)
+    if state is not None:
+        state.sent = max(0, state.sent + datagrams)
+        state.datagrams_sent += datagrams
+        state.bytes_sent += size
+        peer.traffic.datagrams_sent += datagrams
+        peer.traffic.bytes_sent += size
+
+
+def note_repeat(peer: Peer, path: Path, number: int, size: int) -> None:
+    """Count one more transmission of an envelope along a path."""
+    state = peer.paths.find(path)
+    if state is not None:
+        state.note_repeat(number)
+        state.datagrams_sent += 1
+        state.bytes_sent += size
+        peer.traffic.datagrams_sent += 1
+        peer.traffic.bytes_sent += size
 
 
 def report_refusals(peer: Peer, changed: Iterable[Refused], now: float) -> list[Output]:
@@ -87,35 +159,46 @@ def report_refusals(peer: Peer, changed: Iterable[Refused], now: float) -> list[
     A report expects no answer. ``changed``: the totals that changed since the last call.
     """
     peer.own_refusals.update(changed)
-    session, path = peer.sessions.current, peer.path
-    if session is None or path is None or not session.is_usable(now):
+    session, route = peer.sessions.current, peer.paths.routes[Class.BULK]
+    if session is None or not route or not session.is_usable(now):
         return []
     if not session.parameters.features & c.FEATURE_REFUSALS:
         return []
     report = peer.own_refusals.take(now)
-    return [] if report is None else seal(peer, session, report.encode(), path, now, is_answer=True)
+    return [] if report is None else seal(peer, session, report.encode(), route, now, is_answer=True)
 
 
-def ask_for_echo(peer: Peer, session: Session, path: Path, now: float) -> list[Output]:
-    """Send an echo request about a session on it."""
+def send_echo(peer: Peer, session: Session, echo: wire.Echo, route: Route, now: float) -> list[Output]:
+    """Send an echo request or a reply. Of its copies, a slow path gets as many as it would as the best path."""
+    if len(route) > 1:
+        route = (route[0], *(state for state in route[1:] if _may_echo(peer, state, now, is_reply=echo.is_reply)))
+    return seal(peer, session, echo.encode(), route, now, is_answer=echo.is_reply)
+
+
+def _may_echo(peer: Peer, state: PathState, now: float, *, is_reply: bool) -> bool:
+    pace = peer.paths.facts.pace(state.path)
+    if pace is FREE:
+        return True
+    if now < state.echo_at[is_reply]:
+        return False
+    state.echo_at[is_reply] = now + pace.ask_s
+    return True
+
+
+def ask_for_echo(peer: Peer, session: Session, now: float, route: Route = ()) -> list[Output]:
+    """Send an echo request about a session on it, along every usable path unless another ``route`` is given.
+
+    A request that is repeated if it is lost goes along the best path first: ``paths.echo_route``.
+    """
     peer.timers.stop(Timer.PROBE)  # until traffic asks for another
     peer.traffic.echoes_unanswered += peer.echo_requests.expire(now)
     session.held.asked(now)
     session.verification.asked(now)
     peer.set_freshness()
-    echo = wire.Echo(False, peer.echo_requests.add(session, now), session.received, session.expected)
-    out = seal(peer, session, echo.encode(), path, now)
+    repeats = NO_REPEATS if peer.paths.best is None else peer.paths.best.repeats
+    token = peer.echo_requests.add(session, now, session.send_counter + 1, repeats)
+    echo = wire.Echo(False, token, session.received, session.expected)
+    out = send_echo(peer, session, echo, route or peer.paths.routes[Class.CRITICAL], now)
     peer.asked_at = now
-    peer.echo_at = now + peer.durations.echo_after_s
+    peer.echo_at = now + peer.echo_after_s
     return out
-
-
-def challenge(peer: Peer, session: Session, path: Path, size: int, now: float) -> list[Output]:
-    """Challenge a new path, never with more bytes than the ``size`` of what just came from there."""
-    if session.envelope_bytes(wire.CHALLENGE_BYTES) > size:
-        return []
-    record = peer.challenger.challenge(path, now)
-    if record is None:
-        return []
-    peer.timers.set(Timer.CHALLENGE_EXPIRY, peer.challenger.next_expiry())
-    return seal(peer, session, record.encode(), path, now)

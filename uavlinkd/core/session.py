@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from uavlinkd.core import constants as c
 from uavlinkd.core import wire
+from uavlinkd.core.arrivals import Arrivals
 from uavlinkd.core.constants import NEVER
 from uavlinkd.core.counter_history import CounterHistory
 from uavlinkd.core.crypto import AeadKey, MacKey, Secret, equal, hkdf_expand
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.handshake import Keys
+from uavlinkd.core.refusals import RefusalReport
 from uavlinkd.core.replay import ReplayWindow
+from uavlinkd.core.socket_facts import Pace
 from uavlinkd.core.suites import Suite
 from uavlinkd.core.verification import HeldFrames, Verification
 from uavlinkd.core.wire import Parameters
@@ -43,12 +46,14 @@ class Session:
         "_received_history",
         "_send",
         "_sent_history",
+        "arrivals",
         "created_at",
         "first_received_at",
         "held",
         "is_initiator",
         "local_index",
         "max_envelope",
+        "order_base",
         "parameters",
         "payload_limit",
         "received",
@@ -58,6 +63,7 @@ class Session:
         "suite",
         "tag_bytes",
         "trusted_until",
+        "unverified_report",
         "verification",
         "window",
     )
@@ -91,14 +97,20 @@ class Session:
         self.first_received_at = NEVER
         """When the peer's first envelope came: from then on it sends on this session, or on one of higher rank."""
         self.held = HeldFrames()
+        self.unverified_report: tuple[int, RefusalReport] | None = None
+        """The newest report after a silence, with its counter: kept until the peer shows whether it is new."""
         self.verification = Verification(now, verify_interval_s)
+        self.order_base = 0
+        """See :meth:`order_of`."""
+        self.arrivals: Arrivals | None = None
+        """When each envelope arrived first; None while the peer has one path."""
         self._floor = -1  # the peer said that this counter, and those below, are of the past
         self._received_history = CounterHistory(now)
         self._sent_history = CounterHistory(now)
         self.tag_bytes = c.AEAD_TAG_BYTES if keys.parameters.confidential else keys.parameters.tag_bytes
         """Length of the tag in both directions."""
         self.max_envelope = keys.parameters.max_envelope
-        self.payload_limit = keys.parameters.max_envelope - wire.LONG_HEADER_BYTES - self.tag_bytes
+        self.payload_limit = self.payload_limit_of(keys.parameters.max_envelope)
         """Longest payload that fits into an envelope to the peer."""
 
     def __repr__(self) -> str:
@@ -108,6 +120,14 @@ class Session:
         """Length of the next envelope around a payload of this length."""
         header = wire.SHORT_HEADER_BYTES if self.send_counter < c.SHORT_COUNTER_LIMIT else wire.LONG_HEADER_BYTES
         return header + payload_bytes + self.tag_bytes
+
+    def order_of(self, counter: int) -> int:
+        """A number that grows with the counter, and from each session to those of higher rank; 0 with one path."""
+        return 0 if self.arrivals is None else self.order_base + counter
+
+    def payload_limit_of(self, envelope_bytes: int) -> int:
+        """Longest payload that fits into an envelope of this length."""
+        return envelope_bytes - wire.LONG_HEADER_BYTES - self.tag_bytes
 
     @property
     def expected(self) -> int:
@@ -155,11 +175,27 @@ class Session:
         mac.update(signed)
         return signed + mac.finalize()[: self.tag_bytes]
 
-    def open(self, datagram: bytes, header_bytes: int, counter: int, now: float) -> bytes:
-        """The payload of an envelope whose header says it is for this session.
+    def set_pace(self, pace: Pace, interval_s: float, now: float) -> None:
+        """The peer has another best path. ``interval_s``: between requests, if the path's network carries them."""
+        if pace != self.held.pace:
+            self.held.pace = pace
+            self.verification.set_pace(max(interval_s, pace.interval_s), pace.hold_s, now)
+
+    def begin_arrivals(self, now: float) -> None:
+        """The peer has several paths: remember when envelopes arrive."""
+        self.arrivals = Arrivals(now)
+
+    def is_recent(self, counter: int, now: float) -> bool:
+        """Whether this counter was accepted in the last :data:`c.LATE_AFTER_S`, if it was accepted."""
+        return not self._is_late(counter, now)
+
+    def open(self, datagram: bytes, header_bytes: int, counter: int, now: float) -> bytes | None:
+        """The payload of an envelope whose header says it is for this session. None for an authentic copy.
+
+        A copy has a counter that was accepted before, or that is below the window. It changes nothing.
 
         Raises:
-            Drop: ``TOO_LONG``, ``SESSION_EXPIRED``, ``TOO_OLD``, ``REPLAYED``, ``DELAYED`` or ``BAD_TAG``.
+            Drop: ``TOO_LONG``, ``SESSION_EXPIRED``, ``DELAYED`` or ``BAD_TAG``.
         """
         if len(datagram) > self.max_envelope:
             raise Drop(DropReason.TOO_LONG)
@@ -167,9 +203,8 @@ class Session:
             raise Drop(DropReason.SESSION_EXPIRED)
         window = self.window
         is_overtaken = counter <= window.highest
-        if is_overtaken:  # a counter above the highest is neither replayed nor too old
-            window.check(counter)
-        if counter <= self._floor or (is_overtaken and self._is_late(counter, now)):
+        is_copy = is_overtaken and window.is_used(counter)  # a counter above the highest was never used
+        if not is_copy and (counter <= self._floor or (is_overtaken and self._is_late(counter, now))):
             raise Drop(DropReason.DELAYED)
 
         key, tag_at = self._receive, len(datagram) - self.tag_bytes
@@ -183,6 +218,8 @@ class Session:
             if tag_at < header_bytes or not equal(mac.finalize()[: self.tag_bytes], datagram[tag_at:]):
                 raise Drop(DropReason.BAD_TAG)
             payload = datagram[header_bytes:tag_at]
+        if is_copy:
+            return None
 
         if not self.received:
             self.first_received_at = now
@@ -193,6 +230,14 @@ class Session:
         window.mark(counter)
         self.received += 1
         return payload
+
+    def reopen(self, datagram: bytes, header_bytes: int, counter: int) -> bytes:
+        """The payload of an envelope for which :meth:`open` returned None: its tag was verified."""
+        if isinstance(self._receive, AeadKey):
+            payload = self._receive.open(counter, memoryview(datagram)[header_bytes:], datagram[:header_bytes])
+            assert payload is not None
+            return payload
+        return datagram[header_bytes : len(datagram) - self.tag_bytes]
 
     def _is_late(self, counter: int, now: float) -> bool:
         return counter <= self._received_history.past(self.window.highest, self.received, now)[0]

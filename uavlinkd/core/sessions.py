@@ -10,7 +10,7 @@ the highest that they hold, so they settle on the same one without a word about 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from uavlinkd.core import constants as c
 from uavlinkd.core.indices import Indices
@@ -23,15 +23,25 @@ class Unconfirmed:
     """A session that answers an initiation; the first valid envelope on it confirms it."""
 
     session: Session
-    path: Path
-    """Where the response went: the side that confirms has read it there."""
+    initiation_mac1: bytes
+    """Of the initiation that it answers: a copy of it along another path gets the same response."""
+    initiation_bytes: int
+    response: bytes
+    """Without macs."""
+    paths: list[Path]
+    """Where the response went, the first one first."""
     is_expected: bool
     """Whether that is where the peer is, as far as is known: others must not push it out."""
     mac1: bytes
     """Of the response; a cookie reply refers to it."""
     expires_at: float
-    has_cookie: bool = False
-    """Whether a cookie reply to it was accepted: a second one is not."""
+    cookied: set[Path] = field(default_factory=set)
+    """Paths along which a cookie reply to it was accepted: a second one is not."""
+
+    @property
+    def response_bytes(self) -> int:
+        """Length of the response with its macs."""
+        return len(self.response) + 2 * c.MAC_BYTES
 
 
 class Sessions:
@@ -41,9 +51,10 @@ class Sessions:
     quarantine, any other is free at once.
     """
 
-    __slots__ = ("_has_smaller_key", "_indices", "_peer", "confirmed", "current", "unconfirmed")
+    __slots__ = ("_has_smaller_key", "_highest", "_indices", "_peer", "confirmed", "current", "unconfirmed")
 
     def __init__(self, indices: Indices[object], peer: str, *, has_smaller_key: bool) -> None:
+        self._highest = 0
         self._indices = indices
         self._peer = peer
         self._has_smaller_key = has_smaller_key
@@ -71,6 +82,9 @@ class Sessions:
         """The peer proved that it has the session: give it the place of its rank. Returns what ends."""
         self.unconfirmed.pop(session.local_index, None)
         self.confirmed = sorted([session, *self.confirmed], key=self._rank, reverse=True)
+        is_highest = self.confirmed[0] is session
+        self._highest += 2 * is_highest  # one number is left for a session that ranks below
+        session.order_base = (self._highest - (not is_highest)) << 32
         return self._end(self.confirmed[c.USABLE_PER_PEER :], now)
 
     def end_up_to(self, session: Session, now: float) -> list[Session]:

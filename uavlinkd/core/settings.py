@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from enum import StrEnum
 
 from uavlinkd.core import constants as c
 from uavlinkd.core.crypto import Secret
@@ -16,6 +17,25 @@ Screen = Callable[[bytes], tuple[bytes, bytes]]
 def hold_all(payload: bytes) -> tuple[bytes, bytes]:
     """The screen of a node that knows nothing about frames: all of them wait."""
     return b"", payload
+
+
+class Class(StrEnum):
+    """What a lost or late frame costs. It decides along which paths the frame goes."""
+
+    CRITICAL = "critical"
+    """It must arrive: along every usable path."""
+    STREAM = "stream"
+    """Another one follows: along the best path."""
+    BULK = "bulk"
+    """It can wait: along the best path that is not metered."""
+
+
+class Redundancy(StrEnum):
+    """Which classes are sent along every usable path."""
+
+    CRITICAL = "critical"
+    ALL = "all"
+    NONE = "none"
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +68,9 @@ class Link:
     timers: Timers = field(default_factory=Timers)
     features: int = c.FEATURE_REFUSALS
     """Bits of the protocol extensions that this side offers. A session has those that both offer."""
+    redundancy: Redundancy = Redundancy.CRITICAL
+    idle_probe_s: float = c.PROBE_IDLE_S
+    """Between questions along a metered path that is not needed, and while no frames are sent. 0: none."""
     verify_interval_s: float = field(default=c.VERIFY_INTERVAL_S, compare=False)
     """How often freshness is verified while frames arrive. A session keeps the interval that it began with."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from uavlinkd.core import freshness
+from uavlinkd.core import freshness, probing
 from uavlinkd.core.constants import NEVER
 from uavlinkd.core.establish import initiate
 from uavlinkd.core.outputs import Output
@@ -23,9 +23,8 @@ def handle_timeout(peer: Peer, now: float) -> list[Output]:
             case Timer.INITIATION_EXPIRY:
                 peer.initiator.expire(now)
                 peer.timers.set(timer, peer.initiator.next_expiry())
-            case Timer.CHALLENGE_EXPIRY:
-                peer.challenger.expire(now)
-                peer.timers.set(timer, peer.challenger.next_expiry())
+            case Timer.PATHS:
+                out += probing.handle_timeout(peer, now)
             case Timer.SILENCE:
                 out += _handle_silence(peer, now)
             case Timer.INITIATE:
@@ -48,11 +47,11 @@ def _expire_sessions(peer: Peer, now: float) -> list[Output]:
 
 def _handle_silence(peer: Peer, now: float) -> list[Output]:
     """Nothing came since something was sent: ask for an echo, initiate beside the session, give the peer up."""
-    silent_since, durations = peer.unanswered_since, peer.durations
+    silent_since = peer.unanswered_since
     if silent_since is None:
         return []  # the next envelope sets the timer
     out: list[Output] = []
-    handshake_at, lost_at = silent_since + durations.handshake_after_s, silent_since + durations.lost_after_s
+    handshake_at, lost_at = silent_since + peer.handshake_after_s, silent_since + peer.lost_after_s
     stages: list[float] = []
     if peer.is_up and now >= lost_at:
         out += peer.note_lost(now)
@@ -63,9 +62,9 @@ def _handle_silence(peer: Peer, now: float) -> list[Output]:
     if peer.is_up:
         stages.append(lost_at)
         session = peer.sending_session()
-        if session is not None and peer.path is not None:
+        if session is not None and peer.paths.best is not None:
             if now >= peer.echo_at:
-                out += ask_for_echo(peer, session, peer.path, now)
+                out += ask_for_echo(peer, session, now)
             stages.append(peer.echo_at)
     if stages:
         peer.timers.set(Timer.SILENCE, min(stages))
@@ -82,14 +81,16 @@ def _initiate(peer: Peer, now: float) -> list[Output]:
 
 def _probe(peer: Peer, now: float) -> list[Output]:
     session = peer.sending_session()
-    return [] if session is None or peer.path is None else ask_for_echo(peer, session, peer.path, now)
+    return (
+        [] if session is None or peer.paths.best is None else ask_for_echo(peer, session, now, peer.paths.echo_route)
+    )
 
 
 def _keep_alive(peer: Peer, now: float) -> list[Output]:
     session = peer.sending_session()
-    if session is None or peer.path is None:
+    if session is None or peer.paths.best is None:
         return []  # the next session sets the timer
-    out = ask_for_echo(peer, session, peer.path, now) if now >= _keepalive_at(peer) else []
+    out = ask_for_echo(peer, session, now, peer.paths.echo_route) if now >= _keepalive_at(peer) else []
     peer.timers.set(Timer.KEEPALIVE, _keepalive_at(peer))
     return out
 

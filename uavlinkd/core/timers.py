@@ -22,8 +22,8 @@ class Timer(IntEnum):
     """Frames were held for too long, or an echo request about them is repeated."""
     INITIATION_EXPIRY = 2
     """The response to an own initiation would come too late."""
-    CHALLENGE_EXPIRY = 3
-    """The same for a path challenge."""
+    PATHS = 3
+    """A path is to be judged, or a question along it is due."""
     SILENCE = 4
     """Something was sent and nothing received since: ask, initiate, give the peer up."""
     INITIATE = 5

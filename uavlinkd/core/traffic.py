@@ -16,8 +16,8 @@ class Traffic:
     """Envelopes and handshake messages; ``bytes_sent`` are theirs."""
     bytes_sent: int = 0
     bytes_elsewhere: int = 0
-    """Of answers and path challenges to addresses where the peer is not known to be. An attacker that replays its
-    handshakes or envelopes causes them, so ``bytes_sent``, which a link's budget pays for, does not include them."""
+    """Of responses to addresses where the peer is not known to be. An attacker that replays its handshakes causes
+    them, so ``bytes_sent``, which a link's budget pays for, does not include them."""
     envelopes_sent: int = 0
     envelopes_received: int = 0
     bytes_received: int = 0
@@ -28,8 +28,8 @@ class Traffic:
     """Envelopes of sessions that have ended, sent by the peer and never accepted here."""
     out_of_order: int = 0
     """Envelopes accepted after one that was sent later."""
-    challenges_unanswered: int = 0
-    """Paths from which the peer's envelopes came, and along which no challenge was answered."""
+    paths_unproven: int = 0
+    """Addresses from which the peer's envelopes came, and from which no question was answered."""
     echoes_unanswered: int = 0
     """Own echo requests without an answer in time."""
     handshakes_unanswered: int = 0

@@ -11,6 +11,7 @@ from collections import deque
 
 from uavlinkd.core import constants as c
 from uavlinkd.core.constants import NEVER
+from uavlinkd.core.socket_facts import FREE
 
 
 class Verification:
@@ -19,11 +20,12 @@ class Verification:
     An arriving frame costs one comparison, with :attr:`look_at`. An unanswered request is repeated at :attr:`due_at`.
     """
 
-    __slots__ = ("_answered_at", "_interval_s", "_lifetime_s", "ask_at", "due_at", "look_at", "until")
+    __slots__ = ("_answered_at", "_hold_s", "_interval_s", "_lifetime_s", "ask_at", "due_at", "look_at", "until")
 
     def __init__(self, now: float, interval_s: float) -> None:
         self._interval_s = interval_s
-        self._lifetime_s = max(c.LATE_AFTER_S, c.VERIFIED_INTERVALS * interval_s)
+        self._hold_s = c.HOLD_S
+        self._lifetime_s = _lifetime_s(interval_s)
         self._answered_at = now  # the handshake is an answer
         self.until = now + self._lifetime_s
         """Freshness is verified until then."""
@@ -33,6 +35,17 @@ class Verification:
         """When to repeat a request that was not answered."""
         self.look_at = self.ask_at
         """A frame that arrives earlier needs no look at the other moments."""
+
+    def set_pace(self, interval_s: float, hold_s: float, now: float) -> None:
+        """Another path is the best, and its network carries more or fewer requests.
+
+        With a longer interval the last proof lasts longer. With a shorter one a new proof is due after that.
+        """
+        lifetime_s = _lifetime_s(interval_s)
+        self.until = min(self.until + max(0.0, lifetime_s - self._lifetime_s), now + lifetime_s)
+        self.ask_at = min(self.ask_at + max(0.0, interval_s - self._interval_s), now + interval_s)
+        self._interval_s, self._hold_s, self._lifetime_s = interval_s, hold_s, lifetime_s
+        self.look_at = min(self.ask_at, self.until)
 
     def begin(self) -> None:
         """Frames arrive: repeat the request that follows until it is answered."""
@@ -51,7 +64,7 @@ class Verification:
         """The answer came in time."""
         self._answered_at = now
         self.due_at = NEVER
-        self.until = max(self.until, min(now, asked_at + c.HOLD_S) + self._lifetime_s)
+        self.until = max(self.until, min(now, asked_at + self._hold_s) + self._lifetime_s)
         self.ask_at = max(self.ask_at, asked_at + self._interval_s)
         self.look_at = min(self.ask_at, self.until)
 
@@ -70,14 +83,18 @@ class Verification:
         self.due_at = NEVER
 
 
+def _lifetime_s(interval_s: float) -> float:
+    return max(c.LATE_AFTER_S, c.VERIFIED_INTERVALS * interval_s)
+
+
 class HeldFrames:
     """Frames of one session that may be old, and the times of the echo requests about them.
 
-    The peer is asked at once and each :data:`c.HOLD_ASK_S`. Frames that have waited for :data:`c.HOLD_S` are
+    The peer is asked at once and each :attr:`Pace.ask_s`. Frames that have waited for :attr:`Pace.hold_s` are
     dropped. The requests end with the last of them, and the next envelope begins again.
     """
 
-    __slots__ = ("_ask_at", "_ends_at", "_frames", "due_at", "size")
+    __slots__ = ("_ask_at", "_ends_at", "_frames", "due_at", "pace", "size")
 
     def __init__(self) -> None:
         self.due_at = NEVER
@@ -87,26 +104,28 @@ class HeldFrames:
         self._ask_at = NEVER
         self._ends_at = NEVER
         self._frames: deque[tuple[float, int, bytes]] = deque()
+        self.pace = FREE
+        """That of the best path."""
 
     def begin(self, now: float) -> bool:
         """Begin to ask about the session; False if the daemon asks already. If True, send a request now."""
         if self.due_at != NEVER:
             return False
         self.due_at = now
-        self._ends_at = now + c.HOLD_S
+        self._ends_at = now + self.pace.hold_s
         return True
 
     def asked(self, now: float) -> None:
         """An echo request was sent on the session."""
         if self.due_at != NEVER:
-            self._ask_at = now + c.HOLD_ASK_S
+            self._ask_at = now + self.pace.ask_s
             self._set_due()
 
     def add(self, counter: int, payload: bytes, now: float) -> int:
         """Hold frames until the peer answers. Returns how many envelopes they pushed out, the oldest first."""
         self._frames.append((now, counter, payload))
         self.size += len(payload) + c.HELD_OVERHEAD_BYTES
-        self._ends_at = now + c.HOLD_S
+        self._ends_at = now + self.pace.hold_s
         pushed_out = 0
         while self.size > c.HELD_BYTES and len(self._frames) > 1:
             self._drop_oldest()
@@ -123,7 +142,7 @@ class HeldFrames:
     def expire(self, now: float) -> int:
         """Drop the frames that have waited for too long. Returns from how many envelopes they were."""
         expired = 0
-        while self._frames and now >= self._frames[0][0] + c.HOLD_S:
+        while self._frames and now >= self._frames[0][0] + self.pace.hold_s:
             self._drop_oldest()
             expired += 1
         if now >= self._ends_at:
@@ -136,15 +155,15 @@ class HeldFrames:
         """Whether to ask again now."""
         return self.due_at != NEVER and now >= self._ask_at
 
-    def release(self, fresh: int) -> tuple[list[bytes], int]:
-        """The peer answered: the payloads from counter ``fresh`` on, as they arrived, and the count of the others."""
-        new = [payload for _, counter, payload in self._frames if counter >= fresh]
+    def release(self, fresh: int) -> tuple[list[tuple[int, bytes]], int]:
+        """The peer answered: what has a counter from ``fresh`` on, as it arrived, and the count of the others."""
+        new = [(counter, payload) for _, counter, payload in self._frames if counter >= fresh]
         old = len(self.pop_all()) - len(new)
         self.due_at = NEVER
         return new, old
 
     def _set_due(self) -> None:
-        expires_at = self._frames[0][0] + c.HOLD_S if self._frames else self._ends_at
+        expires_at = self._frames[0][0] + self.pace.hold_s if self._frames else self._ends_at
         self.due_at = min(self._ask_at, expires_at)
 
     def _drop_oldest(self) -> None:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 from uavlinkd.core import constants as c
 from uavlinkd.core.drops import Drop, DropReason
+from uavlinkd.core.probe import PROBE, Probe, parse_probe
 from uavlinkd.core.refusals import REFUSAL_REPORT, RefusalReport, parse_report
 from uavlinkd.core.suites import SUITES, Suite
 
@@ -294,11 +295,9 @@ def parse_envelope_header(datagram: bytes) -> tuple[int, int, int]:
 # Control records: the payload of an envelope whose first byte is below FRAMES_FROM.
 
 FRAMES_FROM = 0xF0
-ECHO_REQUEST, ECHO_REPLY, PATH_CHALLENGE, PATH_RESPONSE, CLOSE = 1, 2, 3, 4, 5
+ECHO_REQUEST, ECHO_REPLY, CLOSE = 1, 2, 5
 _ECHO_REQUEST = struct.Struct(">BIII")
 _ECHO_REPLY = struct.Struct(">BIIII")
-_CHALLENGE_PADDING = bytes(2)
-CHALLENGE_BYTES = 1 + c.PATH_TOKEN_BYTES + len(_CHALLENGE_PADDING)
 
 
 class Echo(NamedTuple):
@@ -328,28 +327,11 @@ class Echo(NamedTuple):
         return _ECHO_REQUEST.pack(ECHO_REQUEST, self.token, self.received, self.expected)
 
 
-class PathChallenge(NamedTuple):
-    """Eight bytes that come back only from where they were sent, and two of padding.
+class ProbeAndFrames(NamedTuple):
+    """A probe, and the whole frames behind it, if any."""
 
-    The padding keeps the response shorter than the challenge even where the header that it goes
-    under is the longer one: a challenge never causes more bytes than it has.
-    """
-
-    token: bytes
-
-    def encode(self) -> bytes:
-        """Type 3, token 8, zero 2."""
-        return bytes((PATH_CHALLENGE,)) + self.token + _CHALLENGE_PADDING
-
-
-class PathResponse(NamedTuple):
-    """The token of a challenge."""
-
-    token: bytes
-
-    def encode(self) -> bytes:
-        """Type 4, token 8."""
-        return bytes((PATH_RESPONSE,)) + self.token
+    probe: Probe
+    frames: bytes
 
 
 class Close(NamedTuple):
@@ -360,7 +342,7 @@ class Close(NamedTuple):
         return bytes((CLOSE,))
 
 
-Control = Echo | PathChallenge | PathResponse | Close | RefusalReport
+Control = Echo | ProbeAndFrames | Close | RefusalReport
 
 
 def parse_control(payload: bytes) -> Control:
@@ -376,10 +358,8 @@ def parse_control(payload: bytes) -> Control:
     if kind == ECHO_REPLY and size == _ECHO_REPLY.size:
         _, token, received, expected, fresh = _ECHO_REPLY.unpack(payload)
         return Echo(True, token, received, expected, fresh)
-    if kind == PATH_CHALLENGE and size == CHALLENGE_BYTES and payload.endswith(_CHALLENGE_PADDING):
-        return PathChallenge(payload[1 : 1 + c.PATH_TOKEN_BYTES])
-    if kind == PATH_RESPONSE and size == 1 + c.PATH_TOKEN_BYTES:
-        return PathResponse(payload[1:])
+    if kind == PROBE and (probe := parse_probe(payload)) is not None:
+        return ProbeAndFrames(*probe)
     if kind == CLOSE and size == 1:
         return Close()
     if kind == REFUSAL_REPORT and (report := parse_report(payload)) is not None:

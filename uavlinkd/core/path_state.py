@@ -1,0 +1,379 @@
+"""One path to a peer: whether it answers, how fast, and how much it loses. README.md, section 15.
+
+Only an answered question makes a path usable. What the peer reports can only make it worse.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from enum import StrEnum
+from statistics import median
+from typing import NamedTuple
+
+from uavlinkd.core import constants as c
+from uavlinkd.core import probe
+from uavlinkd.core.constants import NEVER
+from uavlinkd.core.envelope_limit import EnvelopeLimit
+from uavlinkd.core.path import Path
+from uavlinkd.core.path_loss import NO_REPEATS, PathLoss, Repeats
+from uavlinkd.core.probe import Probe
+
+
+class PathCondition(StrEnum):
+    """What is known about a path."""
+
+    UNPROVEN = "unproven"
+    """No question along it was answered yet."""
+    USABLE = "usable"
+    SUSPECT = "suspect"
+    """It may have failed a moment ago."""
+    DOWN = "down"
+
+
+class Question(NamedTuple):
+    """A question that was sent and not answered."""
+
+    sent_at: float
+    sent: int
+    """Envelopes of the session sent along the path until then, the question included."""
+    repeats: Repeats = NO_REPEATS
+
+
+class PathState:
+    """A slot of a :class:`uavlinkd.core.paths.PathSet`."""
+
+    __slots__ = (
+        "_lags",
+        "_loss_by_echo",
+        "_loss_in",
+        "_loss_out",
+        "_recovering_answers",
+        "_recovering_since",
+        "_reported_lag",
+        "_reported_lost",
+        "_unanswered",
+        "_unanswered_since",
+        "_waiting",
+        "answered_at",
+        "answers",
+        "bytes_received",
+        "bytes_sent",
+        "condition",
+        "copied_question",
+        "datagrams_received",
+        "datagrams_sent",
+        "duplicates",
+        "echo_at",
+        "envelope_limit",
+        "held_back_s",
+        "is_configured",
+        "is_known",
+        "is_metered",
+        "is_off",
+        "is_proven",
+        "number",
+        "path",
+        "question_at",
+        "questioned_at",
+        "reason",
+        "received",
+        "received_at",
+        "repeats",
+        "returns_at",
+        "round_trip_s",
+        "rttvar_s",
+        "sent",
+        "since",
+        "srtt_s",
+    )
+
+    def __init__(self, path: Path, number: int, now: float, *, is_configured: bool, is_metered: bool) -> None:
+        self.path = path
+        self.number = number
+        """From 1: names the path in :class:`uavlinkd.core.arrivals.Arrivals`."""
+        self.is_configured = is_configured
+        self.is_metered = is_metered
+        self.is_known = False
+        """Whether the peer was there: a session was made along it, or it is validated."""
+        self.is_proven = is_configured
+        """Whether it may get more bytes than came from there: it is configured, or validated."""
+        self.is_off = False
+        """Whether its network is gone: nothing is sent there."""
+        self.condition = PathCondition.UNPROVEN
+        self.reason = "new"
+        """Why it is in this condition: ``answered``, ``unanswered``, ``loss``, ``network`` or ``new``."""
+        self.since = now
+        """When the condition began."""
+        self.sent = self.received = 0
+        """Envelopes of the current session along this path, copies from other paths too, without repeats."""
+        self.repeats = NO_REPEATS
+        """Of what was sent."""
+        self.datagrams_sent = self.bytes_sent = 0
+        self.datagrams_received = self.bytes_received = 0
+        self.duplicates = 0
+        """Received copies of envelopes that had arrived already."""
+        self.echo_at = [-NEVER, -NEVER]
+        """On a network with a budget: when it may carry a copy of an echo request, and of a reply."""
+        self.held_back_s = 0.0
+        self.returns_at = -NEVER
+        """When it may become the best path again."""
+        self.received_at = -NEVER
+        """When an envelope arrived first along this path."""
+        self.round_trip_s: float | None = None
+        """The last one that was measured. The others are smoothed."""
+        self.srtt_s: float | None = None
+        self.rttvar_s: float | None = None
+        self.envelope_limit = EnvelopeLimit()
+        self.answered_at = -NEVER
+        self.answers = 0
+        """How many of its questions were answered."""
+        self.questioned_at = -NEVER
+        self.question_at = now
+        """When the next question is due."""
+        self.copied_question = 0
+        """The last question that was answered here although it had arrived along another path before."""
+        self._waiting: dict[int, Question] = {}  # the oldest first
+        self._unanswered_since = NEVER
+        self._unanswered = 0  # questions since the last answer
+        self._recovering_since = NEVER
+        self._recovering_answers = 0
+        self._loss_in, self._loss_out, self._loss_by_echo = PathLoss(), PathLoss(), PathLoss()
+        self._lags: deque[tuple[float, float]] = deque(maxlen=c.LAG_SAMPLES)
+        self._reported_lag: tuple[float, float] | None = None  # when, seconds
+        self._reported_lost = 0  # of the peer's datagrams of the current session
+
+    def __repr__(self) -> str:
+        return f"PathState({self.path}, {self.condition})"
+
+    # Facts.
+
+    @property
+    def is_validated(self) -> bool:
+        """Whether a question along it was ever answered."""
+        return self.answered_at != -NEVER
+
+    @property
+    def works(self) -> bool:
+        """Whether frames may be sent along it: it is usable, or suspect."""
+        return self.condition is PathCondition.USABLE or self.condition is PathCondition.SUSPECT
+
+    @property
+    def is_recovering(self) -> bool:
+        """Whether a path that was down answers again."""
+        return self._recovering_since != NEVER
+
+    @property
+    def waiting_questions(self) -> int:
+        """How many questions may still be answered."""
+        return len(self._waiting)
+
+    @property
+    def loss_in(self) -> float:
+        """The share of the peer's envelopes that this path lost recently, 0 to 1. A repeated one is lost with all
+        its repeats.
+        """
+        return self._loss_in.share()
+
+    @property
+    def loss_out(self) -> float:
+        """The share of our datagrams, repeats too, that it lost, as the peer reports."""
+        return self._reported_loss.share()
+
+    def loss_to_repair(self) -> tuple[float, int]:
+        """The share of our datagrams that it lost in the last :data:`c.REPAIR_WINDOW_S`, and how many envelopes."""
+        loss = self._reported_loss
+        return loss.share(c.REPAIR_WINDOW_S), loss.recent(c.REPAIR_WINDOW_S)[1]
+
+    @property
+    def _reported_loss(self) -> PathLoss:
+        by_echo, by_probe = self._loss_by_echo, self._loss_out
+        return by_echo if by_echo.reported_at > by_probe.reported_at else by_probe
+
+    def lag_s(self, now: float) -> float | None:
+        """By how much our copies arrive later along this path than along the first, if the peer said so recently."""
+        if self._reported_lag is None or now > self._reported_lag[0] + c.LAG_VALID_S:
+            return None
+        return self._reported_lag[1]
+
+    @property
+    def wait_s(self) -> float:
+        """An answer that takes longer makes the path suspect (RFC 6298, section 2, with a lower least value)."""
+        if self.srtt_s is None or self.rttvar_s is None:
+            return c.FIRST_ANSWER_S
+        return max(c.LEAST_ANSWER_S, self.srtt_s + 4 * self.rttvar_s)
+
+    @property
+    def _down_after_s(self) -> float:
+        return max(c.DOWN_AFTER_S, 4 * (self.srtt_s or 0.0))
+
+    def allows(self, size: int) -> bool:
+        """Whether a datagram of so many bytes may be sent along it.
+
+        An address that is neither configured nor validated gets no more bytes than came from there.
+        """
+        return self.is_proven or self.bytes_sent + size <= self.bytes_received
+
+    # Datagrams.
+
+    def note_lost_election(self, now: float, *, is_again: bool) -> None:
+        """It lost so much that another path is the best now. ``is_again``: soon after it became the best."""
+        self.held_back_s = min(c.HELD_BACK_MOST_S, 2 * max(c.BETTER_FOR_S, self.held_back_s)) if is_again else 0.0
+        self.returns_at = now + self.held_back_s
+
+    def note_session(self) -> None:
+        """Another session carries the traffic: its datagrams are counted from zero."""
+        self.sent = self.received = self._reported_lost = 0
+        self.repeats = NO_REPEATS
+        self._loss_in, self._loss_out, self._loss_by_echo = PathLoss(), PathLoss(), PathLoss()
+        self._waiting = {token: asked._replace(sent=0) for token, asked in self._waiting.items()}
+
+    def note_repeat(self, number: int) -> None:
+        """An envelope was sent along this path again: its transmission with this number, from 2."""
+        at = number - 2
+        self.repeats = (*self.repeats[:at], self.repeats[at] + 1, *self.repeats[at + 1 :])
+
+    def note_copy(self, lag_s: float, now: float) -> None:
+        """A copy arrived along this path, so much later than the first; 0 for the first itself."""
+        self._lags.append((now, lag_s))
+
+    # Probes.
+
+    def make_test(self, question: int, now: float) -> Probe:
+        """The record of a padded probe. It may well get no answer, so it makes no path suspect."""
+        self.envelope_limit.asked(question, now)
+        self._waiting[question] = Question(now, 0)
+        return Probe(question, 0, self.sent + 1, self.received, self._lag_ms(now))
+
+    def make_probe(self, question: int, answer: int, now: float) -> Probe:
+        """The record to be sent along this path now."""
+        if question:
+            self.questioned_at = now
+            self._expire_questions(now)
+            if len(self._waiting) >= c.QUESTIONS_PER_PATH:
+                del self._waiting[next(iter(self._waiting))]
+            self._waiting[question] = Question(now, self.sent + 1, self.repeats)
+            if not self._unanswered:
+                self._unanswered_since = now
+            self._unanswered += 1
+        return Probe(question, answer, self.sent + 1, self.received, self._lag_ms(now))
+
+    def receive_report(self, report: Probe, now: float) -> int:
+        """The peer's counts, in a probe of the current session.
+
+        Returns how many more of its datagrams are lost than at the last report; 0 if the path did not work since.
+        """
+        self._loss_in.add(now, report.sent, self.received)
+        lost = report.sent - self.received
+        more = max(0, lost - self._reported_lost) if self.works else 0
+        self._reported_lost = max(lost, self._reported_lost)
+        if report.lag_ms != probe.UNKNOWN_LAG:
+            self._reported_lag = now, report.lag_ms / 1000
+        return more
+
+    def receive_answer(self, answer: int, received: int | None, now: float) -> float | None:
+        """The round trip of the question that was answered. None if no such question waits here.
+
+        ``received``: how many of our datagrams had arrived then; None if the answer came on an older session.
+        """
+        self._expire_questions(now)
+        asked = self._waiting.get(answer)
+        if asked is None:
+            return None
+        self.envelope_limit.receive_answer(answer)
+        del self._waiting[answer]
+        # Earlier questions say no more than this one: only the later ones count as unanswered.
+        later = [other.sent_at for other in self._waiting.values() if other.sent_at > asked.sent_at and other.sent]
+        self._unanswered, self._unanswered_since = len(later), min(later, default=NEVER)
+        self.answered_at = now
+        self.answers += 1
+        self.is_proven = True
+        self._add_round_trip(now - asked.sent_at)
+        if received is not None and asked.sent:
+            self._loss_out.add(asked.sent_at, asked.sent, received, asked.repeats)
+        return now - asked.sent_at
+
+    def note_echo(self, round_trip_s: float, now: float) -> None:
+        """An echo request along the only path was answered."""
+        self.answered_at = now
+        self.is_proven = True
+        self._add_round_trip(round_trip_s)
+
+    def note_echo_counts(self, asked_at: float, sent: int, repeats: Repeats, received: int) -> None:
+        """Of the ``sent`` envelopes of the session until an echo request along the only path, so many arrived."""
+        self._loss_by_echo.add(asked_at, sent, received, repeats)
+
+    def _add_round_trip(self, round_trip_s: float) -> None:
+        self.round_trip_s = round_trip_s
+        if self.srtt_s is None or self.rttvar_s is None:
+            self.srtt_s, self.rttvar_s = round_trip_s, round_trip_s / 2
+            return
+        self.rttvar_s += (abs(self.srtt_s - round_trip_s) - self.rttvar_s) / 4
+        self.srtt_s += (round_trip_s - self.srtt_s) / 8
+
+    def _expire_questions(self, now: float) -> None:
+        expired = [token for token, asked in self._waiting.items() if now >= asked.sent_at + c.QUESTION_LIFETIME_S]
+        for token in expired:
+            del self._waiting[token]
+
+    def _lag_ms(self, now: float) -> int:
+        recent = [lag for at, lag in self._lags if at >= now - c.LAG_WINDOW_S]
+        return min(probe.LONGEST_LAG_MS, round(1000 * median(recent))) if recent else probe.UNKNOWN_LAG
+
+    # The condition.
+
+    def set_off(self, *, is_off: bool, now: float) -> None:
+        """Its network disappeared, or appeared or changed: then it has to prove itself at once."""
+        self.is_off = is_off
+        self._waiting.clear()
+        self._unanswered, self._unanswered_since = 0, NEVER
+        if is_off:
+            self._set(PathCondition.DOWN, "network", now)
+        self.question_at = NEVER if is_off else now
+        if not is_off:
+            self.questioned_at = -NEVER  # ask at once, however recently it was asked
+        if not is_off and self.is_validated:
+            self.envelope_limit.begin(now)
+
+    def set_usable(self, now: float) -> None:
+        """A question was answered, and that is enough."""
+        self._set(PathCondition.USABLE, "answered", now)
+
+    def note_answer(self, now: float, *, is_only: bool) -> None:
+        """A question was answered. ``is_only``: no other path works, so this one is used at once."""
+        if self.condition is PathCondition.DOWN and not is_only:
+            if not self.is_recovering:
+                self._recovering_since, self._recovering_answers = now, 0
+            self._recovering_answers += 1
+            if self._recovering_answers < c.RECOVERED_ANSWERS or now < self._recovering_since + c.RECOVERED_AFTER_S:
+                return
+        sent, lost = self._loss_out.recent(c.SUSPECT_WINDOW_S)
+        if sent >= c.SUSPECT_ENVELOPES and lost > c.SUSPECT_LOSS * sent:
+            self._set(PathCondition.SUSPECT, "loss", now)
+        else:
+            self.set_usable(now)
+
+    def check(self, now: float) -> None:
+        """Judge what was not answered in time."""
+        is_late = now >= self._unanswered_since + self.wait_s
+        if is_late and self.is_recovering:
+            self._recovering_since = NEVER
+        if not self.works:
+            return
+        if self._unanswered >= 2 and now >= self._unanswered_since + self._down_after_s:
+            self._set(PathCondition.DOWN, "unanswered", now)
+        elif is_late and self.condition is PathCondition.USABLE:
+            self._set(PathCondition.SUSPECT, "unanswered", now)
+
+    def next_check(self) -> float:
+        """When :meth:`check` has something to do."""
+        if self.condition is PathCondition.USABLE or self.is_recovering:
+            return self._unanswered_since + self.wait_s
+        if self.condition is PathCondition.SUSPECT and self._unanswered >= 2:
+            return self._unanswered_since + self._down_after_s
+        return NEVER
+
+    def _set(self, condition: PathCondition, reason: str, now: float) -> None:
+        self._recovering_since = NEVER
+        if condition is not self.condition:
+            self.condition, self.since = condition, now
+        self.reason = reason

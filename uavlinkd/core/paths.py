@@ -1,0 +1,457 @@
+"""The paths to one peer: their slots, which one is best, and along which ones each class of frames goes.
+
+README.md, section 15. The paths share one session. Nothing here sends: :mod:`.probing` does.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Iterable
+from typing import NamedTuple
+
+from uavlinkd.core import constants as c
+from uavlinkd.core.constants import NEVER
+from uavlinkd.core.election import Election
+from uavlinkd.core.path import Path, SocketAddress
+from uavlinkd.core.path_loss import Repeats
+from uavlinkd.core.path_state import PathCondition, PathState
+from uavlinkd.core.settings import Class, Redundancy
+from uavlinkd.core.socket_facts import FREE, Pace, SocketFacts
+
+Route = tuple[PathState, ...]
+"""The paths along which one envelope goes, the best first."""
+
+
+class BestChanged(NamedTuple):
+    """Another path is the best now."""
+
+    state: PathState
+    before: PathState
+    reason: str
+
+
+class ConditionChanged(NamedTuple):
+    """A path became usable, or went down."""
+
+    state: PathState
+    is_usable: bool
+    reason: str
+
+
+Change = BestChanged | ConditionChanged
+
+
+class PathSet:
+    """Slots for configured and for learned paths.
+
+    ``known``: how many peers have proved to be at an address. It and ``facts`` are shared by all peers of a node.
+    """
+
+    __slots__ = (
+        "_election",
+        "_former",
+        "_idle_probe_s",
+        "_known",
+        "_redundancy",
+        "_reported",
+        "_reported_best",
+        "_revised_at",
+        "_stream_times",
+        "_unanswered",
+        "active_at",
+        "best",
+        "by_path",
+        "echo_route",
+        "facts",
+        "has_standby",
+        "is_multiple",
+        "next_at",
+        "routes",
+        "stream_at",
+        "stream_route",
+    )
+
+    def __init__(
+        self,
+        redundancy: Redundancy,
+        idle_probe_s: float,
+        known: Counter[SocketAddress],
+        facts: SocketFacts,
+    ) -> None:
+        self._redundancy = redundancy
+        self._idle_probe_s = idle_probe_s
+        self._known = known
+        self.facts = facts
+        """Behind the sockets of the paths."""
+        self.by_path: dict[Path, PathState] = {}
+        """The slots in use: the configured paths first, then the oldest."""
+        self._election = Election()
+        self._former: dict[Path, float] = {}  # validated paths that went down, and until when that counts
+        self._reported: set[PathState] = set()  # those that were reported as usable
+        self._reported_best: PathState | None = None
+        self._unanswered = 0
+        self._revised_at = NEVER  # an update is due since then
+        self.best: PathState | None = None
+        """Where frames go; a path that failed stays the best while there is no other."""
+        self.has_standby = False
+        """Whether there is another path than the best one, whatever its condition."""
+        self.is_multiple = False
+        """Whether two paths work: then an envelope holds frames of one class."""
+        self.routes: dict[Class, Route] = dict.fromkeys(Class, ())
+        """The paths of each class; all empty before a path is known."""
+        self.echo_route: Route = ()
+        """Of echo requests that are repeated if they are lost, and of their replies."""
+        self.stream_route: Route = ()
+        """That of stream: a frame needs no look-up."""
+        self.next_at = NEVER
+        """When :meth:`update` has something to do, or a question is due."""
+        self.active_at = -NEVER
+        """When frames were sent last."""
+        self.stream_at = -NEVER
+        """When the best path carried stream last."""
+        self._stream_times = deque[float](maxlen=c.STREAM_ENVELOPES)  # of envelopes, the oldest first
+
+    # Facts.
+
+    @property
+    def states(self) -> list[PathState]:
+        """Every slot in use, the configured paths first."""
+        return list(self.by_path.values())
+
+    @property
+    def has_any(self) -> bool:
+        """Whether there is somewhere to initiate to."""
+        return bool(self.by_path)
+
+    @property
+    def works(self) -> bool:
+        """Whether frames may be sent along the best path."""
+        return self.best is not None and self.best.works
+
+    @property
+    def round_trip_s(self) -> float:
+        """The mean round trip of the best path, if that works: at most `LATE_AFTER_S`, 0 before the first answer.
+
+        An attacker that slows the path must not lengthen waits without bound.
+        """
+        best = self.best
+        return 0.0 if best is None or best.srtt_s is None or not best.works else min(best.srtt_s, c.LATE_AFTER_S)
+
+    @property
+    def pace(self) -> Pace:
+        """That of the best path's network."""
+        return FREE if self.best is None else self.facts.pace(self.best.path)
+
+    @property
+    def has_several(self) -> bool:
+        """Whether there is more than one path, whatever their condition."""
+        return len(self.by_path) > 1
+
+    @property
+    def configured(self) -> tuple[Path, ...]:
+        """The paths of the configuration."""
+        return tuple(state.path for state in self.by_path.values() if state.is_configured)
+
+    def find(self, path: Path) -> PathState | None:
+        """The slot of a path."""
+        return self.by_path.get(path)
+
+    def with_number(self, number: int) -> PathState | None:
+        """The slot with this number."""
+        return next((state for state in self.by_path.values() if state.number == number), None)
+
+    def role(self, state: PathState) -> str:
+        """What the path is used for: ``best``, ``metered`` or ``standby``."""
+        return "best" if state is self.best else "metered" if state.is_metered else "standby"
+
+    def handshake_paths(self, *, is_answering: bool = True) -> tuple[list[Path], list[Path]]:
+        """Where to initiate: every path that may lead to the peer, the best first; those that are not metered, and
+        those that are.
+
+        While another path works, a metered one is only probed. ``is_answering``: the peer is not silent. Of a silent
+        one it is unknown which paths work.
+        """
+        works = is_answering and any(state.works and not state.is_metered for state in self.by_path.values())
+        states = [
+            state
+            for state in self.by_path.values()
+            if (state.is_configured or state.is_validated or state is self.best)
+            and not state.is_off
+            and not (works and state.is_metered)
+        ]
+        states.sort(key=lambda state: state is not self.best)
+        return [state.path for state in states if not state.is_metered], [
+            state.path for state in states if state.is_metered
+        ]
+
+    def take_unanswered(self) -> int:
+        """How many learned paths were given up since the last call, because they answered nothing."""
+        unanswered, self._unanswered = self._unanswered, 0
+        return unanswered
+
+    def was_validated(self, path: Path, now: float) -> bool:
+        """Whether a path without a slot was validated until recently: what was held back there still arrives."""
+        return now < self._former.get(path, -NEVER)
+
+    # Slots.
+
+    def configure(self, paths: Iterable[Path], now: float) -> None:
+        """The paths of the configuration, the likeliest first. One that works stays, as a learned path."""
+        hosts = Counter[tuple[int, str]]()
+        wanted: list[Path] = []
+        for path in dict.fromkeys(paths):
+            hosts[path.socket, path.host] += 1
+            if hosts[path.socket, path.host] <= c.PATHS_PER_HOST and len(wanted) < c.CONFIGURED_PATHS:
+                wanted.append(path)
+        before = self.by_path
+        self.by_path = {}
+        for path in wanted:
+            self.by_path[path] = before.get(path) or self._new(path, now, is_configured=True, others=before)
+            self.by_path[path].is_configured = self.by_path[path].is_proven = True
+        for path, state in before.items():
+            if path not in self.by_path:
+                state.is_configured = False
+                if state is self.best or state.works:
+                    self.by_path[path] = state
+                else:
+                    self._drop(state)
+
+    def learn(self, path: Path, now: float) -> PathState:
+        """A slot for an address from which an authentic envelope came first, or which made the session."""
+        learned = [state for state in self.by_path.values() if not state.is_configured]
+        if len(learned) >= c.LEARNED_PATHS:
+            self.remove(min((state for state in learned if state is not self.best), key=_usefulness))
+        state = self.by_path[path] = self._new(path, now, is_configured=False, others=self.by_path)
+        return state
+
+    def remove(self, state: PathState) -> None:
+        """Free a slot."""
+        del self.by_path[state.path]
+        self._drop(state)
+        if state is self.best:
+            self.best = None
+
+    def clear(self) -> None:
+        """Forget every path: the peer is removed."""
+        for state in self.states:
+            self.remove(state)
+
+    def _new(self, path: Path, now: float, *, is_configured: bool, others: dict[Path, PathState]) -> PathState:
+        taken = {state.number for state in (*others.values(), *self.by_path.values())}
+        number = next(number for number in range(1, 256) if number not in taken)
+        is_metered = path.socket in self.facts.metered
+        return PathState(path, number, now, is_configured=is_configured, is_metered=is_metered)
+
+    def _drop(self, state: PathState) -> None:
+        self._reported.discard(state)
+        self._unanswered += not (state.is_validated or state.is_configured)
+        if not state.is_known:
+            return
+        place = state.path.place
+        self._known[place] -= 1
+        if not self._known[place]:
+            del self._known[place]
+
+    def set_metered(self) -> None:
+        """The metered sockets have changed."""
+        for state in self.by_path.values():
+            state.is_metered = state.path.socket in self.facts.metered
+
+    def set_socket_state(self, socket: int, now: float, *, is_up: bool) -> None:
+        """The network behind a socket disappeared, or appeared, or changed."""
+        for state in self.by_path.values():
+            if state.path.socket == socket:
+                state.set_off(is_off=not is_up, now=now)
+
+    # Answers.
+
+    def note_answer(self, state: PathState, now: float, *, is_first: bool) -> None:
+        """A question along this path was answered. ``is_first``: none was before, so it is validated now."""
+        if is_first:
+            self._note_known(state)
+            state.envelope_limit.begin(now)
+        is_only = not any(other.works for other in self.by_path.values() if other is not state)
+        state.note_answer(now, is_only=is_only)
+
+    def note_echo(self, round_trip_s: float, now: float) -> None:
+        """An echo request was answered. If there is one path, the request was a question along it."""
+        if self.best is not None and len(self.by_path) == 1:
+            is_first = not self.best.is_validated
+            self.best.note_echo(round_trip_s, now)
+            self.note_answer(self.best, now, is_first=is_first)
+
+    def note_echo_counts(self, asked_at: float, sent: int, repeats: Repeats, received: int) -> None:
+        """Of ``sent`` envelopes of the session until an echo request so many arrived: the loss of the only path."""
+        if self.best is not None and len(self.by_path) == 1:
+            self.best.note_echo_counts(asked_at, sent, repeats, received)
+
+    # The election.
+
+    def prefer(self, path: Path, now: float) -> PathState:
+        """A session was made along this path. It carries traffic if none that works does."""
+        state = self.by_path.get(path) or self.learn(path, now)
+        if self.best is None or not self.best.works:
+            self.best = state
+            state.is_proven = True  # for FIRST_PATH_S: without an answer it gives up its slot then
+            if state.condition is PathCondition.UNPROVEN:
+                state.since = now  # the slot may be from before a silence
+        self._note_known(state)
+        return state
+
+    def _note_known(self, state: PathState) -> None:
+        if not state.is_known:
+            state.is_known = True
+            self._known[state.path.place] += 1
+
+    def update(self, now: float) -> list[Change]:
+        """Judge every path, elect the best one, and set the routes and the next deadline."""
+        self._revised_at = NEVER
+        for state in self.states:
+            state.check(now)
+        if not any(state.works for state in self.by_path.values()):
+            for state in self.by_path.values():
+                if state.is_recovering:  # the only one to answer: it need not prove itself for longer
+                    state.set_usable(now)
+        self.best, reason = self._election.elect(self.best, self.by_path.values(), now)
+        changes: list[Change] = []
+        for state in self.by_path.values() if self.has_several else ():
+            is_usable = state.condition is PathCondition.USABLE
+            if is_usable and state not in self._reported:
+                self._reported.add(state)
+                changes.append(ConditionChanged(state, True, state.reason))
+            elif state.condition is PathCondition.DOWN and state in self._reported:
+                self._reported.remove(state)
+                changes.append(ConditionChanged(state, False, state.reason))
+        for state in self.states:
+            if not state.is_configured and self._is_gone(state, now):
+                self.remove(state)
+                if state.is_validated:
+                    self._former[state.path] = now + c.FORMER_PATH_S
+                    if len(self._former) > c.LEARNED_PATHS:
+                        del self._former[next(iter(self._former))]
+        before, self._reported_best = self._reported_best, self.best
+        if self.best is not None and before is not None and self.best is not before:
+            changes.insert(0, BestChanged(self.best, before, reason or "session"))
+        self._set_routes(now)
+        self.has_standby = self.has_several
+        self.schedule(now)
+        return changes
+
+    def _is_gone(self, state: PathState, now: float) -> bool:
+        """Whether a learned path gives up its slot."""
+        if state.condition is PathCondition.UNPROVEN:
+            return now >= state.since + (c.FIRST_PATH_S if state is self.best else c.QUESTION_LIFETIME_S)
+        return state.condition is PathCondition.DOWN and state is not self.best and not state.is_recovering
+
+    def _set_routes(self, now: float) -> None:
+        best = self.best
+        if best is None:
+            self.routes, self.is_multiple = dict.fromkeys(Class, ()), False
+            self.stream_route = self.echo_route = ()
+            return
+        others = [state for state in self.by_path.values() if state is not best and not state.is_off]
+        working = [state for state in others if state.works]
+        recent = [state for state in others if state.works or now < state.answered_at + c.COPIES_AFTER_ANSWER_S]
+        self.is_multiple = bool(recent)
+        alone = (best,)
+        everywhere = (best, *recent)
+        critical = alone if self._redundancy is Redundancy.NONE else everywhere
+        stream: Route = alone
+        if self._redundancy is Redundancy.ALL:
+            stream = (best, *(state for state in working if not state.is_metered))
+        elif best.condition is not PathCondition.USABLE:
+            is_late = best.reason != "loss"
+            answering = [state for state in others if state.works or state.is_recovering]
+            stream = (best, *(state for state in answering if is_late or not state.is_metered))
+        self.stream_route = stream
+        self.echo_route = alone if best.condition is PathCondition.USABLE else critical
+        self.routes = {Class.CRITICAL: critical, Class.STREAM: stream, Class.BULK: alone}
+
+    # Lengths of envelopes.
+
+    def longest(self, cls: Class) -> int:
+        """The longest envelope that frames of this class share, in bytes. A longer one holds a single frame.
+
+        There must be a path.
+        """
+        route, limits = self.routes[cls], self.facts.envelope_limits
+        if cls is Class.CRITICAL:  # bit-identical copies along the whole route
+            most = c.CRITICAL_ENVELOPE_LIMIT if self.is_multiple else c.MAX_ENVELOPE_LIMIT
+            return min(most, *(limits.get(state.path.socket, most) for state in route))
+        return min(route[0].envelope_limit.limit, limits.get(route[0].path.socket, c.MAX_ENVELOPE_LIMIT))
+
+    def carries(self, state: PathState, size: int) -> bool:
+        """Whether a copy of so many bytes may go along a path. Each path carries the longest frame."""
+        limit = self.facts.envelope_limits.get(state.path.socket, c.MAX_ENVELOPE_LIMIT)
+        return size <= min(state.envelope_limit.limit, max(limit, c.MIN_ENVELOPE_LIMIT))
+
+    # Deadlines.
+
+    def revise(self, now: float) -> None:
+        """Slots or networks have changed: :meth:`update` is due, also if frames are sent before it."""
+        self._revised_at = self.next_at = now
+
+    def is_idle(self, now: float) -> bool:
+        """Whether no frames were sent recently."""
+        return now > self.active_at + c.IDLE_AFTER_S
+
+    def note_stream(self, now: float) -> bool:
+        """Frames of another class than critical are sent. Returns whether the best path begins to carry stream now.
+
+        It carries stream only with enough envelopes a second: questions four times a second would cost more than a
+        rare frame is worth.
+        """
+        times = self._stream_times
+        is_stream = len(times) == c.STREAM_ENVELOPES and now < times[0] + c.STREAM_ENDS_AFTER_S
+        times.append(now)
+        if not is_stream:
+            return False
+        begins = now >= self.stream_at + c.STREAM_ENDS_AFTER_S
+        self.stream_at = now
+        return begins
+
+    def interval_s(self, state: PathState, now: float) -> float:
+        """How long after a question the next one along this path is due; infinity for none."""
+        return max(self.facts.least_probe_s(state.path), self._wanted_interval_s(state, now))
+
+    def _wanted_interval_s(self, state: PathState, now: float) -> float:
+        """The same, without regard to budgets."""
+        others = [other for other in self.by_path.values() if other is not state]
+        is_needed = state is self.best or not any(other.works for other in others)
+        if state.is_metered and not is_needed:
+            return self._idle_probe_s or NEVER
+        if state.condition is PathCondition.SUSPECT or state.is_recovering:
+            return c.PROBE_FAST_S
+        if not state.works:
+            age_s = now - state.since
+            if age_s < c.DOWN_AFTER_S or (state is self.best and state.condition is PathCondition.UNPROVEN):
+                return c.PROBE_FAST_S
+            return c.PROBE_DOWN_S if age_s < c.LONG_DOWN_S else c.PROBE_LONG_DOWN_S
+        if not others:
+            return NEVER  # an echo request is the question
+        if self.is_idle(now):
+            return self._idle_probe_s or NEVER
+        if state.answers < c.SETTLING_ANSWERS:
+            return c.PROBE_FAST_S
+        if not any(other.condition is PathCondition.USABLE for other in others):
+            return c.PROBE_INTERVAL_S
+        carries_stream = state is self.best and now < self.stream_at + c.STREAM_ENDS_AFTER_S
+        return c.PROBE_FAST_S if carries_stream else c.PROBE_STANDBY_S
+
+    def schedule(self, now: float) -> None:
+        """Set the next deadline: a question, a judgement, or a better path that has proved itself."""
+        moments = [self._revised_at, self._election.due_at]
+        for state in self.by_path.values():
+            interval_s = NEVER if state.is_off else self.interval_s(state, now)
+            state.question_at = NEVER if interval_s == NEVER else max(now, state.questioned_at + interval_s)
+            copies_until = NEVER
+            if not state.works and now < state.answered_at + c.COPIES_AFTER_ANSWER_S:
+                copies_until = state.answered_at + c.COPIES_AFTER_ANSWER_S
+            moments += [state.question_at, state.next_check(), copies_until]
+            if self.has_several and state.condition is PathCondition.USABLE:
+                moments.append(state.envelope_limit.next_at)
+        self.next_at = min(moments)
+
+
+def _usefulness(state: PathState) -> tuple[bool, bool, float]:
+    return state.is_validated, state.works, max(state.received_at, state.since)

@@ -1,0 +1,171 @@
+"""Probes along the paths to a peer, and what their answers change. README.md, section 15."""
+
+from __future__ import annotations
+
+from uavlinkd.core import constants as c
+from uavlinkd.core.drops import DropReason
+from uavlinkd.core.outputs import Output, PathChanged, PathStateChanged
+from uavlinkd.core.path import Path
+from uavlinkd.core.path_state import PathCondition, PathState
+from uavlinkd.core.paths import BestChanged
+from uavlinkd.core.peer import Peer
+from uavlinkd.core.probe import ANSWER_BYTES, PROBE, QUESTION_BYTES, Probe, parse_probe
+from uavlinkd.core.send import seal
+from uavlinkd.core.session import Session
+from uavlinkd.core.sessions import Unconfirmed
+
+
+def update(peer: Peer, now: float) -> list[Output]:
+    """Judge the paths, and set when to do so again."""
+    out: list[Output] = []
+    for change in peer.paths.update(now):
+        path = change.state.path
+        if isinstance(change, BestChanged):
+            out.append(PathChanged(peer, path, change.before.path, change.reason))
+        else:
+            out.append(PathStateChanged(peer, path, change.is_usable, change.reason))
+    peer.traffic.paths_unproven += peer.paths.take_unanswered()
+    peer.set_paths_timer()
+    follow_paths(peer, now)
+    return out
+
+
+def follow_paths(peer: Peer, now: float) -> None:
+    """The paths have changed, or there is another session: set how long to wait for answers, and how often to ask.
+
+    Every session of a peer with several paths notes its arrivals: copies may overtake the envelopes of each.
+    """
+    peer.set_waits()
+    pace, has_several = peer.paths.pace, peer.paths.has_several
+    for session in peer.sessions.confirmed:
+        session.set_pace(pace, peer.verify_interval_s, now)
+        if has_several and session.arrivals is None:
+            session.begin_arrivals(now)
+
+
+def begin_session(peer: Peer, session: Session, path: Path, now: float) -> list[Output]:
+    """A session that was made along ``path`` carries the traffic now."""
+    paths = peer.paths
+    paths.prefer(path, now)
+    for state in paths.states:
+        state.note_session()
+    return update(peer, now)
+
+
+def ask_everywhere(peer: Peer, session: Session, now: float, waiting: Unconfirmed | None = None) -> list[Output]:
+    """A session begins: ask along every path, also those that carried its handshake (``waiting``)."""
+    paths = peer.paths
+    if waiting is not None:
+        for path in waiting.paths[: c.LEARNED_PATHS]:
+            if paths.find(path) is None:
+                state = learn(peer, path, now)
+                state.bytes_received, state.bytes_sent = waiting.initiation_bytes, waiting.response_bytes
+    out: list[Output] = []
+    for state in paths.states:
+        if state.is_configured and not paths.has_several:
+            break  # the echo requests of the session ask the same
+        is_wanted = not state.is_metered or state is paths.best or peer.settings.link.idle_probe_s > 0
+        if is_wanted and not state.is_off:
+            out += ask(peer, session, state, now)
+    return out + update(peer, now)
+
+
+def ask(peer: Peer, session: Session, state: PathState, now: float) -> list[Output]:
+    """Send a question along a path, if that may get so many bytes."""
+    if not state.allows(session.envelope_bytes(QUESTION_BYTES)):
+        return []
+    return _send(peer, session, state, peer.new_question(), 0, now)
+
+
+def learn(peer: Peer, path: Path, now: float) -> PathState:
+    """An envelope that is not a copy came from an unknown address: it may be the peer's."""
+    state = peer.paths.learn(path, now)
+    follow_paths(peer, now)
+    return state
+
+
+def receive_probe(peer: Peer, session: Session, probe: Probe, state: PathState, now: float) -> list[Output]:
+    """Note the report, take the answer, and answer the question along the path that it came by."""
+    out: list[Output] = []
+    is_current = session is peer.sessions.current
+    if is_current:
+        lost, age_s = state.receive_report(probe, now), now - session.created_at
+        peer.losses.note_report(lost, now, age_s, asks=probe.question != 0)
+    if probe.answer:
+        is_first = not state.is_validated
+        round_trip_s = state.receive_answer(probe.answer, probe.received if is_current else None, now)
+        if round_trip_s is None:
+            out.append(peer.drop_datagram(DropReason.UNEXPECTED_ANSWER, state.path))
+        else:
+            _note_answer(peer, state, round_trip_s, now, is_first=is_first)
+    if probe.question:
+        # A path that does not work here carried a question: it is asked in the answer, if it may get the bytes.
+        asks = not state.works and now >= state.questioned_at + c.PROBE_FAST_S
+        asks = asks and state.allows(session.envelope_bytes(QUESTION_BYTES))
+        if asks or state.allows(session.envelope_bytes(ANSWER_BYTES)):
+            out += _send(peer, session, state, peer.new_question() if asks else 0, probe.question, now)
+    return out + update(peer, now)
+
+
+def receive_copy(peer: Peer, session: Session, payload: bytes, state: PathState, now: float) -> list[Output]:
+    """Take a probe that arrived along another path before: a sender that is faster than the peer copied it.
+
+    Otherwise it could keep every question along the peer's own path from being answered. A question is answered along
+    each path once. The counts belong to one path, and it is unknown which: they are ignored.
+    """
+    parsed = parse_probe(payload) if payload[0] == PROBE else None
+    if parsed is None:
+        return []
+    probe, _ = parsed
+    out: list[Output] = []
+    is_first = not state.is_validated
+    if probe.answer and (round_trip_s := state.receive_answer(probe.answer, None, now)) is not None:
+        _note_answer(peer, state, round_trip_s, now, is_first=is_first)
+    if probe.question and probe.question != state.copied_question:
+        state.copied_question = probe.question
+        if state.allows(session.envelope_bytes(ANSWER_BYTES)):
+            out += _send(peer, session, state, 0, probe.question, now)
+    return out + update(peer, now)
+
+
+def _note_answer(peer: Peer, state: PathState, round_trip_s: float, now: float, *, is_first: bool) -> None:
+    if peer.round_trip_s is None or not peer.paths.has_several:
+        peer.round_trip_s = round_trip_s
+    peer.paths.note_answer(state, now, is_first=is_first)
+
+
+def handle_timeout(peer: Peer, now: float) -> list[Output]:
+    """Judge the paths and send the questions that are due."""
+    out = update(peer, now)
+    session = peer.sending_session()
+    if session is None or not peer.is_up:
+        return out
+    for state in peer.paths.states:
+        if now >= state.question_at:
+            out += ask(peer, session, state, now)
+            state.questioned_at = now  # also if nothing could be sent
+        if peer.paths.has_several and state.condition is PathCondition.USABLE:
+            out += _test_limit(peer, session, state, now)
+    peer.paths.schedule(now)
+    peer.set_paths_timer()
+    return out
+
+
+def _test_limit(peer: Peer, session: Session, state: PathState, now: float) -> list[Output]:
+    """Send a padded probe if a test of the longest envelope is due."""
+    network_limit = peer.paths.facts.envelope_limits.get(state.path.socket, session.max_envelope)
+    longest = min(session.max_envelope, network_limit)
+    size = state.envelope_limit.size_to_test(longest, state.answered_at, now)
+    padding = size - session.envelope_bytes(QUESTION_BYTES)
+    if padding <= 0:
+        return []
+    record = state.make_test(peer.new_question(), now)
+    out = seal(peer, session, record.encode(padding=padding), (state,), now, is_answer=True)
+    # If a short question alone is answered, the length is the reason.
+    return out if state.questioned_at == now else out + ask(peer, session, state, now)
+
+
+def _send(peer: Peer, session: Session, state: PathState, question: int, answer: int, now: float) -> list[Output]:
+    record = state.make_probe(question, answer, now)
+    # Along one path, so its silence says nothing about the peer: it starts no count of silence.
+    return seal(peer, session, record.encode(), (state,), now, is_answer=True)
