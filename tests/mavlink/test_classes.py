@@ -1,47 +1,64 @@
-"""Which frames may be old, and which class a message has."""
+"""The table of messages: each of its facts, message by message, and the rules behind them."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from pathlib import Path
+
 import pytest
-from pymavlink.dialects.v20 import all as mavlink
 
-from uavlinkd.mavlink.classes import CLASSES, Class, MessageClass, screen
-from uavlinkd.mavlink.dialect import GROUPS, ids_by_name
-from uavlinkd.mavlink.egress.kinds import KINDS, Lane
+from uavlinkd.core.settings import Class
+from uavlinkd.mavlink.classes import KINDS, Lane, MessageKind
+from uavlinkd.mavlink.dialect import GROUPS, ids_by_name, name_of
 
-_SENDER = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
-
-
-def frame(message: mavlink.MAVLink_message) -> bytes:
-    """A frame of it."""
-    return bytes(message.pack(_SENDER))
+PINNED = Path(__file__).parent / "message_kinds.txt"
+"""One line for each message, in the order of the names."""
+ID = ids_by_name()
 
 
-def heartbeat(kind: int) -> bytes:
-    """Of a vehicle or a ground station."""
-    return frame(mavlink.MAVLink_heartbeat_message(kind, 3, 81, 0, 4, 3))
+def lines() -> Iterator[str]:
+    """The table as the file has it."""
+    for name in sorted(ID):
+        kind = KINDS[ID[name]]
+        age = "may-be-old" if kind.may_be_old else "must-be-new"
+        waits = "state" if kind.is_state else "event"
+        instance = f" {kind.instance_at}+{kind.instance_bytes}" if kind.instance_bytes else ""
+        yield f"{name} {kind.cls} {age} {kind.lane.name.lower()} {waits}{instance}"
 
 
-VEHICLE = heartbeat(mavlink.MAV_TYPE_QUADROTOR)
-GROUND_STATION = heartbeat(mavlink.MAV_TYPE_GCS)
-ATTITUDE = frame(mavlink.MAVLink_attitude_message(*[1] * 7))
-COMMAND = frame(mavlink.MAVLink_command_long_message(1, 1, 400, *[0] * 8))
+def test_table_has_the_reviewed_facts_about_every_message() -> None:
+    """A change of a group, or a new message of the dialect, shows here as the lines that it changes."""
+    pinned = PINNED.read_text(encoding="utf-8").splitlines()
+    actual = list(lines())
+    assert sorted(set(pinned) ^ set(actual)) == []
+    assert pinned == actual
 
 
 def test_every_message_of_the_dialect_is_in_the_table() -> None:
     """None is left to a default."""
-    assert set(CLASSES) == set(ids_by_name().values())
+    assert set(KINDS) == set(ID.values())
+
+
+@pytest.mark.parametrize("group", ["commands", "parameters", "manual", "setpoints", "heartbeat"])
+def test_every_message_of_these_groups_is_critical(group: str) -> None:
+    """As the specification says: a lost one costs a decision of the pilot or the autopilot."""
+    assert {KINDS[ID[name]].cls for name in GROUPS[group]} == {Class.CRITICAL}
+
+
+def test_files_and_logs_are_bulk_and_no_other_message_is() -> None:
+    """A PARAM_VALUE becomes bulk by what came before, not by the table."""
+    assert {name_of(msgid) for msgid, kind in KINDS.items() if kind.cls is Class.BULK} == set(GROUPS["files"])
 
 
 @pytest.mark.parametrize("group", ["commands", "parameters", "manual", "setpoints", "sensors", "files", "shell"])
 def test_what_steers_must_be_new(group: str) -> None:
     """Every message of the groups that make an autopilot do something."""
-    assert not [name for name in GROUPS[group] if CLASSES[ids_by_name()[name]].may_be_old]
+    assert not [name for name in GROUPS[group] if KINDS[ID[name]].may_be_old]
 
 
 def test_mission_transactions_must_be_new_and_reports_about_a_mission_need_not() -> None:
     """A report is one that is in the group telemetry too, such as MISSION_CURRENT."""
-    may_be_old = {name for name in GROUPS["mission"] if CLASSES[ids_by_name()[name]].may_be_old}
+    may_be_old = {name for name in GROUPS["mission"] if KINDS[ID[name]].may_be_old}
     assert may_be_old == set(GROUPS["mission"]) & set(GROUPS["telemetry"])
     assert "MISSION_CURRENT" in may_be_old
     assert not may_be_old & {"MISSION_ITEM_INT", "MISSION_COUNT", "MISSION_SET_CURRENT", "SET_HOME_POSITION"}
@@ -49,50 +66,27 @@ def test_mission_transactions_must_be_new_and_reports_about_a_mission_need_not()
 
 def test_urgent_lane_is_a_part_of_the_critical_class() -> None:
     """What a slow link sends first is what must arrive."""
-    urgent = {msgid for msgid, kind in KINDS.items() if kind.lane is Lane.URGENT}
-    assert {CLASSES[msgid].cls for msgid in urgent} == {Class.CRITICAL}
+    assert {kind.cls for kind in KINDS.values() if kind.lane is Lane.URGENT} == {Class.CRITICAL}
+
+
+def test_states_lane_has_states_only() -> None:
+    """And a state is in no lane of events."""
+    lanes = {(kind.lane, kind.is_state) for kind in KINDS.values()}
+    assert lanes == {(Lane.URGENT, True), (Lane.URGENT, False), (Lane.EVENTS, False), (Lane.STATES, True)}
 
 
 @pytest.mark.parametrize(
     ("name", "expected"),
     [
-        ("HEARTBEAT", MessageClass(Class.CRITICAL, may_be_old=True)),
-        ("STATUSTEXT", MessageClass(Class.CRITICAL, may_be_old=True)),
-        ("COMMAND_ACK", MessageClass(Class.CRITICAL, may_be_old=False)),
-        ("MISSION_ITEM_INT", MessageClass(Class.CRITICAL, may_be_old=False)),
-        ("ATTITUDE", MessageClass(Class.STREAM, may_be_old=True)),
-        ("ADSB_VEHICLE", MessageClass(Class.STREAM, may_be_old=False)),
-        ("LOG_DATA", MessageClass(Class.BULK, may_be_old=False)),
+        ("HEARTBEAT", MessageKind(Class.CRITICAL, may_be_old=True, lane=Lane.URGENT, is_state=True)),
+        ("STATUSTEXT", MessageKind(Class.CRITICAL, may_be_old=True, lane=Lane.EVENTS, is_state=False)),
+        ("COMMAND_ACK", MessageKind(Class.CRITICAL, may_be_old=False, lane=Lane.URGENT, is_state=False)),
+        ("MISSION_ITEM_INT", MessageKind(Class.CRITICAL, may_be_old=False, lane=Lane.EVENTS, is_state=False)),
+        ("ATTITUDE", MessageKind(Class.STREAM, may_be_old=True, lane=Lane.STATES, is_state=True)),
+        ("ADSB_VEHICLE", MessageKind(Class.STREAM, False, Lane.STATES, True, instance_at=0, instance_bytes=4)),
+        ("LOG_DATA", MessageKind(Class.BULK, may_be_old=False, lane=Lane.EVENTS, is_state=False)),
     ],
 )
-def test_class_of_a_message(name: str, expected: MessageClass) -> None:
+def test_facts_about_a_message(name: str, expected: MessageKind) -> None:
     """One of each kind."""
-    assert CLASSES[ids_by_name()[name]] == expected
-
-
-def test_screen_splits_a_payload_and_keeps_the_order() -> None:
-    """Reports pass; a command and a ground station's heartbeat wait."""
-    passing, waiting = screen(ATTITUDE + COMMAND + VEHICLE + GROUND_STATION + ATTITUDE)
-    assert passing == ATTITUDE + VEHICLE + ATTITUDE
-    assert waiting == COMMAND + GROUND_STATION
-
-
-def test_ground_station_in_mavlink_1_waits_too() -> None:
-    """The type is at another offset there."""
-    old = bytearray(mavlink.MAVLink_heartbeat_message(6, 3, 81, 0, 4, 3).pack(_SENDER, force_mavlink1=True))
-    assert screen(bytes(old)) == (b"", bytes(old))
-
-
-def test_unknown_message_must_be_new() -> None:
-    """What the dialect does not have, or has in another form, may do anything."""
-    raw = bytearray(ATTITUDE)
-    raw[7:10] = (11_999).to_bytes(3, "little")
-    frames = [bytes(raw[:-2]) + number.to_bytes(2, "little") for number in range(65536)]
-    unknown = next(candidate for candidate in frames if screen(candidate + ATTITUDE) == (ATTITUDE, candidate))
-    assert screen(unknown) == (b"", unknown)
-
-
-@pytest.mark.parametrize("garbage", [b"\x00", ATTITUDE[:-1], b"\xfd" + bytes(20)])
-def test_payload_with_garbage_waits_as_a_whole(garbage: bytes) -> None:
-    """It is not split here: the code that delivers it counts what is wrong."""
-    assert screen(ATTITUDE + garbage) == (b"", ATTITUDE + garbage)
+    assert KINDS[ID[name]] == expected

@@ -1,97 +1,171 @@
-"""Two facts about a message: its class, and whether it may be delivered while its age is not known.
+"""All facts about a message, in one table: its class, whether it may be old, how it waits, and its instances.
 
-*Class*: a `critical` frame must arrive, a `stream` frame is followed by another, a `bulk` frame can wait. The lane
-`urgent` of :mod:`.egress.kinds` is the part of `critical` that a slow link sends first.
+*Class*: a `critical` frame must arrive, a `stream` frame is followed by another, a `bulk` frame can wait. One message
+has a class that depends on what came before: a PARAM_VALUE (:mod:`.answers`).
 
 *Age*: after a silence, or without an answer from the peer, a frame may be old (specification, section 11). Only a
 report may be delivered then: a message that asks its receiver for nothing. Positions of other vehicles are reports.
 A vehicle that follows or avoids by them has to judge their age itself: see section 11 for how old they may be. Any
-other message must be known to be new. That includes a ground station's HEARTBEAT, which silences the failsafe, and a
-message that the dialect does not have, or not in this form: the effect of an old one is unknown.
+other message must be known to be new. That includes a ground station's HEARTBEAT, which silences the failsafe
+(:mod:`.screening`), and a message that the dialect does not have, or not in this form: the effect of an old one is
+unknown.
+
+*Lane*: on a link that cannot carry all frames, heartbeats, commands, their answers and manual control go before all
+others (the group ``urgent``, a part of the class `critical`).
+
+*State or event*: a message is a **state** if a newer one from the same source contains everything that the older one
+said: attitude, position, battery, a setpoint. Of states only the newest is worth sending, and worth delivering. Every
+other message is an **event**, which no later message replaces: a parameter, a mission item, a part of a file, a text,
+a command, and every message that the dialect does not define.
+
+*Instance*: some messages describe several things in turn (BATTERY_STATUS of two batteries, ADSB_VEHICLE of the
+aircraft around). If the newest replaced all of them, some would starve. So the field that tells them apart is part of
+the flow (:mod:`.flows`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from enum import StrEnum
+from enum import IntEnum
 from typing import Final, NamedTuple
 
+from uavlinkd.core.settings import Class
 from uavlinkd.mavlink.dialect import GROUPS, ids_by_name
-from uavlinkd.mavlink.frames import Frame, SplitCounters, split_payload
-from uavlinkd.mavlink.policy.gate import HEARTBEAT, claims_to_be_ground_station
 
 
-class Class(StrEnum):
-    """What a lost or late frame costs."""
+class Lane(IntEnum):
+    """Which queue a frame waits in."""
 
-    CRITICAL = "critical"
-    STREAM = "stream"
-    BULK = "bulk"
+    URGENT = 0
+    EVENTS = 1
+    STATES = 2
 
 
-class MessageClass(NamedTuple):
+class MessageKind(NamedTuple):
     """The facts about one message."""
 
     cls: Class
     may_be_old: bool
-    """Whether it may be delivered while freshness is unverified."""
+    """Whether it may be delivered while freshness is unverified. A ground station's HEARTBEAT may not."""
+    lane: Lane
+    is_state: bool
+    """Whether a newer one replaces it."""
+    instance_at: int = 0
+    """Where the payload tells one reported thing from another, in bytes."""
+    instance_bytes: int = 0
+    """The length of that place; 0: the message reports one thing only."""
 
 
-_CRITICAL_GROUPS: Final = ("heartbeat", "commands", "mission", "parameters", "manual", "setpoints", "urgent")
+def _names(text: str) -> frozenset[str]:
+    return frozenset(text.split())
+
+
+def _names_in(groups: Iterable[str]) -> frozenset[str]:
+    return frozenset(name for group in groups for name in GROUPS[group])
+
+
+_CRITICAL_GROUPS: Final = ("urgent", "commands", "mission", "parameters", "manual", "setpoints")
+_MORE_CRITICAL: Final = _names(
+    # Texts of the autopilot, and requests with answers that are commands in another form.
+    "STATUSTEXT CHANGE_OPERATOR_CONTROL CHANGE_OPERATOR_CONTROL_ACK SECURE_COMMAND SECURE_COMMAND_REPLY "
+    "DIGICAM_CONFIGURE DIGICAM_CONTROL MOUNT_CONFIGURE"
+)
 _BULK_GROUPS: Final = ("files",)
-_REPORTS: Final = ("heartbeat", "telemetry", "position", "identification", "payload-reports")
-_STEERING: Final = (
+_REPORT_GROUPS: Final = ("heartbeat", "telemetry", "position", "identification", "payload-reports")
+_STEERING_GROUPS: Final = (
     *("commands", "parameters", "manual", "setpoints", "sensors", "traffic", "rtk", "simulation", "time", "files"),
     *("shell", "firmware", "control-access", "signing"),
 )
 """A report in one of these groups steers an autopilot all the same, such as DISTANCE_SENSOR."""
 
+# All messages of these groups are states ...
+_STATE_GROUPS: Final = ("telemetry", "position", "traffic", "setpoints", "manual", "sensors")
+_MORE_STATES: Final = _names(
+    "RADIO RADIO_STATUS MLRS_RADIO_LINK_STATS GIMBAL_DEVICE_ATTITUDE_STATUS GIMBAL_MANAGER_STATUS GIMBAL_REPORT "
+    "AUTOPILOT_STATE_FOR_GIMBAL_DEVICE CAMERA_FOV_STATUS CELLULAR_STATUS LINK_NODE_STATUS"
+)
+# ... but for what is said once, in parts, or in answer to a question about one of many.
+_EVENTS_AMONG_THEM: Final = _names(
+    "STATUSTEXT AUTOPILOT_VERSION MISSION_ITEM_REACHED MESSAGE_INTERVAL DATA_STREAM MAG_CAL_REPORT BUTTON_CHANGE "
+    "MEMORY_VECT AVAILABLE_MODES UAVCAN_NODE_INFO SMART_BATTERY_INFO FLIGHT_INFORMATION OBSTACLE_DISTANCE_3D "
+    "PROTOCOL_VERSION COMPONENT_INFORMATION COMPONENT_INFORMATION_BASIC COMPONENT_METADATA EVENT"
+)
 
-def _names(groups: Iterable[str]) -> set[str]:
-    return {name for group in groups for name in GROUPS[group]}
+INSTANCES: Final[dict[str, tuple[int, int]]] = {
+    # name: (offset, length) in the payload, in bytes, of the field or neighbouring fields that tell instances apart
+    "ACTUATOR_CONTROL_TARGET": (40, 1),  # group_mlx
+    "ADAP_TUNING": (48, 1),  # axis
+    "ADSB_VEHICLE": (0, 4),  # ICAO_address
+    "AIRSPEED": (10, 1),  # id
+    "AIS_VESSEL": (0, 4),  # MMSI
+    "BATTERY_INFO": (44, 1),  # id
+    "BATTERY_STATUS": (32, 1),  # id
+    "CAMERA_FOV_STATUS": (52, 1),  # camera_device_id
+    "CELLULAR_STATUS": (10, 1),  # id
+    "COLLISION": (0, 4),  # id
+    "DEBUG": (8, 1),  # ind
+    "DEBUG_FLOAT_ARRAY": (8, 12),  # array_id, name
+    "DEBUG_VECT": (20, 10),  # name
+    "DISTANCE_SENSOR": (10, 3),  # type, id, orientation
+    "EFI_STATUS": (0, 4),  # ecu_index
+    "ESC_INFO": (42, 1),  # index
+    "ESC_STATUS": (56, 1),  # index
+    "FUEL_STATUS": (24, 1),  # id
+    "GIMBAL_DEVICE_ATTITUDE_STATUS": (48, 1),  # gimbal_device_id
+    "GIMBAL_MANAGER_STATUS": (8, 1),  # gimbal_device_id
+    "GLOBAL_POSITION_SENSOR": (38, 1),  # id
+    "GNSS_INTEGRITY": (8, 1),  # id
+    "GPS_INPUT": (60, 1),  # gps_id
+    "GPS_RTK": (30, 1),  # rtk_receiver_id
+    "HIGHRES_IMU": (62, 1),  # id
+    "HYGROMETER_SENSOR": (4, 1),  # id
+    "LANDING_TARGET": (28, 1),  # target_num
+    "LOWEHEISER_GOV_EFI": (84, 1),  # efi_index
+    "MAG_CAL_PROGRESS": (12, 1),  # compass_id
+    "MCU_STATUS": (8, 1),  # id
+    "NAMED_VALUE_FLOAT": (8, 10),  # name
+    "NAMED_VALUE_INT": (8, 10),  # name
+    "NAMED_VALUE_STRING": (4, 10),  # name
+    "OBSTACLE_DISTANCE": (156, 1),  # sensor_type
+    "ODOMETRY": (228, 2),  # frame_id, child_frame_id
+    "ONBOARD_COMPUTER_STATUS": (196, 1),  # type
+    "OPTICAL_FLOW": (24, 1),  # sensor_id
+    "OPTICAL_FLOW_RAD": (42, 1),  # sensor_id
+    "PID_TUNING": (24, 1),  # axis
+    "RANGING_BEACON": (36, 2),  # beacon_id
+    "RAW_IMU": (26, 1),  # id
+    "RAW_RPM": (4, 1),  # index
+    "RC_CHANNELS_RAW": (20, 1),  # port
+    "RC_CHANNELS_SCALED": (20, 1),  # port
+    "SERVO_OUTPUT_RAW": (20, 1),  # port
+    "SET_ACTUATOR_CONTROL_TARGET": (40, 1),  # group_mlx
+    "UTM_GLOBAL_POSITION": (50, 18),  # uas_id
+    "WATER_DEPTH": (36, 1),  # id
+}
 
 
-def _table() -> dict[int, MessageClass]:
+def _table() -> dict[int, MessageKind]:
+    may_be_old = _names_in(_REPORT_GROUPS) - _names_in(_STEERING_GROUPS)
+    urgent = _names_in(["urgent"])
     # A report about a mission, such as MISSION_CURRENT, is telemetry: the next one makes up for it.
-    may_be_old = _names(_REPORTS) - _names(_STEERING)
-    bulk = _names(_BULK_GROUPS)
-    critical = (_names(_CRITICAL_GROUPS) - (may_be_old - _names(("urgent",)))) | {"STATUSTEXT"}
-    classes = {
-        name: Class.CRITICAL if name in critical else Class.BULK if name in bulk else Class.STREAM
-        for name in ids_by_name()
+    critical = (_names_in(_CRITICAL_GROUPS) - (may_be_old - urgent)) | _MORE_CRITICAL
+    bulk = _names_in(_BULK_GROUPS)
+    states = (_names_in(_STATE_GROUPS) | _MORE_STATES) - _EVENTS_AMONG_THEM
+    return {
+        msgid: MessageKind(
+            Class.CRITICAL if name in critical else Class.BULK if name in bulk else Class.STREAM,
+            name in may_be_old,
+            Lane.URGENT if name in urgent else Lane.STATES if name in states else Lane.EVENTS,
+            name in states,
+            *INSTANCES.get(name, ()),
+        )
+        for name, msgid in ids_by_name().items()
     }
-    return {msgid: MessageClass(classes[name], name in may_be_old) for name, msgid in ids_by_name().items()}
 
 
-CLASSES: Final = _table()
-"""By message id."""
-UNKNOWN: Final = MessageClass(Class.STREAM, may_be_old=False)
+KINDS: Final = _table()
+"""By message id. The header of a frame has its row: :attr:`.headers.Header.kind`."""
+UNKNOWN: Final = MessageKind(Class.STREAM, may_be_old=False, lane=Lane.EVENTS, is_state=False)
 """Of a message that the dialect does not have, or has in another form."""
-
-
-def class_of(frame: Frame) -> MessageClass:
-    """The facts about this frame's message."""
-    return CLASSES.get(frame.header.msgid, UNKNOWN) if frame.header.is_known else UNKNOWN
-
-
-def may_be_old(frame: Frame) -> bool:
-    """Whether this frame may be delivered while freshness is unverified."""
-    if not class_of(frame).may_be_old:
-        return False
-    return frame.header.msgid != HEARTBEAT or not claims_to_be_ground_station(frame)
-
-
-def screen(payload: bytes) -> tuple[bytes, bytes]:
-    """The frames of an authentic payload that may be old, and those that must be new. Total.
-
-    Of a payload with anything but frames all must be new: the receiver of the rest counts what is wrong with it.
-    """
-    counters = SplitCounters()
-    frames = split_payload(payload, counters)
-    if counters.garbage_bytes:
-        return b"", payload
-    passing: list[bytes] = []
-    waiting: list[bytes] = []
-    for frame in frames:
-        (passing if may_be_old(frame) else waiting).append(frame.raw)
-    return b"".join(passing), b"".join(waiting)
+SAID_ONCE: Final = frozenset(ids_by_name()[name] for name in _EVENTS_AMONG_THEM)
+"""Message ids in groups of states that no later frame replaces, such as a line of STATUSTEXT."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import Final, NamedTuple, final
 
+from uavlinkd.mavlink.classes import KINDS, UNKNOWN
 from uavlinkd.mavlink.dialect_table import MESSAGES
 
 MAX_SENDER_MESSAGES: Final = 2048
@@ -30,6 +31,7 @@ class Header:
         "component",
         "is_known",
         "is_mavlink1",
+        "kind",
         "msgid",
         "system",
         "target_component",
@@ -59,6 +61,8 @@ class Header:
         self.is_known = is_known
         """Whether the checksum fits the dialect's definition. Otherwise target and command could not be read."""
         self.is_mavlink1 = is_mavlink1
+        self.kind = KINDS.get(msgid, UNKNOWN) if is_known else UNKNOWN
+        """All other facts about the message: looked up once for all frames with this header."""
 
 
 class SenderMessage(NamedTuple):

@@ -8,9 +8,8 @@ from typing import Any
 from pymavlink.dialects.v20 import all as mavlink
 
 from uavlinkd.mavlink.dialect import ids_by_name, name_of
-from uavlinkd.mavlink.egress import kinds as egress_kinds
 from uavlinkd.mavlink.egress.budgeted import Egress, EgressSettings, EnvelopeShape
-from uavlinkd.mavlink.egress.kinds import flow_key, kind_of
+from uavlinkd.mavlink.flows import FlowKey, flow_key
 from uavlinkd.mavlink.frames import Frame, SplitCounters, split_datagram
 
 SHAPE = EnvelopeShape(payload_limit=1200, seal_bytes=23, carrier_bytes=28)
@@ -74,9 +73,10 @@ class Link:
 
     def flush(self, now: float) -> None:
         while batch := self.egress.take(now):
-            self.envelopes.append((now, batch))
-            self.sent += [(now, raw) for raw in batch]
-            self.transmit(self.shape.seal_bytes + sum(map(len, batch)), now)
+            sent = raws(batch)
+            self.envelopes.append((now, sent))
+            self.sent += [(now, raw) for raw in sent]
+            self.transmit(self.shape.seal_bytes + sum(map(len, sent)), now)
 
     def transmit(self, datagram_bytes: int, now: float) -> None:
         self.egress.spend(datagram_bytes, now)
@@ -99,9 +99,9 @@ def id_of(raw: bytes) -> int:
     return int.from_bytes(raw[7:10], "little")
 
 
-def flow_of(raw: bytes) -> egress_kinds.FlowKey:
+def flow_of(raw: bytes) -> FlowKey:
     (made,) = split_datagram(raw, SplitCounters())
-    return flow_key(made, kind_of(made))
+    return flow_key(made)
 
 
 def play(link: Link, offers: Iterable[tuple[float, Frame | Callable[[], None]]], until: float) -> None:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from tests.mavlink.egress.samples import MAKERS, attitude, heartbeat, parameter
 from uavlinkd.mavlink.egress.budgeted import Egress, EgressSettings, EnvelopeShape
-from uavlinkd.mavlink.egress.coalescing import Coalescer, make_egress
+from uavlinkd.mavlink.egress.coalescing import Coalescer
 from uavlinkd.mavlink.egress.lanes import EgressDrop
 from uavlinkd.mavlink.frames import Frame
 
@@ -20,9 +20,9 @@ SETTINGS = EgressSettings(coalesce_s=0.1, max_age_s=1.0)
 
 def sent_by(
     egress: Egress | Coalescer, puts: Sequence[tuple[float, Sequence[Frame]]]
-) -> list[tuple[float, list[bytes]]]:
+) -> list[tuple[float, list[Frame]]]:
     """Each envelope, and when it went, if it is asked whenever frames come and whenever it says so."""
-    sent: list[tuple[float, list[bytes]]] = []
+    sent: list[tuple[float, list[Frame]]] = []
 
     def take(now: float) -> None:
         while batch := egress.take(now):
@@ -72,7 +72,7 @@ def test_what_is_fresh_is_not_dropped_with_what_is_stale() -> None:
     coalescer = Coalescer(SETTINGS)
     coalescer.put([attitude(1)], 0.0)
     coalescer.put([heartbeat(2)], 1.5)
-    assert coalescer.take(1.5) == [heartbeat(2).raw]
+    assert coalescer.take(1.5) == [heartbeat(2)]
     assert coalescer.totals == {EgressDrop.STALE: 1}
 
 
@@ -84,10 +84,3 @@ def test_clear_drops_all_that_waits() -> None:
     assert (coalescer.queued_frames, coalescer.queued_bytes, coalescer.next_deadline()) == (0, 0, inf)
     assert coalescer.totals == {EgressDrop.CLOSED: 2}
     assert coalescer.take(0.2) == []
-
-
-def test_who_needs_what() -> None:
-    """A budget needs an Egress; a delay alone this; neither needs nothing."""
-    assert isinstance(make_egress(EgressSettings(budget_bits_s=4000, coalesce_s=0.1), 0.0), Egress)
-    assert isinstance(make_egress(EgressSettings(coalesce_s=0.1), 0.0), Coalescer)
-    assert make_egress(EgressSettings(), 0.0) is None

@@ -33,9 +33,10 @@ from tests.mavlink.egress.samples import (
     raws,
 )
 from uavlinkd.mavlink.dialect import name_of
-from uavlinkd.mavlink.egress import kinds as egress_kinds
-from uavlinkd.mavlink.egress.budgeted import BURST_S, Egress, EgressSettings, EnvelopeShape
+from uavlinkd.mavlink.egress.bucket import BURST_S
+from uavlinkd.mavlink.egress.budgeted import Egress, EgressSettings, EnvelopeShape
 from uavlinkd.mavlink.egress.lanes import EgressDrop
+from uavlinkd.mavlink.flows import FlowKey
 from uavlinkd.mavlink.frames import Frame
 from uavlinkd.mavlink.headers import Header
 
@@ -71,6 +72,15 @@ def test_full_envelope_does_not_wait() -> None:
     assert [raw for _, raw in link.sent] == raws(frames)
 
 
+def test_newer_state_does_not_wait_again() -> None:
+    """Two states arrive more often than the coalescing delay ends, and the budget is short. The newest go in time."""
+    link = Link(EgressSettings(budget_bits_s=4000, coalesce_s=0.25))
+    for n in range(200):
+        link.put(attitude(n), now=n * 0.05)
+    times = [at for at, _ in link.envelopes]
+    assert max(later - earlier for earlier, later in pairwise(times)) < 0.5
+
+
 def test_urgent_frame_ends_the_wait() -> None:
     """A command goes at once and takes along what waits, behind what came before it."""
     link = Link(EgressSettings(coalesce_s=0.5))
@@ -98,7 +108,7 @@ def test_idle_link_sends_at_once_and_in_order() -> None:
     link = Link(SLOW)
     frames = [attitude(1), battery(1, 0), heartbeat(1), attitude(2)]
     link.egress.put(frames, 0.0)
-    assert link.egress.take(0.0) == raws(frames)
+    assert link.egress.take(0.0) == frames
 
 
 def test_core_traffic_counts() -> None:
@@ -318,7 +328,7 @@ def test_whatever_happens_the_rules_hold(seed: int, budget: int, coalesce: float
     assert all(raw in link.offered and at - link.offered[raw] <= 1.0 for at, raw in link.sent)
     assert all(sum(map(len, batch)) <= limit for _, batch in link.envelopes)
     number = {raw: n for n, raw in enumerate(link.offered)}
-    last: dict[egress_kinds.FlowKey, int] = {}
+    last: dict[FlowKey, int] = {}
     for _, raw in link.sent:
         flow = flow_of(raw)
         assert last.get(flow, -1) < number[raw]

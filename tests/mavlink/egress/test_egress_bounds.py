@@ -5,8 +5,8 @@ from __future__ import annotations
 from pymavlink.dialects.v20 import all as mavlink
 
 from tests.mavlink.egress.samples import SLOW, Link, attitude, frame, heartbeat, parameter, raws
+from uavlinkd.mavlink.classes import Lane
 from uavlinkd.mavlink.egress.budgeted import MAX_FLOWS, MIN_LANE_BYTES, Egress, EgressSettings
-from uavlinkd.mavlink.egress.kinds import Lane
 from uavlinkd.mavlink.egress.lanes import EgressDrop
 
 

@@ -21,8 +21,8 @@ from uavlinkd.mavlink.egress.fair_queue import (
     URGENT_PART,
     FairQueue,
 )
-from uavlinkd.mavlink.egress.kinds import flow_key, kind_of
 from uavlinkd.mavlink.egress.lanes import EgressDrop
+from uavlinkd.mavlink.flows import flow_key
 from uavlinkd.mavlink.frames import Frame
 from uavlinkd.mavlink.policy.compilation import compile_policy
 from uavlinkd.mavlink.policy.delivery import Source
@@ -273,6 +273,6 @@ def test_each_frame_leaves_once_and_flows_keep_their_order(steps: list[tuple[str
     assert put_count == len(gone) + dropped.total()
     last: dict[object, int] = defaultdict(lambda: -1)
     for item, source in gone:
-        flow = (source, flow_key(item, kind_of(item)))
+        flow = (source, flow_key(item))
         assert put_order[id(item)] > last[flow]
         last[flow] = put_order[id(item)]

@@ -25,8 +25,8 @@ from tests.mavlink.egress.samples import (
     parameter,
     play,
 )
+from uavlinkd.mavlink.classes import KINDS
 from uavlinkd.mavlink.dialect import name_of
-from uavlinkd.mavlink.egress import kinds as egress_kinds
 from uavlinkd.mavlink.egress.lanes import EgressDrop
 from uavlinkd.mavlink.frames import Frame
 
@@ -116,8 +116,7 @@ def test_all_is_sent_or_counted(slow_flight: Link) -> None:
     assert unsent[ID["ATTITUDE"]] > 40 * OFFER_S
     assert not any(name_of(msgid) in URGENT for msgid in unsent)
     assert egress.totals.keys() == {EgressDrop.THINNED, EgressDrop.STALE}
-    kinds = {msgid: egress_kinds.KINDS.get(msgid, egress_kinds.EVENT) for msgid in unsent}
-    states = sum(count for msgid, count in unsent.items() if kinds[msgid].is_state)
+    states = sum(count for msgid, count in unsent.items() if KINDS[msgid].is_state)
     assert 0.99 * states < egress.totals[EgressDrop.THINNED] <= states
 
 

@@ -4,11 +4,10 @@ A peer without a budget and without a coalescing delay needs none of this. The f
 two reasons:
 
 *Coalescing*: frames wait at most ``coalesce_s`` after the first of them, or until an envelope is full, and then
-share an envelope. An urgent frame (:mod:`.kinds`) ends the wait at once and takes along the frames that wait.
+share an envelope. An urgent frame ends the wait at once and takes along the frames that wait.
 
-*The budget*: a bucket of bytes. It fills at the budget's rate. Every datagram to the peer empties it by all its bytes
-on the wire: IP and UDP header, envelope, handshakes and echoes too. It holds a quarter of a second of the budget, or
-one largest frame in an envelope if that is more. So a radio's own buffer never holds more of these frames than that.
+*The budget*: a bucket of bytes (:mod:`.bucket`). Every datagram to the peer empties it by all its bytes on the wire:
+IP and UDP header, envelope, handshakes and echoes too.
 
 While the bucket covers all waiting frames, they leave in their order of arrival. When it does not:
 
@@ -29,31 +28,26 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import exp, inf
+from math import inf
 from typing import Final
 
-from uavlinkd.mavlink.egress.kinds import Lane
+from uavlinkd.mavlink.classes import Lane
+from uavlinkd.mavlink.egress.bucket import Bucket, Supply
 from uavlinkd.mavlink.egress.lanes import EgressDrop, Lanes, by_number
 from uavlinkd.mavlink.egress.queue import Waiting
 from uavlinkd.mavlink.frames import MAX_FRAME_BYTES, Frame
 
-BURST_S: Final = 0.25
-"""The bucket holds this much of the budget: a command waits for no more than this in a radio's own buffer."""
 URGENT_SHARING_S: Final = 0.4
 """While the budget is short, an urgent frame waits at most this long for others to share the cost of its envelope."""
 URGENT_SHARING: Final = 4
 """It waits no longer than until the bucket holds this many times the cost of an empty envelope."""
 SHARING_OF_AGE: Final = 0.5
 """Other frames wait at most this part of ``max_age_s`` for their envelope to fill."""
-DEBT_S: Final = 1.0
-"""The bucket can be in debt, because the core's own datagrams are never refused. The debt is at most this much: the
-handshakes of a long outage must not silence the link after it."""
 MIN_LANE_BYTES: Final = 8 * 1024
 MAX_LANE_BYTES: Final = 80 * 1024
 """Bounds of each of the three lanes. Between them, a lane holds as much as the budget carries in ``max_age_s``."""
 MAX_FLOWS: Final = 4096
 """Flows that are remembered while none of their frames waits."""
-DEMAND_WINDOW_S: Final = 2.0
 _SLACK_BYTES: Final = 0.5  # a deadline computed in floating point must not come a hair early, over and over
 
 
@@ -102,19 +96,35 @@ class Egress:
     :meth:`put` adds frames. :meth:`take` pops those of one envelope, to be sent at once; call it until it returns
     none. Report every datagram that is sent to the peer by :meth:`spend` before the next take: taking alone costs
     nothing. Call :meth:`take` again at :meth:`next_deadline`, which any call may change.
+
+    ``supply``: what the frames may use, if that is not a bucket of the settings' budget alone. ``totals``: counts
+    dropped frames, for several queues together. ``is_critical``: all its frames are.
     """
 
-    def __init__(self, settings: EgressSettings, now: float, shape: EnvelopeShape | None = None) -> None:
+    def __init__(
+        self,
+        settings: EgressSettings,
+        now: float,
+        shape: EnvelopeShape | None = None,
+        supply: Supply | None = None,
+        totals: Counter[EgressDrop] | None = None,
+        *,
+        is_critical: bool = False,
+    ) -> None:
+        shape = shape or EnvelopeShape()
+        if supply is None:
+            supply = Supply(own_bucket(settings, now, shape))
         self.settings = settings
-        self.totals: Counter[EgressDrop] = Counter()
-        self._rate = settings.budget_bits_s / 8
+        self.totals: Counter[EgressDrop] = Counter() if totals is None else totals
+        self.supply = supply
+        self._is_critical = is_critical
         self._now = now
-        in_time = self._rate * settings.max_age_s if self._rate else inf
-        lane_bytes = min(max(in_time, MIN_LANE_BYTES), MAX_LANE_BYTES)
+        self._level = supply.level if supply.networks or supply.own is None else supply.own.level
+        self._bytes = supply.level(now)  # what may be spent now
+        lane_bytes = min(max(supply.rate * settings.max_age_s, MIN_LANE_BYTES), MAX_LANE_BYTES)
         self._lanes = Lanes(lane_bytes, MAX_FLOWS, self._is_superseded, self._on_drop)
-        self._offered = 0.0  # bytes sent and dropped, fading over the window
-        self.shape = shape or EnvelopeShape()
-        self._bytes = self._burst if self._rate else inf  # what may be spent now
+        self._waiting_since = now  # a newer state in place of an older one changes nothing
+        self.shape = shape
 
     @property
     def shape(self) -> EnvelopeShape:
@@ -125,7 +135,8 @@ class Egress:
     def shape(self, shape: EnvelopeShape) -> None:
         self._shape = shape
         self._overhead = shape.overhead
-        self._burst = max(self._rate * BURST_S, shape.overhead + MAX_FRAME_BYTES)
+        if self.supply.own is not None:
+            self.supply.own.set_least_burst(shape.overhead + MAX_FRAME_BYTES)
 
     @property
     def queued_frames(self) -> int:
@@ -139,8 +150,7 @@ class Egress:
 
     def demand(self, now: float) -> float:
         """The bytes sent and dropped over the last seconds, as a share of the budget; 0 without a budget."""
-        self._advance(now)
-        return self._offered / (DEMAND_WINDOW_S * self._rate) if self._rate else 0.0
+        return self.supply.demand(now)
 
     def has_room(self, payload_bytes: int, now: float) -> bool:
         """Whether an envelope with this payload may go out now: no frame waits, and the budget covers it."""
@@ -150,19 +160,26 @@ class Egress:
     def put(self, frames: Sequence[Frame], now: float) -> None:
         """Let frames for the peer wait, in their order."""
         self._advance(now)
+        if not self.queued_frames:
+            self._waiting_since = now
         for frame in frames:
             self._lanes.put(frame, now)
 
-    def take(self, now: float) -> list[bytes]:
+    def take(self, now: float) -> list[Frame]:
         """Pop the frames of the next envelope, in order. Empty if none is due now."""
         self._advance(now)
         lanes = self._lanes
         lanes.drop_stale(now, self.settings.max_age_s)
         next_one = lanes.next if self._is_short(0) else lanes.first
         first = next_one()
-        if first is None or now < self._due_at() or self._bytes + _SLACK_BYTES < self._price(first):
+        if first is None or now < self._due_at():
+            self.supply.leave(self)
             return []
-        room = min(self._shape.payload_limit, self._bytes + _SLACK_BYTES - self._overhead)
+        price = self._price(first) - _SLACK_BYTES
+        room = self.supply.room_for(self, price, now, is_urgent=self._is_urgent(first))
+        if not room:
+            return []
+        room = min(self._shape.payload_limit, room + _SLACK_BYTES - self._overhead)
         batch: list[Waiting] = []
         size = 0
         waiting: Waiting | None = first
@@ -171,42 +188,50 @@ class Egress:
             lanes.serve(waiting, now)
             batch.append(waiting)
             waiting = next_one()
+        rest = (queue.oldest() for queue in lanes.queues)
+        self._waiting_since = min((oldest.put_at for oldest in rest if oldest is not None), default=now)
         # The turns decide which frames go. Within the envelope they are in the order of arrival.
         batch.sort(key=by_number)
-        return [popped.frame.raw for popped in batch]
+        return [popped.frame for popped in batch]
 
     def spend(self, datagram_bytes: int, now: float, datagrams: int = 1) -> None:
         """Charge datagrams to the peer, of so many bytes together: envelopes, handshakes and all others."""
-        self._advance(now)
-        if not self._rate:
-            return
-        wire_bytes = datagram_bytes + datagrams * self._shape.carrier_bytes
-        self._offered += wire_bytes
-        if self._bytes > -DEBT_S * self._rate:
-            self._bytes -= wire_bytes
+        if self.supply.own is not None:
+            self.supply.own.spend(datagram_bytes + datagrams * self._shape.carrier_bytes, now)
 
     def next_deadline(self) -> float:
         """When :meth:`take` is due next; infinity while no frame waits."""
         first = self._lanes.next()
         if first is None:
             return inf
-        missing = self._price(first) - self._bytes
-        return max(self._due_at(), self._now + missing / self._rate if missing > 0 else self._now)
+        wait_s = self.supply.wait_s(self, self._price(first), self._now, is_urgent=self._is_urgent(first))
+        return max(self._due_at(), self._now + wait_s)
+
+    @property
+    def is_blocked(self) -> bool:
+        """Whether frames wait for the budget, and not for others to share an envelope with."""
+        return self.queued_frames > 0 and self._now >= self._due_at()
+
+    def pop_all(self) -> list[tuple[Frame, float]]:
+        """Take out all frames that wait, each with the time since when."""
+        self.supply.leave(self)
+        return [(waiting.frame, waiting.put_at) for waiting in self._lanes.pop_all()]
 
     def clear(self, now: float) -> None:
         """Drop all frames that wait: the peer is lost."""
         self._advance(now)
+        self.supply.leave(self)
         self._lanes.clear()
 
     # The budget.
 
     def _advance(self, now: float) -> None:
-        elapsed = now - self._now
-        if elapsed > 0:
-            self._now = now
-            if self._rate:
-                self._bytes = min(self._burst, self._bytes + elapsed * self._rate)
-                self._offered *= exp(-elapsed / DEMAND_WINDOW_S)
+        self._now = max(self._now, now)
+        self._bytes = self._level(self._now)
+
+    def _is_urgent(self, first: Waiting) -> bool:
+        """Whether frames of other peers let these go first."""
+        return self._is_critical or first.flow.lane is Lane.URGENT
 
     def _is_short(self, more_bytes: int) -> bool:
         """Whether the bucket holds less than the cost of the waiting frames and of this many bytes more."""
@@ -220,17 +245,17 @@ class Egress:
         overhead = self._overhead
         all_of_it = overhead + min(self.queued_bytes, self._shape.payload_limit)
         if first.flow.lane is Lane.URGENT:
-            worth = min(URGENT_SHARING * overhead, URGENT_SHARING_S * self._rate)
+            worth = min(URGENT_SHARING * overhead, URGENT_SHARING_S * self.supply.rate)
         else:
-            worth = min(self._burst, SHARING_OF_AGE * self.settings.max_age_s * self._rate)
+            worth = min(self.supply.burst, SHARING_OF_AGE * self.settings.max_age_s * self.supply.rate)
         return max(overhead + len(first.frame.raw), min(all_of_it, worth))
 
     def _due_at(self) -> float:
         """When coalescing ends for the waiting frames. There must be one."""
-        urgent, *rest = self._lanes.queues
+        urgent = self._lanes.queues[0]
         if urgent.count or self.queued_bytes >= self._shape.payload_limit:
             return -inf
-        return min(oldest.put_at for queue in rest if (oldest := queue.oldest())) + self.settings.coalesce_s
+        return self._waiting_since + self.settings.coalesce_s
 
     # Callbacks of the lanes.
 
@@ -239,6 +264,13 @@ class Egress:
         return self._is_short(len(newer.raw))
 
     def _on_drop(self, waiting: Waiting, reason: EgressDrop) -> None:
-        if self._rate and reason is not EgressDrop.CLOSED:
-            self._offered += len(waiting.frame.raw)
+        if reason is not EgressDrop.CLOSED:
+            self.supply.note_dropped(len(waiting.frame.raw))
         self.totals[reason] += 1
+
+
+def own_bucket(settings: EgressSettings, now: float, shape: EnvelopeShape) -> Bucket | None:
+    """The bucket of the peer's own budget; None without one."""
+    if not settings.budget_bits_s:
+        return None
+    return Bucket(settings.budget_bits_s, now, shape.overhead + MAX_FRAME_BYTES)

@@ -1,7 +1,7 @@
 """Frames that wait a moment for others before they go to a peer without a budget: a coalescing delay alone.
 
 Frames wait at most ``coalesce_s`` after the first of them, or until an envelope is full, and then share an envelope.
-An urgent frame (:mod:`.kinds`) ends the wait at once and takes along the others. An :class:`.Egress` without
+An urgent frame ends the wait at once and takes along the others. An :class:`~.budgeted.Egress` without
 a budget sends the same envelopes, but its lanes and flows cost more: a frame takes 11 to 14 µs of CPU time there, and
 0.6 to 1.9 µs here (Python 3.11). Sans-IO: ``now`` is monotonic seconds.
 """
@@ -12,21 +12,29 @@ from collections import Counter
 from collections.abc import Sequence
 from math import inf
 
-from uavlinkd.mavlink.egress.budgeted import Egress, EgressSettings, EnvelopeShape
-from uavlinkd.mavlink.egress.kinds import Lane, kind_of
+from uavlinkd.mavlink.classes import Lane
+from uavlinkd.mavlink.egress.budgeted import EgressSettings, EnvelopeShape
 from uavlinkd.mavlink.egress.lanes import EgressDrop
 from uavlinkd.mavlink.frames import Frame
 
 
 class Coalescer:
-    """The frames that wait for one peer. It has the interface of an :class:`.Egress`, without a budget."""
+    """The frames that wait for one peer. It has the interface of an :class:`~.budgeted.Egress`, without a budget."""
 
-    def __init__(self, settings: EgressSettings) -> None:
+    is_blocked = False
+    """Frames never wait for a budget here."""
+
+    def __init__(
+        self,
+        settings: EgressSettings,
+        shape: EnvelopeShape | None = None,
+        totals: Counter[EgressDrop] | None = None,
+    ) -> None:
         assert not settings.budget_bits_s, "a budget needs more than this"
         self.settings = settings
-        self.shape = EnvelopeShape()
+        self.shape = shape or EnvelopeShape()
         """The size of an envelope to this peer."""
-        self.totals: Counter[EgressDrop] = Counter()
+        self.totals: Counter[EgressDrop] = Counter() if totals is None else totals
         self._waiting: list[Frame] = []
         self._size = 0
         self._put_at = 0.0
@@ -66,22 +74,23 @@ class Coalescer:
         if self._size >= self.shape.payload_limit or any(map(_is_urgent, frames)):
             self._due_at = -inf
 
-    def take(self, now: float) -> list[bytes]:
+    def take(self, now: float) -> list[Frame]:
         """Pop the frames of the next envelope, in order. Empty if none is due now."""
         if now < self._due_at:
             return []
         if now - self._put_at > self.settings.max_age_s:
             self._drop_all(EgressDrop.STALE)
             return []
-        batch: list[bytes] = []
-        room = self.shape.payload_limit
-        for raw, _ in self._waiting:
-            if len(raw) > room and batch:
+        waiting = self._waiting
+        room, count = self.shape.payload_limit, 0
+        for raw, _ in waiting:
+            if len(raw) > room and count:
                 break
-            batch.append(raw)
+            count += 1
             room -= len(raw)
-        del self._waiting[: len(batch)]
-        self._size -= sum(map(len, batch))
+        batch = waiting[:count]
+        del waiting[:count]
+        self._size -= self.shape.payload_limit - room
         if not self._waiting:
             self._due_at = inf
         elif self._size < self.shape.payload_limit and not any(map(_is_urgent, self._waiting)):
@@ -98,6 +107,13 @@ class Coalescer:
         """Drop all frames that wait: the peer is lost."""
         self._drop_all(EgressDrop.CLOSED)
 
+    def pop_all(self) -> list[tuple[Frame, float]]:
+        """Take out all frames that wait, each with the time since when."""
+        frames, self._waiting = self._waiting, []
+        self._size = 0
+        self._due_at = inf
+        return [(frame, self._put_at) for frame in frames]
+
     def _drop_all(self, reason: EgressDrop) -> None:
         if self._waiting:
             self.totals[reason] += len(self._waiting)
@@ -107,11 +123,4 @@ class Coalescer:
 
 
 def _is_urgent(frame: Frame) -> bool:
-    return kind_of(frame).lane is Lane.URGENT
-
-
-def make_egress(settings: EgressSettings, now: float) -> Egress | Coalescer | None:
-    """The queue of a peer's frames; None if they never wait."""
-    if settings.budget_bits_s:
-        return Egress(settings, now)
-    return Coalescer(settings) if settings.coalesce_s else None
+    return frame.header.kind.lane is Lane.URGENT

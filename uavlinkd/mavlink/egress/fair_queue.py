@@ -4,7 +4,7 @@ A captured member may send everything that its policy allows, as fast as its lin
 ids and instances, so with fairness between flows alone it would get almost all bytes. Therefore a frame's turn
 depends on its *source* first, and on lane and flow within the source after that:
 
-* Urgent frames (:mod:`.kinds`) of all sources go first. While other frames wait too, urgent ones get three of
+* Urgent frames of all sources go first. While other frames wait too, urgent ones get three of
   four bytes, so a flood of HEARTBEAT stops neither a mission upload nor positions.
 * In both classes the source that was sent the fewest bytes is next, counted from when it began to wait (start-time
   fair queueing). A source that asks for less than its share waits for at most one frame of each other source.
@@ -23,7 +23,7 @@ from collections.abc import Callable, Sequence
 from heapq import heappop, heappush, heapreplace
 from typing import Final
 
-from uavlinkd.mavlink.egress.kinds import Lane
+from uavlinkd.mavlink.classes import Lane
 from uavlinkd.mavlink.egress.lanes import EgressDrop, Lanes, OnDrop
 from uavlinkd.mavlink.egress.queue import Waiting
 from uavlinkd.mavlink.frames import Frame

@@ -10,8 +10,9 @@ from collections.abc import Callable
 from enum import StrEnum
 from typing import Final
 
-from uavlinkd.mavlink.egress.kinds import FlowKey, Lane, flow_key, kind_of
+from uavlinkd.mavlink.classes import Lane
 from uavlinkd.mavlink.egress.queue import Flow, Queue, Waiting
+from uavlinkd.mavlink.flows import FlowKey, flow_key
 from uavlinkd.mavlink.frames import Frame
 
 FLOWS_PER_LANE: Final = 2
@@ -138,6 +139,14 @@ class Lanes:
         assert oldest is not None
         self.drop(oldest, EgressDrop.OVERFLOW)
 
+    def pop_all(self) -> list[Waiting]:
+        """Take out all frames that wait, in the order of arrival."""
+        popped: list[Waiting] = []
+        while (first := self.first()) is not None:
+            self.queues[first.flow.lane].remove(first)
+            popped.append(first)
+        return popped
+
     def clear(self) -> None:
         """Drop all frames that wait: the link is lost."""
         for queue in self.queues:
@@ -150,14 +159,13 @@ class Lanes:
         self._on_drop(waiting, reason)
 
     def _flow_of(self, frame: Frame, now: float) -> Flow:
-        kind = kind_of(frame)
-        key = flow_key(frame, kind)
+        key = flow_key(frame)
         flow = self._flows.get(key)
         if flow is None:
             if len(self._flows) >= self._flows_limit:
                 self._flows = {key: flow for key, flow in self._flows.items() if flow.frames}
                 self._flows_limit = max(self._max_flows, 2 * len(self._flows))
-            flow = self._flows[key] = Flow(kind, now)
+            flow = self._flows[key] = Flow(frame.header.kind, now)
         return flow
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from heapq import heapify, heappop, heappush
 
-from uavlinkd.mavlink.egress.kinds import Lane, MessageKind
+from uavlinkd.mavlink.classes import Lane, MessageKind
 from uavlinkd.mavlink.frames import Frame
 
 

@@ -38,7 +38,7 @@ Each component has a rate of its own. An autopilot and its gimbal both send HEAR
 sender of each second would silence the other for minutes. An incoming frame may name any component, so all components
 of a system together have SYSTEM_SHARE times the rate: invented components do not raise it further. Requests for the
 list of all parameters have one rate for all of them. Outgoing frames have passed another gate already, so there each
-flow to each client has the rate, as in the egress (`egress.kinds`).
+flow to each client has the rate, as in the egress (`uavlinkd.mavlink.flows`).
 The rate of a group of repeated reports, such as `telemetry`, does not apply to its messages that are sent once or in
 parts: a missing line of text is never repeated. A rate for such a message by name applies.
 

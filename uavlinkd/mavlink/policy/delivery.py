@@ -29,7 +29,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final, final
 
-from uavlinkd.mavlink.egress.kinds import Lane, kind_of
+from uavlinkd.mavlink.classes import Lane
 from uavlinkd.mavlink.frames import MAVLINK1, MAX_FRAME_BYTES, Frame
 from uavlinkd.mavlink.headers import Header
 from uavlinkd.mavlink.policy import hidden
@@ -238,4 +238,4 @@ class DeliveredStreams:
 
 
 def _is_urgent(frame: Frame) -> bool:
-    return kind_of(frame).lane is Lane.URGENT
+    return frame.header.kind.lane is Lane.URGENT

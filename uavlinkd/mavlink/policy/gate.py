@@ -11,7 +11,7 @@ from typing import Final
 from uavlinkd.core.drops import Reason
 from uavlinkd.mavlink import dialect
 from uavlinkd.mavlink.dialect_table import COMMANDS, MESSAGES
-from uavlinkd.mavlink.egress.kinds import FlowKey, flow_key, kind_of
+from uavlinkd.mavlink.flows import FlowKey, flow_key
 from uavlinkd.mavlink.frames import Frame
 from uavlinkd.mavlink.headers import Header
 from uavlinkd.mavlink.policy.settings import FILE_TRANSFER, MAX_MSGID, READING_OPCODES, Rules
@@ -348,7 +348,7 @@ class Gate:
     def _takes_token(self, frame: Frame, per_second: float, now: float, to: int) -> bool:
         header = frame.header
         if not self._is_incoming:
-            flow = (to, header.msgid, *flow_key(frame, kind_of(frame)))
+            flow = (to, header.msgid, *flow_key(frame))
             return _take(((self._buckets, flow, 1),), per_second, now)
         # A sender could choose another component for each frame, another target or instance too.
         one = (self._buckets, (header.msgid, header.system, header.component), 1)

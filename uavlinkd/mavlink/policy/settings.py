@@ -10,8 +10,8 @@ from functools import lru_cache
 from typing import Final, NamedTuple
 
 from uavlinkd.mavlink import dialect
+from uavlinkd.mavlink.classes import SAID_ONCE
 from uavlinkd.mavlink.dialect_table import COMMANDS
-from uavlinkd.mavlink.egress.kinds import SAID_ONCE
 from uavlinkd.mavlink.policy.roles import ROLES
 
 MAX_MSGID: Final = 0xFFFFFF

@@ -1,14 +1,13 @@
-"""Each message waits as the documentation says, and its instances are separated by the right bytes."""
+"""Flows: the instances of a state are separated by the right bytes, and commands keep their order."""
 
 from __future__ import annotations
 
-import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
 from tests.mavlink.egress.samples import ID, frame
 from uavlinkd.mavlink import dialect_generate
-from uavlinkd.mavlink.egress import kinds as egress_kinds
-from uavlinkd.mavlink.egress.kinds import Lane, flow_key, kind_of
+from uavlinkd.mavlink.classes import INSTANCES, KINDS
+from uavlinkd.mavlink.flows import flow_key
 
 
 def layouts() -> dict[str, tuple[str | None, list[tuple[str, int, int]]]]:
@@ -33,7 +32,7 @@ def layouts() -> dict[str, tuple[str | None, list[tuple[str, int, int]]]]:
 def test_instance_fields_stand_where_pymavlink_packs_them() -> None:
     """The bytes that tell instances apart are the fields that do, whole, and no other."""
     known = layouts()
-    for name, (at, length) in egress_kinds.INSTANCES.items():
+    for name, (at, length) in INSTANCES.items():
         instance, fields = known[name]
         covered = [(field, size) for field, offset, size in fields if at <= offset < at + length]
         assert sum(size for _, size in covered) == length, f"{name}: half of {covered}"
@@ -43,9 +42,8 @@ def test_instance_fields_stand_where_pymavlink_packs_them() -> None:
 def test_every_state_whose_definition_numbers_it_has_separate_instances() -> None:
     """A message whose definition names an instance field is a state only with that field in its flow."""
     for name, (instance, _) in layouts().items():
-        known = egress_kinds.KINDS.get(ID[name])
-        if instance and known is not None and known.is_state:
-            assert known.instance_bytes, name
+        if instance and KINDS[ID[name]].is_state:
+            assert KINDS[ID[name]].instance_bytes, name
 
 
 def test_cut_instance_is_the_same_instance() -> None:
@@ -55,34 +53,21 @@ def test_cut_instance_is_the_same_instance() -> None:
         whole = frame(mavlink.MAVLink_servo_output_raw_message(n, 0, *([1500 + n] * 8)))
         cut = frame(mavlink.MAVLink_rc_channels_raw_message(n, 0, *([1500 + n] * 8), 0))
         assert cut.raw[1] < 21, "port is cut"
-        keys |= {flow_key(whole, kind_of(whole)), flow_key(cut, kind_of(cut))}
+        keys |= {flow_key(whole), flow_key(cut)}
     assert len(keys) == 2
 
 
-@pytest.mark.parametrize(
-    ("name", "lane", "is_state"),
-    [
-        ("HEARTBEAT", Lane.URGENT, True),
-        ("MANUAL_CONTROL", Lane.URGENT, True),
-        ("COMMAND_LONG", Lane.URGENT, False),
-        ("COMMAND_ACK", Lane.URGENT, False),
-        ("ATTITUDE", Lane.STATES, True),
-        ("SET_POSITION_TARGET_LOCAL_NED", Lane.STATES, True),
-        ("PARAM_VALUE", Lane.EVENTS, False),
-        ("MISSION_ITEM_INT", Lane.EVENTS, False),
-        ("FILE_TRANSFER_PROTOCOL", Lane.EVENTS, False),
-        ("STATUSTEXT", Lane.EVENTS, False),
-        ("GPS_RTCM_DATA", Lane.EVENTS, False),
-        ("TIMESYNC", Lane.EVENTS, False),
-        ("MISSION_ITEM_REACHED", Lane.EVENTS, False),
-        ("EVENT", Lane.EVENTS, False),
-        ("CURRENT_EVENT_SEQUENCE", Lane.STATES, True),
-        ("COMPONENT_METADATA", Lane.EVENTS, False),
-        ("ESC_STATUS", Lane.STATES, True),
-        ("COMMAND_CANCEL", Lane.URGENT, False),
-    ],
-)
-def test_messages_wait_as_documented(name: str, lane: Lane, is_state: bool) -> None:
-    """What replaces nothing is never thinned, and what matters is urgent."""
-    kind = egress_kinds.KINDS.get(ID[name], egress_kinds.EVENT)
-    assert (kind.lane, kind.is_state) == (lane, is_state)
+def test_commands_of_a_sender_are_one_flow_and_each_other_event_has_its_own() -> None:
+    """Arming comes before take-off, whatever message carries each of them."""
+    arm = frame(mavlink.MAVLink_command_long_message(1, 1, 400, 0, *[1] * 7), 255)
+    take_off = frame(mavlink.MAVLink_command_int_message(2, 1, 3, 22, 0, 0, *[1] * 7), 255)
+    first = frame(mavlink.MAVLink_param_request_read_message(1, 1, b"A", -1), 255)
+    second = frame(mavlink.MAVLink_param_request_read_message(2, 1, b"B", -1), 255)
+    assert flow_key(arm) == flow_key(take_off) != flow_key(first) == flow_key(second)
+    assert flow_key(frame(mavlink.MAVLink_command_long_message(1, 1, 400, 0, *[1] * 7), 254)) != flow_key(arm)
+
+
+def test_states_for_different_targets_are_different_flows() -> None:
+    """A ground station may steer two vehicles with one joystick each."""
+    keys = [flow_key(frame(mavlink.MAVLink_manual_control_message(n % 2, 1, 2, 3, 4, 5), 255)) for n in range(4)]
+    assert keys[0] == keys[2] != keys[1] == keys[3]

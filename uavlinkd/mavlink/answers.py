@@ -1,0 +1,98 @@
+"""Which PARAM_VALUE answers a request for one parameter, and which is a part of the list of all parameters.
+
+An answer to PARAM_REQUEST_READ or PARAM_SET is `critical`: a ground station waits for it. The list of all parameters,
+hundreds of frames, is `bulk`: a ground station asks again for those that it lacks, one by one.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from uavlinkd.core.settings import Class
+from uavlinkd.mavlink.classes import KINDS
+from uavlinkd.mavlink.dialect import ids_by_name
+from uavlinkd.mavlink.frames import MAVLINK2, Frame
+
+ANSWERED_S: Final = 2.0
+"""A PARAM_VALUE answers a request that arrived at most so long before."""
+MAX_REQUESTS: Final = 256
+"""Requests that are remembered. The oldest is forgotten first."""
+
+PARAM_VALUE: Final = ids_by_name()["PARAM_VALUE"]
+PARAM_REQUEST_READ: Final = ids_by_name()["PARAM_REQUEST_READ"]
+PARAM_SET: Final = ids_by_name()["PARAM_SET"]
+
+VALUE_KIND: Final = KINDS[PARAM_VALUE]
+"""The facts about a PARAM_VALUE, except its class."""
+REQUESTS: Final = frozenset({PARAM_REQUEST_READ, PARAM_SET})
+"""The messages that :meth:`ParameterAnswers.note` reads."""
+
+_NAME_BYTES: Final = 16
+_NAME_IN_VALUE: Final = 8  # offsets in the payload
+_INDEX_IN_VALUE: Final = 6
+_NAME_IN_READ: Final = 4
+_NAME_IN_SET: Final = 6
+_ALL_SYSTEMS: Final = 0
+_BY_NAME: Final = 0xFFFF  # the index -1
+
+_Parameter = tuple[int, bytes | int]
+"""A system, and its parameter's name or index."""
+
+
+class ParameterAnswers:
+    """The recent requests of one peer for single parameters."""
+
+    __slots__ = ("_requests",)
+
+    def __init__(self) -> None:
+        self._requests: dict[_Parameter, float] = {}  # until when they are answered, the oldest first
+
+    def __len__(self) -> int:
+        """How many requests are remembered."""
+        return len(self._requests)
+
+    def note(self, frame: Frame, now: float) -> None:
+        """A frame came from the peer. Only a request for one parameter, or to set it, changes anything."""
+        header = frame.header
+        if not header.is_known:
+            return
+        if header.msgid == PARAM_SET:
+            parameter: bytes | int = _name(frame, _NAME_IN_SET)
+        elif header.msgid == PARAM_REQUEST_READ:
+            index = _number(frame, 0)
+            parameter = _name(frame, _NAME_IN_READ) if index == _BY_NAME else index
+        else:
+            return
+        key = header.target_system, parameter
+        requests = self._requests
+        requests.pop(key, None)
+        if len(requests) >= MAX_REQUESTS:
+            del requests[next(iter(requests))]
+        requests[key] = now + ANSWERED_S
+
+    def class_of(self, frame: Frame, now: float) -> Class:
+        """The class of a frame for the peer."""
+        header = frame.header
+        if header.kind is not VALUE_KIND:
+            return header.kind.cls
+        if not self._requests:
+            return Class.BULK
+        parameters = _name(frame, _NAME_IN_VALUE), _number(frame, _INDEX_IN_VALUE)
+        systems = header.system, _ALL_SYSTEMS
+        until = (self._requests.get((system, parameter), now) for system in systems for parameter in parameters)
+        return Class.CRITICAL if max(until) > now else Class.BULK
+
+
+def _payload(frame: Frame, at: int, length: int) -> bytes:
+    raw = frame.raw
+    start = 10 if raw[0] == MAVLINK2 else 6
+    # A MAVLink 2 sender cuts zeros from the payload's end: the checksum begins there.
+    return raw[start + at : min(start + at + length, start + raw[1])]
+
+
+def _name(frame: Frame, at: int) -> bytes:
+    return _payload(frame, at, _NAME_BYTES).partition(b"\0")[0]
+
+
+def _number(frame: Frame, at: int) -> int:
+    return int.from_bytes(_payload(frame, at, 2), "little")

@@ -1,0 +1,192 @@
+"""All frames that wait for one peer: together while it has one path, by class while it has several.
+
+With several paths, an envelope has frames of one class, because each class goes along other paths. Critical frames go
+first. Stream and bulk divide the rest of the budget equally, by bytes, while both wait. A class waits for the budget
+of its own paths: a stream frame for the best path's network, a critical frame for the first network with room.
+Sans-IO: ``now`` is monotonic seconds.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from math import inf
+from typing import Final
+
+from uavlinkd.core.constants import CRITICAL_ENVELOPE_LIMIT
+from uavlinkd.core.settings import Class
+from uavlinkd.mavlink.answers import VALUE_KIND
+from uavlinkd.mavlink.egress.bucket import Bucket, Supply
+from uavlinkd.mavlink.egress.budgeted import Egress, EgressSettings, EnvelopeShape, own_bucket
+from uavlinkd.mavlink.egress.coalescing import Coalescer
+from uavlinkd.mavlink.egress.lanes import EgressDrop
+from uavlinkd.mavlink.frames import Frame
+
+ClassOf = Callable[[Frame, float], Class]
+"""The class of a frame that is sent at this time. It differs from the table's for PARAM_VALUE only."""
+
+_TURNS: Final = (Class.CRITICAL, Class.STREAM, Class.BULK)
+_BULK_TURNS: Final = (Class.CRITICAL, Class.BULK, Class.STREAM)
+
+
+def split_by_class(frames: Sequence[Frame], class_of: ClassOf, now: float) -> list[tuple[Class, Sequence[Frame]]]:
+    """Frames that are here together, by class, critical ones first. Within a class their order is kept."""
+    if len(frames) == 1:
+        return [(class_of(frames[0], now), frames)]
+    critical: list[Frame] = []
+    stream: list[Frame] = []
+    bulk: list[Frame] = []
+    for frame in frames:
+        kind = frame.header.kind
+        cls = kind.cls if kind is not VALUE_KIND else class_of(frame, now)  # without a call for nearly all frames
+        if cls is Class.STREAM:
+            stream.append(frame)
+        elif cls is Class.CRITICAL:
+            critical.append(frame)
+        else:
+            bulk.append(frame)
+    return [(cls, part) for cls, part in zip(_TURNS, (critical, stream, bulk), strict=True) if part]
+
+
+class PeerEgress:
+    """The frames that wait for one peer. Its methods are those of an :class:`.Egress`, with the class of a batch."""
+
+    def __init__(self, settings: EgressSettings, now: float, class_of: ClassOf) -> None:
+        self.settings = settings
+        self.totals: Counter[EgressDrop] = Counter()
+        """Dropped frames."""
+        self.is_split = False
+        """Whether frames wait by class."""
+        self._class_of = class_of
+        self._shape = EnvelopeShape()
+        self._own = own_bucket(settings, now, self._shape)
+        self._supplies = dict.fromkeys(_TURNS, Supply(self._own))
+        self._lead = 0  # bytes of the stream sent beyond those of bulk, while both wait
+        self._queues: dict[Class, Egress | Coalescer] = {}  # of each class, if it is split
+        self._together: Egress | Coalescer | None = None  # otherwise
+        self._make_queues(now)
+
+    @property
+    def shape(self) -> EnvelopeShape:
+        """The size of an envelope to this peer."""
+        return self._shape
+
+    @shape.setter
+    def shape(self, shape: EnvelopeShape) -> None:
+        self._shape = shape
+        for cls, queue in self._all:
+            queue.shape = self._shape_of(cls)
+
+    @property
+    def queued_frames(self) -> int:
+        """How many frames wait."""
+        return sum(queue.queued_frames for _, queue in self._all)
+
+    def set_networks(self, networks: Mapping[Class, Sequence[Bucket | None]], now: float) -> None:
+        """The networks along which each class goes now, the best first; None for one without a budget.
+
+        A class waits for the first of them with room. Frames together wait for those of the stream.
+        """
+        self._supplies = {cls: Supply(self._own, buckets) for cls, buckets in networks.items()}
+        self._rebuild(now)
+
+    def demand(self, now: float) -> float:
+        """The bytes sent and dropped over the last seconds, as a share of the tightest budget; 0 without a budget."""
+        return self._supplies[Class.STREAM].demand(now)
+
+    def has_room(self, payload_bytes: int, now: float) -> bool:
+        """Whether an envelope with this payload may go out now: no frame waits, and the budget covers it."""
+        return all(queue.has_room(payload_bytes, now) for _, queue in self._all)
+
+    def put(self, frames: Sequence[Frame], now: float, *, is_split: bool) -> None:
+        """Let frames for the peer wait, in their order. ``is_split``: whether the peer has several paths now."""
+        if is_split != self.is_split:
+            self.is_split = is_split
+            self._rebuild(now)
+        if self._together is not None:
+            self._together.put(frames, now)
+        else:
+            for cls, part in split_by_class(frames, self._class_of, now):
+                self._queues[cls].put(part, now)
+
+    def take(self, now: float) -> tuple[Class, list[Frame]]:
+        """Pop the frames of the next envelope, and their class; without frames if none is due now."""
+        if self._together is not None:
+            return Class.STREAM, self._together.take(now)
+        for cls in self._turns():
+            queue = self._queues[cls]
+            if batch := queue.take(now):
+                self._note_turn(cls, batch)
+                return cls, batch
+            if queue.is_blocked:
+                break  # what is sent in its place would use up what it waits for
+        return Class.STREAM, []
+
+    def next_deadline(self) -> float:
+        """When :meth:`take` is due next; infinity while no frame waits."""
+        if self._together is not None:
+            return self._together.next_deadline()
+        at = inf
+        for cls in self._turns():
+            at = min(at, self._queues[cls].next_deadline())
+            if self._queues[cls].is_blocked:
+                break
+        return at
+
+    def spend(self, datagram_bytes: int, now: float, datagrams: int = 1) -> None:
+        """Charge datagrams to the peer to its own budget."""
+        if self._own is not None:
+            self._own.spend(datagram_bytes + datagrams * self._shape.carrier_bytes, now)
+
+    def clear(self, now: float) -> None:
+        """Drop all frames that wait: the peer is lost."""
+        for _, queue in self._all:
+            queue.clear(now)
+
+    @property
+    def _all(self) -> list[tuple[Class, Egress | Coalescer]]:
+        return list(self._queues.items()) if self._together is None else [(Class.STREAM, self._together)]
+
+    def _turns(self) -> tuple[Class, Class, Class]:
+        return _BULK_TURNS if self._lead > 0 else _TURNS
+
+    def _note_turn(self, cls: Class, batch: Sequence[Frame]) -> None:
+        if cls is Class.CRITICAL:
+            return
+        size = sum(len(raw) for raw, _ in batch)
+        other = self._queues[Class.BULK if cls is Class.STREAM else Class.STREAM]
+        self._lead = (self._lead + (size if cls is Class.STREAM else -size)) if other.queued_frames else 0
+
+    def _shape_of(self, cls: Class) -> EnvelopeShape:
+        shape = self._shape
+        if cls is not Class.CRITICAL:
+            return shape
+        return replace(shape, payload_limit=min(shape.payload_limit, CRITICAL_ENVELOPE_LIMIT - shape.seal_bytes))
+
+    def _make_queues(self, now: float) -> None:
+        if self.is_split:
+            self._together = None
+            self._queues = {cls: self._make_queue(cls, now) for cls in _TURNS}
+        else:
+            self._together = self._make_queue(Class.STREAM, now)
+            self._queues = {}
+
+    def _make_queue(self, cls: Class, now: float) -> Egress | Coalescer:
+        shape, supply = self._shape_of(cls), self._supplies[cls]
+        if supply.is_limited:
+            return Egress(self.settings, now, shape, supply, self.totals, is_critical=cls is Class.CRITICAL)
+        return Coalescer(self.settings, shape, self.totals)
+
+    def _rebuild(self, now: float) -> None:
+        """Have the frames that wait go on waiting in other queues, with the age that they have."""
+        waiting = sorted((entry for _, queue in self._all for entry in queue.pop_all()), key=_put_at)
+        self._lead = 0
+        self._make_queues(now)
+        for frame, put_at in waiting:
+            queue = self._together or self._queues[self._class_of(frame, now)]
+            queue.put([frame], put_at)
+
+
+def _put_at(waiting: tuple[Frame, float]) -> float:
+    return waiting[1]
