@@ -13,6 +13,7 @@ import uvloop
 
 from tests.daemon.udp import open_socket
 from tests.endpoints.clients import Recorder, frame, write
+from tests.link.socket_states import SocketStateLog
 from tests.needs import need
 from tests.waiting import until
 from uavlinkd.core.path import Path
@@ -69,6 +70,7 @@ def test_refusing_peer_delays_no_datagram_of_another(new_loop: NewLoop) -> None:
             DropSummary(log),
             evidence,
             log,
+            SocketStateLog(),
         )
         sockets.open([Address("127.0.0.1", 0)])
         sockets.start()

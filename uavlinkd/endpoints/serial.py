@@ -45,6 +45,22 @@ def has_line_rate(device: str) -> bool:
     return not path.startswith(_PSEUDO_TERMINALS) and not os.path.basename(path).startswith(_WITHOUT_RATE)
 
 
+def open_device(url: SerialUrl) -> BaseSerial:
+    """Open a device for this process alone. It may block: call it in a thread.
+
+    Raises:
+        OSError: any failure, an unsupported baud rate included.
+    """
+    device = serial_for_url(url.device, url.baud, exclusive=True)
+    try:
+        device.open()
+    except OSError:
+        raise
+    except Exception as error:  # exceptions of the library and of termios
+        raise OSError(*error.args) from error
+    return device
+
+
 class SerialChannel:
     """An open serial device. Reads and writes bypass the library, because those of the library block.
 
@@ -159,13 +175,7 @@ class SerialEndpoint(StreamEndpoint):
         Raises:
             OSError: any failure, an unsupported baud rate included.
         """
-        device = serial_for_url(self._url.device, self._url.baud, exclusive=True)
-        try:
-            device.open()
-        except OSError:
-            raise
-        except Exception as error:  # exceptions of the library and of termios
-            raise OSError(*error.args) from error
+        device = open_device(self._url)
         if self._is_closed:  # while it was being opened
             device.close()
             raise OSError("closed")

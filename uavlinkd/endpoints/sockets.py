@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import socket
+import sys
+from collections.abc import Iterable
 from typing import Any
 
 import structlog
@@ -60,13 +62,61 @@ def udp_socket(address: Address, *, may_come_later: bool = False) -> socket.sock
     """
     sock, sockaddr = unbound_socket(address, socket.SOCK_DGRAM)
     try:
-        for option in (socket.SO_RCVBUF, socket.SO_SNDBUF):
-            sock.setsockopt(socket.SOL_SOCKET, option, BUFFER_BYTES)
+        _enlarge(sock)
         bind(sock, sockaddr, may_come_later=may_come_later)
     except OSError as error:
         sock.close()
         raise cannot_listen(address, error) from None
     return sock
+
+
+def _enlarge(sock: socket.socket) -> None:
+    for option in (socket.SO_RCVBUF, socket.SO_SNDBUF):
+        sock.setsockopt(socket.SOL_SOCKET, option, BUFFER_BYTES)
+
+
+def network_socket(address: Address, interface: str | None, others: Iterable[socket.socket]) -> socket.socket:
+    """Make a UDP socket that is bound to a numeric address, and to an interface if there is one.
+
+    ``others``: the daemon's own sockets, whose port it may share. The kernel permits that between two interfaces; a
+    network with an address needs SO_REUSEADDR beside a network with an interface. The option is set on both only
+    while this one is bound, so that another process cannot take the port later.
+
+    Raises:
+        BindError: the address or the interface cannot be used; with the reason.
+    """
+    sock, sockaddr = unbound_socket(address, socket.SOCK_DGRAM)
+    sharing = [sock, *others]
+    try:
+        if interface is not None:
+            _bind_to_interface(sock, interface)
+        _enlarge(sock)
+        for one in sharing:
+            one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            sock.bind(sockaddr)
+        finally:
+            for one in sharing:
+                one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 0)
+    except OSError as error:
+        sock.close()
+        raise cannot_listen(address, error) from None
+    except BindError:
+        sock.close()
+        raise
+    return sock
+
+
+def _bind_to_interface(sock: socket.socket, interface: str) -> None:
+    if sys.platform != "linux":
+        raise BindError(f"cannot bind to the interface {interface}: that needs Linux; write an address instead")
+    try:
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, interface.encode())
+    except PermissionError:
+        raise BindError(
+            f"may not bind to the interface {interface}: before Linux 5.7 that needs CAP_NET_RAW; add"
+            " AmbientCapabilities=CAP_NET_RAW to the unit, or write an address instead"
+        ) from None
 
 
 def bind(sock: socket.socket, sockaddr: tuple[Any, ...], *, may_come_later: bool) -> None:

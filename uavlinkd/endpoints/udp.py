@@ -25,7 +25,7 @@ from uavlinkd.mavlink.policy.delivery import DeliveredStreams, Source
 from uavlinkd.mavlink.stream_splitter import MAX_GAP_S, StreamSplitter
 from uavlinkd.system.addresses import Address, numeric_host
 from uavlinkd.system.clock import monotonic
-from uavlinkd.system.resolver import Resolved, keep_resolving
+from uavlinkd.system.resolver import LONGEST_WAIT_S, Resolved, keep_resolving
 from uavlinkd.system.stall import STALE
 from uavlinkd.system.tasks import keep_running
 
@@ -314,7 +314,7 @@ class UdpClient(UdpEndpoint):
         """Read whenever datagrams are there, and resolve the name again when its address is silent."""
         super().start()
         log = structlog.get_logger().bind(endpoint=self.name)
-        following = keep_resolving((self._remote,), self._is_silent, self._on_resolved, log)
+        following = keep_resolving((self._remote,), self._interval_s, self._on_resolved, log)
         self._task = keep_running(following, f"the search for {self._remote}")
 
     def close(self) -> None:
@@ -336,9 +336,11 @@ class UdpClient(UdpEndpoint):
             self._reader.renew()
         return bool(reports)
 
-    def _is_silent(self) -> bool:
+    def _interval_s(self) -> float:
+        """The interval between look-ups: none while the client answers."""
         received = [port.received_at for port in self.ports if port.received_at is not None]
-        return self._remote.ip is None and (not received or monotonic() - max(received) >= REMOTE_SILENT_S)
+        is_silent = self._remote.ip is None and (not received or monotonic() - max(received) >= REMOTE_SILENT_S)
+        return LONGEST_WAIT_S if is_silent or not self.ports else inf
 
     def _on_resolved(self, resolved: Resolved) -> bool:
         family, address = resolved[0]

@@ -138,6 +138,17 @@ def parse_url(text: str) -> EndpointUrl:
     return _serial(rest) if kind is EndpointKind.SERIAL else _network(kind, rest)
 
 
+def parse_line(text: str) -> SerialUrl:
+    """Parse ``/dev/ttyUSB0:57600``: the device of a serial network with its baud rate.
+
+    Raises:
+        UrlError: the text is something else; the message says what to write.
+    """
+    if re.fullmatch(_DEVICE, text) and not re.search(r"[:,?]", text):
+        raise UrlError(f"has no baud rate: write {text}:57600 with that of the modem")
+    return _serial(text.removeprefix("serial:"), "")
+
+
 def _network(kind: EndpointKind, rest: str) -> NetworkUrl:
     if "@" in rest:
         raise UrlError(_two_addresses(kind.value))
@@ -156,17 +167,18 @@ def _network(kind: EndpointKind, rest: str) -> NetworkUrl:
     return NetworkUrl(kind, address)
 
 
-def _serial(rest: str) -> SerialUrl:
+def _serial(rest: str, scheme: str = "serial:") -> SerialUrl:
+    """``scheme``: what the user has to write before the device."""
     if query := re.fullmatch(r"(/[\x21-\x7e]*)\?baud(?:rate)?=(\d+)", rest):
-        raise UrlError(f"the baud rate follows a colon: write serial:{query[1]}:{query[2]}")
+        raise UrlError(f"the baud rate follows a colon: write {scheme}{query[1]}:{query[2]}")
     if re.match(r"COM\d", rest, re.IGNORECASE):
-        raise UrlError("names a port of Windows: write its device here, such as serial:/dev/ttyACM0:57600")
+        raise UrlError(f"names a port of Windows: write its device here, such as {scheme}/dev/ttyACM0:57600")
     # From the right: names under /dev/serial/by-path have colons in them.
     device, comma, baud_text = rest.rpartition("," if "," in rest else ":")
     if not _DEVICE.fullmatch(device) or not (baud_text.isascii() and baud_text.isdigit() and len(baud_text) <= 8):
-        raise UrlError("needs a device and a baud rate: write serial:/dev/ttyACM0:57600 with yours")
+        raise UrlError(f"needs a device and a baud rate: write {scheme}/dev/ttyACM0:57600 with yours")
     if comma == ",":
-        raise UrlError(f"the baud rate follows a colon: write serial:{device}:{baud_text}")
+        raise UrlError(f"the baud rate follows a colon: write {scheme}{device}:{baud_text}")
     baud = int(baud_text)
     if not 300 <= baud <= _MAX_BAUD:
         raise UrlError(f"has an impossible baud rate: write one from 300 to {_MAX_BAUD}, such as 57600")

@@ -1,0 +1,220 @@
+"""Datagrams on a byte stream: any bytes, cut anywhere, and the reports that a modem puts between them."""
+
+from __future__ import annotations
+
+from binascii import crc_hqx
+from collections.abc import Iterable, Sequence
+from itertools import pairwise
+
+import pytest
+from fastcrc.crc16 import mcrf4xx
+from hypothesis import given
+from hypothesis import strategies as st
+
+from uavlinkd.endpoints.line_framing import MAX_DATAGRAM, MAX_ENCODED, REPORTS_CUT_OUT, LineDecoder, encode
+from uavlinkd.endpoints.radio_reports import RadioReport
+
+DATAGRAMS = [bytes(20), b"", b"\x40" + bytes(range(1, 255)) * 2, b"\x01" * 147, bytes(range(256)), b"\xfe\xfd" * 60]
+FIGURES = RadioReport(rssi=200, remrssi=190, txbuf=98, noise=50, remnoise=0xFE, rxerrors=0, fixed=3)
+
+datagrams = st.binary(max_size=600)
+
+
+def report(version: int = 1, msgid: int = 109, payload: bytes | None = None) -> bytes:
+    """A modem's report."""
+    if payload is None:
+        figures = (FIGURES.rssi, FIGURES.remrssi, FIGURES.txbuf, FIGURES.noise, FIGURES.remnoise)
+        payload = b"".join(value.to_bytes(2, "little") for value in (FIGURES.rxerrors, FIGURES.fixed))
+        payload += bytes(figures)
+    head = bytes((9, 7, 51, 68, msgid)) if version == 1 else bytes((9, 0, 0, 7, 51, 68, msgid, 0, 0))
+    crc = mcrf4xx(head + payload + bytes(({109: 185, 166: 21}[msgid],)))
+    return bytes((0xFE if version == 1 else 0xFD,)) + head + payload + crc.to_bytes(2, "little")
+
+
+def feed_all(chunks: Iterable[bytes]) -> tuple[list[bytes], LineDecoder]:
+    decoder = LineDecoder()
+    return [datagram for chunk in chunks for datagram in decoder.feed(chunk)], decoder
+
+
+def counts(decoder: LineDecoder) -> tuple[object, ...]:
+    return decoder.datagrams, decoder.line_noise, decoder.reports, decoder.reports_inside, decoder.report
+
+
+@pytest.mark.parametrize("size", [*range(500), 500, 506])
+def test_overhead_is_small(size: int) -> None:
+    """With the delimiter that follows a silence, at most 6 bytes; and the worst case of COBS is one long run."""
+    for datagram in (bytes(size), b"\x01" * size, b"\xff" * size):
+        line = encode(datagram)
+        assert len(line) - size <= (4 if size <= 252 else 5)
+        assert line.index(0) == len(line) - 1
+        assert feed_all([line])[0] == [datagram]
+
+
+def test_layout_is_that_of_the_specification() -> None:
+    """COBS by hand, and the check value of the CRC."""
+    assert crc_hqx(b"123456789", 0xFFFF) == 0x29B1
+    assert encode(b"123456789") == b"\x0c123456789\x29\xb1\x00"
+    assert encode(b"") == b"\x03\xff\xff\x00"
+    crc = crc_hqx(b"a\0b", 0xFFFF).to_bytes(2, "big")
+    assert encode(b"a\0b") == b"\x02a\x04b" + crc + b"\x00"
+
+
+def test_longest_datagrams() -> None:
+    """A handshake message of every suite fits; a longer datagram is refused, and dropped if it comes."""
+    longest = b"\x02" * MAX_DATAGRAM
+    line = encode(longest)
+    assert len(line) == MAX_ENCODED + 1
+    assert feed_all([line])[0] == [longest]
+    with pytest.raises(ValueError, match="too long"):
+        encode(longest + b"\x02")
+
+
+@given(st.lists(datagrams, max_size=6), st.data())
+def test_any_datagrams_arrive_however_the_stream_is_cut(sent: list[bytes], data: st.DataObject) -> None:
+    """In order, each once, without noise."""
+    stream = b"".join(map(encode, sent))
+    places = st.lists(st.integers(0, len(stream)), max_size=8)
+    cuts = sorted([0, *data.draw(places), len(stream)])
+    received, decoder = feed_all(stream[a:b] for a, b in pairwise(cuts))
+    assert received == sent
+    assert (decoder.line_noise, decoder.pending_bytes) == (0, 0)
+
+
+def pieces(stream: bytes, cuts: Sequence[int]) -> Iterable[bytes]:
+    at, number = 0, 0
+    while at < len(stream):
+        size = cuts[number % len(cuts)]
+        yield stream[at : at + size]
+        at, number = at + size, number + 1
+
+
+noise = st.one_of(
+    st.binary(max_size=60),
+    datagrams.map(encode),
+    st.sampled_from([report(), report(2), report()[:7], report(2)[:12], b"\0", b"\xfe\x09", b"\xfd\x09\0\0"]),
+    st.builds(lambda size, byte: bytes((byte,)) * size, st.integers(1, 5000), st.sampled_from([0, 1, 0xFE])),
+)
+
+
+@given(st.lists(noise, max_size=8), st.lists(st.integers(1, 700), min_size=1, max_size=5))
+def test_any_bytes_cost_little_and_cuts_change_nothing(parts: list[bytes], cuts: list[int]) -> None:
+    """The same datagrams and counts, memory for one datagram, and the next datagram after a delimiter arrives."""
+    stream = b"".join(parts)
+    decoder = LineDecoder()
+    received: list[bytes] = []
+    for chunk in pieces(stream, cuts):
+        received += decoder.feed(chunk)
+        assert decoder.pending_bytes <= MAX_ENCODED + 22
+    whole_found, whole = feed_all([stream])
+    assert received == whole_found
+    assert counts(decoder) == counts(whole)
+    later = bytes(range(100)), b"two"
+    # 21 bytes that no report contains end what the decoder waits for.
+    assert decoder.feed(bytes(22) + b"".join(map(encode, later)))[-2:] == list(later)
+
+
+def test_line_cut_at_every_offset() -> None:
+    """Cut: the bytes before the cut are lost with their datagram, all later ones arrive."""
+    lines = list(map(encode, DATAGRAMS))
+    stream = b"".join(lines)
+    ends = [sum(map(len, lines[: number + 1])) for number in range(len(lines))]
+    for cut in range(len(stream)):
+        received, decoder = feed_all([stream[cut:]])
+        whole = [
+            datagram for datagram, line, end in zip(DATAGRAMS, lines, ends, strict=True) if end - len(line) >= cut
+        ]
+        assert received[-len(whole) :] == whole if whole else len(received) <= 1
+        assert decoder.line_noise <= 1
+        first, decoder = feed_all([stream[:cut], b"\0", stream])  # the modem is plugged in again
+        assert first[-len(DATAGRAMS) :] == DATAGRAMS
+        assert decoder.line_noise <= 1
+
+
+def test_damage_at_every_offset() -> None:
+    """A byte changed, lost or inserted costs at most the two datagrams beside a delimiter. No other one changes."""
+    stream = b"".join(map(encode, DATAGRAMS))
+    for at in range(len(stream)):
+        for damaged in (
+            stream[:at] + bytes((stream[at] ^ 0x10,)) + stream[at + 1 :],
+            stream[:at] + stream[at + 1 :],
+            stream[:at] + b"\0" + stream[at:],
+            stream[:at] + bytes((stream[at],)) + stream[at:],
+        ):
+            received, decoder = feed_all([damaged, b"\0"])
+            assert set(received) <= set(DATAGRAMS)
+            assert len(received) >= len(DATAGRAMS) - 2
+            assert decoder.line_noise <= 2
+
+
+@pytest.mark.parametrize("one", [report(), report(2), report(1, 166)], ids=["v1", "v2", "old"])
+def test_reports_between_datagrams_are_skipped(one: bytes) -> None:
+    """They are counted, and the last one is kept. They contain zeros, which do not end a datagram."""
+    assert 0 in one
+    stream = one + b"".join(encode(datagram) + one * 2 for datagram in DATAGRAMS)
+    for size in (1, 3, 16, 17, 20, len(stream)):
+        received, decoder = feed_all(pieces(stream, [size]))
+        assert received == DATAGRAMS
+        assert counts(decoder) == (len(DATAGRAMS), 0, 1 + 2 * len(DATAGRAMS), 0, FIGURES)
+
+
+@pytest.mark.parametrize("one", [report(), report(2), report(1, payload=b"\x01" * 9)], ids=["v1", "v2", "no zeros"])
+def test_reports_inside_a_datagram_are_cut_out(one: bytes) -> None:
+    """At every offset, and in any chunks: the datagram arrives, and the counter shows the modem's wrong setting."""
+    datagram = bytes(range(3, 90)) + bytes(10) + b"\xfe\x09\xfd"
+    line = encode(datagram)
+    for at in range(1, len(line)):
+        stream = encode(b"before") + line[:at] + one + line[at:] + encode(b"after")
+        for chunks in ([stream], pieces(stream, [1])):
+            received, decoder = feed_all(chunks)
+            assert received == [b"before", datagram, b"after"], at
+            assert (decoder.reports, decoder.reports_inside, decoder.line_noise) == (1, 1, 0)
+
+
+def test_forged_report_inside_an_intact_datagram_stays() -> None:
+    """A peer's frames may contain RADIO_STATUS: only a broken datagram is searched."""
+    datagram = b"\x40\x01" + report(1, payload=b"\x05" * 9) + bytes(3)
+    assert feed_all([encode(datagram)])[0] == [datagram]
+
+
+def test_almost_a_report_is_noise() -> None:
+    """A wrong checksum, another message, another version."""
+    for broken in (
+        report()[:-1] + b"\x99",
+        report()[:5] + b"\x00" + report()[6:],
+        report(2)[:2] + b"\1" + report(2)[3:],
+    ):
+        received, decoder = feed_all([broken, b"\0", encode(b"fine")])
+        assert received == [b"fine"]
+        assert decoder.reports == 0
+        assert decoder.line_noise >= 1
+
+
+def test_stream_without_delimiters_is_one_piece_of_noise() -> None:
+    """Bounded memory, and one count until the next delimiter."""
+    decoder = LineDecoder()
+    for _ in range(100):
+        assert decoder.feed(b"\x55" * 1000) == []
+        assert decoder.pending_bytes <= MAX_ENCODED
+    assert decoder.line_noise == 1
+    assert decoder.feed(b"\0" + encode(b"fine")) == [b"fine"]
+    assert decoder.line_noise == 1
+
+
+def test_reset_forgets_the_start_of_a_datagram() -> None:
+    """The device was closed: what follows is another stream."""
+    decoder = LineDecoder()
+    line = encode(bytes(range(50)))
+    decoder.feed(line[:20])
+    decoder.reset()
+    assert decoder.pending_bytes == 0
+    assert decoder.feed(encode(b"fine")) == [b"fine"]
+
+
+def test_a_line_full_of_reports_costs_little() -> None:
+    """Only the first ones are cut out of a broken datagram: each cut searches it again."""
+    decoder = LineDecoder()
+    one = report(payload=b"\1" * 9)
+    assert 0 not in one
+    decoder.feed(b"\xfe" * 500 + one * 60 + b"\0")
+    assert decoder.reports_inside == REPORTS_CUT_OUT
+    assert decoder.line_noise == 1

@@ -1,0 +1,161 @@
+"""Datagrams on a byte stream: the framing of serial networks (section 20 of ``uavlinkd/core/README.md``).
+
+::
+
+    COBS(datagram | CRC-16 of the datagram, big-endian) | 0x00
+
+COBS (Consistent Overhead Byte Stuffing) removes the byte 0x00 from its input, so 0x00 always ends a datagram. The CRC
+is CRC-16/CCITT with the initial value 0xFFFF. It only keeps line noise out of the core's counters: envelopes have
+their own tags. Sans-IO.
+"""
+
+from __future__ import annotations
+
+import re
+from binascii import crc_hqx
+from typing import Final
+
+from cobs import cobs
+
+from uavlinkd.endpoints.radio_reports import REPORT_STARTS, RadioReport, parse_report, report_bytes
+
+DELIMITER: Final = b"\0"
+CRC_BYTES: Final = 2
+MAX_DATAGRAM: Final = 2048
+"""The longest datagram on a line: more than the longest handshake message."""
+MAX_ENCODED: Final = MAX_DATAGRAM + CRC_BYTES + (MAX_DATAGRAM + CRC_BYTES + 253) // 254
+"""The longest datagram in COBS, without the delimiter. A receiver holds at most this and one chunk."""
+
+REPORTS_CUT_OUT: Final = 2
+"""So many reports are cut out of one broken datagram: a modem sends one a second, an attacker could fill the line."""
+
+_REPORT_START: Final = re.compile(b"[" + re.escape(REPORT_STARTS) + b"]")
+
+
+def encode(datagram: bytes) -> bytes:
+    """The bytes of a datagram on the line: at most 5 more than its own, up to 506.
+
+    Raises:
+        ValueError: it is longer than :data:`MAX_DATAGRAM`.
+    """
+    if len(datagram) > MAX_DATAGRAM:
+        raise ValueError(f"a datagram of {len(datagram)} bytes is too long for a line")
+    return bytes(cobs.encode(datagram + _crc(datagram))) + DELIMITER
+
+
+def _crc(datagram: bytes) -> bytes:
+    return crc_hqx(datagram, 0xFFFF).to_bytes(CRC_BYTES, "big")
+
+
+class LineDecoder:
+    """Finds the datagrams in a byte stream, however it is cut into chunks. Any bytes are accepted.
+
+    After an error, the next delimiter ends what is broken. Reports of the modem (:mod:`.radio_reports`) between
+    datagrams are skipped. If a datagram is broken because the modem put a report into it, the report is cut out.
+    """
+
+    __slots__ = ("_cuts", "_is_skipping", "_rest", "datagrams", "line_noise", "report", "reports", "reports_inside")
+
+    def __init__(self) -> None:
+        self._rest = b""
+        self._cuts = 0  # reports that were cut out of the piece that begins now
+        self._is_skipping = False  # up to the next delimiter: what precedes it is too long
+        self.datagrams = 0
+        """How many arrived whole."""
+        self.line_noise = 0
+        """Pieces between two delimiters that are not a datagram."""
+        self.reports = 0
+        """Reports of the modem."""
+        self.reports_inside = 0
+        """Those of them that were inside a datagram."""
+        self.report: RadioReport | None = None
+        """The last one."""
+
+    @property
+    def pending_bytes(self) -> int:
+        """Bytes that wait for more."""
+        return len(self._rest)
+
+    def feed(self, chunk: bytes) -> list[bytes]:
+        """The datagrams that these bytes complete. The cost is linear for chunks of a few kilobytes."""
+        datagrams: list[bytes] = []
+        data, at = self._rest + chunk, 0
+        while at < len(data):
+            if not self._is_skipping and data[at] in REPORT_STARTS:
+                # No datagram begins like a report: its first byte, the second one here, would be 9.
+                size = report_bytes(data, at)
+                if size is None:
+                    break
+                if size:
+                    self._note(data[at : at + size])
+                    at += size
+                    continue
+            end = data.find(0, at)
+            if end < 0:
+                break
+            piece = data[at:end]
+            if self._is_skipping:  # counted already
+                self._is_skipping = False
+            elif piece and not self._take(piece, datagrams):
+                is_searched = self._cuts < REPORTS_CUT_OUT and len(piece) <= MAX_ENCODED
+                start, size = _find_report(data, at, end) if is_searched else (0, 0)
+                if size is None:
+                    break
+                if size:
+                    self._note(data[start : start + size])
+                    self.reports_inside += 1
+                    data, at = data[at:start] + data[start + size :], 0
+                    self._cuts += 1
+                    continue
+                self.line_noise += 1
+            at, self._cuts = end + 1, 0
+        self._keep(data[at:])
+        return datagrams
+
+    def reset(self) -> None:
+        """Forget the bytes that wait: the device was closed."""
+        self._rest, self._is_skipping, self._cuts = b"", False, 0
+
+    def _take(self, piece: bytes, datagrams: list[bytes]) -> bool:
+        """Decode what is between two delimiters. Returns whether it is a datagram."""
+        datagram = _decode(piece)
+        if datagram is None:
+            return False
+        datagrams.append(datagram)
+        self.datagrams += 1
+        return True
+
+    def _note(self, frame: bytes) -> None:
+        self.reports += 1
+        self.report = parse_report(frame)
+
+    def _keep(self, rest: bytes) -> None:
+        """Bytes wait for a delimiter, or for the rest of a report."""
+        if self._is_skipping:
+            rest = b""
+        elif len(rest) > MAX_ENCODED and DELIMITER not in rest:
+            self._is_skipping = True
+            self.line_noise += 1
+            rest = b""
+        self._rest = rest
+
+
+def _decode(piece: bytes) -> bytes | None:
+    """The datagram between two delimiters; None if it is broken."""
+    if len(piece) > MAX_ENCODED:
+        return None
+    try:
+        content = bytes(cobs.decode(piece))
+    except cobs.DecodeError:
+        return None
+    datagram, crc = content[:-CRC_BYTES], content[-CRC_BYTES:]
+    return datagram if len(content) >= CRC_BYTES and len(datagram) <= MAX_DATAGRAM and crc == _crc(datagram) else None
+
+
+def _find_report(data: bytes, at: int, end: int) -> tuple[int, int | None]:
+    """Place and length of the first report that begins in a broken piece; as :func:`.report_bytes`."""
+    for match in _REPORT_START.finditer(data, at, end):
+        size = report_bytes(data, match.start())
+        if size != 0:
+            return match.start(), size
+    return 0, 0

@@ -1,0 +1,296 @@
+"""The device of a serial network: opened whenever it is present, read in datagrams, written at the radio's pace.
+
+A modem takes bytes faster than its radio carries them, and holds the rest in a queue that it does not report. So the
+line is written at the rate of this end's part of the air. It accepts no more than :data:`QUEUE_S`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import termios
+from collections import Counter, deque
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+from math import inf
+from typing import Final, Protocol
+
+from serialx import BaseSerial, PinState
+
+from uavlinkd.endpoints.line_framing import DELIMITER, LineDecoder, encode
+from uavlinkd.endpoints.ports import failure_name
+from uavlinkd.endpoints.serial import LATE_S, RETRY_S, TERMINAL_BYTES, open_device
+from uavlinkd.endpoints.url import SerialUrl
+from uavlinkd.system.clock import monotonic
+from uavlinkd.system.stall import STALE, Backlog, StallWatch
+from uavlinkd.system.tasks import keep_running
+from uavlinkd.system.threads import Threads
+
+LINE_IDLE_S: Final = 0.5
+"""After a silence of the sender, a delimiter precedes the next datagram."""
+MODEM_S: Final = 0.25
+"""The modem gets no more than the air carries in this time, or one datagram."""
+QUEUE_S: Final = 0.25
+"""So much may wait here for the modem, and :data:`QUEUE_BYTES` more."""
+QUEUE_BYTES: Final = 320
+"""An initiation and a response of a handshake wait here together, however slow the radio is."""
+READ_BYTES: Final = 4096
+STUCK_S: Final = 5.0
+"""The modem withholds CTS for longer: the wire is broken or not connected. Then the daemon ignores CTS."""
+LINE_FULL: Final = "LINE_FULL"
+"""In place of an error's name: a datagram was dropped because too much waits for the radio."""
+TOO_LONG: Final = "EMSGSIZE"
+
+
+class OnDatagrams(Protocol):
+    """Receives what one read completed."""
+
+    def __call__(self, datagrams: list[bytes], now: float, epoch: int, /) -> None:
+        """The datagrams, the monotonic time of the read, and its epoch (:mod:`uavlinkd.system.stall`)."""
+
+
+class SerialLine:
+    """One serial network. ``on_change`` is called after the device was opened or lost."""
+
+    def __init__(
+        self,
+        name: str,
+        url: SerialUrl,
+        bytes_s: float,
+        on_datagrams: OnDatagrams,
+        on_change: Callable[[], None],
+        stall: StallWatch,
+    ) -> None:
+        self.url = url
+        self.decoder = LineDecoder()
+        self.failures: Counter[str] = Counter()
+        """Failures to open it, lost connections and dropped datagrams, by the name of the error."""
+        self.reason = "it was not opened yet"
+        """Why it is not open."""
+        self.uses_cts = False
+        """Whether the modem can stop this end by the CTS wire."""
+        self.bytes_written = 0
+        self._name = name
+        self._bytes_s = bytes_s
+        self._on_datagrams = on_datagrams
+        self._on_change = on_change
+        self._stall = stall
+        self._device: BaseSerial | None = None
+        self._backlog: Backlog | None = None
+        self._lost = asyncio.Event()
+        self._queue: deque[bytes] = deque()
+        self._queued_bytes = 0
+        self._written_at = -inf
+        self._sent_by = -inf  # when the air will have carried all written bytes
+        self._stuck_since: float | None = None
+        self._timer: asyncio.TimerHandle | None = None
+        self._task: asyncio.Task[None] | None = None
+        self._is_closed = False
+        # Opening and closing may block. A device that hangs occupies this thread only.
+        self._thread = Threads(1, f"line-{name}")
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the device is there."""
+        return self._device is not None
+
+    def set_rate(self, bytes_s: float) -> None:
+        """Write at another rate from now on."""
+        self._bytes_s = bytes_s
+
+    def start(self) -> None:
+        """Open the device as soon as it is present."""
+        self._task = keep_running(self._keep_open(), f"the serial network {self._name}")
+
+    def close(self) -> None:
+        """Write what waits, as far as the kernel takes it at once, and close the device."""
+        self._is_closed = True
+        if self._task is not None:
+            self._task.cancel()
+        device = self._device
+        if device is not None:
+            with suppress(OSError):
+                os.write(device.fileno(), b"".join(self._queue))
+            self._use_cts(device, on=False)  # otherwise the kernel waits up to half a minute for the modem
+            self._detach("closed")
+            _close(device)
+
+    # Sending.
+
+    def send(self, datagram: bytes) -> None:
+        """Write a datagram, or let it wait for the radio. Drop and count it if too much waits already.
+
+        Raises:
+            OSError: the device is not open (ENODEV).
+        """
+        if self._device is None:
+            raise OSError(19, "the device is not open")
+        try:
+            line = encode(datagram)
+        except ValueError:
+            self.failures[TOO_LONG] += 1
+            return
+        if self._queue and self._queued_bytes + len(line) > QUEUE_BYTES + QUEUE_S * self._bytes_s:
+            self.failures[LINE_FULL] += 1
+            return
+        self._queue.append(line)
+        self._queued_bytes += len(line)
+        if self._timer is None:
+            self._write_waiting()
+
+    def _write_waiting(self) -> None:
+        self._timer = None
+        device = self._device
+        while self._queue and device is not None:
+            now = monotonic()
+            held_s = self._held_s(device, now)
+            if held_s > 0 and held_s + len(self._queue[0]) / self._bytes_s > MODEM_S:
+                wait_s = min(held_s, max(held_s + len(self._queue[0]) / self._bytes_s - MODEM_S, 0.0)) + LATE_S
+                self._timer = asyncio.get_running_loop().call_later(wait_s, self._write_waiting)
+                return
+            line = self._queue.popleft()
+            self._queued_bytes -= len(line)
+            if now - self._written_at > LINE_IDLE_S:
+                line = DELIMITER + line
+            if not self._write(device, line, now):
+                return
+
+    def _held_s(self, device: BaseSerial, now: float) -> float:
+        """For how long the radio has something to send; at least as long as the kernel holds bytes."""
+        held_s = max(0.0, self._sent_by - now)
+        in_kernel = device.num_unwritten_bytes()
+        if not in_kernel:
+            self._stuck_since = None
+        elif self._stuck_since is None:
+            self._stuck_since = now
+        elif self.uses_cts and now - self._stuck_since > STUCK_S:
+            self.failures["CTS_STUCK"] += 1
+            self._use_cts(device, on=False)
+        return max(held_s, in_kernel / self._bytes_s)
+
+    def _write(self, device: BaseSerial, line: bytes, now: float) -> bool:
+        """Pass bytes to the kernel. Returns whether the device is still there."""
+        try:
+            count = os.write(device.fileno(), line)
+        except BlockingIOError:
+            count = 0
+        except OSError as error:
+            self._lose(failure_name(error))
+            return False
+        if count < len(line):  # the kernel's queue is full: the other end drops the torn datagram
+            self.failures[LINE_FULL] += 1
+        self.bytes_written += count
+        self._written_at = now
+        self._sent_by = max(self._sent_by, now) + count / self._bytes_s
+        return True
+
+    # The device.
+
+    async def _keep_open(self) -> None:
+        while True:
+            epoch = self._stall.epoch
+            try:
+                device = await self._thread.run(partial(_open, self.url))
+            except OSError as error:
+                self.reason = f"{self.url.device} cannot be opened ({failure_name(error)})"
+                self.failures[failure_name(error)] += 1
+            else:
+                self._lost.clear()
+                self._attach(device, epoch)
+                await self._lost.wait()
+                with suppress(OSError):  # no thread can be started: freeing the object closes it
+                    await self._thread.run(partial(_abort, device))
+            await asyncio.sleep(RETRY_S)
+
+    def _attach(self, device: BaseSerial, epoch: int) -> None:
+        if self._is_closed:
+            _abort(device)
+            return
+        self._device = device
+        self.reason = ""
+        self._sent_by = self._written_at = -inf
+        self._stuck_since = None
+        self.decoder.reset()
+        self.uses_cts = False
+        if _has_cts(device):
+            self._use_cts(device, on=True)
+        self._backlog = Backlog(self._stall, device.fileno(), lambda: TERMINAL_BYTES, epoch)
+        asyncio.get_running_loop().add_reader(device.fileno(), self._on_readable)
+        self._on_change()
+
+    def _use_cts(self, device: BaseSerial, *, on: bool) -> None:
+        """Have the kernel stop writing while the modem lowers CTS, or not."""
+        with suppress(OSError, termios.error):
+            settings = termios.tcgetattr(device.fileno())
+            settings[2] = settings[2] | termios.CRTSCTS if on else settings[2] & ~termios.CRTSCTS
+            termios.tcsetattr(device.fileno(), termios.TCSANOW, settings)
+            self.uses_cts = on
+
+    def _on_readable(self) -> None:
+        device, backlog = self._device, self._backlog
+        if device is None or backlog is None:
+            return
+        now = monotonic()
+        epoch = backlog.begin(now)
+        try:
+            data = os.read(device.fileno(), READ_BYTES)
+        except BlockingIOError:
+            return
+        except OSError as error:
+            self._lose(failure_name(error))
+            return
+        if not data:
+            self._lose("disconnected")
+            return
+        backlog.end(len(data), is_empty=len(data) < READ_BYTES)
+        datagrams = self.decoder.feed(data)
+        if epoch == STALE:
+            self._stall.dropped[self._name] += len(datagrams)
+        elif datagrams:
+            self._on_datagrams(datagrams, now, epoch)
+
+    def _lose(self, reason: str) -> None:
+        """The device is gone."""
+        self.failures[reason] += 1
+        self._detach(f"{self.url.device} was lost ({reason})")
+        self._lost.set()
+        self._on_change()
+
+    def _detach(self, reason: str) -> None:
+        assert self._device is not None, "a device that is not open cannot be lost"
+        asyncio.get_running_loop().remove_reader(self._device.fileno())
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        self._device = self._backlog = None
+        self.reason = reason
+        self._queue.clear()
+        self._queued_bytes = 0
+
+
+def _open(url: SerialUrl) -> BaseSerial:
+    device = open_device(url)
+    os.set_blocking(device.fileno(), False)
+    return device
+
+
+def _has_cts(device: BaseSerial) -> bool:
+    """Whether the modem holds CTS. A device without such wires has none, and a modem that is not ready lowers it."""
+    try:
+        return device.get_modem_pins().cts is PinState.HIGH
+    except OSError:
+        return False
+
+
+def _close(device: BaseSerial) -> None:
+    """Close the device once the kernel has written what it holds."""
+    with suppress(OSError):
+        device.close()
+
+
+def _abort(device: BaseSerial) -> None:
+    """Close the device at once."""
+    with suppress(OSError):
+        device.reset_write_buffer()
+    _close(device)
