@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
-from uavlinkd.config import Config, ConfigError, Recording, Routing, keys
+from uavlinkd.config import Config, ConfigError, PeerAddress, Recording, Routing, keys
 from uavlinkd.config.load import load_config
 from uavlinkd.config.schema import (
     EndpointSection,
@@ -102,7 +102,7 @@ def test_ten_lines_are_enough(load: Load, folder: Path) -> None:
     ]
     (peer,) = config.peers
     assert (peer.name, peer.settings.public_key, peer.settings.psk) == ("drone1", keys.decode_key(_ONE), None)
-    assert peer.addresses == (Address("10.13.0.2", 5790),)
+    assert peer.addresses == (PeerAddress(Address("10.13.0.2", 5790)),)
     assert peer.settings.link == Link()
     assert (config.log.level, config.log.format) == ("info", "auto")
     assert config.warnings == ()
@@ -853,7 +853,11 @@ def test_values_below_the_limit_cause_no_warning(load: Load, lines: str) -> None
     assert load(f"{_GOOD}{lines}\n").warnings == ()
 
 
-_NAMES = {"slow-radio": "drone2"}  # files whose name describes their subject
+_NAMES = {
+    "slow-radio": "drone2",
+    "two-radios": "drone3",
+    "lte-and-sik": "drone4",
+}  # files whose name describes their subject
 _OTHERS = {"mitm"}  # configurations of other commands, with tests of their own
 
 

@@ -21,6 +21,7 @@ _ROW = re.compile(r"^\| `(\w+)` \| (.+?) \| (.+?) \| `(.+?)` \| .+ \|$", re.MULT
 SECTIONS: dict[str, type[BaseModel]] = {
     "Top of the file": schema.FileSection,
     "`[link]`": schema.LinkSection,
+    "`[[network]]`": schema.NetworkSection,
     "`[[peer]]`": schema.PeerSection,
     "`[[endpoint]]`": schema.EndpointSection,
     "Policy": schema.PolicySection,

@@ -5,7 +5,17 @@ not need.
 """
 
 from uavlinkd.config.errors import ConfigError, Problem
-from uavlinkd.config.model import Config, EndpointConfig, Log, PeerConfig, PolicyData, Recording, Routing
+from uavlinkd.config.model import (
+    Config,
+    EndpointConfig,
+    Log,
+    NetworkConfig,
+    PeerAddress,
+    PeerConfig,
+    PolicyData,
+    Recording,
+    Routing,
+)
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
 
 __all__ = [
@@ -14,6 +24,8 @@ __all__ = [
     "EgressSettings",
     "EndpointConfig",
     "Log",
+    "NetworkConfig",
+    "PeerAddress",
     "PeerConfig",
     "PolicyData",
     "Problem",

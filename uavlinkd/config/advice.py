@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from itertools import combinations
 from math import ceil
 
-from uavlinkd.config.model import EndpointConfig, PeerConfig, Routing
+from uavlinkd.config.model import EndpointConfig, PeerAddress, PeerConfig, Routing
 from uavlinkd.core import constants as c
 from uavlinkd.core.settings import Link
 from uavlinkd.core.wire import initiation_bytes, response_bytes
@@ -202,7 +202,7 @@ def _slow(peers: Sequence[PeerConfig]) -> Iterator[str]:
 def _reach(listen: Sequence[Address], peers: Sequence[PeerConfig]) -> Iterator[str]:
     for peer in peers:
         # A name may have addresses of both families.
-        numeric = [address for address in peer.addresses if address.ip is not None]
+        numeric = [written.address for written in peer.addresses if written.address.ip is not None]
         if not listen or not numeric or len(numeric) < len(peer.addresses):
             continue
         if not any(own.family == address.family for own in listen for address in numeric):
@@ -214,8 +214,14 @@ def _reach(listen: Sequence[Address], peers: Sequence[PeerConfig]) -> Iterator[s
         elif all(own.is_loopback for own in listen) and not any(address.is_loopback for address in numeric):
             yield f'peer "{peer.name}" is on the network, but listen names only loopback: neither reaches the other'
     for a, b in combinations(peers, 2):
-        if both := set(a.addresses) & set(b.addresses):
+        both = [one.address for one in a.addresses for other in b.addresses if _clash(one, other)]
+        if both:
             yield f'peers "{a.name}" and "{b.name}" share the address {min(both)}: only one peer can use it'
+
+
+def _clash(a: PeerAddress, b: PeerAddress) -> bool:
+    """Whether both are one address on one network."""
+    return a.address == b.address and (a.network == b.network or not (a.network and b.network))
 
 
 def _peers_with(peers: Sequence[PeerConfig], condition: Callable[[Link], bool]) -> str:

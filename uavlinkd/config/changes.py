@@ -11,6 +11,7 @@ _FIXED = {
     "name": "name",
     "public_key": "private_key_file",
     "listen": "listen",
+    "networks": "network",
     "control_socket": "control_socket",
     "log": "log",
     "routing": "routing",

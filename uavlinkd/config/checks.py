@@ -6,6 +6,7 @@ from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Seq
 from itertools import combinations
 from typing import Any
 
+from uavlinkd.config.model import PeerAddress
 from uavlinkd.config.problems import Problems, Values
 from uavlinkd.config.schema import LinkSection, RecordingSection
 from uavlinkd.endpoints.url import EndpointKind, EndpointUrl, NetworkUrl, SerialUrl
@@ -24,12 +25,12 @@ _RETRIES_BEFORE_REJECT = 2
 
 def names(problems: Problems, sections: Iterable[Values]) -> None:
     """Two sections of a kind have different names."""
-    _unique(problems, sections, "name", lambda name: name, "the name of {other} too: write another")
+    unique(problems, sections, "name", lambda name: name, "the name of {other} too: write another")
 
 
 def public_keys(problems: Problems, peers: Sequence[Values], own: bytes | None, private: bytes | None) -> None:
     """Each peer has a key of its own, which is not this daemon's public key."""
-    _unique(problems, peers, "public_key", bytes, "the key of {other} too: each peer has its own")
+    unique(problems, peers, "public_key", bytes, "the key of {other} too: each peer has its own")
     for peer in peers:
         key = peer.valid.get("public_key")
         if key is not None and key == own and key != private:
@@ -60,12 +61,13 @@ def previous_keys(
     for peer in peers:
         if previous is not None and peer.valid.get("public_key") == previous:
             problems.add(peer.place.key("public_key"), "is this daemon's own previous key: write the peer's")
-    _unique(problems, peers, "previous_public_key", bytes, "the previous key of {other} too: each peer has its own")
+    unique(problems, peers, "previous_public_key", bytes, "the previous key of {other} too: each peer has its own")
 
 
-def _unique(
+def unique(
     problems: Problems, sections: Iterable[Values], key: str, as_hashable: Callable[[Any], Hashable], message: str
 ) -> None:
+    """No two sections have the same value of a key. ``message`` says what to do, with the place of the ``other``."""
     first: dict[Hashable, Values] = {}
     for section in sections:
         if (value := section.valid.get(key)) is None:
@@ -82,17 +84,18 @@ def reachability(problems: Problems, top: Values, peers: Iterable[Values]) -> No
         if overlaps(a, b):
             problems.add("listen", f"names {a} and {b}, which one machine cannot listen on at once: write one")
     for peer in peers:
-        addresses: list[Address] = peer.valid.get("addresses", [])
+        addresses: list[PeerAddress] = peer.valid.get("addresses", [])
         if not addresses and not listen and "listen" not in top.invalid and "addresses" not in peer.invalid:
             problems.add(
                 peer.place.key("addresses"),
                 "is empty, and so is listen: neither end could initiate; write the peer's address here,"
                 ' or listen = ["0.0.0.0:5790"] at the top so that the peer can initiate',
             )
-        for address in addresses:
-            if any(_reaches(address, own) for own in listen):
+        for written in addresses:
+            if any(_reaches(written.address, own) for own in listen):
                 problems.add(
-                    peer.place.key("addresses"), f"names {address}, where this daemon listens: write the peer's"
+                    peer.place.key("addresses"),
+                    f"names {written.address}, where this daemon listens: write the peer's",
                 )
 
 

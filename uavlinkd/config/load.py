@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from uavlinkd.config import checks, pasted_keys, policies
+from uavlinkd.config import checks, network_rules, pasted_keys, policies
 from uavlinkd.config.advice import advice
 from uavlinkd.config.errors import ConfigError, Problem
 from uavlinkd.config.keys import CREDENTIALS, KeyFileError, find_secret_file, read_secret_file
@@ -22,6 +22,7 @@ from uavlinkd.config.schema import (
     LinkSection,
     LogSection,
     MetricsSection,
+    NetworkSection,
     PeerSection,
     RecordingSection,
     RoutingSection,
@@ -29,7 +30,7 @@ from uavlinkd.config.schema import (
 )
 from uavlinkd.config.syntax import at, syntax_problem
 from uavlinkd.core.crypto import Secret, x25519_public_key
-from uavlinkd.core.settings import Link, PeerSettings, Timers
+from uavlinkd.core.settings import Link, PeerSettings, Redundancy, Timers
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
 from uavlinkd.system.threads import Threads
 
@@ -51,6 +52,7 @@ def load_config(path: Path, environ: Mapping[str, str]) -> Config:
     routing = problems.read(RoutingSection, _table(problems, table, "routing"), "routing")
     metrics = problems.read(MetricsSection, _table(problems, table, "metrics"), "metrics")
     recording = problems.read(RecordingSection, _table(problems, table, "recording"), "recording")
+    networks = _sections(problems, table, "network", NetworkSection)
     endpoints = _sections(problems, table, "endpoint", EndpointSection)
     peers = _sections(problems, table, "peer", PeerSection)
 
@@ -71,6 +73,7 @@ def load_config(path: Path, environ: Mapping[str, str]) -> Config:
     )
     checks.previous_keys(problems, top, peers, public, None if previous is None else _public(previous))
     checks.reachability(problems, top, peers)
+    network_rules.networks(problems, top, networks, peers, endpoints)
     checks.endpoints(problems, top, endpoints)
     checks.metrics(problems, metrics, endpoints)
     checks.recording(problems, recording, peers)
@@ -89,6 +92,7 @@ def load_config(path: Path, environ: Mapping[str, str]) -> Config:
 
     assert private is not None  # its absence is a problem, raised above
     listen = tuple(top.valid.get("listen", ()))
+    network_configs = tuple(map(network_rules.network_of, networks))
     endpoint_configs = tuple(map(_endpoint, endpoints))
     peer_configs = tuple(_peer(peer, psk, link) for peer, psk in zip(peers, psks, strict=True))
     routing_config = Routing(**RoutingSection.model_construct(**routing.valid).model_dump())
@@ -107,9 +111,16 @@ def load_config(path: Path, environ: Mapping[str, str]) -> Config:
         log=Log(**LogSection.model_construct(**log.valid).model_dump()),
         previous_private_key=previous,
         key_grace_s=FileSection.model_construct(**top.valid).key_grace_s,
+        networks=network_configs,
         warnings=(
             *pasted_keys.advice(private.reveal(), peer_configs),
-            *advice(listen, endpoint_configs, peer_configs, routing_config, metrics.valid.get("listen")),
+            *advice(
+                () if any(network.serial is None for network in network_configs) else listen,
+                endpoint_configs,
+                peer_configs,
+                routing_config,
+                metrics.valid.get("listen"),
+            ),
         ),
     )
 
@@ -196,6 +207,8 @@ def _peer(peer: Values, psk: Secret | None, link: Values) -> PeerConfig:
                     lost_after_s=keys.lost_after_s,
                     probe_interval_s=keys.probe_interval_s,
                 ),
+                redundancy=Redundancy(keys.redundancy),
+                idle_probe_s=keys.idle_probe_s,
                 verify_interval_s=verify_interval_s(keys.budget_bits_s, tag_bytes),
             ),
         ),

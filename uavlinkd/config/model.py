@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,12 +10,15 @@ from types import MappingProxyType
 from typing import Literal
 
 from uavlinkd.core.crypto import Secret
+from uavlinkd.core.path import SERIAL_HOST
 from uavlinkd.core.settings import PeerSettings
-from uavlinkd.endpoints.url import EndpointUrl
+from uavlinkd.endpoints.url import EndpointUrl, SerialUrl
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
 from uavlinkd.mavlink.policy.compilation import Policy, compile_policy
 from uavlinkd.system.addresses import Address
 
+SERIAL = Address(SERIAL_HOST, 0)
+"""The other end of a serial network."""
 PolicyData = Mapping[str, object]
 """A policy as immutable plain data. :mod:`uavlinkd.mavlink.policy.compilation` documents its keys."""
 
@@ -45,6 +49,60 @@ class EndpointConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class NetworkConfig:
+    """An exit of this machine: an interface, an address of this machine, or a serial device. One of them is not None.
+
+    ``metered``: traffic costs money. ``budget_bits_s``: limit for all peers together; 0: no limit. ``air_bits_s``:
+    what the radio behind a serial device carries, both directions together. This end's part is ``budget_bits_s``.
+    """
+
+    name: str
+    interface: str | None = None
+    address: str | None = None
+    metered: bool = False
+    budget_bits_s: int = 0
+    serial: SerialUrl | None = None
+    air_bits_s: int = 0
+
+    @property
+    def exit(self) -> str:
+        """The interface, the address or the device, for people."""
+        if self.serial is not None:
+            return f"serial {self.serial.device} at {self.serial.baud} baud"
+        return f"interface {self.interface}" if self.address is None else f"address {self.address}"
+
+    @property
+    def families(self) -> tuple[socket.AddressFamily, ...]:
+        """The address families that it can have: none on a serial device."""
+        if self.serial is not None:
+            return ()
+        if self.address is None:
+            return socket.AF_INET, socket.AF_INET6
+        return (socket.AF_INET6 if ":" in self.address else socket.AF_INET,)
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class PeerAddress:
+    """An address of a peer. ``network``: the only network to use it on; empty: every network of its family.
+
+    The peer at the other end of a serial network has the address :data:`.SERIAL` there.
+    """
+
+    address: Address
+    network: str = ""
+
+    @property
+    def is_serial(self) -> bool:
+        """Whether it is the other end of a serial network, which needs no address."""
+        return self.address == SERIAL
+
+    def __str__(self) -> str:
+        if self.is_serial:
+            return f"serial network {self.network}"
+        return f"{self.address} on {self.network}" if self.network else str(self.address)
+
+
+@dataclass(frozen=True, slots=True)
 class PeerConfig:
     """Another daemon: its settings in the core, and its addresses. Without addresses, the peer initiates.
 
@@ -52,7 +110,7 @@ class PeerConfig:
     """
 
     settings: PeerSettings
-    addresses: tuple[Address, ...]
+    addresses: tuple[PeerAddress, ...]
     policy: PolicyData
     egress: EgressSettings = field(default_factory=EgressSettings)
     previous_public_key: bytes | None = None
@@ -106,7 +164,8 @@ class Config:
 
     ``listen`` is empty if the daemon only initiates. ``metrics`` is the address of the server for Prometheus.
     ``warnings`` are sentences for a person; the daemon runs in spite of them. Previous keys are valid for
-    ``key_grace_s``, or until the new ones are confirmed.
+    ``key_grace_s``, or until the new ones are confirmed. If ``networks`` has no interface or address, the
+    kernel's routes decide how to reach peers over IP.
     """
 
     path: Path
@@ -124,3 +183,9 @@ class Config:
     warnings: tuple[str, ...]
     previous_private_key: Secret | None = None
     key_grace_s: float = 0.0
+    networks: tuple[NetworkConfig, ...] = ()
+
+    @property
+    def has_ip_networks(self) -> bool:
+        """Whether networks decide along which sockets of UDP the peers are reached."""
+        return any(network.serial is None for network in self.networks)

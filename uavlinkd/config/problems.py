@@ -21,6 +21,7 @@ from uavlinkd.config.schema import (
     LinkSection,
     LogSection,
     MetricsSection,
+    NetworkSection,
     PeerSection,
     PolicySection,
     RecordingSection,
@@ -170,6 +171,7 @@ _SECTIONS: dict[str, type[Section]] = {
     "in [link] or in a [[peer]]": LinkSection,
     "in a [[peer]] or an [[endpoint]]": PolicySection,
     "in a [[peer]]": PeerSection,
+    "in a [[network]]": NetworkSection,
     "in an [[endpoint]]": EndpointSection,
     "in [log]": LogSection,
     "in [routing]": RoutingSection,
@@ -190,7 +192,6 @@ _OTHERS_CALL_IT = {
     "encrypt": "confidential = true",
     "encryption": "confidential = true",
     "suite": 'suites, a list: suites = ["x25519"]',
-    "interface": "name, private_key_file and listen at the top of the file",
     "udp_endpoint": "[[endpoint]], with name and url",
     "uart_endpoint": "[[endpoint]], with name and url",
 }
@@ -203,8 +204,14 @@ _FILTERS = {
 }
 _UDP, _SERIAL = 'url = "udpin:127.0.0.1:14550"', 'url = "serial:/dev/ttyACM0:57600"'
 _OTHERS_CALL_IT_IN: dict[type[Section], dict[str, str]] = {
-    FileSection: {"log_level": '[log] at the end of the file, and below it level = "info"'},
+    FileSection: {
+        "log_level": '[log] at the end of the file, and below it level = "info"',
+        "interface": "name, private_key_file and listen here, or interface in a [[network]]",
+    },
     PeerSection: {
+        "address": 'addresses, a list: addresses = ["10.13.0.2:5790"]',
+        "interface": 'addresses = [{ address = "10.13.0.2:5790", network = "mesh" }], and a [[network]] "mesh" with'
+        " this interface",
         "endpoint": 'addresses, a list: addresses = ["10.13.0.2:5790"]',
         "allowed_ips": "role and system_ids: they say what the peer may do",
         **_FILTERS,
@@ -231,6 +238,8 @@ def unknown_key(key: str, model: type[Section]) -> str:
             return f"does not belong here: write it {where}"
     known = list(model.model_fields)
     if close := get_close_matches(plain, known, n=1, cutoff=0.7):
-        written = f"[[{close[0]}]]" if model is FileSection and close[0] in ("peer", "endpoint") else close[0]
+        written = (
+            f"[[{close[0]}]]" if model is FileSection and close[0] in ("peer", "endpoint", "network") else close[0]
+        )
         return f"is not known: did you mean {written}?"
     return f"is not known here: the keys are {', '.join(known)}"

@@ -6,6 +6,7 @@ The checks here concern a single value. Checks of several values are in :mod:`ua
 from __future__ import annotations
 
 import re
+from ipaddress import IPv4Address, IPv6Address, ip_address
 from typing import Annotated, Any, Literal
 
 from pydantic import (
@@ -19,14 +20,16 @@ from pydantic import (
 )
 
 from uavlinkd.config.keys import decode_key, is_canonical_public_key
+from uavlinkd.config.model import SERIAL, PeerAddress
 from uavlinkd.core import constants as c
 from uavlinkd.core.crypto import is_usable_public_key
 from uavlinkd.core.suites import SUITES_BY_NAME, X25519, Suite
-from uavlinkd.endpoints.url import EndpointUrl, parse_url
+from uavlinkd.endpoints.url import EndpointUrl, SerialUrl, parse_line, parse_url
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
 from uavlinkd.system.addresses import Address, parse_address
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}")
+_INTERFACE = re.compile(r"[^\s/:]{1,15}")  # as dev_valid_name() of Linux
 # A complete or nearly complete key in base64 or hex: no message repeats it.
 _LIKE_A_KEY = re.compile(r"[A-Za-z0-9+/_-]{40,}={0,2}")
 _FINITE_FIELD = re.compile(r"(?:modp|ffdhe?|dhe?)?[-_ ]?(\d{1,5})(?:[-_ ]?bits?)?")
@@ -34,6 +37,7 @@ _FINITE_FIELD = re.compile(r"(?:modp|ffdhe?|dhe?)?[-_ ]?(\d{1,5})(?:[-_ ]?bits?)
 _SMALL_IKE_GROUPS = {"group1": 768, "group2": 1024, "group22": 1024}
 _BREAKABLE_BITS = 1024
 _LEAST_BUDGET = 1000
+_LEAST_AIR = 1000
 _EGRESS = EgressSettings()
 _AGES = (0.1, 60.0)
 _KEY_GRACE_S = 7 * 24 * 3600.0
@@ -106,9 +110,12 @@ def _suites(values: list[Suite]) -> list[Suite]:
     return values
 
 
-def _addresses(values: list[Address]) -> list[Address]:
+def _addresses(values: list[PeerAddress]) -> list[PeerAddress]:
+    everywhere = {value.address for value in values if not value.network}
     if len(set(values)) != len(values):
         raise ValueError("names an address twice: write each once")
+    if any(value.network and value.address in everywhere for value in values):
+        raise ValueError("names an address with a network and without, which stands for every network: write one")
     return values
 
 
@@ -118,11 +125,47 @@ def _budget(value: int) -> int:
     return value
 
 
-def _peer_address(value: Any) -> Address:
-    address = parse_address(_text(value), allow_names=True)
+def _peer_address(value: Any) -> PeerAddress:
+    text, network = value, ""
+    if isinstance(value, dict):
+        if set(value) == {"network"}:
+            return PeerAddress(SERIAL, _name(value["network"]))
+        if set(value) != {"address", "network"}:
+            raise ValueError(
+                'must have two keys: write { address = "10.13.0.2:5790", network = "mesh" }, or { network = "sik" }'
+                " for a serial network"
+            )
+        text, network = value["address"], _name(value["network"])
+    address = parse_address(_text(text), allow_names=True)
     if address.is_wildcard:
         raise ValueError('is every address of this machine: write the peer\'s own, such as "10.13.0.2:5790"')
-    return address
+    return PeerAddress(address, network)
+
+
+def _interface(value: Any) -> str:
+    text = _text(value)
+    if not _INTERFACE.fullmatch(text) or not text.isprintable() or text in (".", ".."):
+        raise ValueError("is not a name of a network interface: write one of those that `ip -brief link` lists")
+    return text
+
+
+def _own_address(value: Any) -> str:
+    try:
+        ip = ip_address(_text(value))
+    except ValueError:
+        raise ValueError(
+            'is not an IP address: write one of this machine\'s, without a port, such as "10.0.0.5";'
+            " the port is that of listen"
+        ) from None
+    if ip.is_unspecified:
+        raise ValueError('is every address of this machine: write one of them, or interface = "wlan0" instead')
+    if ip.is_multicast or ip == IPv4Address("255.255.255.255"):
+        raise ValueError("is a multicast or broadcast address: write an address of this machine")
+    if isinstance(ip, IPv6Address) and ip.ipv4_mapped is not None:
+        raise ValueError(f'is an IPv4 address in IPv6 form: write "{ip.ipv4_mapped}"')
+    if isinstance(ip, IPv6Address) and ip.is_link_local and ip.scope_id is None:
+        raise ValueError(f'is link-local, valid on one interface only: write "{ip}%wlan0" with that interface')
+    return str(ip)
 
 
 Name = Annotated[str, PlainValidator(_name)]
@@ -186,6 +229,30 @@ class LinkSection(Section):
     """How long a frame may wait for others to share its envelope. 0: it shares only with frames that already wait."""
     max_age_s: float = _seconds(_EGRESS.max_age_s, *_AGES)
     """A frame that waited longer for its turn is dropped as stale."""
+    redundancy: Literal["critical", "all", "none"] = "critical"
+    """Which classes of frames are sent along every usable path."""
+    idle_probe_s: float = _seconds(c.PROBE_IDLE_S, 0, 3600)
+    """Interval of the probes along a metered path that is not needed, and while no frames are sent. 0: none."""
+
+
+class NetworkSection(Section):
+    """``[[network]]``: an exit of this machine to the peers."""
+
+    name: Name = Field(examples=['"lte"'])
+    interface: Annotated[str, PlainValidator(_interface)] | None = Field(default=None, examples=['"wwan0"'])
+    """The sockets are bound to this interface."""
+    address: Annotated[str, PlainValidator(_own_address)] | None = Field(default=None, examples=['"10.0.0.5"'])
+    """The socket is bound to this address of the machine. The kernel's routes decide the interface."""
+    serial: Annotated[SerialUrl, PlainValidator(lambda value: parse_line(_text(value)))] | None = Field(
+        default=None, examples=['"/dev/ttyUSB0:57600"']
+    )
+    """A serial device with its baud rate: a radio modem, with one peer at the other end."""
+    air_bits_s: int | None = Field(default=None, ge=_LEAST_AIR, le=10_000_000, examples=["24000"])
+    """What the radio behind the device carries, in both directions together. This end sends 40 % of it."""
+    metered: bool = False
+    """Whether its traffic costs money."""
+    budget_bits_s: Annotated[int, AfterValidator(_budget)] = Field(default=0, ge=0, le=10**9)
+    """Most bits per second of all peers together, including the headers of IP and UDP. 0: no limit."""
 
 
 class PolicySection(Section):
@@ -213,8 +280,8 @@ class PeerSection(LinkSection, PolicySection):
     public_key: Annotated[bytes, PlainValidator(_public_key)] = Field(
         examples=['"…", what `uavlinkd pubkey` prints on the peer']
     )
-    addresses: Annotated[list[Annotated[Address, PlainValidator(_peer_address)]], AfterValidator(_addresses)] = Field(
-        default=[], examples=['["10.13.0.2:5790"]']
+    addresses: Annotated[list[Annotated[PeerAddress, PlainValidator(_peer_address)]], AfterValidator(_addresses)] = (
+        Field(default=[], examples=['["10.13.0.2:5790"]'])
     )
     """Where this daemon reaches it. Empty: the peer initiates."""
     psk_file: FileName | None = Field(default=None, examples=['"drone0-drone1.psk"'])
@@ -291,5 +358,6 @@ class FileSection(Section):
     routing: Any = None
     metrics: Any = None
     recording: Any = None
+    network: Any = None
     endpoint: Any = None
     peer: Any = None
