@@ -21,7 +21,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from tests.daemon.udp import Client, open_client
 from tests.waiting import until
-from uavlinkd.config import Config, EndpointConfig, PeerConfig
+from uavlinkd.config import Config, EndpointConfig, PeerAddress, PeerConfig
 from uavlinkd.config.model import Log, Routing
 from uavlinkd.core.crypto import KeyPair, Secret
 from uavlinkd.core.settings import Link, PeerSettings
@@ -73,7 +73,9 @@ def config(name: str, url: NetworkUrl, peer: str, addresses: tuple[Address, ...]
         public_key=PUBLIC[name],
         listen=(ANY_PORT,),
         endpoints=(EndpointConfig("client", url),),
-        peers=(PeerConfig(PeerSettings(peer, PUBLIC[peer], None, Link()), addresses, rules),),
+        peers=(
+            PeerConfig(PeerSettings(peer, PUBLIC[peer], None, Link()), tuple(map(PeerAddress, addresses)), rules),
+        ),
         routing=Routing(),
         control_socket=None,
         metrics=None,

@@ -20,6 +20,7 @@ from uavlinkd.core.indices import Indices
 from uavlinkd.core.initiator import Initiator
 from uavlinkd.core.path import Path
 from uavlinkd.core.settings import PeerSettings
+from uavlinkd.core.socket_facts import SocketFacts
 from uavlinkd.lab.sim.loopback_ports import free_port, has_ipv6
 from uavlinkd.ops.causes import Cause
 from uavlinkd.ops.findings import Severity
@@ -29,8 +30,9 @@ def initiation(private_key: str, to: DaemonProcess) -> bytes:
     """An initiation to a daemon by the holder of a key."""
     settings = PeerSettings("target", keys.decode_key(to.public_key))
     identity = KeyPair(keys.decode_key(private_key))
-    initiator = Initiator(settings, identity, Indices[object](os.urandom), os.urandom, 0.0)
-    return initiator.initiate(1, Path(0, ("127.0.0.1", 1)), 1, 0.0)[1]
+    initiator = Initiator(settings, identity, Indices[object](os.urandom), os.urandom, SocketFacts(), 0.0)
+    _, [(datagram, _)] = initiator.initiate(1, [Path(0, ("127.0.0.1", 1))], 1, 0.0)
+    return datagram
 
 
 async def send_until_found(

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from tests.link.test_evidence import HOST, OWN_KEY, THERE, Scene
+from uavlinkd.core import constants as c
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.outputs import Dropped
 from uavlinkd.core.path import Path
@@ -28,7 +29,11 @@ class Diagnosed(Scene):
     def __init__(self) -> None:
         super().__init__()
         self.sockets: Any = SimpleNamespace(
-            unresolved={}, without_socket=set(), absent_addresses=list, is_own=lambda address: False
+            unresolved=lambda name: set[str](),
+            without_socket=set(),
+            absent_addresses=list,
+            networks=None,
+            is_own=lambda address: False,
         )
         self.history = History(0.0)
         self.daemon: Any = SimpleNamespace(
@@ -83,7 +88,7 @@ def test_reports_of_the_network(scene: Diagnosed, number: int, cause: Cause) -> 
 
 def test_name_without_an_address(scene: Diagnosed) -> None:
     """Each name that does not resolve is named."""
-    scene.sockets.unresolved["drone1"] = {"b.test", "a.test"}
+    scene.sockets.unresolved = lambda name: {"b.test", "a.test"}
     assert scene.findings()[Cause.NAME_NOT_RESOLVED].text.startswith("a.test, b.test ")
 
 
@@ -109,6 +114,21 @@ def test_evidence_from_before_the_link_went_down_does_not_count(scene: Diagnosed
     scene.link.silent_since = NOW + 1.0
     assert scene.findings(NOW + 2.0) == {}
     assert set(scene.findings(NOW + 20.0)) == {Cause.NO_ANSWER}
+
+
+def test_other_version_names_the_older_side(scene: Diagnosed) -> None:
+    """It explains the initiations above the limit of comparisons, which count as for another key."""
+    scene.bad_mac1()
+    older, newer = c.PROTOCOL_VERSION - 1, c.PROTOCOL_VERSION + 1
+    for version, remedy in (
+        (older, "update uavlinkd at drone1:"),
+        (newer, "; update uavlinkd at drone0, this machine"),
+    ):
+        scene.evidence.add_dropped(Dropped(DropReason.OTHER_VERSION, None, Path(0, THERE), 1, version), NOW)
+        findings = scene.findings()
+        assert set(findings) == {Cause.OTHER_VERSION}
+        assert f"uavlink/{version}, this daemon uavlink/{c.PROTOCOL_VERSION}" in findings[Cause.OTHER_VERSION].text
+        assert remedy in findings[Cause.OTHER_VERSION].remedy
 
 
 def test_several_keys_from_one_address(scene: Diagnosed) -> None:

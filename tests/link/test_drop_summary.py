@@ -13,14 +13,16 @@ from tests.core.harness import KEY_A, Named, Pair
 from tests.policies import TRUSTED
 from uavlinkd.config import PeerConfig as Peer
 from uavlinkd.config.keys import encode_key
-from uavlinkd.core.drops import DropReason, Reason
+from uavlinkd.core.constants import PROTOCOL_VERSION
+from uavlinkd.core.drops import Detail, DropReason, Reason
 from uavlinkd.core.outputs import Dropped
 from uavlinkd.core.path import Path
 from uavlinkd.core.settings import PeerSettings
 from uavlinkd.link import drop_summary
 from uavlinkd.link.conditions import HOUR_S, LINES_BURST, QUIET_S
-from uavlinkd.link.drop_summary import EVERYDAY, PERSISTENT_S, SECURITY, DropSummary, Fact, ShellReason
+from uavlinkd.link.drop_summary import EVERYDAY, PERSISTENT_S, SECURITY, DropSummary, Fact
 from uavlinkd.link.peer_link import PeerLink
+from uavlinkd.link.shell_reasons import ShellReason
 from uavlinkd.mavlink.headers import Header
 from uavlinkd.mavlink.policy.gate import Refusal
 from uavlinkd.ops import metrics
@@ -91,12 +93,14 @@ def test_totals_are_plain_strings_in_a_log(summary: DropSummary) -> None:
         ("", "from 10.0.0.1:5790"),
         ("x25519", "suite x25519 from 10.0.0.1:5790"),
         (bytes(32), f"key {encode_key(bytes(32))} from 10.0.0.1:5790"),
+        (1, f"uavlink/1, older than uavlink/{PROTOCOL_VERSION} of this daemon, from 10.0.0.1:5790"),
+        (8, f"uavlink/8, newer than uavlink/{PROTOCOL_VERSION} of this daemon, from 10.0.0.1:5790"),
     ],
 )
 def test_dropped_datagram_is_logged_with_its_source(
-    recorder: Recorder, summary: DropSummary, detail: bytes | str, last: str
+    recorder: Recorder, summary: DropSummary, detail: Detail, last: str
 ) -> None:
-    """The line has the address, and the key or suite that the core refused."""
+    """The line has the address, and the key, suite or version that the core refused."""
     summary.add_dropped(Dropped(DropReason.UNKNOWN_PEER, None, Path(0, ("10.0.0.1", 5790)), 1, detail), 100.0)
     ((event, facts),) = recorder.lines
     assert (event, facts["last"]) == ("datagrams_dropped", last)

@@ -12,7 +12,8 @@ from structlog.testing import capture_logs
 from tests.core.harness import Named
 from tests.link.test_switch import Client
 from uavlinkd.config.errors import ConfigError, Problem
-from uavlinkd.core.outputs import PeerLost, PeerUp, SessionEstablished
+from uavlinkd.core.outputs import PathChanged, PathStateChanged, PeerLost, PeerUp, SessionEstablished
+from uavlinkd.core.path import Path
 from uavlinkd.core.traffic import Traffic
 from uavlinkd.link import daemon
 from uavlinkd.link.conditions import HOUR_S, LINES_BURST, LINES_PER_S, QUIET_S
@@ -31,6 +32,9 @@ class Link:
         self.name = name
         self.traffic = Traffic()
         self.totals: dict[LinkProblem, int] = dict.fromkeys(LinkProblem, 0)
+        self.repair = SimpleNamespace(is_on=False, transmissions=1)
+        self.repeats = SimpleNamespace(bytes_sent=0)
+        self.output = self
 
     def problems(self, now: float) -> dict[LinkProblem, int]:
         """Its totals."""
@@ -41,6 +45,17 @@ class Link:
 def log() -> EventLog:
     """A log without lines."""
     return EventLog(get_logger())
+
+
+def test_repair_has_a_line_when_it_begins_and_when_it_ends(log: EventLog) -> None:
+    """The latter with its cost."""
+    link = Link("drone1")
+    link.repair.is_on, link.repair.transmissions, link.repeats.bytes_sent = True, 5, 1000
+    (began,) = run(log, link, 0, 5)
+    link.repair.is_on, link.repeats.bytes_sent = False, 3500
+    (ended,) = run(log, link, 5, 10)
+    assert (began["event"], began["peer"], began["transmissions"]) == ("repair_began", "drone1", 5)
+    assert (ended["event"], ended["duration_s"], ended["bytes"]) == ("repair_ended", 5.0, 2500)
 
 
 def run(log: EventLog, link: Link, begin: int, end: int, **rates: int) -> list[dict[str, Any]]:
@@ -90,7 +105,7 @@ def test_problems_of_removed_peers_are_still_counted(log: EventLog) -> None:
 
 def test_waiting_problems_are_logged_at_the_end(log: EventLog) -> None:
     """A daemon that stops writes the totals of all open conditions."""
-    run(log, Link("b"), 0, 60, challenges_unanswered=1)
+    run(log, Link("b"), 0, 60, paths_unproven=1)
     with capture_logs() as lines:
         log.close()
     assert [(line["event"], line["count"]) for line in lines] == [("link_problem_ended", 60)]
@@ -303,3 +318,37 @@ async def test_problems_of_a_refused_configuration_control_no_terminal(monkeypat
     ((problems, event),) = [(line["problems"], line["event"]) for line in lines]
     assert event == "configuration_refused"
     assert problems == [r"a\x1b]0;owned\x07.toml:1:1: name: is missing", "b.toml: empty"]
+
+
+LTE, MESH = Path(0, ("203.0.113.7", 5790)), Path(1, ("10.13.0.9", 5790))
+
+
+def test_paths_are_logged_with_their_networks(log: EventLog) -> None:
+    """One line when another path is the best, with the reason, and one for each path that answers or fails."""
+    log.network_of = ["lte", "mesh"].__getitem__
+    peer = Named("b")
+    with capture_logs() as lines:
+        log.write(PathStateChanged(peer, LTE, is_usable=True, reason="answered"), 0.0)
+        log.write(PathStateChanged(peer, LTE, is_usable=False, reason="unanswered"), 1.0)
+        log.write(PathChanged(peer, MESH, LTE, "unanswered"), 1.0)
+    usable, down, changed = lines
+    lte = {"peer": "b", "path": "203.0.113.7:5790", "network": "lte"}
+    assert usable == {"event": "path_usable", "log_level": "info", "reason": "answered", **lte}
+    assert down == {"event": "path_down", "log_level": "warning", "reason": "unanswered", **lte}
+    assert changed == {
+        "event": "path_changed",
+        "log_level": "info",
+        "peer": "b",
+        "path": "10.13.0.9:5790",
+        "network": "mesh",
+        "before": "203.0.113.7:5790",
+        "network_before": "lte",
+        "reason": "unanswered",
+    }
+
+
+def test_paths_without_networks_are_logged_by_address(log: EventLog) -> None:
+    """The configuration names no networks."""
+    with capture_logs() as lines:
+        log.write(PathChanged(Named("b"), MESH, LTE, "faster"), 0.0)
+    assert set(lines[0]) == {"event", "log_level", "peer", "path", "before", "reason"}

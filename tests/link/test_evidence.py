@@ -10,7 +10,7 @@ import pytest
 
 from tests.core.harness import PLAIN
 from tests.policies import TRUSTED
-from uavlinkd.config import PeerConfig
+from uavlinkd.config import PeerAddress, PeerConfig
 from uavlinkd.core.crypto import Secret
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.node import Node
@@ -38,7 +38,8 @@ class Scene:
 
     def add(self, name: str, key: bytes, addresses: list[tuple[str, int]]) -> PeerLink:
         """Another peer, at these addresses."""
-        config = PeerConfig(PeerSettings(name, key, None, PLAIN), tuple(Address(*a) for a in addresses), TRUSTED)
+        written = tuple(PeerAddress(Address(*address)) for address in addresses)
+        config = PeerConfig(PeerSettings(name, key, None, PLAIN), written, TRUSTED)
         link = self.links[name] = PeerLink(config, self.node, lambda outputs: None, 0.0)
         link.peers.append(self.node.add_peer(config.settings, 0.0))
         link.set_paths([Path(0, address) for address in addresses], 0.0)

@@ -55,7 +55,7 @@ def test_counts_without_a_share_have_a_threshold_of_their_own() -> None:
     """Unanswered echo requests: a lossy link causes some."""
     assert noted(ECHOES, lambda second: second // 10) == []
     assert noted(ECHOES, lambda second: second // 2)
-    assert noted(LinkProblem.CHALLENGES_UNANSWERED, lambda second: int(second >= 50))[0] == 50
+    assert noted(LinkProblem.PATHS_UNPROVEN, lambda second: int(second >= 50))[0] == 50
 
 
 def test_reset_counters_are_a_new_baseline() -> None:

@@ -12,6 +12,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from tests.core.harness import AT_A, AT_B, ELSEWHERE, KEY_A, KEY_B, PLAIN, QUIET, Pair, Side, exchange, of, payloads
 from tests.endpoints.clients import PASSES
 from tests.policies import TRUSTED
+from uavlinkd.config import PeerAddress
 from uavlinkd.config import PeerConfig as Peer
 from uavlinkd.config.pace import verify_interval_s
 from uavlinkd.core import handshake
@@ -66,7 +67,8 @@ def test_replayed_handshakes_do_not_silence_a_link_with_a_budget(source: Path) -
         egress=EgressSettings(budget_bits_s=BUDGET_BITS_S),
     )
     peer_link = link_of(pair.b, config, outputs.extend)
-    peer_link.on_session()
+    peer_link.follow_paths(0.0)
+    peer_link.send_waiting(0.0)  # the budget pays for the handshake, and for the question along the new path
     heartbeats = heartbeat()
     entropy, arrived = random.Random(7), 0
 
@@ -96,8 +98,8 @@ def test_a_budget_that_comes_with_a_reload_pays_for_nothing_before_it() -> None:
     outputs.clear()
     peer_link.send(heartbeat(), PASSES, 2.0, 0.0)
     assert len(of(outputs, Transmit)) == 1
-    assert peer_link.egress is not None
-    assert peer_link.egress.shape.payload_limit == pair.b.session.payload_limit
+    assert peer_link.output.egress is not None
+    assert peer_link.output.egress.shape.payload_limit == pair.b.session.payload_limit
 
 
 def test_new_budget_changes_the_interval_of_the_next_session() -> None:
@@ -124,25 +126,27 @@ def test_status_has_the_time_of_unverified_freshness(since: float | None, shown:
 def test_a_peer_whose_addresses_are_other_ones_is_not_called_at_those_before() -> None:
     """Its new names may have no address yet. The path that is in use goes on being so."""
     pair = Pair(link_a=Link(suites=PLAIN.suites, timers=QUIET), link_b=PLAIN).establish()
-    config = Peer(PeerSettings("bravo", KEY_B.public, None, PLAIN), (Address("192.0.2.2", 14600),), TRUSTED)
+    config = Peer(
+        PeerSettings("bravo", KEY_B.public, None, PLAIN), (PeerAddress(Address("192.0.2.2", 14600)),), TRUSTED
+    )
     link = link_of(pair.a, config, lambda _: None)
-    assert list(pair.a.peer.initiator.paths) == [AT_B]
+    assert list(pair.a.peer.paths.configured) == [AT_B]
     link.change(replace(config, egress=EgressSettings(coalesce_s=0.01)), 1.0)
-    assert list(pair.a.peer.initiator.paths) == [AT_B]
-    link.change(replace(config, addresses=(Address("new.test", 14600),)), 2.0)
-    assert list(pair.a.peer.initiator.paths) == []
+    assert list(pair.a.peer.paths.configured) == [AT_B]
+    link.change(replace(config, addresses=(PeerAddress(Address("new.test", 14600)),)), 2.0)
+    assert list(pair.a.peer.paths.configured) == []
     assert pair.a.peer.path == AT_B
 
 
-@pytest.mark.parametrize(("addresses", "reported_at"), [((Address("192.0.2.2", 14600),), 5), ((), 10)])
-def test_silent_peer_is_reported_in_time(addresses: tuple[Address, ...], reported_at: int) -> None:
+@pytest.mark.parametrize(("addresses", "reported_at"), [((PeerAddress(Address("192.0.2.2", 14600)),), 5), ((), 10)])
+def test_silent_peer_is_reported_in_time(addresses: tuple[PeerAddress, ...], reported_at: int) -> None:
     """After 5 s if this daemon connects to it, after 10 s if it has to connect; again only after it was up."""
     pair = Pair(link_a=Link(suites=PLAIN.suites, timers=QUIET), link_b=PLAIN)
     config = Peer(PeerSettings("bravo", KEY_B.public, None, PLAIN), addresses, TRUSTED)
     link = link_of(pair.a, config, lambda _: None)
     assert [second for second in range(20) if link.is_overdue(float(second))] == list(range(reported_at, 20))
     link.change(
-        replace(config, addresses=(Address("192.0.2.3", 14600),)), 200.0
+        replace(config, addresses=(PeerAddress(Address("192.0.2.3", 14600)),)), 200.0
     )  # reported again, with the new address
     assert [second for second in range(200, 220) if link.is_overdue(float(second))] == list(range(205, 220))
     link.set_paths([AT_B], 300.0)
@@ -187,7 +191,7 @@ def test_only_links_with_waiting_frames_are_scheduled() -> None:
     links = [PeerLink(config, pair.b.node, lambda _: None, 0.0, None, schedule) for _ in range(2)]
     for member in links:
         member.peers.append(pair.b.peer)
-        member.on_session()
+        member.follow_paths(0.0)
     assert schedule.next_at == NEVER
 
     attitude = split_payload(

@@ -13,6 +13,7 @@ from typing import Any, cast
 import pytest
 import structlog
 
+from tests.link.socket_states import SocketStateLog
 from uavlinkd.core.path import Path
 from uavlinkd.link.drop_summary import EVERYDAY, DropSummary
 from uavlinkd.link.evidence import Evidence
@@ -39,6 +40,9 @@ class Refusing:
             raise OSError(self.error, "out of it")
         self.sent.append(datagram)
 
+    def close(self) -> None:
+        """As a socket's."""
+
 
 @pytest.mark.parametrize("name", ["ENOBUFS", "ENOMEM", "EPERM", "ENETUNREACH", "EAGAIN"])
 def test_what_is_not_taken_is_counted_and_the_next_is_sent(name: str) -> None:
@@ -51,11 +55,12 @@ def test_what_is_not_taken_is_counted_and_the_next_is_sent(name: str) -> None:
 
     log = cast(Any, Log())
     stall = StallWatch(0.0, lambda seconds: None)
-    sockets = PeerSockets(lambda *read: None, stall, DropSummary(log), Evidence({}, b""), structlog.get_logger())
+    sockets = PeerSockets(
+        lambda *read: None, stall, DropSummary(log), Evidence({}, b""), structlog.get_logger(), SocketStateLog()
+    )
     sockets.open([Address("127.0.0.1", 0)])
     sock = Refusing(getattr(errno, name))
-    sockets._sockets[0].close()
-    sockets._sockets[0] = cast(socket.socket, sock)
+    sockets.put(0, cast(socket.socket, sock))
     for _ in range(3):
         sockets.send(b"lost", Path(0, ("127.0.0.1", 9)))
     sock.is_out = False

@@ -92,7 +92,7 @@ def test_reports_leave_room_for_frames(budget: int) -> None:
     """On a link with a budget, a report is sent while no frame waits and the budget covers it, and it is charged."""
     pair, sent = Pair().establish(), list[Output]()
     link = link_of(pair.b, KEY_A.public, sent.extend, config(egress=EgressSettings(budget_bits_s=budget)))
-    link.on_session()
+    link.follow_paths(0.0)
     link.report_refusals(1.0)
     frames = split_payload(b"".join(heartbeat(1, seq=number) for number in range(50)), SplitCounters())
     link.send(frames, PASSES, 1.0, 0.0)
@@ -100,12 +100,12 @@ def test_reports_leave_room_for_frames(budget: int) -> None:
     sent.clear()
     link.report_refusals(1.0)
     assert len(of(sent, Transmit)) == (0 if budget else 1)
-    if budget and link.egress is not None:
-        link.egress.clear(2.0)
-        before = link.egress.demand(30.0)
+    if budget and link.output.egress is not None:
+        link.output.egress.clear(2.0)
+        before = link.output.egress.demand(30.0)
         link.report_refusals(30.0)
         assert len(of(sent, Transmit)) == 1
-        assert link.egress.demand(30.0) > before
+        assert link.output.egress.demand(30.0) > before
 
 
 def test_coalescing_delays_no_report() -> None:

@@ -38,7 +38,7 @@ async def test_the_link_is_described() -> None:
         assert session["lost_in"] == session["lost_out"] == 0
         assert peer["envelopes_missing"] == peer["envelopes_out_of_order"] == 0
         assert peer["cookies_taken"] == 0
-        for key in ("handshakes_unanswered", "challenges_unanswered", "echoes_unanswered"):
+        for key in ("handshakes_unanswered", "paths_unproven", "echoes_unanswered"):
             assert peer[key] >= 0  # a busy machine may answer late
         for key in ("round_trip_s", "last_received_s", "handshake_s"):
             assert 0 <= peer[key] < PATIENCE_S  # both ends may turn within one tick of the clock

@@ -24,23 +24,25 @@ from uavlinkd.core.timers import Schedule
 from uavlinkd.endpoints.ports import LocalPort
 from uavlinkd.link.conditions import LineLimits
 from uavlinkd.link.diagnosis import find
-from uavlinkd.link.drop_summary import DropSummary, ShellReason
+from uavlinkd.link.drop_summary import DropSummary
 from uavlinkd.link.event_log import EventLog
 from uavlinkd.link.evidence import Evidence
 from uavlinkd.link.history import History
 from uavlinkd.link.intake import Intake
 from uavlinkd.link.key_change import Graces
 from uavlinkd.link.local_endpoints import LocalEndpoints
+from uavlinkd.link.network_budgets import NetworkBudget, budgets_of, follow_rates
 from uavlinkd.link.passage import Passage
 from uavlinkd.link.peer_link import PeerLink, radio_figures
 from uavlinkd.link.peer_sockets import PeerSockets
 from uavlinkd.link.pilot_notes import PilotNotes
+from uavlinkd.link.shell_reasons import ShellReason
 from uavlinkd.link.status import daemon_status
 from uavlinkd.link.switch import Switch
-from uavlinkd.mavlink.classes import screen
 from uavlinkd.mavlink.frames import Frame
 from uavlinkd.mavlink.radio_status import INTERVAL_S
 from uavlinkd.mavlink.routing import Router
+from uavlinkd.mavlink.screening import screen
 from uavlinkd.ops.control import ControlServer
 from uavlinkd.ops.recorder import Recorder
 from uavlinkd.ops.schema_versions import LOG_SCHEMA
@@ -90,14 +92,26 @@ class Daemon:
         self._events = EventLog(self.log, limits)
         self.stall = StallWatch(now, self._on_pause)
         self._intake = Intake(
-            self.node, self.stall, self.switch, self._link_of, self._perform, self._on_peer_frames, self._settle
+            self.node,
+            self.stall,
+            self.switch,
+            self._link_of,
+            self._perform,
+            self._on_peer_frames,
+            self._settle,
+            self._on_superseded,
         )
-        self.peer_sockets = PeerSockets(self._intake.receive, self.stall, self._drops, self.evidence, self.log)
+        self.peer_sockets = PeerSockets(
+            self._intake.receive, self.stall, self._drops, self.evidence, self.log, self.node
+        )
+        self._events.network_of = self.peer_sockets.network_name
         self.local = LocalEndpoints(config.name, self.switch, self._events, self.stall, self.on_frames)
         self._timer: asyncio.TimerHandle | None = None
         self._timer_at = NEVER
         self._housekeeping_at = now + HOUSEKEEPING_S
         self._waiting = Schedule[PeerLink]()
+        self._budgets: dict[int, NetworkBudget] = {}
+        """Of networks, by the number of the socket."""
         self._reloading = asyncio.Lock()
         self._hangups: set[asyncio.Task[None]] = set()
         self._control: ControlServer | None = None
@@ -133,7 +147,11 @@ class Daemon:
             ControlError: if it cannot open the control socket.
         """
         try:
-            self.peer_sockets.open(self.config.listen)
+            self.peer_sockets.open(self.config.listen, self.config.networks)
+            self._budgets.update(budgets_of(self.peer_sockets.networks, self.peer_sockets.serial, monotonic()))
+            self.node.set_budgets({number: budget.bits_s for number, budget in self._budgets.items()})
+            serial = self.peer_sockets.serial
+            self.node.set_envelope_limits({line.number: line.envelope_limit for line in serial.networks})
             self.local.open(self.config.endpoints)
             if self.config.metrics is not None:
                 from uavlinkd.ops.metrics_server import serve_metrics  # noqa: PLC0415  only if configured
@@ -149,7 +167,7 @@ class Daemon:
             self.recorder = Recorder(self.config.recording, self.log)
         for peer in self.config.peers:
             self._add_peer(peer)
-        self.peer_sockets.start()
+        self.peer_sockets.start(self._arm)
         self.local.start(self.config.endpoints)
         self._warn()
         self.log.info(
@@ -255,7 +273,7 @@ class Daemon:
 
     def _add_peer(self, config: PeerConfig) -> None:
         now, has_previous = monotonic(), self.config.previous_private_key is not None
-        link = PeerLink(config, self.node, self._perform, now, self.recorder, self._waiting)
+        link = PeerLink(config, self.node, self._perform, now, self.recorder, self._waiting, self._budgets)
         link.join(now, self._graces, self.config.key_grace_s, has_previous_key=has_previous)
         self.links[config.name] = link
         self._map_peers()
@@ -290,6 +308,7 @@ class Daemon:
     def _map_peers(self) -> None:
         self._link_of.clear()
         self._link_of.update((peer, link) for link in self.links.values() for peer in link.peers)
+        self.node.set_point_to_point(self.peer_sockets.serial.peers_at(self.links.values()))
 
     def _note_delays(self) -> None:
         gather_s = min((link.gather_s for link in self.links.values()), default=0.0)
@@ -310,6 +329,9 @@ class Daemon:
         link.record_received(frames, now)
         self._forward_if_fresh(link, frames, now, epoch)
 
+    def _on_superseded(self, link: PeerLink, count: int) -> None:
+        self._drops.add("frames_dropped", ShellReason.SUPERSEDED, link.name, count, monotonic())
+
     def _forward_if_fresh(
         self, source: PeerLink | LocalPort, frames: list[Frame], now: float, epoch: int, waited_s: float = 0.0
     ) -> None:
@@ -326,7 +348,9 @@ class Daemon:
     def _perform(self, outputs: list[Output]) -> None:
         for output in outputs:
             if isinstance(output, o.Transmit):
-                self.peer_sockets.send(*output)
+                if self._budgets and (budget := self._budgets.get(output.path.socket)) is not None:
+                    budget.charge(output.datagram, output.path, monotonic())
+                self.peer_sockets.send(output.datagram, output.path)
             elif isinstance(output, o.Deliver):
                 self._intake.add(output)
             elif isinstance(output, o.Dropped):
@@ -343,8 +367,8 @@ class Daemon:
         if isinstance(event, o.PeerLost | o.PeerClosed):
             if not link.peer.is_up:  # with any key
                 link.on_down(now)
-        elif isinstance(event, o.PathChanged | o.SessionEstablished):
-            link.on_session()
+        elif isinstance(event, o.PathChanged | o.PathStateChanged | o.SessionEstablished):
+            link.follow_paths(now)
             if isinstance(event, o.SessionEstablished) and link.peer.path is not None:
                 self.history.add_session(link.name, link.peer.path.address, now)
             is_current = isinstance(event, o.SessionEstablished) and event.peer is link.peers[0]
@@ -391,6 +415,7 @@ class Daemon:
         if self.recorder is not None:
             self.recorder.do_housekeeping(now)
         self.peer_sockets.do_housekeeping()
+        follow_rates(self.peer_sockets.serial, self._budgets, self.links.values(), now)
         for link in self.links.values():
             link.note_silence(now)
             link.measure(now)

@@ -11,9 +11,11 @@ from typing import Final, Protocol
 
 from uavlinkd.core.drops import DropReason
 from uavlinkd.link import refused_there
-from uavlinkd.link.down_causes import Network, finding, link_down, listed, shown
+from uavlinkd.link.down_causes import Network, finding, link_down, listed, shown, sole_waiting
 from uavlinkd.link.endpoint_causes import Local, endpoint_findings
 from uavlinkd.link.evidence import EVIDENCE_S
+from uavlinkd.link.line_causes import line_findings
+from uavlinkd.link.other_version import other_version
 from uavlinkd.link.passage import Key, Passage
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.system_owners import Switching, SystemOwners
@@ -89,14 +91,22 @@ def _of_daemon(daemon: Diagnosed, now: float) -> Iterator[Finding]:
             f"no interface has {listed(map(str, absent))}, which is in listen",
             'write an address of this machine (`ip -brief address`) or "0.0.0.0:5790"; or wait for the network',
         )
-        all_up = all(link.peer.is_up for link in daemon.links.values())
-        yield replace(missing, severity=Severity.WARNING) if all_up else missing
+        yield _harmless_if_up(daemon, missing)
+    if gone := daemon.peer_sockets.absent_networks():
+        missing = _about(
+            Cause.NETWORK_ABSENT,
+            f"no peer is reached along {'; '.join(gone)}",
+            "plug the modem in, or bring the interface up (`ip -brief address`): the daemon uses it within a second",
+        )
+        yield _harmless_if_up(daemon, missing)
     if (raw := daemon.evidence.seen_anywhere(DropReason.RAW_MAVLINK, now)) is not None and raw.address is not None:
         yield _about(
             Cause.RAW_MAVLINK,
             f"bare MAVLink arrives from {shown(raw.address)} at the port for peers, and is dropped",
             "let the autopilot or ground station send to the port of an [[endpoint]]",
         )
+    yield from line_findings(daemon.peer_sockets.serial)
+    yield from _unnamed_version(daemon, now)
     if refused := _load(daemon, now):
         yield _about(
             Cause.UNDER_LOAD,
@@ -118,6 +128,21 @@ def _of_daemon(daemon: Diagnosed, now: float) -> Iterator[Finding]:
             f"no frame is recorded now ({listed(recorder.failures)})",
             "make room on its disk, and let the daemon's user write there",
         )
+
+
+def _unnamed_version(daemon: Diagnosed, now: float) -> Iterator[Finding]:
+    """Another version from an address of no peer, while it may be one of several peers that are down."""
+    down = [link for link in daemon.links.values() if not link.peer.is_up]
+    sighting = daemon.evidence.seen_elsewhere(DropReason.OTHER_VERSION, now)
+    if sighting is not None and down and sole_waiting(daemon) is None:
+        there = "the sender" if len(down) > 1 else down[0].name
+        yield _about(Cause.OTHER_VERSION, *other_version(sighting, daemon.config.name, there))
+
+
+def _harmless_if_up(daemon: Diagnosed, problem: Finding) -> Finding:
+    """The same as a warning, if every peer is up all the same."""
+    all_up = all(link.peer.is_up for link in daemon.links.values())
+    return replace(problem, severity=Severity.WARNING) if all_up else problem
 
 
 def _load(daemon: Diagnosed, now: float) -> int:

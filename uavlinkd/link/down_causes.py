@@ -15,6 +15,7 @@ from uavlinkd.core.drops import DropReason
 from uavlinkd.core.path import SocketAddress
 from uavlinkd.link.evidence import REPORTED, Evidence, Sighting
 from uavlinkd.link.history import History
+from uavlinkd.link.other_version import other_version
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.peer_sockets import PeerSockets
 from uavlinkd.ops.causes import Cause
@@ -59,17 +60,21 @@ def link_down(daemon: Network, link: PeerLink, now: float) -> list[Finding]:
 
 def _configured(daemon: Network, link: PeerLink) -> Iterator[Finding]:
     name, sockets = link.name, daemon.peer_sockets
-    if names := sorted(sockets.unresolved.get(name, ())):
+    if names := sorted(sockets.unresolved(name)):
         remedy = f"see `getent hosts {names[0]}`, or write an IP address; the daemon tries again each second"
         yield _about(Cause.NAME_NOT_RESOLVED, name, f"{', '.join(names)} has no address now", remedy)
-    for path in link.peers[0].initiator.paths:
+    for path in link.peers[0].paths.configured:
         if path.host.startswith("fe80:") and path.address[-1] == 0:  # of a name: a file must have the interface
             text = f"{shown(path.address)} is valid on one interface only, and names none"
             remedy = f'write it with its interface, as in "[{path.host}%wlan0]:{path.address[1]}"'
             yield _about(Cause.ZONE_MISSING, name, text, remedy)
     if name in sockets.without_socket:
         text = f"no address in listen is of the family of {_addresses(link)}"
-        yield _about(Cause.FAMILY_MISSING, name, text, 'add "[::]:5790" to listen for IPv6, "0.0.0.0:5790" for IPv4')
+        remedy = 'add "[::]:5790" to listen for IPv6, "0.0.0.0:5790" for IPv4'
+        if sockets.networks is not None:
+            text = f"no network has an address from which to reach {_addresses(link)}"
+            remedy = "compare the address families with `ip -brief address`"
+        yield _about(Cause.FAMILY_MISSING, name, text, remedy)
 
 
 def _not_sent(daemon: Network, link: PeerLink, now: float) -> Iterator[Finding]:
@@ -111,7 +116,11 @@ def _reported(daemon: Network, link: PeerLink, now: float) -> Iterator[Finding]:
 def _hints(daemon: Network, link: PeerLink, now: float) -> Iterator[Finding]:
     if (sighting := _handshake_seen(daemon, DropReason.UNKNOWN_PEER, link, now)) is not None:
         yield from _other_key(daemon, link, sighting)
-    if (sighting := _handshake_seen(daemon, DropReason.BAD_MAC1, link, now)) is not None:
+    if (sighting := _handshake_seen(daemon, DropReason.OTHER_VERSION, link, now)) is not None:
+        text, remedy = other_version(sighting, daemon.config.name, link.name)
+        yield _about(Cause.OTHER_VERSION, link.name, text, remedy)
+    elif (sighting := _handshake_seen(daemon, DropReason.BAD_MAC1, link, now)) is not None:
+        # Not while another version is seen: above its limit such initiations are counted as bad_mac1 too.
         yield _our_key_there(daemon, link, sighting)
     psk = _seen(daemon, DropReason.BAD_HANDSHAKE, link, now)
     if psk is not None:
@@ -166,8 +175,16 @@ def _our_key_there(daemon: Network, link: PeerLink, sighting: Sighting) -> Findi
 
 def _silence(daemon: Network, link: PeerLink) -> Finding:
     name = link.name
+    if link.config.addresses and all(written.is_serial for written in link.config.addresses):
+        text = f"no answer along {_addresses(link)}: it is off or out of range, or keys or modem settings differ"
+        remedy = (
+            "compare the baud rate, NETID and air speed of both modems, and set MAVLINK=0; run `uavlinkd status` at"
+            f" {name}: it names the cause if datagrams arrive there"
+        )
+        return _about(Cause.NO_ANSWER, name, text, remedy)
     if link.config.addresses:
-        text = f"no answer from {_addresses(link)}: it is off, a firewall drops UDP, or addresses or keys differ"
+        differ = "addresses, keys or protocol versions differ"
+        text = f"no answer from {_addresses(link)}: it is off, a firewall drops UDP, or {differ}"
         remedy = (
             f"run `uavlinkd status` at {name}: it names the cause if datagrams arrive there; else open its firewall"
         )
@@ -190,9 +207,14 @@ def _handshake_seen(daemon: Network, reason: DropReason, link: PeerLink, now: fl
     """The same; of a peer without addresses, from any sender while it is the only such peer that is not up."""
     if link.config.addresses:
         return _seen(daemon, reason, link, now)
-    waiting = [other for other in daemon.links.values() if not other.config.addresses and not other.peer.is_up]
-    sighting = daemon.evidence.seen_elsewhere(reason, now) if len(waiting) == 1 else None
+    sighting = daemon.evidence.seen_elsewhere(reason, now) if sole_waiting(daemon) is not None else None
     return None if sighting is None or sighting.last_at < link.silent_since else sighting
+
+
+def sole_waiting(daemon: Network) -> PeerLink | None:
+    """The only peer without addresses that is not up: a sender at an unknown address may be this one."""
+    waiting = [link for link in daemon.links.values() if not link.config.addresses and not link.peer.is_up]
+    return waiting[0] if len(waiting) == 1 else None
 
 
 def _has_unconfirmed(link: PeerLink) -> bool:

@@ -10,12 +10,14 @@ from typing import Any, Final
 from structlog.typing import FilteringBoundLogger
 
 from uavlinkd.config.keys import encode_key
-from uavlinkd.core.drops import DropReason, Reason
+from uavlinkd.core.drops import Detail, DropReason, Reason
 from uavlinkd.core.outputs import Dropped
 from uavlinkd.core.path import Path
 from uavlinkd.endpoints.ports import failure_name
 from uavlinkd.link.conditions import Conditions, LineLimits, OpenCondition, Phase
 from uavlinkd.link.key_change import link_name
+from uavlinkd.link.other_version import compared
+from uavlinkd.link.shell_reasons import ShellReason
 from uavlinkd.mavlink.dialect import name_of
 from uavlinkd.mavlink.headers import Header
 from uavlinkd.mavlink.policy.gate import Refusal
@@ -27,16 +29,10 @@ PERSISTENT_S = 5
 """An everyday drop is logged if it occurs in this many different seconds within :data:`WINDOW_S`."""
 WINDOW_S = 60.0
 
-Fact = str | Header | tuple[bytes | str, Path]
+Fact = str | Header | tuple[Detail, Path]
 """What identifies the last drop of a line. It is formatted when the line is written, not for each drop of a flood."""
 Key = tuple[str, str, str]
 """Event, reason, name of the peer or endpoint."""
-
-
-class ShellReason(Reason):
-    """Why the daemon drops frames outside the core and the policies."""
-
-    STALE = "stale", "the frames waited while the daemon was stopped or suspended"
 
 
 class Attention(Enum):
@@ -58,7 +54,7 @@ SECURITY: Final = frozenset[str](
             DropReason.BAD_HANDSHAKE,
         ),
         *(DropReason.UNKNOWN_PEER, DropReason.HEADER_MISMATCH, DropReason.BAD_PARAMETERS, DropReason.BAD_COOKIE),
-        *(DropReason.TOO_LONG, DropReason.LONG_COUNTER, DropReason.REPLAYED, DropReason.TOO_OLD, DropReason.DELAYED),
+        *(DropReason.TOO_LONG, DropReason.LONG_COUNTER, DropReason.REPLAYED, DropReason.DELAYED),
         *(DropReason.BAD_TAG, DropReason.BAD_CONTROL, Refusal.HIDDEN_FRAME, Refusal.FOREIGN_SYSTEM),
     }
 )
@@ -66,11 +62,19 @@ SECURITY: Final = frozenset[str](
 EVERYDAY: Final = frozenset[str](
     {
         *(DropReason.UNEXPECTED_RESPONSE, DropReason.UNEXPECTED_COOKIE, DropReason.UNKNOWN_INDEX, DropReason.LATE),
-        *(DropReason.SESSION_EXPIRED, DropReason.BAD_PATH_RESPONSE, DropReason.DOUBTFUL, DropReason.OVER_SHARE),
+        *(DropReason.SESSION_EXPIRED, DropReason.UNEXPECTED_ANSWER, DropReason.DOUBTFUL, DropReason.OVER_SHARE),
         *("EAGAIN", "ENOBUFS", "ECONNREFUSED"),
     }
 )
 """A lost datagram, a rekey or a restarted peer causes a few of them."""
+
+BY_PATHS: Final = frozenset[str](
+    {
+        *(ShellReason.SUPERSEDED, ShellReason.COPY_OVER_BUDGET, ShellReason.COPY_REPLACED),
+        *(DropReason.DUPLICATE, DropReason.LATE_COPY),
+    }
+)
+"""Several paths with different delays cause them all the time. The status counts them."""
 
 
 def attention(event: str, reason: str) -> Attention:
@@ -82,7 +86,7 @@ def attention(event: str, reason: str) -> Attention:
     if reason in EVERYDAY:
         return Attention.EVERYDAY
     # The peer is lost, or does not answer: that is logged, and how long it lasts.
-    return Attention.EXPLAINED if reason == DropReason.NO_SESSION else Attention.PROBLEM
+    return Attention.EXPLAINED if reason == DropReason.NO_SESSION or reason in BY_PATHS else Attention.PROBLEM
 
 
 class DropSummary:
@@ -219,5 +223,14 @@ def _describe(fact: Fact) -> str:
         case Header():
             return f"{name_of(fact.msgid)} of system {fact.system}"
         case detail, path:
-            about = f"key {encode_key(detail)}" if isinstance(detail, bytes) else f"suite {detail}" if detail else ""
-            return f"{about} from {Address.of(path.address)}".strip()
+            return f"{_about(detail)} from {Address.of(path.address)}".strip()
+
+
+def _about(detail: Detail) -> str:
+    match detail:
+        case bytes():
+            return f"key {encode_key(detail)}"
+        case int():
+            return compared(detail)
+        case _:
+            return detail and f"suite {detail}"

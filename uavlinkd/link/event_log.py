@@ -8,10 +8,12 @@ from collections.abc import Iterable
 from structlog.typing import FilteringBoundLogger
 
 from uavlinkd.core import outputs as o
+from uavlinkd.core.path import Path
 from uavlinkd.endpoints.ports import Endpoint
 from uavlinkd.link.conditions import Conditions, LineLimits, OpenCondition, Phase
 from uavlinkd.link.key_change import link_name
 from uavlinkd.link.link_watch import THRESHOLDS, LinkWatch, is_noteworthy
+from uavlinkd.link.path_status import NetworkOf
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.ops.causes import Cause
 from uavlinkd.ops.findings import Finding, Severity, Subject
@@ -26,7 +28,7 @@ CLIENT_RESTART_S = 15.0
 FINDING_QUIET_S = 10.0
 """A finding has ended when it was absent for so long, see :data:`uavlinkd.link.conditions.QUIET_S`."""
 
-_OTHER_EVENTS = frozenset[str]({Cause.DAEMON_PAUSED, Cause.RECORDING_STOPPED})
+_OTHER_EVENTS = frozenset[str]({Cause.DAEMON_PAUSED, Cause.RECORDING_STOPPED, Cause.NETWORK_ABSENT})
 """Findings that are logged by events of their own."""
 _State = o.PeerUp | o.PeerLost | o.PeerClosed
 _FindingKey = tuple[str, Subject, str]
@@ -38,6 +40,8 @@ class EventLog:
     def __init__(self, log: FilteringBoundLogger, limits: LineLimits | None = None) -> None:
         self._log = log
         self._limits = limits or LineLimits()
+        self.network_of: NetworkOf = lambda _: None
+        """The name of the network of a socket's number."""
         self._states: dict[str, _State] = {}  # of a peer: the latest that was omitted
         self._used: set[str] = set()  # endpoints that have had frames
         self._watches: dict[str, LinkWatch] = {}
@@ -50,9 +54,10 @@ class EventLog:
             self._limits,
             self._write_problem,
             name_of=lambda key: key[0],
-            is_security=lambda key: key[1] is LinkProblem.CHALLENGES_UNANSWERED,
+            is_security=lambda key: key[1] is LinkProblem.PATHS_UNPROVEN,
         )
         self._pauses = Conditions[str]("pause", self._limits, self._write_pause, name_of=lambda _: "")
+        self._repairs: dict[str, tuple[float, int]] = {}  # by peer: when repair began, and the bytes of repeats then
         self._paused_s = 0.0
         self._finding_conditions = Conditions[_FindingKey](
             "finding",
@@ -97,6 +102,7 @@ class EventLog:
         for key in [key for key in self._shares if link_name(key[0]) == peer]:
             del self._shares[key]
         self._limits.forget(lambda name: link_name(name) == peer)
+        self._repairs.pop(peer, None)
 
     # Events of the core.
 
@@ -130,10 +136,22 @@ class EventLog:
                 log.warning("peer_lost", silent_s=round(silent_s, 3))
             case o.PeerClosed():
                 log.info("peer_closed")
-            case o.PathChanged(_, path):
-                log.info("path_changed", path=str(Address.of(path.address)))
+            case o.PathChanged(_, path, before, reason):
+                log = log.bind(**self._path_facts("path", "network", path))
+                log.info("path_changed", **self._path_facts("before", "network_before", before), reason=reason)
+            case o.PathStateChanged(_, path, is_usable, reason):
+                log = log.bind(**self._path_facts("path", "network", path), reason=reason)
+                if is_usable:
+                    log.info("path_usable")
+                else:
+                    log.warning("path_down")
             case o.SessionEstablished():
                 log.info("session_established", **_session_facts(event))
+
+    def _path_facts(self, address_field: str, network_field: str, path: Path) -> dict[str, str]:
+        facts = {address_field: str(Address.of(path.address))}
+        network = self.network_of(path.socket)
+        return facts if network is None else {**facts, network_field: network}
 
     def write_client(self, event: str, endpoint: str, client: str, now: float) -> None:
         """Write that a client connected or disconnected, within the limit of its endpoint."""
@@ -156,7 +174,8 @@ class EventLog:
         self._finding_conditions.close(lambda key: key[1] is Subject.ENDPOINT and key[2] == name)
 
     def check_link(self, link: PeerLink, now: float) -> None:
-        """Note the problems of a link that exceed their thresholds. Call it about once a second."""
+        """Note the problems of a link that exceed their thresholds, and repair. Call it about once a second."""
+        self._check_repair(link, now)
         peer = link.peer.name
         watch = self._watches.get(peer)
         if watch is None:
@@ -168,6 +187,17 @@ class EventLog:
             if growth.minute and is_noteworthy(problem, growth, is_logged=is_open):
                 self._shares[key] = growth.share
                 self._problem_conditions.note(key, now, growth.since if is_open else growth.minute)
+
+    def _check_repair(self, link: PeerLink, now: float) -> None:
+        repair, size = link.output.repair, link.output.repeats.bytes_sent
+        if repair.is_on and link.name not in self._repairs:
+            self._repairs[link.name] = now, size
+            self._log.info("repair_began", peer=link.name, transmissions=repair.transmissions)
+        elif not repair.is_on and link.name in self._repairs:
+            began_at, before = self._repairs.pop(link.name)
+            self._log.info(
+                "repair_ended", peer=link.name, duration_s=round(now - began_at, 3), bytes=max(0, size - before)
+            )
 
     def _write_problem(
         self, key: tuple[str, LinkProblem], phase: Phase, condition: OpenCondition, omitted: dict[str, int]

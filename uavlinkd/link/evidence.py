@@ -11,7 +11,7 @@ import errno
 from collections.abc import Mapping
 from typing import Final
 
-from uavlinkd.core.drops import DropReason
+from uavlinkd.core.drops import Detail, DropReason
 from uavlinkd.core.outputs import Dropped
 from uavlinkd.core.path import SocketAddress
 from uavlinkd.link.key_change import link_name
@@ -35,6 +35,7 @@ _HINTS: Final = frozenset(
     {
         *(DropReason.RAW_MAVLINK, DropReason.BAD_MAC1, DropReason.UNKNOWN_PEER, DropReason.BAD_HANDSHAKE),
         *(DropReason.SUITE_NOT_ACCEPTED, DropReason.COOKIE_REQUIRED, DropReason.RATE_LIMITED),
+        DropReason.OTHER_VERSION,
     }
 )
 
@@ -49,10 +50,10 @@ class Sighting:
         self.first_at = self.last_at = now
         self.address: SocketAddress | None = None
         """The latest source or destination."""
-        self.details: dict[bytes | str, None] = {}
+        self.details: dict[Detail, None] = {}
         """Different details, the latest last."""
 
-    def add(self, address: SocketAddress | None, detail: bytes | str, now: float) -> None:
+    def add(self, address: SocketAddress | None, detail: Detail, now: float) -> None:
         """The same was seen again."""
         if now - self.last_at > EVIDENCE_S:
             self.count, self.first_at = 0, now
@@ -118,7 +119,7 @@ class Evidence:
         recent = [sighting for sighting in sightings if now - sighting.last_at <= EVIDENCE_S]
         return max(recent, key=lambda sighting: sighting.last_at, default=None)
 
-    def _add(self, kind: str, place: Place, address: SocketAddress | None, detail: bytes | str, now: float) -> None:
+    def _add(self, kind: str, place: Place, address: SocketAddress | None, detail: Detail, now: float) -> None:
         sighting = self._sightings.get((kind, place))
         if sighting is None:
             sighting = self._sightings[kind, place] = Sighting(now)
@@ -145,5 +146,5 @@ class Evidence:
 
 
 def _places_of(link: PeerLink) -> list[Place]:
-    addresses = [path.address for path in link.peers[0].initiator.paths] if link.peers else []
+    addresses = [path.address for path in link.peers[0].paths.configured] if link.peers else []
     return [*(("address", address) for address in addresses), *(("host", address[0]) for address in addresses)]

@@ -28,7 +28,8 @@ class Intake:
     ``links`` has the link of each peer of the core. ``perform`` executes the core's outputs, and passes frames among
     them to :meth:`add`. ``forward`` receives the frames of one peer with the time and the epoch of their reading, and
     drops those from before a pause. Without a pause the frames of a datagram that arrived alone go to the switch
-    directly. ``settle`` is called when the core may have new deadlines.
+    directly. ``settle`` is called when the core may have new deadlines. ``on_superseded`` counts the frames of
+    a peer with several paths that are dropped, because newer ones were delivered.
     """
 
     def __init__(
@@ -40,6 +41,7 @@ class Intake:
         perform: Callable[[list[Output]], None],
         forward: Callable[[PeerLink, list[Frame], float, int], None],
         settle: Callable[[], None],
+        on_superseded: Callable[[PeerLink, int], None],
     ) -> None:
         self._node = node
         self._stall = stall
@@ -48,6 +50,7 @@ class Intake:
         self._perform = perform
         self._forward = forward
         self._settle = settle
+        self._on_superseded = on_superseded
         self._loop = asyncio.get_running_loop()
         self._turns = Turns()
         self._frames: dict[PeerLink, list[Frame]] = {}
@@ -70,9 +73,13 @@ class Intake:
             stall = self._stall
             is_fresh = epoch == stall.epoch and monotonic() - stall.turned_at <= STALL_S
             if is_fresh and len(outputs) == 1 and type(outputs[0]) is Deliver:
-                peer, payload = outputs[0]
+                peer, payload, order = outputs[0]
                 link = self._links[peer]
                 frames = split_payload(payload, link.counters)
+                if order:
+                    frames = self._pick_newest(outputs[0], link, frames, now)
+                elif link.is_repairing:
+                    link.note_requests(frames, now)
                 if link.recorder is not None:
                     link.record_received(frames, now)
                 self._switch.forward(link, frames, now)
@@ -113,10 +120,20 @@ class Intake:
         link = self._links[delivered.peer]
         frames = split_payload(delivered.payload, link.counters)
         self._cost += cost_of(delivered.payload, len(frames))
+        if delivered.order:  # the peer has several paths
+            frames = self._pick_newest(delivered, link, frames, monotonic())
+        elif link.is_repairing:
+            link.note_requests(frames, monotonic())
         if link in self._frames:
             self._frames[link] += frames
         else:
             self._frames[link] = frames
+
+    def _pick_newest(self, delivered: Deliver, link: PeerLink, frames: list[Frame], now: float) -> list[Frame]:
+        picked = link.pick_newest(delivered.peer, frames, delivered.order, now)
+        if len(picked) < len(frames):
+            self._on_superseded(link, len(frames) - len(picked))
+        return picked
 
     def clear(self) -> None:
         """Forget the datagrams that wait."""

@@ -26,7 +26,7 @@ class Threshold(NamedTuple):
 THRESHOLDS: Final[Mapping[LinkProblem, Threshold]] = {
     LinkProblem.ENVELOPES_MISSING: Threshold(10, 0.05),
     LinkProblem.ENVELOPES_OUT_OF_ORDER: Threshold(50, 0.25),  # jitter reorders frames that were sent in a burst
-    LinkProblem.CHALLENGES_UNANSWERED: Threshold(1),  # no bad radio causes it: an attacker forwards envelopes
+    LinkProblem.PATHS_UNPROVEN: Threshold(1),  # no bad radio causes it: an attacker forwards envelopes
     LinkProblem.ECHOES_UNANSWERED: Threshold(20),
     LinkProblem.HANDSHAKES_UNANSWERED: Threshold(10),
     LinkProblem.COOKIES_TAKEN: Threshold(5),

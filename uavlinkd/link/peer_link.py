@@ -2,27 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from operator import itemgetter
 
 from uavlinkd.config import PeerConfig
 from uavlinkd.core.constants import NEVER
 from uavlinkd.core.node import Node
-from uavlinkd.core.outputs import Output, Transmit
+from uavlinkd.core.outputs import LinkedPeer, Output, Transmit
 from uavlinkd.core.path import Path
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.refusals import LARGEST_REPORT
 from uavlinkd.core.timers import Deadline, Schedule
 from uavlinkd.link.key_change import Graces, KeyPairing, pairings
-from uavlinkd.mavlink.egress.budgeted import Egress, EnvelopeShape
-from uavlinkd.mavlink.egress.coalescing import Coalescer, make_egress
+from uavlinkd.link.network_budgets import NetworkBudget
+from uavlinkd.link.path_status import PathRates
+from uavlinkd.link.peer_output import PeerOutput
+from uavlinkd.mavlink.answers import REQUESTS, ParameterAnswers
 from uavlinkd.mavlink.frames import Frame, SplitCounters
+from uavlinkd.mavlink.newest import NewestStates
 from uavlinkd.mavlink.policy.delivery import Source
 from uavlinkd.mavlink.policy.refusal_totals import TotalsWatch
 from uavlinkd.mavlink.radio_status import LinkFigures, worst
 from uavlinkd.ops.link_problems import LinkProblem
 from uavlinkd.ops.recorder import FROM_PEER, TO_PEER, Recorder
-from uavlinkd.system.addresses import IPV4_UDP_BYTES, IPV6_UDP_BYTES
 
 NOT_ANSWERING_S = 5.0
 """The log reports a peer that does not answer our handshakes for this long."""
@@ -45,17 +47,24 @@ class PeerLink:
         now: float,
         recorder: Recorder | None = None,
         schedule: Schedule[PeerLink] | None = None,
+        budgets: Mapping[int, NetworkBudget] | None = None,
     ) -> None:
         self.config = config
         self.name = config.name
         self.policy = config.make_policy()
         self.counters = SplitCounters()
         """Frames and faults in its payloads."""
+        self.frames_superseded = 0
+        """Frames with states older than one already delivered: see :meth:`pick_newest`."""
+        self._newest: dict[LinkedPeer, NewestStates] = {}
+        self._answers = ParameterAnswers()
         self._refusals = TotalsWatch()
         self.frames_sent = 0
         """Frames for it that its policy let pass."""
-        self.egress = make_egress(config.egress, now)
-        """Frames that wait; None if frames never wait."""
+        self.output = PeerOutput(config.egress, node, budgets or {}, self._answers.class_of, self._on_sent, now)
+        """What waits for it."""
+        self.is_repairing = False
+        """Whether critical frames to it are repeated."""
         self.timers = Deadline()
         """When :meth:`send_waiting` is due."""
         self._schedule = schedule or Schedule[PeerLink]()
@@ -65,13 +74,14 @@ class PeerLink:
         self.peers: list[Peer] = []
         """In the core: the one of the current keys first, then those of the pairs with a previous key."""
         self._previous: dict[Peer, tuple[KeyPairing, float]] = {}  # the latter, and until when they are valid
-        self._charged: dict[Peer, tuple[int, int]] = {}  # datagrams and bytes that the budget was charged for
         self.silent_since = now
         """When it was up last, to the second; before that, when the daemon began to expect it."""
         self._sample: _Sample | None = None
         self._measured = now, config.name, 0, 0  # when, what, and the bytes received and sent then
         self.bytes_s = 0.0, 0.0
         """Bytes received and sent a second, at the last :meth:`measure`."""
+        self.rates = PathRates()
+        """Of its paths."""
         self._figures = LinkFigures(is_up=False, loss_in=0.0, loss_out=0.0, round_trip_s=None)
 
     def __repr__(self) -> str:
@@ -106,6 +116,7 @@ class PeerLink:
         """Cut the peer off at once."""
         for peer in self.peers:
             self._perform(self._node.remove_peer(peer, now))
+        self.output.clear(now)
         self._schedule.remove(self)
 
     def give_up_theirs(self, now: float) -> None:
@@ -135,7 +146,8 @@ class PeerLink:
         self.peers = [peer for peer in self.peers if peer not in gone]
         for peer in gone:
             del self._previous[peer]
-            self._charged.pop(peer, None)
+            self.output.forget(peer)
+            self._newest.pop(peer, None)
         for peer in gone:  # the outputs of one removal find none of them any more
             self._perform(self._node.remove_peer(peer, now))
 
@@ -149,8 +161,7 @@ class PeerLink:
         if config.policy != self.config.policy:
             self.policy = config.make_policy()
         if config.egress != self.config.egress:
-            self.egress = make_egress(config.egress, now)
-            self._charged = {peer: _sent(peer) for peer in self.peers}
+            self.output.change(config.egress, self.peers, now)
         if config.addresses != self.config.addresses:
             self.silent_since = now
             self.set_paths((), now)  # its new names may have no address: do not connect to the old ones
@@ -159,7 +170,7 @@ class PeerLink:
         for peer in self.peers:
             peer.verify_interval_s = config.settings.link.verify_interval_s
         self.config = config
-        self.on_session()
+        self.follow_paths(now)
 
     def send(self, frames: Sequence[Frame], source: Source, now: float, waited_s: float) -> None:
         """Send frames that arrived together: at once, or when budget and coalescing delay allow it.
@@ -167,12 +178,13 @@ class PeerLink:
         ``source``: the port that sent them. ``waited_s``: how long the first of them has waited already.
         """
         self.frames_sent += len(frames)
-        if self.egress is not None:
-            self.egress.put(frames, now - waited_s)
-            self.send_waiting(now)
+        peer = self.peer if self._previous else self.peers[0]
+        if self.output.egress is not None or peer.paths.is_multiple or self.is_repairing:
+            if self.output.send(peer, frames, now, waited_s):
+                self.send_waiting(now)
             return
         raws = list(map(_RAW, frames))
-        outputs = self._node.send(self.peer if self._previous else self.peers[0], raws, now)
+        outputs = self._node.send(peer, raws, now)
         if self.recorder is not None:
             self._record_sent(raws, outputs, now)
         self._perform(outputs)
@@ -180,57 +192,69 @@ class PeerLink:
     @property
     def gather_s(self) -> float:
         """How long frames for it may wait before they are read: they would wait here anyway."""
-        return self.egress.settings.coalesce_s if isinstance(self.egress, Coalescer) else 0.0
+        settings = self.config.egress
+        return 0.0 if settings.budget_bits_s else settings.coalesce_s
 
     def send_waiting(self, now: float) -> None:
         """Send the waiting frames that are due, and schedule the next ones."""
-        if self.egress is None:
-            return
-        self._charge(self.egress, now)
-        while batch := self.egress.take(now):
-            outputs = self._node.send(self.peer, batch, now)
-            if self.recorder is not None:
-                self._record_sent(batch, outputs, now)
-            self._perform(outputs)
-            self._charge(self.egress, now)
-        self._set_deadline()
+        self.output.send_waiting(self.peer, self.peers, now)
+        self._set_deadline(now)
 
     def report_refusals(self, now: float) -> None:
         """Report to the peer which of its frames the policy refuses. Call it about once a second."""
-        if not self.peer.is_up or (self.egress is not None and not self.egress.has_room(LARGEST_REPORT, now)):
+        if not self.peer.is_up or not self.output.has_room(LARGEST_REPORT, now):
             return  # totals lose nothing until the next call
         self._perform(self._node.report_refusals(self.peer, self._refusals.changed(self.policy.incoming), now))
-        if self.egress is not None:
-            self._charge(self.egress, now)
+        self.output.charge(self.peers, now)
+
+    def pick_newest(self, peer: LinkedPeer, frames: list[Frame], order: int, now: float) -> list[Frame]:
+        """The frames of an envelope without the states that are superseded. Call it if the peer has several paths.
+
+        ``order``: that of the envelope, among those of this peer of the core.
+        """
+        newest = self._newest.get(peer)
+        if newest is None:
+            newest = self._newest[peer] = NewestStates()
+        picked = newest.pick(frames, order)
+        self.frames_superseded += len(frames) - len(picked)
+        self.note_requests(picked, now)
+        return picked
+
+    def note_requests(self, frames: Sequence[Frame], now: float) -> None:
+        """Note requests of the peer, whose answers are critical. Call it while frames are classified."""
+        for frame in frames:
+            if frame.header.msgid in REQUESTS:
+                self._answers.note(frame, now)
 
     def record_received(self, frames: Sequence[Frame], now: float) -> None:
         """Record frames of the peer, if this daemon records."""
         if self.recorder is not None:
             self.recorder.add(self.name, list(map(_RAW, frames)), FROM_PEER, now)
 
+    def _on_sent(self, frames: list[bytes], outputs: list[Output], now: float) -> None:
+        if self.recorder is not None and frames:
+            self._record_sent(frames, outputs, now)
+        self._perform(outputs)
+
     def _record_sent(self, frames: list[bytes], outputs: Sequence[Output], now: float) -> None:
         # Without a session no frame crosses the link.
         if self.recorder is not None and any(isinstance(output, Transmit) for output in outputs):
             self.recorder.add(self.name, frames, TO_PEER, now)
 
-    def _set_deadline(self) -> None:
-        self.timers.next_at = NEVER if self.egress is None else self.egress.next_deadline()
+    def _set_deadline(self, now: float) -> None:
+        self.timers.next_at = self.output.next_deadline(now)
         self._schedule.update(self)
 
-    def on_session(self) -> None:
-        """A session began: its envelopes may have another size."""
-        session, path = self.peer.sessions.current, self.peer.path
-        if self.egress is not None and session is not None and path is not None:
-            carrier = IPV6_UDP_BYTES if ":" in path.host else IPV4_UDP_BYTES
-            seal = session.parameters.max_envelope - session.payload_limit
-            self.egress.shape = EnvelopeShape(session.payload_limit, seal, carrier)
-        self._set_deadline()
+    def follow_paths(self, now: float) -> None:
+        """A session began, or other paths are used: envelopes may have another size and other budgets."""
+        self.output.follow(self.peer, now)
+        self._set_deadline(now)
 
     def on_down(self, now: float) -> None:
-        """The peer is lost: drop the frames that wait, which would be old when it is back."""
-        if self.egress is not None:
-            self.egress.clear(now)
-            self._set_deadline()
+        """The peer is lost: drop what waits, which would be old when it is back."""
+        self.output.clear(now)
+        self.is_repairing = False
+        self._set_deadline(now)
 
     def note_silence(self, now: float) -> None:
         """Note whether the peer is up. Call it about once a second."""
@@ -257,23 +281,38 @@ class PeerLink:
             )
         self._measured = now, peer.name, peer.traffic.bytes_received, peer.traffic.bytes_sent
         before, self._sample = self._sample, _Sample.of(peer)
+        self.rates.measure(peer.paths.states, now)
         loss_in = loss_out = 0.0
-        if before is not None and before.index == self._sample.index:
+        best = peer.paths.best
+        if best is not None and peer.paths.has_several:
+            loss_in, loss_out = best.loss_in, best.loss_out  # gaps in the counters say nothing about one path
+        elif before is not None and before.index == self._sample.index:
             loss_in = _lost(self._sample.expected - before.expected, self._sample.received - before.received)
             there = self._sample.expected_there - before.expected_there
             # The peer reports now and then. Until the next report the last one is valid.
             loss_out = (
                 _lost(there, self._sample.received_there - before.received_there) if there else self._figures.loss_out
             )
+        self.output.measure(peer, now)
+        self.is_repairing = self.output.repair.is_on
+        self.follow_paths(now)
         self._figures = LinkFigures(
             is_up=peer.is_up,
             loss_in=loss_in,
             loss_out=loss_out,
-            round_trip_s=peer.round_trip_s,
-            demand=0.0 if self.egress is None else self.egress.demand(now),
+            round_trip_s=self.round_trip_s,
+            demand=0.0 if self.output.egress is None else self.output.egress.demand(now),
             receive_errors=peer.missing(now),
         )
         return self._figures
+
+    @property
+    def round_trip_s(self) -> float | None:
+        """Of the path in use."""
+        best = self.peer.paths.best
+        if best is not None and best.srtt_s is not None and self.peer.paths.has_several:
+            return best.srtt_s
+        return self.peer.round_trip_s
 
     def problems(self, now: float) -> dict[LinkProblem, int]:
         """The totals of problems that no dropped datagram explains.
@@ -284,7 +323,7 @@ class PeerLink:
         return {
             LinkProblem.ENVELOPES_MISSING: self.peer.missing(now),
             LinkProblem.ENVELOPES_OUT_OF_ORDER: traffic.out_of_order,
-            LinkProblem.CHALLENGES_UNANSWERED: traffic.challenges_unanswered,
+            LinkProblem.PATHS_UNPROVEN: traffic.paths_unproven,
             LinkProblem.ECHOES_UNANSWERED: traffic.echoes_unanswered,
             LinkProblem.HANDSHAKES_UNANSWERED: traffic.handshakes_unanswered,
             LinkProblem.COOKIES_TAKEN: traffic.cookies_taken,
@@ -294,15 +333,6 @@ class PeerLink:
     def figures(self) -> LinkFigures:
         """The last result of :meth:`measure`."""
         return self._figures
-
-    def _charge(self, egress: Egress | Coalescer, now: float) -> None:
-        """Charge the budget for all datagrams to the peer, handshakes and echoes too."""
-        for peer in self.peers:
-            charged = self._charged.get(peer, (0, 0))
-            total = _sent(peer)
-            if total != charged:
-                egress.spend(total[1] - charged[1], now, datagrams=total[0] - charged[0])
-                self._charged[peer] = total
 
 
 def radio_figures(links: Iterable[PeerLink]) -> LinkFigures | None:
@@ -332,10 +362,6 @@ class _Sample:
         if session is None:
             return cls(0, 0, 0, (0, 0))
         return cls(session.local_index, session.expected, session.received, peer.traffic.reported)
-
-
-def _sent(peer: Peer) -> tuple[int, int]:
-    return peer.traffic.datagrams_sent, peer.traffic.bytes_sent
 
 
 def _lost(expected: int, received: int) -> float:

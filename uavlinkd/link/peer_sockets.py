@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import socket
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from typing import Protocol
+from typing import Final, Protocol
 
 from structlog.typing import FilteringBoundLogger
 
+from uavlinkd.config import NetworkConfig, PeerAddress
 from uavlinkd.core.path import Path, SocketAddress
 from uavlinkd.endpoints.error_queue import ErrorReports, send_again
 from uavlinkd.endpoints.ports import failure_name
@@ -18,15 +20,28 @@ from uavlinkd.endpoints.reader import Datagrams, Reader
 from uavlinkd.endpoints.sockets import BindError, is_absent, is_here, udp_socket
 from uavlinkd.link.drop_summary import DropSummary
 from uavlinkd.link.evidence import Evidence
+from uavlinkd.link.networks import Networks, SocketStates
 from uavlinkd.link.peer_link import PeerLink
+from uavlinkd.link.peer_names import PeerNames
+from uavlinkd.link.serial_networks import SerialNetworks
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.clock import monotonic
-from uavlinkd.system.resolver import Resolved, keep_resolving
+from uavlinkd.system.resolver import LONGEST_WAIT_S, RELAXED_WAIT_S, Resolved
 from uavlinkd.system.stall import StallWatch
-from uavlinkd.system.tasks import keep_running
 
 _EPHEMERAL = (Address("0.0.0.0", 0), Address("::", 0))
 """Without a listen address the daemon only connects to peers, from any port."""
+REFRESH_S: Final = 300.0
+"""The names of a peer that is up are resolved this often."""
+LOOK_AGAIN_S: Final = 0.1
+"""After failed sends, the networks are looked at this often at most."""
+_NETWORK_CHANGED: Final = frozenset(
+    {
+        *(errno.ENODEV, errno.ENXIO, errno.ENETDOWN, errno.ENETUNREACH, errno.EADDRNOTAVAIL),
+        *(errno.EHOSTUNREACH, errno.EINVAL),
+    }
+)
+"""Errors of a send that an interface without its address, or a removed one, causes."""
 
 
 class Receive(Protocol):
@@ -36,8 +51,41 @@ class Receive(Protocol):
         """``socket`` is the number of the socket. The rest is as in :class:`uavlinkd.endpoints.reader.Deliver`."""
 
 
+class _Slot:
+    """The place of a socket, by number: the socket may be replaced while the daemon runs."""
+
+    __slots__ = ("family", "number", "reader", "reports", "sock")
+
+    def __init__(self, number: int, family: int, sock: socket.socket | None) -> None:
+        self.number = number
+        self.family = family
+        self.sock = sock
+        self.reader: Reader | None = None
+        """None until the daemon reads it."""
+        self.reports: ErrorReports | None = None
+
+
+class _Followed:
+    """A peer whose names are resolved, and the paths to it that the core knows."""
+
+    names: PeerNames
+
+    def __init__(self, link: PeerLink, on_resolved: Callable[[], None]) -> None:
+        self.link = link
+        self.on_resolved = on_resolved
+        self.paths: dict[PeerAddress, list[Path]] = {}
+        """By address of the configuration."""
+        self.is_set = False
+        """Whether the core knows them."""
+
+
+def _send_nowhere(datagram: bytes, address: SocketAddress) -> int:
+    """Send from a socket that is closed because its network is absent."""
+    raise OSError(errno.ENODEV, "the network is absent")
+
+
 class PeerSockets:
-    """Reads and sends the peers' datagrams. A path's first number is the place of its socket here."""
+    """Reads and sends the peers' datagrams. A path's first number is the number of its socket here."""
 
     def __init__(
         self,
@@ -46,31 +94,43 @@ class PeerSockets:
         drops: DropSummary,
         evidence: Evidence,
         log: FilteringBoundLogger,
+        states: SocketStates,
     ) -> None:
         self.failures: Counter[str] = Counter()
         """Datagrams to peers that the kernel did not accept, by the name of the error."""
-        self.unresolved: dict[str, set[str]] = {}
-        """The host names that have no address now, by peer."""
         self.without_socket: set[str] = set()
-        """The peers none of whose addresses is of a listen address's family."""
+        """The peers none of whose addresses is of a socket's family."""
+        self.networks: Networks | None = None
+        """Those of interfaces and addresses, if the configuration has any."""
+        self.serial: SerialNetworks
         self._receive = receive
         self._stall = stall
         self._drops = drops
         self._evidence = evidence
         self._log = log
-        self._sockets: list[socket.socket] = []
-        self._readers: list[Reader] = []
-        self._reports: list[ErrorReports] = []
-        self._following: dict[str, asyncio.Task[None]] = {}
+        self._states = states
+        self._slots: list[_Slot] = []
+        self._senders: list[Callable[[bytes, SocketAddress], int]] = []
+        self._is_started = False
+        self._checked_at = 0.0
+        self._on_change: Callable[[], None] = lambda: None
+        self._followed: dict[str, _Followed] = {}
+        self._add_serial(())
 
     @property
     def addresses(self) -> list[Address]:
         """The addresses that the sockets are bound to."""
-        return [Address(*sock.getsockname()[:2]) for sock in self._sockets]
+        return [Address(*sock.getsockname()[:2]) for sock in self.open_sockets()]
+
+    def open_sockets(self) -> list[socket.socket]:
+        """The sockets that are open, by number."""
+        return [slot.sock for slot in self._slots if slot.sock is not None]
 
     def absent_addresses(self) -> list[Address]:
         """The listen addresses that no interface of this machine has now."""
-        absent = zip(self._sockets, self.addresses, strict=True)
+        if self.networks is not None:
+            return []
+        absent = zip(self.open_sockets(), self.addresses, strict=True)
         return [address for sock, address in absent if is_absent(sock)]
 
     def is_own(self, address: SocketAddress) -> bool:
@@ -79,69 +139,157 @@ class PeerSockets:
         return any(
             sock.getsockname()[1] == port
             and (own.host == host or (own.is_wildcard and is_here(sock.family, (host, 0, *rest))))
-            for sock, own in zip(self._sockets, self.addresses, strict=True)
+            for sock, own in zip(self.open_sockets(), self.addresses, strict=True)
             if (sock.family == socket.AF_INET6) == (":" in host)
         )
 
-    def open(self, addresses: Sequence[Address]) -> None:
-        """Bind a socket to each address, or ephemeral ones without any.
+    def network_name(self, number: int) -> str | None:
+        """The network of a socket; None if the configuration names no networks."""
+        if (line := self.serial.of_number.get(number)) is not None:
+            return line.name
+        return None if self.networks is None else self.networks.network_of(number).name
+
+    def absent_networks(self) -> list[str]:
+        """The networks that are absent now, each with the reason."""
+        return [*([] if self.networks is None else self.networks.absent()), *self.serial.absent()]
+
+    def network_status(self, now: float) -> dict[str, object]:
+        """Each network by name, as plain values."""
+        serial = {network.name: network.status(now) for network in self.serial.networks}
+        return {**({} if self.networks is None else self.networks.status()), **serial}
+
+    def unresolved(self, name: str) -> set[str]:
+        """The host names of a peer that have no address now."""
+        followed = self._followed.get(name)
+        return set() if followed is None else followed.names.unresolved
+
+    def open(self, addresses: Sequence[Address], networks: Sequence[NetworkConfig] = ()) -> None:
+        """Bind a socket to each address, or ephemeral ones without any; with networks, bind those of each network.
 
         Raises:
             BindError: if the daemon cannot listen on an address. The message names the key.
         """
-        for address in addresses or _EPHEMERAL:
+        if ip_networks := [network for network in networks if network.serial is None]:
+            self.networks = Networks(ip_networks, addresses, self, self._states, self._log)
+            for number, family in enumerate(self.networks.families):
+                self._add_slot(_Slot(number, family, None))
+            self.networks.open(monotonic())
+        else:
+            self._open_addresses(addresses)
+        self._add_serial([network for network in networks if network.serial is not None])
+
+    def _open_addresses(self, addresses: Sequence[Address]) -> None:
+        for number, address in enumerate(addresses or _EPHEMERAL):
             try:
-                self._sockets.append(udp_socket(address, may_come_later=True))
+                sock = udp_socket(address, may_come_later=True)
             except BindError as error:
                 raise BindError(f"listen: {error}") from None
+            self._add_slot(_Slot(number, sock.family, None))
+            self.put(number, sock)
 
-    def start(self) -> None:
-        """Start to read."""
-        for number, sock in enumerate(self._sockets):
-            on_failure = partial(self._on_read_error, number)
-            reader = Reader(sock, partial(self._receive, number), on_failure, self._stall)
-            reader.start()
-            self._readers.append(reader)
-            self._reports.append(ErrorReports(sock))
+    def _add_serial(self, configs: Sequence[NetworkConfig]) -> None:
+        self.serial = SerialNetworks(configs, len(self._slots), self._receive, self._states, self._stall, self._log)
+        for network in self.serial.networks:
+            self._add_slot(_Slot(network.number, socket.AF_UNSPEC, None))
+            self._senders[network.number] = network.send
+
+    def _add_slot(self, slot: _Slot) -> None:
+        self._slots.append(slot)
+        self._senders.append(_send_nowhere)
+
+    def put(self, number: int, sock: socket.socket | None) -> None:
+        """Use this socket under a number from now on, and close the one before. None: there is no socket."""
+        slot = self._slots[number]
+        self._close(slot)
+        slot.sock = sock
+        self._senders[number] = _send_nowhere if sock is None else sock.sendto
+        if self._is_started:
+            self._read(slot)
+
+    def start(self, on_change: Callable[[], None] = lambda: None) -> None:
+        """Start to read. ``on_change`` is called after a change of the networks was reported to the core."""
+        self._is_started = True
+        self._on_change = on_change
+        for slot in self._slots:
+            self._read(slot)
+        self.serial.start()
+        if self.networks is not None:
+            self.check_networks()
+
+    def _read(self, slot: _Slot) -> None:
+        if slot.sock is not None:
+            receive, on_failure = partial(self._receive, slot.number), partial(self._on_read_error, slot)
+            slot.reader = Reader(slot.sock, receive, on_failure, self._stall)
+            slot.reader.start()
+            slot.reports = ErrorReports(slot.sock)
+
+    def _close(self, slot: _Slot) -> None:
+        if slot.reader is not None:
+            slot.reader.stop()
+        if slot.sock is not None:
+            slot.sock.close()
+        slot.sock = slot.reader = slot.reports = None
 
     def do_housekeeping(self) -> None:
-        """Have the kernel report errors again. Call it once a second."""
-        for reports in self._reports:
-            reports.renew()
+        """Have the kernel report errors again, and look at the networks. Call it once a second."""
+        for slot in self._slots:
+            if slot.reports is not None:
+                slot.reports.renew()
+        self.check_networks()
+        self.serial.do_housekeeping()
+
+    def check_networks(self) -> None:
+        """Open and close the sockets of the networks that changed, and resolve names again."""
+        self._checked_at = now = monotonic()
+        if self.networks is not None and self.networks.check(now):
+            for followed in self._followed.values():
+                followed.names.wake()
+                self._set_paths(followed)
+            self._on_change()
 
     def close(self) -> None:
         """Close the sockets and stop resolving names."""
-        for name in list(self._following):
+        for name in list(self._followed):
             self.stop_following(name)
-        for reader in self._readers:
-            reader.stop()
-        for sock in self._sockets:
-            sock.close()
+        self.serial.close()
+        for slot in self._slots:
+            self.put(slot.number, None)
 
     def send(self, datagram: bytes, path: Path) -> None:
         """Pass a datagram to the kernel."""
         number, address = path
         try:
-            self._sockets[number].sendto(datagram, address)
+            self._senders[number](datagram, address)
         except OSError as error:
-            sock, take_errors = self._sockets[number], partial(self._take_errors, number)
-            last = send_again(sock, datagram, address, error, take_errors)
-            if last is not None:
-                # Full buffers, no route, a firewall: as if the network had lost it. The core's timers do the rest.
-                self._count_failure(last, address)
+            self._on_send_error(self._slots[number], datagram, address, error)
 
-    def _on_read_error(self, number: int, error: OSError) -> None:
-        if not self._take_errors(number):
+    def _on_send_error(self, slot: _Slot, datagram: bytes, address: SocketAddress, error: OSError) -> None:
+        if slot.sock is None:  # reported as the state of its network
+            self.failures[failure_name(error)] += 1
+            return
+        last = send_again(slot.sock, datagram, address, error, partial(self._take_errors, slot))
+        if last is None:
+            return
+        # Full buffers, no route, a firewall: as if the network had lost it. The core's timers do the rest.
+        self._count_failure(last, address)
+        is_due = monotonic() - self._checked_at >= LOOK_AGAIN_S
+        if self.networks is not None and is_due and last.errno in _NETWORK_CHANGED:
+            self._checked_at = monotonic()
+            # Not now: the core may be in the middle of its outputs.
+            asyncio.get_running_loop().call_soon(self.check_networks)
+
+    def _on_read_error(self, slot: _Slot, error: OSError) -> None:
+        if not self._take_errors(slot):
             self._count_failure(error, None)
 
-    def _take_errors(self, number: int) -> bool:
+    def _take_errors(self, slot: _Slot) -> bool:
         """Note the ICMP errors of earlier datagrams. Returns whether there were any."""
-        if not self._reports:  # not started
+        if slot.reports is None or slot.reader is None:  # not started
             return False
-        reports = self._reports[number].take()
+        reports = slot.reports.take()
         for address, code in reports:
             self._evidence.add_report(code, address, monotonic())
-        self._readers[number].renew()
+        slot.reader.renew()
         return bool(reports)
 
     def _count_failure(self, error: OSError, address: SocketAddress | None) -> None:
@@ -151,37 +299,68 @@ class PeerSockets:
         self._evidence.add_failure(name, address, monotonic())
 
     def follow(self, link: PeerLink, on_resolved: Callable[[], None]) -> None:
-        """Resolve the peer's names, and connect to it at their addresses from every socket of the same family.
+        """Resolve the peer's names, and connect to it at their addresses from every socket that may reach them.
 
         ``on_resolved`` is called after each change of the addresses.
         """
-        if not link.config.addresses:
-            link.set_paths((), monotonic())
+        followed = self._followed[link.name] = _Followed(link, on_resolved)
+        followed.names = PeerNames(
+            link.config.addresses,
+            lambda address: self._interval_s(followed, address),
+            lambda: self._set_paths(followed),
+            self._log,
+        )
+        self._set_paths(followed)
+
+    def _interval_s(self, followed: _Followed, written: PeerAddress) -> float:
+        """How often an address of a peer is resolved now."""
+        peer = followed.link.peer
+        if not peer.is_up:
+            return LONGEST_WAIT_S
+        states = [peer.paths.find(path) for path in followed.paths.get(written, ())]
+        # Without its network, an address does not answer anyway. A network that is back has all names resolved.
+        is_down = any(state is not None and not (state.works or state.is_off) for state in states)
+        return RELAXED_WAIT_S if is_down else REFRESH_S
+
+    def _set_paths(self, followed: _Followed) -> None:
+        link = followed.link
+        paths = {written: list(self._paths_to(written, resolved)) for written, resolved in followed.names}
+        if followed.is_set and paths == followed.paths:
             return
-
-        def set_paths(addresses: Resolved) -> bool:
-            paths = [
-                Path(number, sockaddr)
-                for family, sockaddr in addresses
-                for number, sock in enumerate(self._sockets)
-                if sock.family == family
-            ]
+        followed.paths, followed.is_set = paths, True
+        if any(paths.values()) or not any(resolved for _, resolved in followed.names):
             self.without_socket.discard(link.name)
-            if not paths:
-                self.without_socket.add(link.name)
-                self._log.warning("peer_unreachable", peer=link.name, reason="no listen address of its family")
-            link.set_paths(paths, monotonic())
-            on_resolved()
-            return True
+        elif link.name not in self.without_socket:
+            self.without_socket.add(link.name)
+            reason = "no listen address of its family" if self.networks is None else "no network of its family"
+            self._log.warning("peer_unreachable", peer=link.name, reason=reason)
+        link.set_paths([path for group in paths.values() for path in group], monotonic())
+        if self.networks is not None:
+            self.networks.report_absent(monotonic())
+        self.serial.report_absent()
+        followed.on_resolved()
 
-        unresolved = self.unresolved[link.name] = set[str]()
-        work = keep_resolving(link.config.addresses, lambda: not link.peer.is_up, set_paths, self._log, unresolved)
-        self._following[link.name] = keep_running(work, f"the search for {link.name}")
+    def _paths_to(self, written: PeerAddress, resolved: Resolved) -> Iterator[Path]:
+        """The paths to an address of a peer."""
+        if written.is_serial:
+            if (path := self.serial.path_to(written.network)) is not None:
+                yield path
+            return
+        for family, sockaddr in resolved:
+            for slot in self._slots:
+                if slot.family == family and self._may_use(slot.number, written, sockaddr):
+                    yield Path(slot.number, sockaddr)
+
+    def _may_use(self, number: int, written: PeerAddress, sockaddr: SocketAddress) -> bool:
+        """Whether the daemon sends to an address of a peer from a socket of its family."""
+        networks = self.networks
+        if networks is None:
+            return True
+        return written.network in ("", networks.network_of(number).name) and networks.may_reach(number, sockaddr)
 
     def stop_following(self, name: str) -> None:
         """Stop resolving this peer's names."""
-        self.unresolved.pop(name, None)
         self.without_socket.discard(name)
-        task = self._following.pop(name, None)
-        if task is not None:
-            task.cancel()
+        followed = self._followed.pop(name, None)
+        if followed is not None:
+            followed.names.stop()

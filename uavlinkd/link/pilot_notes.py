@@ -11,8 +11,9 @@ from typing import Final, NamedTuple
 
 from uavlinkd.core.constants import NEVER
 from uavlinkd.core.refusals import Refused
+from uavlinkd.core.settings import Class
 from uavlinkd.link.peer_link import PeerLink
-from uavlinkd.mavlink.classes import CLASSES, Class
+from uavlinkd.mavlink.classes import KINDS, UNKNOWN
 from uavlinkd.mavlink.dialect import command_name, ids_by_name, name_of
 from uavlinkd.mavlink.policy.gate import Refusal
 from uavlinkd.mavlink.policy.refusal_totals import REFUSALS, TotalsWatch
@@ -151,8 +152,8 @@ def _withheld_here(seen: _Seen) -> Iterator[str]:
 
 def _is_wanted(refused: Refused) -> bool:
     """Whether a pilot sent it on purpose: a command, mission, parameter or setpoint, not a report."""
-    about = CLASSES.get(refused.message)
-    is_order = about is not None and about.cls is Class.CRITICAL and not about.may_be_old
+    kind = KINDS.get(refused.message, UNKNOWN)
+    is_order = kind.cls is Class.CRITICAL and not kind.may_be_old
     return bool(refused.command) or (is_order and refused.message != _STATUSTEXT)
 
 

@@ -8,6 +8,7 @@ from uavlinkd.config.keys import encode_key
 from uavlinkd.endpoints.ports import Endpoint
 from uavlinkd.link import refused_there
 from uavlinkd.link.diagnosis import find
+from uavlinkd.link.path_status import NetworkOf, paths_status
 from uavlinkd.mavlink.dialect import command_name, name_of
 from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.gate import ANY_OTHER
@@ -60,7 +61,10 @@ def daemon_status(daemon: DaemonParts, now: float) -> dict[str, object]:
         "frames_pass": all_up and not blocked,
         "blocked": [dict(zip(("subject", "name", "direction"), key, strict=True)) for key in blocked],
         "findings": [finding.as_json() for finding in find(daemon, now)],
-        "peers": {name: peer_status(link, now) for name, link in daemon.links.items()},
+        "peers": {
+            name: peer_status(link, now, daemon.peer_sockets.network_name) for name, link in daemon.links.items()
+        },
+        "networks": daemon.peer_sockets.network_status(now),
         "endpoints": {
             endpoint.name: endpoint_status(endpoint, daemon.local.policies[endpoint.name], now)
             for endpoint in daemon.local.endpoints
@@ -73,8 +77,11 @@ def daemon_status(daemon: DaemonParts, now: float) -> dict[str, object]:
     }
 
 
-def peer_status(link: PeerLink, now: float) -> dict[str, object]:
-    """The status of a peer. ``state`` is ``up``, ``lost`` (was up) or ``waiting`` (was never up)."""
+def peer_status(link: PeerLink, now: float, network_of: NetworkOf = lambda _: None) -> dict[str, object]:
+    """The status of a peer. ``state`` is ``up``, ``lost`` (was up) or ``waiting`` (was never up).
+
+    ``network_of`` returns the name of the network of a socket's number.
+    """
     peer, figures = link.peer, link.figures
     session = peer.sessions.current
     traffic = peer.traffic
@@ -86,12 +93,13 @@ def peer_status(link: PeerLink, now: float) -> dict[str, object]:
         "path": None if peer.path is None else str(Address.of(peer.path.address)),
         "last_received_s": None if peer.received_at is None else now - peer.received_at,
         "handshake_s": None if peer.established_at is None else now - peer.established_at,
-        "round_trip_s": peer.round_trip_s,
+        "round_trip_s": link.round_trip_s,
         "freshness_unverified_s": None if peer.unverified_since is None else now - peer.unverified_since,
         "loss_in": figures.loss_in,
         "loss_out": figures.loss_out,
         "bytes_in_s": link.bytes_s[0],
         "bytes_out_s": link.bytes_s[1],
+        "paths": paths_status(link, network_of, now),
         "session": None
         if session is None
         else {
@@ -115,13 +123,22 @@ def peer_status(link: PeerLink, now: float) -> dict[str, object]:
         "frames_sent": link.frames_sent,
         "frames_received": link.counters.frames,
         "frames_unknown": link.counters.unknown,
+        "frames_superseded": link.frames_superseded,
         "malformed": {fault.value: count for fault, count in link.counters.faults.items()},
         "refused": policy_status(link.policy),
         "refused_commands": commands_status(link.policy),
         "refused_there": refused_there.as_json(link, now),
         "waiting_dropped": {}
-        if link.egress is None
-        else {reason.value: count for reason, count in link.egress.totals.items()},
+        if link.output.egress is None
+        else {reason.value: count for reason, count in link.output.egress.totals.items()},
+        "repair": {
+            "is_on": link.output.repair.is_on,
+            "on_s": 0.0 if link.output.repair.began_at is None else now - link.output.repair.began_at,
+            "transmissions": link.output.repair.transmissions,
+            "datagrams": link.output.repeats.sent,
+            "bytes": link.output.repeats.bytes_sent,
+        },
+        "copies_dropped": {reason.value: count for reason, count in link.output.copies.dropped.items()},
         "drops": {reason.value: count for reason, count in traffic.drops.items()},
     }
 

@@ -1,0 +1,270 @@
+"""Networks that appear, change and disappear, on sockets of loopback. What the machine has is made up here."""
+
+from __future__ import annotations
+
+import socket
+import sys
+from collections.abc import Iterator
+from itertools import count
+
+import pytest
+import structlog
+from structlog.testing import capture_logs
+
+from tests.link.socket_states import SocketStateLog
+from tests.needs import need
+from uavlinkd.config import NetworkConfig
+from uavlinkd.endpoints.presence import Presence, look
+from uavlinkd.endpoints.sockets import BindError, network_socket
+from uavlinkd.lab.sim.loopback_ports import free_port
+from uavlinkd.link import networks as module
+from uavlinkd.link.conditions import LINES_BURST, LINES_PER_S
+from uavlinkd.link.networks import Networks
+from uavlinkd.system.addresses import Address
+
+LTE = NetworkConfig("lte", interface="lo", metered=True)
+MESH = NetworkConfig("mesh", address="127.0.0.2")
+V4, ALSO_V4 = 0, 2
+"""The numbers of the IPv4 sockets of LTE, which has one for IPv6 too, and of MESH."""
+
+
+class Scene:
+    """Networks, the sockets that they put, and their reports to the core."""
+
+    def __init__(self, *configs: NetworkConfig, port: int = 0) -> None:
+        self.sockets: dict[int, socket.socket] = {}
+        self.core = SocketStateLog()
+        self.present = {(config.interface, config.address): Presence() for config in configs}
+        listen = [Address("0.0.0.0", port)] if port else []
+        self.networks = Networks(configs, listen, self, self.core, structlog.get_logger())
+
+    def put(self, number: int, sock: socket.socket | None) -> None:
+        """As the daemon's sockets."""
+        before = self.sockets.pop(number, None)
+        if before is not None:
+            before.close()
+        if sock is not None:
+            self.sockets[number] = sock
+
+    def open_sockets(self) -> list[socket.socket]:
+        """As the daemon's sockets."""
+        return list(self.sockets.values())
+
+    def set(self, config: NetworkConfig, presence: Presence) -> None:
+        """What the machine has of a network from now on."""
+        self.present[config.interface, config.address] = presence
+
+    def port(self, number: int) -> int:
+        """Where a socket is bound."""
+        port: int = self.sockets[number].getsockname()[1]
+        return port
+
+
+@pytest.fixture
+def scene(monkeypatch: pytest.MonkeyPatch) -> Iterator[Scene]:
+    """LTE, which is absent, and MESH, which is there."""
+    need(sys.platform == "linux", "Linux")
+    made = Scene(LTE, MESH)
+    made.set(MESH, Presence(0, ("127.0.0.2",)))
+    monkeypatch.setattr(module, "look", lambda interface, address: made.present[interface, address])
+    yield made
+    for number in list(made.sockets):
+        made.put(number, None)
+
+
+def test_network_that_is_absent_at_the_start_is_used_when_it_appears(scene: Scene) -> None:
+    """The others are open from the start; the core learns which sockets are closed."""
+    scene.set(LTE, Presence(reason="there is no interface lo"))
+    scene.networks.open(0.0)
+    assert set(scene.sockets) == {ALSO_V4}
+    assert scene.core.metered == [0, 1]
+    assert scene.core.states == [(ALSO_V4, True)]
+    scene.networks.report_absent(0.0)
+    assert scene.core.states[1:] == [(0, False), (1, False)]
+    with capture_logs() as logs:
+        scene.networks.check(0.0)
+        scene.set(LTE, Presence(1, ("127.0.0.1",)))
+        assert scene.networks.check(1.0)
+        assert not scene.networks.check(2.0)
+    assert [(line["event"], line["network"]) for line in logs] == [
+        ("network_not_here_yet", "lte"),
+        ("network_appeared", "mesh"),
+        ("network_appeared", "lte"),
+    ]
+    assert logs[0]["reason"] == "there is no interface lo"
+    assert (logs[2]["addresses"], logs[2]["interface_index"]) == (["127.0.0.1"], 1)
+    assert set(scene.sockets) == {V4, ALSO_V4}
+    assert scene.core.states[3:] == [(V4, True)]
+    assert scene.sockets[V4].getsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, 16).rstrip(b"\0") == b"lo"
+
+
+def test_interface_with_another_number_gets_another_socket(scene: Scene) -> None:
+    """On the same port, under the same number. The socket of the other network stays."""
+    scene.set(LTE, Presence(1, ("127.0.0.1",)))
+    scene.networks.open(0.0)
+    before, other, port = scene.sockets[V4], scene.sockets[ALSO_V4], scene.port(V4)
+    scene.core.states.clear()
+    scene.set(LTE, Presence(7, ("127.0.0.1",)))
+    assert scene.networks.check(1.0)
+    assert scene.sockets[V4] is not before
+    assert before.fileno() == -1
+    assert (scene.port(V4), scene.sockets[ALSO_V4]) == (port, other)
+    assert scene.core.states == [(V4, False), (V4, True)]
+
+
+def test_disappeared_network_is_reported_once(scene: Scene) -> None:
+    """With the reason; another reason of the same absence is not worth a line."""
+    scene.set(LTE, Presence(1, ("127.0.0.1", "::1")))
+    scene.networks.open(0.0)
+    with capture_logs() as logs:
+        scene.networks.check(0.0)
+        for second, reason in ((1.0, "the interface lo is down"), (2.0, "there is no interface lo")):
+            scene.set(LTE, Presence(reason=reason))
+            scene.networks.check(second)
+    assert [(line["event"], line.get("reason")) for line in logs[2:]] == [
+        ("network_disappeared", "the interface lo is down")
+    ]
+    assert set(scene.sockets) == {ALSO_V4}
+    status = scene.networks.status()
+    assert status["lte"] == {
+        "interface": "lo",
+        "address": None,
+        "is_metered": True,
+        "budget_bits_s": 0,
+        "is_present": False,
+        "absent_because": "there is no interface lo",
+        "addresses": [],
+        "ports": [],
+        "serial": None,
+    }
+
+
+def test_changed_address_keeps_the_socket(scene: Scene) -> None:
+    """The kernel chooses the source of each datagram; the core probes the paths of that family again."""
+    scene.set(LTE, Presence(1, ("127.0.0.1",)))
+    scene.networks.open(0.0)
+    scene.networks.check(0.0)
+    before = scene.sockets[V4]
+    scene.core.states.clear()
+    scene.set(LTE, Presence(1, ("127.0.0.9",)))
+    with capture_logs() as logs:
+        assert scene.networks.check(1.0)
+    assert scene.sockets[V4] is before
+    assert scene.core.states == [(V4, True)]
+    assert [(line["event"], line["addresses"]) for line in logs] == [("network_changed", ["127.0.0.9"])]
+
+
+def test_port_of_listen_is_the_port_of_each_network(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where an interface and an address of it share it. A port that is in use is an error at the start."""
+    need(sys.platform == "linux", "Linux")
+    port = free_port()
+    scene = Scene(LTE, MESH, port=port)
+    present = {("lo", None): Presence(1, ("127.0.0.1",)), (None, "127.0.0.2"): Presence(0, ("127.0.0.2",))}
+    monkeypatch.setattr(module, "look", lambda interface, address: present[interface, address])
+    scene.networks.open(0.0)
+    assert (scene.port(V4), scene.port(ALSO_V4)) == (port, port)
+    assert [sock.getsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR) for sock in scene.open_sockets()] == [0, 0]
+    second = Scene(LTE, port=port)
+    with pytest.raises(BindError, match=r"^network \(lte\): cannot listen on 0\.0\.0\.0:\d+: Address already in use"):
+        second.networks.open(0.0)
+    for number in (V4, ALSO_V4):
+        scene.put(number, None)
+
+
+def test_port_that_is_taken_meanwhile(scene: Scene) -> None:
+    """A port that the kernel chose is replaced."""
+    scene.set(LTE, Presence(1, ("127.0.0.1",)))
+    scene.networks.open(0.0)
+    port = scene.port(V4)
+    scene.set(LTE, Presence(reason="gone"))
+    scene.networks.check(1.0)
+    with network_socket(Address("127.0.0.1", port), None, []):
+        scene.set(LTE, Presence(1, ("127.0.0.1",)))
+        scene.networks.check(2.0)
+        assert scene.port(V4) != port
+
+
+def test_port_of_listen_that_is_taken_meanwhile(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Peers know that port: the network waits for it, and the status has the reason."""
+    need(sys.platform == "linux", "Linux")
+    port = free_port()
+    scene = Scene(MESH, port=port)
+    present = Presence(reason="gone")
+    monkeypatch.setattr(module, "look", lambda interface, address: present)
+    scene.networks.open(0.0)
+    with network_socket(Address("127.0.0.2", port), None, []):
+        present = Presence(0, ("127.0.0.2",))
+        assert not scene.networks.check(1.0)
+        (network,) = scene.networks.networks
+        assert "Address already in use" in network.presence.reason
+        assert not network.is_present
+    assert scene.networks.check(2.0)
+    assert scene.port(0) == port
+    scene.put(0, None)
+
+
+@pytest.mark.parametrize(
+    ("hosts", "address", "reaches"),
+    [
+        (("fe80::1",), ("2001:db8::9", 1, 0, 0), False),
+        (("fe80::1", "2001:db8::1"), ("2001:db8::9", 1, 0, 0), True),
+        (("fe80::1",), ("fe80::9", 1, 0, 1), True),
+        (("fe80::1",), ("fe80::9", 1, 0, 2), False),
+        ((), ("2001:db8::9", 1, 0, 0), True),
+    ],
+)
+def test_ipv6_address_is_used_where_it_may_be_reached(
+    monkeypatch: pytest.MonkeyPatch, hosts: tuple[str, ...], address: tuple[str, int, int, int], reaches: bool
+) -> None:
+    """Each interface has a link-local address, with which it reaches its neighbours only."""
+    need(sys.platform == "linux", "Linux")
+    scene = Scene(LTE)
+    monkeypatch.setattr(module, "look", lambda interface, address: Presence(1 if hosts else 0, hosts))
+    scene.networks.open(0.0)
+    assert scene.networks.may_reach(1, address) is reaches
+    assert scene.networks.may_reach(0, ("192.0.2.1", 1))
+    for number in list(scene.sockets):
+        scene.put(number, None)
+
+
+def test_flapping_interface_cannot_fill_the_log(scene: Scene) -> None:
+    """The lines are limited, and the log ends with the state of the network."""
+    states = (Presence(1, ("127.0.0.1",)), Presence(reason="the interface lo is down"))
+    scene.networks.open(0.0)
+    with capture_logs() as logs:
+        for second in range(1000):
+            scene.set(LTE, states[second % 2])
+            scene.networks.check(float(second))
+        for second in count(1000):
+            scene.networks.check(float(second))
+            if logs[-1]["event"] == "network_disappeared":
+                break
+    assert len(logs) <= LINES_BURST + second * LINES_PER_S + 2
+
+
+def test_what_the_machine_has() -> None:
+    """Loopback is there; another interface and another address are not."""
+    need(sys.platform == "linux", "Linux")
+    assert look("lo", None).hosts[0] == "127.0.0.1"
+    assert look(None, "127.0.0.1") == Presence(0, ("127.0.0.1",))
+    assert look("absent0", None) == Presence(reason="there is no interface absent0")
+    assert look(None, "192.0.2.77") == Presence(reason="no interface has 192.0.2.77")
+    assert look(None, "fe80::1%absent0") == Presence(reason="no interface has fe80::1%absent0")
+
+
+def test_interface_that_may_not_be_bound_to_is_explained(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before Linux 5.7, and on other systems."""
+    need(sys.platform == "linux", "Linux")
+    genuine = socket.socket.setsockopt
+
+    def refuse(sock: socket.socket, level: int, option: int, value: int | bytes) -> None:
+        if option == socket.SO_BINDTODEVICE:
+            raise PermissionError(1, "Operation not permitted")
+        genuine(sock, level, option, value)
+
+    monkeypatch.setattr(socket.socket, "setsockopt", refuse)
+    with pytest.raises(BindError, match="CAP_NET_RAW"):
+        network_socket(Address("0.0.0.0", 0), "lo", [])
+    monkeypatch.setattr(sys, "platform", "darwin")
+    with pytest.raises(BindError, match="needs Linux"):
+        network_socket(Address("0.0.0.0", 0), "lo", [])

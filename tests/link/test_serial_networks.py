@@ -1,0 +1,118 @@
+"""Serial networks beside the UDP sockets: their paths, their budgets, what the status and the findings say."""
+
+from __future__ import annotations
+
+from pathlib import Path as FilePath
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+import structlog
+from structlog.testing import capture_logs
+
+from tests.endpoints.test_line_framing import report
+from tests.link.socket_states import SocketStateLog
+from uavlinkd.config import NetworkConfig, PeerAddress
+from uavlinkd.config.model import SERIAL
+from uavlinkd.core.constants import LINE_BYTES
+from uavlinkd.core.path import Path
+from uavlinkd.endpoints.url import SerialUrl
+from uavlinkd.link.line_causes import line_findings
+from uavlinkd.link.network_budgets import budgets_of, follow_rates, wire_bytes
+from uavlinkd.link.serial_networks import NOISE_PIECES, SerialNetworks
+from uavlinkd.mavlink.egress.bucket import Bucket, Supply
+from uavlinkd.ops.causes import Cause
+from uavlinkd.system.clock import monotonic
+from uavlinkd.system.stall import StallWatch
+
+NUMBER = 3
+BITS_S = 9_600
+
+
+@pytest.fixture
+def states() -> SocketStateLog:
+    """What the core gets."""
+    return SocketStateLog()
+
+
+@pytest.fixture
+def serial(tmp_path: FilePath, states: SocketStateLog) -> SerialNetworks:
+    """One network whose device is absent. In a running event loop."""
+    line = SerialUrl(str(tmp_path / "absent"), 57600)
+    sik = NetworkConfig("sik", budget_bits_s=BITS_S, serial=line, air_bits_s=24_000)
+    stall = StallWatch(monotonic(), lambda pause_s: None)
+    return SerialNetworks([sik], NUMBER, lambda *arguments: None, states, stall, structlog.get_logger())
+
+
+async def test_path_and_peer_at_the_other_end(serial: SerialNetworks) -> None:
+    """One path for each line, to the peer that names it; a datagram costs its framing there."""
+    assert serial.path_to("sik") == Path(NUMBER, ("serial", 0))
+    assert serial.path_to("lte") is None
+    links = [
+        SimpleNamespace(config=SimpleNamespace(addresses=[PeerAddress(SERIAL, name)]), peers=[name])
+        for name in ("sik", "other")
+    ]
+    assert list(map(str, serial.peers_at(cast(Any, links))[NUMBER])) == ["sik"]
+    assert wire_bytes(bytes(100), Path(NUMBER, ("serial", 0))) == 100 + LINE_BYTES
+
+
+async def test_absent_device_is_reported(serial: SerialNetworks, states: SocketStateLog) -> None:
+    """To the core after each change of paths, once to the log, and in the status."""
+    with capture_logs() as logs:
+        serial.report_absent()
+        serial.do_housekeeping()
+        serial.do_housekeeping()
+    assert states.states == [(NUMBER, False)]
+    assert [line["event"] for line in logs] == ["network_not_here_yet"]
+    (absent,) = serial.absent()
+    assert absent.startswith("sik (")
+    status = serial.networks[0].status(monotonic())
+    assert (status["is_present"], status["addresses"]) == (False, [])
+
+
+async def test_late_answers_lower_the_budget_of_the_network(serial: SerialNetworks) -> None:
+    """Both that of the frames and that of their copies. An answer counts once."""
+    now = monotonic()
+    budgets = budgets_of(None, serial, now)
+    assert budgets[NUMBER].all.rate == BITS_S / 8
+    assert budgets[NUMBER].all.burst == pytest.approx(300, abs=5)
+    state = SimpleNamespace(path=serial.path_to("sik"), round_trip_s=0.2, answered_at=now)
+    links = cast(Any, [SimpleNamespace(peer=SimpleNamespace(paths=SimpleNamespace(states=[state])))])
+    follow_rates(serial, budgets, links, now)
+    state.round_trip_s, state.answered_at = 5.0, now + 6
+    for _ in range(2):
+        follow_rates(serial, budgets, links, now + 6)
+    assert budgets[NUMBER].all.rate == BITS_S / 16
+    assert budgets[NUMBER].copies.rate == BITS_S / 32
+    follow_rates(serial, budgets, links, now + 60)
+    assert budgets[NUMBER].all.rate == BITS_S / 8
+
+
+async def test_findings_about_modem_and_noise(serial: SerialNetworks) -> None:
+    """They name the setting, and end when it stops."""
+    decoder = serial.networks[0].line.decoder
+    serial.do_housekeeping()
+    assert list(line_findings(serial)) == []
+    decoder.feed(report())
+    decoder.feed(b"noise\0" * NOISE_PIECES)
+    serial.do_housekeeping()
+    modem, noise = line_findings(serial)
+    assert (modem.cause, noise.cause) == (Cause.MODEM_REPORTS, Cause.LINE_NOISE)
+    assert "MAVLINK=0" in modem.remedy
+    assert "57600" in noise.remedy
+    for _ in range(20):
+        serial.do_housekeeping()
+    assert list(line_findings(serial)) == []
+
+
+def test_envelope_above_the_bucket_goes_into_debt() -> None:
+    """One frame always fits: a bucket of a slow network holds less than the longest frame."""
+    bucket = Bucket(1_600, 0.0, 125)
+    supply = Supply(None, [bucket])
+    queue = object()
+    assert supply.room_for(queue, 311, 0.0, is_urgent=False) == 311
+    bucket.spend(311, 0.0)
+    assert supply.room_for(queue, 311, 0.5, is_urgent=False) == 0
+    wait_s = supply.wait_s(queue, 311, 0.5, is_urgent=False)
+    assert 0 < wait_s < 1.1
+    assert supply.room_for(queue, 311, 0.5 + wait_s + 0.01, is_urgent=False) == 311

@@ -1,0 +1,274 @@
+"""Frames that leave for one peer with a budget, a delay, or several paths. Without these, :class:`.PeerLink` sends.
+
+Frames wait unsealed for the peer's own budget and those of networks (:mod:`uavlinkd.mavlink.egress`). Copies for
+other paths wait sealed (:mod:`.copies`). Times are monotonic seconds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from math import inf
+from operator import itemgetter
+from typing import Protocol
+
+from uavlinkd.core.constants import CRITICAL_ENVELOPE_LIMIT, NEVER
+from uavlinkd.core.node import Node
+from uavlinkd.core.outputs import Output, Transmit
+from uavlinkd.core.path import Path
+from uavlinkd.core.peer import Peer
+from uavlinkd.core.settings import Class, Redundancy
+from uavlinkd.link.copies import Copies
+from uavlinkd.link.network_budgets import COPIES_SHARE, NetworkBudget, carrier_bytes
+from uavlinkd.link.repair import Repair
+from uavlinkd.link.repeats import Repeats
+from uavlinkd.mavlink.egress.bucket import Bucket
+from uavlinkd.mavlink.egress.budgeted import EgressSettings, EnvelopeShape
+from uavlinkd.mavlink.egress.by_class import ClassOf, PeerEgress, split_by_class
+from uavlinkd.mavlink.frames import Frame
+
+_RAW = itemgetter(0)
+"""The bytes of a frame."""
+
+
+class OnSent(Protocol):
+    """Receives what was sent."""
+
+    def __call__(self, frames: list[bytes], outputs: list[Output], now: float, /) -> None:
+        """Frames, and the outputs of the core for them, which are to be performed."""
+
+
+class PeerOutput:
+    """What waits for one peer. ``budgets``: of networks, by the number of the socket."""
+
+    def __init__(
+        self,
+        settings: EgressSettings,
+        node: Node,
+        budgets: Mapping[int, NetworkBudget],
+        class_of: ClassOf,
+        on_sent: OnSent,
+        now: float,
+    ) -> None:
+        self._settings = settings
+        self._node = node
+        self._budgets = budgets
+        self._class_of = class_of
+        self._on_sent = on_sent
+        self.egress = PeerEgress(settings, now, class_of) if settings.is_needed else None
+        """Frames that wait; None if frames never wait."""
+        self.copies = Copies(budgets, now)
+        self.repair = Repair()
+        """Whether critical envelopes are repeated."""
+        self.repeats = Repeats(self.copies)
+        self._charged: dict[Peer, tuple[int, int]] = {}  # datagrams and bytes that the budget was charged for
+        self._networks: dict[Class, list[Bucket | None]] = {}
+        self._critical_limit = CRITICAL_ENVELOPE_LIMIT  # of the payload; set for each session
+        self._stream_bytes = 0
+        self._measured_at = now
+
+    def send(self, peer: Peer, frames: Sequence[Frame], now: float, waited_s: float) -> bool:
+        """Send frames that arrived together: at once, or when budgets and the coalescing delay allow it.
+
+        Returns whether :meth:`send_waiting` has something to do.
+        """
+        if self.egress is not None:
+            self.egress.put(frames, now - waited_s, is_split=peer.paths.is_multiple or self.repair.is_on)
+            return True
+        for cls, part in split_by_class(frames, self._class_of, now):
+            self._send_class(peer, part, cls, now)
+        return self.copies.is_waiting or self.repeats.is_waiting
+
+    def send_waiting(self, peer: Peer, peers: Iterable[Peer], now: float) -> None:
+        """Send the waiting frames and copies that are due. ``peers``: all those that the budget is charged for."""
+        if self.egress is not None:
+            self.charge(peers, now)
+            cls, batch = self.egress.take(now)
+            while batch:
+                self._send_class(peer, batch, cls, now)
+                self.charge(peers, now)
+                cls, batch = self.egress.take(now)
+        if self.copies.is_waiting:
+            released = self.copies.release(now)
+            for transmit in released:
+                self._node.recount(peer, transmit.path, 1, len(transmit.datagram))
+            self._on_sent([], list(released), now)
+        if self.repeats.is_waiting:
+            repeats = self.repeats.release(now)
+            for transmit, number in repeats:
+                self._node.note_repeat(peer, transmit.path, number, len(transmit.datagram))
+            self._on_sent([], [repeat.transmit for repeat in repeats], now)
+
+    def next_deadline(self, now: float) -> float:
+        """When :meth:`send_waiting` is due."""
+        at = NEVER if self.egress is None else self.egress.next_deadline()
+        if self.copies.is_waiting:
+            at = min(at, self.copies.next_deadline(now))
+        return min(at, self.repeats.next_deadline(now)) if self.repeats.is_waiting else at
+
+    def has_room(self, payload_bytes: int, now: float) -> bool:
+        """Whether an envelope with this payload may go out now."""
+        return self.egress is None or self.egress.has_room(payload_bytes, now)
+
+    def charge(self, peers: Iterable[Peer], now: float) -> None:
+        """Charge the peer's own budget for all datagrams to it, handshakes and echoes too."""
+        if self.egress is None:
+            return
+        for peer in peers:
+            charged = self._charged.get(peer, (0, 0))
+            total = _sent(peer)
+            if total != charged:
+                self.egress.spend(total[1] - charged[1], now, datagrams=total[0] - charged[0])
+                self._charged[peer] = total
+
+    # Changes.
+
+    def change(self, settings: EgressSettings, peers: Iterable[Peer], now: float) -> None:
+        """Another budget or delay. What waits is dropped. What was sent before is not charged."""
+        if self.egress is not None:
+            self.egress.clear(now)  # and leave the lines of other peers
+        self._settings = settings
+        self.egress = PeerEgress(settings, now, self._class_of) if settings.is_needed else None
+        self._networks = {}
+        self._charged = {peer: _sent(peer) for peer in peers}
+
+    def forget(self, peer: Peer) -> None:
+        """A peer of the core is gone."""
+        self._charged.pop(peer, None)
+
+    def follow(self, peer: Peer, now: float) -> None:
+        """A session began, or other paths are used: envelopes have another size, frames wait for other networks."""
+        if self._budgets:
+            self._follow_networks(peer, now)
+        session, path = peer.sessions.current, peer.path
+        if session is None or path is None:
+            return
+        self._critical_limit = session.payload_limit_of(
+            min(CRITICAL_ENVELOPE_LIMIT, peer.paths.longest(Class.CRITICAL))
+        )
+        if self.egress is not None:
+            limit = min(session.payload_limit, session.payload_limit_of(peer.paths.longest(Class.STREAM)))
+            seal = session.parameters.max_envelope - session.payload_limit
+            self.egress.shape = EnvelopeShape(limit, seal, carrier_bytes(path))
+
+    def _follow_networks(self, peer: Peer, now: float) -> None:
+        routes = {cls: [state for state in route if state.works] or route for cls, route in peer.paths.routes.items()}
+        networks = {
+            cls: [self._bucket_of(state.path) for state in (route if cls is Class.CRITICAL else route[:1])]
+            for cls, route in routes.items()
+        }
+        if networks == self._networks or not networks[Class.CRITICAL]:
+            return
+        self._networks = networks
+        is_limited = any(None not in buckets for buckets in networks.values())
+        if self.egress is None and is_limited:
+            self.egress = PeerEgress(self._settings, now, self._class_of)
+        if self.egress is not None:
+            self.egress.set_networks(networks, now)
+
+    def _bucket_of(self, path: Path) -> Bucket | None:
+        budget = self._budgets.get(path.socket)
+        return None if budget is None else budget.all
+
+    def measure(self, peer: Peer, now: float) -> None:
+        """Note the rate of the stream, which copies may use too, and the loss of paths. Call it once a second."""
+        if now > self._measured_at:
+            own_budget = self._settings.budget_bits_s
+            most_bytes_s = COPIES_SHARE * own_budget / 8 if own_budget else inf
+            self.copies.set_stream_rate(self._stream_bytes / (now - self._measured_at), now, most_bytes_s)
+            self._stream_bytes, self._measured_at = 0, now
+        working = [state for state in peer.paths.routes[Class.CRITICAL] if state.works]
+        is_allowed = peer.is_up and peer.settings.link.redundancy is not Redundancy.NONE
+        self.repair.update(working, now, is_allowed=is_allowed)
+
+    def clear(self, now: float) -> None:
+        """Drop what waits: the peer is lost."""
+        self.copies.clear()
+        self.repeats.clear()
+        self.repair.end()
+        if self.egress is not None:
+            self.egress.clear(now)
+
+    # Envelopes.
+
+    def _send_class(self, peer: Peer, frames: Sequence[Frame], cls: Class, now: float) -> None:
+        """Send frames of one class, in envelopes of their own."""
+        if cls is Class.CRITICAL:
+            # Newer states replace repeats of older ones, which must not contain events then.
+            groups = _split_states(frames) if self.repair.is_on else (frames,)
+            for group in groups:
+                for part in self._envelopes(group):
+                    self._send_part(peer, part, cls, now)
+        else:
+            self._send_part(peer, frames, cls, now)
+
+    def _envelopes(self, frames: Sequence[Frame]) -> Iterator[Sequence[Frame]]:
+        """Frames that share an envelope, so that it is known which of them are in a copy that waits."""
+        part: list[Frame] = []
+        size = 0
+        for frame in frames:
+            size += len(frame.raw)
+            if size > self._critical_limit and part:
+                yield part
+                part, size = [], len(frame.raw)
+            part.append(frame)
+        yield part
+
+    def _send_part(self, peer: Peer, frames: Sequence[Frame], cls: Class, now: float) -> None:
+        raws = list(map(_RAW, frames))
+        outputs = self._node.send(peer, raws, now, cls)
+        if cls is not Class.CRITICAL:
+            self._stream_bytes += sum(map(len, raws))
+        if len(outputs) > 1:
+            outputs = self._pick_copies(peer, outputs, frames if cls is Class.CRITICAL else None, now)
+        if cls is Class.CRITICAL and self.repair.is_on:
+            self._repeat(outputs, frames, now)
+        self._on_sent(raws, outputs, now)
+
+    def _repeat(self, outputs: Sequence[Output], frames: Sequence[Frame], now: float) -> None:
+        """Have what was sent repeated, along the same paths."""
+        paths: dict[bytes, list[Path]] = {}
+        for output in outputs:
+            if isinstance(output, Transmit):
+                paths.setdefault(output.datagram, []).append(output.path)
+        for datagram, along in paths.items():
+            self.repeats.put(datagram, along, frames, self.repair.transmissions, now)
+
+    def _pick_copies(
+        self, peer: Peer, outputs: Sequence[Output], frames: Sequence[Frame] | None, now: float
+    ) -> list[Output]:
+        """The outputs without the datagrams that have to wait or are dropped."""
+        picked: list[Output] = []
+        envelope: list[Transmit] = []
+        for output in outputs:
+            if not isinstance(output, Transmit):
+                picked.append(output)
+            elif output.is_copy:
+                envelope.append(output)
+            else:
+                picked += self._pick(peer, envelope, frames, now)
+                envelope = [output]
+        picked += self._pick(peer, envelope, frames, now)
+        return picked
+
+    def _pick(
+        self, peer: Peer, envelope: Sequence[Transmit], frames: Sequence[Frame] | None, now: float
+    ) -> list[Transmit]:
+        if len(envelope) < 2:
+            return list(envelope)
+        picked = self.copies.pick(envelope, frames, now)
+        if len(picked) < len(envelope):
+            for transmit in envelope:
+                if transmit not in picked:
+                    self._node.recount(peer, transmit.path, -1, -len(transmit.datagram))
+        return picked
+
+
+def _split_states(frames: Sequence[Frame]) -> list[Sequence[Frame]]:
+    """Events, and then states, in envelopes of their own."""
+    events = [frame for frame in frames if not frame.header.kind.is_state]
+    states = [frame for frame in frames if frame.header.kind.is_state]
+    return [group for group in (events, states) if group]
+
+
+def _sent(peer: Peer) -> tuple[int, int]:
+    return peer.traffic.datagrams_sent, peer.traffic.bytes_sent
