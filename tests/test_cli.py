@@ -16,6 +16,7 @@ from tests.needs import need
 from uavlinkd import __version__
 from uavlinkd.cli import FAILED, OK, WRONG, main
 from uavlinkd.config import keys
+from uavlinkd.core.constants import PROTOCOL_NAME
 from uavlinkd.lab.sim import demo, demo_results
 
 
@@ -128,11 +129,11 @@ def test_a_wrong_command_line_gives_status_2(arguments: list[str]) -> None:
 
 
 def test_version_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
-    """``--version`` prints it, with status 0."""
+    """``--version`` prints it and that of the protocol, which must be equal at both ends, with status 0."""
     with pytest.raises(SystemExit) as ended:
         main(["--version"])
     assert ended.value.code == OK
-    assert capsys.readouterr().out == f"uavlinkd {__version__}\n"
+    assert capsys.readouterr().out == f"uavlinkd {__version__}, {PROTOCOL_NAME.decode()}\n"
 
 
 @pytest.mark.parametrize("command", ["run", "check", "status", "reload", "peer list"])

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from uavlinkd import __version__
+from uavlinkd.core.constants import PROTOCOL_NAME
 from uavlinkd.fleet.commands import add_parser as add_fleet
 from uavlinkd.ops.commands import CommandError
 from uavlinkd.ops.commands import add_parsers as add_daemon_commands
@@ -69,7 +70,7 @@ def _parser() -> argparse.ArgumentParser:
         description="Carry MAVLink between drones over an authenticated link. An attacker on the network cannot "
         "forge, alter, replay or redirect a frame.",
     )
-    parser.add_argument("--version", action="version", version=f"uavlinkd {__version__}")
+    parser.add_argument("--version", action="version", version=f"uavlinkd {__version__}, {PROTOCOL_NAME.decode()}")
     commands: argparse._SubParsersAction[argparse.ArgumentParser] = parser.add_subparsers(
         title="commands", metavar="COMMAND", required=True, parser_class=_Parser
     )
@@ -123,7 +124,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     demo.add_argument("--json", action="store_true", help="print the summary as JSON on the last line")
     add_fleet(commands)
-    text = "compare the paper's method with uavlinkd: duration, and what an attacker achieves"
+    text = "measure uavlinkd: beside the paper's method, under attack, and with radios that fail"
     description = text[0].upper() + text[1:] + "."
     commands.add_parser("evaluate", help=text, description=description, fill=_add_evaluations)
     return parser
@@ -132,6 +133,7 @@ def _parser() -> argparse.ArgumentParser:
 def _add_evaluations(parser: argparse.ArgumentParser) -> None:
     from uavlinkd.lab.evaluation.commands import add_report_parser, add_timing_parser
     from uavlinkd.lab.evaluation.flight_commands import add_flight_parser
+    from uavlinkd.lab.evaluation.paths_commands import add_paths_parser
     from uavlinkd.lab.evaluation.tampering_commands import add_member_parser, add_tampering_parser
 
     evaluations = parser.add_subparsers(title="evaluations", metavar="WHAT", required=True)
@@ -139,6 +141,7 @@ def _add_evaluations(parser: argparse.ArgumentParser) -> None:
     add_tampering_parser(evaluations)
     add_member_parser(evaluations)
     add_flight_parser(evaluations)
+    add_paths_parser(evaluations)
     add_report_parser(evaluations)
 
 
@@ -193,7 +196,8 @@ def _check(options: argparse.Namespace) -> int:
     from uavlinkd.config import ConfigError
     from uavlinkd.config.keys import CREDENTIALS
     from uavlinkd.config.load import load_config
-    from uavlinkd.ops.surroundings import lacks
+    from uavlinkd.ops.network_report import look_at_networks
+    from uavlinkd.ops.surroundings import lacks, look_up_names
     from uavlinkd.ops.topology import print_topology
 
     if options.keys is not None and not (options.keys.is_dir() and os.access(options.keys, os.R_OK | os.X_OK)):
@@ -203,8 +207,13 @@ def _check(options: argparse.Namespace) -> int:
         config = load_config(options.config, environ)
     except ConfigError as error:
         return _fail(error, WRONG)
-    print_topology(config, lacks=() if options.elsewhere else lacks(config))
-    return OK
+    if options.elsewhere:
+        print_topology(config)
+        return OK
+    answers = look_up_names(config)
+    networks = look_at_networks(config, answers)
+    print_topology(config, lacks=[*lacks(config, answers), *networks.lacks], networks=networks)
+    return FAILED if networks.errors else OK
 
 
 def _keygen(options: argparse.Namespace) -> int:

@@ -17,8 +17,39 @@ from uavlinkd.core.drops import DropReason
 from uavlinkd.mavlink.policy.gate import Refusal
 from uavlinkd.ops.metrics import exposition
 
+PATH: dict[str, Any] = {
+    "number": 1,
+    "network": "lte",
+    "address": "203.0.113.7:5790",
+    "is_configured": True,
+    "state": "usable",
+    "role": "best",
+    "carries": ["critical", "stream", "bulk"],
+    "round_trip_s": 0.06,
+    "jitter_s": 0.004,
+    "lag_s": 0.0,
+    "loss_in": 0.25,
+    "loss_out": 0.75,
+    "bytes_received": 61,
+    "bytes_sent": 62,
+    "datagrams_received": 63,
+    "datagrams_sent": 64,
+    "duplicates": 65,
+}
+UNKNOWN_PATH = dict.fromkeys(("network", "round_trip_s", "jitter_s", "lag_s"))
+LEARNED_PATH = {
+    **PATH,
+    **UNKNOWN_PATH,
+    "number": 2,
+    "address": "198.51.100.66:4000",
+    "is_configured": False,
+    "state": "down",
+    "role": "standby",
+    "carries": ["critical"],
+}
 PEER: dict[str, Any] = {
     "state": "up",
+    "paths": [PATH, LEARNED_PATH],
     "session": {"suite": "x25519", "mode": "authenticated", "tag_bits": 128},
     "handshake_s": 12.5,
     "last_received_s": 0.25,
@@ -34,13 +65,16 @@ PEER: dict[str, Any] = {
     "bytes_elsewhere": 56,
     "envelopes_missing": 50,
     "envelopes_out_of_order": 51,
-    "challenges_unanswered": 52,
+    "paths_unproven": 52,
     "echoes_unanswered": 53,
     "handshakes_unanswered": 54,
     "cookies_taken": 55,
     "frames_received": 14,
+    "frames_superseded": 9,
     "malformed": {"bad_crc": 15},
     "waiting_dropped": {"stale": 16},
+    "copies_dropped": {"copy_over_budget": 8},
+    "repair": {"is_on": True, "on_s": 3.0, "transmissions": 5, "datagrams": 57, "bytes": 58},
     "drops": {"bad_tag": 17},
     "refused": {
         "in": {"PING": {"message_not_allowed": 1}, "PARAM_SET": {"message_not_allowed": 2, "rate_limited": 4}},
@@ -48,7 +82,7 @@ PEER: dict[str, Any] = {
     },
 }
 UNKNOWN = dict.fromkeys(("session", "handshake_s", "last_received_s", "round_trip_s"))
-NEVER_UP = {**PEER, **UNKNOWN, "state": "waiting"}
+NEVER_UP = {**PEER, **UNKNOWN, "state": "waiting", "paths": []}
 FINDING = {
     "cause": "wrong_psk",
     "severity": "fault",
@@ -107,11 +141,15 @@ def value(name: str, /, **labels: str) -> float:
     return samples(exposition(STATUS, 5.0))[f"uavlinkd_{name}", frozenset(labels.items())]
 
 
+LTE = {"peer": "drone1", "path": "1", "network": "lte", "address": "203.0.113.7:5790"}
+OTHER = {"peer": "drone1", "path": "2", "network": "", "address": "learned"}
+
+
 @pytest.mark.parametrize(
     ("name", "labels", "expected"),
     [
         ("uptime_seconds", {}, 5.0),
-        ("schema_info", {"status": "1", "log": "1", "metrics": "1"}, 1),
+        ("schema_info", {"status": "2", "log": "1", "metrics": "2"}, 1),
         ("frames_pass", {}, 0),
         ("finding", {"cause": "wrong_psk", "severity": "fault", "subject": "peer", "name": "drone2"}, 1),
         ("peer_up", {"peer": "drone1"}, 1),
@@ -130,9 +168,11 @@ def value(name: str, /, **labels: str) -> float:
         ("peer_receive_bytes_total", {"peer": "drone1"}, 13),
         ("peer_elsewhere_bytes_total", {"peer": "drone1"}, 56),
         ("peer_receive_frames_total", {"peer": "drone1"}, 14),
+        ("peer_unsent_copies_total", {"peer": "drone1", "reason": "copy_over_budget"}, 8),
+        ("peer_superseded_frames_total", {"peer": "drone1"}, 9),
         ("peer_missing_envelopes_total", {"peer": "drone1"}, 50),
         ("peer_out_of_order_envelopes_total", {"peer": "drone1"}, 51),
-        ("peer_unanswered_challenges_total", {"peer": "drone1"}, 52),
+        ("peer_unproven_paths_total", {"peer": "drone1"}, 52),
         ("peer_unanswered_echoes_total", {"peer": "drone1"}, 53),
         ("peer_unanswered_handshakes_total", {"peer": "drone1"}, 54),
         ("peer_taken_cookies_total", {"peer": "drone1"}, 55),
@@ -155,6 +195,24 @@ def value(name: str, /, **labels: str) -> float:
             {"endpoint": "autopilot", "direction": "out", "reason": "setup_signing"},
             27,
         ),
+        ("peer_path_state", {**LTE, "state": "usable"}, 1),
+        ("peer_path_state", {**LTE, "state": "down"}, 0),
+        ("peer_path_state", {**OTHER, "state": "down"}, 1),
+        ("peer_path_best", LTE, 1),
+        ("peer_path_best", OTHER, 0),
+        ("peer_path_carries", {**LTE, "class": "bulk"}, 1),
+        ("peer_path_carries", {**OTHER, "class": "critical"}, 1),
+        ("peer_path_carries", {**OTHER, "class": "stream"}, 0),
+        ("peer_path_loss_ratio", {**LTE, "direction": "in"}, 0.25),
+        ("peer_path_loss_ratio", {**LTE, "direction": "out"}, 0.75),
+        ("peer_path_round_trip_seconds", LTE, 0.06),
+        ("peer_path_jitter_seconds", LTE, 0.004),
+        ("peer_path_lag_seconds", LTE, 0.0),
+        ("peer_path_receive_bytes_total", LTE, 61),
+        ("peer_path_transmit_bytes_total", LTE, 62),
+        ("peer_path_receive_datagrams_total", LTE, 63),
+        ("peer_path_transmit_datagrams_total", OTHER, 64),
+        ("peer_path_duplicates_total", OTHER, 65),
         ("unrouted_frames_total", {"reason": "unknown_target"}, 31),
         ("send_failures_total", {"reason": "ENETUNREACH"}, 32),
         ("stale_frames_total", {"source": "autopilot"}, 33),
@@ -168,6 +226,13 @@ def value(name: str, /, **labels: str) -> float:
 def test_number_of_the_status_is_exported(name: str, labels: dict[str, str], expected: float) -> None:
     """The value is unchanged, under its metric name and labels."""
     assert value(name, **labels) == expected
+
+
+def test_learned_address_is_not_a_label() -> None:
+    """An attacker can cause learned paths with any address: the number of series must not grow with them."""
+    text = exposition(STATUS, 0.0)
+    assert LEARNED_PATH["address"].encode() not in text
+    assert ("uavlinkd_peer_path_round_trip_seconds", frozenset(OTHER.items())) not in samples(text)
 
 
 def test_version_is_exported() -> None:

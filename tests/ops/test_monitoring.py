@@ -50,6 +50,16 @@ _REFUSED = 'uavlinkd_peer_refused_frames_total{instance="a",peer="b"'
 
 _FINDING = 'uavlinkd_finding{instance="a",cause="wrong_psk",subject="peer",name="b"'
 
+
+def _path(peer: str, number: str, usable: str, down: str) -> dict[str, str]:
+    """The samples of two states of a path."""
+    labels = f'instance="a",peer="{peer}",path="{number}",network="lte",address="learned"'
+    return {
+        f'uavlinkd_peer_path_state{{{labels},state="usable"}}': usable,
+        f'uavlinkd_peer_path_state{{{labels},state="down"}}': down,
+    }
+
+
 # Alert -> the samples of Prometheus, every 15 s; then times, and whether the alert fires at each.
 CASES: dict[str, tuple[dict[str, str], list[tuple[str, bool]]]] = {
     "UavlinkdDown": ({'up{job="uavlinkd",instance="a"}': "1 0x20"}, [("15s", False), ("1m", True)]),
@@ -76,6 +86,16 @@ CASES: dict[str, tuple[dict[str, str], list[tuple[str, bool]]]] = {
     "UavlinkdSlow": (
         {'uavlinkd_round_trip_seconds{instance="a",peer="b"}': "1x4 1.1x20"},
         [("1m", False), ("2m30s", True)],
+    ),
+    "UavlinkdPathDown": (
+        {  # The first was usable; the second never was; the third belongs to a peer that is down.
+            **_path("b", "1", usable="1x4 0x20", down="0x4 1x20"),
+            **_path("b", "2", usable="0x24", down="1x24"),
+            **_path("c", "1", usable="1x4 0x20", down="0x4 1x20"),
+            'uavlinkd_peer_up{instance="a",peer="b"}': "1x24",
+            'uavlinkd_peer_up{instance="a",peer="c"}': "1x4 0x20",
+        },
+        [("4m", False), ("4m30s", True)],
     ),
     "UavlinkdFreshnessUnverified": (
         {'uavlinkd_peer_freshness_unverified{instance="a",peer="b"}': "0 0 1x20"},

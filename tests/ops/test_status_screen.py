@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Mapping
 from enum import StrEnum
 from typing import Any
@@ -11,6 +12,7 @@ import pytest
 from rich.console import Console, RenderableType
 
 from uavlinkd.core.drops import DropReason
+from uavlinkd.core.path_state import PathCondition
 from uavlinkd.mavlink.egress.lanes import EgressDrop
 from uavlinkd.mavlink.frames import FrameFault
 from uavlinkd.mavlink.policy.gate import Refusal
@@ -28,6 +30,32 @@ from uavlinkd.ops.reason_phrases import (
 from uavlinkd.ops.status_screen import render_peers, render_status
 
 
+def path(**facts: object) -> dict[str, Any]:
+    """The status of a path."""
+    return {
+        "number": 1,
+        "network": None,
+        "address": "203.0.113.255:65535",
+        "is_configured": True,
+        "state": "usable",
+        "reason": "answered",
+        "state_s": 60.0,
+        "role": "best",
+        "carries": ["critical", "stream", "bulk"],
+        "answered_s": 0.1,
+        "round_trip_s": 1.2345,
+        "jitter_s": 0.5678,
+        "loss_in": 0.12,
+        "loss_out": 1.0,
+        "lag_s": 0.4,
+        "bytes_in_s": 123456.0,
+        "bytes_out_s": 1234.0,
+        "bytes_received": 123_456_789,
+        "bytes_sent": 1_234_567,
+        **facts,
+    }
+
+
 def peer(state: str, **facts: object) -> dict[str, Any]:
     """The status of a peer."""
     return {
@@ -35,11 +63,13 @@ def peer(state: str, **facts: object) -> dict[str, Any]:
         "last_received_s": 12.3,
         "round_trip_s": 0.1234,
         "freshness_unverified_s": None,
+        "repair": {"is_on": False, "on_s": 0.0, "transmissions": 1, "datagrams": 1234, "bytes": 123456},
         "loss_in": 0.12,
         "loss_out": 1.0,
         "bytes_in_s": 123456.0,
         "bytes_out_s": 123456.0,
         "path": "203.0.113.255:65535",
+        "paths": [path()],
         "session": {"suite": "x25519-mlkem768", "mode": "authenticated"},
         "handshake_s": 99.9,
         "drops": {},
@@ -62,6 +92,7 @@ def status_of(peers: dict[str, dict[str, Any]], **facts: object) -> dict[str, An
         "findings": [],
         "peers": peers,
         "endpoints": {},
+        "networks": {},
         "drops": {},
         "send_failures": {},
         "stale": {},
@@ -116,8 +147,14 @@ def test_screen_fits_eighty_columns(name: str) -> None:
         "99.9 s",
     ):
         assert part in text
-    dropped = "1,234,567 replayed or duplicated, 12 altered or forged, 1 of an ended session"
+    dropped = "1,234,567 replayed, 12 altered or forged, 1 of an ended session"
     assert f"{name} dropped: {dropped}" in words(text)
+
+
+def test_copies_along_several_paths_are_not_drops() -> None:
+    """They are in the JSON only."""
+    text = shown({"drone1": peer("up", drops={"duplicate": 12, "late_copy": 3})}, 80)
+    assert "dropped" not in text
 
 
 @pytest.mark.parametrize("path", ["[fd00::2]:5790", "[fe80::1%2]:5790", "[2001:db8:a::1]:5790"])
@@ -188,6 +225,33 @@ def test_refused_datagrams_are_explained() -> None:
     assert "from no known peer: 3 handshakes for another key than this daemon's" in text
 
 
+def test_networks_are_shown_with_their_addresses() -> None:
+    """An absent one with the reason."""
+    shared = {"budget_bits_s": 0, "ports": [], "serial": None}
+    networks: dict[str, dict[str, object]] = {
+        "lte": {"interface": "wwan0", "address": None, "is_metered": True, "is_present": True, **shared},
+        "mesh": {"interface": None, "address": "10.13.0.5", "is_metered": False, "is_present": False, **shared},
+    }
+    networks["lte"] |= {"absent_because": None, "addresses": ["10.0.0.5"]}
+    networks["mesh"] |= {"absent_because": "no interface has 10.13.0.5", "addresses": []}
+    text = printed(render_status(status_of({}, networks=networks)), 80)
+    assert "wwan0" in text
+    assert re.search(r"lte +wwan0 +yes +10\.0\.0\.5", text)
+    assert re.search(r"mesh +10\.13\.0\.5 +no +absent: no interface has 10\.13\.0\.5", text)
+
+
+def test_serial_network_is_shown_with_its_radio() -> None:
+    """The device, the rate, damaged pieces, and what the modem reports, if it does."""
+    line: dict[str, object] = {"device": "/dev/ttyUSB0", "baud": 57600, "rate_bits_s": 9600, "line_noise": 3}
+    network = {"interface": None, "address": None, "is_metered": False, "is_present": True, "addresses": ["serial"]}
+    quiet = {**network, "serial": {**line, "radio": None}}
+    text = printed(render_status(status_of({}, networks={"sik": quiet})), 120)
+    assert re.search(r"sik +/dev/ttyUSB0 at 57600 baud +no +up to 9,600 bits/s, 3 damaged", text)
+    radio = {"rssi": 200, "remrssi": 190, "noise": 50, "remnoise": 60, "txbuf": 90}
+    text = printed(render_status(status_of({}, networks={"sik": {**quiet, "serial": {**line, "radio": radio}}})), 160)
+    assert "rssi 200/190, noise 50/60, modem 10 % full" in text
+
+
 def test_broken_links_come_first() -> None:
     """The operator looks for them, also in the list of keys, which has their causes."""
     peers = {"alpha": peer("up", public_key="A="), "zulu": peer("lost", public_key="Z=")}
@@ -217,3 +281,63 @@ def test_healthy_screen_is_short() -> None:
     }
     text = shown({"drone1": peer("up")}, 80, endpoints={"autopilot": endpoint})
     assert len(text.strip().splitlines()) <= 15
+
+
+def test_repair_and_its_cost_are_shown() -> None:
+    """While it is on."""
+    repair = {"is_on": True, "on_s": 12.3, "transmissions": 5, "datagrams": 1234, "bytes": 123456}
+    text = " ".join(shown({"drone1": {**peer("up"), "repair": repair}}, 100, endpoints={}).split())
+    assert "drone1 repair: on for 12.3 s, sends critical frames 5 times; 123 kB repeated so far" in text
+
+
+DOWN: dict[str, Any] = {
+    "network": "mesh",
+    "address": "10.13.0.9:5790",
+    "state": "down",
+    "reason": "unanswered",
+    "role": "standby",
+    "carries": [],
+    "round_trip_s": None,
+    "jitter_s": None,
+    "lag_s": None,
+}
+
+
+def test_peer_with_several_paths_has_a_line_for_each() -> None:
+    """Network, address, state with its reason or role, what it carries, round trip and jitter, losses, rates."""
+    paths = [
+        path(network="lte"),
+        path(**DOWN),
+        path(role="standby", carries=["critical"], state="suspect", reason="loss"),
+    ]
+    text = shown({"drone1": peer("up", paths=paths), "drone2": peer("up")}, 80)
+    assert max(map(len, text.splitlines())) <= 80
+    lines = [words(line) for line in text.splitlines()]
+    assert "path state carries rtt ms loss % kB/s" in lines
+    assert "mesh 10.13.0.9:5790 down: no answer - - 12/100 123/1.2" in lines
+    assert "lte 203.0.113.255:65535 best all 1234±568 12/100 123/1.2" in lines
+    assert "203.0.113.255:65535 suspect: loss critical 1234±568 12/100 123/1.2" in lines
+    assert text.count("drone2") == 2
+
+
+def test_wide_screen_has_lag_and_bytes_of_each_path() -> None:
+    """Where there is room."""
+    paths = [path(network="lte"), path(**DOWN)]
+    lines = [words(line) for line in shown({"drone1": peer("up", paths=paths)}, 120).splitlines()]
+    assert "path state carries rtt ms loss % kB/s lag ms MB" in lines
+    assert "lte 203.0.113.255:65535 best all 1234±568 12/100 123/1.2 400 123/1.2" in lines
+    assert "mesh 10.13.0.9:5790 down: no answer - - 12/100 123/1.2 - 123/1.2" in lines
+
+
+def test_peer_with_one_path_has_no_table_of_paths() -> None:
+    """Its path is in the table of sessions."""
+    assert "carries" not in shown({"drone1": peer("up")}, 120)
+
+
+def test_every_condition_of_a_path_has_a_style() -> None:
+    """And each reason for which a path is not usable has words."""
+    for condition in PathCondition:
+        for reason in ("unanswered", "loss", "network", "new"):
+            paths = [path(state=condition.value, reason=reason), path()]
+            shown_as = "best" if condition is PathCondition.USABLE else condition.value
+            assert shown_as in shown({"drone1": peer("up", paths=paths)}, 80)

@@ -77,6 +77,10 @@ async def test_report_of_a_running_pair_has_no_secret(monkeypatch: pytest.Monkey
         a, b = stage.pair()
         addresses = ["203.0.113.7:5790", "[2001:db8::7]:5790", "drone1.invalid:5790"]
         a.config["peer"][0]["addresses"] += addresses
+        exact = {"address": "203.0.113.99:5790", "network": "loopback"}
+        a.config["listen"] = [f"0.0.0.0:{a.sockaddr[1]}"]
+        a.config["network"] = [{"name": "loopback", "interface": "lo"}]
+        a.config["peer"][0]["addresses"].append(exact)
         await stage.start(a, b)
         await a.until_logged("name_not_resolved")
         monkeypatch.setattr(report, "_log", lambda: "\n".join(a.lines))
@@ -85,11 +89,18 @@ async def test_report_of_a_running_pair_has_no_secret(monkeypatch: pytest.Monkey
         text = await asyncio.to_thread(report.make_report, [a.config_file], [a.folder / "control.sock"])
         for secret in [*stage.secrets, a.public_key, b.public_key, KEY]:
             assert not any(form in text for form in secret_forms(secret))
-        for address in ("203.0.113.7", "2001:db8::7", "drone1.invalid", "198.51.100.1"):
+        for address in ("203.0.113.7", "203.0.113.99", "2001:db8::7", "drone1.invalid", "198.51.100.1"):
             assert address not in text
         titles = ("versions", "configuration", "check", "status", "log", "sockets", "network interfaces", "routes")
         assert all(f"## {title}" in text for title in titles)
-        for part in ("peer-address-1:5790", "peer-address-3", '"state": "up"', "daemon_started", "uavlinkd 0."):
+        for part in (
+            "peer-address-1:5790",
+            "peer-address-3",
+            '"state": "up"',
+            "daemon_started",
+            "uavlinkd 0.",
+            '"loopback"',
+        ):
             assert part in text
         await until(lambda: a.is_running)
 

@@ -99,6 +99,19 @@ def test_each_peer_has_a_line(folder: Path) -> None:
         assert part in second
 
 
+def test_networks_are_printed_with_what_they_are_used_for(folder: Path) -> None:
+    """Of a configuration for another machine: the addresses of peers that each network is for, and the port."""
+    networks = (
+        '[[network]]\nname = "lte"\ninterface = "wwan0"\nmetered = true\nbudget_bits_s = 256000\n'
+        '[[network]]\nname = "wired"\naddress = "2001:db8::5"\n'
+    )
+    printed = " ".join(_printed(_load(folder, _FILE.replace("[[endpoint]]", f"{networks}[[endpoint]]", 1))).split())
+    assert "listens on port 5790 (IPv4) of each network" in printed
+    addresses = "used for drone1 10.13.0.2:5790, drone1 drone1.local:5790"
+    assert f"lte interface wwan0, metered, 256,000 bits/s {addresses}" in printed
+    assert "wired address 2001:db8::5, not metered, no budget used for drone1 drone1.local:5790" in printed
+
+
 def test_sizes_are_those_of_the_wire(folder: Path) -> None:
     """Five to seven bytes of header and the tag; peers with equal sizes share a line."""
     printed = _printed(_load(folder, _FILE + "max_envelope_bytes = 500\n"))

@@ -18,10 +18,11 @@ class Cause(Reason):
 
     # The link is down: this machine.
     LISTEN_ADDRESS_MISSING = "listen_address_missing", "an address in listen is not on this machine"
+    NETWORK_ABSENT = "network_absent", "a network has no interface or address now"
     NAME_NOT_RESOLVED = "name_not_resolved", "the peer's host name has no address"
     OWN_ADDRESS = "own_address", "the peer's address leads to this daemon itself"
     ZONE_MISSING = "zone_missing", "a link-local IPv6 address lacks its network interface"
-    FAMILY_MISSING = "family_missing", "no address in listen is of the peer's address family"
+    FAMILY_MISSING = "family_missing", "no address in listen, or no network, is of the peer's address family"
     FIREWALL_HERE = "firewall_here", "this machine's firewall refuses datagrams to the peer"
     NO_ROUTE = "no_route", "this machine has no route to the peer"
 
@@ -31,6 +32,7 @@ class Cause(Reason):
     WRONG_KEY_HERE = "wrong_key_here", "a sender at the peer's address uses another public key than this file has"
     FORMER_KEY = "former_key", "a sender at the peer's address uses a key that was replaced here"
     WRONG_KEY_THERE = "wrong_key_there", "a sender at the peer's address has another public key for this daemon"
+    OTHER_VERSION = "other_version", "a sender at the peer's address speaks another version of the protocol"
     WRONG_PSK = "wrong_psk", "the PSKs differ, or only one end has one"
     NO_COMMON_SUITE = "no_common_suite", "the peer offers a suite that is not in its list here"
     NOT_CONFIRMED = "not_confirmed", "the peer initiates, but does not confirm this daemon's responses"
@@ -54,6 +56,8 @@ class Cause(Reason):
     CLIENT_SILENT = "client_silent", "the endpoint's client sends no MAVLink"
     GARBAGE = "garbage", "the endpoint's client sends bytes that are not MAVLink"
     RAW_MAVLINK = "raw_mavlink", "bare MAVLink arrives at the port for peers"
+    MODEM_REPORTS = "modem_reports", "a radio modem puts RADIO_STATUS between datagrams: its MAVLINK is not 0"
+    LINE_NOISE = "line_noise", "many pieces that arrive on a serial network are damaged"
     UNDER_LOAD = "under_load", "handshake messages arrive faster than the daemon accepts them"
     DAEMON_PAUSED = "daemon_paused", "the daemon was paused, and dropped frames from that time"
     RECORDING_STOPPED = "recording_stopped", "the recording folder cannot be used"
@@ -73,6 +77,7 @@ _WARNINGS = frozenset(
     {
         *(Cause.OTHER_SYSTEM, Cause.COMMANDS_WITHHELD, Cause.COMMANDS_REFUSED, Cause.NO_CLIENT),
         *(Cause.CLIENT_UNREACHABLE, Cause.CLIENT_SILENT, Cause.GARBAGE, Cause.RAW_MAVLINK, Cause.UNDER_LOAD),
+        *(Cause.MODEM_REPORTS, Cause.LINE_NOISE),
         *(Cause.REFUSED_THERE, Cause.DAEMON_PAUSED, Cause.RECORDING_STOPPED),
     }
 )

@@ -19,8 +19,8 @@ class LinkProblem(Reason):
         "envelopes_out_of_order",
         "envelopes arrived after later ones: the network has several paths, or an attacker reorders them",
     )
-    CHALLENGES_UNANSWERED = (
-        "challenges_unanswered",
+    PATHS_UNPROVEN = (
+        "paths_unproven",
         "the peer's envelopes came from an address that is not the peer's: an attacker forwards them",
     )
     ECHOES_UNANSWERED = (

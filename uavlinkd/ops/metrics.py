@@ -28,6 +28,7 @@ from prometheus_client.registry import Collector
 from uavlinkd import __version__
 from uavlinkd.core.drops import DropReason
 from uavlinkd.mavlink.policy.gate import Refusal
+from uavlinkd.ops.path_metrics import path_families
 from uavlinkd.ops.schema_versions import LOG_SCHEMA, METRICS_SCHEMA, STATUS_SCHEMA
 
 CONTENT_TYPE = CONTENT_TYPE_PLAIN_0_0_4
@@ -53,12 +54,16 @@ _PEER_TOTALS = {
     "envelopes_received": ("peer_receive_envelopes_total", "Authentic envelopes from the peer, without duplicates."),
     "envelopes_sent": ("peer_transmit_envelopes_total", "Envelopes to the peer."),
     "frames_received": ("peer_receive_frames_total", "MAVLink frames from the peer."),
+    "frames_superseded": (
+        "peer_superseded_frames_total",
+        "MAVLink frames from the peer that were dropped because a newer one arrived first along another path.",
+    ),
     "handshakes": ("peer_handshakes_total", "Handshakes that established keys."),
     "envelopes_missing": ("peer_missing_envelopes_total", "Envelopes that the peer sent and that did not arrive."),
     "envelopes_out_of_order": ("peer_out_of_order_envelopes_total", "Envelopes that arrived after later ones."),
-    "challenges_unanswered": (
-        "peer_unanswered_challenges_total",
-        "Path challenges without a response: the address is not the peer's.",
+    "paths_unproven": (
+        "peer_unproven_paths_total",
+        "Addresses of the peer's envelopes from which no question was answered: the address is not the peer's.",
     ),
     "handshakes_unanswered": (
         "peer_unanswered_handshakes_total",
@@ -101,11 +106,15 @@ class _StatusCollector(Collector):
         yield from _daemon(status, self._uptime_s)
         yield _findings(status["findings"])
         yield from _links(peers)
+        yield from (_family(*family) for family in path_families(peers))
         yield from _drops(status)
         yield from _totals("peer", peers, _PEER_TOTALS)
         yield _reasons("peer_malformed_total", "Malformed payloads and frames.", "peer", peers, "malformed")
         text = "Frames that waited for the peer's budget and were dropped."
         yield _reasons("peer_unsent_frames_total", text, "peer", peers, "waiting_dropped")
+        text = "Copies of envelopes for other paths that were not sent."
+        yield _reasons("peer_unsent_copies_total", text, "peer", peers, "copies_dropped")
+        yield from _repair(peers)
         yield _refused("peer", peers)
         clients = [([name], len(endpoint["clients"])) for name, endpoint in endpoints.items()]
         yield _family("endpoint_clients", "Clients of the endpoint.", ["endpoint"], clients)
@@ -158,6 +167,16 @@ def _links(peers: Mapping[str, Status]) -> Iterator[Metric]:
         yield _family(
             metric, text, ["peer"], [([name], peer[key]) for name, peer in peers.items() if peer[key] is not None]
         )
+
+
+def _repair(peers: Mapping[str, Status]) -> Iterator[Metric]:
+    repairs = [([name], peer["repair"]) for name, peer in peers.items()]
+    text = "How often a critical envelope is sent along each path; 1 while repair is off."
+    yield _family("peer_transmissions", text, ["peer"], [(name, repair["transmissions"]) for name, repair in repairs])
+    text = "Repeats of critical envelopes along lossy paths."
+    yield _family("peer_repeats_total", text, ["peer"], [(name, repair["datagrams"]) for name, repair in repairs])
+    text = "Bytes of these repeats, with IP and UDP headers."
+    yield _family("peer_repeat_bytes_total", text, ["peer"], [(name, repair["bytes"]) for name, repair in repairs])
 
 
 def _drops(status: Status) -> Iterator[Metric]:

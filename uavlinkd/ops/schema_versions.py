@@ -6,6 +6,6 @@ A version rises when a name is removed, renamed or changes its type or meaning. 
 
 from typing import Final
 
-STATUS_SCHEMA: Final = 1
+STATUS_SCHEMA: Final = 2
 LOG_SCHEMA: Final = 1
-METRICS_SCHEMA: Final = 1
+METRICS_SCHEMA: Final = 2

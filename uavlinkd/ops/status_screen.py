@@ -10,7 +10,9 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from uavlinkd.core.drops import DropReason
 from uavlinkd.mavlink.policy.gate import Refusal
+from uavlinkd.ops.path_table import PathTable, has_several_paths
 from uavlinkd.ops.reason_phrases import (
     DATAGRAMS,
     ENDPOINT_FAILURES,
@@ -30,6 +32,8 @@ _STYLES = {"up": "green", "lost": "bold red", "waiting": "bold yellow"}
 _SEVERITY_STYLES: Final = {"security": "bold red", "fault": "bold yellow", "warning": "yellow"}
 _SHOWN_REASONS: Final = 3
 _SHOWN_FINDINGS: Final = 20
+_COPIES: Final = frozenset[str]({DropReason.DUPLICATE, DropReason.LATE_COPY})
+"""What several paths cause all the time."""
 _SHOWN_FIRST: Final = (phrase(Refusal.HIDDEN_FRAME, REFUSALS),)
 """Reasons that are always shown. A captured member could cause greater counts of other reasons to hide them."""
 
@@ -45,6 +49,8 @@ def render_status(status: Status) -> RenderableType:
     if status["findings"]:
         parts.append(_findings(status["findings"]))
     parts += [_peers(status), _endpoints(status)]
+    if status["networks"]:
+        parts.append(_networks(status))
     if dropped := _listed(_by_count(status["drops"], DATAGRAMS)):
         parts.append(Text(f"dropped, from no known peer: {dropped}", style="yellow"))
     for error, count in _ranked(list(status["send_failures"].items()))[:_SHOWN_REASONS]:
@@ -98,6 +104,8 @@ def _findings(findings: list[dict[str, str]]) -> Table:
 def _peers(status: Status) -> Group:
     """A table of link quality, a table of paths and sessions in the same order, and the problems.
 
+    Peers with several paths have a line for each path in a table of their own.
+
     The tables fit into 80 columns; long names and IPv6 addresses are folded.
     """
     health = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
@@ -120,12 +128,15 @@ def _peers(status: Status) -> Group:
             _rate(peer["bytes_in_s"]),
             _rate(peer["bytes_out_s"]),
         )
+        if peer["repair"]["is_on"]:
+            problems.append(Text(_repair(name, peer["repair"])))
         if dropped := _listed(_drops(peer)):
             problems.append(Text(f"{name} dropped: {dropped}"))
         session = peer["session"] or {}
         age = _age(peer["handshake_s"]) if session else "-"
         paths.add_row(Text(name), Text(peer["path"] or "-"), session.get("suite", "-"), session.get("mode", "-"), age)
-    return Group(health, paths, *problems)
+    several = {name: peer for name, peer in _by_state(status) if has_several_paths(peer)}
+    return Group(health, paths, *([PathTable(several)] if several else []), *problems)
 
 
 def _by_state(status: Status) -> list[tuple[str, Status]]:
@@ -156,9 +167,38 @@ def _endpoints(status: Status) -> Table:
     return table
 
 
+def _networks(status: Status) -> Table:
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    for name in ("network", "exit", "metered", "addresses"):
+        table.add_column(name, overflow="fold")
+    for name, network in status["networks"].items():
+        here = Text(", ".join(network["addresses"]))
+        if not network["is_present"]:
+            here = Text(f"absent: {network['absent_because']}", style="bold yellow")
+        metered = "yes" if network["is_metered"] else "no"
+        line = network["serial"]
+        leads_out = network["interface"] or network["address"] or f"{line['device']} at {line['baud']} baud"
+        if line is not None and network["is_present"]:
+            here = Text(_line(line))
+        table.add_row(Text(name, style="bold"), Text(leads_out), metered, here)
+    return table
+
+
+def _line(line: Status) -> str:
+    """What is known about the radio behind a serial device. Pairs of numbers are here/there."""
+    parts = [f"up to {line['rate_bits_s']:,} bits/s", f"{line['line_noise']:,} damaged"]
+    if (radio := line["radio"]) is not None:
+        parts += [
+            f"rssi {radio['rssi']}/{radio['remrssi']}",
+            f"noise {radio['noise']}/{radio['remnoise']}",
+            f"modem {100 - radio['txbuf']} % full" if radio["txbuf"] <= 100 else "modem's queue unknown",
+        ]
+    return ", ".join(parts)
+
+
 def _drops(peer: Status) -> list[_Count]:
     return [
-        *_by_count(peer["drops"], DATAGRAMS),
+        *_by_count({reason: count for reason, count in peer["drops"].items() if reason not in _COPIES}, DATAGRAMS),
         *_by_count(peer["malformed"], FAULTS),
         *_by_count(peer["waiting_dropped"], QUEUED),
         *_by_count(_refused(peer), REFUSALS),
@@ -195,6 +235,12 @@ def _loss(peer: Status) -> Text:
     worst = max(peer["loss_in"], peer["loss_out"])
     style = "bold red" if worst > 0.2 else "yellow" if worst > 0.02 else ""
     return Text(f"{100 * peer['loss_in']:.0f}/{100 * peer['loss_out']:.0f} %", style=style)
+
+
+def _repair(name: str, repair: Status) -> str:
+    times, kilobytes = repair["transmissions"], repair["bytes"] / 1000
+    since = _age(repair["on_s"])
+    return f"{name} repair: on for {since}, sends critical frames {times} times; {kilobytes:,.0f} kB repeated so far"
 
 
 def _age(seconds: float | None) -> str:

@@ -150,11 +150,16 @@ def _without_comments(path: Path) -> str:
 
 # The addresses of peers.
 
+_ADDRESS = re.compile(r"""["']([^"']+)["'](?!\s*=)""")
+"""A value in a list of addresses; not a key in quotes."""
+_NETWORK = re.compile(r"""["']?network["']?\s*=\s*["'][^"']*["']""")
+"""The network of an address, whose name is readable."""
+
 
 def _hosts_of_configs(paths: Sequence[Path]) -> Iterator[str]:
     for path in paths:
         for listed in re.findall(r"""(?ms)^\s*["']?addresses["']?\s*=\s*\[(.*?)\]\s*(?:#[^\n]*)?$""", _read(path)):
-            yield from (host for host, _ in map(_split, re.findall(r"""["']([^"']+)["']""", listed)))
+            yield from (host for host, _ in map(_split, _ADDRESS.findall(_NETWORK.sub("", listed))))
 
 
 def _hosts_of_statuses(statuses: Sequence[dict[str, Any] | str]) -> Iterator[str]:

@@ -22,7 +22,7 @@ from typing import NamedTuple
 from uavlinkd.config import Config
 from uavlinkd.endpoints.url import EndpointKind, NetworkUrl, SerialUrl
 from uavlinkd.ops.control import is_served
-from uavlinkd.system.addresses import Address, overlaps
+from uavlinkd.system.addresses import Address, numeric_host, overlaps
 
 RESOLVE_S = 3.0
 """Limit for the look-ups of all names together."""
@@ -31,20 +31,27 @@ _MAX_SOCKET_PATH = 107
 _SERIAL_DEVICES = ("serial/by-id/*", "ttyACM*", "ttyUSB*", "serial0")
 
 
+Answers = dict[str, list[str]]
+"""The numeric hosts of each name; none if it does not resolve."""
+
+
 class _Bound(NamedTuple):
     kind: str
     address: Address
     inode: str
 
 
-def lacks(config: Config) -> list[str]:
-    """Sentences for a person. The daemon may run in spite of them, now or later."""
+def lacks(config: Config, answers: Answers | None = None) -> list[str]:
+    """Sentences for a person. The daemon may run in spite of them, now or later.
+
+    ``answers``: those of :func:`look_up_names`, if it was called already.
+    """
     running = config.control_socket is not None and is_served(config.control_socket)
     return [
         *_serial(config),
         *_addresses(config),
         *(() if running else _ports(config)),
-        *_names(config),
+        *_names(config, look_up_names(config) if answers is None else answers),
         *_recording(config),
         *_control_socket(config),
     ]
@@ -122,8 +129,8 @@ def _addresses(config: Config) -> Iterator[str]:
                 f' daemon uses it as soon as it is; for every address, write "{wildcard}:{address.port}"'
             )
     for peer in config.peers:
-        for address in peer.addresses:
-            zone = address.host.partition("%")[2]
+        for written in peer.addresses:
+            zone = written.address.host.partition("%")[2]
             if zone and not _has_interface(zone):
                 yield (
                     f'peer "{peer.name}": there is no network interface {zone} now: `ip -brief link` lists those of'
@@ -151,28 +158,42 @@ def _is_here(address: Address) -> bool:
     return True
 
 
-def _names(config: Config) -> Iterator[str]:
+def look_up_names(config: Config) -> Answers:
     """Resolve all names at the same time, as the system does for every software."""
-    wanted = [(f'peer "{peer.name}"', address) for peer in config.peers for address in peer.addresses]
+    answers: Answers = {address.host: [] for _, address in _named(config) if address.ip is None}
+
+    def resolve(name: str) -> None:
+        with suppress(OSError, UnicodeError):
+            resolved = socket.getaddrinfo(name, None, type=socket.SOCK_DGRAM)
+            answers[name] = [numeric_host(sockaddr) for *_, sockaddr in resolved]
+
+    threads = [threading.Thread(target=resolve, args=(name,), daemon=True) for name in answers]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(RESOLVE_S / len(threads))
+    return dict(answers)
+
+
+def _named(config: Config) -> list[tuple[str, Address]]:
+    """The addresses that the daemon sends to, each with its section."""
+    wanted = [
+        (f'peer "{peer.name}"', written.address)
+        for peer in config.peers
+        for written in peer.addresses
+        if not written.is_serial
+    ]
     wanted += [
         (f'endpoint "{endpoint.name}"', endpoint.url.address)
         for endpoint in config.endpoints
         if isinstance(endpoint.url, NetworkUrl)
     ]
-    names = {address.host: False for _, address in wanted if address.ip is None}
+    return wanted
 
-    def resolve(name: str) -> None:
-        with suppress(OSError, UnicodeError):
-            socket.getaddrinfo(name, None)
-            names[name] = True
 
-    threads = [threading.Thread(target=resolve, args=(name,), daemon=True) for name in names]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(RESOLVE_S / len(threads))
-    for section, address in wanted:
-        if names.get(address.host) is False:
+def _names(config: Config, answers: Answers) -> Iterator[str]:
+    for section, address in _named(config):
+        if answers.get(address.host) == []:
             yield (
                 f"{section}: {address.host} has no address here now: see `getent hosts {address.host}`, or"
                 f' write an IP address, such as "10.13.0.2:{address.port}"'
@@ -183,6 +204,9 @@ def _serial(config: Config) -> Iterator[str]:
     for endpoint in config.endpoints:
         if isinstance(endpoint.url, SerialUrl) and (why := _serial_problem(Path(endpoint.url.device))):
             yield f'endpoint "{endpoint.name}": {endpoint.url.device} {why}'
+    for network in config.networks:
+        if network.serial is not None and (why := _serial_problem(Path(network.serial.device))):
+            yield f'network "{network.name}": {network.serial.device} {why}'
 
 
 def _serial_problem(path: Path) -> str | None:
@@ -195,7 +219,7 @@ def _serial_problem(path: Path) -> str | None:
         listed = f"this machine has {', '.join(present)}" if present else "this machine has no serial device"
         return f"is not there now: plug it in, or write another device; {listed}"
     if not is_device:
-        return "is not a serial device: write one, such as serial:/dev/ttyACM0:57600"
+        return "is not a serial device: write one, such as /dev/ttyACM0"
     if not os.access(path, os.R_OK | os.W_OK):
         return (
             "may not be opened by this user: add the daemon's user to the device's group, often dialout"

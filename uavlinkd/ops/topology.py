@@ -13,46 +13,56 @@ from rich.text import Text
 from uavlinkd.config import Config, PeerConfig, Routing
 from uavlinkd.config.advice import exposure
 from uavlinkd.config.keys import encode_key, looks_private, short_form
+from uavlinkd.config.network_rules import used_networks
 from uavlinkd.core.constants import AEAD_TAG_BYTES
 from uavlinkd.core.crypto import x25519_public_key
 from uavlinkd.core.settings import Link
 from uavlinkd.core.wire import LONG_HEADER_BYTES, SHORT_HEADER_BYTES, initiation_bytes, response_bytes
+from uavlinkd.ops.network_report import NetworkReport
 from uavlinkd.ops.policy_table import review
 
 _PLAIN_WIDTH = 100
 """Columns of the output if it is not a terminal: a pipe has no width."""
 
 
-def print_topology(config: Config, console: Console | None = None, lacks: Sequence[str] = ()) -> None:
+def print_topology(
+    config: Config,
+    console: Console | None = None,
+    lacks: Sequence[str] = (),
+    networks: NetworkReport | None = None,
+) -> None:
     """Print the topology: with colours on a terminal, as plain text elsewhere.
 
-    ``lacks``: what this machine lacks for it, see :mod:`uavlinkd.ops.surroundings`.
+    ``lacks``: what this machine lacks for it, see :mod:`uavlinkd.ops.surroundings`. ``networks``: what they reach
+    here.
     """
     if console is None:
         console = Console()
     if console.is_terminal:
-        console.print(describe(config, lacks))
+        console.print(describe(config, lacks, networks))
         return
     plain = Console(width=_PLAIN_WIDTH, no_color=True, force_terminal=False)
     with plain.capture() as captured:
-        plain.print(describe(config, lacks))
+        plain.print(describe(config, lacks, networks))
     # Tables pad their columns with spaces, which a file does not need.
     console.file.writelines(line.rstrip() + "\n" for line in captured.get().splitlines())
 
 
-def describe(config: Config, lacks: Sequence[str] = ()) -> Group:
+def describe(config: Config, lacks: Sequence[str] = (), networks: NetworkReport | None = None) -> Group:
     """All tables, the most important first. A few peers fit on one screen.
 
     Text from the file is always a :class:`rich.text.Text`, so that it cannot act as markup.
     """
     parts: list[RenderableType] = [_identity(config)]
+    if config.networks:
+        parts += [_heading("Networks"), _networks(config, networks)]
     if config.peers:
         parts += [_heading("Peers"), _peers(config), _heading("Bytes in a datagram"), _sizes(config)]
         parts += [_heading("Sending to a peer"), _pace(config)]
     if config.endpoints:
         parts += [_heading("Local endpoints"), _endpoints(config)]
     parts += review(config)
-    parts.append(_verdict(config, lacks))
+    parts.append(_verdict(config, lacks, () if networks is None else networks.errors))
     return Group(*parts)
 
 
@@ -96,12 +106,44 @@ def _routing(routing: Routing) -> str:
 
 
 def _listening(config: Config) -> str:
+    if config.has_ip_networks and config.listen:
+        ports = (f"port {address.port} ({'IPv6' if ':' in address.host else 'IPv4'})" for address in config.listen)
+        return f"{', '.join(ports)} of each network (UDP; answers only senders that know the public key)"
     if not config.listen:
         return "nothing: it connects to its peers, from any free port"
     where = ", ".join(str(address) for address in config.listen)
     if all(address.is_loopback for address in config.listen):
         return f"{where} (UDP, this machine only)"
     return f"{where} (UDP, open to the network; answers only senders that know the public key)"
+
+
+def _networks(config: Config, report: NetworkReport | None) -> Table:
+    """Each network with the peers' addresses that are used on it; on this machine, those that it reaches now."""
+    table = Table.grid(padding=(0, 2))
+    table.add_column(style="bold")
+    table.add_column(overflow="fold")
+    for number, network in enumerate(config.networks):
+        budget = f"{network.budget_bits_s:,} bits/s" if network.budget_bits_s else "no budget"
+        text = Text(f"{network.exit}, {'metered' if network.metered else 'not metered'}, {budget}")
+        if network.serial is not None:
+            text = Text(network.exit)
+        if report is None:
+            used = [
+                f"{peer.name} {written.address}"
+                for peer in config.peers
+                for written in peer.addresses
+                if any(used_networks([network], written))
+            ]
+            text.append(f"\nused for {', '.join(used) or 'no address of a peer'}")
+        else:
+            reach = report.reaches[number]
+            text.append(f"; {reach.here}")
+            if reach.reached:
+                text.append(f"\nreaches {', '.join(reach.reached)}")
+            if reach.unreached:
+                text.append(f"\ndoes not reach {', '.join(reach.unreached)}", style="bold red")
+        table.add_row(Text(network.name), text)
+    return table
 
 
 def _peers(config: Config) -> Table:
@@ -194,13 +236,15 @@ def _endpoints(config: Config) -> Table:
     return table
 
 
-def _verdict(config: Config, lacks: Sequence[str]) -> RenderableType:
-    """All warnings, or a line that says that there is no warning."""
-    if not config.warnings and not lacks:
+def _verdict(config: Config, lacks: Sequence[str], errors: Sequence[str]) -> RenderableType:
+    """All errors and warnings, or a line that says that there is no warning."""
+    if not config.warnings and not lacks and not errors:
         return Text("\nNo warnings.", style="green")
     warnings = Table.grid(padding=(0, 1))
     warnings.add_column(style="bold yellow", no_wrap=True)
     warnings.add_column(overflow="fold")
+    for error in errors:
+        warnings.add_row(Text("error:", style="bold red"), Text(error))
     for warning in config.warnings:
         warnings.add_row("warning:", Text(warning))
     for lack in lacks:

@@ -7,9 +7,11 @@ from typing import Any, NamedTuple
 
 from tests.daemon.frames import frame
 from tests.daemon.harness import Stage
+from uavlinkd.endpoints.radio_reports import RadioReport
+from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.ops.findings import Finding, Severity, Subject
 
-MAPS = ("peers", "endpoints", "endpoints.*.clients")
+MAPS = ("peers", "endpoints", "endpoints.*.clients", "networks")
 """Objects whose keys are names of the configuration or addresses."""
 COUNTS: Mapping[str, int] = {
     "drops": 1,
@@ -20,6 +22,8 @@ COUNTS: Mapping[str, int] = {
     "peers.*.drops": 1,
     "peers.*.malformed": 1,
     "peers.*.waiting_dropped": 1,
+    "peers.*.copies_dropped": 1,
+    "networks.*.serial.failures": 1,
     "peers.*.refused": 3,
     "peers.*.refused_commands": 3,
     "endpoints.*.faults": 1,
@@ -31,8 +35,12 @@ COUNTS: Mapping[str, int] = {
 ALSO = {
     "peers.*.freshness_unverified_s": "number",
     "peers.*.role": "null",
+    "peers.*.paths[].lag_s": "number",
+    "peers.*.paths[].network": "string",
     "endpoints.*.clients.*.last_received_s": "null",
     "recording": "null",
+    "networks.*.serial.radio": "object",
+    **{f"networks.*.serial.radio.{name}": "integer" for name in RadioReport.__annotations__},
 }
 """Types that the daemons here do not show."""
 
@@ -49,7 +57,7 @@ class Seen(NamedTuple):
 
 
 async def observed() -> Seen:
-    """Start a daemon, then its peer, and send a frame to each."""
+    """Start a daemon, then its peer, and send a frame to each; and a daemon with networks."""
     statuses: list[dict[str, Any]] = []
     async with Stage() as stage:
         a, b = stage.pair(probe_interval_s=0.1)
@@ -68,12 +76,22 @@ async def observed() -> Seen:
             return is_measured and bool(status["blocked"]) and bool(status["endpoints"]["autopilot"]["clients"])
 
         statuses.append(await a.until(is_complete))
+        roaming = stage.daemon("roaming", [f"0.0.0.0:{free_port()}"])
+        roaming.config["network"] = [
+            {"name": "present", "address": "127.0.0.1"},
+            {"name": "absent", "interface": "absent0"},
+            {"name": "line", "serial": f"{stage.folder}/absent:57600"},
+        ]
+        roaming.add_peer(a, [])
+        roaming.config["peer"][0]["addresses"] = [{"network": "line"}]
+        await stage.start(roaming, linked=False)
+        statuses.append(await roaming.status())
     findings = [Finding("cause", Severity.FAULT, Subject.PEER, "name", "text", "remedy").as_json()]
     types: dict[str, set[str]] = {name: {kind} for name, kind in ALSO.items()}
     for status in statuses:
         _walk(status | {"findings": findings}, "", types)
     names = {name: "|".join(sorted(kinds)) for name, kinds in types.items()}
-    return Seen(names, [*a.events(), *b.events()])
+    return Seen(names, [line for daemon in (a, b, roaming) for line in daemon.events()])
 
 
 def _walk(value: Any, path: str, types: dict[str, set[str]]) -> None:

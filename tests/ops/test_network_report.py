@@ -1,0 +1,79 @@
+"""What ``check`` says about networks on this machine. tests/daemon/test_two_networks.py has real routes."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from tests.needs import need
+from uavlinkd.config import Config, keys
+from uavlinkd.config.load import load_config
+from uavlinkd.ops import network_report
+from uavlinkd.ops.network_report import look_at_networks, needs_privilege
+
+Load = Callable[..., Config]
+_LOOPBACK = '[[network]]\nname = "loopback"\ninterface = "lo"\n'
+
+
+@pytest.fixture
+def load(tmp_path: Path) -> Load:
+    """Loads a file with these networks and one address of the peer."""
+    need(sys.platform == "linux", "Linux")
+    keys.write_secret_file(tmp_path / "drone0.key", keys.generate_private_key())
+    public = keys.public_key_text(keys.generate_private_key())
+
+    def loading(networks: str = _LOOPBACK, address: str = "127.0.0.1:5790") -> Config:
+        path = tmp_path / "drone0.toml"
+        path.write_text(
+            f'name = "drone0"\nprivate_key_file = "drone0.key"\n{networks}'
+            f'[[peer]]\nname = "drone1"\npublic_key = "{public}"\naddresses = ["{address}"]\n'
+            'role = "vehicle"\nsystem_ids = [2]\n'
+        )
+        return load_config(path, {})
+
+    return loading
+
+
+@pytest.mark.parametrize(
+    ("release", "needs"),
+    [("4.19.0-21-amd64", True), ("5.6.19", True), ("5.7.0", False), ("6.1.0-rpi7-rpi-v8", False), ("unknown", False)],
+)
+def test_privilege_follows_from_the_release(release: str, needs: bool) -> None:
+    """A release that says nothing causes no line."""
+    assert needs_privilege(release) is needs
+
+
+def test_old_kernel_is_reported(load: Load, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Once for all networks with an interface; not for an address."""
+    genuine = os.uname()
+    monkeypatch.setattr(os, "uname", lambda: os.uname_result((*genuine[:2], "5.4.0-150-generic", *genuine[3:])))
+    (line,) = look_at_networks(load(), {}).lacks
+    assert "Linux 5.4.0-150-generic lets only a process with CAP_NET_RAW" in line
+    assert look_at_networks(load('[[network]]\nname = "loopback"\naddress = "127.0.0.1"\n'), {}).lacks == []
+
+
+def test_without_networks_there_is_nothing_to_report(load: Load) -> None:
+    """The kernel's routes decide."""
+    assert look_at_networks(load(""), {}) == ([], [], [])
+
+
+def test_without_the_tool_for_routes_nothing_is_said_about_them(load: Load, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No route is reported as missing."""
+    monkeypatch.setattr(network_report, "_IP", None)
+    report = look_at_networks(load(address="203.0.113.7:5790"), {})
+    assert report.lacks == ["there is no `ip` here, so routes were not checked: install iproute2"]
+    assert (report.errors, report.reaches[0].unreached) == ([], [])
+
+
+def test_name_is_reached_at_one_of_its_addresses(load: Load) -> None:
+    """A name that does not resolve is neither reached nor unreached: another line reports it."""
+    need(network_report._IP is not None, "iproute2")
+    config = load(address="drone1.test:5790")
+    (reach,) = look_at_networks(config, {"drone1.test": ["127.0.0.1"]}).reaches
+    assert (reach.reached, reach.unreached) == (["drone1 drone1.test:5790"], [])
+    (reach,) = look_at_networks(config, {"drone1.test": []}).reaches
+    assert (reach.reached, reach.unreached) == ([], [])
