@@ -14,13 +14,13 @@ Make = Callable[[AttackContext, float], Sequence[AttackObject]]
 
 
 class Middle:
-    """A man in the middle between the drones of a network. Each pair has two listeners, one per drone."""
+    """A man in the middle between the drones of a network. Each path of a pair has two listeners, one per drone."""
 
-    def __init__(self, network: Network, *drones: Drone, knows_keys: bool = True) -> None:
+    def __init__(self, network: Network, *drones: Drone, knows_keys: bool = True, paths: int = 1) -> None:
         self.network = network
         self.drones = {drone.name: drone for drone in drones}
         keys = {drone.name: drone.public_key for drone in drones} if knows_keys else {}
-        self.context = AttackContext.between(*self.drones, public_keys=keys)
+        self.context = AttackContext.between(*self.drones, public_keys=keys, paths=paths)
         self.channel = AttackChannel(self.context)
         self.interventions: list[Intervention] = []
         self.to_strangers: list[tuple[str, int, bytes]] = []
@@ -37,24 +37,29 @@ class Middle:
 
     @classmethod
     def between(
-        cls, network: Network, link: Link | None = None, *, knows_keys: bool = True
+        cls, network: Network, link: Link | None = None, *, knows_keys: bool = True, paths: int = 1
     ) -> tuple[Self, Drone, Drone]:
         """Between two new drones, a and b, which have been started."""
         a, b = network.add("a"), network.add("b", clock=1e6)
-        middle = cls(network, a, b, knows_keys=knows_keys)
+        middle = cls(network, a, b, knows_keys=knows_keys, paths=paths)
         middle.introduce(link)
         a.start()
         b.start()
         return middle, a, b
 
-    def listener(self, peer: str, other: str) -> Address:
-        """Where ``peer`` reaches ``other``."""
-        return next(address for address, direction in self._listeners.items() if direction == Direction(peer, other))
+    def listener(self, peer: str, other: str, path: int = 1) -> Address:
+        """Where ``peer`` reaches ``other`` along a path."""
+        wanted = Direction(peer, other, path)
+        return next(address for address, direction in self._listeners.items() if direction == wanted)
 
     def introduce(self, link: Link | None = None) -> None:
         """Every drone knows all others by their listeners."""
+        addresses: dict[tuple[str, str], list[Address]] = {}
         for direction in self.context.directions:
-            self.drones[direction.sender].knows(self.drones[direction.receiver], [self.listener(*direction)], link)
+            pair = direction.sender, direction.receiver
+            addresses.setdefault(pair, []).append(self.listener(*direction))
+        for (one, other), known in addresses.items():
+            self.drones[one].knows(self.drones[other], known, link)
 
     def attack(self, *attacks: AttackObject) -> None:
         """Do this from now on."""
@@ -84,11 +89,7 @@ class Middle:
                 self.interventions.append(action)
                 continue
             datagram, direction, stranger = action
-            source = (
-                self.listener(direction.receiver, direction.sender)
-                if stranger is None
-                else (f"198.51.100.{stranger}", 6000)
-            )
+            source = self.listener(*direction.reverse) if stranger is None else (f"198.51.100.{stranger}", 6000)
             if stranger is not None:
                 key = (direction.receiver, stranger)
                 self.bytes_from_strangers[key] = self.bytes_from_strangers.get(key, 0) + len(datagram)

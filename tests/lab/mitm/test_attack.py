@@ -13,7 +13,9 @@ from uavlinkd.lab.mitm.attack import CATCH_UP_LIMIT, NEVER, AttackContext, Attac
 from uavlinkd.lab.mitm.attacks import ATTACKS, parse_attack
 
 CONVERSATION = converse()
-AMONG_THREE = AttackContext.between("a", "b", "c", public_keys={name: bytes([9]) + bytes(31) for name in "abc"})
+AMONG_THREE = AttackContext.between(
+    "a", "b", "c", paths=2, public_keys={name: bytes([9]) + bytes(31) for name in "abc"}
+)
 
 
 @pytest.mark.parametrize("name", ATTACKS)

@@ -29,6 +29,7 @@ from uavlinkd.ops.control import ask
 from uavlinkd.system.addresses import Address
 
 ANY = Address("127.0.0.1", 0)
+ENVELOPE = b"\x40\x00\x01\x00\x07" + bytes(40)
 
 
 @asynccontextmanager
@@ -58,18 +59,46 @@ async def _until(condition: Callable[[], bool]) -> None:
             await asyncio.sleep(0)
 
 
+async def test_each_path_has_its_own_addresses() -> None:
+    """What is sent to one listener of the second path comes from the other. An attack moves it to the first path."""
+    a, b = await open_client(), await open_client()
+    links = (MitmLink(("a", "b"), (ANY, ANY)), MitmLink(("a", "b"), (ANY, ANY)))
+    proxy = Proxy(ProxySettings((MitmPeer("a"), MitmPeer("b", Address(*b.address))), links))
+    there, second = Direction("a", "b"), Direction("a", "b", 2)
+    await proxy.start()
+    try:
+        a.send(ENVELOPE, proxy.listeners[second])
+        await b.until(lambda: len(b.datagrams) == 1)
+        assert b.sources == [proxy.listeners[second.reverse]]
+        b.send(b"back", proxy.listeners[second.reverse])
+        await a.until(lambda: a.datagrams == [b"back"])
+        assert a.sources == [proxy.listeners[second]]
+        b.send(b"unknown", proxy.listeners[there.reverse])  # along this path, a has not sent yet
+        await _until(lambda: proxy.errors["unknown receiver"] == 1)
+
+        proxy.change_attacks([parse_attack("move,direction=a>b/2,onto=1").make(proxy.context)])
+        a.send(ENVELOPE, proxy.listeners[second])
+        await b.until(lambda: len(b.datagrams) == 2)
+        assert b.sources[1] == proxy.listeners[there.reverse]
+        assert proxy.statistics()["sent"] == {"a>b": 1, "a>b/2": 1, "b>a/2": 1}
+    finally:
+        await proxy.stop()
+        a.close()
+        b.close()
+
+
 async def test_each_peer_hears_the_other_from_the_face_it_knows() -> None:
     """In both directions, byte for byte, empty datagrams too, many in one wake-up."""
     async with _between() as (a, b, proxy):
         said = [b"", b"one", bytes(1400), *(bytes([n]) * 10 for n in range(200))]
         for datagram in said:
-            a.send(datagram, proxy.listeners["a", "b"])
+            a.send(datagram, proxy.listeners[Direction("a", "b")])
         await b.until(lambda: len(b.datagrams) == len(said))
         assert b.datagrams == said
-        assert set(b.sources) == {proxy.listeners["b", "a"]}
-        b.send(b"back", proxy.listeners["b", "a"])
+        assert set(b.sources) == {proxy.listeners[Direction("b", "a")]}
+        b.send(b"back", proxy.listeners[Direction("b", "a")])
         await a.until(lambda: a.datagrams == [b"back"])
-        assert a.sources == [proxy.listeners["a", "b"]]
+        assert a.sources == [proxy.listeners[Direction("a", "b")]]
         assert proxy.statistics()["sent"] == {"a>b": len(said), "b>a": 1}
 
 
@@ -77,8 +106,8 @@ async def test_other_senders_at_a_listener_are_ignored() -> None:
     """Only the peer itself is attacked; the others are counted."""
     async with _between() as (a, b, proxy):
         stranger = await open_client()
-        stranger.send(b"hello", proxy.listeners["a", "b"])
-        a.send(b"genuine", proxy.listeners["a", "b"])
+        stranger.send(b"hello", proxy.listeners[Direction("a", "b")])
+        a.send(b"genuine", proxy.listeners[Direction("a", "b")])
         await b.until(lambda: b.datagrams == [b"genuine"])
         assert proxy.errors["unknown sender"] == 1
         stranger.close()
@@ -90,10 +119,10 @@ async def test_peer_without_an_address_is_learned_from_its_datagrams() -> None:
         settings = replace(known.settings, peers=(MitmPeer("a"), known.settings.peers[1]))
         proxy = Proxy(settings)
         await proxy.start()
-        b.send(b"too early", proxy.listeners["b", "a"])
-        a.send(b"here", proxy.listeners["a", "b"])
+        b.send(b"too early", proxy.listeners[Direction("b", "a")])
+        a.send(b"here", proxy.listeners[Direction("a", "b")])
         await b.until(lambda: b.datagrams == [b"here"])
-        b.send(b"found", proxy.listeners["b", "a"])
+        b.send(b"found", proxy.listeners[Direction("b", "a")])
         await a.until(lambda: a.datagrams == [b"found"])
         assert proxy.errors["unknown receiver"] == 1
         await proxy.stop()
@@ -107,7 +136,7 @@ async def test_strangers_have_addresses_of_their_own_and_hear_answers() -> None:
         if sys.platform == "linux":
             assert len(hosts) > 30
         assert len(set(b.sources)) > 30
-        assert not {proxy.listeners["b", "a"]} & set(b.sources)
+        assert not {proxy.listeners[Direction("b", "a")]} & set(b.sources)
         b.send(b"who is there", b.sources[0])
         await _until(lambda: bool(proxy.stranger_bytes_back))
         assert proxy.stranger_bytes_back.total() == len(b"who is there")
@@ -119,9 +148,21 @@ async def test_held_datagrams_are_released_by_the_timer() -> None:
     async with _between("hold,kinds=any,hold_s=0.2") as (a, b, proxy):
         loop = asyncio.get_running_loop()
         begin = loop.time()
-        a.send(b"later", proxy.listeners["a", "b"])
+        a.send(b"later", proxy.listeners[Direction("a", "b")])
         await b.until(lambda: b.datagrams == [b"later"])
         assert loop.time() - begin >= 0.2
+
+
+async def test_radio_changes_while_it_carries_datagrams() -> None:
+    """A stall ends when other settings replace it: what it held arrives at once, in order."""
+    async with _between(radios=(("a>b", RadioSettings(is_stalled=True)),)) as (a, b, proxy):
+        said = [b"one", b"two"]
+        for datagram in said:
+            a.send(datagram, proxy.listeners[Direction("a", "b")])
+        await _until(lambda: proxy.received[Direction("a", "b")] == 2)
+        assert b.datagrams == []
+        proxy.change_radio("a>b", RadioSettings())
+        await b.until(lambda: b.datagrams == said)
 
 
 async def test_radio_delays_real_datagrams() -> None:
@@ -129,8 +170,8 @@ async def test_radio_delays_real_datagrams() -> None:
     async with _between(radios=(("a>b", RadioSettings(delay_s=0.15)),)) as (a, b, proxy):
         loop = asyncio.get_running_loop()
         begin = loop.time()
-        a.send(b"slow", proxy.listeners["a", "b"])
-        b.send(b"fast", proxy.listeners["b", "a"])
+        a.send(b"slow", proxy.listeners[Direction("a", "b")])
+        b.send(b"fast", proxy.listeners[Direction("b", "a")])
         await a.until(lambda: a.datagrams == [b"fast"])
         assert b.datagrams == []
         await b.until(lambda: b.datagrams == [b"slow"])
@@ -146,18 +187,18 @@ async def test_control_socket_changes_pauses_and_tells(tmp_path: Path) -> None:
 
     async with _between(control_socket=path) as (a, b, proxy):
         assert (await tell("attack drop,direction=a>b extend"))["attacks"] == ["drop", "extend"]
-        a.send(b"lost", proxy.listeners["a", "b"])
-        b.send(b"long", proxy.listeners["b", "a"])
+        a.send(b"lost", proxy.listeners[Direction("a", "b")])
+        b.send(b"long", proxy.listeners[Direction("b", "a")])
         await a.until(lambda: len(a.datagrams) == 1)
         assert (await tell("attack drop,colour=red"))["refused"].startswith("drop: has no such parameter")
         assert "three peers" in (await tell("attack misroute"))["refused"]
         assert (await tell("statistics"))["attacks"] == ["drop", "extend"]
         await tell("pause")
-        a.send(b"passes", proxy.listeners["a", "b"])
+        a.send(b"passes", proxy.listeners[Direction("a", "b")])
         await b.until(lambda: b.datagrams == [b"passes"])
         await tell("resume")
         assert (await tell("attack none"))["attacks"] == []
-        a.send(b"passes too", proxy.listeners["a", "b"])
+        a.send(b"passes too", proxy.listeners[Direction("a", "b")])
         await b.until(lambda: len(b.datagrams) == 2)
         for nonsense in ("nonsense", "", "attack", "pause now"):
             refused = (await tell(nonsense))["refused"]
@@ -174,7 +215,7 @@ async def test_log_of_a_run_begins_and_ends(tmp_path: Path) -> None:
     """Seed and attacks first, every intervention, the statistics last."""
     path = tmp_path / "run.jsonl"
     async with _between("bit-flip,kinds=any,direction=a>b", log=path, seed=5) as (a, b, proxy):
-        a.send(b"\x40 something", proxy.listeners["a", "b"])
+        a.send(b"\x40 something", proxy.listeners[Direction("a", "b")])
         await b.until(lambda: len(b.datagrams) == 1)
         assert b.datagrams != [b"\x40 something"]
     first, middle, last = map(json.loads, path.read_text().splitlines())
@@ -204,11 +245,11 @@ async def test_attacks_can_be_objects() -> None:
         attack = parse_attack("drop").make(known.context)
         proxy = Proxy(known.settings, [attack])
         await proxy.start()
-        a.send(b"x", proxy.listeners["a", "b"])
+        a.send(b"x", proxy.listeners[Direction("a", "b")])
         await _until(lambda: attack.attempts > 0)
         assert proxy.journal.counts["drop", "dropped"] == 1
         proxy.change_attacks([])
-        a.send(b"y", proxy.listeners["a", "b"])
+        a.send(b"y", proxy.listeners[Direction("a", "b")])
         await b.until(lambda: b.datagrams == [b"y"])
         assert proxy.received[Direction("a", "b")] == 2
         await proxy.stop()

@@ -57,9 +57,27 @@ def test_least_file_is_a_cable(tmp_path: Path) -> None:
     assert settings.peers[1].address is None
 
 
+def test_a_second_link_of_a_pair_is_a_second_path(tmp_path: Path) -> None:
+    """Its radio and its attacks name it by its number, whichever peer comes first."""
+    second = '[[link]]\nbetween = ["b", "a"]\nlisten = ["127.0.0.1:5", "127.0.0.1:6"]\n'
+    more = (
+        '[[radio]]\ndirection = "both/2"\ndelay_s = 0.1\n[[attack]]\nname = "move"\ndirection = "both/1"\nonto = 2\n'
+    )
+    settings = _load(tmp_path, GOOD + second + more)
+    assert settings.listeners == {
+        Direction("a", "b"): Address("127.0.0.1", 3),
+        Direction("b", "a"): Address("127.0.0.1", 4),
+        Direction("b", "a", 2): Address("127.0.0.1", 5),
+        Direction("a", "b", 2): Address("127.0.0.1", 6),
+    }
+    assert {str(direction) for direction in settings.radio_of()} == {"a>b/2", "b>a/2"}
+
+
 @pytest.mark.parametrize(
     ("text", "problems"),
     [
+        (GOOD + '[[attack]]\nname = "move"', ["attack move: there is no path 2"]),
+        (GOOD + '[[radio]]\ndirection = "both/2"', ["radio: direction must be both"]),
         ("", ["peer: at least two peers are required", "link: at least one link is required"]),
         ("a = b", ["is not valid TOML"]),
         (GOOD + "x = 1", ["link[0].x: is an unknown key"]),

@@ -302,6 +302,21 @@ def test_every_datagram_is_accounted_for(settings: RadioSettings, seed: int, gap
     assert _is_accounted_for(radio)
 
 
+def test_stall_holds_everything_until_it_ends() -> None:
+    """Also what was sent before it. Then everything arrives in order, and later datagrams as before."""
+    radio = Radio(RadioSettings(delay_s=0.1), Random(1))
+    radio.send(b"before", 0.0)
+    radio.settings = RadioSettings(delay_s=0.1, is_stalled=True)
+    radio.send(b"during", 1.0)
+    assert (radio.due(5.0), radio.next_deadline(), radio.in_flight) == ([], math.inf, 2)
+    radio.settings = RadioSettings(delay_s=0.1)
+    assert radio.next_deadline() == pytest.approx(0.1)
+    assert radio.due(10.0) == [b"before", b"during"]
+    radio.send(b"after", 10.0)
+    assert (radio.due(10.05), radio.due(10.2)) == ([], [b"after"])
+    assert _is_accounted_for(radio)
+
+
 @pytest.mark.parametrize(
     ("make", "named"),
     [

@@ -11,15 +11,15 @@ import pytest
 
 from tests.lab.mitm.middle import Middle
 from tests.network.network import Drone, Flow, Network
-from uavlinkd.core import handshake, receive, session, wire
+from uavlinkd.core import handshake, probing, session, wire
 from uavlinkd.core.cookie import CookieJar, MacKeys
 from uavlinkd.core.drops import Drop
 from uavlinkd.core.drops import DropReason as Reason
 from uavlinkd.core.echo_requests import EchoRequests
 from uavlinkd.core.indices import Indices
 from uavlinkd.core.node import Node
-from uavlinkd.core.outputs import Output
 from uavlinkd.core.path import Path
+from uavlinkd.core.path_state import PathState
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.replay import ReplayWindow
 from uavlinkd.core.settings import Link, Timers
@@ -89,9 +89,11 @@ def test_receiver_without_tag_check_accepts_a_false_tag(monkeypatch: pytest.Monk
 def test_receiver_that_marks_before_it_verifies_loses_the_link_to_one_counter(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """One forged envelope with the last counter there is, and every genuine one is too old."""
+    """One forged envelope with the last counter there is, and every genuine one looks like a copy."""
 
-    def marks_at_once(self: session.Session, datagram: bytes, header_bytes: int, counter: int, now: float) -> bytes:
+    def marks_at_once(
+        self: session.Session, datagram: bytes, header_bytes: int, counter: int, now: float
+    ) -> bytes | None:
         try:
             return genuine_open(self, datagram, header_bytes, counter, now)
         except Drop as drop:
@@ -105,13 +107,19 @@ def test_receiver_that_marks_before_it_verifies_loses_the_link_to_one_counter(
     stage.begin("counter-jump,to=last,limit=2")
     stage.network.run(0.5)
     assert stage.flows[0].lost(1.1, 1.4)
-    assert stage.b.drops[Reason.TOO_OLD] + stage.a.drops[Reason.TOO_OLD] > 5
+    assert sum(_copies(side) for side in (stage.a, stage.b)) > 5
+
+
+def _copies(drone: Drone) -> int:
+    """How many envelopes of its peers it took for copies."""
+    assert drone.node is not None
+    return sum(peer.traffic.drops[Reason.DUPLICATE] for peer in drone.node.peers.values())
 
 
 @pytest.mark.parametrize("attack", ["replay-data", "duplicate", "replay-data,when=later,delay_s=2"])
 def test_receiver_without_replay_check_delivers_twice(attack: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same frame is delivered again."""
-    monkeypatch.setattr(ReplayWindow, "check", lambda _self, _counter: None)
+    monkeypatch.setattr(ReplayWindow, "is_used", lambda _self, _counter: False)
     stage = _stage()
     stage.begin(attack)
     with pytest.raises(AssertionError, match="delivered twice"):
@@ -173,7 +181,7 @@ def test_receiver_with_one_key_for_both_directions_takes_its_own_frames(monkeypa
     monkeypatch.setattr(session, "derive", derive)
     monkeypatch.setattr("uavlinkd.core.establish.Session", OneKey)
     monkeypatch.setattr(Indices, "pick", lambda _self, _now: 7)
-    monkeypatch.setattr(ReplayWindow, "check", lambda _self, _counter: None)
+    monkeypatch.setattr(ReplayWindow, "is_used", lambda _self, _counter: False)
     stage = _stage()
     stage.b.acquaintances["a"] = (stage.b.acquaintances["a"][0], ())  # it is called, so there is one session
     stage.begin("reflect,kinds=envelope")
@@ -230,13 +238,16 @@ def test_receiver_without_memory_of_initiations_answers_replays(origin: str, mon
 
 
 def test_receiver_that_follows_every_address_loses_its_traffic(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without a path challenge one forwarded envelope pulls the frames to the attacker, who then stops."""
+    """Without a question one forwarded envelope pulls the frames to the attacker, who then stops."""
+    genuine_learn = probing.learn
 
-    def follow(peer: Peer, _session: object, path: Path, *_rest: object) -> list[Output]:
-        peer.path = path
-        return []
+    def follow(peer: Peer, path: Path, now: float) -> PathState:
+        state = peer.paths.best = genuine_learn(peer, path, now)
+        state.is_proven = True
+        state.set_usable(now)
+        return state
 
-    monkeypatch.setattr(receive, "challenge", follow)
+    monkeypatch.setattr(probing, "learn", follow)
     stage = _stage()
     stage.begin("roam,mode=race")
     stage.network.run(3)

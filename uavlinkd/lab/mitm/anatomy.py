@@ -15,6 +15,7 @@ import fastcrc
 from uavlinkd.core import constants as c
 from uavlinkd.core import wire
 from uavlinkd.core.drops import Drop
+from uavlinkd.core.probe import ANSWER_BYTES, PROBE, QUESTION_BYTES, parse_probe
 from uavlinkd.core.refusals import REFUSAL_REPORT, parse_report
 from uavlinkd.core.suites import Suite
 
@@ -155,6 +156,29 @@ def is_refusal_report(datagram: bytes) -> bool:
         return False
     payload = datagram[envelope.header_bytes :]
     return any(parse_report(payload[:-tag_bytes]) is not None for tag_bytes in wire.TAG_LENGTHS)
+
+
+_ECHO_BYTES = frozenset(
+    len(wire.Echo(is_reply, 0, 0, 0).encode()) + tag_bytes
+    for is_reply in (False, True)
+    for tag_bytes in wire.TAG_LENGTHS
+)
+_PROBE_BYTES = frozenset(size + tag for size in (ANSWER_BYTES, QUESTION_BYTES) for tag in wire.TAG_LENGTHS)
+
+
+def is_echo(datagram: bytes) -> bool:
+    """Whether an envelope, encrypted or not, has the length of an echo record."""
+    envelope = envelope_of(datagram)
+    return envelope is not None and len(datagram) - envelope.header_bytes in _ECHO_BYTES
+
+
+def is_probe(datagram: bytes) -> bool:
+    """Whether an envelope has the length of a probe, or seems to carry one in the clear before frames."""
+    envelope = envelope_of(datagram)
+    if envelope is None:
+        return False
+    payload = datagram[envelope.header_bytes :]
+    return len(payload) in _PROBE_BYTES or (payload[:1] == bytes((PROBE,)) and parse_probe(payload) is not None)
 
 
 def message_ids(datagram: bytes) -> tuple[int, ...]:

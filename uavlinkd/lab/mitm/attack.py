@@ -13,11 +13,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from random import Random
-from typing import Any, ClassVar, Final, Generic, Literal, NamedTuple, Protocol, TypeVar
+from typing import Any, ClassVar, Generic, NamedTuple, Protocol, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from uavlinkd.lab.mitm.anatomy import HANDSHAKE, DatagramKind, is_refusal_report, kind_of
+from uavlinkd.lab.mitm.anatomy import DatagramKind, kind_of
 
 NEVER = math.inf
 STRANGERS = 256
@@ -31,18 +31,24 @@ class AttackError(ValueError):
 
 
 class Direction(NamedTuple):
-    """From one peer to another, by name."""
+    """From one peer to another, by name, along one of the paths between them."""
 
     sender: str
     receiver: str
+    path: int = 1
+    """From 1: the position among the links between the two peers."""
 
     @property
     def reverse(self) -> Direction:
-        """The opposite direction."""
-        return Direction(self.receiver, self.sender)
+        """The opposite direction of the same path."""
+        return Direction(self.receiver, self.sender, self.path)
+
+    def along(self, path: int) -> Direction:
+        """The same direction along another path."""
+        return Direction(self.sender, self.receiver, path)
 
     def __str__(self) -> str:
-        return f"{self.sender}>{self.receiver}"
+        return f"{self.sender}>{self.receiver}" + (f"/{self.path}" if self.path > 1 else "")
 
 
 class Send(NamedTuple):
@@ -134,14 +140,20 @@ class AttackContext:
     """What an attacker knows: the directions between the peers, and public keys."""
 
     directions: tuple[Direction, ...]
-    """Both directions of each link."""
+    """Both directions of each link. Several links between the same peers are paths."""
     public_keys: Mapping[str, bytes] = field(default_factory=dict)
     """The known public keys, by peer: they are sufficient for ``mac1``."""
 
     @classmethod
-    def between(cls, *peers: str, public_keys: Mapping[str, bytes] | None = None) -> AttackContext:
-        """The context with a link between each pair of these peers."""
-        directions = tuple(Direction(one, other) for one in peers for other in peers if one != other)
+    def between(cls, *peers: str, public_keys: Mapping[str, bytes] | None = None, paths: int = 1) -> AttackContext:
+        """The context with a link between each pair of these peers, along one path or more."""
+        directions = tuple(
+            Direction(one, other, path)
+            for path in range(1, paths + 1)
+            for one in peers
+            for other in peers
+            if one != other
+        )
         return cls(directions, public_keys or {})
 
     @property
@@ -150,15 +162,27 @@ class AttackContext:
         return tuple(dict.fromkeys(direction.sender for direction in self.directions))
 
     def select(self, text: str) -> tuple[Direction, ...]:
-        """The directions that ``both`` or ``A>B`` means.
+        """The directions that ``both`` or ``A>B`` means: of all paths, or with ``/2`` behind it of the second one.
 
         Raises:
             AttackError: there is no such direction.
         """
-        chosen = tuple(direction for direction in self.directions if text in ("both", str(direction)))
+        wanted, _, path = text.partition("/")
+        chosen = tuple(
+            direction
+            for direction in self.directions
+            if wanted in ("both", f"{direction.sender}>{direction.receiver}") and path in ("", str(direction.path))
+        )
         if not chosen:
-            raise AttackError(f"direction must be both or one of {', '.join(map(str, self.directions))}")
+            hint = "; /2 behind it means the second path" if any(one.path > 1 for one in self.directions) else ""
+            listed = dict.fromkeys(f"{direction.sender}>{direction.receiver}" for direction in self.directions)
+            raise AttackError(f"direction must be both or one of {', '.join(listed)}{hint}")
         return chosen
+
+    def check_path(self, number: int) -> None:
+        """Raise AttackError if there is no path with this number."""
+        if not any(direction.path == number for direction in self.directions):
+            raise AttackError(f"there is no path {number}: configure another link between the same two peers")
 
 
 class Options(BaseModel):
@@ -168,7 +192,7 @@ class Options(BaseModel):
 
     begin_s: float = Field(0.0, ge=0, description="seconds before the attack begins")
     seconds: float | None = Field(None, gt=0, description="duration of the attack in seconds")
-    direction: str = Field("both", description="both, or one direction: A>B")
+    direction: str = Field("both", description="both, or one direction: A>B; of one path: both/2, A>B/2")
     share: float = Field(1.0, gt=0, le=1, description="share of the matching datagrams that are attacked")
     skip: int = Field(0, ge=0, description="number of matching datagrams that pass first")
     limit: int | None = Field(None, ge=1, description="maximum number of attacked datagrams")
@@ -358,24 +382,6 @@ class Timed(Attack[T]):
             Send(datagram, direction, stranger),
             self.note(Operation.INJECTED, datagram, direction, now, detail + origin, own=True),
         ]
-
-
-KindFilter = Literal["any", "handshake", "initiation", "response", "cookie", "envelope", "report"]
-KINDS: Final = "any, handshake, initiation, response, cookie, envelope, or report (a refusal report in the clear)"
-
-
-def matches_kind(kinds: KindFilter, datagram: bytes) -> bool:
-    """Whether a datagram is of the kinds that the parameter names."""
-    kind = kind_of(datagram)
-    match kinds:
-        case "any":
-            return True
-        case "handshake":
-            return kind in HANDSHAKE
-        case "report":
-            return is_refusal_report(datagram)
-        case _:
-            return kind.value == kinds
 
 
 def describe_options(model: type[Options]) -> list[tuple[str, Any, str]]:

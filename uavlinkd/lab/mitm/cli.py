@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import json
 import math
 import os
 import sys
@@ -20,6 +19,8 @@ from uavlinkd import __version__
 from uavlinkd.endpoints.sockets import BindError
 from uavlinkd.lab.mitm.attack import AttackError
 from uavlinkd.lab.mitm.attacks import list_attacks, parse_attack
+from uavlinkd.lab.mitm.console import FAILED, OK, WRONG, fail, run_until_stopped, send_request
+from uavlinkd.lab.mitm.modem_cli import modem_main
 from uavlinkd.lab.mitm.proxy import REQUESTS, Proxy
 from uavlinkd.lab.mitm.proxy_settings import (
     ProxySettings,
@@ -30,18 +31,17 @@ from uavlinkd.lab.mitm.proxy_settings import (
     parse_peer,
     parse_radio,
 )
-from uavlinkd.ops.control import ControlError, ask
+from uavlinkd.ops.control import ControlError
 from uavlinkd.ops.log import set_up_logging
-from uavlinkd.system.signals import on_signal
-from uavlinkd.system.terminal import printable
 
-OK, FAILED, WRONG = 0, 1, 2
 _EPILOG = """\
 Example: drone0 listens on port 5791 of this machine and drone1 on port 5792. In drone0's configuration, drone1 has
 the address 127.0.0.1:5801; in drone1's, drone0 has 127.0.0.1:5802:
 
   uavlink-mitm --peer drone0=127.0.0.1:5791 --peer drone1=127.0.0.1:5792 \\
       --link drone0@127.0.0.1:5801,drone1@127.0.0.1:5802 --attack replay-data,share=0.1 --radio loss=0.05,delay_s=0.02
+
+`uavlink-mitm modem --help`: emulated telemetry modems between two serial ports, and attacks on the line.
 
 Attack only your own links.
 """
@@ -119,11 +119,14 @@ def _parser() -> argparse.ArgumentParser:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command and return its exit status."""
-    options = _parser().parse_args(arguments)
+    words = sys.argv[1:] if arguments is None else arguments
+    if words[:1] == ["modem"]:
+        return modem_main(words[1:])
+    options = _parser().parse_args(words)
     if options.list:
         return _list()
     if options.seconds is not None and not (math.isfinite(options.seconds) and options.seconds > 0):
-        return _fail("--seconds must be a number above 0", WRONG)
+        return fail("--seconds must be a number above 0", WRONG)
     try:
         settings = load_proxy_settings(options.config) if options.config is not None else ProxySettings((), ())
         settings = overridden(
@@ -137,19 +140,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
             control_socket=options.control_socket,
         )
     except SettingsError as error:
-        return _fail(error, WRONG)
+        return fail(error, WRONG)
     if options.ask is not None:
-        return _ask(settings.control_socket, options.ask)
+        if settings.control_socket is None:
+            return fail("--ask needs --control-socket, or a --config that names one", WRONG)
+        return send_request(settings.control_socket, options.ask)
     problems = settings.check()
     if problems:
-        return _fail("\n".join(problems), WRONG)
+        return fail("\n".join(problems), WRONG)
     set_up_logging("info", "auto")
     try:
         asyncio.run(run(settings, options.seconds))
     except (BindError, ControlError, AttackError) as error:
-        return _fail(error)
+        return fail(error)
     except OSError as error:
-        return _fail(f"cannot write the log {settings.log}: {error.strerror or error}")
+        return fail(f"cannot write the log {settings.log}: {error.strerror or error}")
     return OK
 
 
@@ -160,15 +165,7 @@ async def run(settings: ProxySettings, seconds: float | None = None) -> None:
         BindError, AttackError, ControlError, OSError: see :meth:`Proxy.start`.
     """
     proxy = Proxy(settings)
-    for name in ("SIGTERM", "SIGINT"):
-        on_signal(name, proxy.stopping.set)
-    await proxy.start()
-    try:
-        with suppress(TimeoutError):
-            async with asyncio.timeout(seconds):
-                await proxy.stopping.wait()
-    finally:
-        await proxy.stop()
+    await run_until_stopped(proxy, seconds, lambda: None)
 
 
 def _list() -> int:
@@ -179,21 +176,3 @@ def _list() -> int:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILED
     return OK
-
-
-def _ask(path: Path | None, request: str) -> int:
-    if path is None:
-        return _fail("--ask needs --control-socket, or a --config that names one", WRONG)
-    try:
-        answer = ask(path, request)
-    except ControlError as error:
-        return _fail(error)
-    if "refused" in answer:
-        return _fail(answer["refused"])
-    print(json.dumps(answer, indent=2))
-    return OK
-
-
-def _fail(problem: object, status: int = FAILED) -> int:
-    print(printable(str(problem), keep="\n"), file=sys.stderr)
-    return status

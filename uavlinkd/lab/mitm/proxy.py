@@ -25,6 +25,7 @@ from uavlinkd.lab.mitm.attacks import parse_attack
 from uavlinkd.lab.mitm.channel import AttackChannel
 from uavlinkd.lab.mitm.journal import Journal
 from uavlinkd.lab.mitm.proxy_settings import ProxySettings
+from uavlinkd.lab.mitm.radio import RadioSettings
 from uavlinkd.ops.control import ControlServer
 from uavlinkd.system.addresses import Address
 
@@ -49,8 +50,8 @@ class Proxy:
         self.settings = settings
         self.context: AttackContext = settings.context
         self.log = structlog.get_logger().bind(daemon="mitm")
-        self.listeners: dict[tuple[str, str], Sockaddr] = {}
-        """The address at which the first peer reaches the second."""
+        self.listeners: dict[Direction, Sockaddr] = {}
+        """The address at which the sender reaches the receiver."""
         self.sent: Counter[Direction] = Counter()
         self.received: Counter[Direction] = Counter()
         self.stranger_bytes_sent: Counter[tuple[str, int]] = Counter()
@@ -61,9 +62,9 @@ class Proxy:
         """Datagrams that were not forwarded, by reason."""
         self._attacks = attacks
         self._now = monotonic()
-        self._sockets: dict[tuple[str, str], socket.socket] = {}
+        self._sockets: dict[Direction, socket.socket] = {}
         self._strangers: dict[tuple[int, int], socket.socket] = {}
-        self._addresses: dict[str, Sockaddr] = {}
+        self._addresses: dict[tuple[str, int], Sockaddr] = {}  # by peer and path
         self._is_fixed = {peer.name: peer.address is not None for peer in settings.peers}
         self._timer: asyncio.TimerHandle | None = None
         self._timer_at = NEVER
@@ -97,13 +98,13 @@ class Proxy:
             if self._control is not None:
                 await self._control.stop()
             raise
-        for (peer, other), sock in self._sockets.items():
-            self._loop.add_reader(sock, self._on_listener_readable, sock, Direction(peer, other))
+        for direction, sock in self._sockets.items():
+            self._loop.add_reader(sock, self._on_listener_readable, sock, direction)
         self.journal.event(
             "mitm_started",
             self._now,
             seed=self.settings.seed,
-            listeners={f"{peer} reaches {other}": str(Address(*at)) for (peer, other), at in self.listeners.items()},
+            listeners={str(direction): str(Address(*at)) for direction, at in self.listeners.items()},
             attacks=self._names(),
         )
         self._arm()
@@ -135,14 +136,14 @@ class Proxy:
                 except OSError as error:
                     raise BindError(f"cannot resolve {peer.name} at {peer.address}: {error.strerror}") from None
                 host, port = addresses[0][4][:2]
-                self._addresses[peer.name] = str(host), int(port)
+                for direction in self.context.directions:
+                    if direction.sender == peer.name:
+                        self._addresses[peer.name, direction.path] = str(host), int(port)
 
     def _bind(self) -> None:
-        for link in self.settings.links:
-            for peer, other, address in zip(link.peers, link.peers[::-1], link.listen, strict=True):
-                sock = udp_socket(address)
-                self._sockets[peer, other] = sock
-                self.listeners[peer, other] = sock.getsockname()[:2]
+        for direction, address in self.settings.listeners.items():
+            sock = self._sockets[direction] = udp_socket(address)
+            self.listeners[direction] = sock.getsockname()[:2]
 
     def _close_sockets(self) -> None:
         for sock in (*self._sockets.values(), *self._strangers.values()):
@@ -154,6 +155,17 @@ class Proxy:
         """Replace the attacks. Datagrams that the old ones hold are lost."""
         self.channel.attacks = tuple(attacks)
         self.journal.event("attacks_changed", monotonic(), attacks=self._names())
+        self._arm()
+
+    def change_radio(self, directions: str, settings: RadioSettings) -> None:
+        """Replace the settings of radios. ``directions`` is ``both`` or ``A>B``. Datagrams in flight stay in flight.
+
+        Raises:
+            AttackError: there is no such direction.
+            KeyError: a direction has no radio.
+        """
+        for direction in self.context.select(directions):
+            self.channel.radios[direction].settings = settings
         self._arm()
 
     def pause(self) -> None:
@@ -223,7 +235,7 @@ class Proxy:
     # Datagrams.
 
     def _on_listener_readable(self, sock: socket.socket, direction: Direction) -> None:
-        now = monotonic()
+        now, end = monotonic(), (direction.sender, direction.path)
         for _ in range(DATAGRAMS_PER_WAKE_UP):
             try:
                 datagram, source = sock.recvfrom(RECEIVE_BYTES)
@@ -233,11 +245,11 @@ class Proxy:
                 self._count_error(error)
                 continue
             if self._is_fixed[direction.sender]:
-                if source[:2] != self._addresses[direction.sender]:
+                if source[:2] != self._addresses[end]:
                     self.errors["unknown sender"] += 1
                     continue
             else:
-                self._addresses[direction.sender] = source[:2]
+                self._addresses[end] = source[:2]
             self.received[direction] += 1
             self._perform(self.channel.on_datagram(datagram, direction, now))
         self._arm()
@@ -252,7 +264,7 @@ class Proxy:
             except OSError as error:
                 self._count_error(error)
                 continue
-            peer = next((name for name, at in self._addresses.items() if at == source[:2]), None)
+            peer = next((name for (name, _), at in self._addresses.items() if at == source[:2]), None)
             if peer is None:
                 self.errors["unknown sender"] += 1
                 continue
@@ -267,8 +279,8 @@ class Proxy:
                 self.journal.add(action)
                 continue
             datagram, direction, stranger = action
-            to = self._addresses.get(direction.receiver)
-            sock = self._sockets.get((direction.receiver, direction.sender)) if to and stranger is None else None
+            to = self._addresses.get((direction.receiver, direction.path))
+            sock = self._sockets.get(direction.reverse) if to and stranger is None else None
             try:
                 if to is not None and stranger is not None:
                     sock = self._stranger(stranger, to)

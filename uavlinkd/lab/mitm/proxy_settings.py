@@ -8,6 +8,7 @@ from __future__ import annotations
 import base64
 import binascii
 import tomllib
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -47,7 +48,10 @@ class MitmPeer:
 
 @dataclass(frozen=True, slots=True)
 class MitmLink:
-    """Two peers, and the addresses of the man in the middle where each reaches the other."""
+    """Two peers, and the addresses of the man in the middle where each reaches the other.
+
+    A second link between the same peers is a second path.
+    """
 
     peers: tuple[str, str]
     listen: tuple[Address, Address]
@@ -62,20 +66,29 @@ class ProxySettings:
     links: tuple[MitmLink, ...]
     attacks: tuple[AttackSpec, ...] = ()
     radios: tuple[tuple[str, RadioSettings], ...] = ()
-    """Direction (``both`` or ``A>B``) and settings. The last entry for a direction applies."""
+    """Direction (``both``, ``A>B``, or of one path ``both/2``) and settings. The last entry applies."""
     seed: int = 0
     log: Path | None = None
     log_detail: int = LOG_DETAIL
     control_socket: Path | None = None
 
     @property
+    def listeners(self) -> dict[Direction, Address]:
+        """Where the sender of each direction reaches the receiver. Links between the same peers are paths."""
+        listeners: dict[Direction, Address] = {}
+        paths = Counter[frozenset[str]]()
+        for link in self.links:
+            pair = frozenset(link.peers)
+            paths[pair] += 1
+            direction = Direction(*link.peers, paths[pair])
+            listeners[direction], listeners[direction.reverse] = link.listen
+        return listeners
+
+    @property
     def context(self) -> AttackContext:
         """The directions and public keys that the attacks know."""
-        directions = tuple(
-            direction for link in self.links for direction in (Direction(*link.peers), Direction(*link.peers).reverse)
-        )
         keys = {peer.name: peer.public_key for peer in self.peers if peer.public_key is not None}
-        return AttackContext(directions, keys)
+        return AttackContext(tuple(self.listeners), keys)
 
     def radio_of(self) -> dict[Direction, RadioSettings]:
         """The radio of each direction that has one.
@@ -100,8 +113,6 @@ class ProxySettings:
             unknown = [name for name in link.peers if name not in names]
             if unknown or link.peers[0] == link.peers[1]:
                 problems.append(f"link[{number}].between: must name two of the peers, which are {', '.join(names)}")
-        if len({frozenset(link.peers) for link in self.links}) < len(self.links):
-            problems.append("link: there are two links between the same peers: remove one")
         listening = [address for link in self.links for address in link.listen if address.port]
         if len(set(listening)) < len(listening):
             problems.append("link: a listen address is used twice: each must be unique")

@@ -93,6 +93,8 @@ class RadioSettings:
     overhead_bytes: int = 28
     """Added to each datagram's length: the headers of IPv4 and UDP."""
     outages: tuple[Outage, ...] = ()
+    is_stalled: bool = False
+    """Nothing arrives until other settings end the stall. Then everything arrives that was due meanwhile."""
     in_flight_limit: int = 65536
     """The maximum number of datagrams in flight; more are dropped. It bounds memory and does not model a radio."""
 
@@ -176,14 +178,14 @@ class Radio:
     def due(self, now: float) -> list[bytes]:
         """Pop the datagrams that have arrived by ``now``, in the order of arrival."""
         arrived: list[bytes] = []
-        while self._in_flight and self._in_flight[0][0] <= now:
+        while not self.settings.is_stalled and self._in_flight and self._in_flight[0][0] <= now:
             arrived.append(heapq.heappop(self._in_flight)[2])
         self.outcomes[Outcome.DELIVERED] += len(arrived)
         return arrived
 
     def next_deadline(self) -> float:
-        """The time of the next arrival; infinity if nothing is in flight."""
-        return self._in_flight[0][0] if self._in_flight else math.inf
+        """The time of the next arrival; infinity if nothing is in flight, or during a stall."""
+        return self._in_flight[0][0] if self._in_flight and not self.settings.is_stalled else math.inf
 
     @property
     def in_flight(self) -> int:

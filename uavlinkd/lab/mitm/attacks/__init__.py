@@ -57,6 +57,7 @@ _ALL: tuple[type[Attack[Any]], ...] = (
     withholding.BlockRekey,
     withholding.Blackout,
     withholding.Hold,
+    withholding.Move,
     withholding.Cross,
     withholding.Reorder,
     stretch.Stretch,

@@ -12,18 +12,16 @@ from uavlinkd.core import constants as c
 from uavlinkd.core import wire
 from uavlinkd.lab.mitm.anatomy import HANDSHAKE, DatagramKind, envelope_of, kind_of, mavlink_frame, with_mac1
 from uavlinkd.lab.mitm.attack import (
-    KINDS,
     STRANGERS,
     Action,
     Alteration,
     AttackContext,
     Direction,
-    KindFilter,
     Options,
     Timed,
     TimedOptions,
-    matches_kind,
 )
+from uavlinkd.lab.mitm.kinds import KINDS, KindFilter, matches_kind
 
 
 class ForgeryOptions(Options):

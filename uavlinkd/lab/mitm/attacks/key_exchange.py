@@ -15,7 +15,8 @@ from uavlinkd.core import constants as c
 from uavlinkd.core import wire
 from uavlinkd.core.suites import SUITES_BY_NAME, X25519, Suite
 from uavlinkd.lab.mitm.anatomy import DatagramKind, Parts, kind_of, message_bytes, parts_of, with_mac1
-from uavlinkd.lab.mitm.attack import Alteration, AttackContext, Direction, Options, matches_kind
+from uavlinkd.lab.mitm.attack import Alteration, AttackContext, Direction, Options
+from uavlinkd.lab.mitm.kinds import matches_kind
 
 Message = Literal["handshake", "initiation", "response"]
 

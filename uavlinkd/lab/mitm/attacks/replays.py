@@ -15,7 +15,6 @@ from pydantic import Field
 from uavlinkd.lab.mitm.anatomy import DatagramKind, has_cookie, kind_of
 from uavlinkd.lab.mitm.attack import (
     CATCH_UP_LIMIT,
-    KINDS,
     NEVER,
     STRANGERS,
     Action,
@@ -23,12 +22,11 @@ from uavlinkd.lab.mitm.attack import (
     AttackContext,
     AttackError,
     Direction,
-    KindFilter,
     Operation,
     Options,
     Send,
-    matches_kind,
 )
+from uavlinkd.lab.mitm.kinds import KINDS, KindFilter, matches_kind
 
 RECORD_LIMIT = 4096
 """Datagrams recorded for a later replay; the oldest are discarded first."""
@@ -51,6 +49,7 @@ class ReplayOptions(Options):
     origin: Literal["sender", "stranger"] = Field(
         "sender", description="source of the replay: the sender's address, or a stranger's"
     )
+    onto: int = Field(0, ge=0, description="number of the path along which the replay is sent; 0: the same one")
 
 
 class Replay(Attack[ReplayOptions]):
@@ -66,6 +65,8 @@ class Replay(Attack[ReplayOptions]):
         self._scheduled: list[tuple[float, int, bytes, Direction]] = []
         self._number = 0
         self._last_seen_at: dict[str, float] = {}
+        if options.onto:
+            context.check_path(options.onto)
 
     def is_target(self, datagram: bytes) -> bool:
         """Whether to replay this datagram."""
@@ -73,7 +74,7 @@ class Replay(Attack[ReplayOptions]):
 
     def target(self, direction: Direction) -> Direction:
         """The direction of the replay."""
-        return direction
+        return direction.along(self.options.onto) if self.options.onto else direction
 
     def intercept(self, datagram: bytes, direction: Direction, now: float) -> list[Action]:
         """Pass the datagram and replay or record it."""

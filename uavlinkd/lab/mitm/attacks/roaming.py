@@ -7,19 +7,8 @@ from typing import Literal
 
 from pydantic import Field
 
-from uavlinkd.lab.mitm.attack import (
-    KINDS,
-    STRANGERS,
-    Action,
-    Attack,
-    AttackContext,
-    Direction,
-    KindFilter,
-    Operation,
-    Options,
-    Send,
-    matches_kind,
-)
+from uavlinkd.lab.mitm.attack import STRANGERS, Action, Attack, AttackContext, Direction, Operation, Options, Send
+from uavlinkd.lab.mitm.kinds import KINDS, KindFilter, matches_kind
 
 
 class RoamOptions(Options):
@@ -76,10 +65,15 @@ class WanderOptions(Options):
     kinds: KindFilter = Field("any", description=KINDS)
     sources: int = Field(64, ge=2, le=STRANGERS, description="number of strangers")
     every: int = Field(1, ge=1, description="number of datagrams until the address changes")
+    mode: Literal["relay", "race"] = Field(
+        "relay",
+        description="relay: only from the stranger, and the answers are relayed; race: from the stranger first, then"
+        " from the genuine address, without answers",
+    )
 
 
 class Wander(Attack[WanderOptions]):
-    """Forwards each datagram from another stranger, like a broken NAT, and relays the answers."""
+    """Forwards each datagram from another stranger, like a broken NAT. Relays the answers, unless it races."""
 
     name = "wander"
     catalogue = ("H20",)
@@ -96,7 +90,8 @@ class Wander(Attack[WanderOptions]):
         stranger = self.attempts // self.options.every % self.options.sources
         self._direction_of[direction.receiver, stranger] = direction  # at most peers times strangers
         note = self.note(Operation.FORWARDED, datagram, direction, now, f"from stranger {stranger}")
-        return [Send(datagram, direction, stranger), note]
+        actions: list[Action] = [Send(datagram, direction, stranger), note]
+        return [*actions, Send(datagram, direction)] if self.options.mode == "race" else actions
 
     def on_answer(self, datagram: bytes, peer: str, stranger: int, now: float) -> list[Action]:
         """Relay the answer to the sender of the forwarded datagram."""
@@ -104,4 +99,5 @@ class Wander(Attack[WanderOptions]):
         if direction is None:
             return []
         note = self.note(Operation.ANSWERED, datagram, direction.reverse, now, f"to stranger {stranger}", own=True)
-        return [Send(datagram, direction.reverse), note] if self.is_on(now) else [note]
+        is_relayed = self.is_on(now) and self.options.mode == "relay"
+        return [Send(datagram, direction.reverse), note] if is_relayed else [note]

@@ -8,16 +8,9 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from uavlinkd.core import wire
-from uavlinkd.lab.mitm.anatomy import HANDSHAKE, DatagramKind, envelope_of, kind_of
+from uavlinkd.lab.mitm.anatomy import HANDSHAKE, DatagramKind, is_echo, kind_of
 from uavlinkd.lab.mitm.attack import NEVER, Action, Attack, AttackContext, Direction, Operation, Options, Send
 from uavlinkd.lab.mitm.attacks.withholding import HELD_LIMIT
-
-_ECHO_BYTES = frozenset(
-    len(wire.Echo(is_reply, 0, 0, 0).encode()) + tag_bytes
-    for is_reply in (False, True)
-    for tag_bytes in wire.TAG_LENGTHS
-)
 
 
 class StretchOptions(Options):
@@ -113,12 +106,6 @@ class StretchOneWay(Stretch):
 
     def intercept(self, datagram: bytes, direction: Direction, now: float) -> list[Action]:
         """Drop the echoes that would show the age of the delayed frames."""
-        if direction.reverse in self._held and (self.options.back == "all" or _may_be_echo(datagram)):
+        if direction.reverse in self._held and (self.options.back == "all" or is_echo(datagram)):
             return self._drop(datagram, direction, now, "the direction of the answers")
         return super().intercept(datagram, direction, now)
-
-
-def _may_be_echo(datagram: bytes) -> bool:
-    """Whether an envelope, encrypted or not, has the length of an echo record."""
-    envelope = envelope_of(datagram)
-    return envelope is not None and len(datagram) - envelope.header_bytes in _ECHO_BYTES

@@ -10,19 +10,8 @@ from typing import ClassVar, Literal
 from pydantic import Field
 
 from uavlinkd.lab.mitm.anatomy import DatagramKind, envelope_of, kind_of, message_ids
-from uavlinkd.lab.mitm.attack import (
-    KINDS,
-    NEVER,
-    Action,
-    Attack,
-    AttackContext,
-    Direction,
-    KindFilter,
-    Operation,
-    Options,
-    Send,
-    matches_kind,
-)
+from uavlinkd.lab.mitm.attack import NEVER, Action, Attack, AttackContext, Direction, Operation, Options, Send
+from uavlinkd.lab.mitm.kinds import KINDS, KindFilter, matches_kind
 
 HELD_LIMIT = 65536
 """The maximum number of held datagrams, which bounds memory. More pass immediately."""
@@ -168,6 +157,7 @@ class HoldOptions(Options):
 
     kinds: KindFilter = Field("envelope", description=KINDS)
     hold_s: float = Field(30.0, gt=0, description="seconds until the release")
+    at_once: bool = Field(False, description="release all together, hold_s after the first was held")
 
 
 class Hold(Attack[HoldOptions]):
@@ -189,7 +179,9 @@ class Hold(Attack[HoldOptions]):
             or not self.should_attack()
         ):
             return [Send(datagram, direction)]
-        heapq.heappush(self._held, (now + self.options.hold_s, self.seen, datagram, direction))
+        is_later = self.options.at_once and bool(self._held)
+        until = self._held[0][0] if is_later else now + self.options.hold_s
+        heapq.heappush(self._held, (until, self.seen, datagram, direction))
         return [self.note(Operation.HELD, datagram, direction, now, f"for {self.options.hold_s:g} s")]
 
     def due(self, now: float) -> list[Action]:
@@ -207,6 +199,34 @@ class Hold(Attack[HoldOptions]):
     def next_deadline(self) -> float:
         """The time of the next release."""
         return self._held[0][0] if self._held else NEVER
+
+
+class MoveOptions(Options):
+    """The parameters of ``move``."""
+
+    kinds: KindFilter = Field("envelope", description=KINDS)
+    onto: int = Field(2, ge=1, description="number of the path along which they are sent")
+    beside: bool = Field(False, description="then pass the genuine datagram too")
+
+
+class Move(Attack[MoveOptions]):
+    """Sends datagrams of one path along another, before or instead of along their own."""
+
+    name = "move"
+    catalogue = ("D2", "D10")
+    options_model = MoveOptions
+
+    def __init__(self, options: MoveOptions, context: AttackContext, rng: Random, now: float) -> None:
+        super().__init__(options, context, rng, now)
+        context.check_path(options.onto)
+
+    def intercept(self, datagram: bytes, direction: Direction, now: float) -> list[Action]:
+        """Send the datagram along the other path."""
+        onto = direction.along(self.options.onto)
+        if onto == direction or not matches_kind(self.options.kinds, datagram) or not self.should_attack():
+            return [Send(datagram, direction)]
+        note = self.note(Operation.MISROUTED, datagram, onto, now, f"from {direction}")
+        return [Send(datagram, onto), note, *([Send(datagram, direction)] if self.options.beside else [])]
 
 
 class Cross(Attack[Options]):

@@ -1,0 +1,242 @@
+"""The emulated modems on pseudo-terminals: bytes, the plug, hosts that do not read, requests, the command line."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import json
+import os
+import time
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.waiting import until
+from uavlinkd.endpoints.line_framing import encode
+from uavlinkd.lab.mitm.cli import main
+from uavlinkd.lab.mitm.modem import Fate, ModemEnd, ModemSettings
+from uavlinkd.lab.mitm.modem_ports import ModemPorts, PortSettings, parse_modem
+from uavlinkd.ops.control import ask
+
+LEFT, RIGHT = ModemEnd.LEFT, ModemEnd.RIGHT
+FAST = ModemSettings(air_bits_s=1e6, line_baud=1e6, turn_around_s=0.001, has_flow_control=True)
+
+
+def settings_in(folder: Path, modem: ModemSettings = FAST, **others: Any) -> PortSettings:
+    """Devices and files in a folder."""
+    return PortSettings(folder / "left", folder / "right", modem, **others)
+
+
+@asynccontextmanager
+async def running(settings: PortSettings) -> AsyncIterator[ModemPorts]:
+    """Emulated modems while they run."""
+    ports = ModemPorts(settings)
+    await ports.start()
+    try:
+        yield ports
+    finally:
+        await ports.stop()
+
+
+class Host:
+    """A process with an open device."""
+
+    def __init__(self, device: Path) -> None:
+        self.fd = os.open(device, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+        self.received = b""
+
+    def has(self, data: bytes) -> Callable[[], bool]:
+        """A condition: it received this."""
+
+        def look() -> bool:
+            with suppress(BlockingIOError):
+                self.received += os.read(self.fd, 65536)
+            return data in self.received
+
+        return look
+
+    def write(self, data: bytes) -> None:
+        """Write all of it."""
+        assert os.write(self.fd, data) == len(data)
+
+    def close(self) -> None:
+        """Close the device."""
+        os.close(self.fd)
+
+
+async def test_bytes_cross_unchanged(tmp_path: Path) -> None:
+    """All values, in both directions: the terminals are raw."""
+    async with running(settings_in(tmp_path)) as ports:
+        left, right = Host(tmp_path / "left"), Host(tmp_path / "right")
+        left.write(bytes(range(256)))
+        await until(right.has(bytes(range(256))))
+        right.write(bytes(range(255, -1, -1)))
+        await until(left.has(bytes(range(255, -1, -1))))
+        left.close()
+        right.close()
+        assert ports.link.bytes[RIGHT][Fate.DELIVERED] == 256
+    assert not os.listdir(tmp_path)
+
+
+async def test_pulled_modem_fails_and_comes_back(tmp_path: Path) -> None:
+    """The device vanishes, a process that has it open gets an error, and the new device works."""
+    async with running(settings_in(tmp_path, log=tmp_path / "log")) as ports:
+        left, right = Host(tmp_path / "left"), Host(tmp_path / "right")
+        ports.pull(LEFT)
+        ports.pull(LEFT)
+        assert not (tmp_path / "left").is_symlink()
+        with pytest.raises(OSError) as failure:  # noqa: PT011  the number matters
+            os.write(left.fd, b"x")
+        assert failure.value.errno == errno.EIO
+        left.close()
+        right.write(b"lost")
+        await until(lambda: ports.link.bytes[LEFT][Fate.UNPLUGGED] == 4)
+        ports.plug(LEFT)
+        ports.plug(LEFT)
+        left = Host(tmp_path / "left")
+        right.write(b"again")
+        await until(left.has(b"again"))
+        assert left.received == b"again"
+        left.close()
+        right.close()
+    events = [json.loads(line)["event"] for line in (tmp_path / "log").read_text().splitlines()]
+    assert events == ["modem_started", "modem_pulled", "modem_plugged", "modem_stopped"]
+
+
+async def test_host_that_does_not_read_stops_nothing(tmp_path: Path) -> None:
+    """Its bytes are lost and counted when its kernel holds no more. The other direction works."""
+    async with running(settings_in(tmp_path)) as ports:
+        left, right = Host(tmp_path / "left"), Host(tmp_path / "right")
+
+        def flood() -> bool:
+            with suppress(BlockingIOError):
+                os.write(left.fd, bytes(4096))
+            return ports.stalled[RIGHT] > 0
+
+        await until(flood)
+        right.write(b"still here")
+        await until(left.has(b"still here"))
+        left.close()
+        right.close()
+
+
+async def test_emulator_sleeps(tmp_path: Path) -> None:
+    """Also while the host's kernel is full at a slow line: the CPU time is a small part of what a loop would use."""
+    slow = ModemSettings(line_baud=1_200, air_bits_s=1_200)
+    async with running(settings_in(tmp_path, slow)) as ports:
+        left = Host(tmp_path / "left")
+        for _ in range(20):
+            try:
+                os.write(left.fd, bytes(4096))
+            except BlockingIOError:
+                break
+        await until(lambda: ports.link.bytes[LEFT][Fate.WRITTEN] >= slow.host_bytes)
+        began_cpu, began = time.process_time(), time.monotonic()
+        await until(lambda: time.monotonic() - began >= 1)
+        assert time.process_time() - began_cpu < 0.5
+        left.close()
+
+
+async def test_requests(tmp_path: Path) -> None:
+    """Each request of the control socket, and refusals that name what is wrong."""
+    path = tmp_path / "control"
+
+    async def asked(request: str) -> dict[str, Any]:
+        return await asyncio.to_thread(ask, path, request)
+
+    async with running(settings_in(tmp_path, control_socket=path, log=tmp_path / "log")) as ports:
+        right = Host(tmp_path / "right")
+        assert await asked("inject right 00ff10") == {"done": "inject right 00ff10"}
+        await until(right.has(b"\x00\xff\x10"))
+        await asked("set packet_loss=0.5 byte_error_rate=0.25")
+        assert (ports.link.settings.packet_loss, ports.link.settings.byte_error_rate) == (0.5, 0.25)
+        await asked("attack line-noise,end=left,interval_s=0.01 line-forge,interval_s=0.01")
+        await until(lambda: ports.journal.counts.total() > 5)
+        assert (await asked("statistics"))["attacks"] == ["line-noise", "line-forge"]
+        await asked("attack none")
+        assert ports.attacker.names == []
+        await asked("hold right 100")
+        await asked("hold left")
+        await asked("release right")
+        await asked("pull left")
+        assert not ports.link.is_plugged(LEFT)
+        statistics = await asked("statistics")
+        assert statistics["modems"]["left"]["is_plugged"] is False
+        assert statistics["interventions"]["hold: held"] == 2
+        await asked("plug left")
+        assert ports.link.is_plugged(LEFT)
+        for wrong, message in (
+            ("pull middle", "left or right"),
+            ("inject left xy", "hexadecimal"),
+            ("set loss=1", "packet_loss"),
+            ("set packet_loss=2", "share"),
+            ("set packet_loss=much", "float"),
+            ("set has_flow_control=1", "bool"),
+            ("attack line", "line-noise"),
+            ("jump", "no request"),
+        ):
+            assert message in (await asked(wrong))["refused"], wrong
+        await asked("stop")
+        assert ports.stopping.is_set()
+        right.close()
+
+
+async def test_frames_are_recorded_and_replayed(tmp_path: Path) -> None:
+    """The attacker reads the lines."""
+    async with running(settings_in(tmp_path)) as ports:
+        left, right = Host(tmp_path / "left"), Host(tmp_path / "right")
+        left.write(encode(b"a genuine datagram"))
+        await until(right.has(encode(b"a genuine datagram")))
+        assert list(ports.attacker.recorded(RIGHT)) == [b"a genuine datagram"]
+        left.close()
+        right.close()
+
+
+def test_modem_text_is_parsed() -> None:
+    """Numbers, whole numbers and truth values."""
+    parsed = parse_modem("air_bits_s=4000, queue_bytes=1000,cuts_at_start=true", ModemSettings())
+    assert parsed == replace(ModemSettings(), air_bits_s=4000.0, queue_bytes=1000, cuts_at_start=True)
+
+
+def test_stale_link_is_replaced_but_no_other_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A killed emulator leaves a link to a pseudo-terminal. A file of the user stays."""
+    (tmp_path / "left").symlink_to("/dev/pts/1234567")
+    (tmp_path / "right").write_text("mine")
+    arguments = ["modem", f"--left={tmp_path}/left", f"--right={tmp_path}/right", "--seconds=0.05"]
+    assert main(arguments) == 1
+    assert str(tmp_path / "right") in capsys.readouterr().err
+    assert (tmp_path / "right").read_text() == "mine"
+    assert not (tmp_path / "left").is_symlink()
+    (tmp_path / "right").unlink()
+    assert main(arguments) == 0
+    printed = capsys.readouterr().out
+    assert json.loads(printed[printed.index("{\n") :])["modems"]["left"]["is_plugged"] is True
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "--left and --right"),
+        (["--left=a", "--right=a"], "--left and --right"),
+        (["--left=a", "--right=b", "--set=loss=1"], "packet_loss"),
+        (["--left=a", "--right=b", "--attack=drop"], "line-noise"),
+        (["--left=a", "--right=b", "--seconds=0"], "--seconds"),
+        (["--ask=statistics"], "--control-socket"),
+    ],
+)
+def test_wrong_command_line_ends_with_status_2(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Before anything is made."""
+    assert main(["modem", *arguments]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_list_prints_the_attacks_on_the_line(capsys: pytest.CaptureFixture[str]) -> None:
+    """With their parameters."""
+    assert main(["modem", "--list"]) == 0
+    assert "line-forge" in capsys.readouterr().out

@@ -1,0 +1,239 @@
+"""Attacks on a serial line between two daemons, by a modem's firmware or a device on the wires. Sans-IO, seeded.
+
+The attacker reads what comes out of both modems, puts bytes on the lines to the hosts, and can hold modems back. It
+has no keys. So it can make a valid frame of the line (COBS and CRC), but no valid envelope.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from random import Random
+from types import MappingProxyType
+from typing import Final, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from uavlinkd.core import wire
+from uavlinkd.endpoints.line_framing import DELIMITER, LineDecoder, encode
+from uavlinkd.lab.mitm.anatomy import DatagramKind, kind_of
+from uavlinkd.lab.mitm.attack import NEVER, AttackError, Direction, Intervention, Operation
+from uavlinkd.lab.mitm.modem import ModemEnd, ModemLink
+
+RECORD_LIMIT: Final = 1024
+"""Datagrams recorded at each end, for replays and forgeries."""
+CATCH_UP_LIMIT: Final = 256
+"""Interventions of one call of :meth:`LineAttacker.due`. Those beyond it are never made."""
+_FORGED_BYTES = 40
+
+
+class LineAttack(BaseModel):
+    """An attack on the line, with its parameters. Unknown ones are refused."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, hide_input_in_errors=True, allow_inf_nan=False)
+
+    name: str
+    end: Literal["left", "right", "both"] = Field("both", description="the host that is attacked")
+    begin_s: float = Field(0.0, ge=0, description="seconds before the attack begins")
+    interval_s: float = Field(0.2, gt=0, description="seconds between two interventions")
+    limit: int | None = Field(None, ge=1, description="most interventions")
+    size: int = Field(64, ge=1, le=4096, description="line-noise: bytes at once")
+    hold_s: float = Field(10.0, gt=0, description="line-hold: duration of a hold in seconds")
+
+    @property
+    def ends(self) -> tuple[ModemEnd, ...]:
+        """The hosts that are attacked."""
+        return tuple(ModemEnd) if self.end == "both" else (ModemEnd(self.end),)
+
+
+class LineAttacker:
+    """Attacks on both lines of a :class:`.ModemLink`.
+
+    Args:
+        link: the modems.
+        rng: the random source.
+        on_done: gets each intervention, for the log.
+    """
+
+    def __init__(self, link: ModemLink, rng: Random, on_done: Callable[[Intervention], object]) -> None:
+        self._link = link
+        self._rng = rng
+        self._on_done = on_done
+        self._decoders = {end: LineDecoder() for end in ModemEnd}
+        self._recorded: dict[ModemEnd, deque[bytes]] = {end: deque(maxlen=RECORD_LIMIT) for end in ModemEnd}
+        self._attacks: list[_Running] = []
+        self._number = 0
+
+    @property
+    def names(self) -> list[str]:
+        """The attacks that run."""
+        return [running.attack.name for running in self._attacks]
+
+    def recorded(self, end: ModemEnd) -> Sequence[bytes]:
+        """The last datagrams that came out at an end."""
+        return self._recorded[end]
+
+    def observe(self, end: ModemEnd, data: bytes) -> None:
+        """Bytes came out at an end."""
+        self._recorded[end].extend(self._decoders[end].feed(data))
+
+    def change(self, attacks: Sequence[LineAttack], now: float) -> None:
+        """Run these attacks from now on, in place of the others."""
+        self._attacks = [_Running(attack, now + attack.begin_s) for attack in attacks]
+
+    def next_deadline(self) -> float:
+        """The time of the next call of :meth:`due`."""
+        return min((running.next_at for running in self._attacks), default=NEVER)
+
+    def due(self, now: float) -> None:
+        """Do what is due at ``now``."""
+        for _ in range(CATCH_UP_LIMIT):
+            running = min(self._attacks, key=lambda one: one.next_at, default=None)
+            if running is None or running.next_at > now:
+                return
+            running.schedule(now)
+            for end in running.attack.ends:
+                self.attack(running.attack, end, now)
+
+    def attack(self, attack: LineAttack, end: ModemEnd, now: float) -> None:
+        """Make one intervention at an end."""
+        if attack.name == "line-hold":
+            self._link.hold(end, now + attack.hold_s, now)
+            self._note(attack.name, Operation.HELD, end, b"", now, f"for {attack.hold_s:g} s")
+            return
+        data, detail = _MAKERS[attack.name](attack, self._recorded[end], self._rng, self._number)
+        if data:
+            self._link.inject(end, data, now)
+            self._note(attack.name, Operation.INJECTED, end, data, now, detail)
+
+    def _note(self, name: str, operation: Operation, end: ModemEnd, data: bytes, now: float, detail: str) -> None:
+        self._number += 1
+        direction, kind = Direction(end.other, end), _kind_in(data)
+        self._on_done(Intervention(now, name, operation, direction, 0, kind, len(data), detail))
+
+
+class _Running:
+    """An attack, and when it acts next."""
+
+    def __init__(self, attack: LineAttack, begin_at: float) -> None:
+        self.attack = attack
+        self.next_at = begin_at
+        self._left = math.inf if attack.limit is None else attack.limit
+
+    def schedule(self, now: float) -> None:
+        """It acts now."""
+        self._left -= 1
+        # After a pause of the process, do not catch up on more than one call allows.
+        earliest = now - CATCH_UP_LIMIT * self.attack.interval_s
+        self.next_at = max(self.next_at, earliest) + self.attack.interval_s if self._left else NEVER
+
+
+def _kind_in(data: bytes) -> DatagramKind:
+    """The kind of the first datagram in bytes of the line."""
+    datagrams = LineDecoder().feed(data)
+    return kind_of(datagrams[0]) if datagrams else DatagramKind.OTHER
+
+
+# What is put on the line. Each maker returns bytes, none if it needs a recorded datagram first, and a detail.
+
+Made = tuple[bytes, str]
+
+
+def _noise(attack: LineAttack, recorded: Sequence[bytes], rng: Random, number: int) -> Made:
+    del recorded, number
+    return rng.randbytes(attack.size), ""
+
+
+def _bad_crc(attack: LineAttack, recorded: Sequence[bytes], rng: Random, number: int) -> Made:
+    del attack, number
+    datagram = rng.choice(recorded) if recorded else _invented(rng)
+    return DELIMITER + damaged(encode(datagram), rng) + DELIMITER, ""
+
+
+def _forge(attack: LineAttack, recorded: Sequence[bytes], rng: Random, number: int) -> Made:
+    """In turn: a genuine datagram with one bit changed, and an envelope that is invented."""
+    del attack
+    if recorded and number % 2:
+        datagram = bytearray(rng.choice(recorded))
+        at = rng.randrange(len(datagram))
+        datagram[at] ^= 1 << rng.randrange(8)
+        return DELIMITER + encode(bytes(datagram)), f"bit in byte {at}"
+    return DELIMITER + encode(_invented(rng)), "invented"
+
+
+def _replay(attack: LineAttack, recorded: Sequence[bytes], rng: Random, number: int) -> Made:
+    del attack, number
+    return (DELIMITER + encode(rng.choice(recorded)), "") if recorded else (b"", "")
+
+
+def _cut(attack: LineAttack, recorded: Sequence[bytes], rng: Random, number: int) -> Made:
+    """The first bytes of a genuine frame: one more each time."""
+    del attack, rng
+    if not recorded:
+        return b"", ""
+    framed = encode(recorded[-1])
+    at = number % len(framed)
+    return DELIMITER + framed[:at], f"at {at} of {len(framed)}"
+
+
+def _invented(rng: Random) -> bytes:
+    return bytes((wire.SHORT_ENVELOPE,)) + rng.randbytes(_FORGED_BYTES)
+
+
+def damaged(framed: bytes, rng: Random) -> bytes:
+    """A frame of the line, without its delimiter, of which one byte is another that is not a delimiter."""
+    data = bytearray(framed.removesuffix(DELIMITER))
+    at = rng.randrange(len(data))
+    data[at] = rng.choice([byte for byte in range(1, 256) if byte != data[at]])
+    return bytes(data)
+
+
+_MAKERS: Final = MappingProxyType(
+    {
+        "line-noise": _noise,
+        "line-bad-crc": _bad_crc,
+        "line-forge": _forge,
+        "line-replay": _replay,
+        "line-cut": _cut,
+    }
+)
+LINE_ATTACKS: Final[Mapping[str, str]] = MappingProxyType(
+    {
+        "line-noise": "random bytes between and inside the frames of the line",
+        "line-bad-crc": "frames of the line with one altered byte",
+        "line-forge": "forged and altered datagrams in frames with a valid CRC",
+        "line-replay": "datagrams that were received before, in frames with a valid CRC",
+        "line-cut": "genuine frames cut off, after one byte more each time",
+        "line-hold": "everything is held back in the modem, and then released",
+    }
+)
+"""What each attack puts on the line."""
+
+
+def list_line_attacks() -> str:
+    """Every attack, and the parameters, for the command line."""
+    width = max(map(len, LINE_ATTACKS))
+    lines = [f"{name:<{width}}  {text}" for name, text in LINE_ATTACKS.items()]
+    lines += ["", "parameters of every attack:"]
+    for name, field in LineAttack.model_fields.items():
+        if name != "name":
+            lines.append(f"  {name}={'' if field.default is None else field.default}: {field.description}")
+    return "\n".join(lines)
+
+
+def parse_line_attack(text: str) -> LineAttack:
+    """Parse ``NAME,key=value,key=value``.
+
+    Raises:
+        AttackError: there is no such attack, or a parameter is wrong.
+    """
+    name, *pairs = (part.strip() for part in text.split(","))
+    if name not in LINE_ATTACKS:
+        raise AttackError(f"there is no attack {name!r} on the line: choose one of {', '.join(LINE_ATTACKS)}")
+    values = {key.strip(): value.strip() for key, _, value in (pair.partition("=") for pair in pairs)}
+    try:
+        return LineAttack.model_validate_strings({**values, "name": name})
+    except ValidationError as error:
+        problems = (f"{'.'.join(map(str, item['loc']))}: {item['msg']}" for item in error.errors())
+        raise AttackError(f"{name}: {'; '.join(problems)}") from None
