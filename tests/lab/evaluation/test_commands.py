@@ -69,7 +69,7 @@ def test_without_matplotlib_the_report_says_what_to_install(
     assert "'.[evaluation]'" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("name", ["timing", "tampering", "flight", "report", "captured-member"])
+@pytest.mark.parametrize("name", ["timing", "tampering", "flight", "paths", "report", "captured-member"])
 def test_help_says_what_to_install_before_the_command(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     """A reader learns of matplotlib before a run fails for lack of it. One evaluation has no figures."""
     with pytest.raises(SystemExit):

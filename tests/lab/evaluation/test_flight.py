@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import asyncio
 import io
 import json
-import os
-import sys
 from dataclasses import replace
 from importlib.util import find_spec
-from itertools import combinations
 from pathlib import Path
 from random import Random
 
@@ -17,9 +13,9 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from tests import waiting
+from tests.lab.evaluation.quick_runs import run_quickly
 from tests.needs import need
 from uavlinkd.core import wire
-from uavlinkd.lab.child_processes import end_with_parent
 from uavlinkd.lab.evaluation.flight_attacks import DisplaceOptions, DisplacePositions, Drift, ExchangeWatch
 from uavlinkd.lab.evaluation.flight_findings import FlightFindings, flight_problems, read_flight, summary
 from uavlinkd.lab.evaluation.flight_links import PaperLink
@@ -42,8 +38,6 @@ HERE = (470_000_000, 80_000_000)
 """Latitude and longitude of the origin, as in frames."""
 CONTEXT = AttackContext.between("drone0", "drone1")
 THERE = Direction("drone0", "drone1")
-LIMIT_S = 1200.0
-"""A run takes less than a minute on an idle machine. One that does much else at the same time takes longer."""
 
 
 def position(latitude_e7: int, longitude_e7: int, time_ms: int = 1000, system: int = 1) -> bytes:
@@ -332,24 +326,16 @@ def test_report_says_what_a_quick_run_does_not_check(is_quick: bool) -> None:
 def test_no_text_of_the_figure_covers_another() -> None:
     """Titles, labels, ticks and legends; every axis has a label with its unit, on the outer panels."""
     need(find_spec("matplotlib") is not None, "matplotlib, for the figures")
-    from matplotlib.transforms import Bbox
-
-    from tests.lab.evaluation.test_figures import shown, texts_of
+    from tests.lab.evaluation.test_figures import boxes_of, overlaps
     from uavlinkd.lab.evaluation.flight_figures import draw_flight
 
     figure = draw_flight(FlightFindings(RUN, some_records()))
     figure.savefig(io.BytesIO(), format="png")
-    boxes = [
-        (text.get_text(), text.get_window_extent())
-        for text in texts_of(figure)
-        if text.get_visible() and text.get_text().strip() and shown(text, figure)
-    ]
+    boxes = boxes_of(figure)
     assert {"east (m)", "north (m)", "time since take-off (s)", "uavlinkd reports: link down"} <= {
         t for t, _ in boxes
     }
-    for (one, first), (other, second) in combinations(boxes, 2):
-        overlap = Bbox.intersection(first.shrunk(0.95, 0.95), second.shrunk(0.95, 0.95))
-        assert overlap is None or overlap.width * overlap.height < 1, f"{one!r} and {other!r} overlap"
+    assert overlaps(boxes) == []
 
 
 def test_figure_shows_every_point() -> None:
@@ -403,24 +389,11 @@ def test_report_is_made_again_from_the_records(tmp_path: Path, capsys: pytest.Ca
 async def test_quick_run(tmp_path: Path) -> None:
     """uavlinkd accepts no false position, the paper's protocol does. The error output names what it does not use."""
     need(find_spec("matplotlib") is not None, "matplotlib, for the figures")
-    process = await asyncio.create_subprocess_exec(
-        *end_with_parent(
-            *(sys.executable, "-m", "uavlinkd", "evaluate", "flight", "--quick", "--out", str(tmp_path)),
-        ),
-        stdout=asyncio.subprocess.PIPE,
-        stderr=asyncio.subprocess.PIPE,
-        env={**os.environ, "UAVLINKD_ARDUPILOT": "/missing", "UAVLINKD_PX4": ""},
-    )
-    try:
-        out, err = await asyncio.wait_for(process.communicate(), LIMIT_S)
-    finally:
-        if process.returncode is None:
-            process.terminate()
-            await process.wait()
+    run = await run_quickly("flight", tmp_path, UAVLINKD_ARDUPILOT="/missing", UAVLINKD_PX4="")
     unused = "UAVLINKD_ARDUPILOT is not used: --quick flies our simulator\n"
-    assert (process.returncode, err.decode()) == (0, unused)
+    assert (run.status, run.err) == (0, unused)
 
-    facts = json.loads(out.decode().splitlines()[-1])
+    facts = json.loads(run.out.splitlines()[-1])
     assert (facts["ours_replayed_accepted"], facts["ours_altered_accepted"]) == (0, 0)
     assert min(facts["paper_replayed_accepted"], facts["paper_altered_accepted"], facts["plain_altered_accepted"]) > 0
     assert facts["paper_max_error_m_replay"] > facts["ours_max_error_m_replay"]

@@ -93,3 +93,29 @@ def test_recovery_counts_frames_sent_after_the_moment_alone(ledger: Ledger) -> N
     assert ledger.recovery_s is None
     ledger.on_received("a", numbered_frame(2, 1), 3.5)
     assert ledger.recovery_s == 1.5
+
+
+def test_heartbeats_are_counted_alone() -> None:
+    """One frame in twenty, from the first one on; here the second heartbeat is lost."""
+    ledger = Ledger(("a", "b"), {"a": {"b"}, "b": set()})
+    begin = ledger.mark()
+    frames = [ledger.next_frame("a", 1.0 + number) for number in range(41)]
+    for number, frame in enumerate(frames):
+        if number != 20:
+            ledger.on_received("b", frame, 1.0 + number)
+    assert ledger.count_critical(begin, ledger.mark()) == (3, 2)
+    assert ledger.count_critical({"a": 1, "b": 0}, {"a": 40, "b": 0}) == (1, 0)
+
+
+def test_longest_silence_includes_the_present_one() -> None:
+    """Of each direction, since the measurement began."""
+    ledger = Ledger(("a", "b"), {"a": {"b"}, "b": set()})
+    for number in range(3):
+        ledger.next_frame("a", float(number))
+    ledger.await_gap(10.0)
+    ledger.on_received("b", numbered_frame(1, 0), 10.5)
+    assert ledger.gap_s(10.6) == 0.5
+    ledger.on_received("b", numbered_frame(1, 1), 11.5)
+    ledger.on_received("b", numbered_frame(1, 2), 11.6)
+    assert ledger.gap_s(11.7) == 1.0
+    assert ledger.gap_s(14.6) == 3.0

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from uavlinkd.lab.evaluation.middle import MiddleError, MiddleHere, MiddleProcess
-from uavlinkd.lab.mitm.attack import AttackError
+from uavlinkd.lab.mitm.attack import AttackError, Direction
 
 NAMES = ("a", "b")
 KEYS = {"a": b"\1" * 32, "b": b"\2" * 32}
@@ -46,7 +46,7 @@ async def middle(
 
 async def passed(ends: dict[str, socket.socket], middle: MiddleProcess | MiddleHere) -> bytes:
     """What b gets when a sends an envelope."""
-    ends["a"].sendto(ENVELOPE, ("127.0.0.1", middle.ports["a", "b"]))
+    ends["a"].sendto(ENVELOPE, ("127.0.0.1", middle.ports[Direction("a", "b")]))
     return await asyncio.wait_for(asyncio.get_running_loop().sock_recv(ends["b"], 2048), 20)
 
 

@@ -117,3 +117,26 @@ def test_malformed_records_are_refused(tmp_path: Path, line: str) -> None:
         read_run(file)
     with pytest.raises(TamperingRecordsError):
         read_run(tmp_path / "none.jsonl")
+
+
+@pytest.mark.parametrize(
+    ("changes", "success"),
+    [
+        ({"critical_sent": 9}, ""),
+        ({"critical_sent": 9, "critical_lost": 2}, "2 critical frames lost while a path worked"),
+        ({"gap_s": RECOVERY_LIMIT_S + 0.1}, "the link went down while a path worked"),
+        ({"events": {"drone0": {"peer_lost": 1}}}, "the link went down while a path worked"),
+    ],
+)
+def test_link_must_stay_up_while_a_path_works(changes: dict[str, Any], success: str) -> None:
+    """Where the attacker has both paths, or a drone is restarted, the same proves nothing."""
+    assert replace(TRIAL, must_stay_up=True, **changes).successes == ([success] if success else [])
+    assert replace(TRIAL, **changes).successes == []
+
+
+def test_what_a_plan_needs_must_be_counted_or_logged() -> None:
+    """A counter of status, or an event of the log, whatever its reason."""
+    noticed, events = {"drone0": {"late_copy": 3}}, {"drone1": {"path_changed: loss": 1}}
+    trial = replace(TRIAL, needs=("late_copy", "path_changed", "delayed"), noticed=noticed, events=events)
+    assert trial.unseen == ["delayed"]
+    assert "bit-flip: not noticed: delayed" in problems(Run({}, [trial]))

@@ -102,6 +102,15 @@ def test_counters_without_an_attack_and_timers_are_shown(tmp_path: Path) -> None
     assert "Without an attack" not in report(tmp_path, TRIAL, RELAY)
 
 
+def test_attacks_on_two_paths_have_a_section(tmp_path: Path) -> None:
+    """What they cost, how often the best path changed, and whether the link stayed up."""
+    events = {"drone0": {"path_changed: loss": 2}, "drone1": {"path_changed: faster": 1}}
+    trial = replace(TRIAL, attack="held", group="paths", critical_sent=10, critical_lost=1, gap_s=0.25, events=events)
+    text = report(tmp_path, TRIAL, trial, RELAY)
+    assert "| held | 2 s | 1 of 10 | 0 of 200 | 250 ms | 3 | yes |" in text
+    assert "## Two paths" not in report(tmp_path, TRIAL, RELAY)
+
+
 def test_report_has_tables_and_figures(tmp_path: Path) -> None:
     """The figures can be parsed, and text from a trial is escaped in HTML."""
     text = report(tmp_path, TRIAL, OURS, RELAY)

@@ -110,11 +110,8 @@ def _report(options: argparse.Namespace) -> int:
     from uavlinkd.lab.evaluation.records import RecordsError  # noqa: PLC0415
 
     try:
-        from uavlinkd.lab.evaluation.flight_report import (  # noqa: PLC0415
-            has_flight,
-            write_flight_page,
-            write_flight_report,
-        )
+        from uavlinkd.lab.evaluation.flight_report import FLIGHT_REPORT  # noqa: PLC0415
+        from uavlinkd.lab.evaluation.paths_report import PATHS_REPORT  # noqa: PLC0415
         from uavlinkd.lab.evaluation.report import write_page, write_report  # noqa: PLC0415
         from uavlinkd.lab.evaluation.tampering_records import TamperingRecordsError  # noqa: PLC0415
         from uavlinkd.lab.evaluation.tampering_report import (  # noqa: PLC0415
@@ -129,8 +126,9 @@ def _report(options: argparse.Namespace) -> int:
     report, page = write_report, write_page
     if has_tampering(options.folder):
         report, page = write_tampering_report, write_tampering_page
-    elif has_flight(options.folder):
-        report, page = write_flight_report, write_flight_page
+    for writer in (FLIGHT_REPORT, PATHS_REPORT):
+        if writer.has_records(options.folder):
+            report, page = writer.write, writer.write_page
     try:
         print(report(options.folder))
         if options.page is not None:

@@ -48,7 +48,7 @@ def _flight(options: argparse.Namespace) -> int:
     from uavlinkd.lab.sim.real_autopilot import RealAutopilotError  # noqa: PLC0415
 
     try:
-        from uavlinkd.lab.evaluation.flight_report import write_flight_report  # noqa: PLC0415
+        from uavlinkd.lab.evaluation.flight_report import FLIGHT_REPORT  # noqa: PLC0415
     except ModuleNotFoundError as error:
         if error.name is None or error.name.partition(".")[0] != "matplotlib":
             raise
@@ -61,7 +61,7 @@ def _flight(options: argparse.Namespace) -> int:
             print(f"{variable} is not used: {reason}", file=sys.stderr)
         with interrupted_by_signals():
             asyncio.run(FlightEvaluation(options.out, settings, choice, _show).run())
-        print(write_flight_report(options.out))
+        print(FLIGHT_REPORT.write(options.out))
         findings = read_flight(options.out)
     except (FlightError, PilotError, RealAutopilotError, DroneError, RecordsError, OSError) as error:
         return fail(error)

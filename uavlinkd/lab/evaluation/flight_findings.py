@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -10,7 +10,7 @@ from statistics import median
 
 from uavlinkd.lab.evaluation.flight_plan import NAME, AttackPhase, LinkKind
 from uavlinkd.lab.evaluation.flight_positions import Provenance
-from uavlinkd.lab.evaluation.records import Record, Value, read_records
+from uavlinkd.lab.evaluation.records import RunRecords, Value, read_records
 
 _DELIVERED = (AttackPhase.QUIET, AttackPhase.REPLAY, AttackPhase.ALTER, AttackPhase.KEYS)
 """In these phases, frames must arrive: the attacker passes some of them in time."""
@@ -38,12 +38,8 @@ class Spread:
     max_age_s: float
 
 
-class FlightFindings:
-    """The records of one run."""
-
-    def __init__(self, run: dict[str, Value], records: Sequence[Record]) -> None:
-        self.run = run
-        self.records = records
+class FlightFindings(RunRecords):
+    """The records of one flight."""
 
     @property
     def spans(self) -> list[PhaseSpan]:
@@ -58,14 +54,6 @@ class FlightFindings:
         """From take-off to the last measurement; 0 if the run was interrupted."""
         ends = self.of("end")
         return ends[0].number("duration_s") if ends else 0.0
-
-    def of(self, kind: str, **point: str) -> list[Record]:
-        """The records of a kind at a point."""
-        return [
-            record
-            for record in self.records
-            if record.kind == kind and all(record.point.get(name) == value for name, value in point.items())
-        ]
 
     def spread(self, link: LinkKind, phase: AttackPhase | None = None) -> Spread | None:
         """The errors in one phase, or in the whole flight; None without samples."""

@@ -29,7 +29,7 @@ from uavlinkd.lab.evaluation.flight_plan import (
 from uavlinkd.lab.evaluation.middle import HOST, MiddleHere
 from uavlinkd.lab.evaluation.paper_attacks import PaperRelay
 from uavlinkd.lab.evaluation.paper_protocol import VERIFIED, PaperEnd
-from uavlinkd.lab.mitm.attack import AttackObject
+from uavlinkd.lab.mitm.attack import AttackObject, Direction
 from uavlinkd.lab.sim.drone_process import DroneProcess
 from uavlinkd.lab.sim.loopback_ports import free_ports
 from uavlinkd.mavlink.frames import SplitCounters, split_datagram
@@ -167,7 +167,7 @@ class PlainLink(PositionLink):
     def send(self, name: str, frame: bytes) -> None:
         """Send a frame."""
         (other,) = set(PAIR) - {name}
-        self._clients.send(name, frame, self.middle.ports[name, other])
+        self._clients.send(name, frame, self.middle.ports[Direction(name, other)])
 
 
 class PaperLink(PositionLink):
@@ -194,7 +194,7 @@ class PaperLink(PositionLink):
         await self.middle.start({name: end.port for name, end in self._ends.items()}, {})
         await self.middle.attack([], [self.watch])
         for one, other in (PAIR, PAIR[::-1]):
-            self._ends[one].start((HOST, self.middle.ports[one, other]))
+            self._ends[one].start((HOST, self.middle.ports[Direction(one, other)]))
 
     async def close(self) -> None:
         """Stop both ends."""
@@ -252,7 +252,7 @@ class DaemonLink(PositionLink):
         for one, other in (PAIR, PAIR[::-1]):
             drone, peer = self._drones[one], self._drones[other]
             drone.share_psk(psk, "pair.psk")
-            address = f"{HOST}:{self.middle.ports[one, other]}"
+            address = f"{HOST}:{self.middle.ports[Direction(one, other)]}"
             rules: dict[str, object] = {"role": "swarm-member", "system_ids": [SYSTEM_IDS[other]]}
             drone.configure(link, [peer.as_peer(address, "pair.psk", **rules)])
         for drone in self._drones.values():

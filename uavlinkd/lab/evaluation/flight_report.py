@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from uavlinkd.lab.evaluation.flight_figures import flight_figures
 from uavlinkd.lab.evaluation.flight_findings import REPORTED_WITHIN_S, FlightFindings, flight_problems, read_flight
 from uavlinkd.lab.evaluation.flight_plan import (
@@ -16,52 +14,11 @@ from uavlinkd.lab.evaluation.flight_plan import (
     LinkKind,
 )
 from uavlinkd.lab.evaluation.flight_positions import Provenance
-from uavlinkd.lab.evaluation.page import THE_PAPER, ReportSection, Table, to_html, to_markdown
+from uavlinkd.lab.evaluation.page import THE_PAPER, ReportSection, ReportWriter, Table
 from uavlinkd.lab.evaluation.spread import duration
 
 TITLE = "Two aircraft exchange positions in flight under attack"
 _FACTS = ("aircraft", "began", "cpu", "cores", "load_before", "system", "python", "uavlinkd", "commit")
-
-
-def has_flight(folder: Path) -> bool:
-    """Whether ``folder`` has records of this evaluation."""
-    return (folder / f"{NAME}.jsonl").exists()
-
-
-def write_flight_report(folder: Path) -> Path:
-    """Draw the figure and write the report from the records in ``folder``. Return the path of the HTML.
-
-    Raises:
-        RecordsError: there are no records, or they cannot be read.
-    """
-    findings = read_flight(folder)
-    figures = _write_figures(findings, folder)
-    sections = make_sections(findings)
-    (folder / f"{NAME}.md").write_text(to_markdown(TITLE, sections, figures), encoding="utf-8")
-    html = folder / f"{NAME}.html"
-    html.write_text(to_html(TITLE, sections, figures), encoding="utf-8")
-    return html
-
-
-def write_flight_page(folder: Path, page: Path) -> Path:
-    """Write the report as a Markdown page, with the figure in the folder ``results`` beside it.
-
-    Raises:
-        RecordsError: see :func:`write_flight_report`.
-    """
-    findings = read_flight(folder)
-    results = page.parent / "results"
-    results.mkdir(parents=True, exist_ok=True)
-    figures = _write_figures(findings, results)
-    page.write_text(to_markdown(TITLE, make_sections(findings), figures, "results/"), encoding="utf-8")
-    return page
-
-
-def _write_figures(findings: FlightFindings, folder: Path) -> dict[str, bytes]:
-    figures = flight_figures(findings)
-    for name, svg in figures.items():
-        (folder / f"{name}.svg").write_bytes(svg)
-    return figures
 
 
 def make_sections(findings: FlightFindings) -> list[ReportSection]:
@@ -232,3 +189,6 @@ def _run(findings: FlightFindings) -> Table:
 
 def _metres(metres: float) -> str:
     return f"{metres:.1f} m"
+
+
+FLIGHT_REPORT = ReportWriter(NAME, TITLE, read_flight, flight_figures, make_sections)

@@ -22,7 +22,7 @@ from uavlinkd.core.peer import Peer
 from uavlinkd.core.refusals import RefusalReport, Refused
 from uavlinkd.core.send import seal
 from uavlinkd.core.session import Session
-from uavlinkd.core.settings import Link, PeerSettings, Timers
+from uavlinkd.core.settings import Class, Link, PeerSettings, Timers
 from uavlinkd.core.suites import Suite
 from uavlinkd.lab.mitm.anatomy import DatagramKind, kind_of
 from uavlinkd.lab.mitm.attack import NEVER, Action, Direction, Intervention, Operation, PassiveAttack, Send
@@ -157,12 +157,18 @@ class Impostor(PassiveAttack):
 
     def _invent(self, peer: Peer, session: Session, now: float) -> list[Output]:
         """A flood of reports, each about other frames, without regard to the limits of an honest sender."""
-        assert peer.path is not None, "a session came along a path"
         out: list[Output] = []
         for _ in range(REPORTS_AT_ONCE):
             self._claimed += 1
             entries = (Refused(self._claimed % 2**24, 400, place, 2**32 - 1) for place in range(REFUSALS_PER_REPORT))
-            out += seal(peer, session, RefusalReport(tuple(entries)).encode(), peer.path, now, is_answer=True)
+            out += seal(
+                peer,
+                session,
+                RefusalReport(tuple(entries)).encode(),
+                peer.paths.routes[Class.BULK],
+                now,
+                is_answer=True,
+            )
         return out
 
     def next_deadline(self) -> float:

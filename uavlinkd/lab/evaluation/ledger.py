@@ -64,6 +64,7 @@ class Ledger:
         """When each frame of a drone was sent, by its number."""
         self._directions = [(sender, to) for sender in self.names for to in sorted(self.audience[sender])]
         self._delivered = {direction: bytearray() for direction in self._directions}
+        self._arrived_at: dict[tuple[str, str], float] = {}
         self._newest: dict[tuple[str, str], tuple[float, float]] = {}
 
     def next_frame(self, sender: str, now: float) -> bytes:
@@ -96,6 +97,8 @@ class Ledger:
             self.faults[Fault.REPLAYED] += 1
         else:
             self._delivered[sender, receiver][number] = 1
+            self._gap_s = max(self._gap_s, now - self._arrived_at.get((sender, receiver), now))
+            self._arrived_at[sender, receiver] = now
             sent_at = self.sent_at[sender][number]
             if now - sent_at > STALE_S:
                 self.faults[Fault.STALE] += 1
@@ -115,6 +118,27 @@ class Ledger:
             sent += len(part)
             delivered += sum(part)
         return sent, delivered
+
+    def count_critical(self, begin: dict[str, int], end: dict[str, int]) -> tuple[int, int]:
+        """The same of the heartbeats alone."""
+        sent = delivered = 0
+        for sender, to in self._directions:
+            first = -(-begin[sender] // _HEARTBEAT_EVERY) * _HEARTBEAT_EVERY
+            part = self._delivered[sender, to][first : end[sender] : _HEARTBEAT_EVERY]
+            sent += len(part)
+            delivered += sum(part)
+        return sent, delivered
+
+    def await_gap(self, since: float) -> None:
+        """Measure the longest silence from now on."""
+        self._arrived_at = dict.fromkeys(self._directions, since)
+        self._gap_s = 0.0
+
+    def gap_s(self, now: float) -> float:
+        """The longest time without a frame in any direction, the time since the last one included."""
+        return max(self._gap_s, *(now - at for at in self._arrived_at.values()))
+
+    _gap_s = 0.0
 
     def delivered_total(self) -> int:
         """The number of correctly delivered frames."""

@@ -21,10 +21,11 @@ import structlog
 
 from uavlinkd.config.keys import encode_key
 from uavlinkd.lab.child_processes import end_with_parent
-from uavlinkd.lab.mitm.attack import AttackContext, AttackObject
+from uavlinkd.lab.mitm.attack import AttackContext, AttackObject, Direction
 from uavlinkd.lab.mitm.attacks import parse_attack
 from uavlinkd.lab.mitm.proxy import Proxy
 from uavlinkd.lab.mitm.proxy_settings import MitmLink, MitmPeer, ProxySettings
+from uavlinkd.lab.mitm.radio import RadioSettings
 from uavlinkd.lab.sim.loopback_ports import free_ports
 from uavlinkd.ops.control import ControlError, ask
 from uavlinkd.system.addresses import Address
@@ -65,8 +66,8 @@ class Middle(Protocol):
     """The interface of both."""
 
     @property
-    def ports(self) -> Mapping[tuple[str, str], int]:
-        """The port where the first peer reaches the second."""
+    def ports(self) -> Mapping[Direction, int]:
+        """The port where the sender reaches the receiver."""
 
     async def start(self, addresses: Mapping[str, int], public_keys: Mapping[str, bytes]) -> None:
         """Start between peers with these ports."""
@@ -81,21 +82,27 @@ class Middle(Protocol):
         """Stop."""
 
 
-def _listen_ports(names: Sequence[str]) -> dict[tuple[str, str], int]:
-    pairs = [(one, other) for one in names for other in names if one != other]
-    return dict(zip(pairs, free_ports(len(pairs)), strict=True))
+def _listen_ports(names: Sequence[str], paths: int) -> dict[Direction, int]:
+    directions = AttackContext.between(*names, paths=paths).directions
+    return dict(zip(directions, free_ports(len(directions)), strict=True))
 
 
-def _pairs(names: Sequence[str]) -> list[tuple[str, str]]:
-    return [(one, other) for number, one in enumerate(names) for other in names[number + 1 :]]
+def _links(ports: Mapping[Direction, int]) -> list[MitmLink]:
+    """One for each pair and path."""
+    return [
+        MitmLink(
+            (direction.sender, direction.receiver), (Address(HOST, port), Address(HOST, ports[direction.reverse]))
+        )
+        for direction, port in ports.items()
+        if direction.sender < direction.receiver
+    ]
 
 
 class MiddleProcess:
     """``uavlink-mitm`` as a process, controlled by its socket. It writes every intervention to ``log``."""
 
     def __init__(self, names: Sequence[str], folder: Path, log: Path, seed: int) -> None:
-        self.ports = _listen_ports(names)
-        self._names = tuple(names)
+        self.ports = _listen_ports(names, 1)
         self._socket = folder / "mitm.sock"
         self._log = log
         self._seed = seed
@@ -111,9 +118,8 @@ class MiddleProcess:
         for name, port in addresses.items():
             key = f",{encode_key(public_keys[name])}" if name in public_keys else ""
             flags += ["--peer", f"{name}={HOST}:{port}{key}"]
-        for one, other in _pairs(self._names):
-            here, there = self.ports[one, other], self.ports[other, one]
-            flags += ["--link", f"{one}@{HOST}:{here},{other}@{HOST}:{there}"]
+        for link in _links(self.ports):
+            flags += ["--link", ",".join(f"{name}@{at}" for name, at in zip(link.peers, link.listen, strict=True))]
         self._process = await asyncio.create_subprocess_exec(
             *end_with_parent(sys.executable, "-m", "uavlinkd.lab.mitm", *flags),
             stdin=asyncio.subprocess.DEVNULL,
@@ -161,13 +167,20 @@ class MiddleProcess:
 
 
 class MiddleHere:
-    """A :class:`Proxy` in this process."""
+    """A :class:`Proxy` in this process. ``paths``: between each pair of peers; ``radios``: as for the proxy."""
 
-    def __init__(self, names: Sequence[str], log: Path | None, seed: int) -> None:
-        self.ports = _listen_ports(names)
-        self._names = tuple(names)
+    def __init__(
+        self,
+        names: Sequence[str],
+        log: Path | None,
+        seed: int,
+        paths: int = 1,
+        radios: Sequence[tuple[str, RadioSettings]] = (),
+    ) -> None:
+        self.ports = _listen_ports(names, paths)
         self._log = log
         self._seed = seed
+        self._radios = tuple(radios)
         self._proxy: Proxy | None = None
 
     @property
@@ -184,11 +197,8 @@ class MiddleHere:
     async def start(self, addresses: Mapping[str, int], public_keys: Mapping[str, bytes]) -> None:
         """Start between peers."""
         peers = tuple(MitmPeer(name, Address(HOST, port), public_keys.get(name)) for name, port in addresses.items())
-        links = tuple(
-            MitmLink(pair, (Address(HOST, self.ports[pair]), Address(HOST, self.ports[pair[::-1]])))
-            for pair in _pairs(self._names)
-        )
-        proxy = Proxy(ProxySettings(peers, links, seed=self._seed, log=self._log), [])
+        links = tuple(_links(self.ports))
+        proxy = Proxy(ProxySettings(peers, links, radios=self._radios, seed=self._seed, log=self._log), [])
         proxy.log = silent_log()
         await proxy.start()
         self._proxy = proxy

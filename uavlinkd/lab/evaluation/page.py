@@ -7,6 +7,8 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from html import escape
+from pathlib import Path
+from typing import Generic, TypeVar
 
 THE_PAPER = (
     "The paper: Ouadah and Merazka, Securing UAV Communication: Authentication and Integrity, 2024 "
@@ -31,6 +33,52 @@ class ReportSection:
     figure: str = ""
     paragraphs: Sequence[str] = ()
     tables: Sequence[Table] = ()
+
+
+F = TypeVar("F")
+
+
+@dataclass(frozen=True, slots=True)
+class ReportWriter(Generic[F]):
+    """Writes the report of one evaluation from its records, ``name``.jsonl in the folder of a run."""
+
+    name: str
+    title: str
+    read: Callable[[Path], F]
+    """The records in a folder. It raises RecordsError without records, or if they cannot be read."""
+    draw: Callable[[F], dict[str, bytes]]
+    """The figures as SVG, by name."""
+    make_sections: Callable[[F], list[ReportSection]]
+
+    def has_records(self, folder: Path) -> bool:
+        """Whether ``folder`` has records of this evaluation."""
+        return (folder / f"{self.name}.jsonl").exists()
+
+    def write(self, folder: Path) -> Path:
+        """Draw the figures and write the report in HTML and Markdown. Return the path of the HTML."""
+        findings = self.read(folder)
+        figures = self._write_figures(findings, folder)
+        sections = self.make_sections(findings)
+        (folder / f"{self.name}.md").write_text(to_markdown(self.title, sections, figures), encoding="utf-8")
+        html = folder / f"{self.name}.html"
+        html.write_text(to_html(self.title, sections, figures), encoding="utf-8")
+        return html
+
+    def write_page(self, folder: Path, page: Path) -> Path:
+        """Write the report as a Markdown page, with the figures in the folder ``results`` beside it."""
+        findings = self.read(folder)
+        results = page.parent / "results"
+        results.mkdir(parents=True, exist_ok=True)
+        figures = self._write_figures(findings, results)
+        text = to_markdown(self.title, self.make_sections(findings), figures, "results/")
+        page.write_text(text, encoding="utf-8")
+        return page
+
+    def _write_figures(self, findings: F, folder: Path) -> dict[str, bytes]:
+        figures = self.draw(findings)
+        for name, svg in figures.items():
+            (folder / f"{name}.svg").write_bytes(svg)
+        return figures
 
 
 _CSS = """

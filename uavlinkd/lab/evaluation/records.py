@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
@@ -54,10 +54,49 @@ class Record:
         Raises:
             KeyError: the record has no such number.
         """
+        return _number(self.values, name)
+
+    def number_at(self, name: str) -> float:
+        """A number of the point.
+
+        Raises:
+            KeyError: the point has no such number.
+        """
+        return _number(self.point, name)
+
+    def list_of(self, name: str) -> list[float]:
+        """A list of measured numbers.
+
+        Raises:
+            KeyError: the record has no such list.
+        """
         value = self.values[name]
-        if isinstance(value, int | float):
-            return float(value)
+        if isinstance(value, list):
+            return value
         raise KeyError(name)
+
+
+def _number(values: Mapping[str, Value], name: str) -> float:
+    value = values[name]
+    if isinstance(value, int | float):
+        return float(value)
+    raise KeyError(name)
+
+
+class RunRecords:
+    """The facts of one run, and its records."""
+
+    def __init__(self, run: Mapping[str, Value], records: Sequence[Record]) -> None:
+        self.run = run
+        self.records = records
+
+    def of(self, kind: str, **point: Value) -> list[Record]:
+        """The records of a kind at a point."""
+        return [
+            record
+            for record in self.records
+            if record.kind == kind and all(record.point.get(name) == value for name, value in point.items())
+        ]
 
 
 class RecordsError(Exception):

@@ -24,6 +24,7 @@ from uavlinkd.config.keys import decode_key, generate_psk
 from uavlinkd.lab.evaluation.ledger import Ledger
 from uavlinkd.lab.evaluation.middle import Middle, MiddleHere, MiddleProcess
 from uavlinkd.lab.evaluation.paper_protocol import VERIFIED, PaperEnd
+from uavlinkd.lab.mitm.attack import Direction
 from uavlinkd.lab.sim.drone_process import DroneProcess
 from uavlinkd.lab.sim.loopback_ports import free_ports
 from uavlinkd.ops.link_problems import LinkProblem
@@ -127,6 +128,10 @@ class Stage(ABC):
     async def close(self) -> None:
         """Stop all parts except the traffic."""
 
+    async def settle(self) -> None:
+        """Wait until an attack may begin: nothing of the attack before it is left. Most stages need no pause."""
+        return
+
     @abstractmethod
     def send(self, name: str, frame: bytes) -> None:
         """A drone's client sends a frame."""
@@ -207,8 +212,13 @@ class DaemonStage(Stage):
                 psk = self.psks.setdefault(pair, generate_psk())
                 file = f"{other}.psk"
                 self.drones[one].share_psk(psk, file)
-                address = f"127.0.0.1:{self.middle.ports[one, other]}"
-                peers.append(self.drones[other].as_peer(address, file, **self.rules(one, other)))
+                addresses = [
+                    f"127.0.0.1:{port}"
+                    for direction, port in self.middle.ports.items()
+                    if (direction.sender, direction.receiver) == (one, other)
+                ]
+                settings = {"addresses": addresses, **self.rules(one, other)}
+                peers.append(self.drones[other].as_peer("", file, **settings))
             self.drones[one].configure(self._link, peers)
 
     def rules(self, one: str, other: str) -> dict[str, object]:
@@ -331,7 +341,7 @@ class PaperStage(Stage):
             )
         await self.middle.start({name: end.port for name, end in self.ends.items()}, {})
         for one, other in (self.names, self.names[::-1]):
-            self.ends[one].start(("127.0.0.1", self.middle.ports[one, other]))
+            self.ends[one].start(("127.0.0.1", self.middle.ports[Direction(one, other)]))
 
     async def close(self) -> None:
         """Stop."""

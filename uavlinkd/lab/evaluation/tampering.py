@@ -15,6 +15,7 @@ from pathlib import Path
 from random import Random
 from time import monotonic
 
+from uavlinkd.core.drops import DropReason
 from uavlinkd.lab.child_processes import private_folder
 from uavlinkd.lab.evaluation import tampering_plan as plans
 from uavlinkd.lab.evaluation.flood import run_floods
@@ -27,6 +28,7 @@ from uavlinkd.lab.evaluation.stage import DaemonStage, PaperStage, Stage
 from uavlinkd.lab.evaluation.tampering_bench import Bench, Show, TamperingSettings, TrialRecorder
 from uavlinkd.lab.evaluation.tampering_keys import key_attacks, run_impostor, run_paper_relay, run_sealed_cookies
 from uavlinkd.lab.evaluation.tampering_log import write_logs
+from uavlinkd.lab.evaluation.tampering_paths import PATH_PLANS, PATHS, TwoPathStage
 from uavlinkd.lab.evaluation.tampering_plan import TrialPlan
 from uavlinkd.lab.evaluation.tampering_records import OURS, PAPER, RELAY, Run, Verdict
 
@@ -41,6 +43,7 @@ FAST_LINK = {
     "retry_max_s": 0.1,
 }
 DATA_LINK = {"rekey_after_s": 2.0, "reject_after_s": 20.0}
+PATHS_LINK = {"rekey_after_s": 5.0, "reject_after_s": 30.0}
 KEYS_LINK = {"rekey_after_s": 1.0, "reject_after_s": 10.0}
 PLAIN_LINK: dict[str, object] = {}
 
@@ -77,7 +80,7 @@ class Evaluation:
             try:
                 async with asyncio.TaskGroup() as group:
                     lanes = (self._handshakes, self._data, self._with_keys, self._captured_member, self._paper)
-                    for lane in (*lanes, self._reports):
+                    for lane in (*lanes, self._reports, self._paths):
                         group.create_task(lane(recorder))
             except ExceptionGroup as failed:  # the first is the cause: the others were cancelled
                 raise failed.exceptions[0] from None
@@ -137,7 +140,9 @@ class Evaluation:
         for name, lines in stage.logs().items():
             logged = {str(line.get(field)) for line in lines for field in ("reason", "problem")}
             # Everyday drops and problems have no line of their own, but are counted when the daemon stops.
-            logged |= {reason for line in lines for reason in line.get("counted", ())}
+            logged |= {DropReason.DUPLICATE, DropReason.LATE_COPY} | {
+                reason for line in lines for reason in line.get("counted", ())
+            }
             missing = {reason for reason in counted[name] if reason.removeprefix("refused_") not in logged}
             self._unlogged += [f"{label}: {name}: {reason}" for reason in sorted(missing - stage.unwritten[name])]
 
@@ -194,6 +199,19 @@ class Evaluation:
 
         await self._try("reports", stage, recorder, work)
 
+    async def _paths(self, recorder: TrialRecorder) -> None:
+        folder = self._folder / PATHS
+        folder.mkdir()
+        self._links[PATHS] = PATHS_LINK
+        log, rate_hz = self._log(PATHS), self.settings.rate_hz / 2
+        stage = TwoPathStage(PAIR, folder, log, self.settings.seed, PATHS_LINK, rate_hz=rate_hz)
+
+        async def work(bench: Bench) -> None:
+            for plan in self._chosen(PATH_PLANS):
+                await bench.run(plan)
+
+        await self._try(PATHS, stage, recorder, work)
+
     async def _captured_member(self, recorder: TrialRecorder) -> None:
         begin_s, began = monotonic() - recorder.began_at, monotonic()
         folder = self._folder / "member"
@@ -235,6 +253,7 @@ def problems(run: Run) -> list[str]:
         for trial in run.of(OURS)
         if trial.verdict in (Verdict.SUCCEEDED, Verdict.BROKEN)
     ]
+    lines += [f"{trial.attack}: not noticed: {', '.join(trial.unseen)}" for trial in run.trials if trial.unseen]
     lines += [f"{trial.attack} on the paper's protocol: broken" for trial in run.of(PAPER) if trial.attempts == 0]
     relay = [trial for trial in run.of(PAPER) if trial.attack == RELAY]
     if not relay or relay[0].verdict is not Verdict.SUCCEEDED or not relay[0].faults:

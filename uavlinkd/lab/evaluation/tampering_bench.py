@@ -11,9 +11,10 @@ from time import monotonic
 from typing import Any, TextIO
 
 from uavlinkd.core.constants import LATE_AFTER_S, LATE_STEP_S
-from uavlinkd.lab.evaluation.stage import Stage
+from uavlinkd.core.missing import WAITS_S
+from uavlinkd.lab.evaluation.stage import Notice, Stage
 from uavlinkd.lab.evaluation.tampering_plan import HANDSHAKE, KEYS, TrialPlan, with_target
-from uavlinkd.lab.evaluation.tampering_records import PAPER, Run, Trial
+from uavlinkd.lab.evaluation.tampering_records import PAPER, Run, Trial, unseen
 from uavlinkd.lab.mitm.attack import AttackObject
 
 GIVE_UP_S, QUICK_GIVE_UP_S = 5.0, 120.0
@@ -22,11 +23,15 @@ QUICK_AFTER_S = 1.2
 """How long a quick run continues at most after the last attempt."""
 CONTROL_S, QUICK_CONTROL_S = 10.0, 1.0
 """The duration of the control without an attack, before the first attack."""
+_UNTIL_FIRST = 4
+"""An attack that has not reached the network may take so many times as long: on a busy machine, a flood is weaker."""
 _LOOK_S = 0.02
 _SETTLE_S = 0.08
 """After the recovery, for datagrams in flight."""
 _DETECTION_S = LATE_AFTER_S + 2 * LATE_STEP_S + 0.1
 """The same if envelopes may be missing: a daemon counts them when they are too late to arrive."""
+_SHOWN_S = WAITS_S + 5.0
+"""How long the drones may take to show what an attack's row needs: a gap in the counters may wait for a report."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,10 +131,12 @@ class Bench:
         target = settings.target(plan.group, stage.system) if plan.targeted else 0
         commands = tuple(with_target(phase, target) for phase in (plan.phases if phases is None else phases))
         names = [phase.split()[0].split(",")[0] for phase in commands]
+        await stage.settle()
         notices, noticed_at = await stage.notices(), monotonic()
         lines = {name: len(log) for name, log in stage.logs().items()}
         stats = await stage.middle.statistics()
         faults, begin, begin_at = Counter(ledger.faults), ledger.mark(), monotonic()
+        ledger.await_gap(begin_at)
         self._mark(f"attack begins: {plan.attack} {'; then '.join(commands)}")
         most_s = max(settings.most_s(plan.group), plan.least_s)
         for position in range(max(1, len(commands))):
@@ -153,7 +160,8 @@ class Bench:
                     continue
                 done = _attempts((await stage.middle.statistics()).of(names), stats.of(names))
                 enough = done >= wanted if plan.targeted else done > 0
-                if (enough and now >= least_at) or now - phase_at > most_s:
+                limit_s = most_s if done else _UNTIL_FIRST * most_s
+                if (enough and now >= least_at) or now - phase_at > limit_s:
                     break
         is_cut = settings.quick and not plan.takes_away
         await asyncio.sleep(min(plan.after_s, QUICK_AFTER_S) if is_cut else plan.after_s)
@@ -161,6 +169,7 @@ class Bench:
         end = ledger.mark()
         await stage.middle.attack([])
         ended_at = monotonic()
+        gap_s = ledger.gap_s(ended_at)
         self._mark(f"attack ended: {plan.attack}")
         ledger.await_recovery(ended_at)
         give_up_at = ended_at + (QUICK_GIVE_UP_S if settings.quick else GIVE_UP_S)
@@ -169,10 +178,13 @@ class Bench:
         recovery_s = ledger.recovery_s
         logs_late = plan.takes_away and stage.system != PAPER  # the paper's drones log immediately
         settle_s = _DETECTION_S if logs_late or not settings.quick else _SETTLE_S
-        await asyncio.sleep(max(settle_s, plan.noticed_after_s if stage.system != PAPER else 0.0))
-        after_stats, after = await stage.middle.statistics(), await stage.notices()
+        await asyncio.sleep(max(settle_s, plan.noticed_after_s + _SETTLE_S if stage.system != PAPER else 0.0))
+        needs = plan.needs if stage.system != PAPER else ()
+        after_stats = await stage.middle.statistics()
+        after, events = await self._observe(needs, notices, lines)
         done_counts = _difference(after_stats.of(names), stats.of(names))
         sent, delivered = ledger.count(begin, end)
+        critical_sent, critical_delivered = ledger.count_critical(begin, end)
         trial = Trial(
             system=stage.system,
             attack=plan.attack,
@@ -192,8 +204,13 @@ class Bench:
             amplified=() if plan.validates else tuple(sorted(_difference(after_stats.amplified, stats.amplified))),
             frames_sent=sent,
             frames_delivered=delivered,
-            noticed={name: dict(after[name].since(notices[name]).drops) for name in after},
-            events=_events(stage, lines),
+            critical_sent=critical_sent,
+            critical_lost=critical_sent - critical_delivered,
+            gap_s=round(gap_s, 4),
+            must_stay_up=plan.keeps_link,
+            needs=needs,
+            noticed=after,
+            events=events,
             recovery_s=None if recovery_s is None else round(recovery_s, 4),
             notes=plan.notes,
             observed_s=round(monotonic() - noticed_at, 3),
@@ -201,6 +218,19 @@ class Bench:
         )
         self._recorder.add(trial)
         return trial
+
+    async def _observe(
+        self, needs: Sequence[str], notices: Mapping[str, Notice], lines: Mapping[str, int]
+    ) -> tuple[dict[str, dict[str, int]], dict[str, dict[str, int]]]:
+        """The drones' counters and events since the attack began, as soon as they show what the row needs."""
+        give_up_at = monotonic() + _SHOWN_S
+        while True:
+            counters = await self.stage.notices()
+            noticed = {name: dict(counters[name].since(notices[name]).drops) for name in counters}
+            events = _events(self.stage, lines)
+            if not unseen(needs, noticed, events) or monotonic() >= give_up_at:
+                return noticed, events
+            await asyncio.sleep(_LOOK_S)
 
     async def run_control(self) -> None:
         """Measure the drones' counters while the man in the middle passes all datagrams."""
@@ -226,7 +256,7 @@ def _difference(now: Mapping[str, int], before: Mapping[str, int]) -> dict[str, 
     return {key: n - before.get(key, 0) for key, n in now.items() if n > before.get(key, 0)}
 
 
-def _events(stage: Stage, seen: dict[str, int]) -> dict[str, dict[str, int]]:
+def _events(stage: Stage, seen: Mapping[str, int]) -> dict[str, dict[str, int]]:
     """The new lines of each drone's log, counted by event and reason."""
     events = {}
     for name, lines in stage.logs().items():

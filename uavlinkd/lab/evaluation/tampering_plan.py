@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from uavlinkd.core.constants import CHALLENGE_LIFETIME_S
+from uavlinkd.core.constants import QUESTION_LIFETIME_S
 
 HANDSHAKE, DATA, FLOOD, TRAFFIC, KEYS = "handshake", "data", "flood", "traffic", "keys"
 LOAD = "flood-initiations,rate_per_s=600"
@@ -41,6 +41,10 @@ class TrialPlan:
     """How long after its end the drones may still count it."""
     takes_away: bool = False
     """Envelopes are missing, reordered or come from elsewhere: the drones count them later."""
+    keeps_link: bool = False
+    """A path that it does not attack works: then the link must stay up, and no critical frame may be lost."""
+    needs: tuple[str, ...] = ()
+    """Counters that must grow, or events that must be in the log."""
     is_variant: bool = False
     """Omitted in a quick run, which has another row of the same attack."""
     notes: str = ""
@@ -207,7 +211,7 @@ DATA_PLANS: tuple[TrialPlan, ...] = (
         DATA,
         ("roam,mode=instead",),
         "roam,mode=instead",
-        noticed_after_s=CHALLENGE_LIFETIME_S,
+        noticed_after_s=QUESTION_LIFETIME_S,
         takes_away=True,
     ),
 )
@@ -283,6 +287,7 @@ TRAFFIC_PLANS: tuple[TrialPlan, ...] = (
         targeted=False,
         least_s=1.0,
         takes_away=True,
+        needs=("envelopes_missing",),
     ),
     TrialPlan(
         "stretch",
@@ -311,6 +316,7 @@ TRAFFIC_PLANS: tuple[TrialPlan, ...] = (
         targeted=False,
         least_s=1.0,
         takes_away=True,
+        needs=("envelopes_missing",),
     ),
 )
 """Between three drones, with a rekey per second."""

@@ -7,7 +7,7 @@ intervention.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from pathlib import Path
@@ -89,6 +89,26 @@ class Trial:
     control: Mapping[str, float] = field(default_factory=dict)
     """The counters of all drones of this stage per second without an attack."""
 
+    critical_sent: int = 0
+    critical_lost: int = 0
+    """Heartbeats, of those sent during the attack."""
+    gap_s: float = 0.0
+    """The longest time without a frame at any receiver during the attack."""
+    must_stay_up: bool = False
+    """Whether a path worked that was not attacked."""
+    needs: tuple[str, ...] = ()
+    """The counters and events that must show the attack."""
+
+    @property
+    def stayed_up(self) -> bool:
+        """Whether no drone lost its peer, or was silent for as long as a recovery may take."""
+        return self.gap_s <= RECOVERY_LIMIT_S and not any(events.get("peer_lost") for events in self.events.values())
+
+    @property
+    def unseen(self) -> list[str]:
+        """What should have shown the attack, and did not."""
+        return unseen(self.needs, self.noticed, self.events)
+
     @property
     def withheld(self) -> int:
         """The attempts that dropped or held a genuine datagram, so that it could not be accepted."""
@@ -102,7 +122,8 @@ class Trial:
     @property
     def is_noticed(self) -> bool:
         """Whether an operator can notice it: an event that attacks cause, or a counter beyond its usual rate."""
-        is_logged = any(events.get("peer_lost") or events.get("path_changed") for events in self.events.values())
+        logged = {name.partition(":")[0] for events in self.events.values() for name in events}
+        is_logged = bool(logged & {"peer_lost", "path_changed"})
         return is_logged or any(count > self._usual(reason) for reason, count in self.reasons.items())
 
     def _usual(self, reason: str) -> float:
@@ -131,6 +152,10 @@ class Trial:
             successes.append(f"amplified: {', '.join(self.amplified)}")
         if self.recovery_s is None or self.recovery_s > RECOVERY_LIMIT_S:
             successes.append(NOT_IN_TIME)
+        if self.must_stay_up and self.critical_lost:
+            successes.append(f"{self.critical_lost} critical frames lost while a path worked")
+        if self.must_stay_up and not self.stayed_up:
+            successes.append("the link went down while a path worked")
         return successes
 
     @property
@@ -148,6 +173,15 @@ class Trial:
         """One line, with the verdict."""
         facts = {**asdict(self), "frames_lost": self.frames_lost, "verdict": self.verdict.value}
         return json.dumps({**facts, "successes": self.successes})
+
+
+def unseen(
+    needs: Sequence[str], noticed: Mapping[str, Mapping[str, int]], events: Mapping[str, Mapping[str, int]]
+) -> list[str]:
+    """The counters and events of ``needs`` that no drone shows."""
+    shown = {name.partition(":")[0] for logged in events.values() for name in logged}
+    shown.update(reason for counts in noticed.values() for reason, count in counts.items() if count)
+    return [name for name in needs if name not in shown]
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,4 +254,5 @@ def read_run(path: Path) -> Run:
 def _trial(fields: dict[str, Any]) -> Trial:
     for derived in ("frames_lost", "verdict", "successes"):
         fields.pop(derived)
-    return Trial(**{**fields, "parameters": tuple(fields["parameters"]), "amplified": tuple(fields["amplified"])})
+    lists = ("parameters", "amplified", "needs")
+    return Trial(**{**fields, **{name: tuple(fields[name]) for name in lists if name in fields}})

@@ -11,6 +11,7 @@ from uavlinkd.lab.evaluation.spread import duration
 from uavlinkd.lab.evaluation.tampering import NAME, problems
 from uavlinkd.lab.evaluation.tampering_bench import run_settings
 from uavlinkd.lab.evaluation.tampering_figures import tampering_figures
+from uavlinkd.lab.evaluation.tampering_paths import PATHS, paths_section
 from uavlinkd.lab.evaluation.tampering_plan import DATA, HANDSHAKE, KEYS
 from uavlinkd.lab.evaluation.tampering_records import (
     OURS,
@@ -103,6 +104,7 @@ def make_sections(run: Run, figures: Sequence[str]) -> list[ReportSection]:
         ReportSection("Recovery of the link", "recovery", _ON_RECOVERY, [_recoveries(run)]),
         *floods,
         ReportSection("Attackers with keys", "", _ON_KEYS, [_keys(run)]),
+        *([paths_section(run)] if any(trial.group == PATHS for trial in run.trials) else []),
         ReportSection("What the drones noticed", "", _ON_NOTICED, [_noticed(run)]),
         *control,
         ReportSection("The paper's protocol", "", _ON_PAPER),

@@ -29,7 +29,8 @@ ATTACKED_LINK: dict[str, object] = {
 _LOAD = "flood-initiations,rate_per_s=600"
 _NEEDS_LOAD = ("replay-cookie", "stolen-cookie")
 """These attacks need cookies, which daemons require only under load."""
-_NEEDS_MORE_PEERS = ("misroute",)
+_NEEDS_MORE = ("misroute", "move")
+"""These attacks need a third peer, or a second path."""
 _WITHHOLDS = ("drop", "drop-heartbeats", "blackout", "hold", "truncate", "tamper-tag")
 _DETECTION_S = LATE_AFTER_S + 2 * LATE_STEP_S + 0.2
 """A drone counts a missing envelope when it is too late to arrive."""
@@ -72,7 +73,7 @@ class AttackCourse:
     """
 
     def __init__(self, text: str) -> None:
-        names = [name for name in ATTACKS if name not in _NEEDS_MORE_PEERS] if text == ALL else [text]
+        names = [name for name in ATTACKS if name not in _NEEDS_MORE] if text == ALL else [text]
         self.specs = [parse_attack(name + (_OPTIONS.get(name, "") if text == ALL else "")) for name in names]
         self.is_recovered = False
         self._results: list[AttackResult] = []
@@ -83,7 +84,7 @@ class AttackCourse:
         """Start the proxy between two drones. Return, by drone, the port where the other reaches it.
 
         Raises:
-            AttackError: an attack needs more than two peers.
+            AttackError: an attack needs more than two peers, or more than one path.
         """
         (one, other), anywhere = tuple(ports), Address("127.0.0.1", 0)
         peers = tuple(MitmPeer(name, Address("127.0.0.1", ports[name]), public_keys[name]) for name in ports)
@@ -93,7 +94,7 @@ class AttackCourse:
             spec.make(proxy.context)
         await proxy.start()
         self._proxy = proxy
-        return {one: proxy.listeners[other, one][1], other: proxy.listeners[one, other][1]}
+        return {direction.receiver: port for direction, (_, port) in proxy.listeners.items()}
 
     async def leave(self) -> None:
         """Stop the proxy."""

@@ -59,19 +59,24 @@ class DroneProcess:
         assert self._process is not None
         return self._process.pid
 
-    def configure(self, link: Mapping[str, object], peers: Sequence[Mapping[str, object]]) -> None:
-        """Write the configuration: the ``[link]`` section, and each ``[[peer]]``."""
+    def configure(
+        self,
+        link: Mapping[str, object],
+        peers: Sequence[Mapping[str, object]],
+        networks: Sequence[Mapping[str, object]] = (),
+    ) -> None:
+        """Write the configuration: the ``[link]`` section, each ``[[peer]]``, and each ``[[network]]`` if any."""
         top = {
             "name": self.name,
             "private_key_file": "drone.key",
-            "listen": [f"127.0.0.1:{self.port}"],
+            "listen": [f"{'0.0.0.0' if networks else '127.0.0.1'}:{self.port}"],
             "control_socket": self.socket.name,
         }
         endpoint = {"name": "autopilot", "url": f"udpin:127.0.0.1:{self.endpoint_port}"}
-        tables = [("", top), ("[link]", link), ("[[endpoint]]", endpoint), *(("[[peer]]", peer) for peer in peers)]
-        lines = [
-            f"{name}\n" + "".join(f"{key} = {json.dumps(value)}\n" for key, value in t.items()) for name, t in tables
-        ]
+        tables = [("", top), ("[link]", link), ("[[endpoint]]", endpoint)]
+        tables += [("[[network]]", network) for network in networks]
+        tables += [("[[peer]]", peer) for peer in peers]
+        lines = [f"{name}\n" + "".join(f"{key} = {_toml(value)}\n" for key, value in t.items()) for name, t in tables]
         (self.folder / "drone.toml").write_text("\n".join(lines).lstrip(), encoding="utf-8")
 
     def as_peer(self, address: str, psk_file: str, **settings: object) -> dict[str, object]:
@@ -139,6 +144,15 @@ class DroneProcess:
     def last_lines(self, count: int) -> list[str]:
         """The last lines of its log."""
         return self.log.read_text(errors="replace").splitlines()[-count:]
+
+
+def _toml(value: object) -> str:
+    """A value as in TOML: JSON, but for tables."""
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(f"{key} = {_toml(item)}" for key, item in value.items()) + " }"
+    if isinstance(value, list):
+        return f"[{', '.join(map(_toml, value))}]"
+    return json.dumps(value)
 
 
 def _interpreter() -> tuple[str, ...]:

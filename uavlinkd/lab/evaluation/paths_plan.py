@@ -1,0 +1,255 @@
+"""The plan of the paths evaluation: what happens to two emulated radios, and what users have in place of uavlinkd."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+from pathlib import Path
+from typing import Final
+
+from uavlinkd.lab.evaluation.records import Value
+from uavlinkd.lab.mitm.radio import RadioSettings
+
+NAME: Final = "paths"
+VEHICLE, STATION = "vehicle", "station"
+BOTH: Final = "both"
+VEHICLE_TO_STATION: Final = f"{VEHICLE}>{STATION}"
+STATION_TO_VEHICLE: Final = f"{STATION}>{VEHICLE}"
+STALL_S: Final = 10.0
+STALE_S: Final = 2.75
+"""The maximum age of a delivered frame where two paths carry traffic: section 11 of the specification."""
+RTT_MS, JITTER_MS = 100, 5
+CONDITIONS: Final = tuple((rtt_ms, jitter_ms) for rtt_ms in (20, 100, 300) for jitter_ms in (5, 20))
+"""Round trip and jitter of the repeated deaths, in milliseconds."""
+DEAD_S: Final = 4.0
+"""How long a path is dead in each of the repeated deaths."""
+
+
+class Means(StrEnum):
+    """What carries the frames."""
+
+    OURS = "uavlinkd, two paths"
+    ALL = "uavlinkd, everything on two paths"
+    ONE = "uavlinkd, one path"
+    OTHER = "uavlinkd, the other path"
+    DUPLICATES = "plain MAVLink, duplicated"
+
+
+MEANINGS: Final = {
+    Means.OURS: "two daemons with their default settings; the vehicle's daemon has both addresses of the station",
+    Means.ALL: 'the same with `redundancy = "all"`',
+    Means.ONE: "two daemons, and only the path that fails",
+    Means.OTHER: "two daemons, and only the path that does not fail",
+    Means.DUPLICATES: "no daemon: each frame is sent along both paths, and each copy is delivered, as "
+    "mavlink-router and MAVProxy do with two endpoints",
+}
+RADIOS: Final[Mapping[Means, tuple[int, ...]]] = {Means.ONE: (0,), Means.OTHER: (1,)}
+"""The radios of means that do not use both."""
+
+
+class Scenario(StrEnum):
+    """What happens to the radios."""
+
+    QUIET = "quiet"
+    DIES = "dies"
+    STALLS = "stalls"
+    DEGRADES = "degrades"
+    FLAPS = "flaps"
+    ALTERNATES = "alternates"
+    SWAPS = "swaps"
+    ASYMMETRIC = "asymmetric"
+    METERED = "metered"
+    STANDBY = "standby"
+    OFF = "off"
+    MANUAL = "manual"
+    DEATHS = "deaths"
+    RECORDED = "recorded"
+
+
+SCENARIO_MEANINGS: Final = {
+    Scenario.QUIET: "both paths work",
+    Scenario.DIES: "one path carries nothing, then returns",
+    Scenario.STALLS: f"one path holds everything for {STALL_S:g} s and then delivers all of it",
+    Scenario.DEGRADES: "one path loses 8 % more and becomes 20 ms slower in each of ten steps, then recovers",
+    Scenario.FLAPS: "one path fails four times, for as long as it works between",
+    Scenario.ALTERNATES: "one path fails and returns; later the other one fails and returns",
+    Scenario.SWAPS: "one path fails at the moment at which the other one returns, again and again",
+    Scenario.ASYMMETRIC: "one path loses 30 % towards the station, the other one 30 % towards the vehicle",
+    Scenario.METERED: "the other path is metered at the vehicle; the unmetered one dies and returns",
+    Scenario.STANDBY: "both paths work, and the other one is metered at the vehicle",
+    Scenario.OFF: "the other path is metered at the vehicle, and the station has been off for ten minutes",
+    Scenario.MANUAL: "manual control at 25 Hz; a path of 50 ms loses 30 %, the other one has a round trip of 400 ms",
+    Scenario.DEATHS: f"the path that carries the stream is dead for {DEAD_S:g} s, many times",
+    Scenario.RECORDED: "a recorded flight over two working paths",
+}
+
+MEANS_OF: Final[Mapping[Scenario, tuple[Means, ...]]] = {
+    Scenario.QUIET: tuple(Means),
+    Scenario.DIES: tuple(Means),
+    Scenario.SWAPS: (Means.OURS, Means.DUPLICATES),
+    Scenario.STANDBY: (Means.OURS,),
+    Scenario.OFF: (Means.OURS,),
+    Scenario.DEATHS: (Means.OURS,),
+    Scenario.RECORDED: (Means.OURS, Means.ALL, Means.ONE),
+}
+MEANS_ELSEWHERE: Final = (Means.OURS, Means.ONE, Means.DUPLICATES)
+QUICK_MEANS: Final[Mapping[Scenario, tuple[Means, ...]]] = {
+    Scenario.QUIET: (Means.OURS, Means.ONE),
+    Scenario.DIES: (Means.OURS, Means.ONE, Means.DUPLICATES),
+    Scenario.STALLS: (Means.OURS, Means.DUPLICATES),
+    Scenario.ALTERNATES: (Means.OURS,),
+}
+_AT_ONCE: Final = 2
+"""How many scenarios run at the same time: one core carries them."""
+_OFF_S: Final = 240.0
+"""How long the datagrams to a station that is off are counted."""
+
+
+@dataclass(frozen=True, slots=True)
+class RadioChange:
+    """New settings of a radio. The values that are not named are those from the beginning."""
+
+    at_s: float
+    radio: int
+    values: Mapping[str, float | bool] = field(default_factory=dict)
+    directions: str = BOTH
+
+
+@dataclass(frozen=True, slots=True)
+class PathFailure:
+    """A radio does not work from ``at_s`` until ``until_s``."""
+
+    radio: int
+    at_s: float
+    until_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class PathsPlan:
+    """One scenario. Radio 0 is the path that carries the stream at the beginning, if both are equal."""
+
+    scenario: Scenario
+    duration_s: float
+    radios: tuple[RadioSettings, RadioSettings]
+    changes: tuple[RadioChange, ...] = ()
+    failures: tuple[PathFailure, ...] = ()
+    deaths: int = 0
+    """How often the path that carries the stream dies."""
+    tlog: Path | None = None
+    """The flight that is played in place of the numbered frames."""
+
+    @property
+    def is_metered(self) -> bool:
+        """Whether the other path is metered at the vehicle."""
+        return self.scenario in (Scenario.METERED, Scenario.STANDBY, Scenario.OFF)
+
+    @property
+    def point(self) -> dict[str, Value]:
+        """Where its records are in the grid."""
+        delay_s, jitter_s = self.radios[0].delay_s, self.radios[0].jitter_s
+        point: dict[str, Value] = {
+            "scenario": self.scenario.value,
+            "rtt_ms": round(2e3 * (delay_s + jitter_s / 2)),
+            "jitter_ms": round(1e3 * jitter_s),
+        }
+        return point if self.tlog is None else {**point, "flight": self.tlog.stem}
+
+
+@dataclass(frozen=True, slots=True)
+class PathsSettings:
+    """The settings of one run."""
+
+    quick: bool = False
+    seed: int = 0
+    repeats: int = 100
+    """Deaths for each of :data:`CONDITIONS`; a quick run has none."""
+    tlogs: tuple[Path, ...] = ()
+    """Recorded flights whose redundancy is measured."""
+    recorded_s: float = 300.0
+    """How much of each is played."""
+
+    def rounds(self) -> list[list[tuple[PathsPlan, Means]]]:
+        """What runs at the same time. A quick run has one round."""
+        if self.quick:
+            return [[(self.plan(scenario), means) for scenario, chosen in QUICK_MEANS.items() for means in chosen]]
+        slow = (Scenario.DEATHS, Scenario.OFF, Scenario.RECORDED)
+        plans = [self.plan(scenario) for scenario in Scenario if scenario not in slow]
+        rounds = [plans[begin : begin + _AT_ONCE] for begin in range(0, len(plans), _AT_ONCE)]
+        if self.tlogs:
+            rounds.append([replace(_flat(Scenario.RECORDED, self.recorded_s), tlog=tlog) for tlog in self.tlogs])
+        if self.repeats:
+            deaths = [
+                replace(_flat(Scenario.DEATHS, 0.0, *condition), deaths=self.repeats) for condition in CONDITIONS
+            ]
+            rounds.append([*deaths, _flat(Scenario.OFF, _OFF_S)])
+        return [
+            [(plan, means) for plan in chosen for means in MEANS_OF.get(plan.scenario, MEANS_ELSEWHERE)]
+            for chosen in rounds
+        ]
+
+    def plan(self, scenario: Scenario) -> PathsPlan:
+        """The plan of a scenario. Its times are twice as long in a full run, except the stall itself."""
+        unit_s = 1.0 if self.quick else 2.0
+        begin_s = 3 * unit_s
+        match scenario:
+            case Scenario.DIES | Scenario.METERED:
+                return _failing(_flat(scenario, 14 * unit_s), [(0, begin_s, 9 * unit_s)], {"loss": 1.0})
+            case Scenario.STALLS:
+                end_s = begin_s + STALL_S
+                return _failing(_flat(scenario, end_s + begin_s), [(0, begin_s, end_s)], {"is_stalled": True})
+            case Scenario.DEGRADES:
+                return _degrading(_flat(scenario, 17 * unit_s), begin_s, unit_s)
+            case Scenario.FLAPS:
+                times = [begin_s + 3 * unit_s * number for number in range(4)]
+                outages = [(0, at_s, at_s + 1.5 * unit_s) for at_s in times]
+                return _failing(_flat(scenario, 17 * unit_s), outages, {"loss": 1.0})
+            case Scenario.ALTERNATES:
+                outages = [(0, begin_s, 6 * unit_s), (1, 10 * unit_s, 13 * unit_s)]
+                return _failing(_flat(scenario, 16 * unit_s), outages, {"loss": 1.0})
+            case Scenario.SWAPS:
+                outages = [(number % 2, (3 + 3 * number) * unit_s, (6 + 3 * number) * unit_s) for number in range(4)]
+                return _failing(_flat(scenario, 17 * unit_s), outages, {"loss": 1.0})
+            case Scenario.ASYMMETRIC:
+                changes = (
+                    RadioChange(0.0, 0, {"loss": 0.3}, VEHICLE_TO_STATION),
+                    RadioChange(0.0, 1, {"loss": 0.3}, STATION_TO_VEHICLE),
+                )
+                return replace(_flat(scenario, 12 * unit_s), changes=changes)
+            case Scenario.MANUAL:
+                return PathsPlan(scenario, 12 * unit_s, (replace(_radio(50, JITTER_MS), loss=0.3), _radio(400, 5)))
+            case Scenario.STANDBY:
+                return _flat(scenario, 30 * unit_s)
+            case _:
+                return _flat(scenario, 12 * unit_s)
+
+
+def _radio(rtt_ms: float, jitter_ms: float) -> RadioSettings:
+    """A radio with this mean round trip, whose jitter keeps the order of datagrams."""
+    delay_s = (rtt_ms - jitter_ms) / 2e3
+    return RadioSettings(delay_s=delay_s, jitter_s=jitter_ms / 1e3, keeps_order=True)
+
+
+def _flat(scenario: Scenario, duration_s: float, rtt_ms: int = RTT_MS, jitter_ms: int = JITTER_MS) -> PathsPlan:
+    radio = _radio(rtt_ms, jitter_ms)
+    return PathsPlan(scenario, duration_s, (radio, radio))
+
+
+def _failing(plan: PathsPlan, outages: list[tuple[int, float, float]], values: Mapping[str, float]) -> PathsPlan:
+    changes = []
+    for radio, at_s, until_s in outages:
+        # Where one outage ends as another begins, the path that returns comes first.
+        changes += [RadioChange(until_s, radio), RadioChange(at_s, radio, values)]
+    changes.sort(key=lambda change: (change.at_s, bool(change.values)))
+    return replace(plan, changes=tuple(changes), failures=tuple(PathFailure(*outage) for outage in outages))
+
+
+def _degrading(plan: PathsPlan, begin_s: float, step_s: float, steps: int = 10) -> PathsPlan:
+    delay_s = plan.radios[0].delay_s
+    changes = [
+        RadioChange(begin_s + number * step_s, 0, {"loss": 0.08 * (number + 1), "delay_s": delay_s + 0.02 * number})
+        for number in range(steps)
+    ]
+    end_s = begin_s + steps * step_s
+    failure = PathFailure(0, begin_s, end_s)
+    return replace(plan, changes=(*changes, RadioChange(end_s, 0)), failures=(failure,))
