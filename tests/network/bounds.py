@@ -25,6 +25,14 @@ LIMITS: dict[str, int] = {
     "bytes held on a session": c.HELD_BYTES,
     "steps of the past of a session": int(c.LATE_AFTER_S / c.LATE_STEP_S) + 3,
     "indices in use or quarantine": 2**16 - 1,
+    "configured paths of a peer": c.CONFIGURED_PATHS,
+    "learned paths of a peer": c.LEARNED_PATHS,
+    "questions that wait on a path": c.QUESTIONS_PER_PATH,
+    "reports of a path": c.LOSS_POINTS,
+    "lags of a path": c.LAG_SAMPLES,
+    "paths that carried a response": c.COPIES_OF_A_RESPONSE,
+    "cookies of a peer": c.COOKIES_PER_PEER,
+    "addresses of proven paths of a peer": c.CONFIGURED_PATHS + c.LEARNED_PATHS,
 }
 
 
@@ -33,6 +41,11 @@ def measure(node: Node) -> Sizes:
     peers = node.peers.values()
     sessions = [session for peer in peers for session in peer.sessions.confirmed]
     histories = [part for session in sessions for part in (session._received_history, session._sent_history)]
+    waiting = [waiting for peer in peers for waiting in peer.sessions.unconfirmed.values()]
+    paths = [state for peer in peers for state in peer.paths.states]
+    reports = [len(loss._points) for state in paths for loss in (state._loss_in, state._loss_out)]
+    learned = [sum(not state.is_configured for state in peer.paths.states) for peer in peers]
+    proven = [sum(state.is_known for state in peer.paths.states) for peer in peers]
     indices, admission = node._indices, node._admission
     return Counter(
         {
@@ -43,13 +56,24 @@ def measure(node: Node) -> Sizes:
             "sources under load": len(admission._sources._buckets),
             "networks that get cookies": len(admission._prefixes._buckets),
             "sources of group work": len(admission._group._sources._buckets),
-            "known addresses with shares": max(len(admission._known._buckets), len(admission._known_read._buckets)),
+            "known addresses with shares": max(
+                len(shares._buckets)
+                for shares in (admission._known, admission._known_read, admission._known_versions)
+            ),
             "echo requests that wait for an answer": max((len(peer.echo_requests) for peer in peers), default=0),
             "refusals counted for a peer": max((len(peer.own_refusals._totals) for peer in peers), default=0),
             "claims of a peer": max((len(peer.refusal_claims.recent()) for peer in peers), default=0),
             "bytes held on a session": max((session.held.size for session in sessions), default=0),
             "steps of the past of a session": max((len(part._steps) for part in histories), default=0),
             "indices in use or quarantine": len(indices.owners) + len(indices._quarantine),
+            "configured paths of a peer": max((len(peer.paths.configured) for peer in peers), default=0),
+            "learned paths of a peer": max(learned, default=0),
+            "questions that wait on a path": max((state.waiting_questions for state in paths), default=0),
+            "reports of a path": max(reports, default=0),
+            "lags of a path": max((len(state._lags) for state in paths), default=0),
+            "paths that carried a response": max((len(response.paths) for response in waiting), default=0),
+            "cookies of a peer": max((len(peer.initiator._received_cookies) for peer in peers), default=0),
+            "addresses of proven paths of a peer": max(proven, default=0),
         }
     )
 
@@ -71,6 +95,11 @@ def check(node: Node) -> Sizes:
     assert len(node._remembered) == sum(len(peer.remembered) for peer in peers)
     assert len(node._by_keys) == len(node.peers)
     assert all(node.peers.get(peer.name) is peer for peer in node._by_address.values())
-    assert node._last_seen == Counter(peer.path.address for peer in peers if peer.path is not None)
-    assert len(node._by_address) <= sum(len(peer.initiator.paths) for peer in peers)
+    proven = [state.path.address for peer in peers for state in peer.paths.states if state.is_known]
+    assert node._last_seen == Counter(proven), f"{node._last_seen} are known, {proven} are proven"
+    assert len(node._by_address) <= sum(len(peer.paths.configured) for peer in peers)
+    for peer in peers:
+        numbers = [state.number for state in peer.paths.states]
+        assert len(set(numbers)) == len(numbers), f"{peer.name}: two paths have one number: {numbers}"
+        assert peer.paths.best is None or peer.paths.best in peer.paths.states, f"{peer.name}: the best path is gone"
     return sizes

@@ -4,6 +4,7 @@
     python -m tests.network --minutes 100000 --processes 4 --first-seed 1000
         python -m tests.network --seed 1234              one history again, with details
         python -m tests.network --handshakes 10000       and the time of handshakes at 30 % loss in each direction
+        python -m tests.network --minutes 0 --failovers 100 --metered --flights *.tlog       what paths cost and gain
 
 Exit code 1: a property did not hold. The output names the seed.
 """
@@ -13,12 +14,14 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Iterator, Sequence
-from itertools import count
+from itertools import chain, count
 from multiprocessing import get_context
+from pathlib import Path
 
-from tests.network import handshakes
+from tests.network import failover, flights, handshakes, metered
 from tests.network.bounds import LIMITS
-from tests.network.histories import UP_WITHIN_S, Played, play
+from tests.network.histories import UP_ALONG_ONE_PATH_S, UP_WITHIN_S, play
+from tests.network.played import Played
 
 _REPORT_INTERVAL_S = 30.0
 _AT_ONCE = 4
@@ -37,6 +40,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         is_sound = not total.violations
     if options.handshakes:
         is_sound &= _handshakes(options.handshakes)
+    lines = chain(
+        *(failover.table(radios, options.failovers) for radios in failover.RADIOS if options.failovers),
+        *(flights.table(flight, options.flight_seconds) for flight in options.flights),
+        metered.table() if options.metered else (),
+    )
+    for line in lines:
+        print(line, flush=True)
     return 0 if is_sound else 1
 
 
@@ -48,6 +58,10 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--first-seed", type=int, default=0, help="the others follow it (0)")
     parser.add_argument("--seed", type=int, help="play this one history again")
     parser.add_argument("--handshakes", type=int, default=0, help="how many to time, of either kind (none)")
+    parser.add_argument("--failovers", type=int, default=0, help="how often one of two paths dies (never)")
+    parser.add_argument("--flights", type=Path, nargs="*", default=[], help="recorded flights, to cost redundancy")
+    parser.add_argument("--flight-seconds", type=float, default=float("inf"), help="of each flight (all)")
+    parser.add_argument("--metered", action="store_true", help="bytes a day on a metered path")
     return parser
 
 
@@ -111,13 +125,17 @@ def table(total: Played, wall_s: float) -> list[str]:
         "histories": f"{sum(total.histories.values()):,} ({'; '.join(kinds)})",
         "virtual minutes": f"{minutes:,.0f}",
         "by number of nodes": ", ".join(sizes),
+        "pairs by number of paths": ", ".join(f"{paths}: {n:,}" for paths, n in sorted(total.paths.items())),
         "frames sent": f"{total.sent:,}",
         "frames delivered": f"{total.delivered:,}",
+        "critical frames": f"{total.critical_sent:,}; {total.critical_judged:,} while a path delivered",
         "datagrams": f"{total.datagrams:,}, the attackers' too",
         "sessions made": f"{total.sessions:,}, counted at each end",
         **{f"  {name}": f"{count:,}" for name, count in sorted(total.events.items())},
         "judged": f"{total.judged:,} times, {total.pairs:,} pairs",
         "worst until all up": f"{total.worst_up_s:.2f} s, bound {UP_WITHIN_S:.0f} s",
+        "worst along one path": f"{total.worst_one_path_up_s:.2f} s, bound {UP_ALONG_ONE_PATH_S:.0f} s",
+        "  critical frames": f"{total.worst_critical_up_s:.2f} s, bound {UP_WITHIN_S:.0f} s",
         "oldest frame": f"{total.oldest_s:.2f} s when it came out",
         **{f"  {name}": f"{total.largest[name]:,}, limit {limit:,}" for name, limit in LIMITS.items()},
         "wall time": f"{wall_s:,.0f} s",

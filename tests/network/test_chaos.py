@@ -6,21 +6,26 @@ A few of the histories that ``python -m tests.network`` plays by the thousand, a
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from typing import Any
 
 import pytest
 
 from tests.network.command import main
-from tests.network.histories import BUSY, HOURS, LARGE, Plan, Played, play
+from tests.network.histories import play
+from tests.network.plans import BUSY, HOURS, LARGE, MANY_PATHS, PATHS, Plan
+from tests.network.played import Played
+from uavlinkd.core import constants as c
 from uavlinkd.core import establish
 from uavlinkd.core.indices import Indices
 from uavlinkd.core.initiator import Initiator
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Output
 from uavlinkd.core.path import Path
+from uavlinkd.core.paths import PathSet
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.replay import ReplayWindow
+from uavlinkd.core.session import Session
+from uavlinkd.core.settings import Class
 
 SEEDS = int(os.environ.get("UAVLINKD_CHAOS_SEEDS", "8"))
 """Number of random histories: most of them small and busy."""
@@ -39,6 +44,22 @@ def test_a_large_fleet_and_a_long_flight(plan: Plan, seed: int) -> None:
     _assert_sound(play(seed, plan))
 
 
+@pytest.mark.parametrize("batch", range(4))
+def test_one_usable_path_is_enough_after_any_history(batch: int) -> None:
+    """Paths fail one by one, in any way: peers with one usable path are up, and no critical frame is lost."""
+    for seed in range(batch, SEEDS // 2, 4):
+        played = play(seed, PATHS)
+        _assert_sound(played)
+        assert played.critical_judged
+
+
+def test_a_large_fleet_with_many_paths() -> None:
+    """A dozen drones or more, each with up to four networks."""
+    played = play(4, MANY_PATHS)
+    _assert_sound(played)
+    assert played.critical_judged
+
+
 def _assert_sound(played: Played) -> None:
     assert not played.violations, played.violations[0][1]
     assert played.judged
@@ -55,33 +76,57 @@ def _keeps_a_removed_peer(node: Node, peer: Peer, now: float) -> list[Output]:
     return []
 
 
-def _initiates_once(initiator: Initiator, candidates: list[Path], now: float) -> Path:
+def _initiates_once(initiator: Initiator, now: float, *, is_metered: bool = False, slow_at: float = 0.0) -> None:
     initiator.retry_at = now + 100.0
-    return candidates[0]
+
+
+def _returns_zero(*_: Any) -> int:
+    return 0
+
+
+_set_routes = PathSet._set_routes
+
+
+def _copies_nothing(paths: PathSet, now: float) -> None:
+    _set_routes(paths, now)
+    paths.routes = dict.fromkeys(Class, paths.routes[Class.BULK])
+
+
+def _tries_one_path(paths: PathSet, *, is_answering: bool = True) -> tuple[list[Path], list[Path]]:
+    return [state.path for state in paths.states[:1]], []
+
+
+def _counts_arrivals(session: Session, counter: int) -> int:
+    return session.order_base + session.received
 
 
 def _raises(peer: Peer, *_: Any) -> None:
     raise KeyError(peer.name)
 
 
-PLANTS: dict[str, tuple[Any, str, Callable[..., Any], str]] = {
-    "no replay window": (ReplayWindow, "check", _nothing, "delivered twice"),
-    "a removed peer keeps its keys": (Node, "remove_peer", _keeps_a_removed_peer, "d1 has removed d0"),
-    "indices leak": (Indices, "forget", _nothing, "indices are owned"),
-    "one initiation is all": (Initiator, "next_path", _initiates_once, "not within"),
-    "an exception": (establish, "receive_hint", _raises, "KeyError"),
+PLANTS: dict[str, tuple[Any, str, Any, str, Plan]] = {
+    "no replay window": (ReplayWindow, "is_used", _nothing, "delivered twice", BUSY),
+    "a removed peer keeps its keys": (Node, "remove_peer", _keeps_a_removed_peer, "has removed d", BUSY),
+    "indices leak": (Indices, "forget", _nothing, "indices are owned", BUSY),
+    "one initiation is all": (Initiator, "begin_try", _initiates_once, "not within", BUSY),
+    "an exception": (establish, "receive_hint", _raises, "KeyError", BUSY),
+    "no copies": (PathSet, "_set_routes", _copies_nothing, "was lost although paths", PATHS),
+    "handshakes along one path": (PathSet, "handshake_paths", _tries_one_path, "not within", PATHS),
+    "no order": (Session, "order_of", _returns_zero, "the order is unknown", PATHS),
+    "order by arrival": (Session, "order_of", _counts_arrivals, "is before", PATHS),
+    "slots without end": (c, "LEARNED_PATHS", 99, "learned paths of a peer", PATHS),
 }
 
 
-@pytest.mark.parametrize(("where", "name", "plant", "message"), PLANTS.values(), ids=PLANTS)
+@pytest.mark.parametrize(("where", "name", "plant", "message", "plan"), PLANTS.values(), ids=PLANTS)
 def test_a_planted_bug_is_found(
-    monkeypatch: pytest.MonkeyPatch, where: Any, name: str, plant: Callable[..., Any], message: str
+    monkeypatch: pytest.MonkeyPatch, where: Any, name: str, plant: Any, message: str, plan: Plan
 ) -> None:
     """A history finds each broken property soon."""
     monkeypatch.setattr(where, name, plant)
     violations: list[str] = []
     for seed in (2, 1, 3, 0):  # the short ones first
-        violations += [what for _, what in play(seed, BUSY).violations]
+        violations += [what for _, what in play(seed, plan).violations]
         if any(message in what for what in violations):
             return
     pytest.fail(f"not found, but {violations}")
@@ -101,5 +146,5 @@ def test_the_command_reports_the_result(monkeypatch: pytest.MonkeyPatch, capsys:
     assert "virtual minutes" in output
     assert "30 % loss in each direction, one knows: 20 handshakes" in output
     monkeypatch.setattr(Indices, "forget", _nothing)
-    assert main(["--seed", "10"]) == 1
+    assert main(["--seed", "6"]) == 1
     assert "indices are owned" in capsys.readouterr().out

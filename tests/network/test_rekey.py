@@ -19,7 +19,8 @@ def _want_new_keys(drone: Drone, other: Drone) -> None:
     assert drone.node is not None
     assert session is not None
     session.created_at -= 1000.0
-    drone.node.set_paths(drone.peer(other), drone.peer(other).initiator.paths, drone.local_now)  # looks at its timers
+    peer = drone.peer(other)
+    drone.node.set_paths(peer, peer.paths.configured, drone.local_now)  # looks at its timers
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.02, 0.3])

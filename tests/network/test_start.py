@@ -35,7 +35,7 @@ def _crossing(network: Network) -> tuple[Drone, Drone]:
     drones = network.add("a", clock=lot.uniform(0, 2**32)), network.add("b", clock=lot.uniform(0, 2**32))
     for drone in drones:
         if lot.random() < 0.3:
-            drone.addresses.append((f"10.1.0.{len(drone.name)}{ord(drone.name)}", 5791))
+            drone.move(*drone.addresses, (f"10.1.0.{len(drone.name)}{ord(drone.name)}", 5791))
     knowing = lot.choice(((True, True), (True, True), (True, False), (False, True)))
     for drone, other, knows in zip(drones, reversed(drones), knowing, strict=True):
         known = lot.sample(other.addresses, lot.randint(1, len(other.addresses))) if knows else []

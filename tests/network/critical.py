@@ -1,0 +1,80 @@
+"""No critical frame is lost while any path delivers.
+
+A path *delivers* if for :data:`SETTLED_S` before the frame was sent, and :data:`DELIVERED_WITHIN_S` after it, it
+carried everything in both directions: no loss, no cut, no stall, at one address at each end, between two daemons that
+ran and had each other as a peer. The sender and the receiver have exchanged questions and answers along it in that
+time. A path on a metered network is asked less often, and must have delivered for longer.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+from tests.network.air import Endpoint, Hop
+from tests.network.drone import Drone
+from tests.network.fleet import Fleet, Pair
+from uavlinkd.core import constants as c
+from uavlinkd.core.settings import Class
+
+SETTLED_S = 10.0
+"""A path that was down is asked each second, and is usable again after three answers and 2 s."""
+METERED_SETTLED_S = SETTLED_S + 2 * c.PROBE_IDLE_S
+DELIVERED_WITHIN_S = 2.0
+"""The receiver may ask for a second whether the frame is new; the delay comes on top."""
+LONGEST_DELAY_S = 0.35
+"""A path with a longer one way delay than this, jitter included, does not count: its answers come too late."""
+
+
+class CriticalWatch:
+    """Sends critical frames between all peers, and checks each of them some time later."""
+
+    def __init__(self, fleet: Fleet) -> None:
+        self.sent = 0
+        self.judged = 0
+        """Frames for which a path delivered."""
+        self._fleet = fleet
+        self._network = fleet.network
+
+    def begin(self) -> None:
+        """Send from now on, at random intervals, so that frames meet every phase of a failure."""
+        for pair in self._fleet.pairs:
+            for sender, receiver in ((pair.a, pair.b), (pair.b, pair.a)):
+                self._network.at(self._network.now, partial(self._send, pair, sender, receiver))
+
+    def _send(self, pair: Pair, sender: Drone, receiver: Drone) -> None:
+        network, (shortest_s, longest_s) = self._network, (0.5, 1.5)
+        if network.send(sender, receiver, Class.CRITICAL):
+            self.sent += 1
+            number = len(network.flow(sender, receiver, Class.CRITICAL).sent_at) - 1
+            network.at(network.now + DELIVERED_WITHIN_S, partial(self._check, pair, sender, receiver, number))
+        interval_s = self._fleet.lot.uniform(shortest_s, longest_s) * self._fleet.plan.intervals_s[0]
+        network.at(network.now + interval_s, partial(self._send, pair, sender, receiver))
+
+    def _check(self, pair: Pair, sender: Drone, receiver: Drone, number: int) -> None:
+        flow = self._network.flow(sender, receiver, Class.CRITICAL)
+        sent_at = flow.sent_at[number]
+        are_peers = _has(sender, receiver) and _has(receiver, sender)
+        delivering = [hop for hop in pair.hops if self._delivered(hop, sent_at)] if are_peers else []
+        self.judged += bool(delivering)
+        assert not delivering or number in flow.delivered, (
+            f"critical frame {number} from {sender.name} to {receiver.name}, sent at {sent_at:.3f},"
+            f" was lost although paths delivered: {delivering}"
+        )
+
+    def _delivered(self, hop: Hop, sent_at: float) -> bool:
+        """Whether a path has delivered from long before a frame was sent until now."""
+        air = self._network.air
+        settled_s = METERED_SETTLED_S if any(map(self._was_metered, hop)) else SETTLED_S
+        for one in (hop, hop.back):
+            radio = air.settings_of(one)
+            delay_s = radio.delay_s + radio.jitter_s + (radio.held_back_s if radio.reordering else 0.0)
+            if air.undisturbed_since(one) > sent_at - settled_s or delay_s > LONGEST_DELAY_S:
+                return False
+        return True
+
+    def _was_metered(self, end: Endpoint) -> bool:
+        return end.socket in self._network.drones[end.drone].once_metered
+
+
+def _has(drone: Drone, other: Drone) -> bool:
+    return drone.node is not None and other.name in drone.node.peers

@@ -1,0 +1,263 @@
+"""A daemon in the simulated network: a node, its sockets with their addresses, and what it reported."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from random import Random
+from typing import Protocol
+
+from tests.network.air import Address, Air, Endpoint, Hop
+from tests.network.bounds import Sizes, check
+from tests.network.flow import Flow
+from uavlinkd.core.cookie import MacKeys
+from uavlinkd.core.crypto import Secret, x25519_public_key
+from uavlinkd.core.drops import Drop
+from uavlinkd.core.node import Node
+from uavlinkd.core.outputs import Output, SessionEstablished
+from uavlinkd.core.path import Path
+from uavlinkd.core.peer import Peer
+from uavlinkd.core.refusals import Refused
+from uavlinkd.core.session import Session
+from uavlinkd.core.settings import Link, PeerSettings, Screen
+
+
+class World(Protocol):
+    """What a drone needs of its network."""
+
+    now: float
+    rng: Random
+    screen: Screen
+    air: Air
+    drones: dict[str, Drone]
+
+    def flows_between(self, sender: str, receiver: str) -> Sequence[Flow]:
+        """The frames of every class from one drone to another."""
+
+    def perform(self, drone: Drone, outputs: list[Output]) -> None:
+        """Process the outputs of a node."""
+
+    def note(self, text: str) -> None:
+        """Add a line to the log that a failed test prints."""
+
+
+class Drone:
+    """A daemon in the simulated network. A restart creates a new :class:`Node` and keeps only the key."""
+
+    def __init__(self, world: World, name: str, addresses: Sequence[Address], clock: float) -> None:
+        self.name = name
+        self.addresses: tuple[Address, ...] = ()
+        """By the number of the socket; :meth:`move` changes one at any time without notice to the node."""
+        self.clock = clock
+        """Its clock at the network's time zero."""
+        self.nat_sockets: set[int] = set()
+        """Sockets behind a NAT: only a destination of their datagrams since their address changed reaches them."""
+        self.metered_sockets: set[int] = set()
+        """Sockets whose network is metered."""
+        self.once_metered: set[int] = set()
+        """Those whose network is or was metered."""
+        self.outputs: list[tuple[float, Output]] = []
+        """All outputs but datagrams and frames, with the network's time."""
+        self.drops: Counter[str] = Counter()
+        self.contacted: set[tuple[Address, Address]] = set()
+        self.datagrams_sent: Counter[int] = Counter()
+        """By socket, as :attr:`bytes_sent`."""
+        self.bytes_sent: Counter[int] = Counter()
+        """Lengths of its datagrams, without headers of UDP and IP."""
+        self.private_key = world.rng.randbytes(32)
+        self.public_key = x25519_public_key(self.private_key)
+        self.acquaintances: dict[str, tuple[PeerSettings, tuple[Path, ...]]] = {}
+        self.removed: dict[str, tuple[PeerSettings, tuple[Path, ...]]] = {}
+        """Peers that were removed from the configuration, and can be added again."""
+        self.reported: set[tuple[str, Refused]] = set()
+        """The refusals that it has ever reported, and to whom."""
+        self.largest: Sizes = Counter()
+        """The maximum size of each table of its nodes."""
+        self.node: Node | None = None
+        """None while it is off."""
+        self._world = world
+        self._place(addresses)
+
+    # Its addresses.
+
+    @property
+    def is_behind_nat(self) -> bool:
+        """Whether each of its sockets is behind a NAT."""
+        return len(self.nat_sockets) == len(self.addresses)
+
+    @is_behind_nat.setter
+    def is_behind_nat(self, is_behind_nat: bool) -> None:
+        self.nat_sockets = set(range(len(self.addresses))) if is_behind_nat else set()
+
+    def move(self, *addresses: Address) -> None:
+        """Use other addresses from now on: another network, or a NAT that forgot its mapping."""
+        self.contacted.clear()
+        self._place(addresses)
+        self._world.note(f"{self.name} is at {addresses}")
+
+    def move_socket(self, socket: int, address: Address) -> None:
+        """The address of one socket changes, as when its NAT forgets a mapping. The others stay as they are."""
+        before = self.addresses[socket]
+        self.contacted = {pair for pair in self.contacted if pair[0] != before}
+        self._place([address if number == socket else other for number, other in enumerate(self.addresses)])
+        self._world.note(f"{self.name} is at {address} with socket {socket}")
+
+    def lose_network(self, socket: int) -> None:
+        """The network behind one socket is gone, and the daemon notices it."""
+        self._set_network(socket, is_up=False)
+
+    def find_network(self, socket: int) -> None:
+        """The network behind one socket is back, and the daemon notices it."""
+        self._set_network(socket, is_up=True)
+
+    def _set_network(self, socket: int, *, is_up: bool) -> None:
+        end = Endpoint(self.name, socket)
+        (self._world.air.absent.discard if is_up else self._world.air.absent.add)(end)
+        self._world.air.disturb(end, self._world.now)
+        self._world.note(f"{self.name} {'finds' if is_up else 'loses'} network {socket}")
+        if self.node is not None:
+            self.node.set_socket_state(socket, is_up=is_up, now=self.local_now)
+
+    def set_metered(self, sockets: Iterable[int]) -> None:
+        """The networks that are metered from now on."""
+        self.metered_sockets = set(sockets)
+        self.once_metered |= self.metered_sockets
+        self._world.note(f"{self.name} has metered networks {sorted(self.metered_sockets)}")
+        if self.node is not None:
+            self.node.set_metered(self.metered_sockets, self.local_now)
+
+    def hop(self, socket: int, other: Drone, other_socket: int) -> Hop:
+        """The direction from here of a path to another drone."""
+        return Hop(Endpoint(self.name, socket), Endpoint(other.name, other_socket))
+
+    def _place(self, addresses: Sequence[Address]) -> None:
+        air, now = self._world.air, self._world.now
+        for socket, (before, after) in enumerate(zip(self.addresses, addresses, strict=False)):
+            if before != after:
+                air.disturb(Endpoint(self.name, socket), now)
+        air.place(self.name, self.addresses, addresses)
+        self.addresses = tuple(addresses)
+
+    # Its configuration.
+
+    def knows(self, other: Drone, addresses: Iterable[Address | Path] = (), link: Link | None = None) -> None:
+        """Configure a peer and its addresses: paths, or addresses that the first socket reaches."""
+        settings = PeerSettings(other.name, other.public_key, link=link or Link())
+        paths = tuple(where if isinstance(where, Path) else Path(0, where) for where in addresses)
+        self.acquaintances[other.name] = settings, paths
+
+    def remove(self, other: Drone) -> None:
+        """Remove a peer from the configuration: from now on it is a stranger."""
+        self.removed[other.name] = self.acquaintances.pop(other.name)
+        self._world.note(f"{self.name} removes {other.name}")
+        self._refuse_before(other, math.inf)
+        if self.node is not None:
+            self._world.perform(self, self.node.remove_peer(self.peer(other), self.local_now))
+            assert other.name not in self.node.peers
+
+    def restore(self, other: Drone) -> None:
+        """Add a removed peer again. The frames that it sent so far stay refused."""
+        settings, paths = self.acquaintances[other.name] = self.removed.pop(other.name)
+        self._world.note(f"{self.name} has {other.name} back")
+        self._refuse_before(other, self._world.now)
+        if self.node is not None:
+            peer = self.node.add_peer(settings, self.local_now)
+            self.node.set_paths(peer, paths, self.local_now)
+
+    def _refuse_before(self, other: Drone, moment: float) -> None:
+        self._world.air.disturb(frozenset((self.name, other.name)), self._world.now)
+        for flow in self._world.flows_between(other.name, self.name):
+            flow.refused_before = moment
+            flow.orders.clear()
+
+    # Its life.
+
+    def start(self, clock: float | None = None) -> None:
+        """A new node without state; ``clock`` is the present time of its clock."""
+        self._world.air.disturb(self.name, self._world.now)
+        for name in self.acquaintances:
+            for flow in self._world.flows_between(name, self.name):
+                flow.refused_before = self._world.now
+                flow.orders.clear()
+        if clock is not None:
+            self.clock = clock - self._world.now
+        now = self.local_now
+        entropy = Random(self._world.rng.randbytes(16))
+        self.node = Node(Secret(self.private_key), entropy.randbytes, now, screen=self._world.screen)
+        self.node.set_metered(self.metered_sockets, self.local_now)
+        for settings, paths in self.acquaintances.values():
+            self.node.set_paths(self.node.add_peer(settings, now), paths, now)
+        for end in self._world.air.absent:
+            if end.drone == self.name:
+                self.node.set_socket_state(end.socket, is_up=False, now=now)
+        self._world.note(f"{self.name} starts, its clock at {now:.3f}")
+
+    def stop(self) -> None:
+        """Power off, without a close record."""
+        self._world.air.disturb(self.name, self._world.now)
+        self.node = None
+        self._world.note(f"{self.name} is off")
+
+    def leap(self, seconds: float) -> None:
+        """A machine that slept: its clock, which never runs backwards, is suddenly later."""
+        self._world.air.disturb(self.name, self._world.now)
+        self.clock += seconds
+        self._world.note(f"{self.name} slept {seconds} s")
+
+    @property
+    def local_now(self) -> float:
+        """The time of its clock."""
+        return self._world.now + self.clock
+
+    # What it knows.
+
+    def peer(self, other: Drone) -> Peer:
+        """The node's state of the link with another drone."""
+        assert self.node is not None
+        return self.node.peers[other.name]
+
+    def session(self, other: Drone) -> Session | None:
+        """The session that sends to another drone."""
+        return self.peer(other).sessions.current if self.node is not None else None
+
+    def established(self) -> Iterator[tuple[float, SessionEstablished]]:
+        """When sessions came up here."""
+        return ((at, output) for at, output in self.outputs if isinstance(output, SessionEstablished))
+
+    def check_bounds(self) -> None:
+        """The memory that others can use in a node is bounded."""
+        if self.node is not None:
+            self.largest |= check(self.node)
+            for name, peer in self.node.peers.items():
+                for claim in peer.refusal_claims.recent():
+                    reported = self._world.drones[name].reported
+                    assert (self.name, claim.refused) in reported, f"{name} never reported {claim} to {self.name}"
+
+    def check_no_initiation(self, datagram: bytes) -> None:
+        """A removed peer is a stranger: no handshake message has its key."""
+        for settings, _ in self.removed.values():
+            try:
+                MacKeys(settings.public_key).check_mac1(datagram)
+            except Drop:
+                continue
+            raise AssertionError(f"{self.name} calls {settings.name}, which it has removed")
+
+
+def share_a_session(a: Drone, b: Drone) -> bool:
+    """Whether both send on the same session."""
+    mine, theirs = a.session(b), b.session(a)
+    return (
+        mine is not None
+        and theirs is not None
+        and mine.parameters.generation == theirs.parameters.generation
+        and mine.is_initiator != theirs.is_initiator
+        and (mine.local_index, mine.remote_index) == (theirs.remote_index, theirs.local_index)
+    )
+
+
+def session_name(a: Drone, b: Drone) -> tuple[int, int, int]:
+    """What identifies the session that ``a`` sends on: generation and both indices."""
+    session = a.session(b)
+    assert session is not None
+    return session.parameters.generation, session.local_index, session.remote_index

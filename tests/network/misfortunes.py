@@ -1,0 +1,132 @@
+"""What befalls a fleet in a random history: radios, cuts, restarts, moves, removals, replays and floods."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from functools import partial
+
+from tests.network.attackers import Flooder, Recorder
+from tests.network.drone import Drone
+from tests.network.fleet import Fleet
+from tests.network.path_misfortunes import PathMisfortunes, random_address, random_radio
+
+_KEPT = 2000
+_SHARE_OF_PATHS = 0.85
+"""Of the misfortunes in a fleet with several paths: most concern one path, so that another one works."""
+
+
+class Misfortunes:
+    """Befalls a fleet with one random misfortune at a time."""
+
+    def __init__(self, fleet: Fleet) -> None:
+        self.events: Counter[str] = Counter()
+        """How often each one happened, by name."""
+        self._fleet = fleet
+        self._network = fleet.network
+        self._lot = fleet.lot
+        self._recorder = Recorder(fleet.network, keep=_KEPT)
+        self._until = 0.0
+        self._of_paths = PathMisfortunes(fleet)
+        self._kinds: list[tuple[str, Callable[[], None]]] = [
+            ("other radios", self._other_radios),
+            ("cut", self._cut),
+            ("cut one way", self._cut_one_way),
+            ("partition", self._partition),
+            ("cuts healed", self._network.heal),
+            ("restart", self._restart),
+            ("off for a while", self._off),
+            ("close", self._close),
+            ("move", self._move),
+            ("clock ahead", self._jump),
+            ("peer removed", self._remove),
+            ("peer back", self._restore),
+            ("replays", self._replay),
+            ("flood by strangers", partial(self._flood, knows_key=False)),
+            ("flood with the public key", partial(self._flood, knows_key=True)),
+        ]
+
+    def befall(self, until: float) -> None:
+        """Let something happen now. What ends by itself ends by ``until``, or not at all."""
+        self._until = until
+        if self._fleet.plan.has_paths and self._lot.random() < _SHARE_OF_PATHS:
+            name = self._of_paths.befall(until)
+        else:
+            name, befalls = self._lot.choice(self._kinds)
+            self._network.note(name)
+            befalls()
+        self.events[name] += 1
+
+    def _other_radios(self) -> None:
+        self._network.set_radio(random_radio(self._fleet))
+
+    def _cut(self) -> None:
+        a, b, _ = self._lot.choice(self._fleet.pairs)
+        self._network.cut(a, b)
+
+    def _cut_one_way(self) -> None:
+        self._network.cut_one_way(*self._random_peers())
+
+    def _partition(self) -> None:
+        drones = self._fleet.drones
+        here = set(self._lot.sample([drone.name for drone in drones], self._lot.randint(1, len(drones) - 1)))
+        for a, b, _ in self._fleet.pairs:
+            if (a.name in here) != (b.name in here):
+                self._network.cut(a, b)
+
+    def _restart(self) -> None:
+        self._random_drone().start(self._fleet.random_clock())
+
+    def _off(self) -> None:
+        drone = self._random_drone()
+        drone.stop()
+        self._start_later(drone)
+
+    def _close(self) -> None:
+        drone = self._random_drone()
+        if drone.node is not None:
+            self._network.perform(drone, drone.node.close(drone.local_now))
+            drone.stop()
+            self._start_later(drone)
+
+    def _start_later(self, drone: Drone) -> None:
+        clock, after_s = self._fleet.random_clock(), self._lot.choice((0.5, 5.0, 400.0))
+        if self._network.now + after_s < self._until:
+            self._network.at(self._network.now + after_s, lambda: drone.start(clock) if drone.node is None else None)
+
+    def _move(self) -> None:
+        drone = self._lot.choice(self._fleet.wanderers)
+        drone.move_socket(0, random_address(self._fleet, drone))
+
+    def _jump(self) -> None:
+        self._random_drone().leap(self._lot.choice((0.3, 3.0, 100.0, 5000.0)))
+
+    def _remove(self) -> None:
+        a, b = self._random_peers()
+        if b.name in a.acquaintances:
+            a.remove(b)
+
+    def _restore(self) -> None:
+        for a, b, _ in self._fleet.pairs:
+            for drone, other in ((a, b), (b, a)):
+                if other.name in drone.removed and self._lot.random() < 0.5:
+                    drone.restore(other)
+
+    def _replay(self) -> None:
+        if self._recorder.recorded:
+            for datagram, source, destination in self._lot.choices(self._recorder.recorded, k=50):
+                self._network.inject(datagram, self._lot.choice((source, destination)), destination)
+
+    def _flood(self, *, knows_key: bool) -> None:
+        lot = self._lot
+        sources = lot.choice((1, 8, 64, 64, 1200))
+        flooder = Flooder(self._network, self._random_drone(), lot, sources=sources, knows_key=knows_key)
+        duration_s = lot.choice((1.0, 3.0, 8.0))
+        flooder.flood(lot.choice((50.0, 200.0, 400.0)), min(self._network.now + duration_s, self._until))
+
+    def _random_drone(self) -> Drone:
+        return self._lot.choice(self._fleet.drones)
+
+    def _random_peers(self) -> tuple[Drone, Drone]:
+        a, b, _ = self._lot.choice(self._fleet.pairs)
+        return (a, b) if self._lot.random() < 0.5 else (b, a)
