@@ -20,6 +20,7 @@ from uavlinkd.core import handshake, wire
 from uavlinkd.core.cookie import MacKeys
 from uavlinkd.core.outputs import Deliver, Dropped, Output, Transmit
 from uavlinkd.core.path import Path
+from uavlinkd.core.probe import ANSWER_BYTES, PROBE, QUESTION_BYTES, Probe
 from uavlinkd.core.refusals import RefusalReport, Refused
 from uavlinkd.core.session import Session
 from uavlinkd.core.settings import Link, PeerSettings, Timers
@@ -27,6 +28,7 @@ from uavlinkd.core.settings import Link, PeerSettings, Timers
 PATHS: Final = (AT_A, AT_A, ELSEWHERE, Path(0, ("2001:db8::9", 5, 0, 0)))
 CHECKS_THE_SEQUEL: Final = 0xE0
 _LIVELY = Timers()
+_PROBE_AND_FRAMES: Final = bytes((PROBE, 1))
 
 
 class Insider:
@@ -41,8 +43,11 @@ class Insider:
         self.sessions: list[Session] = [pair.a.session]
         self.sealed: Counter[bytes] = Counter()
         self.delivered: Counter[bytes] = Counter()
+        self.credit: Counter[Path] = Counter()
+        """Bytes that came from an address and were not answered with as many."""
         self.recorded: list[bytes] = []
-        self.tokens: list[bytes] = [bytes(8)]
+        self.questions: list[int] = [1]
+        """Of the victim's probes: the last four."""
         self.echoes: list[int] = [0]
         self._random_state = SeededEntropy(77)
         self._to_bravo = MacKeys(KEY_B.public)
@@ -109,11 +114,11 @@ class Insider:
             case 2:
                 return wire.Echo(True, script.long(), script.long(), script.long(), script.long()).encode()
             case 3:
-                return wire.PathChallenge(script.take(8).ljust(8, b"\0")).encode()
+                return self.probe(script, 0)
             case 4:
-                return wire.PathResponse(self.tokens[-1]).encode()
+                return self.probe(script, self.questions[-1 - (which >> 4) % len(self.questions)])
             case 5:
-                return wire.PathResponse(script.take(8).ljust(8, b"\0")).encode()
+                return self.probe(script, script.long())
             case 6:
                 return wire.Close().encode()
             case 7 if which & 8:
@@ -124,6 +129,14 @@ class Insider:
                 return RefusalReport(entries).encode()
             case _:
                 return bytes((script.byte() % wire.FRAMES_FROM,)) + script.take(script.byte() & 31)
+
+    def probe(self, script: Script, answer: int) -> bytes:
+        """A probe with any report; alone, or before frames or padding."""
+        how = script.byte()
+        question = script.long() if how & 1 else 0
+        record = Probe(question, answer, script.word(), script.word(), script.word())
+        behind = script.byte() >> 2
+        return record.encode(bytes((0xFD,)) * behind if how & 2 else b"", behind if how & 4 else 0)
 
     def _seal(self, payload: bytes, script: Script, what: int) -> bytes:
         """An envelope around any bytes; sometimes on an older session, or with a counter of its choice."""
@@ -140,6 +153,8 @@ class Insider:
         session.send_counter %= c.SESSION_ENVELOPE_LIMIT
         datagram = session.seal(payload, self.now)
         self.sealed[payload] += 1
+        if payload[:2] == _PROBE_AND_FRAMES:
+            self.sealed[payload[QUESTION_BYTES if any(payload[2:6]) else ANSWER_BYTES :]] += 1
         self.recorded.append(datagram)
         del self.recorded[:-64]
         return datagram
@@ -161,15 +176,11 @@ class Insider:
     def _offer(self, datagram: bytes, what: int) -> list[Output]:
         path = PATHS[what >> 5 & 3]
         TALLY.add(datagram)
-        before = self.peer.path
+        self.credit[path] += len(datagram)
+        before = set(self.peer.paths.by_path)
         outputs = self.node.receive(datagram, path, self.now)
-        unproven = [
-            output.datagram for output in of(outputs, Transmit) if output.path not in (before, self.peer.path)
-        ]
-        assert all(output.path in (path, before, self.peer.path) for output in of(outputs, Transmit)), (
-            "sent elsewhere"
-        )
-        assert sum(map(len, unproven)) <= len(datagram), "more bytes to an unproven address than came from there"
+        places = {path, *before, *self.peer.paths.by_path}
+        assert all(output.path in places for output in of(outputs, Transmit)), "sent elsewhere"
         self._take(outputs, path)
         return outputs
 
@@ -177,6 +188,7 @@ class Insider:
         refused = 0
         for out in outputs:
             if type(out) is Transmit:
+                self._charge(out)
                 self._see(out)
             elif type(out) is Deliver:
                 assert out.peer is self.peer, "delivered for another peer"
@@ -187,6 +199,18 @@ class Insider:
                 refused += 1
         assert refused <= (path is not None), f"one datagram, {refused} drops"
 
+    def _charge(self, sent: Transmit) -> None:
+        """An address that is neither configured nor proven gets no more bytes than came from there."""
+        if self.is_proven(sent.path):
+            return
+        self.credit[sent.path] -= len(sent.datagram)
+        assert self.credit[sent.path] >= 0, "more bytes to an unproven address than came from there"
+
+    def is_proven(self, path: Path) -> bool:
+        """Whether the victim may send there first."""
+        state = self.peer.paths.find(path)
+        return state is not None and state.is_proven
+
     def _see(self, sent: Transmit) -> None:
         """Read from the victim's outputs what an honest peer would read."""
         if sent.datagram[0] not in (wire.SHORT_ENVELOPE, wire.LONG_ENVELOPE):
@@ -196,11 +220,14 @@ class Insider:
             if session.local_index == index:
                 payload = unsealed(session, sent.datagram)
                 if payload and payload[0] < wire.FRAMES_FROM:
-                    self._learn(wire.parse_control(payload))
+                    self.learn(wire.parse_control(payload), sent)
 
-    def _learn(self, control: wire.Control) -> None:
-        if isinstance(control, wire.PathChallenge):
-            self.tokens = [*self.tokens[-3:], control.token]
+    def learn(self, control: wire.Control, sent: Transmit) -> None:
+        """A record that an honest peer would read."""
+        if isinstance(control, wire.ProbeAndFrames):
+            assert not sent.is_copy, "a probe was copied"
+            if control.probe.question:
+                self.questions = [*self.questions[-3:], control.probe.question]
         elif isinstance(control, wire.Echo) and not control.is_reply:
             self.echoes = [*self.echoes[-3:], control.token]
 

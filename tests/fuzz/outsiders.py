@@ -42,9 +42,10 @@ CHECKS_THE_SEQUEL: Final = 0xF0
 """Set in a script's first byte. Then the genuine datagram follows at the end, and the link must work."""
 BUDGET: Final = 8
 """Handshake messages of a script that reach a key exchange."""
-_SPENT = ONLY_COUNTED | {"_cookied", "_sources"}
+_OF_COPIES = {"datagrams_received", "bytes_received", "duplicates", "received"}
+_SPENT = ONLY_COUNTED | {"_cookied", "_sources"} | _OF_COPIES
 _DEADLINES = {"deadlines", "next_at", "scheduled_at", "_heap", "_pushed"}
-_SPENT_WITH_COOKIES = _SPENT | {"_received_cookies", "has_cookie", "retry_at", "cookies_taken", *_DEADLINES}
+_SPENT_WITH_COOKIES = _SPENT | {"_received_cookies", "cookied", "retry_at", "cookies_taken", *_DEADLINES}
 _KINDS = (*range(1, 4), 0x40, 0x41, 0xFD, 0xFE, 0)
 _HANDSHAKE_SIZES = tuple(
     size(suite) for suite in SUITES.values() for size in (wire.initiation_bytes, wire.response_bytes)
@@ -61,10 +62,12 @@ class Outsider:
         self._node = stage.victim.node
         self._receivers = tuple(MacKeys(key) for key in stage.public_keys)
         self._cookies: dict[Path, bytes] = {}  # from the victim, by the path of the request
+        self._copied_to: set[Path] = set()  # responses, in addition to the first one
         self._random_state = 0
         # Unaltered, these are genuine. mac2 has no effect until the node is under load.
         self._genuine = {*(stage.genuine, *stage.others)}
         self._genuine |= {datagram[: -c.MAC_BYTES] for datagram in self._genuine if datagram[0] in _REPAIRED}
+        self._recorded = {datagram[: -c.MAC_BYTES] for datagram in stage.templates}
         self._copy = copier(stage.pair)
         self._take_pictures()
 
@@ -76,6 +79,7 @@ class Outsider:
         cookies_taken = 0
         self._random_state = zlib.crc32(script.data)
         self._cookies.clear()
+        self._copied_to.clear()
         now = stage.now
         self._reset()
         while script:
@@ -89,15 +93,19 @@ class Outsider:
             outputs = receive(datagram, path, now)
             if len(outputs) == 1 and type(outputs[0]) is Dropped:
                 reasons.append(outputs[0].reason)
+            elif not outputs and datagram in stage.templates and datagram not in cookies:
+                reasons.append(DropReason.DUPLICATE)  # an authentic copy: it changes only counters
             elif not outputs and datagram in cookies:
                 cookies_taken += 1
             else:
-                assert is_repaired, f"a stranger without a key got {outputs}"
-                reasons.append(self._judge_cookie(outputs, datagram, path))
+                is_copy = datagram[: -c.MAC_BYTES] in self._recorded
+                assert is_repaired or is_copy, f"a stranger without a key got {outputs}"
+                reasons.append(self._judge_answer(outputs, datagram, path))
         counted = Counter(self._node.drops)
         for peer in self._node.peers.values():
             counted += peer.traffic.drops
         assert counted == Counter(reasons), f"dropped {reasons}, counted {counted}"
+        self._forget_copies()
         if cookies_taken:
             assert state_of(self._node, ignoring=_SPENT_WITH_COOKIES) == self._before_cookies, (
                 "a forgery left a trace"
@@ -159,22 +167,39 @@ class Outsider:
         size = (wire.initiation_bytes if kind == wire.INITIATION else wire.response_bytes)(suite)
         return (bytes((kind, suite.number)) + script.take(script.byte() & 31)).ljust(size, b"\7")[:size]
 
-    def _judge_cookie(self, outputs: Sequence[Output], datagram: bytes, path: Path) -> DropReason:
-        """The only answer to a sender that knows the public key: a cookie, to itself, no longer than its message."""
-        assert len(outputs) == 2, f"more than a cookie: {outputs}"
+    def _judge_answer(self, outputs: Sequence[Output], datagram: bytes, path: Path) -> DropReason:
+        """Answers to a sender that knows the public key go to itself, and are no longer than its message.
+
+        They are a cookie; and the response, once for each path, to a copy of the initiation that it answered.
+        """
+        assert len(outputs) == 2, f"more than an answer: {outputs}"
         sent, dropped = outputs
-        assert isinstance(sent, Transmit), f"more than a cookie: {outputs}"
-        assert isinstance(dropped, Dropped), f"more than a cookie: {outputs}"
+        assert isinstance(sent, Transmit), f"more than an answer: {outputs}"
+        assert isinstance(dropped, Dropped), f"more than an answer: {outputs}"
+        assert sent.path == path, "an answer went elsewhere"
+        assert len(sent.datagram) <= len(datagram), "an answer longer than its message"
+        if dropped.reason is DropReason.DUPLICATE:
+            assert {datagram[: -c.MAC_BYTES], sent.datagram[: -c.MAC_BYTES]} <= self._recorded, "not a copy"
+            assert path not in self._copied_to, "a path got two copies of a response"
+            self._copied_to.add(path)
+            return dropped.reason
         assert dropped.reason is DropReason.COOKIE_REQUIRED
         assert sent.datagram[0] == wire.COOKIE
-        assert sent.path == path, "a cookie went elsewhere"
-        assert len(sent.datagram) <= len(datagram), "an answer longer than its message"
         reply, mac1 = wire.parse_cookie_reply(sent.datagram), mac1_of(datagram)
         for receiver in self._receivers:
             with suppress(Drop):
                 self._cookies[path] = receiver.open_cookie(reply, mac1)
                 return dropped.reason
         raise AssertionError("a cookie that does not open")
+
+    def _forget_copies(self) -> None:
+        """A response remembers the paths that it was sent along; its copies leave no other trace."""
+        peer = self._stage.victim.peer
+        peer.traffic.bytes_elsewhere = self._bytes_elsewhere
+        for waiting in peer.sessions.unconfirmed.values():
+            assert set(waiting.paths[1:]) == self._copied_to
+            assert len(waiting.paths) <= c.COPIES_OF_A_RESPONSE
+            del waiting.paths[1:]
 
     def _check_sequel(self, now: float) -> None:
         """The expected datagram arrives at last: it completes, and frames cross in both directions."""
@@ -200,6 +225,7 @@ class Outsider:
 
     def _take_pictures(self) -> None:
         self._reset()
+        self._bytes_elsewhere = self._stage.victim.peer.traffic.bytes_elsewhere
         self._before = state_of(self._node, ignoring=_SPENT)
         self._before_cookies = state_of(self._node, ignoring=_SPENT_WITH_COOKIES)
 

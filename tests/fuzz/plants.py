@@ -16,15 +16,15 @@ from typing import Any, Final
 from uavlinkd.config import checks as config_checks
 from uavlinkd.config import keys
 from uavlinkd.config import load as config_load
-from uavlinkd.core import constants as c
 from uavlinkd.core import (
     cookie,
     handshake,
     initiator,
+    path_state,
+    probe,
     receive,
     refusals,
     replay,
-    send,
     session,
     sessions,
     verification,
@@ -32,7 +32,8 @@ from uavlinkd.core import (
 )
 from uavlinkd.core import node as core_node
 from uavlinkd.core.drops import Drop, DropReason
-from uavlinkd.core.outputs import Deliver, Transmit
+from uavlinkd.core.outputs import Transmit
+from uavlinkd.endpoints import line_framing
 from uavlinkd.lab.mitm import anatomy
 from uavlinkd.lab.mitm import proxy_settings as mitm_settings
 from uavlinkd.lab.sim import tlog
@@ -136,19 +137,11 @@ def _delivers_held_twice(right: Any) -> Any:
 
 
 def _delivers_control(right: Any) -> Any:
-    def receive_control(peer: Any, session_: Any, payload: bytes, path: Any, now: float, *, is_new: bool) -> Any:
-        is_response = payload[0] == wire.PATH_RESPONSE and len(payload) == 1 + c.PATH_TOKEN_BYTES
-        delivered = [Deliver(peer, payload)] if is_response else []
-        return delivered + right(peer, session_, payload, path, now, is_new=is_new)
+    def receive_control(peer: Any, session_: Any, counter: int, payload: bytes, *rest: Any, **facts: bool) -> Any:
+        out, frames_behind = right(peer, session_, counter, payload, *rest, **facts)
+        return out, payload if payload[0] == probe.PROBE and not frames_behind else frames_behind
 
     return receive_control
-
-
-def _trusts_paths(right: Any) -> Any:
-    def challenge(peer: Any, session_: Any, path: Any, size: int, now: float) -> Any:
-        return send.seal(peer, session_, bytes((wire.ECHO_REQUEST,)) + bytes(60), path, now)
-
-    return challenge
 
 
 def _bad_crc_passes(right: Any) -> Any:
@@ -175,6 +168,10 @@ def _holds_everything(right: Any) -> Any:
         return right(self, data, result, is_final=is_final)
 
     return scan
+
+
+def _keeps_the_line(self: Any, rest: bytes) -> None:
+    self._rest = rest
 
 
 def _keeps_every_claim(_: Any) -> Any:
@@ -254,7 +251,11 @@ PLANTS: Final = {
     "tag off, confirmation": Plant("responder", "any tag confirms", session, "equal", _without_tag),
     "marked before the tag": Plant("session", "forgeries use up counters", session.Session, "open", _marks_first),
     "replay window off": Plant(
-        "sealed", "an envelope is accepted twice", replay.ReplayWindow, "check", lambda _: lambda self, counter: None
+        "sealed",
+        "an envelope is accepted twice",
+        replay.ReplayWindow,
+        "is_used",
+        lambda _: lambda self, counter: False,
     ),
     "wedged": Plant(
         "initiator",
@@ -277,7 +278,11 @@ PLANTS: Final = {
         "sealed", "a record passes for a frame", receive, "_receive_control", _delivers_control
     ),
     "amplifies": Plant(
-        "sealed", "more bytes to an unproven address than received", receive, "challenge", _trusts_paths
+        "sealed",
+        "more bytes to an unproven address than received",
+        path_state.PathState,
+        "allows",
+        lambda _: lambda self, size: True,
     ),
     "header not compared": Plant(
         "handshakes",
@@ -290,6 +295,9 @@ PLANTS: Final = {
     "bad checksum": Plant("stream", "a frame with a bad checksum passes", frames, "parse_frames", _bad_crc_passes),
     "unbounded buffer": Plant(
         "stream", "more is held than a frame", stream_splitter.StreamSplitter, "_find", _holds_everything
+    ),
+    "unbounded line": Plant(
+        "line", "more is held than a datagram", line_framing.LineDecoder, "_keep", lambda _: _keeps_the_line
     ),
     "a byte lost": Plant(
         "frames",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from tests.fuzz import files, frames, handshakes, insiders, outsiders, requests
+from tests.fuzz import files, frames, handshakes, insiders, lines, outsiders, requests
 from tests.fuzz.engine import Target
 
 _CORE: Final = 4096
@@ -44,6 +44,7 @@ TARGETS: Final = {
         Target(
             "stream", "a client's MAVLink on a serial port or TCP, cut anywhere", frames.make_stream, frames.seeds
         ),
+        Target("line", "the line of a serial network, cut anywhere", lines.make, lines.seeds),
         Target("frames", "a client's datagrams, and a peer's payloads", frames.make_datagrams, frames.seeds),
         Target("gate", "frames at a policy", frames.make_gate, frames.seeds),
         Target(

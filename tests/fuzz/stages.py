@@ -130,7 +130,7 @@ def _make_small(pair: Pair, seed: int) -> None:
         # The generator of the harness would make copies slow.
         node._entropy = node._cookies._entropy = node._indices._entropy = entropy
         for peer in node.peers.values():
-            peer.entropy = peer.initiator._entropy = peer.challenger._entropy = entropy
+            peer.entropy = peer.initiator._entropy = entropy
 
 
 def _cookie_for(message: bytes, receiver: bytes, index: int) -> bytes:

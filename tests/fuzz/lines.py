@@ -1,0 +1,82 @@
+"""Bytes on the line of a serial network: datagrams, reports of the modem, noise, cut anywhere."""
+
+from __future__ import annotations
+
+from itertools import chain
+from typing import Final
+
+from fastcrc.crc16 import mcrf4xx
+
+from tests.fuzz.engine import TALLY, Run, Script
+from uavlinkd.endpoints.line_framing import DELIMITER, MAX_ENCODED, LineDecoder, encode
+
+LONGEST_REPORT: Final = 21
+
+
+def _report(script: Script) -> bytes:
+    """A modem's report with any figures, in MAVLink 1 or 2."""
+    how = script.byte()
+    head = bytes((9, 0, 0, 1, 51, 68, 109, 0, 0)) if how & 1 else bytes((9, 1, 51, 68, 109))
+    payload = script.take(9).ljust(9, b"\0")
+    crc = mcrf4xx(head + payload + b"\xb9")
+    return bytes((0xFE - (how & 1),)) + head + payload + crc.to_bytes(2, "little")
+
+
+def _stream(script: Script) -> bytes:
+    parts = []
+    while script:
+        how = script.byte()
+        match how & 7:
+            case 0:
+                parts.append(script.take(1 + (script.byte() & 31)))
+            case 1:
+                parts.append(bytes((script.byte(),)) * (script.byte() * (1 + (how >> 4))))
+            case 2:
+                parts.append(_report(script))
+            case 3:
+                line, report = encode(script.take(script.byte())), _report(script)
+                at = script.byte() % (len(line) + 1)
+                parts.append(line[:at] + report + line[at:])
+            case 4:
+                damaged = bytearray(encode(script.take(script.byte())))
+                damaged[script.byte() % len(damaged)] ^= 1 << (how >> 5)
+                parts.append(bytes(damaged))
+            case _:
+                parts.append(encode(script.take(script.byte()) * (1 + (how >> 6))))
+    return b"".join(parts)
+
+
+def make() -> Run:
+    """Any cuts give the same datagrams; memory is bounded; whole datagrams after the noise arrive."""
+
+    def run(data: bytes) -> None:
+        cuts, stream = data[:8], _stream(Script(data[8:]))
+        decoder, datagrams = LineDecoder(), []
+        at, number = 0, 0
+        while at < len(stream):
+            size = 1 + (cuts[number % len(cuts)] if cuts else 64)
+            TALLY.add(stream[at : at + size])
+            datagrams += decoder.feed(stream[at : at + size])
+            assert decoder.pending_bytes <= MAX_ENCODED + LONGEST_REPORT + 1, "more is held than a datagram"
+            at, number = at + size, number + 1
+        whole = LineDecoder()
+        assert whole.feed(stream) == datagrams, "the cuts change what is received"
+        assert _counts(whole) == _counts(decoder), "the cuts change what is counted"
+        for datagram in datagrams:
+            again = LineDecoder()
+            assert again.feed(encode(datagram)) == [datagram], "a datagram that is not encoded like this"
+        later = [b"first", bytes(range(200))]
+        tail = decoder.feed(DELIMITER * (LONGEST_REPORT + 1) + b"".join(map(encode, later)))
+        assert tail[-2:] == later, "the stream is not in step again"
+
+    return run
+
+
+def _counts(decoder: LineDecoder) -> tuple[object, ...]:
+    return decoder.datagrams, decoder.line_noise, decoder.reports, decoder.reports_inside, decoder.report
+
+
+def seeds() -> list[bytes]:
+    """Some of each kind, cut into different chunks."""
+    kinds = [bytes((kind, 20, *range(1, 41))) for kind in range(8)]
+    return [bytes(range(first, first + 8)) + b"".join(chain(kinds, kinds)) for first in (0, 20, 200)]
