@@ -1,4 +1,4 @@
--- Wireshark dissector of the uavlink protocol, version 1. README.md beside this file says how to use it.
+-- Wireshark dissector of the uavlink protocol, version 2. README.md beside this file says how to use it.
 --
 -- It needs no key. The handshake encrypts tag length and mode, so the dissector infers them: in authenticated mode the
 -- payload is readable, and the tag is what follows the last whole frame or record. It runs on Lua 5.2 and 5.4.
@@ -37,12 +37,15 @@ local IS_TAG_LENGTH = { [8] = true, [12] = true, [16] = true, [32] = true }
 local RECORDS = {
     [1] = { "Echo Request", 13 },
     [2] = { "Echo Reply", 17 },
-    [3] = { "Path Challenge", 11 },
-    [4] = { "Path Response", 9 },
+    [3] = { "Probe" }, -- 22 bytes with a question, else 20; frames or padding may follow
     [5] = { "Close", 1 },
     [6] = { "Refusal Report" }, -- 1 byte, and 10 for each of 1 to 16 entries
 }
 local REFUSAL_REPORT, ENTRY_BYTES, MOST_ENTRIES = 6, 10, 16
+local PROBE, ANSWER_BYTES, QUESTION_BYTES = 3, 20, 22
+local ALONE, FRAMES_FOLLOW, PADDING_FOLLOWS = 0, 1, 2
+local PROBE_FLAGS = { [ALONE] = "alone", [FRAMES_FOLLOW] = "frames follow", [PADDING_FOLLOWS] = "padding follows" }
+local UNKNOWN_LAG = 0xFFFF
 local REASONS = {
     [1] = "foreign_system",
     [2] = "message_not_allowed",
@@ -86,6 +89,13 @@ local f = {
     received = ProtoField.uint32("uavlink.received", "Envelopes received", base.DEC),
     expected = ProtoField.uint32("uavlink.expected", "Envelopes expected", base.DEC),
     fresh = ProtoField.uint32("uavlink.fresh", "Fresh from counter", base.DEC),
+    probe_flags = ProtoField.uint8("uavlink.probe.flags", "Flags", base.DEC, PROBE_FLAGS),
+    probe_question = ProtoField.uint32("uavlink.probe.question", "Question (0: none)", base.HEX),
+    probe_answer = ProtoField.uint32("uavlink.probe.answer", "Answer to question (0: none)", base.HEX),
+    probe_sent = ProtoField.uint32("uavlink.probe.sent", "Datagrams sent along this path", base.DEC),
+    probe_received = ProtoField.uint32("uavlink.probe.received", "Datagrams received along this path", base.DEC),
+    probe_lag = ProtoField.uint16("uavlink.probe.lag", "Lag of copies along this path in ms", base.DEC),
+    probe_padding = ProtoField.bytes("uavlink.probe.padding", "Padding"),
     refused_msgid = ProtoField.uint24("uavlink.refused.msgid", "Refused message id", base.DEC),
     refused_command = ProtoField.uint16("uavlink.refused.command", "Refused command (0: none)", base.DEC),
     refused_reason = ProtoField.uint8("uavlink.refused.reason", "Reason", base.DEC, REASONS),
@@ -140,12 +150,53 @@ local function frame_length(tvb, offset)
     return length <= left and length or nil
 end
 
--- Whether a control record of this kind can have this length.
+-- The length of the probe at `offset`, without what follows it, or nil if it is not a valid one.
+local function probe_length(tvb, offset)
+    local left = tvb:len() - offset
+    if left < ANSWER_BYTES or not PROBE_FLAGS[tvb(offset + 1, 1):uint()] then
+        return nil
+    end
+    if tvb(offset + 2, 4):uint() == 0 then
+        return tvb(offset + 6, 4):uint() ~= 0 and ANSWER_BYTES or nil
+    end
+    return left >= QUESTION_BYTES and tvb(offset + ANSWER_BYTES, 2):uint() == 0 and QUESTION_BYTES or nil
+end
+
+-- Whether a control record of this kind, which is not a probe, can have this length.
 local function is_record(kind, size)
     if kind == REFUSAL_REPORT then
         return (size - 1) % ENTRY_BYTES == 0 and size > 1 and size <= 1 + MOST_ENTRIES * ENTRY_BYTES
     end
     return RECORDS[kind] ~= nil and RECORDS[kind][2] == size
+end
+
+-- Adds the tag lengths that may follow whole frames from `offset`.
+local function add_tags_after_frames(tvb, offset, found)
+    local length = frame_length(tvb, offset)
+    while length do
+        offset = offset + length
+        if IS_TAG_LENGTH[tvb:len() - offset] then
+            found[tvb:len() - offset] = true
+        end
+        length = frame_length(tvb, offset)
+    end
+end
+
+-- Adds the tag lengths that may follow a probe and what is behind it.
+local function add_tags_after_probe(tvb, offset, found)
+    local length = probe_length(tvb, offset)
+    if not length then
+        return
+    end
+    local flags, left = tvb(offset + 1, 1):uint(), tvb:len() - offset - length
+    if flags == FRAMES_FOLLOW then
+        add_tags_after_frames(tvb, offset + length, found)
+    end
+    for _, tag_bytes in ipairs(TAG_LENGTHS) do
+        if (flags == ALONE and left == tag_bytes) or (flags == PADDING_FOLLOWS and left > tag_bytes) then
+            found[tag_bytes] = true
+        end
+    end
 end
 
 -- The tag lengths with which the bytes from `offset` are a keepalive, a record, or whole frames: {16 = true, …}.
@@ -158,21 +209,16 @@ local function possible_tags(tvb, offset)
         return found
     end
     local kind = tvb(offset, 1):uint()
-    if RECORDS[kind] then
+    if kind == PROBE then
+        add_tags_after_probe(tvb, offset, found)
+    elseif RECORDS[kind] then
         for _, tag_bytes in ipairs(TAG_LENGTHS) do
             if is_record(kind, size - tag_bytes) then
                 found[tag_bytes] = true
             end
         end
-        return found
-    end
-    local length = frame_length(tvb, offset)
-    while length do
-        offset = offset + length
-        if IS_TAG_LENGTH[tvb:len() - offset] then
-            found[tvb:len() - offset] = true
-        end
-        length = frame_length(tvb, offset)
+    else
+        add_tags_after_frames(tvb, offset, found)
     end
     return found
 end
@@ -256,8 +302,6 @@ local function add_record(tvb, tree, offset, kind, stop)
         if kind == 2 then
             tree:add(f.fresh, tvb(offset + 13, 4))
         end
-    elseif kind == 3 or kind == 4 then
-        tree:add(f.token, tvb(offset + 1, 8))
     elseif kind == REFUSAL_REPORT then
         for at = offset + 1, stop - ENTRY_BYTES, ENTRY_BYTES do
             tree:add(f.refused_msgid, tvb(at, 3))
@@ -268,19 +312,54 @@ local function add_record(tvb, tree, offset, kind, stop)
     end
 end
 
+local function count_text(count)
+    return count == 1 and "1 frame" or count .. " frames"
+end
+
+-- Adds a probe and what follows it, and returns what it is in a few words; nil if it is not a valid one.
+local function add_probe(tvb, pinfo, tree, offset, stop)
+    local length = probe_length(tvb, offset)
+    local flags = length and tvb(offset + 1, 1):uint()
+    local after = length and offset + length
+    if not length or after > stop or (flags == ALONE) ~= (after == stop) then
+        return nil
+    end
+    tree:add(f.record, tvb(offset, 1))
+    tree:add(f.probe_flags, tvb(offset + 1, 1))
+    tree:add(f.probe_question, tvb(offset + 2, 4))
+    tree:add(f.probe_answer, tvb(offset + 6, 4))
+    tree:add(f.probe_sent, tvb(offset + 10, 4))
+    tree:add(f.probe_received, tvb(offset + 14, 4))
+    local lag = tree:add(f.probe_lag, tvb(offset + 18, 2))
+    if tvb(offset + 18, 2):uint() == UNKNOWN_LAG then
+        lag:append_text(" (unknown)")
+    end
+    local text = length == ANSWER_BYTES and "Probe, answer"
+        or tvb(offset + 6, 4):uint() ~= 0 and "Probe, answer and question"
+        or "Probe, question"
+    if flags == FRAMES_FOLLOW then
+        text = text .. ", " .. count_text(add_frames(tvb, pinfo, tree, after, stop))
+    elseif flags == PADDING_FOLLOWS then
+        tree:add(f.probe_padding, tvb(after, stop - after))
+    end
+    return text
+end
+
 -- Adds the payload, and returns what it is in a few words.
 local function add_payload(tvb, pinfo, tree, offset, stop)
     if stop == offset then
         return "keepalive"
     end
     local kind = tvb(offset, 1):uint()
-    if is_record(kind, stop - offset) then
+    local probe = kind == PROBE and add_probe(tvb, pinfo, tree, offset, stop)
+    if probe then
+        return probe
+    elseif is_record(kind, stop - offset) then
         add_record(tvb, tree, offset, kind, stop)
         return RECORDS[kind][1]
     end
     if kind >= FRAMES_FROM then
-        local count = add_frames(tvb, pinfo, tree, offset, stop)
-        return count == 1 and "1 frame" or count .. " frames"
+        return count_text(add_frames(tvb, pinfo, tree, offset, stop))
     end
     tree:add(f.payload, tvb(offset, stop - offset))
     tree:add_proto_expert_info(malformed)

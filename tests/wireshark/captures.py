@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 from tests.core.harness import AT_A, AT_B, FRAME, PLAIN, Pair, datagrams, exhaust, only
 from uavlinkd.core import wire
+from uavlinkd.core.probe import Probe
 from uavlinkd.core.refusals import RefusalReport, Refused
 from uavlinkd.core.settings import Link
 
@@ -55,12 +56,16 @@ def conversation(link: Link = PLAIN) -> list[Sent]:
     records = (
         wire.Echo(False, 0x01020304, 5, 6),
         wire.Echo(True, 0x01020304, 7, 8, 9),
-        wire.PathChallenge(b"8 bytes."),
-        wire.PathResponse(b"8 bytes."),
         RefusalReport((Refused(76, 400, 4, 3), Refused(0, 0, 1, 70000))),
         wire.Close(),
     )
-    payloads = [HEARTBEAT, HEARTBEAT + FRAME, b"", *(record.encode() for record in records)]
+    probes = (
+        Probe(0x0A0B0C0D, 0, 11, 10).encode(),
+        Probe(0, 0x0A0B0C0D, 12, 10, 85).encode(),
+        Probe(0x0A0B0C0D, 0x01020304, 13, 10).encode(FRAME + HEARTBEAT),
+        Probe(0x0A0B0C0D, 0, 14, 10).encode(padding=100),
+    )
+    payloads = [HEARTBEAT, HEARTBEAT + FRAME, b"", *(record.encode() for record in records), *probes]
     sent += [Sent(True, pair.a.envelope(1.0, payload)) for payload in payloads]
     pair.a.session.send_counter = 2**16
     return [*sent, Sent(True, pair.a.envelope(1.0, HEARTBEAT))]

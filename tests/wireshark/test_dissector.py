@@ -23,11 +23,13 @@ from uavlinkd.core.wire import TAG_LENGTHS
 SCRIPT = Path(__file__).parents[2] / "configs/wireshark/uavlink.lua"
 ROOT = Path(os.environ.get("UAVLINKD_TSHARK_ROOT", "/"))
 """The root folder of the system whose tshark runs: this one, or that of another Debian release."""
+PROBE_FIELDS = ("flags", "question", "answer", "sent", "received", "lag")
 FIELDS = (
     *("type", "suite", "counter", "record", "tag_bytes", "mode", "frame.msgid", "frame.system", "token", "fresh"),
+    *(f"probe.{field}" for field in PROBE_FIELDS),
     *("refused.msgid", "refused.command", "refused.reason", "refused.total"),
 )
-RECORDS = ["1", "2", "3", "4", "6", "5"]
+RECORDS = ["1", "2", "6", "5", "3", "3", "3", "3"]
 
 
 @pytest.fixture
@@ -80,19 +82,33 @@ def test_envelopes_with_every_tag_length(folder: Path, tag_bytes: int) -> None:
     """Counters, frames and control records are readable without a key, and the tag's length is inferred."""
     packets = rows(folder, conversation(with_tag(tag_bytes)))
 
-    assert [packet["type"] for packet in packets] == ["0x01", "0x02", *["0x40"] * 10, "0x41"]
+    assert [packet["type"] for packet in packets] == ["0x01", "0x02", *["0x40"] * 12, "0x41"]
     envelopes = packets[2:]
-    assert [int(envelope["counter"]) for envelope in envelopes] == [*range(10), 2**16]
+    assert [int(envelope["counter"]) for envelope in envelopes] == [*range(12), 2**16]
     assert {envelope["tag_bytes"] for envelope in envelopes} == {str(tag_bytes)}
     assert {envelope["mode"] for envelope in envelopes} == {"authenticated (inferred)"}
     assert [envelope.get("frame.msgid", "") for envelope in envelopes][1:3] == ["0", "0,0"]
     assert envelopes[1]["frame.system"] == "1"
-    assert [envelope["record"] for envelope in envelopes if "record" in envelope][-6:] == RECORDS
+    assert [envelope["record"] for envelope in envelopes if "record" in envelope][-8:] == RECORDS
     assert envelopes[4]["token"] == "01020304"
     assert envelopes[5]["fresh"] == "9"
-    report = envelopes[8]
+    report = envelopes[6]
     shown = [report[f"refused.{field}"] for field in ("msgid", "command", "reason", "total")]
     assert shown == ["76,0", "400,0", "4,1", "3,70000"]
+
+
+def test_probes(folder: Path) -> None:
+    """A question, an answer, both with frames behind them, and a question with padding."""
+    probes = [packet for packet in rows(folder, conversation()) if packet.get("record") == "3"]
+    shown = [[probe[f"probe.{field}"] for field in PROBE_FIELDS] for probe in probes]
+    assert shown == [
+        ["0", "0x0a0b0c0d", "0x00000000", "11", "10", "65535"],
+        ["0", "0x00000000", "0x0a0b0c0d", "12", "10", "85"],
+        ["1", "0x0a0b0c0d", "0x01020304", "13", "10", "65535"],
+        ["2", "0x0a0b0c0d", "0x00000000", "14", "10", "65535"],
+    ]
+    assert [probe.get("frame.msgid") for probe in probes] == [None, None, "0,0", None]
+    assert {probe["tag_bytes"] for probe in probes} == {"16"}
 
 
 @pytest.mark.parametrize("suite", SUITES.values(), ids=lambda suite: suite.name)
