@@ -108,6 +108,9 @@ async def test_dashboard_and_alerts_find_what_they_ask_for(stage: Stage) -> None
     for daemon, peer in ((a, a.config["peer"][0]), (b, b.config["peer"][0])):
         peer |= {"role": "swarm-member", "system_ids": [1, 2]}  # to which no command goes
         daemon.config["metrics"] = {"listen": f"127.0.0.1:{free_port()}"}
+    second = f"127.0.0.1:{free_port()}"  # two paths, of which one has a lag
+    b.config["listen"].append(second)
+    a.config["peer"][0]["addresses"].append(second)
     await stage.start(a, b)
     client = await stage.client()
     dropping = asyncio.create_task(cause_drops(client, into, a.sockaddr))

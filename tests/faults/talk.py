@@ -10,8 +10,10 @@ from pathlib import Path
 from time import monotonic
 from typing import Any
 
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
 from tests.compose.cluster import socket_in
-from tests.daemon.frames import frame
+from tests.daemon.frames import frame, pack
 from tests.daemon.losses import lost_to_waiting
 from tests.daemon.process import DaemonProcess, Status
 from tests.daemon.udp import Sockaddr, open_socket
@@ -146,10 +148,23 @@ class Talk:
         assert [voice.copies for voice in self.voices] == [0, 0]
 
 
-def prepare(a: DaemonProcess, b: DaemonProcess, namespaces: tuple[Path | None, Path | None] = (None, None)) -> Talk:
+class CriticalVoice(Voice):
+    """A client whose frames go along every usable path: STATUSTEXT."""
+
+    def frame(self, number: int) -> bytes:
+        """Its frame with this number. All have the same length."""
+        return pack(mavlink.MAVLink_statustext_message(6, b"%050d" % (number + 1)), self._system, seq=number)
+
+
+def prepare(
+    a: DaemonProcess,
+    b: DaemonProcess,
+    namespaces: tuple[Path | None, Path | None] = (None, None),
+    voice: type[Voice] = Voice,
+) -> Talk:
     """Give each an endpoint, in its network namespace, and a client there."""
     voices = [
-        Voice(
+        voice(
             open_socket("127.0.0.1") if namespace is None else socket_in(namespace),
             daemon.add_endpoint("talk"),
             system,
