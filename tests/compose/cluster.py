@@ -215,15 +215,22 @@ def socket_in(namespace: Path) -> socket.socket:
     return there(namespace, opened)
 
 
+def heartbeat(system: int, number: int) -> bytes:
+    """A HEARTBEAT, which goes along every path, that differs from that of every other number."""
+    codec = mavlink.MAVLink(None, system, COMPONENT)
+    codec.seq = number % 256
+    return bytes(mavlink.MAVLink_heartbeat_message(18, 8, 0, number, 4, 3).pack(codec))
+
+
 def numbered(system: int, number: int) -> bytes:
     """A frame that differs from that of every other number, of a message that its sender may send often.
 
     Drones send VFR_HUD: `swarm-member` passes 250 a second by default. A ground station may send its HEARTBEAT.
     """
+    if system == SYSTEM_IDS["ground-station"]:
+        return heartbeat(system, number)
     codec = mavlink.MAVLink(None, system, COMPONENT)
     codec.seq = number % 256
-    if system == SYSTEM_IDS["ground-station"]:
-        return bytes(mavlink.MAVLink_heartbeat_message(18, 8, 0, number, 4, 3).pack(codec))
     return bytes(mavlink.MAVLink_vfr_hud_message(0, 0, number >> 16, number & 0xFFFF, 1, 0).pack(codec))
 
 
@@ -233,8 +240,9 @@ class Conversation:
     _numbers_used = 0
     """In conversations before: a daemon takes the same frame, soon after, for one that came by another way."""
 
-    def __init__(self, cluster: Cluster, names: Sequence[str]) -> None:
+    def __init__(self, cluster: Cluster, names: Sequence[str], frame: Callable[[int, int], bytes] = numbered) -> None:
         self._cluster = cluster
+        self._frame = frame
         self._names = names
         self._clients: dict[str, Client] = {}
         self._dropped_before = 0
@@ -257,7 +265,7 @@ class Conversation:
     def _does_latest_arrive(self) -> bool:
         """Whether the last frames reached all; if not, more are sent."""
         if self.said > self._first:
-            latest = {name: numbered(SYSTEM_IDS[name], self.said - 1) for name in self._names}
+            latest = {name: self._frame(SYSTEM_IDS[name], self.said - 1) for name in self._names}
             if all(self.received(name).keys() >= set(latest.values()) - {latest[name]} for name in self._names):
                 return True
         self.say()
@@ -272,7 +280,7 @@ class Conversation:
     def say(self) -> None:
         """One frame by each."""
         for name, client in self._clients.items():
-            client.send(numbered(SYSTEM_IDS[name], self.said), ENDPOINT)
+            client.send(self._frame(SYSTEM_IDS[name], self.said), ENDPOINT)
         self.said += 1
 
     async def say_many(self, count: int, interval_s: float = 0.005) -> None:
@@ -308,7 +316,7 @@ class Conversation:
     def expected(self, name: str) -> Counter[bytes]:
         """What each other said, once."""
         return Counter(
-            numbered(SYSTEM_IDS[other], number)
+            self._frame(SYSTEM_IDS[other], number)
             for other in self._names
             if other != name
             for number in range(self._first, self.said)
@@ -317,7 +325,7 @@ class Conversation:
     def forget(self) -> None:
         """Start again: frames sent so far do not count, received or still in flight."""
         self._forgotten |= {
-            numbered(SYSTEM_IDS[name], number) for name in self._names for number in range(self._first, self.said)
+            self._frame(SYSTEM_IDS[name], number) for name in self._names for number in range(self._first, self.said)
         }
         self._first = self.said
 
@@ -357,7 +365,7 @@ class Conversation:
         reported: dict[str, list[int]] = {}
         for other in self._names:
             for number in range(self._first, self.said):
-                if numbered(SYSTEM_IDS[other], number) in frames:
+                if self._frame(SYSTEM_IDS[other], number) in frames:
                     reported.setdefault(other, []).append(number - self._first)
         return str(reported)
 

@@ -1,0 +1,175 @@
+"""Fleets in containers, by a real `docker compose up`."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+
+from tests.compose import images, outages
+from tests.compose.cluster import Cluster, run
+from uavlinkd.fleet import operations
+from uavlinkd.fleet.manifest import FleetSettings
+from uavlinkd.ops.control import ControlError, ask
+
+USER = 10001
+"""Of the daemons in the image."""
+NETWORK = f"10.{64 + os.getpid() % 128}"
+"""The first half of the addresses. Another checkout may test on the same machine."""
+SUBNET, MITM_SUBNET = f"{NETWORK}.0.0/24", f"{NETWORK}.1.0/24"
+
+
+class Containers(Cluster):
+    """The services of compose.yaml."""
+
+    cut_s = outages.OUTAGE_S
+    file = "compose.yaml"
+    drones = 3
+
+    def __init__(self, folder: Path, image: str, *, mitm: bool = False) -> None:
+        self._folder = folder
+        self.project = f"uavlinkd-test-{os.getpid()}{'-mitm' if mitm else ''}"
+        self._mitm = mitm
+        compose = images.compose_command()
+        assert compose is not None
+        self._compose = [*compose, "--project-name", self.project, "--file", str(images.HERE / self.file)]
+        if mitm:
+            self._compose += ["--profile", "mitm"]
+        self.environ = {
+            "UAVLINKD_IMAGE": image,
+            "FLEET": str(folder / "fleet"),
+            "SUBNET": MITM_SUBNET if mitm else SUBNET,
+            "RESTART": "no",  # here it is the test that starts what it stopped
+        }
+        self._pids: dict[str, int] = {}
+        self._logs = ""
+
+    async def open(self) -> None:
+        """Make the fleet, and start everything."""
+        settings = FleetSettings(
+            address_plan="{name}:5790",
+            psk=True,
+            control_socket="/run/uavlinkd/control.sock",
+            ground_station_url="udpin:127.0.0.1:14550",
+        )
+        fleet = self._folder / "fleet"
+        operations.init(fleet, settings, self.drones, 1, 0)
+        self.change(fleet)
+        for path in (fleet, *fleet.rglob("*")):
+            os.chown(path, USER, USER)
+        for path in (fleet, *fleet.parents):
+            if path == self._folder.parent:
+                break
+            path.chmod(0o755)
+        await self.compose("up", "--detach", "--no-build")
+        await self._look_up()
+
+    def change(self, fleet: Path) -> None:
+        """Change the configurations of the fleet before it starts."""
+        if self._mitm:
+            replace(fleet / "drone1" / "drone1.toml", '"ground-station:5790"', '"mitm:5801"')
+            replace(fleet / "ground-station" / "ground-station.toml", '"drone1:5790"', '"mitm:5802"')
+
+    async def close(self) -> None:
+        """Stop and remove everything but the image."""
+        self._logs = await self.compose("logs", "--no-color", check=False)
+        await self.compose("down", "--volumes", "--timeout", "1", check=False)
+
+    async def compose(self, *arguments: str, check: bool = True) -> str:
+        """One compose command."""
+        return await run(*self._compose, *arguments, environ=self.environ, check=check)
+
+    async def container(self, service: str) -> str:
+        """The container's id, running or not."""
+        filters = (f"com.docker.compose.project={self.project}", f"com.docker.compose.service={service}")
+        containers = await run("docker", "ps", "-aq", *(f"--filter=label={label}" for label in filters))
+        assert len(containers.split()) == 1, f"{service} has the containers: {containers}"
+        return containers.strip()
+
+    async def inspect(self, service: str, what: str) -> str:
+        """A fact about a service's container, as a template names it."""
+        return (await run("docker", "inspect", "--format", what, await self.container(service))).strip()
+
+    async def _look_up(self, *names: str) -> None:
+        for name in names or (*self.names, *(("mitm",) if self._mitm else ())):
+            self._pids[name] = int(await self.inspect(name, "{{.State.Pid}}"))
+
+    def namespace_of(self, name: str) -> Path:
+        return Path(f"/proc/{self._pids[name]}/ns/net")
+
+    def control_socket_of(self, name: str) -> Path:
+        return Path(f"/proc/{self._pids[name]}/root/run/uavlinkd/control.sock")
+
+    async def stop(self, name: str) -> None:
+        await run("docker", "stop", await self.container(name))
+        assert await self.inspect(name, "{{.State.ExitCode}}") == "0"
+
+    async def kill(self, name: str) -> None:
+        await run("docker", "kill", await self.container(name))
+
+    async def start(self, name: str) -> None:
+        await run("docker", "start", await self.container(name))
+        await self._look_up(name)
+
+    async def pause(self, name: str) -> None:
+        await run("docker", "pause", await self.container(name))
+
+    async def resume(self, name: str) -> None:
+        await run("docker", "unpause", await self.container(name))
+
+    async def cut(self, name: str) -> None:
+        await run("docker", "network", "disconnect", f"{self.project}_air", await self.container(name))
+
+    async def join(self, name: str, *, elsewhere: bool = False) -> None:
+        address = ["--ip", f"{NETWORK}.0.77"] if elsewhere else []
+        await run(
+            *("docker", "network", "connect", "--alias", name, *address),
+            *(f"{self.project}_air", await self.container(name)),
+        )
+
+    def health(self, container: str) -> str:
+        """What a container's health check says."""
+        command = ("docker", "inspect", "--format", "{{.State.Health.Status}}", container)
+        return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
+
+    def logs(self) -> str:
+        return self._logs
+
+    # The man in the middle.
+
+    def ask_mitm(self, request: str) -> dict[str, Any]:
+        """What the man in the middle answers; nothing where he is not there."""
+        try:
+            return ask(Path(f"/proc/{self._pids['mitm']}/root/run/uavlinkd/mitm.sock"), request)
+        except ControlError:
+            return {}
+
+    def interventions(self, attack: str) -> int:
+        """How often an attack did something."""
+        counts: dict[str, int] = self.ask_mitm("statistics").get("interventions", {})
+        return sum(count for name, count in counts.items() if name.partition(":")[0] == attack)
+
+
+def replace(path: Path, old: str, new: str) -> None:
+    """Replace the only occurrence of a text in a file."""
+    text = path.read_text()
+    assert text.count(old) == 1
+    path.write_text(text.replace(old, new))
+
+
+Cluster_T = TypeVar("Cluster_T", bound=Containers)
+
+
+@asynccontextmanager
+async def opened(cluster: Cluster_T) -> AsyncIterator[Cluster_T]:
+    """A cluster from `up` to `down`."""
+    try:
+        await cluster.open()
+        await cluster.until_linked()
+        yield cluster
+    finally:
+        await cluster.close()
+        print(cluster.logs())
