@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import signal
 from bisect import bisect_right
+from itertools import pairwise
 from time import monotonic
 
 from tests.daemon.frames import sender_of
@@ -19,6 +20,9 @@ OUTAGES_S = (3.0, 6.0, 20.0)
 LEG_M = 30.0
 LEAD_M = 60.0
 FOLLOW_OFFSET_M = 10.0
+RADIO_LOSS = 0.3
+RETURN_S = 5.0
+"""A radio that is back is used again within this time."""
 BACK_S = 60.0
 """How long frames may take to pass again after an outage or a restart."""
 
@@ -91,6 +95,44 @@ async def _outage(world: World, pilot: Pilot, seconds: float) -> Figures:
         raise FlightError(f"the failsafe {did} in an outage of {seconds:g} s", figures)
     if tripped_at is not None and not limit_s - 0.5 <= tripped_at - heartbeats[-1] <= limit_s + 3.0:
         raise FlightError(f"the failsafe tripped after {figures['failsafe_after_s']} s", figures)
+    return figures
+
+
+async def two_radios(world: World, pilot: Pilot) -> Figures:
+    """In the air, one of two radios dies and the other loses 30 %: the failsafe never trips, a mission is uploaded.
+
+    Then the other radio dies, and the first one is back.
+    """
+    vehicle, (first, second) = world.vehicles[0], world.radios
+    await pilot.request_streams()
+    await pilot.set_parameters(pilot.kind.failsafe)
+    await pilot.take_off()
+    start = pilot.place
+    await pilot.set_mode(Mode.GUIDED)
+    began = monotonic()
+    await first.cut()
+    await second.lose(RADIO_LOSS)
+    await pilot.fly_mission(start.moved(0.0, LEG_M), start.moved(LEG_M, LEG_M), start)
+    mission_s = monotonic() - began
+    await first.restore()
+    await asyncio.sleep(RETURN_S)
+    await second.cut()
+    await pilot.set_mode(Mode.GUIDED)
+    await pilot.go_to(start.moved(LEG_M, 0.0))
+    beats = [began, *(at for at in beats_of_station(world, vehicle) if at > began), monotonic()]
+    silence_s = max(later - earlier for earlier, later in pairwise(beats))
+    flown = {pilot.kind.modes[mode] for mode in (Mode.GUIDED, Mode.MISSION)}
+    others = sorted({mode for at, mode in modes(vehicle) if at > began} - flown)
+    await second.restore()
+    await pilot.return_and_land()
+    figures: Figures = {
+        "mission_s": round(mission_s, 1),
+        "heartbeats": len(beats) - 2,
+        "longest_silence_s": round(silence_s, 2),
+        "other_modes": others,
+    }
+    if others:
+        raise FlightError(f"the autopilot left its mode: {others}", figures)
     return figures
 
 

@@ -20,9 +20,10 @@ from uavlinkd.ops.control import ControlError, ask
 class Radio:
     """A radio for several links. Add links with :meth:`connect`, then :meth:`start`."""
 
-    def __init__(self, folder: Path, impairments: Mapping[str, object], seed: int = 0) -> None:
-        self._folder = folder
-        self._config: dict[str, Any] = {"seed": seed, "control_socket": "radio.sock", "peer": [], "link": []}
+    def __init__(self, folder: Path, impairments: Mapping[str, object], seed: int = 0, name: str = "radio") -> None:
+        self._path = folder / f"{name}.toml"
+        self._socket = folder / f"{name}.sock"
+        self._config: dict[str, Any] = {"seed": seed, "control_socket": self._socket.name, "peer": [], "link": []}
         self._config["radio"] = [{"direction": "both", **impairments}] if impairments else []
         self._process: asyncio.subprocess.Process | None = None
 
@@ -39,10 +40,9 @@ class Radio:
 
     async def start(self) -> None:
         """Start the process, and wait until it answers."""
-        path = self._folder / "radio.toml"
-        path.write_text(to_toml({key: value for key, value in self._config.items() if value != []}))
+        self._path.write_text(to_toml({key: value for key, value in self._config.items() if value != []}))
         self._process = await asyncio.create_subprocess_exec(
-            *end_with_parent(sys.executable, "-m", "uavlinkd.lab.mitm", "--config", str(path)),
+            *end_with_parent(sys.executable, "-m", "uavlinkd.lab.mitm", "--config", str(self._path)),
             stdin=asyncio.subprocess.DEVNULL,
             stdout=asyncio.subprocess.DEVNULL,
             stderr=asyncio.subprocess.DEVNULL,
@@ -60,7 +60,7 @@ class Radio:
         Raises:
             ControlError: there is no answer.
         """
-        answer = await asyncio.to_thread(ask, self._folder / "radio.sock", request)
+        answer = await asyncio.to_thread(ask, self._socket, request)
         assert "refused" not in answer, answer
         return answer
 
@@ -68,8 +68,12 @@ class Radio:
         """Drop every datagram in both directions."""
         await self.ask("attack drop")
 
+    async def lose(self, share: float) -> None:
+        """Drop a share of the datagrams in both directions."""
+        await self.ask(f"attack drop,share={share:g}")
+
     async def restore(self) -> None:
-        """End :meth:`cut`."""
+        """End :meth:`cut` and :meth:`lose`."""
         await self.ask("attack none")
 
     async def stop(self) -> None:

@@ -84,6 +84,17 @@ def report(records: list[Record]) -> str:
             f"{failsafes()} The first frame up is the station's heartbeat, once per second.",
         ),
         _section(
+            "Two radios: one dies, the other loses 30 % of its datagrams, then they change places",
+            (
+                "autopilot",
+                "mission uploaded and flown in",
+                "heartbeats of the station",
+                "longest silence",
+                "failsafe",
+            ),
+            _two_radios(passed),
+        ),
+        _section(
             "Restarts",
             ("autopilot", "", "what", "absent", "first frame down / up after the start"),
             _restarts(passed),
@@ -261,6 +272,15 @@ def _outages(records: list[Record]) -> Iterable[Cells]:
                 *("tripped" if o["failsafe"] else "did not trip", _with(o, "failsafe_after_s")),
                 f"{o['control_after_s']} s",
             )
+
+
+def _two_radios(records: list[Record]) -> Iterable[Cells]:
+    for record in _of(records, "two-radios"):
+        f = record.figures
+        yield (
+            *(record.kind, f"{f['mission_s']} s", f["heartbeats"], f"{f['longest_silence_s']} s"),
+            "tripped" if f["other_modes"] else "did not trip",
+        )
 
 
 def _restarts(records: list[Record]) -> Iterable[Cells]:

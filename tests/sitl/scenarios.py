@@ -12,7 +12,7 @@ from typing import Any
 from pymavlink.dialects.v20 import all as mavlink
 
 from tests.sitl.conditions import BY_NAME, CLEAN
-from tests.sitl.flights import flight, follow_me, outages, restarts, two_vehicles
+from tests.sitl.flights import flight, follow_me, outages, restarts, two_radios, two_vehicles
 from tests.sitl.pilots import COPTER, OWN, PX4, ROVER, Kind, Pilot
 from tests.sitl.simulators import OwnSimulator, RealSimulator, Simulator
 from tests.sitl.station import Station
@@ -39,6 +39,8 @@ class Scenario:
     vehicles: int = 1
     can_cut: bool = False
     swarm: bool = False
+    two_radios: bool = False
+    """Needs daemons."""
     has_maintenance_port: bool = False
 
 
@@ -66,6 +68,7 @@ SCENARIOS = (
     ),
     Scenario("outages", _alone(outages), can_cut=True),
     Scenario("restarts", _alone(restarts)),
+    Scenario("two-radios", _alone(two_radios), two_radios=True),
 )
 SCENARIO_BY_NAME = {scenario.name: scenario for scenario in SCENARIOS}
 
@@ -107,7 +110,7 @@ def runs(kinds: tuple[str, ...]) -> list[Run]:
         if kind in scenario.kinds
         for condition in (scenario.conditions if KINDS[kind].flies else (CLEAN.name,))
         for with_daemons in (True, False)
-        if with_daemons or not BY_NAME[condition].needs_daemons
+        if with_daemons or not (BY_NAME[condition].needs_daemons or scenario.two_radios)
     ]
 
 
@@ -140,6 +143,7 @@ async def _fly(run: Run, record: Record, folder: Path) -> None:
         with_daemons=run.with_daemons,
         can_cut=scenario.can_cut,
         swarm=scenario.swarm,
+        two_radios=scenario.two_radios,
         maintenance_port=maintenance_port,
     ) as world:
         pilots = [Pilot(world.station, system, kind) for system in systems]

@@ -56,8 +56,15 @@ class World:
     vehicles: list[Vehicle] = field(default_factory=list)
     ground: DaemonProcess | None = None
     radio: Radio | None = None
+    second_radio: Radio | None = None
+    """Of a vehicle with two radios. Both carry its link all the time."""
     maintenance: Tap | None = None
     """The other end of the autopilot's second port."""
+
+    @property
+    def radios(self) -> list[Radio]:
+        """The radios between vehicles and station."""
+        return [radio for radio in (self.radio, self.second_radio) if radio]
 
     @property
     def daemons(self) -> list[DaemonProcess]:
@@ -171,6 +178,7 @@ async def flying(
     with_daemons: bool = True,
     can_cut: bool = False,
     swarm: bool = False,
+    two_radios: bool = False,
     maintenance_port: int | None = None,
 ) -> AsyncIterator[World]:
     """Start everything, and wait until the station receives each vehicle.
@@ -179,16 +187,20 @@ async def flying(
         simulators: one for each vehicle, not yet started.
         can_cut: whether the radio must be there, to be cut.
         swarm: whether the vehicles are peers of each other, as swarm members.
+        two_radios: whether there are two radios to each vehicle. It needs daemons.
         maintenance_port: where a simulator sends MAVLink on a second port.
     """
-    assert with_daemons or not condition.needs_daemons
+    assert with_daemons or not (condition.needs_daemons or two_radios)
     async with AsyncExitStack() as stack:
         stage = await stack.enter_async_context(Stage())
         station = await stack.enter_async_context(Station())
         world = World(stage, condition, station)
-        if condition.radio or can_cut:
+        if condition.radio or can_cut or two_radios:
             world.radio = Radio(stage.folder, condition.radio)
             stack.push_async_callback(world.radio.stop)
+        if two_radios:
+            world.second_radio = Radio(stage.folder, condition.radio, 1, "second-radio")
+            stack.push_async_callback(world.second_radio.stop)
         if maintenance_port is not None:
             world.maintenance = Tap()
             await world.maintenance.open(maintenance_port)
@@ -216,14 +228,11 @@ async def _start_daemons(world: World, *, swarm: bool) -> None:
     for vehicle in world.vehicles:
         drone = vehicle.daemon = stage.daemon(f"drone{vehicle.system}")
         vehicle.tap.onward = drone.add_endpoint(AUTOPILOT_ENDPOINT)
-        to_ground, to_drone = (
-            world.radio.connect(drone.name, drone.sockaddr, ground.sockaddr)
-            if world.radio
-            else (ground.sockaddr, drone.sockaddr)
-        )
+        ways = [radio.connect(drone.name, drone.sockaddr, ground.sockaddr) for radio in world.radios]
+        to_ground, to_drone = zip(*(ways or [(ground.sockaddr, drone.sockaddr)]), strict=True)
         psk = stage.psk()
-        drone.add_peer(ground, [shown(to_ground)], psk, **AN_OPERATOR)
-        ground.add_peer(drone, [shown(to_drone)], psk, **a_vehicle(vehicle.system))
+        drone.add_peer(ground, list(map(shown, to_ground)), psk, **AN_OPERATOR)
+        ground.add_peer(drone, list(map(shown, to_drone)), psk, **a_vehicle(vehicle.system))
     for one, other in _pairs(world.vehicles) if swarm else ():
         assert one.daemon is not None
         assert other.daemon is not None
@@ -232,8 +241,8 @@ async def _start_daemons(world: World, *, swarm: bool) -> None:
         other.daemon.add_peer(one.daemon, [one.daemon.address], psk, **a_member(one.system))
     for daemon in world.daemons:
         daemon.config["link"].update(world.condition.link)
-    if world.radio:
-        await world.radio.start()
+    for radio in world.radios:
+        await radio.start()
     await stage.start(*world.daemons)
 
 
