@@ -26,7 +26,7 @@ USERS_OF_PYMAVLINK = ("mavlink/dialect", "lab/sim/")
 """The generated tables, and the simulated autopilot with its tools."""
 CORE_WITHOUT_KEYS = {
     f"uavlinkd.core.{name}"
-    for name in ("constants", "drops", "limits", "outputs", "path", "refusals", "suites", "wire")
+    for name in ("constants", "drops", "limits", "outputs", "path", "probe", "refusals", "suites", "wire")
 }
 """The modules of the core that contain no key and cannot use one."""
 PAPER = ("lab/evaluation/paper.py", "lab/evaluation/paper_protocol.py")

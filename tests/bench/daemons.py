@@ -6,7 +6,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from copy import copy
 from pathlib import Path
@@ -27,13 +27,17 @@ OF_OTHER: Final = "-against"
 class Uavlinkd(Contender):
     """Two daemons that are linked, each with the role of the other in its file, as in flight.
 
-    Without ``has_roles`` policy lets everything pass: the difference is what policy costs.
+    Without ``has_roles`` policy lets everything pass: the difference is what policy costs. With two ``paths``, the
+    right side listens at two ports.
     """
 
-    def __init__(self, name: str, about: str, *, uvloop: bool = True, has_roles: bool = True, **link: str) -> None:
+    def __init__(
+        self, name: str, about: str, *, uvloop: bool = True, has_roles: bool = True, paths: int = 1, **link: str
+    ) -> None:
         super().__init__(name, about)
         self._uvloop = uvloop
         self._has_roles = has_roles
+        self._paths = paths
         self._link = link
         self._python = Path(sys.executable)
         self._checkout: Path | None = None
@@ -77,11 +81,10 @@ class Uavlinkd(Contender):
             keys.write_secret_file(folder / f"{side}.key", text + "\n")
         public = {side: keys.public_key_text(text) for side, text in private.items()}
         link = "".join(f"{key} = {value}\n" for key, value in self._link.items())
+        addresses = [f"{cable.right.address}:{port}" for port in self._ports]
         left = configuration(
             "left",
-            peers=[
-                peer("right", public["right"], self._rules("operator", 255), f"{cable.right.address}:{LINK_PORT}")
-            ],
+            peers=[peer("right", public["right"], self._rules("operator", 255), addresses)],
             endpoint=f"udpin:127.0.0.1:{INTO_PORT}",
             link=link,
         )
@@ -90,6 +93,7 @@ class Uavlinkd(Contender):
             peers=[peer("left", public["left"], self._rules("vehicle", SYSTEM))],
             endpoint=f"udpout:{LOCAL_SINK}",
             link=link,
+            ports=self._ports,
         )
         (folder / "left.toml").write_text(left)
         (folder / "right.toml").write_text(right)
@@ -99,6 +103,10 @@ class Uavlinkd(Contender):
         }
         until(lambda: all(peers_up(folder / f"{side}.sock") == 1 for side in private), "the daemons are linked")
         return Running([processes[cable.left]], [processes[cable.right]])
+
+    @property
+    def _ports(self) -> range:
+        return range(LINK_PORT, LINK_PORT + self._paths)
 
     def _rules(self, role: str, system: int) -> dict[str, object]:
         """Role and systems of a peer."""
@@ -117,17 +125,20 @@ class Uavlinkd(Contender):
         return subprocess.run([self._python, "-c", asks], capture_output=True, check=False).returncode == 0
 
 
-def peer(name: str, public: str, rules: Mapping[str, object], address: str = "") -> str:
+def peer(name: str, public: str, rules: Mapping[str, object], addresses: Sequence[str] = ()) -> str:
     """A ``[[peer]]``."""
     said = "".join(f"{key} = {json.dumps(value)}\n" for key, value in rules.items())
-    said += f'addresses = ["{address}"]\n' if address else ""
+    said += f"addresses = {json.dumps(addresses)}\n" if addresses else ""
     return f'\n[[peer]]\nname = "{name}"\npublic_key = "{public}"\n{said}'
 
 
-def configuration(name: str, *, peers: Sequence[str], endpoint: str, link: str = "") -> str:
+def configuration(
+    name: str, *, peers: Sequence[str], endpoint: str, link: str = "", ports: Iterable[int] = (LINK_PORT,)
+) -> str:
     """A daemon's file; its key and control socket are beside it, by its name."""
+    listen = json.dumps([f"0.0.0.0:{port}" for port in ports])
     return (
-        f'name = "{name}"\nprivate_key_file = "{name}.key"\nlisten = ["0.0.0.0:{LINK_PORT}"]\n'
+        f'name = "{name}"\nprivate_key_file = "{name}.key"\nlisten = {listen}\n'
         f'control_socket = "{name}.sock"\n\n[link]\n{link}\n'
         f'[[endpoint]]\nname = "client"\nurl = "{endpoint}"\n{"".join(peers)}'
     )
@@ -166,5 +177,7 @@ DAEMONS: Final = (
     Uavlinkd("uavlinkd-confidential", "encrypted too", confidential="true"),
     Uavlinkd("uavlinkd-coalesced", "authenticated, coalesce_s = 0.002", coalesce_s="0.002"),
     Uavlinkd("uavlinkd-all", "authenticated, without roles: policy passes everything", has_roles=False),
+    Uavlinkd("uavlinkd-paths", "authenticated, two paths: stream along one of them", paths=2),
+    Uavlinkd("uavlinkd-copies", "authenticated, two paths: every frame along both", paths=2, redundancy='"all"'),
     Uavlinkd("uavlinkd-asyncio", "authenticated, without uvloop", uvloop=False),
 )

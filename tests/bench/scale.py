@@ -108,7 +108,7 @@ def start() -> dict[str, Value]:
         text = configuration(
             "drone",
             peers=[
-                peer("ground", keys.public_key_text(other), {"role": "operator", "system_ids": [255]}, NO_LISTENER)
+                peer("ground", keys.public_key_text(other), {"role": "operator", "system_ids": [255]}, [NO_LISTENER])
             ],
             endpoint=f"udpout:{NO_LISTENER}",
         )

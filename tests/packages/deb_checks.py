@@ -22,6 +22,7 @@ from tests.compose.machine import Machine, build_clean
 from tests.daemon.frames import numbered
 from tests.needs import need
 from uavlinkd import __version__
+from uavlinkd.core.constants import PROTOCOL_NAME
 
 ROOT = Path(__file__).parents[2]
 SCRIPT = ROOT / "systemd/deb/make_deb.py"
@@ -158,7 +159,7 @@ def test_installation_by_hand_is_refused(package: Package, machine: Machine) -> 
     assert files(machine) - before == {"/opt/uavlinkd", "/opt/uavlinkd/file"}
 
     machine.say("rm -r /opt/uavlinkd; dpkg --install /root/uavlinkd.deb")
-    assert machine.say("uavlinkd --version").strip() == f"uavlinkd {__version__}"
+    assert machine.say("uavlinkd --version").strip() == f"uavlinkd {__version__}, {PROTOCOL_NAME.decode()}"
     assert "replay" in machine.say("uavlink-mitm --list")
     assert machine.say("dpkg --verify uavlinkd") == ""
     for unit in ("uavlinkd.service", "uavlinkd@.service", "uavlink-mitm.service"):
@@ -224,7 +225,7 @@ def test_upgrade_and_downgrade_under_traffic(package: Package, machine: Machine,
 
         outage_s = max(later - earlier for earlier, later in pairwise(arrivals(machine)[count - 1 :]))
         print(f"Debian {package.release}, to {version}: no frame for {outage_s:.1f} s")
-        assert machine.say("uavlinkd --version").strip() == f"uavlinkd {version}"
+        assert machine.say("uavlinkd --version").strip() == f"uavlinkd {version}, {PROTOCOL_NAME.decode()}"
         assert all(machine.show(f"uavlinkd@{name}", "MainPID") not in ("0", before[name]) for name in "ab")
         machine.until(lambda: all(is_up(machine, name) for name in "ab"))
         assert machine.say("find /etc/uavlinkd -type f -exec sha256sum {} +") == mine

@@ -16,6 +16,7 @@ from tempfile import TemporaryDirectory
 import pytest
 
 from uavlinkd import __version__
+from uavlinkd.core.constants import PROTOCOL_NAME
 
 ROOT = Path(__file__).parents[2]
 
@@ -92,7 +93,7 @@ def test_installed_commands_run(folder: Path) -> None:
     commands = folder / "venv/bin"
 
     pip(commands / "python", "check")
-    assert run(commands / "uavlinkd", "--version") == f"uavlinkd {__version__}\n"
+    assert run(commands / "uavlinkd", "--version") == f"uavlinkd {__version__}, {PROTOCOL_NAME.decode()}\n"
     assert "replay" in run(commands / "uavlink-mitm", "--list")
     summary = json.loads(run(commands / "uavlinkd", "demo", "--seconds", "1", "--json").splitlines()[-1])
     assert summary["frames_delivered"] > 0
