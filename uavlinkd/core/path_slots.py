@@ -1,0 +1,147 @@
+"""The slots of the paths to one peer: which paths are configured, learned, and known. README.md, section 15."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+
+from uavlinkd.core import constants as c
+from uavlinkd.core.constants import NEVER
+from uavlinkd.core.path import Path, SocketAddress
+from uavlinkd.core.path_state import PathState
+from uavlinkd.core.socket_facts import SocketFacts
+
+
+class PathSlots:
+    """Slots for configured and for learned paths.
+
+    ``known``: how many peers have proved to be at an address. It and ``facts`` are shared by all peers of a node.
+    """
+
+    __slots__ = ("_former", "_known", "_reported", "_unanswered", "best", "by_path", "facts")
+
+    def __init__(self, known: Counter[SocketAddress], facts: SocketFacts) -> None:
+        self._known = known
+        self.facts = facts
+        """Behind the sockets of the paths."""
+        self.by_path: dict[Path, PathState] = {}
+        """The slots in use: the configured paths first, then the oldest."""
+        self.best: PathState | None = None
+        """Where frames go; a path that failed stays the best while there is no other."""
+        self._former: dict[Path, float] = {}  # validated paths that went down, and until when that counts
+        self._reported: set[PathState] = set()  # those that were reported as usable
+        self._unanswered = 0
+
+    @property
+    def states(self) -> list[PathState]:
+        """Every slot in use, the configured paths first."""
+        return list(self.by_path.values())
+
+    @property
+    def has_any(self) -> bool:
+        """Whether there is somewhere to initiate to."""
+        return bool(self.by_path)
+
+    @property
+    def has_several(self) -> bool:
+        """Whether there is more than one path, whatever their condition."""
+        return len(self.by_path) > 1
+
+    @property
+    def configured(self) -> tuple[Path, ...]:
+        """The paths of the configuration."""
+        return tuple(state.path for state in self.by_path.values() if state.is_configured)
+
+    def find(self, path: Path) -> PathState | None:
+        """The slot of a path."""
+        return self.by_path.get(path)
+
+    def with_number(self, number: int) -> PathState | None:
+        """The slot with this number."""
+        return next((state for state in self.by_path.values() if state.number == number), None)
+
+    def take_unanswered(self) -> int:
+        """How many learned paths were given up since the last call, because they answered nothing."""
+        unanswered, self._unanswered = self._unanswered, 0
+        return unanswered
+
+    def was_validated(self, path: Path, now: float) -> bool:
+        """Whether a path without a slot was validated until recently: what was held back there still arrives."""
+        return now < self._former.get(path, -NEVER)
+
+    def configure(self, paths: Iterable[Path], now: float) -> None:
+        """The paths of the configuration, the likeliest first. One that works stays, as a learned path."""
+        hosts = Counter[tuple[int, str]]()
+        wanted: list[Path] = []
+        for path in dict.fromkeys(paths):
+            hosts[path.socket, path.host] += 1
+            if hosts[path.socket, path.host] <= c.PATHS_PER_HOST and len(wanted) < c.CONFIGURED_PATHS:
+                wanted.append(path)
+        before = self.by_path
+        self.by_path = {}
+        for path in wanted:
+            self.by_path[path] = before.get(path) or self._new(path, now, is_configured=True, others=before)
+            self.by_path[path].is_configured = self.by_path[path].is_proven = True
+        for path, state in before.items():
+            if path not in self.by_path:
+                state.is_configured = False
+                if state is self.best or state.works:
+                    self.by_path[path] = state
+                else:
+                    self._drop(state)
+
+    def learn(self, path: Path, now: float) -> PathState:
+        """A slot for an address from which an authentic envelope came first, or which made the session."""
+        learned = [state for state in self.by_path.values() if not state.is_configured]
+        if len(learned) >= c.LEARNED_PATHS:
+            self.remove(min((state for state in learned if state is not self.best), key=_usefulness))
+        state = self.by_path[path] = self._new(path, now, is_configured=False, others=self.by_path)
+        return state
+
+    def remove(self, state: PathState) -> None:
+        """Free a slot."""
+        del self.by_path[state.path]
+        self._drop(state)
+        if state is self.best:
+            self.best = None
+
+    def clear(self) -> None:
+        """Forget every path: the peer is removed."""
+        for state in self.states:
+            self.remove(state)
+
+    def _new(self, path: Path, now: float, *, is_configured: bool, others: dict[Path, PathState]) -> PathState:
+        taken = {state.number for state in (*others.values(), *self.by_path.values())}
+        number = next(number for number in range(1, 256) if number not in taken)
+        is_metered = path.socket in self.facts.metered
+        return PathState(path, number, now, is_configured=is_configured, is_metered=is_metered)
+
+    def _drop(self, state: PathState) -> None:
+        self._reported.discard(state)
+        self._unanswered += not (state.is_validated or state.is_configured)
+        if not state.is_known:
+            return
+        place = state.path.place
+        self._known[place] -= 1
+        if not self._known[place]:
+            del self._known[place]
+
+    def set_metered(self) -> None:
+        """The metered sockets have changed."""
+        for state in self.by_path.values():
+            state.is_metered = state.path.socket in self.facts.metered
+
+    def set_socket_state(self, socket: int, now: float, *, is_up: bool) -> None:
+        """The network behind a socket disappeared, or appeared, or changed."""
+        for state in self.by_path.values():
+            if state.path.socket == socket:
+                state.set_off(is_off=not is_up, now=now)
+
+    def _note_known(self, state: PathState) -> None:
+        if not state.is_known:
+            state.is_known = True
+            self._known[state.path.place] += 1
+
+
+def _usefulness(state: PathState) -> tuple[bool, bool, float]:
+    return state.is_validated, state.works, max(state.received_at, state.since)
