@@ -11,7 +11,7 @@ from fastcrc.crc16 import mcrf4xx
 from hypothesis import given
 from hypothesis import strategies as st
 
-from uavlinkd.endpoints.line_framing import MAX_DATAGRAM, MAX_ENCODED, REPORTS_CUT_OUT, LineDecoder, encode
+from uavlinkd.endpoints.line_framing import MAX_DATAGRAM, MAX_ENCODED, REPORTS_CUT_OUT, LineDecoder, Noise, encode
 from uavlinkd.endpoints.radio_reports import RadioReport
 
 DATAGRAMS = [bytes(20), b"", b"\x40" + bytes(range(1, 255)) * 2, b"\x01" * 147, bytes(range(256)), b"\xfe\xfd" * 60]
@@ -37,33 +37,40 @@ def feed_all(chunks: Iterable[bytes]) -> tuple[list[bytes], LineDecoder]:
 
 
 def counts(decoder: LineDecoder) -> tuple[object, ...]:
-    return decoder.datagrams, decoder.line_noise, decoder.reports, decoder.reports_inside, decoder.report
+    return (
+        decoder.datagrams,
+        decoder.discarded,
+        decoder.discarded_bytes,
+        decoder.reports,
+        decoder.reports_inside,
+        decoder.report,
+    )
 
 
 @pytest.mark.parametrize("size", [*range(500), 500, 506])
 def test_overhead_is_small(size: int) -> None:
-    """With the delimiter that follows a silence, at most 6 bytes; and the worst case of COBS is one long run."""
+    """With both delimiters at most 6 bytes; and the worst case of COBS is one long run."""
     for datagram in (bytes(size), b"\x01" * size, b"\xff" * size):
         line = encode(datagram)
-        assert len(line) - size <= (4 if size <= 252 else 5)
-        assert line.index(0) == len(line) - 1
+        assert len(line) - size <= (5 if size <= 252 else 6)
+        assert [at for at, byte in enumerate(line) if not byte] == [0, len(line) - 1]
         assert feed_all([line])[0] == [datagram]
 
 
 def test_layout_is_that_of_the_specification() -> None:
     """COBS by hand, and the check value of the CRC."""
     assert crc_hqx(b"123456789", 0xFFFF) == 0x29B1
-    assert encode(b"123456789") == b"\x0c123456789\x29\xb1\x00"
-    assert encode(b"") == b"\x03\xff\xff\x00"
+    assert encode(b"123456789") == b"\x00\x0c123456789\x29\xb1\x00"
+    assert encode(b"") == b"\x00\x03\xff\xff\x00"
     crc = crc_hqx(b"a\0b", 0xFFFF).to_bytes(2, "big")
-    assert encode(b"a\0b") == b"\x02a\x04b" + crc + b"\x00"
+    assert encode(b"a\0b") == b"\x00\x02a\x04b" + crc + b"\x00"
 
 
 def test_longest_datagrams() -> None:
     """A handshake message of every suite fits; a longer datagram is refused, and dropped if it comes."""
     longest = b"\x02" * MAX_DATAGRAM
     line = encode(longest)
-    assert len(line) == MAX_ENCODED + 1
+    assert len(line) == MAX_ENCODED + 2
     assert feed_all([line])[0] == [longest]
     with pytest.raises(ValueError, match="too long"):
         encode(longest + b"\x02")
@@ -125,13 +132,13 @@ def test_line_cut_at_every_offset() -> None:
         ]
         assert received[-len(whole) :] == whole if whole else len(received) <= 1
         assert decoder.line_noise <= 1
-        first, decoder = feed_all([stream[:cut], b"\0", stream])  # the modem is plugged in again
+        first, decoder = feed_all([stream[:cut], stream])  # the modem is plugged in again
         assert first[-len(DATAGRAMS) :] == DATAGRAMS
         assert decoder.line_noise <= 1
 
 
 def test_damage_at_every_offset() -> None:
-    """A byte changed, lost or inserted costs at most the two datagrams beside a delimiter. No other one changes."""
+    """A byte changed, lost or inserted costs at most one datagram, also if it is a delimiter. No other changes."""
     stream = b"".join(map(encode, DATAGRAMS))
     for at in range(len(stream)):
         for damaged in (
@@ -142,8 +149,41 @@ def test_damage_at_every_offset() -> None:
         ):
             received, decoder = feed_all([damaged, b"\0"])
             assert set(received) <= set(DATAGRAMS)
-            assert len(received) >= len(DATAGRAMS) - 2
+            assert len(received) >= len(DATAGRAMS) - 1
             assert decoder.line_noise <= 2
+
+
+@given(st.binary(max_size=MAX_ENCODED), datagrams)
+def test_noise_costs_no_datagram_after_it(before: bytes, datagram: bytes) -> None:
+    """Whatever it is: the end of a lost datagram, a modem's start text, bytes without any delimiter."""
+    received, _ = feed_all([before, encode(datagram), bytes(22)])  # no report goes on for so long
+    assert received[-1:] == [datagram]
+
+
+@given(st.lists(st.one_of(st.binary(max_size=60), st.just(b"\1" * 5000), datagrams.map(encode)), max_size=8))
+def test_every_byte_is_accounted_for(parts: list[bytes]) -> None:
+    """Of a datagram, a delimiter, a discarded piece with its reason, or it waits."""
+    stream = b"".join(parts).replace(b"\xfe", b"").replace(b"\xfd", b"")  # no reports
+    received, decoder = feed_all(pieces(stream, [50]))
+    whole = sum(len(encode(datagram)) - 2 for datagram in received)
+    discarded = decoder.discarded_bytes.total()
+    assert whole + discarded + decoder.pending_bytes + stream.count(0) == len(stream)
+    assert decoder.discarded.keys() == decoder.discarded_bytes.keys()
+
+
+@pytest.mark.parametrize(
+    ("piece", "noise"),
+    [
+        (b"\x05abc", Noise.BAD_COBS),
+        (b"\x01", Noise.BAD_CRC),
+        (encode(b"abc")[1:-1].replace(b"a", b"b"), Noise.BAD_CRC),
+        (b"\x01" * MAX_ENCODED + b"\x01", Noise.TOO_LONG),
+    ],
+)
+def test_discarded_pieces_are_counted_by_reason(piece: bytes, noise: Noise) -> None:
+    """And their bytes."""
+    _, decoder = feed_all([piece + b"\0"])
+    assert (decoder.discarded, decoder.discarded_bytes) == ({noise: 1}, {noise: len(piece)})
 
 
 @pytest.mark.parametrize("one", [report(), report(2), report(1, 166)], ids=["v1", "v2", "old"])
@@ -154,7 +194,7 @@ def test_reports_between_datagrams_are_skipped(one: bytes) -> None:
     for size in (1, 3, 16, 17, 20, len(stream)):
         received, decoder = feed_all(pieces(stream, [size]))
         assert received == DATAGRAMS
-        assert counts(decoder) == (len(DATAGRAMS), 0, 1 + 2 * len(DATAGRAMS), 0, FIGURES)
+        assert counts(decoder) == (len(DATAGRAMS), {}, {}, 1 + 2 * len(DATAGRAMS), 0, FIGURES)
 
 
 @pytest.mark.parametrize("one", [report(), report(2), report(1, payload=b"\x01" * 9)], ids=["v1", "v2", "no zeros"])
@@ -162,7 +202,7 @@ def test_reports_inside_a_datagram_are_cut_out(one: bytes) -> None:
     """At every offset, and in any chunks: the datagram arrives, and the counter shows the modem's wrong setting."""
     datagram = bytes(range(3, 90)) + bytes(10) + b"\xfe\x09\xfd"
     line = encode(datagram)
-    for at in range(1, len(line)):
+    for at in range(2, len(line)):
         stream = encode(b"before") + line[:at] + one + line[at:] + encode(b"after")
         for chunks in ([stream], pieces(stream, [1])):
             received, decoder = feed_all(chunks)

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import errno
 import os
-from collections.abc import AsyncIterator, Iterator
+import termios
+import threading
+from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+from serialx import serial_for_url
 
 from tests.endpoints.test_serial import Autopilot
-from tests.waiting import until
+from tests.waiting import PATIENCE_S, until
 from uavlinkd.endpoints import serial_line
-from uavlinkd.endpoints.line_framing import DELIMITER, LineDecoder, encode
-from uavlinkd.endpoints.serial_line import LINE_FULL, TOO_LONG, SerialLine
+from uavlinkd.endpoints.line_framing import LineDecoder, encode
+from uavlinkd.endpoints.serial_line import CTS_STUCK, LINE_FULL, TOO_LONG, SerialLine
 from uavlinkd.endpoints.url import SerialUrl
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.stall import StallWatch
@@ -82,13 +87,13 @@ async def plugged_in(other: Other, line: SerialLine) -> None:
 
 
 async def test_datagrams_go_in_both_directions(other: Other, line: SerialLine, received: Received) -> None:
-    """Any bytes; after a silence a delimiter comes first."""
+    """Any bytes."""
     await plugged_in(other, line)
     sent = [bytes(range(256)), b"\x11\x13\x03\x04\r\n", b""]
     for datagram in sent:
         line.send(datagram)
     await until(lambda: other.datagrams() == sent)
-    assert other.raw == DELIMITER + b"".join(map(encode, sent))
+    assert other.raw == b"".join(map(encode, sent))
     os.write(other.master, b"".join(map(encode, sent)))
     await until(lambda: received.datagrams == sent)
     assert (line.reason, line.uses_cts, received.changes) == ("", False, 1)
@@ -135,21 +140,107 @@ async def test_datagram_that_is_longer_than_a_moment_of_the_air_passes(other: Ot
 
 
 async def test_modem_that_withholds_cts_for_good_is_ignored(
-    other: Other, line: SerialLine, monkeypatch: pytest.MonkeyPatch
+    other: Other, line: SerialLine, received: Received, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its wire is not connected after all."""
+    """Its wire is not connected after all. The next modem is tried again."""
     monkeypatch.setattr(serial_line, "STUCK_S", 0.05)
+    monkeypatch.setattr(serial_line, "_has_cts", lambda device: True)
     await plugged_in(other, line)
-    device = line._device
-    assert device is not None
-    line._use_cts(device, on=True)
-    assert [line.uses_cts] == [True]
-    held = [7]
-    monkeypatch.setattr(device, "num_unwritten_bytes", lambda: held[0])
+    assert line.uses_cts
+    monkeypatch.setattr(line._device, "num_unwritten_bytes", lambda: 7)
     line.set_rate(50)
     for number in range(3):
         line.send(bytes([number + 1]) * 30)
-    await until(lambda: line.failures["CTS_STUCK"] == 1)
+    await until(lambda: line.failures[CTS_STUCK] == 1 and line.is_open)
     assert [line.uses_cts] == [False]
-    held[0] = 0
-    await until(lambda: len(other.datagrams()) == 3)
+    assert line.cts.total_s > 0.05
+    line.send(b"passes")
+    await until(lambda: b"passes" in other.datagrams())
+    other.unplug()
+    await until(lambda: not line.is_open)
+    await plugged_in(other, line)
+    assert [line.uses_cts] == [True]
+    assert received.changes == 5
+
+
+async def test_plug_that_is_pulled_before_a_look_at_the_queue(
+    other: Other, line: SerialLine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The error of TIOCOUTQ is that of a lost device: counted, and the device is opened again."""
+    await plugged_in(other, line)
+
+    def lost() -> int:
+        raise OSError(errno.EIO, "unplugged")
+
+    monkeypatch.setattr(line._device, "num_unwritten_bytes", lost)
+    line.send(b"lost with the plug")
+    assert (line.is_open, line.failures["EIO"]) == (False, 1)
+    await until(lambda: line.is_open)
+
+
+HANGS = ("open", "get_modem_pins", "tcsetattr", "reset_write_buffer", "close")
+
+
+@pytest.mark.parametrize("call", HANGS)
+async def test_adapter_that_hangs_does_not_stop_the_event_loop(
+    other: Other, line: SerialLine, monkeypatch: pytest.MonkeyPatch, call: str
+) -> None:
+    """While a call of the driver waits, the loop goes on; when the call returns, the line works."""
+    hangs, may_go_on = threading.Event(), threading.Event()
+    loop_thread = threading.get_ident()
+
+    def hanging(real: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*arguments: Any) -> Any:
+            if not may_go_on.is_set():
+                assert threading.get_ident() != loop_thread, "the event loop hangs"
+                hangs.set()
+                assert may_go_on.wait(PATIENCE_S)
+            return real(*arguments)
+
+        return call
+
+    of: Any = termios if call == "tcsetattr" else type(serial_for_url("/dev/null", 57600))
+    monkeypatch.setattr(serial_line, "_has_cts", lambda device: bool(device.get_modem_pins()))
+    try:
+        if call in ("reset_write_buffer", "close"):
+            await plugged_in(other, line)
+            monkeypatch.setattr(of, call, hanging(getattr(of, call)))
+            other.unplug()
+        else:
+            monkeypatch.setattr(of, call, hanging(getattr(of, call)))
+            other.plug_in()
+        await until(hangs.is_set)  # in a turn of the loop
+        assert not line.is_open
+    finally:
+        may_go_on.set()
+    if call in ("reset_write_buffer", "close"):
+        other.plug_in()
+    await until(lambda: line.is_open)
+    line.send(b"passes")
+    await until(lambda: other.datagrams() == [b"passes"])
+
+
+async def test_end_of_the_daemon_does_not_wait_for_an_adapter_that_hangs(
+    other: Other, line: SerialLine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What waits is written, then the device has a moment to close."""
+    monkeypatch.setattr(serial_line, "CLOSE_S", 0.01)
+    await plugged_in(other, line)
+    device = line._device
+    assert device is not None
+    may_close, closed, close = threading.Event(), threading.Event(), device.close
+
+    def hang() -> None:
+        assert may_close.wait(PATIENCE_S)
+        close()
+        closed.set()
+
+    monkeypatch.setattr(device, "close", hang)
+    line.set_rate(1)
+    line.send(b"first")
+    line.send(b"waits for the radio")
+    line.close()
+    assert not closed.is_set()
+    await until(lambda: other.datagrams() == [b"first", b"waits for the radio"])
+    may_close.set()
+    await until(closed.is_set)

@@ -73,7 +73,14 @@ def make() -> Run:
 
 
 def _counts(decoder: LineDecoder) -> tuple[object, ...]:
-    return decoder.datagrams, decoder.line_noise, decoder.reports, decoder.reports_inside, decoder.report
+    return (
+        decoder.datagrams,
+        decoder.discarded,
+        decoder.discarded_bytes,
+        decoder.reports,
+        decoder.reports_inside,
+        decoder.report,
+    )
 
 
 def seeds() -> list[bytes]:

@@ -274,9 +274,9 @@ ENVELOPE_AIR_S = 0.25
 SLOW_ENVELOPE_LEAST = 120
 """and at least this many bytes: below it, envelopes are mostly overhead,"""
 SLOW_ENVELOPE_MOST = 500
-"""and at most this many: then framing on a line adds at most 5 bytes."""
+"""and at most this many: then framing on a line adds at most 6 bytes."""
 LINE_BYTES = 5
-"""What framing on a line adds to a datagram: two bytes of COBS, two of the CRC, a delimiter."""
+"""What framing on a line adds to a datagram of up to 252 bytes: one byte of COBS, two of the CRC, two delimiters."""
 LIMIT_TESTS = 3
 """Padded probes without an answer, while others are answered, that lower the limit of a path."""
 LIMIT_TEST_S = 1.0

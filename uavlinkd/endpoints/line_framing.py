@@ -2,17 +2,19 @@
 
 ::
 
-    COBS(datagram | CRC-16 of the datagram, big-endian) | 0x00
+    0x00 | COBS(datagram | CRC-16 of the datagram, big-endian) | 0x00
 
-COBS (Consistent Overhead Byte Stuffing) removes the byte 0x00 from its input, so 0x00 always ends a datagram. The CRC
-is CRC-16/CCITT with the initial value 0xFFFF. It only keeps line noise out of the core's counters: envelopes have
-their own tags. Sans-IO.
+COBS (Consistent Overhead Byte Stuffing) removes the byte 0x00 from its input, so 0x00 always ends a datagram. The one
+in front ends noise from before it. The CRC is CRC-16/CCITT with the initial value 0xFFFF. It only keeps line noise
+out of the core's counters: envelopes have their own tags. Sans-IO.
 """
 
 from __future__ import annotations
 
 import re
 from binascii import crc_hqx
+from collections import Counter
+from enum import StrEnum
 from typing import Final
 
 from cobs import cobs
@@ -24,7 +26,7 @@ CRC_BYTES: Final = 2
 MAX_DATAGRAM: Final = 2048
 """The longest datagram on a line: more than the longest handshake message."""
 MAX_ENCODED: Final = MAX_DATAGRAM + CRC_BYTES + (MAX_DATAGRAM + CRC_BYTES + 253) // 254
-"""The longest datagram in COBS, without the delimiter. A receiver holds at most this and one chunk."""
+"""The longest datagram in COBS, without delimiters. A receiver holds at most this and one chunk."""
 
 REPORTS_CUT_OUT: Final = 2
 """So many reports are cut out of one broken datagram: a modem sends one a second, an attacker could fill the line."""
@@ -32,15 +34,23 @@ REPORTS_CUT_OUT: Final = 2
 _REPORT_START: Final = re.compile(b"[" + re.escape(REPORT_STARTS) + b"]")
 
 
+class Noise(StrEnum):
+    """Why a piece between two delimiters is not a datagram."""
+
+    BAD_COBS = "bad_cobs"
+    BAD_CRC = "bad_crc"
+    TOO_LONG = "too_long"
+
+
 def encode(datagram: bytes) -> bytes:
-    """The bytes of a datagram on the line: at most 5 more than its own, up to 506.
+    """The bytes of a datagram on the line: 5 more than its own, up to 252, and 6 more up to 506.
 
     Raises:
         ValueError: it is longer than :data:`MAX_DATAGRAM`.
     """
     if len(datagram) > MAX_DATAGRAM:
         raise ValueError(f"a datagram of {len(datagram)} bytes is too long for a line")
-    return bytes(cobs.encode(datagram + _crc(datagram))) + DELIMITER
+    return DELIMITER + bytes(cobs.encode(datagram + _crc(datagram))) + DELIMITER
 
 
 def _crc(datagram: bytes) -> bytes:
@@ -54,7 +64,10 @@ class LineDecoder:
     datagrams are skipped. If a datagram is broken because the modem put a report into it, the report is cut out.
     """
 
-    __slots__ = ("_cuts", "_is_skipping", "_rest", "datagrams", "line_noise", "report", "reports", "reports_inside")
+    __slots__ = (
+        *("_cuts", "_is_skipping", "_rest"),
+        *("datagrams", "discarded", "discarded_bytes", "report", "reports", "reports_inside"),
+    )
 
     def __init__(self) -> None:
         self._rest = b""
@@ -62,14 +75,21 @@ class LineDecoder:
         self._is_skipping = False  # up to the next delimiter: what precedes it is too long
         self.datagrams = 0
         """How many arrived whole."""
-        self.line_noise = 0
+        self.discarded = Counter[Noise]()
         """Pieces between two delimiters that are not a datagram."""
+        self.discarded_bytes = Counter[Noise]()
+        """Their bytes."""
         self.reports = 0
         """Reports of the modem."""
         self.reports_inside = 0
         """Those of them that were inside a datagram."""
         self.report: RadioReport | None = None
         """The last one."""
+
+    @property
+    def line_noise(self) -> int:
+        """All discarded pieces."""
+        return self.discarded.total()
 
     @property
     def pending_bytes(self) -> int:
@@ -94,9 +114,10 @@ class LineDecoder:
             if end < 0:
                 break
             piece = data[at:end]
-            if self._is_skipping:  # counted already
+            if self._is_skipping:  # the piece is counted already
                 self._is_skipping = False
-            elif piece and not self._take(piece, datagrams):
+                self.discarded_bytes[Noise.TOO_LONG] += len(piece)
+            elif piece and (noise := self._take(piece, datagrams)) is not None:
                 is_searched = self._cuts < REPORTS_CUT_OUT and len(piece) <= MAX_ENCODED
                 start, size = _find_report(data, at, end) if is_searched else (0, 0)
                 if size is None:
@@ -107,7 +128,7 @@ class LineDecoder:
                     data, at = data[at:start] + data[start + size :], 0
                     self._cuts += 1
                     continue
-                self.line_noise += 1
+                self._discard(noise, len(piece))
             at, self._cuts = end + 1, 0
         self._keep(data[at:])
         return datagrams
@@ -116,14 +137,18 @@ class LineDecoder:
         """Forget the bytes that wait: the device was closed."""
         self._rest, self._is_skipping, self._cuts = b"", False, 0
 
-    def _take(self, piece: bytes, datagrams: list[bytes]) -> bool:
-        """Decode what is between two delimiters. Returns whether it is a datagram."""
+    def _take(self, piece: bytes, datagrams: list[bytes]) -> Noise | None:
+        """Decode what is between two delimiters. Returns why it is not a datagram."""
         datagram = _decode(piece)
-        if datagram is None:
-            return False
+        if isinstance(datagram, Noise):
+            return datagram
         datagrams.append(datagram)
         self.datagrams += 1
-        return True
+        return None
+
+    def _discard(self, noise: Noise, size: int) -> None:
+        self.discarded[noise] += 1
+        self.discarded_bytes[noise] += size
 
     def _note(self, frame: bytes) -> None:
         self.reports += 1
@@ -132,24 +157,27 @@ class LineDecoder:
     def _keep(self, rest: bytes) -> None:
         """Bytes wait for a delimiter, or for the rest of a report."""
         if self._is_skipping:
+            self.discarded_bytes[Noise.TOO_LONG] += len(rest)
             rest = b""
         elif len(rest) > MAX_ENCODED and DELIMITER not in rest:
             self._is_skipping = True
-            self.line_noise += 1
+            self._discard(Noise.TOO_LONG, len(rest))
             rest = b""
         self._rest = rest
 
 
-def _decode(piece: bytes) -> bytes | None:
-    """The datagram between two delimiters; None if it is broken."""
+def _decode(piece: bytes) -> bytes | Noise:
+    """The datagram between two delimiters, or why it is none."""
     if len(piece) > MAX_ENCODED:
-        return None
+        return Noise.TOO_LONG
     try:
         content = bytes(cobs.decode(piece))
     except cobs.DecodeError:
-        return None
+        return Noise.BAD_COBS
     datagram, crc = content[:-CRC_BYTES], content[-CRC_BYTES:]
-    return datagram if len(content) >= CRC_BYTES and len(datagram) <= MAX_DATAGRAM and crc == _crc(datagram) else None
+    if len(content) < CRC_BYTES or crc != _crc(datagram):
+        return Noise.BAD_CRC
+    return datagram if len(datagram) <= MAX_DATAGRAM else Noise.TOO_LONG
 
 
 def _find_report(data: bytes, at: int, end: int) -> tuple[int, int | None]:

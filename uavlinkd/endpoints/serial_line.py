@@ -2,6 +2,11 @@
 
 A modem takes bytes faster than its radio carries them, and holds the rest in a queue that it does not report. So the
 line is written at the rate of this end's part of the air. It accepts no more than :data:`QUEUE_S`.
+
+A USB adapter that hangs must not stop the daemon. Opening, closing, TIOCMGET and tcsetattr wait for answers of the
+adapter, and tcsetattr locks out reads and writes meanwhile. So a worker thread calls them, while the event loop does
+not use the device. The event loop itself reads and writes with O_NONBLOCK, and asks TIOCOUTQ. That does not block:
+Linux answers it from the driver's memory, as it does for each poll of the device (``n_tty_poll``).
 """
 
 from __future__ import annotations
@@ -14,11 +19,13 @@ from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from math import inf
+from threading import Thread
 from typing import Final, Protocol
 
 from serialx import BaseSerial, PinState
 
-from uavlinkd.endpoints.line_framing import DELIMITER, LineDecoder, encode
+from uavlinkd.endpoints.cts_hold import CtsHold
+from uavlinkd.endpoints.line_framing import LineDecoder, encode
 from uavlinkd.endpoints.ports import failure_name
 from uavlinkd.endpoints.serial import LATE_S, RETRY_S, TERMINAL_BYTES, open_device
 from uavlinkd.endpoints.url import SerialUrl
@@ -27,8 +34,6 @@ from uavlinkd.system.stall import STALE, Backlog, StallWatch
 from uavlinkd.system.tasks import keep_running
 from uavlinkd.system.threads import Threads
 
-LINE_IDLE_S: Final = 0.5
-"""After a silence of the sender, a delimiter precedes the next datagram."""
 MODEM_S: Final = 0.25
 """The modem gets no more than the air carries in this time, or one datagram."""
 QUEUE_S: Final = 0.25
@@ -37,9 +42,17 @@ QUEUE_BYTES: Final = 320
 """An initiation and a response of a handshake wait here together, however slow the radio is."""
 READ_BYTES: Final = 4096
 STUCK_S: Final = 5.0
-"""The modem withholds CTS for longer: the wire is broken or not connected. Then the daemon ignores CTS."""
+"""The modem withholds CTS for longer: the wire is broken or not connected. Then the daemon opens the device again,
+and ignores CTS until the device is lost for another reason."""
+WIRE_LATE_S: Final = 0.05
+"""A USB adapter reports later than this wire's rate shows that bytes were sent."""
+CLOSE_S: Final = 0.5
+"""At the end of the daemon, the last datagram has this time to leave the kernel."""
 LINE_FULL: Final = "LINE_FULL"
 """In place of an error's name: a datagram was dropped because too much waits for the radio."""
+CTS_STUCK: Final = "CTS_STUCK"
+"""In place of an error's name: see :data:`STUCK_S`."""
+_BITS_PER_BYTE: Final = 10  # with start and stop bit
 TOO_LONG: Final = "EMSGSIZE"
 
 
@@ -70,6 +83,7 @@ class SerialLine:
         """Why it is not open."""
         self.uses_cts = False
         """Whether the modem can stop this end by the CTS wire."""
+        self.cts = CtsHold()
         self.bytes_written = 0
         self._name = name
         self._bytes_s = bytes_s
@@ -81,9 +95,9 @@ class SerialLine:
         self._lost = asyncio.Event()
         self._queue: deque[bytes] = deque()
         self._queued_bytes = 0
-        self._written_at = -inf
         self._sent_by = -inf  # when the air will have carried all written bytes
-        self._stuck_since: float | None = None
+        self._wire_by = -inf  # when the wire to the modem will have carried them
+        self._ignores_cts = False
         self._timer: asyncio.TimerHandle | None = None
         self._task: asyncio.Task[None] | None = None
         self._is_closed = False
@@ -104,7 +118,7 @@ class SerialLine:
         self._task = keep_running(self._keep_open(), f"the serial network {self._name}")
 
     def close(self) -> None:
-        """Write what waits, as far as the kernel takes it at once, and close the device."""
+        """Write what waits, as far as the kernel takes it at once, and close the device. Call it at the end only."""
         self._is_closed = True
         if self._task is not None:
             self._task.cancel()
@@ -112,9 +126,12 @@ class SerialLine:
         if device is not None:
             with suppress(OSError):
                 os.write(device.fileno(), b"".join(self._queue))
-            self._use_cts(device, on=False)  # otherwise the kernel waits up to half a minute for the modem
             self._detach("closed")
-            _close(device)
+            # Not in `_thread`, for which the event loop would have to go on. At exit, Python leaves it behind.
+            closing = Thread(target=_close, args=(device,), name=f"line-{self._name}-close", daemon=True)
+            with suppress(RuntimeError):  # no thread can be started: freeing the object closes it
+                closing.start()
+                closing.join(CLOSE_S)
 
     # Sending.
 
@@ -141,33 +158,30 @@ class SerialLine:
 
     def _write_waiting(self) -> None:
         self._timer = None
-        device = self._device
-        while self._queue and device is not None:
+        while self._queue and (device := self._device) is not None:
             now = monotonic()
-            held_s = self._held_s(device, now)
+            try:
+                in_kernel = device.num_unwritten_bytes()
+            except OSError as error:
+                self._lose(failure_name(error))
+                return
+            self.cts.note(now, is_held=self.uses_cts and in_kernel > 0 and now > self._wire_by + WIRE_LATE_S)
+            if self.cts.lasts_s(now) > STUCK_S:
+                self._lose(CTS_STUCK)
+                return
+            held_s = self._held_s(in_kernel, now)
             if held_s > 0 and held_s + len(self._queue[0]) / self._bytes_s > MODEM_S:
                 wait_s = min(held_s, max(held_s + len(self._queue[0]) / self._bytes_s - MODEM_S, 0.0)) + LATE_S
                 self._timer = asyncio.get_running_loop().call_later(wait_s, self._write_waiting)
                 return
             line = self._queue.popleft()
             self._queued_bytes -= len(line)
-            if now - self._written_at > LINE_IDLE_S:
-                line = DELIMITER + line
             if not self._write(device, line, now):
                 return
 
-    def _held_s(self, device: BaseSerial, now: float) -> float:
+    def _held_s(self, in_kernel: int, now: float) -> float:
         """For how long the radio has something to send; at least as long as the kernel holds bytes."""
-        held_s = max(0.0, self._sent_by - now)
-        in_kernel = device.num_unwritten_bytes()
-        if not in_kernel:
-            self._stuck_since = None
-        elif self._stuck_since is None:
-            self._stuck_since = now
-        elif self.uses_cts and now - self._stuck_since > STUCK_S:
-            self.failures["CTS_STUCK"] += 1
-            self._use_cts(device, on=False)
-        return max(held_s, in_kernel / self._bytes_s)
+        return max(0.0, self._sent_by - now, in_kernel / self._bytes_s)
 
     def _write(self, device: BaseSerial, line: bytes, now: float) -> bool:
         """Pass bytes to the kernel. Returns whether the device is still there."""
@@ -181,8 +195,8 @@ class SerialLine:
         if count < len(line):  # the kernel's queue is full: the other end drops the torn datagram
             self.failures[LINE_FULL] += 1
         self.bytes_written += count
-        self._written_at = now
         self._sent_by = max(self._sent_by, now) + count / self._bytes_s
+        self._wire_by = max(self._wire_by, now) + count * _BITS_PER_BYTE / self.url.baud
         return True
 
     # The device.
@@ -191,7 +205,7 @@ class SerialLine:
         while True:
             epoch = self._stall.epoch
             try:
-                device = await self._thread.run(partial(_open, self.url))
+                device, self.uses_cts = await self._thread.run(self._open_device)
             except OSError as error:
                 self.reason = f"{self.url.device} cannot be opened ({failure_name(error)})"
                 self.failures[failure_name(error)] += 1
@@ -203,29 +217,27 @@ class SerialLine:
                     await self._thread.run(partial(_abort, device))
             await asyncio.sleep(RETRY_S)
 
-    def _attach(self, device: BaseSerial, epoch: int) -> None:
-        if self._is_closed:
+    def _open_device(self) -> tuple[BaseSerial, bool]:
+        """Open the device, and use CTS if the modem has it; in a thread.
+
+        Raises:
+            OSError: any failure.
+        """
+        device = open_device(self.url)
+        if self._is_closed:  # while it was being opened
             _abort(device)
-            return
+            raise OSError("closed")
+        os.set_blocking(device.fileno(), False)
+        return device, not self._ignores_cts and _has_cts(device) and _set_cts(device, on=True)
+
+    def _attach(self, device: BaseSerial, epoch: int) -> None:
         self._device = device
         self.reason = ""
-        self._sent_by = self._written_at = -inf
-        self._stuck_since = None
+        self._sent_by = self._wire_by = -inf
         self.decoder.reset()
-        self.uses_cts = False
-        if _has_cts(device):
-            self._use_cts(device, on=True)
         self._backlog = Backlog(self._stall, device.fileno(), lambda: TERMINAL_BYTES, epoch)
         asyncio.get_running_loop().add_reader(device.fileno(), self._on_readable)
         self._on_change()
-
-    def _use_cts(self, device: BaseSerial, *, on: bool) -> None:
-        """Have the kernel stop writing while the modem lowers CTS, or not."""
-        with suppress(OSError, termios.error):
-            settings = termios.tcgetattr(device.fileno())
-            settings[2] = settings[2] | termios.CRTSCTS if on else settings[2] & ~termios.CRTSCTS
-            termios.tcsetattr(device.fileno(), termios.TCSANOW, settings)
-            self.uses_cts = on
 
     def _on_readable(self) -> None:
         device, backlog = self._device, self._backlog
@@ -253,6 +265,7 @@ class SerialLine:
     def _lose(self, reason: str) -> None:
         """The device is gone."""
         self.failures[reason] += 1
+        self._ignores_cts = reason == CTS_STUCK
         self._detach(f"{self.url.device} was lost ({reason})")
         self._lost.set()
         self._on_change()
@@ -265,14 +278,9 @@ class SerialLine:
             self._timer = None
         self._device = self._backlog = None
         self.reason = reason
+        self.cts.end()
         self._queue.clear()
         self._queued_bytes = 0
-
-
-def _open(url: SerialUrl) -> BaseSerial:
-    device = open_device(url)
-    os.set_blocking(device.fileno(), False)
-    return device
 
 
 def _has_cts(device: BaseSerial) -> bool:
@@ -283,8 +291,20 @@ def _has_cts(device: BaseSerial) -> bool:
         return False
 
 
+def _set_cts(device: BaseSerial, *, on: bool) -> bool:
+    """Have the kernel stop writing while the modem lowers CTS, or not. Returns whether it does so now."""
+    try:
+        settings = termios.tcgetattr(device.fileno())
+        settings[2] = settings[2] | termios.CRTSCTS if on else settings[2] & ~termios.CRTSCTS
+        termios.tcsetattr(device.fileno(), termios.TCSANOW, settings)
+    except (OSError, termios.error):
+        return False
+    return on
+
+
 def _close(device: BaseSerial) -> None:
     """Close the device once the kernel has written what it holds."""
+    _set_cts(device, on=False)  # otherwise the kernel waits up to half a minute for the modem
     with suppress(OSError):
         device.close()
 
@@ -293,4 +313,5 @@ def _abort(device: BaseSerial) -> None:
     """Close the device at once."""
     with suppress(OSError):
         device.reset_write_buffer()
-    _close(device)
+    with suppress(OSError):
+        device.close()

@@ -116,12 +116,11 @@ def test_line_cut_at_every_offset() -> None:
     """Whatever was cut off, the next datagram after a delimiter arrives, and nothing else does."""
     before, cut, after = DATAGRAMS[2], DATAGRAMS[20], DATAGRAMS[5]
     framed = encode(cut)
-    for at in range(len(framed)):
+    for at in range(1, len(framed)):
         decoder = LineDecoder()
         received = decoder.feed(encode(before) + framed[:at])
-        received += decoder.feed(encode(after))  # the first one after the cut may be lost with it
         received += decoder.feed(encode(after))
-        assert received in ([before, after, after], [before, after], [before, cut, after, after]), at
+        assert received == ([before, after] if at < len(framed) - 1 else [before, cut, after]), at
 
 
 def test_plug_pulled_at_every_offset() -> None:
@@ -137,11 +136,9 @@ def test_plug_pulled_at_every_offset() -> None:
         scene.run(scene.now + 1)
         assert scene.received[RIGHT] in ([], [first])
         scene.link.plug(LEFT, scene.now)
-        for _ in range(2):  # the rest of what was cut off ends at the first delimiter
-            scene.link.write(LEFT, encode(second), scene.now)
-            scene.run(scene.now + 1)
-        assert scene.received[RIGHT][-1] == second
-        assert set(scene.received[RIGHT]) <= {first, second}
+        scene.link.write(LEFT, encode(second), scene.now)
+        scene.run(scene.now + 1)
+        assert scene.received[RIGHT] in ([second], [first, second])
 
 
 def test_damaged_frame_keeps_its_length_and_has_no_delimiter() -> None:
@@ -150,8 +147,8 @@ def test_damaged_frame_keeps_its_length_and_has_no_delimiter() -> None:
         rng = Random(seed)
         framed = encode(DATAGRAMS[seed % 40])
         data = damaged(framed, rng)
-        assert len(data) == len(framed) - 1
-        assert data != framed[:-1]
+        assert len(data) == len(framed) - 2
+        assert data != framed[1:-1]
         assert 0 not in data
         assert not LineDecoder().feed(data + b"\0")
 

@@ -158,13 +158,13 @@ def _forge(attack: LineAttack, recorded: Sequence[bytes], rng: Random, number: i
         datagram = bytearray(rng.choice(recorded))
         at = rng.randrange(len(datagram))
         datagram[at] ^= 1 << rng.randrange(8)
-        return DELIMITER + encode(bytes(datagram)), f"bit in byte {at}"
-    return DELIMITER + encode(_invented(rng)), "invented"
+        return encode(bytes(datagram)), f"bit in byte {at}"
+    return encode(_invented(rng)), "invented"
 
 
 def _replay(attack: LineAttack, recorded: Sequence[bytes], rng: Random, number: int) -> Made:
     del attack, number
-    return (DELIMITER + encode(rng.choice(recorded)), "") if recorded else (b"", "")
+    return (encode(rng.choice(recorded)), "") if recorded else (b"", "")
 
 
 def _cut(attack: LineAttack, recorded: Sequence[bytes], rng: Random, number: int) -> Made:
@@ -173,8 +173,8 @@ def _cut(attack: LineAttack, recorded: Sequence[bytes], rng: Random, number: int
     if not recorded:
         return b"", ""
     framed = encode(recorded[-1])
-    at = number % len(framed)
-    return DELIMITER + framed[:at], f"at {at} of {len(framed)}"
+    at = number % (len(framed) - 1)
+    return framed[: at + 1], f"at {at} of {len(framed) - 1}"
 
 
 def _invented(rng: Random) -> bytes:
@@ -182,8 +182,8 @@ def _invented(rng: Random) -> bytes:
 
 
 def damaged(framed: bytes, rng: Random) -> bytes:
-    """A frame of the line, without its delimiter, of which one byte is another that is not a delimiter."""
-    data = bytearray(framed.removesuffix(DELIMITER))
+    """A frame of the line, without its delimiters, of which one byte is another that is not a delimiter."""
+    data = bytearray(framed.strip(DELIMITER))
     at = rng.randrange(len(data))
     data[at] = rng.choice([byte for byte in range(1, 256) if byte != data[at]])
     return bytes(data)
