@@ -167,7 +167,7 @@ class LineDecoder:
 
 
 def _decode(piece: bytes) -> bytes | Noise:
-    """The datagram between two delimiters, or why it is none."""
+    """The datagram between two delimiters, or why it is not one."""
     if len(piece) > MAX_ENCODED:
         return Noise.TOO_LONG
     try:
