@@ -284,6 +284,32 @@ def test_peer_that_is_off_costs_little_on_a_metered_path() -> None:
     assert len(initiations(radios)) >= len(tries) + 4
 
 
+def test_network_that_flaps_does_not_hasten_the_tries_along_a_metered_one() -> None:
+    """The other network appears every second. After a minute the metered one is tried every 15 s all the same."""
+    radios = Radios()
+    radios.a.node.set_metered([0], 0.0)
+    radios.radios[0].is_dead = radios.radios[1].is_dead = True
+    for _ in range(180):
+        radios.run(1.0)
+        radios.a.node.set_socket_state(1, radios.now, is_up=True)
+    tries = {radio: [s.at for s in radios.sent if s.path == at_b(radio) and s.at > 60.0] for radio in (0, 1)}
+
+    assert 7 <= len(tries[0]) <= 9
+    assert len(tries[1]) > 120
+
+
+def test_metered_setting_hastens_no_try() -> None:
+    """The path that is not metered any more is tried when it was due."""
+    radios = Radios(delays_s=(0.05,))
+    radios.radios[0].is_dead = True
+    radios.run(100.0)
+    tries, due_at = len(initiations(radios)), radios.a.peer.initiator.retry_at
+    radios.a.node.set_metered([], radios.now)
+    assert radios.a.peer.initiator.retry_at == due_at > radios.now
+    radios.run(due_at - radios.now)
+    assert len(initiations(radios)) - tries <= 1
+
+
 # A network appears.
 
 
@@ -298,6 +324,16 @@ def test_network_that_appears_is_tried_at_once() -> None:
 
     assert radios.a.peer.is_up
     assert radios.a.node.send(radios.a.peer, [], radios.now, Class.CRITICAL) == []
+
+
+def test_network_that_appears_hastens_no_try_to_a_peer_that_is_not_there() -> None:
+    """The peer has no path on it."""
+    radios = Radios(delays_s=(0.05,))
+    radios.radios[0].is_dead = True
+    radios.run(30.0)
+    due_at = radios.a.peer.initiator.retry_at
+    radios.a.node.set_socket_state(1, radios.now, is_up=True)
+    assert radios.a.peer.initiator.retry_at == due_at > radios.now
 
 
 def test_idle_link_needs_no_answer_of_a_path_whose_network_is_gone() -> None:

@@ -105,6 +105,22 @@ def test_a_network_that_appears_is_tried_at_once() -> None:
     assert len(times(radios, radios.a, 0, wire.INITIATION, since)) == 1
 
 
+def test_a_network_that_flaps_does_not_hasten_the_tries_along_a_slow_one() -> None:
+    """LTE appears every second, and other networks become metered. The radio keeps its pace."""
+    radios = slow(0.03, 0.5)
+    for radio in radios.radios:
+        radio.is_dead = True
+    for second in range(30):
+        radios.run(1.0)
+        radios.a.node.set_socket_state(LTE, radios.now, is_up=False)
+        radios.a.node.set_metered([LTE] if second % 2 else [], radios.now)
+        radios.a.node.set_socket_state(LTE, radios.now, is_up=True)
+    gaps = [later - earlier for earlier, later in pairwise(times(radios, radios.a, SIK, wire.INITIATION))]
+    assert len(gaps) > 5
+    assert min(gaps) >= c.TRY_AIRTIMES * AIRTIME_S
+    assert len(times(radios, radios.a, LTE, wire.INITIATION)) >= 30
+
+
 def test_two_paths_of_one_slow_socket_are_tried_together() -> None:
     """They have one turn."""
     radios = slow(0.5, slow_sockets=(0,))

@@ -129,7 +129,9 @@ class History:
         usable = lot.choice(pair.hops)
         network.note(f"one path is usable: {usable}")
         for drone, end in zip((pair.a, pair.b), usable, strict=True):
-            drone.set_metered(drone.metered_sockets - {end.socket})  # a metered one is tried rarely after a minute
+            if end.socket in drone.metered_sockets:  # tried rarely after a minute, unless its network changes
+                drone.set_metered(drone.metered_sockets - {end.socket})
+                drone.find_network(end.socket)
         for hop in pair.hops:
             if hop == usable:
                 continue

@@ -125,7 +125,7 @@ def test_a_planted_bug_is_found(
     """A history finds each broken property soon."""
     monkeypatch.setattr(where, name, plant)
     violations: list[str] = []
-    for seed in (2, 1, 3, 0):  # the short ones first
+    for seed in (2, 7, 1, 3, 0):  # the short ones first
         violations += [what for _, what in play(seed, plan).violations]
         if any(message in what for what in violations):
             return

@@ -185,10 +185,15 @@ class Initiator:
         cookie, held_until = self._received_cookies.get(path, (None, now))
         return self._mac_keys.add_macs(message, cookie if now < held_until else None)
 
-    def hurry(self, now: float) -> None:
-        """A network has appeared or changed: try at once, and often."""
-        self.attempts = 0
-        self._slow_at.clear()
+    def hurry(self, socket: int, now: float) -> None:
+        """The network behind a socket has appeared or changed: try there at once, and often.
+
+        Slow and metered networks behind other sockets keep their pace: this one may appear every second.
+        """
+        self._slow_at.pop(socket, None)
+        if socket in self._facts.metered:
+            self._began_at, self._metered_at = now, -c.NEVER
+        self.attempts = min(self.attempts, 1)  # not 0: then the time of silence would begin anew for all of them
         self.retry_at = min(self.retry_at, now)
 
     def reset(self) -> None:

@@ -133,11 +133,10 @@ class Node:
         self._revise_paths(peer, now)
 
     def set_metered(self, sockets: Iterable[int], now: float) -> None:
-        """The sockets whose network is paid by the byte. A peer that does not answer is tried at once, and often."""
+        """The sockets whose network is paid by the byte. This hastens no try."""
         self._facts.metered = set(sockets)
         for peer in self.peers.values():
             peer.paths.set_metered()
-            peer.initiator.hurry(now)
             self._revise_paths(peer, now)
 
     def set_budgets(self, budgets: Mapping[int, float]) -> None:
@@ -165,9 +164,8 @@ class Node:
         The events come with the next :meth:`handle_timeout`, which is due at once.
         """
         for peer in self.peers.values():
-            peer.paths.set_socket_state(socket, now, is_up=is_up)
-            if is_up:
-                peer.initiator.hurry(now)
+            if peer.paths.set_socket_state(socket, now, is_up=is_up) and is_up:
+                peer.initiator.hurry(socket, now)
             self._revise_paths(peer, now)
 
     def _revise_paths(self, peer: Peer, now: float) -> None:

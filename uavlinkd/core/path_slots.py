@@ -131,11 +131,12 @@ class PathSlots:
         for state in self.by_path.values():
             state.is_metered = state.path.socket in self.facts.metered
 
-    def set_socket_state(self, socket: int, now: float, *, is_up: bool) -> None:
-        """The network behind a socket disappeared, or appeared, or changed."""
-        for state in self.by_path.values():
-            if state.path.socket == socket:
-                state.set_off(is_off=not is_up, now=now)
+    def set_socket_state(self, socket: int, now: float, *, is_up: bool) -> bool:
+        """The network behind a socket disappeared, or appeared, or changed. Returns whether there is a path on it."""
+        states = [state for state in self.by_path.values() if state.path.socket == socket]
+        for state in states:
+            state.set_off(is_off=not is_up, now=now)
+        return bool(states)
 
     def _note_known(self, state: PathState) -> None:
         if not state.is_known:
