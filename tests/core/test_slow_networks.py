@@ -153,6 +153,22 @@ def test_a_slow_try_waits_longer_for_its_response() -> None:
     assert pending.expires_at == pytest.approx(c.TRY_AIRTIMES * 8 * (147 + 103 + 96) / 300)
 
 
+def test_tries_and_probes_follow_the_rate_and_freshness_follows_the_budget() -> None:
+    """An attacker that delays answers lowers the rate. Frames must not become older by that."""
+    radios = slow(0.5, slow_sockets=(0,))
+    radios.run(5.0)
+    peer, path = radios.a.peer, radios.state(radios.a, 0).path
+    shared = peer.paths.facts
+    before = shared.try_interval_s(path, X25519), shared.least_probe_s(path), shared.pace(path)
+    radios.a.node.set_rates({0: BUDGET_BITS_S / 2}, radios.now)
+    assert shared.try_interval_s(path, X25519) == 2 * before[0]
+    assert shared.least_probe_s(path) == 2 * before[1]
+    assert shared.pace(path) == peer.paths.pace == before[2]
+    assert radios.a.node.next_deadline() == radios.now
+    radios.a.node.set_rates({0: BUDGET_BITS_S}, radios.now)
+    assert shared.try_interval_s(path, X25519) == before[0]
+
+
 @pytest.mark.parametrize(
     ("budget", "interval_s", "hold_s", "ask_s"),
     [(1_600, 8.6, 2.0, 0.86), (4_000, 3.44, 1.376, 0.344), (9_600, 1.4333, 1.0, 0.25), (100_000, 0.1376, 1.0, 0.25)],

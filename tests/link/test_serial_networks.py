@@ -18,7 +18,7 @@ from uavlinkd.core.constants import LINE_BYTES
 from uavlinkd.core.path import Path
 from uavlinkd.endpoints.url import SerialUrl
 from uavlinkd.link.line_causes import line_findings
-from uavlinkd.link.network_budgets import budgets_of, follow_rates, wire_bytes
+from uavlinkd.link.network_budgets import NetworkBudget, budgets_of, follow_rates, wire_bytes
 from uavlinkd.link.serial_networks import NOISE_PIECES, SerialNetworks
 from uavlinkd.mavlink.egress.bucket import Bucket, Supply
 from uavlinkd.ops.causes import Cause
@@ -78,14 +78,24 @@ async def test_late_answers_lower_the_budget_of_the_network(serial: SerialNetwor
     assert budgets[NUMBER].all.burst == pytest.approx(300, abs=5)
     state = SimpleNamespace(path=serial.path_to("sik"), round_trip_s=0.2, answered_at=now)
     links = cast(Any, [SimpleNamespace(peer=SimpleNamespace(paths=SimpleNamespace(states=[state])))])
-    follow_rates(serial, budgets, links, now)
+    assert follow_rates(serial, budgets, links, now) == {}
     state.round_trip_s, state.answered_at = 5.0, now + 6
-    for _ in range(2):
-        follow_rates(serial, budgets, links, now + 6)
+    for rates in ({NUMBER: BITS_S / 2}, {}):
+        assert follow_rates(serial, budgets, links, now + 6) == rates
     assert budgets[NUMBER].all.rate == BITS_S / 16
     assert budgets[NUMBER].copies.rate == BITS_S / 32
-    follow_rates(serial, budgets, links, now + 60)
-    assert budgets[NUMBER].all.rate == BITS_S / 8
+    later = [follow_rates(serial, budgets, links, now + at) for at in range(7, 60)]
+    told = [rates[NUMBER] for rates in later if rates]
+    assert told[-1] == BITS_S == 8 * budgets[NUMBER].all.rate
+    assert len(told) == 3  # each a quarter more than the one before, and the full rate
+
+
+def test_core_gets_a_quarter_of_the_budget_at_least() -> None:
+    """A lost peer is tried every few seconds also if the modem's queue was long before."""
+    budget = NetworkBudget(BITS_S, 0.0)
+    assert budget.update_core(BITS_S / 16)
+    assert budget.core_bits_s == BITS_S / 4
+    assert not budget.update_core(BITS_S / 8)
 
 
 async def test_findings_about_modem_and_noise(serial: SerialNetworks) -> None:

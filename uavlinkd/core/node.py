@@ -144,6 +144,12 @@ class Node:
         self._facts.set_budgets(budgets)
         self._facts.share_budgets(len(self.peers))
 
+    def set_rates(self, rates: Mapping[int, float], now: float) -> None:
+        """The bits a second that networks with a budget carry at present. Tries and probes follow them."""
+        self._facts.set_rates(rates)
+        for peer in self.peers.values():
+            self._revise_paths(peer, now)
+
     def set_envelope_limits(self, limits: Mapping[int, int]) -> None:
         """The longest envelopes for the networks of these sockets, in bytes: :func:`.envelope_limit.limit_at`.
 

@@ -32,11 +32,12 @@ FREE = Pace()
 class SocketFacts:
     """The facts about each socket. ``metered``: those whose network is paid by the byte."""
 
-    __slots__ = ("_budgets", "_peers", "envelope_limits", "metered", "peers_at")
+    __slots__ = ("_budgets", "_peers", "_rates", "envelope_limits", "metered", "peers_at")
 
     def __init__(self, metered: Iterable[int] = ()) -> None:
         self.metered = set(metered)
         self._budgets: dict[int, float] = {}
+        self._rates: dict[int, float] = {}
         self._peers = 0
         self.envelope_limits: dict[int, int] = {}
         """The longest envelopes that several frames share, in bytes."""
@@ -48,6 +49,11 @@ class SocketFacts:
     def set_budgets(self, budgets: Mapping[int, float]) -> None:
         """In bits a second."""
         self._budgets = dict(budgets)
+        self._rates = dict(budgets)
+
+    def set_rates(self, rates: Mapping[int, float]) -> None:
+        """In bits a second, of networks with a budget that carry less at present."""
+        self._rates = {**self._budgets, **rates}
 
     def share_budgets(self, peers: int) -> None:
         """So many peers use each network."""
@@ -55,32 +61,37 @@ class SocketFacts:
 
     def least_probe_s(self, path: Path) -> float:
         """Between questions along a path: every peer may be probed, and sends as many probes as it gets."""
-        return self._share_s(path, c.PROBE_BYTES, c.PROBE_BUDGET_SHARE)
+        return self._share_s(path, c.PROBE_BYTES, c.PROBE_BUDGET_SHARE, self._rates)
 
     def try_interval_s(self, path: Path, suite: Suite) -> float:
         """Between two initiations along a path; 0 without a budget."""
-        return c.TRY_AIRTIMES * self._airtime_s(path, wire.initiation_bytes(suite) + wire.response_bytes(suite))
+        size = wire.initiation_bytes(suite) + wire.response_bytes(suite)
+        return c.TRY_AIRTIMES * self._airtime_s(path, size, self._rates)
 
     def pace(self, path: Path) -> Pace:
-        """That of a peer whose best path this is."""
-        airtime_s = self._airtime_s(path, c.ECHO_BYTES)
+        """That of a peer whose best path this is.
+
+        By the budget, not by the rate: an attacker that delays answers lowers the rate, and must not make the peer
+        accept older frames by that.
+        """
+        airtime_s = self._airtime_s(path, c.ECHO_BYTES, self._budgets)
         if not airtime_s:
             return FREE
         return Pace(
-            self._share_s(path, c.ECHO_BYTES, c.ECHO_BUDGET_SHARE),
+            self._share_s(path, c.ECHO_BYTES, c.ECHO_BUDGET_SHARE, self._budgets),
             min(max(c.HOLD_S, c.HOLD_AIRTIMES * airtime_s), c.LATE_AFTER_S),
             max(c.HOLD_ASK_S, c.ASK_AIRTIMES * airtime_s),
         )
 
-    def _airtime_s(self, path: Path, size: int) -> float:
-        """How long a datagram and its answer, with so many bytes together, take at the budget; 0 without one."""
-        budget = self._budgets.get(path.socket)
+    def _airtime_s(self, path: Path, size: int, rates: Mapping[int, float]) -> float:
+        """How long a datagram and its answer, with so many bytes together, take; 0 on a network without a budget."""
+        rate = rates.get(path.socket)
         carriers = 2 * (c.LINE_BYTES if path.is_serial else c.IP_BYTES)
-        return 0.0 if budget is None else 8 * (size + carriers) / budget
+        return 0.0 if rate is None else 8 * (size + carriers) / rate
 
-    def _share_s(self, path: Path, size: int, share: float) -> float:
+    def _share_s(self, path: Path, size: int, share: float, rates: Mapping[int, float]) -> float:
         peers = 1 if path.socket in self.peers_at else self._peers
-        return peers * self._airtime_s(path, size) / share
+        return peers * self._airtime_s(path, size, rates) / share
 
     # Point-to-point networks.
 

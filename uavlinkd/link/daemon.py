@@ -415,7 +415,8 @@ class Daemon:
         if self.recorder is not None:
             self.recorder.do_housekeeping(now)
         self.peer_sockets.do_housekeeping()
-        follow_rates(self.peer_sockets.serial, self._budgets, self.links.values(), now)
+        if rates := follow_rates(self.peer_sockets.serial, self._budgets, self.links.values(), now):
+            self.node.set_rates(rates, now)
         for link in self.links.values():
             link.note_silence(now)
             link.measure(now)

@@ -18,6 +18,11 @@ COPIES_SHARE: Final = 0.5
 LARGEST_BYTES: Final = 400
 """A bucket holds a largest frame in an envelope, with IP and UDP header."""
 
+RATE_CHANGE: Final = 0.25
+"""The core gets a rate that differs by more than this share from the last one that it got."""
+LEAST_CORE_SHARE: Final = 0.25
+"""The core gets this part of the budget at least: a peer that is lost must not wait minutes for the next try."""
+
 
 def carrier_bytes(path: Path) -> int:
     """What a network adds to each datagram: headers of IP and UDP, or the framing on a line."""
@@ -34,10 +39,12 @@ def wire_bytes(datagram: bytes, path: Path) -> int:
 class NetworkBudget:
     """The budget of one network, and the part of it that copies may use. All peers share both."""
 
-    __slots__ = ("all", "bits_s", "copies")
+    __slots__ = ("all", "bits_s", "copies", "core_bits_s")
 
     def __init__(self, budget_bits_s: int, now: float, least_burst: int = LARGEST_BYTES) -> None:
         self.bits_s = budget_bits_s
+        self.core_bits_s: float = budget_bits_s
+        """The rate that the core has."""
         self.all = Bucket(budget_bits_s, now, least_burst)
         self.copies = Bucket(COPIES_SHARE * budget_bits_s, now, least_burst)
 
@@ -45,6 +52,15 @@ class NetworkBudget:
         """Use another budget from now on."""
         self.all.set_rate(bits_s / 8, now)
         self.copies.set_rate(COPIES_SHARE * bits_s / 8, now)
+
+    def update_core(self, bits_s: float) -> bool:
+        """Choose the rate for the core. Returns whether it has changed."""
+        rate = max(bits_s, LEAST_CORE_SHARE * self.bits_s)
+        is_full_again = rate == self.bits_s != self.core_bits_s
+        if not is_full_again and abs(rate - self.core_bits_s) <= RATE_CHANGE * self.core_bits_s:
+            return False
+        self.core_bits_s = rate
+        return True
 
     def charge(self, datagram: bytes, path: Path, now: float) -> None:
         """Charge a datagram that is sent: an envelope, a handshake message, a probe or any other."""
@@ -69,14 +85,21 @@ def budgets_of(networks: Networks | None, serial: SerialNetworks, now: float) ->
 
 def follow_rates(
     serial: SerialNetworks, budgets: Mapping[int, NetworkBudget], links: Iterable[PathsOwner], now: float
-) -> None:
-    """Adapt the budgets of serial networks to the round trips along them. Call it once a second."""
+) -> dict[int, float]:
+    """Adapt the budgets of serial networks to the round trips along them. Call it once a second.
+
+    Returns the rates for the core, by the number of the socket, if one of them has changed.
+    """
     if not serial.networks:
-        return
+        return {}
     for link in links:
         for state in link.peer.paths.states:
             line = serial.of_number.get(state.path.socket)
             if line is not None and state.round_trip_s is not None:
                 line.add_round_trip(state.round_trip_s, state.answered_at)
+    has_changed = False
     for line in serial.networks:
-        budgets[line.number].set_rate(line.bits_s(now), now)
+        budget, bits_s = budgets[line.number], line.bits_s(now)
+        budget.set_rate(bits_s, now)
+        has_changed |= budget.update_core(bits_s)
+    return {line.number: budgets[line.number].core_bits_s for line in serial.networks} if has_changed else {}
