@@ -85,9 +85,9 @@ async def test_late_answers_lower_the_budget_of_the_network(serial: SerialNetwor
     assert budgets[NUMBER].all.rate == BITS_S / 16
     assert budgets[NUMBER].copies.rate == BITS_S / 32
     later = [follow_rates(serial, budgets, links, now + at) for at in range(7, 60)]
-    told = [rates[NUMBER] for rates in later if rates]
-    assert told[-1] == BITS_S == 8 * budgets[NUMBER].all.rate
-    assert len(told) == 3  # each a quarter more than the one before, and the full rate
+    reported = [rates[NUMBER] for rates in later if rates]
+    assert reported[-1] == BITS_S == 8 * budgets[NUMBER].all.rate
+    assert len(reported) == 3  # each a quarter more than the one before, and the full rate
 
 
 def test_core_gets_a_quarter_of_the_budget_at_least() -> None:

@@ -193,7 +193,7 @@ class Initiator:
         self._slow_at.pop(socket, None)
         if socket in self._facts.metered:
             self._began_at, self._metered_at = now, -c.NEVER
-        self.attempts = min(self.attempts, 1)  # not 0: then the time of silence would begin anew for all of them
+        self.attempts = min(self.attempts, 1)  # not 0: then the time of silence would restart for all of them
         self.retry_at = min(self.retry_at, now)
 
     def reset(self) -> None:
