@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from binascii import crc_hqx
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
 
@@ -168,7 +169,7 @@ def test_every_byte_is_accounted_for(parts: list[bytes]) -> None:
     whole = sum(len(encode(datagram)) - 2 for datagram in received)
     discarded = decoder.discarded_bytes.total()
     assert whole + discarded + decoder.pending_bytes + stream.count(0) == len(stream)
-    assert decoder.discarded.keys() == decoder.discarded_bytes.keys()
+    assert all(bool(decoder.discarded[noise]) == bool(size) for noise, size in decoder.discarded_bytes.items())
 
 
 @pytest.mark.parametrize(
@@ -183,7 +184,7 @@ def test_every_byte_is_accounted_for(parts: list[bytes]) -> None:
 def test_discarded_pieces_are_counted_by_reason(piece: bytes, noise: Noise) -> None:
     """And their bytes."""
     _, decoder = feed_all([piece + b"\0"])
-    assert (decoder.discarded, decoder.discarded_bytes) == ({noise: 1}, {noise: len(piece)})
+    assert (decoder.discarded, decoder.discarded_bytes) == (Counter({noise: 1}), Counter({noise: len(piece)}))
 
 
 @pytest.mark.parametrize("one", [report(), report(2), report(1, 166)], ids=["v1", "v2", "old"])
@@ -194,7 +195,7 @@ def test_reports_between_datagrams_are_skipped(one: bytes) -> None:
     for size in (1, 3, 16, 17, 20, len(stream)):
         received, decoder = feed_all(pieces(stream, [size]))
         assert received == DATAGRAMS
-        assert counts(decoder) == (len(DATAGRAMS), {}, {}, 1 + 2 * len(DATAGRAMS), 0, FIGURES)
+        assert counts(decoder) == (len(DATAGRAMS), Counter(), Counter(), 1 + 2 * len(DATAGRAMS), 0, FIGURES)
 
 
 @pytest.mark.parametrize("one", [report(), report(2), report(1, payload=b"\x01" * 9)], ids=["v1", "v2", "no zeros"])

@@ -16,7 +16,10 @@ from uavlinkd.config import NetworkConfig, PeerAddress
 from uavlinkd.config.model import SERIAL
 from uavlinkd.core.constants import LINE_BYTES
 from uavlinkd.core.path import Path
+from uavlinkd.endpoints.serial_line import SerialLine
 from uavlinkd.endpoints.url import SerialUrl
+from uavlinkd.link import serial_networks
+from uavlinkd.link.conditions import LINES_BURST, LINES_PER_S
 from uavlinkd.link.line_causes import line_findings
 from uavlinkd.link.network_budgets import NetworkBudget, budgets_of, follow_rates, wire_bytes
 from uavlinkd.link.serial_networks import NOISE_PIECES, SerialNetworks
@@ -70,6 +73,25 @@ async def test_absent_device_is_reported(serial: SerialNetworks, states: SocketS
     assert (status["is_present"], status["addresses"]) == (False, [])
 
 
+async def test_flapping_device_cannot_fill_the_log(serial: SerialNetworks, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The lines are limited, and the log ends with the state of the device."""
+    now, is_open = [monotonic()], [False]
+    monkeypatch.setattr(serial_networks, "monotonic", lambda: now[0])
+    monkeypatch.setattr(SerialLine, "is_open", property(lambda line: is_open[0]))
+    (network,) = serial.networks
+    with capture_logs() as logs:
+        for number in range(2 * LINES_BURST + 1):
+            is_open[0] = number % 2 == 0
+            network.report_state(is_change=True)
+        assert len(logs) == LINES_BURST
+        assert logs[-1]["event"] == "network_disappeared"
+        now[0] += 2 / LINES_PER_S
+        serial.do_housekeeping()
+        serial.do_housekeeping()
+    assert len(logs) == LINES_BURST + 1
+    assert (logs[-1]["event"], logs[-1]["addresses"]) == ("network_appeared", ["serial"])
+
+
 async def test_late_answers_lower_the_budget_of_the_network(serial: SerialNetworks) -> None:
     """Both that of the frames and that of their copies. An answer counts once."""
     now = monotonic()
@@ -110,9 +132,13 @@ async def test_findings_about_modem_and_noise(serial: SerialNetworks) -> None:
     assert (modem.cause, noise.cause) == (Cause.MODEM_REPORTS, Cause.LINE_NOISE)
     assert "MAVLINK=0" in modem.remedy
     assert "57600" in noise.remedy
+    line = cast(Any, serial.networks[0].status(monotonic())["serial"])
+    assert line["radio"]["rssi"] == 200
+    assert (line["discarded"]["bad_cobs"], line["discarded_bytes"]["bad_cobs"]) == (NOISE_PIECES, 5 * NOISE_PIECES)
     for _ in range(20):
         serial.do_housekeeping()
     assert list(line_findings(serial)) == []
+    assert cast(Any, serial.networks[0].status(monotonic())["serial"])["radio"] is None, "old figures"
 
 
 def test_envelope_above_the_bucket_goes_into_debt() -> None:

@@ -91,8 +91,28 @@ FINDING = {
     "text": "the PSKs differ",
     "remedy": "give both ends the same psk_file",
 }
+RADIO = {"rssi": 200, "remrssi": 255, "txbuf": 98, "noise": 50, "remnoise": 51, "rxerrors": 77, "fixed": 78}
+LINE: dict[str, Any] = {
+    "rate_bits_s": 9600,
+    "uses_cts": True,
+    "cts_held_s": 1.5,
+    "discarded": {"bad_cobs": 0, "bad_crc": 70, "too_long": 0},
+    "discarded_bytes": {"bad_cobs": 0, "bad_crc": 71, "too_long": 0},
+    "datagrams_received": 72,
+    "bytes_received": 73,
+    "bytes_written": 74,
+    "failures": {"LINE_FULL": 75},
+    "reports": 76,
+    "radio": RADIO,
+}
+NETWORKS: dict[str, Any] = {
+    "lte": {"is_present": True, "serial": None},
+    "sik": {"is_present": True, "serial": LINE},
+    "quiet": {"is_present": False, "serial": {**LINE, "uses_cts": False, "radio": None}},
+}
 STATUS: dict[str, Any] = {
     "name": "drone0",
+    "networks": NETWORKS,
     "frames_pass": False,
     "findings": [FINDING, FINDING | {"text": "other evidence of the same"}],
     "peers": {"drone1": PEER, "drone2": NEVER_UP},
@@ -143,6 +163,7 @@ def value(name: str, /, **labels: str) -> float:
 
 LTE = {"peer": "drone1", "path": "1", "network": "lte", "address": "203.0.113.7:5790"}
 OTHER = {"peer": "drone1", "path": "2", "network": "", "address": "learned"}
+SIK = {"network": "sik"}
 
 
 @pytest.mark.parametrize(
@@ -213,6 +234,26 @@ OTHER = {"peer": "drone1", "path": "2", "network": "", "address": "learned"}
         ("peer_path_receive_datagrams_total", LTE, 63),
         ("peer_path_transmit_datagrams_total", OTHER, 64),
         ("peer_path_duplicates_total", OTHER, 65),
+        ("line_open", SIK, 1),
+        ("line_open", {"network": "quiet"}, 0),
+        ("line_uses_cts", SIK, 1),
+        ("line_uses_cts", {"network": "quiet"}, 0),
+        ("line_rate_bytes_per_second", SIK, 1200),
+        ("line_cts_held_seconds_total", SIK, 1.5),
+        ("line_discarded_total", {**SIK, "reason": "bad_crc"}, 70),
+        ("line_discarded_total", {**SIK, "reason": "too_long"}, 0),
+        ("line_discarded_bytes_total", {**SIK, "reason": "bad_crc"}, 71),
+        ("line_receive_datagrams_total", SIK, 72),
+        ("line_receive_bytes_total", SIK, 73),
+        ("line_transmit_bytes_total", SIK, 74),
+        ("line_failures_total", {**SIK, "reason": "LINE_FULL"}, 75),
+        ("line_radio_reports_total", SIK, 76),
+        ("line_radio_rssi", {**SIK, "end": "here"}, 200),
+        ("line_radio_noise", {**SIK, "end": "here"}, 50),
+        ("line_radio_noise", {**SIK, "end": "there"}, 51),
+        ("line_radio_free_buffer_ratio", SIK, 0.98),
+        ("line_radio_receive_errors_total", SIK, 77),
+        ("line_radio_corrected_total", SIK, 78),
         ("unrouted_frames_total", {"reason": "unknown_target"}, 31),
         ("send_failures_total", {"reason": "ENETUNREACH"}, 32),
         ("stale_frames_total", {"source": "autopilot"}, 33),
@@ -233,6 +274,15 @@ def test_learned_address_is_not_a_label() -> None:
     text = exposition(STATUS, 0.0)
     assert LEARNED_PATH["address"].encode() not in text
     assert ("uavlinkd_peer_path_round_trip_seconds", frozenset(OTHER.items())) not in samples(text)
+
+
+def test_silent_modem_and_unknown_figures_have_no_samples() -> None:
+    """A modem that reports nothing has no figures; 255 means that the modem does not know one. UDP has no line."""
+    lines = [(name, dict(labels)) for name, labels in samples(exposition(STATUS, 0.0)) if "uavlinkd_line_" in name]
+    radio = {(name, labels["network"]) for name, labels in lines if "radio" in name and "reports" not in name}
+    assert {network for _, network in radio} == {"sik"}
+    assert ("uavlinkd_line_radio_rssi", {"network": "sik", "end": "there"}) not in lines
+    assert {labels["network"] for _, labels in lines} == {"sik", "quiet"}
 
 
 def test_version_is_exported() -> None:

@@ -75,9 +75,9 @@ class LineDecoder:
         self._is_skipping = False  # up to the next delimiter: what precedes it is too long
         self.datagrams = 0
         """How many arrived whole."""
-        self.discarded = Counter[Noise]()
+        self.discarded = Counter[Noise](dict.fromkeys(Noise, 0))
         """Pieces between two delimiters that are not a datagram."""
-        self.discarded_bytes = Counter[Noise]()
+        self.discarded_bytes = Counter[Noise](dict.fromkeys(Noise, 0))
         """Their bytes."""
         self.reports = 0
         """Reports of the modem."""

@@ -84,6 +84,7 @@ class SerialLine:
         self.uses_cts = False
         """Whether the modem can stop this end by the CTS wire."""
         self.cts = CtsHold()
+        self.bytes_received = 0
         self.bytes_written = 0
         self._name = name
         self._bytes_s = bytes_s
@@ -255,6 +256,7 @@ class SerialLine:
         if not data:
             self._lose("disconnected")
             return
+        self.bytes_received += len(data)
         backlog.end(len(data), is_empty=len(data) < READ_BYTES)
         datagrams = self.decoder.feed(data)
         if epoch == STALE:

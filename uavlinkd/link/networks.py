@@ -24,6 +24,7 @@ from uavlinkd.core.path import SocketAddress
 from uavlinkd.endpoints.presence import LINK_LOCAL, Presence, family_of, look
 from uavlinkd.endpoints.sockets import BindError, network_socket
 from uavlinkd.link.conditions import LineLimits
+from uavlinkd.link.network_log import NetworkLog
 from uavlinkd.system.addresses import Address
 
 _WILDCARDS: Final = {socket.AF_INET: "0.0.0.0", socket.AF_INET6: "::"}
@@ -59,12 +60,11 @@ class NetworkSocket:
 class Network:
     """One ``[[network]]``: its sockets, and what the machine had of it when it was last looked at."""
 
-    def __init__(self, config: NetworkConfig, sockets: Sequence[NetworkSocket]) -> None:
+    def __init__(self, config: NetworkConfig, sockets: Sequence[NetworkSocket], log: NetworkLog) -> None:
         self.config = config
         self.sockets = sockets
         self.presence = Presence()
-        self.written: Presence | None = None
-        """What the log says about it."""
+        self.log = log
 
     @property
     def name(self) -> str:
@@ -103,14 +103,13 @@ class Networks:
         self._of_socket: dict[int, tuple[Network, NetworkSocket]] = {}
         self._holder = holder
         self._states = states
-        self._log = log
-        self._limits = LineLimits()
+        limits = LineLimits()
         for config in configs:
             sockets = [
                 NetworkSocket(len(self._of_socket) + place, family, ports.get(family, 0))
                 for place, family in enumerate(config.families)
             ]
-            network = Network(config, sockets)
+            network = Network(config, sockets, NetworkLog(config.name, limits, log))
             self.networks.append(network)
             self._of_socket.update({one.number: (network, one) for one in sockets})
 
@@ -162,7 +161,7 @@ class Networks:
                 except BindError as error:  # it is tried again at the next call
                     if not network.is_present:
                         network.presence = Presence(reason=str(error))
-            self._write(network, now)
+            network.log.note(network.presence, now)
         return has_changed
 
     def _follow(self, network: Network, one: NetworkSocket, now: float) -> bool:
@@ -200,29 +199,6 @@ class Networks:
             sock = network_socket(Address(host, 0), config.interface, others)
         one.port = sock.getsockname()[1]
         self._holder.put(one.number, sock)
-
-    def _write(self, network: Network, now: float) -> None:
-        """Write to the log what changed since the last line about a network, unless there were too many lines."""
-        before, presence = network.written, network.presence
-        if presence == before:
-            return
-        is_worth_a_line = before is None or presence.hosts or before.hosts  # not another reason of absence
-        if not is_worth_a_line:
-            network.written = presence
-            return
-        omitted = self._limits.take("network", network.name, now)
-        if omitted is None:
-            return
-        network.written = presence
-        log = self._log.bind(network=network.name, **omitted)
-        if before is None and not presence.hosts:
-            log.warning("network_not_here_yet", reason=presence.reason)
-        elif not presence.hosts:
-            log.warning("network_disappeared", reason=presence.reason)
-        elif before is None or not before.hosts:
-            log.info("network_appeared", addresses=list(presence.hosts), interface_index=presence.ifindex)
-        else:
-            log.info("network_changed", addresses=list(presence.hosts), interface_index=presence.ifindex)
 
     def absent(self) -> list[str]:
         """The networks that are absent now, each with the reason."""

@@ -17,9 +17,11 @@ from uavlinkd.core.constants import LINE_BYTES
 from uavlinkd.core.envelope_limit import limit_at
 from uavlinkd.core.path import SERIAL_HOST, Path, SocketAddress
 from uavlinkd.core.peer import Peer
+from uavlinkd.endpoints.presence import Presence
 from uavlinkd.endpoints.reader import Datagrams
 from uavlinkd.link.conditions import LineLimits
 from uavlinkd.link.line_rate import LineRate
+from uavlinkd.link.network_log import NetworkLog
 from uavlinkd.link.networks import SocketStates
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.stall import StallWatch
@@ -66,9 +68,7 @@ class SerialNetwork:
         self.rate = LineRate(config.budget_bits_s, self.envelope_limit + LINE_BYTES, monotonic())
         self._receive = receive
         self._states = states
-        self._log = log.bind(network=config.name)
-        self._limits = limits
-        self._was_open: bool | None = None  # what the log says
+        self._log = NetworkLog(config.name, limits, log)
         self._answered_at = 0.0
         self._seconds = deque[tuple[int, int, int]](maxlen=RECENT_S + 1)  # totals, one for each second
         # Imported only if configured: a daemon on UDP starts faster and stays smaller.
@@ -103,30 +103,18 @@ class SerialNetwork:
         if is_change or not is_open:
             self._states.set_socket_state(self.number, now, is_up=is_open)
         if is_change:
-            self._write(now)
+            self._note(now)
 
     def do_housekeeping(self) -> None:
-        """Note what was received. Write to the log that the device is not there, if it says nothing yet."""
+        """Note what was received. Write to the log what it does not say yet about the device."""
         decoder = self.line.decoder
         self._seconds.append((decoder.line_noise, decoder.datagrams, decoder.reports))
-        if self._was_open is None and not self.line.is_open:
-            self._write(monotonic())
+        self._note(monotonic())
 
-    def _write(self, now: float) -> None:
-        is_open = self.line.is_open
-        if is_open == self._was_open:
-            return
-        omitted = self._limits.take("network", self.name, now)
-        if omitted is None:
-            return
-        log = self._log.bind(**omitted)
-        if is_open:
-            log.info("network_appeared", addresses=[SERIAL_HOST], interface_index=0)
-        elif self._was_open is None:
-            log.warning("network_not_here_yet", reason=self.line.reason)
-        else:
-            log.warning("network_disappeared", reason=self.line.reason)
-        self._was_open = is_open
+    def _note(self, now: float) -> None:
+        """Have the log say whether the device is there."""
+        line = self.line
+        self._log.note(Presence(hosts=(SERIAL_HOST,)) if line.is_open else Presence(reason=line.reason), now)
 
     def add_round_trip(self, round_trip_s: float, answered_at: float) -> None:
         """Note the last round trip along the line. One that was noted before does not count again."""
@@ -143,7 +131,7 @@ class SerialNetwork:
     @property
     def recent_reports(self) -> int:
         """RADIO_STATUS frames of the modem in the last seconds: its MAVLINK is not 0."""
-        return self._seconds[-1][2] - self._seconds[0][2] if self._seconds else 0
+        return self.line.decoder.reports - (self._seconds[0][2] if self._seconds else 0)
 
     @property
     def recent_noise(self) -> tuple[int, int] | None:
@@ -157,7 +145,8 @@ class SerialNetwork:
 
     def status(self, now: float) -> dict[str, object]:
         """As plain values, with the keys of every network."""
-        line, decoder, report = self.line, self.line.decoder, self.line.decoder.report
+        line, decoder = self.line, self.line.decoder
+        report = decoder.report if self.recent_reports else None
         return {
             "interface": None,
             "address": None,
@@ -174,7 +163,11 @@ class SerialNetwork:
                 "rate_bits_s": round(self.rate.bits_s(now)),
                 "uses_cts": line.uses_cts,
                 "line_noise": decoder.line_noise,
+                "discarded": {noise.value: count for noise, count in decoder.discarded.items()},
+                "discarded_bytes": {noise.value: size for noise, size in decoder.discarded_bytes.items()},
+                "cts_held_s": line.cts.total_s,
                 "datagrams_received": decoder.datagrams,
+                "bytes_received": line.bytes_received,
                 "bytes_written": line.bytes_written,
                 "failures": dict(line.failures),
                 "reports": decoder.reports,

@@ -28,7 +28,7 @@ from prometheus_client.registry import Collector
 from uavlinkd import __version__
 from uavlinkd.core.drops import DropReason
 from uavlinkd.mavlink.policy.gate import Refusal
-from uavlinkd.ops.path_metrics import path_families
+from uavlinkd.ops.path_metrics import line_families, path_families
 from uavlinkd.ops.schema_versions import LOG_SCHEMA, METRICS_SCHEMA, STATUS_SCHEMA
 
 CONTENT_TYPE = CONTENT_TYPE_PLAIN_0_0_4
@@ -107,6 +107,7 @@ class _StatusCollector(Collector):
         yield _findings(status["findings"])
         yield from _links(peers)
         yield from (_family(*family) for family in path_families(peers))
+        yield from (_family(*family) for family in line_families(status["networks"]))
         yield from _drops(status)
         yield from _totals("peer", peers, _PEER_TOTALS)
         yield _reasons("peer_malformed_total", "Malformed payloads and frames.", "peer", peers, "malformed")

@@ -1,8 +1,10 @@
-"""The paths of each peer as metrics.
+"""The paths of each peer, and the serial lines, as metrics.
 
 A path has the labels ``peer``, ``path`` (the number of its slot, of which a peer has twelve), ``network`` (empty
 without ``[[network]]``) and ``address``: of a path that is not configured only ``learned``. An attacker can cause
 learned paths with any address, so their addresses must not become labels.
+
+A line has the label ``network``. What its modem reports may be forged on the line: it becomes values, not labels.
 """
 
 from __future__ import annotations
@@ -32,6 +34,31 @@ _TOTALS: Final = {
         "peer_path_duplicates_total",
         "Datagrams along the path that were copies of ones that had arrived already.",
     ),
+}
+
+
+UNKNOWN: Final = 255
+"""A modem's figure that it does not know."""
+_LINE_TOTALS: Final = {
+    "datagrams_received": ("line_receive_datagrams_total", "Whole datagrams from the line."),
+    "bytes_received": ("line_receive_bytes_total", "Bytes from the line, noise included."),
+    "bytes_written": ("line_transmit_bytes_total", "Bytes to the line."),
+    "reports": ("line_radio_reports_total", "RADIO_STATUS frames of the modem: its MAVLINK should be 0."),
+    "cts_held_s": ("line_cts_held_seconds_total", "Time for which the modem held this end by the CTS wire."),
+}
+_LINE_REASONS: Final = {
+    "discarded": ("line_discarded_total", "Pieces between two delimiters that are not a datagram."),
+    "discarded_bytes": ("line_discarded_bytes_total", "Bytes of these pieces."),
+    "failures": ("line_failures_total", "Datagrams that the line dropped, and failures to open or keep the device."),
+}
+_RADIO: Final = (
+    ("line_radio_rssi", "rssi", "remrssi", "Signal strength in the modem's units."),
+    ("line_radio_noise", "noise", "remnoise", "Noise in the modem's units."),
+)
+"""Metric, and the figures of this end and of the other one."""
+_RADIO_TOTALS: Final = {
+    "rxerrors": ("line_radio_receive_errors_total", "Damaged packets that the modem received; it counts to 65,535."),
+    "fixed": ("line_radio_corrected_total", "Packets that the modem corrected; it counts to 65,535."),
 }
 
 
@@ -71,3 +98,33 @@ def path_families(peers: Mapping[str, Status]) -> Iterator[Family]:
 def _labels(peer: str, path: Status) -> list[str]:
     address = path["address"] if path["is_configured"] else LEARNED
     return [peer, str(path["number"]), path["network"] or "", address]
+
+
+def line_families(networks: Mapping[str, Status]) -> Iterator[Family]:
+    """Every metric of serial lines. What the modem reports has samples while it reports."""
+    labels, by_reason = ["network"], ["network", "reason"]
+    lines = {name: network["serial"] for name, network in networks.items() if network["serial"] is not None}
+    opened = [([name], float(networks[name]["is_present"])) for name in lines]
+    yield Family("line_open", "1 if the device of the serial network is open.", labels, opened)
+    uses_cts = [([name], float(line["uses_cts"])) for name, line in lines.items()]
+    yield Family("line_uses_cts", "1 if the modem can hold this end by the CTS wire.", labels, uses_cts)
+    rates = [([name], line["rate_bits_s"] / 8) for name, line in lines.items()]
+    yield Family("line_rate_bytes_per_second", "Rate at which this end may send now.", labels, rates)
+    for key, (metric, text) in _LINE_TOTALS.items():
+        yield Family(metric, text, labels, [([name], line[key]) for name, line in lines.items()])
+    for key, (metric, text) in _LINE_REASONS.items():
+        counts = [([name, reason], count) for name, line in lines.items() for reason, count in line[key].items()]
+        yield Family(metric, text, by_reason, counts)
+    radios = {name: line["radio"] for name, line in lines.items() if line["radio"] is not None}
+    for metric, here, there, text in _RADIO:
+        figures = [
+            ([name, end], radio[key])
+            for name, radio in radios.items()
+            for end, key in (("here", here), ("there", there))
+            if radio[key] != UNKNOWN
+        ]
+        yield Family(metric, text, ["network", "end"], figures)
+    free = [([name], radio["txbuf"] / 100) for name, radio in radios.items() if radio["txbuf"] <= 100]
+    yield Family("line_radio_free_buffer_ratio", "Free part of the modem's send buffer.", labels, free)
+    for key, (metric, text) in _RADIO_TOTALS.items():
+        yield Family(metric, text, labels, [([name], radio[key]) for name, radio in radios.items()])
