@@ -128,6 +128,22 @@ def test_repeat_along_the_same_path_hides_no_loss(radios: Radios) -> None:
     assert (state.received, state.duplicates) == (received, duplicates + 5)
 
 
+def test_repeats_below_the_replay_window_hide_no_loss(radios: Radios) -> None:
+    """The receiver cannot tell any more along which paths these envelopes arrived, so it counts none of them."""
+    envelopes = [radios.pair.a.envelope(radios.now) for _ in range(5)]
+    for envelope in envelopes:
+        cross(radios, 0, envelope)
+    radios.a.session.send_counter += c.REPLAY_WINDOW
+    cross(radios, 0, radios.pair.a.envelope(radios.now))
+    states = [radios.state(radios.b, radio) for radio in (0, 1)]
+    before = [(state.received, state.duplicates) for state in states]
+    for radio in (0, 1):
+        for envelope in envelopes:
+            cross(radios, radio, envelope)
+
+    assert [(state.received, state.duplicates - 5) for state in states] == before
+
+
 def test_copy_from_elsewhere_is_counted_and_answered_with_nothing(radios: Radios) -> None:
     """A duplicate for two seconds; after that it is replayed."""
     envelope = radios.pair.a.envelope(radios.now)
