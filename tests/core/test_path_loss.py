@@ -6,8 +6,10 @@ import random
 
 import pytest
 
-from tests.core.harness import AT_B, ELSEWHERE, Pair
+from tests.core.harness import AT_B, ELSEWHERE, Pair, datagrams, only
+from tests.core.radios import Radios
 from uavlinkd.core import constants as c
+from uavlinkd.core import establish
 from uavlinkd.core.path_loss import NO_REPEATS, PathLoss, datagram_loss
 from uavlinkd.core.path_state import PathState
 
@@ -50,6 +52,17 @@ def test_share_of_repeated_envelopes_is_that_of_datagrams() -> None:
     assert loss.recent(c.LOSS_WINDOW_S) == (100, 25)
 
 
+def test_repeats_that_were_counted_along_another_path_are_not_compared() -> None:
+    """Fewer repeats than before: the estimate begins with that report."""
+    loss = PathLoss()
+    loss.add(1.0, 10, 10, (90, 0, 0, 0))
+    loss.add(2.0, 100, 80, (50, 0, 0, 0))
+    assert loss.recent(c.LOSS_WINDOW_S) == (0, 0)
+    loss.add(3.0, 200, 155, (150, 0, 0, 0))
+    assert loss.recent(c.LOSS_WINDOW_S) == (100, 25)
+    assert loss.share() == pytest.approx(0.5, abs=1e-3)
+
+
 def test_reports_are_limited_in_age_and_number() -> None:
     """The window of repair is the longest one."""
     loss = PathLoss()
@@ -64,18 +77,39 @@ def test_reports_are_limited_in_age_and_number() -> None:
 def test_repeat_is_counted_in_bytes_but_not_as_another_envelope() -> None:
     """The receiver counts an envelope once too. A path that is gone has no totals."""
     pair = Pair().establish()
-    pair.a.send(1.0)
+    envelope = only(datagrams(pair.a.send(1.0)))
     peer = pair.a.peer
     state = peer.paths.find(AT_B)
     assert state is not None
-    sent, datagrams, size = state.sent, state.datagrams_sent, state.bytes_sent
-    pair.a.node.note_repeat(peer, AT_B, 2, 100)
-    pair.a.node.note_repeat(peer, AT_B, 3, 100)
-    pair.a.node.note_repeat(peer, ELSEWHERE, 2, 100)
-    assert (state.sent, state.datagrams_sent, state.bytes_sent) == (sent, datagrams + 2, size + 200)
+    sent, datagrams_sent, size = state.sent, state.datagrams_sent, state.bytes_sent
+    pair.a.node.note_repeat(peer, AT_B, 2, envelope)
+    pair.a.node.note_repeat(peer, AT_B, 3, envelope)
+    pair.a.node.note_repeat(peer, ELSEWHERE, 2, envelope)
+    assert (state.sent, state.datagrams_sent, state.bytes_sent) == (
+        sent,
+        datagrams_sent + 2,
+        size + 2 * len(envelope),
+    )
     assert state.repeats == (1, 1, 0, 0)
     state.note_session()
     assert sum(state.repeats) == 0
+
+
+def test_repeats_of_an_older_session_do_not_count_along_the_path() -> None:
+    """Its bytes count, but the totals of the path are those of the current session."""
+    radios = Radios().run(1.0)
+    peer, state = radios.a.peer, radios.state(radios.a, 0)
+    old = radios.pair.a.envelope(radios.now)
+    radios.act(radios.a, establish.initiate(peer, radios.now))
+    radios.run(0.5)
+    size = state.bytes_sent
+    radios.a.node.note_repeat(peer, state.path, 2, old)
+    assert (state.repeats, state.bytes_sent) == (NO_REPEATS, size + len(old))
+    radios.a.node.note_repeat(peer, state.path, 2, radios.pair.a.envelope(radios.now))
+    assert state.repeats == (1, 0, 0, 0)
+    radios.a.node.close(radios.now)
+    radios.a.node.note_repeat(peer, state.path, 2, old)
+    assert state.repeats == (1, 0, 0, 0)
 
 
 def test_echoes_show_the_loss_of_the_only_path() -> None:

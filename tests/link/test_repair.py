@@ -106,7 +106,7 @@ class Scene:
             now = max(now, self.repeats.next_deadline(now))
             if now > until:
                 return
-            for transmit, number in self.repeats.release(now):
+            for transmit, number in self.repeats.release((HERE, THERE), now):
                 self.sent.append((round(now, 4), transmit.datagram.rstrip(b"."), number))
         raise AssertionError("deadlines without end")
 
@@ -132,6 +132,17 @@ def test_newer_state_replaces_repeats_of_an_older_one() -> None:
     assert scene.copies.dropped == {ShellReason.COPY_REPLACED: 1}
 
 
+def test_newer_command_replaces_no_repeats_of_an_older_one() -> None:
+    """Both must arrive. The older one may be the later one to do so, by less than half a second."""
+    scene = Scene()
+    scene.put(b"arm", [command(1)], 0.0)
+    scene.put(b"take off", [command(2)], 0.01)
+    scene.run(0.01, 1.0)
+    assert [number for _, name, number in scene.sent if name == b"arm"] == [2, 3, 4, 5]
+    assert [number for _, name, number in scene.sent if name == b"take off"] == [2, 3, 4, 5]
+    assert scene.copies.dropped == {}
+
+
 def test_commands_go_first_and_old_repeats_are_dropped() -> None:
     """On a network whose budget is used up."""
     scene = Scene({0: (budget := NetworkBudget(8000, 0.0))})
@@ -152,7 +163,38 @@ def test_copies_that_wait_for_a_path_go_before_its_repeats() -> None:
     budget.all.spend(1000, 0.0)
     assert len(scene.copies.pick([Transmit(b"x", HERE), Transmit(b"x", THERE, is_copy=True)], [command(1)], 0.0)) == 1
     scene.put(b"a", [command(1)], 0.0, along=THERE)
-    assert scene.repeats.release(0.1) == []
+    assert scene.repeats.release((HERE, THERE), 0.1) == []
+
+
+def test_repeats_behind_copies_that_wait_need_no_polling() -> None:
+    """The rate of copies is used up, the network's budget is not: the next deadline is that of the copies."""
+    scene = Scene()
+    pair = [Transmit(bytes(1000), HERE), Transmit(bytes(1000), THERE, is_copy=True)]
+    for _ in range(3):
+        scene.copies.charge(pair[1], 0.0)
+    assert len(scene.copies.pick(pair, [command(1)], 0.0)) == 1
+    scene.put(b"a", [command(1)], 0.0, along=THERE)
+    now, wakeups = 0.0, 0
+    while scene.repeats.is_waiting:
+        now = min(scene.copies.next_deadline(now), scene.repeats.next_deadline(now))
+        scene.copies.release(now)
+        scene.sent += [(now, b"a", number) for _, number in scene.repeats.release((THERE,), now)]
+        wakeups += 1
+    assert [number for _, _, number in scene.sent] == [2, 3, 4, 5]
+    assert scene.sent[0][0] > 2 * SPACING_S
+    assert wakeups <= 7
+
+
+def test_nothing_is_repeated_along_a_path_that_is_gone() -> None:
+    """It is not counted either. An envelope without a path ends."""
+    scene = Scene()
+    scene.repeats.put(b"both", [HERE, THERE], [command(1)], 5, 0.0)
+    scene.repeats.put(b"there", [THERE], [command(1)], 5, 0.0)
+    (repeat,) = scene.repeats.release((HERE,), SPACING_S)
+    assert (repeat.transmit.datagram, repeat.transmit.path) == (b"both", HERE)
+    assert (scene.repeats.sent, scene.repeats.count) == (1, 1)
+    assert scene.repeats.release((), 1.0) == []
+    assert not scene.repeats.is_waiting
 
 
 def test_rate_of_repeats_is_limited_on_average() -> None:
@@ -238,3 +280,18 @@ def test_peer_that_is_lost_is_repaired_no_more() -> None:
     network.alpha.link.on_down(network.now)
     assert not network.alpha.link.is_repairing
     assert not network.alpha.link.output.repeats.is_waiting
+
+
+def test_nothing_is_repeated_while_the_network_is_gone() -> None:
+    """What repeats cost does not grow."""
+    network = Network([Radio(0.01, 0.3)])
+    in_use(network, 20.0)
+    end = network.alpha
+    end.send(command(1))
+    assert end.link.output.repeats.is_waiting
+    end.node.set_socket_state(0, network.now, is_up=False)
+    state, repeats = end.peer.paths.states[0], end.link.output.repeats
+    before = state.repeats, repeats.sent, repeats.bytes_sent
+    network.run(network.now + 0.5)
+    assert (state.repeats, repeats.sent, repeats.bytes_sent) == before
+    assert not repeats.is_waiting

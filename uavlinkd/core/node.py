@@ -196,12 +196,12 @@ class Node:
         """
         recount(peer, path, datagrams, size)
 
-    def note_repeat(self, peer: Peer, path: Path, number: int, size: int) -> None:
-        """A datagram of ``size`` bytes that :meth:`send` returned is sent along this path again.
+    def note_repeat(self, peer: Peer, path: Path, number: int, datagram: bytes) -> None:
+        """A datagram that :meth:`send` returned is sent along this path again.
 
         ``number``: which transmission of the envelope it is along this path, 2 to :data:`c.TRANSMISSIONS`.
         """
-        note_repeat(peer, path, number, size)
+        note_repeat(peer, path, number, datagram)
 
     def report_refusals(self, peer: Peer, changed: Iterable[Refused], now: float) -> list[Output]:
         """Report to the peer which of its frames are refused here: totals that changed since the last call."""

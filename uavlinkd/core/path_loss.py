@@ -43,6 +43,8 @@ class PathLoss:
         points = self._points
         if points and (sent < points[-1].sent or received < points[-1].received):
             return  # an older report, or a session that begins
+        if points and any(after < before for before, after in zip(points[-1].repeats, repeats, strict=True)):
+            points.clear()  # repeats are counted from zero, or along another path than before
         points.append(_Point(at, sent, received, repeats))
         while len(points) > 2 and points[1].at <= at - c.REPAIR_WINDOW_S:
             points.popleft()

@@ -142,11 +142,12 @@ def recount(peer: Peer, path: Path, datagrams: int, size: int) -> None:
         peer.traffic.bytes_sent += size
 
 
-def note_repeat(peer: Peer, path: Path, number: int, size: int) -> None:
-    """Count one more transmission of an envelope along a path."""
-    state = peer.paths.find(path)
+def note_repeat(peer: Peer, path: Path, number: int, datagram: bytes) -> None:
+    """Count one more transmission of an envelope along a path. The loss of a path is that of the current session."""
+    state, session, size = peer.paths.find(path), peer.sessions.current, len(datagram)
     if state is not None:
-        state.note_repeat(number)
+        if session is not None and wire.claimed_receiver_index(datagram) == session.remote_index:
+            state.note_repeat(number)
         state.datagrams_sent += 1
         state.bytes_sent += size
         peer.traffic.datagrams_sent += 1

@@ -136,15 +136,17 @@ class Copies:
 
     def next_deadline(self, now: float) -> float:
         """When :meth:`release` has something to do; infinity while no copy waits."""
-        at = inf
-        for path, waiting in self._waiting.items():
-            wait_s = max(self._rate.wait_s(0.0, now), self._budget_wait_s(path, now))
-            at = min(at, now + wait_s, waiting[0].put_at + MAX_WAIT_S)
-        return at
+        return min((self._release_at(path, now) for path in self._waiting), default=inf)
 
-    def repeat_wait_s(self, path: Path, now: float) -> float:
-        """How long until there is room for a repeat along a path, if nothing else is sent."""
-        return max(self._average.wait_s(0.0, now), self._budget_wait_s(path, now))
+    def _release_at(self, path: Path, now: float) -> float:
+        """When a copy that waits for this path is sent or dropped."""
+        wait_s = max(self._rate.wait_s(0.0, now), self._budget_wait_s(path, now))
+        return min(now + wait_s, self._waiting[path][0].put_at + MAX_WAIT_S)
+
+    def repeat_at(self, path: Path, now: float) -> float:
+        """When there may be room for a repeat along a path: after the copies that wait for it."""
+        at = now + max(self._average.wait_s(0.0, now), self._budget_wait_s(path, now))
+        return max(at, self._release_at(path, now)) if path in self._waiting else at
 
     def _budget_wait_s(self, path: Path, now: float) -> float:
         wait_s = 0.0

@@ -93,9 +93,9 @@ class PeerOutput:
                 self._node.recount(peer, transmit.path, 1, len(transmit.datagram))
             self._on_sent([], list(released), now)
         if self.repeats.is_waiting:
-            repeats = self.repeats.release(now)
+            repeats = self.repeats.release({state.path for state in peer.paths.states if not state.is_off}, now)
             for transmit, number in repeats:
-                self._node.note_repeat(peer, transmit.path, number, len(transmit.datagram))
+                self._node.note_repeat(peer, transmit.path, number, transmit.datagram)
             self._on_sent([], [repeat.transmit for repeat in repeats], now)
 
     def next_deadline(self, now: float) -> float:

@@ -7,7 +7,7 @@ deadline for all of them. Sans-IO: ``now`` is monotonic seconds.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from math import inf
 from typing import Final, NamedTuple
 
@@ -23,7 +23,6 @@ SPACING_S: Final = 0.02
 """Between two transmissions of an envelope: a short burst of losses does not hit both."""
 MAX_ENVELOPES: Final = 256
 """Of one peer that wait for repeats."""
-_LEAST_WAIT_S: Final = 0.001
 
 
 class Repeat(NamedTuple):
@@ -87,9 +86,15 @@ class Repeats:
             self._waiting.remove(max(self._waiting, key=_order))
             self.dropped[ShellReason.COPY_OVER_BUDGET] += 1
 
-    def release(self, now: float) -> list[Repeat]:
-        """The repeats that are due and for which there is room. Those that waited too long are dropped."""
+    def release(self, paths: Container[Path], now: float) -> list[Repeat]:
+        """The repeats that are due and for which there is room. Those that waited too long are dropped.
+
+        ``paths``: those that are not gone. Along others nothing is repeated.
+        """
         self._drop_old(now)
+        for one in self._waiting:
+            one.paths = [path for path in one.paths if path in paths]
+        self._waiting = [one for one in self._waiting if one.paths]
         released: list[Repeat] = []
         for one in sorted((one for one in self._waiting if one.due_at <= now), key=_order):
             transmits = [Transmit(one.datagram, path, is_copy=True) for path in one.paths]
@@ -114,8 +119,7 @@ class Repeats:
             if one.due_at > now:
                 at = min(at, one.due_at)
             else:
-                wait_s = min(self._copies.repeat_wait_s(path, now) for path in one.paths)
-                at = min(at, now + max(_LEAST_WAIT_S, wait_s), one.put_at + MAX_WAIT_S)
+                at = min(at, one.put_at + MAX_WAIT_S, *(self._copies.repeat_at(path, now) for path in one.paths))
         return at
 
     def clear(self) -> None:
