@@ -75,7 +75,10 @@ class LineNetwork(Network):
             for state in end.peer.paths.states:
                 if state.round_trip_s is not None:
                     rate.add_round_trip(state.round_trip_s, state.answered_at)
-            end.budgets[LINE.socket].set_rate(rate.bits_s(self.now), self.now)
+            budget, bits_s = end.budgets[LINE.socket], rate.bits_s(self.now)
+            budget.set_rate(bits_s, self.now)
+            if budget.update_core(bits_s):
+                end.node.set_rates({LINE.socket: budget.core_bits_s}, self.now)
 
     def _next_event(self) -> float:
         lines = min(self.modems.next_deadline(), self.attacker.next_deadline())
