@@ -115,6 +115,8 @@ async def test_noise_and_reports_of_the_modem(stage: Stage, pair: Connect) -> No
     assert "MAVLINK=0" in finding["remedy"]
     autopilot.send(heartbeat(1, 5), into_vehicle)
     await pilot.until(lambda: has_all(pilot, heartbeat(1, 5)))
+    assert await ground.stop() == 0
+    assert ground.events("daemon_stopped")[0]["counted"]["line_noise"] >= 1
 
 
 async def test_flood_of_states_does_not_fill_the_modem(stage: Stage, pair: Connect) -> None:

@@ -197,7 +197,7 @@ class Daemon:
         self._events.close()
         if self.recorder is not None:
             self.recorder.stop(now)
-        counted = {**self._drops.plain_totals(), **self._events.totals}
+        counted = {**self._drops.plain_totals(), **self._events.totals, **self.peer_sockets.serial.totals}
         self.log.info("daemon_stopped", uptime_s=round(now - self._started_at, 1), counted=counted)
 
     def _close_sockets(self) -> None:

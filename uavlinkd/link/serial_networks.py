@@ -242,6 +242,12 @@ class SerialNetworks:
         for network in self.networks:
             network.line.close()
 
+    @property
+    def totals(self) -> dict[str, int]:
+        """The number of damaged pieces since the start, by its name in the log. Empty if there are none."""
+        noise = sum(network.line.decoder.line_noise for network in self.networks)
+        return {"line_noise": noise} if noise else {}
+
     def absent(self) -> list[str]:
         """The serial networks that are absent now, each with the reason."""
         return [f"{network.name} ({network.line.reason})" for network in self.networks if not network.line.is_open]

@@ -22,7 +22,7 @@ from typing import Any, Self
 
 from uavlinkd.config.keys import decode_key, generate_psk
 from uavlinkd.lab.evaluation.ledger import Ledger
-from uavlinkd.lab.evaluation.middle import Middle, MiddleHere, MiddleProcess
+from uavlinkd.lab.evaluation.middle import Middle, MiddleHere
 from uavlinkd.lab.evaluation.paper_protocol import VERIFIED, PaperEnd
 from uavlinkd.lab.mitm.attack import Direction
 from uavlinkd.lab.sim.drone_process import DroneProcess
@@ -163,7 +163,7 @@ class DaemonStage(Stage):
         self,
         names: Sequence[str],
         folder: Path,
-        middle: MiddleProcess | MiddleHere,
+        middle: Middle,
         link: Mapping[str, object],
         *,
         rate_hz: float,
@@ -212,14 +212,22 @@ class DaemonStage(Stage):
                 psk = self.psks.setdefault(pair, generate_psk())
                 file = f"{other}.psk"
                 self.drones[one].share_psk(psk, file)
-                addresses = [
-                    f"127.0.0.1:{port}"
-                    for direction, port in self.middle.ports.items()
-                    if (direction.sender, direction.receiver) == (one, other)
-                ]
-                settings = {"addresses": addresses, **self.rules(one, other)}
+                settings = {"addresses": self.addresses(one, other), **self.rules(one, other)}
                 peers.append(self.drones[other].as_peer("", file, **settings))
-            self.drones[one].configure(self._link, peers)
+            self.drones[one].configure(self._link, peers, self.networks(one))
+
+    def addresses(self, one: str, other: str) -> list[object]:
+        """The addresses where one drone reaches another: in front of the man in the middle."""
+        return [
+            f"127.0.0.1:{port}"
+            for direction, port in self.middle.ports.items()
+            if (direction.sender, direction.receiver) == (one, other)
+        ]
+
+    def networks(self, name: str) -> list[dict[str, object]]:
+        """The networks of a drone; by default none is configured."""
+        del name
+        return []
 
     def rules(self, one: str, other: str) -> dict[str, object]:
         """The policy of one drone for another."""
@@ -315,6 +323,9 @@ def _notice(status: Mapping[str, Any]) -> Notice:
         for reasons in peer["refused"]["in"].values():
             for reason, count in reasons.items():
                 drops[f"refused_{reason}"] += count
+    for network in status.get("networks", {}).values():
+        if network["serial"] is not None:
+            drops["line_noise"] += network["serial"]["line_noise"]
     return Notice(drops, figures)
 
 

@@ -42,6 +42,8 @@ class TamperingSettings:
     attempts_data: int = 10_000
     attempts_handshake: int = 200
     seed: int = 0
+    only: tuple[str, ...] = ()
+    """The stages that run; empty: all of them, and the floods."""
 
     @property
     def rate_hz(self) -> float:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from uavlinkd.lab.evaluation.commands import FAILED, NEEDS_EXTRA, OK, add_command, fail, positive_int
+from uavlinkd.lab.evaluation.tampering_plan import STAGES
 
 if TYPE_CHECKING:
     from uavlinkd.lab.evaluation.tampering_records import Trial
@@ -43,6 +44,14 @@ def add_tampering_parser(commands: argparse._SubParsersAction[argparse.ArgumentP
         type=int,
         default=0,
         help="seed of the attacks' choices, not of keys (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--only",
+        metavar="STAGE",
+        choices=STAGES,
+        action="append",
+        default=[],
+        help=f"run this stage alone; may be repeated: {', '.join(STAGES)} (default: all, and floods)",
     )
 
 
@@ -92,7 +101,9 @@ def _tampering(options: argparse.Namespace) -> int:
         if error.name is None or error.name.partition(".")[0] != "matplotlib":
             raise
         return fail(NEEDS_EXTRA)
-    settings = TamperingSettings(options.quick, options.attempts_data, options.attempts_handshake, options.seed)
+    settings = TamperingSettings(
+        options.quick, options.attempts_data, options.attempts_handshake, options.seed, tuple(options.only)
+    )
     try:
         with interrupted_by_signals():
             run = asyncio.run(Evaluation(options.out, settings, _show).run())

@@ -11,6 +11,7 @@ from uavlinkd.lab.evaluation.spread import duration
 from uavlinkd.lab.evaluation.tampering import NAME, problems
 from uavlinkd.lab.evaluation.tampering_bench import run_settings
 from uavlinkd.lab.evaluation.tampering_figures import tampering_figures
+from uavlinkd.lab.evaluation.tampering_line import LINE, line_section
 from uavlinkd.lab.evaluation.tampering_paths import PATHS, paths_section
 from uavlinkd.lab.evaluation.tampering_plan import DATA, HANDSHAKE, KEYS
 from uavlinkd.lab.evaluation.tampering_records import (
@@ -105,6 +106,7 @@ def make_sections(run: Run, figures: Sequence[str]) -> list[ReportSection]:
         *floods,
         ReportSection("Attackers with keys", "", _ON_KEYS, [_keys(run)]),
         *([paths_section(run)] if any(trial.group == PATHS for trial in run.trials) else []),
+        *([line_section(run)] if any(trial.group == LINE for trial in run.trials) else []),
         ReportSection("What the drones noticed", "", _ON_NOTICED, [_noticed(run)]),
         *control,
         ReportSection("The paper's protocol", "", _ON_PAPER),
@@ -172,6 +174,7 @@ def _on_run(run: Run) -> list[str]:
         options += " --quick"
     else:
         options += f" --attempts-data {settings.attempts_data} --attempts-handshake {settings.attempts_handshake}"
+    options += "".join(f" --only {stage}" for stage in settings.only)
     counts = " and ".join(
         f"{settings.target(DATA, system):,} for an attack on data, {settings.target(HANDSHAKE, system):,} on the "
         f"handshake ({name})"
@@ -361,7 +364,7 @@ def _facts(run: Run) -> Table:
     rows = [
         [name.replace("_", " "), _NOTHING if value in (None, []) else str(value)]
         for name, value in run.facts.items()
-        if name not in ("control", "links", "quick", "attempts_data", "attempts_handshake", "seed")
+        if name not in ("control", "links", "quick", "attempts_data", "attempts_handshake", "seed", "only")
     ]
     return Table(["", ""], rows)
 

@@ -7,7 +7,7 @@ has no keys. So it can make a valid frame of the line (COBS and CRC), but no val
 from __future__ import annotations
 
 import math
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from random import Random
 from types import MappingProxyType
@@ -63,7 +63,7 @@ class LineAttacker:
         self._decoders = {end: LineDecoder() for end in ModemEnd}
         self._recorded: dict[ModemEnd, deque[bytes]] = {end: deque(maxlen=RECORD_LIMIT) for end in ModemEnd}
         self._attacks: list[_Running] = []
-        self._number = 0
+        self._numbers: Counter[tuple[str, ModemEnd]] = Counter()
 
     @property
     def names(self) -> list[str]:
@@ -102,13 +102,14 @@ class LineAttacker:
             self._link.hold(end, now + attack.hold_s, now)
             self._note(attack.name, Operation.HELD, end, b"", now, f"for {attack.hold_s:g} s")
             return
-        data, detail = _MAKERS[attack.name](attack, self._recorded[end], self._rng, self._number)
+        number = self._numbers[attack.name, end]
+        data, detail = _MAKERS[attack.name](attack, self._recorded[end], self._rng, number)
         if data:
             self._link.inject(end, data, now)
             self._note(attack.name, Operation.INJECTED, end, data, now, detail)
 
     def _note(self, name: str, operation: Operation, end: ModemEnd, data: bytes, now: float, detail: str) -> None:
-        self._number += 1
+        self._numbers[name, end] += 1
         direction, kind = Direction(end.other, end), _kind_in(data)
         self._on_done(Intervention(now, name, operation, direction, 0, kind, len(data), detail))
 

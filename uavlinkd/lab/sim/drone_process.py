@@ -66,10 +66,11 @@ class DroneProcess:
         networks: Sequence[Mapping[str, object]] = (),
     ) -> None:
         """Write the configuration: the ``[link]`` section, each ``[[peer]]``, and each ``[[network]]`` if any."""
+        has_interfaces = any("serial" not in network for network in networks)
         top = {
             "name": self.name,
             "private_key_file": "drone.key",
-            "listen": [f"{'0.0.0.0' if networks else '127.0.0.1'}:{self.port}"],
+            "listen": [f"{'0.0.0.0' if has_interfaces else '127.0.0.1'}:{self.port}"],
             "control_socket": self.socket.name,
         }
         endpoint = {"name": "autopilot", "url": f"udpin:127.0.0.1:{self.endpoint_port}"}
