@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -100,7 +100,7 @@ class Evaluation:
             write_logs(self.out, self._benches)
         return recorder.run
 
-    def _lanes(self) -> Iterable[tuple[str, Callable[[TrialRecorder], Awaitable[None]]]]:
+    def _lanes(self) -> Iterable[tuple[str, Callable[[TrialRecorder], Coroutine[None, None, None]]]]:
         """The work of each stage."""
         works = (self._handshakes, self._data, self._with_keys, self._captured_member, self._paper)
         return zip(plans.STAGES, (*works, self._reports, self._paths, self._line), strict=True)

@@ -1,7 +1,7 @@
 """Attacks on a serial line between two daemons: their plans, the modems with the attacker, and the stage.
 
-The attacker is the modem's firmware, or a device on the wires. It puts bytes on the lines to both hosts, or holds back
-what they should receive. It has no keys, but it knows the framing: it makes frames with a valid CRC.
+The attacker is the modem's firmware, or a device on the wires. It puts bytes on the lines to both hosts, or holds
+back what they should receive. It has no keys, but it knows the framing: it makes frames with a valid CRC.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ LINE_PLANS: Final[tuple[TrialPlan, ...]] = (
     _plan("bytes injected on the line", "line-noise,interval_s=0.1", "line_noise", notes="64 random bytes each time"),
     _plan("line frames with one altered byte", "line-bad-crc,interval_s=0.025", "line_noise"),
     _plan("line frames cut at every offset", "line-cut,interval_s=0.1", "line_noise"),
-    _plan("datagrams replayed on the line", "line-replay,interval_s=0.025", "replayed"),
+    _plan("datagrams replayed on the line", "line-replay,interval_s=0.025", "duplicate"),
     _plan("datagrams forged on the line", "line-forge,interval_s=0.025", "bad_tag", "unknown_index"),
     _held("line held for 3 s and let go", "end=both", 3.0),
     _held("line held for 10 s and let go", "end=both", 10.0, "peer_lost", is_variant=True),
