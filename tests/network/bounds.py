@@ -95,7 +95,7 @@ def check(node: Node) -> Sizes:
     assert len(node._remembered) == sum(len(peer.remembered) for peer in peers)
     assert len(node._by_keys) == len(node.peers)
     assert all(node.peers.get(peer.name) is peer for peer in node._by_address.values())
-    proven = [state.path.address for peer in peers for state in peer.paths.states if state.is_known]
+    proven = [state.path.place for peer in peers for state in peer.paths.states if state.is_known]
     assert node._last_seen == Counter(proven), f"{node._last_seen} are known, {proven} are proven"
     assert len(node._by_address) <= sum(len(peer.paths.configured) for peer in peers)
     for peer in peers:

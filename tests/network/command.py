@@ -128,7 +128,9 @@ def table(total: Played, wall_s: float) -> list[str]:
         "pairs by number of paths": ", ".join(f"{paths}: {n:,}" for paths, n in sorted(total.paths.items())),
         "frames sent": f"{total.sent:,}",
         "frames delivered": f"{total.delivered:,}",
-        "critical frames": f"{total.critical_sent:,}; {total.critical_judged:,} while a path delivered",
+        "critical frames": f"{total.critical_sent:,}; {total.critical_judged:,} while a path delivered,"
+        f" {total.critical_on_lines:,} of them a serial line alone",
+        "damaged pieces on lines": f"{total.damaged:,}",
         "datagrams": f"{total.datagrams:,}, the attackers' too",
         "sessions made": f"{total.sessions:,}, counted at each end",
         **{f"  {name}": f"{count:,}" for name, count in sorted(total.events.items())},

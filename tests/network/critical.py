@@ -32,6 +32,8 @@ class CriticalWatch:
         self.sent = 0
         self.judged = 0
         """Frames for which a path delivered."""
+        self.judged_on_lines = 0
+        """Those of them for which only a serial line did."""
         self._fleet = fleet
         self._network = fleet.network
 
@@ -56,6 +58,7 @@ class CriticalWatch:
         are_peers = _has(sender, receiver) and _has(receiver, sender)
         delivering = [hop for hop in pair.hops if self._delivered(hop, sent_at)] if are_peers else []
         self.judged += bool(delivering)
+        self.judged_on_lines += bool(delivering) and all(hop.sender in self._network.lines for hop in delivering)
         assert not delivering or number in flow.delivered, (
             f"critical frame {number} from {sender.name} to {receiver.name}, sent at {sent_at:.3f},"
             f" was lost although paths delivered: {delivering}"
@@ -63,7 +66,9 @@ class CriticalWatch:
 
     def _delivered(self, hop: Hop, sent_at: float) -> bool:
         """Whether a path has delivered from long before a frame was sent until now."""
-        air = self._network.air
+        air, line = self._network.air, self._network.lines.get(hop.sender)
+        if line is not None and not line.is_sound:
+            return False
         settled_s = METERED_SETTLED_S if any(map(self._was_metered, hop)) else SETTLED_S
         for one in (hop, hop.back):
             radio = air.settings_of(one)

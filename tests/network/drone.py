@@ -11,9 +11,11 @@ from typing import Protocol
 from tests.network.air import Address, Air, Endpoint, Hop
 from tests.network.bounds import Sizes, check
 from tests.network.flow import Flow
+from tests.network.serial_line import BUDGET_BITS_S, SerialLine
 from uavlinkd.core.cookie import MacKeys
 from uavlinkd.core.crypto import Secret, x25519_public_key
 from uavlinkd.core.drops import Drop
+from uavlinkd.core.envelope_limit import limit_at
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Output, SessionEstablished
 from uavlinkd.core.path import Path
@@ -31,6 +33,7 @@ class World(Protocol):
     screen: Screen
     air: Air
     drones: dict[str, Drone]
+    lines: dict[Endpoint, SerialLine]
 
     def flows_between(self, sender: str, receiver: str) -> Sequence[Flow]:
         """The frames of every class from one drone to another."""
@@ -57,6 +60,8 @@ class Drone:
         """Sockets whose network is metered."""
         self.once_metered: set[int] = set()
         """Those whose network is or was metered."""
+        self.lines: dict[int, str] = {}
+        """The sockets that are serial lines, with the drone at the other end."""
         self.outputs: list[tuple[float, Output]] = []
         """All outputs but datagrams and frames, with the network's time."""
         self.drops: Counter[str] = Counter()
@@ -115,6 +120,8 @@ class Drone:
         end = Endpoint(self.name, socket)
         (self._world.air.absent.discard if is_up else self._world.air.absent.add)(end)
         self._world.air.disturb(end, self._world.now)
+        if (line := self._world.lines.get(end)) is not None:
+            line.plug(end, self._world.now, is_plugged=is_up)
         self._world.note(f"{self.name} {'finds' if is_up else 'loses'} network {socket}")
         if self.node is not None:
             self.node.set_socket_state(socket, is_up=is_up, now=self.local_now)
@@ -130,6 +137,22 @@ class Drone:
     def hop(self, socket: int, other: Drone, other_socket: int) -> Hop:
         """The direction from here of a path to another drone."""
         return Hop(Endpoint(self.name, socket), Endpoint(other.name, other_socket))
+
+    def add_line(self, address: Address, other: Drone) -> None:
+        """Add a socket with a serial line to another drone."""
+        self.lines[len(self.addresses)] = other.name
+        self._place((*self.addresses, address))
+
+    def _set_lines(self) -> None:
+        """Tell the node which sockets are serial lines, and to which peers. A daemon does it at each change."""
+        if self.node is None or not self.lines:
+            return
+        peers = self.node.peers
+        self.node.set_budgets(dict.fromkeys(self.lines, BUDGET_BITS_S))
+        self.node.set_envelope_limits(dict.fromkeys(self.lines, limit_at(BUDGET_BITS_S)))
+        self.node.set_point_to_point(
+            {socket: [peers[name]] if name in peers else [] for socket, name in self.lines.items()}
+        )
 
     def _place(self, addresses: Sequence[Address]) -> None:
         air, now = self._world.air, self._world.now
@@ -154,6 +177,7 @@ class Drone:
         self._refuse_before(other, math.inf)
         if self.node is not None:
             self._world.perform(self, self.node.remove_peer(self.peer(other), self.local_now))
+            self._set_lines()
             assert other.name not in self.node.peers
 
     def restore(self, other: Drone) -> None:
@@ -163,6 +187,7 @@ class Drone:
         self._refuse_before(other, self._world.now)
         if self.node is not None:
             peer = self.node.add_peer(settings, self.local_now)
+            self._set_lines()
             self.node.set_paths(peer, paths, self.local_now)
 
     def _refuse_before(self, other: Drone, moment: float) -> None:
@@ -186,8 +211,10 @@ class Drone:
         entropy = Random(self._world.rng.randbytes(16))
         self.node = Node(Secret(self.private_key), entropy.randbytes, now, screen=self._world.screen)
         self.node.set_metered(self.metered_sockets, self.local_now)
-        for settings, paths in self.acquaintances.values():
-            self.node.set_paths(self.node.add_peer(settings, now), paths, now)
+        peers = [(self.node.add_peer(settings, now), paths) for settings, paths in self.acquaintances.values()]
+        self._set_lines()
+        for peer, paths in peers:
+            self.node.set_paths(peer, paths, now)
         for end in self._world.air.absent:
             if end.drone == self.name:
                 self.node.set_socket_state(end.socket, is_up=False, now=now)

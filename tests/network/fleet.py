@@ -9,7 +9,7 @@ from tests.network.air import Address, Hop
 from tests.network.drone import Drone
 from tests.network.network import Network
 from tests.network.plans import Plan
-from uavlinkd.core.path import Path
+from uavlinkd.core.path import SERIAL_HOST, Path
 from uavlinkd.core.settings import Link, Timers
 
 CLOCKS = {"zero": 0.0, "1970": 1.0, "2038": 2.0**31 - 1, "2106": 2.0**32 - 1, "after 2106": 2.0**32 + 0.25}
@@ -39,6 +39,7 @@ class Fleet:
             for b in self.drones[number + 1 :]
             if self.is_mesh or number == 0
         ]
+        self.pairs = [self._with_line(pair) for pair in self.pairs]
         self.wanderers = self._wanderers()
         """Drones whose addresses change. Of two peers at least one keeps its addresses: else they could not meet."""
 
@@ -75,6 +76,12 @@ class Fleet:
         addresses: list[Address] = [(f"10.{socket}.0.{number + 1}", 5790) for socket in range(networks)]
         return self.network.add(f"d{number}", *addresses, clock=clock)
 
+    def _with_line(self, pair: Pair) -> Pair:
+        """Join some pairs by a serial line too."""
+        if not self.plan.lines or self.lot.random() >= self.plan.lines:
+            return pair
+        return pair._replace(hops=(*pair.hops, self.network.join(pair.a, pair.b)))
+
     def _wanderers(self) -> list[Drone]:
         if not self.plan.has_paths:
             return self.drones if self.is_mesh else self.drones[1:]
@@ -82,13 +89,19 @@ class Fleet:
 
     def _introduce(self, pair: Pair, link: Link) -> None:
         lot, (a, b, hops) = self.lot, pair
-        there = [Path(hop.sender.socket, b.addresses[hop.receiver.socket]) for hop in hops]
-        back = [Path(hop.receiver.socket, a.addresses[hop.sender.socket]) for hop in hops]
+        by_ip = [hop for hop in hops if hop.sender not in self.network.lines]
+        there = [Path(hop.sender.socket, b.addresses[hop.receiver.socket]) for hop in by_ip]
+        back = [Path(hop.receiver.socket, a.addresses[hop.sender.socket]) for hop in by_ip]
+        on_line = [hop for hop in hops if hop.sender in self.network.lines]
+        lines_there = [Path(hop.sender.socket, (SERIAL_HOST, 0)) for hop in on_line]
+        lines_back = [Path(hop.receiver.socket, (SERIAL_HOST, 0)) for hop in on_line]
         # The first one is fixed. The second one tries all its networks.
-        b.knows(a, back, link)
-        a.knows(b, lot.choice(((), there, lot.sample(there, lot.randint(1, len(there))))), link)
+        b.knows(a, [*back, *lines_back], link)
+        known = lot.choice(((), there, lot.sample(there, lot.randint(1, len(there)))))
+        a.knows(b, [*known, *lines_there], link)
         if b in self.wanderers:
-            b.nat_sockets = {socket for socket in range(len(b.addresses)) if lot.random() < 0.3}
+            by_ip_sockets = set(range(len(b.addresses))) - b.lines.keys()
+            b.nat_sockets = {socket for socket in sorted(by_ip_sockets) if lot.random() < 0.3}
 
     def _introduce_by_address(self, pair: Pair, link: Link) -> None:
         lot, (a, b, _) = self.lot, pair

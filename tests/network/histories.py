@@ -22,7 +22,7 @@ from tests.network.fleet import Fleet, Pair
 from tests.network.flow import Flow
 from tests.network.misfortunes import Misfortunes
 from tests.network.network import Network
-from tests.network.path_misfortunes import random_radio
+from tests.network.path_misfortunes import random_modems, random_radio
 from tests.network.plans import PLANS, WEIGHTS, Plan
 from tests.network.played import Played
 from uavlinkd.core.outputs import SessionEstablished
@@ -135,6 +135,8 @@ class History:
         for hop in pair.hops:
             if hop == usable:
                 continue
+            if hop.sender in network.lines:
+                network.set_modems(hop.sender, random_modems(self.fleet))
             match lot.randrange(4):
                 case 0:
                     network.cut_path(hop)
@@ -200,6 +202,8 @@ class History:
         played.delivered += sum(len(flow.delivered) for flow in network.flows.values())
         played.oldest_s = max((flow.oldest_s for flow in network.flows.values()), default=0.0)
         played.critical_sent, played.critical_judged = self.critical.sent, self.critical.judged
+        played.critical_on_lines = self.critical.judged_on_lines
+        played.damaged = sum(line.damaged for line in set(network.lines.values()))
         played.events += self.misfortunes.events
         played.judged += len(self.up_s)
         played.pairs += len(self.up_s) * len(self.fleet.pairs)

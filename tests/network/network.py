@@ -17,12 +17,14 @@ from typing import Protocol, Self
 from tests.network.air import Address, Air, Crossing, Endpoint, Hop
 from tests.network.drone import Drone, session_name, share_a_session
 from tests.network.flow import FRAME_BYTES, Flow, FlowKey, class_in, every_second_may_be_old, split_frames
+from tests.network.serial_line import SIK, SerialLine
 from uavlinkd.core import wire
 from uavlinkd.core.constants import REFUSALS_KEPT
 from uavlinkd.core.outputs import Deliver, Dropped, Output, Transmit
-from uavlinkd.core.path import Path
+from uavlinkd.core.path import SERIAL_HOST, Path
 from uavlinkd.core.refusals import Refused
 from uavlinkd.core.settings import Class, Link, Screen, hold_all
+from uavlinkd.lab.mitm.modem import ModemSettings
 from uavlinkd.lab.mitm.radio import RadioSettings
 
 __all__ = [
@@ -64,6 +66,8 @@ class Network:
         self.air = Air(seed, radio or RadioSettings())
         self.drones: dict[str, Drone] = {}
         self.flows: dict[FlowKey, Flow] = {}
+        self.lines: dict[Endpoint, SerialLine] = {}
+        """The serial line at a socket of a drone. Both its ends are here."""
         self.attackers: dict[Address, Attacker] = {}
         self.listeners: list[Attacker] = []
         self.steps = 0
@@ -99,6 +103,16 @@ class Network:
         drone = self.drones[name] = Drone(self, name, at, clock)
         self._in_turn.append(drone)
         return drone
+
+    def join(self, a: Drone, b: Drone) -> Hop:
+        """Join two drones, which are not started yet, by a serial line on another socket of each."""
+        hop = a.hop(len(a.addresses), b, len(b.addresses))
+        addresses = {end: (f"line-{end.drone}-{end.socket}", 0) for end in hop}
+        line = SerialLine(addresses, Random(f"line {self.seed} {hop}"))
+        for drone, other, end in ((a, b, hop.sender), (b, a, hop.receiver)):
+            self.lines[end] = line
+            drone.add_line(addresses[end], other)
+        return hop
 
     def pair(self, link: Link | None = None, clocks: tuple[float, float] = (0.0, 0.0)) -> tuple[Drone, Drone]:
         """Two drones that know each other's address, started now."""
@@ -221,8 +235,20 @@ class Network:
         self.air.heal(hop.back, self.now)
 
     def heal(self) -> None:
-        """End all cuts."""
+        """End all cuts, and make all modems sound."""
         self.air.heal_all(self.now)
+        for end in self.lines:
+            self.set_modems(end, SIK)
+
+    def set_modems(self, end: Endpoint, settings: ModemSettings) -> None:
+        """Change the modems of a line from now on."""
+        self.air.disturb(end, self.now)
+        self.lines[end].set_modems(settings)
+
+    def make_noise(self, end: Endpoint, count: int) -> None:
+        """Random bytes appear on a line."""
+        self.air.disturb(end, self.now)
+        self.lines[end].make_noise(count, self.now)
 
     def stall_path(self, hop: Hop, seconds: float) -> None:
         """Keep everything that arrives on one path for some seconds, and then deliver it at once."""
@@ -283,6 +309,10 @@ class Network:
             heapq.heappop(self._actions)[2]()
         elif self.air.next_arrival() <= self.now:
             self._deliver(self.air.arrivals(self.now))
+        elif self._next_from_lines() <= self.now:
+            for line in self.lines.values():
+                for datagram, source, destination in line.read(self.now):
+                    self._send(datagram, source, destination)
         else:
             for drone in self.drones.values():
                 if drone.node is not None and drone.node.next_deadline() - drone.clock <= self.now:
@@ -295,10 +325,14 @@ class Network:
 
     def _next_event(self) -> float:
         moment = min(self._actions[0][0] if self._actions else math.inf, self.air.next_arrival())
+        moment = min(moment, self._next_from_lines())
         for drone in self.drones.values():
             if drone.node is not None:
                 moment = min(moment, drone.node.next_deadline() - drone.clock)
         return moment
+
+    def _next_from_lines(self) -> float:
+        return min((line.next_deadline() for line in self.lines.values()), default=math.inf)
 
     # Datagrams.
 
@@ -311,13 +345,21 @@ class Network:
                         drone.check_no_initiation(datagram)
                     drone.datagrams_sent[path.socket] += 1
                     drone.bytes_sent[path.socket] += len(datagram)
-                    if Endpoint(drone.name, path.socket) in self.air.absent:
+                    end = Endpoint(drone.name, path.socket)
+                    if end in self.air.absent:
                         continue
+                    line = self.lines.get(end)
+                    assert path.is_serial == (line is not None)
                     source, destination = drone.addresses[path.socket], (path.host, path.address[1])
+                    if line is not None:
+                        destination = line.addresses[line.other[end]]
                     drone.contacted.add((source, destination))
                     for listener in self.listeners:
                         listener.overhear(datagram, source, destination)
-                    self._send(datagram, source, destination)
+                    if line is None:
+                        self._send(datagram, source, destination)
+                    else:
+                        line.write(end, datagram, self.now)
                 case Deliver(peer, payload, order):
                     assert peer.name in drone.acquaintances, f"{drone.name} has removed {peer.name}"
                     assert payload
@@ -353,6 +395,11 @@ class Network:
             if endpoint.socket in drone.nat_sockets and (destination, source) not in drone.contacted:
                 continue
             path = Path(endpoint.socket, source)
+            line = self.lines.get(endpoint)
+            if line is not None:
+                path = Path(endpoint.socket, (SERIAL_HOST, 0))
+                if source != line.addresses[line.other[endpoint]]:  # an attacker on the wires
+                    self.air.disturb(endpoint, self.now)
             self.perform(drone, drone.node.receive(datagram, path, drone.local_now))
 
     def _states(self) -> str:

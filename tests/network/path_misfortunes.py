@@ -9,7 +9,12 @@ from functools import partial
 from tests.network.air import Address, Hop
 from tests.network.drone import Drone
 from tests.network.fleet import Fleet
+from tests.network.serial_line import SIK
+from uavlinkd.lab.mitm.modem import ModemSettings
 from uavlinkd.lab.mitm.radio import Bursts, RadioSettings
+
+_SHARE_OF_MODEMS = 0.5
+"""Of what befalls a serial line. The rest may befall any path."""
 
 
 class PathMisfortunes:
@@ -34,12 +39,21 @@ class PathMisfortunes:
             ("path rebinds", self._rebind),
             ("network metered", self._meter),
         )
+        self._of_lines: tuple[tuple[str, Callable[[Hop], None]], ...] = (
+            ("modems lose and alter", self._spoil_modems),
+            ("modems are sound", self._repair_modems),
+            ("noise on the line", self._make_noise),
+            ("modem pulled", self._lose_network),
+        )
 
     def befall(self, until: float) -> str:
         """Let something happen to a random path, and return its name."""
         self._until = until
-        name, befalls = self._lot.choice(self._kinds)
+        kinds = self._kinds
         hop = self._lot.choice(self._lot.choice(self._fleet.pairs).hops)
+        if hop.sender in self._network.lines and self._lot.random() < _SHARE_OF_MODEMS:
+            kinds = self._of_lines
+        name, befalls = self._lot.choice(kinds)
         self._network.note(f"{name}: {hop}")
         befalls(hop)
         return name
@@ -100,13 +114,25 @@ class PathMisfortunes:
         wanderers = [drone for drone in self._fleet.wanderers if drone.name in {end.drone for end in hop}]
         for drone in wanderers:
             for end in hop:
-                if end.drone == drone.name:
+                if end.drone == drone.name and end not in self._network.lines:
                     drone.move_socket(end.socket, random_address(self._fleet, drone))
 
     def _meter(self, hop: Hop) -> None:
         endpoint = self._lot.choice(hop)
         drone = self._network.drones[endpoint.drone]
         drone.set_metered(drone.metered_sockets ^ {endpoint.socket})
+
+    def _spoil_modems(self, hop: Hop) -> None:
+        self._network.set_modems(hop.sender, random_modems(self._fleet))
+
+    def _repair_modems(self, hop: Hop) -> None:
+        self._network.set_modems(hop.sender, SIK)
+
+    def _make_noise(self, hop: Hop) -> None:
+        """A burst of bytes, several times."""
+        count, step_s = self._lot.choice((1, 60, 600)), self._lot.choice((0.1, 0.7))
+        for step in range(10):
+            self._later(step * step_s, partial(self._network.make_noise, hop.sender, count))
 
     def _later(self, seconds: float, action: Callable[[], None]) -> None:
         """Do it after some seconds, unless the disruption is over by then."""
@@ -126,6 +152,18 @@ def random_radio(fleet: Fleet) -> RadioSettings:
         duplication=lot.choice((0.0, 0.2)),
         reordering=lot.choice((0.0, 0.1)),
         bits_per_s=lot.choice((None, None, 200_000.0)),
+    )
+
+
+def random_modems(fleet: Fleet) -> ModemSettings:
+    """Modems that damage some datagrams, or most."""
+    lot = fleet.lot
+    return replace(
+        SIK,
+        packet_loss=lot.choice((0.0, 0.05, 0.3)),
+        byte_error_rate=lot.choice((0.0, 0.0001, 0.001, 0.01)),
+        byte_loss_rate=lot.choice((0.0, 0.0, 0.001)),
+        turn_around_s=lot.choice((0.01, 0.05)),
     )
 
 

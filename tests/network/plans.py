@@ -25,6 +25,9 @@ class Plan:
     networks: tuple[int, int] = (1, 1)
     """Of a node: with more than one in the fleet, paths fail one by one, and critical frames are sent too."""
 
+    lines: float = 0.0
+    """The share of pairs that a serial line joins too."""
+
     @property
     def has_paths(self) -> bool:
         """Whether nodes may have several paths to one another."""
@@ -37,6 +40,7 @@ PLANS = (
     Plan("hours", (2, 4), (4, 12), (1200, 7200), (30, 300), (2, 8), (30.0, 60.0, 120.0), (120.0, 120.0, 900.0)),
     Plan("paths, small", (2, 4), (1, 3), (0, 10), (30, 60), (15, 30), (0.1, 0.2), (5.0, 20.0, 120.0), (1, 4)),
     Plan("paths, large", (5, 20), (1, 2), (0, 10), (20, 40), (15, 40), (1.0, 2.0), (10.0, 120.0), (1, 4)),
+    Plan("lines, small", (2, 4), (1, 3), (0, 15), (40, 80), (10, 25), (0.2, 0.5), (10.0, 30.0, 120.0), (1, 2), 0.8),
 )
-BUSY, LARGE, HOURS, PATHS, MANY_PATHS = PLANS
-WEIGHTS = (4, 1, 6, 4, 1)
+BUSY, LARGE, HOURS, PATHS, MANY_PATHS, LINES = PLANS
+WEIGHTS = (4, 1, 6, 4, 1, 3)

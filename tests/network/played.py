@@ -27,6 +27,10 @@ class Played:
     critical_sent: int = 0
     critical_judged: int = 0
     """Critical frames that must not be lost: a path delivered."""
+    critical_on_lines: int = 0
+    """Those of them for which only a serial line did."""
+    damaged: int = 0
+    """Pieces of a serial line's bytes that the framing dropped."""
     sessions: int = 0
     """As each end counts them."""
     datagrams: int = 0

@@ -12,7 +12,7 @@ import pytest
 
 from tests.network.command import main
 from tests.network.histories import play
-from tests.network.plans import BUSY, HOURS, LARGE, MANY_PATHS, PATHS, Plan
+from tests.network.plans import BUSY, HOURS, LARGE, LINES, MANY_PATHS, PATHS, Plan
 from tests.network.played import Played
 from uavlinkd.core import constants as c
 from uavlinkd.core import establish
@@ -26,6 +26,7 @@ from uavlinkd.core.peer import Peer
 from uavlinkd.core.replay import ReplayWindow
 from uavlinkd.core.session import Session
 from uavlinkd.core.settings import Class
+from uavlinkd.core.socket_facts import SocketFacts
 
 SEEDS = int(os.environ.get("UAVLINKD_CHAOS_SEEDS", "8"))
 """Number of random histories: most of them small and busy."""
@@ -60,6 +61,17 @@ def test_a_large_fleet_with_many_paths() -> None:
     assert played.critical_judged
 
 
+def test_a_serial_line_beside_another_path() -> None:
+    """Modems that lose, alter and are pulled: the line alone is enough, and damaged bytes are not delivered."""
+    total = Played()
+    for seed in range(SEEDS // 2):
+        played = play(seed, LINES)
+        _assert_sound(played)
+        total.add(played)
+    assert total.critical_on_lines > 100
+    assert total.damaged > 20
+
+
 def _assert_sound(played: Played) -> None:
     assert not played.violations, played.violations[0][1]
     assert played.judged
@@ -82,6 +94,10 @@ def _initiates_once(initiator: Initiator, now: float, *, is_metered: bool = Fals
 
 def _returns_zero(*_: Any) -> int:
     return 0
+
+
+def _leads_nowhere(facts: SocketFacts, socket: int, _peer: Any) -> bool:
+    return socket not in facts.peers_at
 
 
 _set_routes = PathSet._set_routes
@@ -114,6 +130,7 @@ PLANTS: dict[str, tuple[Any, str, Any, str, Plan]] = {
     "handshakes along one path": (PathSet, "handshake_paths", _tries_one_path, "not within", PATHS),
     "no order": (Session, "order_of", _returns_zero, "the order is unknown", PATHS),
     "order by arrival": (Session, "order_of", _counts_arrivals, "is before", PATHS),
+    "lines lead nowhere": (SocketFacts, "leads_to", _leads_nowhere, "was lost although paths", LINES),
     "slots without end": (c, "LEARNED_PATHS", 99, "learned paths of a peer", PATHS),
 }
 

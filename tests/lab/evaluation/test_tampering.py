@@ -13,6 +13,7 @@ from tests.lab.evaluation.quick_runs import run_quickly
 from uavlinkd.lab.evaluation import tampering_plan as plans
 from uavlinkd.lab.evaluation.paper_attacks import CHANGES
 from uavlinkd.lab.evaluation.tampering_bench import TamperingSettings
+from uavlinkd.lab.evaluation.tampering_line import LINE_PLANS
 from uavlinkd.lab.evaluation.tampering_paths import PATH_PLANS
 from uavlinkd.lab.evaluation.tampering_plan import HANDSHAKE, TrialPlan
 from uavlinkd.lab.evaluation.tampering_records import (
@@ -26,6 +27,7 @@ from uavlinkd.lab.evaluation.tampering_records import (
 )
 from uavlinkd.lab.mitm.attack import AttackContext
 from uavlinkd.lab.mitm.attacks import ATTACKS, parse_attack
+from uavlinkd.lab.mitm.line_attacks import LINE_ATTACKS, parse_line_attack
 
 ALL_PLANS: tuple[TrialPlan, ...] = (
     *plans.HANDSHAKE_PLANS,
@@ -51,6 +53,14 @@ def test_every_attack_of_the_registry_is_tried_also_in_a_quick_run() -> None:
         for spec in text.split()
     }
     assert tried == set(ATTACKS)
+
+
+def test_every_attack_on_the_line_is_tried_also_in_a_quick_run() -> None:
+    """A new one needs a plan too, and the modems accept each line."""
+    attacks = [parse_line_attack(text) for plan in LINE_PLANS if not plan.is_variant for text in plan.phases]
+    assert {attack.name for attack in attacks} == set(LINE_ATTACKS)
+    for plan in LINE_PLANS:
+        assert plan.names == tuple(parse_line_attack(text).name for text in plan.phases)
 
 
 @pytest.mark.parametrize("plan", ALL_PLANS, ids=lambda plan: plan.attack)
@@ -86,7 +96,7 @@ async def test_quick_run(tmp_path: Path) -> None:
 
     run = read_run(tmp_path / "tampering.jsonl")
     ours, paper = run.of(OURS), run.of(PAPER)
-    chosen = [plan for plan in ALL_PLANS if not plan.is_variant]
+    chosen = [plan for plan in (*ALL_PLANS, *LINE_PLANS) if not plan.is_variant]
     assert {trial.attack for trial in ours} >= {plan.attack for plan in chosen}
     assert len({trial.attack for trial in ours if trial.group == "keys"}) == 7
     for trial in ours:
@@ -125,6 +135,10 @@ async def test_quick_run(tmp_path: Path) -> None:
         ("sealed-cookies", "cookies_taken"),
         ("captured drone, as itself", "refused_foreign_system"),
         ("captured member", "refused_hidden_frame"),
+        ("bytes injected on the line", "line_noise"),
+        ("datagrams replayed on the line", "duplicate"),
+        ("datagrams forged on the line", "bad_tag"),
+        ("line held for 3 s and let go", "delayed"),
     ):
         assert by_name[name].reasons[reason] > 0
     (flood,) = run.floods
@@ -140,3 +154,6 @@ async def test_quick_run(tmp_path: Path) -> None:
         assert "bad_handshake" in text or "hmac_mismatch" in text
     interventions = [json.loads(line) for line in (tmp_path / "mitm-data.jsonl").read_text().splitlines()]
     assert any(line["event"] == "intervention" and line["attack"] == "bit-flip" for line in interventions)
+    on_line = [json.loads(line) for line in (tmp_path / "mitm-line.jsonl").read_text().splitlines()]
+    cuts = {line["detail"].split()[1] for line in on_line if line.get("attack") == "line-cut"}
+    assert len(cuts) >= 0.4 * by_name["line frames cut at every offset"].attempts

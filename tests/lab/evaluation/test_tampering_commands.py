@@ -11,7 +11,7 @@ from uavlinkd.cli import main
 
 
 @pytest.mark.parametrize(
-    "flags", [["--attempts-data", "0"], ["--attempts-handshake", "-1"], ["--attempts-data", "x"], []]
+    "flags", [["--attempts-data", "0"], ["--attempts-handshake", "-1"], ["--attempts-data", "x"], ["--only", "x"], []]
 )
 def test_impossible_flags_are_refused(tmp_path: Path, flags: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     """Numbers must be 1 or more, and --out is required; status 2 before a start."""

@@ -111,6 +111,16 @@ def test_attacks_on_two_paths_have_a_section(tmp_path: Path) -> None:
     assert "## Two paths" not in report(tmp_path, TRIAL, RELAY)
 
 
+def test_attacks_on_a_line_have_a_section_and_a_run_may_have_no_others(tmp_path: Path) -> None:
+    """A run of one stage lacks the relay, which every other run needs; the command says so."""
+    trial = replace(TRIAL, attack="noise", group="line", noticed={"drone0": {"line_noise": 9}})
+    text = report(tmp_path, trial, only=["line"])
+    assert "| noise | 2 s | 100 | 0 | 0 of 200 | line_noise |" in text
+    assert "--only line`" in text
+    assert "Not as expected" not in text
+    assert "Not as expected" in report(tmp_path, trial)
+
+
 def test_report_has_tables_and_figures(tmp_path: Path) -> None:
     """The figures can be parsed, and text from a trial is escaped in HTML."""
     text = report(tmp_path, TRIAL, OURS, RELAY)
