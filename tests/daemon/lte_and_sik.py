@@ -58,7 +58,7 @@ class Crew:
         self._client.clear()
         counters = SplitCounters()
         frames = split_payload(data, counters)
-        assert b"".join(frame.raw for frame in frames) == data, "bytes that are no whole frames"
+        assert b"".join(frame.raw for frame in frames) == data, "bytes that do not form whole frames"
         for frame in frames:
             if frame.raw[5] == self._other:  # others are notes of the daemon
                 self.received[frame.raw] += 1
@@ -188,7 +188,7 @@ class LteAndSik:
             await daemon.until(lambda status, peer=peer: _usable(status, peer) == count)  # type: ignore[misc]
 
     async def until_best(self, network: str | None) -> None:
-        """Wait until both ends send along this network. None: along LTE, which is none of the configured ones."""
+        """Wait until both ends send along this network. None: along LTE, which is not a `[[network]]`."""
         for daemon, peer in self.both:
             await daemon.until(lambda status, peer=peer: _best(status, peer)["network"] == network)  # type: ignore[misc]
 

@@ -244,7 +244,7 @@ class SerialNetworks:
 
     @property
     def totals(self) -> dict[str, int]:
-        """The number of damaged pieces since the start, by its name in the log. Empty if there are none."""
+        """The number of damaged pieces since the start, by its name in the log. Without such pieces: empty."""
         noise = sum(network.line.decoder.line_noise for network in self.networks)
         return {"line_noise": noise} if noise else {}
 
