@@ -70,12 +70,10 @@ class Outcome:
     """What became of critical frames in both directions."""
 
     arrived: int = 0
-    events: list[str] = field(default_factory=list)
-    """Commands and answers that did not arrive."""
-    heartbeats: list[str] = field(default_factory=list)
-    """Heartbeats that did not arrive."""
+    lost: list[str] = field(default_factory=list)
+    """Commands, answers and heartbeats that did not arrive."""
     superseded: int = 0
-    """States that the daemons dropped since their start because a newer one had arrived. A heartbeat is a state."""
+    """Heartbeats instead of which the next one arrived: a daemon drops a state if a newer one overtakes it."""
     to_waiting: int = 0
     """Frames that they lost since then because a process had to wait for a processor."""
 
@@ -214,13 +212,13 @@ class LteAndSik:
         await self.cross(3)
         outcome = Outcome()
         for (speaker, hearer), first, end in zip(self._ways, since, before, strict=True):
-            for frame in speaker.critical[first:end]:
+            for at, frame in enumerate(speaker.critical[first:end], first):
                 if frame in hearer.received:
                     outcome.arrived += 1
+                elif _message(frame) == HEARTBEAT and _next_heartbeat(speaker.critical, at) in hearer.received:
+                    outcome.superseded += 1
                 else:
-                    (outcome.heartbeats if _message(frame) == HEARTBEAT else outcome.events).append(frame.hex(" "))
-        statuses = [(await daemon.status())["peers"][peer] for daemon, peer in self.both]
-        outcome.superseded = sum(status["frames_superseded"] for status in statuses)
+                    outcome.lost.append(frame.hex(" "))
         outcome.to_waiting = await self._lost_to_waiting()
         return outcome
 
@@ -246,6 +244,10 @@ class LteAndSik:
 
 def _message(frame: bytes) -> int:
     return int.from_bytes(frame[7:10], "little")
+
+
+def _next_heartbeat(frames: list[bytes], at: int) -> bytes | None:
+    return next((frame for frame in frames[at + 1 :] if _message(frame) == HEARTBEAT), None)
 
 
 def _usable(status: Status, peer: str) -> int:
