@@ -4,7 +4,16 @@ from __future__ import annotations
 
 import pytest
 
-from uavlinkd.link.line_rate import GROWTH, LATER_S, LEAST_SHARE, SHORTEST_OF_S, LineRate
+from uavlinkd.link.line_rate import (
+    GROWTH,
+    LATER_S,
+    LEAST_SHARE,
+    SHARE_AFTER,
+    SHARE_UNANSWERED,
+    SHORTEST_OF_S,
+    UNANSWERED,
+    LineRate,
+)
 
 FULL = 9_600.0
 ENVELOPE = 300
@@ -70,3 +79,25 @@ def test_a_day_without_a_look_grows_to_the_full_rate() -> None:
     rate.add_round_trip(0.2, 0.0)
     assert rate.add_round_trip(5.0, 5.0)
     assert rate.bits_s(86_400.0) == FULL
+
+
+def test_questions_without_answers_lower_the_rate_until_one_is_answered() -> None:
+    """The queue may be longer than answers may take. After the answer the rate grows from half of the full one."""
+    rate = LineRate(FULL, ENVELOPE, 0.0)
+    rate.add_round_trip(0.2, 0.0)
+    rate.add_unanswered(UNANSWERED - 1, 10.0)
+    assert rate.bits_s(10.0) == FULL
+    rate.add_unanswered(1, 11.0)
+    assert rate.bits_s(11.0) == rate.bits_s(100.0) == FULL * SHARE_UNANSWERED
+    rate.add_round_trip(0.2, 101.0)
+    assert rate.bits_s(101.0) == FULL * SHARE_AFTER
+    assert rate.bits_s(102.0) == pytest.approx(FULL * SHARE_AFTER * GROWTH)
+
+
+def test_questions_that_the_radio_lost_do_not_lower_the_rate() -> None:
+    """Answers come between them."""
+    rate = LineRate(FULL, ENVELOPE, 0.0)
+    for at in range(50):
+        rate.add_unanswered(UNANSWERED - 1, at)
+        rate.add_round_trip(0.2, at + 0.5)
+    assert rate.bits_s(50.0) == FULL

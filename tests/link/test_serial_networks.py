@@ -21,6 +21,7 @@ from uavlinkd.endpoints.url import SerialUrl
 from uavlinkd.link import serial_networks
 from uavlinkd.link.conditions import LINES_BURST, LINES_PER_S
 from uavlinkd.link.line_causes import line_findings
+from uavlinkd.link.line_rate import SHARE_UNANSWERED, UNANSWERED
 from uavlinkd.link.network_budgets import NetworkBudget, budgets_of, follow_rates, wire_bytes
 from uavlinkd.link.serial_networks import NOISE_PIECES, SerialNetworks
 from uavlinkd.mavlink.egress.bucket import Bucket, Supply
@@ -99,7 +100,8 @@ async def test_late_answers_lower_the_budget_of_the_network(serial: SerialNetwor
     assert budgets[NUMBER].all.rate == BITS_S / 8
     assert budgets[NUMBER].all.burst == pytest.approx(300, abs=5)
     state = SimpleNamespace(path=serial.path_to("sik"), round_trip_s=0.2, answered_at=now)
-    links = cast(Any, [SimpleNamespace(peer=SimpleNamespace(paths=SimpleNamespace(states=[state])))])
+    traffic, paths = SimpleNamespace(echoes_unanswered=0), SimpleNamespace(states=[state], best=state)
+    links = cast(Any, [SimpleNamespace(peer=SimpleNamespace(paths=paths, traffic=traffic))])
     assert follow_rates(serial, budgets, links, now) == {}
     state.round_trip_s, state.answered_at = 5.0, now + 6
     for rates in ({NUMBER: BITS_S / 2}, {}):
@@ -118,6 +120,24 @@ def test_core_gets_a_quarter_of_the_budget_at_least() -> None:
     assert budget.update_core(BITS_S / 16)
     assert budget.core_bits_s == BITS_S / 4
     assert not budget.update_core(BITS_S / 8)
+
+
+async def test_unanswered_questions_lower_the_budget_of_the_best_path(serial: SerialNetworks) -> None:
+    """Those along another path do not count, nor does a total that begins again."""
+    now = monotonic()
+    budgets = budgets_of(None, serial, now)
+    state = SimpleNamespace(path=serial.path_to("sik"), round_trip_s=None, answered_at=0.0)
+    traffic, paths = SimpleNamespace(echoes_unanswered=0), SimpleNamespace(states=[state], best=None)
+    links = cast(Any, [SimpleNamespace(peer=SimpleNamespace(paths=paths, traffic=traffic))])
+    for total, best, share in (
+        (50, None, 1.0),
+        (UNANSWERED - 1, state, 1.0),
+        (2 * UNANSWERED - 2, state, 1.0),
+        (2 * UNANSWERED - 1, state, SHARE_UNANSWERED),
+    ):
+        traffic.echoes_unanswered, paths.best = total, best
+        follow_rates(serial, budgets, links, now)
+        assert budgets[NUMBER].all.rate == share * BITS_S / 8
 
 
 async def test_findings_about_modem_and_noise(serial: SerialNetworks) -> None:

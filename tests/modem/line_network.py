@@ -5,6 +5,7 @@ The left end is ``alpha``, the right one ``bravo``. Each has the other's line in
 
 from __future__ import annotations
 
+from collections import Counter
 from random import Random
 from typing import Final
 
@@ -44,6 +45,7 @@ class LineNetwork(Network):
             end.link.set_paths([LINE], 0.0)
         self.rates = {end: LineRate(budget_bits_s, limit + LINE_BYTES, 0.0) for end in self._end_of}
         """How fast each end sends, by the round trips of its probes."""
+        self._answered_at, self._unanswered = dict.fromkeys(self.rates, 0.0), Counter[End]()
         self._rates_at = 1.0
 
     def transmit(self, sender: End, datagram: bytes, path: Path) -> None:
@@ -73,8 +75,11 @@ class LineNetwork(Network):
         self._rates_at = self.now + 1.0
         for end, rate in self.rates.items():
             for state in end.peer.paths.states:
-                if state.round_trip_s is not None:
+                if state.round_trip_s is not None and state.answered_at > self._answered_at[end]:
+                    self._answered_at[end] = state.answered_at
                     rate.add_round_trip(state.round_trip_s, state.answered_at)
+            unanswered, self._unanswered[end] = self._unanswered[end], end.peer.traffic.echoes_unanswered
+            rate.add_unanswered(self._unanswered[end] - unanswered, self.now)
             budget, bits_s = end.budgets[LINE.socket], rate.bits_s(self.now)
             budget.set_rate(bits_s, self.now)
             if budget.update_core(bits_s):

@@ -8,10 +8,11 @@ from pathlib import Path
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from tests.modem import command
+from tests.modem import command, line_network
 from tests.modem.line_network import LineNetwork
 from tests.modem.measure import on_bare_line, through_daemons
 from tests.modem.offered import STATION, VEHICLE, Arrivals, Offered, offered
+from uavlinkd.config.serial_rules import SENDING_SHARE
 from uavlinkd.core.settings import Link
 from uavlinkd.lab.mitm.line_attacks import LINE_ATTACKS, parse_line_attack
 from uavlinkd.lab.mitm.modem import ModemEnd, ModemSettings
@@ -88,6 +89,13 @@ def test_all_critical_frames_arrive_under_load() -> None:
     assert (result.lost_in_queue, result.foreign) == (0, 0)
     assert result.oldest_s < OLDEST_S
     assert result.delivered_s > 15
+
+
+def test_radio_that_carries_half_of_what_the_file_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Answers come too late to be accepted; the rate falls nevertheless. Otherwise 4 % arrive at this load."""
+    monkeypatch.setattr(line_network, "SENDING_SHARE", 2 * SENDING_SHARE)
+    result = through_daemons(command.SLOW, 120, command.factor_of(command.SLOW, 2))
+    assert min(result.critical_vehicle, result.critical_station) > 0.4
 
 
 def test_most_bytes_are_frames() -> None:

@@ -86,7 +86,7 @@ def budgets_of(networks: Networks | None, serial: SerialNetworks, now: float) ->
 def follow_rates(
     serial: SerialNetworks, budgets: Mapping[int, NetworkBudget], links: Iterable[PathsOwner], now: float
 ) -> dict[int, float]:
-    """Adapt the budgets of serial networks to the round trips along them. Call it once a second.
+    """Adapt the budgets of serial networks to the answers along them. Call it once a second.
 
     Returns the rates for the core, by the number of the socket, if one of them has changed.
     """
@@ -94,9 +94,12 @@ def follow_rates(
         return {}
     for link in links:
         for state in link.peer.paths.states:
-            line = serial.of_number.get(state.path.socket)
-            if line is not None and state.round_trip_s is not None:
+            if (line := serial.of_number.get(state.path.socket)) is None:
+                continue
+            if state.round_trip_s is not None:
                 line.add_round_trip(state.round_trip_s, state.answered_at)
+            unanswered = link.peer.traffic.echoes_unanswered
+            line.add_unanswered(unanswered, now, is_best=state is link.peer.paths.best)
     has_changed = False
     for line in serial.networks:
         budget, bits_s = budgets[line.number], line.bits_s(now)

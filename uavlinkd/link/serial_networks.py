@@ -70,6 +70,7 @@ class SerialNetwork:
         self._states = states
         self._log = NetworkLog(config.name, limits, log)
         self._answered_at = 0.0
+        self._unanswered = 0
         self._seconds = deque[tuple[int, int, int]](maxlen=RECENT_S + 1)  # totals, one for each second
         # Imported only if configured: a daemon on UDP starts faster and stays smaller.
         from uavlinkd.endpoints.serial_line import SerialLine  # noqa: PLC0415
@@ -121,6 +122,12 @@ class SerialNetwork:
         if answered_at > self._answered_at:
             self._answered_at = answered_at
             self.rate.add_round_trip(round_trip_s, answered_at)
+
+    def add_unanswered(self, total: int, now: float, *, is_best: bool) -> None:
+        """Note the total of the peer's unanswered echo requests, which go along the best path."""
+        if is_best and total > self._unanswered:
+            self.rate.add_unanswered(total - self._unanswered, now)
+        self._unanswered = total
 
     def bits_s(self, now: float) -> float:
         """The rate at which this end sends now. The line is written at it from now on."""
