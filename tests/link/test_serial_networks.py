@@ -99,7 +99,7 @@ async def test_late_answers_lower_the_budget_of_the_network(serial: SerialNetwor
     budgets = budgets_of(None, serial, now)
     assert budgets[NUMBER].all.rate == BITS_S / 8
     assert budgets[NUMBER].all.burst == pytest.approx(300, abs=5)
-    state = SimpleNamespace(path=serial.path_to("sik"), round_trip_s=0.2, answered_at=now)
+    state = SimpleNamespace(path=serial.path_to("sik"), round_trip_s=0.2, answered_at=now, is_off=False)
     traffic, paths = SimpleNamespace(echoes_unanswered=0), SimpleNamespace(states=[state], best=state)
     links = cast(Any, [SimpleNamespace(peer=SimpleNamespace(paths=paths, traffic=traffic))])
     assert follow_rates(serial, budgets, links, now) == {}
@@ -123,19 +123,20 @@ def test_core_gets_a_quarter_of_the_budget_at_least() -> None:
 
 
 async def test_unanswered_questions_lower_the_budget_of_the_best_path(serial: SerialNetworks) -> None:
-    """Those along another path do not count, nor does a total that begins again."""
+    """Those along another path do not count, nor while the device is absent, nor does a total that begins again."""
     now = monotonic()
     budgets = budgets_of(None, serial, now)
-    state = SimpleNamespace(path=serial.path_to("sik"), round_trip_s=None, answered_at=0.0)
+    state = SimpleNamespace(path=serial.path_to("sik"), round_trip_s=None, answered_at=0.0, is_off=False)
     traffic, paths = SimpleNamespace(echoes_unanswered=0), SimpleNamespace(states=[state], best=None)
     links = cast(Any, [SimpleNamespace(peer=SimpleNamespace(paths=paths, traffic=traffic))])
     for total, best, share in (
+        (40, "off", 1.0),
         (50, None, 1.0),
         (UNANSWERED - 1, state, 1.0),
         (2 * UNANSWERED - 2, state, 1.0),
         (2 * UNANSWERED - 1, state, SHARE_UNANSWERED),
     ):
-        traffic.echoes_unanswered, paths.best = total, best
+        traffic.echoes_unanswered, paths.best, state.is_off = total, state if best == "off" else best, best == "off"
         follow_rates(serial, budgets, links, now)
         assert budgets[NUMBER].all.rate == share * BITS_S / 8
 

@@ -79,7 +79,8 @@ class LineNetwork(Network):
                     self._answered_at[end] = state.answered_at
                     rate.add_round_trip(state.round_trip_s, state.answered_at)
             unanswered, self._unanswered[end] = self._unanswered[end], end.peer.traffic.echoes_unanswered
-            rate.add_unanswered(self._unanswered[end] - unanswered, self.now)
+            if not end.peer.paths.states[0].is_off:
+                rate.add_unanswered(self._unanswered[end] - unanswered, self.now)
             budget, bits_s = end.budgets[LINE.socket], rate.bits_s(self.now)
             budget.set_rate(bits_s, self.now)
             if budget.update_core(bits_s):

@@ -99,7 +99,8 @@ def follow_rates(
             if state.round_trip_s is not None:
                 line.add_round_trip(state.round_trip_s, state.answered_at)
             unanswered = link.peer.traffic.echoes_unanswered
-            line.add_unanswered(unanswered, now, is_best=state is link.peer.paths.best)
+            is_asked = state is link.peer.paths.best and not state.is_off
+            line.add_unanswered(unanswered, now, is_asked=is_asked)
     has_changed = False
     for line in serial.networks:
         budget, bits_s = budgets[line.number], line.bits_s(now)

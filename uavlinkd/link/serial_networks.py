@@ -123,9 +123,9 @@ class SerialNetwork:
             self._answered_at = answered_at
             self.rate.add_round_trip(round_trip_s, answered_at)
 
-    def add_unanswered(self, total: int, now: float, *, is_best: bool) -> None:
-        """Note the total of the peer's unanswered echo requests, which go along the best path."""
-        if is_best and total > self._unanswered:
+    def add_unanswered(self, total: int, now: float, *, is_asked: bool) -> None:
+        """Note the total of the peer's unanswered echo requests. ``is_asked``: they went along this line."""
+        if is_asked and total > self._unanswered:
             self.rate.add_unanswered(total - self._unanswered, now)
         self._unanswered = total
 
