@@ -74,6 +74,20 @@ async def test_absent_device_is_reported(serial: SerialNetworks, states: SocketS
     assert (status["is_present"], status["addresses"]) == (False, [])
 
 
+async def test_change_is_due_at_once(
+    serial: SerialNetworks, states: SocketStateLog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The daemon sets its timer after the core knows: else the first try waits for the housekeeping, up to 1 s."""
+    known = list[list[tuple[int, bool]]]()
+    monkeypatch.setattr(SerialLine, "start", lambda line: None)
+    serial.start(lambda: known.append(list(states.states)))
+    (network,), is_open = serial.networks, [False]
+    monkeypatch.setattr(SerialLine, "is_open", property(lambda line: is_open[0]))
+    for is_open[0] in (True, False):
+        network.report_state(is_change=True)
+    assert known == [[(NUMBER, True)], [(NUMBER, True), (NUMBER, False)]]
+
+
 async def test_flapping_device_cannot_fill_the_log(serial: SerialNetworks, monkeypatch: pytest.MonkeyPatch) -> None:
     """The lines are limited, and the log ends with the state of the device."""
     now, is_open = [monotonic()], [False]

@@ -212,7 +212,7 @@ class PeerSockets:
         self._on_change = on_change
         for slot in self._slots:
             self._read(slot)
-        self.serial.start()
+        self.serial.start(on_change)
         if self.networks is not None:
             self.check_networks()
 

@@ -6,7 +6,7 @@ Each has one socket number, and one path: to the peer at the other end of the li
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Final, Protocol
 
@@ -69,6 +69,7 @@ class SerialNetwork:
         self._receive = receive
         self._states = states
         self._log = NetworkLog(config.name, limits, log)
+        self._on_change: Callable[[], None] = lambda: None
         self._answered_at = 0.0
         self._unanswered = 0
         self._seconds = deque[tuple[int, int, int]](maxlen=RECENT_S + 1)  # totals, one for each second
@@ -89,6 +90,11 @@ class SerialNetwork:
         """Its name in the configuration."""
         return self.config.name
 
+    def start(self, on_change: Callable[[], None]) -> None:
+        """Open the device, whenever it is present. ``on_change`` is called after a change was reported to the core."""
+        self._on_change = on_change
+        self.line.start()
+
     def send(self, datagram: bytes, _address: SocketAddress) -> int:
         """As a socket's ``sendto``."""
         self.line.send(datagram)
@@ -105,6 +111,7 @@ class SerialNetwork:
             self._states.set_socket_state(self.number, now, is_up=is_open)
         if is_change:
             self._note(now)
+            self._on_change()
 
     def do_housekeeping(self) -> None:
         """Note what was received. Write to the log what it does not say yet about the device."""
@@ -229,10 +236,10 @@ class SerialNetworks:
             for network in self.networks
         }
 
-    def start(self) -> None:
-        """Open the devices, whenever they are present."""
+    def start(self, on_change: Callable[[], None]) -> None:
+        """Open the devices, whenever they are present. ``on_change``: see :meth:`SerialNetwork.start`."""
         for network in self.networks:
-            network.line.start()
+            network.start(on_change)
 
     def report_absent(self) -> None:
         """Report the devices that are not open. Call it after other paths were set: the core knows states by path."""
