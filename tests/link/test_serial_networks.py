@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 from pathlib import Path as FilePath
 from types import SimpleNamespace
 from typing import Any, cast
+from unittest.mock import patch
 
 import pytest
 import structlog
@@ -12,10 +14,12 @@ from structlog.testing import capture_logs
 
 from tests.endpoints.test_line_framing import report
 from tests.link.socket_states import SocketStateLog
+from tests.waiting import until
 from uavlinkd.config import NetworkConfig, PeerAddress
 from uavlinkd.config.model import SERIAL
 from uavlinkd.core.constants import LINE_BYTES
 from uavlinkd.core.path import Path
+from uavlinkd.endpoints import serial_line
 from uavlinkd.endpoints.serial_line import SerialLine
 from uavlinkd.endpoints.url import SerialUrl
 from uavlinkd.link import serial_networks
@@ -23,7 +27,7 @@ from uavlinkd.link.conditions import LINES_BURST, LINES_PER_S
 from uavlinkd.link.line_causes import line_findings
 from uavlinkd.link.line_rate import SHARE_UNANSWERED, UNANSWERED
 from uavlinkd.link.network_budgets import NetworkBudget, budgets_of, follow_rates, wire_bytes
-from uavlinkd.link.serial_networks import NOISE_PIECES, SerialNetworks
+from uavlinkd.link.serial_networks import NOISE_PIECES, PLUG_IN, SerialNetworks
 from uavlinkd.mavlink.egress.bucket import Bucket, Supply
 from uavlinkd.ops.causes import Cause
 from uavlinkd.system.clock import monotonic
@@ -68,10 +72,29 @@ async def test_absent_device_is_reported(serial: SerialNetworks, states: SocketS
         serial.do_housekeeping()
     assert states.states == [(NUMBER, False)]
     assert [line["event"] for line in logs] == ["network_not_here_yet"]
-    (absent,) = serial.absent()
+    ((absent, remedy),) = serial.absent().items()
     assert absent.startswith("sik (")
+    assert remedy == PLUG_IN
     status = serial.networks[0].status(monotonic())
     assert (status["is_present"], status["addresses"]) == (False, [])
+
+
+@pytest.mark.parametrize(
+    ("error", "remedy"),
+    [("EACCES", "dialout"), ("EBUSY", "ModemManager"), ("ENOENT", "plug it in"), ("ENOTTY", "name")],
+)
+async def test_remedy_names_what_keeps_the_device_closed(serial: SerialNetworks, error: str, remedy: str) -> None:
+    """A missing permission, and another process that has the device, are not mended by the plug."""
+    line = serial.networks[0].line
+    with patch.object(serial_line, "open_device", side_effect=OSError(getattr(errno, error), "")):
+        line.start()
+        try:
+            await until(lambda: bool(line.failures))
+        finally:
+            line.close()
+    ((absent, text),) = serial.absent().items()
+    assert absent == f"sik ({line.url.device} cannot be opened ({error}))"
+    assert remedy in text
 
 
 async def test_change_is_due_at_once(

@@ -81,6 +81,8 @@ class SerialLine:
         """Failures to open it, lost connections and dropped datagrams, by the name of the error."""
         self.reason = "it was not opened yet"
         """Why it is not open."""
+        self.error = ""
+        """The name of the error behind that."""
         self.uses_cts = False
         """Whether the modem can stop this end by the CTS wire."""
         self.cts = CtsHold()
@@ -208,8 +210,9 @@ class SerialLine:
             try:
                 device, self.uses_cts = await self._thread.run(self._open_device)
             except OSError as error:
-                self.reason = f"{self.url.device} cannot be opened ({failure_name(error)})"
-                self.failures[failure_name(error)] += 1
+                self.error = failure_name(error)
+                self.reason = f"{self.url.device} cannot be opened ({self.error})"
+                self.failures[self.error] += 1
             else:
                 self._lost.clear()
                 self._attach(device, epoch)
@@ -266,6 +269,7 @@ class SerialLine:
 
     def _lose(self, reason: str) -> None:
         """The device is gone."""
+        self.error = reason
         self.failures[reason] += 1
         self._ignores_cts = reason == CTS_STUCK
         self._detach(f"{self.url.device} was lost ({reason})")

@@ -96,7 +96,7 @@ def _of_daemon(daemon: Diagnosed, now: float) -> Iterator[Finding]:
         missing = _about(
             Cause.NETWORK_ABSENT,
             f"no peer is reached along {'; '.join(gone)}",
-            "plug the modem in, or bring the interface up (`ip -brief address`): the daemon uses it within a second",
+            "; ".join(dict.fromkeys(gone.values())),
         )
         yield _harmless_if_up(daemon, missing)
     if (raw := daemon.evidence.seen_anywhere(DropReason.RAW_MAVLINK, now)) is not None and raw.address is not None:

@@ -27,6 +27,9 @@ from uavlinkd.link.conditions import LineLimits
 from uavlinkd.link.network_log import NetworkLog
 from uavlinkd.system.addresses import Address
 
+BRING_UP: Final = (
+    "plug the modem in, or bring the interface up (`ip -brief address`): the daemon uses it within a second"
+)
 _WILDCARDS: Final = {socket.AF_INET: "0.0.0.0", socket.AF_INET6: "::"}
 
 
@@ -200,9 +203,13 @@ class Networks:
         one.port = sock.getsockname()[1]
         self._holder.put(one.number, sock)
 
-    def absent(self) -> list[str]:
-        """The networks that are absent now, each with the reason."""
-        return [f"{network.name} ({network.presence.reason})" for network in self.networks if not network.is_present]
+    def absent(self) -> dict[str, str]:
+        """The networks that are absent now, each with the reason, and what a person can do."""
+        return {
+            f"{network.name} ({network.presence.reason})": BRING_UP
+            for network in self.networks
+            if not network.is_present
+        }
 
     def status(self) -> dict[str, object]:
         """Each network by name, as plain values."""

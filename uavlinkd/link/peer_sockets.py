@@ -149,9 +149,9 @@ class PeerSockets:
             return line.name
         return None if self.networks is None else self.networks.network_of(number).name
 
-    def absent_networks(self) -> list[str]:
-        """The networks that are absent now, each with the reason."""
-        return [*([] if self.networks is None else self.networks.absent()), *self.serial.absent()]
+    def absent_networks(self) -> dict[str, str]:
+        """The networks that are absent now, each with the reason, and what a person can do."""
+        return {**({} if self.networks is None else self.networks.absent()), **self.serial.absent()}
 
     def network_status(self, now: float) -> dict[str, object]:
         """Each network by name, as plain values."""

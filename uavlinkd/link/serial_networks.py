@@ -24,6 +24,7 @@ from uavlinkd.link.line_rate import LineRate
 from uavlinkd.link.network_log import NetworkLog
 from uavlinkd.link.networks import SocketStates
 from uavlinkd.system.clock import monotonic
+from uavlinkd.system.error_meanings import meaning_of
 from uavlinkd.system.stall import StallWatch
 
 RECENT_S: Final = 10
@@ -31,6 +32,7 @@ RECENT_S: Final = 10
 NOISE_PIECES: Final = 10
 """Damaged pieces in :data:`RECENT_S` that are reported, if they are more than :data:`NOISE_SHARE` of all."""
 NOISE_SHARE: Final = 0.1
+PLUG_IN: Final = "plug the modem in: the daemon uses it within a second"
 
 
 class Receive(Protocol):
@@ -91,7 +93,7 @@ class SerialNetwork:
         return self.config.name
 
     def start(self, on_change: Callable[[], None]) -> None:
-        """Open the device, whenever it is present. ``on_change`` is called after a change was reported to the core."""
+        """Open the device, whenever it is present. ``on_change`` is called after the core got a change."""
         self._on_change = on_change
         self.line.start()
 
@@ -262,6 +264,7 @@ class SerialNetworks:
         noise = sum(network.line.decoder.line_noise for network in self.networks)
         return {"line_noise": noise} if noise else {}
 
-    def absent(self) -> list[str]:
-        """The serial networks that are absent now, each with the reason."""
-        return [f"{network.name} ({network.line.reason})" for network in self.networks if not network.line.is_open]
+    def absent(self) -> dict[str, str]:
+        """The serial networks that are absent now, each with the reason, and what a person can do."""
+        lines = {network.name: network.line for network in self.networks if not network.line.is_open}
+        return {f"{name} ({line.reason})": meaning_of(line.error) or PLUG_IN for name, line in lines.items()}

@@ -42,6 +42,7 @@ ERROR_MEANINGS: Final[Mapping[str, str]] = {
     "EIO": "the device does not work: it was unplugged, or is broken",
     "EACCES": "this user has no permission: for a serial device, add the user to its group, often dialout",
     "EBUSY": "another process has the device: end it (`fuser -v DEVICE` names it), often ModemManager",
+    "ENOTTY": "it is not a serial device: name one, such as /dev/ttyUSB0",
     "ENOSPC": "no space is left on the disk: delete files, or set min_free_bytes lower",
     "EDQUOT": "the user's quota on the disk is used up",
     "EROFS": "the file system is mounted read-only: after an error, check it with fsck",
