@@ -29,11 +29,12 @@ def lacks(tmp_path: Path) -> Lacks:
         listen: str = "", url: str = "", address: str = "127.0.0.1:9", more: str = "", control: str = ""
     ) -> list[str]:
         path = tmp_path / "drone0.toml"
+        where = f'"{address}"' if ":" in address else f'{{ network = "{address}" }}'
         path.write_text(
             f'name = "drone0"\nprivate_key_file = "drone0.key"\ncontrol_socket = "{control or "/tmp/drone0.sock"}"\n'
             f'listen = ["{listen or f"127.0.0.1:{free_port()}"}"]\n{more}'
             f'[[endpoint]]\nname = "autopilot"\nurl = "{url or f"udpin:127.0.0.1:{free_port()}"}"\n'
-            f'[[peer]]\nname = "drone1"\npublic_key = "{public}"\naddresses = ["{address}"]\n'
+            f'[[peer]]\nname = "drone1"\npublic_key = "{public}"\naddresses = [{where}]\n'
             'role = "vehicle"\nsystem_ids = [2]\n'
         )
         return surroundings.lacks(load_config(path, {}))
@@ -108,6 +109,14 @@ def test_serial_devices(lacks: Lacks, tmp_path: Path) -> None:
     (line,) = lacks(url=f"serial:{tmp_path}/file:57600")
     assert "is not a serial device" in line
     assert lacks(url="serial:/dev/ptmx:57600") == []
+
+
+def test_device_with_two_names(lacks: Lacks, tmp_path: Path) -> None:
+    """A name below /dev/serial/by-id, and that of the kernel."""
+    (tmp_path / "by-id").symlink_to("/dev/ptmx")
+    named = f'[[network]]\nname = "sik"\nserial = "{tmp_path}/by-id:57600"\n'
+    (line,) = lacks(url="serial:/dev/ptmx:57600", more=named, address="sik")
+    assert line.startswith(f'network "sik": {tmp_path}/by-id is the device of endpoint "autopilot" too')
 
 
 def test_device_without_permission(lacks: Lacks, monkeypatch: pytest.MonkeyPatch) -> None:

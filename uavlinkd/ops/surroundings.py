@@ -49,6 +49,7 @@ def lacks(config: Config, answers: Answers | None = None) -> list[str]:
     running = config.control_socket is not None and is_served(config.control_socket)
     return [
         *_serial(config),
+        *_shared_devices(config),
         *_addresses(config),
         *(() if running else _ports(config)),
         *_names(config, look_up_names(config) if answers is None else answers),
@@ -201,12 +202,27 @@ def _names(config: Config, answers: Answers) -> Iterator[str]:
 
 
 def _serial(config: Config) -> Iterator[str]:
+    for user, url in _serial_users(config):
+        if why := _serial_problem(Path(url.device)):
+            yield f"{user}: {url.device} {why}"
+
+
+def _shared_devices(config: Config) -> Iterator[str]:
+    """A device that has two names in the file, as those below /dev/serial/by-id. The file itself cannot show that."""
+    users: dict[str, str] = {}
+    for user, url in _serial_users(config):
+        other = users.setdefault(os.path.realpath(url.device), user)
+        if other != user:
+            yield f"{user}: {url.device} is the device of {other} too, and only one can open it: write another"
+
+
+def _serial_users(config: Config) -> Iterator[tuple[str, SerialUrl]]:
     for endpoint in config.endpoints:
-        if isinstance(endpoint.url, SerialUrl) and (why := _serial_problem(Path(endpoint.url.device))):
-            yield f'endpoint "{endpoint.name}": {endpoint.url.device} {why}'
+        if isinstance(endpoint.url, SerialUrl):
+            yield f'endpoint "{endpoint.name}"', endpoint.url
     for network in config.networks:
-        if network.serial is not None and (why := _serial_problem(Path(network.serial.device))):
-            yield f'network "{network.name}": {network.serial.device} {why}'
+        if network.serial is not None:
+            yield f'network "{network.name}"', network.serial
 
 
 def _serial_problem(path: Path) -> str | None:
