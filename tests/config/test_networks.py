@@ -306,6 +306,7 @@ def test_rate_of_the_radio(load: Load, baud: int, written: str, air: int, sent: 
         (_SIK + "budget_bits_s = 4000\n", _BY_SIK, "network[0].budget_bits_s (sik)", "write air_bits_s"),
         (_SIK + 'interface = "wwan0"\n', _BY_SIK, "network[0].serial (sik)", "write two networks"),
         (_SIK + 'address = "10.0.0.5"\n', _BY_SIK, "network[0].serial (sik)", "write two networks"),
+        (_SIK, '["sik"]', "peer[0].addresses[0] (drone1)", 'end of a serial network is { network = "sik" }'),
         (_SIK, "[]", "network[0].serial (sik)", 'addresses = [{ network = "sik" }]'),
         (_SIK + _LTE, '[{ network = "lte" }]', "peer[0].addresses (drone1)", "or the serial network"),
         (_SIK, '[{ address = "10.0.0.9:1", network = "sik" }]', "peer[0].addresses (drone1)", "has no addresses"),

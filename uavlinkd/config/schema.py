@@ -26,7 +26,7 @@ from uavlinkd.core.crypto import is_usable_public_key
 from uavlinkd.core.suites import SUITES_BY_NAME, X25519, Suite
 from uavlinkd.endpoints.url import EndpointUrl, SerialUrl, parse_line, parse_url
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
-from uavlinkd.system.addresses import Address, parse_address
+from uavlinkd.system.addresses import Address, AddressError, parse_address
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}")
 _INTERFACE = re.compile(r"[^\s/:]{1,15}")  # as dev_valid_name() of Linux
@@ -136,7 +136,14 @@ def _peer_address(value: Any) -> PeerAddress:
                 " for a serial network"
             )
         text, network = value["address"], _name(value["network"])
-    address = parse_address(_text(text), allow_names=True)
+    try:
+        address = parse_address(_text(text), allow_names=True)
+    except AddressError as error:
+        if network or {".", ":"} & set(text):
+            raise
+        raise ValueError(
+            f'{error}. The other end of a serial network is {{ network = "sik" }}, with its name'
+        ) from None
     if address.is_wildcard:
         raise ValueError('is every address of this machine: write the peer\'s own, such as "10.13.0.2:5790"')
     return PeerAddress(address, network)
