@@ -20,7 +20,7 @@ from tests.link.test_switch import Client
 from tests.network.network import Drone, Network
 from tests.policies import TRUSTED
 from uavlinkd.config import PeerConfig
-from uavlinkd.core.outputs import Deliver, Dropped, Output, Transmit
+from uavlinkd.core.outputs import Deliver, Dropped, Output, RecordReceived, Transmit
 from uavlinkd.lab.mitm.radio import RadioSettings
 from uavlinkd.link.conditions import HOUR_S, LineLimits
 from uavlinkd.link.drop_summary import DropSummary
@@ -68,7 +68,7 @@ class LoggedDaemon:
         for output in outputs:
             if isinstance(output, Dropped):
                 self.drops.add_dropped(output, now)
-            elif not isinstance(output, Transmit | Deliver):
+            elif not isinstance(output, Transmit | Deliver | RecordReceived):
                 self.events.write(output, now)
 
     def tick(self, now: float) -> None:

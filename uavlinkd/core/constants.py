@@ -37,6 +37,9 @@ SHORT_COUNTER_LIMIT = 2**16
 """Counters below this travel in two bytes, others in four; either in the other's form is refused."""
 FEATURE_REFUSALS = 1
 """Bit of the parameters' features: the sender understands refusal reports. Both ends must set it."""
+FEATURE_RECORDS = 2
+"""The same for the records between a member and its relay."""
+KNOWN_FEATURES = FEATURE_REFUSALS | FEATURE_RECORDS
 REFUSALS_PER_REPORT = 16
 """Entries of a refusal report at most: with 161 bytes it fits the smallest envelope."""
 
@@ -325,3 +328,20 @@ MAX_ENVELOPE_LIMIT = 65000
 """Largest limit on an envelope: under what a UDP datagram over IPv4 holds (65,507)."""
 DEFAULT_ENVELOPE_LIMIT = 1232
 """1,280 (least MTU of IPv6, RFC 8200 section 5) less 40 and 8 bytes of IPv6 and UDP header."""
+
+# Relays. README.md, section 21.
+RELAY_BYTES = 3
+"""What a relay adds to a datagram: type and handle."""
+KEYS_PER_BIND = 16
+ENTRIES_PER_BOUND = 32
+"""1,126 bytes of record: with everything around it, it fits an MTU of 1,280 bytes."""
+HANDLES_PER_PAIR = 4
+"""Two networks at each end, so that copies along both are possible whichever of them works."""
+HANDLE_QUARANTINE_S = 600.0
+"""A handle is not given to the same member again for so long: longer than any session lasts."""
+BIND_LIFETIME_S = 60.0
+"""A wish ends after this: two repeated binds may be lost."""
+BIND_INTERVAL_S = 20.0
+BIND_WAITING_S = 5.0
+"""The relay reports a change by itself; this is for reports that were lost."""
+BIND_RETRY_S = 1.0

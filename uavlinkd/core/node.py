@@ -22,8 +22,9 @@ from uavlinkd.core.outputs import Deliver, Dropped, Output
 from uavlinkd.core.path import Path, SocketAddress
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.receive import receive_envelope
+from uavlinkd.core.records import Record
 from uavlinkd.core.refusals import Refused
-from uavlinkd.core.send import note_repeat, recount, report_refusals, send_frames
+from uavlinkd.core.send import note_repeat, recount, report_refusals, send_frames, send_record
 from uavlinkd.core.session import Session
 from uavlinkd.core.settings import Class, PeerSettings, Screen, hold_all
 from uavlinkd.core.socket_facts import SocketFacts
@@ -206,6 +207,10 @@ class Node:
     def report_refusals(self, peer: Peer, changed: Iterable[Refused], now: float) -> list[Output]:
         """Report to the peer which of its frames are refused here: totals that changed since the last call."""
         return report_refusals(peer, changed, now)
+
+    def send_record(self, peer: Peer, path: Path, record: Record, now: float) -> list[Output]:
+        """Send a record to a relay or to a member, along one path, which works; otherwise nothing is sent."""
+        return send_record(peer, path, record, now)
 
     def receive(self, datagram: bytes, path: Path, now: float) -> list[Output]:
         """What to do about a datagram. Never raises, whatever the bytes."""

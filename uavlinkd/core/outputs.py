@@ -6,6 +6,7 @@ from typing import NamedTuple, Protocol
 
 from uavlinkd.core.drops import Detail, DropReason
 from uavlinkd.core.path import Path
+from uavlinkd.core.records import Record
 
 
 class LinkedPeer(Protocol):
@@ -32,6 +33,18 @@ class Deliver(NamedTuple):
     payload: bytes
     order: int = 0
     """Grows in the order in which the peer sealed its envelopes, also from one session to the next."""
+
+
+class RecordReceived(NamedTuple):
+    """A record of a member or a relay came along this path. ``order`` grows as the peer seals records.
+
+    It may be old: a later one along the same path counts.
+    """
+
+    peer: LinkedPeer
+    path: Path
+    record: Record
+    order: int
 
 
 class Dropped(NamedTuple):
@@ -123,4 +136,4 @@ Event = (
     | FreshnessUnverified
     | FreshnessVerified
 )
-Output = Transmit | Deliver | Dropped | Event
+Output = Transmit | Deliver | RecordReceived | Dropped | Event

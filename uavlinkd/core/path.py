@@ -11,6 +11,10 @@ SERIAL_HOST = "serial"
 """The host of the only path along a serial network: ``Path(socket, (SERIAL_HOST, 0))``."""
 
 
+RELAY_HOST = "relay "
+"""How the host of a relayed path begins; the relay's name follows. See :func:`relayed`."""
+
+
 class Path(NamedTuple):
     """A local socket and a peer's address there. The core compares paths, and sends along those that it was given."""
 
@@ -29,6 +33,16 @@ class Path(NamedTuple):
         return self.address[0] == SERIAL_HOST
 
     @property
+    def is_relayed(self) -> bool:
+        """Whether it leads through a relay."""
+        return self.address[0].startswith(RELAY_HOST)
+
+    @property
     def place(self) -> SocketAddress:
         """Where the peer is, whichever socket reaches it. Each line is a place of its own."""
         return (SERIAL_HOST, self.socket) if self.is_serial else self.address
+
+
+def relayed(socket: int, relay: str, handle: int) -> Path:
+    """The path along a relay, by its name here, with a handle that it assigned on this socket."""
+    return Path(socket, (RELAY_HOST + relay, handle))

@@ -6,11 +6,12 @@ from uavlinkd.core import constants as c
 from uavlinkd.core import freshness, probing, wire
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.establish import adopt, receive_close
-from uavlinkd.core.outputs import Deliver, Output
+from uavlinkd.core.outputs import Deliver, Output, RecordReceived
 from uavlinkd.core.path import Path
 from uavlinkd.core.path_state import PathState
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.probe import ANSWER_BYTES, PROBE, QUESTION_BYTES
+from uavlinkd.core.records import parse_record
 from uavlinkd.core.refusals import RefusalReport
 from uavlinkd.core.send import send_echo
 from uavlinkd.core.session import Session
@@ -155,12 +156,27 @@ def _receive_control(
             return probing.receive_probe(peer, session, probe, state, now), frames
         case wire.Close():
             return receive_close(peer, session, now), b""
+        case wire.SealedRecord(sealed):
+            return _receive_record(peer, session, counter, sealed, state, is_superseded=is_superseded), b""
         case RefusalReport():  # pragma: no branch  # the last kind there is
             if not session.parameters.features & c.FEATURE_REFUSALS:
                 return [peer.drop_datagram(DropReason.BAD_CONTROL, state.path)], b""
             if is_superseded:
                 return [], b""
             return freshness.receive_report(peer, session, counter, control, now, is_new=is_new), b""
+
+
+def _receive_record(
+    peer: Peer, session: Session, counter: int, sealed: bytes, state: PathState, *, is_superseded: bool
+) -> list[Output]:
+    try:
+        record = parse_record(session.open_record(counter, sealed))
+    except Drop as drop:
+        return [peer.drop_datagram(drop.reason, state.path)]
+    if is_superseded:
+        return []
+    order = (session.parameters.generation << 32) + counter
+    return [RecordReceived(peer, state.path, record, order)]
 
 
 def _receive_echo(peer: Peer, session: Session, echo: wire.Echo, now: float) -> list[Output]:

@@ -15,6 +15,7 @@ from uavlinkd.core.path_state import PathState
 from uavlinkd.core.paths import Route
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.probe import QUESTION_BYTES
+from uavlinkd.core.records import Record
 from uavlinkd.core.refusals import Refused
 from uavlinkd.core.session import Session
 from uavlinkd.core.settings import Class
@@ -93,7 +94,12 @@ def seal(
     """
     if session.send_counter >= c.SESSION_ENVELOPE_LIMIT:
         return peer.drop(DropReason.NO_SESSION, 1)
-    datagram = session.seal(payload, now)
+    return _send_sealed(peer, session, session.seal(payload, now), route, now, is_answer=is_answer)
+
+
+def _send_sealed(
+    peer: Peer, session: Session, datagram: bytes, route: Route, now: float, *, is_answer: bool
+) -> list[Output]:
     peer.sent_at = now
     if peer.unanswered_since is None and not is_answer:
         peer.unanswered_since = now
@@ -167,6 +173,19 @@ def report_refusals(peer: Peer, changed: Iterable[Refused], now: float) -> list[
         return []
     report = peer.own_refusals.take(now)
     return [] if report is None else seal(peer, session, report.encode(), route, now, is_answer=True)
+
+
+def send_record(peer: Peer, path: Path, record: Record, now: float) -> list[Output]:
+    """Send a record along one path, encrypted. It expects no answer from the session.
+
+    Nothing is sent if the path is unknown or does not work, or the session takes no records.
+    """
+    session, state = peer.sessions.current, peer.paths.find(path)
+    if session is None or not session.is_usable(now) or not session.parameters.features & c.FEATURE_RECORDS:
+        return []
+    if state is None or not state.works:
+        return []
+    return _send_sealed(peer, session, session.seal_record(record.encode(), now), (state,), now, is_answer=True)
 
 
 def send_echo(peer: Peer, session: Session, echo: wire.Echo, route: Route, now: float) -> list[Output]:

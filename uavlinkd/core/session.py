@@ -21,17 +21,33 @@ EnvelopeKey = MacKey | AeadKey
 """The key of one direction: of HMAC-SHA256, or in a confidential session of ChaCha20-Poly1305."""
 
 
+_DIRECTIONS = b" initiator to responder", b" responder to initiator"
+
+
 def derive(parameters: Parameters, transport: Secret, handshake_hash: bytes, *, from_initiator: bool) -> EnvelopeKey:
     """The envelope key of one direction, from that direction's key of Noise ``Split()``.
 
     The label names purpose and direction; the transcript hash behind it ties the key to every byte of the handshake.
     """
-    direction = b" initiator to responder" if from_initiator else b" responder to initiator"
+    direction = _DIRECTIONS[not from_initiator]
     purpose = b" confidential" if parameters.confidential else b" authenticated"
     info = c.PROTOCOL_NAME + purpose + direction + handshake_hash
     if parameters.confidential:
         return AeadKey(hkdf_expand(transport.reveal(), info, c.KEY_BYTES))
     return MacKey(hkdf_expand(transport.reveal(), info, parameters.mac_key_bits // 8))
+
+
+def _record_keys(keys: Keys, *, is_initiator: bool) -> tuple[AeadKey, AeadKey] | None:
+    """The keys of the records to the peer and from it; None if an end does not take records."""
+    if not keys.parameters.features & c.FEATURE_RECORDS:
+        return None
+    first, second = (
+        AeadKey(
+            hkdf_expand(key.reveal(), c.PROTOCOL_NAME + b" records" + direction + keys.handshake_hash, c.KEY_BYTES)
+        )
+        for key, direction in zip(keys.transport, _DIRECTIONS, strict=True)
+    )
+    return (first, second) if is_initiator else (second, first)
 
 
 class Session:
@@ -44,6 +60,7 @@ class Session:
         "_floor",
         "_receive",
         "_received_history",
+        "_record_keys",
         "_send",
         "_sent_history",
         "arrivals",
@@ -82,6 +99,7 @@ class Session:
         first = derive(keys.parameters, keys.transport[0], keys.handshake_hash, from_initiator=True)
         second = derive(keys.parameters, keys.transport[1], keys.handshake_hash, from_initiator=False)
         self._send, self._receive = (first, second) if is_initiator else (second, first)
+        self._record_keys = _record_keys(keys, is_initiator=is_initiator)  # to the peer, and from it
         self.suite = suite
         self.parameters = keys.parameters
         self.is_initiator = is_initiator
@@ -174,6 +192,26 @@ class Session:
         mac = key.prepared.copy()
         mac.update(signed)
         return signed + mac.finalize()[: self.tag_bytes]
+
+    def seal_record(self, record: bytes, now: float) -> bytes:
+        """The next envelope around a record, which is encrypted in every mode.
+
+        Both ends must have set :data:`c.FEATURE_RECORDS`. Its counter is the nonce, so it must be sealed at once.
+        """
+        assert self._record_keys is not None
+        sealed = self._record_keys[0].seal(self.send_counter, record, b"")
+        return self.seal(wire.SealedRecord(sealed).encode(), now)
+
+    def open_record(self, counter: int, sealed: bytes) -> bytes:
+        """The record in an authentic envelope with this counter.
+
+        Raises:
+            Drop: ``BAD_CONTROL`` if it does not open, or if this session has no records.
+        """
+        record = None if self._record_keys is None else self._record_keys[1].open(counter, sealed, b"")
+        if record is None:
+            raise Drop(DropReason.BAD_CONTROL)
+        return record
 
     def set_pace(self, pace: Pace, interval_s: float, now: float) -> None:
         """The peer has another best path. ``interval_s``: between requests, if the path's network carries them."""

@@ -50,7 +50,7 @@ class Parameters:
 
         offset size field
         0      4    generation     of the session on which the sender sends to the peer, or 0
-        4      2    features       bits of protocol extensions: 1 refusal reports; others are ignored
+        4      2    features       bits of protocol extensions: 1 refusal reports, 2 records; others are ignored
         6      1    flags          bit 0: confidential
         7      1    tag length     bytes: 8, 12, 16 or 32
         8      2    MAC key bits   256, 512, 1024 or 2048
@@ -96,7 +96,7 @@ def parse_parameters(data: bytes) -> Parameters:
     generation, features, flags, tag_bytes, mac_key_bits, max_envelope = _PARAMETERS.unpack(data)
     if tag_bytes not in TAG_LENGTHS or mac_key_bits not in MAC_KEY_LENGTHS or max_envelope < c.MIN_ENVELOPE_LIMIT:
         raise Drop(DropReason.BAD_PARAMETERS)
-    known = features & c.FEATURE_REFUSALS
+    known = features & c.KNOWN_FEATURES
     return Parameters(generation, bool(flags & _CONFIDENTIAL), tag_bytes, mac_key_bits, max_envelope, known)
 
 
@@ -295,7 +295,7 @@ def parse_envelope_header(datagram: bytes) -> tuple[int, int, int]:
 # Control records: the payload of an envelope whose first byte is below FRAMES_FROM.
 
 FRAMES_FROM = 0xF0
-ECHO_REQUEST, ECHO_REPLY, CLOSE = 1, 2, 5
+ECHO_REQUEST, ECHO_REPLY, CLOSE, SEALED_RECORD = 1, 2, 5, 7
 _ECHO_REQUEST = struct.Struct(">BIII")
 _ECHO_REPLY = struct.Struct(">BIIII")
 
@@ -342,7 +342,17 @@ class Close(NamedTuple):
         return bytes((CLOSE,))
 
 
-Control = Echo | ProbeAndFrames | Close | RefusalReport
+class SealedRecord(NamedTuple):
+    """A record between a member and its relay, encrypted in every mode: see :mod:`uavlinkd.core.records`."""
+
+    sealed: bytes
+
+    def encode(self) -> bytes:
+        """Type 7, and the record with its tag."""
+        return bytes((SEALED_RECORD,)) + self.sealed
+
+
+Control = Echo | ProbeAndFrames | Close | RefusalReport | SealedRecord
 
 
 def parse_control(payload: bytes) -> Control:
@@ -364,6 +374,8 @@ def parse_control(payload: bytes) -> Control:
         return Close()
     if kind == REFUSAL_REPORT and (report := parse_report(payload)) is not None:
         return report
+    if kind == SEALED_RECORD and size > 1 + c.AEAD_TAG_BYTES:
+        return SealedRecord(payload[1:])
     raise Drop(DropReason.BAD_CONTROL)
 
 

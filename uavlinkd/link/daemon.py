@@ -357,7 +357,7 @@ class Daemon:
                 now = monotonic()
                 self._drops.add_dropped(output, now)
                 self.evidence.add_dropped(output, now)
-            else:
+            elif not isinstance(output, o.RecordReceived):  # no peer is a relay, or a member of one
                 self._on_event(output)
 
     def _on_event(self, event: o.Event) -> None:

@@ -1,0 +1,129 @@
+"""Records between a member and its relay, and data along a relay. README.md, section 21. Total parsers; no keys."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Mapping, Sequence
+from ipaddress import IPv6Address, ip_address
+from typing import NamedTuple
+
+from uavlinkd.core import constants as c
+from uavlinkd.core.drops import Drop, DropReason
+
+BIND, BOUND = 1, 2
+WAITING = 0
+"""The handle of a peer that cannot be reached through the relay now."""
+_BOUND_HEADER = struct.Struct(">B16sH")
+_ENTRY = struct.Struct(f">{c.KEY_BYTES}sH")
+
+
+class Bind(NamedTuple):
+    """A member wants to reach these peers along the path that carries the record.
+
+    ::
+
+        offset  size  field
+        0       1     kind (1)
+        1       32·n  static public keys, n from 1 to 16
+    """
+
+    keys: tuple[bytes, ...]
+
+    def encode(self) -> bytes:
+        """The record."""
+        return bytes((BIND,)) + b"".join(self.keys)
+
+
+class Bound(NamedTuple):
+    """All handles of some peers on the path that carries the record, and the member's address there.
+
+    ::
+
+        offset  size  field
+        0       1     kind (2)
+        1       16    IPv6 address of the member as the relay sees it; IPv4 mapped into it
+        17      2     port
+        19      34·n  public key (32), handle (2), n from 1 to 32
+    """
+
+    host: str
+    """Numeric, without a zone; an IPv4 host in its own form."""
+    port: int
+    handles: tuple[tuple[bytes, int], ...]
+    """Key and handle; :data:`WAITING` for a peer that has none. A peer with several has an entry for each."""
+
+    def encode(self) -> bytes:
+        """The record."""
+        address = ip_address(self.host)
+        packed = b"".join((bytes(10), b"\xff\xff", address.packed)) if address.version == 4 else address.packed
+        return _BOUND_HEADER.pack(BOUND, packed, self.port) + b"".join(_ENTRY.pack(*entry) for entry in self.handles)
+
+
+Record = Bind | Bound
+
+
+def parse_record(data: bytes) -> Record:
+    """The record in decrypted bytes.
+
+    Raises:
+        Drop: ``BAD_CONTROL``.
+    """
+    kind, size = data[:1], len(data)
+    if kind == bytes((BIND,)):
+        count, rest = divmod(size - 1, c.KEY_BYTES)
+        if not rest and 1 <= count <= c.KEYS_PER_BIND:
+            return Bind(tuple(data[at : at + c.KEY_BYTES] for at in range(1, size, c.KEY_BYTES)))
+    elif kind == bytes((BOUND,)) and size > _BOUND_HEADER.size:
+        count, rest = divmod(size - _BOUND_HEADER.size, _ENTRY.size)
+        if not rest and count <= c.ENTRIES_PER_BOUND:
+            _, packed, port = _BOUND_HEADER.unpack_from(data)
+            address = IPv6Address(packed)
+            entries: Iterator[tuple[bytes, int]] = _ENTRY.iter_unpack(data[_BOUND_HEADER.size :])
+            return Bound(str(address.ipv4_mapped or address), port, tuple(entries))
+    raise Drop(DropReason.BAD_CONTROL)
+
+
+def binds_of(keys: Sequence[bytes]) -> Iterator[Bind]:
+    """As few records as hold these keys."""
+    for at in range(0, len(keys), c.KEYS_PER_BIND):
+        yield Bind(tuple(keys[at : at + c.KEYS_PER_BIND]))
+
+
+def bounds_of(host: str, port: int, handles: Mapping[bytes, Sequence[int]]) -> Iterator[Bound]:
+    """As few records as hold the handles of these keys: all of one key in the same record."""
+    entries: list[tuple[bytes, int]] = []
+    for key, of_key in handles.items():
+        added = [(key, handle) for handle in of_key or (WAITING,)]
+        if len(entries) + len(added) > c.ENTRIES_PER_BOUND:
+            yield Bound(host, port, tuple(entries))
+            entries = []
+        entries += added
+    if entries:
+        yield Bound(host, port, tuple(entries))
+
+
+# Data along a relay.
+
+RELAYED = 0x50
+_RELAYED_HEADER = struct.Struct(">BH")
+INNER_STARTS = frozenset((1, 2, 3, 0x40, 0x41))
+"""First bytes of handshake messages, cookie replies and envelopes: what may be inside."""
+
+
+def wrap(handle: int, datagram: bytes) -> bytes:
+    """A datagram on its way to or from a relay.
+
+    ::
+
+        offset  size  field
+        0       1     type (0x50)
+        1       2     handle
+        3       n     datagram
+    """
+    return _RELAYED_HEADER.pack(RELAYED, handle) + datagram
+
+
+def handle_of(data: bytes) -> int:
+    """The handle of data that begins with 0x50; 0, which is never a handle, if it is malformed."""
+    is_valid = len(data) > _RELAYED_HEADER.size and data[_RELAYED_HEADER.size] in INNER_STARTS
+    return int.from_bytes(data[1:3], "big") if is_valid else 0
