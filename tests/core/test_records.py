@@ -1,0 +1,210 @@
+"""Records between a member and its relay: encodings, parsers, encryption, and what a node does with them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.core.harness import AT_A, AT_B, ELSEWHERE, Pair, Side, datagrams, of, only, quiet, reasons, unsealed
+from uavlinkd.core import constants as c
+from uavlinkd.core.drops import Drop, DropReason
+from uavlinkd.core.outputs import Output, RecordReceived
+from uavlinkd.core.path import relayed
+from uavlinkd.core.records import WAITING, Bind, Bound, binds_of, bounds_of, handle_of, parse_record, wrap
+
+KEYS = [bytes([number]) * c.KEY_BYTES for number in range(1, 41)]
+BIND = Bind((KEYS[0], KEYS[1]))
+BOUND = Bound("203.0.113.7", 5790, ((KEYS[0], 0x1234), (KEYS[1], WAITING)))
+LINK = quiet(features=c.FEATURE_RECORDS)
+
+
+# Encodings.
+
+
+def test_encodings_are_the_documented_ones() -> None:
+    """Byte by byte, as the specification draws them."""
+    assert BIND.encode() == b"\x01" + KEYS[0] + KEYS[1]
+    mapped = bytes(10) + b"\xff\xff\xcb\x00\x71\x07"
+    assert BOUND.encode() == b"\x02" + mapped + b"\x16\x9e" + KEYS[0] + b"\x12\x34" + KEYS[1] + b"\x00\x00"
+    assert wrap(0x1234, b"\x40abc") == b"\x50\x12\x34\x40abc"
+
+
+@pytest.mark.parametrize("record", [BIND, BOUND, Bound("2001:db8::1", 1, ((KEYS[2], 7),))])
+def test_record_is_parsed(record: Bind | Bound) -> None:
+    """What is encoded comes back."""
+    assert parse_record(record.encode()) == record
+
+
+@given(st.binary(max_size=1300))
+def test_any_bytes_parse_or_drop(data: bytes) -> None:
+    """And what parses is encoded as it was."""
+    try:
+        record = parse_record(data)
+    except Drop as drop:
+        assert drop.reason is DropReason.BAD_CONTROL
+    else:
+        assert record.encode() == data
+
+
+@given(st.sampled_from((1, 2)), st.integers(0, 1300))
+def test_only_whole_entries_within_the_limits_are_valid(kind: int, size: int) -> None:
+    """1 to 16 keys in a bind, 1 to 32 entries in a bound record."""
+    first, entry, most = (1, c.KEY_BYTES, c.KEYS_PER_BIND) if kind == 1 else (19, 34, c.ENTRIES_PER_BOUND)
+    valid = {first + entry * count for count in range(1, most + 1)}
+    data = (bytes([kind]) + bytes(size))[: max(1, size)]
+    if len(data) in valid:
+        assert parse_record(data).encode() == data
+    else:
+        with pytest.raises(Drop):
+            parse_record(data)
+
+
+@pytest.mark.parametrize("inner", [1, 2, 3, 0x40, 0x41])
+def test_handle_of_data(inner: int) -> None:
+    """Handshake messages, cookie replies and envelopes may be inside."""
+    assert handle_of(wrap(9, bytes([inner]))) == 9
+
+
+@pytest.mark.parametrize("data", [b"\x50", b"\x50\x00\x09", wrap(9, b"\x50\x00\x09\x40"), wrap(9, b"\xfd"), wrap(9, b"")])
+def test_malformed_data_has_no_handle(data: bytes) -> None:
+    """Nothing inside, a relay inside a relay, or a bare frame."""
+    assert handle_of(data) == 0
+
+
+def test_many_keys_need_several_binds() -> None:
+    """Each full but the last."""
+    assert [len(bind.keys) for bind in binds_of(KEYS)] == [16, 16, 8]
+    assert not list(binds_of([]))
+
+
+def test_handles_of_one_key_are_in_one_record() -> None:
+    """The receiver replaces all handles of the keys that a record names. A key without handles waits."""
+    handles = {key: [1, 2, 3] for key in KEYS[:11]} | {KEYS[11]: []}
+    records = list(bounds_of("2001:db8::1", 5790, handles))
+    assert [len(record.handles) for record in records] == [30, 4]
+    assert records[1].handles[-1] == (KEYS[11], WAITING)
+    assert not list(bounds_of("2001:db8::1", 5790, {}))
+
+
+def test_largest_record_fits_an_envelope() -> None:
+    """The sealed record with its type, in the longest header, with the longest tag."""
+    largest = Bound("::1", 1, ((KEYS[0], 1),) * c.ENTRIES_PER_BOUND).encode()
+    assert 7 + 1 + len(largest) + 16 + 32 <= c.DEFAULT_ENVELOPE_LIMIT
+
+
+# In a session.
+
+
+def send(side: Side, record: Bind | Bound, now: float) -> list[bytes]:
+    """The datagrams by which a side sends a record to the other one."""
+    return datagrams(side.node.send_record(side.peer, side.peer_at, record, now))
+
+
+@pytest.fixture
+def pair() -> Pair:
+    """Both take records, and know that they answer."""
+    made = Pair(LINK, LINK).establish()
+    assert made.carries(0.0)
+    return made
+
+
+def received(outputs: list[Output]) -> RecordReceived:
+    """The record among outputs."""
+    return only(of(outputs, RecordReceived))
+
+
+@pytest.mark.parametrize("confidential", [False, True])
+def test_record_crosses_in_both_directions(confidential: bool) -> None:
+    """With the path that it came by."""
+    link = replace(LINK, confidential=confidential)
+    pair = Pair(link, link).establish()
+    assert pair.carries(0.0)
+    there = received(pair.b.receive(only(send(pair.a, BIND, 1.0)), 1.0))
+    assert (there.peer, there.path, there.record) == (pair.b.peer, AT_A, BIND)
+    back = received(pair.a.receive(only(send(pair.b, BOUND, 1.0)), 1.0))
+    assert (back.peer, back.path, back.record) == (pair.a.peer, AT_B, BOUND)
+
+
+def test_no_key_is_readable_where_frames_are(pair: Pair) -> None:
+    """A listener must not learn the keys of the fleet."""
+    datagram = only(send(pair.a, BIND, 1.0))
+    payload = unsealed(pair.b.session, datagram)
+    assert payload is not None
+    assert payload[0] == 7
+    assert KEYS[0] not in payload
+    assert KEYS[0][:8] not in datagram
+
+
+def test_order_grows(pair: Pair) -> None:
+    """With each record, and with each session."""
+    first = received(pair.b.receive(only(send(pair.a, BIND, 1.0)), 1.0))
+    second = received(pair.b.receive(only(send(pair.a, BIND, 1.0)), 1.0))
+    pair.a.peer.initiator.retry_at = 0.0
+    pair.establish(200.0)
+    pair.carries(200.0)
+    third = received(pair.b.receive(only(send(pair.a, BIND, 200.5)), 200.5))
+    assert first.order < second.order < third.order
+
+
+def test_record_with_altered_bytes_has_no_effect(pair: Pair) -> None:
+    """An envelope with a valid tag whose record does not open, or has another type or length."""
+    session = pair.a.session
+    for payload in (b"\x07" + bytes(64), b"\x07" + bytes(16), b"\x07"):
+        assert reasons(pair.b.receive(session.seal(payload, 1.0), 1.0)) == [DropReason.BAD_CONTROL]
+    assert session._record_keys is not None
+    sealed = session._record_keys[0].seal(session.send_counter, b"\x09", b"")
+    assert reasons(pair.b.receive(session.seal(b"\x07" + sealed, 1.0), 1.0)) == [DropReason.BAD_CONTROL]
+
+
+def test_record_sealed_for_another_counter_does_not_open(pair: Pair) -> None:
+    """A peer cannot send what it received before as its own."""
+    session = pair.a.session
+    assert session._record_keys is not None
+    sealed = session._record_keys[0].seal(session.send_counter + 1, BIND.encode(), b"")
+    assert reasons(pair.b.receive(session.seal(b"\x07" + sealed, 1.0), 1.0)) == [DropReason.BAD_CONTROL]
+
+
+@pytest.mark.parametrize("link_b", [quiet(), quiet(features=c.FEATURE_REFUSALS)])
+def test_record_needs_both_ends(link_b: object) -> None:
+    """Without the feature nothing is sent, and what is sent anyway is an invalid control record."""
+    pair = Pair(LINK, link_b).establish()  # type: ignore[arg-type]
+    assert pair.carries(0.0)
+    assert not send(pair.a, BIND, 1.0)
+    datagram = pair.a.session.seal(b"\x07" + bytes(60), 1.0)
+    assert reasons(pair.b.receive(datagram, 1.0)) == [DropReason.BAD_CONTROL]
+
+
+def test_nothing_is_sent_without_a_path_that_works(pair: Pair) -> None:
+    """Nor without a session."""
+    assert not pair.a.node.send_record(pair.a.peer, ELSEWHERE, BIND, 1.0)
+    assert not send(Pair(LINK, LINK).a, BIND, 0.0)
+
+
+def test_record_on_a_superseded_session_is_ignored(pair: Pair) -> None:
+    """The peer has sent on newer keys for a while."""
+    late = pair.a.session.seal_record(BIND.encode(), 1.0)
+    pair.a.peer.initiator.retry_at = 0.0
+    pair.establish(121.0)
+    assert pair.carries(121.0)
+    assert pair.carries(124.0)
+    assert not of(pair.b.receive(late, 125.0), RecordReceived)
+
+
+def test_record_expects_no_answer(pair: Pair) -> None:
+    """It does not count as unanswered: a relay answers binds, and nobody answers that."""
+    pair.a.receive(pair.b.envelope(1.0), 1.0)
+    assert send(pair.a, BIND, 1.0)
+    assert pair.a.peer.unanswered_since is None
+
+
+def test_relayed_path_names_relay_and_handle() -> None:
+    """Two handles of one relay are one host and two places."""
+    path, other = relayed(1, "vps", 7), relayed(1, "vps", 8)
+    assert path.is_relayed
+    assert not path.is_serial
+    assert not AT_A.is_relayed
+    assert path.host == other.host == "relay vps"
+    assert path.place != other.place
