@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import get_args
 
 from uavlinkd.core.drops import DropReason
-from uavlinkd.core.outputs import Deliver, Dropped, Event, Output, Transmit
+from uavlinkd.core.outputs import Deliver, Dropped, Event, Output, RecordReceived, Transmit
 
 
 def test_drop_is_one_datagram_without_a_peer_by_default() -> None:
@@ -14,8 +14,8 @@ def test_drop_is_one_datagram_without_a_peer_by_default() -> None:
 
 
 def test_events_are_the_outputs_that_move_no_bytes() -> None:
-    """A shell that handles Transmit, Deliver, Dropped and Event has handled every output."""
-    assert set(get_args(Output)) == {Transmit, Deliver, Dropped, *get_args(Event)}
+    """A shell that handles Transmit, Deliver, RecordReceived, Dropped and Event has handled every output."""
+    assert set(get_args(Output)) == {Transmit, Deliver, RecordReceived, Dropped, *get_args(Event)}
 
 
 def test_outputs_cannot_be_altered() -> None:

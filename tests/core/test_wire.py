@@ -33,7 +33,7 @@ PARAMETERS = st.builds(
     tag_bytes=st.sampled_from(wire.TAG_LENGTHS),
     mac_key_bits=st.sampled_from(wire.MAC_KEY_LENGTHS),
     max_envelope=st.integers(c.MIN_ENVELOPE_LIMIT, 2**16 - 1),
-    features=st.sampled_from((0, c.FEATURE_REFUSALS)),
+    features=st.integers(0, c.KNOWN_FEATURES),
 )
 T = TypeVar("T")
 CONTROL: st.SearchStrategy[wire.Control] = st.one_of(
@@ -257,7 +257,7 @@ def test_unknown_features_and_flags_are_ignored(features: int, flags: int) -> No
 
     parsed = wire.parse_parameters(encoded[:4] + features.to_bytes(2, "big") + bytes((flags,)) + encoded[7:])
 
-    assert parsed == Parameters(7, bool(flags & 1), 16, 256, 1232, features & c.FEATURE_REFUSALS)
+    assert parsed == Parameters(7, bool(flags & 1), 16, 256, 1232, features & c.KNOWN_FEATURES)
 
 
 def test_other_tag_length_is_refused() -> None:

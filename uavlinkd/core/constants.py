@@ -332,6 +332,10 @@ DEFAULT_ENVELOPE_LIMIT = 1232
 # Relays. README.md, section 21.
 RELAY_BYTES = 3
 """What a relay adds to a datagram: type and handle."""
+RELAYED_ENVELOPE_LIMIT = 1229
+"""So that a datagram along a relay is not longer than a direct one."""
+RELAYED_COPIES = 2
+"""Paths from one socket along which copies go, if one of them leads through a relay."""
 KEYS_PER_BIND = 16
 ENTRIES_PER_BOUND = 32
 """1,126 bytes of record: with everything around it, it fits an MTU of 1,280 bytes."""

@@ -51,6 +51,10 @@ class Election:
             elected = min(usable or pool, key=lambda state: _cost(state, None))
             return elected, "first" if best is None else "metered" if best.works else best.reason
         rivals = [state for state in usable if state is not best and now >= state.returns_at]
+        if best.path.is_relayed and (direct := [state for state in rivals if not state.path.is_relayed]):
+            elected = min(direct, key=lambda state: _cost(state, None))
+            if _better_than(elected, [best], now) is None:
+                return elected, "direct"
         rival = _better_than(best, rivals, now) if rivals else None
         if rival is None or rival is not self._better:
             self._better, self._better_since = rival, now

@@ -22,8 +22,8 @@ from uavlinkd.core.outputs import Deliver, Dropped, Output
 from uavlinkd.core.path import Path, SocketAddress
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.receive import receive_envelope
-from uavlinkd.core.records import Record
 from uavlinkd.core.refusals import Refused
+from uavlinkd.core.relay_records import Record
 from uavlinkd.core.send import note_repeat, recount, report_refusals, send_frames, send_record
 from uavlinkd.core.session import Session
 from uavlinkd.core.settings import Class, PeerSettings, Screen, hold_all

@@ -6,7 +6,7 @@ from typing import NamedTuple, Protocol
 
 from uavlinkd.core.drops import Detail, DropReason
 from uavlinkd.core.path import Path
-from uavlinkd.core.records import Record
+from uavlinkd.core.relay_records import Record
 
 
 class LinkedPeer(Protocol):
@@ -94,8 +94,8 @@ class SessionEstablished(NamedTuple):
 class PathChanged(NamedTuple):
     """Traffic goes along ``path`` now, and went along ``before``.
 
-    ``reason``: ``faster``, ``loss``, ``metered``, ``session`` (it was made there), or why the path before failed:
-    ``unanswered``, ``network``.
+    ``reason``: ``faster``, ``direct`` (and before it was relayed), ``loss``, ``metered``, ``session`` (it was made
+    there), or why the path before failed: ``unanswered``, ``network``.
     """
 
     peer: LinkedPeer

@@ -53,6 +53,7 @@ class PathSet(PathSlots):
         "_stream_times",
         "active_at",
         "echo_route",
+        "has_relayed",
         "has_standby",
         "is_multiple",
         "next_at",
@@ -74,6 +75,8 @@ class PathSet(PathSlots):
         self._election = Election()
         self._reported_best: PathState | None = None
         self._revised_at = NEVER  # an update is due since then
+        self.has_relayed = False
+        """Whether one of them leads through a relay."""
         self.has_standby = False
         """Whether there is another path than the best one, whatever its condition."""
         self.is_multiple = False
@@ -219,6 +222,9 @@ class PathSet(PathSlots):
             self.stream_route = self.echo_route = ()
             return
         others = [state for state in self.by_path.values() if state is not best and not state.is_off]
+        self.has_relayed = any(state.path.is_relayed for state in self.by_path.values())
+        if self.has_relayed:
+            others = self._without_spares(best, others)
         working = [state for state in others if state.works]
         recent = [state for state in others if state.works or now < state.answered_at + c.COPIES_AFTER_ANSWER_S]
         self.is_multiple = bool(recent)
@@ -236,6 +242,23 @@ class PathSet(PathSlots):
         self.echo_route = alone if best.condition is PathCondition.USABLE else critical
         self.routes = {Class.CRITICAL: critical, Class.STREAM: stream, Class.BULK: alone}
 
+    def _without_spares(self, best: PathState, others: list[PathState]) -> list[PathState]:
+        """Without the relayed paths that carry no copies: a better path from the same socket does."""
+        direct = (state for state in self.by_path.values() if not state.path.is_relayed)
+        carrying = {state.path.socket: 1 for state in direct if state.condition is PathCondition.USABLE}
+        relays = set[tuple[int, str]]()
+        picked = [state for state in others if not state.path.is_relayed]
+        others.sort(key=lambda state: (not state.works, state.srtt_s or NEVER))
+        for state in (best, *others):
+            socket, relay = state.path.socket, state.path.host
+            if not state.path.is_relayed or (socket, relay) in relays or carrying.get(socket, 0) >= c.RELAYED_COPIES:
+                continue
+            relays.add((socket, relay))
+            carrying[socket] = carrying.get(socket, 0) + 1
+            if state is not best:
+                picked.append(state)
+        return picked
+
     # Lengths of envelopes.
 
     def longest(self, cls: Class) -> int:
@@ -243,16 +266,20 @@ class PathSet(PathSlots):
 
         There must be a path.
         """
-        route, limits = self.routes[cls], self.facts.envelope_limits
+        route = self.routes[cls]
         if cls is Class.CRITICAL:  # bit-identical copies along the whole route
             most = c.CRITICAL_ENVELOPE_LIMIT if self.is_multiple else c.MAX_ENVELOPE_LIMIT
-            return min(most, *(limits.get(state.path.socket, most) for state in route))
-        return min(route[0].envelope_limit.limit, limits.get(route[0].path.socket, c.MAX_ENVELOPE_LIMIT))
+            return min(most, *(self.network_limit(state) for state in route))
+        return min(route[0].envelope_limit.limit, self.network_limit(route[0]))
 
     def carries(self, state: PathState, size: int) -> bool:
         """Whether a copy of so many bytes may go along a path. Each path carries the longest frame."""
+        return size <= min(state.envelope_limit.limit, max(self.network_limit(state), c.MIN_ENVELOPE_LIMIT))
+
+    def network_limit(self, state: PathState) -> int:
+        """The longest envelope that the network or the relay of a path carries, in bytes."""
         limit = self.facts.envelope_limits.get(state.path.socket, c.MAX_ENVELOPE_LIMIT)
-        return size <= min(state.envelope_limit.limit, max(limit, c.MIN_ENVELOPE_LIMIT))
+        return min(limit, c.RELAYED_ENVELOPE_LIMIT) if state.path.is_relayed else limit
 
     # Deadlines.
 

@@ -153,8 +153,7 @@ def handle_timeout(peer: Peer, now: float) -> list[Output]:
 
 def _test_limit(peer: Peer, session: Session, state: PathState, now: float) -> list[Output]:
     """Send a padded probe if a test of the longest envelope is due."""
-    network_limit = peer.paths.facts.envelope_limits.get(state.path.socket, session.max_envelope)
-    longest = min(session.max_envelope, network_limit)
+    longest = min(session.max_envelope, peer.paths.network_limit(state))
     size = state.envelope_limit.size_to_test(longest, state.answered_at, now)
     padding = size - session.envelope_bytes(QUESTION_BYTES)
     if padding <= 0:

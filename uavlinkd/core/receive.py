@@ -11,8 +11,8 @@ from uavlinkd.core.path import Path
 from uavlinkd.core.path_state import PathState
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.probe import ANSWER_BYTES, PROBE, QUESTION_BYTES
-from uavlinkd.core.records import parse_record
 from uavlinkd.core.refusals import RefusalReport
+from uavlinkd.core.relay_records import parse_record
 from uavlinkd.core.send import send_echo
 from uavlinkd.core.session import Session
 

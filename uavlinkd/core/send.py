@@ -15,8 +15,8 @@ from uavlinkd.core.path_state import PathState
 from uavlinkd.core.paths import Route
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.probe import QUESTION_BYTES
-from uavlinkd.core.records import Record
 from uavlinkd.core.refusals import Refused
+from uavlinkd.core.relay_records import Record
 from uavlinkd.core.session import Session
 from uavlinkd.core.settings import Class
 from uavlinkd.core.socket_facts import FREE
@@ -37,7 +37,7 @@ def send_frames(peer: Peer, frames: Sequence[bytes], now: float, cls: Class) -> 
     asks_at = NEVER
     if paths.has_standby:
         _note_activity(peer, cls, now)
-    if paths.is_multiple or paths.facts.envelope_limits:
+    if paths.is_multiple or paths.has_relayed or paths.facts.envelope_limits:
         limit = min(limit, session.payload_limit_of(paths.longest(cls)))
     if paths.is_multiple and cls is not Class.CRITICAL and len(route) == 1:
         asks_at = route[0].question_at - c.QUESTION_EARLY_S
@@ -86,20 +86,22 @@ def _ask_too(peer: Peer, session: Session, state: PathState, frames: bytes, limi
 
 
 def seal(
-    peer: Peer, session: Session, payload: bytes, route: Route, now: float, *, is_answer: bool = False
+    peer: Peer,
+    session: Session,
+    payload: bytes,
+    route: Route,
+    now: float,
+    *,
+    is_answer: bool = False,
+    is_record: bool = False,
 ) -> list[Output]:
-    """Send an envelope along each path of a route, the same bytes.
+    """Send an envelope along each path of a route, the same bytes. A record is encrypted in every mode.
 
     It expects an answer, unless it is one: two ends must not answer each other endlessly.
     """
     if session.send_counter >= c.SESSION_ENVELOPE_LIMIT:
         return peer.drop(DropReason.NO_SESSION, 1)
-    return _send_sealed(peer, session, session.seal(payload, now), route, now, is_answer=is_answer)
-
-
-def _send_sealed(
-    peer: Peer, session: Session, datagram: bytes, route: Route, now: float, *, is_answer: bool
-) -> list[Output]:
+    datagram = session.seal_record(payload, now) if is_record else session.seal(payload, now)
     peer.sent_at = now
     if peer.unanswered_since is None and not is_answer:
         peer.unanswered_since = now
@@ -178,14 +180,14 @@ def report_refusals(peer: Peer, changed: Iterable[Refused], now: float) -> list[
 def send_record(peer: Peer, path: Path, record: Record, now: float) -> list[Output]:
     """Send a record along one path, encrypted. It expects no answer from the session.
 
-    Nothing is sent if the path is unknown or does not work, or the session takes no records.
+    Nothing is sent if the path is unknown or does not work, or the session has no records.
     """
     session, state = peer.sessions.current, peer.paths.find(path)
     if session is None or not session.is_usable(now) or not session.parameters.features & c.FEATURE_RECORDS:
         return []
     if state is None or not state.works:
         return []
-    return _send_sealed(peer, session, session.seal_record(record.encode(), now), (state,), now, is_answer=True)
+    return seal(peer, session, record.encode(), (state,), now, is_answer=True, is_record=True)
 
 
 def send_echo(peer: Peer, session: Session, echo: wire.Echo, route: Route, now: float) -> list[Output]:

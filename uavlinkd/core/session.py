@@ -38,7 +38,7 @@ def derive(parameters: Parameters, transport: Secret, handshake_hash: bytes, *, 
 
 
 def _record_keys(keys: Keys, *, is_initiator: bool) -> tuple[AeadKey, AeadKey] | None:
-    """The keys of the records to the peer and from it; None if an end does not take records."""
+    """The keys of the records to the peer and from it; None if an end does not have records."""
     if not keys.parameters.features & c.FEATURE_RECORDS:
         return None
     first, second = (

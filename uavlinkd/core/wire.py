@@ -343,7 +343,7 @@ class Close(NamedTuple):
 
 
 class SealedRecord(NamedTuple):
-    """A record between a member and its relay, encrypted in every mode: see :mod:`uavlinkd.core.records`."""
+    """A record between a member and its relay, encrypted in every mode: see :mod:`uavlinkd.core.relay_records`."""
 
     sealed: bytes
 

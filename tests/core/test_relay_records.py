@@ -14,7 +14,7 @@ from uavlinkd.core import constants as c
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.outputs import Output, RecordReceived
 from uavlinkd.core.path import relayed
-from uavlinkd.core.records import WAITING, Bind, Bound, binds_of, bounds_of, handle_of, parse_record, wrap
+from uavlinkd.core.relay_records import WAITING, Bind, Bound, binds_of, bounds_of, handle_of, parse_record, wrap
 
 KEYS = [bytes([number]) * c.KEY_BYTES for number in range(1, 41)]
 BIND = Bind((KEYS[0], KEYS[1]))
@@ -102,7 +102,7 @@ def send(side: Side, record: Bind | Bound, now: float) -> list[bytes]:
 
 @pytest.fixture
 def pair() -> Pair:
-    """Both take records, and know that they answer."""
+    """Both have records, and know that they answer."""
     made = Pair(LINK, LINK).establish()
     assert made.carries(0.0)
     return made
@@ -191,7 +191,7 @@ def test_record_on_a_superseded_session_is_ignored(pair: Pair) -> None:
 
 
 def test_record_expects_no_answer(pair: Pair) -> None:
-    """It does not count as unanswered: a relay answers binds, and nobody answers that."""
+    """It does not count as unanswered: a relay answers binds, and that gets no answer."""
     pair.a.receive(pair.b.envelope(1.0), 1.0)
     assert send(pair.a, BIND, 1.0)
     assert pair.a.peer.unanswered_since is None

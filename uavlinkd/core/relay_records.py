@@ -111,7 +111,7 @@ INNER_STARTS = frozenset((1, 2, 3, 0x40, 0x41))
 
 
 def wrap(handle: int, datagram: bytes) -> bytes:
-    """A datagram on its way to or from a relay.
+    """Data to or from a relay.
 
     ::
 

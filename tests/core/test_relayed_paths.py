@@ -1,0 +1,106 @@
+"""Paths through relays beside direct ones: which is the best, which carry copies, and how long envelopes are."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.core.test_path_set import answer, fail, linked, of, path_set, route, suspect
+from uavlinkd.core import constants as c
+from uavlinkd.core.path import Path, relayed
+from uavlinkd.core.paths import BestChanged
+from uavlinkd.core.settings import Class
+
+LTE, MESH = Path(0, ("192.0.2.1", 5790)), Path(1, ("198.51.100.1", 5790))
+LTE_A, LTE_A2, LTE_B, LTE_C = (relayed(0, name, number) for number, name in enumerate(("a", "a", "b", "c"), 1))
+MESH_A = relayed(1, "a", 9)
+
+
+# The best path.
+
+
+@pytest.mark.parametrize(("direct_s", "becomes_best"), [(0.05, True), (0.1, True), (0.115, True), (0.3, False)])
+def test_direct_path_replaces_relayed_one_immediately(direct_s: float, becomes_best: bool) -> None:
+    """Unless it is so much slower that the relayed one would replace it."""
+    paths = linked(LTE_A)
+    answer(paths, LTE_A, 1.1, 0.1)
+    of(paths, LTE_A).srtt_s = 0.1
+    paths.configure([LTE_A, LTE], 1.5)
+    changes = answer(paths, LTE, 2.0, direct_s)
+    assert (paths.best is of(paths, LTE)) is becomes_best
+    reasons = [change.reason for change in changes if isinstance(change, BestChanged)]
+    assert reasons == ["direct"] * becomes_best
+
+
+def test_direct_path_stays_the_best_for_a_similar_relayed_one() -> None:
+    """A relay is one more machine that may fail."""
+    paths = linked(LTE, LTE_A)
+    for tenth in range(11, 60):
+        for path in (LTE, LTE_A):
+            answer(paths, path, tenth / 10, 0.1)
+    assert paths.best is of(paths, LTE)
+
+
+def test_relayed_path_takes_over_from_a_direct_one_that_fails() -> None:
+    """Without waiting."""
+    paths = linked(LTE, LTE_A)
+    fail(paths, LTE, 4.0)
+    assert paths.best is of(paths, LTE_A)
+
+
+# Copies.
+
+
+def test_copies_go_along_two_paths_of_a_socket() -> None:
+    """A direct one and the fastest relayed one."""
+    paths = linked(LTE, LTE_A, LTE_B)
+    assert route(paths, Class.CRITICAL) == [LTE, LTE_A]
+    assert paths.is_multiple
+
+
+def test_copies_go_through_different_relays() -> None:
+    """One relay that dies must not take both copies with it; a third copy would only cost."""
+    paths = linked(LTE_A, LTE_A2, LTE_B, LTE_C)
+    assert route(paths, Class.CRITICAL) == [LTE_A, LTE_B]
+
+
+def test_each_socket_has_its_own_copies() -> None:
+    """LTE and mesh behind NAT, one relay: along both."""
+    paths = linked(LTE_A, LTE_A2, MESH_A)
+    assert route(paths, Class.CRITICAL) == [LTE_A, MESH_A]
+
+
+def test_further_relayed_path_replaces_a_direct_one_that_is_suspect() -> None:
+    """At once: the direct one no longer counts as the network's own."""
+    paths = linked(LTE, LTE_A, LTE_B)
+    suspect(paths, LTE, 2.0)
+    assert set(route(paths, Class.CRITICAL)) == {LTE, LTE_A, LTE_B}
+
+
+def test_relayed_path_that_is_down_gives_its_place_to_another() -> None:
+    """The one that works comes first, however slow."""
+    paths = linked(LTE, LTE_A, LTE_B)
+    fail(paths, LTE_A, 4.0)
+    assert route(paths, Class.CRITICAL)[:2] == [LTE, LTE_B]
+
+
+# Envelopes.
+
+
+@pytest.mark.parametrize("cls", [Class.STREAM, Class.BULK])
+def test_envelopes_along_a_relay_are_shorter(cls: Class) -> None:
+    """With what the relay adds they are as long as direct ones."""
+    assert linked(LTE_A).longest(cls) == c.DEFAULT_ENVELOPE_LIMIT - c.RELAY_BYTES
+    assert linked(LTE).longest(cls) > c.DEFAULT_ENVELOPE_LIMIT
+
+
+def test_copy_that_is_too_long_does_not_go_along_a_relay() -> None:
+    """The longest direct envelope."""
+    paths = linked(LTE, LTE_A)
+    assert paths.carries(of(paths, LTE_A), c.RELAYED_ENVELOPE_LIMIT)
+    assert not paths.carries(of(paths, LTE_A), c.RELAYED_ENVELOPE_LIMIT + 1)
+
+
+def test_peer_without_relays_pays_nothing() -> None:
+    """Its envelopes are not limited."""
+    assert not linked(LTE, MESH).has_relayed
+    assert not path_set().has_relayed
