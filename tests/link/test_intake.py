@@ -13,14 +13,19 @@ from tests.link.test_peer_link import link_of
 from tests.mavlink.egress.samples import attitude, command, raws
 from tests.policies import TRUSTED
 from uavlinkd.config import PeerConfig
+from uavlinkd.core.drops import DropReason
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Deliver, Output
+from uavlinkd.core.path import Path, SocketAddress, relayed
+from uavlinkd.core.relay_records import wrap
 from uavlinkd.core.settings import PeerSettings
 from uavlinkd.core.wire import ENVELOPE_STARTS
 from uavlinkd.endpoints.ports import LocalPort
 from uavlinkd.link.intake import Intake
 from uavlinkd.link.peer_link import PeerLink
+from uavlinkd.link.relay_handles import RelayHandles
 from uavlinkd.link.switch import Switch
+from uavlinkd.link.turns import WaitingDatagram
 from uavlinkd.mavlink.frames import Frame
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.stall import StallWatch
@@ -40,6 +45,8 @@ class Scene:
         self.envelopes = list(envelopes)
         self.delivered: list[bytes] = []
         self.superseded = 0
+        self.received: list[tuple[bytes, Path]] = []
+        self.dropped: list[tuple[DropReason, str]] = []
         self.intake = Intake(
             cast("Node", SimpleNamespace(receive=self.receive, claimed_sender=lambda *_: 0)),
             StallWatch(monotonic(), lambda _: None),
@@ -49,10 +56,12 @@ class Scene:
             lambda link, frames, now, epoch: self.forward(link, frames, now),
             lambda: None,
             self.on_superseded,
+            lambda reason, name: self.dropped.append((reason, name)),
         )
 
-    def receive(self, *_: object) -> list[Output]:
+    def receive(self, datagram: bytes, path: Path, now: float) -> list[Output]:
         """The core's."""
+        self.received.append((datagram, path))
         order, frames = self.envelopes.pop(0)
         return [Deliver(self.peer, b"".join(raws(frames)), order)]
 
@@ -105,3 +114,37 @@ async def test_previous_key_of_a_peer_has_orders_of_its_own() -> None:
     other = Pair().b.peer
     assert scene.link.pick_newest(other, [OLD], 1, monotonic()) == [OLD]
     assert scene.link.pick_newest(scene.peer, [OLD], 1, monotonic()) == []
+
+
+@pytest.mark.parametrize("wake_ups", [(1, 1), (2,)], ids=["alone", "together"])
+async def test_frames_of_a_peer_without_a_link_are_dropped_and_counted(wake_ups: tuple[int, ...]) -> None:
+    """A relay carries no frames of its own, whatever a policy says."""
+    scene = Scene([(0, [NEW]), (0, [OLD])])
+    scene.peer = Pair().b.peer
+    scene.read(*wake_ups)
+    assert scene.delivered == []
+    assert scene.dropped == [(DropReason.FRAMES_NOT_ALLOWED, "alpha")] * 2
+
+
+async def test_data_along_a_relay_is_unwrapped_or_taken() -> None:
+    """The core gets the inner datagram with the relayed path; what the hook keeps for itself goes nowhere else."""
+    scene = Scene([(0, [NEW]), (0, [OLD])])
+    table = RelayHandles()
+    table.assign("vps", AT_A, [7])
+    reasons: list[DropReason] = []
+
+    def take(socket: int, data: bytes, source: SocketAddress) -> WaitingDatagram | None:
+        taken = table.unwrap(socket, data, source)
+        if isinstance(taken, DropReason):
+            reasons.append(taken)
+            return None
+        return taken
+
+    scene.intake.take_relayed = take
+    data = [wrap(7, DATAGRAM + b"rest"), wrap(8, DATAGRAM), wrap(7, b"\x50"), DATAGRAM]
+    scene.intake.receive(AT_A.socket, [(datagram, AT_A.address) for datagram in data], monotonic(), 0, 0.0)
+    assert reasons == [DropReason.RELAY_UNKNOWN_HANDLE, DropReason.RELAY_MALFORMED]
+    assert scene.received == [
+        (DATAGRAM + b"rest", relayed(AT_A.socket, "vps", 7)),
+        (DATAGRAM, AT_A),
+    ]

@@ -14,10 +14,12 @@ import pytest
 import structlog
 
 from tests.link.socket_states import SocketStateLog
-from uavlinkd.core.path import Path
+from uavlinkd.core.path import Path, relayed
+from uavlinkd.core.relay_records import wrap
 from uavlinkd.link.drop_summary import EVERYDAY, DropSummary
 from uavlinkd.link.evidence import Evidence
 from uavlinkd.link.peer_sockets import PeerSockets
+from uavlinkd.link.relay_handles import RelayHandles
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.stall import StallWatch
 
@@ -69,3 +71,22 @@ def test_what_is_not_taken_is_counted_and_the_next_is_sent(name: str) -> None:
     assert sockets.failures == {name: 3}
     logged = [] if name in EVERYDAY else [("sends_failed", name)]
     assert [(event, fields["reason"]) for event, fields in lines] == logged
+
+
+def test_relayed_path_goes_to_the_relay_or_nowhere() -> None:
+    """Wrapped, along the same socket. Without its handle nothing is sent: its host is not a name to look up."""
+    stall = StallWatch(0.0, lambda seconds: None)
+    drops = DropSummary(structlog.get_logger())
+    sockets = PeerSockets(
+        lambda *read: None, stall, drops, Evidence({}, b""), structlog.get_logger(), SocketStateLog()
+    )
+    sockets.open([Address("127.0.0.1", 0)])
+    sock = Refusing(errno.EPERM)
+    sock.is_out = False
+    sockets.put(0, cast(socket.socket, sock))
+    sockets.relayed = RelayHandles()
+    sockets.relayed.assign("vps", Path(0, ("127.0.0.1", 9)), [7])
+    sockets.send(b"inner", relayed(0, "vps", 7))
+    sockets.send(b"inner", relayed(0, "vps", 8))
+    assert sock.sent == [wrap(7, b"inner")]
+    assert sockets.failures == {"relay_handle_gone": 1} == drops.totals

@@ -27,6 +27,13 @@ class DropReason(Reason):
     MALFORMED = "malformed", "the length or type fits no message, or an index or counter has an invalid value"
     RAW_MAVLINK = "raw_mavlink", "a bare MAVLink frame arrived at the port for peers: any sender could have sent it"
 
+    # Along relays: section 21. The shell counts these.
+    RELAY_MALFORMED = "relay_malformed", "data along a relay has no handle, or contains no datagram of a session"
+    RELAY_UNKNOWN_HANDLE = (
+        "relay_unknown_handle",
+        "data along a relay has a handle that is not assigned to its sender: it is old or forged",
+    )
+
     # Handshake.
     UNEXPECTED_RESPONSE = "unexpected_response", "the response belongs to no pending initiation of this daemon"
     BAD_MAC1 = "bad_mac1", "the sender does not know this daemon's public key, or the message was altered"
@@ -92,6 +99,7 @@ class DropReason(Reason):
     DELAYED = "delayed", "the peer sent the envelope too long ago: it was delayed on its path"
     BAD_TAG = "bad_tag", "the tag does not verify: the envelope was altered or forged"
     BAD_CONTROL = "bad_control", "the envelope is authentic, but its control record is invalid"
+    FRAMES_NOT_ALLOWED = "frames_not_allowed", "a relay, or a member that is not a peer, sent frames"
     UNEXPECTED_ANSWER = (
         "unexpected_answer",
         "the answer belongs to no question that waits, or came along another path than the question",

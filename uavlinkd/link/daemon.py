@@ -18,8 +18,10 @@ from uavlinkd.config.changes import compare
 from uavlinkd.config.load import load_in_thread
 from uavlinkd.core import outputs as o
 from uavlinkd.core.constants import NEVER
+from uavlinkd.core.drops import DropReason
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import LinkedPeer, Output
+from uavlinkd.core.path import Path
 from uavlinkd.core.timers import Schedule
 from uavlinkd.endpoints.ports import LocalPort
 from uavlinkd.link.conditions import LineLimits
@@ -34,6 +36,7 @@ from uavlinkd.link.local_endpoints import LocalEndpoints
 from uavlinkd.link.network_budgets import NetworkBudget, budgets_of, follow_rates
 from uavlinkd.link.passage import Passage
 from uavlinkd.link.peer_link import PeerLink, radio_figures
+from uavlinkd.link.peer_owners import PeerOwner
 from uavlinkd.link.peer_sockets import PeerSockets
 from uavlinkd.link.pilot_notes import PilotNotes
 from uavlinkd.link.shell_reasons import ShellReason
@@ -77,6 +80,8 @@ class Daemon:
         self.node = Node(config.private_key, os.urandom, now, config.previous_private_key, screen=screen)
         self.links: dict[str, PeerLink] = {}
         self._link_of: dict[LinkedPeer, PeerLink] = {}
+        self.owners: dict[LinkedPeer, PeerOwner] = {}
+        """Of the peers in the core that carry no frames."""
         self.evidence = Evidence(self.links, config.public_key)
         self.history = History(now)
         self.passage = Passage()
@@ -100,6 +105,7 @@ class Daemon:
             self._on_peer_frames,
             self._settle,
             self._on_superseded,
+            self._drop_datagram,
         )
         self.peer_sockets = PeerSockets(
             self._intake.receive, self.stall, self._drops, self.evidence, self.log, self.node
@@ -332,6 +338,11 @@ class Daemon:
     def _on_superseded(self, link: PeerLink, count: int) -> None:
         self._drops.add("frames_dropped", ShellReason.SUPERSEDED, link.name, count, monotonic())
 
+    def _drop_datagram(self, reason: DropReason, name: str = "", path: Path | None = None) -> None:
+        """Count a datagram that the core does not drop."""
+        self.node.drops[reason] += 1
+        self._drops.add("datagrams_dropped", reason, name, 1, monotonic(), "" if path is None else ("", path))
+
     def _forward_if_fresh(
         self, source: PeerLink | LocalPort, frames: list[Frame], now: float, epoch: int, waited_s: float = 0.0
     ) -> None:
@@ -357,11 +368,17 @@ class Daemon:
                 now = monotonic()
                 self._drops.add_dropped(output, now)
                 self.evidence.add_dropped(output, now)
-            elif not isinstance(output, o.RecordReceived):  # no peer is a relay, or a member of one
+            elif isinstance(output, o.RecordReceived):
+                if (owner := self.owners.get(output.peer)) is not None:  # without one, the session refuses records
+                    owner.on_record(output, monotonic())
+            else:
                 self._on_event(output)
 
     def _on_event(self, event: o.Event) -> None:
         now = monotonic()
+        if (owner := self.owners.get(event.peer)) is not None:
+            owner.on_event(event, now)
+            return
         self._events.write(event, now)
         link = self._link_of[event.peer]
         if isinstance(event, o.PeerLost | o.PeerClosed):

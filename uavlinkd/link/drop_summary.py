@@ -56,6 +56,7 @@ SECURITY: Final = frozenset[str](
         *(DropReason.UNKNOWN_PEER, DropReason.HEADER_MISMATCH, DropReason.BAD_PARAMETERS, DropReason.BAD_COOKIE),
         *(DropReason.TOO_LONG, DropReason.LONG_COUNTER, DropReason.REPLAYED, DropReason.DELAYED),
         *(DropReason.BAD_TAG, DropReason.BAD_CONTROL, Refusal.HIDDEN_FRAME, Refusal.FOREIGN_SYSTEM),
+        DropReason.FRAMES_NOT_ALLOWED,
     }
 )
 """An attack, a captured member, or wrong keys. A healthy link causes none of them."""
@@ -63,7 +64,7 @@ EVERYDAY: Final = frozenset[str](
     {
         *(DropReason.UNEXPECTED_RESPONSE, DropReason.UNEXPECTED_COOKIE, DropReason.UNKNOWN_INDEX, DropReason.LATE),
         *(DropReason.SESSION_EXPIRED, DropReason.UNEXPECTED_ANSWER, DropReason.DOUBTFUL, DropReason.OVER_SHARE),
-        *("EAGAIN", "ENOBUFS", "ECONNREFUSED"),
+        *("EAGAIN", "ENOBUFS", "ECONNREFUSED", DropReason.RELAY_UNKNOWN_HANDLE, ShellReason.RELAY_HANDLE_GONE),
     }
 )
 """A lost datagram, a rekey or a restarted peer causes a few of them."""

@@ -6,12 +6,14 @@ import asyncio
 from collections.abc import Callable, Iterator, Mapping
 from time import thread_time
 
+from uavlinkd.core.drops import DropReason
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Deliver, LinkedPeer, Output
 from uavlinkd.core.path import Path, SocketAddress
 from uavlinkd.core.wire import ENVELOPE_STARTS
 from uavlinkd.endpoints.reader import Datagrams
 from uavlinkd.link.peer_link import PeerLink
+from uavlinkd.link.relay_handles import RELAYED_START
 from uavlinkd.link.switch import Switch
 from uavlinkd.link.turns import TURN_FRAMES, TURN_S, Turns, WaitingDatagram, cost_of
 from uavlinkd.mavlink.frames import Frame, split_payload
@@ -22,6 +24,11 @@ MAX_PATHS = 1024
 """Paths of received datagrams that are remembered: a frame on one of them costs no new object."""
 
 
+TakeRelayed = Callable[[int, bytes, SocketAddress], WaitingDatagram | None]
+"""Receives the number of a socket, data that begins with 0x50, and its source. Returns the datagram inside with its
+path; or None if the data was forwarded, or dropped and counted."""
+
+
 class Intake:
     """Receives the datagrams of the peers, and forwards the frames in them once per turn.
 
@@ -29,7 +36,8 @@ class Intake:
     them to :meth:`add`. ``forward`` receives the frames of one peer with the time and the epoch of their reading, and
     drops those from before a pause. Without a pause the frames of a datagram that arrived alone go to the switch
     directly. ``settle`` is called when the core may have new deadlines. ``on_superseded`` counts the frames of
-    a peer with several paths that are dropped, because newer ones were delivered.
+    a peer with several paths that are dropped, because newer ones were delivered. ``on_dropped`` counts a datagram
+    with frames of a peer of the core that has no link, such as a relay, with its name.
     """
 
     def __init__(
@@ -42,6 +50,7 @@ class Intake:
         forward: Callable[[PeerLink, list[Frame], float, int], None],
         settle: Callable[[], None],
         on_superseded: Callable[[PeerLink, int], None],
+        on_dropped: Callable[[DropReason, str], None],
     ) -> None:
         self._node = node
         self._stall = stall
@@ -51,6 +60,9 @@ class Intake:
         self._forward = forward
         self._settle = settle
         self._on_superseded = on_superseded
+        self._on_dropped = on_dropped
+        self.take_relayed: TakeRelayed | None = None
+        """None while this daemon neither uses relays nor is one: the core drops such data."""
         self._loop = asyncio.get_running_loop()
         self._turns = Turns()
         self._frames: dict[PeerLink, list[Frame]] = {}
@@ -59,9 +71,13 @@ class Intake:
 
     def receive(self, socket: int, datagrams: Datagrams, now: float, epoch: int, waited_s: float) -> None:
         """Receive the datagrams of one wake-up from a socket, or let them wait for their senders' turns."""
-        paths = self._paths
+        paths, take_relayed = self._paths, self.take_relayed
         arrived: list[WaitingDatagram] = []
         for datagram, address in datagrams:
+            if take_relayed is not None and datagram[:1] == RELAYED_START:
+                if (taken := take_relayed(socket, datagram, address)) is not None:
+                    arrived.append(taken)
+                continue
             path = paths.get((socket, address))
             if path is None:
                 if len(paths) >= MAX_PATHS:
@@ -72,9 +88,13 @@ class Intake:
             outputs = self._node.receive(*arrived[0], now)
             stall = self._stall
             is_fresh = epoch == stall.epoch and monotonic() - stall.turned_at <= STALL_S
-            if is_fresh and len(outputs) == 1 and type(outputs[0]) is Deliver:
-                peer, payload, order = outputs[0]
-                link = self._links[peer]
+            if (
+                is_fresh
+                and len(outputs) == 1
+                and type(outputs[0]) is Deliver
+                and (link := self._links.get(outputs[0].peer)) is not None
+            ):
+                _, payload, order = outputs[0]
                 frames = split_payload(payload, link.counters)
                 if order:
                     frames = self._pick_newest(outputs[0], link, frames, now)
@@ -117,7 +137,10 @@ class Intake:
 
     def add(self, delivered: Deliver) -> None:
         """Keep frames that the core delivers until the turn is over. Their cost is charged to it."""
-        link = self._links[delivered.peer]
+        link = self._links.get(delivered.peer)
+        if link is None:  # whatever a policy says
+            self._on_dropped(DropReason.FRAMES_NOT_ALLOWED, delivered.peer.name)
+            return
         frames = split_payload(delivered.payload, link.counters)
         self._cost += cost_of(delivered.payload, len(frames))
         if delivered.order:  # the peer has several paths

@@ -23,7 +23,9 @@ from uavlinkd.link.evidence import Evidence
 from uavlinkd.link.networks import Networks, SocketStates
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.peer_names import PeerNames
+from uavlinkd.link.relay_handles import RelayHandles
 from uavlinkd.link.serial_networks import SerialNetworks
+from uavlinkd.link.shell_reasons import ShellReason
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.resolver import LONGEST_WAIT_S, RELAXED_WAIT_S, Resolved
@@ -103,6 +105,8 @@ class PeerSockets:
         self.networks: Networks | None = None
         """Those of interfaces and addresses, if the configuration has any."""
         self.serial: SerialNetworks
+        self.relayed: RelayHandles | None = None
+        """Those of this daemon, if it uses relays."""
         self._receive = receive
         self._stall = stall
         self._drops = drops
@@ -258,6 +262,12 @@ class PeerSockets:
     def send(self, datagram: bytes, path: Path) -> None:
         """Pass a datagram to the kernel."""
         number, address = path
+        if self.relayed is not None and path.is_relayed:
+            if (wrapped := self.relayed.wrap(datagram, path)) is None:
+                self._drops.add("sends_failed", ShellReason.RELAY_HANDLE_GONE, "", 1, monotonic())
+                self.failures[ShellReason.RELAY_HANDLE_GONE] += 1
+                return
+            datagram, address = wrapped
         try:
             self._senders[number](datagram, address)
         except OSError as error:

@@ -12,3 +12,4 @@ class ShellReason(Reason):
     SUPERSEDED = "superseded", "newer states arrived first along another path of the peer"
     COPY_OVER_BUDGET = "copy_over_budget", "copies waited too long for a budget"
     COPY_REPLACED = "copy_replaced", "newer states replaced copies that waited"
+    RELAY_HANDLE_GONE = "relay_handle_gone", "a datagram for a relay has a handle that the relay assigns no more"

@@ -46,6 +46,9 @@ DATAGRAMS: Final[Mapping[str, str]] = {
     "doubtful": "not confirmed as new in time",
     "no_session": "while the link was down",
     "too_large": "too large for an envelope",
+    "frames_not_allowed": "with frames of a relay or a member",
+    "relay_malformed": "malformed along a relay",
+    "relay_unknown_handle": "of an unknown handle of a relay",
 }
 """Of dropped datagrams and outgoing frames (``DropReason``)."""
 

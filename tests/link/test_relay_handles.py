@@ -1,0 +1,54 @@
+"""Handles on paths to relays: only those that were assigned lead somewhere, in both directions."""
+
+from __future__ import annotations
+
+from uavlinkd.core.drops import DropReason
+from uavlinkd.core.path import Path, relayed
+from uavlinkd.core.relay_records import wrap
+from uavlinkd.link.relay_handles import RelayHandles
+
+LTE, MESH = Path(0, ("203.0.113.1", 5790)), Path(1, ("203.0.113.1", 5790))
+ENVELOPE = b"\x40envelope"
+
+
+def test_what_is_wrapped_here_is_unwrapped_there() -> None:
+    """Data goes to the address of the relay; what comes from there came along the relayed path."""
+    paths = RelayHandles()
+    paths.assign("vps", LTE, [7, 8])
+    assert paths.wrap(ENVELOPE, relayed(0, "vps", 7)) == (wrap(7, ENVELOPE), LTE.address)
+    assert paths.unwrap(0, wrap(7, ENVELOPE), LTE.address) == (ENVELOPE, relayed(0, "vps", 7))
+
+
+def test_handle_is_valid_on_its_socket_and_from_its_relay_only() -> None:
+    """The same relay along another network has other handles."""
+    paths = RelayHandles()
+    paths.assign("vps", LTE, [7])
+    paths.assign("vps", MESH, [9])
+    unknown = DropReason.RELAY_UNKNOWN_HANDLE
+    assert paths.unwrap(1, wrap(7, ENVELOPE), MESH.address) is unknown
+    assert paths.unwrap(0, wrap(9, ENVELOPE), LTE.address) is unknown
+    assert paths.unwrap(0, wrap(7, ENVELOPE), ("203.0.113.1", 5791)) is unknown
+    assert paths.wrap(ENVELOPE, relayed(1, "vps", 7)) is None
+    assert paths.wrap(ENVELOPE, relayed(0, "other", 7)) is None
+
+
+def test_later_handles_replace_those_of_the_same_path() -> None:
+    """And no others."""
+    paths = RelayHandles()
+    paths.assign("vps", LTE, [7])
+    paths.assign("vps", MESH, [9])
+    paths.assign("vps", LTE, [8])
+    assert paths.wrap(ENVELOPE, relayed(0, "vps", 7)) is None
+    assert paths.unwrap(0, wrap(7, ENVELOPE), LTE.address) is DropReason.RELAY_UNKNOWN_HANDLE
+    assert paths.wrap(ENVELOPE, relayed(0, "vps", 8)) is not None
+    paths.assign("vps", LTE, [])
+    assert paths.wrap(ENVELOPE, relayed(0, "vps", 8)) is None
+    assert paths.wrap(ENVELOPE, relayed(1, "vps", 9)) is not None
+
+
+def test_malformed_data_is_dropped_before_its_handle_is_looked_up() -> None:
+    """Nothing inside, and a relay inside a relay."""
+    paths = RelayHandles()
+    paths.assign("vps", LTE, [7])
+    for data in (wrap(7, b""), wrap(7, wrap(7, ENVELOPE)), b"\x50"):
+        assert paths.unwrap(0, data, LTE.address) is DropReason.RELAY_MALFORMED

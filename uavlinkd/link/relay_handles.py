@@ -1,0 +1,46 @@
+"""Paths along relays: which handles are ours, and data along them. uavlinkd/core/README.md, section 21."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from uavlinkd.core.drops import DropReason
+from uavlinkd.core.path import Path, SocketAddress, relayed
+from uavlinkd.core.relay_records import RELAYED, handle_of, wrap
+from uavlinkd.link.turns import WaitingDatagram
+
+RELAYED_START = bytes((RELAYED,))
+_HEADER_BYTES = 3
+
+
+class RelayHandles:
+    """The handles that relays assigned to this daemon, each on its path to the relay."""
+
+    def __init__(self) -> None:
+        self._inward: dict[tuple[int, SocketAddress, int], Path] = {}
+        self._outward: dict[Path, tuple[SocketAddress, int]] = {}
+
+    def assign(self, relay: str, at: Path, handles: Iterable[int]) -> None:
+        """These are all handles on the path ``at`` to the relay of this name from now on."""
+        for key in [key for key in self._inward if key[:2] == at]:
+            del self._outward[self._inward.pop(key)]
+        for handle in handles:
+            path = relayed(at.socket, relay, handle)
+            self._inward[at.socket, at.address, handle] = path
+            self._outward[path] = at.address, handle
+
+    def unwrap(self, socket: int, data: bytes, source: SocketAddress) -> WaitingDatagram | DropReason:
+        """The datagram in data that begins with :data:`RELAYED_START`, and its relayed path; or why it is dropped."""
+        handle = handle_of(data)
+        if not handle:
+            return DropReason.RELAY_MALFORMED
+        path = self._inward.get((socket, source, handle))
+        return DropReason.RELAY_UNKNOWN_HANDLE if path is None else (data[_HEADER_BYTES:], path)
+
+    def wrap(self, datagram: bytes, path: Path) -> tuple[bytes, SocketAddress] | None:
+        """What is sent instead of a datagram along a relayed path, and where. None if its handle is gone."""
+        known = self._outward.get(path)
+        if known is None:
+            return None
+        address, handle = known
+        return wrap(handle, datagram), address
