@@ -14,7 +14,10 @@ import pytest
 from tests.imports import circle, graph, imports, is_inside, roots, sources
 from uavlinkd import core
 
-ORDER = ("system", "core", "mavlink", "endpoints", "config", "ops", "fleet", "lab", "link", "cli", "__main__")
+ORDER = (
+    *("system", "core", "mavlink", "endpoints", "relay", "config", "ops", "fleet", "lab", "link"),
+    *("cli", "__main__"),
+)
 """Each package may import those before it."""
 IMPURE = {
     *("asyncio", "concurrent", "multiprocessing", "select", "selectors", "signal", "socket", "ssl", "threading"),

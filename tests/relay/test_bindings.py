@@ -1,0 +1,314 @@
+"""The bindings of a relay: against a model with random histories, and rule by rule."""
+
+from __future__ import annotations
+
+import random
+from collections import defaultdict
+from collections.abc import Iterable
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from uavlinkd.core import constants as c
+from uavlinkd.core.path import Path
+from uavlinkd.relay.bindings import QUARANTINED_PER_MEMBER, Bindings, Changes, ConnectionEnd, MemberConnection
+
+A, B, C, D = (bytes([number]) * c.KEY_BYTES for number in range(1, 5))
+STRANGER = bytes([9]) * c.KEY_BYTES
+MEMBERS = (A, B, C, D)
+PATHS = {
+    member: [Path(socket, (f"192.0.2.{1 + MEMBERS.index(member)}", port)) for socket in (0, 1) for port in (1, 2, 3)]
+    for member in MEMBERS
+}
+
+
+def path(member: bytes, number: int = 0) -> Path:
+    """A path of a member."""
+    return PATHS[member][number]
+
+
+def bindings(seed: int = 1, members: Iterable[bytes] = MEMBERS, most_peers: int = 10) -> Bindings:
+    """Of these members."""
+    made = Bindings(random.Random(seed).randbytes)
+    for member in members:
+        made.set_member(member, most_peers)
+    return made
+
+
+def connect(made: Bindings, now: float = 0.0) -> MemberConnection:
+    """Connect A with B."""
+    made.bind(A, path(A), [B], now)
+    (connection,) = made.bind(B, path(B), [A], now).opened
+    return connection
+
+
+class Model:
+    """The rules, without any concern for cost."""
+
+    def __init__(self) -> None:
+        self.wishes: dict[tuple[bytes, bytes, Path], float] = {}
+        self.quarantine: dict[tuple[bytes, int], float] = {}
+        self.connections: set[MemberConnection] = set()
+
+    def paths(self, member: bytes, key: bytes) -> set[Path]:
+        """Along which a member wishes for a key."""
+        return {path for of, wanted, path in self.wishes if (of, wanted) == (member, key)}
+
+    def apply(self, changes: Changes, now: float) -> None:
+        """Check what changed by itself."""
+        for connection in changes.closed:
+            self.connections.remove(connection)
+            for end in connection:
+                self.quarantine[end.member, end.handle] = now + c.HANDLE_QUARANTINE_S
+        for connection in changes.opened:
+            for end in connection:
+                assert 0 < end.handle < 2**16
+                assert now >= self.quarantine.get((end.member, end.handle), 0.0)
+            self.connections.add(connection)
+        for end, other in ends(changes.opened + changes.closed):
+            assert other.member in changes.concerned[end.member, end.path]
+
+    def check(self, made: Bindings) -> None:
+        """Check everything that holds after every step."""
+        of_pair: dict[frozenset[bytes], list[MemberConnection]] = defaultdict(list)
+        handles: dict[tuple[bytes, Path, bytes], set[int]] = defaultdict(set)
+        for connection in self.connections:
+            of_pair[frozenset(end.member for end in connection)].append(connection)
+        for end, other in ends(self.connections):
+            assert end.path in self.paths(end.member, other.member)
+            handles[end.member, end.path, other.member].add(end.handle)
+        every = [(end.member, end.handle) for end, _ in ends(self.connections)]
+        assert len(set(every)) == len(every)
+        for one in MEMBERS:
+            for other_key in MEMBERS:
+                theirs, ours = self.paths(other_key, one), self.paths(one, other_key)
+                count = len(of_pair[frozenset((one, other_key))]) if one != other_key else 0
+                assert count == (min(c.HANDLES_PER_PAIR, len(ours) * len(theirs)) if one != other_key else 0)
+                for a_path in PATHS[one]:
+                    shown = made.handles(one, a_path, other_key)
+                    assert set(shown) == handles[one, a_path, other_key]
+                    assert bool(shown) == (a_path in ours and bool(theirs))
+        assert made.connections == len(self.connections)
+
+
+def ends(connections: Iterable[MemberConnection]) -> Iterable[tuple[ConnectionEnd, ConnectionEnd]]:
+    """Each end, with the one opposite."""
+    return [pair for connection in connections for pair in (tuple(connection), tuple(connection[::-1]))]  # type: ignore[misc]
+
+
+Step = tuple[str, bytes, int, list[bytes]]
+member_keys = st.sampled_from(MEMBERS)
+steps: st.SearchStrategy[Step] = st.one_of(
+    st.tuples(st.just("bind"), member_keys, st.integers(0, 5), st.lists(st.sampled_from((*MEMBERS, STRANGER)))),
+    st.tuples(st.just("end"), member_keys, st.integers(0, 5), st.just([])),
+    st.tuples(st.just("wait"), member_keys, st.integers(1, 40), st.just([])),
+)
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.integers(0, 1000), st.lists(steps, max_size=40))
+def test_random_histories_follow_the_rules(seed: int, history: list[Step]) -> None:
+    """Whatever members bind, lose and let expire."""
+    made, model, now = bindings(seed), Model(), 0.0
+    for kind, member, number, keys in history:
+        if kind == "wait":
+            now += number
+            changes = made.expire(now)
+            model.wishes = {wish: until for wish, until in model.wishes.items() if until > now}
+        elif kind == "end":
+            changes = made.end_path(member, path(member, number), now)
+            gone = [wish for wish in model.wishes if (wish[0], wish[2]) == (member, path(member, number))]
+            for wish in gone:
+                del model.wishes[wish]
+        else:
+            changes = made.bind(member, path(member, number), keys, now)
+            for key in dict.fromkeys(keys):
+                assert key in changes.concerned[member, path(member, number)]
+                if key in (member, STRANGER):
+                    continue
+                wish = member, key, path(member, number)
+                others = {(member, key, other) for other in model.paths(member, key)} - {wish}
+                if wish not in model.wishes and len(others) >= c.HANDLES_PER_PAIR:
+                    # Of equally old ones, any may go: the one that the bindings chose has no handle any more.
+                    least = min(model.wishes[other] for other in others)
+                    oldest = [other for other in others if model.wishes[other] == least]
+                    kept = [other for other in oldest if other[2] in made.paths_of(member)]
+                    del model.wishes[next((other for other in oldest if other not in kept), oldest[0])]
+                model.wishes[wish] = now + c.BIND_LIFETIME_S
+        model.apply(changes, now)
+        model.check(made)
+
+
+# Rule by rule.
+
+
+def test_pair_is_connected_once_both_have_asked() -> None:
+    """Each gets a handle of its own, and both are to be notified."""
+    made = bindings()
+    first = made.bind(A, path(A), [B], 0.0)
+    assert first == Changes([], [], {(A, path(A)): {B: None}})
+    assert made.handles(A, path(A), B) == ()
+    changes = made.bind(B, path(B), [A], 0.0)
+    (connection,) = changes.opened
+    assert made.handles(A, path(A), B) == (connection.one.handle,)
+    assert made.handles(B, path(B), A) == (connection.other.handle,)
+    assert changes.concerned == {(A, path(A)): {B: None}, (B, path(B)): {A: None}}
+
+
+@pytest.mark.parametrize("key", [STRANGER, C, A], ids=["unknown", "absent", "its own"])
+def test_answer_does_not_tell_who_exists(key: bytes) -> None:
+    """The same for a key that is not a member, for a member that did not ask, and for the member's own."""
+    made = bindings()
+    assert made.bind(A, path(A), [key], 0.0) == Changes([], [], {(A, path(A)): {key: None}})
+    assert made.handles(A, path(A), key) == ()
+
+
+def test_renewal_keeps_the_handles() -> None:
+    """The other member is not notified."""
+    made = bindings()
+    connection = connect(made)
+    changes = made.bind(A, path(A), [B], 30.0)
+    assert (changes.opened, changes.closed) == ([], [])
+    assert changes.concerned == {(A, path(A)): {B: None}}
+    assert made.handles(A, path(A), B) == (connection.one.handle,)
+
+
+def test_connection_ends_with_the_wish_of_either() -> None:
+    """After the lifetime of a wish, and not before."""
+    made = bindings()
+    connection = connect(made)
+    made.bind(A, path(A), [B], 30.0)
+    assert made.next_expiry == c.BIND_LIFETIME_S
+    assert made.expire(c.BIND_LIFETIME_S - 0.01) == Changes.none()
+    changes = made.expire(c.BIND_LIFETIME_S)
+    assert changes.closed == [connection]
+    assert changes.concerned == {(A, path(A)): {B: None}, (B, path(B)): {A: None}}
+    assert made.handles(A, path(A), B) == ()
+    made.expire(30.0 + c.BIND_LIFETIME_S)
+    assert made.next_expiry == c.NEVER
+
+
+def test_connection_ends_with_its_path() -> None:
+    """Those along other paths stay."""
+    made = bindings()
+    connection = connect(made)
+    made.bind(A, path(A, 1), [B], 0.0)
+    assert made.end_path(A, path(A), 1.0).closed == [connection]
+    assert made.handles(A, path(A, 1), B)
+    assert made.handles(A, path(A), B) == ()
+
+
+def test_two_networks_at_each_end_have_four_connections() -> None:
+    """So copies along both pass whichever of them works."""
+    made = bindings()
+    for member, key in ((A, B), (B, A)):
+        for number in (0, 1):
+            made.bind(member, path(member, number), [key], 0.0)
+    assert made.connections == 4
+    assert [len(made.handles(A, path(A, number), B)) for number in (0, 1)] == [2, 2]
+
+
+def test_new_path_takes_the_place_of_a_spare_connection() -> None:
+    """Every path has one; the others keep their handles."""
+    made = bindings()
+    for member, key in ((A, B), (B, A)):
+        for number in (0, 1):
+            made.bind(member, path(member, number), [key], 0.0)
+    changes = made.bind(A, path(A, 2), [B], 1.0)
+    assert (len(changes.opened), len(changes.closed)) == (1, 1)
+    assert all(made.handles(A, path(A, number), B) for number in (0, 1, 2))
+    assert all(made.handles(B, path(B, number), A) for number in (0, 1))
+
+
+def test_fifth_path_replaces_the_one_renewed_least_recently() -> None:
+    """A member whose NAT changes its address keeps the paths that it renews."""
+    made = bindings()
+    connect(made)
+    for number in (1, 2, 3):
+        made.bind(A, path(A, number), [B], float(number))
+    made.bind(A, path(A), [B], 4.0)
+    made.bind(A, path(A, 4), [B], 5.0)
+    assert [bool(made.handles(A, path(A, number), B)) for number in range(5)] == [True, False, True, True, True]
+    assert made.connections == c.HANDLES_PER_PAIR
+
+
+def test_handle_is_quarantined() -> None:
+    """It is not given to its member again until then, although the random source returns it."""
+    draws = [1, 2, 1, 2, 3, 2, 4]  # A's, B's; then both again
+    made = Bindings(lambda size: (draws.pop(0) if draws else 1).to_bytes(size, "big"))
+    made.set_member(A, 10)
+    made.set_member(B, 10)
+    assert {end.handle for end in connect(made)} == {1, 2}
+    made.end_path(A, path(A), 1.0)
+    made.bind(A, path(A), [B], 2.0)
+    assert made.handles(A, path(A), B) == (2,)  # which was only B's
+    assert made.handles(B, path(B), A) == (3,)
+    draws[:] = [1, 5]
+    made.bind(B, path(B), [A], 1.0 + c.HANDLE_QUARANTINE_S)
+    made.end_path(A, path(A), 1.0 + c.HANDLE_QUARANTINE_S)
+    made.bind(A, path(A), [B], 1.0 + c.HANDLE_QUARANTINE_S)
+    assert made.handles(A, path(A), B) == (1,)
+
+
+def test_zero_is_not_a_handle() -> None:
+    """It stands for none."""
+    draws = [0, 7, 0, 8]
+    made = Bindings(lambda size: draws.pop(0).to_bytes(size, "big"))
+    made.set_member(A, 10)
+    made.set_member(B, 10)
+    assert {end.handle for end in connect(made)} == {7, 8}
+
+
+def test_member_that_changes_its_paths_fast_does_not_use_up_the_handles_of_another() -> None:
+    """Of 65,535 handles at most so many rest; the others are free for other members."""
+    made = bindings()
+    made.bind(A, path(A), [B, C], 0.0)
+    made.bind(C, path(C), [A], 0.0)
+    used = set[int]()
+    for port in range(1, 3 * QUARANTINED_PER_MEMBER):
+        made.bind(B, Path(0, ("192.0.2.7", port)), [A], 1.0)
+        used.update(made.handles(A, path(A), B))
+        made.end_path(B, Path(0, ("192.0.2.7", port)), 1.0)
+    assert len(used) > 2 * QUARANTINED_PER_MEMBER
+    assert made.handles(A, path(A), C)
+    assert made.connections == 1
+
+
+def test_ten_thousand_requested_bindings_are_bounded() -> None:
+    """A member has as many wishes as it may; those beyond are waiting, like all that are not there."""
+    members = [number.to_bytes(c.KEY_BYTES, "big") for number in range(1, 10_001)]
+    made = bindings(members=members, most_peers=100)
+    greedy = members[0]
+    answers = [made.bind(greedy, Path(0, ("192.0.2.1", 1)), [key], 0.0) for key in members[1:]]
+    assert made.peers_of(greedy) == (0, 100)
+    assert made.refused(greedy) == 9_899
+    assert all(
+        list(answer.concerned.values()) == [{key: None}] for answer, key in zip(answers, members[1:], strict=True)
+    )
+    made.expire(c.BIND_LIFETIME_S)
+    made.bind(greedy, Path(0, ("192.0.2.1", 1)), [members[-1]], 61.0)
+    assert made.peers_of(greedy) == (0, 1)
+
+
+def test_removed_member_leaves_nothing_behind_it() -> None:
+    """Its handles end for both, and the wishes for it too."""
+    made = bindings()
+    connection = connect(made)
+    made.bind(C, path(C), [A], 0.0)
+    changes = made.remove_member(A, 1.0)
+    assert changes.closed == [connection]
+    assert {member for member, _ in changes.concerned} >= {B}
+    assert made.peers_of(B) == made.peers_of(C) == (0, 0)
+    made.set_member(A, 10)
+    assert made.bind(A, path(A), [B, C], 2.0).opened == []
+
+
+def test_lower_limit_keeps_what_is_there() -> None:
+    """It counts for new wishes."""
+    made = bindings()
+    made.bind(A, path(A), [B, C], 0.0)
+    made.set_member(A, 1)
+    made.bind(A, path(A), [B, C, D], 1.0)
+    assert made.peers_of(A) == (0, 2)
+    assert made.refused(A) == 1

@@ -1,0 +1,158 @@
+"""The forwarding of datagrams: which ones pass, to where, and what each drop is called."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from uavlinkd.core.path import Path
+from uavlinkd.core.relay_records import INNER_STARTS, wrap
+from uavlinkd.relay.bindings import ConnectionEnd, MemberConnection
+from uavlinkd.relay.forwarding import BURST_S, Forwarding, MemberLimits, Meter, RelayDrop
+
+AT_A, AT_B = Path(0, ("192.0.2.1", 1000)), Path(1, ("2001:db8::2", 2000, 0, 0))
+A, B = ConnectionEnd(b"a" * 32, AT_A, 0x1111), ConnectionEnd(b"b" * 32, AT_B, 0x2222)
+DATAGRAM = b"\x40datagram"
+DEFAULT = MemberLimits()
+STRANGER = ("198.51.100.9", 4000)
+
+
+class Relay:
+    """A forwarding with one connection, and what it sent."""
+
+    def __init__(self, limits: MemberLimits = DEFAULT) -> None:
+        self.sent: list[tuple[bytes, Path]] = []
+        self.forwarding = Forwarding(lambda datagram, path: self.sent.append((datagram, path)))
+        self.meters = Meter(limits), Meter(limits)
+        self.forwarding.open(MemberConnection(A, B), self.meters)
+
+    def arrive(self, *datagrams: bytes, path: Path = AT_A, now: float = 0.0) -> list[bytes]:
+        """These arrive along a path. Returns those that are for the node."""
+        rest = self.forwarding.forward(path.socket, [(datagram, path.address) for datagram in datagrams], now)
+        return [datagram for datagram, _ in rest]
+
+
+def test_datagram_is_forwarded_with_the_handle_of_its_receiver() -> None:
+    """In both directions, byte for byte, and no longer than it was."""
+    relay = Relay()
+    assert relay.arrive(wrap(A.handle, DATAGRAM)) == []
+    assert relay.arrive(wrap(B.handle, DATAGRAM), path=AT_B) == []
+    assert relay.sent == [(wrap(B.handle, DATAGRAM), AT_B), (wrap(A.handle, DATAGRAM), AT_A)]
+    size = len(wrap(A.handle, DATAGRAM))
+    assert [(meter.datagrams, meter.bytes) for meter in relay.meters] == [(1, size), (1, size)]
+    assert (relay.forwarding.datagrams, relay.forwarding.bytes) == (2, 2 * size)
+    assert not relay.forwarding.dropped
+
+
+@pytest.mark.parametrize("path", [Path(0, STRANGER), Path(1, AT_A.address), Path(0, ("192.0.2.1", 1001)), AT_B])
+def test_handle_counts_only_at_its_address(path: Path) -> None:
+    """Not at a stranger's, on another socket, at another port, or at the other member's. No member is charged."""
+    relay = Relay()
+    relay.arrive(wrap(A.handle, DATAGRAM), path=path)
+    assert relay.sent == []
+    assert relay.forwarding.dropped == {RelayDrop.UNKNOWN_HANDLE: 1}
+    assert not any(meter.datagrams or meter.over_limit for meter in relay.meters)
+
+
+@pytest.mark.parametrize("inner", [b"", b"\x50" + bytes(9), b"\x00abc", b"\xfd" + bytes(20)])
+def test_only_datagrams_of_a_session_pass(inner: bytes) -> None:
+    """No relay inside a relay, and no bare MAVLink."""
+    relay = Relay()
+    relay.arrive(wrap(A.handle, inner))
+    assert relay.sent == []
+    assert relay.forwarding.dropped == {RelayDrop.MALFORMED: 1}
+
+
+@pytest.mark.parametrize("start", sorted(INNER_STARTS))
+def test_every_datagram_of_a_session_passes(start: int) -> None:
+    """Handshake messages, cookie replies and envelopes."""
+    relay = Relay()
+    relay.arrive(wrap(A.handle, bytes([start])))
+    assert [path for _, path in relay.sent] == [AT_B]
+
+
+@given(st.lists(st.binary(max_size=12)))
+def test_everything_else_is_for_the_node(datagrams: list[bytes]) -> None:
+    """In its order. Whatever the bytes, a stranger gets no answer."""
+    relay = Relay()
+    assert relay.arrive(*datagrams, path=Path(0, STRANGER)) == [data for data in datagrams if data[:1] != b"\x50"]
+    assert relay.sent == []
+    assert relay.forwarding.dropped.total() == sum(data[:1] == b"\x50" for data in datagrams)
+
+
+@given(st.binary(max_size=40), st.sampled_from((AT_A, AT_B)))
+def test_no_datagram_grows(tail: bytes, path: Path) -> None:
+    """One byte for each byte."""
+    relay = Relay()
+    for end in (A, B):
+        datagram = wrap(end.handle, tail)
+        relay.arrive(datagram, path=path)
+        assert sum(len(sent) for sent, _ in relay.sent) <= len(datagram)
+
+
+def test_closed_connection_forwards_nothing() -> None:
+    """In neither direction."""
+    relay = Relay()
+    relay.forwarding.close(MemberConnection(A, B))
+    relay.arrive(wrap(A.handle, DATAGRAM))
+    relay.arrive(wrap(B.handle, DATAGRAM), path=AT_B)
+    assert relay.sent == []
+    assert len(relay.forwarding) == 0
+
+
+def test_address_that_another_member_has_now_keeps_its_route() -> None:
+    """A NAT may assign the address of one member to another, with the same handle."""
+    relay = Relay()
+    later = ConnectionEnd(b"c" * 32, AT_A, A.handle)
+    to = ConnectionEnd(b"d" * 32, Path(0, ("192.0.2.4", 1)), 0x4444)
+    relay.forwarding.open(MemberConnection(later, to), relay.meters)
+    relay.forwarding.close(MemberConnection(A, B))
+    relay.arrive(wrap(A.handle, DATAGRAM))
+    assert relay.sent == [(wrap(to.handle, DATAGRAM), to.path)]
+
+
+# Limits.
+
+
+def test_member_over_its_limit_slows_only_itself() -> None:
+    """The rest of what it sends is dropped and counted as its own; the other member is not affected."""
+    relay = Relay(MemberLimits(datagrams_s=1000))
+    for tick in range(1000):
+        relay.arrive(*[wrap(A.handle, DATAGRAM)] * 10, now=tick / 1000)
+        relay.arrive(wrap(B.handle, DATAGRAM), path=AT_B, now=tick / 1000)
+    greedy, modest = relay.meters
+    assert greedy.datagrams == pytest.approx(1000 + 1000 * BURST_S, abs=2)
+    assert greedy.over_limit == 10_000 - greedy.datagrams
+    assert (modest.datagrams, modest.over_limit) == (1000, 0)
+    assert relay.forwarding.dropped == {RelayDrop.OVER_LIMIT: greedy.over_limit}
+    assert len(relay.sent) == greedy.datagrams + modest.datagrams
+
+
+def test_bits_are_limited_too() -> None:
+    """By the length of the datagrams."""
+    meter = Meter(MemberLimits(bits_s=1_000_000))
+    passed = sum(1000 for tick in range(1000) if meter.take(1000, tick / 1000))
+    assert passed * 8 == pytest.approx(1_000_000 * (1 + BURST_S), abs=8 * 1500)
+
+
+def test_lowest_limits_let_single_datagrams_pass() -> None:
+    """Although their rate has none in a burst's time."""
+    meter = Meter(MemberLimits(datagrams_s=1, bits_s=1000))
+    assert [meter.take(1232, now) for now in (0.0, 1.0, 10.0, 20.0)] == [True, False, True, True]
+
+
+def test_silence_saves_up_no_more_than_a_burst() -> None:
+    """A bucket, not an account."""
+    meter = Meter(MemberLimits(datagrams_s=1000))
+    meter.take(10, 0.0)
+    assert sum(meter.take(10, 3600.0) for _ in range(1000)) == pytest.approx(1000 * BURST_S, abs=1)
+
+
+def test_limits_can_change() -> None:
+    """Counters stay."""
+    meter = Meter(MemberLimits(datagrams_s=1000))
+    meter.take(10, 0.0)
+    meter.set_limits(MemberLimits(datagrams_s=100_000))
+    assert sum(meter.take(10, 1.0) for _ in range(10_000)) == pytest.approx(100_000 * BURST_S, abs=1)
+    assert meter.datagrams == pytest.approx(1 + 100_000 * BURST_S, abs=1)

@@ -1,0 +1,288 @@
+"""Which members of a relay want to reach which, along which of their paths, and the handles for that.
+
+README.md of :mod:`uavlinkd.core`, section 21. Pure: no I/O, no clock, no randomness of its own. The static public key
+of a member names it. Methods return the changes that they caused.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import product
+from typing import NamedTuple
+
+from uavlinkd.core import constants as c
+from uavlinkd.core.crypto import Entropy
+from uavlinkd.core.path import Path
+
+HANDLE_BYTES = 2
+QUARANTINED_PER_MEMBER = 4096
+"""Quarantined handles of one member. A member that changes its paths fast must not use up the handles of another."""
+
+
+class ConnectionEnd(NamedTuple):
+    """One of the two ends of a connection."""
+
+    member: bytes
+    path: Path
+    handle: int
+
+
+class MemberConnection(NamedTuple):
+    """A path of one member, connected with a path of another."""
+
+    one: ConnectionEnd
+    other: ConnectionEnd
+
+
+class Changes(NamedTuple):
+    """What a call changed. ``concerned``: by member and path, the keys whose handles there the member must get."""
+
+    opened: list[MemberConnection]
+    closed: list[MemberConnection]
+    concerned: dict[tuple[bytes, Path], dict[bytes, None]]
+
+    @classmethod
+    def none(cls) -> Changes:
+        """No changes, to be filled."""
+        return cls([], [], {})
+
+    def concern(self, member: bytes, path: Path, key: bytes) -> None:
+        """The member must get the handles of this key on this path."""
+        self.concerned.setdefault((member, path), {})[key] = None
+
+
+class _Wish:
+    """Of a member, to reach a key along a path. Compared by identity."""
+
+    __slots__ = ("key", "member", "number", "path", "until")
+
+    def __init__(self, member: bytes, key: bytes, path: Path, number: int) -> None:
+        self.member = member
+        self.key = key
+        self.path = path
+        self.number = number
+        """Grows from one wish to the next."""
+        self.until = 0.0
+
+
+class _Member:
+    __slots__ = ("handles", "most_peers", "paths", "quarantine", "refused", "wishes")
+
+    def __init__(self, most_peers: int) -> None:
+        self.most_peers = most_peers
+        self.wishes: dict[bytes, dict[Path, _Wish]] = {}  # by key
+        self.paths: dict[Path, dict[bytes, None]] = {}  # the keys of the wishes along each
+        self.handles: set[int] = set()
+        self.quarantine: dict[int, float] = {}  # until when, the oldest first
+        self.refused = 0
+
+
+_Pair = tuple[bytes, bytes]
+_Choice = tuple[_Wish, _Wish]
+
+
+class Bindings:
+    """The wishes, connections and handles of all members."""
+
+    def __init__(self, entropy: Entropy) -> None:
+        self._entropy = entropy
+        self._members: dict[bytes, _Member] = {}
+        self._pairs: dict[_Pair, dict[tuple[Path, Path], MemberConnection]] = {}
+        self._by_age: OrderedDict[_Wish, None] = OrderedDict()  # the next to end first
+        self._wishes = 0  # so far
+        self.connections = 0
+        """How many there are."""
+
+    # Facts.
+
+    def handles(self, member: bytes, path: Path, key: bytes) -> tuple[int, ...]:
+        """The handles of a member on a path for a key. Empty: waiting."""
+        ends = (end for connection in self._pairs.get(_pair(member, key), {}).values() for end in connection)
+        return tuple(end.handle for end in ends if end.member == member and end.path == path)
+
+    def peers_of(self, member: bytes) -> tuple[int, int]:
+        """To how many members a member is bound, and how many of its wishes wait."""
+        wanted = self._members[member].wishes
+        bound = sum(1 for key in wanted if self._pairs.get(_pair(member, key)))
+        return bound, len(wanted) - bound
+
+    def paths_of(self, member: bytes) -> list[Path]:
+        """The paths along which a member has wishes."""
+        return list(self._members[member].paths)
+
+    def refused(self, member: bytes) -> int:
+        """How many wishes of a member were ignored so far, because it had as many as it may have."""
+        return self._members[member].refused
+
+    @property
+    def next_expiry(self) -> float:
+        """When the next wish ends."""
+        return next(iter(self._by_age)).until if self._by_age else c.NEVER
+
+    # Members.
+
+    def set_member(self, key: bytes, most_peers: int) -> None:
+        """Accept a member, or change how many peers it may ask for. Wishes that it has already stay."""
+        if key in self._members:
+            self._members[key].most_peers = most_peers
+        else:
+            self._members[key] = _Member(most_peers)
+
+    def remove_member(self, key: bytes, now: float) -> Changes:
+        """ConnectionEnd its connections, and forget it."""
+        changes = Changes.none()
+        for path in self.paths_of(key):
+            self._end(key, path, changes, now)
+        for member in self._members.values():
+            for wish in member.wishes.get(key, {}).copy().values():
+                self._remove(wish)
+        del self._members[key]
+        return changes
+
+    # Wishes.
+
+    def bind(self, member: bytes, path: Path, keys: Sequence[bytes], now: float) -> Changes:
+        """A member wishes to reach these keys along a path that the relay has validated."""
+        changes = Changes.none()
+        for key in dict.fromkeys(keys):
+            changes.concern(member, path, key)  # the answer, the same for a key that is not a member
+            if key in self._members and key != member and self._wish(member, key, path, now):
+                self._match(_pair(member, key), changes, now)
+        return changes
+
+    def end_path(self, member: bytes, path: Path, now: float) -> Changes:
+        """A path of a member is gone."""
+        changes = Changes.none()
+        self._end(member, path, changes, now)
+        return changes
+
+    def expire(self, now: float) -> Changes:
+        """ConnectionEnd the wishes that were not renewed."""
+        changes = Changes.none()
+        while self.next_expiry <= now:
+            wish = next(iter(self._by_age))
+            self._remove(wish)
+            self._match(_pair(wish.member, wish.key), changes, now)
+        return changes
+
+    def _end(self, member: bytes, path: Path, changes: Changes, now: float) -> None:
+        wanted = self._members[member]
+        for key in list(wanted.paths.get(path, ())):
+            self._remove(wanted.wishes[key][path])
+            self._match(_pair(member, key), changes, now)
+
+    def _wish(self, member: bytes, key: bytes, path: Path, now: float) -> bool:
+        """Note or renew a wish. Returns whether it is new."""
+        of_member = self._members[member]
+        wishes = of_member.wishes.get(key)
+        if wishes is None:
+            if len(of_member.wishes) >= of_member.most_peers:
+                of_member.refused += 1
+                return False
+            wishes = of_member.wishes[key] = {}
+        wish = wishes.get(path)
+        is_new = wish is None
+        if wish is None:
+            if len(wishes) >= c.HANDLES_PER_PAIR:  # more paths could not all have connections
+                self._remove(min(wishes.values(), key=lambda wish: wish.until), keeps_key=True)
+            self._wishes += 1
+            wish = wishes[path] = _Wish(member, key, path, self._wishes)
+            of_member.paths.setdefault(path, {})[key] = None
+        wish.until = now + c.BIND_LIFETIME_S
+        self._by_age[wish] = None
+        self._by_age.move_to_end(wish)
+        return is_new
+
+    def _remove(self, wish: _Wish, *, keeps_key: bool = False) -> None:
+        of_member = self._members[wish.member]
+        del self._by_age[wish]
+        wishes, keys = of_member.wishes[wish.key], of_member.paths[wish.path]
+        del wishes[wish.path], keys[wish.key]
+        if not wishes and not keeps_key:
+            del of_member.wishes[wish.key]
+        if not keys:
+            del of_member.paths[wish.path]
+
+    # Connections.
+
+    def _match(self, pair: _Pair, changes: Changes, now: float) -> None:
+        """Connect the paths of two members after their wishes have changed."""
+        before = self._pairs.get(pair, {})
+        one, other = (self._wishes_of(member, key) for member, key in (pair, pair[::-1]))
+        chosen = _choose(list(product(one.values(), other.values())), before)
+        for paths in [paths for paths in before if paths not in chosen]:
+            self._close(before.pop(paths), changes, now)
+        for paths in chosen:
+            if paths not in before:
+                before[paths] = self._open(pair, paths, changes, now)
+        if before:
+            self._pairs[pair] = before
+        else:
+            self._pairs.pop(pair, None)
+
+    def _wishes_of(self, member: bytes, key: bytes) -> Mapping[Path, _Wish]:
+        return self._members[member].wishes.get(key, {})
+
+    def _open(self, pair: _Pair, paths: tuple[Path, Path], changes: Changes, now: float) -> MemberConnection:
+        one, other = (
+            ConnectionEnd(member, path, self._new_handle(member, now))
+            for member, path in zip(pair, paths, strict=True)
+        )
+        connection = MemberConnection(one, other)
+        changes.opened.append(connection)
+        _note(connection, changes)
+        self.connections += 1
+        return connection
+
+    def _close(self, connection: MemberConnection, changes: Changes, now: float) -> None:
+        for end in connection:
+            of_member = self._members[end.member]
+            of_member.handles.remove(end.handle)
+            of_member.quarantine[end.handle] = now + c.HANDLE_QUARANTINE_S
+            if len(of_member.quarantine) > QUARANTINED_PER_MEMBER:
+                del of_member.quarantine[next(iter(of_member.quarantine))]
+        changes.closed.append(connection)
+        _note(connection, changes)
+        self.connections -= 1
+
+    def _new_handle(self, member: bytes, now: float) -> int:
+        of_member = self._members[member]
+        quarantine = of_member.quarantine
+        while quarantine and quarantine[oldest := next(iter(quarantine))] <= now:
+            del quarantine[oldest]
+        while True:
+            handle = int.from_bytes(self._entropy(HANDLE_BYTES), "big")
+            if handle and handle not in of_member.handles and handle not in quarantine:
+                of_member.handles.add(handle)
+                return handle
+
+
+def _pair(one: bytes, other: bytes) -> _Pair:
+    return (one, other) if one < other else (other, one)
+
+
+def _note(connection: MemberConnection, changes: Changes) -> None:
+    one, other = connection
+    changes.concern(one.member, one.path, other.member)
+    changes.concern(other.member, other.path, one.member)
+
+
+def _choose(choices: Iterable[_Choice], before: Mapping[tuple[Path, Path], object]) -> list[tuple[Path, Path]]:
+    """At most :data:`c.HANDLES_PER_PAIR` connections, first between paths without one, then those of ``before``, then
+    of the newest wishes. Each member has at most as many paths, so each path has a connection.
+    """
+    chosen: list[tuple[Path, Path]] = []
+    connected: set[_Wish] = set()
+    rest = {(one.path, other.path): (one, other) for one, other in choices}
+    while rest and len(chosen) < c.HANDLES_PER_PAIR:
+
+        def rank(paths: tuple[Path, Path]) -> tuple[int, bool, int]:
+            one, other = rest[paths]
+            new = (one not in connected) + (other not in connected)
+            return new, paths in before, max(one.number, other.number)
+
+        best = max(rest, key=rank)
+        connected.update(rest.pop(best))
+        chosen.append(best)
+    return chosen
