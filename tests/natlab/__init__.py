@@ -1,0 +1,1 @@
+"""A laboratory of address translators (NAT) in network namespaces: README.md beside this file."""

@@ -1,0 +1,62 @@
+"""All pairs of kinds of places, and tables of what was measured between them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations_with_replacement
+from typing import Final
+
+from tests.natlab.laboratory import Laboratory, Place
+
+BEHIND_ONE_ROUTER: Final[Mapping[str, tuple[str, Callable[[Place], Place]]]] = {
+    "one home": ("port-restricted", Place.housemate),
+    "one carrier": ("carrier", Place.neighbour),
+    "one carrier that hairpins": ("carrier-hairpin", Place.neighbour),
+}
+"""Pairs that share a router: the kind of the first, and how to place the second."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """Two places, and the kinds that name them in a table. A pair behind one router has a name of its own."""
+
+    kinds: tuple[str, str]
+    places: tuple[Place, Place]
+    name: str = ""
+
+    @property
+    def title(self) -> str:
+        """For a row."""
+        return self.name or " - ".join(self.kinds)
+
+
+def make_pairs(
+    laboratory: Laboratory, kinds: Sequence[str], *, delay_s: float = 0.0, loss: float = 0.0, shared: bool = True
+) -> list[Pair]:
+    """Two places of every kind, and all pairs of kinds between them; then those behind one router."""
+
+    def place(kind: str) -> Place:
+        return laboratory.place(kind, delay_s=delay_s, loss=loss)
+
+    left, right = ({kind: place(kind) for kind in kinds} for _ in range(2))
+    pairs = [Pair((a, b), (left[a], right[b])) for a, b in combinations_with_replacement(kinds, 2)]
+    if shared:
+        for name, (kind, second) in BEHIND_ONE_ROUTER.items():
+            first = place(kind)
+            pairs.append(Pair((kind, kind), (first, second(first)), name))
+    return pairs
+
+
+def matrix(kinds: Sequence[str], cells: Mapping[tuple[str, str], str]) -> str:
+    """A table in Markdown. It is symmetric, so only its upper half is filled."""
+    rows = [["", *(str(number) for number in range(1, len(kinds) + 1))], ["---", *(["--:"] * len(kinds))]]
+    for number, kind in enumerate(kinds):
+        filled = [cells[kind, other] for other in kinds[number:]]
+        rows.append([f"{number + 1} {kind}", *([""] * number), *filled])
+    return table(rows)
+
+
+def table(rows: Iterable[Sequence[str]]) -> str:
+    """Rows in Markdown."""
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
