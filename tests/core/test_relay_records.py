@@ -14,7 +14,18 @@ from uavlinkd.core import constants as c
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.outputs import Output, RecordReceived
 from uavlinkd.core.path import relayed
-from uavlinkd.core.relay_records import WAITING, Bind, Bound, binds_of, bounds_of, handle_of, parse_record, wrap
+from uavlinkd.core.relay_records import (
+    WAITING,
+    Bind,
+    Bound,
+    Candidates,
+    Record,
+    binds_of,
+    bounds_of,
+    handle_of,
+    parse_record,
+    wrap,
+)
 
 KEYS = [bytes([number]) * c.KEY_BYTES for number in range(1, 41)]
 BIND = Bind((KEYS[0], KEYS[1]))
@@ -30,11 +41,15 @@ def test_encodings_are_the_documented_ones() -> None:
     assert BIND.encode() == b"\x01" + KEYS[0] + KEYS[1]
     mapped = bytes(10) + b"\xff\xff\xcb\x00\x71\x07"
     assert BOUND.encode() == b"\x02" + mapped + b"\x16\x9e" + KEYS[0] + b"\x12\x34" + KEYS[1] + b"\x00\x00"
+    places = Candidates((("203.0.113.7", 5790), ("2001:db8::1", 1)))
+    assert places.encode() == b"\x03" + mapped + b"\x16\x9e" + bytes.fromhex("20010db8" + 22 * "0" + "01" + "0001")
     assert wrap(0x1234, b"\x40abc") == b"\x50\x12\x34\x40abc"
 
 
-@pytest.mark.parametrize("record", [BIND, BOUND, Bound("2001:db8::1", 1, ((KEYS[2], 7),))])
-def test_record_is_parsed(record: Bind | Bound) -> None:
+@pytest.mark.parametrize(
+    "record", [BIND, BOUND, Bound("2001:db8::1", 1, ((KEYS[2], 7),)), Candidates((("192.0.2.1", 1), ("fe80::1", 2)))]
+)
+def test_record_is_parsed(record: Record) -> None:
     """What is encoded comes back."""
     assert parse_record(record.encode()) == record
 
@@ -46,10 +61,14 @@ def test_any_bytes_parse_or_drop(data: bytes) -> None:
         assert parse_record(data).encode() == data
 
 
-@given(st.sampled_from((1, 2)), st.integers(0, 1300))
+@given(st.sampled_from((1, 2, 3)), st.integers(0, 1300))
 def test_only_whole_entries_within_the_limits_are_valid(kind: int, size: int) -> None:
-    """1 to 16 keys in a bind, 1 to 32 entries in a bound record."""
-    first, entry, most = (1, c.KEY_BYTES, c.KEYS_PER_BIND) if kind == 1 else (19, 34, c.ENTRIES_PER_BOUND)
+    """1 to 16 keys in a bind, 1 to 32 entries in a bound record, 1 to 8 candidates."""
+    first, entry, most = {
+        1: (1, c.KEY_BYTES, c.KEYS_PER_BIND),
+        2: (19, 34, c.ENTRIES_PER_BOUND),
+        3: (1, 18, c.CANDIDATES),
+    }[kind]
     valid = {first + entry * count for count in range(1, most + 1)}
     data = (bytes([kind]) + bytes(size))[: max(1, size)]
     if len(data) in valid:
@@ -95,7 +114,7 @@ def test_largest_record_fits_an_envelope() -> None:
 # In a session.
 
 
-def send(side: Side, record: Bind | Bound, now: float) -> list[bytes]:
+def send(side: Side, record: Record, now: float) -> list[bytes]:
     """The datagrams by which a side sends a record to the other one."""
     return datagrams(side.node.send_record(side.peer, side.peer_at, record, now))
 

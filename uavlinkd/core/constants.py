@@ -349,3 +349,18 @@ BIND_INTERVAL_S = 20.0
 BIND_WAITING_S = 5.0
 """The relay reports a change by itself; this is for reports that were lost."""
 BIND_RETRY_S = 1.0
+
+# Direct connections through NAT. README.md, section 22.
+CANDIDATES = 8
+"""Addresses in a record, and paths to candidates that are asked."""
+CANDIDATES_PER_HOST = 2
+CANDIDATE_QUESTIONS = 80
+"""Ten questions to each candidate at first."""
+CANDIDATE_QUESTIONS_PER_S = 1.0
+"""Then one a second to all of them together, whatever lists a captured peer sends: RFC 8445, section 19.5.1."""
+CANDIDATE_TRIES = 10
+CANDIDATE_TRY_S = 0.5
+"""The first questions: the first one usually opens the sender's own NAT, and is dropped by the other one."""
+CANDIDATE_ROUND_S = 10.0
+CANDIDATE_ROUND_MOST_S = 60.0
+"""Later rounds of one question each; the time between them doubles."""

@@ -21,6 +21,7 @@ from uavlinkd.core.initiator import Pending
 from uavlinkd.core.outputs import Deliver, Dropped, Output
 from uavlinkd.core.path import Path, SocketAddress
 from uavlinkd.core.peer import Peer
+from uavlinkd.core.probing import ask_candidates
 from uavlinkd.core.receive import receive_envelope
 from uavlinkd.core.refusals import Refused
 from uavlinkd.core.relay_records import Record
@@ -211,6 +212,14 @@ class Node:
     def send_record(self, peer: Peer, path: Path, record: Record, now: float) -> list[Output]:
         """Send a record to a relay or to a member, along one path, which works; otherwise nothing is sent."""
         return send_record(peer, path, record, now)
+
+    def set_candidates(self, peer: Peer, paths: Iterable[Path]) -> None:
+        """Paths along which the peer may be reached directly. They get no slot before an authentic envelope came."""
+        peer.paths.set_candidates(paths)
+
+    def ask_candidates(self, peer: Peer, now: float) -> list[Output]:
+        """Send a question to each candidate without a slot; to fewer of them if that was done often."""
+        return ask_candidates(peer, now)
 
     def receive(self, datagram: bytes, path: Path, now: float) -> list[Output]:
         """What to do about a datagram. Never raises, whatever the bytes."""

@@ -18,7 +18,7 @@ class PathSlots:
     ``known``: how many peers have proved to be at an address. It and ``facts`` are shared by all peers of a node.
     """
 
-    __slots__ = ("_former", "_known", "_reported", "_unanswered", "best", "by_path", "facts")
+    __slots__ = ("_asked", "_former", "_known", "_reported", "_unanswered", "best", "by_path", "candidates", "facts")
 
     def __init__(self, known: Counter[SocketAddress], facts: SocketFacts) -> None:
         self._known = known
@@ -31,6 +31,9 @@ class PathSlots:
         self._former: dict[Path, float] = {}  # validated paths that went down, and until when that counts
         self._reported: set[PathState] = set()  # those that were reported as usable
         self._unanswered = 0
+        self.candidates: tuple[Path, ...] = ()
+        """Paths without a slot that may be asked: the peer says that it may be there."""
+        self._asked: dict[Path, PathState] = {}  # those of them that were asked, to know their answers
 
     @property
     def states(self) -> list[PathState]:
@@ -90,12 +93,30 @@ class PathSlots:
                 else:
                     self._drop(state)
 
+    def set_candidates(self, paths: Iterable[Path]) -> None:
+        """The peer may be there too. The first :data:`c.CANDIDATES` count."""
+        self.candidates = tuple(dict.fromkeys(paths))[: c.CANDIDATES]
+        self._asked = {path: state for path, state in self._asked.items() if path in self.candidates}
+
+    def to_ask(self, now: float) -> list[PathState]:
+        """The candidates without a slot. They may be asked without having sent anything: the caller limits that."""
+        for path in self.candidates:
+            if path in self.by_path:
+                self._asked.pop(path, None)
+            elif path not in self._asked:
+                state = self._asked[path] = PathState(path, 0, now, is_configured=False, is_metered=False)
+                state.is_proven = True
+        return list(self._asked.values())
+
     def learn(self, path: Path, now: float) -> PathState:
         """A slot for an address from which an authentic envelope came first, or which made the session."""
         learned = [state for state in self.by_path.values() if not state.is_configured]
         if len(learned) >= c.LEARNED_PATHS:
             self.remove(min((state for state in learned if state is not self.best), key=_usefulness))
-        state = self.by_path[path] = self._new(path, now, is_configured=False, others=self.by_path)
+        state = self._new(path, now, is_configured=False, others=self.by_path)
+        if (asked := self._asked.pop(path, None)) is not None:
+            state.take_questions(asked)
+        self.by_path[path] = state
         return state
 
     def remove(self, state: PathState) -> None:

@@ -244,6 +244,10 @@ class PathState:
         self._waiting[question] = Question(now, 0)
         return Probe(question, 0, self.sent + 1, self.received, self._lag_ms(now))
 
+    def take_questions(self, candidate: PathState) -> None:
+        """The path was asked as a candidate, before it had a slot: the answers to those questions count."""
+        self._waiting = candidate._waiting
+
     def make_probe(self, question: int, answer: int, now: float) -> Probe:
         """The record to be sent along this path now."""
         if question:

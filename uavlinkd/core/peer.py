@@ -72,6 +72,8 @@ class Peer:
         self.answers_while_up = TokenBucket(c.ANSWERS_WHILE_UP_PER_S, c.ANSWERS_BURST, now)
         self.cookied_answers = TokenBucket(c.COOKIED_ANSWERS_PER_S, c.COOKIED_ANSWERS_PER_S, now)
         """Responses that it may get with cookies, at all addresses together."""
+        self.candidate_questions = TokenBucket(c.CANDIDATE_QUESTIONS_PER_S, c.CANDIDATE_QUESTIONS, now)
+        """Questions to addresses that it named and that never answered."""
         self.group_share = GroupShare(now)
         """Of the CPU time for the groups of its suites."""
         self.remembered: deque[bytes] = deque()

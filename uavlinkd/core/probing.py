@@ -77,6 +77,19 @@ def ask(peer: Peer, session: Session, state: PathState, now: float) -> list[Outp
     return _send(peer, session, state, peer.new_question(), 0, now)
 
 
+def ask_candidates(peer: Peer, now: float) -> list[Output]:
+    """Send a question to each candidate, as far as the peer's bucket allows. README.md, section 22."""
+    session = peer.sending_session()
+    if session is None or not peer.is_up:
+        return []
+    out: list[Output] = []
+    for state in peer.paths.to_ask(now):
+        if not peer.candidate_questions.take(now):
+            break
+        out += _send(peer, session, state, peer.new_question(), 0, now)
+    return out
+
+
 def learn(peer: Peer, path: Path, now: float) -> PathState:
     """An envelope that is not a copy came from an unknown address: it may be the peer's."""
     state = peer.paths.learn(path, now)

@@ -10,10 +10,11 @@ from typing import NamedTuple
 from uavlinkd.core import constants as c
 from uavlinkd.core.drops import Drop, DropReason
 
-BIND, BOUND = 1, 2
+BIND, BOUND, CANDIDATES = 1, 2, 3
 WAITING = 0
 """The handle of a peer that cannot be reached through the relay now."""
 _BOUND_HEADER = struct.Struct(">B16sH")
+_PLACE = struct.Struct(">16sH")
 _ENTRY = struct.Struct(f">{c.KEY_BYTES}sH")
 
 
@@ -54,12 +55,41 @@ class Bound(NamedTuple):
 
     def encode(self) -> bytes:
         """The record."""
-        address = ip_address(self.host)
-        packed = b"".join((bytes(10), b"\xff\xff", address.packed)) if address.version == 4 else address.packed
-        return _BOUND_HEADER.pack(BOUND, packed, self.port) + b"".join(_ENTRY.pack(*entry) for entry in self.handles)
+        return _BOUND_HEADER.pack(BOUND, _packed(self.host), self.port) + b"".join(
+            _ENTRY.pack(*entry) for entry in self.handles
+        )
 
 
-Record = Bind | Bound
+class Candidates(NamedTuple):
+    """Where the sender may be reached directly: a record between two members, along a relay.
+
+    ::
+
+        offset  size  field
+        0       1     kind (3)
+        1       18·n  IPv6 address (16), IPv4 mapped into it; port (2), n from 1 to 8
+    """
+
+    places: tuple[tuple[str, int], ...]
+    """Numeric host and port of each."""
+
+    def encode(self) -> bytes:
+        """The record."""
+        return bytes((CANDIDATES,)) + b"".join(_PLACE.pack(_packed(host), port) for host, port in self.places)
+
+
+Record = Bind | Bound | Candidates
+
+
+def _packed(host: str) -> bytes:
+    """A numeric address as 16 bytes; an IPv4 address mapped into IPv6 (RFC 4291, section 2.5.5.2)."""
+    address = ip_address(host)
+    return bytes(10) + b"\xff\xff" + address.packed if address.version == 4 else address.packed
+
+
+def _host_of(packed: bytes) -> str:
+    address = IPv6Address(packed)
+    return str(address.ipv4_mapped or address)
 
 
 def parse_record(data: bytes) -> Record:
@@ -77,9 +107,13 @@ def parse_record(data: bytes) -> Record:
         count, rest = divmod(size - _BOUND_HEADER.size, _ENTRY.size)
         if not rest and count <= c.ENTRIES_PER_BOUND:
             _, packed, port = _BOUND_HEADER.unpack_from(data)
-            address = IPv6Address(packed)
             entries: Iterator[tuple[bytes, int]] = _ENTRY.iter_unpack(data[_BOUND_HEADER.size :])
-            return Bound(str(address.ipv4_mapped or address), port, tuple(entries))
+            return Bound(_host_of(packed), port, tuple(entries))
+    elif kind == bytes((CANDIDATES,)):
+        count, rest = divmod(size - 1, _PLACE.size)
+        if not rest and 1 <= count <= c.CANDIDATES:
+            places: Iterator[tuple[bytes, int]] = _PLACE.iter_unpack(data[1:])
+            return Candidates(tuple((_host_of(packed), port) for packed, port in places))
     raise Drop(DropReason.BAD_CONTROL)
 
 
