@@ -359,8 +359,10 @@ CANDIDATE_QUESTIONS = 80
 CANDIDATE_QUESTIONS_PER_S = 1.0
 """Then one a second to all of them together, whatever lists a captured peer sends: RFC 8445, section 19.5.1."""
 CANDIDATE_TRIES = 10
-CANDIDATE_TRY_S = 0.5
-"""The first questions: the first one usually opens the sender's own NAT, and is dropped by the other one."""
+CANDIDATE_TRY_S = 0.1
+CANDIDATE_TRY_MOST_S = 1.0
+"""Between the first questions; it doubles. The first one usually opens the sender's own NAT, and the other one drops
+it."""
 CANDIDATE_ROUND_S = 10.0
 CANDIDATE_ROUND_MOST_S = 60.0
 """Later rounds of one question each; the time between them doubles."""

@@ -99,7 +99,7 @@ class PathSlots:
         self._asked = {path: state for path, state in self._asked.items() if path in self.candidates}
 
     def to_ask(self, now: float) -> list[PathState]:
-        """The candidates without a slot. They may be asked without having sent anything: their number is limited elsewhere."""
+        """The candidates without a slot. They need not have sent anything, so questions are limited elsewhere."""
         for path in self.candidates:
             if path in self.by_path:
                 self._asked.pop(path, None)

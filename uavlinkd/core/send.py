@@ -180,12 +180,12 @@ def report_refusals(peer: Peer, changed: Iterable[Refused], now: float) -> list[
 def send_record(peer: Peer, path: Path, record: Record, now: float) -> list[Output]:
     """Send a record along one path, encrypted. It expects no answer from the session.
 
-    Nothing is sent if the path is unknown or does not work, or the session has no records.
+    Nothing is sent if the path is unknown or does not work and is not the best, or the session has no records.
     """
     session, state = peer.sessions.current, peer.paths.find(path)
     if session is None or not session.is_usable(now) or not session.parameters.features & c.FEATURE_RECORDS:
         return []
-    if state is None or not state.works:
+    if state is None or not (state.works or state is peer.paths.best):
         return []
     return seal(peer, session, record.encode(), (state,), now, is_answer=True, is_record=True)
 

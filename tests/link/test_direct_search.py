@@ -1,0 +1,229 @@
+"""The search for direct paths: which candidates are asked, when, and what two ends reach with it."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.core.harness import Pair, Side, of, quiet
+from uavlinkd.core import constants as c
+from uavlinkd.core.constants import NEVER
+from uavlinkd.core.outputs import Output, PathStateChanged, RecordReceived, SessionEstablished, Transmit
+from uavlinkd.core.path import Path, relayed
+from uavlinkd.core.relay_records import Candidates
+from uavlinkd.link.candidates import OwnSocket, Place, is_private, may_be_asked, paths_to, places_of
+from uavlinkd.link.direct_search import DirectSearch
+
+LINK = quiet(features=c.FEATURE_RECORDS)
+HOME_A, HOME_B = ("198.51.100.1", 4001), ("203.0.113.2", 4002)
+
+
+def leads_to_mesh(host: str) -> bool:
+    """The only private network of a socket."""
+    return host.startswith("10.13.")
+
+
+SOCKET = OwnSocket(0, False, (("10.13.0.5", 5790),), leads_to_mesh)
+SOCKET_6 = OwnSocket(1, True, (("2001:db8::5", 5790),), leads_to_mesh)
+
+
+def asked(*places: Place) -> list[Path]:
+    """The paths to these candidates from both sockets."""
+    return list(paths_to(places, [SOCKET, SOCKET_6], {("192.0.2.1", 5790)}))
+
+
+# Which candidates are asked.
+
+
+@pytest.mark.parametrize(
+    "place",
+    [
+        ("127.0.0.1", 5790),
+        ("::1", 5790),
+        ("0.0.0.0", 5790),
+        ("::", 5790),
+        ("224.0.0.1", 5790),
+        ("ff02::1", 5790),
+        ("255.255.255.255", 5790),
+        ("240.0.0.1", 5790),
+        ("fe80::1", 5790),
+        ("203.0.113.1", 53),
+        ("203.0.113.1", 0),
+    ],
+)
+def test_special_addresses_and_low_ports_are_never_asked(place: Place) -> None:
+    """A captured member must not make others ask servers, groups or themselves."""
+    assert not may_be_asked(place)
+    assert asked(place) == []
+
+
+def test_relays_and_own_sockets_are_not_asked() -> None:
+    """They are known already."""
+    assert asked(("192.0.2.1", 5790), ("10.13.0.5", 5790), ("2001:db8::5", 5790)) == []
+
+
+def test_addresses_are_asked_from_sockets_of_their_family() -> None:
+    """With the form that each needs."""
+    assert asked(("203.0.113.1", 4000), ("2001:db8::1", 4000)) == [
+        Path(0, ("203.0.113.1", 4000)),
+        Path(1, ("2001:db8::1", 4000, 0, 0)),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("host", "expected"), [("10.13.0.9", True), ("10.14.0.9", False), ("192.168.1.1", False), ("100.64.0.1", False)]
+)
+def test_private_addresses_need_a_route(host: str, expected: bool) -> None:
+    """The same address is another machine elsewhere: the default route does not lead to the peer."""
+    assert is_private(host)
+    assert bool(asked((host, 5790))) is expected
+
+
+def test_hosts_and_candidates_are_limited() -> None:
+    """Two ports for each host, eight paths in all."""
+    ports = [("203.0.113.1", 4000 + number) for number in range(5)]
+    assert len(asked(*ports)) == c.CANDIDATES_PER_HOST
+    assert len(asked(*(("203.0.113.1", 4000), *((f"203.0.113.{number}", 4000) for number in range(2, 30))))) == 8
+
+
+def test_own_candidates_begin_with_what_relays_see() -> None:
+    """Behind NAT only that leads here. What the other end would refuse is not named."""
+    places = places_of([HOME_A, HOME_A, ("127.0.0.1", 5790)], [SOCKET, SOCKET_6])
+    assert places == (HOME_A, ("10.13.0.5", 5790), ("2001:db8::5", 5790))
+    many = [(f"203.0.113.{number}", 4000) for number in range(20)]
+    assert places_of(many, [SOCKET]) == tuple(many[: c.CANDIDATES])
+
+
+# When.
+
+
+class Network:
+    """Two members behind NATs that filter by address and port, and a relay. A hole opens with a datagram to there."""
+
+    def __init__(self, *, hard: bool = False) -> None:
+        self.pair = Pair(LINK, LINK)
+        self.pair.a.peer_at, self.pair.b.peer_at = relayed(0, "vps", 7), relayed(0, "vps", 8)
+        for side in (self.pair.a, self.pair.b):
+            side.configure_path(0.0)
+        self.pair.establish()
+        assert self.pair.carries(0.0)
+        self.hard = hard
+        """Alpha's NAT is symmetric, and bravo's filters by port."""
+        self.open: set[tuple[str, Place]] = set()
+        self.search = {"a": DirectSearch(self.pair.a.node, self.pair.a.peer)}
+        self.search["b"] = DirectSearch(self.pair.b.node, self.pair.b.peer)
+        self.questions = 0
+
+    def set_own(self, now: float) -> None:
+        """Both ends know how the relay sees them."""
+        for name, home in (("a", HOME_A), ("b", HOME_B)):
+            self.search[name].set_own((home,), [OwnSocket(0, False, (), leads_to_mesh)], (), now)
+
+    def play(self, until: float, start: float = 0.0) -> None:
+        """Let both search, and pass what goes along the relay or through an open NAT."""
+        now = start
+        while now < until:
+            for name, side in (("a", self.pair.a), ("b", self.pair.b)):
+                outputs = side.timeout(now)
+                if now >= self.search[name].next_at:
+                    outputs += self.search[name].do_due(now)
+                self._perform(name, outputs, now)
+            now += 0.05
+
+    def _perform(self, name: str, outputs: list[Output], now: float) -> None:
+        other, side = ("b", self.pair.b) if name == "a" else ("a", self.pair.a)
+        for output in outputs:
+            if isinstance(output, Transmit):
+                at = self._arrives(name, output.path)
+                if at is not None:
+                    self._perform(other, side.node.receive(output.datagram, at, now + 0.01), now + 0.01)
+            elif isinstance(output, RecordReceived):
+                self.search[name].on_record(output, now)
+            elif isinstance(output, PathStateChanged | SessionEstablished):
+                self.search[name].on_event(output, now)
+
+    def _arrives(self, name: str, path: Path) -> Path | None:
+        """The path by which a datagram comes to the other end; None if it does not."""
+        source, target = (HOME_A, HOME_B) if name == "a" else (HOME_B, HOME_A)
+        if path.is_relayed:
+            return self._side("b" if name == "a" else "a").peer_at
+        self.questions += 1
+        if name == "a" and self.hard:
+            source = ("198.51.100.1", 40_000)
+        self.open.add((name, (path.address[0], path.address[1])))
+        is_there = path.address == target or (name == "b" and self.hard and path.address == ("198.51.100.1", 40_000))
+        return Path(0, source) if is_there and ("b" if name == "a" else "a", source) in self.open else None
+
+    def _side(self, name: str) -> Side:
+        return self.pair.a if name == "a" else self.pair.b
+
+
+def test_both_ends_find_each_other_through_their_nats() -> None:
+    """Within a second. The relay stays a standby."""
+    network = Network()
+    network.set_own(0.1)
+    network.play(1.0)
+    assert network.pair.a.peer.path == Path(0, HOME_B)
+    assert network.pair.b.peer.path == Path(0, HOME_A)
+    assert [state.path.is_relayed for state in network.pair.a.peer.paths.states].count(True) == 1
+    assert network.search["a"].theirs == (HOME_B,)
+
+
+def test_impossible_pair_stays_on_the_relay_and_asks_less_and_less() -> None:
+    """A symmetric NAT and one that filters by port: no implementation connects them."""
+    network = Network(hard=True)
+    network.set_own(0.1)
+    network.play(10.0)
+    assert network.pair.a.peer.path == network.pair.a.peer_at
+    assert network.questions == 2 * c.CANDIDATE_TRIES
+    network.play(110.0, start=10.0)  # before the next session, with which the tries begin again
+    assert network.questions <= 2 * (c.CANDIDATE_TRIES + 4)
+
+
+def test_nothing_is_due_without_a_relay() -> None:
+    """And without candidates nothing is named."""
+    pair = Pair(LINK, LINK).establish()
+    search = DirectSearch(pair.a.node, pair.a.peer)
+    assert search.next_at == NEVER
+    search.begin(1.0)
+    assert search.do_due(1.0) == []
+    assert search.next_at == NEVER
+
+
+def test_older_list_is_ignored() -> None:
+    """Records may overtake each other along two paths."""
+    network = Network()
+    peer, path = network.pair.a.peer, network.pair.a.peer_at
+    search = network.search["a"]
+    search.on_record(RecordReceived(peer, path, Candidates((HOME_B,)), 5), 1.0)
+    search.on_record(RecordReceived(peer, path, Candidates((HOME_A,)), 4), 1.0)
+    assert search.theirs == (HOME_B,)
+    assert search.next_at == 1.0
+    search.do_due(1.0)
+    search.on_record(RecordReceived(peer, path, Candidates((HOME_B,)), 6), 1.05)
+    assert search.next_at == pytest.approx(1.0 + c.CANDIDATE_TRY_S)
+
+
+@pytest.mark.parametrize(
+    ("is_relayed", "is_usable", "begins"),
+    [(True, True, True), (False, False, True), (False, True, False), (True, False, False)],
+)
+def test_search_begins_again_when_it_may_help(is_relayed: bool, is_usable: bool, begins: bool) -> None:
+    """A relayed path works, or a direct one failed."""
+    network = Network()
+    path = network.pair.a.peer_at if is_relayed else Path(0, HOME_B)
+    network.search["a"].on_event(PathStateChanged(network.pair.a.peer, path, is_usable, "answered"), 3.0)
+    assert (network.search["a"].next_at == 3.0) is begins
+
+
+def test_captured_member_cannot_make_a_peer_ask_forever() -> None:
+    """A list each tenth of a second, each with other victims: the bucket of the core holds."""
+    network = Network()
+    search, pair = network.search["a"], network.pair
+    network.set_own(0.1)
+    sent = 0
+    for round_ in range(200):
+        now = 0.1 + round_ / 10
+        victims = tuple((f"203.0.113.{(8 * round_ + number) % 250}", 4000) for number in range(8))
+        search.on_record(RecordReceived(pair.a.peer, pair.a.peer_at, Candidates(victims), round_), now)
+        sent += sum(not transmit.path.is_relayed for transmit in of(search.do_due(now), Transmit))
+    assert sent <= c.CANDIDATE_QUESTIONS + 20 * c.CANDIDATE_QUESTIONS_PER_S
