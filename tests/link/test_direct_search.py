@@ -215,7 +215,7 @@ def test_search_begins_again_when_it_may_help(is_relayed: bool, is_usable: bool,
     assert (network.search["a"].next_at == 3.0) is begins
 
 
-def test_captured_member_cannot_make_a_peer_ask_without end() -> None:
+def test_captured_member_cannot_make_a_peer_ask_without_end() -> None:
     """A list each tenth of a second, each with other victims: the bucket of the core holds."""
     network = Network()
     search, pair = network.search["a"], network.pair
