@@ -28,6 +28,11 @@ _NEEDS_PYMAVLINK = (
     " python3 -m venv .venv && .venv/bin/pip install ."
 )
 
+_NOT_A_RELAY = (
+    "is not the file of a relay: that has a [[member]] for each daemon that may use it, no [[peer]] and no"
+    " [[endpoint]]. A daemon that is also a relay is started with `uavlinkd run`"
+)
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command and return its exit status."""
@@ -82,6 +87,10 @@ def _parser() -> argparse.ArgumentParser:
 
     run = add("run", _run, "run the daemon")
     run.add_argument("--config", metavar="FILE", type=Path, required=True)
+    run.set_defaults(is_relay=False)
+    relay = add("relay", _run, "run a relay: it passes datagrams between its members, and cannot read or forge them")
+    relay.add_argument("--config", metavar="FILE", type=Path, required=True)
+    relay.set_defaults(is_relay=True)
     add_daemon_commands(commands)
 
     check = add("check", _check, "check a configuration and show its effect")
@@ -163,6 +172,8 @@ def _run(options: argparse.Namespace) -> int:
         config = load_config(options.config, os.environ)
     except ConfigError as error:
         return _fail(error, WRONG)
+    if options.is_relay and not config.is_only_relay:
+        return _fail(f"{options.config}: {_NOT_A_RELAY}", WRONG)
     set_up_logging(config.log.level, config.log.format)
 
     async def work() -> None:

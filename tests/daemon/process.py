@@ -77,6 +77,7 @@ class DaemonProcess:
         """All that it answered, as JSON."""
         self.exit_status: int | None = None
         """Of the last process; None while it runs."""
+        self.command = "run"
         self.launcher: tuple[str, ...] = ()
         """The command that starts the daemon, such as ``ip netns exec NAME``. It execs the daemon: one process."""
         self.environ: dict[str, str] = {}
@@ -147,7 +148,7 @@ class DaemonProcess:
         self.exit_status = None
         master, slave = os.openpty() if on_terminal else (None, asyncio.subprocess.PIPE)
         self._process = await asyncio.create_subprocess_exec(
-            *end_with_parent(*self.launcher, sys.executable, *self._executable(), "run"),
+            *end_with_parent(*self.launcher, sys.executable, *self._executable(), self.command),
             *("--config", str(self.config_file)),
             stdin=asyncio.subprocess.DEVNULL,
             stdout=slave if on_terminal else asyncio.subprocess.PIPE,

@@ -6,42 +6,48 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from uavlinkd.core.drops import DropReason
 from uavlinkd.core.path import Path
 from uavlinkd.core.relay_records import INNER_STARTS, wrap
 from uavlinkd.relay.bindings import ConnectionEnd, MemberConnection
-from uavlinkd.relay.forwarding import BURST_S, Forwarding, MemberLimits, Meter, RelayDrop
+from uavlinkd.relay.forwarding import BURST_S, Forwarding, Meter
+from uavlinkd.relay.member_settings import RelayLimits
 
 AT_A, AT_B = Path(0, ("192.0.2.1", 1000)), Path(1, ("2001:db8::2", 2000, 0, 0))
 A, B = ConnectionEnd(b"a" * 32, AT_A, 0x1111), ConnectionEnd(b"b" * 32, AT_B, 0x2222)
 DATAGRAM = b"\x40datagram"
-DEFAULT = MemberLimits()
+DEFAULT = RelayLimits(2000, 20_000_000)
+AMPLE = RelayLimits(1_000_000, 10**10)
 STRANGER = ("198.51.100.9", 4000)
 
 
 class Relay:
     """A forwarding with one connection, and what it sent."""
 
-    def __init__(self, limits: MemberLimits = DEFAULT) -> None:
+    def __init__(self, limits: RelayLimits = DEFAULT, total: RelayLimits = AMPLE) -> None:
+        self.now = 0.0
         self.sent: list[tuple[bytes, Path]] = []
-        self.forwarding = Forwarding(lambda datagram, path: self.sent.append((datagram, path)))
+        self.forwarding = Forwarding(
+            lambda datagram, path: self.sent.append((datagram, path)), lambda: self.now, total
+        )
         self.meters = Meter(limits), Meter(limits)
         self.forwarding.open(MemberConnection(A, B), self.meters)
 
-    def arrive(self, *datagrams: bytes, path: Path = AT_A, now: float = 0.0) -> list[bytes]:
-        """These arrive along a path. Returns those that are for the node."""
-        rest = self.forwarding.forward(path.socket, [(datagram, path.address) for datagram in datagrams], now)
-        return [datagram for datagram, _ in rest]
+    def arrive(self, *datagrams: bytes, path: Path = AT_A, now: float = 0.0) -> None:
+        """These arrive along a path."""
+        self.now = now
+        for datagram in datagrams:
+            self.forwarding.take(path.socket, datagram, path.address)
 
 
 def test_datagram_is_forwarded_with_the_handle_of_its_receiver() -> None:
     """In both directions, byte for byte, and no longer than it was."""
     relay = Relay()
-    assert relay.arrive(wrap(A.handle, DATAGRAM)) == []
-    assert relay.arrive(wrap(B.handle, DATAGRAM), path=AT_B) == []
+    relay.arrive(wrap(A.handle, DATAGRAM))
+    relay.arrive(wrap(B.handle, DATAGRAM), path=AT_B)
     assert relay.sent == [(wrap(B.handle, DATAGRAM), AT_B), (wrap(A.handle, DATAGRAM), AT_A)]
     size = len(wrap(A.handle, DATAGRAM))
     assert [(meter.datagrams, meter.bytes) for meter in relay.meters] == [(1, size), (1, size)]
-    assert (relay.forwarding.datagrams, relay.forwarding.bytes) == (2, 2 * size)
     assert not relay.forwarding.dropped
 
 
@@ -51,7 +57,7 @@ def test_handle_counts_only_at_its_address(path: Path) -> None:
     relay = Relay()
     relay.arrive(wrap(A.handle, DATAGRAM), path=path)
     assert relay.sent == []
-    assert relay.forwarding.dropped == {RelayDrop.UNKNOWN_HANDLE: 1}
+    assert relay.forwarding.dropped == {DropReason.RELAY_UNKNOWN_HANDLE: 1}
     assert not any(meter.datagrams or meter.over_limit for meter in relay.meters)
 
 
@@ -61,7 +67,7 @@ def test_only_datagrams_of_a_session_pass(inner: bytes) -> None:
     relay = Relay()
     relay.arrive(wrap(A.handle, inner))
     assert relay.sent == []
-    assert relay.forwarding.dropped == {RelayDrop.MALFORMED: 1}
+    assert relay.forwarding.dropped == {DropReason.RELAY_MALFORMED: 1}
 
 
 @pytest.mark.parametrize("start", sorted(INNER_STARTS))
@@ -72,13 +78,14 @@ def test_every_datagram_of_a_session_passes(start: int) -> None:
     assert [path for _, path in relay.sent] == [AT_B]
 
 
-@given(st.lists(st.binary(max_size=12)))
-def test_everything_else_is_for_the_node(datagrams: list[bytes]) -> None:
-    """In its order. Whatever the bytes, a stranger gets no answer."""
+@given(st.binary(max_size=12), st.sampled_from((Path(0, STRANGER), AT_A, AT_B)))
+def test_no_bytes_raise_or_get_an_answer(data: bytes, path: Path) -> None:
+    """Whatever follows the first byte. A stranger's data is dropped."""
     relay = Relay()
-    assert relay.arrive(*datagrams, path=Path(0, STRANGER)) == [data for data in datagrams if data[:1] != b"\x50"]
-    assert relay.sent == []
-    assert relay.forwarding.dropped.total() == sum(data[:1] == b"\x50" for data in datagrams)
+    relay.arrive(b"\x50" + data, path=path)
+    assert len(relay.sent) + relay.forwarding.dropped.total() == 1
+    assert path.address not in [sent.address for _, sent in relay.sent]
+    assert path.address != STRANGER or not relay.sent
 
 
 @given(st.binary(max_size=40), st.sampled_from((AT_A, AT_B)))
@@ -117,7 +124,7 @@ def test_address_that_another_member_has_now_keeps_its_route() -> None:
 
 def test_member_over_its_limit_slows_only_itself() -> None:
     """The rest of what it sends is dropped and counted as its own; the other member is not affected."""
-    relay = Relay(MemberLimits(datagrams_s=1000))
+    relay = Relay(RelayLimits(1000, 1_000_000_000))
     for tick in range(1000):
         relay.arrive(*[wrap(A.handle, DATAGRAM)] * 10, now=tick / 1000)
         relay.arrive(wrap(B.handle, DATAGRAM), path=AT_B, now=tick / 1000)
@@ -125,34 +132,44 @@ def test_member_over_its_limit_slows_only_itself() -> None:
     assert greedy.datagrams == pytest.approx(1000 + 1000 * BURST_S, abs=2)
     assert greedy.over_limit == 10_000 - greedy.datagrams
     assert (modest.datagrams, modest.over_limit) == (1000, 0)
-    assert relay.forwarding.dropped == {RelayDrop.OVER_LIMIT: greedy.over_limit}
+    assert relay.forwarding.dropped == {DropReason.RELAY_OVER_LIMIT: greedy.over_limit}
     assert len(relay.sent) == greedy.datagrams + modest.datagrams
 
 
 def test_bits_are_limited_too() -> None:
     """By the length of the datagrams."""
-    meter = Meter(MemberLimits(bits_s=1_000_000))
+    meter = Meter(RelayLimits(1_000_000, 1_000_000))
     passed = sum(1000 for tick in range(1000) if meter.take(1000, tick / 1000))
     assert passed * 8 == pytest.approx(1_000_000 * (1 + BURST_S), abs=8 * 1500)
 
 
 def test_lowest_limits_let_single_datagrams_pass() -> None:
     """Although their rate has none in a burst's time."""
-    meter = Meter(MemberLimits(datagrams_s=1, bits_s=1000))
+    meter = Meter(RelayLimits(1, 1000))
     assert [meter.take(1232, now) for now in (0.0, 1.0, 10.0, 20.0)] == [True, False, True, True]
 
 
 def test_silence_saves_up_no_more_than_a_burst() -> None:
     """A bucket, not an account."""
-    meter = Meter(MemberLimits(datagrams_s=1000))
+    meter = Meter(RelayLimits(1000, 1_000_000_000))
     meter.take(10, 0.0)
     assert sum(meter.take(10, 3600.0) for _ in range(1000)) == pytest.approx(1000 * BURST_S, abs=1)
 
 
+def test_limit_of_all_members_together() -> None:
+    """A datagram that exceeds it counts as dropped for its sender."""
+    relay = Relay(total=RelayLimits(1000, 10**9))
+    for _ in range(40):
+        relay.arrive(wrap(A.handle, DATAGRAM))
+        relay.arrive(wrap(B.handle, DATAGRAM), path=AT_B)
+    assert len(relay.sent) == pytest.approx(1000 * BURST_S, abs=1)
+    assert [meter.datagrams + meter.over_limit for meter in relay.meters] == [40, 40]
+    assert all(24 <= meter.datagrams <= 26 for meter in relay.meters)
+
+
 def test_limits_can_change() -> None:
-    """Counters stay."""
-    meter = Meter(MemberLimits(datagrams_s=1000))
+    """From then on."""
+    meter = Meter(RelayLimits(1000, 1_000_000_000))
     meter.take(10, 0.0)
-    meter.set_limits(MemberLimits(datagrams_s=100_000))
+    meter.set_limits(RelayLimits(100_000, 1_000_000_000))
     assert sum(meter.take(10, 1.0) for _ in range(10_000)) == pytest.approx(100_000 * BURST_S, abs=1)
-    assert meter.datagrams == pytest.approx(1 + 100_000 * BURST_S, abs=1)

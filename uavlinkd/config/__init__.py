@@ -14,6 +14,7 @@ from uavlinkd.config.model import (
     PeerConfig,
     PolicyData,
     Recording,
+    RelayServer,
     Routing,
 )
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
@@ -30,5 +31,6 @@ __all__ = [
     "PolicyData",
     "Problem",
     "Recording",
+    "RelayServer",
     "Routing",
 ]

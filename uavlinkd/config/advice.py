@@ -29,6 +29,8 @@ def advice(
     peers: Sequence[PeerConfig],
     routing: Routing,
     metrics: Address | None,
+    *,
+    is_relay: bool = False,
 ) -> Iterator[str]:
     """Yield the warnings, those about safety first."""
     yield from _policies(endpoints, peers)
@@ -39,6 +41,8 @@ def advice(
     yield from _lengths(peers)
     yield from _slow(peers)
     yield from _reach(listen, peers)
+    if is_relay and not endpoints and not peers:
+        return
     if not endpoints and not (routing.relay and len(peers) > 1):
         yield "there is no [[endpoint]]: no MAVLink client can connect to this daemon"
     if not peers:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from uavlinkd.config.errors import ConfigError, Problem
 from uavlinkd.config.model import Config, EndpointConfig, PeerConfig
+from uavlinkd.relay.member_settings import MemberSettings
 
 _FIXED = {
     "name": "name",
@@ -33,6 +34,9 @@ class ConfigChanges:
     closed_endpoints: tuple[str, ...]
     opened_endpoints: tuple[EndpointConfig, ...]
     changed_endpoints: tuple[EndpointConfig, ...]
+    added_members: tuple[str, ...] = ()
+    removed_members: tuple[str, ...] = ()
+    changed_members: tuple[str, ...] = ()
 
     def summary(self) -> dict[str, list[str]]:
         """Names by kind of change, for a log, without kinds that did not occur."""
@@ -43,6 +47,9 @@ class ConfigChanges:
             "endpoints_closed": list(self.closed_endpoints),
             "endpoints_opened": [endpoint.name for endpoint in self.opened_endpoints],
             "endpoints_changed": [endpoint.name for endpoint in self.changed_endpoints],
+            "members_removed": list(self.removed_members),
+            "members_added": list(self.added_members),
+            "members_changed": list(self.changed_members),
         }
         return {kind: names for kind, names in named.items() if names}
 
@@ -58,6 +65,8 @@ def compare(old: Config, new: Config) -> ConfigChanges:
         for field, key in _FIXED.items()
         if getattr(old, field) != getattr(new, field)
     )
+    if (old.relay_server is None) != (new.relay_server is None):
+        fixed += (Problem(str(new.path), "relay_server", _NEEDS_RESTART),)
     if new.previous_private_key not in (None, old.previous_private_key):
         fixed += (Problem(str(new.path), "previous_private_key_file", _NEEDS_RESTART),)
     endpoints_before = {endpoint.name: endpoint for endpoint in old.endpoints}
@@ -81,6 +90,7 @@ def compare(old: Config, new: Config) -> ConfigChanges:
         for name, peer in peers_now.items()
         if name in peers_before and _is_accepted_already(peer, peers_before[name])
     }
+    members_before, members_now = _members(old), _members(new)
     return ConfigChanges(
         removed_peers=tuple(name for name in peers_before if name not in same_peers),
         added_peers=tuple(peer for name, peer in peers_now.items() if name not in same_peers),
@@ -90,7 +100,16 @@ def compare(old: Config, new: Config) -> ConfigChanges:
         changed_endpoints=tuple(
             endpoints_now[name] for name in same_endpoints if endpoints_now[name] != endpoints_before[name]
         ),
+        added_members=tuple(name for name in members_now if name not in members_before),
+        removed_members=tuple(name for name in members_before if name not in members_now),
+        changed_members=tuple(
+            name for name in members_now if members_before.get(name, members_now[name]) != members_now[name]
+        ),
     )
+
+
+def _members(config: Config) -> dict[str, MemberSettings]:
+    return {} if config.relay_server is None else {member.name: member for member in config.relay_server.members}
 
 
 def _is_accepted_already(peer: PeerConfig, before: PeerConfig) -> bool:

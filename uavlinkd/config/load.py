@@ -5,32 +5,36 @@ from __future__ import annotations
 import os
 import shlex
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from uavlinkd.config import checks, network_rules, pasted_keys, policies
+from uavlinkd.config import checks, network_rules, pasted_keys, policies, relay_rules
 from uavlinkd.config.advice import advice
 from uavlinkd.config.errors import ConfigError, Problem
 from uavlinkd.config.keys import CREDENTIALS, KeyFileError, find_secret_file, read_secret_file
+from uavlinkd.config.link_settings import link_of
 from uavlinkd.config.model import Config, EndpointConfig, Log, PeerConfig, Recording, Routing
-from uavlinkd.config.pace import verify_interval_s
 from uavlinkd.config.problems import Problems, Values
 from uavlinkd.config.schema import (
     EndpointSection,
     FileSection,
     LinkSection,
     LogSection,
+    MemberSection,
     MetricsSection,
     NetworkSection,
     PeerSection,
     RecordingSection,
+    RelayServerSection,
     RoutingSection,
     Section,
 )
 from uavlinkd.config.syntax import at, syntax_problem
+from uavlinkd.core import constants as c
 from uavlinkd.core.crypto import Secret, x25519_public_key
-from uavlinkd.core.settings import Link, PeerSettings, Redundancy, Timers
+from uavlinkd.core.settings import PeerSettings
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
 from uavlinkd.system.threads import Threads
 
@@ -55,20 +59,25 @@ def load_config(path: Path, environ: Mapping[str, str]) -> Config:
     networks = _sections(problems, table, "network", NetworkSection)
     endpoints = _sections(problems, table, "endpoint", EndpointSection)
     peers = _sections(problems, table, "peer", PeerSection)
+    members = _sections(problems, table, "member", MemberSection)
+    server = problems.read(RelayServerSection, _table(problems, table, "relay_server"), "relay_server")
 
     private = _secret(problems, top, "private_key_file", path, environ)
     previous = _secret(problems, top, "previous_private_key_file", path, environ)
     psks = [_secret(problems, peer, "psk_file", path, environ) for peer in peers]
+    member_psks = [_secret(problems, member, "psk_file", path, environ) for member in members]
     public = _public(private) if private else None
 
     checks.names(problems, endpoints)
     checks.names(problems, peers)
     checks.public_keys(problems, peers, public, private.reveal() if private else None)
+    relay_rules.members(problems, members, peers, public, private.reveal() if private else None)
+    relay_rules.relay_server(problems, top, server, members, has_frames=bool(peers or endpoints))
     pasted_keys.check(
         problems,
-        peers,
+        [*peers, *members],
         private.reveal() if private else None,
-        [psk.reveal() if psk else None for psk in psks],
+        [psk.reveal() if psk else None for psk in (*psks, *member_psks)],
         path.absolute().parent,
     )
     checks.previous_keys(problems, top, peers, public, None if previous is None else _public(previous))
@@ -80,12 +89,13 @@ def load_config(path: Path, environ: Mapping[str, str]) -> Config:
     checks.timers(problems, link)
     for endpoint in endpoints:
         policies.check(problems, endpoint, is_local=True)
-    for peer, psk in zip(peers, psks, strict=True):
+    for peer in peers:
         checks.timers(problems, peer, link)
         policies.check(problems, peer, is_local=False)
+    for section, psk in zip((*peers, *members), (*psks, *member_psks), strict=True):
         if psk is not None and psk == private:
             problems.add(
-                peer.place.key("psk_file"),
+                section.place.key("psk_file"),
                 "holds this daemon's private key, which must stay secret: make a PSK with `uavlinkd psk`",
             )
     problems.raise_any()
@@ -94,7 +104,9 @@ def load_config(path: Path, environ: Mapping[str, str]) -> Config:
     listen = tuple(top.valid.get("listen", ()))
     network_configs = tuple(map(network_rules.network_of, networks))
     endpoint_configs = tuple(map(_endpoint, endpoints))
-    peer_configs = tuple(_peer(peer, psk, link) for peer, psk in zip(peers, psks, strict=True))
+    relay_config = relay_rules.relay_server_of(server, members, member_psks, link)
+    member_keys = {member.valid["public_key"] for member in members}
+    peer_configs = tuple(_peer(peer, psk, link, member_keys) for peer, psk in zip(peers, psks, strict=True))
     routing_config = Routing(**RoutingSection.model_construct(**routing.valid).model_dump())
     return Config(
         path=path,
@@ -112,6 +124,7 @@ def load_config(path: Path, environ: Mapping[str, str]) -> Config:
         previous_private_key=previous,
         key_grace_s=FileSection.model_construct(**top.valid).key_grace_s,
         networks=network_configs,
+        relay_server=relay_config,
         warnings=(
             *pasted_keys.advice(private.reveal(), peer_configs),
             *advice(
@@ -120,7 +133,9 @@ def load_config(path: Path, environ: Mapping[str, str]) -> Config:
                 peer_configs,
                 routing_config,
                 metrics.valid.get("listen"),
+                is_relay=relay_config is not None,
             ),
+            *(() if relay_config is None else relay_rules.advice(relay_config)),
         ),
     )
 
@@ -182,35 +197,14 @@ def _endpoint(section: Values) -> EndpointConfig:
     )
 
 
-def _peer(peer: Values, psk: Secret | None, link: Values) -> PeerConfig:
+def _peer(peer: Values, psk: Secret | None, link: Values, member_keys: Set[bytes]) -> PeerConfig:
     keys = LinkSection.model_construct(**checks.inherited(link, peer))
-    tag_bytes = keys.tag_bits // 8
+    link_settings = link_of(keys)
+    if peer.valid["public_key"] in member_keys:
+        link_settings = replace(link_settings, features=link_settings.features | c.FEATURE_RECORDS)
     return PeerConfig(
         settings=PeerSettings(
-            name=peer.valid["name"],
-            public_key=peer.valid["public_key"],
-            psk=psk,
-            link=Link(
-                suites=tuple(keys.suites),
-                confidential=keys.confidential,
-                tag_bytes=tag_bytes,
-                mac_key_bits=keys.mac_key_bits,
-                max_envelope=keys.max_envelope_bytes,
-                timers=Timers(
-                    rekey_after_s=keys.rekey_after_s,
-                    reject_after_s=keys.reject_after_s,
-                    retry_min_s=keys.retry_min_s,
-                    retry_max_s=keys.retry_max_s,
-                    keepalive_s=keys.keepalive_s,
-                    echo_after_s=keys.echo_after_s,
-                    handshake_after_s=keys.handshake_after_s,
-                    lost_after_s=keys.lost_after_s,
-                    probe_interval_s=keys.probe_interval_s,
-                ),
-                redundancy=Redundancy(keys.redundancy),
-                idle_probe_s=keys.idle_probe_s,
-                verify_interval_s=verify_interval_s(keys.budget_bits_s, tag_bytes),
-            ),
+            name=peer.valid["name"], public_key=peer.valid["public_key"], psk=psk, link=link_settings
         ),
         addresses=tuple(peer.valid.get("addresses", ())),
         previous_public_key=peer.valid.get("previous_public_key"),

@@ -15,6 +15,7 @@ from uavlinkd.core.settings import PeerSettings
 from uavlinkd.endpoints.url import EndpointUrl, SerialUrl
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
 from uavlinkd.mavlink.policy.compilation import Policy, compile_policy
+from uavlinkd.relay.member_settings import MemberSettings, RelayLimits
 from uavlinkd.system.addresses import Address
 
 SERIAL = Address(SERIAL_HOST, 0)
@@ -126,6 +127,14 @@ class PeerConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class RelayServer:
+    """This daemon is a relay. ``limits``: of all members together."""
+
+    members: tuple[MemberSettings, ...]
+    limits: RelayLimits
+
+
+@dataclass(frozen=True, slots=True)
 class Routing:
     """``relay``: whether frames from a peer may go to other peers.
 
@@ -184,6 +193,12 @@ class Config:
     previous_private_key: Secret | None = None
     key_grace_s: float = 0.0
     networks: tuple[NetworkConfig, ...] = ()
+    relay_server: RelayServer | None = None
+
+    @property
+    def is_only_relay(self) -> bool:
+        """Whether this daemon carries no frames."""
+        return self.relay_server is not None and not self.peers and not self.endpoints
 
     @property
     def has_ip_networks(self) -> bool:

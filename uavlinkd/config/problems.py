@@ -20,11 +20,13 @@ from uavlinkd.config.schema import (
     FileSection,
     LinkSection,
     LogSection,
+    MemberSection,
     MetricsSection,
     NetworkSection,
     PeerSection,
     PolicySection,
     RecordingSection,
+    RelayServerSection,
     RoutingSection,
     Section,
 )
@@ -173,6 +175,8 @@ _SECTIONS: dict[str, type[Section]] = {
     "in a [[peer]]": PeerSection,
     "in a [[network]]": NetworkSection,
     "in an [[endpoint]]": EndpointSection,
+    "in a [[member]]": MemberSection,
+    "in [relay_server]": RelayServerSection,
     "in [log]": LogSection,
     "in [routing]": RoutingSection,
     "in [metrics]": MetricsSection,
@@ -239,7 +243,9 @@ def unknown_key(key: str, model: type[Section]) -> str:
     known = list(model.model_fields)
     if close := get_close_matches(plain, known, n=1, cutoff=0.7):
         written = (
-            f"[[{close[0]}]]" if model is FileSection and close[0] in ("peer", "endpoint", "network") else close[0]
+            f"[[{close[0]}]]"
+            if model is FileSection and close[0] in ("peer", "endpoint", "network", "member")
+            else close[0]
         )
         return f"is not known: did you mean {written}?"
     return f"is not known here: the keys are {', '.join(known)}"

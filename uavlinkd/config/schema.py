@@ -298,6 +298,31 @@ class PeerSection(LinkSection, PolicySection):
     """Also accepted while the peer's key changes, until the first session with the new key or ``key_grace_s``."""
 
 
+class MemberSection(Section):
+    """``[[member]]``: a daemon that may use this relay."""
+
+    name: Name = Field(examples=['"drone1"'])
+    public_key: Annotated[bytes, PlainValidator(_public_key)] = Field(
+        examples=['"…", what `uavlinkd pubkey` prints on the member']
+    )
+    psk_file: FileName | None = Field(default=None, examples=['"vps-drone1.psk"'])
+    peers: int = Field(default=256, ge=1, le=4000)
+    """Members that it may ask for."""
+    datagrams_s: int = Field(default=2000, ge=1, le=10**6)
+    """Most datagrams per second from it."""
+    bits_s: int = Field(default=20_000_000, ge=_LEAST_BUDGET, le=10**10, examples=["20_000_000"])
+    """Most bits per second from it, without the headers of IP and UDP."""
+
+
+class RelayServerSection(Section):
+    """``[relay_server]``: whether this daemon is a relay, and what it carries for all members together."""
+
+    enabled: bool = False
+    """A file with members, and without peers and endpoints, is a relay without this key."""
+    datagrams_s: int = Field(default=10**6, ge=1, le=10**6, examples=["100_000"])
+    bits_s: int = Field(default=10**10, ge=_LEAST_BUDGET, le=10**10, examples=["100_000_000"])
+
+
 class EndpointSection(PolicySection):
     """``[[endpoint]]``: a local MAVLink port."""
 
@@ -368,3 +393,5 @@ class FileSection(Section):
     network: Any = None
     endpoint: Any = None
     peer: Any = None
+    member: Any = None
+    relay_server: Any = None

@@ -34,6 +34,8 @@ class DropReason(Reason):
         "data along a relay has a handle that is not assigned to its sender: it is old or forged",
     )
 
+    RELAY_OVER_LIMIT = "relay_over_limit", "a member sends more along this relay than its limit allows"
+
     # Handshake.
     UNEXPECTED_RESPONSE = "unexpected_response", "the response belongs to no pending initiation of this daemon"
     BAD_MAC1 = "bad_mac1", "the sender does not know this daemon's public key, or the message was altered"

@@ -50,6 +50,7 @@ from uavlinkd.ops.control import ControlServer
 from uavlinkd.ops.recorder import Recorder
 from uavlinkd.ops.schema_versions import LOG_SCHEMA
 from uavlinkd.ops.sdnotify import Supervisor
+from uavlinkd.relay.service import RelayService
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.signals import on_signal
 from uavlinkd.system.stall import STALL_S, StallWatch
@@ -112,6 +113,18 @@ class Daemon:
         )
         self._events.network_of = self.peer_sockets.network_name
         self.local = LocalEndpoints(config.name, self.switch, self._events, self.stall, self.on_frames)
+        self.relay: RelayService | None = None
+        if config.relay_server is not None:
+            self.relay = RelayService(
+                self.node,
+                os.urandom,
+                monotonic,
+                config.relay_server.limits,
+                perform=self._perform,
+                send=self.peer_sockets.send,
+                on_event=self._events.write,
+            )
+            self._intake.take_relayed = self.relay.take
         self._timer: asyncio.TimerHandle | None = None
         self._timer_at = NEVER
         self._housekeeping_at = now + HOUSEKEEPING_S
@@ -173,6 +186,7 @@ class Daemon:
             self.recorder = Recorder(self.config.recording, self.log)
         for peer in self.config.peers:
             self._add_peer(peer)
+        self._follow_members()
         self.peer_sockets.start(self._arm)
         self.local.start(self.config.endpoints)
         self._warn()
@@ -182,6 +196,7 @@ class Daemon:
             listen=[str(address) for address in self.peer_sockets.addresses],
             endpoints={endpoint.name: str(endpoint.url) for endpoint in self.config.endpoints},
             peers=list(self.links),
+            **({} if self.relay is None else {"members": len(self.relay.members)}),
         )
         self._arm()
         self.supervisor.ready()
@@ -253,10 +268,13 @@ class Daemon:
             self.node.forget_previous_key()
         for name in changes.removed_peers:
             self._remove_peer(name)
+        if self.relay is not None:
+            self.relay.release({peer.settings.public_key for peer in config.peers}, monotonic())
         for peer in changes.changed_peers:  # first: a new peer may have a key that one of these gives up
             self._change_peer(peer)
         for peer in changes.added_peers:
             self._add_peer(peer)
+        self._follow_members()
         for name in changes.closed_endpoints:
             self.local.close_one(name)
         for endpoint, endpoint_config in zip(opened, changes.opened_endpoints, strict=True):
@@ -315,6 +333,18 @@ class Daemon:
         self._link_of.clear()
         self._link_of.update((peer, link) for link in self.links.values() for peer in link.peers)
         self.node.set_point_to_point(self.peer_sockets.serial.peers_at(self.links.values()))
+
+    def _follow_members(self) -> None:
+        """The configuration, or the peers of the core, have changed."""
+        relay, server = self.relay, self.config.relay_server
+        if relay is None or server is None:
+            return
+        peers = {link.config.settings.public_key: link.peers[0] for link in self.links.values()}
+        relay.set_members({member.peer.public_key: member for member in server.members}, peers, monotonic())
+        relay.forwarding.total.set_limits(server.limits)
+        for peer in [peer for peer, owner in self.owners.items() if owner is relay]:
+            del self.owners[peer]
+        self.owners.update((member.peer, relay) for member in relay.members.values())
 
     def _note_delays(self) -> None:
         gather_s = min((link.gather_s for link in self.links.values()), default=0.0)
@@ -378,9 +408,10 @@ class Daemon:
         now = monotonic()
         if (owner := self.owners.get(event.peer)) is not None:
             owner.on_event(event, now)
+        link = self._link_of.get(event.peer)
+        if link is None:
             return
         self._events.write(event, now)
-        link = self._link_of[event.peer]
         if isinstance(event, o.PeerLost | o.PeerClosed):
             if not link.peer.is_up:  # with any key
                 link.on_down(now)
@@ -397,6 +428,8 @@ class Daemon:
 
     def _settle(self) -> None:
         """After new input: a deadline may now be earlier than the timer."""
+        if self.relay is not None and self.relay.is_due:
+            self.relay.settle(monotonic())
         if self.node.next_deadline() < self._timer_at or self._waiting.next_at < self._timer_at:
             self._arm()
 
@@ -427,8 +460,11 @@ class Daemon:
         self._events.write_pause(pause_s, monotonic())
 
     def _do_housekeeping(self, now: float) -> None:
-        up = sum(link.peer.is_up for link in self.links.values())
-        self.supervisor.turn(f"{up} of {len(self.links)} peers up", now)
+        self.supervisor.turn(self._summary(), now)
+        if self.relay is not None:
+            self.relay.do_housekeeping(now)
+            for reason, name, count in self.relay.count_drops():
+                self._drops.add("datagrams_dropped", reason, name, count, now)
         if self.recorder is not None:
             self.recorder.do_housekeeping(now)
         self.peer_sockets.do_housekeeping()
@@ -449,6 +485,14 @@ class Daemon:
         self._events.write_findings(find(self, now), now)
         self._drops.check(now)
         self._events.check(now)
+
+    def _summary(self) -> str:
+        up = sum(link.peer.is_up for link in self.links.values())
+        texts = [] if self.config.is_only_relay else [f"{up} of {len(self.links)} peers up"]
+        if self.relay is not None:
+            members = self.relay.members.values()
+            texts.append(f"{sum(member.peer.is_up for member in members)} of {len(members)} members up")
+        return ", ".join(texts)
 
     # The control socket.
 

@@ -9,6 +9,7 @@ from uavlinkd.endpoints.ports import Endpoint
 from uavlinkd.link import refused_there
 from uavlinkd.link.diagnosis import find
 from uavlinkd.link.path_status import NetworkOf, paths_status
+from uavlinkd.link.relay_server_status import relay_status
 from uavlinkd.mavlink.dialect import command_name, name_of
 from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.gate import ANY_OTHER
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from uavlinkd.link.peer_sockets import PeerSockets
     from uavlinkd.link.switch import Switch
     from uavlinkd.ops.recorder import Recorder
+    from uavlinkd.relay.service import RelayService
     from uavlinkd.system.stall import StallWatch
 
 
@@ -43,6 +45,7 @@ class DaemonParts(Protocol):
     peer_sockets: PeerSockets
     stall: StallWatch
     recorder: Recorder | None
+    relay: RelayService | None
 
 
 def daemon_status(daemon: DaemonParts, now: float) -> dict[str, object]:
@@ -52,7 +55,9 @@ def daemon_status(daemon: DaemonParts, now: float) -> dict[str, object]:
     """
     node = daemon.node
     blocked = daemon.passage.blocked(daemon.links.values(), daemon.local.judged)
-    all_up = bool(daemon.links) and all(link.peer.is_up for link in daemon.links.values())
+    all_up = (bool(daemon.links) or daemon.config.is_only_relay) and all(
+        link.peer.is_up for link in daemon.links.values()
+    )
     return {
         "schema": STATUS_SCHEMA,
         "name": daemon.config.name,
@@ -73,6 +78,7 @@ def daemon_status(daemon: DaemonParts, now: float) -> dict[str, object]:
         "stale": dict(daemon.stall.dropped),
         "unrouted": {reason.value: count for reason, count in daemon.switch.router.unrouted.items()},
         "send_failures": dict(daemon.peer_sockets.failures),
+        "relay": None if daemon.relay is None else relay_status(daemon.relay, now),
         "recording": None if daemon.recorder is None else recording_status(daemon.recorder),
     }
 

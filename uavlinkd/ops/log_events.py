@@ -29,6 +29,7 @@ class LogEvent(NamedTuple):
 _CHANGES = (
     *("peers_removed", "peers_added", "peers_changed"),
     *("endpoints_closed", "endpoints_opened", "endpoints_changed"),
+    *("members_removed", "members_added", "members_changed"),
 )
 _INFO, _WARNING = ("info",), ("warning",)
 _FINDING = ("cause", "severity", "subject", "name")
@@ -37,7 +38,7 @@ _DROP_OPTIONAL = ("who", "meaning", "last")
 
 LOG_EVENTS: Final[Mapping[str, LogEvent]] = {
     # The daemon.
-    "daemon_started": LogEvent(_INFO, ("log_schema", "listen", "endpoints", "peers")),
+    "daemon_started": LogEvent(_INFO, ("log_schema", "listen", "endpoints", "peers"), ("members",)),
     "daemon_stopped": LogEvent(_INFO, ("uptime_s", "counted")),
     "daemon_paused": LogEvent(_WARNING, ("count", "seconds")),
     "pauses_ended": LogEvent(_INFO, ("count", "seconds", "duration_s")),

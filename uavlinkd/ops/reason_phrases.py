@@ -49,6 +49,7 @@ DATAGRAMS: Final[Mapping[str, str]] = {
     "frames_not_allowed": "with frames of a relay or a member",
     "relay_malformed": "malformed along a relay",
     "relay_unknown_handle": "of an unknown handle of a relay",
+    "relay_over_limit": "above a member's limit",
 }
 """Of dropped datagrams and outgoing frames (``DropReason``)."""
 

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
-from uavlinkd.core.drops import Reason
+from uavlinkd.core.drops import DropReason
 from uavlinkd.core.path import Path, SocketAddress
 from uavlinkd.core.relay_records import INNER_STARTS, RELAYED
-from uavlinkd.endpoints.reader import Datagrams
 from uavlinkd.relay.bindings import ConnectionEnd, MemberConnection
+from uavlinkd.relay.member_settings import RelayLimits
 
 BURST_S = 0.05
 """A member may send what its limits allow in this time at once. The relay has no queue."""
@@ -23,80 +23,60 @@ _START = bytes((RELAYED,))
 _HEADER_BYTES = 3
 
 
-class RelayDrop(Reason):
-    """Why a relay drops data that a member, or a stranger, sent to be forwarded."""
-
-    MALFORMED = "relay_malformed", "the datagram for a relay is too short, or contains no datagram of a session"
-    UNKNOWN_HANDLE = "relay_unknown_handle", "the handle does not exist at the address from which the datagram came"
-    OVER_LIMIT = "relay_over_limit", "the member sends more through the relay than its limit allows"
-
-
-@dataclass(frozen=True, slots=True)
-class MemberLimits:
-    """What a member may use of the relay."""
-
-    peers: int = 256
-    """Members that it may ask for."""
-    datagrams_s: int = 2000
-    bits_s: int = 20_000_000
-    """Of UDP payload."""
-
-
 class Meter:
     """What one member sends through the relay: two limits without a queue, and counters."""
 
     __slots__ = (
-        "_burst_s",
-        "_byte_s",
-        "_bytes_until",
-        "_count_until",
-        "_datagram_s",
-        "bytes",
-        "datagrams",
-        "over_limit",
+        *("_burst_s", "_byte_s", "_bytes_until", "_count_until", "_datagram_s"),
+        *("bytes", "datagrams", "over_limit"),
     )
 
-    def __init__(self, limits: MemberLimits) -> None:
+    def __init__(self, limits: RelayLimits) -> None:
         self._bytes_until = self._count_until = 0.0
         self.datagrams = self.bytes = 0
         """Forwarded."""
         self.over_limit = 0
-        """Dropped."""
+        """Datagrams that were dropped."""
         self.set_limits(limits)
 
-    def set_limits(self, limits: MemberLimits) -> None:
+    def set_limits(self, limits: RelayLimits) -> None:
         """Apply other limits from now on."""
         self._datagram_s, self._byte_s = 1 / limits.datagrams_s, 8 / limits.bits_s
         self._burst_s = max(BURST_S, self._datagram_s, BURST_BYTES * self._byte_s)
 
     def take(self, size: int, now: float) -> bool:
-        """Count a datagram of so many bytes. Returns whether it is within the limits."""
+        """Use up what a datagram of so many bytes takes. Returns whether it is within the limits."""
         count_until, bytes_until = self._count_until, self._bytes_until
         count_until = (count_until if count_until > now else now) + self._datagram_s
         bytes_until = (bytes_until if bytes_until > now else now) + size * self._byte_s
         latest = now + self._burst_s
         if count_until > latest or bytes_until > latest:
-            self.over_limit += 1
             return False
         self._count_until, self._bytes_until = count_until, bytes_until
-        self.datagrams += 1
-        self.bytes += size
         return True
 
 
 _Key = tuple[int, SocketAddress, bytes]
-_Route = tuple[bytes, Path, Meter]
+
+
+class _Route(NamedTuple):
+    header: bytes
+    """Of the data that is sent."""
+    path: Path
+    meter: Meter
+    """Of the sender."""
 
 
 class Forwarding:
-    """The routes of all connections. ``send`` passes a datagram to the kernel."""
+    """The routes of all connections. ``send`` passes a datagram to the kernel; ``clock`` is monotonic."""
 
-    def __init__(self, send: Callable[[bytes, Path], None]) -> None:
+    def __init__(self, send: Callable[[bytes, Path], None], clock: Callable[[], float], limits: RelayLimits) -> None:
         self._send = send
+        self._clock = clock
         self._routes: dict[_Key, _Route] = {}
-        self.dropped = Counter[RelayDrop]()
-        self.datagrams = self.bytes = 0
-        """Forwarded."""
+        self.total = Meter(limits)
+        """The limits of all members together."""
+        self.dropped = Counter[DropReason]()
 
     def __len__(self) -> int:
         return len(self._routes)
@@ -104,7 +84,7 @@ class Forwarding:
     def open(self, connection: MemberConnection, meters: tuple[Meter, Meter]) -> None:
         """Forward along a connection. ``meters``: those of its two members."""
         for sender, receiver, meter in zip(connection, connection[::-1], meters, strict=True):
-            self._routes[_key(sender)] = _START + _bytes(receiver.handle), receiver.path, meter
+            self._routes[_key(sender)] = _Route(_START + _bytes(receiver.handle), receiver.path, meter)
 
     def close(self, connection: MemberConnection) -> None:
         """Forward along a connection no more."""
@@ -114,34 +94,25 @@ class Forwarding:
             if route is not None and route[:2] == (_START + _bytes(receiver.handle), receiver.path):
                 del self._routes[_key(sender)]
 
-    def forward(self, socket: int, datagrams: Datagrams, now: float) -> Datagrams:
-        """Forward the datagrams that are relayed data, or drop them. Returns the others, which are for the node."""
-        others: Datagrams = []
-        routes, send = self._routes, self._send
-        count = size = 0
-        for arrived in datagrams:
-            datagram, address = arrived
-            if datagram[:1] != _START:
-                others.append(arrived)
-                continue
-            length = len(datagram)
-            if length <= _HEADER_BYTES or datagram[_HEADER_BYTES] not in INNER_STARTS:
-                self.dropped[RelayDrop.MALFORMED] += 1
-                continue
-            route = routes.get((socket, address, datagram[1:_HEADER_BYTES]))
-            if route is None:
-                self.dropped[RelayDrop.UNKNOWN_HANDLE] += 1
-                continue
-            header, path, meter = route
-            if not meter.take(length, now):
-                self.dropped[RelayDrop.OVER_LIMIT] += 1
-                continue
-            send(header + datagram[_HEADER_BYTES:], path)
-            count += 1
-            size += length
-        self.datagrams += count
-        self.bytes += size
-        return others
+    def take(self, socket: int, data: bytes, source: SocketAddress) -> None:
+        """Forward data that begins with 0x50, or drop it."""
+        size = len(data)
+        route = self._routes.get((socket, source, data[1:_HEADER_BYTES]))
+        if size <= _HEADER_BYTES or data[_HEADER_BYTES] not in INNER_STARTS:
+            self.dropped[DropReason.RELAY_MALFORMED] += 1
+        elif route is None:
+            self.dropped[DropReason.RELAY_UNKNOWN_HANDLE] += 1
+        elif (meter := route.meter).take(size, now := self._clock()) and self.total.take(size, now):
+            meter.datagrams += 1
+            meter.bytes += size
+            self._send(route.header + data[_HEADER_BYTES:], route.path)
+        else:
+            meter.over_limit += 1
+            self.dropped[DropReason.RELAY_OVER_LIMIT] += 1
+
+    def has(self, socket: int, data: bytes, source: SocketAddress) -> bool:
+        """Whether data is along a connection of the relay."""
+        return (socket, source, data[1:_HEADER_BYTES]) in self._routes
 
 
 def _key(end: ConnectionEnd) -> _Key:

@@ -1,0 +1,177 @@
+"""A relay as a process, and members that are nodes of the core."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Callable
+from typing import Any
+
+import pytest
+
+from tests.core.harness import FRAME
+from tests.daemon.harness import Stage
+from tests.daemon.process import DaemonProcess, Status
+from tests.daemon.test_reload import reload
+from tests.relay.core_member import CoreMember
+from uavlinkd.config.keys import decode_key, encode_key
+
+INNER = b"\x40datagram"
+
+MakeMember = Callable[[str], CoreMember]
+
+
+@pytest.fixture
+async def stage() -> AsyncIterator[Stage]:
+    """Ends the daemons of a test, and searches their output for tracebacks and secrets."""
+    async with Stage() as stage:
+        yield stage
+
+
+def relay_of(stage: Stage) -> DaemonProcess:
+    """A relay without members."""
+    relay = stage.daemon("vps")
+    relay.command = "relay"
+    del relay.config["endpoint"], relay.config["peer"]
+    relay.config["member"] = []
+    return relay
+
+
+@pytest.fixture
+async def relay(stage: Stage) -> DaemonProcess:
+    """The same, not started."""
+    return relay_of(stage)
+
+
+@pytest.fixture
+async def make_member(relay: DaemonProcess) -> AsyncIterator[MakeMember]:
+    """Make members that are in the relay's file."""
+    members: list[CoreMember] = []
+
+    def make(name: str, **settings: Any) -> CoreMember:
+        member = CoreMember(decode_key(relay.public_key), relay.sockaddr)
+        members.append(member)
+        relay.config["member"].append({"name": name, "public_key": encode_key(member.key), **settings})
+        return member
+
+    yield make
+    for member in members:
+        member.close()
+
+
+async def connect(one: CoreMember, other: CoreMember) -> tuple[int, int]:
+    """Have both bind. The handles."""
+    await one.bind(other.key)
+    await other.bind(one.key)
+    return await one.until_bound(other.key), await other.until_bound(one.key)
+
+
+def member_of(status: Status, name: str) -> dict[str, Any]:
+    """The member in a status."""
+    member: dict[str, Any] = status["relay"]["members"][name]
+    return member
+
+
+async def test_members_reach_each_other_through_the_relay(relay: DaemonProcess, make_member: MakeMember) -> None:
+    """Handles, data in both directions, the addresses that the relay sees, and its counters."""
+    drone, station = make_member("drone1"), make_member("station")
+    await relay.start()
+    to_station, to_drone = await connect(drone, station)
+    assert (drone.bounds[-1].host, drone.bounds[-1].port) == drone.address
+    drone.send(to_station, INNER)
+    await station.until(lambda: station.data == [to_drone.to_bytes(2, "big") + INNER])
+    station.send(to_drone, INNER)
+    await drone.until(lambda: drone.data == [to_station.to_bytes(2, "big") + INNER])
+    status = await relay.until(lambda status: status["relay"]["connections"] == 1)
+    assert status["frames_pass"]
+    assert status["relay"]["dropped"] == {}
+    host, port = drone.address
+    size = 3 + len(INNER)
+    expected = {
+        "is_up": True,
+        "addresses": [f"{host}:{port}"],
+        "bound": 1,
+        "waiting": 0,
+        "datagrams": 1,
+        "bytes": size,
+    }
+    assert member_of(status, "drone1").items() >= expected.items()
+
+
+async def test_drops_are_counted_and_strangers_get_no_answer(
+    stage: Stage, relay: DaemonProcess, make_member: MakeMember
+) -> None:
+    """A stranger's data, malformed data, and frames of a member."""
+    drone, station = make_member("drone1"), make_member("station")
+    await relay.start()
+    handle, _ = await connect(drone, station)
+    stranger = await stage.client()
+    stranger.send(b"\x50" + handle.to_bytes(2, "big") + INNER, relay.sockaddr)
+    drone.send(handle, b"\x50" + INNER)
+    drone.send_frames(FRAME)
+    status = await relay.until(
+        lambda status: bool(status["drops"].get("frames_not_allowed")) and len(status["relay"]["dropped"]) == 2
+    )
+    assert status["relay"]["dropped"] == {"relay_unknown_handle": 1, "relay_malformed": 1}
+    assert stranger.datagrams == []
+    assert station.data == []
+    await relay.until_logged("datagrams_dropped", reason="frames_not_allowed")
+
+
+async def test_member_waits_for_one_that_is_not_there(relay: DaemonProcess, make_member: MakeMember) -> None:
+    """The answer does not tell whether the other is a member. When the other asks, both get handles at once."""
+    drone, station = make_member("drone1"), make_member("station")
+    unknown = bytes(31) + b"\x09"
+    await relay.start()
+    await drone.bind(station.key, unknown)
+    await drone.until(lambda: bool(drone.bounds))
+    assert drone.bounds[-1].handles == ((station.key, 0), (unknown, 0))
+    await station.bind(drone.key)
+    assert await drone.until_bound(station.key)
+
+
+async def test_members_change_while_the_relay_runs(relay: DaemonProcess, make_member: MakeMember) -> None:
+    """A new one is accepted, a removed one is cut off, and the connection of the others stays."""
+    drone, station, third = make_member("drone1"), make_member("station"), make_member("drone2")
+    sections = list(relay.config["member"])
+    relay.config["member"] = sections[:2]
+    await relay.start()
+    handle, _ = await connect(drone, station)
+    relay.config["member"] = sections
+    relay.write_config()
+    assert await reload(relay) == []
+    await connect(third, station)
+    status = await relay.status()
+    assert status["relay"]["connections"] == 2
+    relay.config["member"] = sections[1:]
+    relay.write_config()
+    assert await reload(relay) == []
+    await station.until(lambda: station.handles(drone.key) == [0])
+    status = await relay.until(lambda status: status["relay"]["connections"] == 1)
+    assert set(status["relay"]["members"]) == {"station", "drone2"}
+    drone.send(handle, INNER)
+    await relay.until(lambda status: status["relay"]["dropped"].get("relay_unknown_handle") == 1)
+
+
+async def test_relay_that_starts_again_is_of_use_at_once(relay: DaemonProcess, make_member: MakeMember) -> None:
+    """It remembers nothing. Members make new sessions, and bind again."""
+    drone, station = make_member("drone1"), make_member("station")
+    await relay.start()
+    await connect(drone, station)
+    await relay.kill()
+    await relay.start()
+    await relay.ready()
+    for member in (drone, station):
+        member.bounds.clear()
+        member.send_frames(FRAME)  # so that it notices that nothing answers
+    made = [member.peer.traffic.handshakes for member in (drone, station)]
+    await drone.until(lambda: all(m.peer.traffic.handshakes > n for m, n in zip((drone, station), made, strict=True)))
+    to_station, _ = await connect(drone, station)
+    drone.send(to_station, INNER)
+    await station.until(lambda: len(station.data) == 1)
+
+
+async def test_file_without_members_is_refused(relay: DaemonProcess) -> None:
+    """With what to do."""
+    del relay.config["member"]
+    await relay.start()
+    assert await relay.ended() == 2
+    assert any("[[member]]" in line for line in relay.plain_lines)

@@ -1,0 +1,223 @@
+"""The relay of a daemon: its members as peers of the core, their bindings, and the forwarding between them.
+
+A member is found by its public key. Its peer in the core may be one that carries frames too: one session serves both.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import NamedTuple
+
+from uavlinkd.core import constants as c
+from uavlinkd.core import outputs as o
+from uavlinkd.core.crypto import Entropy
+from uavlinkd.core.drops import DropReason
+from uavlinkd.core.limits import TokenBucket
+from uavlinkd.core.node import Node
+from uavlinkd.core.outputs import Output
+from uavlinkd.core.path import Path, SocketAddress
+from uavlinkd.core.peer import Peer
+from uavlinkd.core.relay_records import Bind, bounds_of
+from uavlinkd.relay.bindings import Bindings, Changes
+from uavlinkd.relay.forwarding import Forwarding, Meter
+from uavlinkd.relay.member_settings import MemberSettings, RelayLimits
+
+BINDS_PER_S = 32
+"""Binds of one member a second, each of up to 16 keys. Each may cause reports to other members."""
+BINDS_BURST = 256
+"""So many at once, after a quiet while: a ground station with 1,000 vehicles, along four paths."""
+
+
+class RelayMember:
+    """A member, and what it does."""
+
+    def __init__(self, settings: MemberSettings, peer: Peer, now: float, *, is_own: bool) -> None:
+        self.settings = settings
+        self.peer = peer
+        self.is_own = is_own
+        """Whether the relay added its peer to the core: it does not carry frames."""
+        self.meter = Meter(settings.limits)
+        self.binds = TokenBucket(BINDS_PER_S, BINDS_BURST, now)
+        self.binds_ignored = 0
+        """Binds above :data:`BINDS_PER_S`."""
+        self.since = now
+        """When it was up or not for the first time, as it is now."""
+        self.reported_over_limit = 0
+        """Of the meter's count."""
+
+    @property
+    def key(self) -> bytes:
+        """Its static public key."""
+        return self.settings.peer.public_key
+
+
+class _Asked(NamedTuple):
+    """Keys that a member asked for along a path that may yet be validated."""
+
+    until: float
+    keys: dict[bytes, None]
+
+
+class RelayService:
+    """The members of a relay.
+
+    ``perform`` executes outputs of the core, ``send`` passes a datagram to the kernel. ``on_event`` receives the
+    events of the members that are not peers. ``clock`` is monotonic.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        entropy: Entropy,
+        clock: Callable[[], float],
+        limits: RelayLimits,
+        *,
+        perform: Callable[[list[Output]], None],
+        send: Callable[[bytes, Path], None],
+        on_event: Callable[[o.Event, float], None],
+    ) -> None:
+        self._node = node
+        self._perform = perform
+        self._on_event = on_event
+        self.members: dict[bytes, RelayMember] = {}
+        """By public key."""
+        self.bindings = Bindings(entropy)
+        self.forwarding = Forwarding(send, clock, limits)
+        self._due: dict[tuple[bytes, Path], dict[bytes, None]] = {}  # reports to members
+        self._asked: dict[tuple[bytes, Path], _Asked] = {}
+        self._reported = Counter[DropReason]()
+
+    # Members.
+
+    def set_members(self, members: Mapping[bytes, MemberSettings], peers: Mapping[bytes, Peer], now: float) -> None:
+        """These are all members from now on, by public key. ``peers``: the daemon's peers, which carry frames.
+
+        A member that changes from one to the other, or that has another name or PSK, has to make a new session.
+        """
+        for member in list(self.members.values()):
+            settings, peer = members.get(member.key), peers.get(member.key)
+            is_same = settings is not None and settings.peer == member.settings.peer
+            if not is_same or peer is not (None if member.is_own else member.peer):
+                self._remove(member, now)
+        for key, settings in members.items():
+            if key not in self.members:
+                self.members[key] = self._new_member(settings, peers.get(key), now)
+            member = self.members[key]
+            member.settings = settings
+            member.meter.set_limits(settings.limits)
+            self.bindings.set_member(key, settings.most_peers)
+
+    def _new_member(self, settings: MemberSettings, peer: Peer | None, now: float) -> RelayMember:
+        if peer is not None:
+            return RelayMember(settings, peer, now, is_own=False)
+        return RelayMember(settings, self._node.add_peer(settings.peer, now), now, is_own=True)
+
+    def release(self, keys: Iterable[bytes], now: float) -> None:
+        """Give up the peers in the core of those members that are to be peers of the daemon."""
+        for key in keys:
+            if (member := self.members.get(key)) is not None and member.is_own:
+                self._remove(member, now)
+
+    def _remove(self, member: RelayMember, now: float) -> None:
+        self._apply(self.bindings.remove_member(member.key, now))
+        del self.members[member.key]
+        for place in [place for place in self._asked if place[0] == member.key]:
+            del self._asked[place]
+        if member.is_own:
+            self._perform(self._node.remove_peer(member.peer, now))
+
+    # From the core. Neither method sends.
+
+    def on_event(self, event: o.Event, now: float) -> None:
+        """An event of a member."""
+        assert isinstance(event.peer, Peer)
+        member = self.members.get(event.peer.settings.public_key)
+        if member is None or member.peer is not event.peer:
+            return
+        if isinstance(event, o.PeerUp | o.PeerLost | o.PeerClosed):
+            member.since = now
+        if isinstance(event, o.PeerClosed):
+            for path in self.bindings.paths_of(member.key):
+                self._apply(self.bindings.end_path(member.key, path, now))
+        if member.is_own:
+            self._on_event(event, now)
+
+    def on_record(self, received: o.RecordReceived, now: float) -> None:
+        """A record came from a member."""
+        assert isinstance(received.peer, Peer)
+        member = self.members.get(received.peer.settings.public_key)
+        if member is None or member.peer is not received.peer or not isinstance(received.record, Bind):
+            return
+        if received.path.is_serial or member.peer.paths.find(received.path) is None:
+            return
+        if not member.binds.take(now):
+            member.binds_ignored += 1
+            return
+        place = member.key, received.path
+        asked = self._asked.get(place)
+        keys = {} if asked is None else asked.keys
+        for key in received.record.keys:
+            if len(keys) < member.settings.most_peers:
+                keys[key] = None
+        self._asked[place] = _Asked(now + c.QUESTION_LIFETIME_S, keys)
+
+    # From the shell.
+
+    @property
+    def is_due(self) -> bool:
+        """Whether :meth:`settle` may have something to do."""
+        return bool(self._due or self._asked)
+
+    def settle(self, now: float) -> None:
+        """Bind along paths that are validated now, and report changes to the members."""
+        for place, asked in list(self._asked.items()):
+            key, path = place
+            state = self.members[key].peer.paths.find(path)
+            # The first bind comes with the first envelope of a session. Its path is validated one round trip later.
+            if state is not None and state.is_validated and state.works:
+                self._apply(self.bindings.bind(key, path, list(asked.keys), now))
+            elif now < asked.until:
+                continue
+            del self._asked[place]
+        due, self._due = self._due, {}
+        for (key, path), keys in due.items():
+            if (member := self.members.get(key)) is None:
+                continue
+            handles = {other: self.bindings.handles(key, path, other) for other in keys}
+            host, port = path.address[:2]
+            for bound in bounds_of(host.partition("%")[0], port, handles):
+                self._perform(self._node.send_record(member.peer, path, bound, now))
+
+    def do_housekeeping(self, now: float) -> None:
+        """End the wishes that were not renewed, and those along paths that the core has given up."""
+        self._apply(self.bindings.expire(now))
+        for key, member in self.members.items():
+            for path in self.bindings.paths_of(key):
+                if member.peer.paths.find(path) is None:
+                    self._apply(self.bindings.end_path(key, path, now))
+        self.settle(now)
+
+    def take(self, socket: int, data: bytes, source: SocketAddress) -> None:
+        """Forward data that begins with 0x50, or drop it."""
+        self.forwarding.take(socket, data, source)
+
+    def count_drops(self) -> Iterator[tuple[DropReason, str, int]]:
+        """How many datagrams were dropped since the last call: reason, member or an empty name, count."""
+        for reason in (DropReason.RELAY_MALFORMED, DropReason.RELAY_UNKNOWN_HANDLE):
+            if count := self.forwarding.dropped[reason] - self._reported[reason]:
+                yield reason, "", count
+        self._reported = self.forwarding.dropped.copy()
+        for member in self.members.values():
+            if count := member.meter.over_limit - member.reported_over_limit:
+                member.reported_over_limit = member.meter.over_limit
+                yield DropReason.RELAY_OVER_LIMIT, member.settings.name, count
+
+    def _apply(self, changes: Changes) -> None:
+        for connection in changes.closed:
+            self.forwarding.close(connection)
+        for connection in changes.opened:
+            one, other = (self.members[end.member].meter for end in connection)
+            self.forwarding.open(connection, (one, other))
+        for place, keys in changes.concerned.items():
+            self._due.setdefault(place, {}).update(keys)
