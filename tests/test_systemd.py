@@ -37,8 +37,8 @@ def settings(name: str) -> dict[str, list[str]]:
 
 
 def test_there_is_a_unit_for_each_purpose() -> None:
-    """The daemon, several daemons, and the man in the middle."""
-    assert NAMES == ["uavlink-mitm.service", "uavlinkd.service", "uavlinkd@.service"]
+    """The daemon, several daemons, a relay, and the man in the middle."""
+    assert NAMES == ["uavlink-mitm.service", "uavlinkd-relay.service", "uavlinkd.service", "uavlinkd@.service"]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -112,3 +112,16 @@ def test_instances_are_apart_and_otherwise_alike() -> None:
     differing = {key for key in one.keys() | many.keys() if one[key] != many[key]}
     assert differing == {"Description", "ExecStart", "LoadCredential", "RuntimeDirectory", "StateDirectory"}
     assert all("%i" in value for key in differing for value in many[key])
+
+
+def test_relay_is_restarted_and_isolated_as_a_daemon_is() -> None:
+    """With more memory, and without devices."""
+    one, relay = settings("uavlinkd.service"), settings("uavlinkd-relay.service")
+    differing = {key for key in one.keys() | relay.keys() if one[key] != relay[key]}
+    assert differing == {
+        *("Description", "ExecStart", "LoadCredential", "RuntimeDirectory", "StateDirectory", "MemoryMax"),
+        *("Wants", "After", "SupplementaryGroups", "DevicePolicy", "DeviceAllow", "PrivateDevices"),
+    }
+    assert relay["PrivateDevices"] == ["yes"]
+    assert relay["ExecStart"] == ["/opt/uavlinkd/bin/uavlinkd relay --config /etc/uavlinkd/relay.toml"]
+    assert (relay["DynamicUser"], relay["LoadCredential"]) == (["yes"], ["keys:/etc/uavlinkd/relay"])

@@ -88,7 +88,7 @@ def _parser() -> argparse.ArgumentParser:
     run = add("run", _run, "run the daemon")
     run.add_argument("--config", metavar="FILE", type=Path, required=True)
     run.set_defaults(is_relay=False)
-    relay = add("relay", _run, "run a relay: it passes datagrams between its members, and cannot read or forge them")
+    relay = add("relay", _run, "run a relay: it passes datagrams between its members, and cannot forge them")
     relay.add_argument("--config", metavar="FILE", type=Path, required=True)
     relay.set_defaults(is_relay=True)
     add_daemon_commands(commands)

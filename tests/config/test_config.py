@@ -16,6 +16,7 @@ import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
 from uavlinkd.config import Config, ConfigError, PeerAddress, Recording, Routing, keys
+from uavlinkd.config.changes import compare
 from uavlinkd.config.load import load_config
 from uavlinkd.config.schema import (
     EndpointSection,
@@ -25,6 +26,7 @@ from uavlinkd.config.schema import (
     RecordingSection,
     RoutingSection,
 )
+from uavlinkd.core import constants as c
 from uavlinkd.core.constants import DEFAULT_ENVELOPE_LIMIT, MIN_ENVELOPE_LIMIT
 from uavlinkd.core.settings import Link, Timers
 from uavlinkd.core.suites import SUITES_BY_NAME
@@ -33,6 +35,7 @@ from uavlinkd.mavlink.frames import Frame, SplitCounters, split_payload
 from uavlinkd.mavlink.policy.gate import Refusal
 from uavlinkd.mavlink.policy.roles import ROLES
 from uavlinkd.mavlink.policy.settings import KEYS
+from uavlinkd.relay.member_settings import RelayLimits
 from uavlinkd.system.addresses import Address
 
 EXAMPLES = Path(__file__).parents[2] / "configs"
@@ -878,8 +881,7 @@ def test_example_is_valid(tmp_path: Path, path: Path) -> None:
     )
     config = load_config(copy, {})
     assert (config.name, _warnings(config)) == (_NAMES.get(path.stem, path.stem), [])
-    assert config.peers
-    assert config.endpoints
+    assert config.is_only_relay or (config.peers and config.endpoints)
 
 
 def test_example_with_every_link_key_has_the_defaults() -> None:
@@ -982,3 +984,82 @@ def test_environment_is_an_argument(folder: Path, monkeypatch: pytest.MonkeyPatc
     path.write_text(_GOOD)
     with pytest.raises(ConfigError, match="there is no file"):
         load_config(path, {})
+
+
+# Relays.
+
+_MEMBERS = f'[[member]]\nname = "drone1"\npublic_key = "{_ONE}"\n[[member]]\nname = "drone2"\npublic_key = "{_TWO}"\n'
+_RELAY = _TOP + _LISTEN + _MEMBERS
+
+
+def test_relay_needs_members_and_little_else(load: Load) -> None:
+    """Members have the default limits, and the core's feature for records."""
+    config = load(_RELAY + "max_peers = 7\ndatagrams_s = 8\nbits_s = 9000\n")
+    assert config.warnings == ()
+    assert config.is_only_relay
+    assert config.relay_server is not None
+    one, two = config.relay_server.members
+    assert (one.name, one.most_peers, one.limits) == ("drone1", 256, RelayLimits(2000, 20_000_000))
+    assert (two.name, two.most_peers, two.limits) == ("drone2", 7, RelayLimits(8, 9000))
+    assert one.peer.link.features & c.FEATURE_RECORDS
+
+
+def test_daemon_may_be_a_relay_too(load: Load) -> None:
+    """A member that is also a peer has one session for both."""
+    config = load(_GOOD + _MEMBERS + "[relay_server]\nenabled = true\n")
+    assert config.relay_server is not None
+    assert not config.is_only_relay
+    assert config.peers[0].settings.link.features & c.FEATURE_RECORDS
+    assert not load(_GOOD).peers[0].settings.link.features & c.FEATURE_RECORDS
+
+
+@pytest.mark.parametrize(
+    ("text", "key", "part"),
+    [
+        (_GOOD + _MEMBERS, "relay_server.enabled", "enabled = true"),
+        (_RELAY + "[relay_server]\nenabled = false\n", "relay_server.enabled", "remove the members"),
+        (_GOOD + "[relay_server]\nenabled = true\n", "relay_server.enabled", "no [[member]]"),
+        (_TOP + _MEMBERS, "listen", "no member could reach"),
+        (_RELAY.replace("drone2", "drone1"), "member[1].name (drone1)", "write another"),
+        (_RELAY.replace(_TWO, _ONE), "member[1].public_key (drone2)", "each peer has its own"),
+        (_RELAY + "max_peers = 0\n", "member[1].max_peers (drone2)", "too small"),
+        (_RELAY + "role = 'observer'\n", "member[1].role (drone2)", "does not belong here"),
+        (
+            _GOOD
+            + _MEMBERS.replace("drone2", "drone1x").replace("drone1", "other", 1)
+            + "[relay_server]\nenabled = true\n"
+            + f'[[peer]]\nname = "drone1x"\npublic_key = "{_public()}"\nrole = "observer"\nsystem_ids = [4]\n',
+            "member[1].name (drone1x)",
+            "which has another key",
+        ),
+        (
+            _GOOD
+            + _MEMBERS.replace("[[member]]", '[[member]]\npsk_file = "pair.psk"', 1)
+            + "[relay_server]\nenabled = true\n",
+            "member[0].psk_file (drone1)",
+            "write the PSK there only",
+        ),
+        (
+            _GOOD + f'previous_public_key = "{_TWO}"\n' + _MEMBERS + "[relay_server]\nenabled = true\n",
+            "member[1].public_key (drone2)",
+            "previous key",
+        ),
+    ],
+)
+def test_relay_with_a_mistake_is_refused(refused: Refused, text: str, key: str, part: str) -> None:
+    """With the key, and what to write."""
+    assert part in refused(text)[key]
+
+
+def test_members_change_without_a_restart(load: Load) -> None:
+    """Added, removed and changed ones are named; whether there is a relay needs a restart."""
+    before = load(_RELAY)
+    three = f'[[member]]\nname = "drone3"\npublic_key = "{_public()}"\n'
+    now = load(_RELAY.replace('name = "drone1"', 'name = "drone4"') + "bits_s = 5000\n" + three)
+    assert compare(before, now).summary() == {
+        "members_removed": ["drone1"],
+        "members_added": ["drone4", "drone3"],
+        "members_changed": ["drone2"],
+    }
+    with pytest.raises(ConfigError, match="relay_server: cannot change while the daemon runs"):
+        compare(load(_GOOD), load(_GOOD + _MEMBERS + "[relay_server]\nenabled = true\n"))

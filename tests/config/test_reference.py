@@ -23,6 +23,8 @@ SECTIONS: dict[str, type[BaseModel]] = {
     "`[link]`": schema.LinkSection,
     "`[[network]]`": schema.NetworkSection,
     "`[[peer]]`": schema.PeerSection,
+    "`[[member]]`": schema.MemberSection,
+    "`[relay_server]`": schema.RelayServerSection,
     "`[[endpoint]]`": schema.EndpointSection,
     "Policy": schema.PolicySection,
     "`[routing]`": schema.RoutingSection,

@@ -110,7 +110,17 @@ NETWORKS: dict[str, Any] = {
     "sik": {"is_present": True, "serial": LINE},
     "quiet": {"is_present": False, "serial": {**LINE, "uses_cts": False, "radio": None}},
 }
+MEMBER = {
+    "is_up": True,
+    "bound": 2,
+    "waiting": 1,
+    "binds_ignored": 3,
+    "datagrams": 40,
+    "bytes": 50,
+    "over_limit": 6,
+}
 STATUS: dict[str, Any] = {
+    "relay": {"connections": 4, "dropped": {"relay_over_limit": 6}, "members": {"drone1": MEMBER}},
     "name": "drone0",
     "networks": NETWORKS,
     "frames_pass": False,
@@ -170,6 +180,16 @@ SIK = {"network": "sik"}
     ("name", "labels", "expected"),
     [
         ("uptime_seconds", {}, 5.0),
+        ("relay_connections", {}, 4),
+        ("relay_member_up", {"member": "drone1"}, 1),
+        ("relay_member_bindings", {"member": "drone1"}, 2),
+        ("relay_member_waiting", {"member": "drone1"}, 1),
+        ("relay_member_ignored_binds_total", {"member": "drone1"}, 3),
+        ("relay_member_forwarded_datagrams_total", {"member": "drone1"}, 40),
+        ("relay_member_forwarded_bytes_total", {"member": "drone1"}, 50),
+        ("relay_member_over_limit_total", {"member": "drone1"}, 6),
+        ("relay_dropped_total", {"reason": "relay_over_limit"}, 6),
+        ("relay_dropped_total", {"reason": "relay_unknown_handle"}, 0),
         ("schema_info", {"status": "2", "log": "1", "metrics": "2"}, 1),
         ("frames_pass", {}, 0),
         ("finding", {"cause": "wrong_psk", "severity": "fault", "subject": "peer", "name": "drone2"}, 1),

@@ -145,6 +145,17 @@ CASES: dict[str, tuple[dict[str, str], list[tuple[str, bool]]]] = {
         {'uavlinkd_recording_up{instance="a"}': "1x4 0x20"},
         [("1m15s", False), ("4m", True)],
     ),
+    "UavlinkdRelayOverLimit": (
+        {'uavlinkd_relay_member_over_limit_total{instance="a",member="b"}': "0x8 0+30x20"},
+        [("2m", False), ("5m", True)],
+    ),
+    "UavlinkdRelayFlood": (
+        {
+            'uavlinkd_relay_dropped_total{instance="a",reason="relay_unknown_handle"}': "0+100x20 2000+1000x20",
+            'uavlinkd_relay_dropped_total{instance="a",reason="relay_over_limit"}': "0+9000x40",
+        },
+        [("4m", False), ("8m", True)],
+    ),
 }
 
 

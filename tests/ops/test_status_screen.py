@@ -341,3 +341,24 @@ def test_every_condition_of_a_path_has_a_style() -> None:
             paths = [path(state=condition.value, reason=reason), path()]
             shown_as = "best" if condition is PathCondition.USABLE else condition.value
             assert shown_as in shown({"drone1": peer("up", paths=paths)}, 80)
+
+
+def test_relay_shows_its_members_those_that_are_down_first() -> None:
+    """Without tables of peers and endpoints that it does not have."""
+    member = {
+        "is_up": True,
+        "since_s": 60.0,
+        "addresses": ["203.0.113.7:4000"],
+        "bound": 1,
+        "waiting": 0,
+        "datagrams": 1234,
+        "over_limit": 5,
+    }
+    down = {**member, "is_up": False, "addresses": [], "over_limit": 0}
+    relay = {"members": {"drone1": member, "drone2": down}, "dropped": {"relay_unknown_handle": 7}}
+    text = printed(render_status(status_of({}, endpoints={}, relay=relay)), 120)
+    assert "relay: 1 of 2 members up" in text
+    assert text.index("drone2") < text.index("drone1  ")
+    assert "203.0.113.7:4000" in text
+    assert "not forwarded: 7 of an unknown handle of a relay" in text
+    assert "endpoint" not in text

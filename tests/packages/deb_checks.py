@@ -162,7 +162,7 @@ def test_installation_by_hand_is_refused(package: Package, machine: Machine) -> 
     assert machine.say("uavlinkd --version").strip() == f"uavlinkd {__version__}, {PROTOCOL_NAME.decode()}"
     assert "replay" in machine.say("uavlink-mitm --list")
     assert machine.say("dpkg --verify uavlinkd") == ""
-    for unit in ("uavlinkd.service", "uavlinkd@.service", "uavlink-mitm.service"):
+    for unit in ("uavlinkd.service", "uavlinkd@.service", "uavlinkd-relay.service", "uavlink-mitm.service"):
         assert machine.run(f"systemctl is-enabled {unit}").stdout.strip() in {"disabled", "static"}
     without = machine.run("uavlinkd demo")
     assert without.returncode == 1

@@ -100,7 +100,7 @@ def _member(section: Values, psk: Secret | None, link: Link) -> MemberSettings:
     keys = MemberSection.model_construct(**section.valid)
     return MemberSettings(
         peer=PeerSettings(keys.name, keys.public_key, psk, link),
-        most_peers=keys.peers,
+        most_peers=keys.max_peers,
         limits=RelayLimits(keys.datagrams_s, keys.bits_s),
     )
 

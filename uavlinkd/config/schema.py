@@ -306,7 +306,7 @@ class MemberSection(Section):
         examples=['"…", what `uavlinkd pubkey` prints on the member']
     )
     psk_file: FileName | None = Field(default=None, examples=['"vps-drone1.psk"'])
-    peers: int = Field(default=256, ge=1, le=4000)
+    max_peers: int = Field(default=256, ge=1, le=4000)
     """Members that it may ask for."""
     datagrams_s: int = Field(default=2000, ge=1, le=10**6)
     """Most datagrams per second from it."""

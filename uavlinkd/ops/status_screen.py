@@ -22,6 +22,7 @@ from uavlinkd.ops.reason_phrases import (
     REFUSALS,
     phrase,
 )
+from uavlinkd.ops.relay_table import members_status, relay_drops
 from uavlinkd.system.error_meanings import meaning_of
 
 Status = dict[str, Any]
@@ -48,7 +49,13 @@ def render_status(status: Status) -> RenderableType:
     parts: list[RenderableType] = [_headline(status)]
     if status["findings"]:
         parts.append(_findings(status["findings"]))
-    parts += [_peers(status), _endpoints(status)]
+    relay = status.get("relay")
+    if relay is None or status["peers"] or status["endpoints"]:
+        parts += [_peers(status), _endpoints(status)]
+    if relay is not None:
+        parts.append(members_status(relay))
+        if text := relay_drops(relay):
+            parts.append(Text(f"not forwarded: {text}", style="yellow"))
     if status["networks"]:
         parts.append(_networks(status))
     if dropped := _listed(_by_count(status["drops"], DATAGRAMS)):
@@ -73,7 +80,12 @@ def _headline(status: Status) -> Text:
     peers = status["peers"].values()
     up = sum(peer["state"] == "up" for peer in peers)
     text = Text(f"{status['name']}  ", style="bold")
-    text.append(f"{up} of {len(peers)} peers up", style="bold green" if frames_pass(status) else "bold red")
+    relay = status.get("relay")  # an older daemon has none
+    counts = [f"{up} of {len(peers)} peers up"] if peers or relay is None else []
+    if relay is not None:
+        members = relay["members"].values()
+        counts.append(f"relay: {sum(member['is_up'] for member in members)} of {len(members)} members up")
+    text.append(", ".join(counts), style="bold green" if frames_pass(status) else "bold red")
     for blocked in status["blocked"]:
         towards = "from" if blocked["direction"] == "in" else "to"
         text.append(f", all frames {towards} {blocked['name']} are refused", style="bold red")

@@ -20,6 +20,7 @@ from uavlinkd.core.settings import Link
 from uavlinkd.core.wire import LONG_HEADER_BYTES, SHORT_HEADER_BYTES, initiation_bytes, response_bytes
 from uavlinkd.ops.network_report import NetworkReport
 from uavlinkd.ops.policy_table import review
+from uavlinkd.ops.relay_table import members_configured
 
 _PLAIN_WIDTH = 100
 """Columns of the output if it is not a terminal: a pipe has no width."""
@@ -61,6 +62,8 @@ def describe(config: Config, lacks: Sequence[str] = (), networks: NetworkReport 
         parts += [_heading("Sending to a peer"), _pace(config)]
     if config.endpoints:
         parts += [_heading("Local endpoints"), _endpoints(config)]
+    if config.relay_server is not None:
+        parts += [_heading("Members of this relay, and their limits"), members_configured(config.relay_server)]
     parts += review(config)
     parts.append(_verdict(config, lacks, () if networks is None else networks.errors))
     return Group(*parts)
@@ -81,7 +84,8 @@ def _identity(config: Config) -> Table:
         before = encode_key(x25519_public_key(config.previous_private_key.reveal()))
         table.add_row("previous key", Text(f"{before}\n{_grace(config)}"))
     table.add_row("listens on", Text(_listening(config)))
-    table.add_row("routing", Text(_routing(config.routing)))
+    if not config.is_only_relay:
+        table.add_row("routing", Text(_routing(config.routing)))
     if config.metrics is not None:
         table.add_row("metrics", Text(f"http://{config.metrics}/metrics"))
     if config.recording is not None:

@@ -11,7 +11,7 @@ from uavlinkd.endpoints.radio_reports import RadioReport
 from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.ops.findings import Finding, Severity, Subject
 
-MAPS = ("peers", "endpoints", "endpoints.*.clients", "networks")
+MAPS = ("peers", "endpoints", "endpoints.*.clients", "networks", "relay.members")
 """Objects whose keys are names of the configuration or addresses."""
 COUNTS: Mapping[str, int] = {
     "drops": 1,
@@ -19,6 +19,7 @@ COUNTS: Mapping[str, int] = {
     "unrouted": 1,
     "send_failures": 1,
     "recording.failures": 1,
+    "relay.dropped": 1,
     "peers.*.drops": 1,
     "peers.*.malformed": 1,
     "peers.*.waiting_dropped": 1,
@@ -86,12 +87,20 @@ async def observed() -> Seen:
         roaming.config["peer"][0]["addresses"] = [{"network": "line"}]
         await stage.start(roaming, linked=False)
         statuses.append(await roaming.status())
+        relay = stage.daemon("relay0")
+        relay.config["relay_server"] = {"enabled": True}
+        relay.config["member"] = [{"name": "drone1", "public_key": b.public_key}]
+        relay.add_peer(b, [b.address])
+        b.add_peer(relay, [relay.address])
+        await b.stop()
+        await stage.start(relay, b, linked=False)
+        statuses.append(await relay.until(lambda status: bool(status["relay"]["members"]["drone1"]["addresses"])))
     findings = [Finding("cause", Severity.FAULT, Subject.PEER, "name", "text", "remedy").as_json()]
     types: dict[str, set[str]] = {name: {kind} for name, kind in ALSO.items()}
     for status in statuses:
         _walk(status | {"findings": findings}, "", types)
     names = {name: "|".join(sorted(kinds)) for name, kinds in types.items()}
-    return Seen(names, [line for daemon in (a, b, roaming) for line in daemon.events()])
+    return Seen(names, [line for daemon in (a, b, roaming, relay) for line in daemon.events()])
 
 
 def _walk(value: Any, path: str, types: dict[str, set[str]]) -> None:

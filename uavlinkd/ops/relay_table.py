@@ -1,0 +1,60 @@
+"""The members of a relay for people: in ``uavlinkd status`` and ``uavlinkd check``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+from rich.text import Text
+
+from uavlinkd.config import RelayServer
+from uavlinkd.config.keys import encode_key
+from uavlinkd.ops.reason_phrases import DATAGRAMS, phrase
+
+SHOWN_MEMBERS = 30
+
+
+def members_status(relay: dict[str, Any]) -> Table:
+    """A line per member, those that are down first."""
+    table = Table(box=SIMPLE_HEAD, pad_edge=False)
+    for title in ("member", "state", "for", "address", "bound", "waiting", "forwarded", "over limit"):
+        table.add_column(title, justify="left" if title in ("member", "state", "address") else "right")
+    members = sorted(relay["members"].items(), key=lambda item: (item[1]["is_up"], item[0]))
+    for name, member in members[:SHOWN_MEMBERS]:
+        table.add_row(
+            Text(name),
+            Text("up", style="green") if member["is_up"] else Text("down", style="yellow"),
+            f"{member['since_s']:,.0f} s",
+            Text(", ".join(member["addresses"]) or "-"),
+            f"{member['bound']:,}",
+            f"{member['waiting']:,}",
+            f"{member['datagrams']:,}",
+            Text(f"{member['over_limit']:,}", style="yellow" if member["over_limit"] else ""),
+        )
+    if len(members) > SHOWN_MEMBERS:
+        table.add_row(f"and {len(members) - SHOWN_MEMBERS:,} more")
+    return table
+
+
+def relay_drops(relay: dict[str, Any]) -> str:
+    """What the relay dropped, in plain words; empty for nothing."""
+    counts = sorted(relay["dropped"].items(), key=lambda item: -item[1])
+    return ", ".join(f"{count:,} {phrase(reason, DATAGRAMS)}" for reason, count in counts)
+
+
+def members_configured(server: RelayServer) -> Table:
+    """A line per member of a configuration."""
+    table = Table(box=SIMPLE_HEAD, pad_edge=False)
+    for title in ("name", "public key", "PSK", "members", "datagrams/s", "kbit/s"):
+        table.add_column(title, overflow="fold", justify="right" if "/" in title or title == "members" else "left")
+    for member in server.members:
+        table.add_row(
+            Text(member.name),
+            Text(encode_key(member.peer.public_key)),
+            "yes" if member.peer.psk is not None else "no",
+            f"{member.most_peers:,}",
+            f"{member.limits.datagrams_s:,}",
+            f"{member.limits.bits_s / 1000:,.0f}",
+        )
+    return table
