@@ -25,6 +25,7 @@ SECTIONS: dict[str, type[BaseModel]] = {
     "`[[peer]]`": schema.PeerSection,
     "`[[member]]`": schema.MemberSection,
     "`[relay_server]`": schema.RelayServerSection,
+    "`[[relay]]`": schema.RelaySection,
     "`[[endpoint]]`": schema.EndpointSection,
     "Policy": schema.PolicySection,
     "`[routing]`": schema.RoutingSection,
@@ -37,7 +38,8 @@ SECTIONS: dict[str, type[BaseModel]] = {
 def own_keys(model: type[BaseModel]) -> set[str]:
     """The keys that a section adds to those it shares with others, without the names of sections."""
     shared = {key for base in model.__mro__[1:] if issubclass(base, BaseModel) for key in base.__annotations__}
-    return set(model.model_fields) - shared - {title.strip("`[]") for title in SECTIONS}
+    sections = {title.strip("`[]") for title in SECTIONS} if model is schema.FileSection else set()
+    return set(model.model_fields) - shared - sections
 
 
 def rows(title: str) -> dict[str, tuple[str, str, str]]:

@@ -373,7 +373,10 @@ COUNTED_ONLY = {DropReason.LATE_COPY}
 """Copies of envelopes are ordinary: they are counted, and nothing is reported."""
 
 
-OUTSIDE = {DropReason.FRAMES_NOT_ALLOWED, DropReason.RELAY_MALFORMED, DropReason.RELAY_UNKNOWN_HANDLE}
+OUTSIDE = {
+    *(DropReason.FRAMES_NOT_ALLOWED, DropReason.RELAY_MALFORMED, DropReason.RELAY_UNKNOWN_HANDLE),
+    DropReason.RELAY_OVER_LIMIT,
+}
 """Reasons of the shell around the node: data along a relay, and frames of a relay. ``tests/link`` provokes them."""
 
 

@@ -139,6 +139,15 @@ STATUS: dict[str, Any] = {
             "refused": {"in": {}, "out": {"PING": {"setup_signing": 27}}},
         }
     },
+    "relays": {
+        "vps": {
+            "state": "up",
+            "round_trip_s": 0.05,
+            "bytes_received": 50,
+            "bytes_sent": 51,
+            "peers": {"drone1": "bound", "drone2": "waiting"},
+        }
+    },
     "drops": {"malformed": 30},
     "unrouted": {"unknown_target": 31},
     "send_failures": {"ENETUNREACH": 32},

@@ -14,6 +14,7 @@ from uavlinkd.config.model import (
     PeerConfig,
     PolicyData,
     Recording,
+    RelayConfig,
     RelayServer,
     Routing,
 )
@@ -31,6 +32,7 @@ __all__ = [
     "PolicyData",
     "Problem",
     "Recording",
+    "RelayConfig",
     "RelayServer",
     "Routing",
 ]

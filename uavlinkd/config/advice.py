@@ -38,6 +38,7 @@ def advice(
     yield from _exposed(endpoints)
     yield from _exposed_metrics(metrics)
     yield from _shared_secrets(peers)
+    yield from _readable(peers)
     yield from _lengths(peers)
     yield from _slow(peers)
     yield from _reach(listen, peers)
@@ -148,6 +149,16 @@ def _shared_secrets(peers: Sequence[PeerConfig]) -> Iterator[str]:
                 f'peers "{a.name}" and "{b.name}" have the same PSK: an attacker that captures one of them has it'
                 " for both; make one for each pair with `uavlinkd psk`"
             )
+
+
+def _readable(peers: Sequence[PeerConfig]) -> Iterator[str]:
+    """Warn of links through a relay whose frames are not encrypted."""
+    names = [f'"{peer.name}"' for peer in peers if peer.relays and not peer.settings.link.confidential]
+    if names:
+        yield (
+            f"links through a relay are not confidential ({', '.join(names)}): the owner of the relay cannot alter"
+            " their frames, but can read them; write confidential = true in [link], at one end or both"
+        )
 
 
 def _lengths(peers: Sequence[PeerConfig]) -> Iterator[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from uavlinkd.config.errors import ConfigError, Problem
-from uavlinkd.config.model import Config, EndpointConfig, PeerConfig
+from uavlinkd.config.model import Config, EndpointConfig, PeerConfig, RelayConfig
 from uavlinkd.relay.member_settings import MemberSettings
 
 _FIXED = {
@@ -26,7 +26,10 @@ _NEEDS_RESTART = "cannot change while the daemon runs: restart it, or put the ol
 
 @dataclass(frozen=True, slots=True)
 class ConfigChanges:
-    """Added, removed and changed peers and endpoints. A peer with new keys or link settings is removed and added."""
+    """Added, removed and changed peers, endpoints and relays.
+
+    A peer or relay with new keys or link settings is removed and added.
+    """
 
     removed_peers: tuple[str, ...]
     added_peers: tuple[PeerConfig, ...]
@@ -37,6 +40,9 @@ class ConfigChanges:
     added_members: tuple[str, ...] = ()
     removed_members: tuple[str, ...] = ()
     changed_members: tuple[str, ...] = ()
+    removed_relays: tuple[str, ...] = ()
+    added_relays: tuple[RelayConfig, ...] = ()
+    changed_relays: tuple[RelayConfig, ...] = ()
 
     def summary(self) -> dict[str, list[str]]:
         """Names by kind of change, for a log, without kinds that did not occur."""
@@ -50,6 +56,9 @@ class ConfigChanges:
             "members_removed": list(self.removed_members),
             "members_added": list(self.added_members),
             "members_changed": list(self.changed_members),
+            "relays_removed": list(self.removed_relays),
+            "relays_added": [relay.name for relay in self.added_relays],
+            "relays_changed": [relay.name for relay in self.changed_relays],
         }
         return {kind: names for kind, names in named.items() if names}
 
@@ -91,6 +100,13 @@ def compare(old: Config, new: Config) -> ConfigChanges:
         if name in peers_before and _is_accepted_already(peer, peers_before[name])
     }
     members_before, members_now = _members(old), _members(new)
+    relays_before = {relay.name: relay for relay in old.relays}
+    relays_now = {relay.name: relay for relay in new.relays}
+    same_relays = {
+        name
+        for name, relay in relays_now.items()
+        if name in relays_before and relay.settings == relays_before[name].settings
+    }
     return ConfigChanges(
         removed_peers=tuple(name for name in peers_before if name not in same_peers),
         added_peers=tuple(peer for name, peer in peers_now.items() if name not in same_peers),
@@ -105,6 +121,9 @@ def compare(old: Config, new: Config) -> ConfigChanges:
         changed_members=tuple(
             name for name in members_now if members_before.get(name, members_now[name]) != members_now[name]
         ),
+        removed_relays=tuple(name for name in relays_before if name not in same_relays),
+        added_relays=tuple(relay for name, relay in relays_now.items() if name not in same_relays),
+        changed_relays=tuple(relays_now[name] for name in same_relays if relays_now[name] != relays_before[name]),
     )
 
 

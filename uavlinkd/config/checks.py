@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from itertools import combinations
 from typing import Any
 
@@ -77,15 +77,20 @@ def unique(
             problems.add(section.place.key(key), "is " + message.format(other=other.place.key("")))
 
 
-def reachability(problems: Problems, top: Values, peers: Iterable[Values]) -> None:
-    """One of the two ends must be able to initiate, and a daemon does not initiate to itself."""
+def reachability(problems: Problems, top: Values, peers: Iterable[Values], relayed: Collection[Values] = ()) -> None:
+    """One of the two ends must be able to initiate, and a daemon does not initiate to itself.
+
+    ``relayed``: the peers that need no address, because they are reached along a relay.
+    """
     listen: list[Address] = top.valid.get("listen", [])
     for a, b in combinations(listen, 2):
         if overlaps(a, b):
             problems.add("listen", f"names {a} and {b}, which one machine cannot listen on at once: write one")
     for peer in peers:
         addresses: list[PeerAddress] = peer.valid.get("addresses", [])
-        if not addresses and not listen and "listen" not in top.invalid and "addresses" not in peer.invalid:
+        if peer in relayed:
+            pass
+        elif not addresses and not listen and "listen" not in top.invalid and "addresses" not in peer.invalid:
             problems.add(
                 peer.place.key("addresses"),
                 "is empty, and so is listen: neither end could initiate; write the peer's address here,"

@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from uavlinkd.config import checks, network_rules, pasted_keys, policies, relay_rules
+from uavlinkd.config import checks, network_rules, pasted_keys, policies, relay_rules, used_relays
 from uavlinkd.config.advice import advice
 from uavlinkd.config.errors import ConfigError, Problem
 from uavlinkd.config.keys import CREDENTIALS, KeyFileError, find_secret_file, read_secret_file
@@ -27,6 +27,7 @@ from uavlinkd.config.schema import (
     NetworkSection,
     PeerSection,
     RecordingSection,
+    RelaySection,
     RelayServerSection,
     RoutingSection,
     Section,
@@ -61,11 +62,13 @@ def load_config(path: Path, environ: Mapping[str, str]) -> Config:
     peers = _sections(problems, table, "peer", PeerSection)
     members = _sections(problems, table, "member", MemberSection)
     server = problems.read(RelayServerSection, _table(problems, table, "relay_server"), "relay_server")
+    relays = _sections(problems, table, "relay", RelaySection)
 
     private = _secret(problems, top, "private_key_file", path, environ)
     previous = _secret(problems, top, "previous_private_key_file", path, environ)
     psks = [_secret(problems, peer, "psk_file", path, environ) for peer in peers]
     member_psks = [_secret(problems, member, "psk_file", path, environ) for member in members]
+    relay_psks = [_secret(problems, relay, "psk_file", path, environ) for relay in relays]
     public = _public(private) if private else None
 
     checks.names(problems, endpoints)
@@ -75,14 +78,16 @@ def load_config(path: Path, environ: Mapping[str, str]) -> Config:
     relay_rules.relay_server(problems, top, server, members, has_frames=bool(peers or endpoints))
     pasted_keys.check(
         problems,
-        [*peers, *members],
+        [*peers, *members, *relays],
         private.reveal() if private else None,
-        [psk.reveal() if psk else None for psk in (*psks, *member_psks)],
+        [psk.reveal() if psk else None for psk in (*psks, *member_psks, *relay_psks)],
         path.absolute().parent,
     )
     checks.previous_keys(problems, top, peers, public, None if previous is None else _public(previous))
-    checks.reachability(problems, top, peers)
-    network_rules.networks(problems, top, networks, peers, endpoints)
+    checks.reachability(problems, top, peers, [peer for peer in peers if used_relays.uses_relay(peer, relays)])
+    checks.reachability(problems, top, relays, relays)
+    used_relays.relays(problems, relays, peers, public)
+    network_rules.networks(problems, top, networks, [*peers, *relays], endpoints)
     checks.endpoints(problems, top, endpoints)
     checks.metrics(problems, metrics, endpoints)
     checks.recording(problems, recording, peers)
@@ -92,7 +97,7 @@ def load_config(path: Path, environ: Mapping[str, str]) -> Config:
     for peer in peers:
         checks.timers(problems, peer, link)
         policies.check(problems, peer, is_local=False)
-    for section, psk in zip((*peers, *members), (*psks, *member_psks), strict=True):
+    for section, psk in zip((*peers, *members, *relays), (*psks, *member_psks, *relay_psks), strict=True):
         if psk is not None and psk == private:
             problems.add(
                 section.place.key("psk_file"),
@@ -106,7 +111,13 @@ def load_config(path: Path, environ: Mapping[str, str]) -> Config:
     endpoint_configs = tuple(map(_endpoint, endpoints))
     relay_config = relay_rules.relay_server_of(server, members, member_psks, link)
     member_keys = {member.valid["public_key"] for member in members}
-    peer_configs = tuple(_peer(peer, psk, link, member_keys) for peer, psk in zip(peers, psks, strict=True))
+    peer_configs = tuple(
+        replace(_peer(peer, psk, link, member_keys), relays=used_relays.relays_of(peer, relays))
+        for peer, psk in zip(peers, psks, strict=True)
+    )
+    relay_configs = tuple(
+        used_relays.relay_of(relay, psk, link) for relay, psk in zip(relays, relay_psks, strict=True)
+    )
     routing_config = Routing(**RoutingSection.model_construct(**routing.valid).model_dump())
     return Config(
         path=path,
@@ -125,6 +136,7 @@ def load_config(path: Path, environ: Mapping[str, str]) -> Config:
         key_grace_s=FileSection.model_construct(**top.valid).key_grace_s,
         networks=network_configs,
         relay_server=relay_config,
+        relays=relay_configs,
         warnings=(
             *pasted_keys.advice(private.reveal(), peer_configs),
             *advice(
@@ -256,7 +268,9 @@ def _sections(problems: Problems, table: Mapping[str, Any], key: str, model: typ
     """The sections of a kind that a file may have many times."""
     value = table.get(key, [])
     sections = value if isinstance(value, list) else [value]
-    if sections is not value or not all(isinstance(section, dict) for section in sections):
+    if key == "relay" and isinstance(value, bool):
+        problems.add(key, "does not belong here: write it in [routing], or [[relay]] for a relay")
+    elif sections is not value or not all(isinstance(section, dict) for section in sections):
         problems.add(key, f"must be a list of sections: write [[{key}]], in double brackets, for each")
     return [
         problems.read(model, section, f"{key}[{number}]")

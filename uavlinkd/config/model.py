@@ -10,7 +10,7 @@ from types import MappingProxyType
 from typing import Literal
 
 from uavlinkd.core.crypto import Secret
-from uavlinkd.core.path import SERIAL_HOST
+from uavlinkd.core.path import RELAY_HOST, SERIAL_HOST
 from uavlinkd.core.settings import PeerSettings
 from uavlinkd.endpoints.url import EndpointUrl, SerialUrl
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
@@ -107,7 +107,7 @@ class PeerAddress:
 class PeerConfig:
     """Another daemon: its settings in the core, and its addresses. Without addresses, the peer initiates.
 
-    ``previous_public_key``: its old key, while the key changes.
+    ``previous_public_key``: its old key, while the key changes. ``relays``: names of those along which it is reached.
     """
 
     settings: PeerSettings
@@ -115,11 +115,17 @@ class PeerConfig:
     policy: PolicyData
     egress: EgressSettings = field(default_factory=EgressSettings)
     previous_public_key: bytes | None = None
+    relays: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
         """The name of the peer in this configuration, unique among the peers."""
         return self.settings.name
+
+    @property
+    def is_called(self) -> bool:
+        """Whether this daemon initiates to it: it has an address, or a relay."""
+        return bool(self.addresses or self.relays)
 
     def make_policy(self) -> Policy:
         """A new policy: its counters at zero, its rates unused."""
@@ -132,6 +138,19 @@ class RelayServer:
 
     members: tuple[MemberSettings, ...]
     limits: RelayLimits
+
+
+@dataclass(frozen=True, slots=True)
+class RelayConfig:
+    """A relay: its settings in the core, where its name begins with :data:`.RELAY_HOST`, and its addresses."""
+
+    settings: PeerSettings
+    addresses: tuple[PeerAddress, ...]
+
+    @property
+    def name(self) -> str:
+        """The name of the relay in this configuration, unique among the relays."""
+        return self.settings.name.removeprefix(RELAY_HOST)
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,6 +213,7 @@ class Config:
     key_grace_s: float = 0.0
     networks: tuple[NetworkConfig, ...] = ()
     relay_server: RelayServer | None = None
+    relays: tuple[RelayConfig, ...] = ()
 
     @property
     def is_only_relay(self) -> bool:

@@ -26,6 +26,7 @@ from uavlinkd.config.schema import (
     PeerSection,
     PolicySection,
     RecordingSection,
+    RelaySection,
     RelayServerSection,
     RoutingSection,
     Section,
@@ -173,6 +174,7 @@ _SECTIONS: dict[str, type[Section]] = {
     "in [link] or in a [[peer]]": LinkSection,
     "in a [[peer]] or an [[endpoint]]": PolicySection,
     "in a [[peer]]": PeerSection,
+    "in a [[relay]]": RelaySection,
     "in a [[network]]": NetworkSection,
     "in an [[endpoint]]": EndpointSection,
     "in a [[member]]": MemberSection,
@@ -244,7 +246,7 @@ def unknown_key(key: str, model: type[Section]) -> str:
     if close := get_close_matches(plain, known, n=1, cutoff=0.7):
         written = (
             f"[[{close[0]}]]"
-            if model is FileSection and close[0] in ("peer", "endpoint", "network", "member")
+            if model is FileSection and close[0] in ("peer", "endpoint", "network", "member", "relay")
             else close[0]
         )
         return f"is not known: did you mean {written}?"

@@ -297,6 +297,23 @@ class PeerSection(LinkSection, PolicySection):
     )
     """Also accepted while the peer's key changes, until the first session with the new key or ``key_grace_s``."""
 
+    relays: list[Name] | None = Field(default=None, examples=["[]"])
+    """The relays along which to reach it, by name. By default all of the file."""
+
+
+class RelaySection(Section):
+    """``[[relay]]``: a host that passes datagrams between this daemon and its peers, and cannot forge them."""
+
+    name: Name = Field(examples=['"vps"'])
+    public_key: Annotated[bytes, PlainValidator(_public_key)] = Field(
+        examples=['"…", what `uavlinkd pubkey` prints on the relay']
+    )
+    addresses: Annotated[list[Annotated[PeerAddress, PlainValidator(_peer_address)]], AfterValidator(_addresses)] = (
+        Field(default=[], examples=['["relay.example.org:5790"]'])
+    )
+    """Where this daemon reaches it."""
+    psk_file: FileName | None = Field(default=None, examples=['"drone0-vps.psk"'])
+
 
 class MemberSection(Section):
     """``[[member]]``: a daemon that may use this relay."""
@@ -392,6 +409,7 @@ class FileSection(Section):
     recording: Any = None
     network: Any = None
     endpoint: Any = None
+    relay: Any = None
     peer: Any = None
     member: Any = None
     relay_server: Any = None

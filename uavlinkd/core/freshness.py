@@ -75,6 +75,7 @@ def receive_answer(peer: Peer, echo: wire.Echo, now: float) -> list[Output]:
     peer.round_trip_s = now - request.sent_at
     peer.paths.note_echo(peer.round_trip_s, now)
     peer.set_waits()
+    peer.set_paths_timer()
     session = request.session
     if session is None:
         return []

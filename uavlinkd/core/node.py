@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 
 from uavlinkd.core import constants as c
-from uavlinkd.core import establish, handshake, wire
+from uavlinkd.core import establish, handshake, probing, wire
 from uavlinkd.core.admission import Admission, CookieRequired, Message
 from uavlinkd.core.cookie import CookieJar, MacKeys, mac1_of
 from uavlinkd.core.crypto import Entropy, KeyPair, Secret, equal
@@ -25,7 +25,7 @@ from uavlinkd.core.probing import ask_candidates
 from uavlinkd.core.receive import receive_envelope
 from uavlinkd.core.refusals import Refused
 from uavlinkd.core.relay_records import Record
-from uavlinkd.core.send import note_repeat, recount, report_refusals, send_frames, send_record
+from uavlinkd.core.send import ask_for_echo, note_repeat, recount, report_refusals, send_frames, send_record
 from uavlinkd.core.session import Session
 from uavlinkd.core.settings import Class, PeerSettings, Screen, hold_all
 from uavlinkd.core.socket_facts import SocketFacts
@@ -129,7 +129,11 @@ class Node:
     def set_paths(self, peer: Peer, paths: Iterable[Path], now: float) -> None:
         """Where to initiate to this peer, the likeliest first. A path that works stays in use."""
         self._forget_addresses(peer)
+        before = peer.paths.configured
         peer.paths.configure(paths, now)
+        for path in peer.paths.configured:
+            if path.is_relayed and path not in before and not peer.is_up:
+                peer.initiator.hurry(path.socket, now)  # its handle shows that the peer asked for this node just now
         for path in peer.paths.configured:
             self._by_address[path.place] = peer
         self._revise_paths(peer, now)
@@ -220,6 +224,17 @@ class Node:
     def ask_candidates(self, peer: Peer, now: float) -> list[Output]:
         """Send a question to each candidate without a slot; to fewer of them if that was done often."""
         return ask_candidates(peer, now)
+
+    def ask(self, peer: Peer, path: Path, now: float) -> list[Output]:
+        """Ask along one path now whether the peer is there. Without an answer in time, the node initiates to it."""
+        session, state = peer.sending_session(), peer.paths.find(path)
+        if session is None or state is None or state.is_off:
+            return []
+        out = ask_for_echo(peer, session, now, (state,))
+        if peer.paths.has_several:
+            out += probing.ask(peer, session, state, now) + probing.update(peer, now)
+        self._schedule.update(peer)
+        return out
 
     def receive(self, datagram: bytes, path: Path, now: float) -> list[Output]:
         """What to do about a datagram. Never raises, whatever the bytes."""

@@ -113,6 +113,13 @@ class PathStateChanged(NamedTuple):
     reason: str
 
 
+class PathSuspected(NamedTuple):
+    """A relayed path failed a moment ago. The relay may be the reason: ask it."""
+
+    peer: LinkedPeer
+    path: Path
+
+
 class FreshnessUnverified(NamedTuple):
     """Frames of the peer arrive, but no answers: frames that must be new are held, the others are delivered."""
 
@@ -133,6 +140,7 @@ Event = (
     | SessionEstablished
     | PathChanged
     | PathStateChanged
+    | PathSuspected
     | FreshnessUnverified
     | FreshnessVerified
 )

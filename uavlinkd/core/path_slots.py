@@ -73,7 +73,10 @@ class PathSlots:
         return now < self._former.get(path, -NEVER)
 
     def configure(self, paths: Iterable[Path], now: float) -> None:
-        """The paths of the configuration, the likeliest first. One that works stays, as a learned path."""
+        """The paths of the configuration, the likeliest first. One that works stays, as a learned path.
+
+        A relayed one does not stay: its handle leads nowhere any more.
+        """
         hosts = Counter[tuple[int, str]]()
         wanted: list[Path] = []
         for path in dict.fromkeys(paths):
@@ -88,10 +91,12 @@ class PathSlots:
         for path, state in before.items():
             if path not in self.by_path:
                 state.is_configured = False
-                if state is self.best or state.works:
+                if not path.is_relayed and (state is self.best or state.works):
                     self.by_path[path] = state
                 else:
                     self._drop(state)
+                    if state is self.best:
+                        self.best = None
 
     def set_candidates(self, paths: Iterable[Path]) -> None:
         """The peer may be there too. The first :data:`c.CANDIDATES` count."""

@@ -38,7 +38,13 @@ class ConditionChanged(NamedTuple):
     reason: str
 
 
-Change = BestChanged | ConditionChanged
+class Suspected(NamedTuple):
+    """A relayed path became suspect: the relay may have failed."""
+
+    state: PathState
+
+
+Change = BestChanged | ConditionChanged | Suspected
 
 
 class PathSet(PathSlots):
@@ -57,6 +63,7 @@ class PathSet(PathSlots):
         "has_standby",
         "is_multiple",
         "next_at",
+        "reports_single",
         "routes",
         "stream_at",
         "stream_route",
@@ -77,6 +84,8 @@ class PathSet(PathSlots):
         self._revised_at = NEVER  # an update is due since then
         self.has_relayed = False
         """Whether one of them leads through a relay."""
+        self.reports_single = False
+        """Whether the condition of a path is reported even if it is the only one."""
         self.has_standby = False
         """Whether there is another path than the best one, whatever its condition."""
         self.is_multiple = False
@@ -156,6 +165,8 @@ class PathSet(PathSlots):
             is_first = not self.best.is_validated
             self.best.note_echo(round_trip_s, now)
             self.note_answer(self.best, now, is_first=is_first)
+            if self.reports_single and self.best not in self._reported:
+                self.revise(now)
 
     def note_echo_counts(self, asked_at: float, sent: int, repeats: Repeats, received: int) -> None:
         """Of ``sent`` envelopes of the session until an echo request so many arrived: the loss of the only path."""
@@ -178,15 +189,18 @@ class PathSet(PathSlots):
     def update(self, now: float) -> list[Change]:
         """Judge every path, elect the best one, and set the routes and the next deadline."""
         self._revised_at = NEVER
+        changes: list[Change] = []
         for state in self.states:
+            was_usable = state.condition is PathCondition.USABLE
             state.check(now)
+            if was_usable and state.path.is_relayed and state.condition is not PathCondition.USABLE:
+                changes.append(Suspected(state))
         if not any(state.works for state in self.by_path.values()):
             for state in self.by_path.values():
                 if state.is_recovering:  # the only one to answer: it need not prove itself for longer
                     state.set_usable(now)
         self.best, reason = self._election.elect(self.best, self.by_path.values(), now)
-        changes: list[Change] = []
-        for state in self.by_path.values() if self.has_several else ():
+        for state in self.by_path.values() if self.has_several or self.reports_single else ():
             is_usable = state.condition is PathCondition.USABLE
             if is_usable and state not in self._reported:
                 self._reported.add(state)

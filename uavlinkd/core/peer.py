@@ -80,6 +80,7 @@ class Peer:
         """Ephemerals of its initiations, the oldest first."""
         self.paths = PathSet(settings.link.redundancy, settings.link.idle_probe_s, known, facts)
         """Where the peer is, or may be."""
+        self.paths.reports_single = bool(settings.link.features & c.FEATURE_RECORDS)
         self.is_up = False
         self.established_at: float | None = None
         self.received_at: float | None = None

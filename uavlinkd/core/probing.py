@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from uavlinkd.core import constants as c
 from uavlinkd.core.drops import DropReason
-from uavlinkd.core.outputs import Output, PathChanged, PathStateChanged
+from uavlinkd.core.outputs import Output, PathChanged, PathStateChanged, PathSuspected
 from uavlinkd.core.path import Path
 from uavlinkd.core.path_state import PathCondition, PathState
-from uavlinkd.core.paths import BestChanged
+from uavlinkd.core.paths import BestChanged, Suspected
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.probe import ANSWER_BYTES, PROBE, QUESTION_BYTES, Probe, parse_probe
 from uavlinkd.core.send import seal
@@ -20,7 +20,9 @@ def update(peer: Peer, now: float) -> list[Output]:
     out: list[Output] = []
     for change in peer.paths.update(now):
         path = change.state.path
-        if isinstance(change, BestChanged):
+        if isinstance(change, Suspected):
+            out.append(PathSuspected(peer, path))
+        elif isinstance(change, BestChanged):
             out.append(PathChanged(peer, path, change.before.path, change.reason))
         else:
             out.append(PathStateChanged(peer, path, change.is_usable, change.reason))

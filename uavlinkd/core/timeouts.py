@@ -5,7 +5,7 @@ from __future__ import annotations
 from uavlinkd.core import freshness, probing
 from uavlinkd.core.constants import NEVER
 from uavlinkd.core.establish import initiate
-from uavlinkd.core.outputs import Output
+from uavlinkd.core.outputs import Output, PathSuspected
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.send import ask_for_echo
 from uavlinkd.core.timers import Timer
@@ -65,6 +65,8 @@ def _handle_silence(peer: Peer, now: float) -> list[Output]:
         if session is not None and peer.paths.best is not None:
             if now >= peer.echo_at:
                 out += ask_for_echo(peer, session, now)
+                if peer.paths.best.path.is_relayed:
+                    out.append(PathSuspected(peer, peer.paths.best.path))
             stages.append(peer.echo_at)
     if stages:
         peer.timers.set(Timer.SILENCE, min(stages))

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import structlog
 
-from uavlinkd.config import Config, ConfigError, PeerConfig
+from uavlinkd.config import Config, ConfigError, PeerConfig, RelayConfig
 from uavlinkd.config.changes import compare
 from uavlinkd.config.load import load_in_thread
 from uavlinkd.core import outputs as o
@@ -21,7 +21,7 @@ from uavlinkd.core.constants import NEVER
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import LinkedPeer, Output
-from uavlinkd.core.path import Path
+from uavlinkd.core.path import Path, SocketAddress
 from uavlinkd.core.timers import Schedule
 from uavlinkd.endpoints.ports import LocalPort
 from uavlinkd.link.conditions import LineLimits
@@ -39,9 +39,11 @@ from uavlinkd.link.peer_link import PeerLink, radio_figures
 from uavlinkd.link.peer_owners import PeerOwner
 from uavlinkd.link.peer_sockets import PeerSockets
 from uavlinkd.link.pilot_notes import PilotNotes
+from uavlinkd.link.relays import Relays
 from uavlinkd.link.shell_reasons import ShellReason
 from uavlinkd.link.status import daemon_status
 from uavlinkd.link.switch import Switch
+from uavlinkd.link.turns import WaitingDatagram
 from uavlinkd.mavlink.frames import Frame
 from uavlinkd.mavlink.radio_status import INTERVAL_S
 from uavlinkd.mavlink.routing import Router
@@ -112,6 +114,7 @@ class Daemon:
             self._intake.receive, self.stall, self._drops, self.evidence, self.log, self.node
         )
         self._events.network_of = self.peer_sockets.network_name
+        self.relays = Relays(self.node, self.peer_sockets, self.links, self.owners, self.log, self._arm)
         self.local = LocalEndpoints(config.name, self.switch, self._events, self.stall, self.on_frames)
         self.relay: RelayService | None = None
         if config.relay_server is not None:
@@ -184,6 +187,8 @@ class Daemon:
             raise
         if self.config.recording is not None:
             self.recorder = Recorder(self.config.recording, self.log)
+        for relay in self.config.relays:
+            self._add_relay(relay)
         for peer in self.config.peers:
             self._add_peer(peer)
         self._follow_members()
@@ -266,10 +271,16 @@ class Daemon:
                 link.give_up_ours(monotonic())
             self._map_peers()
             self.node.forget_previous_key()
+        for name in changes.removed_relays:
+            self._perform(self.relays.remove(name, monotonic()))
         for name in changes.removed_peers:
             self._remove_peer(name)
         if self.relay is not None:
             self.relay.release({peer.settings.public_key for peer in config.peers}, monotonic())
+        for relay in changes.added_relays:
+            self._add_relay(relay)
+        for relay in changes.changed_relays:
+            self.relays.change(relay)
         for peer in changes.changed_peers:  # first: a new peer may have a key that one of these gives up
             self._change_peer(peer)
         for peer in changes.added_peers:
@@ -294,6 +305,20 @@ class Daemon:
     async def _reload_for_signal(self) -> None:
         with suppress(ConfigError):  # logged already
             await self.reload()
+
+    def _add_relay(self, config: RelayConfig) -> None:
+        self.relays.add(config, monotonic())
+        self._intake.take_relayed = self._take_relayed
+
+    def _take_relayed(self, socket: int, data: bytes, source: SocketAddress) -> WaitingDatagram | None:
+        taken = self.relays.handles.unwrap(socket, data, source)
+        if isinstance(taken, DropReason):
+            if self.relay is not None:  # of a member of this daemon
+                self.relay.take(socket, data, source)
+            else:
+                self._drop_datagram(taken, path=Path(socket, source))
+            return None
+        return taken
 
     def _add_peer(self, config: PeerConfig) -> None:
         now, has_previous = monotonic(), self.config.previous_private_key is not None
@@ -333,6 +358,7 @@ class Daemon:
         self._link_of.clear()
         self._link_of.update((peer, link) for link in self.links.values() for peer in link.peers)
         self.node.set_point_to_point(self.peer_sockets.serial.peers_at(self.links.values()))
+        self.relays.follow_links(monotonic())
 
     def _follow_members(self) -> None:
         """The configuration, or the peers of the core, have changed."""
@@ -411,14 +437,18 @@ class Daemon:
         link = self._link_of.get(event.peer)
         if link is None:
             return
+        if isinstance(event, o.PathSuspected):
+            self.relays.on_suspected(event.path)
+            return
         self._events.write(event, now)
         if isinstance(event, o.PeerLost | o.PeerClosed):
             if not link.peer.is_up:  # with any key
                 link.on_down(now)
         elif isinstance(event, o.PathChanged | o.PathStateChanged | o.SessionEstablished):
             link.follow_paths(now)
-            if isinstance(event, o.SessionEstablished) and link.peer.path is not None:
-                self.history.add_session(link.name, link.peer.path.address, now)
+            path = link.peer.path
+            if isinstance(event, o.SessionEstablished) and path is not None and not path.is_relayed:
+                self.history.add_session(link.name, path.address, now)
             is_current = isinstance(event, o.SessionEstablished) and event.peer is link.peers[0]
             if is_current and link.confirm(now, self._graces):
                 self._map_peers()
@@ -435,7 +465,7 @@ class Daemon:
 
     def _arm(self) -> None:
         """Set the one timer to the next deadline. It is moved only to an earlier time: firing too early is cheap."""
-        deadline = min(self.node.next_deadline(), self._waiting.next_at, self._housekeeping_at)
+        deadline = min(self.node.next_deadline(), self._waiting.next_at, self._housekeeping_at, self.relays.next_at)
         if deadline < self._timer_at:
             if self._timer is not None:
                 self._timer.cancel()
@@ -449,6 +479,8 @@ class Daemon:
             self._perform(self.node.handle_timeout(now))
             for link in self._waiting.pop(now):
                 link.send_waiting(now)
+            if now >= self.relays.next_at:
+                self._perform(self.relays.handle_timeout(now))
             if now >= self._housekeeping_at:
                 self._housekeeping_at = now + HOUSEKEEPING_S
                 self._do_housekeeping(now)
@@ -470,6 +502,7 @@ class Daemon:
         self.peer_sockets.do_housekeeping()
         if rates := follow_rates(self.peer_sockets.serial, self._budgets, self.links.values(), now):
             self.node.set_rates(rates, now)
+        self.relays.do_housekeeping(now)
         for link in self.links.values():
             link.note_silence(now)
             link.measure(now)

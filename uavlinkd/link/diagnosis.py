@@ -11,13 +11,14 @@ from typing import Final, Protocol
 
 from uavlinkd.core.drops import DropReason
 from uavlinkd.link import refused_there
-from uavlinkd.link.down_causes import Network, finding, link_down, listed, shown, sole_waiting
+from uavlinkd.link.down_causes import Network, finding, link_down, listed, sole_waiting
 from uavlinkd.link.endpoint_causes import Local, endpoint_findings
 from uavlinkd.link.evidence import EVIDENCE_S
 from uavlinkd.link.line_causes import line_findings
 from uavlinkd.link.other_version import other_version
 from uavlinkd.link.passage import Key, Passage
 from uavlinkd.link.peer_link import PeerLink
+from uavlinkd.link.shown import shown
 from uavlinkd.link.system_owners import Switching, SystemOwners
 from uavlinkd.link.traffic_causes import SECURITY_S, freshness, refusals, security
 from uavlinkd.mavlink.policy.gate import Refusal

@@ -12,19 +12,21 @@ from typing import Final, Protocol
 from uavlinkd.config import Config
 from uavlinkd.config.keys import encode_key
 from uavlinkd.core.drops import DropReason
-from uavlinkd.core.path import SocketAddress
 from uavlinkd.link.evidence import REPORTED, Evidence, Sighting
 from uavlinkd.link.history import History
 from uavlinkd.link.other_version import other_version
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.peer_sockets import PeerSockets
+from uavlinkd.link.relays import Relays
+from uavlinkd.link.shown import shown
 from uavlinkd.ops.causes import Cause
 from uavlinkd.ops.findings import Finding, Subject
-from uavlinkd.system.addresses import Address
 from uavlinkd.system.error_meanings import meaning_of
 
 CONFIRM_S: Final = 2.0
 """A handshake that is not complete after this time is reported."""
+RELAY_SILENT_S: Final = 5.0
+"""A relay that does not answer for this long is reported with the peers that need it."""
 _UNROUTED: Final = ("ENETUNREACH", "EHOSTUNREACH", "ENETDOWN", "EADDRNOTAVAIL", "EINVAL", "EMSGSIZE", "EAFNOSUPPORT")
 """Errors of sending that are certain: this machine's kernel reports them at once."""
 _UNREACHABLE: Final = ("EHOSTUNREACH", "ENETUNREACH", "EACCES")
@@ -37,6 +39,7 @@ class Network(Protocol):
     config: Config
     links: dict[str, PeerLink]
     peer_sockets: PeerSockets
+    relays: Relays
     evidence: Evidence
     history: History
 
@@ -48,7 +51,7 @@ def finding(cause: Cause, subject: Subject, name: str, text: str, remedy: str) -
 
 def link_down(daemon: Network, link: PeerLink, now: float) -> list[Finding]:
     """Why a peer is not up: a line for each cause with evidence; without any, one about its silence."""
-    certain = [*_configured(daemon, link), *_not_sent(daemon, link, now)]
+    certain = [*_configured(daemon, link), *_not_sent(daemon, link, now), *_relays(daemon, link, now)]
     findings = [*certain, *_reported(daemon, link, now), *_hints(daemon, link, now)]
     if not findings and link.is_overdue(now):
         findings.append(_silence(daemon, link))
@@ -93,6 +96,32 @@ def _not_sent(daemon: Network, link: PeerLink, now: float) -> Iterator[Finding]:
                 meaning_of(error),
             )
             return
+
+
+def _relays(daemon: Network, link: PeerLink, now: float) -> Iterator[Finding]:
+    """The relays of a peer that has no other path: one that does not answer, or that the peer does not use."""
+    relays = [daemon.relays.by_name[name] for name in link.config.relays if name in daemon.relays.by_name]
+    if not link.is_overdue(now) or any(relay.state_for(link) == "bound" for relay in relays):
+        return
+    for relay in relays:
+        relay_name = relay.config.name
+        if relay.state_for(link) == "waiting":
+            text = f"{link.name} is not bound at the relay {relay_name}: it is off, not a member, or does not use it"
+            remedy = (
+                f"start {link.name}; write a [[relay]] for {relay_name} into its file, and a [[member]] for it into"
+                " the file of the relay"
+            )
+            yield _about(Cause.NOT_BOUND, link.name, text, remedy)
+        elif now - relay.silent_since >= RELAY_SILENT_S:
+            where = listed(map(str, relay.addresses))
+            text = (
+                f"the relay {relay_name} does not answer at {where}: it is off, a firewall drops UDP, or keys differ"
+            )
+            remedy = (
+                f"run `uavlinkd status` at {relay_name}: it names the cause if datagrams arrive there; this daemon"
+                " must be a [[member]] there"
+            )
+            yield _about(Cause.RELAY_NOT_ANSWERING, link.name, text, remedy)
 
 
 # Hints: anything here may be forged.
@@ -182,6 +211,12 @@ def _silence(daemon: Network, link: PeerLink) -> Finding:
             f" {name}: it names the cause if datagrams arrive there"
         )
         return _about(Cause.NO_ANSWER, name, text, remedy)
+    if link.config.relays and not link.config.addresses:
+        text = (
+            f"no answer through a relay ({', '.join(link.config.relays)}): keys or PSKs differ, or it has just gone"
+        )
+        remedy = f"run `uavlinkd status` at {name}: it names the cause if datagrams arrive there"
+        return _about(Cause.NO_ANSWER, name, text, remedy)
     if link.config.addresses:
         differ = "addresses, keys or protocol versions differ"
         text = f"no answer from {_addresses(link)}: it is off, a firewall drops UDP, or {differ}"
@@ -205,7 +240,7 @@ def _seen(daemon: Network, kind: str, link: PeerLink, now: float) -> Sighting | 
 
 def _handshake_seen(daemon: Network, reason: DropReason, link: PeerLink, now: float) -> Sighting | None:
     """The same; of a peer without addresses, from any sender while it is the only such peer that is not up."""
-    if link.config.addresses:
+    if link.config.addresses or link.relayed:
         return _seen(daemon, reason, link, now)
     sighting = daemon.evidence.seen_elsewhere(reason, now) if sole_waiting(daemon) is not None else None
     return None if sighting is None or sighting.last_at < link.silent_since else sighting
@@ -227,11 +262,6 @@ def _about(cause: Cause, name: str, text: str, remedy: str) -> Finding:
 
 def _at(sighting: Sighting) -> str:
     return "its address" if sighting.address is None else shown(sighting.address)
-
-
-def shown(address: SocketAddress) -> str:
-    """An address for people."""
-    return str(Address.of(address))
 
 
 def _addresses(link: PeerLink) -> str:

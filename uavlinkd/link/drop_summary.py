@@ -18,10 +18,10 @@ from uavlinkd.link.conditions import Conditions, LineLimits, OpenCondition, Phas
 from uavlinkd.link.key_change import link_name
 from uavlinkd.link.other_version import compared
 from uavlinkd.link.shell_reasons import ShellReason
+from uavlinkd.link.shown import shown
 from uavlinkd.mavlink.dialect import name_of
 from uavlinkd.mavlink.headers import Header
 from uavlinkd.mavlink.policy.gate import Refusal
-from uavlinkd.system.addresses import Address
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.error_meanings import meaning_of
 
@@ -224,7 +224,7 @@ def _describe(fact: Fact) -> str:
         case Header():
             return f"{name_of(fact.msgid)} of system {fact.system}"
         case detail, path:
-            return f"{_about(detail)} from {Address.of(path.address)}".strip()
+            return f"{_about(detail)} from {shown(path.address)}".strip()
 
 
 def _about(detail: Detail) -> str:

@@ -15,10 +15,10 @@ from uavlinkd.link.key_change import link_name
 from uavlinkd.link.link_watch import THRESHOLDS, LinkWatch, is_noteworthy
 from uavlinkd.link.path_status import NetworkOf
 from uavlinkd.link.peer_link import PeerLink
+from uavlinkd.link.shown import shown
 from uavlinkd.ops.causes import Cause
 from uavlinkd.ops.findings import Finding, Severity, Subject
 from uavlinkd.ops.link_problems import LinkProblem
-from uavlinkd.system.addresses import Address
 
 FINDING_DELAY_S = 2.0
 """A finding is logged if it lasts for so long; one about an attack at once. Three lost answers in a row make a moment
@@ -149,7 +149,7 @@ class EventLog:
                 log.info("session_established", **_session_facts(event))
 
     def _path_facts(self, address_field: str, network_field: str, path: Path) -> dict[str, str]:
-        facts = {address_field: str(Address.of(path.address))}
+        facts = {address_field: shown(path.address)}
         network = self.network_of(path.socket)
         return facts if network is None else {**facts, network_field: network}
 

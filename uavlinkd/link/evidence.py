@@ -16,6 +16,7 @@ from uavlinkd.core.outputs import Dropped
 from uavlinkd.core.path import SocketAddress
 from uavlinkd.link.key_change import link_name
 from uavlinkd.link.peer_link import PeerLink
+from uavlinkd.link.shown import relay_name
 
 EVIDENCE_S: Final = 30.0
 """Evidence is forgotten after this time without more of it."""
@@ -147,4 +148,5 @@ class Evidence:
 
 def _places_of(link: PeerLink) -> list[Place]:
     addresses = [path.address for path in link.peers[0].paths.configured] if link.peers else []
-    return [*(("address", address) for address in addresses), *(("host", address[0]) for address in addresses)]
+    hosts = [address[0] for address in addresses if relay_name(address) is None]  # a relay leads to many peers
+    return [*(("address", address) for address in addresses), *(("host", host) for host in hosts)]

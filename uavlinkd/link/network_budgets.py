@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Final
 
-from uavlinkd.core.constants import LINE_BYTES
+from uavlinkd.core.constants import LINE_BYTES, RELAY_BYTES
 from uavlinkd.core.path import Path
 from uavlinkd.link.networks import Networks
 from uavlinkd.link.path_status import PathsOwner
@@ -25,9 +25,14 @@ LEAST_CORE_SHARE: Final = 0.25
 
 
 def carrier_bytes(path: Path) -> int:
-    """What a network adds to each datagram: headers of IP and UDP, or the framing on a line."""
+    """What a network adds to each datagram: headers of IP and UDP, or the framing on a line.
+
+    On a relayed path also what the relay adds. Its own address is not in the path: the longer header counts.
+    """
     if path.is_serial:
         return LINE_BYTES
+    if path.is_relayed:
+        return RELAY_BYTES + IPV6_UDP_BYTES
     return IPV6_UDP_BYTES if ":" in path.host else IPV4_UDP_BYTES
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from uavlinkd.core import constants as c
 from uavlinkd.link.evidence import Sighting
-from uavlinkd.system.addresses import Address
+from uavlinkd.link.shown import shown
 
 
 def compared(version: int) -> str:
@@ -20,7 +20,7 @@ def other_version(sighting: Sighting, here: str, there: str) -> tuple[str, str]:
     """The text and the remedy of a finding. ``here``: this daemon's name. ``there``: the sender's, if it is known."""
     versions = sorted(version for version in sighting.details if isinstance(version, int))
     named = " and ".join(f"uavlink/{version}" for version in versions)
-    at = "its address" if sighting.address is None else str(Address.of(sighting.address))
+    at = "its address" if sighting.address is None else shown(sighting.address)
     text = f"a sender at {at} speaks {named}, this daemon uavlink/{c.PROTOCOL_VERSION}: the two cannot link"
     remedies = []
     if min(versions) < c.PROTOCOL_VERSION:

@@ -7,7 +7,7 @@ from typing import Protocol
 
 from uavlinkd.core.path_state import PathState
 from uavlinkd.core.peer import Peer
-from uavlinkd.system.addresses import Address
+from uavlinkd.link.shown import relay_name, shown
 
 NetworkOf = Callable[[int], str | None]
 """The name of the network of a socket's number; None if the configuration names no networks."""
@@ -57,7 +57,7 @@ def paths_status(link: PathsOwner, network_of: NetworkOf, now: float) -> list[di
 
     ``carries`` has the classes of frames that go along it now. Losses are shares of recent datagrams, ``lag_s`` is by
     how much our copies arrive later along it than along the first path. ``number`` stays the same as long as the path
-    is known, and is below 256.
+    is known, and is below 256. ``relay`` is the one through which it leads; null for a direct path.
     """
     paths = link.peer.paths
     states = sorted(paths.states, key=lambda state: state is not paths.best)
@@ -70,7 +70,8 @@ def _path_status(link: PathsOwner, state: PathState, network_of: NetworkOf, now:
     return {
         "number": state.number,
         "network": network_of(state.path.socket),
-        "address": str(Address.of(state.path.address)),
+        "address": shown(state.path.address),
+        "relay": relay_name(state.path.address),
         "is_configured": state.is_configured,
         "state": state.condition.value,
         "reason": state.reason,

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from operator import itemgetter
 
-from uavlinkd.config import PeerConfig
-from uavlinkd.core.constants import NEVER
+from uavlinkd.config import PeerAddress, PeerConfig
+from uavlinkd.core.constants import CONFIGURED_PATHS, NEVER
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import LinkedPeer, Output, Transmit
 from uavlinkd.core.path import Path
@@ -30,6 +30,9 @@ NOT_ANSWERING_S = 5.0
 """The log reports a peer that does not answer our handshakes for this long."""
 NOT_CONNECTING_S = 10.0
 """The same for a peer without an address here, which has to connect."""
+
+RELAYED_LEAST = 3
+"""Slots for configured paths that relayed ones have at least: one for each relay."""
 
 Perform = Callable[[list[Output]], None]
 _RAW = itemgetter(0)
@@ -77,6 +80,9 @@ class PeerLink:
         self.silent_since = now
         """When it was up last, to the second; before that, when the daemon began to expect it."""
         self._sample: _Sample | None = None
+        self._direct: Sequence[Path] = ()
+        self.relayed: Sequence[Path] = ()
+        """The paths to it through relays."""
         self._measured = now, config.name, 0, 0  # when, what, and the bytes received and sent then
         self.bytes_s = 0.0, 0.0
         """Bytes received and sent a second, at the last :meth:`measure`."""
@@ -151,10 +157,31 @@ class PeerLink:
         for peer in gone:  # the outputs of one removal find none of them any more
             self._perform(self._node.remove_peer(peer, now))
 
+    @property
+    def keys(self) -> set[bytes]:
+        """The keys by which a relay may know the peer: also the previous one, while it changes."""
+        config = self.config
+        return {key for key in (config.settings.public_key, config.previous_public_key) if key is not None}
+
+    @property
+    def addresses(self) -> tuple[PeerAddress, ...]:
+        """Those of the configuration."""
+        return self.config.addresses
+
     def set_paths(self, paths: Sequence[Path], now: float) -> None:
-        """Connect to the peer along these paths."""
+        """Connect to the peer along these paths, and along the relayed ones."""
+        self._direct = paths
+        kept = CONFIGURED_PATHS - min(len(self.relayed), RELAYED_LEAST)
         for peer in reversed(self.peers):  # a hint from an address is for the one that was set last
-            self._node.set_paths(peer, paths, now)
+            self._node.set_paths(peer, [*paths[:kept], *self.relayed, *paths[kept:]], now)
+
+    def set_relayed(self, paths: Sequence[Path], now: float) -> bool:
+        """Connect along these paths through relays too. Returns whether they changed."""
+        if paths == self.relayed:
+            return False
+        self.relayed = paths
+        self.set_paths(self._direct, now)
+        return True
 
     def change(self, config: PeerConfig, now: float) -> None:
         """Apply other rules to the same peer. Frames that wait are dropped only if budget or delay change."""
@@ -264,9 +291,9 @@ class PeerLink:
     def is_overdue(self, now: float) -> bool:
         """Whether to report that the peer is silent, after a time by its kind.
 
-        It is :data:`NOT_ANSWERING_S` if the daemon connects to the peer, else :data:`NOT_CONNECTING_S`.
+        It is :data:`NOT_ANSWERING_S` if the daemon initiates to the peer, else :data:`NOT_CONNECTING_S`.
         """
-        limit_s = NOT_ANSWERING_S if self.config.addresses else NOT_CONNECTING_S
+        limit_s = NOT_ANSWERING_S if self.config.is_called else NOT_CONNECTING_S
         return not self.peer.is_up and now - self.silent_since >= limit_s
 
     def measure(self, now: float) -> LinkFigures:

@@ -14,6 +14,7 @@ from structlog.typing import FilteringBoundLogger
 
 from uavlinkd.config import NetworkConfig, PeerAddress
 from uavlinkd.core.path import Path, SocketAddress
+from uavlinkd.core.peer import Peer
 from uavlinkd.endpoints.error_queue import ErrorReports, send_again
 from uavlinkd.endpoints.ports import failure_name
 from uavlinkd.endpoints.reader import Datagrams, Reader
@@ -21,11 +22,11 @@ from uavlinkd.endpoints.sockets import BindError, is_absent, is_here, udp_socket
 from uavlinkd.link.drop_summary import DropSummary
 from uavlinkd.link.evidence import Evidence
 from uavlinkd.link.networks import Networks, SocketStates
-from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.peer_names import PeerNames
 from uavlinkd.link.relay_handles import RelayHandles
 from uavlinkd.link.serial_networks import SerialNetworks
 from uavlinkd.link.shell_reasons import ShellReason
+from uavlinkd.link.shown import relay_name
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.resolver import LONGEST_WAIT_S, RELAXED_WAIT_S, Resolved
@@ -67,12 +68,29 @@ class _Slot:
         self.reports: ErrorReports | None = None
 
 
+class Reached(Protocol):
+    """A peer or a relay, whose addresses are resolved and followed."""
+
+    name: str
+
+    @property
+    def addresses(self) -> tuple[PeerAddress, ...]:
+        """Those of the configuration."""
+
+    @property
+    def peer(self) -> Peer:
+        """Its object in the core."""
+
+    def set_paths(self, paths: Sequence[Path], now: float) -> None:
+        """Connect to it along these paths."""
+
+
 class _Followed:
     """A peer whose names are resolved, and the paths to it that the core knows."""
 
     names: PeerNames
 
-    def __init__(self, link: PeerLink, on_resolved: Callable[[], None]) -> None:
+    def __init__(self, link: Reached, on_resolved: Callable[[], None]) -> None:
         self.link = link
         self.on_resolved = on_resolved
         self.paths: dict[PeerAddress, list[Path]] = {}
@@ -140,7 +158,7 @@ class PeerSockets:
     def is_own(self, address: SocketAddress) -> bool:
         """Whether an address leads to one of these sockets."""
         host, port, *rest = address
-        return any(
+        return relay_name(address) is None and any(
             sock.getsockname()[1] == port
             and (own.host == host or (own.is_wildcard and is_here(sock.family, (host, 0, *rest))))
             for sock, own in zip(self.open_sockets(), self.addresses, strict=True)
@@ -308,14 +326,14 @@ class PeerSockets:
         self._drops.add("sends_failed", name, "", 1, monotonic())
         self._evidence.add_failure(name, address, monotonic())
 
-    def follow(self, link: PeerLink, on_resolved: Callable[[], None]) -> None:
+    def follow(self, link: Reached, on_resolved: Callable[[], None]) -> None:
         """Resolve the peer's names, and connect to it at their addresses from every socket that may reach them.
 
         ``on_resolved`` is called after each change of the addresses.
         """
         followed = self._followed[link.name] = _Followed(link, on_resolved)
         followed.names = PeerNames(
-            link.config.addresses,
+            link.addresses,
             lambda address: self._interval_s(followed, address),
             lambda: self._set_paths(followed),
             self._log,
@@ -345,10 +363,14 @@ class PeerSockets:
             reason = "no listen address of its family" if self.networks is None else "no network of its family"
             self._log.warning("peer_unreachable", peer=link.name, reason=reason)
         link.set_paths([path for group in paths.values() for path in group], monotonic())
-        if self.networks is not None:
-            self.networks.report_absent(monotonic())
-        self.serial.report_absent()
+        self.report_absent(monotonic())
         followed.on_resolved()
+
+    def report_absent(self, now: float) -> None:
+        """Report the sockets of absent networks to the core. Call it after other paths were set."""
+        if self.networks is not None:
+            self.networks.report_absent(now)
+        self.serial.report_absent()
 
     def _paths_to(self, written: PeerAddress, resolved: Resolved) -> Iterator[Path]:
         """The paths to an address of a peer."""

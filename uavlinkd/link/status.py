@@ -10,21 +10,26 @@ from uavlinkd.link import refused_there
 from uavlinkd.link.diagnosis import find
 from uavlinkd.link.path_status import NetworkOf, paths_status
 from uavlinkd.link.relay_server_status import relay_status
+from uavlinkd.link.shown import shown
 from uavlinkd.mavlink.dialect import command_name, name_of
 from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.gate import ANY_OTHER
 from uavlinkd.ops.schema_versions import STATUS_SCHEMA
-from uavlinkd.system.addresses import Address
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from uavlinkd.config import Config
     from uavlinkd.core.node import Node
+    from uavlinkd.core.peer import Peer
     from uavlinkd.link.evidence import Evidence
     from uavlinkd.link.history import History
     from uavlinkd.link.local_endpoints import LocalEndpoints
     from uavlinkd.link.passage import Passage
     from uavlinkd.link.peer_link import PeerLink
     from uavlinkd.link.peer_sockets import PeerSockets
+    from uavlinkd.link.relay_link import RelayLink
+    from uavlinkd.link.relays import Relays
     from uavlinkd.link.switch import Switch
     from uavlinkd.ops.recorder import Recorder
     from uavlinkd.relay.service import RelayService
@@ -42,6 +47,7 @@ class DaemonParts(Protocol):
     links: dict[str, PeerLink]
     local: LocalEndpoints
     switch: Switch
+    relays: Relays
     peer_sockets: PeerSockets
     stall: StallWatch
     recorder: Recorder | None
@@ -69,6 +75,10 @@ def daemon_status(daemon: DaemonParts, now: float) -> dict[str, object]:
         "peers": {
             name: peer_status(link, now, daemon.peer_sockets.network_name) for name, link in daemon.links.items()
         },
+        "relays": {
+            name: used_relay_status(relay, daemon.links.values(), now, daemon.peer_sockets.network_name)
+            for name, relay in daemon.relays.by_name.items()
+        },
         "networks": daemon.peer_sockets.network_status(now),
         "endpoints": {
             endpoint.name: endpoint_status(endpoint, daemon.local.policies[endpoint.name], now)
@@ -93,10 +103,10 @@ def peer_status(link: PeerLink, now: float, network_of: NetworkOf = lambda _: No
     traffic = peer.traffic
     expected_there, received_there = traffic.reported
     return {
-        "state": "up" if peer.is_up else "lost" if peer.received_at is not None else "waiting",
+        "state": state_of(peer),
         "public_key": encode_key(peer.settings.public_key),
         "accepts_previous_key": link.accepts_previous_keys,
-        "path": None if peer.path is None else str(Address.of(peer.path.address)),
+        "path": None if peer.path is None else shown(peer.path.address),
         "last_received_s": None if peer.received_at is None else now - peer.received_at,
         "handshake_s": None if peer.established_at is None else now - peer.established_at,
         "round_trip_s": link.round_trip_s,
@@ -146,6 +156,34 @@ def peer_status(link: PeerLink, now: float, network_of: NetworkOf = lambda _: No
         },
         "copies_dropped": {reason.value: count for reason, count in link.output.copies.dropped.items()},
         "drops": {reason.value: count for reason, count in traffic.drops.items()},
+    }
+
+
+def state_of(peer: Peer) -> str:
+    """``up``, ``lost`` (was up) or ``waiting`` (was never up)."""
+    return "up" if peer.is_up else "lost" if peer.received_at is not None else "waiting"
+
+
+def used_relay_status(
+    relay: RelayLink, links: Iterable[PeerLink], now: float, network_of: NetworkOf = lambda _: None
+) -> dict[str, object]:
+    """The status of a relay. ``peers``: those that use it, each ``bound``, ``waiting`` for the peer to ask too, or
+    ``unanswered``. ``seen_as``: this daemon's addresses as the relay sees them.
+    """
+    peer = relay.peer
+    return {
+        "state": state_of(peer),
+        "public_key": encode_key(peer.settings.public_key),
+        "addresses": [str(written) for written in relay.addresses],
+        "seen_as": [str(address) for address in relay.seen_as],
+        "last_received_s": None if peer.received_at is None else now - peer.received_at,
+        "handshake_s": None if peer.established_at is None else now - peer.established_at,
+        "round_trip_s": peer.round_trip_s,
+        "paths": paths_status(relay, network_of, now),
+        "peers": {link.name: relay.state_for(link) for link in links if relay.config.name in link.config.relays},
+        "bytes_received": peer.traffic.bytes_received,
+        "bytes_sent": peer.traffic.bytes_sent,
+        "drops": {reason.value: count for reason, count in peer.traffic.drops.items()},
     }
 
 

@@ -13,10 +13,11 @@ from functools import cache
 from itertools import pairwise
 from typing import Final
 
-from uavlinkd.link.down_causes import Network, finding, listed, shown
+from uavlinkd.link.down_causes import Network, finding, listed
 from uavlinkd.link.history import GateHistory, SessionBegin
 from uavlinkd.link.passage import Key
 from uavlinkd.link.peer_link import PeerLink
+from uavlinkd.link.shown import shown
 from uavlinkd.link.system_owners import SystemOwners
 from uavlinkd.mavlink.dialect import GROUPS, command_name, ids_by_name, name_of
 from uavlinkd.mavlink.policy.gate import ANY_OTHER, Gate, Refusal

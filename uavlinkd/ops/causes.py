@@ -37,6 +37,8 @@ class Cause(Reason):
     NO_COMMON_SUITE = "no_common_suite", "the peer offers a suite that is not in its list here"
     NOT_CONFIRMED = "not_confirmed", "the peer initiates, but does not confirm this daemon's responses"
     NO_ANSWER = "no_answer", "the peer does not answer"
+    RELAY_NOT_ANSWERING = "relay_not_answering", "a relay that the peer needs does not answer"
+    NOT_BOUND = "not_bound", "the peer does not ask the relay for this daemon"
     NOT_CONNECTING = "not_connecting", "only the peer can initiate, and it does not"
 
     # The link is up, but frames do not pass.

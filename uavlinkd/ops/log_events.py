@@ -30,6 +30,7 @@ _CHANGES = (
     *("peers_removed", "peers_added", "peers_changed"),
     *("endpoints_closed", "endpoints_opened", "endpoints_changed"),
     *("members_removed", "members_added", "members_changed"),
+    *("relays_removed", "relays_added", "relays_changed"),
 )
 _INFO, _WARNING = ("info",), ("warning",)
 _FINDING = ("cause", "severity", "subject", "name")
@@ -56,6 +57,9 @@ LOG_EVENTS: Final[Mapping[str, LogEvent]] = {
     "path_changed": LogEvent(_INFO, ("peer", "path", "before", "reason"), ("network", "network_before")),
     "path_usable": LogEvent(_INFO, ("peer", "path", "reason"), ("network",)),
     "path_down": LogEvent(_WARNING, ("peer", "path", "reason"), ("network",)),
+    "relay_up": LogEvent(_INFO, ("relay",)),
+    "relay_lost": LogEvent(_WARNING, ("relay", "silent_s")),
+    "relay_closed": LogEvent(_INFO, ("relay",)),
     "repair_began": LogEvent(_INFO, ("peer", "transmissions")),
     "repair_ended": LogEvent(_INFO, ("peer", "duration_s", "bytes")),
     "key_change_confirmed": LogEvent(_INFO, ("peer",)),

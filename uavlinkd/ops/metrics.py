@@ -31,6 +31,7 @@ from uavlinkd.mavlink.policy.gate import Refusal
 from uavlinkd.ops.path_metrics import line_families, path_families
 from uavlinkd.ops.relay_metrics import relay_families
 from uavlinkd.ops.schema_versions import LOG_SCHEMA, METRICS_SCHEMA, STATUS_SCHEMA
+from uavlinkd.ops.used_relay_metrics import used_relay_families
 
 CONTENT_TYPE = CONTENT_TYPE_PLAIN_0_0_4
 
@@ -125,6 +126,7 @@ class _StatusCollector(Collector):
         yield _reasons("endpoint_failures_total", "Errors of the endpoint.", "endpoint", endpoints, "failures")
         yield _refused("endpoint", endpoints)
         yield from (_family(*family) for family in relay_families(status["relay"]))
+        yield from (_family(*family) for family in used_relay_families(status["relays"]))
         yield from _recording(status["recording"])
 
 

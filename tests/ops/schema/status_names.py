@@ -11,7 +11,7 @@ from uavlinkd.endpoints.radio_reports import RadioReport
 from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.ops.findings import Finding, Severity, Subject
 
-MAPS = ("peers", "endpoints", "endpoints.*.clients", "networks", "relay.members")
+MAPS = ("peers", "relays", "relays.*.peers", "endpoints", "endpoints.*.clients", "networks", "relay.members")
 """Objects whose keys are names of the configuration or addresses."""
 COUNTS: Mapping[str, int] = {
     "drops": 1,
@@ -21,6 +21,7 @@ COUNTS: Mapping[str, int] = {
     "recording.failures": 1,
     "relay.dropped": 1,
     "peers.*.drops": 1,
+    "relays.*.drops": 1,
     "peers.*.malformed": 1,
     "peers.*.waiting_dropped": 1,
     "peers.*.copies_dropped": 1,
@@ -38,6 +39,9 @@ ALSO = {
     "peers.*.role": "null",
     "peers.*.paths[].lag_s": "number",
     "peers.*.paths[].network": "string",
+    "peers.*.paths[].relay": "string",
+    "relays.*.paths[].lag_s": "number",
+    "relays.*.paths[].network": "string",
     "endpoints.*.clients.*.last_received_s": "null",
     "recording": "null",
     "networks.*.serial.radio": "object",
@@ -89,18 +93,27 @@ async def observed() -> Seen:
         statuses.append(await roaming.status())
         relay = stage.daemon("relay0")
         relay.config["relay_server"] = {"enabled": True}
-        relay.config["member"] = [{"name": "drone1", "public_key": b.public_key}]
+        far = stage.daemon("far", [])
+        far.config["relay"] = [{"name": "vps", "public_key": relay.public_key, "addresses": [relay.address]}]
+        far.add_peer(a, [])
+        relay.config["member"] = [
+            {"name": "drone1", "public_key": b.public_key},
+            {"name": "far", "public_key": far.public_key},
+        ]
         relay.add_peer(b, [b.address])
         b.add_peer(relay, [relay.address])
         await b.stop()
+        await stage.start(far, linked=False)
+        statuses.append(await far.status())
         await stage.start(relay, b, linked=False)
+        statuses.append(await far.until(lambda status: bool(status["relays"]["vps"]["seen_as"])))
         statuses.append(await relay.until(lambda status: bool(status["relay"]["members"]["drone1"]["addresses"])))
     findings = [Finding("cause", Severity.FAULT, Subject.PEER, "name", "text", "remedy").as_json()]
     types: dict[str, set[str]] = {name: {kind} for name, kind in ALSO.items()}
     for status in statuses:
         _walk(status | {"findings": findings}, "", types)
     names = {name: "|".join(sorted(kinds)) for name, kinds in types.items()}
-    return Seen(names, [line for daemon in (a, b, roaming, relay) for line in daemon.events()])
+    return Seen(names, [line for daemon in (a, b, roaming, far, relay) for line in daemon.events()])
 
 
 def _walk(value: Any, path: str, types: dict[str, set[str]]) -> None:

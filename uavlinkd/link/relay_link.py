@@ -1,0 +1,248 @@
+"""One relay of this daemon: a peer of the core without frames. uavlinkd/core/README.md, section 21.
+
+It binds this daemon's peers along each working path to the relay, and knows the handles that the relay assigned.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Final
+
+from uavlinkd.config import PeerAddress, RelayConfig
+from uavlinkd.core import constants as c
+from uavlinkd.core import outputs as o
+from uavlinkd.core.constants import NEVER
+from uavlinkd.core.node import Node
+from uavlinkd.core.path import Path, relayed
+from uavlinkd.core.relay_records import WAITING, Bound, binds_of
+from uavlinkd.link.path_status import PathRates
+from uavlinkd.link.peer_link import PeerLink
+from uavlinkd.link.relay_handles import RelayHandles
+from uavlinkd.system.addresses import Address
+
+BIND_SOON_S: Final = 0.1
+"""The first bind is repeated after this: it may have come before the relay validated the path. Each further wait is
+twice as long, up to ``BIND_RETRY_S``."""
+ASK_S: Final = 0.25
+"""A relay is asked this often at most along one socket."""
+
+
+class _Binding:
+    """What this daemon asked for along one path to the relay, and what it got."""
+
+    __slots__ = ("at", "bound_at", "due_at", "handles", "orders", "seen_as", "tries", "unanswered")
+
+    def __init__(self, path: Path) -> None:
+        self.at = path
+        self.due_at = -NEVER
+        self.tries = 0
+        """Binds since the last answer."""
+        self.unanswered: frozenset[bytes] = frozenset()
+        """The keys of the last bind that no record has named since."""
+        self.handles: dict[bytes, tuple[int, ...]] = {}
+        """By key of a peer; empty while the peer is not there."""
+        self.orders: dict[bytes, int] = {}
+        self.bound_at = -NEVER
+        """When the relay answered last."""
+        self.seen_as: Address | None = None
+        """This daemon's address as the relay sees it."""
+
+    def note_sent(self, keys: Sequence[bytes], now: float) -> None:
+        """A bind was sent. Sets when the next one is due without an answer."""
+        self.unanswered = frozenset(keys)
+        self.due_at = now + min(c.BIND_RETRY_S, BIND_SOON_S * 2.0 ** min(self.tries, 8))
+        self.tries += 1
+
+    def receive(self, bound: Bound, order: int, wanted: Iterable[bytes], now: float) -> set[bytes]:
+        """Take the handles of those peers that are wanted. Returns the keys whose handles changed."""
+        self.bound_at, self.seen_as = now, Address(bound.host, bound.port)
+        named: dict[bytes, tuple[int, ...]] = {key: () for key, _ in bound.handles if key in wanted}
+        for key, handle in bound.handles:
+            if key in named and handle != WAITING and len(named[key]) < c.HANDLES_PER_PAIR:
+                named[key] = (*named[key], handle)
+        changed = set[bytes]()
+        for key, handles in named.items():
+            if order <= self.orders.get(key, -1):
+                continue
+            self.orders[key] = order
+            if handles != self.handles.get(key, ()):
+                changed.add(key)
+            self.handles[key] = handles
+        self.unanswered -= named.keys()
+        if not self.unanswered:
+            self.tries = 0
+            is_waiting = not all(self.handles.get(key) for key in wanted)
+            self.due_at = now + (c.BIND_WAITING_S if is_waiting else c.BIND_INTERVAL_S)
+        return changed
+
+
+class RelayLink:
+    """A relay of the configuration. Times are monotonic seconds. It sends in :meth:`do_due` only.
+
+    ``on_handles`` is called with the keys of the peers whose handles changed. ``on_due`` is called when
+    :attr:`next_at` may be earlier than before.
+    """
+
+    def __init__(
+        self,
+        config: RelayConfig,
+        node: Node,
+        handles: RelayHandles,
+        on_handles: Callable[[set[bytes], float], None],
+        on_due: Callable[[], None],
+        now: float,
+    ) -> None:
+        self.config = config
+        self.name = config.settings.name
+        """Of its peer in the core: no peer of the configuration has such a name."""
+        self.peer = node.add_peer(config.settings, now)
+        self.rates = PathRates()
+        """Of the paths to it."""
+        self.keys: tuple[bytes, ...] = ()
+        """Of the peers that use it."""
+        self.next_at = NEVER
+        """When :meth:`do_due` has something to do."""
+        self.silent_since = now
+        """When it was up last, to the second."""
+        self._node = node
+        self._handles = handles
+        self._on_handles = on_handles
+        self._on_due = on_due
+        self._bindings: dict[Path, _Binding] = {}
+        self._asks: set[int] = set()  # sockets
+        self._asked_at: dict[int, float] = {}
+
+    @property
+    def addresses(self) -> tuple[PeerAddress, ...]:
+        """Those of the configuration."""
+        return self.config.addresses
+
+    @property
+    def seen_as(self) -> list[Address]:
+        """This daemon's addresses as the relay sees them, one for each path."""
+        return [binding.seen_as for binding in self._bindings.values() if binding.seen_as is not None]
+
+    def state_for(self, link: PeerLink) -> str:
+        """Whether a peer is reached along the relay: ``bound``, ``waiting`` for it to ask too, or ``unanswered``."""
+        handles = [
+            binding.handles[key] for binding in self._bindings.values() for key in link.keys & binding.handles.keys()
+        ]
+        return "bound" if any(handles) else "waiting" if handles and self.peer.is_up else "unanswered"
+
+    def paths_to(self, keys: Iterable[bytes]) -> list[list[Path]]:
+        """The relayed paths to a peer with one of these keys: a list for each path to the relay."""
+        return [
+            [relayed(at.socket, self.config.name, handle) for key in keys for handle in binding.handles.get(key, ())]
+            for at, binding in self._bindings.items()
+        ]
+
+    # What happens.
+
+    def set_paths(self, paths: Sequence[Path], now: float) -> None:
+        """The relay is reached along these paths."""
+        self._node.set_paths(self.peer, paths, now)
+        self._forget_lost(now)
+
+    def follow(self, keys: Sequence[bytes]) -> None:
+        """Bind these peers from now on."""
+        before, self.keys = set(self.keys), tuple(keys)
+        for binding in self._bindings.values():
+            for key in before - set(keys):
+                binding.handles.pop(key, None)
+            self._assign(binding)
+            if set(keys) - before:
+                self._hurry(binding)
+        self._schedule()
+
+    def on_event(self, event: o.Event, now: float) -> None:
+        """A path works, or a session began, perhaps because the relay was restarted: bind immediately."""
+        for path, binding in self._bindings.items():
+            if isinstance(event, o.SessionEstablished) or (
+                isinstance(event, o.PathStateChanged) and event.is_usable and event.path == path
+            ):
+                self._hurry(binding)
+        self._forget_lost(now)
+        self._schedule()
+
+    def on_record(self, received: o.RecordReceived, now: float) -> None:
+        """The relay assigned handles."""
+        binding = self._bindings.get(received.path)
+        if binding is None or not isinstance(received.record, Bound):
+            return  # a path without a bind; a bind, which is for a relay
+        changed = binding.receive(received.record, received.order, self.keys, now)
+        if changed:
+            self._assign(binding)
+            self._on_handles(changed, now)
+        self._schedule()
+
+    def ask(self, socket: int) -> None:
+        """A path along the relay failed on this socket: ask the relay there as soon as possible."""
+        self._asks.add(socket)
+        self._schedule()
+
+    def do_due(self, now: float) -> list[o.Output]:
+        """Ask and bind. Call it at :attr:`next_at`."""
+        out: list[o.Output] = []
+        sockets, self._asks = self._asks, set()
+        for path in [state.path for state in self.peer.paths.states if state.path.socket in sockets]:
+            if now >= self._asked_at.get(path.socket, -NEVER) + ASK_S:
+                out += self._node.ask(self.peer, path, now)
+        self._asked_at |= dict.fromkeys(sockets, now)
+        for binding in self._working():
+            if now >= binding.due_at and self.keys:
+                binding.note_sent(self.keys, now)
+                for bind in binds_of(self.keys):
+                    out += self._node.send_record(self.peer, binding.at, bind, now)
+        self._schedule()
+        return out
+
+    def do_housekeeping(self, now: float) -> None:
+        """Call it about once a second."""
+        if self.peer.is_up:
+            self.silent_since = now
+        self.rates.measure(self.peer.paths.states, now)
+        self._forget_lost(now)
+        self._schedule()
+
+    def leave(self, now: float) -> list[o.Output]:
+        """End the session with the relay, and forget its handles."""
+        changed = set(self.keys)
+        self.keys = ()
+        for path in list(self._bindings):
+            self._forget(path)
+        self._on_handles(changed, now)
+        return self._node.remove_peer(self.peer, now)
+
+    # Parts.
+
+    def _working(self) -> Iterator[_Binding]:
+        for state in self.peer.paths.states:
+            if state.works and self.peer.is_up:
+                yield self._bindings.setdefault(state.path, _Binding(state.path))
+
+    def _hurry(self, binding: _Binding) -> None:
+        binding.due_at, binding.tries = -NEVER, 0
+
+    def _assign(self, binding: _Binding) -> None:
+        handles = [handle for of_key in binding.handles.values() for handle in of_key]
+        self._handles.assign(self.config.name, binding.at, handles)
+
+    def _forget_lost(self, now: float) -> None:
+        """Forget the handles on paths that are gone, or along which the relay has not answered for long."""
+        changed = set[bytes]()
+        for path, binding in list(self._bindings.items()):
+            is_old = now >= binding.bound_at + c.BIND_LIFETIME_S and any(binding.handles.values())
+            if is_old or self.peer.paths.find(path) is None:
+                changed |= binding.handles.keys()
+                self._forget(path)
+        if changed:
+            self._on_handles(changed, now)
+
+    def _forget(self, path: Path) -> None:
+        del self._bindings[path]
+        self._handles.assign(self.config.name, path, ())
+
+    def _schedule(self) -> None:
+        due_at = min((binding.due_at for binding in self._working()), default=NEVER) if self.keys else NEVER
+        self.next_at = -NEVER if self._asks else due_at
+        self._on_due()
