@@ -40,6 +40,8 @@ class Insider:
         self.peer = pair.b.peer
         self.now = NOW
         self.link = link
+        self.places = PATHS
+        """Where its datagrams come from; the first one is its own."""
         self.sessions: list[Session] = [pair.a.session]
         self.sealed: Counter[bytes] = Counter()
         self.delivered: Counter[bytes] = Counter()
@@ -174,7 +176,7 @@ class Insider:
     # Properties.
 
     def _offer(self, datagram: bytes, what: int) -> list[Output]:
-        path = PATHS[what >> 5 & 3]
+        path = self.places[what >> 5 & 3]
         TALLY.add(datagram)
         self.credit[path] += len(datagram)
         before = set(self.peer.paths.by_path)

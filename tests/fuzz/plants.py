@@ -32,15 +32,18 @@ from uavlinkd.core import (
 )
 from uavlinkd.core import node as core_node
 from uavlinkd.core.drops import Drop, DropReason
+from uavlinkd.core.limits import TokenBucket
 from uavlinkd.core.outputs import Transmit
 from uavlinkd.endpoints import line_framing
 from uavlinkd.lab.mitm import anatomy
 from uavlinkd.lab.mitm import proxy_settings as mitm_settings
 from uavlinkd.lab.sim import tlog
+from uavlinkd.link import candidates
 from uavlinkd.mavlink import frames, routing, stream_splitter
 from uavlinkd.mavlink.headers import Header
 from uavlinkd.mavlink.policy import gate
 from uavlinkd.ops import control, metrics_server
+from uavlinkd.relay import bindings, forwarding, service
 
 Undo = Callable[[], None]
 
@@ -224,6 +227,54 @@ def _back_to_sender(right: Any) -> Any:
     return decide
 
 
+def _forwards_by_handle(right: Any) -> Any:
+    def take(self: Any, socket: int, data: bytes, source: Any) -> None:
+        places = {handle: (number, address) for number, address, handle in self._routes}
+        number, address = places.get(data[1:3], (socket, source))
+        right(self, number, data, address)
+
+    return take
+
+
+def _longer_by_a_byte(right: Any) -> Any:
+    def make(self: Any, send: Any, *rest: Any) -> None:
+        right(self, lambda datagram, path: send(datagram + b"\0", path), *rest)
+
+    return make
+
+
+def _drops_in_silence(right: Any) -> Any:
+    def take(self: Any, socket: int, data: bytes, source: Any) -> None:
+        if len(data) > 3:
+            right(self, socket, data, source)
+
+    return take
+
+
+def _remembers_every_wish(right: Any) -> Any:
+    def _wish(self: Any, member: bytes, *rest: Any) -> Any:
+        self._members[member].most_peers = 99
+        return right(self, member, *rest)
+
+    return _wish
+
+
+def _reports_at_once(right: Any) -> Any:
+    def on_record(self: Any, received: Any, now: float) -> None:
+        right(self, received, now)
+        self._perform([Transmit(bytes(600), received.path)])
+
+    return on_record
+
+
+def _fills_the_bucket(right: Any) -> Any:
+    def ask_candidates(peer: Any, now: float) -> Any:
+        peer.candidate_questions = TokenBucket(1e6, 1e6, now)
+        return right(peer, now)
+
+    return ask_candidates
+
+
 def _raises(error: Exception, of: Callable[[Any], bool]) -> Callable[[Any], Any]:
     """Raises if the first argument that is bytes, text or a mapping meets a condition."""
 
@@ -283,6 +334,33 @@ PLANTS: Final = {
         path_state.PathState,
         "allows",
         lambda _: lambda self, size: True,
+    ),
+    "relay, any address": Plant(
+        "relay", "a handle is valid at any address", forwarding.Forwarding, "take", _forwards_by_handle
+    ),
+    "relay, longer": Plant("relay", "forwarded data grows", forwarding.Forwarding, "__init__", _longer_by_a_byte),
+    "relay, not counted": Plant(
+        "relay", "an empty datagram is not counted", forwarding.Forwarding, "take", _drops_in_silence
+    ),
+    "relay, unbounded wishes": Plant(
+        "relay", "a member asks for any number of peers", bindings.Bindings, "_wish", _remembers_every_wish
+    ),
+    "relay, unproven address": Plant(
+        "relay",
+        "an unproven path gets an answer",
+        service.RelayService,
+        "on_record",
+        _reports_at_once,
+    ),
+    "any candidate": Plant(
+        "candidates", "special addresses are asked", candidates, "may_be_asked", lambda _: lambda place: True
+    ),
+    "questions without end": Plant(
+        "candidates",
+        "candidates are asked without a bucket",
+        core_node,
+        "ask_candidates",
+        _fills_the_bucket,
     ),
     "header not compared": Plant(
         "handshakes",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from tests.fuzz import files, frames, handshakes, insiders, lines, outsiders, requests
+from tests.fuzz import candidates, files, frames, handshakes, insiders, lines, outsiders, relays, requests
 from tests.fuzz.engine import Target
 
 _CORE: Final = 4096
@@ -40,6 +40,14 @@ TARGETS: Final = {
             handshakes.make,
             handshakes.seeds,
             512,
+        ),
+        Target("relay", "a relay: strangers, and members that hold their keys", relays.make, relays.seeds, 512),
+        Target(
+            "candidates",
+            "the candidates of a peer that holds its keys",
+            candidates.make,
+            candidates.seeds,
+            1024,
         ),
         Target(
             "stream", "a client's MAVLink on a serial port or TCP, cut anywhere", frames.make_stream, frames.seeds
