@@ -184,6 +184,15 @@ def test_a_busy_socket_is_read_by_a_timer(pair: Pair) -> None:
     assert pair.waited[-2:] == [PAUSE_S, PAUSE_S]
 
 
+def test_reader_without_a_pause_reads_a_busy_socket_at_once(pair: Pair) -> None:
+    """As a relay has it: what it forwards must not wait."""
+    pair.reader._pause_s = 0.0
+    for _ in range(5):
+        pair.send(b"one", b"two")
+        assert b"".join(pair.wake_up() + pair.wake_up()) == b"onetwo"
+        assert not pair.reader.is_paused
+
+
 @pytest.mark.parametrize("count", [0, 1])
 def test_a_socket_that_is_no_longer_busy_is_watched_again(pair: Pair, count: int) -> None:
     """A pause in which fewer than two datagrams came is the last one."""

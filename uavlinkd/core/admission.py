@@ -71,6 +71,11 @@ class Admission:
         )
         self._group = GroupBudget(now)
 
+    def set_peers(self, count: int) -> None:
+        """So many peers may initiate at once, when this daemon starts again. The rate afterwards stays as it is."""
+        burst = min(c.INITIATIONS_BURST_PER_PEER * count, c.INITIATIONS_BURST_MOST)
+        self._initiations.set_burst(max(c.INITIATIONS_BURST, burst))
+
     def read(self, path: Path, now: float) -> None:
         """An initiation from there is to be read.
 

@@ -117,6 +117,10 @@ INITIATIONS_PER_S = 50.0
 """Messages a second that may reach a key exchange without a cookie. Beyond that we are under load."""
 INITIATIONS_BURST = 50
 """So many at once, after a quiet while."""
+INITIATIONS_BURST_PER_PEER = 2
+"""Or so many for each peer, if that is more: all of them initiate when this daemon starts again, some twice."""
+INITIATIONS_BURST_MOST = 2000
+"""But no more than this: an attacker can use it up, which takes half a second of a desktop's core."""
 COOKIED_PER_SOURCE_PER_S = 10.0
 """Under load: initiations a second from one source that holds a cookie."""
 COOKIED_PER_SOURCE_BURST = 10

@@ -30,6 +30,11 @@ class TokenBucket:
         self._tokens -= count
         return True
 
+    def set_burst(self, burst: float) -> None:
+        """Have another burst. What was spent stays spent."""
+        self._tokens = max(0.0, self._tokens + burst - self._burst)
+        self._burst = burst
+
 
 def source_of(host: str) -> Hashable:
     """The source of a numeric host: itself, or its /64 in IPv6, because one machine may have every address of it."""

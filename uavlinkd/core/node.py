@@ -107,6 +107,7 @@ class Node:
         peer = Peer(settings, identity, self._indices, self._entropy, now, *shared)
         self.peers[settings.name] = self._by_keys[keys] = peer
         self._facts.share_budgets(len(self.peers))
+        self._admission.set_peers(len(self.peers))
         return peer
 
     def forget_previous_key(self) -> None:
@@ -117,6 +118,7 @@ class Node:
         """Cut this peer off at once: its keys are forgotten, and nothing from it is accepted any more."""
         del self.peers[peer.name]
         self._facts.share_budgets(len(self.peers))
+        self._admission.set_peers(len(self.peers))
         self._by_keys = {keys: other for keys, other in self._by_keys.items() if other is not peer}
         self._forget_addresses(peer)
         for ephemeral in peer.remembered:

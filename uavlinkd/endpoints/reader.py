@@ -54,7 +54,8 @@ class Reader:
     * If it is readable within :data:`BUSY_S` once more, it is busy. The loop stops to watch it, and a timer reads it
       every :data:`PAUSE_S` until a read finds fewer than two datagrams.
 
-    ``on_failure`` receives each error that a read returns, such as the failure of an earlier send.
+    ``on_failure`` receives each error that a read returns, such as the failure of an earlier send. With a ``pause_s``
+    of 0 a busy socket is read at once too: a relay must not delay what it forwards.
     """
 
     __slots__ = (
@@ -66,6 +67,7 @@ class Reader:
         "_is_watched",
         "_loop",
         "_on_failure",
+        "_pause_s",
         "_sock",
         "_stall",
         "_timer",
@@ -74,12 +76,18 @@ class Reader:
     )
 
     def __init__(
-        self, sock: socket.socket, deliver: DatagramHandler, on_failure: Callable[[OSError], None], stall: StallWatch
+        self,
+        sock: socket.socket,
+        deliver: DatagramHandler,
+        on_failure: Callable[[OSError], None],
+        stall: StallWatch,
+        pause_s: float = PAUSE_S,
     ) -> None:
         self.backlog = Backlog(stall, sock.fileno(), lambda: sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF))
         self._sock = sock
         self._deliver = deliver
         self._on_failure = on_failure
+        self._pause_s = pause_s
         self._stall = stall
         self._loop = asyncio.get_running_loop()
         self._is_watched = False  # by the loop
@@ -145,8 +153,8 @@ class Reader:
         elif is_quiet:
             self._is_burst = False
             self.read(now, drains=False)
-        elif self._is_burst:
-            self._pause(PAUSE_S)
+        elif self._is_burst and self._pause_s:
+            self._pause(self._pause_s)
         else:
             self._is_burst = True
             self.read(now)
@@ -165,7 +173,7 @@ class Reader:
                 if count < 2 or self._gather_s:
                     self.start()
                 else:
-                    seconds = PAUSE_S if count < DATAGRAMS_PER_WAKE_UP else 0.0
+                    seconds = self._pause_s if count < DATAGRAMS_PER_WAKE_UP else 0.0
                     self._timer = self._loop.call_later(seconds, self._on_timer, seconds)
 
     def _unwatch(self) -> None:

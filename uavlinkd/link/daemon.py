@@ -128,6 +128,7 @@ class Daemon:
                 on_event=self._events.write,
             )
             self._intake.take_relayed = self.relay.take
+            self.peer_sockets.pause_s = 0.0
         self._timer: asyncio.TimerHandle | None = None
         self._timer_at = NEVER
         self._housekeeping_at = now + HOUSEKEEPING_S

@@ -17,7 +17,7 @@ from uavlinkd.core.path import Path, SocketAddress
 from uavlinkd.core.peer import Peer
 from uavlinkd.endpoints.error_queue import ErrorReports, send_again
 from uavlinkd.endpoints.ports import failure_name
-from uavlinkd.endpoints.reader import Datagrams, Reader
+from uavlinkd.endpoints.reader import PAUSE_S, Datagrams, Reader
 from uavlinkd.endpoints.sockets import BindError, is_absent, is_here, udp_socket
 from uavlinkd.link.drop_summary import DropSummary
 from uavlinkd.link.evidence import Evidence
@@ -125,6 +125,8 @@ class PeerSockets:
         self.serial: SerialNetworks
         self.relayed: RelayHandles | None = None
         """Those of this daemon, if it uses relays."""
+        self.pause_s = PAUSE_S
+        """How long datagrams gather in a busy socket."""
         self._receive = receive
         self._stall = stall
         self._drops = drops
@@ -241,7 +243,7 @@ class PeerSockets:
     def _read(self, slot: _Slot) -> None:
         if slot.sock is not None:
             receive, on_failure = partial(self._receive, slot.number), partial(self._on_read_error, slot)
-            slot.reader = Reader(slot.sock, receive, on_failure, self._stall)
+            slot.reader = Reader(slot.sock, receive, on_failure, self._stall, self.pause_s)
             slot.reader.start()
             slot.reports = ErrorReports(slot.sock)
 
