@@ -258,7 +258,7 @@ class FuzzedRelay:
 
     def _data(self, script: Script, member: _Member) -> bytes:
         how = script.byte()
-        handles = [handle for keys in member.handles.values() for found in keys.values() for handle in found]
+        handles = [handle for keys in member.handles.values() for those in keys.values() for handle in those]
         handle = handles[how >> 4] if how >> 4 < len(handles) else script.word()
         start = b"" if how & 1 else bytes((sorted(INNER_STARTS)[how >> 1 & 3],))
         return wrap(handle, start + script.take(script.byte() & 31) * (1 + (how >> 3 & 1) * 30))
