@@ -112,7 +112,7 @@ def load_config(path: Path, environ: Mapping[str, str]) -> Config:
     relay_config = relay_rules.relay_server_of(server, members, member_psks, link)
     member_keys = {member.valid["public_key"] for member in members}
     peer_configs = tuple(
-        replace(_peer(peer, psk, link, member_keys), relays=used_relays.relays_of(peer, relays))
+        _peer(peer, psk, link, member_keys, used_relays.relays_of(peer, relays))
         for peer, psk in zip(peers, psks, strict=True)
     )
     relay_configs = tuple(
@@ -209,10 +209,12 @@ def _endpoint(section: Values) -> EndpointConfig:
     )
 
 
-def _peer(peer: Values, psk: Secret | None, link: Values, member_keys: Set[bytes]) -> PeerConfig:
+def _peer(
+    peer: Values, psk: Secret | None, link: Values, member_keys: Set[bytes], relays: tuple[str, ...]
+) -> PeerConfig:
     keys = LinkSection.model_construct(**checks.inherited(link, peer))
     link_settings = link_of(keys)
-    if peer.valid["public_key"] in member_keys:
+    if peer.valid["public_key"] in member_keys or relays:  # they exchange records
         link_settings = replace(link_settings, features=link_settings.features | c.FEATURE_RECORDS)
     return PeerConfig(
         settings=PeerSettings(
@@ -220,6 +222,7 @@ def _peer(peer: Values, psk: Secret | None, link: Values, member_keys: Set[bytes
         ),
         addresses=tuple(peer.valid.get("addresses", ())),
         previous_public_key=peer.valid.get("previous_public_key"),
+        relays=relays,
         policy=policies.data(peer),
         egress=EgressSettings(
             budget_bits_s=keys.budget_bits_s,

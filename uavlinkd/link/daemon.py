@@ -426,8 +426,10 @@ class Daemon:
                 self._drops.add_dropped(output, now)
                 self.evidence.add_dropped(output, now)
             elif isinstance(output, o.RecordReceived):
-                if (owner := self.owners.get(output.peer)) is not None:  # without one, the session refuses records
-                    owner.on_record(output, monotonic())
+                now = monotonic()
+                if (owner := self.owners.get(output.peer)) is not None:
+                    owner.on_record(output, now)
+                self.relays.on_peer_record(output, now)
             else:
                 self._on_event(output)
 
@@ -438,8 +440,8 @@ class Daemon:
         link = self._link_of.get(event.peer)
         if link is None:
             return
+        self.relays.on_peer_event(event, now)
         if isinstance(event, o.PathSuspected):
-            self.relays.on_suspected(event.path)
             return
         self._events.write(event, now)
         if isinstance(event, o.PeerLost | o.PeerClosed):

@@ -150,6 +150,14 @@ class PeerSockets:
         """The sockets that are open, by number."""
         return [slot.sock for slot in self._slots if slot.sock is not None]
 
+    def numbered_sockets(self) -> list[tuple[int, socket.socket]]:
+        """The sockets that are open, each with its number."""
+        return [(slot.number, slot.sock) for slot in self._slots if slot.sock is not None]
+
+    def interface_of(self, number: int) -> str | None:
+        """The network interface that a socket is bound to; None if it uses any."""
+        return None if self.networks is None else self.networks.network_of(number).config.interface
+
     def absent_addresses(self) -> list[Address]:
         """The listen addresses that no interface of this machine has now."""
         if self.networks is not None:

@@ -15,6 +15,7 @@ from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import LinkedPeer, Output
 from uavlinkd.core.path import RELAY_HOST, Path
 from uavlinkd.link.conditions import LineLimits
+from uavlinkd.link.direct_searches import DirectSearches
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.peer_owners import PeerOwner
 from uavlinkd.link.peer_sockets import PeerSockets
@@ -83,11 +84,12 @@ class Relays:
         self._limits = LineLimits()
         self._look_at = NEVER
         self._silences: dict[PeerLink, _Silence] = {}
+        self._searches = DirectSearches(node, sockets, links, on_due)
 
     @property
     def next_at(self) -> float:
         """When :meth:`handle_timeout` has something to do."""
-        return min((self._look_at, *(relay.next_at for relay in self.by_name.values())))
+        return min((self._look_at, self._searches.next_at, *(relay.next_at for relay in self.by_name.values())))
 
     # The configuration.
 
@@ -127,7 +129,19 @@ class Relays:
         """Ask relays and bind peers. Call it at :attr:`next_at`."""
         if now >= self._look_at:
             self._look(now)
-        return [output for relay in self.by_name.values() if now >= relay.next_at for output in relay.do_due(now)]
+        out = [output for relay in self.by_name.values() if now >= relay.next_at for output in relay.do_due(now)]
+        return out + self._searches.handle_timeout(now)
+
+    def on_peer_event(self, event: o.Event, now: float) -> None:
+        """An event of a peer, whether it uses relays or not."""
+        if isinstance(event, o.PathSuspected):
+            self.on_suspected(event.path)
+        else:
+            self._searches.on_event(event, now)
+
+    def on_peer_record(self, received: o.RecordReceived, now: float) -> None:
+        """A record of a peer, along a relay."""
+        self._searches.on_record(received, now)
 
     def on_suspected(self, path: Path) -> None:
         """A relayed path of a peer failed a moment ago: ask the relay along the same socket."""
@@ -138,6 +152,9 @@ class Relays:
         """Call it about once a second."""
         for relay in self.by_name.values():
             relay.do_housekeeping(now)
+        seen = [place.sockaddr for relay in self.by_name.values() for place in relay.seen_as]
+        at = {state.path.address[:2] for relay in self.by_name.values() for state in relay.peer.paths.states}
+        self._searches.follow(seen, at, now)
         self._look_at = min(self._look_at, now)
 
     # Parts.
