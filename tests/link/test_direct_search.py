@@ -174,9 +174,9 @@ def test_impossible_pair_stays_on_the_relay_and_asks_less_and_less() -> None:
     network.set_own(0.1)
     network.play(10.0)
     assert network.pair.a.peer.path == network.pair.a.peer_at
-    assert network.questions == 2 * c.CANDIDATE_TRIES
+    assert 2 * c.CANDIDATE_TRIES <= network.questions < 2 * (c.CANDIDATE_TRIES + 4)  # the relayed path became usable
     network.play(110.0, start=10.0)  # before the next session, with which the tries begin again
-    assert network.questions <= 2 * (c.CANDIDATE_TRIES + 4)
+    assert network.questions <= 2 * (c.CANDIDATE_TRIES + 7)
 
 
 def test_nothing_is_due_without_a_relay() -> None:
