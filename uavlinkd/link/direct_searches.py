@@ -103,5 +103,5 @@ def _leads_to(routes: list[SpecificRoute], interface: str | None, host: str) -> 
 
 
 def _machine_hosts() -> dict[str, tuple[str, ...]]:
-    found = ((name, find_interface(name)) for name in interface_names())
-    return {name: interface.hosts for name, interface in found if interface is not None and interface.is_up}
+    states = ((name, find_interface(name)) for name in interface_names())
+    return {name: interface.hosts for name, interface in states if interface is not None and interface.is_up}
