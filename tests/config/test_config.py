@@ -860,6 +860,7 @@ _NAMES = {
     "slow-radio": "drone2",
     "two-radios": "drone3",
     "lte-and-sik": "drone4",
+    "behind-nat": "drone5",
 }  # files whose name describes their subject
 _OTHERS = {"mitm"}  # configurations of other commands, with tests of their own
 

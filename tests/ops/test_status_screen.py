@@ -362,3 +362,12 @@ def test_relay_shows_its_members_those_that_are_down_first() -> None:
     assert "203.0.113.7:4000" in text
     assert "not forwarded: 7 of an unknown handle of a relay" in text
     assert "endpoint" not in text
+
+
+def test_relays_of_a_member_have_a_line_each() -> None:
+    """With the state of each peer there."""
+    used = {"state": "up", "round_trip_s": 0.0123, "peers": {"drone1": "bound", "drone2": "waiting"}}
+    lost: dict[str, Any] = {"state": "lost", "round_trip_s": None, "peers": {}}
+    text = printed(render_status(status_of({}, endpoints={}, relays={"vps": used, "spare": lost})), 120)
+    assert "relay vps: up, 12 ms; drone1 bound, drone2 waiting" in text
+    assert "relay spare: lost; no peer uses it" in text

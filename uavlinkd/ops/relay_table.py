@@ -58,3 +58,12 @@ def members_configured(server: RelayServer) -> Table:
             f"{member.limits.bits_s / 1000:,.0f}",
         )
     return table
+
+
+def used_relay(name: str, relay: dict[str, Any]) -> Text:
+    """A line about a relay that this daemon uses, with the state of each peer there."""
+    time_s = relay["round_trip_s"]
+    measured = "" if time_s is None else f", {1000 * time_s:.0f} ms"
+    peers = ", ".join(f"{peer} {state}" for peer, state in relay["peers"].items()) or "no peer uses it"
+    is_well = relay["state"] == "up" and "unanswered" not in relay["peers"].values()
+    return Text(f"relay {name}: {relay['state']}{measured}; {peers}", style="" if is_well else "yellow")

@@ -22,7 +22,7 @@ from uavlinkd.ops.reason_phrases import (
     REFUSALS,
     phrase,
 )
-from uavlinkd.ops.relay_table import members_status, relay_drops
+from uavlinkd.ops.relay_table import members_status, relay_drops, used_relay
 from uavlinkd.system.error_meanings import meaning_of
 
 Status = dict[str, Any]
@@ -56,6 +56,7 @@ def render_status(status: Status) -> RenderableType:
         parts.append(members_status(relay))
         if text := relay_drops(relay):
             parts.append(Text(f"not forwarded: {text}", style="yellow"))
+    parts += [used_relay(name, used) for name, used in status.get("relays", {}).items()]
     if status["networks"]:
         parts.append(_networks(status))
     if dropped := _listed(_by_count(status["drops"], DATAGRAMS)):

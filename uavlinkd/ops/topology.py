@@ -159,7 +159,8 @@ def _peers(config: Config) -> Table:
         cells = (
             peer.name,
             _keys(peer),
-            "\n".join(map(str, peer.addresses)) or "(it connects)",
+            "\n".join([*map(str, peer.addresses), *(f"relayed via {name}" for name in peer.relays)])
+            or "(it connects)",
             " ".join(suite.name for suite in settings.link.suites),
             _mode(settings.link),
             "yes" if settings.psk is not None else "no",

@@ -1,0 +1,114 @@
+"""``[[relay]]``, and which peers use which relays."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from uavlinkd.config import Config, ConfigError, PeerAddress, keys
+from uavlinkd.config.changes import compare
+from uavlinkd.config.load import load_config
+from uavlinkd.core import constants as c
+from uavlinkd.system.addresses import Address
+
+KEY = {name: keys.public_key_text(keys.generate_private_key()) for name in ("drone1", "vps", "b", "c", "d")}
+
+Load = Callable[..., Config]
+
+
+def relay(name: str = "vps", *, key: str = "", addresses: str = '["relay.example.org:5790"]', more: str = "") -> str:
+    """A section."""
+    return f'[[relay]]\nname = "{name}"\npublic_key = "{key or KEY[name]}"\naddresses = {addresses}\n{more}\n'
+
+
+@pytest.fixture
+def load(tmp_path: Path) -> Load:
+    """Loads a file with these relays, and other keys in the section of its peer."""
+    keys.write_secret_file(tmp_path / "drone0.key", keys.generate_private_key())
+
+    def loading(relays: str = relay(), peer: str = "", link: str = "confidential = true", top: str = "") -> Config:
+        path = tmp_path / "drone0.toml"
+        path.write_text(
+            f'name = "drone0"\nprivate_key_file = "drone0.key"\n{top}\n[link]\n{link}\n{relays}\n'
+            f'[[endpoint]]\nname = "autopilot"\nurl = "udpin:127.0.0.1:14550"\n'
+            f'[[peer]]\nname = "drone1"\npublic_key = "{KEY["drone1"]}"\nrole = "vehicle"\nsystem_ids = [2]\n{peer}\n'
+        )
+        return load_config(path, {})
+
+    return loading
+
+
+def test_peer_with_a_relay_needs_no_address(load: Load) -> None:
+    """Neither does this daemon need to listen. By default a peer uses all relays."""
+    config = load(relay() + relay("b"))
+    assert [one.name for one in config.relays] == ["vps", "b"]
+    assert config.relays[0].settings.name == "relay vps"
+    assert config.relays[0].settings.link.features & c.FEATURE_RECORDS
+    assert config.relays[0].addresses == (PeerAddress(Address("relay.example.org", 5790)),)
+    assert config.peers[0].relays == ("vps", "b")
+    assert config.peers[0].is_called
+    assert config.warnings == ()
+
+
+@pytest.mark.parametrize(("written", "used"), [('["b"]', ("b",)), ('["b", "vps"]', ("vps", "b")), ("[]", ())])
+def test_peer_uses_the_relays_that_it_names(load: Load, written: str, used: tuple[str, ...]) -> None:
+    """In the order of the file."""
+    config = load(relay() + relay("b"), f'relays = {written}\naddresses = ["10.13.0.2:5790"]')
+    assert config.peers[0].relays == used
+
+
+def test_relay_inherits_the_suites(load: Load) -> None:
+    """Otherwise a recording of the handshakes with it would be the weakest part."""
+    config = load(link='confidential = true\nsuites = ["ffdhe2048"]')
+    assert config.relays[0].settings.link.suites[0].name == "ffdhe2048"
+
+
+def test_owner_of_the_relay_could_read_frames(load: Load) -> None:
+    """The file says so, unless the link is confidential or uses no relay."""
+    (warning,) = load(link="").warnings
+    assert "the owner of the relay cannot alter their frames, but can read them" in warning
+    assert load(link="", peer='relays = []\naddresses = ["10.13.0.2:5790"]').warnings == ()
+
+
+@pytest.mark.parametrize(
+    ("relays", "peer", "key", "says"),
+    [
+        (relay() + relay("b") + relay("c") + relay("d"), "", "relay", "at most 3"),
+        (relay() + relay("vps", key=KEY["b"]), "", "relay[1].name (vps)", "the name of relay[0] (vps) too"),
+        (relay() + relay("b", key=KEY["vps"]), "", "relay[1].public_key (b)", "each relay has its own"),
+        (relay(key=KEY["drone1"]), "", "relay[0].public_key (vps)", "a key of its own"),
+        (relay(addresses="[]"), "", "relay[0].addresses (vps)", "a relay never initiates"),
+        (relay(addresses='[{ network = "sik" }]'), "", "relay[0].addresses (vps)", "reached over IP"),
+        (relay(more="mtu = 1"), "", "relay[0].mtu (vps)", "is not known"),
+        (relay(), 'relays = ["other"]', "peer[0].relays (drone1)", 'write one of "vps"'),
+        ("", 'relays = ["vps"]', "peer[0].relays (drone1)", "add a [[relay]] of that name"),
+        (relay(), "relays = []", "peer[0].addresses (drone1)", "neither end could initiate"),
+    ],
+)
+def test_problem_is_named_with_what_to_write(load: Load, relays: str, peer: str, key: str, says: str) -> None:
+    """Each with its key."""
+    with pytest.raises(ConfigError) as caught:
+        load(relays, peer)
+    assert any(problem.key == key and says in problem.message for problem in caught.value.problems)
+
+
+def test_own_key_is_not_a_relay(load: Load, tmp_path: Path) -> None:
+    """It would be this daemon."""
+    own = keys.public_key_text((tmp_path / "drone0.key").read_text().strip())
+    with pytest.raises(ConfigError, match="is this daemon's own key"):
+        load(relay(key=own))
+
+
+def test_changes_of_relays_are_found(load: Load) -> None:
+    """Another address is a change; another key is another relay."""
+    before = load(relay() + relay("b"))
+    same = load(relay() + relay("b"))
+    assert not compare(before, same).summary()
+    after = load(relay(addresses='["other.example.org:5790"]') + relay("c"))
+    changes = compare(before, after)
+    assert changes.removed_relays == ("b",)
+    assert [one.name for one in changes.added_relays] == ["c"]
+    assert [one.name for one in changes.changed_relays] == ["vps"]
+    assert [one.name for one in changes.changed_peers] == ["drone1"]

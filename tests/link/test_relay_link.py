@@ -1,0 +1,187 @@
+"""When a member binds, which handles it takes, and when it asks its relay: with literal times, without sockets."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.core.harness import AT_B, KEY_B, Pair, quiet
+from uavlinkd.config import RelayConfig
+from uavlinkd.core import constants as c
+from uavlinkd.core import outputs as o
+from uavlinkd.core.path import Path, relayed
+from uavlinkd.core.relay_records import WAITING, Bind, Bound
+from uavlinkd.core.settings import PeerSettings
+from uavlinkd.link.relay_handles import RelayHandles
+from uavlinkd.link.relay_link import BIND_SOON_S, RelayLink
+from uavlinkd.link.relays import SILENT_RARE_S, SILENT_S, _Silence
+
+LINK = quiet(features=c.FEATURE_RECORDS)
+ONE, TWO = bytes([7]) * 32, bytes([8]) * 32
+ELSE = bytes([9]) * 32
+T = 10.0
+
+
+class Scene:
+    """Alpha is the member, beta the relay: a session, one path that works, two peers that use the relay."""
+
+    def __init__(self) -> None:
+        self.pair = Pair(LINK, LINK)
+        node, peer = self.pair.a.node, self.pair.a.peer
+        self.handles = RelayHandles()
+        self.changed: list[set[bytes]] = []
+        config = RelayConfig(PeerSettings("relay vps", KEY_B.public, None, LINK), ())
+        node.remove_peer(peer, 0.0)
+        self.link = RelayLink(
+            config, node, self.handles, lambda keys, _: self.changed.append(keys), lambda: None, 0.0
+        )
+        self.pair.a.peer_name = self.link.name
+        self.link.set_paths([AT_B], 0.0)
+        self.pair.establish()
+        assert self.pair.carries(0.0)
+        self.link.follow([ONE, TWO])
+        self.order = 0
+
+    def on_handles(self, keys: set[bytes], now: float) -> None:
+        """The daemon's."""
+        del now
+        self.changed.append(keys)
+
+    def binds(self, now: float) -> list[tuple[bytes, ...]]:
+        """The keys of each bind that the relay gets now."""
+        outputs = self.link.do_due(now)
+        received = [
+            output
+            for sent in outputs
+            if isinstance(sent, o.Transmit)
+            for output in self.pair.b.receive(sent.datagram, now)
+            if isinstance(output, o.RecordReceived)
+        ]
+        return [output.record.keys for output in received if isinstance(output.record, Bind)]
+
+    def bound(self, now: float, *entries: tuple[bytes, int], order: int | None = None, path: Path = AT_B) -> None:
+        """The relay's record."""
+        self.order += 1
+        record = Bound("198.51.100.1", 4000, entries)
+        self.link.on_record(
+            o.RecordReceived(self.link.peer, path, record, self.order if order is None else order), now
+        )
+
+
+@pytest.fixture
+def scene() -> Scene:
+    """A member with a session."""
+    return Scene()
+
+
+def test_bind_is_repeated_until_it_is_answered(scene: Scene) -> None:
+    """Soon at first, then each time after twice as long, up to once a second."""
+    now, waits = T, []
+    for _ in range(7):
+        assert scene.binds(now) == [(ONE, TWO)]
+        assert not scene.binds(now)
+        waits.append(scene.link.next_at - now)
+        now = scene.link.next_at
+    assert waits == pytest.approx([BIND_SOON_S, 0.2, 0.4, 0.8, *[c.BIND_RETRY_S] * 3])
+
+
+def test_bind_that_is_answered_is_repeated_rarely(scene: Scene) -> None:
+    """More often while a peer has not asked for this one."""
+    assert scene.binds(T)
+    scene.bound(T, (ONE, 5))
+    assert scene.link.next_at == pytest.approx(T + BIND_SOON_S)  # the other key is not answered
+    scene.bound(T, (TWO, WAITING))
+    assert scene.link.next_at == T + c.BIND_WAITING_S
+    scene.bound(T + 1, (TWO, 6))
+    assert scene.link.next_at == T + 1 + c.BIND_INTERVAL_S
+
+
+def test_handles_are_paths_until_the_relay_ends_them(scene: Scene) -> None:
+    """A record replaces the handles of the keys that it names, and of no others."""
+    assert scene.binds(T)
+    scene.bound(T, (ONE, 5), (ONE, 6), (TWO, 7))
+    assert scene.link.paths_to([ONE]) == [[relayed(0, "vps", 5), relayed(0, "vps", 6)]]
+    scene.bound(T, (ONE, 8))
+    assert scene.link.paths_to([ONE, TWO]) == [[relayed(0, "vps", 8), relayed(0, "vps", 7)]]
+    assert scene.handles.wrap(b"\x40", relayed(0, "vps", 5)) is None
+    scene.bound(T, (ONE, WAITING))
+    assert scene.link.paths_to([ONE]) == [[]]
+    assert scene.changed == [{ONE, TWO}, {ONE}, {ONE}]
+
+
+def test_older_record_about_a_key_is_ignored(scene: Scene) -> None:
+    """The network may reorder records."""
+    assert scene.binds(T)
+    scene.bound(T, (ONE, 5), order=10)
+    scene.bound(T, (ONE, 4), (TWO, 7), order=9)
+    assert scene.link.paths_to([ONE]) == [[relayed(0, "vps", 5)]]
+    assert scene.link.paths_to([TWO]) == [[relayed(0, "vps", 7)]]
+
+
+def test_handle_for_a_key_that_was_not_asked_for_is_ignored(scene: Scene) -> None:
+    """A relay cannot attract traffic for others, nor assign handles without bound or on an unknown path."""
+    assert scene.binds(T)
+    scene.bound(T, (ELSE, 5))
+    scene.bound(T, (ONE, 5), path=Path(3, ("203.0.113.9", 1)))
+    assert scene.changed == []
+    assert scene.link.paths_to([ELSE, ONE]) == [[]]
+    scene.bound(T, *((ONE, handle) for handle in range(1, 20)))
+    assert len(scene.link.paths_to([ONE])[0]) == c.HANDLES_PER_PAIR
+
+
+def test_member_binds_at_once_after_a_session_was_made(scene: Scene) -> None:
+    """The relay may have been restarted."""
+    assert scene.binds(T)
+    scene.bound(T, (ONE, 5), (TWO, 6))
+    assert not scene.binds(T + 1)
+    event = o.SessionEstablished(scene.link.peer, 2, "x25519", False, 16, True, True)
+    scene.link.on_event(event, T + 1)
+    assert scene.binds(T + 1) == [(ONE, TWO)]
+
+
+def test_handles_of_a_relay_that_is_gone_are_forgotten(scene: Scene) -> None:
+    """It has forgotten them too, and its peers are not initiated to through it any more."""
+    assert scene.binds(T)
+    scene.bound(T, (ONE, 5))
+    scene.link.do_housekeeping(T + c.BIND_LIFETIME_S - 0.1)
+    assert scene.link.paths_to([ONE]) == [[relayed(0, "vps", 5)]]
+    scene.link.do_housekeeping(T + c.BIND_LIFETIME_S)
+    assert not any(scene.link.paths_to([ONE]))
+
+
+def test_peer_that_does_not_use_the_relay_any_more_loses_its_handles(scene: Scene) -> None:
+    """The configuration changed."""
+    assert scene.binds(T)
+    scene.bound(T, (ONE, 5), (TWO, 6))
+    scene.link.follow([TWO])
+    assert scene.link.paths_to([ONE, TWO]) == [[relayed(0, "vps", 6)]]
+    assert scene.handles.wrap(b"\x40", relayed(0, "vps", 5)) is None
+
+
+def test_relay_is_asked_along_the_socket_of_the_path_that_failed(scene: Scene) -> None:
+    """At most every quarter of a second, however many paths fail."""
+    assert scene.binds(T)
+    scene.bound(T, (ONE, 5), (TWO, 6))
+    scene.link.ask(AT_B.socket)
+    assert scene.link.do_due(T + 1)
+    scene.link.ask(AT_B.socket)
+    assert not scene.link.do_due(T + 1.1)
+    scene.link.ask(AT_B.socket + 1)
+    assert not scene.link.do_due(T + 2)
+
+
+def test_silence_of_a_steady_peer_is_noticed_sooner() -> None:
+    """A ground station that sends a heartbeat a second is not silent between two of them."""
+    steady = _Silence(0.0)
+    assert not any(steady.look(number, number / 10) for number in range(1, 31))
+    assert not steady.look(30, 3.0 + SILENT_S - 0.1)
+    assert steady.look(30, 3.0 + SILENT_S)
+    rare = _Silence(0.0)
+    assert not any(rare.look(quarter // 4, quarter / 4) for quarter in range(40))
+    assert rare.look(9, 9.0 + SILENT_RARE_S)
+
+
+def test_silent_peer_causes_few_questions() -> None:
+    """Each after twice as long: then the keepalives of the session with the relay are enough."""
+    silence = _Silence(0.0)
+    asked = [quarter / 4 for quarter in range(4 * 600) if silence.look(0, quarter / 4)]
+    assert asked == [1.25, 2.5, 5.0, 10.0, 20.0]
