@@ -104,3 +104,25 @@ async def test_relay_that_does_not_answer_is_named() -> None:
         (finding,) = (one for one in find(line.left, monotonic()) if one.cause is Cause.RELAY_NOT_ANSWERING)
         assert finding.name == "right"
         assert "127.0.0.1" in finding.text
+
+
+async def test_ping_asks_along_each_path() -> None:
+    """The next answer has the results; a name that is not a peer's is refused."""
+    async with linked("vps", "spare") as line:
+        first = await line.left._answer("ping right")
+        assert first is not None
+
+        async def answers() -> list[int]:
+            answer = await line.left._answer("ping right")
+            assert answer is not None
+            paths = answer["paths"]
+            assert isinstance(paths, list)
+            assert {path["relay"] for path in paths} == {"vps", "spare"}
+            return [state.answers for state in line.links[0].peer.paths.states]
+
+        before = await answers()
+        states = line.links[0].peer.paths.states
+        await until(lambda: all(state.answers > count for state, count in zip(states, before, strict=True)))
+        refused = await line.left._answer("ping stranger")
+        assert refused is not None
+        assert "error" in refused

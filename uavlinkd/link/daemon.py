@@ -35,6 +35,7 @@ from uavlinkd.link.key_change import Graces
 from uavlinkd.link.local_endpoints import LocalEndpoints
 from uavlinkd.link.network_budgets import NetworkBudget, budgets_of, follow_rates
 from uavlinkd.link.passage import Passage
+from uavlinkd.link.path_status import paths_status
 from uavlinkd.link.peer_link import PeerLink, radio_figures
 from uavlinkd.link.peer_owners import PeerOwner
 from uavlinkd.link.peer_sockets import PeerSockets
@@ -542,4 +543,17 @@ class Daemon:
                 except ConfigError as error:
                     return {"problems": str(error).splitlines()}
                 return {"problems": [], "name": self.config.name}
+            case _ if request.startswith("ping "):
+                return self._ping(request.removeprefix("ping "), monotonic())
         return None
+
+    def _ping(self, name: str, now: float) -> dict[str, object]:
+        """The paths to a peer. A question goes along each of them: the next answer has the results."""
+        link = self.links.get(name)
+        if link is None:
+            return {"error": f"there is no peer of this name, but {', '.join(self.links) or 'none'}"}
+        paths = paths_status(link, self.peer_sockets.network_name, now)
+        for path in [state.path for state in link.peer.paths.states]:
+            self._perform(self.node.ask(link.peer, path, now))
+        self._settle()
+        return {"paths": paths}

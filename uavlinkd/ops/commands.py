@@ -1,4 +1,4 @@
-"""The commands that talk to a running daemon: ``status``, ``reload``, ``peer list`` and ``report``.
+"""The commands that talk to a running daemon: ``status``, ``reload``, ``peer list``, ``ping`` and ``report``.
 
 Each command imports what it needs when it runs: the other commands start without it.
 """
@@ -33,6 +33,11 @@ def add_parsers(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
     _add(commands, "reload", _reload, "make a daemon read its configuration again")
     peer = _add(commands, "peer", _peer_list, "list a daemon's peers and their keys")
     peer.add_argument("action", choices=["list"])
+    ping = _add(commands, "ping", _ping, "ask along each path to a peer, and show which answer and carry frames")
+    ping.add_argument("peer", metavar="PEER", help="its name in the daemon's configuration")
+    ping.add_argument(
+        "--count", metavar="N", type=int, default=5, help="questions, one a second (default: %(default)s)"
+    )
     report = _add(commands, "report", _report, "write one file for a support request, without keys and addresses")
     report.add_argument("--out", metavar="FILE", type=Path, help="where to write it (default: a name with the time)")
     report.add_argument("--yes", action="store_true", help="write it without showing it first")
@@ -183,13 +188,30 @@ def _reload(options: argparse.Namespace) -> int:
 
     sockets = _control_sockets(options)
     if len(sockets) > 1:
-        listed = "\n".join(f"  --socket {socket}" for socket in sockets)
-        raise CommandError(f"several daemons run here: name one of them\n{listed}", WRONG)
+        raise CommandError(_several(sockets), WRONG)
     answer = _ask(sockets[0], "reload", on_waiting=report_wait)
     if answer["problems"]:
         raise CommandError("\n".join(answer["problems"]), WRONG)
     print(printable(f"{answer.get('name', sockets[0])} reloaded"))
     return OK
+
+
+def _ping(options: argparse.Namespace) -> int:
+    from uavlinkd.ops.ping import run
+
+    sockets = _control_sockets(options)
+    if len(sockets) > 1:
+        raise CommandError(_several(sockets), WRONG)
+    if options.count < 1:
+        raise CommandError("--count must be 1 or more", WRONG)
+    with suppress(KeyboardInterrupt):
+        return OK if run(lambda: _ask(sockets[0], f"ping {options.peer}"), options.count) else FAILED
+    return FAILED
+
+
+def _several(sockets: Sequence[Path]) -> str:
+    listed = "\n".join(f"  --socket {socket}" for socket in sockets)
+    return f"several daemons run here: name one of them\n{listed}"
 
 
 def _report(options: argparse.Namespace) -> int:
