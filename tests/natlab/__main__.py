@@ -1,6 +1,6 @@
 """``python -m tests.natlab``: connect all pairs of kinds of NAT, and print the table. As root.
 
-``--baseline`` connects them by ICE (the package aioice).
+Daemons know only a relay on the internet. ``--baseline`` connects the pairs by ICE (the package aioice).
 """
 
 from __future__ import annotations
@@ -8,10 +8,13 @@ from __future__ import annotations
 import argparse
 import asyncio
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import redirect_stdout
+from io import StringIO
 from statistics import median
 
-from tests.natlab import ice, namespaces
+from tests.natlab import daemons, ice, namespaces
+from tests.natlab.daemons import Outcome
 from tests.natlab.kinds import KINDS, PAIRED
 from tests.natlab.laboratory import Laboratory
 from tests.natlab.pairs import Pair, make_pairs, matrix
@@ -25,6 +28,8 @@ def main() -> int:
     parser.add_argument("--baseline", action="store_true", help="ICE instead of daemons")
     parser.add_argument("--delay-ms", type=float, default=0, help="of each place's line, in each direction")
     parser.add_argument("--loss-percent", type=float, default=0, help="of each place's line, in each direction")
+    parser.add_argument("--direct-s", type=float, default=0, help="wait so long for a direct path")
+    parser.add_argument("--at-once", type=int, default=4, help="pairs of daemons that run at the same time")
     options = parser.parse_args()
     reason = namespaces.why_not() or (ice.why_not() if options.baseline else None)
     if reason is not None:
@@ -34,24 +39,45 @@ def main() -> int:
     with interrupted_by_signals(), Laboratory() as laboratory:
         public = laboratory.public()
         pairs = make_pairs(laboratory, kinds, delay_s=options.delay_ms / 1000, loss=options.loss_percent / 100)
-        print(_baseline(kinds, pairs, asyncio.run(ice.connect_all(pairs, public))))
+        if options.baseline:
+            print(_baseline(kinds, pairs, asyncio.run(ice.connect_all(pairs, public))))
+        else:
+            run = daemons.connect_all(pairs, public, direct_limit_s=options.direct_s, at_once=options.at_once)
+            with redirect_stdout(StringIO()):  # what the daemons said
+                outcomes = asyncio.run(run)
+            print(_report(kinds, pairs, outcomes))
     return 0
 
 
-def _baseline(kinds: Sequence[str], pairs: Sequence[Pair], results: dict[Pair, float | None]) -> str:
-    def cell(pair: Pair) -> str:
-        seconds = results[pair]
-        return "-" if seconds is None else f"{seconds:.2f}"
+def _baseline(kinds: Sequence[str], pairs: Sequence[Pair], results: Mapping[Pair, float | None]) -> str:
+    return "\n".join([_tables(kinds, pairs, results), "", _summary("direct", results)])
 
-    times = sorted(seconds for seconds in results.values() if seconds is not None)
-    lines = [matrix(kinds, {pair.kinds: cell(pair) for pair in pairs if not pair.name}), ""]
-    lines += [f"{pair.name}: {cell(pair)}" for pair in pairs if pair.name]
-    if times:
-        lines.append(
-            f"{len(times)} of {len(pairs)} pairs connect directly: median {median(times):.2f} s,"
-            f" 95 % within {times[int(0.95 * (len(times) - 1))]:.2f} s"
-        )
+
+def _report(kinds: Sequence[str], pairs: Sequence[Pair], outcomes: Mapping[Pair, Outcome]) -> str:
+    relayed = {pair: outcome.relayed_s for pair, outcome in outcomes.items()}
+    direct = {pair: outcome.direct_s for pair, outcome in outcomes.items()}
+    lines = ["Relayed after:", "", _tables(kinds, pairs, relayed), "", _summary("relayed", relayed)]
+    if any(seconds is not None for seconds in direct.values()):
+        lines += ["", "Direct after:", "", _tables(kinds, pairs, direct), "", _summary("direct", direct)]
+    sent, lost = (sum(counts) for counts in zip(*((o.sent, o.lost) for o in outcomes.values()), strict=True))
+    lines.append(f"{lost} of {sent} frames lost")
+    lines += [f"{pair.title}: {outcomes[pair].lost} lost" for pair in pairs if outcomes[pair].lost]
     return "\n".join(lines)
+
+
+def _tables(kinds: Sequence[str], pairs: Sequence[Pair], results: Mapping[Pair, float | None]) -> str:
+    cells = {pair: "-" if (seconds := results[pair]) is None else f"{seconds:.2f}" for pair in pairs}
+    lines = [matrix(kinds, {pair.kinds: cells[pair] for pair in pairs if not pair.name}), ""]
+    return "\n".join(lines + [f"{pair.name}: {cells[pair]}" for pair in pairs if pair.name])
+
+
+def _summary(what: str, results: Mapping[Pair, float | None]) -> str:
+    times = sorted(seconds for seconds in results.values() if seconds is not None)
+    summary = f"{len(times)} of {len(results)} pairs are {what}"
+    if times:
+        most = times[min(len(times) - 1, int(0.95 * len(times)))]
+        summary += f": median {median(times):.2f} s, 95 % within {most:.2f} s, all within {times[-1]:.2f} s"
+    return summary
 
 
 sys.exit(main())
