@@ -152,12 +152,16 @@ class Relays:
         """Call it about once a second."""
         for relay in self.by_name.values():
             relay.do_housekeeping(now)
-        seen = [place.sockaddr for relay in self.by_name.values() for place in relay.seen_as]
-        at = {state.path.address[:2] for relay in self.by_name.values() for state in relay.peer.paths.states}
-        self._searches.follow(seen, at, now)
+        self._search(now)
         self._look_at = min(self._look_at, now)
 
     # Parts.
+
+    def _search(self, now: float) -> None:
+        """Have direct paths searched with what is known now."""
+        seen = [place.sockaddr for relay in self.by_name.values() for place in relay.seen_as]
+        at = {state.path.address[:2] for relay in self.by_name.values() for state in relay.peer.paths.states}
+        self._searches.follow(seen, at, now)
 
     def _look(self, now: float) -> None:
         """Ask the relays of peers that have become silent."""
@@ -174,6 +178,7 @@ class Relays:
 
     def _on_handles(self, keys: set[bytes], now: float) -> None:
         self._set_paths([link for link in self._links.values() if keys & link.keys], now)
+        self._search(now)
 
     def _set_paths(self, links: Iterable[PeerLink], now: float) -> None:
         has_changed = False
