@@ -35,11 +35,11 @@ from uavlinkd.link.key_change import Graces
 from uavlinkd.link.local_endpoints import LocalEndpoints
 from uavlinkd.link.network_budgets import NetworkBudget, budgets_of, follow_rates
 from uavlinkd.link.passage import Passage
-from uavlinkd.link.path_status import paths_status
 from uavlinkd.link.peer_link import PeerLink, radio_figures
 from uavlinkd.link.peer_owners import PeerOwner
 from uavlinkd.link.peer_sockets import PeerSockets
 from uavlinkd.link.pilot_notes import PilotNotes
+from uavlinkd.link.reachability import ping, views
 from uavlinkd.link.relays import Relays
 from uavlinkd.link.shell_reasons import ShellReason
 from uavlinkd.link.status import daemon_status
@@ -534,26 +534,20 @@ class Daemon:
     # The control socket.
 
     async def _answer(self, request: str) -> dict[str, object] | None:
-        match request:
-            case "status":
+        match request.partition(" "):
+            case ("status", "", ""):
                 return daemon_status(self, monotonic())
-            case "reload":
+            case ("reload", "", ""):
                 try:
                     await self.reload()
                 except ConfigError as error:
                     return {"problems": str(error).splitlines()}
                 return {"problems": [], "name": self.config.name}
-            case _ if request.startswith("ping "):
-                return self._ping(request.removeprefix("ping "), monotonic())
+            case ("netcheck", "", ""):
+                return views(self.relays, self.peer_sockets.network_name)
+            case ("ping", " ", name):
+                answer, outputs = ping(self.links, name, self.node, self.peer_sockets.network_name, monotonic())
+                self._perform(outputs)
+                self._settle()
+                return answer
         return None
-
-    def _ping(self, name: str, now: float) -> dict[str, object]:
-        """The paths to a peer. A question goes along each of them: the next answer has the results."""
-        link = self.links.get(name)
-        if link is None:
-            return {"error": f"there is no peer of this name, but {', '.join(self.links) or 'none'}"}
-        paths = paths_status(link, self.peer_sockets.network_name, now)
-        for path in [state.path for state in link.peer.paths.states]:
-            self._perform(self.node.ask(link.peer, path, now))
-        self._settle()
-        return {"paths": paths}

@@ -117,10 +117,14 @@ class RelayLink:
         """Those of the configuration."""
         return self.config.addresses
 
+    def views(self) -> list[tuple[Path, Address]]:
+        """The paths to the relay, each with this daemon's address as the relay sees it there."""
+        return [(path, binding.seen_as) for path, binding in self._bindings.items() if binding.seen_as is not None]
+
     @property
     def seen_as(self) -> list[Address]:
         """This daemon's addresses as the relay sees them, one for each path."""
-        return [binding.seen_as for binding in self._bindings.values() if binding.seen_as is not None]
+        return [seen for _, seen in self.views()]
 
     def state_for(self, link: PeerLink) -> str:
         """Whether a peer is reached along the relay: ``bound``, ``waiting`` for it to ask too, or ``unanswered``."""

@@ -14,8 +14,9 @@ from uavlinkd.core.constants import NEVER
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import LinkedPeer, Output
 from uavlinkd.core.path import RELAY_HOST, Path
+from uavlinkd.link.candidates import Place, places_of
 from uavlinkd.link.conditions import LineLimits
-from uavlinkd.link.direct_searches import DirectSearches
+from uavlinkd.link.direct_searches import DirectSearches, own_sockets
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.peer_owners import PeerOwner
 from uavlinkd.link.peer_sockets import PeerSockets
@@ -123,6 +124,16 @@ class Relays:
             relay.follow([key for link in links for key in link.keys])
         self._set_paths(self._links.values(), now)
 
+    # Facts.
+
+    def own_places(self) -> list[Place]:
+        """Addresses and ports of the own sockets in their own networks."""
+        return [place for sock in own_sockets(self._sockets) for place in sock.places]
+
+    def candidates(self) -> tuple[Place, ...]:
+        """Where peers may reach this daemon directly."""
+        return places_of(self._seen(), own_sockets(self._sockets))
+
     # Time and events.
 
     def handle_timeout(self, now: float) -> list[Output]:
@@ -157,9 +168,12 @@ class Relays:
 
     # Parts.
 
+    def _seen(self) -> list[Place]:
+        return [place.sockaddr for relay in self.by_name.values() for place in relay.seen_as]
+
     def _search(self, now: float) -> None:
         """Have direct paths searched with what is known now."""
-        seen = [place.sockaddr for relay in self.by_name.values() for place in relay.seen_as]
+        seen = self._seen()
         at = {state.path.address[:2] for relay in self.by_name.values() for state in relay.peer.paths.states}
         self._searches.follow(seen, at, now)
 

@@ -38,6 +38,7 @@ def add_parsers(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
     ping.add_argument(
         "--count", metavar="N", type=int, default=5, help="questions, one a second (default: %(default)s)"
     )
+    _add(commands, "netcheck", _netcheck, "show whether UDP gets out, how relays see this machine, and its NAT")
     report = _add(commands, "report", _report, "write one file for a support request, without keys and addresses")
     report.add_argument("--out", metavar="FILE", type=Path, help="where to write it (default: a name with the time)")
     report.add_argument("--yes", action="store_true", help="write it without showing it first")
@@ -207,6 +208,18 @@ def _ping(options: argparse.Namespace) -> int:
     with suppress(KeyboardInterrupt):
         return OK if run(lambda: _ask(sockets[0], f"ping {options.peer}"), options.count) else FAILED
     return FAILED
+
+
+def _netcheck(options: argparse.Namespace) -> int:
+    from uavlinkd.ops.netcheck import report
+
+    def show(socket: Path) -> int:
+        answer = _ask(socket, "netcheck")
+        for line in report(answer):
+            print(printable(line))
+        return OK if any(relay["state"] == "up" for relay in answer["relays"].values()) else FAILED
+
+    return _for_each(_control_sockets(options), show)
 
 
 def _several(sockets: Sequence[Path]) -> str:

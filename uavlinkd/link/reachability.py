@@ -1,0 +1,48 @@
+"""Answers to ``uavlinkd ping`` and ``uavlinkd netcheck``: how a peer is reached, and how relays see this daemon."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from uavlinkd.core.node import Node
+from uavlinkd.core.outputs import Output
+from uavlinkd.link.path_status import NetworkOf, paths_status
+from uavlinkd.link.peer_link import PeerLink
+from uavlinkd.link.relays import Relays
+from uavlinkd.link.status import state_of
+from uavlinkd.system.addresses import Address
+
+
+def ping(
+    links: Mapping[str, PeerLink], name: str, node: Node, network_of: NetworkOf, now: float
+) -> tuple[dict[str, object], list[Output]]:
+    """The paths to a peer, and a question along each of them. The next answer has the results."""
+    link = links.get(name)
+    if link is None:
+        return {"error": f"there is no peer of this name, but {', '.join(links) or 'none'}"}, []
+    states = link.peer.paths.states
+    answer: dict[str, object] = {"paths": paths_status(link, network_of, now)}
+    return answer, [output for state in states for output in node.ask(link.peer, state.path, now)]
+
+
+def views(relays: Relays, network_of: NetworkOf) -> dict[str, object]:
+    """How each relay sees each socket, and the candidates of this daemon."""
+    return {
+        "relays": {
+            name: {"state": state_of(relay.peer), "round_trip_s": relay.peer.round_trip_s}
+            for name, relay in relays.by_name.items()
+        },
+        "views": [
+            {
+                "relay": name,
+                "relay_address": str(Address.of(path.address)),
+                "socket": path.socket,
+                "network": network_of(path.socket),
+                "seen_as": str(seen),
+            }
+            for name, relay in relays.by_name.items()
+            for path, seen in relay.views()
+        ],
+        "candidates": [str(Address(*place)) for place in relays.candidates()],
+        "own": [str(Address(*place)) for place in relays.own_places()],
+    }
