@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from tests.core.harness import FRAME
+from tests.daemon.frames import heartbeat
 from tests.daemon.harness import Stage
 from tests.daemon.process import DaemonProcess, Status
 from tests.daemon.test_reload import reload
@@ -175,3 +176,21 @@ async def test_file_without_members_is_refused(relay: DaemonProcess) -> None:
     await relay.start()
     assert await relay.ended() == 2
     assert any("[[member]]" in line for line in relay.plain_lines)
+
+
+async def test_member_may_become_a_peer_too(relay: DaemonProcess, make_member: MakeMember) -> None:
+    """One session serves both: after a reload its frames are accepted, and it is still connected."""
+    drone, station = make_member("drone1"), make_member("station")
+    relay.config["relay_server"] = {"enabled": True}
+    await relay.start()
+    await connect(drone, station)
+    section = {"name": "drone1", "public_key": encode_key(drone.key), "role": "all", "system_ids": "all"}
+    relay.config["peer"] = [section]
+    assert await reload(relay) == []
+    made = drone.peer.traffic.handshakes
+    await drone.until(lambda: drone.peer.traffic.handshakes > made)
+    await connect(drone, station)
+    drone.send_frames(heartbeat(1))
+    status = await relay.until(lambda status: status["peers"]["drone1"]["frames_received"] == 1)
+    assert status["relay"]["connections"] == 1
+    assert "frames_not_allowed" not in status["drops"]
