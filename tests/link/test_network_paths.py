@@ -40,7 +40,7 @@ class Link:
     name = "drone1"
 
     def __init__(self, *addresses: PeerAddress) -> None:
-        self.config = SimpleNamespace(addresses=addresses)
+        self.addresses = addresses
         self.states: dict[Path, Any] = {}
         self.peer = SimpleNamespace(is_up=True, paths=SimpleNamespace(find=self.states.get))
         self.paths: list[Path] = []
