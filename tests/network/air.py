@@ -148,6 +148,10 @@ class Air:
         """Something happened that may stop hops, for a moment or for longer."""
         self._disturbed_at[scope] = now
 
+    def disturbed_at(self, scope: Scope) -> float:
+        """When something happened to this last."""
+        return self._disturbed_at.get(scope, -math.inf)
+
     def undisturbed_since(self, hop: Hop) -> float:
         """Since when a hop carries everything, with no other delay than its radio's. Infinity: it does not now."""
         state, settings, (sender, receiver) = self._hops.get(hop) or _HopState(), self.settings_of(hop), hop

@@ -10,9 +10,9 @@ from __future__ import annotations
 
 from functools import partial
 
-from tests.network.air import Endpoint, Hop
+from tests.network.air import Endpoint
 from tests.network.drone import Drone
-from tests.network.fleet import Fleet, Pair
+from tests.network.fleet import Fleet, Pair, Route
 from uavlinkd.core import constants as c
 from uavlinkd.core.settings import Class
 
@@ -56,26 +56,43 @@ class CriticalWatch:
         flow = self._network.flow(sender, receiver, Class.CRITICAL)
         sent_at = flow.sent_at[number]
         are_peers = _has(sender, receiver) and _has(receiver, sender)
-        delivering = [hop for hop in pair.hops if self._delivered(hop, sent_at)] if are_peers else []
+        delivering = self._delivering(pair, sent_at) if are_peers else []
         self.judged += bool(delivering)
-        self.judged_on_lines += bool(delivering) and all(hop.sender in self._network.lines for hop in delivering)
+        self.judged_on_lines += bool(delivering) and all(hop.sender in self._network.lines for hop, *_ in delivering)
         assert not delivering or number in flow.delivered, (
             f"critical frame {number} from {sender.name} to {receiver.name}, sent at {sent_at:.3f},"
             f" was lost although paths delivered: {delivering}"
         )
 
-    def _delivered(self, hop: Hop, sent_at: float) -> bool:
-        """Whether a path has delivered from long before a frame was sent until now."""
-        air, line = self._network.air, self._network.lines.get(hop.sender)
-        if line is not None and not line.is_sound:
-            return False
-        settled_s = METERED_SETTLED_S if any(map(self._was_metered, hop)) else SETTLED_S
-        for one in (hop, hop.back):
-            radio = air.settings_of(one)
-            delay_s = radio.delay_s + radio.jitter_s + (radio.held_back_s if radio.reordering else 0.0)
-            if air.undisturbed_since(one) > sent_at - settled_s or delay_s > LONGEST_DELAY_S:
+    def _delivering(self, pair: Pair, sent_at: float) -> list[Route]:
+        """The ways that have delivered from long before a frame was sent until now.
+
+        Through relays there may be more ways than copies. These survive one failure: of a relay, or of a network.
+        """
+        if self._network.air.disturbed_at(frozenset((pair.a.name, pair.b.name))) > sent_at - SETTLED_S:
+            return []
+        routes = [route for route in self._fleet.routes(pair) if self._delivered(route, sent_at)]
+        if self._fleet.relays:
+            failed = [hop for hop in pair.hops if not self._delivered((hop,), sent_at)]
+            if failed and not set[object].intersection(*({hop, *hop, hop.receiver.drone} for hop in failed)):
+                return []
+        return routes
+
+    def _delivered(self, route: Route, sent_at: float) -> bool:
+        delays_s = [0.0, 0.0]
+        for hop in route:
+            line = self._network.lines.get(hop.sender)
+            if line is not None and not line.is_sound:
                 return False
-        return True
+            if any(self._network.drones[end.drone].node is None for end in hop):
+                return False
+            settled_s = METERED_SETTLED_S if any(map(self._was_metered, hop)) else SETTLED_S
+            for direction, one in enumerate((hop, hop.back)):
+                radio = self._network.air.settings_of(one)
+                delays_s[direction] += radio.delay_s + radio.jitter_s + (radio.held_back_s if radio.reordering else 0.0)
+                if self._network.air.undisturbed_since(one) > sent_at - settled_s:
+                    return False
+        return max(delays_s) <= LONGEST_DELAY_S
 
     def _was_metered(self, end: Endpoint) -> bool:
         return end.socket in self._network.drones[end.drone].once_metered

@@ -11,13 +11,14 @@ from typing import Protocol
 from tests.network.air import Address, Air, Endpoint, Hop
 from tests.network.bounds import Sizes, check
 from tests.network.flow import Flow
+from tests.network.nat import Nat
 from tests.network.serial_line import BUDGET_BITS_S, SerialLine
 from uavlinkd.core.cookie import MacKeys
 from uavlinkd.core.crypto import Secret, x25519_public_key
 from uavlinkd.core.drops import Drop
 from uavlinkd.core.envelope_limit import limit_at
 from uavlinkd.core.node import Node
-from uavlinkd.core.outputs import Output, SessionEstablished
+from uavlinkd.core.outputs import Event, Output, RecordReceived, SessionEstablished
 from uavlinkd.core.path import Path
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.refusals import Refused
@@ -33,6 +34,7 @@ class World(Protocol):
     screen: Screen
     air: Air
     drones: dict[str, Drone]
+    owners: dict[Address, str]
     lines: dict[Endpoint, SerialLine]
 
     def flows_between(self, sender: str, receiver: str) -> Sequence[Flow]:
@@ -56,6 +58,8 @@ class Drone:
         """Its clock at the network's time zero."""
         self.nat_sockets: set[int] = set()
         """Sockets behind a NAT: only a destination of their datagrams since their address changed reaches them."""
+        self.nats: dict[int, Nat] = {}
+        """Those that have public addresses of their own, by socket."""
         self.metered_sockets: set[int] = set()
         """Sockets whose network is metered."""
         self.once_metered: set[int] = set()
@@ -103,6 +107,8 @@ class Drone:
 
     def move_socket(self, socket: int, address: Address) -> None:
         """The address of one socket changes, as when its NAT forgets a mapping. The others stay as they are."""
+        if socket in self.nats:
+            self.nats[socket].forget()
         before = self.addresses[socket]
         self.contacted = {pair for pair in self.contacted if pair[0] != before}
         self._place([address if number == socket else other for number, other in enumerate(self.addresses)])
@@ -154,6 +160,57 @@ class Drone:
             {socket: [peers[name]] if name in peers else [] for socket, name in self.lines.items()}
         )
 
+    # Its datagrams. Relays and members of relays do more.
+
+    def source_for(self, socket: int, destination: Address) -> Address:
+        """The source address that a datagram has on its way."""
+        if (nat := self.nats.get(socket)) is None:
+            return self.addresses[socket]
+        public = nat.outward(destination, self._world.now)
+        self._world.air.endpoints[public] = Endpoint(self.name, socket)
+        self._world.owners[public] = self.name
+        return public
+
+    def admits(self, socket: int, destination: Address, source: Address) -> bool:
+        """Whether the NAT of a socket lets a datagram in."""
+        if (nat := self.nats.get(socket)) is not None:
+            return nat.admits(destination, source, self._world.now)
+        return socket not in self.nat_sockets or (destination, source) in self.contacted
+
+    def forget_mappings(self, socket: int) -> None:
+        """The NAT of a socket forgets all."""
+        self._world.air.disturb(Endpoint(self.name, socket), self._world.now)
+        self._world.note(f"{self.name}: the NAT of socket {socket} forgets")
+        self.nats[socket].forget()
+
+    def datagram_for(self, datagram: bytes, path: Path) -> tuple[bytes, Address] | None:
+        """What is sent along a path of the node, and where."""
+        return datagram, path.address[:2]
+
+    def receive(self, datagram: bytes, path: Path) -> None:
+        """A datagram arrived."""
+        assert self.node is not None
+        self._world.perform(self, self.node.receive(datagram, path, self.local_now))
+
+    def on_record(self, received: RecordReceived) -> None:
+        """Only relays and their members use records."""
+
+    def on_event(self, event: Event) -> None:
+        """The same for events."""
+
+    def next_deadline(self) -> float:
+        """When :meth:`handle_timeout` is due, on its clock."""
+        return math.inf if self.node is None else self.node.next_deadline()
+
+    def handle_timeout(self) -> None:
+        """Wake the node, if it is due."""
+        # A clock far from zero rounds: do not wake the node before its own deadline.
+        self._perform_timeout(max(self.local_now, self.next_deadline()))
+
+    def _perform_timeout(self, now: float) -> None:
+        assert self.node is not None
+        self._world.perform(self, self.node.handle_timeout(now))
+
     def _place(self, addresses: Sequence[Address]) -> None:
         air, now = self._world.air, self._world.now
         for socket, (before, after) in enumerate(zip(self.addresses, addresses, strict=False)):
@@ -161,6 +218,7 @@ class Drone:
                 air.disturb(Endpoint(self.name, socket), now)
         air.place(self.name, self.addresses, addresses)
         self.addresses = tuple(addresses)
+        self._world.owners.update(dict.fromkeys(addresses, self.name))
 
     # Its configuration.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from random import Random
 from typing import NamedTuple
 
@@ -24,6 +25,10 @@ class Pair(NamedTuple):
     """The paths between them, from the first drone to the second."""
 
 
+Route = tuple[Hop, ...]
+"""The hops of a way between two peers. Behind a relay there are two, each from a member to the relay."""
+
+
 class Fleet:
     """A star around one drone, or a mesh. It is configured, and not started."""
 
@@ -31,10 +36,11 @@ class Fleet:
         self.network = network
         self.plan = plan
         self.lot = lot
+        self.relays: list[Drone] = []
         self.is_mesh = lot.random() < 0.4
         self.drones = [self._drone(number) for number in range(lot.randint(*plan.nodes))]
         self.pairs = [
-            Pair(a, b, _paths(a, b))
+            Pair(a, b, self._paths(a, b))
             for number, a in enumerate(self.drones)
             for b in self.drones[number + 1 :]
             if self.is_mesh or number == 0
@@ -42,6 +48,21 @@ class Fleet:
         self.pairs = [self._with_line(pair) for pair in self.pairs]
         self.wanderers = self._wanderers()
         """Drones whose addresses change. Of two peers at least one keeps its addresses: else they could not meet."""
+
+    @property
+    def everyone(self) -> list[Drone]:
+        """All that can be started."""
+        return [*self.relays, *self.drones]
+
+    def routes(self, pair: Pair) -> Sequence[Route]:
+        """The ways from one peer to the other."""
+        return [(hop,) for hop in pair.hops]
+
+    def usable_and_others(self) -> Iterator[tuple[Route, list[Hop]]]:
+        """A random way for each pair, or for several, and all other hops."""
+        for pair in self.pairs:
+            usable = self.lot.choice(pair.hops)
+            yield (usable,), [hop for hop in pair.hops if hop != usable]
 
     def random_clock(self) -> float:
         """The time at which a machine's clock starts."""
@@ -75,6 +96,11 @@ class Fleet:
         networks = self.lot.randint(*self.plan.networks) if self.plan.has_paths else 1 + self.is_mesh
         addresses: list[Address] = [(f"10.{socket}.0.{number + 1}", 5790) for socket in range(networks)]
         return self.network.add(f"d{number}", *addresses, clock=clock)
+
+    def _paths(self, a: Drone, b: Drone) -> tuple[Hop, ...]:
+        """The networks of the drone that has fewer are used several times."""
+        here, there = len(a.addresses), len(b.addresses)
+        return tuple(a.hop(number % here, b, number % there) for number in range(max(here, there)))
 
     def _with_line(self, pair: Pair) -> Pair:
         """Join some pairs by a serial line too."""
@@ -113,9 +139,3 @@ class Fleet:
             b.knows(a, a.addresses, link)
             a.knows(b, lot.choice(((), b.addresses)), link)
             b.is_behind_nat = lot.random() < 0.3
-
-
-def _paths(a: Drone, b: Drone) -> tuple[Hop, ...]:
-    """The networks of the drone that has fewer are used several times."""
-    here, there = len(a.addresses), len(b.addresses)
-    return tuple(a.hop(number % here, b, number % there) for number in range(max(here, there)))

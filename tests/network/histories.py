@@ -16,15 +16,17 @@ from functools import partial
 from random import Random
 from typing import NamedTuple
 
+from tests.network.air import Hop
 from tests.network.critical import CriticalWatch
 from tests.network.drone import Drone, share_a_session
-from tests.network.fleet import Fleet, Pair
+from tests.network.fleet import Fleet, Route
 from tests.network.flow import Flow
 from tests.network.misfortunes import Misfortunes
 from tests.network.network import Network
 from tests.network.path_misfortunes import random_modems, random_radio
 from tests.network.plans import PLANS, WEIGHTS, Plan
 from tests.network.played import Played
+from tests.network.relay_fleet import RelayFleet
 from uavlinkd.core.outputs import SessionEstablished
 from uavlinkd.core.settings import Class
 from uavlinkd.lab.mitm.radio import RadioSettings
@@ -83,7 +85,7 @@ class History:
         self.up_s: list[float] = []
         self.one_path_up_s: list[float] = []
         self.critical_up_s: list[float] = []
-        self.fleet = Fleet(self.network, plan, lot)
+        self.fleet = (RelayFleet if plan.relays[1] else Fleet)(self.network, plan, lot)
         self.misfortunes = Misfortunes(self.fleet)
         self.critical = CriticalWatch(self.fleet)
 
@@ -102,8 +104,8 @@ class History:
             network.run(end - network.now)
             self._end_misfortunes()
             if plan.has_paths:
-                for pair in self.fleet.pairs:
-                    self._leave_one_path(pair)
+                for usable, others in self.fleet.usable_and_others():
+                    self._leave_one_path(usable, others)
                 self._judge_one_path()
                 self._end_misfortunes()
             self._judge()
@@ -118,25 +120,24 @@ class History:
         network.set_radio(USABLE)
         for end in list(network.air.absent):
             network.drones[end.drone].find_network(end.socket)
-        for drone in self.fleet.drones:
+        for drone in self.fleet.everyone:
             if drone.node is None:
                 drone.start(self.fleet.random_clock())
+        for drone in self.fleet.drones:
             for other in self.fleet.drones:
                 if other.name in drone.removed:
                     drone.restore(other)
 
-    def _leave_one_path(self, pair: Pair) -> None:
-        """Make one path of two peers usable. Something else is wrong with each of the others, or nothing."""
+    def _leave_one_path(self, usable: Route, others: list[Hop]) -> None:
+        """Make one path of peers usable. Something else is wrong with each of the others, or nothing."""
         network, lot = self.network, self.lot
-        usable = lot.choice(pair.hops)
         network.note(f"one path is usable: {usable}")
-        for drone, end in zip((pair.a, pair.b), usable, strict=True):
+        for end in {end for hop in usable for end in hop}:
+            drone = network.drones[end.drone]
             if end.socket in drone.metered_sockets:  # tried rarely after a minute, unless its network changes
                 drone.set_metered(drone.metered_sockets - {end.socket})
                 drone.find_network(end.socket)
-        for hop in pair.hops:
-            if hop == usable:
-                continue
+        for hop in others:
             if hop.sender in network.lines:
                 network.set_modems(hop.sender, random_modems(self.fleet))
             match lot.randrange(4):
@@ -214,7 +215,7 @@ class History:
         played.worst_up_s = max(self.up_s, default=0.0)
         played.worst_one_path_up_s = max(self.one_path_up_s, default=0.0)
         played.worst_critical_up_s = max(self.critical_up_s, default=0.0)
-        for drone in self.fleet.drones:
+        for drone in self.fleet.everyone:
             played.sessions += sum(isinstance(event, SessionEstablished) for _, event in drone.outputs)
             played.largest |= drone.largest
         played.datagrams = network.datagrams

@@ -10,10 +10,14 @@ from tests.network.attackers import Flooder, Recorder
 from tests.network.drone import Drone
 from tests.network.fleet import Fleet
 from tests.network.path_misfortunes import PathMisfortunes, random_address, random_radio
+from tests.network.relay_fleet import RelayFleet
+from tests.network.relay_misfortunes import RelayMisfortunes
 
 _KEPT = 2000
 _SHARE_OF_PATHS = 0.85
 """Of the misfortunes in a fleet with several paths: most concern one path, so that another one works."""
+_SHARE_OF_RELAYS = 0.4
+"""Of the misfortunes in a fleet with relays."""
 
 
 class Misfortunes:
@@ -28,6 +32,7 @@ class Misfortunes:
         self._recorder = Recorder(fleet.network, keep=_KEPT)
         self._until = 0.0
         self._of_paths = PathMisfortunes(fleet)
+        self._of_relays = RelayMisfortunes(fleet, self._recorder) if isinstance(fleet, RelayFleet) else None
         self._kinds: list[tuple[str, Callable[[], None]]] = [
             ("other radios", self._other_radios),
             ("cut", self._cut),
@@ -49,7 +54,9 @@ class Misfortunes:
     def befall(self, until: float) -> None:
         """Let something happen now. What ends by itself ends by ``until``, or not at all."""
         self._until = until
-        if self._fleet.plan.has_paths and self._lot.random() < _SHARE_OF_PATHS:
+        if self._of_relays is not None and self._lot.random() < _SHARE_OF_RELAYS:
+            name = self._of_relays.befall(until)
+        elif self._fleet.plan.has_paths and self._lot.random() < _SHARE_OF_PATHS:
             name = self._of_paths.befall(until)
         else:
             name, befalls = self._lot.choice(self._kinds)

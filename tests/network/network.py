@@ -12,7 +12,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from random import Random
 from types import TracebackType
-from typing import Protocol, Self
+from typing import Protocol, Self, TypeVar
 
 from tests.network.air import Address, Air, Crossing, Endpoint, Hop
 from tests.network.drone import Drone, session_name, share_a_session
@@ -20,7 +20,7 @@ from tests.network.flow import FRAME_BYTES, Flow, FlowKey, class_in, every_secon
 from tests.network.serial_line import SIK, SerialLine
 from uavlinkd.core import wire
 from uavlinkd.core.constants import REFUSALS_KEPT
-from uavlinkd.core.outputs import Deliver, Dropped, Output, Transmit
+from uavlinkd.core.outputs import Deliver, Dropped, Output, RecordReceived, Transmit
 from uavlinkd.core.path import SERIAL_HOST, Path
 from uavlinkd.core.refusals import Refused
 from uavlinkd.core.settings import Class, Link, Screen, hold_all
@@ -46,6 +46,9 @@ _CHECK_BOUNDS_EVERY = 16
 """The number of events at one drone after which the next drone has its turn."""
 
 
+DroneKind = TypeVar("DroneKind", bound=Drone)
+
+
 class Attacker(Protocol):
     """Sees every datagram when it is sent, and those that are sent to its own addresses."""
 
@@ -65,6 +68,8 @@ class Network:
         self.rng = Random(f"network {seed}")
         self.air = Air(seed, radio or RadioSettings())
         self.drones: dict[str, Drone] = {}
+        self.owners: dict[Address, str] = {}
+        """The drone that had an address last. Behind a NAT, an address is used once."""
         self.flows: dict[FlowKey, Flow] = {}
         self.lines: dict[Endpoint, SerialLine] = {}
         """The serial line at a socket of a drone. Both its ends are here."""
@@ -100,7 +105,11 @@ class Network:
     def add(self, name: str, *addresses: Address, clock: float = 0.0) -> Drone:
         """Add a drone, without starting it. By default it has an address of its own."""
         at = addresses or ((f"10.0.0.{len(self.drones) + 1}", 5790),)
-        drone = self.drones[name] = Drone(self, name, at, clock)
+        return self.add_drone(Drone(self, name, at, clock))
+
+    def add_drone(self, drone: DroneKind) -> DroneKind:
+        """Add a drone of any kind."""
+        self.drones[drone.name] = drone
         self._in_turn.append(drone)
         return drone
 
@@ -315,10 +324,8 @@ class Network:
                     self._send(datagram, source, destination)
         else:
             for drone in self.drones.values():
-                if drone.node is not None and drone.node.next_deadline() - drone.clock <= self.now:
-                    # A clock far from zero rounds: do not wake the node before its own deadline.
-                    local_now = max(drone.local_now, drone.node.next_deadline())
-                    self.perform(drone, drone.node.handle_timeout(local_now))
+                if drone.next_deadline() - drone.clock <= self.now:
+                    drone.handle_timeout()
         if self.checks_bounds and self.steps % _CHECK_BOUNDS_EVERY == 0:
             self._in_turn.rotate()
             self._in_turn[0].check_bounds()
@@ -326,10 +333,7 @@ class Network:
     def _next_event(self) -> float:
         moment = min(self._actions[0][0] if self._actions else math.inf, self.air.next_arrival())
         moment = min(moment, self._next_from_lines())
-        for drone in self.drones.values():
-            if drone.node is not None:
-                moment = min(moment, drone.node.next_deadline() - drone.clock)
-        return moment
+        return min(moment, *(drone.next_deadline() - drone.clock for drone in self.drones.values()))
 
     def _next_from_lines(self) -> float:
         return min((line.next_deadline() for line in self.lines.values()), default=math.inf)
@@ -350,9 +354,13 @@ class Network:
                         continue
                     line = self.lines.get(end)
                     assert path.is_serial == (line is not None)
-                    source, destination = drone.addresses[path.socket], (path.host, path.address[1])
                     if line is not None:
-                        destination = line.addresses[line.other[end]]
+                        source, destination = drone.addresses[path.socket], line.addresses[line.other[end]]
+                    else:
+                        if (sent := drone.datagram_for(datagram, path)) is None:
+                            continue
+                        datagram, destination = sent
+                        source = drone.source_for(path.socket, destination)
                     drone.contacted.add((source, destination))
                     for listener in self.listeners:
                         listener.overhear(datagram, source, destination)
@@ -366,8 +374,11 @@ class Network:
                     self.deliver(drone, self.drones[peer.name], payload, order)
                 case Dropped(reason, number=number):
                     drone.drops[reason] += number
+                case RecordReceived():
+                    drone.on_record(output)
                 case event:
                     assert event.peer.name not in drone.removed, event
+                    drone.on_event(event)
                     drone.outputs.append((self.now, event))
                     self.note(f"{drone.name} {event}")
 
@@ -392,7 +403,7 @@ class Network:
             drone = None if endpoint is None else self.drones[endpoint.drone]
             if endpoint is None or drone is None or drone.node is None or endpoint in self.air.absent:
                 continue
-            if endpoint.socket in drone.nat_sockets and (destination, source) not in drone.contacted:
+            if not drone.admits(endpoint.socket, destination, source):
                 continue
             path = Path(endpoint.socket, source)
             line = self.lines.get(endpoint)
@@ -400,7 +411,7 @@ class Network:
                 path = Path(endpoint.socket, (SERIAL_HOST, 0))
                 if source != line.addresses[line.other[endpoint]]:  # an attacker on the wires
                     self.air.disturb(endpoint, self.now)
-            self.perform(drone, drone.node.receive(datagram, path, drone.local_now))
+            drone.receive(datagram, path)
 
     def _states(self) -> str:
         lines = []

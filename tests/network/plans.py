@@ -28,6 +28,9 @@ class Plan:
     lines: float = 0.0
     """The share of pairs that a serial line joins too."""
 
+    relays: tuple[int, int] = (0, 0)
+    """Between nodes behind NATs, which search for direct paths or not."""
+
     @property
     def has_paths(self) -> bool:
         """Whether nodes may have several paths to one another."""
@@ -41,6 +44,7 @@ PLANS = (
     Plan("paths, small", (2, 4), (1, 3), (0, 10), (30, 60), (15, 30), (0.1, 0.2), (5.0, 20.0, 120.0), (1, 4)),
     Plan("paths, large", (5, 20), (1, 2), (0, 10), (20, 40), (15, 40), (1.0, 2.0), (10.0, 120.0), (1, 4)),
     Plan("lines, small", (2, 4), (1, 3), (0, 15), (40, 80), (10, 25), (0.2, 0.5), (10.0, 30.0, 120.0), (1, 2), 0.8),
+    Plan("relays", (2, 3), (1, 2), (0, 15), (40, 80), (6, 16), (0.1, 0.2), (20.0, 120.0), (1, 2), relays=(1, 2)),
 )
-BUSY, LARGE, HOURS, PATHS, MANY_PATHS, LINES = PLANS
-WEIGHTS = (4, 1, 6, 4, 1, 3)
+BUSY, LARGE, HOURS, PATHS, MANY_PATHS, LINES, RELAYS = PLANS
+WEIGHTS = (4, 1, 6, 4, 1, 3, 3)

@@ -1,0 +1,348 @@
+"""Relays and their members in the simulated network: the node, and around it what a daemon has for relays."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from functools import partial
+from random import Random
+from typing import Final
+
+import structlog
+
+from tests.network.air import Address
+from tests.network.drone import Drone, World
+from uavlinkd.config import PeerAddress, PeerConfig, RelayConfig
+from uavlinkd.config.used_relays import TIMERS
+from uavlinkd.core import constants as c
+from uavlinkd.core import outputs as o
+from uavlinkd.core.drops import DropReason
+from uavlinkd.core.path import RELAY_HOST, Path
+from uavlinkd.core.peer import Peer
+from uavlinkd.core.relay_records import Bind
+from uavlinkd.core.settings import Link, PeerSettings
+from uavlinkd.link.candidates import OwnSocket, places_of
+from uavlinkd.link.direct_search import DirectSearch
+from uavlinkd.link.peer_link import PeerLink
+from uavlinkd.link.relay_handles import RELAYED_START
+from uavlinkd.link.relay_link import RelayLink
+from uavlinkd.link.relays import Relays
+from uavlinkd.relay.bindings import QUARANTINED_PER_MEMBER
+from uavlinkd.relay.member_settings import MemberSettings, RelayLimits
+from uavlinkd.relay.service import RelayService
+from uavlinkd.system import addresses
+
+HOUSEKEEPING_S: Final = 1.0
+MOST_PEERS: Final = 8
+"""Of each member at a relay."""
+FEATURES: Final = c.FEATURE_REFUSALS | c.FEATURE_RECORDS
+LINK: Final = Link(features=FEATURES)
+_LIMITS: Final = RelayLimits(datagrams_s=20_000, bits_s=100_000_000)
+_REMEMBERED_S: Final = c.BIND_LIFETIME_S + c.QUESTION_LIFETIME_S + HOUSEKEEPING_S
+"""A bind has no effect later than this."""
+_LOG: Final = structlog.wrap_logger(structlog.ReturnLogger(), wrapper_class=structlog.make_filtering_bound_logger("critical"))
+
+
+class Relay(Drone):
+    """A relay with a public address. It is configured with its members, and carries no frames of its own."""
+
+    def __init__(self, world: World, name: str, address: Address, clock: float = 0.0) -> None:
+        super().__init__(world, name, (address,), clock)
+        self.members: dict[bytes, str] = {}
+        """Names by public key."""
+        self.service: RelayService | None = None
+        self.forwarded = 0
+        """Datagrams from member to member."""
+        self._asked: dict[tuple[str, str], float] = {}
+        self._arrived: tuple[Path, int] | None = None
+        self._housekeeping_at = 0.0
+
+    def start(self, clock: float | None = None) -> None:
+        """A new relay that knows its members, and nothing of what was before."""
+        super().start(clock)
+        assert self.node is not None
+        self._asked.clear()
+        self.service = RelayService(
+            self.node,
+            Random(self._world.rng.randbytes(16)).randbytes,
+            lambda: self.local_now,
+            _LIMITS,
+            perform=partial(self._world.perform, self),
+            send=self._forward,
+            on_event=lambda event, now: None,
+        )
+        members = {
+            key: MemberSettings(PeerSettings(name, key, None, LINK), MOST_PEERS, _LIMITS)
+            for key, name in self.members.items()
+        }
+        self.service.set_members(members, {}, self.local_now)
+        self._housekeeping_at = self.local_now + HOUSEKEEPING_S
+
+    def receive(self, datagram: bytes, path: Path) -> None:
+        """Forward data, and pass anything else to the node."""
+        assert self.service is not None
+        if datagram[:1] == RELAYED_START:
+            self._arrived = path, len(datagram)
+            self.service.take(path.socket, datagram, path.address)
+            self._arrived = None
+        else:
+            super().receive(datagram, path)
+            self.service.settle(self.local_now)
+
+    def _forward(self, datagram: bytes, path: Path) -> None:
+        """Both members must have asked for the other one, and one datagram causes one that is not longer."""
+        assert self._arrived is not None, f"{self.name} sends data that did not arrive"
+        arrived, size = self._arrived
+        self._arrived = None
+        assert len(datagram) <= size
+        sender, receiver = (self._world.owners[one.address[:2]] for one in (arrived, path))
+        for asking in ((sender, receiver), (receiver, sender)):
+            at = self._asked.get(asking, -math.inf)
+            assert self._world.now <= at + _REMEMBERED_S, f"{self.name} forwards, but {asking} is not asked for"
+        self.forwarded += 1
+        self._world.perform(self, [o.Transmit(datagram, path)])
+
+    def on_record(self, received: o.RecordReceived) -> None:
+        """Members ask for others."""
+        assert self.service is not None
+        if isinstance(received.record, Bind):
+            for key in received.record.keys:
+                if (name := self.members.get(key)) is not None:
+                    self._asked[received.peer.name, name] = self._world.now
+        self.service.on_record(received, self.local_now)
+
+    def on_event(self, event: o.Event) -> None:
+        """Of a member."""
+        assert self.service is not None
+        self.service.on_event(event, self.local_now)
+
+    def next_deadline(self) -> float:
+        """When something is due, on its clock."""
+        return min(super().next_deadline(), self._housekeeping_at) if self.node is not None else math.inf
+
+    def handle_timeout(self) -> None:
+        """Wake the node, and do the housekeeping of a daemon."""
+        assert self.service is not None
+        now = max(self.local_now, self.next_deadline())
+        self._perform_timeout(now)
+        if now >= self._housekeeping_at:
+            self._housekeeping_at = now + HOUSEKEEPING_S
+            self.service.do_housekeeping(now)
+        self.service.settle(now)
+
+    def check_bounds(self) -> None:
+        """The tables of the relay too."""
+        super().check_bounds()
+        if self.node is None:
+            return
+        assert self.service is not None
+        bindings, forwarding = self.service.bindings, self.service.forwarding
+        for member in bindings._members.values():
+            assert len(member.wishes) <= MOST_PEERS
+            assert all(len(wishes) <= c.HANDLES_PER_PAIR for wishes in member.wishes.values())
+            assert len(member.quarantine) <= QUARANTINED_PER_MEMBER
+            assert len(member.handles) <= MOST_PEERS * c.HANDLES_PER_PAIR
+        connections = [connection for of_pair in bindings._pairs.values() for connection in of_pair]
+        assert len(connections) == bindings.connections
+        assert len(forwarding) <= 2 * bindings.connections
+        slots = len(self.members) * (c.CONFIGURED_PATHS + c.LEARNED_PATHS)
+        assert len(self.service._asked) <= slots
+        assert len(self.service._due) <= slots * MOST_PEERS
+
+
+class _Link(PeerLink):
+    """Of a peer link only what relays need: the paths."""
+
+    def __init__(self, config: PeerConfig, node_of: Member, peer: Peer) -> None:  # without what a daemon does more
+        assert node_of.node is not None
+        self.config, self.name = config, config.name
+        self._node, self.peers = node_of.node, [peer]
+        self._previous = {}
+        self._direct = self.relayed = ()
+
+
+class _Sockets:
+    """What relays need of a daemon's sockets: each socket reaches each relay."""
+
+    def __init__(self, member: Member) -> None:
+        self.relayed = None
+        self._member = member
+
+    def follow(self, relay: RelayLink, _on_resolved: Callable[[], None]) -> None:
+        """Connect to a relay from every socket."""
+        member = self._member
+        relay.set_paths(
+            [
+                Path(socket, (written.address.host, written.address.port))
+                for written in relay.addresses
+                for socket in range(len(member.addresses))
+                if written.address is not None
+            ],
+            member.local_now,
+        )
+
+    def report_absent(self, now: float) -> None:
+        """A new path along a socket without network is off."""
+        for end in self._member.absent_ends():
+            assert self._member.node is not None
+            self._member.node.set_socket_state(end, is_up=False, now=now)
+
+
+class Member(Drone):
+    """A daemon that reaches its peers along relays, and searches direct paths."""
+
+    def __init__(
+        self, world: World, name: str, at: Sequence[Address], clock: float = 0.0, *, searches: bool = False
+    ) -> None:
+        super().__init__(world, name, at, clock)
+        self.uses: list[Relay] = []
+        self.relays: Relays | None = None
+        self.searches = searches
+        """Whether it looks for direct paths to its peers."""
+        self.search: dict[str, DirectSearch] = {}
+        self.links: dict[str, _Link] = {}
+        self._owners: dict[o.LinkedPeer, object] = {}
+        self._housekeeping_at = 0.0
+
+    def joins(self, relays: Iterable[Relay]) -> None:
+        """Become a member of relays, and use them. They must start later than this."""
+        for relay in relays:
+            relay.members[self.public_key] = self.name
+            self.uses.append(relay)
+
+    def start(self, clock: float | None = None) -> None:
+        """A new daemon without state."""
+        super().start(clock)
+        now = self.local_now
+        assert self.node is not None
+        self.links, self.search, self._owners = {}, {}, {}
+        relays = Relays(self.node, _Sockets(self), self.links, self._owners, _LOG, lambda: None)  # type: ignore[arg-type]
+        self.relays = relays
+        for name in self.acquaintances:
+            self._link(name)
+        for relay in self.uses:
+            link = replace(LINK, timers=TIMERS)
+            settings = PeerSettings(RELAY_HOST + relay.name, relay.public_key, None, link)
+            relays.add(RelayConfig(settings, (PeerAddress(addresses.Address(*relay.addresses[0])),)), now)
+        relays.follow_links(now)
+        for end in self.absent_ends():
+            self.node.set_socket_state(end, is_up=False, now=now)
+        self._housekeeping_at = now + HOUSEKEEPING_S
+
+    def _link(self, name: str) -> None:
+        assert self.node is not None
+        peer = self.node.peers[name]
+        config = PeerConfig(peer.settings, (), {}, relays=tuple(relay.name for relay in self.uses))
+        self.links[name] = _Link(config, self, peer)
+        self.links[name].set_paths(self.acquaintances[name][1], self.local_now)
+        if self.searches:
+            self.search[name] = DirectSearch(self.node, peer)
+            self._tell_candidates()
+
+    def remove(self, other: Drone) -> None:
+        """Its relays are not asked for the peer any more."""
+        self.links.pop(other.name, None)
+        self.search.pop(other.name, None)
+        super().remove(other)
+        if self.relays is not None and self.node is not None:
+            self.relays.follow_links(self.local_now)
+
+    def restore(self, other: Drone) -> None:
+        """Its relays are asked for the peer again."""
+        super().restore(other)
+        if self.relays is not None and self.node is not None:
+            self._link(other.name)
+            self.relays.follow_links(self.local_now)
+
+    def absent_ends(self) -> list[int]:
+        """The sockets whose networks are gone."""
+        return [end.socket for end in self._world.air.absent if end.drone == self.name]
+
+    # Datagrams.
+
+    def datagram_for(self, datagram: bytes, path: Path) -> tuple[bytes, Address] | None:
+        """Along a relayed path, data for the relay."""
+        if not path.is_relayed:
+            return super().datagram_for(datagram, path)
+        assert self.relays is not None
+        wrapped = self.relays.handles.wrap(datagram, path)
+        return None if wrapped is None else (wrapped[0], wrapped[1][:2])
+
+    def receive(self, datagram: bytes, path: Path) -> None:
+        """Data from a relay comes along a relayed path."""
+        assert self.relays is not None
+        if datagram[:1] == RELAYED_START:
+            taken = self.relays.handles.unwrap(path.socket, datagram, path.address)
+            if isinstance(taken, DropReason):
+                self.drops[taken] += 1
+                return
+            datagram, path = taken
+        super().receive(datagram, path)
+
+    def on_record(self, received: o.RecordReceived) -> None:
+        """Of a relay, or of a peer."""
+        now = self.local_now
+        if (owner := self._owners.get(received.peer)) is not None:
+            owner.on_record(received, now)  # type: ignore[attr-defined]
+        elif (search := self.search.get(received.peer.name)) is not None:
+            search.on_record(received, now)
+
+    def on_event(self, event: o.Event) -> None:
+        """Of a relay, or of a peer."""
+        now = self.local_now
+        if (owner := self._owners.get(event.peer)) is not None:
+            owner.on_event(event, now)  # type: ignore[attr-defined]
+        elif isinstance(event, o.PathSuspected):
+            assert self.relays is not None
+            self.relays.on_suspected(event.path)
+        elif (search := self.search.get(event.peer.name)) is not None:
+            search.on_event(event, now)
+
+    # Time.
+
+    def next_deadline(self) -> float:
+        """When something is due, on its clock."""
+        if self.node is None or self.relays is None:
+            return math.inf
+        searches = (search.next_at for search in self.search.values())
+        return min(super().next_deadline(), self._housekeeping_at, self.relays.next_at, *searches)
+
+    def handle_timeout(self) -> None:
+        """Wake the node, relays and searches, and do the housekeeping of a daemon."""
+        assert self.node is not None
+        assert self.relays is not None
+        now = max(self.local_now, self.next_deadline())
+        self._perform_timeout(now)
+        if now >= self.relays.next_at:
+            self._world.perform(self, self.relays.handle_timeout(now))
+        if now >= self._housekeeping_at:
+            self._housekeeping_at = now + HOUSEKEEPING_S
+            self.relays.do_housekeeping(now)
+            self._tell_candidates()
+        for search in self.search.values():
+            if now >= search.next_at:
+                self._world.perform(self, search.do_due(now))
+
+    def _tell_candidates(self) -> None:
+        if not self.search:
+            return
+        assert self.relays is not None
+        sockets = [
+            OwnSocket(number, is_ipv6=False, places=(address,), leads_to=lambda host: False)
+            for number, address in enumerate(self.addresses)
+        ]
+        seen = [(at.host, at.port) for relay in self.relays.by_name.values() for at in relay.seen_as]
+        at = [relay.addresses[0] for relay in self.uses]
+        for search in self.search.values():
+            search.set_own(places_of(seen, sockets), sockets, at, self.local_now)
+
+    def check_bounds(self) -> None:
+        """The handles too."""
+        super().check_bounds()
+        if self.node is None or self.relays is None:
+            return
+        handles = self.relays.handles
+        assert len(handles._inward) == len(handles._outward)
+        to_relays = len(self.uses) * len(self.addresses)
+        assert len(handles._outward) <= to_relays * len(self.acquaintances) * c.HANDLES_PER_PAIR

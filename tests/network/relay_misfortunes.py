@@ -1,0 +1,98 @@
+"""What befalls relays, NATs and data along relays in a random history."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+from tests.network.attackers import Recorder
+from tests.network.path_misfortunes import random_address
+from tests.network.relay_fleet import RelayFleet
+from uavlinkd.core.relay_records import RELAYED
+
+_FORGED = 50
+"""Datagrams of an attacker at once."""
+
+
+class RelayMisfortunes:
+    """Befalls one random relay or member at a time."""
+
+    def __init__(self, fleet: RelayFleet, recorder: Recorder) -> None:
+        self._fleet = fleet
+        self._network = fleet.network
+        self._lot = fleet.lot
+        self._recorder = recorder
+        self._until = 0.0
+        self._kinds: tuple[tuple[str, Callable[[], None]], ...] = (
+            ("relay restarts", self._restart),
+            ("relay off for a while", self._off),
+            ("relay unreachable for a member", self._cut),
+            ("NAT forgets", self._forget),
+            ("member roams", self._roam),
+            ("data replayed", self._replay),
+            ("data forged", self._forge),
+        )
+
+    def befall(self, until: float) -> str:
+        """Let something happen, and return its name."""
+        self._until = until
+        name, befalls = self._lot.choice(self._kinds)
+        self._network.note(name)
+        befalls()
+        return name
+
+    def _restart(self) -> None:
+        self._lot.choice(self._fleet.relays).start(self._fleet.random_clock())
+
+    def _off(self) -> None:
+        relay = self._lot.choice(self._fleet.relays)
+        relay.stop()
+        clock = self._fleet.random_clock()
+        self._later(self._lot.choice((0.3, 2.0, 15.0)), lambda: relay.start(clock) if relay.node is None else None)
+
+    def _cut(self) -> None:
+        drone, relay = self._lot.choice(self._fleet.drones), self._lot.choice(self._fleet.relays)
+        for socket in range(len(drone.addresses)):
+            hop = drone.hop(socket, relay, 0)
+            self._network.cut_path(hop)
+            self._later(self._lot.choice((1.0, 5.0, 15.0)), partial(self._network.heal_path, hop))
+
+    def _forget(self) -> None:
+        drone = self._lot.choice(self._fleet.drones)
+        drone.forget_mappings(self._lot.choice(list(drone.nats)))
+
+    def _roam(self) -> None:
+        """Another network, and so another NAT."""
+        drone = self._lot.choice(self._fleet.drones)
+        drone.move_socket(self._lot.choice(list(drone.nats)), random_address(self._fleet, drone))
+
+    def _replay(self) -> None:
+        for datagram, source, destination in self._data():
+            self._network.inject(datagram, self._lot.choice((source, destination)), destination)
+
+    def _forge(self) -> None:
+        """Another handle, another sender, altered or shortened data, a relay inside a relay."""
+        lot = self._lot
+        for datagram, source, destination in self._data():
+            header, inner = datagram[:3], bytearray(datagram[3:])
+            match lot.randrange(5):
+                case 0:
+                    header = bytes((RELAYED,)) + lot.randbytes(2)
+                case 1:
+                    source = lot.choice([address for address in self._network.owners if address != destination])
+                case 2:
+                    inner[lot.randrange(len(inner))] ^= 1 << lot.randrange(8)
+                case 3:
+                    del inner[lot.randrange(len(inner)) :]
+                case _:
+                    inner[:0] = header
+            self._network.inject(header + inner, source, destination)
+
+    def _data(self) -> list[tuple[bytes, tuple[str, int], tuple[str, int]]]:
+        data = [recorded for recorded in self._recorder.recorded if recorded[0][0] == RELAYED]
+        return self._lot.choices(data, k=_FORGED) if data else []
+
+    def _later(self, seconds: float, action: Callable[[], object]) -> None:
+        """Do it after some seconds, unless the disruption is over by then."""
+        if self._network.now + seconds < self._until:
+            self._network.at(self._network.now + seconds, lambda: action() and None)

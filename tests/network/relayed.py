@@ -1,0 +1,274 @@
+"""``python -m tests.network.relayed``: what relays gain and cost when they or networks fail. In virtual time.
+
+    python -m tests.network.relayed --tries 100
+
+A vehicle and a station, both behind NATs that filter by port. One of the two NATs has a mapping for each destination,
+so that without a relay they could not meet; not where a direct path is wanted.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from statistics import median
+
+from tests.network.air import Hop
+from tests.network.drone import share_a_session
+from tests.network.failover import STREAM_PER_S
+from tests.network.flow import Flow
+from tests.network.members import LINK, Member, Relay
+from tests.network.nat import Nat
+from tests.network.network import Network
+from uavlinkd.core.outputs import PeerUp
+from uavlinkd.core.path import RELAY_HOST
+from uavlinkd.core.settings import Class
+from uavlinkd.lab.mitm.radio import RadioSettings
+
+RADIO = RadioSettings(delay_s=0.0225, jitter_s=0.005)
+"""From a member to a relay or back: with both hops, a round trip of 100 ms."""
+SLOWER = RadioSettings(delay_s=0.05, jitter_s=0.005)
+"""Of a second network, or of a second relay."""
+_SETTLE_S = 8.0
+_WATCH_S = 10.0
+_RETURN_S = 10.0
+
+
+@dataclass(frozen=True)
+class Relayed:
+    """The result of one failure. Durations in seconds."""
+
+    critical_sent: int
+    critical_lost: int
+    stream_gap_s: float
+    """The longest time without a frame of the stream, from the failure until :data:`_RETURN_S` after its end."""
+    was_real: bool
+    """Whether the failure concerned the path of the stream."""
+
+
+@dataclass
+class Couple:
+    """Vehicle, station and their relays, which talk."""
+
+    network: Network
+    vehicle: Member
+    station: Member
+    relays: list[Relay] = field(default_factory=list)
+
+    def to_relay(self, member: Member, socket: int, relay: Relay) -> Hop:
+        """The hop from a member to a relay."""
+        return member.hop(socket, relay, 0)
+
+    def direct(self) -> Hop:
+        """The direct path between the first networks."""
+        return self.vehicle.hop(0, self.station, 0)
+
+    def flows(self, cls: Class) -> tuple[Flow, Flow]:
+        """Both directions."""
+        return (
+            self.network.flow(self.vehicle, self.station, cls),
+            self.network.flow(self.station, self.vehicle, cls),
+        )
+
+    def begin(self) -> None:
+        """Start all, and talk: telemetry, heartbeats of both, commands and their acknowledgements."""
+        network, vehicle, station = self.network, self.vehicle, self.station
+        for drone in (*self.relays, vehicle, station):
+            drone.start()
+        network.traffic(vehicle, station, 1 / STREAM_PER_S)
+        for sender, receiver in ((vehicle, station), (station, vehicle)):
+            for interval_s in (1.0, 0.5):
+                network.traffic(sender, receiver, interval_s, cls=Class.CRITICAL)
+        network.run_until(lambda: share_a_session(vehicle, station), within_s=5)
+
+    def is_direct(self) -> bool:
+        """Whether both send along a direct path."""
+        paths = self.vehicle.peer(self.station).path, self.station.peer(self.vehicle).path
+        return all(path is not None and not path.is_relayed for path in paths)
+
+
+def couple(network: Network, *, relays: int = 1, networks: tuple[int, int] = (1, 1), searches: bool = False) -> Couple:
+    """A couple that is not started. ``networks``: those of the vehicle and of the station."""
+    at = [network.add_drone(Relay(network, f"r{number}", (f"192.0.2.{number + 1}", 5790))) for number in range(relays)]
+    vehicle, station = (
+        network.add_drone(
+            Member(
+                network, name, [(f"10.{socket}.{place}.1", 5790) for socket in range(count)], clock, searches=searches
+            )
+        )
+        for place, (name, count, clock) in enumerate(zip("vs", networks, (0.0, 1e6), strict=True))
+    )
+    for place, member in enumerate((vehicle, station)):
+        member.joins(at)
+        for socket in range(len(member.addresses)):
+            is_symmetric = member is vehicle and not searches
+            host = f"203.0.113.{10 * place + socket + 1}"
+            member.nats[socket] = Nat(host, is_symmetric=is_symmetric, filters_by_port=True)
+            for number, relay in enumerate(at):
+                network.set_path(member.hop(socket, relay, 0), SLOWER if socket or number else RADIO)
+    vehicle.knows(station, link=LINK)
+    station.knows(vehicle, link=LINK)
+    return Couple(network, vehicle, station, at)
+
+
+# Times.
+
+
+def first_frame_s(seed: int) -> float:
+    """How long after both reached the relay until a frame crossed in each direction."""
+    with Network(f"first frame {seed}", RADIO) as network:
+        pair = couple(network)
+        pair.relays[0].start()
+        for member in (pair.vehicle, pair.station):
+            network.at(5 * network.rng.random(), member.start)
+        flows = network.talk(pair.vehicle, pair.station, 0.02)
+        network.run_until(lambda: all(flow.delivered for flow in flows), within_s=15)
+        return network.now - max(_reached_at(member) for member in (pair.vehicle, pair.station))
+
+
+def _reached_at(member: Member) -> float:
+    return next(
+        at
+        for at, event in member.outputs
+        if isinstance(event, PeerUp) and event.peer.name.startswith(RELAY_HOST)
+    )
+
+
+def back_s(seed: int, off_s: float = 0.0) -> float:
+    """How long after the start of a relay that was killed until a frame crossed in each direction."""
+    with Network(f"relay restarts {seed}", RADIO) as network:
+        pair = couple(network)
+        pair.begin()
+        network.run(_SETTLE_S + network.rng.random())
+        pair.relays[0].stop()
+        network.run(off_s)
+        pair.relays[0].start()
+        begin = network.now
+        flows = *pair.flows(Class.STREAM)[:1], *pair.flows(Class.CRITICAL)[1:]
+        network.run_until(lambda: all(flow.first_delivery(begin + 0.001) <= network.now for flow in flows), within_s=15)
+        return network.now - begin
+
+
+# Failures.
+
+Fault = Callable[[Couple], Callable[[], None]]
+"""Makes something fail. Returns what mends it."""
+
+
+def one_relay_of_two_dies(seed: int) -> Relayed:
+    """The relay that carries the stream dies, and returns."""
+
+    def kill(pair: Couple) -> Callable[[], None]:
+        path = pair.vehicle.peer(pair.station).path
+        assert path is not None
+        relay = next(relay for relay in pair.relays if path.host == RELAY_HOST + relay.name)
+        relay.stop()
+        return relay.start
+
+    with Network(f"two relays {seed}", RADIO) as network:
+        return _fail(couple(network, relays=2), kill)
+
+
+def one_network_of_two_dies(seed: int, *, of_station: int = 1, relays: int = 1) -> Relayed:
+    """The vehicle's network that carries the stream dies, and returns. The station has one network, or two."""
+
+    def kill(pair: Couple) -> Callable[[], None]:
+        path = pair.vehicle.peer(pair.station).path
+        assert path is not None
+        hops = [pair.to_relay(pair.vehicle, path.socket, relay) for relay in pair.relays]
+        return _cut(pair.network, hops)
+
+    with Network(f"two networks {seed} {of_station} {relays}", RADIO) as network:
+        return _fail(couple(network, relays=relays, networks=(2, of_station)), kill)
+
+
+def station_network_dies(seed: int) -> Relayed:
+    """Both have two networks, and the station's first one dies, and returns."""
+    with Network(f"station's network {seed}", RADIO) as network:
+        pair = couple(network, networks=(2, 2))
+        return _fail(pair, lambda pair: _cut(network, [pair.to_relay(pair.station, 0, pair.relays[0])]))
+
+
+def direct_path_dies(seed: int) -> Relayed:
+    """The direct path dies, and is found again later."""
+    with Network(f"direct path {seed}", RADIO) as network:
+        pair = couple(network, searches=True)
+        result = _fail(pair, lambda pair: _cut(network, [pair.direct()]), ready=pair.is_direct)
+        network.run_until(pair.is_direct, within_s=70)
+        return result
+
+
+def _cut(network: Network, hops: Sequence[Hop]) -> Callable[[], None]:
+    for hop in hops:
+        network.cut_path(hop)
+
+    def heal() -> None:
+        for hop in hops:
+            network.heal_path(hop)
+
+    return heal
+
+
+def _fail(pair: Couple, fault: Fault, ready: Callable[[], bool] = lambda: True) -> Relayed:
+    network = pair.network
+    pair.begin()
+    begin = network.now + 1
+    network.run_until(ready, within_s=20)
+    network.run(_SETTLE_S + network.rng.random())
+    (stream, _), critical = pair.flows(Class.STREAM), pair.flows(Class.CRITICAL)
+    died = network.now
+    heal = fault(pair)
+    network.run(_WATCH_S)
+    was_real = bool(stream.lost(died - 0.2, network.now - 1))
+    heal()
+    network.run(_RETURN_S)
+    return Relayed(
+        critical_sent=sum(len(flow.sent_at) for flow in critical),
+        critical_lost=sum(len(flow.lost(begin, network.now - 1)) for flow in critical),
+        stream_gap_s=stream.longest_gap(died - 1, network.now),
+        was_real=was_real,
+    )
+
+
+FAILURES: dict[str, Callable[[int], Relayed]] = {
+    "one of two relays dies": one_relay_of_two_dies,
+    "one of two networks dies, one relay": one_network_of_two_dies,
+    "the same, two networks at each end": lambda seed: one_network_of_two_dies(seed, of_station=2),
+    "the same, two relays": lambda seed: one_network_of_two_dies(seed, of_station=2, relays=2),
+    "a network of the station dies": station_network_dies,
+    "the direct path dies, and is found again": direct_path_dies,
+}
+
+
+def table(tries: int) -> Iterator[str]:
+    """The figures of many tries, one line for each."""
+    yield f"{tries} tries"
+    yield f"  first frame after both reached the relay   {spread([first_frame_s(seed) for seed in range(tries)])}"
+    for off_s in (0.0, 0.5, 3.0, 20.0):
+        times = [back_s(seed, off_s) for seed in range(tries)]
+        yield f"  relay killed, started {off_s:>4} s later: back    {spread(times)}"
+    for name, play in FAILURES.items():
+        results = [play(seed) for seed in range(tries)]
+        sent, lost = sum(result.critical_sent for result in results), sum(result.critical_lost for result in results)
+        yield f"  {name}"
+        yield f"    critical frames lost                     {lost} of {sent:,}"
+        yield f"    gap of the stream                        {spread([result.stream_gap_s for result in results])}"
+
+
+def spread(values: Sequence[float]) -> str:
+    """Some quantiles."""
+    ordered = sorted(values)
+    nine = ordered[min(len(ordered) - 1, int(0.9 * len(ordered)))]
+    return f"median {median(values):.3f} s, 90 % {nine:.3f} s, largest {ordered[-1]:.3f} s"
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print the figures."""
+    parser = argparse.ArgumentParser(prog="python -m tests.network.relayed", description="Relays in virtual time.")
+    parser.add_argument("--tries", type=int, default=20, help="of each failure (20)")
+    for line in table(parser.parse_args(arguments).tries):
+        print(line, flush=True)
+
+
+if __name__ == "__main__":
+    main()
