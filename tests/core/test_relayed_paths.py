@@ -57,16 +57,30 @@ def test_copies_go_along_two_paths_of_a_socket() -> None:
     assert paths.is_multiple
 
 
-def test_copies_go_through_different_relays() -> None:
-    """One relay that dies must not take both copies with it; a third copy would only cost."""
-    paths = linked(LTE_A, LTE_A2, LTE_B, LTE_C)
-    assert route(paths, Class.CRITICAL) == [LTE_A, LTE_B]
+@pytest.mark.parametrize("second", [LTE_A2, LTE_B], ids=["handle", "relay"])
+def test_copies_go_through_two_relays_and_to_two_networks(second: Path) -> None:
+    """A relay that dies must not take all copies with it, nor a network of the peer; a fourth would only cost."""
+    paths = linked(LTE_A, second, LTE_B if second is LTE_A2 else LTE_A2, LTE_C)
+    assert set(route(paths, Class.CRITICAL)) == {LTE_A, LTE_A2, LTE_B}
+
+
+def test_copies_go_to_two_networks_beside_a_direct_path() -> None:
+    """The direct path and one handle may lead to the same network of the peer."""
+    paths = linked(LTE, LTE_A, LTE_B, LTE_A2)
+    assert route(paths, Class.CRITICAL) == [LTE, LTE_A, LTE_A2]
+
+
+def test_one_copy_goes_along_a_relay_beside_many_direct_paths() -> None:
+    """If they fail together, it is there."""
+    direct = [LTE, *(Path(0, (f"192.0.2.{number}", 5790)) for number in (2, 3, 4))]
+    paths = linked(*direct, LTE_A, LTE_A2)
+    assert route(paths, Class.CRITICAL) == [*direct, LTE_A]
 
 
 def test_each_socket_has_its_own_copies() -> None:
     """LTE and mesh behind NAT, one relay: along both."""
     paths = linked(LTE_A, LTE_A2, MESH_A)
-    assert route(paths, Class.CRITICAL) == [LTE_A, MESH_A]
+    assert route(paths, Class.CRITICAL) == [LTE_A, LTE_A2, MESH_A]
 
 
 def test_further_relayed_path_replaces_a_direct_one_that_is_suspect() -> None:

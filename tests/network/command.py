@@ -132,6 +132,7 @@ def table(total: Played, wall_s: float) -> list[str]:
         f" {total.critical_on_lines:,} of them a serial line alone",
         "damaged pieces on lines": f"{total.damaged:,}",
         "datagrams": f"{total.datagrams:,}, the attackers' too",
+        "  forwarded by relays": f"{total.relayed:,}",
         "sessions made": f"{total.sessions:,}, counted at each end",
         **{f"  {name}": f"{count:,}" for name, count in sorted(total.events.items())},
         "judged": f"{total.judged:,} times, {total.pairs:,} pairs",

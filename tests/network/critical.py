@@ -74,7 +74,8 @@ class CriticalWatch:
         routes = [route for route in self._fleet.routes(pair) if self._delivered(route, sent_at)]
         if self._fleet.relays:
             failed = [hop for hop in pair.hops if not self._delivered((hop,), sent_at)]
-            if failed and not set[object].intersection(*({hop, *hop, hop.receiver.drone} for hop in failed)):
+            things: list[set[object]] = [{hop, *hop, hop.receiver.drone} for hop in failed]
+            if things and not things[0].intersection(*things[1:]):
                 return []
         return routes
 
@@ -89,7 +90,8 @@ class CriticalWatch:
             settled_s = METERED_SETTLED_S if any(map(self._was_metered, hop)) else SETTLED_S
             for direction, one in enumerate((hop, hop.back)):
                 radio = self._network.air.settings_of(one)
-                delays_s[direction] += radio.delay_s + radio.jitter_s + (radio.held_back_s if radio.reordering else 0.0)
+                held_back_s = radio.held_back_s if radio.reordering else 0.0
+                delays_s[direction] += radio.delay_s + radio.jitter_s + held_back_s
                 if self._network.air.undisturbed_since(one) > sent_at - settled_s:
                     return False
         return max(delays_s) <= LONGEST_DELAY_S

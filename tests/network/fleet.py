@@ -64,6 +64,9 @@ class Fleet:
             usable = self.lot.choice(pair.hops)
             yield (usable,), [hop for hop in pair.hops if hop != usable]
 
+    def check(self) -> None:
+        """What must hold besides, when the network is usable."""
+
     def random_clock(self) -> float:
         """The time at which a machine's clock starts."""
         return self.lot.choice(tuple(CLOCKS.values()))

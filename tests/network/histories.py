@@ -21,6 +21,7 @@ from tests.network.critical import CriticalWatch
 from tests.network.drone import Drone, share_a_session
 from tests.network.fleet import Fleet, Route
 from tests.network.flow import Flow
+from tests.network.members import Relay
 from tests.network.misfortunes import Misfortunes
 from tests.network.network import Network
 from tests.network.path_misfortunes import random_modems, random_radio
@@ -36,6 +37,9 @@ UP_WITHIN_S = 3.0
 UP_ALONG_ONE_PATH_S = 5.0
 """The same for frames of the stream while all other paths fail at the same moment: a path that stands by is asked
 every 2 s, and is down a second later. Critical frames must cross within :data:`UP_WITHIN_S` even then."""
+UP_ALONG_ONE_RELAY_S = 12.0
+"""The same, also for critical frames, if there are relays. A member whose peer is away notices the restart of its relay
+when it asks it next, once in ten seconds."""
 OLDEST_S = 5.5
 """No delivered frame is older than this: section 11 of the specification."""
 OLDEST_ON_LINES_S = 6.4
@@ -152,10 +156,13 @@ class History:
 
     def _judge_one_path(self) -> None:
         usable_at = self.network.now
-        marks = self._talk(UP_ALONG_ONE_PATH_S)
-        self._run_until_up([self._mark(mark.a, mark.b, Class.CRITICAL) for mark in marks], UP_WITHIN_S)
+        critical_s, stream_s = (
+            (UP_ALONG_ONE_RELAY_S, UP_ALONG_ONE_RELAY_S) if self.fleet.relays else (UP_WITHIN_S, UP_ALONG_ONE_PATH_S)
+        )
+        marks = self._talk(stream_s)
+        self._run_until_up([self._mark(mark.a, mark.b, Class.CRITICAL) for mark in marks], critical_s)
         self.critical_up_s.append(self.network.now - usable_at)
-        self._run_until_up(marks, usable_at + UP_ALONG_ONE_PATH_S - self.network.now)
+        self._run_until_up(marks, usable_at + stream_s - self.network.now)
         self.one_path_up_s.append(self.network.now - usable_at)
 
     def _judge(self) -> None:
@@ -170,6 +177,7 @@ class History:
             for flow in mark.flows:
                 lost = flow.lost(back, network.now - 0.2)
                 assert not lost, f"{flow.sender} to {flow.receiver}: {len(lost)} lost since {back}"
+        self.fleet.check()
         for flow in network.flows.values():
             flow.check_order()
             assert flow.oldest_s <= (OLDEST_ON_LINES_S if self.plan.lines else OLDEST_S), (
@@ -218,4 +226,5 @@ class History:
         for drone in self.fleet.everyone:
             played.sessions += sum(isinstance(event, SessionEstablished) for _, event in drone.outputs)
             played.largest |= drone.largest
+        played.relayed = sum(relay.forwarded for relay in self.fleet.relays if isinstance(relay, Relay))
         played.datagrams = network.datagrams

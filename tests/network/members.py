@@ -41,7 +41,8 @@ LINK: Final = Link(features=FEATURES)
 _LIMITS: Final = RelayLimits(datagrams_s=20_000, bits_s=100_000_000)
 _REMEMBERED_S: Final = c.BIND_LIFETIME_S + c.QUESTION_LIFETIME_S + HOUSEKEEPING_S
 """A bind has no effect later than this."""
-_LOG: Final = structlog.wrap_logger(structlog.ReturnLogger(), wrapper_class=structlog.make_filtering_bound_logger("critical"))
+_QUIET: Final = structlog.make_filtering_bound_logger("critical")
+_LOG: Final = structlog.wrap_logger(structlog.ReturnLogger(), wrapper_class=_QUIET)
 
 
 class Relay(Drone):
@@ -177,7 +178,6 @@ class _Sockets:
                 Path(socket, (written.address.host, written.address.port))
                 for written in relay.addresses
                 for socket in range(len(member.addresses))
-                if written.address is not None
             ],
             member.local_now,
         )

@@ -34,6 +34,8 @@ class Played:
     sessions: int = 0
     """As each end counts them."""
     datagrams: int = 0
+    relayed: int = 0
+    """Datagrams that relays forwarded."""
     events: Counter[str] = field(default_factory=Counter)
     """Faults by name."""
     judged: int = 0

@@ -89,4 +89,13 @@ class RelayFleet(Fleet):
         """One relay, and one network of each drone."""
         relay = self.lot.choice(self.relays)
         usable = tuple(drone.hop(self.lot.randrange(len(drone.addresses)), relay, 0) for drone in self.drones)
-        yield usable, [hop for hop in dict.fromkeys(hop for pair in self.pairs for hop in pair.hops) if hop not in usable]
+        hops = dict.fromkeys(hop for pair in self.pairs for hop in pair.hops)
+        yield usable, [hop for hop in hops if hop not in usable]
+
+    def check(self) -> None:
+        """Relays forward, but a member that no drone asked for gets no handle and no session with one."""
+        assert self.unwanted.node is not None
+        assert self.unwanted.relays is not None
+        assert not self.unwanted.relays.handles._outward
+        for drone in self.drones:
+            assert not self.unwanted.peer(drone).is_up

@@ -73,8 +73,8 @@ class RelayMisfortunes:
     def _forge(self) -> None:
         """Another handle, another sender, altered or shortened data, a relay inside a relay."""
         lot = self._lot
-        for datagram, source, destination in self._data():
-            header, inner = datagram[:3], bytearray(datagram[3:])
+        for datagram, sender, destination in self._data():
+            header, inner, source = datagram[:3], bytearray(datagram[3:]), sender
             match lot.randrange(5):
                 case 0:
                     header = bytes((RELAYED,)) + lot.randbytes(2)
@@ -92,7 +92,7 @@ class RelayMisfortunes:
         data = [recorded for recorded in self._recorder.recorded if recorded[0][0] == RELAYED]
         return self._lot.choices(data, k=_FORGED) if data else []
 
-    def _later(self, seconds: float, action: Callable[[], object]) -> None:
+    def _later(self, seconds: float, action: Callable[[], None]) -> None:
         """Do it after some seconds, unless the disruption is over by then."""
         if self._network.now + seconds < self._until:
-            self._network.at(self._network.now + seconds, lambda: action() and None)
+            self._network.at(self._network.now + seconds, action)

@@ -9,6 +9,7 @@ so that without a relay they could not meet; not where a direct path is wanted.
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from statistics import median
@@ -87,9 +88,13 @@ class Couple:
         return all(path is not None and not path.is_relayed for path in paths)
 
 
-def couple(network: Network, *, relays: int = 1, networks: tuple[int, int] = (1, 1), searches: bool = False) -> Couple:
+def couple(
+    network: Network, *, relays: int = 1, networks: tuple[int, int] = (1, 1), searches: bool = False
+) -> Couple:
     """A couple that is not started. ``networks``: those of the vehicle and of the station."""
-    at = [network.add_drone(Relay(network, f"r{number}", (f"192.0.2.{number + 1}", 5790))) for number in range(relays)]
+    at = [
+        network.add_drone(Relay(network, f"r{number}", (f"192.0.2.{number + 1}", 5790))) for number in range(relays)
+    ]
     vehicle, station = (
         network.add_drone(
             Member(
@@ -128,9 +133,7 @@ def first_frame_s(seed: int) -> float:
 
 def _reached_at(member: Member) -> float:
     return next(
-        at
-        for at, event in member.outputs
-        if isinstance(event, PeerUp) and event.peer.name.startswith(RELAY_HOST)
+        at for at, event in member.outputs if isinstance(event, PeerUp) and event.peer.name.startswith(RELAY_HOST)
     )
 
 
@@ -144,9 +147,26 @@ def back_s(seed: int, off_s: float = 0.0) -> float:
         network.run(off_s)
         pair.relays[0].start()
         begin = network.now
-        flows = *pair.flows(Class.STREAM)[:1], *pair.flows(Class.CRITICAL)[1:]
-        network.run_until(lambda: all(flow.first_delivery(begin + 0.001) <= network.now for flow in flows), within_s=15)
-        return network.now - begin
+        return _back_at(pair, begin) - begin
+
+
+def rebound_s(seed: int, *, of_station: bool = False) -> float:
+    """How long until frames cross again after the NAT of one end has forgotten its mappings."""
+    with Network(f"NAT forgets {seed}", RADIO) as network:
+        pair = couple(network)
+        pair.begin()
+        network.run(_SETTLE_S + network.rng.random())
+        (pair.station if of_station else pair.vehicle).forget_mappings(0)
+        begin = network.now
+        return _back_at(pair, begin) - begin
+
+
+def _back_at(pair: Couple, since: float) -> float:
+    """When a frame that was sent later had crossed in each direction."""
+    (there, _), (_, back) = pair.flows(Class.STREAM), pair.flows(Class.CRITICAL)
+    since = math.nextafter(since, math.inf)
+    pair.network.run_until(lambda: all(flow.first_delivery(since) < math.inf for flow in (there, back)), within_s=30)
+    return pair.network.now
 
 
 # Failures.
@@ -247,6 +267,9 @@ def table(tries: int) -> Iterator[str]:
     for off_s in (0.0, 0.5, 3.0, 20.0):
         times = [back_s(seed, off_s) for seed in range(tries)]
         yield f"  relay killed, started {off_s:>4} s later: back    {spread(times)}"
+    for name, of_station in (("vehicle", False), ("station", True)):
+        times = [rebound_s(seed, of_station=of_station) for seed in range(tries)]
+        yield f"  NAT of the {name} forgets: back             {spread(times)}"
     for name, play in FAILURES.items():
         results = [play(seed) for seed in range(tries)]
         sent, lost = sum(result.critical_sent for result in results), sum(result.critical_lost for result in results)

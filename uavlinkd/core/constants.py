@@ -339,6 +339,8 @@ RELAY_BYTES = 3
 RELAYED_ENVELOPE_LIMIT = 1229
 """So that a datagram along a relay is not longer than a direct one."""
 RELAYED_COPIES = 2
+"""From one socket, copies go through so many relays, and with so many handles of one relay."""
+COPIES_PER_SOCKET = 3
 """Paths from one socket along which copies go, if one of them leads through a relay."""
 KEYS_PER_BIND = 16
 ENTRIES_PER_BOUND = 32

@@ -257,18 +257,26 @@ class PathSet(PathSlots):
         self.routes = {Class.CRITICAL: critical, Class.STREAM: stream, Class.BULK: alone}
 
     def _without_spares(self, best: PathState, others: list[PathState]) -> list[PathState]:
-        """Without the relayed paths that carry no copies: a better path from the same socket does."""
-        direct = (state for state in self.by_path.values() if not state.path.is_relayed)
-        carrying = {state.path.socket: 1 for state in direct if state.condition is PathCondition.USABLE}
-        relays = set[tuple[int, str]]()
+        """Without the relayed paths that carry no copies: better paths from the same socket do.
+
+        One failure, of a relay or of a network at either end, leaves a path with copies. Two handles of one relay
+        lead to two networks of the peer. Where those of different relays lead is not known.
+        """
+        usable = [state.path for state in self.by_path.values() if state.condition is PathCondition.USABLE]
+        direct = Counter(path.socket for path in usable if not path.is_relayed)
+        carrying: dict[int, Counter[str]] = {}  # by socket, how many through each relay
         picked = [state for state in others if not state.path.is_relayed]
         others.sort(key=lambda state: (not state.works, state.srtt_s or NEVER))
         for state in (best, *others):
-            socket, relay = state.path.socket, state.path.host
-            if not state.path.is_relayed or (socket, relay) in relays or carrying.get(socket, 0) >= c.RELAYED_COPIES:
+            if not state.path.is_relayed:
                 continue
-            relays.add((socket, relay))
-            carrying[socket] = carrying.get(socket, 0) + 1
+            socket, relay = state.path.socket, state.path.host
+            relays = carrying.setdefault(socket, Counter())
+            is_full = relays.total() >= max(1, c.COPIES_PER_SOCKET - direct[socket])
+            is_further = relay not in relays and len(relays) >= (1 if direct[socket] else c.RELAYED_COPIES)
+            if is_full or is_further or relays[relay] >= c.RELAYED_COPIES:
+                continue
+            relays[relay] += 1
             if state is not best:
                 picked.append(state)
         return picked
