@@ -38,8 +38,8 @@ UP_ALONG_ONE_PATH_S = 5.0
 """The same for frames of the stream while all other paths fail at the same moment: a path that stands by is asked
 every 2 s, and is down a second later. Critical frames must cross within :data:`UP_WITHIN_S` even then."""
 UP_ALONG_ONE_RELAY_S = 12.0
-"""The same, also for critical frames, if there are relays. A member whose peer is away notices the restart of its relay
-when it asks it next, once in ten seconds."""
+"""The same, also for critical frames, if there are relays. A member whose peer is away notices the restart of its
+relay when it asks it next, once in ten seconds."""
 OLDEST_S = 5.5
 """No delivered frame is older than this: section 11 of the specification."""
 OLDEST_ON_LINES_S = 6.4

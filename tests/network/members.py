@@ -22,9 +22,9 @@ from uavlinkd.core.path import RELAY_HOST, Path
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.relay_records import Bind
 from uavlinkd.core.settings import Link, PeerSettings
-from uavlinkd.link.candidates import OwnSocket, places_of
-from uavlinkd.link.direct_search import DirectSearch
+from uavlinkd.link.candidates import OwnSocket
 from uavlinkd.link.peer_link import PeerLink
+from uavlinkd.link.peer_owners import PeerOwner
 from uavlinkd.link.relay_handles import RELAYED_START
 from uavlinkd.link.relay_link import RelayLink
 from uavlinkd.link.relays import Relays
@@ -200,9 +200,8 @@ class Member(Drone):
         self.relays: Relays | None = None
         self.searches = searches
         """Whether it looks for direct paths to its peers."""
-        self.search: dict[str, DirectSearch] = {}
         self.links: dict[str, _Link] = {}
-        self._owners: dict[o.LinkedPeer, object] = {}
+        self._owners: dict[o.LinkedPeer, PeerOwner] = {}
         self._housekeeping_at = 0.0
 
     def joins(self, relays: Iterable[Relay]) -> None:
@@ -216,9 +215,10 @@ class Member(Drone):
         super().start(clock)
         now = self.local_now
         assert self.node is not None
-        self.links, self.search, self._owners = {}, {}, {}
+        self.links, self._owners = {}, {}
         relays = Relays(self.node, _Sockets(self), self.links, self._owners, _LOG, lambda: None)  # type: ignore[arg-type]
         self.relays = relays
+        self._look()
         for name in self.acquaintances:
             self._link(name)
         for relay in self.uses:
@@ -236,14 +236,10 @@ class Member(Drone):
         config = PeerConfig(peer.settings, (), {}, relays=tuple(relay.name for relay in self.uses))
         self.links[name] = _Link(config, self, peer)
         self.links[name].set_paths(self.acquaintances[name][1], self.local_now)
-        if self.searches:
-            self.search[name] = DirectSearch(self.node, peer)
-            self._tell_candidates()
 
     def remove(self, other: Drone) -> None:
         """Its relays are not asked for the peer any more."""
         self.links.pop(other.name, None)
-        self.search.pop(other.name, None)
         super().remove(other)
         if self.relays is not None and self.node is not None:
             self.relays.follow_links(self.local_now)
@@ -282,22 +278,18 @@ class Member(Drone):
 
     def on_record(self, received: o.RecordReceived) -> None:
         """Of a relay, or of a peer."""
-        now = self.local_now
+        assert self.relays is not None
         if (owner := self._owners.get(received.peer)) is not None:
-            owner.on_record(received, now)  # type: ignore[attr-defined]
-        elif (search := self.search.get(received.peer.name)) is not None:
-            search.on_record(received, now)
+            owner.on_record(received, self.local_now)
+        self.relays.on_peer_record(received, self.local_now)
 
     def on_event(self, event: o.Event) -> None:
         """Of a relay, or of a peer."""
-        now = self.local_now
+        assert self.relays is not None
         if (owner := self._owners.get(event.peer)) is not None:
-            owner.on_event(event, now)  # type: ignore[attr-defined]
-        elif isinstance(event, o.PathSuspected):
-            assert self.relays is not None
-            self.relays.on_suspected(event.path)
-        elif (search := self.search.get(event.peer.name)) is not None:
-            search.on_event(event, now)
+            owner.on_event(event, self.local_now)
+        else:
+            self.relays.on_peer_event(event, self.local_now)
 
     # Time.
 
@@ -305,11 +297,10 @@ class Member(Drone):
         """When something is due, on its clock."""
         if self.node is None or self.relays is None:
             return math.inf
-        searches = (search.next_at for search in self.search.values())
-        return min(super().next_deadline(), self._housekeeping_at, self.relays.next_at, *searches)
+        return min(super().next_deadline(), self._housekeeping_at, self.relays.next_at)
 
     def handle_timeout(self) -> None:
-        """Wake the node, relays and searches, and do the housekeeping of a daemon."""
+        """Wake the node and the relays, and do the housekeeping of a daemon."""
         assert self.node is not None
         assert self.relays is not None
         now = max(self.local_now, self.next_deadline())
@@ -318,24 +309,18 @@ class Member(Drone):
             self._world.perform(self, self.relays.handle_timeout(now))
         if now >= self._housekeeping_at:
             self._housekeeping_at = now + HOUSEKEEPING_S
+            self._look()
             self.relays.do_housekeeping(now)
-            self._tell_candidates()
-        for search in self.search.values():
-            if now >= search.next_at:
-                self._world.perform(self, search.do_due(now))
 
-    def _tell_candidates(self) -> None:
-        if not self.search:
-            return
+    def _look(self) -> None:
+        """What a daemon reads of its machine for the search of direct paths. Without it, there is none."""
         assert self.relays is not None
-        sockets = [
+        places = enumerate(self.addresses) if self.searches else ()
+        self.relays._searches._looked_at = math.inf
+        self.relays._searches._own = [
             OwnSocket(number, is_ipv6=False, places=(address,), leads_to=lambda host: False)
-            for number, address in enumerate(self.addresses)
+            for number, address in places
         ]
-        seen = [(at.host, at.port) for relay in self.relays.by_name.values() for at in relay.seen_as]
-        at = [relay.addresses[0] for relay in self.uses]
-        for search in self.search.values():
-            search.set_own(places_of(seen, sockets), sockets, at, self.local_now)
 
     def check_bounds(self) -> None:
         """The handles too."""

@@ -30,6 +30,8 @@ RADIO = RadioSettings(delay_s=0.0225, jitter_s=0.005)
 """From a member to a relay or back: with both hops, a round trip of 100 ms."""
 SLOWER = RadioSettings(delay_s=0.05, jitter_s=0.005)
 """Of a second network, or of a second relay."""
+OFF_S = (0.0, 0.5, 3.0, 20.0)
+"""How long a relay that was killed is off."""
 _SETTLE_S = 8.0
 _WATCH_S = 10.0
 _RETURN_S = 10.0
@@ -264,7 +266,7 @@ def table(tries: int) -> Iterator[str]:
     """The figures of many tries, one line for each."""
     yield f"{tries} tries"
     yield f"  first frame after both reached the relay   {spread([first_frame_s(seed) for seed in range(tries)])}"
-    for off_s in (0.0, 0.5, 3.0, 20.0):
+    for off_s in OFF_S:
         times = [back_s(seed, off_s) for seed in range(tries)]
         yield f"  relay killed, started {off_s:>4} s later: back    {spread(times)}"
     for name, of_station in (("vehicle", False), ("station", True)):

@@ -5,7 +5,7 @@ It binds this daemon's peers along each working path to the relay, and knows the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from typing import Final
 
 from uavlinkd.config import PeerAddress, RelayConfig
@@ -14,7 +14,7 @@ from uavlinkd.core import outputs as o
 from uavlinkd.core.constants import NEVER
 from uavlinkd.core.node import Node
 from uavlinkd.core.path import Path, relayed
-from uavlinkd.core.relay_records import WAITING, Bound, binds_of
+from uavlinkd.core.relay_records import WAITING, Bind, Bound, binds_of
 from uavlinkd.link.path_status import PathRates
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.relay_handles import RelayHandles
@@ -109,7 +109,7 @@ class RelayLink:
         self._on_handles = on_handles
         self._on_due = on_due
         self._bindings: dict[Path, _Binding] = {}
-        self._asks: set[int] = set()  # sockets
+        self._asks: set[Path] = set()
         self._asked_at: dict[int, float] = {}
 
     @property
@@ -179,19 +179,24 @@ class RelayLink:
             self._on_handles(changed, now)
         self._schedule()
 
-    def ask(self, socket: int) -> None:
-        """A path along the relay failed on this socket: ask the relay there as soon as possible."""
-        self._asks.add(socket)
+    def ask(self, path: Path) -> None:
+        """A path along the relay failed: ask the relay on its socket, and bind again, as soon as possible.
+
+        The relay may answer although it forwards nothing: a NAT has given this daemon another address there.
+        """
+        self._asks.add(path)
         self._schedule()
 
     def do_due(self, now: float) -> list[o.Output]:
         """Ask and bind. Call it at :attr:`next_at`."""
         out: list[o.Output] = []
-        sockets, self._asks = self._asks, set()
-        for path in [state.path for state in self.peer.paths.states if state.path.socket in sockets]:
-            if now >= self._asked_at.get(path.socket, -NEVER) + ASK_S:
-                out += self._node.ask(self.peer, path, now)
+        failed, self._asks = self._asks, set()
+        sockets = {path.socket for path in failed if now >= self._asked_at.get(path.socket, -NEVER) + ASK_S}
         self._asked_at |= dict.fromkeys(sockets, now)
+        for path in [state.path for state in self.peer.paths.states if state.path.socket in sockets]:
+            out += self._node.ask(self.peer, path, now)
+            if keys := self._keys_of(failed, path)[: c.KEYS_PER_BIND]:
+                out += self._node.send_record(self.peer, path, Bind(keys), now)
         for binding in self._working():
             if now >= binding.due_at and self.keys:
                 binding.note_sent(self.keys, now)
@@ -223,6 +228,13 @@ class RelayLink:
         for state in self.peer.paths.states:
             if state.works and self.peer.is_up:
                 yield self._bindings.setdefault(state.path, _Binding(state.path))
+
+    def _keys_of(self, paths: Collection[Path], at: Path) -> tuple[bytes, ...]:
+        """Of the peers to which these lead by handles on a path to the relay."""
+        handles = self._bindings[at].handles if at in self._bindings else {}
+        return tuple(
+            key for key, own in handles.items() if any(relayed(at.socket, self.config.name, h) in paths for h in own)
+        )
 
     def _hurry(self, binding: _Binding) -> None:
         binding.due_at, binding.tries = -NEVER, 0

@@ -157,7 +157,7 @@ class Relays:
     def on_suspected(self, path: Path) -> None:
         """A relayed path of a peer failed a moment ago: ask the relay along the same socket."""
         if (relay := self.by_name.get(path.host.removeprefix(RELAY_HOST))) is not None:
-            relay.ask(path.socket)
+            relay.ask(path)
 
     def do_housekeeping(self, now: float) -> None:
         """Call it about once a second."""

@@ -1,0 +1,114 @@
+"""Peers that meet at relays, behind NATs: random histories, and what is lost when relays, networks or NATs fail."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+
+import pytest
+
+from tests.network import relayed
+from tests.network.histories import play
+from tests.network.nat import IDLE_S, Nat
+from tests.network.plans import RELAYS
+from tests.network.relayed import FAILURES, back_s, first_frame_s, one_network_of_two_dies, rebound_s
+from uavlinkd.core import constants as c
+from uavlinkd.core.path import Path
+from uavlinkd.relay.bindings import Bindings, Changes
+
+TRIES = int(os.environ.get("UAVLINKD_RELAY_TRIES", "2"))
+"""Failures of each kind; each begins at a random moment."""
+SEEDS = int(os.environ.get("UAVLINKD_CHAOS_SEEDS", "8"))
+FIRST_FRAME_S = 1.0
+BACK_S = 2.0
+STREAM_GAP_S = 0.5
+
+
+@pytest.mark.parametrize("batch", range(2))
+def test_links_along_relays_are_back_soon_after_any_history(batch: int) -> None:
+    """Relays die, NATs forget, members roam, data is replayed and forged: links are back, and nothing is violated."""
+    for seed in (19, *range(20, 20 + SEEDS // 4))[batch::2]:
+        played = play(seed, RELAYS)
+        assert not played.violations, played.violations[0][1]
+        assert played.judged
+        assert played.critical_judged
+        assert played.relayed > 100
+
+
+@pytest.mark.parametrize("seed", range(TRIES))
+def test_first_frame_crosses_soon_after_both_reached_the_relay(seed: int) -> None:
+    """Whichever comes first."""
+    assert first_frame_s(seed) < FIRST_FRAME_S
+
+
+@pytest.mark.parametrize("off_s", [0.0, 0.5, 20.0])
+def test_link_is_back_soon_after_the_start_of_a_relay_that_was_killed(off_s: float) -> None:
+    """The relay has forgotten all."""
+    assert max(back_s(seed, off_s) for seed in range(TRIES)) < BACK_S
+
+
+@pytest.mark.parametrize("of_station", [False, True], ids=["vehicle", "station"])
+def test_link_is_back_soon_after_a_nat_has_forgotten_its_mappings(*, of_station: bool) -> None:
+    """The member has another address at the relay, and does not know it."""
+    assert max(rebound_s(seed, of_station=of_station) for seed in range(TRIES)) < BACK_S
+
+
+@pytest.mark.parametrize("name", FAILURES)
+def test_no_critical_frame_is_lost_when_a_relay_or_a_network_dies(name: str) -> None:
+    """Another one carries copies. The stream stops shortly."""
+    for seed in range(TRIES):
+        result = FAILURES[name](seed)
+        assert result.critical_lost == 0
+        assert result.critical_sent > 100
+        assert result.was_real
+        assert result.stream_gap_s <= STREAM_GAP_S
+
+
+def test_one_copy_for_each_relay_is_too_few(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It goes to one network of the peer: the figures show the loss when that network dies."""
+    monkeypatch.setattr(c, "RELAYED_COPIES", 1)
+    assert sum(one_network_of_two_dies(seed).critical_lost for seed in range(2))
+
+
+def test_relay_that_connects_members_that_did_not_both_ask_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Planted: one wish is enough."""
+    bind = Bindings.bind
+
+    def bind_both(bindings: Bindings, member: bytes, path: Path, keys: Sequence[bytes], now: float) -> Changes:
+        for key in keys:
+            for its_path in bindings.paths_of(key):
+                bind(bindings, key, its_path, [member], now)
+        return bind(bindings, member, path, keys, now)
+
+    monkeypatch.setattr(Bindings, "bind", bind_both)
+    violations = play(21, RELAYS).violations
+    assert violations
+    assert "is not asked for" in violations[0][1] or "_outward" in violations[0][1]
+
+
+def test_command_prints_the_figures(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """One line for each figure."""
+    monkeypatch.setattr(relayed, "FAILURES", {"one of two relays dies": relayed.one_relay_of_two_dies})
+    monkeypatch.setattr(relayed, "OFF_S", (0.0,))
+    relayed.main(["--tries", "1"])
+    output = capsys.readouterr().out
+    assert "first frame after both reached the relay" in output
+    assert "critical frames lost                     0 of 1" in output
+
+
+def test_nat_maps_filters_and_forgets() -> None:
+    """Mappings by endpoint or by destination, filters by port or not, an end when idle."""
+    relay, peer = ("192.0.2.1", 5790), ("198.51.100.1", 5790)
+    cone = Nat("203.0.113.1", is_symmetric=False, filters_by_port=False)
+    public = cone.outward(relay, 0.0)
+    assert cone.outward(peer, 0.0) == public
+    assert cone.admits(public, ("198.51.100.9", 1), 0.0)
+    assert not cone.admits(public, relay, IDLE_S)
+    assert cone.outward(relay, IDLE_S) != public
+    strict = Nat("203.0.113.2", is_symmetric=True, filters_by_port=True)
+    public = strict.outward(relay, 0.0)
+    assert strict.outward(peer, 0.0) != public
+    assert strict.admits(public, relay, 0.0)
+    assert not strict.admits(public, peer, 0.0)
+    strict.forget()
+    assert not strict.admits(public, relay, 0.0)
