@@ -161,12 +161,25 @@ def test_relay_is_asked_along_the_socket_of_the_path_that_failed(scene: Scene) -
     """At most every quarter of a second, however many paths fail."""
     assert scene.binds(T)
     scene.bound(T, (ONE, 5), (TWO, 6))
-    scene.link.ask(AT_B.socket)
+    scene.link.ask(relayed(0, "vps", 5))
     assert scene.link.do_due(T + 1)
-    scene.link.ask(AT_B.socket)
-    assert not scene.link.do_due(T + 1.1)
-    scene.link.ask(AT_B.socket + 1)
+    for tenth in (1, 2):
+        scene.link.ask(relayed(0, "vps", 6))
+        assert not scene.link.do_due(T + 1 + tenth / 10)
+    scene.link.ask(relayed(0, "vps", 6))
+    assert scene.link.do_due(T + 1.25)
+    scene.link.ask(relayed(1, "vps", 5))
     assert not scene.link.do_due(T + 2)
+
+
+def test_peer_whose_path_failed_is_bound_again(scene: Scene) -> None:
+    """The relay may answer and yet drop data: a NAT has given this member another address there."""
+    assert scene.binds(T)
+    scene.bound(T, (ONE, 5), (TWO, 6))
+    scene.link.ask(relayed(0, "vps", 6))
+    assert scene.binds(T + 1) == [(TWO,)]
+    scene.link.ask(relayed(0, "vps", 99))
+    assert scene.binds(T + 2) == []
 
 
 def test_silence_of_a_steady_peer_is_noticed_sooner() -> None:
