@@ -163,7 +163,7 @@ class Drone:
     # Its datagrams. Relays and members of relays do more.
 
     def source_for(self, socket: int, destination: Address) -> Address:
-        """The source address that a datagram has on its way."""
+        """The source address of a datagram, as its receiver sees it."""
         if (nat := self.nats.get(socket)) is None:
             return self.addresses[socket]
         public = nat.outward(destination, self._world.now)

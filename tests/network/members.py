@@ -313,7 +313,7 @@ class Member(Drone):
             self.relays.do_housekeeping(now)
 
     def _look(self) -> None:
-        """What a daemon reads of its machine for the search of direct paths. Without it, there is none."""
+        """What a daemon reads of its machine for the search of direct paths.."""
         assert self.relays is not None
         places = enumerate(self.addresses) if self.searches else ()
         self.relays._searches._looked_at = math.inf

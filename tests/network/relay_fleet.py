@@ -1,4 +1,4 @@
-"""The drones of a random history that meet at relays: each behind its NATs, and one that nobody asked for."""
+"""The drones of a random history that meet at relays, each behind its NATs, and one that is no peer of the others."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class RelayFleet(Fleet):
         ]
         self.pairs = [pair._replace(hops=self._hops(pair)) for pair in self.pairs]
         self.unwanted = self._member("x", 99, 1)
-        """Asks for every drone. No drone asks for it."""
+        """It asks for every drone, but is no peer of theirs."""
         for drone in self.drones:
             self.unwanted.knows(drone, link=LINK)
         for member in (*self.drones, self.unwanted):
@@ -93,7 +93,7 @@ class RelayFleet(Fleet):
         yield usable, [hop for hop in hops if hop not in usable]
 
     def check(self) -> None:
-        """Relays forward, but a member that no drone asked for gets no handle and no session with one."""
+        """The unwanted member gets no handle, and no session with a drone."""
         assert self.unwanted.node is not None
         assert self.unwanted.relays is not None
         assert not self.unwanted.relays.handles._outward
