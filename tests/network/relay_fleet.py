@@ -1,4 +1,4 @@
-"""The drones of a random history that meet at relays, each behind its NATs, and one that is no peer of the others."""
+"""The drones of a random history that meet at relays, each behind its NATs, and one that they do not know."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class RelayFleet(Fleet):
         ]
         self.pairs = [pair._replace(hops=self._hops(pair)) for pair in self.pairs]
         self.unwanted = self._member("x", 99, 1)
-        """It asks for every drone, but is no peer of theirs."""
+        """It asks for every drone, but they do not know it."""
         for drone in self.drones:
             self.unwanted.knows(drone, link=LINK)
         for member in (*self.drones, self.unwanted):
