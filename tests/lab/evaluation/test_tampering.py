@@ -11,6 +11,7 @@ import pytest
 
 from tests.lab.evaluation.quick_runs import run_quickly
 from uavlinkd.lab.evaluation import tampering_plan as plans
+from uavlinkd.lab.evaluation.hostile_relay import RELAY_ATTACKS
 from uavlinkd.lab.evaluation.paper_attacks import CHANGES
 from uavlinkd.lab.evaluation.tampering_bench import TamperingSettings
 from uavlinkd.lab.evaluation.tampering_line import LINE_PLANS
@@ -25,6 +26,7 @@ from uavlinkd.lab.evaluation.tampering_records import (
     Verdict,
     read_run,
 )
+from uavlinkd.lab.evaluation.tampering_relay import RELAYED_PLANS
 from uavlinkd.lab.mitm.attack import AttackContext
 from uavlinkd.lab.mitm.attacks import ATTACKS, parse_attack
 from uavlinkd.lab.mitm.line_attacks import LINE_ATTACKS, parse_line_attack
@@ -63,7 +65,16 @@ def test_every_attack_on_the_line_is_tried_also_in_a_quick_run() -> None:
         assert plan.names == tuple(parse_line_attack(text).name for text in plan.phases)
 
 
-@pytest.mark.parametrize("plan", ALL_PLANS, ids=lambda plan: plan.attack)
+def test_every_attack_of_a_relay_is_tried_also_in_a_quick_run() -> None:
+    """Its own ones. The others are those of the man in the middle, on what the relay forwards."""
+    tried = {name for plan in RELAYED_PLANS if not plan.is_variant for name in plan.names}
+    assert tried - set(ATTACKS) == set(RELAY_ATTACKS)
+
+
+ON_RELAY = [plan for plan in RELAYED_PLANS if not set(plan.names) & set(RELAY_ATTACKS)]
+
+
+@pytest.mark.parametrize("plan", [*ALL_PLANS, *ON_RELAY], ids=lambda plan: plan.attack)
 def test_plans_can_be_made(plan: TrialPlan) -> None:
     """The man in the middle accepts each line, and it fits into a request."""
     around = AttackContext.between(
@@ -96,7 +107,7 @@ async def test_quick_run(tmp_path: Path) -> None:
 
     run = read_run(tmp_path / "tampering.jsonl")
     ours, paper = run.of(OURS), run.of(PAPER)
-    chosen = [plan for plan in (*ALL_PLANS, *LINE_PLANS) if not plan.is_variant]
+    chosen = [plan for plan in (*ALL_PLANS, *LINE_PLANS, *RELAYED_PLANS) if not plan.is_variant]
     assert {trial.attack for trial in ours} >= {plan.attack for plan in chosen}
     assert len({trial.attack for trial in ours if trial.group == "keys"}) == 7
     for trial in ours:
@@ -139,6 +150,9 @@ async def test_quick_run(tmp_path: Path) -> None:
         ("datagrams replayed on the line", "duplicate"),
         ("datagrams forged on the line", "bad_tag"),
         ("line held for 3 s and let go", "delayed"),
+        ("relay misdelivers envelopes", "unknown_index"),
+        ("relay invents handles", "relay_unknown_handle"),
+        ("relay sends frames of its own", "frames_not_allowed"),
     ):
         assert by_name[name].reasons[reason] > 0
     (flood,) = run.floods

@@ -214,7 +214,7 @@ class DaemonStage(Stage):
                 self.drones[one].share_psk(psk, file)
                 settings = {"addresses": self.addresses(one, other), **self.rules(one, other)}
                 peers.append(self.drones[other].as_peer("", file, **settings))
-            self.drones[one].configure(self._link, peers, self.networks(one))
+            self.drones[one].configure(self._link, peers, self.networks(one), self.relays())
 
     def addresses(self, one: str, other: str) -> list[object]:
         """The addresses where one drone reaches another: in front of the man in the middle."""
@@ -227,6 +227,10 @@ class DaemonStage(Stage):
     def networks(self, name: str) -> list[dict[str, object]]:
         """The networks of a drone; by default none is configured."""
         del name
+        return []
+
+    def relays(self) -> list[dict[str, object]]:
+        """The relays of every drone; by default it uses no relay."""
         return []
 
     def rules(self, one: str, other: str) -> dict[str, object]:

@@ -19,6 +19,7 @@ from uavlinkd.core.drops import DropReason
 from uavlinkd.lab.child_processes import private_folder
 from uavlinkd.lab.evaluation import tampering_plan as plans
 from uavlinkd.lab.evaluation.flood import run_floods
+from uavlinkd.lab.evaluation.hostile_relay import HostileRelay
 from uavlinkd.lab.evaluation.machine import load, machine_facts
 from uavlinkd.lab.evaluation.member_trial import as_trial, run_attacks
 from uavlinkd.lab.evaluation.middle import MiddleHere, MiddleProcess
@@ -32,6 +33,7 @@ from uavlinkd.lab.evaluation.tampering_log import write_logs
 from uavlinkd.lab.evaluation.tampering_paths import PATH_PLANS, PATHS, TwoPathStage
 from uavlinkd.lab.evaluation.tampering_plan import TrialPlan
 from uavlinkd.lab.evaluation.tampering_records import OURS, PAPER, RELAY, Run, Verdict
+from uavlinkd.lab.evaluation.tampering_relay import RELAYED, RELAYED_PLANS, RelayStage
 
 NAME = "tampering"
 PAIR = ("drone0", "drone1")
@@ -46,6 +48,7 @@ FAST_LINK = {
 DATA_LINK = {"rekey_after_s": 2.0, "reject_after_s": 20.0}
 LINE_LINK = {"rekey_after_s": 10.0, "reject_after_s": 60.0}
 PATHS_LINK = {"rekey_after_s": 5.0, "reject_after_s": 30.0}
+RELAY_LINK = {"rekey_after_s": 2.0, "reject_after_s": 10.0}
 KEYS_LINK = {"rekey_after_s": 1.0, "reject_after_s": 10.0}
 PLAIN_LINK: dict[str, object] = {}
 
@@ -103,7 +106,7 @@ class Evaluation:
     def _lanes(self) -> Iterable[tuple[str, Callable[[TrialRecorder], Coroutine[None, None, None]]]]:
         """The work of each stage."""
         works = (self._handshakes, self._data, self._with_keys, self._captured_member, self._paper)
-        return zip(plans.STAGES, (*works, self._reports, self._paths, self._line), strict=True)
+        return zip(plans.STAGES, (*works, self._reports, self._paths, self._line, self._relay), strict=True)
 
     async def _floods(self, recorder: TrialRecorder) -> None:
         rates = (500.0,) if self.settings.quick else (200.0, 1000.0, 2000.0)
@@ -234,6 +237,19 @@ class Evaluation:
                 await bench.run(plan)
 
         await self._try(LINE, stage, recorder, work)
+
+    async def _relay(self, recorder: TrialRecorder) -> None:
+        folder = self._folder / RELAYED
+        folder.mkdir()
+        self._links[RELAYED] = RELAY_LINK
+        relay = HostileRelay(TRIO, self._log(RELAYED), self.settings.seed)
+        stage = RelayStage(TRIO, folder, relay, RELAY_LINK, rate_hz=self.settings.rate_hz / 4)
+
+        async def work(bench: Bench) -> None:
+            for plan in self._chosen(RELAYED_PLANS):
+                await bench.run(plan)
+
+        await self._try(RELAYED, stage, recorder, work)
 
     async def _captured_member(self, recorder: TrialRecorder) -> None:
         begin_s, began = monotonic() - recorder.began_at, monotonic()

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from uavlinkd.core.constants import QUESTION_LIFETIME_S
 
 HANDSHAKE, DATA, FLOOD, TRAFFIC, KEYS = "handshake", "data", "flood", "traffic", "keys"
-STAGES = ("handshake", "data", "keys", "member", "paper", "reports", "paths", "line")
+STAGES = ("handshake", "data", "keys", "member", "paper", "reports", "paths", "line", "relay")
 """What a run may be limited to. Each has its own daemons."""
 LOAD = "flood-initiations,rate_per_s=600"
 """The load at which daemons require cookies."""

@@ -25,6 +25,7 @@ from uavlinkd.lab.evaluation.tampering_records import (
     Verdict,
     read_run,
 )
+from uavlinkd.lab.evaluation.tampering_relay import RELAYED, relay_section
 
 TITLE = "Attacks by a man in the middle: the paper's protocol and uavlinkd"
 _NOTHING = "-"
@@ -107,6 +108,7 @@ def make_sections(run: Run, figures: Sequence[str]) -> list[ReportSection]:
         ReportSection("Attackers with keys", "", _ON_KEYS, [_keys(run)]),
         *([paths_section(run)] if any(trial.group == PATHS for trial in run.trials) else []),
         *([line_section(run)] if any(trial.group == LINE for trial in run.trials) else []),
+        *([relay_section(run)] if any(trial.group == RELAYED for trial in run.trials) else []),
         ReportSection("What the drones noticed", "", _ON_NOTICED, [_noticed(run)]),
         *control,
         ReportSection("The paper's protocol", "", _ON_PAPER),

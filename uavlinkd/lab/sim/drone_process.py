@@ -64,8 +64,9 @@ class DroneProcess:
         link: Mapping[str, object],
         peers: Sequence[Mapping[str, object]],
         networks: Sequence[Mapping[str, object]] = (),
+        relays: Sequence[Mapping[str, object]] = (),
     ) -> None:
-        """Write the configuration: the ``[link]`` section, each ``[[peer]]``, and each ``[[network]]`` if any."""
+        """Write the configuration: the ``[link]`` section, each ``[[peer]]``, ``[[network]]`` and ``[[relay]]``."""
         has_interfaces = any("serial" not in network for network in networks)
         top = {
             "name": self.name,
@@ -76,6 +77,7 @@ class DroneProcess:
         endpoint = {"name": "autopilot", "url": f"udpin:127.0.0.1:{self.endpoint_port}"}
         tables = [("", top), ("[link]", link), ("[[endpoint]]", endpoint)]
         tables += [("[[network]]", network) for network in networks]
+        tables += [("[[relay]]", relay) for relay in relays]
         tables += [("[[peer]]", peer) for peer in peers]
         lines = [f"{name}\n" + "".join(f"{key} = {_toml(value)}\n" for key, value in t.items()) for name, t in tables]
         (self.folder / "drone.toml").write_text("\n".join(lines).lstrip(), encoding="utf-8")

@@ -1,0 +1,173 @@
+"""What captured members and strangers can make a relay and its members do: no more than the specification says."""
+
+from __future__ import annotations
+
+import tracemalloc
+
+import pytest
+
+from tests.core.harness import Pair, of
+from tests.fuzz.relays import HOMES, KEYS, RELAY_AT, STRANGERS, FuzzedRelay
+from tests.link.test_direct_search import HOME_A, LINK, leads_to_mesh
+from uavlinkd.core import constants as c
+from uavlinkd.core.outputs import RecordReceived, Transmit
+from uavlinkd.core.path import Path, relayed
+from uavlinkd.core.relay_records import Bind, Candidates, wrap
+from uavlinkd.link.candidates import OwnSocket
+from uavlinkd.link.direct_search import DirectSearch
+from uavlinkd.relay.service import BINDS_BURST
+
+FLEET = 50
+SECONDS = 10
+VICTIM = "203.0.113.99"
+ELSEWHERE = Path(0, ("203.0.113.7", 4000))
+DATA = b"\x40datagram"
+
+
+@pytest.fixture
+def relay() -> FuzzedRelay:
+    """A relay with three members that are up, which may each ask for three."""
+    relay = FuzzedRelay()
+    relay.set_members(0b111, 3)
+    relay.pass_time(2.0)
+    assert all(member.peer.is_up for member in relay.members)
+    return relay
+
+
+def connect(relay: FuzzedRelay) -> tuple[int, int]:
+    """Connect the first two members along their first paths. The handle of each."""
+    one, other = relay.members[:2]
+    for member, key in ((one, KEYS[2]), (other, KEYS[1])):
+        relay.send(member, member.node.send_record(member.peer, RELAY_AT[0], Bind((key,)), relay.now))
+        relay.settle()
+    return one.handles[RELAY_AT[0]][KEYS[2]][0], other.handles[RELAY_AT[0]][KEYS[1]][0]
+
+
+# Candidates.
+
+
+def test_captured_member_of_a_fleet_of_50_causes_at_most_the_buckets_at_a_victim() -> None:
+    """It names other ports of one victim ten times a second to each of its 49 peers, which ask at most 80, then one a
+    second. The total of section 22: 3,920 questions of some 45 bytes at once, then 49 a second.
+    """
+    questions: list[list[Transmit]] = []
+    for _ in range(FLEET - 1):
+        pair = Pair(LINK, LINK)
+        pair.a.peer_at = pair.b.peer_at = relayed(0, "vps", 7)
+        for side in (pair.a, pair.b):
+            side.configure_path(0.0)
+        pair.establish()
+        search = DirectSearch(pair.a.node, pair.a.peer)
+        search.set_own((HOME_A,), [OwnSocket(0, False, (), leads_to_mesh)], (), 0.0)
+        sent: list[Transmit] = []
+        for number in range(10 * SECONDS):
+            places = tuple((VICTIM, 2000 + (2 * number + port) % 60000) for port in range(c.CANDIDATES))
+            received = RecordReceived(pair.a.peer, pair.a.peer_at, Candidates(places), number)
+            search.on_record(received, number / 10)
+            sent += [
+                transmit for transmit in of(search.do_due(number / 10), Transmit) if not transmit.path.is_relayed
+            ]
+        questions.append(sent)
+    most = c.CANDIDATE_QUESTIONS + c.CANDIDATE_QUESTIONS_PER_S * SECONDS
+    assert all(c.CANDIDATE_QUESTIONS <= len(sent) <= most for sent in questions)
+    assert {transmit.path.host for sent in questions for transmit in sent} == {VICTIM}
+    at_once = sum(min(len(sent), int(c.CANDIDATE_QUESTIONS)) for sent in questions)
+    assert at_once == (FLEET - 1) * c.CANDIDATE_QUESTIONS == 3920
+    assert max(len(transmit.datagram) for sent in questions for transmit in sent) <= 50
+
+
+# The relay.
+
+
+def test_spoofed_sources_move_no_path(relay: FuzzedRelay) -> None:
+    """An attacker repeats a member's datagrams from elsewhere, faster than it, and sends data with its handle.
+    The data for the member goes where the member is.
+    """
+    to_other, to_one = connect(relay)
+    one = relay.members[0]
+    for transmit in of(one.node.send_record(one.peer, RELAY_AT[0], Bind((KEYS[2],)), relay.now), Transmit):
+        relay.arrive(transmit.datagram, ELSEWHERE)
+    for recorded in one.recorded:
+        relay.arrive(recorded, ELSEWHERE)
+    relay.arrive(wrap(to_other, DATA), ELSEWHERE)
+    assert relay.forwarded == []
+    relay.settle()
+    relay.pass_time(8.0)
+    relay.arrive(wrap(to_one, DATA), HOMES[1][0])
+    assert relay.forwarded == [(wrap(to_other, DATA), HOMES[0][0])]
+    assert one.peer.is_up
+    assert ELSEWHERE not in relay.service.bindings.paths_of(KEYS[1])
+
+
+def test_unproven_address_gets_no_report(relay: FuzzedRelay) -> None:
+    """A bind of 16 keys would be answered with 563 bytes. Its path is asked first, with no more than came."""
+    connect(relay)
+    session = relay.members[0].peer.sessions.current
+    assert session is not None
+    relay.members[0].bounds.clear()
+    bind = session.seal_record(Bind((KEYS[2],)).encode(), relay.now)
+    relay.arrive(bind, ELSEWHERE)
+    answers = [datagram for datagram, path in relay._wire if path == ELSEWHERE]
+    assert sum(map(len, answers)) <= len(bind)
+    assert ELSEWHERE not in relay.service.bindings.paths_of(KEYS[1])
+
+
+def test_strangers_get_nothing_and_change_nothing(relay: FuzzedRelay) -> None:
+    """Whatever they send: data with valid handles, envelopes, MAVLink. Each datagram is counted."""
+    handles = connect(relay)
+    counted = relay.node.drops.total() + relay.service.forwarding.dropped.total()
+    sent = 0
+    for stranger in STRANGERS:
+        starts = [wrap(handle, DATA) for handle in handles] + [
+            b"\x50",
+            b"\xfd" + bytes(20),
+            b"\x01" + bytes(146),
+            b"",
+        ]
+        for datagram in starts:
+            relay.arrive(datagram, stranger)
+            sent += 1
+    assert relay.forwarded == []
+    assert relay.node.drops.total() + relay.service.forwarding.dropped.total() == counted + sent
+    relay.check_bounds()
+
+
+def test_ten_thousand_requested_bindings_take_bounded_memory(relay: FuzzedRelay) -> None:
+    """A captured member asks for 10,000 keys in a second, along paths that it invents too."""
+    handle, _ = connect(relay)
+    member = relay.members[2]
+    session = member.peer.sessions.current
+    assert session is not None
+    keys = [number.to_bytes(c.KEY_BYTES, "big") for number in range(10_000)]
+    binds = [Bind(tuple(keys[at : at + c.KEYS_PER_BIND])) for at in range(0, len(keys), c.KEYS_PER_BIND)]
+    sealed = [session.seal_record(bind.encode(), relay.now) for bind in binds]
+    relay.settle()
+    tracemalloc.start()
+    try:
+        for number, datagram in enumerate(sealed):
+            path = Path(0, ("203.0.113.5", number)) if number % 2 else HOMES[2][0]
+            relay.arrive(datagram, path)
+            relay._wire.clear()
+        grown, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert grown < 1_000_000
+    assert relay.service.members[KEYS[3]].binds_ignored >= len(binds) - BINDS_BURST - 1
+    assert relay.service.bindings.peers_of(KEYS[3]) == (0, 0)
+    relay.check_bounds()
+    relay.arrive(wrap(handle, DATA), HOMES[0][0])
+    assert len(relay.forwarded) == 1, "another member is slowed"
+
+
+def test_member_beyond_its_limits_slows_only_itself(relay: FuzzedRelay) -> None:
+    """Also while its data costs the relay nothing but the drop: the other direction passes all."""
+    to_other, to_one = connect(relay)
+    greedy, modest = relay.service.members[KEYS[1]].meter, relay.service.members[KEYS[2]].meter
+    for _ in range(200):
+        relay.now += 0.01
+        for _ in range(10):
+            relay.arrive(wrap(to_other, DATA), HOMES[0][0])
+        relay.arrive(wrap(to_one, DATA), HOMES[1][0])
+    assert (modest.datagrams, modest.over_limit) == (200, 0)
+    assert greedy.datagrams + greedy.over_limit == 2000
+    assert greedy.over_limit > 1500
