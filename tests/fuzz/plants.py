@@ -38,7 +38,7 @@ from uavlinkd.endpoints import line_framing
 from uavlinkd.lab.mitm import anatomy
 from uavlinkd.lab.mitm import proxy_settings as mitm_settings
 from uavlinkd.lab.sim import tlog
-from uavlinkd.link import candidates
+from uavlinkd.link import candidates, relay_link
 from uavlinkd.mavlink import frames, routing, stream_splitter
 from uavlinkd.mavlink.headers import Header
 from uavlinkd.mavlink.policy import gate
@@ -267,6 +267,13 @@ def _reports_at_once(right: Any) -> Any:
     return on_record
 
 
+def _accepts_any_key(right: Any) -> Any:
+    def receive(self: Any, bound: Any, order: int, wanted: Any, now: float) -> Any:
+        return right(self, bound, order, [*wanted, *(key for key, _ in bound.handles)], now)
+
+    return receive
+
+
 def _fills_the_bucket(right: Any) -> Any:
     def ask_candidates(peer: Any, now: float) -> Any:
         peer.candidate_questions = TokenBucket(1e6, 1e6, now)
@@ -351,6 +358,9 @@ PLANTS: Final = {
         service.RelayService,
         "on_record",
         _reports_at_once,
+    ),
+    "handles of others": Plant(
+        "handles", "a handle for a peer that was not asked for", relay_link._Binding, "receive", _accepts_any_key
     ),
     "any candidate": Plant(
         "candidates", "special addresses are asked", candidates, "may_be_asked", lambda _: lambda place: True

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from tests.fuzz import candidates, files, frames, handshakes, insiders, lines, outsiders, relays, requests
+from tests.fuzz import candidates, files, frames, handles, handshakes, insiders, lines, outsiders, relays, requests
 from tests.fuzz.engine import Target
 
 _CORE: Final = 4096
@@ -42,6 +42,7 @@ TARGETS: Final = {
             512,
         ),
         Target("relay", "a relay: strangers, and members that hold their keys", relays.make, relays.seeds, 512),
+        Target("handles", "the handles that a hostile relay assigns", handles.make, handles.seeds, 1024),
         Target(
             "candidates",
             "the candidates of a peer that holds its keys",

@@ -1,0 +1,134 @@
+"""A member of a hostile relay, which holds its keys and assigns any handles.
+
+It does all that :mod:`tests.fuzz.insiders` does. Besides, the member accepts data only from an address of the relay,
+with a handle that a record assigned there for a peer that the member asked for.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from tests.core.harness import AT_A, ELSEWHERE, KEY_A, KEY_C, quiet
+from tests.fuzz.engine import Run, Script
+from tests.fuzz.insiders import CHECKS_THE_SEQUEL, Insider
+from tests.fuzz.stages import NOW, copier, pair_of
+from uavlinkd.config import PeerAddress, RelayConfig
+from uavlinkd.core import constants as c
+from uavlinkd.core.drops import DropReason
+from uavlinkd.core.outputs import Event, Output, RecordReceived
+from uavlinkd.core.path import Path, relayed
+from uavlinkd.core.relay_records import Bound, wrap
+from uavlinkd.core.settings import Link, PeerSettings, Timers
+from uavlinkd.link.relay_handles import RelayHandles
+from uavlinkd.link.relay_link import RelayLink
+from uavlinkd.system.addresses import Address
+
+WANTED: Final = (KEY_C.public, bytes([5]) * c.KEY_BYTES)
+OTHERS: Final = (KEY_A.public, bytes(c.KEY_BYTES))
+"""Keys that the member did not ask for: the relay's own among them."""
+HANDLES: Final = 64
+"""Those that a script assigns."""
+
+
+def _ignore(*_: object) -> None:
+    """What the rest of the daemon does."""
+
+
+class Stage:
+    """The relay's end, and the member."""
+
+    def __init__(self, link: Link) -> None:
+        self.link = link
+        self.pair = pair = pair_of(link)
+        pair.b.node.remove_peer(pair.b.peer, NOW)
+        pair.b.peer_name = "relay vps"
+        settings = PeerSettings(pair.b.peer_name, KEY_A.public, None, link)
+        config = RelayConfig(settings, (PeerAddress(Address("192.0.2.1", 14600)),))
+        self.handles = RelayHandles()
+        self.relay = RelayLink(config, pair.b.node, self.handles, _ignore, _ignore, NOW)
+        self.relay.set_paths([AT_A], NOW)
+        self.relay.follow(WANTED)
+        pair.establish(NOW)
+
+
+class Assigned(Insider):
+    """The hostile relay, and its member."""
+
+    def __init__(self, stage: Stage) -> None:
+        super().__init__(stage.pair, stage.link)
+        self._relay, self._handles = stage.relay, stage.handles
+        self._assigned: set[int] = set()
+
+    def step(self, script: Script) -> None:
+        """Assign handles, or do what any hostile peer does."""
+        if script.byte() & 3 == 0:
+            super().step(script)
+            return
+        what = script.byte()
+        entries = []
+        for _ in range(1 + (what & 31)):
+            which, handle = script.byte(), script.byte() % HANDLES
+            key = (*WANTED, *OTHERS)[which & 3]
+            entries.append((key, handle))
+            if key in WANTED:
+                self._assigned.add(handle)
+        record = Bound("192.0.2.7", script.word(), tuple(entries))
+        self._offer(self.sessions[-1].seal_record(record.encode(), self.now), what)
+        self._pass(0.01)
+
+    def _pass(self, seconds: float) -> None:
+        super()._pass(seconds)
+        if self._relay.next_at <= self.now:
+            self._take(self._relay.do_due(self.now), None)
+        self._relay.do_housekeeping(self.now)
+
+    def _take(self, outputs: list[Output], path: Path | None) -> None:
+        super()._take(outputs, path)
+        for output in outputs:
+            if isinstance(output, RecordReceived):
+                self._relay.on_record(output, self.now)
+            elif isinstance(output, Event):
+                self._relay.on_event(output, self.now)
+
+    def check_bounds(self) -> None:
+        """Those of every peer, and of the handles; and which data is accepted."""
+        super().check_bounds()
+        most = len(self.peer.paths.states) * len(WANTED) * c.HANDLES_PER_PAIR
+        assert len(self._handles._inward) <= most, "too many handles"
+        assert len(self._handles._outward) <= most, "handles in one direction only"
+        for handle in range(HANDLES):
+            for at in (AT_A, ELSEWHERE):
+                taken = self._handles.unwrap(at.socket, wrap(handle, b"\x40"), at.address)
+                if taken is DropReason.RELAY_UNKNOWN_HANDLE or taken is DropReason.RELAY_MALFORMED:
+                    continue
+                assert handle in self._assigned, "a handle that was not assigned"
+                assert self.peer.paths.find(at) is not None, "data from another address than the relay's"
+                assert taken == (b"\x40", relayed(at.socket, "vps", handle))
+
+
+def make() -> Run:
+    """With and without the other timers of a link."""
+    links = [quiet(features=c.FEATURE_RECORDS), Link(features=c.FEATURE_RECORDS, timers=Timers())]
+    stages = [copier(Stage(link)) for link in links]
+
+    def run(data: bytes) -> None:
+        script = Script(data)
+        first = script.byte()
+        assigned = Assigned(stages[first % len(stages)]())
+        while script:
+            assigned.step(script)
+            assigned.check_bounds()
+        if first & CHECKS_THE_SEQUEL == CHECKS_THE_SEQUEL:
+            assigned.check_sequel()
+
+    return run
+
+
+def seeds() -> list[bytes]:
+    """Handles for peers that the member asked for and for others, many, repeated, and withdrawn; other addresses."""
+    many = bytes((1, 31)) + b"".join(bytes((number, number)) for number in range(32)) + b"\0\7"
+    same = bytes((1, 3, 0, 9, 1, 9, 2, 9, 3, 10, 0, 7))
+    withdrawn = bytes((1, 1, 0, 0, 1, 0, 0, 7))
+    roams = bytes((0, 12 | 0x40, 1, 0x41, 0, 33, 2, 34, 0, 7)) + bytes((0, 7, 255))
+    parts = (many + same + withdrawn, same * 4 + roams + same, roams * 3 + many * 3)
+    return [bytes((CHECKS_THE_SEQUEL | link,)) + part for link in (0, 1) for part in parts]
