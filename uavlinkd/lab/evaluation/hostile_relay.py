@@ -56,8 +56,8 @@ class RelayAttack:
     name: ClassVar[str]
     every_s: float = 0.05
     """Between calls of :meth:`act`."""
-    restarts_after: ClassVar[bool] = False
-    """At its end the relay starts again as an honest one: its members keep wrong handles otherwise."""
+    reports_after: ClassVar[bool] = False
+    """At its end the relay reports the true handles: its members keep wrong ones otherwise, up to 20 s."""
 
     def __init__(self, relay: HostileRelay, rng: Random) -> None:
         self.relay = relay
@@ -99,7 +99,7 @@ class BindWrongMembers(RelayAttack):
     """Assigns the handle of one peer for another: a member's datagrams arrive at the wrong one."""
 
     name = "relay-bind-wrong"
-    restarts_after = True
+    reports_after = True
 
     def bound(self, member: str, bound: Bound) -> Bound:
         """Each key has the handles of the next one."""
@@ -297,8 +297,8 @@ class HostileRelay:
             for position, text in enumerate(specs)
             if text.partition(",")[0] in ATTACKS
         )
-        if former is not None and former.restarts_after:
-            self.restart()
+        if former is not None and former.reports_after:
+            self.report_all()
 
     async def statistics(self) -> Interventions:
         """The counters so far. The victim of false addresses is a stranger."""

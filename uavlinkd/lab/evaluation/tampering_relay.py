@@ -79,7 +79,7 @@ class RelayStage(DaemonStage):
 _ON_RELAY: Final = [
     "Three daemons that reach each other only along a hostile relay. It holds a relay's key, and no key of a member: "
     "it has sessions with the members as every relay. It makes of the datagrams that it forwards what a man in the "
-    "middle makes, and lies in its own records. When it bound the wrong members, an honest relay takes its place at "
+    "middle makes, and lies in its own records. When it bound the wrong members, it reports the true handles at "
     "the end. An attempt is one datagram or record. What a relay can do is to deny service.",
 ]
 
