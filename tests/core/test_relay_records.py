@@ -165,6 +165,20 @@ def test_order_grows(pair: Pair) -> None:
     assert first.order < second.order < third.order
 
 
+def test_order_grows_after_the_peer_was_restarted(pair: Pair) -> None:
+    """It closed its sessions, or forgot them: the generation begins again, and the order does not."""
+    first = received(pair.b.receive(only(send(pair.a, BIND, 1.0)), 1.0))
+    for closed in datagrams(pair.a.node.close(2.0)):
+        pair.b.receive(closed, 2.0)
+    assert pair.b.peer.sessions.current is None
+    pair.a.configure_path(10.0)
+    pair.establish(10.0)
+    pair.carries(10.0)
+    second = received(pair.b.receive(only(send(pair.a, BIND, 11.0)), 11.0))
+    assert pair.b.session.parameters.generation == 1
+    assert first.order < second.order
+
+
 def test_record_with_altered_bytes_has_no_effect(pair: Pair) -> None:
     """An envelope with a valid tag whose record does not open, or has another type or length."""
     session = pair.a.session

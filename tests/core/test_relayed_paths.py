@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import pytest
 
+from tests.core.harness import Pair, datagrams
 from tests.core.test_path_set import answer, fail, linked, of, path_set, route, suspect
 from uavlinkd.core import constants as c
+from uavlinkd.core import wire
+from uavlinkd.core.limits import prefix_of
 from uavlinkd.core.path import Path, relayed
 from uavlinkd.core.paths import BestChanged
 from uavlinkd.core.settings import Class
@@ -118,3 +121,26 @@ def test_peer_without_relays_pays_nothing() -> None:
     """Its envelopes are not limited."""
     assert not linked(LTE, MESH).has_relayed
     assert not path_set().has_relayed
+
+
+# Tries, and budgets.
+
+
+def test_new_handles_do_not_hasten_initiations_without_limit() -> None:
+    """A hostile relay changes them all the time. A peer that is not up is tried as often as at first, no more."""
+    pair = Pair()
+    pair.initiation(0.0)
+    sent = 0
+    for number in range(1, 1001):
+        now = number / 1000
+        pair.a.node.set_paths(pair.a.peer, [relayed(0, "a", number)], now)
+        sent += len(datagrams(pair.a.timeout(now), wire.INITIATION))
+    assert 1 <= sent <= 1 / c.RETRY_MIN_S + 1
+
+
+def test_handles_of_one_relay_are_one_sender() -> None:
+    """Each address of a peer has budgets of its own. A relay could invent as many handles."""
+    assert LTE_A.sender == LTE_A2.sender == "relay a"
+    assert LTE.sender == LTE.place
+    assert LTE_A.sender != LTE_B.sender
+    assert prefix_of(LTE_A.host) != prefix_of(LTE_B.host)

@@ -52,7 +52,7 @@ class Named(Insider):
     def __init__(self, pair: Pair, link: Link) -> None:
         super().__init__(pair, link)
         self.places = (RELAYED, RELAYED, ELSEWHERE, AT_A)
-        self.search = DirectSearch(self.node, self.peer)
+        self.search = DirectSearch(self.node, self.peer, 0.0)
         self.asked = 0
         self.search.set_own((OWN,), SOCKETS, {RELAY}, self.now)
 

@@ -11,7 +11,7 @@ from uavlinkd.core.outputs import Output, PathStateChanged, RecordReceived, Sess
 from uavlinkd.core.path import Path, relayed
 from uavlinkd.core.relay_records import Candidates
 from uavlinkd.link.candidates import OwnSocket, Place, is_private, may_be_asked, paths_to, places_of
-from uavlinkd.link.direct_search import DirectSearch
+from uavlinkd.link.direct_search import LISTS, LISTS_PER_S, DirectSearch
 
 LINK = quiet(features=c.FEATURE_RECORDS)
 HOME_A, HOME_B = ("198.51.100.1", 4001), ("203.0.113.2", 4002)
@@ -28,7 +28,7 @@ SOCKET_6 = OwnSocket(1, True, (("2001:db8::5", 5790),), leads_to_mesh)
 
 def asked(*places: Place) -> list[Path]:
     """The paths to these candidates from both sockets."""
-    return list(paths_to(places, [SOCKET, SOCKET_6], {("192.0.2.1", 5790)}))
+    return list(paths_to(places, [SOCKET, SOCKET_6], {("192.0.2.1", 5790)}, {"10.13.0.5", "2001:db8::5"}))
 
 
 # Which candidates are asked.
@@ -46,6 +46,14 @@ def asked(*places: Place) -> list[Path]:
         ("255.255.255.255", 5790),
         ("240.0.0.1", 5790),
         ("fe80::1", 5790),
+        ("0.1.2.3", 5790),
+        ("fec0::1", 5790),
+        ("::127.0.0.1", 5790),
+        ("::ffff:192.0.2.1", 5790),
+        ("64:ff9b::7f00:1", 5790),
+        ("2002:7f00:1::1", 5790),
+        ("2001:0:7f00:1::1", 5790),
+        ("4000::1", 5790),
         ("203.0.113.1", 53),
         ("203.0.113.1", 0),
     ],
@@ -56,9 +64,9 @@ def test_special_addresses_and_low_ports_are_never_asked(place: Place) -> None:
     assert asked(place) == []
 
 
-def test_relays_and_own_sockets_are_not_asked() -> None:
-    """They are known already."""
-    assert asked(("192.0.2.1", 5790), ("10.13.0.5", 5790), ("2001:db8::5", 5790)) == []
+def test_relays_and_this_machine_are_not_asked() -> None:
+    """Relays are known already. Another service of this machine is not the peer's business, on whichever port."""
+    assert asked(("192.0.2.1", 5790), ("10.13.0.5", 5790), ("10.13.0.5", 14550), ("2001:db8::5", 5790)) == []
 
 
 def test_addresses_are_asked_from_sockets_of_their_family() -> None:
@@ -109,8 +117,8 @@ class Network:
         self.hard = hard
         """Alpha's NAT is symmetric, and bravo's filters by port."""
         self.open: set[tuple[str, Place]] = set()
-        self.search = {"a": DirectSearch(self.pair.a.node, self.pair.a.peer)}
-        self.search["b"] = DirectSearch(self.pair.b.node, self.pair.b.peer)
+        self.search = {"a": DirectSearch(self.pair.a.node, self.pair.a.peer, 0.0)}
+        self.search["b"] = DirectSearch(self.pair.b.node, self.pair.b.peer, 0.0)
         self.questions = 0
 
     def set_own(self, now: float) -> None:
@@ -182,7 +190,7 @@ def test_impossible_pair_stays_on_the_relay_and_asks_less_and_less() -> None:
 def test_nothing_is_due_without_a_relay() -> None:
     """And without candidates nothing is named."""
     pair = Pair(LINK, LINK).establish()
-    search = DirectSearch(pair.a.node, pair.a.peer)
+    search = DirectSearch(pair.a.node, pair.a.peer, 0.0)
     assert search.next_at == NEVER
     search.begin(1.0)
     assert search.do_due(1.0) == []
@@ -213,6 +221,26 @@ def test_search_begins_again_when_it_may_help(is_relayed: bool, is_usable: bool,
     path = network.pair.a.peer_at if is_relayed else Path(0, HOME_B)
     network.search["a"].on_event(PathStateChanged(network.pair.a.peer, path, is_usable, "answered"), 3.0)
     assert (network.search["a"].next_at == 3.0) is begins
+
+
+def test_lists_are_limited_too() -> None:
+    """A relay that reports another address each time makes this daemon name its candidates, but not without end."""
+    network = Network()
+    search = network.search["a"]
+    lists = 0
+    for round_ in range(200):
+        now = 0.1 + round_ / 10
+        search.set_own((("203.0.113.9", 4000 + round_),), [], (), now)
+        lists += sum(transmit.path.is_relayed for transmit in of(search.do_due(now), Transmit))
+    assert LISTS <= lists <= LISTS + 20 * LISTS_PER_S + 1
+
+
+def test_list_along_a_direct_path_is_ignored() -> None:
+    """Only members that a relay connects look for direct paths."""
+    network = Network()
+    search = network.search["a"]
+    search.on_record(RecordReceived(network.pair.a.peer, Path(0, HOME_B), Candidates((HOME_B,)), 5), 1.0)
+    assert search.theirs == ()
 
 
 def test_captured_member_cannot_make_a_peer_ask_without_end() -> None:

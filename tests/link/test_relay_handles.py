@@ -46,6 +46,26 @@ def test_later_handles_replace_those_of_the_same_path() -> None:
     assert paths.wrap(ENVELOPE, relayed(1, "vps", 9)) is not None
 
 
+def test_relay_with_two_addresses_may_assign_a_handle_twice() -> None:
+    """By chance, or to confuse: the first one counts, and nothing fails."""
+    paths, other = RelayHandles(), Path(0, ("203.0.113.1", 5791))
+    paths.assign("vps", LTE, [7])
+    paths.assign("vps", other, [7, 8])
+    assert paths.wrap(ENVELOPE, relayed(0, "vps", 7)) == (wrap(7, ENVELOPE), LTE.address)
+    assert paths.unwrap(0, wrap(7, ENVELOPE), other.address) is DropReason.RELAY_UNKNOWN_HANDLE
+    paths.assign("vps", LTE, [])
+    paths.assign("vps", other, [])
+    assert paths.wrap(ENVELOPE, relayed(0, "vps", 8)) is None
+
+
+def test_path_to_a_relay_is_never_relayed() -> None:
+    """A relay sends its own envelopes along a handle, and assigns more there: they would lead to no address."""
+    paths = RelayHandles()
+    paths.assign("vps", LTE, [7])
+    paths.assign("vps", relayed(0, "vps", 7), [8])
+    assert paths.wrap(ENVELOPE, relayed(0, "vps", 8)) is None
+
+
 def test_malformed_data_is_dropped_before_its_handle_is_looked_up() -> None:
     """Nothing inside, and a relay inside a relay."""
     paths = RelayHandles()

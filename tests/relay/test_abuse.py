@@ -57,7 +57,7 @@ def test_captured_member_of_a_fleet_of_50_causes_at_most_the_buckets_at_a_victim
         for side in (pair.a, pair.b):
             side.configure_path(0.0)
         pair.establish()
-        search = DirectSearch(pair.a.node, pair.a.peer)
+        search = DirectSearch(pair.a.node, pair.a.peer, 0.0)
         search.set_own((HOME_A,), [OwnSocket(0, False, (), leads_to_mesh)], (), 0.0)
         sent: list[Transmit] = []
         for number in range(10 * SECONDS):

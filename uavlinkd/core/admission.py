@@ -135,7 +135,7 @@ class Admission:
 
     def _take(self, known: SourceLimiter, budget: TokenBucket, path: Path, now: float) -> bool:
         """Where a peer is known to be, a flood from elsewhere does not count."""
-        return (self._is_known(path.place) and known.take(path.place, now)) or budget.take(now)
+        return (self._is_known(path.place) and known.take(path.sender, now)) or budget.take(now)
 
     def _admit(self, budget: TokenBucket, ceiling: TokenBucket, message: Message, now: float) -> None:
         """Until the budget is spent, each message; then those with a cookie, by their source's share."""
@@ -147,7 +147,7 @@ class Admission:
         # or network, such as those behind one router, nor with the owner of many addresses, which the ceiling limits.
         path = message.path
         is_known = self._is_known(path.place)
-        if not self._sources.take((ceiling, path.place if is_known else source_of(path.host)), now):
+        if not self._sources.take((ceiling, path.sender if is_known else source_of(path.host)), now):
             raise Drop(DropReason.RATE_LIMITED)
         if not is_known and not ceiling.take(now):
             raise Drop(DropReason.RATE_LIMITED)
@@ -159,7 +159,7 @@ class Admission:
             Drop: ``COOKIE_REQUIRED``, or ``RATE_LIMITED`` without a reply.
         """
         datagram, sender_index, path, cookies = message
-        is_due = self._is_known(path.place) and self._known.take(path.place, now)
+        is_due = self._is_known(path.place) and self._known.take(path.sender, now)
         # The total is looked at first: a flood from many prefixes then costs no more than this.
         if not is_due and self._cookie_replies.has(now):
             is_due = self._prefixes.take(prefix_of(path.host), now) and self._cookie_replies.take(now)

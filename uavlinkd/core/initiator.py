@@ -196,6 +196,10 @@ class Initiator:
         self.attempts = min(self.attempts, 1)  # not 0: then the time of silence would restart for all of them
         self.retry_at = min(self.retry_at, now)
 
+    def invite(self, now: float) -> None:
+        """A relay shows that the peer is there: try soon, but not faster than the first retry. It may be a lie."""
+        self.retry_at = min(self.retry_at, max(now, self.initiated_at + self._settings.link.timers.retry_min_s))
+
     def reset(self) -> None:
         """No new keys are wanted now: the next initiation is repeated after the shortest wait."""
         self.attempts = 0

@@ -42,8 +42,8 @@ def source_of(host: str) -> Hashable:
 
 
 def prefix_of(host: str) -> Hashable:
-    """The network of a numeric host: its /24 in IPv4, its /64 in IPv6."""
-    return IPv6Address(host).packed[:8] if ":" in host else host.rpartition(".")[0]
+    """The network of a numeric host: its /24 in IPv4, its /64 in IPv6. Of another host, itself."""
+    return IPv6Address(host).packed[:8] if ":" in host else host.rpartition(".")[0] or host
 
 
 class SourceLimiter:

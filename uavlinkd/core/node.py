@@ -135,7 +135,7 @@ class Node:
         peer.paths.configure(paths, now)
         for path in peer.paths.configured:
             if path.is_relayed and path not in before and not peer.is_up:
-                peer.initiator.hurry(path.socket, now)  # its handle shows that the peer asked for this node just now
+                peer.initiator.invite(now)  # its handle shows that the peer asked for this node just now
         for path in peer.paths.configured:
             self._by_address[path.place] = peer
         self._revise_paths(peer, now)
@@ -300,7 +300,7 @@ class Node:
         if datagram[:1] in wire.ENVELOPE_STARTS and (peer := self._claimed_peer(datagram)) is not None:
             state = peer.paths.find(path)
             return peer, state is not None and state.is_proven
-        return path.place if self._is_known(path.place) else None
+        return path.sender if self._is_known(path.place) else None
 
     def refuse(self, datagram: bytes, path: Path) -> Dropped:
         """Count a datagram that a busy shell does not hand over: its sender has more waiting than its share."""

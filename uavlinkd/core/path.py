@@ -38,6 +38,11 @@ class Path(NamedTuple):
         return self.address[0].startswith(RELAY_HOST)
 
     @property
+    def sender(self) -> SocketAddress | str:
+        """What has budgets of its own: a place, or a relay with all its handles."""
+        return self.host if self.is_relayed else self.place
+
+    @property
     def place(self) -> SocketAddress:
         """Where the peer is, whichever socket reaches it. Each line is a place of its own."""
         return (SERIAL_HOST, self.socket) if self.is_serial else self.address

@@ -175,8 +175,7 @@ def _receive_record(
         return [peer.drop_datagram(drop.reason, state.path)]
     if is_superseded:
         return []
-    order = (session.parameters.generation << 32) + counter
-    return [RecordReceived(peer, state.path, record, order)]
+    return [RecordReceived(peer, state.path, record, session.order_base + counter)]
 
 
 def _receive_echo(peer: Peer, session: Session, echo: wire.Echo, now: float) -> list[Output]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator
-from ipaddress import IPv6Address, ip_address, ip_network
+from ipaddress import ip_address, ip_network
 from typing import Final, NamedTuple
 
 from uavlinkd.core import constants as c
@@ -21,7 +21,9 @@ _PRIVATE: Final = tuple(
     map(ip_network, ("10.0.0.0/8", "172.16.0.0/12", "192.168.0.0/16", "100.64.0.0/10", "169.254.0.0/16", "fc00::/7"))
 )
 """RFC 1918, RFC 6598, RFC 3927, RFC 4193."""
-_IPV4_BROADCAST: Final = ip_address("255.255.255.255")
+_PUBLIC: Final = tuple(map(ip_network, ("0.0.0.0/0", "2000::/3", "fc00::/7")))
+_NEVER: Final = tuple(map(ip_network, ("0.0.0.0/8", "240.0.0.0/4", "2001::/32", "2002::/16")))
+"""This network (RFC 1122), reserved and broadcast addresses, and those that contain one of IPv4 (Teredo, 6to4)."""
 
 
 class OwnSocket(NamedTuple):
@@ -47,26 +49,25 @@ def may_be_asked(place: Place) -> bool:
     is_special = (
         address.is_loopback
         or address.is_multicast
-        or address.is_unspecified
-        or address == _IPV4_BROADCAST
-        or (address.version == 4 and address.is_reserved)
-        or (isinstance(address, IPv6Address) and (address.is_link_local or address.ipv4_mapped is not None))
+        or any(address in network for network in _NEVER)
+        or not any(address in network for network in _PUBLIC)
     )
     return port >= LEAST_PORT and not is_special
 
 
-def paths_to(places: Iterable[Place], sockets: Collection[OwnSocket], relays: Collection[Place]) -> Iterator[Path]:
+def paths_to(
+    places: Iterable[Place], sockets: Collection[OwnSocket], relays: Collection[Place], own: Collection[str] = ()
+) -> Iterator[Path]:
     """The paths to be asked, at most :data:`c.CANDIDATES`, in the order of the list.
 
-    ``relays``: where relays are, which are not asked.
+    ``relays``: where relays are, and ``own``: the hosts of this machine, which are not asked.
     """
-    own = {place for socket in sockets for place in socket.places}
     hosts = Counter[tuple[int, str]]()
     count = 0
     for place in dict.fromkeys(places):
-        if not may_be_asked(place) or place in relays or place in own:
-            continue
         host, port = place
+        if not may_be_asked(place) or place in relays or host in own:
+            continue
         for socket in sockets:
             if socket.is_ipv6 != (":" in host) or (is_private(host) and not socket.leads_to(host)):
                 continue

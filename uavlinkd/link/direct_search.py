@@ -6,9 +6,11 @@ Both ends name their candidates in their session, and ask those of the other one
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from typing import Final
 
 from uavlinkd.core import constants as c
 from uavlinkd.core.constants import NEVER
+from uavlinkd.core.limits import TokenBucket
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Event, Output, PathStateChanged, RecordReceived, SessionEstablished
 from uavlinkd.core.path_state import PathCondition
@@ -16,11 +18,16 @@ from uavlinkd.core.peer import Peer
 from uavlinkd.core.relay_records import Candidates
 from uavlinkd.link.candidates import OwnSocket, Place, paths_to
 
+LISTS: Final = 20
+LISTS_PER_S: Final = 0.2
+"""Lists of candidates that the peer gets at most, whatever a relay or the peer says: first so many, then so many a
+second."""
+
 
 class DirectSearch:
     """Names candidates to one peer, and asks its candidates. Times are monotonic seconds."""
 
-    def __init__(self, node: Node, peer: Peer) -> None:
+    def __init__(self, node: Node, peer: Peer, now: float) -> None:
         self._node = node
         self._peer = peer
         self._own: tuple[Place, ...] = ()
@@ -29,6 +36,7 @@ class DirectSearch:
         self._theirs: tuple[Place, ...] = ()
         self._order = -1
         self._tries = 0
+        self._lists = TokenBucket(LISTS_PER_S, LISTS, now)
         self.next_at = NEVER
         """When :meth:`do_due` has something to do."""
 
@@ -60,7 +68,9 @@ class DirectSearch:
 
     def on_record(self, received: RecordReceived, now: float) -> None:
         """The peer named its candidates. An older list is ignored."""
-        if not isinstance(received.record, Candidates) or received.order <= self._order:
+        if not isinstance(received.record, Candidates) or not received.path.is_relayed:
+            return
+        if received.order <= self._order:
             return
         self._order = received.order
         if received.record.places != self._theirs:
@@ -81,9 +91,10 @@ class DirectSearch:
             if not state.path.is_relayed and state.condition is PathCondition.USABLE
         }
         sockets = [socket for socket in self._sockets if socket.number not in connected]
-        self._node.set_candidates(self._peer, paths_to(self._theirs, sockets, self._relays))
+        hosts = {host for socket in self._sockets for host, _ in socket.places}
+        self._node.set_candidates(self._peer, paths_to(self._theirs, sockets, self._relays, hosts))
         out: list[Output] = []
-        if self._own and (sockets or self._tries < c.CANDIDATE_TRIES):
+        if self._own and (sockets or self._tries < c.CANDIDATE_TRIES) and self._lists.take(now):
             named = min(relayed, key=lambda state: state.srtt_s or NEVER)
             out += self._node.send_record(self._peer, named.path, Candidates(self._own), now)
         out += self._node.ask_candidates(self._peer, now)

@@ -48,7 +48,7 @@ class DirectSearches:
         ``seen``: this daemon's addresses as relays see them. ``relays``: where relays are.
         """
         peers: list[Peer] = [link.peer for link in self._links.values() if link.relayed]
-        self._searches = {peer: self._searches.get(peer) or DirectSearch(self._node, peer) for peer in peers}
+        self._searches = {peer: self._searches.get(peer) or DirectSearch(self._node, peer, now) for peer in peers}
         if not peers:
             return
         if now >= self._looked_at + LOOK_S:

@@ -21,11 +21,18 @@ class RelayHandles:
         self._outward: dict[Path, tuple[SocketAddress, int]] = {}
 
     def assign(self, relay: str, at: Path, handles: Iterable[int]) -> None:
-        """These are all handles on the path ``at`` to the relay of this name from now on."""
+        """These are all handles on the path ``at`` to the relay of this name from now on.
+
+        A path to a relay is never relayed: whatever a relay sends, no datagram goes to a host that is not an address.
+        """
         for key in [key for key in self._inward if key[:2] == at]:
             del self._outward[self._inward.pop(key)]
+        if at.is_relayed:
+            return
         for handle in handles:
             path = relayed(at.socket, relay, handle)
+            if path in self._outward:  # a relay with two addresses gave the same handle there too
+                continue
             self._inward[at.socket, at.address, handle] = path
             self._outward[path] = at.address, handle
 

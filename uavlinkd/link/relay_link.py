@@ -55,15 +55,17 @@ class _Binding:
 
     def receive(self, bound: Bound, order: int, wanted: Iterable[bytes], now: float) -> set[bytes]:
         """Take the handles of those peers that are wanted. Returns the keys whose handles changed."""
+        named: dict[bytes, tuple[int, ...]] = {
+            key: () for key, _ in bound.handles if key in wanted and order > self.orders.get(key, -1)
+        }
+        if not named:
+            return set()
         self.bound_at, self.seen_as = now, Address(bound.host, bound.port)
-        named: dict[bytes, tuple[int, ...]] = {key: () for key, _ in bound.handles if key in wanted}
         for key, handle in bound.handles:
             if key in named and handle != WAITING and len(named[key]) < c.HANDLES_PER_PAIR:
                 named[key] = (*named[key], handle)
         changed = set[bytes]()
         for key, handles in named.items():
-            if order <= self.orders.get(key, -1):
-                continue
             self.orders[key] = order
             if handles != self.handles.get(key, ()):
                 changed.add(key)
@@ -226,7 +228,7 @@ class RelayLink:
 
     def _working(self) -> Iterator[_Binding]:
         for state in self.peer.paths.states:
-            if state.works and self.peer.is_up:
+            if state.works and self.peer.is_up and not state.path.is_relayed:
                 yield self._bindings.setdefault(state.path, _Binding(state.path))
 
     def _keys_of(self, paths: Collection[Path], at: Path) -> tuple[bytes, ...]:

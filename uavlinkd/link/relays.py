@@ -169,7 +169,9 @@ class Relays:
     # Parts.
 
     def _seen(self) -> list[Place]:
-        return [place.sockaddr for relay in self.by_name.values() for place in relay.seen_as]
+        """One for each relay and socket, so that the lies of one relay leave room for the others."""
+        views = ((relay, path, place) for relay in self.by_name.values() for path, place in relay.views())
+        return list({(relay, path.socket): place.sockaddr for relay, path, place in views}.values())
 
     def _search(self, now: float) -> None:
         """Have direct paths searched with what is known now."""
