@@ -5,13 +5,15 @@ from __future__ import annotations
 import pytest
 
 from tests.core.harness import Pair, datagrams
+from tests.core.harness import of as outputs_of
 from tests.core.test_path_set import answer, fail, linked, of, path_set, route, suspect
 from uavlinkd.core import constants as c
-from uavlinkd.core import wire
+from uavlinkd.core import probing, wire
 from uavlinkd.core.limits import prefix_of
+from uavlinkd.core.outputs import Output, PathSuspected, Transmit
 from uavlinkd.core.path import Path, relayed
 from uavlinkd.core.paths import BestChanged
-from uavlinkd.core.settings import Class
+from uavlinkd.core.settings import Class, Link
 
 LTE, MESH = Path(0, ("192.0.2.1", 5790)), Path(1, ("198.51.100.1", 5790))
 LTE_A, LTE_A2, LTE_B, LTE_C = (relayed(0, name, number) for number, name in enumerate(("a", "a", "b", "c"), 1))
@@ -144,3 +146,66 @@ def test_handles_of_one_relay_are_one_sender() -> None:
     assert LTE.sender == LTE.place
     assert LTE_A.sender != LTE_B.sender
     assert prefix_of(LTE_A.host) != prefix_of(LTE_B.host)
+
+
+# A relay that fails.
+
+
+@pytest.fixture
+def pair() -> Pair:
+    """Linked along a relay."""
+    link = Link(features=c.FEATURE_RECORDS)
+    made = Pair(link, link)
+    made.a.peer_at, made.b.peer_at = LTE_A, LTE_A2
+    for side in (made.a, made.b):
+        side.configure_path(0.0)
+    made.establish()
+    assert made.carries(0.0)
+    return made
+
+
+def suspected(outputs: list[Output]) -> list[Path]:
+    """The paths that are reported to the shell."""
+    return [event.path for event in outputs_of(outputs, PathSuspected)]
+
+
+def test_relayed_path_that_becomes_suspect_is_reported(pair: Pair) -> None:
+    """The shell asks the relay then."""
+    state = pair.a.peer.paths.find(LTE_A)
+    assert state is not None
+    state.make_probe(3, 0, 1.0)
+    assert suspected(probing.update(pair.a.peer, 3.0)) == [LTE_A]
+    assert suspected(probing.update(pair.a.peer, 3.1)) == []
+
+
+def test_question_about_a_silence_reports_the_path(pair: Pair) -> None:
+    """The only path of a peer gets no probes."""
+    pair.a.send(1.0)
+    assert LTE_A in suspected(pair.a.timeout(1.0 + pair.a.peer.echo_after_s))
+
+
+def test_path_ends_with_its_handle(pair: Pair) -> None:
+    """Also the best one: it leads nowhere any more. A direct one stays."""
+    pair.a.node.set_paths(pair.a.peer, [LTE_B], 1.0)
+    assert pair.a.peer.paths.find(LTE_A) is None
+    assert pair.a.peer.path != LTE_A
+    paths = linked(LTE)
+    paths.configure([LTE_B], 2.0)
+    assert paths.find(LTE) is not None
+
+
+def test_one_path_is_asked(pair: Pair) -> None:
+    """By an echo request, and by a probe if there are several; not along an unknown path, nor one without network."""
+    node, peer = pair.a.node, pair.a.peer
+    assert [sent.path for sent in outputs_of(node.ask(peer, LTE_A, 1.0), Transmit)] == [LTE_A]
+    assert node.ask(peer, LTE_B, 1.0) == []
+    node.set_paths(peer, [LTE_A, LTE_B], 1.0)
+    assert [sent.path for sent in outputs_of(node.ask(peer, LTE_B, 1.1), Transmit)] == [LTE_B, LTE_B]
+    node.set_socket_state(0, 1.2, is_up=False)
+    assert node.ask(peer, LTE_B, 1.3) == []
+
+
+def test_peer_without_a_session_is_not_asked() -> None:
+    """There is no key for the question."""
+    pair = Pair()
+    assert pair.a.node.ask(pair.a.peer, pair.a.peer_at, 0.0) == []

@@ -47,7 +47,7 @@ def test_later_handles_replace_those_of_the_same_path() -> None:
 
 
 def test_relay_with_two_addresses_may_assign_a_handle_twice() -> None:
-    """By chance, or to confuse: the first one counts, and nothing fails."""
+    """By accident, or to confuse: the first one counts, and nothing fails."""
     paths, other = RelayHandles(), Path(0, ("203.0.113.1", 5791))
     paths.assign("vps", LTE, [7])
     paths.assign("vps", other, [7, 8])
