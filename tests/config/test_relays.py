@@ -20,6 +20,8 @@ KEY = {
 }
 """The same in every worker: they are parts of the names of tests."""
 
+MEMBER = f'[relay_server]\nenabled = true\n[[member]]\nname = "b"\npublic_key = "{KEY["b"]}"\n'
+
 Load = Callable[..., Config]
 
 
@@ -84,6 +86,7 @@ def test_owner_of_the_relay_could_read_frames(load: Load) -> None:
         (relay() + relay("vps", key=KEY["b"]), "", "relay[1].name (vps)", "the name of relay[0] (vps) too"),
         (relay() + relay("b", key=KEY["vps"]), "", "relay[1].public_key (b)", "each relay has its own"),
         (relay(key=KEY["drone1"]), "", "relay[0].public_key (vps)", "a key of its own"),
+        (relay(key=KEY["b"], more=MEMBER), "", "relay[0].public_key (vps)", "the key of member[0] (b) too"),
         (relay(addresses="[]"), "", "relay[0].addresses (vps)", "a relay never initiates"),
         (relay(addresses='[{ network = "sik" }]'), "", "relay[0].addresses (vps)", "reached over IP"),
         (relay(more="mtu = 1"), "", "relay[0].mtu (vps)", "is not known"),

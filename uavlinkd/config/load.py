@@ -86,7 +86,7 @@ def load_config(path: Path, environ: Mapping[str, str]) -> Config:
     checks.previous_keys(problems, top, peers, public, None if previous is None else _public(previous))
     checks.reachability(problems, top, peers, [peer for peer in peers if used_relays.uses_relay(peer, relays)])
     checks.reachability(problems, top, relays, relays)
-    used_relays.relays(problems, relays, peers, public)
+    used_relays.relays(problems, relays, peers, members, public)
     network_rules.networks(problems, top, networks, [*peers, *relays], endpoints)
     checks.endpoints(problems, top, endpoints)
     checks.metrics(problems, metrics, endpoints)

@@ -21,13 +21,19 @@ TIMERS: Final = Timers(echo_after_s=0.15, handshake_after_s=0.3, retry_max_s=0.5
 try costs 0.3 kB: while a relay is down, 5 kbit/s."""
 
 
-def relays(problems: Problems, sections: Sequence[Values], peers: Sequence[Values], own: bytes | None) -> None:
+def relays(
+    problems: Problems,
+    sections: Sequence[Values],
+    peers: Sequence[Values],
+    members: Sequence[Values],
+    own: bytes | None,
+) -> None:
     """Each relay has a key and an address of its own, and each relay that a peer names is in the file."""
     if len(sections) > MOST:
         problems.add("relay", f"has {len(sections)} sections: write at most {MOST}, the most reliable ones")
     unique(problems, sections, "name", str, "the name of {other} too: write another")
     unique(problems, sections, "public_key", bytes, "the key of {other} too: each relay has its own")
-    owners = {peer.valid[key]: peer for peer in peers for key in _KEYS if key in peer.valid}
+    owners = {peer.valid[key]: peer for peer in (*members, *peers) for key in _KEYS if key in peer.valid}
     for section in sections:
         place, key = section.place.key("public_key"), section.valid.get("public_key")
         if key is not None and key == own:
