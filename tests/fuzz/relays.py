@@ -26,7 +26,7 @@ from uavlinkd.core.settings import PeerSettings
 from uavlinkd.core.suites import SUITES_BY_NAME
 from uavlinkd.relay.bindings import QUARANTINED_PER_MEMBER, ConnectionEnd
 from uavlinkd.relay.member_settings import MemberSettings, RelayLimits
-from uavlinkd.relay.service import BINDS_BURST, BINDS_PER_S, RelayService
+from uavlinkd.relay.service import RelayService
 
 CHECKS_THE_SEQUEL: Final = 0xE0
 MOST_PEERS: Final = 3
@@ -301,8 +301,8 @@ class FuzzedRelay:
             assert all(len(wishes) <= c.HANDLES_PER_PAIR for wishes in member.wishes.values()), "too many paths"
             assert len(member.quarantine) <= QUARANTINED_PER_MEMBER, "too many handles in quarantine"
             assert len(member.handles) == ends[key], "a handle without a connection"
-        asked = BINDS_BURST + BINDS_PER_S * c.QUESTION_LIFETIME_S
-        assert len(service._asked) <= asked * len(self.members), "too many binds wait"
+        slots = c.CONFIGURED_PATHS + c.LEARNED_PATHS
+        assert all(len(asked) <= slots for asked in service._asked.values()), "too many binds wait"
         assert not service._due, "a report that is never sent"
 
     def check_sequel(self) -> None:

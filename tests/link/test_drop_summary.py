@@ -27,6 +27,7 @@ from uavlinkd.mavlink.headers import Header
 from uavlinkd.mavlink.policy.gate import Refusal
 from uavlinkd.ops import metrics
 from uavlinkd.ops.link_problems import LinkProblem
+from uavlinkd.relay.forwarding import RelayReason
 
 
 def test_link_problems_are_what_the_status_counts() -> None:
@@ -37,7 +38,7 @@ def test_link_problems_are_what_the_status_counts() -> None:
     assert set(link.problems(0.0)) == set(LinkProblem) <= set(metrics._PEER_TOTALS)
 
 
-@pytest.mark.parametrize("reasons", [DropReason, Refusal, LinkProblem, ShellReason])
+@pytest.mark.parametrize("reasons", [DropReason, Refusal, LinkProblem, ShellReason, RelayReason])
 def test_every_reason_has_a_meaning(reasons: type[Reason]) -> None:
     """An operator reads a sentence, not only a name."""
     assert all(len(reason.meaning.split()) > 3 for reason in reasons)

@@ -148,7 +148,7 @@ class Relay(Drone):
         assert len(connections) == bindings.connections
         assert len(forwarding) <= 2 * bindings.connections
         slots = len(self.members) * (c.CONFIGURED_PATHS + c.LEARNED_PATHS)
-        assert len(self.service._asked) <= slots
+        assert sum(map(len, self.service._asked.values())) <= slots
         assert len(self.service._due) <= slots * MOST_PEERS
 
 

@@ -149,10 +149,15 @@ CASES: dict[str, tuple[dict[str, str], list[tuple[str, bool]]]] = {
         {'uavlinkd_relay_member_over_limit_total{instance="a",member="b"}': "0x8 0+30x20"},
         [("2m", False), ("5m", True)],
     ),
+    "UavlinkdRelayFull": (
+        {'uavlinkd_relay_dropped_total{instance="a",reason="relay_over_total"}': "0x8 0+30x20"},
+        [("2m", False), ("5m", True)],
+    ),
     "UavlinkdRelayFlood": (
         {
             'uavlinkd_relay_dropped_total{instance="a",reason="relay_unknown_handle"}': "0+100x20 2000+1000x20",
             'uavlinkd_relay_dropped_total{instance="a",reason="relay_over_limit"}': "0+9000x40",
+            'uavlinkd_relay_dropped_total{instance="a",reason="relay_over_total"}': "0+9000x40",
         },
         [("4m", False), ("8m", True)],
     ),

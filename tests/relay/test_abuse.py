@@ -10,12 +10,13 @@ from tests.core.harness import Pair, of
 from tests.fuzz.relays import HOMES, KEYS, RELAY_AT, STRANGERS, FuzzedRelay
 from tests.link.test_direct_search import HOME_A, LINK, leads_to_mesh
 from uavlinkd.core import constants as c
-from uavlinkd.core.outputs import RecordReceived, Transmit
+from uavlinkd.core.drops import DropReason
+from uavlinkd.core.outputs import PathStateChanged, RecordReceived, Transmit
 from uavlinkd.core.path import Path, relayed
 from uavlinkd.core.relay_records import Bind, Candidates, wrap
 from uavlinkd.link.candidates import OwnSocket
 from uavlinkd.link.direct_search import DirectSearch
-from uavlinkd.relay.service import BINDS_BURST
+from uavlinkd.relay.service import BINDS_BURST, LOOK_S
 
 FLEET = 50
 SECONDS = 10
@@ -153,10 +154,68 @@ def test_ten_thousand_requested_bindings_take_bounded_memory(relay: FuzzedRelay)
         tracemalloc.stop()
     assert grown < 1_000_000
     assert relay.service.members[KEYS[3]].binds_ignored >= len(binds) - BINDS_BURST - 1
-    assert relay.service.bindings.peers_of(KEYS[3]) == (0, 0)
+    assert relay.service.bindings.peers_of(KEYS[3]) == (0, 3)
     relay.check_bounds()
     relay.arrive(wrap(handle, DATA), HOMES[0][0])
     assert len(relay.forwarded) == 1, "another member is slowed"
+
+
+def test_member_that_asks_along_another_relay_harms_no_report(relay: FuzzedRelay) -> None:
+    """Such a path has no address that a report could name. The bind has no effect."""
+    peer = relay.service.members[KEYS[1]].peer
+    along = relayed(0, "other", 7)
+    relay.node.set_paths(peer, [along], relay.now)
+    relay.settle()
+    assert peer.paths.find(along) is not None
+    relay.service.on_record(RecordReceived(peer, along, Bind((KEYS[2],)), 1), relay.now)
+    assert not relay.service.is_due
+
+
+def test_binds_along_unproven_paths_wait_only_while_the_paths_have_slots(relay: FuzzedRelay) -> None:
+    """A captured member names 200 addresses: what waits is bounded, and ends with the slot, not after 5 s."""
+    service, peer = relay.service, relay.service.members[KEYS[3]].peer
+    session = relay.members[2].peer.sessions.current
+    assert session is not None
+    for number in range(200):
+        bind = session.seal_record(Bind((KEYS[1],)).encode(), relay.now)
+        relay.arrive(bind, Path(0, ("203.0.113.5", 1000 + number)))
+    waiting = service._asked[KEYS[3]]
+    assert 0 < len(waiting) <= c.CONFIGURED_PATHS + c.LEARNED_PATHS
+    peer.paths.clear()
+    service.settle(relay.now + LOOK_S)
+    assert not service.is_due
+
+
+def test_data_does_not_make_the_relay_look_at_what_waits(relay: FuzzedRelay, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It settles after every wake-up. It looks every 0.1 s, and when a path may have been validated."""
+    session = relay.members[0].peer.sessions.current
+    assert session is not None
+    relay.arrive(session.seal_record(Bind((KEYS[2],)).encode(), relay.now), ELSEWHERE)
+    looks = list[float]()
+    monkeypatch.setattr(relay.service, "_bind_validated", looks.append)
+    start = relay.now + LOOK_S
+    for number in range(1000):
+        relay.service.settle(start + number / 1000)
+    assert 9 <= len(looks) <= 11
+    del looks[:]
+    relay.service.on_event(
+        PathStateChanged(relay.service.members[KEYS[1]].peer, ELSEWHERE, True, "answered"), start + 1.0
+    )
+    relay.service.settle(start + 1.0)
+    assert looks == [start + 1.0]
+
+
+def test_drops_of_a_removed_member_are_reported(relay: FuzzedRelay) -> None:
+    """Also those since the last report."""
+    to_other, _ = connect(relay)
+    for _ in range(100):
+        relay.arrive(wrap(to_other, DATA), HOMES[0][0])
+    over_limit = relay.service.members[KEYS[1]].meter.over_limit
+    assert over_limit > 0
+    relay.set_members(0b110, 3)
+    reports = [(DropReason.RELAY_OVER_LIMIT, "member0", over_limit)]
+    assert [report for report in relay.service.count_drops() if report[1]] == reports
+    assert not list(relay.service.count_drops())
 
 
 def test_member_beyond_its_limits_slows_only_itself(relay: FuzzedRelay) -> None:

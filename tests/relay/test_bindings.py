@@ -12,7 +12,14 @@ from hypothesis import strategies as st
 
 from uavlinkd.core import constants as c
 from uavlinkd.core.path import Path
-from uavlinkd.relay.bindings import QUARANTINED_PER_MEMBER, Bindings, Changes, ConnectionEnd, MemberConnection
+from uavlinkd.relay.bindings import (
+    FEWEST_PEERS,
+    QUARANTINED_PER_MEMBER,
+    Bindings,
+    Changes,
+    ConnectionEnd,
+    MemberConnection,
+)
 
 A, B, C, D = (bytes([number]) * c.KEY_BYTES for number in range(1, 5))
 STRANGER = bytes([9]) * c.KEY_BYTES
@@ -110,7 +117,7 @@ steps: st.SearchStrategy[Step] = st.one_of(
 @given(st.integers(0, 1000), st.lists(steps, max_size=40))
 def test_random_histories_follow_the_rules(seed: int, history: list[Step]) -> None:
     """Whatever members bind, lose and let expire."""
-    made, model, now = bindings(seed), Model(), 0.0
+    made, model, now = bindings(seed, most_peers=100), Model(), 0.0
     for kind, member, number, keys in history:
         if kind == "wait":
             now += number
@@ -133,7 +140,7 @@ def test_random_histories_follow_the_rules(seed: int, history: list[Step]) -> No
                     # Of equally old ones, any may go: the one that the bindings chose has no handle any more.
                     least = min(model.wishes[other] for other in others)
                     oldest = [other for other in others if model.wishes[other] == least]
-                    kept = [other for other in oldest if other[2] in made.paths_of(member)]
+                    kept = [other for other in oldest if other[2] in made._members[member].wishes[key]]
                     del model.wishes[next((other for other in oldest if other not in kept), oldest[0])]
                 model.wishes[wish] = now + c.BIND_LIFETIME_S
         model.apply(changes, now)
@@ -262,7 +269,7 @@ def test_zero_is_not_a_handle() -> None:
 
 def test_member_that_changes_its_paths_fast_does_not_use_up_the_handles_of_another() -> None:
     """Of 65,535 handles at most so many rest; the others are free for other members."""
-    made = bindings()
+    made = bindings(most_peers=QUARANTINED_PER_MEMBER)
     made.bind(A, path(A), [B, C], 0.0)
     made.bind(C, path(C), [A], 0.0)
     used = set[int]()
@@ -292,16 +299,47 @@ def test_ten_thousand_requested_bindings_are_bounded() -> None:
 
 
 def test_removed_member_leaves_nothing_behind_it() -> None:
-    """Its handles end for both, and the wishes for it too."""
+    """Its handles end for both. The others wait, as for any key without a member, and get it when it is back."""
     made = bindings()
     connection = connect(made)
     made.bind(C, path(C), [A], 0.0)
     changes = made.remove_member(A, 1.0)
     assert changes.closed == [connection]
     assert {member for member, _ in changes.concerned} >= {B}
-    assert made.peers_of(B) == made.peers_of(C) == (0, 0)
+    assert made.peers_of(B) == made.peers_of(C) == (0, 1)
+    made.expire(c.BIND_LIFETIME_S - 0.1)
     made.set_member(A, 10)
-    assert made.bind(A, path(A), [B, C], 2.0).opened == []
+    assert len(made.bind(A, path(A), [B, C], 2.0).opened) == 2
+    made.remove_member(A, 3.0)
+    made.expire(c.BIND_LIFETIME_S)
+    assert made.peers_of(B) == made.peers_of(C) == (0, 0)
+
+
+@pytest.mark.parametrize("key", [STRANGER, C], ids=["unknown", "absent"])
+def test_what_is_left_does_not_tell_who_exists(key: bytes) -> None:
+    """A wish for a key without a member counts as one for a member that did not ask."""
+    made = bindings(most_peers=1)
+    made.bind(B, path(B), [A], 0.0)
+    made.bind(A, path(A), [key], 0.0)
+    assert made.bind(A, path(A), [B], 0.0).opened == []
+    assert (made.peers_of(A), made.refused(A)) == ((0, 1), 1)
+
+
+@pytest.mark.parametrize("key", [STRANGER, B], ids=["unknown", "connected"])
+def test_new_wishes_have_a_budget(key: bytes) -> None:
+    """A member that asks from ever new paths makes no more connections, and none of the reports, than it may.
+    Renewals cost nothing. A key without a member costs as much.
+    """
+    made = bindings()
+    connect(made)
+    most = c.HANDLES_PER_PAIR * FEWEST_PEERS - 1
+    changes = [made.bind(A, Path(0, ("192.0.2.7", port)), [key], 0.0) for port in range(1, 1000)]
+    assert sum(len(change.opened) for change in changes) == (most if key == B else 0)
+    assert made.refused(A) == 999 - most
+    made.bind(A, Path(0, ("192.0.2.7", most)), [key], 0.0)
+    assert made.refused(A) == 999 - most
+    assert made.bind(A, path(A, 1), [B], 0.0).opened == []
+    assert made.bind(A, path(A, 1), [B], c.BIND_LIFETIME_S / most).opened
 
 
 def test_lower_limit_keeps_what_is_there() -> None:

@@ -10,7 +10,7 @@ from uavlinkd.core.drops import DropReason
 from uavlinkd.core.path import Path
 from uavlinkd.core.relay_records import INNER_STARTS, wrap
 from uavlinkd.relay.bindings import ConnectionEnd, MemberConnection
-from uavlinkd.relay.forwarding import BURST_S, Forwarding, Meter
+from uavlinkd.relay.forwarding import BURST_S, Forwarding, Meter, RelayReason
 from uavlinkd.relay.member_settings import RelayLimits
 
 AT_A, AT_B = Path(0, ("192.0.2.1", 1000)), Path(1, ("2001:db8::2", 2000, 0, 0))
@@ -157,14 +157,19 @@ def test_silence_saves_up_no_more_than_a_burst() -> None:
 
 
 def test_limit_of_all_members_together() -> None:
-    """A datagram that exceeds it counts as dropped for its sender."""
+    """A datagram that exceeds it is counted for no member, and uses up nothing of its sender's limits."""
     relay = Relay(total=RelayLimits(1000, 10**9))
     for _ in range(40):
         relay.arrive(wrap(A.handle, DATAGRAM))
         relay.arrive(wrap(B.handle, DATAGRAM), path=AT_B)
     assert len(relay.sent) == pytest.approx(1000 * BURST_S, abs=1)
-    assert [meter.datagrams + meter.over_limit for meter in relay.meters] == [40, 40]
     assert all(24 <= meter.datagrams <= 26 for meter in relay.meters)
+    assert [meter.over_limit for meter in relay.meters] == [0, 0]
+    assert relay.forwarding.dropped == {RelayReason.OVER_TOTAL: 80 - len(relay.sent)}
+    relay.forwarding.total.set_limits(AMPLE)
+    relay.arrive(*[wrap(A.handle, DATAGRAM)] * 100)
+    burst = DEFAULT.datagrams_s * BURST_S
+    assert relay.meters[0].datagrams == pytest.approx(burst, abs=1)
 
 
 def test_limits_can_change() -> None:

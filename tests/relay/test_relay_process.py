@@ -14,6 +14,7 @@ from tests.daemon.process import DaemonProcess, Status
 from tests.daemon.test_reload import reload
 from tests.relay.core_member import CoreMember
 from uavlinkd.config.keys import decode_key, encode_key
+from uavlinkd.core.crypto import KeyPair
 
 INNER = b"\x40datagram"
 
@@ -194,3 +195,45 @@ async def test_member_may_become_a_peer_too(relay: DaemonProcess, make_member: M
     status = await relay.until(lambda status: status["peers"]["drone1"]["frames_received"] == 1)
     assert status["relay"]["connections"] == 1
     assert "frames_not_allowed" not in status["drops"]
+
+
+async def test_names_and_keys_of_members_may_go_to_others(relay: DaemonProcess, make_member: MakeMember) -> None:
+    """In one reload: a renamed member's name to a peer with another key, a member's key to a relay."""
+    drone, station, vps = make_member("drone1"), make_member("station"), make_member("vps")
+    relay.config["relay_server"] = {"enabled": True}
+    await relay.start()
+    await connect(drone, station)
+    other = encode_key(KeyPair(bytes([7]) * 32).public)
+    relay.config["peer"] = [{"name": "drone1", "public_key": other, "role": "all", "system_ids": "all", "relays": []}]
+    relay.config["member"] = [
+        {"name": "drone2", "public_key": encode_key(drone.key)},
+        {"name": "station", "public_key": encode_key(station.key)},
+    ]
+    relay.config["relay"] = [{"name": "vps", "public_key": encode_key(vps.key), "addresses": ["127.0.0.1:9"]}]
+    assert await reload(relay) == []
+    status = await relay.status()
+    assert set(status["relay"]["members"]) == {"drone2", "station"}
+    assert set(status["peers"]) == {"drone1"}
+    assert set(status["relays"]) == {"vps"}
+    made = drone.peer.traffic.handshakes
+    await drone.until(lambda: drone.peer.traffic.handshakes > made)
+    await connect(drone, station)
+
+
+async def test_relay_with_another_key_is_asked_for_the_same_peers(
+    stage: Stage, relay: DaemonProcess, make_member: MakeMember
+) -> None:
+    """Although nothing changes about the peers."""
+    station, drone = make_member("station"), stage.daemon("drone0")
+    relay.config["member"].append({"name": "drone0", "public_key": drone.public_key})
+    peer = {"name": "station", "public_key": encode_key(station.key), "role": "all", "system_ids": "all"}
+    before = encode_key(KeyPair(bytes([7]) * 32).public)
+    host, port = relay.sockaddr
+    drone.config["peer"] = [peer]
+    drone.config["relay"] = [{"name": "vps", "public_key": before, "addresses": [f"{host}:{port}"]}]
+    await relay.start()
+    await drone.start()
+    await drone.ready()
+    drone.config["relay"][0]["public_key"] = relay.public_key
+    assert await reload(drone) == []
+    await relay.until(lambda status: member_of(status, "drone0")["waiting"] == 1)

@@ -139,6 +139,11 @@ class RelayServer:
     members: tuple[MemberSettings, ...]
     limits: RelayLimits
 
+    @property
+    def by_key(self) -> dict[bytes, MemberSettings]:
+        """The members by public key."""
+        return {member.peer.public_key: member for member in self.members}
+
 
 @dataclass(frozen=True, slots=True)
 class RelayConfig:

@@ -277,14 +277,19 @@ class Daemon:
             self._perform(self.relays.remove(name, monotonic()))
         for name in changes.removed_peers:
             self._remove_peer(name)
-        if self.relay is not None:
-            self.relay.release({peer.settings.public_key for peer in config.peers}, monotonic())
-        for relay in changes.added_relays:
-            self._add_relay(relay)
+        # First of all give up names and keys: what is added may have them.
+        if self.relay is not None and config.relay_server is not None:
+            others = {one.settings.public_key for one in config.peers}
+            others |= {one.settings.public_key for one in config.relays}
+            self.relay.release(config.relay_server.by_key, others, monotonic())
         for relay in changes.changed_relays:
             self.relays.change(relay)
-        for peer in changes.changed_peers:  # first: a new peer may have a key that one of these gives up
+        for peer in changes.changed_peers:
             self._change_peer(peer)
+        for relay in changes.added_relays:
+            self._add_relay(relay)
+        if changes.added_relays:
+            self.relays.follow_links(monotonic())
         for peer in changes.added_peers:
             self._add_peer(peer)
         self._follow_members()
@@ -368,7 +373,7 @@ class Daemon:
         if relay is None or server is None:
             return
         peers = {link.config.settings.public_key: link.peers[0] for link in self.links.values()}
-        relay.set_members({member.peer.public_key: member for member in server.members}, peers, monotonic())
+        relay.set_members(server.by_key, peers, monotonic())
         relay.forwarding.total.set_limits(server.limits)
         for peer in [peer for peer, owner in self.owners.items() if owner is relay]:
             del self.owners[peer]

@@ -50,6 +50,7 @@ DATAGRAMS: Final[Mapping[str, str]] = {
     "relay_malformed": "malformed along a relay",
     "relay_unknown_handle": "of an unknown handle of a relay",
     "relay_over_limit": "above a member's limit",
+    "relay_over_total": "above the limit of all members together",
 }
 """Of dropped datagrams and outgoing frames (``DropReason``)."""
 

@@ -7,8 +7,12 @@ from typing import Any, Final
 
 from uavlinkd.core.drops import DropReason
 from uavlinkd.ops.path_metrics import Family
+from uavlinkd.relay.forwarding import RelayReason
 
-REASONS: Final = (DropReason.RELAY_MALFORMED, DropReason.RELAY_UNKNOWN_HANDLE, DropReason.RELAY_OVER_LIMIT)
+REASONS: Final = (
+    *(DropReason.RELAY_MALFORMED, DropReason.RELAY_UNKNOWN_HANDLE, DropReason.RELAY_OVER_LIMIT),
+    *RelayReason,
+)
 _OF_MEMBER: Final = {
     "is_up": ("relay_member_up", "1 if the member has a session with this relay."),
     "bound": ("relay_member_bindings", "Members to which the member is connected."),

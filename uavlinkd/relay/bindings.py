@@ -13,11 +13,16 @@ from typing import NamedTuple
 
 from uavlinkd.core import constants as c
 from uavlinkd.core.crypto import Entropy
+from uavlinkd.core.limits import TokenBucket
 from uavlinkd.core.path import Path
 
 HANDLE_BYTES = 2
 QUARANTINED_PER_MEMBER = 4096
 """Quarantined handles of one member. A member that changes its paths fast must not use up the handles of another."""
+
+
+FEWEST_PEERS = 16
+"""A member that may ask for fewer has the budget for new wishes of one that may ask for so many."""
 
 
 class ConnectionEnd(NamedTuple):
@@ -67,15 +72,22 @@ class _Wish:
 
 
 class _Member:
-    __slots__ = ("handles", "most_peers", "paths", "quarantine", "refused", "wishes")
+    __slots__ = ("handles", "most_peers", "new_wishes", "paths", "quarantine", "refused", "wishes")
 
     def __init__(self, most_peers: int) -> None:
-        self.most_peers = most_peers
+        self.set_most_peers(most_peers)
         self.wishes: dict[bytes, dict[Path, _Wish]] = {}  # by key
         self.paths: dict[Path, dict[bytes, None]] = {}  # the keys of the wishes along each
         self.handles: set[int] = set()
         self.quarantine: dict[int, float] = {}  # until when, the oldest first
         self.refused = 0
+
+    def set_most_peers(self, most_peers: int) -> None:
+        self.most_peers = most_peers
+        # Each may close connections and make others, which the other member gets reports about. All wishes that a
+        # member may have at once, and as many again in the lifetime of one.
+        most = c.HANDLES_PER_PAIR * max(most_peers, FEWEST_PEERS)
+        self.new_wishes = TokenBucket(most / c.BIND_LIFETIME_S, most, 0.0)
 
 
 _Pair = tuple[bytes, bytes]
@@ -112,7 +124,7 @@ class Bindings:
         return list(self._members[member].paths)
 
     def refused(self, member: bytes) -> int:
-        """How many wishes of a member were ignored so far, because it had as many as it may have."""
+        """How many wishes of a member were ignored so far, because it had or made as many as it may."""
         return self._members[member].refused
 
     @property
@@ -125,18 +137,16 @@ class Bindings:
     def set_member(self, key: bytes, most_peers: int) -> None:
         """Accept a member, or change how many peers it may ask for. Wishes that it has already stay."""
         if key in self._members:
-            self._members[key].most_peers = most_peers
+            if most_peers != self._members[key].most_peers:
+                self._members[key].set_most_peers(most_peers)
         else:
             self._members[key] = _Member(most_peers)
 
     def remove_member(self, key: bytes, now: float) -> Changes:
-        """ConnectionEnd its connections, and forget it."""
+        """End its connections, and forget it. The wishes of others for it stay, as for any key without a member."""
         changes = Changes.none()
         for path in self.paths_of(key):
             self._end(key, path, changes, now)
-        for member in self._members.values():
-            for wish in member.wishes.get(key, {}).copy().values():
-                self._remove(wish)
         del self._members[key]
         return changes
 
@@ -147,7 +157,8 @@ class Bindings:
         changes = Changes.none()
         for key in dict.fromkeys(keys):
             changes.concern(member, path, key)  # the answer, the same for a key that is not a member
-            if key in self._members and key != member and self._wish(member, key, path, now):
+            # A key without a member counts as much: what is left for others must not tell which keys are members.
+            if key != member and self._wish(member, key, path, now):
                 self._match(_pair(member, key), changes, now)
         return changes
 
@@ -158,7 +169,7 @@ class Bindings:
         return changes
 
     def expire(self, now: float) -> Changes:
-        """ConnectionEnd the wishes that were not renewed."""
+        """End the wishes that were not renewed."""
         changes = Changes.none()
         while self.next_expiry <= now:
             wish = next(iter(self._by_age))
@@ -175,15 +186,15 @@ class Bindings:
     def _wish(self, member: bytes, key: bytes, path: Path, now: float) -> bool:
         """Note or renew a wish. Returns whether it is new."""
         of_member = self._members[member]
-        wishes = of_member.wishes.get(key)
-        if wishes is None:
-            if len(of_member.wishes) >= of_member.most_peers:
-                of_member.refused += 1
-                return False
-            wishes = of_member.wishes[key] = {}
+        wishes = of_member.wishes.get(key, {})
         wish = wishes.get(path)
         is_new = wish is None
         if wish is None:
+            is_full = not wishes and len(of_member.wishes) >= of_member.most_peers
+            if is_full or not of_member.new_wishes.take(now):
+                of_member.refused += 1
+                return False
+            of_member.wishes[key] = wishes
             if len(wishes) >= c.HANDLES_PER_PAIR:  # more paths could not all have connections
                 self._remove(min(wishes.values(), key=lambda wish: wish.until), keeps_key=True)
             self._wishes += 1
@@ -222,7 +233,8 @@ class Bindings:
             self._pairs.pop(pair, None)
 
     def _wishes_of(self, member: bytes, key: bytes) -> Mapping[Path, _Wish]:
-        return self._members[member].wishes.get(key, {})
+        of_member = self._members.get(member)
+        return {} if of_member is None else of_member.wishes.get(key, {})
 
     def _open(self, pair: _Pair, paths: tuple[Path, Path], changes: Changes, now: float) -> MemberConnection:
         one, other = (

@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Callable
 from typing import NamedTuple
 
-from uavlinkd.core.drops import DropReason
+from uavlinkd.core.drops import DropReason, Reason
 from uavlinkd.core.path import Path, SocketAddress
 from uavlinkd.core.relay_records import INNER_STARTS, RELAYED
 from uavlinkd.relay.bindings import ConnectionEnd, MemberConnection
@@ -21,6 +21,12 @@ BURST_BYTES = 1500
 """And at least one datagram of this length."""
 _START = bytes((RELAYED,))
 _HEADER_BYTES = 3
+
+
+class RelayReason(Reason):
+    """Why a relay drops data, beside the reasons of the core."""
+
+    OVER_TOTAL = "relay_over_total", "all members together send more along this relay than its own limit allows"
 
 
 class Meter:
@@ -43,6 +49,14 @@ class Meter:
         """Apply other limits from now on."""
         self._datagram_s, self._byte_s = 1 / limits.datagrams_s, 8 / limits.bits_s
         self._burst_s = max(BURST_S, self._datagram_s, BURST_BYTES * self._byte_s)
+
+    def has(self, size: int, now: float) -> bool:
+        """Whether a datagram of so many bytes is within the limits."""
+        latest = now + self._burst_s
+        return (
+            max(self._count_until, now) + self._datagram_s <= latest
+            and max(self._bytes_until, now) + size * self._byte_s <= latest
+        )
 
     def take(self, size: int, now: float) -> bool:
         """Use up what a datagram of so many bytes takes. Returns whether it is within the limits."""
@@ -76,7 +90,7 @@ class Forwarding:
         self._routes: dict[_Key, _Route] = {}
         self.total = Meter(limits)
         """The limits of all members together."""
-        self.dropped = Counter[DropReason]()
+        self.dropped = Counter[Reason]()
 
     def __len__(self) -> int:
         return len(self._routes)
@@ -102,7 +116,10 @@ class Forwarding:
             self.dropped[DropReason.RELAY_MALFORMED] += 1
         elif route is None:
             self.dropped[DropReason.RELAY_UNKNOWN_HANDLE] += 1
-        elif (meter := route.meter).take(size, now := self._clock()) and self.total.take(size, now):
+        elif not self.total.has(size, now := self._clock()):  # no single member exceeds it
+            self.dropped[RelayReason.OVER_TOTAL] += 1
+        elif (meter := route.meter).take(size, now):
+            self.total.take(size, now)
             meter.datagrams += 1
             meter.bytes += size
             self._send(route.header + data[_HEADER_BYTES:], route.path)

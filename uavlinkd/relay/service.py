@@ -6,13 +6,13 @@ A member is found by its public key. Its peer in the core may be one that carrie
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterator, Mapping
 from typing import NamedTuple
 
 from uavlinkd.core import constants as c
 from uavlinkd.core import outputs as o
 from uavlinkd.core.crypto import Entropy
-from uavlinkd.core.drops import DropReason
+from uavlinkd.core.drops import DropReason, Reason
 from uavlinkd.core.limits import TokenBucket
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Output
@@ -20,13 +20,15 @@ from uavlinkd.core.path import Path, SocketAddress
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.relay_records import Bind, bounds_of
 from uavlinkd.relay.bindings import Bindings, Changes
-from uavlinkd.relay.forwarding import Forwarding, Meter
+from uavlinkd.relay.forwarding import Forwarding, Meter, RelayReason
 from uavlinkd.relay.member_settings import MemberSettings, RelayLimits
 
 BINDS_PER_S = 32
 """Binds of one member a second, each of up to 16 keys. Each may cause reports to other members."""
 BINDS_BURST = 256
 """So many at once, after a quiet while: a ground station with 1,000 vehicles, along four paths."""
+LOOK_S = 0.1
+"""Paths along which members asked before they were validated are looked at so often, and after an event."""
 
 
 class RelayMember:
@@ -85,8 +87,10 @@ class RelayService:
         self.bindings = Bindings(entropy)
         self.forwarding = Forwarding(send, clock, limits)
         self._due: dict[tuple[bytes, Path], dict[bytes, None]] = {}  # reports to members
-        self._asked: dict[tuple[bytes, Path], _Asked] = {}
-        self._reported = Counter[DropReason]()
+        self._asked: dict[bytes, dict[Path, _Asked]] = {}
+        self._look_at = 0.0
+        self._reported = Counter[Reason]()
+        self._of_removed: list[tuple[Reason, str, int]] = []  # drops of removed members, to be reported
 
     # Members.
 
@@ -96,9 +100,8 @@ class RelayService:
         A member that changes from one to the other, or that has another name or PSK, has to make a new session.
         """
         for member in list(self.members.values()):
-            settings, peer = members.get(member.key), peers.get(member.key)
-            is_same = settings is not None and settings.peer == member.settings.peer
-            if not is_same or peer is not (None if member.is_own else member.peer):
+            peer = None if member.is_own else member.peer
+            if not _is_same(member, members) or peers.get(member.key) is not peer:
                 self._remove(member, now)
         for key, settings in members.items():
             if key not in self.members:
@@ -113,17 +116,19 @@ class RelayService:
             return RelayMember(settings, peer, now, is_own=False)
         return RelayMember(settings, self._node.add_peer(settings.peer, now), now, is_own=True)
 
-    def release(self, keys: Iterable[bytes], now: float) -> None:
-        """Give up the peers in the core of those members that are to be peers of the daemon."""
-        for key in keys:
-            if (member := self.members.get(key)) is not None and member.is_own:
+    def release(self, members: Mapping[bytes, MemberSettings], others: Container[bytes], now: float) -> None:
+        """Give up the peers in the core whose name or key another one may have now. ``others``: keys of the daemon's
+        peers and relays.
+        """
+        for member in list(self.members.values()):
+            if member.is_own and (member.key in others or not _is_same(member, members)):
                 self._remove(member, now)
 
     def _remove(self, member: RelayMember, now: float) -> None:
         self._apply(self.bindings.remove_member(member.key, now))
         del self.members[member.key]
-        for place in [place for place in self._asked if place[0] == member.key]:
-            del self._asked[place]
+        self._asked.pop(member.key, None)
+        self._of_removed += _over_limit(member)
         if member.is_own:
             self._perform(self._node.remove_peer(member.peer, now))
 
@@ -135,6 +140,7 @@ class RelayService:
         member = self.members.get(event.peer.settings.public_key)
         if member is None or member.peer is not event.peer:
             return
+        self._look_at = now  # a path may be validated
         if isinstance(event, o.PeerUp | o.PeerLost | o.PeerClosed):
             member.since = now
         if isinstance(event, o.PeerClosed):
@@ -149,18 +155,23 @@ class RelayService:
         member = self.members.get(received.peer.settings.public_key)
         if member is None or member.peer is not received.peer or not isinstance(received.record, Bind):
             return
-        if received.path.is_serial or member.peer.paths.find(received.path) is None:
+        path, paths = received.path, member.peer.paths
+        if path.is_serial or path.is_relayed or (state := paths.find(path)) is None:
             return
         if not member.binds.take(now):
             member.binds_ignored += 1
             return
-        place = member.key, received.path
-        asked = self._asked.get(place)
-        keys = {} if asked is None else asked.keys
+        if state.is_validated and state.works:
+            self._apply(self.bindings.bind(member.key, path, received.record.keys, now))
+            return
+        # The first bind comes with the first envelope of a session. Its path is validated one round trip later.
+        asked = {path: one for path, one in self._asked.get(member.key, {}).items() if paths.find(path) is not None}
+        keys = asked[path].keys if path in asked else {}
         for key in received.record.keys:
             if len(keys) < member.settings.most_peers:
                 keys[key] = None
-        self._asked[place] = _Asked(now + c.QUESTION_LIFETIME_S, keys)
+        asked[path] = _Asked(now + c.QUESTION_LIFETIME_S, keys)
+        self._asked[member.key] = asked
 
     # From the shell.
 
@@ -171,15 +182,9 @@ class RelayService:
 
     def settle(self, now: float) -> None:
         """Bind along paths that are validated now, and report changes to the members."""
-        for place, asked in list(self._asked.items()):
-            key, path = place
-            state = self.members[key].peer.paths.find(path)
-            # The first bind comes with the first envelope of a session. Its path is validated one round trip later.
-            if state is not None and state.is_validated and state.works:
-                self._apply(self.bindings.bind(key, path, list(asked.keys), now))
-            elif now < asked.until:
-                continue
-            del self._asked[place]
+        if self._asked and now >= self._look_at:
+            self._look_at = now + LOOK_S
+            self._bind_validated(now)
         due, self._due = self._due, {}
         for (key, path), keys in due.items():
             if (member := self.members.get(key)) is None:
@@ -188,6 +193,18 @@ class RelayService:
             host, port = path.address[:2]
             for bound in bounds_of(host.partition("%")[0], port, handles):
                 self._perform(self._node.send_record(member.peer, path, bound, now))
+
+    def _bind_validated(self, now: float) -> None:
+        before, self._asked = self._asked, {}
+        for key, asked_along in before.items():
+            for path, asked in asked_along.items():
+                state = self.members[key].peer.paths.find(path)
+                if state is None or now >= asked.until:
+                    continue
+                if state.is_validated and state.works:
+                    self._apply(self.bindings.bind(key, path, list(asked.keys), now))
+                else:
+                    self._asked.setdefault(key, {})[path] = asked
 
     def do_housekeeping(self, now: float) -> None:
         """End the wishes that were not renewed, and those along paths that the core has given up."""
@@ -202,16 +219,16 @@ class RelayService:
         """Forward data that begins with 0x50, or drop it."""
         self.forwarding.take(socket, data, source)
 
-    def count_drops(self) -> Iterator[tuple[DropReason, str, int]]:
+    def count_drops(self) -> Iterator[tuple[Reason, str, int]]:
         """How many datagrams were dropped since the last call: reason, member or an empty name, count."""
-        for reason in (DropReason.RELAY_MALFORMED, DropReason.RELAY_UNKNOWN_HANDLE):
+        for reason in (DropReason.RELAY_MALFORMED, DropReason.RELAY_UNKNOWN_HANDLE, RelayReason.OVER_TOTAL):
             if count := self.forwarding.dropped[reason] - self._reported[reason]:
                 yield reason, "", count
         self._reported = self.forwarding.dropped.copy()
+        of_removed, self._of_removed = self._of_removed, []
+        yield from of_removed
         for member in self.members.values():
-            if count := member.meter.over_limit - member.reported_over_limit:
-                member.reported_over_limit = member.meter.over_limit
-                yield DropReason.RELAY_OVER_LIMIT, member.settings.name, count
+            yield from _over_limit(member)
 
     def _apply(self, changes: Changes) -> None:
         for connection in changes.closed:
@@ -221,3 +238,16 @@ class RelayService:
             self.forwarding.open(connection, (one, other))
         for place, keys in changes.concerned.items():
             self._due.setdefault(place, {}).update(keys)
+
+
+def _is_same(member: RelayMember, members: Mapping[bytes, MemberSettings]) -> bool:
+    """Whether it is one of these members, with the same name and PSK."""
+    settings = members.get(member.key)
+    return settings is not None and settings.peer == member.settings.peer
+
+
+def _over_limit(member: RelayMember) -> Iterator[tuple[Reason, str, int]]:
+    """What the member sent above its limits since the last call."""
+    if count := member.meter.over_limit - member.reported_over_limit:
+        member.reported_over_limit = member.meter.over_limit
+        yield DropReason.RELAY_OVER_LIMIT, member.settings.name, count
