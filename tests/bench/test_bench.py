@@ -34,6 +34,8 @@ from tests.needs import need
 from uavlinkd.lab.child_processes import end_with_parent
 from uavlinkd.lab.evaluation.records import Record, RecordWriter, Status, Value
 
+pytestmark = pytest.mark.long
+
 PLAIN_HEADERS = 28
 """Headers of IPv4 and UDP."""
 CONTENDERS = {contender.name: contender for contender in all_contenders()}

@@ -13,6 +13,8 @@ from tests.compose import images
 from tests.compose.machine import Machine, build
 from tests.needs import need
 
+pytestmark = pytest.mark.long
+
 WATCHDOG_S = 6.0
 """Of the unit."""
 
@@ -112,7 +114,6 @@ def test_a_stopped_loop_is_restarted(machine: Machine) -> None:
     machine.until(lambda: is_linked(machine))
 
 
-@pytest.mark.long
 def test_a_killed_daemon_is_restarted_each_time(machine: Machine) -> None:
     """More often in a row than systemd's own limit would let it."""
     for _ in range(6):
@@ -159,7 +160,6 @@ def test_serial_port_of_the_group_is_opened(machine: Machine) -> None:
     machine.until(lambda: is_linked(machine))
 
 
-@pytest.mark.long
 def test_keys_may_be_encrypted(machine: Machine) -> None:
     """As the unit says: with the machine's own key, and the plain ones away."""
     machine.say(
@@ -177,7 +177,6 @@ def test_keys_may_be_encrypted(machine: Machine) -> None:
     machine.until(lambda: is_linked(machine))
 
 
-@pytest.mark.long
 def test_man_in_the_middle_runs_confined(machine: Machine) -> None:
     """uavlink-mitm.service with the example's configuration and the two addresses: it attacks, and they stay up."""
     machine.say(

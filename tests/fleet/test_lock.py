@@ -18,6 +18,8 @@ from uavlinkd.fleet.manifest import FleetSettings, read_manifest
 from uavlinkd.fleet.transaction import check_members
 from uavlinkd.lab.child_processes import end_with_parent
 
+pytestmark = pytest.mark.long
+
 WAITING = "waiting for another fleet command in fleet\n"
 
 

@@ -24,6 +24,8 @@ from uavlinkd.lab.child_processes import end_with_parent
 from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.ops.control import ControlError, ask
 
+pytestmark = pytest.mark.long
+
 NAMES = ("drone1", "drone2", "drone3")
 
 
@@ -131,8 +133,8 @@ async def vehicles() -> AsyncIterator[Vehicles]:
     "order",
     [
         pytest.param(NAMES, id="first"),
-        pytest.param(NAMES[::-1], id="last", marks=pytest.mark.long),
-        pytest.param(("drone2", "drone1", "drone3"), id="between", marks=pytest.mark.long),
+        pytest.param(NAMES[::-1], id="last"),
+        pytest.param(("drone2", "drone1", "drone3"), id="between"),
     ],
 )
 async def test_new_key_may_arrive_in_any_order(vehicles: Vehicles, order: Sequence[str]) -> None:
@@ -144,7 +146,6 @@ async def test_new_key_may_arrive_in_any_order(vehicles: Vehicles, order: Sequen
     await vehicles.until_linked(by_new_keys=True)
 
 
-@pytest.mark.long
 async def test_two_keys_may_change_at_a_time(vehicles: Vehicles) -> None:
     """If both ends of a link rotate, every combination of their old and new keys makes the link."""
     operations.rotate(vehicles.fleet, "drone1")
@@ -180,7 +181,6 @@ def strangers(vehicles: Vehicles, name: str) -> int:
     return drops.get("unknown_peer", 0)
 
 
-@pytest.mark.long
 async def test_grace_ends(vehicles: Vehicles) -> None:
     """A peer that does not rotate in time is cut off, and the others are not."""
     operations.rotate(vehicles.fleet, "drone1")
@@ -216,7 +216,6 @@ async def test_finishing_touches_no_session(vehicles: Vehicles) -> None:
     assert not list(vehicles.fleet.rglob("*.previous.key"))
 
 
-@pytest.mark.long
 def test_files_load_after_every_command(tmp_path: Path) -> None:
     """A daemon accepts its file after the commands in every order."""
     for number, order in enumerate(permutations(("rotate", "finish", "add", "remove"))):

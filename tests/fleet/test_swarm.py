@@ -5,7 +5,11 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+import pytest
+
 from tests.fleet import swarm
+
+pytestmark = pytest.mark.long
 
 DRONES = int(os.environ.get("UAVLINKD_SWARM", "8"))
 """50 is the full test, which `.ci/run` runs: 1,225 pairs."""

@@ -28,6 +28,8 @@ from uavlinkd.core.session import Session
 from uavlinkd.core.settings import Class
 from uavlinkd.core.socket_facts import SocketFacts
 
+pytestmark = pytest.mark.long
+
 SEEDS = int(os.environ.get("UAVLINKD_CHAOS_SEEDS", "8"))
 """Number of random histories: most of them small and busy."""
 

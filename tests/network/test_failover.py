@@ -12,6 +12,8 @@ from tests.network.flights import fly, read_flight
 from tests.network.metered import absent_peer_bytes, standby_bytes_a_day
 from uavlinkd.core.settings import Redundancy
 
+pytestmark = pytest.mark.long
+
 TRIES = int(os.environ.get("UAVLINKD_FAILOVER_TRIES", "5"))
 """Failures with each pair of radios; each begins at a random moment."""
 STREAM_GAP_S = 0.5
@@ -32,7 +34,6 @@ def test_no_critical_frame_is_lost_when_one_of_two_paths_dies(radios: Radios) ->
         assert result.return_gap_s <= 0.1
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("flight", FLIGHTS)
 def test_redundancy_costs_at_most_a_quarter_by_default(shared_data: Path, flight: str) -> None:
     """Copies and probes in both directions, manual control apart. Copies of everything cost as much again."""

@@ -16,6 +16,8 @@ from uavlinkd.core.settings import Link
 from uavlinkd.lab.mitm.attacks import parse_attack
 from uavlinkd.lab.mitm.radio import Bursts, RadioSettings
 
+pytestmark = pytest.mark.long
+
 VERIFIED_S = c.LATE_AFTER_S + c.HOLD_S
 """The maximum age of a frame that must be new and arrives in order,"""
 EVER_S = 2 * (c.LATE_AFTER_S + c.LATE_STEP_S) + c.HOLD_S

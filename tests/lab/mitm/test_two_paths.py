@@ -10,6 +10,8 @@ import pytest
 from tests.lab.mitm.two_paths import CRITICAL_S, TwoPaths
 from uavlinkd.core.constants import LATE_AFTER_S
 
+pytestmark = pytest.mark.long
+
 LASTING_S = 14.0
 """Longer than a path that is down still gets copies."""
 

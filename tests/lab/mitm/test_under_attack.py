@@ -19,6 +19,8 @@ from uavlinkd.lab.mitm.attack import Attack, Operation, Options
 from uavlinkd.lab.mitm.attacks import ATTACKS, parse_attack
 from uavlinkd.lab.mitm.radio import RadioSettings
 
+pytestmark = pytest.mark.long
+
 FAST = Timers(rekey_after_s=1.0, reject_after_s=6.0)
 """A handshake per second, so that attacks on handshakes have targets."""
 ATTACK_S = 8.0
