@@ -93,6 +93,13 @@ def test_psk_as_public_key(load: Load, tmp_path: Path) -> None:
     assert "is a PSK, which must stay secret" in _problem(load, _config(psk, 'psk_file = "pair.psk"\n'), psk)
 
 
+def test_public_key_in_a_file_beside_the_configuration_is_fine(load: Load, tmp_path: Path) -> None:
+    """People write what keygen prints into a file."""
+    public = keys.public_key_text(keys.generate_private_key())
+    (tmp_path / "drone1.pub").write_text(public + "\n")
+    assert load(_config(public)).peers[0].settings.public_key == keys.decode_key(public)
+
+
 def test_public_key_in_the_private_key_file(load: Load, tmp_path: Path) -> None:
     """The peer's own key in the file of the private key: no secret is exposed."""
     public = keys.public_key_text(keys.generate_private_key())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from enum import StrEnum
 from typing import Any
 
@@ -28,6 +28,7 @@ from uavlinkd.ops.reason_phrases import (
     phrase,
 )
 from uavlinkd.ops.status_screen import render_peers, render_status
+from uavlinkd.relay.forwarding import RelayReason
 
 
 def path(**facts: object) -> dict[str, Any]:
@@ -200,8 +201,8 @@ def test_everyday_problems_do_not_push_out_security() -> None:
 
 def test_codes_are_in_json_only() -> None:
     """Every reason of every closed list is shown in plain words, and none of them twice in a list."""
-    lists: list[tuple[type[StrEnum], Mapping[str, str]]] = [
-        (DropReason, DATAGRAMS),
+    lists: list[tuple[Iterable[StrEnum], Mapping[str, str]]] = [
+        ((*DropReason, *RelayReason), DATAGRAMS),
         (Refusal, REFUSALS),
         (FrameFault, FAULTS),
         (EgressDrop, QUEUED),

@@ -77,7 +77,7 @@ def _add_own(problems: Problems, place: str, peer: Values, *, is_private: bool) 
 
 
 def _key_files(folder: Path) -> Mapping[bytes, str]:
-    """The keys in the small files of a folder, with the names of the files."""
+    """The keys in the small files of a folder, with the names of the files. In ``.pub`` people keep public keys."""
     keys: dict[bytes, str] = {}
     with suppress(OSError):
         for number, path in enumerate(folder.iterdir()):
@@ -86,7 +86,9 @@ def _key_files(folder: Path) -> Mapping[bytes, str]:
             with suppress(OSError, ValueError):
                 status = path.lstat()
                 if stat.S_ISREG(status.st_mode) and KEY_TEXT_LENGTH <= status.st_size <= KEY_TEXT_LENGTH + 4:
-                    keys[decode_key(path.read_text(encoding="ascii"))] = path.name
+                    key = decode_key(path.read_text(encoding="ascii"))
+                    if path.suffix != ".pub" or looks_private(key):
+                        keys[key] = path.name
     return keys
 
 
