@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable, Iterator
 from time import monotonic
 
@@ -77,7 +78,8 @@ async def test_link_over_a_serial_radio_alone(stage: Stage, pair: Connect) -> No
     assert (path["network"], path["address"], path["is_configured"]) == ("sik", "serial", True)
     line = status["networks"]["sik"]
     assert (line["is_present"], line["addresses"], line["absent_because"]) == (True, ["serial"], None)
-    assert (line["serial"]["line_noise"], line["serial"]["uses_cts"]) == (0, False)
+    assert line["serial"]["line_noise"] <= 1  # opening the device may cut the other end's first datagram in two
+    assert line["serial"]["uses_cts"] is False
     assert line["serial"]["air_bits_s"] == SIK_BITS_S
 
     modems.a.pull()
@@ -86,9 +88,16 @@ async def test_link_over_a_serial_radio_alone(stage: Stage, pair: Connect) -> No
     modems.a.plug_in()
     await vehicle.until(lambda status: status["networks"]["sik"]["is_present"])
     back = monotonic()
-    pilot.send(command(77), into_ground)
-    pilot.send(heartbeat(255, 77), into_ground)
+
+    async def repeat() -> None:  # as a ground station does. On a busy machine the pull may have lasted for seconds
+        while True:
+            pilot.send(command(77), into_ground)
+            pilot.send(heartbeat(255, 77), into_ground)
+            await asyncio.sleep(0.3)
+
+    repeating = asyncio.create_task(repeat())
     await autopilot.until(lambda: has_all(autopilot, command(77), heartbeat(255, 77)))
+    repeating.cancel()
     print(f"a command arrives {monotonic() - back:.2f} s after the line returned")
 
 
