@@ -11,6 +11,9 @@ from uavlinkd.system.terminal import printable
 INTERVAL_S: Final = 1.0
 """Between questions."""
 
+ANSWERED_S: Final = 1.5 * INTERVAL_S
+"""A younger answer is one to the last question, which is an interval old; an older one is not."""
+
 Answer = Mapping[str, Any]
 
 
@@ -35,8 +38,8 @@ def ping(ask: Callable[[], Answer], count: int, write: Callable[[str], None], sl
 
 
 def is_answered(path: Answer) -> bool:
-    """Whether a question of the last interval was answered along a path."""
-    return path["answered_s"] is not None and path["answered_s"] <= INTERVAL_S
+    """Whether the last question was answered along a path."""
+    return path["answered_s"] is not None and path["answered_s"] < ANSWERED_S
 
 
 def describe(path: Answer) -> str:
