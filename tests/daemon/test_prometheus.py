@@ -17,7 +17,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from tests.daemon.frames import command_long, heartbeat
 from tests.daemon.harness import Stage
+from tests.daemon.serial_pair import SerialPair
 from tests.daemon.udp import Client, Sockaddr
+from tests.endpoints.test_line_framing import report
 from tests.needs import need
 from tests.ops.test_monitoring import ALERTS, DASHBOARD, expressions
 from tests.waiting import PATIENCE_S
@@ -99,6 +101,13 @@ async def cause_drops(client: Client, into: Sockaddr, peers: Sockaddr) -> None:
         await asyncio.sleep(0.02)
 
 
+async def disturb(modems: SerialPair) -> None:
+    """Noise on a line, and the modem's own reports."""
+    while True:
+        modems.injected = b"\0noise" * 3 + b"\0" + report()
+        await asyncio.sleep(0.1)
+
+
 async def test_dashboard_and_alerts_find_what_they_ask_for(stage: Stage) -> None:
     """Of a daemon to which all happens that the panels show."""
     a, b = stage.pair(budget_bits_s=20_000)
@@ -111,9 +120,13 @@ async def test_dashboard_and_alerts_find_what_they_ask_for(stage: Stage) -> None
     second = f"127.0.0.1:{free_port()}"  # two paths, of which one has a lag
     b.config["listen"].append(second)
     a.config["peer"][0]["addresses"].append(second)
+    modems = SerialPair(stage.folder, 24_000)
+    modems.connect(a, b)
+    modems.start()
     await stage.start(a, b)
     client = await stage.client()
     dropping = asyncio.create_task(cause_drops(client, into, a.sockaddr))
+    disturbing = asyncio.create_task(disturb(modems))
     try:
         async with prometheus(stage, [daemon.config["metrics"]["listen"] for daemon in (a, b)]) as server:
             wanted = [expression.replace("[1m]", f"[{WINDOW}]") for expression in expressions()]
@@ -130,6 +143,8 @@ async def test_dashboard_and_alerts_find_what_they_ask_for(stage: Stage) -> None
         raise AssertionError(f"nothing is found by: {missing}") from None
     finally:
         dropping.cancel()
+        disturbing.cancel()
+        modems.stop()
     assert len(wanted) > len(DASHBOARD["panels"])
     assert len(rules) == ALERTS.read_text().count("- alert:")
     assert {rule["health"] for rule in rules} <= {"ok", "unknown"}  # unknown: not yet evaluated
