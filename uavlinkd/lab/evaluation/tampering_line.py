@@ -15,7 +15,7 @@ from uavlinkd.lab.evaluation.middle import Interventions, silent_log
 from uavlinkd.lab.evaluation.page import ReportSection, Table
 from uavlinkd.lab.evaluation.stage import DaemonStage
 from uavlinkd.lab.evaluation.tampering_plan import TrialPlan
-from uavlinkd.lab.evaluation.tampering_records import Run
+from uavlinkd.lab.evaluation.tampering_records import EFFECT_HEAD, Run
 from uavlinkd.lab.mitm.attack import AttackObject, Direction
 from uavlinkd.lab.mitm.line_attacks import parse_line_attack
 from uavlinkd.lab.mitm.modem import ModemEnd, ModemSettings
@@ -115,15 +115,11 @@ def line_section(run: Run) -> ReportSection:
     """What the attacks on a serial line achieved."""
     rows = [
         [
-            trial.attack,
-            f"{trial.duration_s:.0f} s",
-            f"{trial.attempts:,}",
-            str(sum(trial.faults.values())),
-            f"{trial.frames_lost:,} of {trial.frames_sent:,}",
+            *trial.effect,
             ", ".join(trial.reasons) or "-",
         ]
         for trial in run.trials
         if trial.group == LINE
     ]
-    head = ["attack", "duration", "attempts", "false frames accepted", "genuine frames lost", "noticed by"]
+    head = [*EFFECT_HEAD, "noticed by"]
     return ReportSection("On a serial line", "", _ON_LINE, [Table(head, rows)])

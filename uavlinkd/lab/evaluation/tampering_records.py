@@ -24,6 +24,8 @@ RECOVERY_LIMIT_S = 2.0
 NOT_IN_TIME = "the link did not recover in time"
 
 
+EFFECT_HEAD = ("attack", "duration", "attempts", "false frames accepted", "genuine frames lost")
+"""The heads of the columns of :attr:`Trial.effect`."""
 _WITHHELD = (Operation.DROPPED, Operation.HELD, Operation.REORDERED)
 
 
@@ -118,6 +120,17 @@ class Trial:
     def frames_lost(self) -> int:
         """Frames sent during the attack and never delivered."""
         return self.frames_sent - self.frames_delivered
+
+    @property
+    def effect(self) -> list[str]:
+        """What it did and achieved, as the first cells of a row."""
+        return [
+            self.attack,
+            f"{self.duration_s:.0f} s",
+            f"{self.attempts:,}",
+            str(sum(self.faults.values())),
+            f"{self.frames_lost:,} of {self.frames_sent:,}",
+        ]
 
     @property
     def is_noticed(self) -> bool:

@@ -11,7 +11,7 @@ from uavlinkd.lab.evaluation.page import ReportSection, Table
 from uavlinkd.lab.evaluation.spread import duration
 from uavlinkd.lab.evaluation.stage import DaemonStage
 from uavlinkd.lab.evaluation.tampering_plan import TrialPlan
-from uavlinkd.lab.evaluation.tampering_records import Run
+from uavlinkd.lab.evaluation.tampering_records import EFFECT_HEAD, Run
 
 RELAYED: Final = "relay"
 
@@ -87,11 +87,7 @@ def relay_section(run: Run) -> ReportSection:
     """What a hostile relay achieved."""
     rows = [
         [
-            trial.attack,
-            f"{trial.duration_s:.0f} s",
-            f"{trial.attempts:,}",
-            str(sum(trial.faults.values())),
-            f"{trial.frames_lost:,} of {trial.frames_sent:,}",
+            *trial.effect,
             "not in 5 s" if trial.recovery_s is None else duration(trial.recovery_s),
             ", ".join(trial.reasons) or "-",
         ]
@@ -99,11 +95,7 @@ def relay_section(run: Run) -> ReportSection:
         if trial.group == RELAYED
     ]
     head = [
-        "attack",
-        "duration",
-        "attempts",
-        "false frames accepted",
-        "genuine frames lost",
+        *EFFECT_HEAD,
         "recovery",
         "noticed by",
     ]
