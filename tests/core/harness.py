@@ -259,7 +259,7 @@ def initiation_of(version: int, receiver_public_key: bytes, length: int = 147) -
 
 def exhaust(side: Side, now: float) -> None:
     """Bring a node under load: its budget of initiations and of responses is spent."""
-    for bucket in (side.node._admission._initiations, side.node._admission._responses):
+    for bucket in (side.node._handshakes.admission._initiations, side.node._handshakes.admission._responses):
         while bucket.take(now):
             pass
 

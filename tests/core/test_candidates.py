@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.core.harness import Pair, datagrams, of, only, probe_in, quiet, reasons
+from tests.core.harness import Pair, datagrams, exchange, of, only, probe_in, quiet, reasons
 from uavlinkd.core import constants as c
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.outputs import PathChanged, Transmit
@@ -133,3 +133,16 @@ def test_forgotten_candidate_answers_in_vain(pair: Pair) -> None:
     answered = only(of(pair.b.node.receive(question, HOME, 1.0), Transmit))
     ask(pair, 1.0, at(1))
     assert DropReason.UNEXPECTED_ANSWER in reasons(pair.a.node.receive(answered.datagram, DIRECT, 1.01))
+
+
+def test_questions_in_vain_are_not_a_loss_of_the_path(pair: Pair) -> None:
+    """Otherwise a search would start repair. What the path itself loses is a loss."""
+    best = pair.a.peer.paths.best
+    assert best is not None
+    for now in (1.0, 2.0, 3.0):
+        exchange(pair.b, pair.a, pair.a.node.ask(pair.a.peer, best.path, now), now)
+        assert len(ask(pair, now, *map(at, range(8)))) == 8
+    assert best.loss_to_repair() == (0.0, 0)
+    pair.a.send(3.5)
+    exchange(pair.b, pair.a, pair.a.node.ask(pair.a.peer, best.path, 4.0), 4.0)
+    assert best.loss_to_repair()[1] == 1

@@ -48,8 +48,8 @@ def initiation(pair: Pair, at: Path, now: float, link: Link = COSTLY, *, with_co
     plain = with_macs(message, KEY_B.public)
     if not with_cookie:
         return pair.b.receive(plain, now, at)
-    reply = wire.parse_cookie_reply(pair.b.node._cookies.reply(plain, 77, at, now))
-    cookie = pair.b.node._mac_keys.open_cookie(reply, plain[-wire.MACS_BYTES : -c.MAC_BYTES])
+    reply = wire.parse_cookie_reply(pair.b.node._handshakes.own.cookies.reply(plain, 77, at, now))
+    cookie = pair.b.node._handshakes.own.mac_keys.open_cookie(reply, plain[-wire.MACS_BYTES : -c.MAC_BYTES])
     return pair.b.receive(with_macs(message, KEY_B.public, cookie), now, at)
 
 
@@ -94,7 +94,7 @@ def test_a_flood_from_ten_thousand_networks_leaves_a_known_peer_its_cookie(known
     assert fates.count([DropReason.COOKIE_REQUIRED]) <= 2 * c.COOKIE_REPLIES_PER_S
     assert fates.count([DropReason.BAD_HANDSHAKE]) <= c.INITIATIONS_PER_S
     exhaust(pair.b, 2.0)
-    while pair.b.node._admission._cookie_replies.take(2.0):
+    while pair.b.node._handshakes.admission._cookie_replies.take(2.0):
         pass
     assert reasons(initiation(pair, Path(0, ("10.99.0.1", 9)), 2.0)) == [DropReason.RATE_LIMITED]
     asked = initiation(pair, at, 2.0)

@@ -43,7 +43,7 @@ def initiations(radios: Radios) -> list[float]:
 def cookie_reply(radios: Radios, datagram: bytes, path: Path, now: float) -> bytes:
     """Bravo's cookie for a sender along a path."""
     index = wire.parse_initiation(datagram).sender_index
-    return radios.b.node._cookies.reply(datagram, index, path, now)
+    return radios.b.node._handshakes.own.cookies.reply(datagram, index, path, now)
 
 
 # Responses.
@@ -223,7 +223,7 @@ def test_cookie_belongs_to_its_path() -> None:
         assert radios.a.node.receive(reply, at_b(radio), 0.1) == []
 
     again = initiation(radios, 0.5)
-    jar = radios.b.node._cookies
+    jar = radios.b.node._handshakes.own.cookies
     assert again[0][:-16] == again[1][:-16]
     for radio in (0, 1):
         assert jar.has_valid_mac2(again[radio], at_a(radio), 0.5)

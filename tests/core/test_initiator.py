@@ -169,7 +169,9 @@ def test_cookie_is_used_until_it_is_too_old() -> None:
     """A cookie goes into every handshake message for two minutes, not longer."""
     pair = Pair()
     initiation = pair.initiation(0.0)
-    reply = pair.b.node._cookies.reply(initiation, wire.parse_initiation(initiation).sender_index, pair.a.at, 0.0)
+    reply = pair.b.node._handshakes.own.cookies.reply(
+        initiation, wire.parse_initiation(initiation).sender_index, pair.a.at, 0.0
+    )
     assert pair.a.receive(reply, 0.0) == []
     assert pair.a.peer.traffic.cookies_taken == 1
 
@@ -184,7 +186,7 @@ def test_cookies_of_two_paths_are_kept_apart() -> None:
     six = Path(1, ("2001:db8::2", 5790, 0, 0))
     from_six = Path(1, ("2001:db8::1", 5790, 0, 0))
     pair.a.node.set_paths(pair.a.peer, [AT_B, six], 0.0)
-    jar = pair.b.node._cookies
+    jar = pair.b.node._handshakes.own.cookies
     for now, initiation in initiations(pair, 2):
         assert now == 0.0
         source = pair.a.at if initiation.path == AT_B else from_six
@@ -200,7 +202,7 @@ def test_few_cookies_are_held() -> None:
     """Of a name with many addresses, each of which sends a cookie, only the newest few are held."""
     pair = Pair()
     many = [Path(number, (f"198.51.100.{number}", 5790)) for number in range(c.CONFIGURED_PATHS)]
-    jar = pair.b.node._cookies
+    jar = pair.b.node._handshakes.own.cookies
     sent: dict[Path, Transmit] = {}
     for number in range(c.CONFIGURED_PATHS + 1):  # the peer moves: its first address has another port now
         paths = [Path(0, ("198.51.100.0", 5791)), *many[1:]] if number == c.CONFIGURED_PATHS else many
@@ -220,7 +222,7 @@ def test_cookies_do_not_shorten_the_first_wait() -> None:
     now = initiations(pair, 40)[-1][0]
     assert pair.a.peer.initiator.retry_at >= now + c.RETRY_MAX_S
     index, pending = list(pair.a.peer.initiator.pending.items())[-1]
-    keys = pair.b.node._mac_keys
+    keys = pair.b.node._handshakes.own.mac_keys
     for number in range(20):
         nonce = bytes((number,)) * 16
         forged = wire.encode_cookie_reply(index, nonce, keys.seal_cookie(bytes(16), nonce, pending.mac1))

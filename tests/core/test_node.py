@@ -125,8 +125,8 @@ def rate_limited(pair: Pair, now: float) -> list[Output]:
     exhaust(pair.b, now)
     initiation = made_initiation()
     initiated = wire.parse_initiation(initiation)
-    raw = pair.b.node._cookies.reply(initiation, initiated.sender_index, AT_A, now)
-    cookie = pair.b.node._mac_keys.open_cookie(wire.parse_cookie_reply(raw), initiation[-32:-16])
+    raw = pair.b.node._handshakes.own.cookies.reply(initiation, initiated.sender_index, AT_A, now)
+    cookie = pair.b.node._handshakes.own.mac_keys.open_cookie(wire.parse_cookie_reply(raw), initiation[-32:-16])
     outputs: list[Output] = []
     for _ in range(c.COOKIED_PER_SOURCE_BURST + 1):
         message = made_initiation(KEY_C)[: -wire.MACS_BYTES]
@@ -375,9 +375,11 @@ COUNTED_ONLY = {DropReason.LATE_COPY}
 
 OUTSIDE = {
     *(DropReason.FRAMES_NOT_ALLOWED, DropReason.RELAY_MALFORMED, DropReason.RELAY_UNKNOWN_HANDLE),
-    DropReason.RELAY_OVER_LIMIT,
+    *(DropReason.RELAY_OVER_LIMIT, DropReason.RELAY_UNEXPECTED_TOKEN, DropReason.RECORD_OVER_LIMIT),
+    *(DropReason.UNEXPECTED_RECORD, DropReason.OLD_RECORD),
 }
-"""Reasons of the shell around the node: data along a relay, and frames of a relay. ``tests/link`` provokes them."""
+"""Reasons of the shell around the node: data along a relay, records, and frames of a relay. ``tests/link`` and
+``tests/relay`` provoke them."""
 
 
 def test_every_reason_is_provoked() -> None:
@@ -684,8 +686,8 @@ def test_memory_for_initiations_is_bounded(monkeypatch: pytest.MonkeyPatch) -> N
     assert c.REMEMBERED_INITIATIONS == 1024
     pair = established()
     for number in range(c.REMEMBERED_INITIATIONS + 100):
-        pair.b.node._remember(pair.b.peer, number.to_bytes(32, "big"))
-        assert len(pair.b.node._remembered) <= c.REMEMBERED_INITIATIONS
+        pair.b.node._handshakes.remember(pair.b.peer, number.to_bytes(32, "big"))
+        assert len(pair.b.node._handshakes.remembered) <= c.REMEMBERED_INITIATIONS
 
     monkeypatch.setattr(c, "REMEMBERED_INITIATIONS", 3)
     pair = established()
@@ -700,11 +702,11 @@ def test_memory_for_initiations_is_bounded(monkeypatch: pytest.MonkeyPatch) -> N
 def test_forged_initiations_are_not_remembered() -> None:
     """Only authentic initiations of peers are kept in that memory: no other sender can flush it."""
     pair = established()
-    known = len(pair.b.node._remembered)
+    known = len(pair.b.node._handshakes.remembered)
     for datagram in (made_initiation(KEY_C), repaired(flipped(made_initiation(), 60), KEY_B.public)):
         pair.b.receive(datagram, 1.0)
 
-    assert len(pair.b.node._remembered) == known
+    assert len(pair.b.node._handshakes.remembered) == known
 
 
 def test_sixteen_answers_wait_for_confirmation() -> None:
@@ -808,12 +810,12 @@ def test_cookie_counts_from_its_address_only() -> None:
 def test_cookie_of_the_previous_secret_counts_once_more(age: float, works: bool) -> None:
     """When the secret changed a cookie is still good, when it changed twice it is not."""
     pair = Pair(link_a=QUIET, link_b=QUIET)
-    pair.b.node._cookies._change_secret(0.0)
+    pair.b.node._handshakes.own.cookies._change_secret(0.0)
     given = 119.0
     initiation = made_initiation()
     exhaust(pair.b, given)
     reply = wire.parse_cookie_reply(only(datagrams(pair.b.receive(initiation, given))))
-    cookie = pair.b.node._mac_keys.open_cookie(reply, initiation[-32:-16])
+    cookie = pair.b.node._handshakes.own.mac_keys.open_cookie(reply, initiation[-32:-16])
     message = made_initiation()[: -wire.MACS_BYTES]
     now = given + age
     exhaust(pair.b, now)
@@ -830,7 +832,7 @@ def test_forged_cookie_is_harmless() -> None:
         pair = Pair(link_a=QUIET, link_b=QUIET)
         pair.initiation(0.0)
         index, pending = next(iter(pair.a.peer.initiator.pending.items()))
-        sealed = pair.b.node._mac_keys.seal_cookie(b"forged cookie!!!", bytes(16), pending.mac1)
+        sealed = pair.b.node._handshakes.own.mac_keys.seal_cookie(b"forged cookie!!!", bytes(16), pending.mac1)
         assert pair.a.receive(wire.encode_cookie_reply(index, bytes(16), sealed), 0.0) == []
 
         now, initiation = retried(pair, 0.0)
@@ -850,7 +852,7 @@ def test_forged_cookie_does_not_replace_the_genuine_one() -> None:
     exhaust(pair.b, 0.0)
     assert pair.a.receive(only(datagrams(pair.b.receive(initiation, 0.0))), 0.0) == []
     index, pending = next(iter(pair.a.peer.initiator.pending.items()))
-    sealed = pair.b.node._mac_keys.seal_cookie(b"forged cookie!!!", bytes(16), pending.mac1)
+    sealed = pair.b.node._handshakes.own.mac_keys.seal_cookie(b"forged cookie!!!", bytes(16), pending.mac1)
     forged = wire.encode_cookie_reply(index, bytes(16), sealed)
     assert reasons(pair.a.receive(forged, 0.01)) == [DropReason.UNEXPECTED_COOKIE]
 
@@ -878,7 +880,7 @@ def test_initiations_do_not_spend_the_budget_of_responses() -> None:
     """A flood of initiations leaves our own handshakes alone."""
     pair = Pair(link_a=QUIET, link_b=QUIET)
     response = only(datagrams(pair.b.receive(pair.initiation(0.0), 0.0)))
-    while pair.a.node._admission._initiations.take(0.0):
+    while pair.a.node._handshakes.admission._initiations.take(0.0):
         pass
 
     assert of(pair.a.receive(response, 0.0), SessionEstablished)
@@ -902,8 +904,8 @@ def test_one_source_has_its_share_under_load() -> None:
     assert reasons(rate_limited(pair, 1.0)) == [DropReason.RATE_LIMITED]
 
     initiation = made_initiation()
-    raw = pair.b.node._cookies.reply(initiation, 77, ELSEWHERE, 1.0)
-    cookie = pair.b.node._mac_keys.open_cookie(wire.parse_cookie_reply(raw), initiation[-32:-16])
+    raw = pair.b.node._handshakes.own.cookies.reply(initiation, 77, ELSEWHERE, 1.0)
+    cookie = pair.b.node._handshakes.own.mac_keys.open_cookie(wire.parse_cookie_reply(raw), initiation[-32:-16])
     with_cookie = with_macs(initiation[: -wire.MACS_BYTES], KEY_B.public, cookie)
     assert datagrams(pair.b.receive(with_cookie, 1.0, ELSEWHERE), wire.RESPONSE)
 
@@ -918,8 +920,8 @@ def test_neighbours_do_not_use_up_a_peers_share() -> None:
 
     def asked(place: Path, key: KeyPair) -> list[Output]:
         initiation = made_initiation(key)
-        raw = pair.b.node._cookies.reply(initiation, 77, place, 1.0)
-        cookie = pair.b.node._mac_keys.open_cookie(wire.parse_cookie_reply(raw), initiation[-32:-16])
+        raw = pair.b.node._handshakes.own.cookies.reply(initiation, 77, place, 1.0)
+        cookie = pair.b.node._handshakes.own.mac_keys.open_cookie(wire.parse_cookie_reply(raw), initiation[-32:-16])
         return pair.b.receive(with_macs(initiation[: -wire.MACS_BYTES], KEY_B.public, cookie), 1.0, place)
 
     fates = [reasons(asked(neighbour, KEY_C)) for _ in range(c.COOKIED_PER_SOURCE_BURST + 1)]
@@ -1050,12 +1052,12 @@ def test_one_peer_cannot_flush_another_ones_memory(monkeypatch: pytest.MonkeyPat
     assert datagrams(pair.b.receive(first, 1.0), wire.RESPONSE)
     node.add_peer(PeerSettings("noisy", KEY_C.public), 1.0)
     for number in range(10):
-        node._remember(node.peers["noisy"], number.to_bytes(32, "big"))
+        node._handshakes.remember(node.peers["noisy"], number.to_bytes(32, "big"))
 
     assert reasons(pair.b.receive(first, 2.0)) == [DropReason.DUPLICATE]
-    remembered = len(node._remembered)
+    remembered = len(node._handshakes.remembered)
     node.remove_peer(node.peers["noisy"], 3.0)
-    assert len(node._remembered) == remembered - 3
+    assert len(node._handshakes.remembered) == remembered - 3
 
 
 @pytest.mark.parametrize("known_by", ["its path", "its configured address"])
@@ -1066,8 +1068,8 @@ def test_all_sources_together_have_a_bound(monkeypatch: pytest.MonkeyPatch, know
     """
     pair = established() if known_by == "its path" else Pair(link_a=QUIET, link_b=QUIET)
     node = pair.b.node
-    monkeypatch.setattr(node._cookies, "has_valid_mac2", lambda *_: True)
-    while node._admission._initiations.take(1.0):
+    monkeypatch.setattr(node._handshakes.own.cookies, "has_valid_mac2", lambda *_: True)
+    while node._handshakes.admission._initiations.take(1.0):
         pass
     fates = [
         reasons(node.receive(made_initiation(KEY_C), Path(0, (f"10.0.{number // 200}.{number % 200}", 1)), 1.0))
@@ -1087,7 +1089,7 @@ def test_one_peer_is_answered_a_bounded_number_of_times(monkeypatch: pytest.Monk
     """Its initiations from any number of addresses with cookies get so many answers a second, and no more indices."""
     pair = established()
     node = pair.b.node
-    monkeypatch.setattr(node._cookies, "has_valid_mac2", lambda *_: True)
+    monkeypatch.setattr(node._handshakes.own.cookies, "has_valid_mac2", lambda *_: True)
     answers = 0
     for number in range(100):
         out = node.receive(made_initiation(), Path(0, (f"10.0.0.{number}", 1)), 1.0)

@@ -136,8 +136,8 @@ def test_hints_are_for_the_peer_of_the_line(order: tuple[int, int]) -> None:
 def test_a_cookie_is_valid_on_its_line_alone() -> None:
     """As it is for one address."""
     side: Side = Pair().b
-    cookies = side.node._cookies
-    keys = side.node._mac_keys
+    cookies = side.node._handshakes.own.cookies
+    keys = side.node._handshakes.own.mac_keys
     message = bytes(range(100))
     reply = wire.parse_cookie_reply(cookies.reply(keys.add_macs(message, None), 1, LINE, 0.0))
     cookie = keys.open_cookie(reply, keys.add_macs(message, None)[-32:-16])

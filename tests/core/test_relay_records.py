@@ -19,17 +19,22 @@ from uavlinkd.core.relay_records import (
     Bind,
     Bound,
     Candidates,
+    FilterTest,
+    FilterTested,
     Record,
     binds_of,
     bounds_of,
     handle_of,
     parse_record,
+    token_datagram,
+    token_of,
     wrap,
 )
 
 KEYS = [bytes([number]) * c.KEY_BYTES for number in range(1, 41)]
 BIND = Bind((KEYS[0], KEYS[1]))
 BOUND = Bound("203.0.113.7", 5790, ((KEYS[0], 0x1234), (KEYS[1], WAITING)))
+TOKEN = bytes(range(16))
 LINK = quiet(features=c.FEATURE_RECORDS)
 
 
@@ -44,10 +49,17 @@ def test_encodings_are_the_documented_ones() -> None:
     places = Candidates((("203.0.113.7", 5790), ("2001:db8::1", 1)))
     assert places.encode() == b"\x03" + mapped + b"\x16\x9e" + bytes.fromhex("20010db8" + 22 * "0" + "01" + "0001")
     assert wrap(0x1234, b"\x40abc") == b"\x50\x12\x34\x40abc"
+    assert FilterTest(TOKEN).encode() == b"\x04" + TOKEN + bytes(79)
+    assert FilterTested(TOKEN).encode() == b"\x05" + TOKEN
+    assert token_datagram(TOKEN) == b"\x51" + TOKEN
 
 
 @pytest.mark.parametrize(
-    "record", [BIND, BOUND, Bound("2001:db8::1", 1, ((KEYS[2], 7),)), Candidates((("192.0.2.1", 1), ("fe80::1", 2)))]
+    "record",
+    [
+        *(BIND, BOUND, Bound("2001:db8::1", 1, ((KEYS[2], 7),)), Candidates((("192.0.2.1", 1), ("fe80::1", 2)))),
+        *(FilterTest(TOKEN), FilterTested(TOKEN)),
+    ],
 )
 def test_record_is_parsed(record: Record) -> None:
     """What is encoded comes back."""
@@ -59,6 +71,42 @@ def test_any_bytes_parse_or_drop(data: bytes) -> None:
     """And what parses is encoded as it was."""
     with suppress(Drop):
         assert parse_record(data).encode() == data
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        FilterTest(TOKEN).encode()[:-1],
+        FilterTest(TOKEN).encode() + b"\0",
+        FilterTest(TOKEN).encode()[:-1] + b"\1",
+        FilterTested(TOKEN).encode()[:-1],
+        FilterTested(TOKEN).encode() + b"\0",
+    ],
+    ids=["test short", "test long", "test not padded with zeros", "tested short", "tested long"],
+)
+def test_filter_test_of_another_form_is_dropped(data: bytes) -> None:
+    """Each has one length, and the padding is zero."""
+    with pytest.raises(Drop):
+        parse_record(data)
+
+
+def test_token_has_one_length() -> None:
+    """A datagram of another length contains none."""
+    assert token_of(token_datagram(TOKEN)) == TOKEN
+    assert token_of(token_datagram(TOKEN) + b"\0") == token_of(token_datagram(TOKEN)[:-1]) == token_of(b"\x51") == b""
+
+
+@pytest.mark.parametrize("counter", [0, c.SHORT_COUNTER_LIMIT], ids=["short", "long"])
+def test_filter_test_is_not_shorter_than_what_a_relay_sends_for_it(counter: int) -> None:
+    """The token, with IP and UDP header of its own, and the record, whose envelope may have the longer header."""
+    pair = Pair(LINK, LINK).establish()
+    session = pair.a.session
+    session.send_counter = 0
+    asked = session.seal_record(FilterTest(TOKEN).encode(), 0.0)
+    session.send_counter = counter
+    answer = session.seal_record(FilterTested(TOKEN).encode(), 0.0)
+    ipv6_and_udp = 40 + 8
+    assert len(asked) >= len(answer) + len(token_datagram(TOKEN)) + ipv6_and_udp
 
 
 @given(st.sampled_from((1, 2, 3)), st.integers(0, 1300))
@@ -213,14 +261,14 @@ def test_nothing_is_sent_without_a_path_that_works(pair: Pair) -> None:
     assert not send(Pair(LINK, LINK).a, BIND, 0.0)
 
 
-def test_record_on_a_superseded_session_is_ignored(pair: Pair) -> None:
+def test_record_on_a_superseded_session_is_dropped(pair: Pair) -> None:
     """The peer has sent on newer keys for a while."""
     late = pair.a.session.seal_record(BIND.encode(), 1.0)
     pair.a.peer.initiator.retry_at = 0.0
     pair.establish(121.0)
     assert pair.carries(121.0)
     assert pair.carries(124.0)
-    assert not of(pair.b.receive(late, 125.0), RecordReceived)
+    assert reasons(pair.b.receive(late, 125.0)) == [DropReason.OLD_RECORD]
 
 
 def test_record_expects_no_answer(pair: Pair) -> None:

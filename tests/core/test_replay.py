@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -75,8 +77,17 @@ def test_checking_writes_nothing() -> None:
 
 def test_nothing_was_seen_at_first() -> None:
     """Every counter of the first window is new to a fresh window, also those that share a place with another."""
-    assert not any(ReplayWindow().is_used(counter) for counter in range(3 * W))
+    assert not any(is_refused(ReplayWindow(), counter) for counter in range(3 * W))
     assert ReplayWindow().highest == -1
+
+
+def test_a_session_that_was_never_used_has_no_window() -> None:
+    """A relay with 4,000 members may have many of them, 32 KiB each."""
+    window = ReplayWindow()
+    unused = sys.getsizeof(window._slots)
+    window.mark(0)
+    assert unused < 200
+    assert sys.getsizeof(window._slots) > 4 * W
 
 
 def test_every_counter_of_a_full_window_is_remembered() -> None:

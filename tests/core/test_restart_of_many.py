@@ -76,7 +76,7 @@ def test_burst_grows_with_the_peers_and_is_bounded(peers: int, expected: int) ->
         node.add_peer(PeerSettings(f"m{number}", KeyPair(number.to_bytes(2, "big") * 16).public), 0.0)
         for number in range(1, peers + 1)
     ]
-    bucket = node._admission._initiations
+    bucket = node._handshakes.admission._initiations
     assert bucket.has(0.0, expected)
     assert not bucket.has(0.0, expected + 1)
     for peer in added:

@@ -8,7 +8,7 @@ import pytest
 
 from uavlinkd.core import constants as c
 from uavlinkd.core import wire
-from uavlinkd.core.settings import Link, PeerSettings, Timers
+from uavlinkd.core.settings import Link, PeerSettings, Timers, previous_of
 from uavlinkd.core.suites import X25519
 
 
@@ -36,3 +36,12 @@ def test_settings_are_frozen() -> None:
     with pytest.raises(dataclasses.FrozenInstanceError):
         settings.link = Link()  # type: ignore[misc]
     assert settings.psk is None
+
+
+def test_a_peer_by_its_previous_key_differs_in_name_and_key() -> None:
+    """It is another peer of the node, with the same link."""
+    settings = PeerSettings("alpha", bytes(32), None, Link(tag_bytes=12), initiates=False)
+    before = previous_of(settings, bytes([1]) * 32)
+    assert before.name not in ("", settings.name)
+    assert before.public_key == bytes([1]) * 32
+    assert (before.link, before.initiates) == (settings.link, False)

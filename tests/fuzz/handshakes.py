@@ -113,7 +113,7 @@ def _refill(pair: Pair, now: float) -> None:
     for pending in pair.a.peer.initiator.pending.values():
         pending.__post_init__()
     for node in (pair.a.node, pair.b.node):
-        node._admission = Admission(node._is_known, now)
+        node._handshakes.admission = Admission(node._is_known, now)
         for peer in node.peers.values():
             peer.group_share = GroupShare(now)
             peer.answers = peer.answers_while_up = TokenBucket(c.ANSWERS_PER_S, c.ANSWERS_BURST, now)

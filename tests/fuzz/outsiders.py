@@ -232,8 +232,8 @@ class Outsider:
 
 def _refill(node: Node, now: float) -> None:
     """Full budgets, and no drops. The budgets are small, so that scripts reach requests for cookies."""
-    node._admission._initiations = TokenBucket(1.0, BUDGET, now)
-    node._admission._responses = TokenBucket(1.0, BUDGET, now)
+    node._handshakes.admission._initiations = TokenBucket(1.0, BUDGET, now)
+    node._handshakes.admission._responses = TokenBucket(1.0, BUDGET, now)
     node.drops.clear()
     for peer in node.peers.values():
         peer.traffic.drops.clear()

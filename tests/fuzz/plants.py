@@ -34,11 +34,12 @@ from uavlinkd.core import node as core_node
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.limits import TokenBucket
 from uavlinkd.core.outputs import Transmit
+from uavlinkd.core.path import Path
 from uavlinkd.endpoints import line_framing
 from uavlinkd.lab.mitm import anatomy
 from uavlinkd.lab.mitm import proxy_settings as mitm_settings
 from uavlinkd.lab.sim import tlog
-from uavlinkd.link import candidates, relay_link
+from uavlinkd.link import candidates, filter_tests, relay_link
 from uavlinkd.mavlink import frames, routing, stream_splitter
 from uavlinkd.mavlink.headers import Header
 from uavlinkd.mavlink.policy import gate
@@ -274,6 +275,23 @@ def _accepts_any_key(right: Any) -> Any:
     return receive
 
 
+def _takes_tokens_from_anywhere(right: Any) -> Any:
+    def take_token(self: Any, data: bytes, path: Any) -> Any:
+        test = self._tests.get(data[1:])
+        return right(self, data, path if test is None else Path(test.path.socket, (test.path.host, 1)))
+
+    return take_token
+
+
+def _tests_without_a_limit(right: Any) -> Any:
+    def on_record(self: Any, received: Any, now: float) -> None:
+        for member in self.members.values():
+            member.filter_tests = TokenBucket(1e6, 1e6, now)
+        right(self, received, now)
+
+    return on_record
+
+
 def _fills_the_bucket(right: Any) -> Any:
     def ask_candidates(peer: Any, now: float) -> Any:
         peer.candidate_questions = TokenBucket(1e6, 1e6, now)
@@ -361,6 +379,16 @@ PLANTS: Final = {
     ),
     "handles of others": Plant(
         "handles", "a handle for a peer that was not asked for", relay_link._Binding, "receive", _accepts_any_key
+    ),
+    "token from anywhere": Plant(
+        "handles",
+        "a token counts from the relay's own port too",
+        filter_tests.FilterTests,
+        "take_token",
+        _takes_tokens_from_anywhere,
+    ),
+    "filter tests without end": Plant(
+        "relay", "a member's filter tests have no limit", service.RelayService, "on_record", _tests_without_a_limit
     ),
     "any candidate": Plant(
         "candidates", "special addresses are asked", candidates, "may_be_asked", lambda _: lambda place: True

@@ -128,7 +128,7 @@ def _make_small(pair: Pair, seed: int) -> None:
         entropy = SeededEntropy(seed + number)
         node = side.node
         # The generator of the harness would make copies slow.
-        node._entropy = node._cookies._entropy = node._indices._entropy = entropy
+        node._entropy = node._handshakes.own.cookies._entropy = node._indices._entropy = entropy
         for peer in node.peers.values():
             peer.entropy = peer.initiator._entropy = entropy
 

@@ -34,7 +34,18 @@ class DropReason(Reason):
         "data along a relay has a handle that is not assigned to its sender: it is old or forged",
     )
 
+    RELAY_UNEXPECTED_TOKEN = (
+        "relay_unexpected_token",
+        "a token arrived that this daemon did not ask a relay for, or not from another port of that relay",
+    )
     RELAY_OVER_LIMIT = "relay_over_limit", "a member sends more along this relay than its limit allows"
+    RECORD_OVER_LIMIT = "record_over_limit", "a member asks this relay for more, or more often, than it may"
+    UNEXPECTED_RECORD = (
+        "unexpected_record",
+        "an authentic record of a relay or a member has no effect: this daemon asked for nothing that it names, or"
+        " may not act on it along this path",
+    )
+    OLD_RECORD = "old_record", "an authentic record of a relay or a member is older than one that came before it"
 
     # Handshake.
     UNEXPECTED_RESPONSE = "unexpected_response", "the response belongs to no pending initiation of this daemon"
@@ -85,7 +96,7 @@ class DropReason(Reason):
         "the envelope names a session that does not exist here: one side restarted, or the envelope is forged",
     )
     LATE = "late", "the envelope belongs to a session that ended recently"
-    OVER_SHARE = "over_share", "the daemon is busy, and the sender has more datagrams waiting than its share"
+    OVER_SHARE = "over_share", "the daemon is busy, and more datagrams wait than the share of their sender or kind"
     TOO_LONG = "too_long", "the envelope is longer than both ends agreed"
     SESSION_EXPIRED = "session_expired", "the keys of the envelope are too old"
     LONG_COUNTER = "long_counter", "the envelope has a small counter in the long form"

@@ -17,7 +17,7 @@ class EchoRequest:
     """On which it was sent; None if that has ended."""
     sent_at: float
     sent: int
-    """Envelopes of the session until then, the request included."""
+    """Envelopes of the session until then, the request included, without questions to candidates."""
     repeats: Repeats
     """Of them, along the best path."""
     is_answered: bool = False

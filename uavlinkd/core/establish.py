@@ -89,7 +89,7 @@ def receive_hint(peer: Peer, now: float) -> list[Output]:
     is_silent = silent_since is not None and now >= silent_since + peer.echo_after_s
     if peer.sessions.current is not None and not is_silent:
         return []  # the peer sends on a session of ours: the hint is false, and anyone can replay an old envelope
-    if now < peer.hinted_at + c.HINTS_INTERVAL_S:
+    if now < peer.hinted_at + c.HINTS_INTERVAL_S or not peer.settings.initiates:
         return []
     peer.hinted_at = now
     return initiate(peer, now)

@@ -1,7 +1,7 @@
 """The two handshake messages: the Noise messages, the headers in front of them and what is sealed inside.
 
-Functions without state. ``node.py``, ``establish.py`` and ``initiator.py`` decide when a message is read or written,
-and what it changes.
+Functions without state. ``receive_handshake.py``, ``establish.py`` and ``initiator.py`` decide when a message is read
+or written, and what it changes.
 """
 
 from __future__ import annotations

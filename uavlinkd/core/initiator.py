@@ -60,7 +60,7 @@ class Initiator:
         """No initiation is sent earlier, however much new keys are wanted."""
         self.attempts = 0
         """Initiations since new keys were wanted."""
-        self._settings = settings
+        self.settings = settings
         self._identity = identity
         self._indices = indices
         self._entropy = entropy
@@ -108,8 +108,8 @@ class Initiator:
 
     def _try_interval_s(self, path: Path) -> float:
         """Between tries along a path; 0 if it carries the usual ones."""
-        interval_s = self._facts.try_interval_s(path, self._settings.link.suites[0])
-        return interval_s if interval_s > self._settings.link.timers.retry_min_s else 0.0
+        interval_s = self._facts.try_interval_s(path, self.settings.link.suites[0])
+        return interval_s if interval_s > self.settings.link.timers.retry_min_s else 0.0
 
     def _jitter(self) -> float:
         return 1.0 + c.RETRY_JITTER * int.from_bytes(self._entropy(2), "big") / 2**16
@@ -125,7 +125,7 @@ class Initiator:
         """
         if not self.attempts:
             self._began_at = now
-        timers = self._settings.link.timers
+        timers = self.settings.link.timers
         # Bounded before the power is taken: a peer may stay away for years.
         doublings = min(self.attempts // c.RETRIES_PER_WAIT, 32)
         wait = min(timers.retry_min_s * 2.0**doublings, timers.retry_max_s)
@@ -139,7 +139,7 @@ class Initiator:
         self, index: int, paths: Sequence[Path], generation: int, now: float
     ) -> tuple[Pending, list[tuple[bytes, Path]]]:
         """An initiation under this index, and its datagram for each path. They are equal up to mac1."""
-        initiated = handshake.initiate(self._identity, self._settings, index, generation, self._entropy)
+        initiated = handshake.initiate(self._identity, self.settings, index, generation, self._entropy)
         datagrams = [(self.add_macs(initiated.message, path, now), path) for path in paths]
         mac1 = mac1_of(datagrams[0][0])
         slowest_s = max(map(self._try_interval_s, paths))
@@ -177,7 +177,7 @@ class Initiator:
             del self._received_cookies[next(iter(self._received_cookies))]
         self._received_cookies[path] = cookie, now + c.COOKIE_HELD_S
         # Anyone who sees our datagrams can make a cookie, so it may not make us send faster than the first retry.
-        soon = max(now, self.initiated_at + self._settings.link.timers.retry_min_s)
+        soon = max(now, self.initiated_at + self.settings.link.timers.retry_min_s)
         self.retry_at = min(self.retry_at, soon)
 
     def add_macs(self, message: bytes, path: Path, now: float) -> bytes:
@@ -198,7 +198,7 @@ class Initiator:
 
     def invite(self, now: float) -> None:
         """A relay shows that the peer is there: try soon, but not faster than the first retry. It may be a lie."""
-        self.retry_at = min(self.retry_at, max(now, self.initiated_at + self._settings.link.timers.retry_min_s))
+        self.retry_at = min(self.retry_at, max(now, self.initiated_at + self.settings.link.timers.retry_min_s))
 
     def reset(self) -> None:
         """No new keys are wanted now: the next initiation is repeated after the shortest wait."""

@@ -10,11 +10,9 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 
-from uavlinkd.core import constants as c
-from uavlinkd.core import establish, handshake, probing, wire
-from uavlinkd.core.admission import Admission, CookieRequired, Message
-from uavlinkd.core.cookie import CookieJar, MacKeys, mac1_of
-from uavlinkd.core.crypto import Entropy, KeyPair, Secret, equal
+from uavlinkd.core import establish, probing, wire
+from uavlinkd.core.admission import Admission, CookieRequired
+from uavlinkd.core.crypto import Entropy, Secret
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.indices import Indices
 from uavlinkd.core.initiator import Pending
@@ -23,6 +21,7 @@ from uavlinkd.core.path import Path, SocketAddress
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.probing import ask_candidates
 from uavlinkd.core.receive import receive_envelope
+from uavlinkd.core.receive_handshake import HandshakeReceiver, OwnKeys
 from uavlinkd.core.refusals import Refused
 from uavlinkd.core.relay_records import Record
 from uavlinkd.core.send import ask_for_echo, note_repeat, recount, report_refusals, send_frames, send_record
@@ -31,10 +30,6 @@ from uavlinkd.core.settings import Class, PeerSettings, Screen, hold_all
 from uavlinkd.core.socket_facts import SocketFacts
 from uavlinkd.core.timeouts import handle_timeout
 from uavlinkd.core.timers import Schedule
-from uavlinkd.core.versions import version_of
-
-_MAVLINK_STARTS = frozenset((0xFD, 0xFE))
-_NOT_OUR_VERSION = frozenset((DropReason.MALFORMED, DropReason.BAD_MAC1))
 
 
 class Node:
@@ -58,19 +53,16 @@ class Node:
         screen: Screen = hold_all,
     ) -> None:
         self._screen = screen
-        self._identity = KeyPair(private_key.reveal())
         self._entropy = entropy
-        self._mac_keys = MacKeys(self._identity.public)
-        self._cookies = CookieJar(self._mac_keys, entropy, now)
-        self._previous = None if previous_private_key is None else _Previous(previous_private_key, entropy, now)
         self._indices = Indices[tuple[Peer, Session | Pending]](entropy)
-        self._by_keys: dict[tuple[bytes, bytes], Peer] = {}  # ours, theirs
         self._by_address: dict[SocketAddress, Peer] = {}
-        self._remembered: dict[bytes, Peer] = {}  # by the ephemeral of an authentic initiation: its sender
         self._last_seen: Counter[SocketAddress] = Counter()  # where peers have proved to be, and how many
         self._facts = SocketFacts()
-        self._admission = Admission(self._is_known, now)
         self._schedule = Schedule[Peer]()
+        own = OwnKeys(private_key, entropy, now)
+        previous = None if previous_private_key is None else OwnKeys(previous_private_key, entropy, now)
+        admission = Admission(self._is_known, now)
+        self._handshakes = HandshakeReceiver(own, previous, self._indices, admission, self._facts, self._schedule)
         self.peers: dict[str, Peer] = {}
         """By name."""
         self.drops: Counter[DropReason] = Counter()
@@ -79,7 +71,7 @@ class Node:
     @property
     def public_key(self) -> bytes:
         """This daemon's identity."""
-        return self._identity.public
+        return self._handshakes.own.identity.public
 
     # Peers.
 
@@ -93,36 +85,35 @@ class Node:
             ValueError: the name or the pair of keys is there already, the peer's key is one of ours, or
                 ``by_previous_key`` without a previous key.
         """
-        identity, previous = self._identity, None if self._previous is None else self._previous.identity
+        handshakes = self._handshakes
+        identity, previous = handshakes.own.identity, handshakes.previous_identity
         if by_previous_key:
             if previous is None:
                 raise ValueError(f"peer {settings.name} cannot know a previous key: this node has only one")
             identity = previous
         keys = identity.public, settings.public_key
-        if settings.name in self.peers or keys in self._by_keys:
+        if settings.name in self.peers or keys in handshakes.peers:
             raise ValueError(f"peer {settings.name} is there already")
         if settings.public_key in (self.public_key, None if previous is None else previous.public):
             raise ValueError(f"peer {settings.name} has this daemon's own key")
         shared = self._screen, self._last_seen, self._facts
         peer = Peer(settings, identity, self._indices, self._entropy, now, *shared)
-        self.peers[settings.name] = self._by_keys[keys] = peer
+        self.peers[settings.name] = handshakes.peers[keys] = peer
         self._facts.share_budgets(len(self.peers))
-        self._admission.set_peers(len(self.peers))
+        self._handshakes.admission.set_peers(len(self.peers))
         return peer
 
     def forget_previous_key(self) -> None:
         """Accept nothing for our previous key any more. Remove the peers by it first."""
-        self._previous = None
+        self._handshakes.previous = None
 
     def remove_peer(self, peer: Peer, now: float) -> list[Output]:
         """Cut this peer off at once: its keys are forgotten, and nothing from it is accepted any more."""
         del self.peers[peer.name]
         self._facts.share_budgets(len(self.peers))
-        self._admission.set_peers(len(self.peers))
-        self._by_keys = {keys: other for keys, other in self._by_keys.items() if other is not peer}
+        self._handshakes.admission.set_peers(len(self.peers))
+        self._handshakes.forget(peer)
         self._forget_addresses(peer)
-        for ephemeral in peer.remembered:
-            self._remembered.pop(ephemeral, None)
         out = establish.close(peer, now)
         peer.paths.clear()
         self._schedule.remove(peer)
@@ -139,6 +130,12 @@ class Node:
         for path in peer.paths.configured:
             self._by_address[path.place] = peer
         self._revise_paths(peer, now)
+
+    def offer(self, peer: Peer, features: int, now: float) -> None:
+        """Offer other features to a peer from now on. Its session stays until there are new keys."""
+        if features != peer.settings.link.features:
+            peer.offer(features, now)
+            self._revise_paths(peer, now)
 
     def set_metered(self, sockets: Iterable[int], now: float) -> None:
         """The sockets whose network is paid by the byte. This hastens no try."""
@@ -242,17 +239,19 @@ class Node:
         """What to do about a datagram. Never raises, whatever the bytes."""
         try:
             if datagram[:1] not in wire.ENVELOPE_STARTS:
-                return self._receive_handshake(datagram, path, now)
+                return self._handshakes.receive(datagram, path, now)
             index, counter, header_bytes = wire.parse_envelope_header(datagram)
             peer, session = self._indices.owners.get(index, (None, None))
             if peer is None or not isinstance(session, Session):
                 return self._receive_stray(datagram, index, path, now)
             if self._facts.peers_at:
-                self._check_network(peer, path)
+                self._facts.check_network(peer, path)
             out = receive_envelope(peer, session, datagram, header_bytes, counter, path, now)
             if peer.timers.next_at < peer.timers.scheduled_at:
                 self._schedule.update(peer)
             return out
+        except CookieRequired as drop:
+            return [drop.reply, self._count(datagram, drop, path)]
         except Drop as drop:
             return [self._count(datagram, drop, path)]
 
@@ -303,7 +302,7 @@ class Node:
         return path.sender if self._is_known(path.place) else None
 
     def refuse(self, datagram: bytes, path: Path) -> Dropped:
-        """Count a datagram that a busy shell does not hand over: its sender has more waiting than its share."""
+        """Count a datagram that a busy shell does not hand over: more wait than their share."""
         return self._count(datagram, Drop(DropReason.OVER_SHARE), path)
 
     # Envelopes without a session.
@@ -317,145 +316,7 @@ class Node:
             self._schedule.update(peer)
         return [*out, self._count(datagram, Drop(DropReason.UNKNOWN_INDEX), path)]
 
-    # Handshake messages, the cheapest check first.
-
-    def _receive_handshake(self, datagram: bytes, path: Path, now: float) -> list[Output]:
-        kind = datagram[0] if datagram else 0
-        try:
-            if kind == wire.INITIATION:
-                try:
-                    return self._receive_initiation(datagram, path, now)
-                except Drop as drop:
-                    self._name_version(drop.reason, datagram, path, now)
-                    raise
-            if kind == wire.RESPONSE:
-                return self._receive_response(datagram, path, now)
-        except CookieRequired as drop:
-            return [drop.reply, self._count(datagram, drop, path)]
-        if kind == wire.COOKIE:
-            return self._receive_cookie(datagram, path, now)
-        raise Drop(DropReason.RAW_MAVLINK if kind in _MAVLINK_STARTS else DropReason.MALFORMED)
-
-    def _receive_initiation(self, datagram: bytes, path: Path, now: float) -> list[Output]:
-        initiation = wire.parse_initiation(datagram)
-        self._admission.read(path, now)
-        identity, cookies = self._addressed(datagram)
-        sender = self._remembered.get(initiation.ephemeral)
-        if sender is not None:  # before the budget: one recording must not use it up
-            self._check_network(sender, path)
-            return self._answer_copy(sender, datagram, path, now)
-        message = Message(datagram, initiation.sender_index, path, cookies)
-        self._admission.admit_initiation(message, now)
-        received = handshake.receive_initiation(identity, initiation)
-        peer = self._by_keys.get((identity.public, received.public_key))
-        if peer is None:
-            raise Drop(DropReason.UNKNOWN_PEER, received.public_key)
-        # Before it is remembered: otherwise a line could use up what this peer sends along its own network.
-        self._check_network(peer, path)
-        self._remember(peer, initiation.ephemeral)
-        try:
-            out = self._answer(peer, received, message, now)
-        except CookieRequired as drop:
-            return [drop.reply, peer.drop_datagram(drop.reason, path)]
-        except Drop as drop:
-            return [peer.drop_datagram(drop.reason, path, drop.detail)]
-        self._schedule.update(peer)
-        return out
-
-    def _answer_copy(self, peer: Peer, datagram: bytes, path: Path, now: float) -> list[Output]:
-        """An initiation of this peer that was read before: it sends one along several paths.
-
-        Raises:
-            Drop: ``REPLAYED_INITIATION``, or ``DUPLICATE`` if the response went along this path already.
-        """
-        mac1 = mac1_of(datagram)
-        for waiting in peer.sessions.unconfirmed.values():
-            if equal(waiting.initiation_mac1, mac1):
-                out = establish.answer_copy(peer, waiting, path, now)
-                return [*out, peer.drop_datagram(DropReason.DUPLICATE, path)]
-        raise Drop(DropReason.REPLAYED_INITIATION)
-
-    def _answer(self, peer: Peer, received: handshake.Received, message: Message, now: float) -> list[Output]:
-        suite = received.initiation.suite
-        self._admission.admit_answer(peer, message, now)
-        if suite not in peer.settings.link.suites:
-            raise Drop(DropReason.SUITE_NOT_ACCEPTED, suite.name)
-        if suite.has_group:
-            self._admission.admit_group(peer, suite, message, now)
-        return establish.answer(peer, received, message.datagram, message.path, now)
-
-    def _receive_response(self, datagram: bytes, path: Path, now: float) -> list[Output]:
-        response = wire.parse_response(datagram)
-        peer, pending = self._indices.owners.get(response.receiver_index, (None, None))
-        if peer is None or not isinstance(pending, Pending):
-            # The peer sends its response along several paths; the first one made the session.
-            is_copy = isinstance(pending, Session) and pending.remote_index == response.sender_index
-            raise Drop(DropReason.DUPLICATE if is_copy else DropReason.UNEXPECTED_RESPONSE)
-        self._check_network(peer, path)
-        _, cookies = self._addressed(datagram)
-        self._admission.admit_response(Message(datagram, response.sender_index, path, cookies), now)
-        out = establish.receive_response(peer, pending, response, path, now)
-        self._schedule.update(peer)
-        return out
-
-    def _receive_cookie(self, datagram: bytes, path: Path, now: float) -> list[Output]:
-        reply = wire.parse_cookie_reply(datagram)
-        peer, owner = self._indices.owners.get(reply.receiver_index, (None, None))
-        if peer is None:
-            raise Drop(DropReason.UNEXPECTED_COOKIE)
-        asked = owner if isinstance(owner, Pending) else peer.sessions.unconfirmed.get(reply.receiver_index)
-        # One for each message and path: an observer can make more, but has to be faster than the peer each time.
-        if asked is None or path not in asked.paths or path in asked.cookied:
-            raise Drop(DropReason.UNEXPECTED_COOKIE)
-        establish.receive_cookie(peer, asked.mac1, path, reply, now)
-        asked.cookied.add(path)
-        self._schedule.update(peer)
-        return []
-
-    def _addressed(self, datagram: bytes) -> tuple[KeyPair, CookieJar]:
-        """Which of our keys a handshake message is for.
-
-        Raises:
-            Drop: ``BAD_MAC1`` if it is for none of them.
-        """
-        try:
-            self._mac_keys.check_mac1(datagram)
-        except Drop:
-            if self._previous is None:
-                raise
-            self._previous.mac_keys.check_mac1(datagram)
-            return self._previous.identity, self._previous.cookies
-        return self._identity, self._cookies
-
-    def _name_version(self, reason: DropReason, datagram: bytes, path: Path, now: float) -> None:
-        """Another version may have other lengths (malformed), and has another label of mac1.
-
-        Raises:
-            Drop: ``OTHER_VERSION``.
-        """
-        if reason not in _NOT_OUR_VERSION or not self._admission.may_compare_versions(path, now):
-            return
-        identities = [self._identity] + ([] if self._previous is None else [self._previous.identity])
-        if (version := version_of(datagram, (identity.public for identity in identities))) is not None:
-            raise Drop(DropReason.OTHER_VERSION, version)
-
-    def _remember(self, peer: Peer, ephemeral: bytes) -> None:
-        # A memory for each peer: no peer can make us forget what another sent.
-        self._remembered[ephemeral] = peer
-        peer.remembered.append(ephemeral)
-        if len(peer.remembered) > c.REMEMBERED_INITIATIONS:
-            self._remembered.pop(peer.remembered.popleft(), None)
-
     # Where peers are.
-
-    def _check_network(self, peer: Peer, path: Path) -> None:
-        """A datagram names this peer, or is of it.
-
-        Raises:
-            Drop: ``WRONG_NETWORK`` if it came along a network with another peer at its other end.
-        """
-        if not self._facts.leads_to(path.socket, peer):
-            raise Drop(DropReason.WRONG_NETWORK)
 
     def _is_known(self, address: SocketAddress) -> bool:
         """Whether a peer is configured at an address, or was last seen there."""
@@ -479,14 +340,3 @@ class Node:
         index = wire.claimed_receiver_index(datagram)
         owner = self._indices.owners.get(index) if index else None
         return None if owner is None else owner[0]
-
-
-class _Previous:
-    """The previous identity, and what goes with it."""
-
-    __slots__ = ("cookies", "identity", "mac_keys")
-
-    def __init__(self, private_key: Secret, entropy: Entropy, now: float) -> None:
-        self.identity = KeyPair(private_key.reveal())
-        self.mac_keys = MacKeys(self.identity.public)
-        self.cookies = CookieJar(self.mac_keys, entropy, now)

@@ -7,6 +7,7 @@ Functions change it, in modules by topic: :mod:`.send`, :mod:`.receive`, :mod:`.
 from __future__ import annotations
 
 from collections import Counter, deque
+from dataclasses import replace
 
 from uavlinkd.core import constants as c
 from uavlinkd.core.constants import NEVER
@@ -82,6 +83,8 @@ class Peer:
         """Where the peer is, or may be."""
         self.paths.reports_single = bool(settings.link.features & c.FEATURE_RECORDS)
         self.is_up = False
+        self.offered_at = -NEVER
+        """When the features changed that this side offers."""
         self.established_at: float | None = None
         self.received_at: float | None = None
         """When an envelope or response that is known to be new arrived last."""
@@ -119,6 +122,13 @@ class Peer:
         session = self.sessions.current
         return None if session is None or session.is_used_up else session
 
+    def offer(self, features: int, now: float) -> None:
+        """Offer other features. A session keeps those that it began with, so new keys are wanted."""
+        self.settings = replace(self.settings, link=replace(self.settings.link, features=features))
+        self.initiator.settings = self.settings
+        self.paths.reports_single = bool(features & c.FEATURE_RECORDS)
+        self.offered_at = now
+
     # Outputs.
 
     def drop(self, reason: DropReason, count: int) -> list[Output]:
@@ -154,10 +164,10 @@ class Peer:
 
     def keys_wanted_at(self) -> float:
         """When new keys are wanted: at once without a session; else by count, by age, or by silence."""
-        if not self.paths.has_any:
+        if not self.paths.has_any or not self.settings.initiates:
             return NEVER
         session = self.sessions.current
-        if session is None or session.send_counter >= c.REKEY_AFTER_ENVELOPES:
+        if session is None or session.send_counter >= c.REKEY_AFTER_ENVELOPES or session.created_at < self.offered_at:
             return -NEVER
         durations = self.durations
         wanted_at = session.created_at + durations.rekey_after_s

@@ -88,6 +88,7 @@ def ask_candidates(peer: Peer, now: float) -> list[Output]:
     for state in peer.paths.to_ask(now):
         if not peer.candidate_questions.take(now):
             break
+        session.candidate_questions += 1
         out += _send(peer, session, state, peer.new_question(), 0, now)
     return out
 

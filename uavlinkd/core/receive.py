@@ -174,7 +174,7 @@ def _receive_record(
     except Drop as drop:
         return [peer.drop_datagram(drop.reason, state.path)]
     if is_superseded:
-        return []
+        return [peer.drop_datagram(DropReason.OLD_RECORD, state.path)]
     return [RecordReceived(peer, state.path, record, session.order_base + counter)]
 
 

@@ -10,12 +10,13 @@ from typing import NamedTuple
 from uavlinkd.core import constants as c
 from uavlinkd.core.drops import Drop, DropReason
 
-BIND, BOUND, CANDIDATES = 1, 2, 3
+BIND, BOUND, CANDIDATES, FILTER_TEST, FILTER_TESTED = 1, 2, 3, 4, 5
 WAITING = 0
 """The handle of a peer that cannot be reached through the relay now."""
 _BOUND_HEADER = struct.Struct(">B16sH")
 _PLACE = struct.Struct(">16sH")
 _ENTRY = struct.Struct(f">{c.KEY_BYTES}sH")
+_TOKEN_END = 1 + c.FILTER_TOKEN_BYTES
 
 
 class Bind(NamedTuple):
@@ -78,7 +79,44 @@ class Candidates(NamedTuple):
         return bytes((CANDIDATES,)) + b"".join(_PLACE.pack(_packed(host), port) for host, port in self.places)
 
 
-Record = Bind | Bound | Candidates
+class FilterTest(NamedTuple):
+    """A member asks for the token from another port of the relay: whether a NAT or a firewall lets it in.
+
+    It is longer than the token and the answer together, with their IP headers.
+
+    ::
+
+        offset  size  field
+        0       1     kind (4)
+        1       16    token
+        17      79    zeros
+    """
+
+    token: bytes
+
+    def encode(self) -> bytes:
+        """The record."""
+        return (bytes((FILTER_TEST,)) + self.token).ljust(c.FILTER_TEST_BYTES, b"\0")
+
+
+class FilterTested(NamedTuple):
+    """The relay sent the token from another port, to the address that this record goes to.
+
+    ::
+
+        offset  size  field
+        0       1     kind (5)
+        1       16    token
+    """
+
+    token: bytes
+
+    def encode(self) -> bytes:
+        """The record."""
+        return bytes((FILTER_TESTED,)) + self.token
+
+
+Record = Bind | Bound | Candidates | FilterTest | FilterTested
 
 
 def _packed(host: str) -> bytes:
@@ -114,6 +152,10 @@ def parse_record(data: bytes) -> Record:
         if not rest and 1 <= count <= c.CANDIDATES:
             places: Iterator[tuple[bytes, int]] = _PLACE.iter_unpack(data[1:])
             return Candidates(tuple((_host_of(packed), port) for packed, port in places))
+    elif kind == bytes((FILTER_TEST,)) and size == c.FILTER_TEST_BYTES and not any(data[_TOKEN_END:]):
+        return FilterTest(data[1:_TOKEN_END])
+    elif kind == bytes((FILTER_TESTED,)) and size == _TOKEN_END:
+        return FilterTested(data[1:])
     raise Drop(DropReason.BAD_CONTROL)
 
 
@@ -161,3 +203,25 @@ def handle_of(data: bytes) -> int:
     """The handle of data that begins with 0x50; 0, which is never a handle, if it is malformed."""
     is_valid = len(data) > _RELAYED_HEADER.size and data[_RELAYED_HEADER.size] in INNER_STARTS
     return int.from_bytes(data[1:3], "big") if is_valid else 0
+
+
+# A token from another port of a relay. Section 22.
+
+TOKEN = 0x51
+
+
+def token_datagram(token: bytes) -> bytes:
+    """What a relay sends from another port.
+
+    ::
+
+        offset  size  field
+        0       1     type (0x51)
+        1       16    token
+    """
+    return bytes((TOKEN,)) + token
+
+
+def token_of(data: bytes) -> bytes:
+    """The token in a datagram that begins with 0x51; empty, which is never a token, if the length is wrong."""
+    return data[1:] if len(data) == _TOKEN_END else b""

@@ -218,7 +218,7 @@ def ask_for_echo(peer: Peer, session: Session, now: float, route: Route = ()) ->
     session.verification.asked(now)
     peer.set_freshness()
     repeats = NO_REPEATS if peer.paths.best is None else peer.paths.best.repeats
-    token = peer.echo_requests.add(session, now, session.send_counter + 1, repeats)
+    token = peer.echo_requests.add(session, now, session.send_counter + 1 - session.candidate_questions, repeats)
     echo = wire.Echo(False, token, session.received, session.expected)
     out = send_echo(peer, session, echo, route or peer.paths.routes[Class.CRITICAL], now)
     peer.asked_at = now

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 from uavlinkd.core import constants as c
@@ -83,3 +83,10 @@ class PeerSettings:
     public_key: bytes
     psk: Secret | None = None
     link: Link = field(default_factory=Link)
+    initiates: bool = True
+    """Whether this side makes sessions too. A relay leaves that to its members."""
+
+
+def previous_of(settings: PeerSettings, public_key: bytes) -> PeerSettings:
+    """The same peer by its previous key, while its key changes: another peer of the node."""
+    return replace(settings, name=f"{settings.name} (previous key)", public_key=public_key)

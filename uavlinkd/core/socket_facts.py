@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 from uavlinkd.core import constants as c
 from uavlinkd.core import wire
+from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.path import Path
 from uavlinkd.core.suites import Suite
 
@@ -99,7 +100,12 @@ class SocketFacts:
         """The peers at the other end of each of these sockets; those of all other sockets may have any peer."""
         self.peers_at = {socket: frozenset(those) for socket, those in peers.items()}
 
-    def leads_to(self, socket: int, peer: Hashable) -> bool:
-        """Whether datagrams of this peer may arrive on a socket."""
-        peers = self.peers_at.get(socket)
-        return peers is None or peer in peers
+    def check_network(self, peer: Hashable, path: Path) -> None:
+        """A datagram that names this peer, or is of it, came along a path.
+
+        Raises:
+            Drop: ``WRONG_NETWORK`` if there is another peer at the other end of this network.
+        """
+        peers = self.peers_at.get(path.socket)
+        if peers is not None and peer not in peers:
+            raise Drop(DropReason.WRONG_NETWORK)

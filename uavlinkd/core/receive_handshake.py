@@ -1,0 +1,204 @@
+"""Handshake messages, the cheapest check first. README.md, sections 7 and 13."""
+
+from __future__ import annotations
+
+from uavlinkd.core import constants as c
+from uavlinkd.core import establish, handshake, wire
+from uavlinkd.core.admission import Admission, CookieRequired, Message
+from uavlinkd.core.cookie import CookieJar, MacKeys, mac1_of
+from uavlinkd.core.crypto import Entropy, KeyPair, Secret, equal
+from uavlinkd.core.drops import Drop, DropReason
+from uavlinkd.core.indices import Indices
+from uavlinkd.core.initiator import Pending
+from uavlinkd.core.outputs import Output
+from uavlinkd.core.path import Path
+from uavlinkd.core.peer import Peer
+from uavlinkd.core.session import Session
+from uavlinkd.core.socket_facts import SocketFacts
+from uavlinkd.core.timers import Schedule
+from uavlinkd.core.versions import version_of
+
+_MAVLINK_STARTS = frozenset((0xFD, 0xFE))
+_NOT_OUR_VERSION = frozenset((DropReason.MALFORMED, DropReason.BAD_MAC1))
+
+
+class OwnKeys:
+    """A static key of this daemon, and what goes with it."""
+
+    __slots__ = ("cookies", "identity", "mac_keys")
+
+    def __init__(self, private_key: Secret, entropy: Entropy, now: float) -> None:
+        self.identity = KeyPair(private_key.reveal())
+        self.mac_keys = MacKeys(self.identity.public)
+        self.cookies = CookieJar(self.mac_keys, entropy, now)
+
+
+class HandshakeReceiver:
+    """Decides which handshake messages are read, and passes them to the peer that sent them.
+
+    ``previous``: this daemon's previous key, while it is being changed.
+    """
+
+    def __init__(
+        self,
+        own: OwnKeys,
+        previous: OwnKeys | None,
+        indices: Indices[tuple[Peer, Session | Pending]],
+        admission: Admission,
+        facts: SocketFacts,
+        schedule: Schedule[Peer],
+    ) -> None:
+        self.own = own
+        self.previous = previous
+        self.admission = admission
+        self.peers: dict[tuple[bytes, bytes], Peer] = {}
+        """By our public key and theirs."""
+        self.remembered: dict[bytes, Peer] = {}
+        """By the ephemeral of an authentic initiation: its sender."""
+        self._indices = indices
+        self._facts = facts
+        self._schedule = schedule
+
+    @property
+    def previous_identity(self) -> KeyPair | None:
+        """The previous key pair, while there is one."""
+        return None if self.previous is None else self.previous.identity
+
+    def receive(self, datagram: bytes, path: Path, now: float) -> list[Output]:
+        """What to do about a datagram that is not an envelope.
+
+        Raises:
+            Drop: in particular :class:`.admission.CookieRequired`, with a reply to the sender.
+        """
+        kind = datagram[0] if datagram else 0
+        if kind == wire.INITIATION:
+            try:
+                return self._receive_initiation(datagram, path, now)
+            except Drop as drop:
+                self._name_version(drop.reason, datagram, path, now)
+                raise
+        if kind == wire.RESPONSE:
+            return self._receive_response(datagram, path, now)
+        if kind == wire.COOKIE:
+            return self._receive_cookie(datagram, path, now)
+        raise Drop(DropReason.RAW_MAVLINK if kind in _MAVLINK_STARTS else DropReason.MALFORMED)
+
+    def remember(self, peer: Peer, ephemeral: bytes) -> None:
+        """An authentic initiation of this peer came, with this ephemeral."""
+        # A memory for each peer: no peer can make us forget what another sent.
+        self.remembered[ephemeral] = peer
+        peer.remembered.append(ephemeral)
+        if len(peer.remembered) > c.REMEMBERED_INITIATIONS:
+            self.remembered.pop(peer.remembered.popleft(), None)
+
+    def forget(self, peer: Peer) -> None:
+        """Accept nothing from this peer any more."""
+        for keys in [keys for keys, other in self.peers.items() if other is peer]:
+            del self.peers[keys]
+        for ephemeral in peer.remembered:
+            self.remembered.pop(ephemeral, None)
+
+    # Parts.
+
+    def _receive_initiation(self, datagram: bytes, path: Path, now: float) -> list[Output]:
+        initiation = wire.parse_initiation(datagram)
+        self.admission.read(path, now)
+        identity, cookies = self._addressed(datagram)
+        sender = self.remembered.get(initiation.ephemeral)
+        if sender is not None:  # before the budget: one recording must not use it up
+            self._facts.check_network(sender, path)
+            return self._answer_copy(sender, datagram, path, now)
+        message = Message(datagram, initiation.sender_index, path, cookies)
+        self.admission.admit_initiation(message, now)
+        received = handshake.receive_initiation(identity, initiation)
+        peer = self.peers.get((identity.public, received.public_key))
+        if peer is None:
+            raise Drop(DropReason.UNKNOWN_PEER, received.public_key)
+        # Before it is remembered: otherwise a line could use up what this peer sends along its own network.
+        self._facts.check_network(peer, path)
+        self.remember(peer, initiation.ephemeral)
+        try:
+            out = self._answer(peer, received, message, now)
+        except CookieRequired as drop:
+            return [drop.reply, peer.drop_datagram(drop.reason, path)]
+        except Drop as drop:
+            return [peer.drop_datagram(drop.reason, path, drop.detail)]
+        self._schedule.update(peer)
+        return out
+
+    def _answer_copy(self, peer: Peer, datagram: bytes, path: Path, now: float) -> list[Output]:
+        """An initiation of this peer that was read before: it sends one along several paths.
+
+        Raises:
+            Drop: ``REPLAYED_INITIATION``, or ``DUPLICATE`` if the response went along this path already.
+        """
+        mac1 = mac1_of(datagram)
+        for waiting in peer.sessions.unconfirmed.values():
+            if equal(waiting.initiation_mac1, mac1):
+                out = establish.answer_copy(peer, waiting, path, now)
+                return [*out, peer.drop_datagram(DropReason.DUPLICATE, path)]
+        raise Drop(DropReason.REPLAYED_INITIATION)
+
+    def _answer(self, peer: Peer, received: handshake.Received, message: Message, now: float) -> list[Output]:
+        suite = received.initiation.suite
+        self.admission.admit_answer(peer, message, now)
+        if suite not in peer.settings.link.suites:
+            raise Drop(DropReason.SUITE_NOT_ACCEPTED, suite.name)
+        if suite.has_group:
+            self.admission.admit_group(peer, suite, message, now)
+        return establish.answer(peer, received, message.datagram, message.path, now)
+
+    def _receive_response(self, datagram: bytes, path: Path, now: float) -> list[Output]:
+        response = wire.parse_response(datagram)
+        peer, pending = self._indices.owners.get(response.receiver_index, (None, None))
+        if peer is None or not isinstance(pending, Pending):
+            # The peer sends its response along several paths; the first one made the session.
+            is_copy = isinstance(pending, Session) and pending.remote_index == response.sender_index
+            raise Drop(DropReason.DUPLICATE if is_copy else DropReason.UNEXPECTED_RESPONSE)
+        self._facts.check_network(peer, path)
+        _, cookies = self._addressed(datagram)
+        self.admission.admit_response(Message(datagram, response.sender_index, path, cookies), now)
+        out = establish.receive_response(peer, pending, response, path, now)
+        self._schedule.update(peer)
+        return out
+
+    def _receive_cookie(self, datagram: bytes, path: Path, now: float) -> list[Output]:
+        reply = wire.parse_cookie_reply(datagram)
+        peer, owner = self._indices.owners.get(reply.receiver_index, (None, None))
+        if peer is None:
+            raise Drop(DropReason.UNEXPECTED_COOKIE)
+        asked = owner if isinstance(owner, Pending) else peer.sessions.unconfirmed.get(reply.receiver_index)
+        # One for each message and path: an observer can make more, but has to be faster than the peer each time.
+        if asked is None or path not in asked.paths or path in asked.cookied:
+            raise Drop(DropReason.UNEXPECTED_COOKIE)
+        establish.receive_cookie(peer, asked.mac1, path, reply, now)
+        asked.cookied.add(path)
+        self._schedule.update(peer)
+        return []
+
+    def _addressed(self, datagram: bytes) -> tuple[KeyPair, CookieJar]:
+        """Which of our keys a handshake message is for.
+
+        Raises:
+            Drop: ``BAD_MAC1`` if it is for none of them.
+        """
+        try:
+            self.own.mac_keys.check_mac1(datagram)
+        except Drop:
+            if self.previous is None:
+                raise
+            self.previous.mac_keys.check_mac1(datagram)
+            return self.previous.identity, self.previous.cookies
+        return self.own.identity, self.own.cookies
+
+    def _name_version(self, reason: DropReason, datagram: bytes, path: Path, now: float) -> None:
+        """Another version may have other lengths (malformed), and has another label of mac1.
+
+        Raises:
+            Drop: ``OTHER_VERSION``.
+        """
+        if reason not in _NOT_OUR_VERSION or not self.admission.may_compare_versions(path, now):
+            return
+        identities = [self.own.identity] + ([] if self.previous is None else [self.previous.identity])
+        if (version := version_of(datagram, (identity.public for identity in identities))) is not None:
+            raise Drop(DropReason.OTHER_VERSION, version)
