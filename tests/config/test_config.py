@@ -861,6 +861,7 @@ _NAMES = {
     "two-radios": "drone3",
     "lte-and-sik": "drone4",
     "behind-nat": "drone5",
+    "station-that-relays": "station",
 }  # files whose name describes their subject
 _OTHERS = {"mitm"}  # configurations of other commands, with tests of their own
 
@@ -1038,12 +1039,12 @@ def test_daemon_may_be_a_relay_too(load: Load) -> None:
             + _MEMBERS.replace("[[member]]", '[[member]]\npsk_file = "pair.psk"', 1)
             + "[relay_server]\nenabled = true\n",
             "member[0].psk_file (drone1)",
-            "write the PSK there only",
+            "write it there only",
         ),
         (
             _GOOD + f'previous_public_key = "{_TWO}"\n' + _MEMBERS + "[relay_server]\nenabled = true\n",
-            "member[1].public_key (drone2)",
-            "previous key",
+            "peer[0].previous_public_key (drone1)",
+            "is the key of member[1] (drone2)",
         ),
     ],
 )

@@ -133,3 +133,18 @@ def test_key_of_an_example_is_warned_of(load: Load, key: str) -> None:
     (warning,) = load(_config(key)).warnings
     assert warning.startswith('peer "drone1": public_key is the key of an example')
     assert "`uavlinkd pubkey` printed on the peer" in warning
+
+
+@pytest.mark.parametrize("what", ["relay", "member"])
+def test_relays_and_members_are_looked_at_too(load: Load, what: str) -> None:
+    """The key of an example, and the private key of another machine."""
+    more = {"relay": 'addresses = ["192.0.2.1:5790"]', "member": "[relay_server]\nenabled = true"}[what]
+    private = keys.generate_private_key()
+    for key, words in ((min(EXAMPLE_KEYS), "the key of an example"), (private, "the form of a private key")):
+        config = _config(keys.public_key_text(keys.generate_private_key()), "confidential = true\n")
+        warnings = load(f'{config}[[{what}]]\nname = "vps"\npublic_key = "{key}"\n{more}\n').warnings
+        (warning,) = (warning for warning in warnings if "public_key" in warning)
+        assert warning.startswith(f'{what} "vps": public_key')
+        assert words in warning
+        assert f"on the {what}" in warning
+        assert private[:8] not in warning

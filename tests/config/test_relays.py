@@ -20,6 +20,8 @@ KEY = {
 }
 """The same in every worker: they are parts of the names of tests."""
 
+PREVIOUS = f'previous_public_key = "{KEY["vps"]}"'
+PSK = 'psk_file = "pair.psk"'
 MEMBER = f'[relay_server]\nenabled = true\n[[member]]\nname = "b"\npublic_key = "{KEY["b"]}"\n'
 
 Load = Callable[..., Config]
@@ -85,7 +87,18 @@ def test_owner_of_the_relay_could_read_frames(load: Load) -> None:
         (relay() + relay("b") + relay("c") + relay("d"), "", "relay", "at most 3"),
         (relay() + relay("vps", key=KEY["b"]), "", "relay[1].name (vps)", "the name of relay[0] (vps) too"),
         (relay() + relay("b", key=KEY["vps"]), "", "relay[1].public_key (b)", "each relay has its own"),
-        (relay(key=KEY["drone1"]), "", "relay[0].public_key (vps)", "a key of its own"),
+        (relay(), PREVIOUS, "peer[0].previous_public_key (drone1)", "is the key of relay[0] (vps)"),
+        (relay(more=PREVIOUS), "", "relay[0].previous_public_key (vps)", "is its current key"),
+        (
+            relay("b", more=PREVIOUS) + relay("c", more=PREVIOUS),
+            "",
+            "relay[1].previous_public_key (c)",
+            "of relay[0]",
+        ),
+        (relay(key=KEY["drone1"], more=PSK), "", "relay[0].psk_file (vps)", "because peer[0] (drone1) has the same"),
+        (relay(key=KEY["drone1"], more=PREVIOUS), "", "relay[0].previous_public_key (vps)", "write it there only"),
+        (relay(key=KEY["drone1"], addresses="[]"), "", "relay[0].addresses (vps)", "a relay never initiates"),
+        (relay(key=KEY["drone1"]), 'relays = ["vps"]', "peer[0].relays (drone1)", "which has this peer's key"),
         (relay(key=KEY["b"], more=MEMBER), "", "relay[0].public_key (vps)", "the key of member[0] (b) too"),
         (relay(addresses="[]"), "", "relay[0].addresses (vps)", "a relay never initiates"),
         (relay(addresses='[{ network = "sik" }]'), "", "relay[0].addresses (vps)", "reached over IP"),
@@ -107,6 +120,87 @@ def test_own_key_is_not_a_relay(load: Load, tmp_path: Path) -> None:
     own = keys.public_key_text((tmp_path / "drone0.key").read_text().strip())
     with pytest.raises(ConfigError, match="is this daemon's own key"):
         load(relay(key=own))
+
+
+def test_relay_may_be_a_peer_too(load: Load) -> None:
+    """Both have the addresses of the two sections. The peer is not reached along itself."""
+    at = 'addresses = ["10.13.0.9:5790", "relay.example.org:5790"]'
+    config = load(relay(key=KEY["drone1"]) + relay("b"), at)
+    peer, (own, other) = config.peers[0], config.relays
+    assert [str(address) for address in peer.addresses] == ["10.13.0.9:5790", "relay.example.org:5790"]
+    assert own.addresses == peer.addresses
+    assert (own.peer, other.peer) == ("drone1", None)
+    assert peer.relays == ("b",)
+
+
+@pytest.mark.parametrize(
+    ("relays", "peer"),
+    [
+        pytest.param(relay(key=KEY["drone1"]), "", id="of-the-relay"),
+        pytest.param(relay(key=KEY["drone1"], addresses="[]"), 'addresses = ["10.13.0.9:5790"]', id="of-the-peer"),
+    ],
+)
+def test_addresses_of_a_peer_and_relay_are_written_once(load: Load, relays: str, peer: str) -> None:
+    """In one of its sections. Its session carries records although it uses no relay."""
+    config = load(relays, peer)
+    assert config.peers[0].addresses == config.relays[0].addresses
+    assert len(config.peers[0].addresses) == 1
+    assert config.peers[0].relays == ()
+    assert config.peers[0].settings.link.features & c.FEATURE_RECORDS
+
+
+def test_relay_of_a_peer_is_reached_over_ip(load: Load) -> None:
+    """The serial network is the peer's alone."""
+    network = '[[network]]\nname = "sik"\nserial = "/dev/ttyUSB0:57600"\n'
+    config = load(relay(key=KEY["drone1"]) + network, 'addresses = [{ network = "sik" }]')
+    assert len(config.peers[0].addresses) == 2
+    assert [str(address) for address in config.relays[0].addresses] == ["relay.example.org:5790"]
+
+
+@pytest.mark.parametrize(
+    ("section", "key"),
+    [
+        pytest.param(relay(key="OWN"), "relay[0].public_key (vps)", id="relay"),
+        pytest.param(
+            f'[relay_server]\nenabled = true\n[[member]]\nname = "b"\npublic_key = "{KEY["b"]}"\n'
+            '[[member]]\nname = "c"\npublic_key = "OWN"\n',
+            "member[1].public_key (c)",
+            id="member",
+        ),
+    ],
+)
+def test_own_previous_key_is_neither_relay_nor_member(load: Load, tmp_path: Path, section: str, key: str) -> None:
+    """A copied line would otherwise stop the daemon at its start."""
+    previous = keys.generate_private_key()
+    keys.write_secret_file(tmp_path / "old.key", previous)
+    top = 'previous_private_key_file = "old.key"\nlisten = ["127.0.0.1:5790"]'
+    with pytest.raises(ConfigError) as caught:
+        load(section.replace("OWN", keys.public_key_text(previous)), top=top)
+    assert any(problem.key == key and "own" in problem.message for problem in caught.value.problems)
+
+
+def test_relay_whose_key_changes_is_accepted_with_both(load: Load) -> None:
+    """The previous one makes a new link to it; to leave it out does not."""
+    before, both = load(), load(relay(more=f'previous_public_key = "{KEY["c"]}"'))
+    assert both.relays[0].previous_public_key == keys.decode_key(KEY["c"])
+    assert compare(before, both).removed_relays == ("vps",)
+    assert [one.name for one in compare(both, before).changed_relays] == ["vps"]
+
+
+def test_relay_of_a_peer_follows_it(load: Load) -> None:
+    """Another role is another relay, and so is one whose peer gets a new link. Other features need no new link."""
+    at = 'addresses = ["10.13.0.9:5790"]'
+    plain, both = load("", at), load(relay(key=KEY["drone1"], addresses="[]"), at)
+    added = compare(plain, both)
+    assert [one.name for one in added.changed_peers] == ["drone1"]
+    assert not added.added_peers
+    assert not added.removed_peers
+    assert compare(both, plain).removed_relays == ("vps",)
+    fast = load(relay(key=KEY["drone1"], addresses="[]"), f"{at}\nretry_max_s = 3")
+    changes = compare(both, fast)
+    assert changes.removed_peers == ("drone1",)
+    assert changes.removed_relays == ("vps",)
+    assert [one.name for one in changes.added_relays] == ["vps"]
 
 
 def test_changes_of_relays_are_found(load: Load) -> None:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import socket
+import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from tests.needs import need
-from uavlinkd.endpoints.sockets import BUFFER_BYTES, BindError, udp_socket
+from tests.waiting import PATIENCE_S
+from uavlinkd.endpoints.sockets import BUFFER_BYTES, BindError, network_socket, send_from_new_port, udp_socket
 from uavlinkd.lab.sim.loopback_ports import free_port, has_ipv6
 from uavlinkd.system.addresses import Address
 
@@ -59,3 +62,37 @@ def test_names_and_unknown_zones_are_errors(host: str) -> None:
     """Names are never looked up, and a zone must be an interface of this machine."""
     with pytest.raises(BindError, match=r"^cannot use "):
         udp_socket(Address(host, 5790))
+
+
+@pytest.mark.parametrize("host", ["127.0.0.2", "::1"])
+def test_datagram_from_a_new_port_comes_from_the_same_address(host: str) -> None:
+    """Each from another port, which is closed afterwards."""
+    need(host != "::1" or has_ipv6(), "an IPv6 loopback")
+    with udp_socket(Address(host, 0)) as sock, udp_socket(Address(host, 0)) as receiver:
+        receiver.settimeout(PATIENCE_S)
+        send_from_new_port(sock, b"one", receiver.getsockname())
+        data, source = receiver.recvfrom(64)
+        assert (data, source[0]) == (b"one", host)
+        assert source[1] not in (sock.getsockname()[1], receiver.getsockname()[1])
+        with udp_socket(Address(host, source[1])):
+            send_from_new_port(sock, b"two", receiver.getsockname())
+            assert receiver.recvfrom(64)[1][1] != source[1]
+
+
+def test_datagram_from_a_new_port_leaves_by_the_same_interface(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A relay's networks may be bound to interfaces."""
+    need(sys.platform == "linux", "Linux, to bind to interfaces")
+    interfaces: list[bytes] = []
+
+    class Watched(socket.socket):
+        """Notes its interface when it sends."""
+
+        def sendto(self, *args: Any) -> int:
+            interfaces.append(self.getsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, 16))
+            return super().sendto(*args)
+
+    with network_socket(Address("127.0.0.1", 0), "lo", ()) as bound, udp_socket(Address("127.0.0.1", 0)) as free:
+        monkeypatch.setattr(socket, "socket", Watched)
+        for sock in (bound, free):
+            send_from_new_port(sock, b"one", free.getsockname())
+    assert [interface.rstrip(b"\0") for interface in interfaces] == [b"lo", b""]

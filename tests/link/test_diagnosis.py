@@ -7,6 +7,8 @@ import os
 import signal
 from collections.abc import Iterator
 
+import pytest
+
 from tests.daemon.frames import heartbeat
 from tests.daemon.harness import Stage
 from tests.daemon.process import DaemonProcess
@@ -109,6 +111,7 @@ async def test_no_common_suite() -> None:
         assert "offers the suite x25519;" in (await until_found(b, Cause.NO_COMMON_SUITE, "drone0"))["text"]
 
 
+@pytest.mark.long
 async def test_peers_that_are_not_there() -> None:
     """One daemon, and peers each of which is absent in another way: each has its own cause, and no other."""
     need(has_ipv6(), "IPv6 on loopback")
@@ -161,6 +164,7 @@ async def test_key_that_was_replaced() -> None:
         await until_gone(a, Cause.FORMER_KEY)
 
 
+@pytest.mark.long
 async def test_copied_card_at_the_other_end() -> None:
     """Two machines with one private key: their sessions alternate. It is the first line."""
     async with Stage() as stage:

@@ -7,6 +7,7 @@ import pytest
 from tests.core.harness import Pair, Side, of, quiet
 from uavlinkd.core import constants as c
 from uavlinkd.core.constants import NEVER
+from uavlinkd.core.drops import DropReason
 from uavlinkd.core.outputs import Output, PathStateChanged, RecordReceived, SessionEstablished, Transmit
 from uavlinkd.core.path import Path, relayed
 from uavlinkd.core.relay_records import Candidates
@@ -197,17 +198,17 @@ def test_nothing_is_due_without_a_relay() -> None:
     assert search.next_at == NEVER
 
 
-def test_older_list_is_ignored() -> None:
+def test_older_list_is_dropped() -> None:
     """Records may overtake each other along two paths."""
     network = Network()
     peer, path = network.pair.a.peer, network.pair.a.peer_at
     search = network.search["a"]
     search.on_record(RecordReceived(peer, path, Candidates((HOME_B,)), 5), 1.0)
-    search.on_record(RecordReceived(peer, path, Candidates((HOME_A,)), 4), 1.0)
+    assert search.on_record(RecordReceived(peer, path, Candidates((HOME_A,)), 4), 1.0) is DropReason.OLD_RECORD
     assert search.theirs == (HOME_B,)
     assert search.next_at == 1.0
     search.do_due(1.0)
-    search.on_record(RecordReceived(peer, path, Candidates((HOME_B,)), 6), 1.05)
+    assert search.on_record(RecordReceived(peer, path, Candidates((HOME_B,)), 6), 1.05) is None
     assert search.next_at == pytest.approx(1.0 + c.CANDIDATE_TRY_S)
 
 
@@ -235,11 +236,12 @@ def test_lists_are_limited_too() -> None:
     assert LISTS <= lists <= LISTS + 20 * LISTS_PER_S + 1
 
 
-def test_list_along_a_direct_path_is_ignored() -> None:
+def test_list_along_a_direct_path_is_dropped() -> None:
     """Only members that a relay connects look for direct paths."""
     network = Network()
     search = network.search["a"]
-    search.on_record(RecordReceived(network.pair.a.peer, Path(0, HOME_B), Candidates((HOME_B,)), 5), 1.0)
+    received = RecordReceived(network.pair.a.peer, Path(0, HOME_B), Candidates((HOME_B,)), 5)
+    assert search.on_record(received, 1.0) is DropReason.UNEXPECTED_RECORD
     assert search.theirs == ()
 
 

@@ -70,6 +70,20 @@ def test_evidence_from_the_host_of_a_peer_counts_until_it_expires(scene: Scene, 
     assert scene.seen(scene.link, 100.0).count == 1
 
 
+def test_evidence_of_a_relay_counts_for_no_peer_of_that_name(scene: Scene) -> None:
+    """Its name in the core begins with "relay". It is not forgotten when the places of the peers are looked up."""
+    link = scene.add("relay", bytes([3]) * 32, [])
+    relay = scene.node.add_peer(PeerSettings("relay vps", bytes([4]) * 32, None, PLAIN), 0.0)
+    scene.evidence.add_dropped(Dropped(DropReason.BAD_HANDSHAKE, relay, Path(0, THERE), 1, ""), 10.0)
+    scene.drop(("198.51.100.1", 5790), 10.0 + PLACES_S)
+    now = 10.0 + PLACES_S
+    assert scene.evidence.seen(DropReason.BAD_HANDSHAKE, link, now) is None
+    assert scene.evidence.seen_of_relay(DropReason.BAD_HANDSHAKE, "drone1", now) is None
+    seen = scene.evidence.seen_of_relay(DropReason.BAD_HANDSHAKE, "vps", now)
+    assert seen is not None
+    assert seen.address == THERE
+
+
 def test_evidence_from_elsewhere_counts_for_no_peer(scene: Scene) -> None:
     """It counts for no configured address."""
     scene.drop(("198.51.100.1", 5790), 10.0)
@@ -123,6 +137,22 @@ def test_errors_of_sending_and_icmp_differ(scene: Scene) -> None:
         assert scene.evidence.seen(kind, scene.link, 3.0) is not None
     assert scene.evidence.seen("ECONNREFUSED", scene.link, 3.0) is None
     assert scene.evidence.seen_anywhere("ENOMEM", 3.0) is not None
+
+
+def test_errors_of_a_candidate_are_not_those_of_another_peer_of_its_host(scene: Scene) -> None:
+    """A candidate of one peer may be another port of the host of a peer that is well."""
+    scene.evidence.add_failure("EPERM", (HOST, 40000), 1.0)
+    scene.evidence.add_report(errno.ECONNREFUSED, (HOST, 40000), 1.0)
+    for kind in ("EPERM", f"{REPORTED}ECONNREFUSED"):
+        assert scene.evidence.seen(kind, scene.link, 1.0) is None
+        assert scene.evidence.seen_elsewhere(kind, 1.0) is not None
+
+
+def test_errors_of_a_learned_path_are_those_of_its_peer(scene: Scene) -> None:
+    """As after a NAT gave the peer another port."""
+    scene.link.peer.paths.learn(Path(0, (HOST, 40000)), 0.0)
+    scene.evidence.add_report(errno.ECONNREFUSED, (HOST, 40000), 1.0)
+    assert scene.evidence.seen(f"{REPORTED}ECONNREFUSED", scene.link, 1.0) is not None
 
 
 def test_growth_is_remembered_and_begins_again() -> None:

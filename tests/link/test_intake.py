@@ -23,7 +23,7 @@ from uavlinkd.core.wire import ENVELOPE_STARTS
 from uavlinkd.endpoints.ports import LocalPort
 from uavlinkd.link.intake import Intake
 from uavlinkd.link.peer_link import PeerLink
-from uavlinkd.link.relay_handles import RelayHandles
+from uavlinkd.link.relay_handles import RELAYED_START, RelayHandles
 from uavlinkd.link.switch import Switch
 from uavlinkd.link.turns import WaitingDatagram
 from uavlinkd.mavlink.frames import Frame
@@ -140,7 +140,7 @@ async def test_data_along_a_relay_is_unwrapped_or_taken() -> None:
             return None
         return taken
 
-    scene.intake.take_relayed = take
+    scene.intake.takers[RELAYED_START] = take
     data = [wrap(7, DATAGRAM + b"rest"), wrap(8, DATAGRAM), wrap(7, b"\x50"), DATAGRAM]
     scene.intake.receive(AT_A.socket, [(datagram, AT_A.address) for datagram in data], monotonic(), 0, 0.0)
     assert reasons == [DropReason.RELAY_UNKNOWN_HANDLE, DropReason.RELAY_MALFORMED]

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from tests.core.harness import AT_B, KEY_B, Pair, quiet
+from tests.core.harness import AT_B, KEY_B, Pair, quiet, run
 from uavlinkd.config import RelayConfig
 from uavlinkd.core import constants as c
 from uavlinkd.core import outputs as o
+from uavlinkd.core.constants import NEVER
+from uavlinkd.core.drops import DropReason
 from uavlinkd.core.path import Path, relayed
 from uavlinkd.core.relay_records import WAITING, Bind, Bound
 from uavlinkd.core.settings import PeerSettings
@@ -58,11 +60,13 @@ class Scene:
         ]
         return [output.record.keys for output in received if isinstance(output.record, Bind)]
 
-    def bound(self, now: float, *entries: tuple[bytes, int], order: int | None = None, path: Path = AT_B) -> None:
-        """The relay's record."""
+    def bound(
+        self, now: float, *entries: tuple[bytes, int], order: int | None = None, path: Path = AT_B
+    ) -> DropReason | None:
+        """The relay's record. Returns why it has no effect."""
         self.order += 1
         record = Bound("198.51.100.1", 4000, entries)
-        self.link.on_record(
+        return self.link.on_record(
             o.RecordReceived(self.link.peer, path, record, self.order if order is None else order), now
         )
 
@@ -108,20 +112,23 @@ def test_handles_are_paths_until_the_relay_ends_them(scene: Scene) -> None:
     assert scene.changed == [{ONE, TWO}, {ONE}, {ONE}]
 
 
-def test_older_record_about_a_key_is_ignored(scene: Scene) -> None:
-    """The network may reorder records."""
+def test_older_record_about_a_key_is_dropped(scene: Scene) -> None:
+    """The network may reorder records. What such a record says of other keys counts."""
     assert scene.binds(T)
-    scene.bound(T, (ONE, 5), order=10)
-    scene.bound(T, (ONE, 4), (TWO, 7), order=9)
+    assert scene.bound(T, (ONE, 5), order=10) is None
+    assert scene.bound(T, (ONE, 4), (TWO, 7), order=9) is None
+    assert scene.bound(T, (ONE, 3), (TWO, 2), order=8) is DropReason.OLD_RECORD
     assert scene.link.paths_to([ONE]) == [[relayed(0, "vps", 5)]]
     assert scene.link.paths_to([TWO]) == [[relayed(0, "vps", 7)]]
 
 
-def test_handle_for_a_key_that_was_not_asked_for_is_ignored(scene: Scene) -> None:
+def test_handle_for_a_key_that_was_not_asked_for_is_dropped(scene: Scene) -> None:
     """A relay cannot attract traffic for others, nor assign handles without bound or on an unknown path."""
     assert scene.binds(T)
-    scene.bound(T, (ELSE, 5))
-    scene.bound(T, (ONE, 5), path=Path(3, ("203.0.113.9", 1)))
+    assert scene.bound(T, (ELSE, 5)) is DropReason.UNEXPECTED_RECORD
+    assert scene.bound(T, (ONE, 5), path=Path(3, ("203.0.113.9", 1))) is DropReason.UNEXPECTED_RECORD
+    bind = o.RecordReceived(scene.link.peer, AT_B, Bind((ONE,)), 99)
+    assert scene.link.on_record(bind, T) is DropReason.UNEXPECTED_RECORD, "a member is not a relay"
     assert scene.changed == []
     assert scene.link.paths_to([ELSE, ONE]) == [[]]
     scene.bound(T, *((ONE, handle) for handle in range(1, 20)))
@@ -182,19 +189,60 @@ def test_peer_whose_path_failed_is_bound_again(scene: Scene) -> None:
     assert scene.binds(T + 2) == []
 
 
+def test_relay_is_asked_again_without_a_bind(scene: Scene) -> None:
+    """While a silence lasts: the first question bound the peer again."""
+    assert scene.binds(T)
+    scene.bound(T, (ONE, 5), (TWO, 6))
+    scene.link.ask(relayed(0, "vps", 6), binds=False)
+    outputs = scene.link.do_due(T + 1)
+    assert len([output for output in outputs if isinstance(output, o.Transmit)]) == 1
+    scene.link.ask(relayed(0, "vps", 6))
+    scene.link.ask(relayed(0, "vps", 6), binds=False)
+    assert scene.binds(T + 2) == [(TWO,)]
+
+
 def test_silence_of_a_steady_peer_is_noticed_sooner() -> None:
     """A ground station that sends a heartbeat a second is not silent between two of them."""
     steady = _Silence(0.0)
-    assert not any(steady.look(number, number / 10) for number in range(1, 31))
-    assert not steady.look(30, 3.0 + SILENT_S - 0.1)
-    assert steady.look(30, 3.0 + SILENT_S)
+    assert not any(steady.look(number, number / 10, number / 10) for number in range(1, 31))
+    assert steady.due_at == 3.0 + SILENT_S
+    assert not steady.look(30, 3.0, 3.0 + SILENT_S - 0.1)
+    assert steady.look(30, 3.0, 3.0 + SILENT_S)
     rare = _Silence(0.0)
-    assert not any(rare.look(quarter // 4, quarter / 4) for quarter in range(40))
-    assert rare.look(9, 9.0 + SILENT_RARE_S)
+    assert not any(rare.look(quarter // 4, quarter // 4, quarter / 4) for quarter in range(40))
+    assert rare.due_at == 9.0 + SILENT_RARE_S
+    assert rare.look(9, 9.0, 9.0 + SILENT_RARE_S)
 
 
-def test_silent_peer_causes_few_questions() -> None:
-    """Each after twice as long: then the keepalives of the session with the relay are enough."""
-    silence = _Silence(0.0)
-    asked = [quarter / 4 for quarter in range(4 * 600) if silence.look(0, quarter / 4)]
-    assert asked == [1.25, 2.5, 5.0, 10.0, 20.0]
+def test_relay_is_asked_as_long_as_the_peer_is_silent() -> None:
+    """At one interval. A peer that was never there is silent too."""
+    for received_at, asked_at in ((-NEVER, 0.0), (0.5, 1.6)):
+        silence = _Silence(0.0)
+        moments: list[float] = []
+        while len(moments) < 4:
+            now = silence.due_at
+            if silence.look(1, received_at, now):
+                moments.append(now - asked_at)
+        assert moments == pytest.approx([number * SILENT_RARE_S for number in range(4)])
+
+
+def test_previous_key_of_a_relay_is_accepted_until_the_new_one_is_confirmed() -> None:
+    """Both are tried along the same paths. After a session with the new key there is one peer in the core."""
+    pair = Pair(LINK, LINK)
+    node = pair.a.node
+    node.remove_peer(pair.a.peer, 0.0)
+    config = RelayConfig(PeerSettings("relay vps", ONE, None, LINK), (), previous_public_key=KEY_B.public)
+    link = RelayLink(config, node, RelayHandles(), lambda *_: None, lambda: None, 0.0)
+    current, previous = link.peers
+    assert link.peer is current
+    link.set_paths([AT_B], 0.0)
+    list(run(pair, 0.0, 1.0, lambda *_: True))
+    assert previous.is_up
+    assert link.peer is previous
+    assert link.next_at > 1.0
+
+    link.on_event(o.SessionEstablished(current, 1, "x25519", False, 16, True, False), 1.0)
+    assert link.next_at < 1.0
+    link.do_due(1.0)
+    assert link.peers == [current]
+    assert list(node.peers.values()) == [current]

@@ -7,10 +7,13 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from itertools import count
 
+import pytest
+
 from tests.daemon.frames import ground_heartbeat, heartbeat
 from tests.link.relay_line import RelayLine
 from tests.link.test_calls_per_frame import attitude
 from tests.waiting import Stopwatch, until
+from uavlinkd.link.control_answers import answer
 from uavlinkd.link.diagnosis import find
 from uavlinkd.ops.causes import Cause
 from uavlinkd.system.clock import monotonic
@@ -96,6 +99,7 @@ async def test_peer_that_does_not_ask_for_this_one_is_waited_for() -> None:
         await line.stop()
 
 
+@pytest.mark.long
 async def test_relay_that_does_not_answer_is_named() -> None:
     """With its addresses, and with each peer that needs it."""
     async with linked("vps") as line:
@@ -109,13 +113,13 @@ async def test_relay_that_does_not_answer_is_named() -> None:
 async def test_ping_asks_along_each_path() -> None:
     """The next answer has the results; a name that is not a peer's is refused."""
     async with linked("vps", "spare") as line:
-        first = await line.left._answer("ping right")
+        first = await answer(line.left, "ping right")
         assert first is not None
 
         async def answers() -> list[int]:
-            answer = await line.left._answer("ping right")
-            assert answer is not None
-            paths = answer["paths"]
+            pinged = await answer(line.left, "ping right")
+            assert pinged is not None
+            paths = pinged["paths"]
             assert isinstance(paths, list)
             assert {path["relay"] for path in paths} == {"vps", "spare"}
             return [state.answers for state in line.links[0].peer.paths.states]
@@ -123,6 +127,6 @@ async def test_ping_asks_along_each_path() -> None:
         before = await answers()
         states = line.links[0].peer.paths.states
         await until(lambda: all(state.answers > count for state, count in zip(states, before, strict=True)))
-        refused = await line.left._answer("ping stranger")
+        refused = await answer(line.left, "ping stranger")
         assert refused is not None
         assert "error" in refused

@@ -13,7 +13,8 @@ from uavlinkd.core import constants as c
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.outputs import PathStateChanged, RecordReceived, Transmit
 from uavlinkd.core.path import Path, relayed
-from uavlinkd.core.relay_records import Bind, Candidates, wrap
+from uavlinkd.core.path_state import PathState
+from uavlinkd.core.relay_records import Bind, Bound, Candidates, FilterTest, Record, wrap
 from uavlinkd.link.candidates import OwnSocket
 from uavlinkd.link.direct_search import DirectSearch
 from uavlinkd.relay.service import BINDS_BURST, LOOK_S
@@ -23,6 +24,7 @@ SECONDS = 10
 VICTIM = "203.0.113.99"
 ELSEWHERE = Path(0, ("203.0.113.7", 4000))
 DATA = b"\x40datagram"
+TOKEN = bytes(range(c.FILTER_TOKEN_BYTES))
 
 
 @pytest.fixture
@@ -160,6 +162,46 @@ def test_ten_thousand_requested_bindings_take_bounded_memory(relay: FuzzedRelay)
     assert len(relay.forwarded) == 1, "another member is slowed"
 
 
+def test_captured_member_that_tests_filters_without_end_costs_few_sockets(relay: FuzzedRelay) -> None:
+    """1,000 tests a second for 20.1 s: 16 sockets, then one in 2 s. Another member has its own limit."""
+    session = relay.members[2].peer.sessions.current
+    assert session is not None
+    sent_before = sum(len(datagram) for datagram, _ in relay._wire)
+    received = 0
+    for number in range(20_100):
+        relay.now += 0.001
+        test = session.seal_record(FilterTest(number.to_bytes(c.FILTER_TOKEN_BYTES)).encode(), relay.now)
+        received += len(test)
+        relay.arrive(test, HOMES[2][0])
+    assert relay.tokens_sent == c.FILTER_TESTS + 20 * c.FILTER_TESTS_PER_S
+    assert relay.service.members[KEYS[3]].filter_tests_ignored == 20_100 - relay.tokens_sent
+    answers = sum(len(datagram) for datagram, _ in relay._wire) - sent_before
+    assert answers + relay.tokens_sent * (17 + 48) < received
+    before, one = relay.tokens_sent, relay.members[0]
+    relay.send(one, one.node.send_record(one.peer, RELAY_AT[0], FilterTest(TOKEN), relay.now))
+    assert relay.tokens_sent == before + 1
+    relay.check_bounds()
+
+
+def test_filter_test_from_an_unproven_address_sends_nothing_there(relay: FuzzedRelay) -> None:
+    """A captured member cannot name a victim: it is counted, and the victim gets no token."""
+    session = relay.members[0].peer.sessions.current
+    assert session is not None
+    relay.arrive(session.seal_record(FilterTest(TOKEN).encode(), relay.now), ELSEWHERE)
+    assert relay.tokens_sent == 0
+    assert relay.service.members[KEYS[1]].filter_tests_ignored == 1
+    assert not relay.service._filter_tests
+
+
+def test_token_that_cannot_be_sent_has_no_answer(relay: FuzzedRelay, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Otherwise the member would see a filter that is not there."""
+    one = relay.members[0]
+    monkeypatch.setattr(relay.service, "_send_from_new_port", lambda datagram, path: False)
+    before = len(relay._wire)
+    relay.send(one, one.node.send_record(one.peer, RELAY_AT[0], FilterTest(TOKEN), relay.now))
+    assert len(relay._wire) == before
+
+
 def test_member_that_asks_along_another_relay_harms_no_report(relay: FuzzedRelay) -> None:
     """Such a path has no address that a report could name. The bind has no effect."""
     peer = relay.service.members[KEYS[1]].peer
@@ -167,7 +209,8 @@ def test_member_that_asks_along_another_relay_harms_no_report(relay: FuzzedRelay
     relay.node.set_paths(peer, [along], relay.now)
     relay.settle()
     assert peer.paths.find(along) is not None
-    relay.service.on_record(RecordReceived(peer, along, Bind((KEYS[2],)), 1), relay.now)
+    received = RecordReceived(peer, along, Bind((KEYS[2],)), 1)
+    assert relay.service.on_record(received, relay.now) is DropReason.UNEXPECTED_RECORD
     assert not relay.service.is_due
 
 
@@ -181,9 +224,50 @@ def test_binds_along_unproven_paths_wait_only_while_the_paths_have_slots(relay: 
         relay.arrive(bind, Path(0, ("203.0.113.5", 1000 + number)))
     waiting = service._asked[KEYS[3]]
     assert 0 < len(waiting) <= c.CONFIGURED_PATHS + c.LEARNED_PATHS
+    counted = list(service.count_drops())
+    count = len(waiting)
     peer.paths.clear()
     service.settle(relay.now + LOOK_S)
     assert not service.is_due
+    assert set(counted) <= {(DropReason.UNEXPECTED_RECORD, "member2", 1)}
+    assert list(service.count_drops()) == [(DropReason.UNEXPECTED_RECORD, "member2", 1)] * count
+    assert relay.node.drops[DropReason.UNEXPECTED_RECORD] == len(counted) + count
+
+
+def test_each_bind_that_has_no_effect_has_a_reason(relay: FuzzedRelay) -> None:
+    """Above the limits; and records that are not for a relay."""
+    service, peer = relay.service, relay.service.members[KEYS[3]].peer
+    at = HOMES[2][0]
+
+    def ask(record: Record) -> DropReason | None:
+        return service.on_record(RecordReceived(peer, at, record, 1), relay.now)
+
+    assert ask(Bind(KEYS[:3])) is None
+    assert ask(Bind((bytes(32),))) is DropReason.RECORD_OVER_LIMIT, "it may ask for three"
+    assert ask(Bound("203.0.113.1", 4000, ((KEYS[1], 1),))) is DropReason.UNEXPECTED_RECORD
+    assert ask(Candidates((("203.0.113.1", 4000),))) is DropReason.UNEXPECTED_RECORD
+    results = [ask(Bind((KEYS[1],))) for _ in range(BINDS_BURST)]
+    assert results.count(DropReason.RECORD_OVER_LIMIT) == 2
+
+
+def test_wishes_that_wait_for_their_path_count_when_they_are_too_many(
+    relay: FuzzedRelay, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Three at once while they wait, and the limit of the member when the path is validated."""
+    service, peer = relay.service, relay.service.members[KEYS[3]].peer
+    state = next(state for state in peer.paths.states if state.path == HOMES[2][0])
+    keys = tuple(bytes((number,)) * 32 for number in range(8))
+
+    def ask(*keys: bytes) -> DropReason | None:
+        return service.on_record(RecordReceived(peer, state.path, Bind(keys), 1), relay.now)
+
+    assert ask(*keys[:2]) is None
+    with monkeypatch.context() as unproven:
+        unproven.setattr(PathState, "is_validated", False)
+        assert ask(*keys[4:]) is DropReason.RECORD_OVER_LIMIT
+    service.settle(relay.now + LOOK_S)
+    assert list(service.count_drops()) == [(DropReason.RECORD_OVER_LIMIT, "member2", 1)]
+    assert service.bindings.peers_of(KEYS[3]) == (0, 3)
 
 
 def test_data_does_not_make_the_relay_look_at_what_waits(relay: FuzzedRelay, monkeypatch: pytest.MonkeyPatch) -> None:

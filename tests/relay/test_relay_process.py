@@ -2,23 +2,32 @@
 
 from __future__ import annotations
 
+import asyncio
+import sys
 from collections.abc import AsyncIterator, Callable
 from typing import Any
 
 import pytest
 
 from tests.core.harness import FRAME
+from tests.daemon.fleet import relay_for
 from tests.daemon.frames import heartbeat
 from tests.daemon.harness import Stage
 from tests.daemon.process import DaemonProcess, Status
 from tests.daemon.test_reload import reload
+from tests.needs import need
 from tests.relay.core_member import CoreMember
 from uavlinkd.config.keys import decode_key, encode_key
+from uavlinkd.core import constants as c
 from uavlinkd.core.crypto import KeyPair
+from uavlinkd.core.relay_records import Bind, Bound, Candidates
+from uavlinkd.lab.sim.loopback_ports import free_port, has_ipv6
+from uavlinkd.ops.netcheck import ANY_PEER, Filtered, Mapped, behaviours
+from uavlinkd.system.addresses import Address
 
 INNER = b"\x40datagram"
 
-MakeMember = Callable[[str], CoreMember]
+MakeMember = Callable[..., CoreMember]
 
 
 @pytest.fixture
@@ -28,19 +37,10 @@ async def stage() -> AsyncIterator[Stage]:
         yield stage
 
 
-def relay_of(stage: Stage) -> DaemonProcess:
-    """A relay without members."""
-    relay = stage.daemon("vps")
-    relay.command = "relay"
-    del relay.config["endpoint"], relay.config["peer"]
-    relay.config["member"] = []
-    return relay
-
-
 @pytest.fixture
 async def relay(stage: Stage) -> DaemonProcess:
-    """The same, not started."""
-    return relay_of(stage)
+    """A relay without members, not started."""
+    return relay_for(stage)
 
 
 @pytest.fixture
@@ -72,6 +72,11 @@ def member_of(status: Status, name: str) -> dict[str, Any]:
     return member
 
 
+def causes(status: Status) -> list[str]:
+    """Of the findings in a status."""
+    return [finding["cause"] for finding in status["findings"]]
+
+
 async def test_members_reach_each_other_through_the_relay(relay: DaemonProcess, make_member: MakeMember) -> None:
     """Handles, data in both directions, the addresses that the relay sees, and its counters."""
     drone, station = make_member("drone1"), make_member("station")
@@ -98,6 +103,48 @@ async def test_members_reach_each_other_through_the_relay(relay: DaemonProcess, 
     assert member_of(status, "drone1").items() >= expected.items()
 
 
+@pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
+async def test_netcheck_of_a_member_shows_what_is_let_in(host: str, stage: Stage) -> None:
+    """Without NAT and firewall a token from another port arrives. The relay and the member drop nothing."""
+    need(host != "::1" or has_ipv6(), "an IPv6 loopback")
+    listen = str(Address(host, free_port()))
+    member = stage.daemon("drone1", [str(Address(host, free_port()))])
+    relay = relay_for(stage, member)
+    relay.config["listen"] = member.config["relay"][0]["addresses"] = [listen]
+    member.add_peer(stage.daemon("absent"), [], stage.psk())
+    await stage.start(relay, member, linked=False)
+    await member.until(lambda status: bool(status["relays"]["vps"]["seen_as"]))
+    for _ in range(2):
+        answer = await member.ask("netcheck")
+        assert list(behaviours(answer)) == [(None, Mapped.NO_NAT, Filtered.NOT_BY_PORT)]
+        assert [result["relay_address"] for result in answer["filtering"]] == [listen]
+    command = [sys.executable, "-m", "uavlinkd", "netcheck", "--socket", str(member.folder / "control.sock")]
+    process = await asyncio.create_subprocess_exec(*command, stdout=asyncio.subprocess.PIPE)
+    printed, _ = await process.communicate()
+    assert process.returncode == 0
+    assert f"filtering    {Filtered.NOT_BY_PORT}\n             {ANY_PEER}\n" in printed.decode()
+    assert not (await member.status())["drops"]
+    status = await relay.status()
+    assert not status["drops"]
+    assert member_of(status, "drone1")["filter_tests_ignored"] == 0
+
+
+async def test_relay_ignores_filter_tests_above_the_limit(relay: DaemonProcess, make_member: MakeMember) -> None:
+    """They are counted. Each of the others sends one token, from a port of its own, which is closed."""
+    drone = make_member("drone1")
+    await relay.start()
+    await drone.test_filter(bytes(16))
+    await drone.until(lambda: drone.tested == [bytes(16)] and bool(drone.tokens))
+    for number in range(1, 100):
+        await drone.test_filter(number.to_bytes(16))
+    await relay.until(lambda status: member_of(status, "drone1")["filter_tests_ignored"] > 50)
+    await drone.until(lambda: len(drone.tokens) == len(drone.tested) >= c.FILTER_TESTS)
+    sources = {source for _, source in drone.tokens}
+    assert drone.path.address not in sources
+    assert {host for host, _ in sources} == {drone.path.host}
+    assert [token for token, _ in drone.tokens] == drone.tested
+
+
 async def test_drops_are_counted_and_strangers_get_no_answer(
     stage: Stage, relay: DaemonProcess, make_member: MakeMember
 ) -> None:
@@ -116,6 +163,44 @@ async def test_drops_are_counted_and_strangers_get_no_answer(
     assert stranger.datagrams == []
     assert station.data == []
     await relay.until_logged("datagrams_dropped", reason="frames_not_allowed")
+
+
+async def test_status_names_the_key_of_a_sender_that_is_not_a_member(
+    relay: DaemonProcess, make_member: MakeMember
+) -> None:
+    """Although all members are up. Nothing is accepted because of it."""
+    drone = make_member("drone1")
+    make_member("station")
+    del relay.config["member"][0]
+    await relay.start()
+    status = await relay.until(
+        lambda status: "not_a_member" in causes(status) and member_of(status, "station")["is_up"]
+    )
+    (finding,) = status["findings"]
+    assert encode_key(drone.key) in finding["text"]
+    assert "uavlinkd pubkey" in finding["remedy"]
+    assert finding["severity"] == "warning"
+    assert not drone.peer.is_up
+
+
+async def test_status_names_another_key_for_the_relay_while_a_member_is_down(
+    relay: DaemonProcess, make_member: MakeMember
+) -> None:
+    """Any sender can cause it. So it does not count when all members are up."""
+    make_member("station")
+    absent = KeyPair(bytes([7]) * 32)
+    relay.config["member"].append({"name": "drone1", "public_key": encode_key(absent.public)})
+    stranger = CoreMember(KeyPair(bytes([8]) * 32).public, relay.sockaddr)
+    try:
+        await relay.start()
+        status = await relay.until(lambda status: "other_relay_key" in causes(status))
+        assert relay.public_key in status["findings"][0]["remedy"]
+        del relay.config["member"][1]
+        relay.write_config()
+        assert await reload(relay) == []
+        await relay.until(lambda status: member_of(status, "station")["is_up"] and not causes(status))
+    finally:
+        stranger.close()
 
 
 async def test_member_waits_for_one_that_is_not_there(relay: DaemonProcess, make_member: MakeMember) -> None:
@@ -237,3 +322,17 @@ async def test_relay_with_another_key_is_asked_for_the_same_peers(
     drone.config["relay"][0]["public_key"] = relay.public_key
     assert await reload(drone) == []
     await relay.until(lambda status: member_of(status, "drone0")["waiting"] == 1)
+
+
+async def test_records_without_effect_are_counted(relay: DaemonProcess, make_member: MakeMember) -> None:
+    """Records that are not for a relay, and wishes for more than one peer."""
+    drone, station = make_member("drone1", max_peers=1), make_member("station")
+    await relay.start()
+    await connect(drone, station)
+    drone.send_record(Bound("203.0.113.1", 4000, ((station.key, 1),)))
+    drone.send_record(Candidates((("203.0.113.1", 4000),)))
+    drone.send_record(Bind((bytes(31) + b"\x09",)))
+    status = await relay.until(lambda status: len(status["drops"]) == 2)
+    assert status["drops"] == {"unexpected_record": 2, "record_over_limit": 1}
+    assert member_of(status, "drone1")["binds_ignored"] == 1
+    await relay.until_logged("datagrams_dropped", reason="record_over_limit", who="drone1")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from uavlinkd.config.errors import ConfigError, Problem
 from uavlinkd.config.model import Config, EndpointConfig, PeerConfig, RelayConfig
@@ -105,7 +105,10 @@ def compare(old: Config, new: Config) -> ConfigChanges:
     same_relays = {
         name
         for name, relay in relays_now.items()
-        if name in relays_before and relay.settings == relays_before[name].settings
+        if name in relays_before
+        and (relay.settings, relay.peer) == (relays_before[name].settings, relays_before[name].peer)
+        and relay.previous_public_key in (None, relays_before[name].previous_public_key)
+        and (relay.peer is None or relay.peer in same_peers)
     }
     return ConfigChanges(
         removed_peers=tuple(name for name in peers_before if name not in same_peers),
@@ -133,4 +136,6 @@ def _members(config: Config) -> dict[str, MemberSettings]:
 
 def _is_accepted_already(peer: PeerConfig, before: PeerConfig) -> bool:
     """Whether a link made for ``before`` accepts this peer with every key that it may have now."""
-    return peer.settings == before.settings and peer.previous_public_key in (None, before.previous_public_key)
+    link = replace(peer.settings.link, features=before.settings.link.features)  # new keys are enough for others
+    is_same = replace(peer.settings, link=link) == before.settings
+    return is_same and peer.previous_public_key in (None, before.previous_public_key)

@@ -41,27 +41,39 @@ def public_keys(problems: Problems, peers: Sequence[Values], own: bytes | None, 
 
 
 def previous_keys(
-    problems: Problems, top: Values, peers: Sequence[Values], own: bytes | None, previous: bytes | None
+    problems: Problems, top: Values, sections: Sequence[Values], own: bytes | None, previous: bytes | None
 ) -> None:
-    """Each current or previous key belongs to one daemon."""
+    """Each previous key belongs to one daemon. ``sections``: the peers, members and relays."""
     if previous is not None and previous == own:
         problems.add("previous_private_key_file", "holds the key of private_key_file: leave it out")
-    owners = {peer.valid.get("public_key"): peer for peer in peers}
-    for peer in peers:
-        key = peer.valid.get("previous_public_key")
+    owners = {section.valid.get("public_key"): section for section in sections}
+    for section in sections:
+        if previous is not None and section.valid.get("public_key") == previous:
+            problems.add(
+                section.place.key("public_key"),
+                "is this daemon's own previous key: write what `uavlinkd pubkey` prints on the other daemon",
+            )
+        key = section.valid.get("previous_public_key")
         if key is None:
             continue
-        place = peer.place.key("previous_public_key")
+        place = section.place.key("previous_public_key")
         if key in (own, previous):
-            problems.add(place, "is this daemon's own key: write the peer's previous key, or leave it out")
-        elif key == peer.valid.get("public_key"):
-            problems.add(place, "is the peer's current key: leave it out")
+            problems.add(place, "is this daemon's own key: write the other daemon's previous key, or leave it out")
+        elif key == section.valid.get("public_key"):
+            problems.add(place, "is its current key: leave it out")
         elif key in owners:
-            problems.add(place, f"is the key of {owners[key].place.key('')}: each peer has its own")
-    for peer in peers:
-        if previous is not None and peer.valid.get("public_key") == previous:
-            problems.add(peer.place.key("public_key"), "is this daemon's own previous key: write the peer's")
-    unique(problems, peers, "previous_public_key", bytes, "the previous key of {other} too: each peer has its own")
+            problems.add(place, f"is the key of {owners[key].place.key('')}: write its own, or leave it out")
+    unique(problems, sections, "previous_public_key", bytes, "the previous key of {other} too: write its own")
+
+
+def of_peer(problems: Problems, section: Values, peer: Values) -> None:
+    """A member or relay that is a peer too leaves to the peer what belongs to their one session."""
+    for key in ("psk_file", "previous_public_key"):
+        if key in section.valid:
+            problems.add(
+                section.place.key(key),
+                f"has no effect, because {peer.place.key('')} has the same public_key: write it there only",
+            )
 
 
 def unique(
@@ -94,7 +106,8 @@ def reachability(problems: Problems, top: Values, peers: Iterable[Values], relay
             problems.add(
                 peer.place.key("addresses"),
                 "is empty, and so is listen: neither end could initiate; write the peer's address here,"
-                ' or listen = ["0.0.0.0:5790"] at the top so that the peer can initiate',
+                ' or listen = ["0.0.0.0:5790"] at the top so that the peer can initiate, or a [[relay]] that both'
+                " ends use",
             )
         for written in addresses:
             if any(_reaches(written.address, own) for own in listen):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 import tomllib
-from collections.abc import Mapping, Set
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -83,8 +83,9 @@ def load_config(path: Path, environ: Mapping[str, str]) -> Config:
         [psk.reveal() if psk else None for psk in (*psks, *member_psks, *relay_psks)],
         path.absolute().parent,
     )
-    checks.previous_keys(problems, top, peers, public, None if previous is None else _public(previous))
-    checks.reachability(problems, top, peers, [peer for peer in peers if used_relays.uses_relay(peer, relays)])
+    previous_public = _public(previous) if previous else None
+    checks.previous_keys(problems, top, [*peers, *members, *relays], public, previous_public)
+    checks.reachability(problems, top, peers, [peer for peer in peers if used_relays.needs_no_address(peer, relays)])
     checks.reachability(problems, top, relays, relays)
     used_relays.relays(problems, relays, peers, members, public)
     network_rules.networks(problems, top, networks, [*peers, *relays], endpoints)
@@ -110,13 +111,9 @@ def load_config(path: Path, environ: Mapping[str, str]) -> Config:
     network_configs = tuple(map(network_rules.network_of, networks))
     endpoint_configs = tuple(map(_endpoint, endpoints))
     relay_config = relay_rules.relay_server_of(server, members, member_psks, link)
-    member_keys = {member.valid["public_key"] for member in members}
-    peer_configs = tuple(
-        _peer(peer, psk, link, member_keys, used_relays.relays_of(peer, relays))
-        for peer, psk in zip(peers, psks, strict=True)
-    )
+    peer_configs = tuple(_peer(peer, psk, link, members, relays) for peer, psk in zip(peers, psks, strict=True))
     relay_configs = tuple(
-        used_relays.relay_of(relay, psk, link) for relay, psk in zip(relays, relay_psks, strict=True)
+        used_relays.relay_of(relay, peers, psk, link) for relay, psk in zip(relays, relay_psks, strict=True)
     )
     routing_config = Routing(**RoutingSection.model_construct(**routing.valid).model_dump())
     return Config(
@@ -138,7 +135,14 @@ def load_config(path: Path, environ: Mapping[str, str]) -> Config:
         relay_server=relay_config,
         relays=relay_configs,
         warnings=(
-            *pasted_keys.advice(private.reveal(), peer_configs),
+            *pasted_keys.advice(
+                private.reveal(),
+                (
+                    (what, section.valid["name"], section.valid["public_key"])
+                    for what, sections in (("peer", peers), ("member", members), ("relay", relays))
+                    for section in sections
+                ),
+            ),
             *advice(
                 () if any(network.serial is None for network in network_configs) else listen,
                 endpoint_configs,
@@ -210,19 +214,20 @@ def _endpoint(section: Values) -> EndpointConfig:
 
 
 def _peer(
-    peer: Values, psk: Secret | None, link: Values, member_keys: Set[bytes], relays: tuple[str, ...]
+    peer: Values, psk: Secret | None, link: Values, members: Sequence[Values], relays: Sequence[Values]
 ) -> PeerConfig:
     keys = LinkSection.model_construct(**checks.inherited(link, peer))
-    link_settings = link_of(keys)
-    if peer.valid["public_key"] in member_keys or relays:  # they exchange records
+    link_settings, used = link_of(keys), used_relays.relays_of(peer, relays)
+    served = {section.valid["public_key"] for section in (*members, *relays)}
+    if used or peer.valid["public_key"] in served:  # they exchange records
         link_settings = replace(link_settings, features=link_settings.features | c.FEATURE_RECORDS)
     return PeerConfig(
         settings=PeerSettings(
             name=peer.valid["name"], public_key=peer.valid["public_key"], psk=psk, link=link_settings
         ),
-        addresses=tuple(peer.valid.get("addresses", ())),
+        addresses=used_relays.addresses_of(peer, relays),
         previous_public_key=peer.valid.get("previous_public_key"),
-        relays=relays,
+        relays=used,
         policy=policies.data(peer),
         egress=EgressSettings(
             budget_bits_s=keys.budget_bits_s,

@@ -147,10 +147,16 @@ class RelayServer:
 
 @dataclass(frozen=True, slots=True)
 class RelayConfig:
-    """A relay: its settings in the core, where its name begins with :data:`.RELAY_HOST`, and its addresses."""
+    """A relay: its settings in the core, where its name begins with :data:`.RELAY_HOST`, and its addresses.
+
+    ``previous_public_key``: its old key, while the key changes. ``peer``: the name of the peer with the same key.
+    Then that peer's session serves both, with that peer's settings.
+    """
 
     settings: PeerSettings
     addresses: tuple[PeerAddress, ...]
+    previous_public_key: bytes | None = None
+    peer: str | None = None
 
     @property
     def name(self) -> str:
@@ -224,6 +230,14 @@ class Config:
     def is_only_relay(self) -> bool:
         """Whether this daemon carries no frames."""
         return self.relay_server is not None and not self.peers and not self.endpoints
+
+    @property
+    def keys_of_others(self) -> set[bytes]:
+        """The keys of the peers and relays, current and previous."""
+        others: tuple[PeerConfig | RelayConfig, ...] = (*self.peers, *self.relays)
+        return {
+            key for one in others for key in (one.settings.public_key, one.previous_public_key) if key is not None
+        }
 
     @property
     def has_ip_networks(self) -> bool:

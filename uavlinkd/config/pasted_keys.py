@@ -7,12 +7,11 @@ the remedy is always a new key.
 from __future__ import annotations
 
 import stat
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
 from uavlinkd.config.keys import KEY_TEXT_LENGTH, decode_key, encode_key, looks_private
-from uavlinkd.config.model import PeerConfig
 from uavlinkd.config.problems import Problems, Values
 from uavlinkd.core.crypto import x25519_public_key
 
@@ -27,11 +26,6 @@ EXAMPLE_KEYS = frozenset(
 """The public keys in README.md and configs/. Their private keys do not exist. A test compares this list with them."""
 _MAX_FILES = 512
 _EXPOSED = "it is exposed: make a new one there with `uavlinkd keygen`, and write here the public key that it prints"
-
-
-def is_example(public_key: bytes) -> bool:
-    """Whether a public key is that of an example."""
-    return encode_key(public_key) in EXAMPLE_KEYS
 
 
 def check(
@@ -92,23 +86,25 @@ def _key_files(folder: Path) -> Mapping[bytes, str]:
     return keys
 
 
-def advice(private: bytes, peers: Sequence[PeerConfig]) -> Iterator[str]:
-    """Yield a warning for each key that is probably in the wrong place."""
+def advice(private: bytes, owners: Iterable[tuple[str, str, bytes]]) -> Iterator[str]:
+    """Yield a warning for each key that is probably in the wrong place.
+
+    ``owners``: for each public key what it is the key of, such as a peer, and that one's name.
+    """
     if not looks_private(private):
         yield (
             "private_key_file holds a key without the form of a private key, perhaps a public key: make one with"
             " `uavlinkd keygen`, unless software other than `uavlinkd` and `wg` made it"
         )
-    for peer in peers:
-        key = peer.settings.public_key
-        if is_example(key):
+    for what, name, key in owners:
+        if encode_key(key) in EXAMPLE_KEYS:
             yield (
-                f'peer "{peer.name}": public_key is the key of an example, whose private key does not exist: write'
-                " what `uavlinkd keygen` or `uavlinkd pubkey` printed on the peer"
+                f'{what} "{name}": public_key is the key of an example, whose private key does not exist: write'
+                f" what `uavlinkd keygen` or `uavlinkd pubkey` printed on the {what}"
             )
         elif looks_private(key):
             yield (
-                f'peer "{peer.name}": public_key has the form of a private key. `uavlinkd keygen` makes no such'
-                " public key, `wg` one of 16: compare it with what `uavlinkd pubkey FILE` prints on the peer."
+                f'{what} "{name}": public_key has the form of a private key. `uavlinkd keygen` makes no such'
+                f" public key, `wg` one of 16: compare it with what `uavlinkd pubkey FILE` prints on the {what}."
                 f" If it is its private key, {_EXPOSED}"
             )

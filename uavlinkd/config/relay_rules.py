@@ -8,18 +8,15 @@ from dataclasses import replace
 from uavlinkd.config import checks
 from uavlinkd.config.link_settings import link_of
 from uavlinkd.config.model import RelayServer
-from uavlinkd.config.pasted_keys import is_example
 from uavlinkd.config.problems import Problems, Values
 from uavlinkd.config.schema import LinkSection, MemberSection, RelayServerSection
 from uavlinkd.core import constants as c
 from uavlinkd.core.crypto import Secret
-from uavlinkd.core.settings import Link, PeerSettings
+from uavlinkd.core.settings import Link, PeerSettings, previous_of
 from uavlinkd.relay.member_settings import MemberSettings, RelayLimits
 
 MOST_MEMBERS = 4000
 """Each has up to three sessions, of 65,535 indices."""
-_RETRY_MAX_S = 60.0
-"""A member that is away initiates by itself when it is back."""
 
 
 def members(
@@ -30,26 +27,17 @@ def members(
     checks.public_keys(problems, sections, own, private)
     by_name = {peer.valid.get("name"): peer for peer in peers}
     by_key = {peer.valid.get("public_key"): peer for peer in peers}
-    previous = {peer.valid.get("previous_public_key"): peer for peer in peers}
     for section in sections:
         name, key = section.valid.get("name"), section.valid.get("public_key")
         if name is None or key is None:
             continue
         peer = by_key.get(key)
-        if peer is not None and "psk_file" in section.valid:
-            problems.add(
-                section.place.key("psk_file"),
-                f"has no effect, because {peer.place.key('')} has this key: write the PSK there only",
-            )
+        if peer is not None:
+            checks.of_peer(problems, section, peer)
         if (other := by_name.get(name)) is not None and other is not peer:
             problems.add(
                 section.place.key("name"),
                 f"is the name of {other.place.key('')} too, which has another key: write another name",
-            )
-        if (other := previous.get(key)) is not None:
-            problems.add(
-                section.place.key("public_key"),
-                f"is the previous key of {other.place.key('')}: write its new key",
             )
     if len(sections) > MOST_MEMBERS:
         problems.add(
@@ -89,28 +77,26 @@ def relay_server_of(
         return None
     keys = RelayServerSection.model_construct(**server.valid)
     common = link_of(LinkSection.model_construct(**link.valid))
-    common = replace(common, features=c.FEATURE_RECORDS, timers=replace(common.timers, retry_max_s=_RETRY_MAX_S))
+    common = replace(common, features=c.FEATURE_RECORDS)
     return RelayServer(
-        members=tuple(_member(section, psk, common) for section, psk in zip(sections, psks, strict=True)),
+        members=tuple(
+            member for section, psk in zip(sections, psks, strict=True) for member in _members(section, psk, common)
+        ),
         limits=RelayLimits(keys.datagrams_s, keys.bits_s),
     )
 
 
-def _member(section: Values, psk: Secret | None, link: Link) -> MemberSettings:
+def _members(section: Values, psk: Secret | None, link: Link) -> Iterator[MemberSettings]:
+    """One, or two while its key changes: others ask for it by the key that they know."""
     keys = MemberSection.model_construct(**section.valid)
-    return MemberSettings(
-        peer=PeerSettings(keys.name, keys.public_key, psk, link),
-        most_peers=keys.max_peers,
-        limits=RelayLimits(keys.datagrams_s, keys.bits_s),
-    )
+    peer = PeerSettings(keys.name, keys.public_key, psk, link, initiates=False)
+    limits = RelayLimits(keys.datagrams_s, keys.bits_s)
+    yield MemberSettings(peer, keys.max_peers, limits)
+    if keys.previous_public_key is not None:
+        yield MemberSettings(previous_of(peer, keys.previous_public_key), keys.max_peers, limits)
 
 
 def advice(server: RelayServer) -> Iterator[str]:
     """Yield the warnings."""
-    if examples := [member.name for member in server.members if is_example(member.peer.public_key)]:
-        yield (
-            f"member {', '.join(examples)}: public_key is the key of an example, whose private key does not exist:"
-            " write what `uavlinkd keygen` or `uavlinkd pubkey` printed on the member"
-        )
     if len(server.members) == 1:
         yield "there is only one [[member]]: a relay connects two"

@@ -1,183 +1,36 @@
 """The keys of a configuration file, with their ranges and defaults: one class for each section.
 
-The checks here concern a single value. Checks of several values are in :mod:`uavlinkd.config.checks`.
+The kinds of values are in :mod:`uavlinkd.config.values`, checks of several values in :mod:`uavlinkd.config.checks`.
 """
 
 from __future__ import annotations
 
-import re
-from ipaddress import IPv4Address, IPv6Address, ip_address
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    ConfigDict,
-    Field,
-    PlainValidator,
-    ValidationInfo,
-    field_validator,
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
+
+from uavlinkd.config.values import (
+    LEAST_BUDGET,
+    Budget,
+    FileName,
+    Interface,
+    ListenAddress,
+    Name,
+    OwnAddress,
+    PeerAddresses,
+    PublicKey,
+    SerialLine,
+    Suites,
+    Url,
 )
-
-from uavlinkd.config.keys import decode_key, is_canonical_public_key
-from uavlinkd.config.model import SERIAL, PeerAddress
 from uavlinkd.core import constants as c
-from uavlinkd.core.crypto import is_usable_public_key
-from uavlinkd.core.suites import SUITES_BY_NAME, X25519, Suite
-from uavlinkd.endpoints.url import EndpointUrl, SerialUrl, parse_line, parse_url
+from uavlinkd.core.suites import X25519
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
-from uavlinkd.system.addresses import Address, AddressError, parse_address
 
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}")
-_INTERFACE = re.compile(r"[^\s/:]{1,15}")  # as dev_valid_name() of Linux
-# A complete or nearly complete key in base64 or hex: no message repeats it.
-_LIKE_A_KEY = re.compile(r"[A-Za-z0-9+/_-]{40,}={0,2}")
-_FINITE_FIELD = re.compile(r"(?:modp|ffdhe?|dhe?)?[-_ ]?(\d{1,5})(?:[-_ ]?bits?)?")
-# IKE's numbers for small groups: RFC 2409 section 6, RFC 5114 section 2.1.
-_SMALL_IKE_GROUPS = {"group1": 768, "group2": 1024, "group22": 1024}
-_BREAKABLE_BITS = 1024
-_LEAST_BUDGET = 1000
 _LEAST_AIR = 1000
 _EGRESS = EgressSettings()
 _AGES = (0.1, 60.0)
 _KEY_GRACE_S = 7 * 24 * 3600.0
-
-
-def _text(value: Any) -> str:
-    if not isinstance(value, str):
-        raise ValueError("must be text in quotes")
-    return value
-
-
-def _name(value: Any) -> str:
-    # Logs, metrics and file names contain names, so a name has no character with a special meaning there.
-    if not _NAME.fullmatch(_text(value)):
-        raise ValueError("must be a name of up to 63 letters, digits, dots, hyphens and underscores")
-    return str(value)
-
-
-def _file_name(value: Any) -> str:
-    text = _text(value)
-    if _LIKE_A_KEY.fullmatch(text.strip()):
-        raise ValueError("is a key, not the name of a file: write the key to a file of mode 0600 and name that file")
-    if not text or not text.isprintable():
-        raise ValueError('must name a file: write a name such as "drone0.key"')
-    return text
-
-
-def _public_key(value: Any) -> bytes:
-    try:
-        key = decode_key(_text(value))
-    except ValueError as error:
-        raise ValueError(f"{error}: write what `uavlinkd pubkey` prints on the peer") from None
-    if not is_usable_public_key(key):
-        raise ValueError(
-            "is a point of low order, with which everyone knows the shared secret:"
-            " write what `uavlinkd pubkey` prints on the peer"
-        )
-    if not is_canonical_public_key(key):
-        raise ValueError(
-            "is not a public key of X25519, but perhaps a private key, which must stay secret:"
-            " write what `uavlinkd pubkey` prints on the peer"
-        )
-    return key
-
-
-def _suite(value: Any) -> Suite:
-    if isinstance(value, int) and not isinstance(value, bool):
-        value = str(value)
-    text = _text(value).strip().lower()
-    if (suite := SUITES_BY_NAME.get(text)) and text == value:
-        return suite
-    sized = _FINITE_FIELD.fullmatch(text)
-    bits = _SMALL_IKE_GROUPS.get(text) or (int(sized[1]) if sized else None)
-    if bits is not None and 0 < bits <= _BREAKABLE_BITS:
-        raise ValueError(
-            f"is a Diffie-Hellman group of {bits} bits: groups of {_BREAKABLE_BITS} bits and less are refused."
-            " One long computation in advance, which a state can afford, breaks every exchange in such a group"
-            " (Logjam, 2015), so they are for measurements only;"
-            ' write "x25519", or "ffdhe2048" and above'
-        )
-    names = ", ".join(SUITES_BY_NAME)
-    raise ValueError(f"is not a suite: write one of {names}")
-
-
-def _suites(values: list[Suite]) -> list[Suite]:
-    if not values:
-        raise ValueError('must name a suite: write ["x25519"]')
-    if len(set(values)) != len(values):
-        raise ValueError("names a suite twice: write each once, first the one to offer")
-    return values
-
-
-def _addresses(values: list[PeerAddress]) -> list[PeerAddress]:
-    everywhere = {value.address for value in values if not value.network}
-    if len(set(values)) != len(values):
-        raise ValueError("names an address twice: write each once")
-    if any(value.network and value.address in everywhere for value in values):
-        raise ValueError("names an address with a network and without, which stands for every network: write one")
-    return values
-
-
-def _budget(value: int) -> int:
-    if 0 < value < _LEAST_BUDGET:
-        raise ValueError(f"is too small: write {_LEAST_BUDGET} or more, in bits a second, or 0 for no limit")
-    return value
-
-
-def _peer_address(value: Any) -> PeerAddress:
-    text, network = value, ""
-    if isinstance(value, dict):
-        if set(value) == {"network"}:
-            return PeerAddress(SERIAL, _name(value["network"]))
-        if set(value) != {"address", "network"}:
-            raise ValueError(
-                'must have two keys: write { address = "10.13.0.2:5790", network = "mesh" }, or { network = "sik" }'
-                " for a serial network"
-            )
-        text, network = value["address"], _name(value["network"])
-    try:
-        address = parse_address(_text(text), allow_names=True)
-    except AddressError as error:
-        if network or {".", ":"} & set(text):
-            raise
-        raise ValueError(
-            f'{error}. The other end of a serial network is {{ network = "sik" }}, with its name'
-        ) from None
-    if address.is_wildcard:
-        raise ValueError('is every address of this machine: write the peer\'s own, such as "10.13.0.2:5790"')
-    return PeerAddress(address, network)
-
-
-def _interface(value: Any) -> str:
-    text = _text(value)
-    if not _INTERFACE.fullmatch(text) or not text.isprintable() or text in (".", ".."):
-        raise ValueError("is not a name of a network interface: write one of those that `ip -brief link` lists")
-    return text
-
-
-def _own_address(value: Any) -> str:
-    try:
-        ip = ip_address(_text(value))
-    except ValueError:
-        raise ValueError(
-            'is not an IP address: write one of this machine\'s, without a port, such as "10.0.0.5";'
-            " the port is that of listen"
-        ) from None
-    if ip.is_unspecified:
-        raise ValueError('is every address of this machine: write one of them, or interface = "wlan0" instead')
-    if ip.is_multicast or ip == IPv4Address("255.255.255.255"):
-        raise ValueError("is a multicast or broadcast address: write an address of this machine")
-    if isinstance(ip, IPv6Address) and ip.ipv4_mapped is not None:
-        raise ValueError(f'is an IPv4 address in IPv6 form: write "{ip.ipv4_mapped}"')
-    if isinstance(ip, IPv6Address) and ip.is_link_local and ip.scope_id is None:
-        raise ValueError(f'is link-local, valid on one interface only: write "{ip}%wlan0" with that interface')
-    return str(ip)
-
-
-Name = Annotated[str, PlainValidator(_name)]
-FileName = Annotated[str, PlainValidator(_file_name)]
-ListenAddress = Annotated[Address, PlainValidator(lambda value: parse_address(_text(value), allow_names=False))]
 
 
 def _seconds(default: float, least: float, most: float) -> Any:
@@ -204,9 +57,7 @@ class Section(BaseModel):
 class LinkSection(Section):
     """``[link]``, and the same keys in ``[[peer]]``: how to communicate with peers."""
 
-    suites: Annotated[list[Annotated[Suite, PlainValidator(_suite)]], AfterValidator(_suites)] = Field(
-        default=[X25519], examples=['["x25519"]']
-    )
+    suites: Suites = Field(default=[X25519], examples=['["x25519"]'])
     """Accepted suites. The first is offered."""
     confidential: bool = False
     """Whether frames are encrypted too. Both ends use the stronger of the two settings."""
@@ -230,7 +81,7 @@ class LinkSection(Section):
     reject_after_s: float = _seconds(c.REJECT_AFTER_S, 1, 7200)
     probe_interval_s: float = _seconds(c.PROBE_INTERVAL_S, 0.1, 3600)
 
-    budget_bits_s: Annotated[int, AfterValidator(_budget)] = Field(default=_EGRESS.budget_bits_s, ge=0, le=10**9)
+    budget_bits_s: Budget = Field(default=_EGRESS.budget_bits_s, ge=0, le=10**9)
     """Most bits per second to the peer, including the headers of IP and UDP. 0: no limit."""
     coalesce_s: float = _seconds(_EGRESS.coalesce_s, 0, 0.5)
     """How long a frame may wait for others to share its envelope. 0: it shares only with frames that already wait."""
@@ -246,19 +97,17 @@ class NetworkSection(Section):
     """``[[network]]``: an exit of this machine to the peers."""
 
     name: Name = Field(examples=['"lte"'])
-    interface: Annotated[str, PlainValidator(_interface)] | None = Field(default=None, examples=['"wwan0"'])
+    interface: Interface | None = Field(default=None, examples=['"wwan0"'])
     """The sockets are bound to this interface."""
-    address: Annotated[str, PlainValidator(_own_address)] | None = Field(default=None, examples=['"10.0.0.5"'])
+    address: OwnAddress | None = Field(default=None, examples=['"10.0.0.5"'])
     """The socket is bound to this address of the machine. The kernel's routes decide the interface."""
-    serial: Annotated[SerialUrl, PlainValidator(lambda value: parse_line(_text(value)))] | None = Field(
-        default=None, examples=['"/dev/ttyUSB0:57600"']
-    )
+    serial: SerialLine | None = Field(default=None, examples=['"/dev/ttyUSB0:57600"'])
     """A serial device with its baud rate: a radio modem, with one peer at the other end."""
     air_bits_s: int | None = Field(default=None, ge=_LEAST_AIR, le=10_000_000, examples=["24000"])
     """What the radio behind the device carries, in both directions together. This end sends 40 % of it."""
     metered: bool = False
     """Whether its traffic costs money."""
-    budget_bits_s: Annotated[int, AfterValidator(_budget)] = Field(default=0, ge=0, le=10**9)
+    budget_bits_s: Budget = Field(default=0, ge=0, le=10**9)
     """Most bits per second of all peers together, including the headers of IP and UDP. 0: no limit."""
 
 
@@ -284,17 +133,11 @@ class PeerSection(LinkSection, PolicySection):
     """``[[peer]]``: another daemon."""
 
     name: Name = Field(examples=['"drone1"'])
-    public_key: Annotated[bytes, PlainValidator(_public_key)] = Field(
-        examples=['"…", what `uavlinkd pubkey` prints on the peer']
-    )
-    addresses: Annotated[list[Annotated[PeerAddress, PlainValidator(_peer_address)]], AfterValidator(_addresses)] = (
-        Field(default=[], examples=['["10.13.0.2:5790"]'])
-    )
+    public_key: PublicKey = Field(examples=['"…", what `uavlinkd pubkey` prints on the peer'])
+    addresses: PeerAddresses = Field(default=[], examples=['["10.13.0.2:5790"]'])
     """Where this daemon reaches it. Empty: the peer initiates."""
     psk_file: FileName | None = Field(default=None, examples=['"drone0-drone1.psk"'])
-    previous_public_key: Annotated[bytes, PlainValidator(_public_key)] | None = Field(
-        default=None, examples=['"…", what its public key was']
-    )
+    previous_public_key: PublicKey | None = Field(default=None, examples=['"…", what its public key was'])
     """Also accepted while the peer's key changes, until the first session with the new key or ``key_grace_s``."""
 
     relays: list[Name] | None = Field(default=None, examples=["[]"])
@@ -305,29 +148,27 @@ class RelaySection(Section):
     """``[[relay]]``: a host that passes datagrams between this daemon and its peers, and cannot forge them."""
 
     name: Name = Field(examples=['"vps"'])
-    public_key: Annotated[bytes, PlainValidator(_public_key)] = Field(
-        examples=['"…", what `uavlinkd pubkey` prints on the relay']
-    )
-    addresses: Annotated[list[Annotated[PeerAddress, PlainValidator(_peer_address)]], AfterValidator(_addresses)] = (
-        Field(default=[], examples=['["relay.example.org:5790"]'])
-    )
+    public_key: PublicKey = Field(examples=['"…", what `uavlinkd pubkey` prints on the relay'])
+    addresses: PeerAddresses = Field(default=[], examples=['["relay.example.org:5790"]'])
     """Where this daemon reaches it."""
     psk_file: FileName | None = Field(default=None, examples=['"drone0-vps.psk"'])
+    previous_public_key: PublicKey | None = Field(default=None, examples=['"…", what its public key was'])
+    """Also accepted while the relay's key changes, until the first session with the new key."""
 
 
 class MemberSection(Section):
     """``[[member]]``: a daemon that may use this relay."""
 
     name: Name = Field(examples=['"drone1"'])
-    public_key: Annotated[bytes, PlainValidator(_public_key)] = Field(
-        examples=['"…", what `uavlinkd pubkey` prints on the member']
-    )
+    public_key: PublicKey = Field(examples=['"…", what `uavlinkd pubkey` prints on the member'])
     psk_file: FileName | None = Field(default=None, examples=['"vps-drone1.psk"'])
+    previous_public_key: PublicKey | None = Field(default=None, examples=['"…", what its public key was'])
+    """Also accepted while the member's key changes."""
     max_peers: int = Field(default=256, ge=1, le=4000)
     """Members that it may ask for."""
     datagrams_s: int = Field(default=2000, ge=1, le=10**6)
     """Most datagrams per second from it."""
-    bits_s: int = Field(default=20_000_000, ge=_LEAST_BUDGET, le=10**10, examples=["20_000_000"])
+    bits_s: int = Field(default=20_000_000, ge=LEAST_BUDGET, le=10**10, examples=["20_000_000"])
     """Most bits per second from it, without the headers of IP and UDP."""
 
 
@@ -337,16 +178,14 @@ class RelayServerSection(Section):
     enabled: bool = False
     """A file with members, and without peers and endpoints, is a relay without this key."""
     datagrams_s: int = Field(default=10**6, ge=1, le=10**6, examples=["100_000"])
-    bits_s: int = Field(default=10**10, ge=_LEAST_BUDGET, le=10**10, examples=["100_000_000"])
+    bits_s: int = Field(default=10**10, ge=LEAST_BUDGET, le=10**10, examples=["100_000_000"])
 
 
 class EndpointSection(PolicySection):
     """``[[endpoint]]``: a local MAVLink port."""
 
     name: Name = Field(examples=['"autopilot"'])
-    url: Annotated[EndpointUrl, PlainValidator(lambda value: parse_url(_text(value)))] = Field(
-        examples=['"udpin:127.0.0.1:14550"']
-    )
+    url: Url = Field(examples=['"udpin:127.0.0.1:14550"'])
     max_age_s: float = _seconds(_EGRESS.max_age_s, *_AGES)
     """A frame that waited longer for a TCP connection or a serial port is dropped."""
     radio_status: bool = False

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-from uavlinkd.config.checks import unique
-from uavlinkd.config.model import RelayConfig
+from uavlinkd.config.checks import of_peer, unique
+from uavlinkd.config.model import PeerAddress, RelayConfig
 from uavlinkd.config.problems import Problems, Values
 from uavlinkd.config.schema import LinkSection
 from uavlinkd.core import constants as c
@@ -16,9 +16,9 @@ from uavlinkd.core.settings import Link, PeerSettings, Timers
 
 MOST: Final = 3
 """Relays of one daemon. A peer has room for the paths along so many."""
-TIMERS: Final = Timers(echo_after_s=0.15, handshake_after_s=0.3, retry_max_s=0.5)
-"""A relay is asked when a path along it fails, or once in ten seconds, and answers at once unless it was restarted. A
-try costs 0.3 kB: while a relay is down, 5 kbit/s."""
+TIMERS: Final = Timers(echo_after_s=0.1, handshake_after_s=0.2, lost_after_s=1.0, retry_max_s=0.5)
+"""A relay is asked when a path along it fails or its peer is silent, and answers at once unless it was restarted. A
+try costs 0.3 kB: while a relay is down, 5 kbit/s. When it is lost, its name is resolved again: it may have moved."""
 
 
 def relays(
@@ -28,38 +28,47 @@ def relays(
     members: Sequence[Values],
     own: bytes | None,
 ) -> None:
-    """Each relay has a key and an address of its own, and each relay that a peer names is in the file."""
+    """Each relay has an address, and a key of its own or a peer's. Each relay that a peer names is in the file."""
     if len(sections) > MOST:
         problems.add("relay", f"has {len(sections)} sections: write at most {MOST}, the most reliable ones")
     unique(problems, sections, "name", str, "the name of {other} too: write another")
     unique(problems, sections, "public_key", bytes, "the key of {other} too: each relay has its own")
-    owners = {peer.valid[key]: peer for peer in (*members, *peers) for key in _KEYS if key in peer.valid}
+    by_member = {member.valid["public_key"]: member for member in members if "public_key" in member.valid}
     for section in sections:
         place, key = section.place.key("public_key"), section.valid.get("public_key")
+        peer = peer_of(section, peers)
         if key is not None and key == own:
             problems.add(place, "is this daemon's own key: write what `uavlinkd pubkey` prints on the relay")
-        elif key in owners:
+        elif key in by_member:
             problems.add(
                 place,
-                f"is the key of {owners[key].place.key('')} too, and one daemon cannot be both for another one: run"
-                " the relay with a key of its own (`uavlinkd keygen`)",
+                f"is the key of {by_member[key].place.key('')} too, and two daemons cannot be relays of each other:"
+                " run the relay with a key of its own (`uavlinkd keygen`)",
             )
-        _addresses(problems, section)
-    known = {section.valid["name"] for section in sections if "name" in section.valid}
+        if peer is not None:
+            of_peer(problems, section, peer)
+        _addresses(problems, section, peer)
+    known = {section.valid["name"]: section for section in sections if "name" in section.valid}
     for peer in peers if len(known) == len(sections) else ():
         for name in peer.valid.get("relays") or ():
             if name not in known:
                 names = ", ".join(f'"{name}"' for name in sorted(known))
                 remedy = f"write one of {names}" if names else "add a [[relay]] of that name"
                 problems.add(peer.place.key("relays"), f"names a relay that this file does not have: {remedy}")
+            elif peer_of(known[name], [peer]) is not None:
+                problems.add(peer.place.key("relays"), f"names {name}, which has this peer's key: leave it out")
 
 
-_KEYS = ("public_key", "previous_public_key")
+def peer_of(section: Values, peers: Sequence[Values]) -> Values | None:
+    """The peer with the key of a relay."""
+    key = section.valid.get("public_key")
+    return next((peer for peer in peers if key is not None and peer.valid.get("public_key") == key), None)
 
 
-def _addresses(problems: Problems, section: Values) -> None:
+def _addresses(problems: Problems, section: Values, peer: Values | None) -> None:
     place, addresses = section.place.key("addresses"), section.valid.get("addresses", ())
-    if not addresses and "addresses" not in section.invalid:
+    has_peers = peer is not None and ("addresses" in peer.invalid or bool(_over_ip(peer)))
+    if not addresses and not has_peers and "addresses" not in section.invalid:
         problems.add(
             place, 'is empty, and a relay never initiates: write its address, such as ["relay.example.org:5790"]'
         )
@@ -67,20 +76,36 @@ def _addresses(problems: Problems, section: Values) -> None:
         problems.add(place, "names a serial network, but a relay is reached over IP: write its IP address or name")
 
 
-def uses_relay(peer: Values, sections: Sequence[Values]) -> bool:
-    """Whether a peer uses one of the relays of the file."""
-    return bool(sections) and peer.valid.get("relays") != [] and "relays" not in peer.invalid
+def _over_ip(section: Values) -> list[PeerAddress]:
+    return [written for written in section.valid.get("addresses", ()) if not written.is_serial]
+
+
+def needs_no_address(peer: Values, sections: Sequence[Values]) -> bool:
+    """Whether a peer uses a relay of the file, or is one, which has an address."""
+    uses_relays = bool(sections) and peer.valid.get("relays") != [] and "relays" not in peer.invalid
+    return uses_relays or any(peer_of(section, [peer]) is not None for section in sections)
 
 
 def relays_of(peer: Values, sections: Sequence[Values]) -> tuple[str, ...]:
-    """The names of the relays that a peer uses, in a file without problems."""
+    """The names of the relays that a peer uses, in a file without problems. It is not reached along itself."""
     names: list[str] | None = peer.valid.get("relays")
-    return tuple(section.valid["name"] for section in sections if names is None or section.valid["name"] in names)
+    return tuple(
+        section.valid["name"]
+        for section in sections
+        if peer_of(section, [peer]) is None and (names is None or section.valid["name"] in names)
+    )
 
 
-def relay_of(section: Values, psk: Secret | None, link: Values) -> RelayConfig:
+def addresses_of(peer: Values, sections: Sequence[Values]) -> tuple[PeerAddress, ...]:
+    """The addresses of a peer: its own, and those of the relay that it is."""
+    of_relay = [written for section in sections if peer_of(section, [peer]) for written in _over_ip(section)]
+    return tuple(dict.fromkeys((*peer.valid.get("addresses", ()), *of_relay)))
+
+
+def relay_of(section: Values, peers: Sequence[Values], psk: Secret | None, link: Values) -> RelayConfig:
     """The relay of a valid section. It inherits the suites of ``[link]``."""
     suites = tuple(LinkSection.model_construct(**link.valid).suites)
+    peer = peer_of(section, peers)
     return RelayConfig(
         settings=PeerSettings(
             name=RELAY_HOST + section.valid["name"],
@@ -88,5 +113,7 @@ def relay_of(section: Values, psk: Secret | None, link: Values) -> RelayConfig:
             psk=psk,
             link=Link(suites, timers=TIMERS, features=c.FEATURE_REFUSALS | c.FEATURE_RECORDS),
         ),
-        addresses=tuple(section.valid["addresses"]),
+        addresses=tuple(dict.fromkeys((*([] if peer is None else _over_ip(peer)), *_over_ip(section)))),
+        previous_public_key=section.valid.get("previous_public_key"),
+        peer=None if peer is None else peer.valid["name"],
     )

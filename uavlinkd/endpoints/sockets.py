@@ -17,6 +17,8 @@ BUFFER_BYTES = 1 << 20
 """Requested for the receive buffer and the send buffer: room for hundreds of envelopes of the default size. The
 kernel may grant less (net.core.rmem_max)."""
 
+_INTERFACE_NAME_BYTES = 16
+"""IFNAMSIZ: linux/if.h."""
 _FREEBIND = {
     socket.AF_INET: (socket.IPPROTO_IP, 15),  # IP_FREEBIND, which Python does not name: linux/in.h
     socket.AF_INET6: (socket.IPPROTO_IPV6, 78),  # IPV6_FREEBIND: linux/in6.h
@@ -68,6 +70,22 @@ def udp_socket(address: Address, *, may_come_later: bool = False) -> socket.sock
         sock.close()
         raise cannot_listen(address, error) from None
     return sock
+
+
+def send_from_new_port(sock: socket.socket, datagram: bytes, target: tuple[Any, ...]) -> None:
+    """Send a datagram from the address and interface of a socket, but from an ephemeral port that is closed at once.
+
+    Raises:
+        OSError: the kernel's error.
+    """
+    host, _, *rest = sock.getsockname()
+    with socket.socket(sock.family, socket.SOCK_DGRAM) as other:
+        if sys.platform == "linux":
+            if interface := sock.getsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, _INTERFACE_NAME_BYTES):
+                other.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, interface)
+        other.setblocking(False)
+        other.bind((host, 0, *rest))
+        other.sendto(datagram, target)
 
 
 def _enlarge(sock: socket.socket) -> None:

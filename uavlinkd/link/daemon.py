@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import asyncio
 import os
-from contextlib import suppress
+from functools import partial
 from typing import TYPE_CHECKING
 
 import structlog
 
-from uavlinkd.config import Config, ConfigError, PeerConfig, RelayConfig
+from uavlinkd.config import Config, ConfigError, PeerConfig
 from uavlinkd.config.changes import compare
 from uavlinkd.config.load import load_in_thread
 from uavlinkd.core import outputs as o
@@ -21,17 +21,19 @@ from uavlinkd.core.constants import NEVER
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import LinkedPeer, Output
-from uavlinkd.core.path import Path, SocketAddress
+from uavlinkd.core.path import Path
 from uavlinkd.core.timers import Schedule
 from uavlinkd.endpoints.ports import LocalPort
 from uavlinkd.link.conditions import LineLimits
+from uavlinkd.link.control_answers import answer
 from uavlinkd.link.diagnosis import find
 from uavlinkd.link.drop_summary import DropSummary
 from uavlinkd.link.event_log import EventLog
 from uavlinkd.link.evidence import Evidence
+from uavlinkd.link.forwarder import Forwarder
+from uavlinkd.link.from_relays import FromRelays
 from uavlinkd.link.history import History
 from uavlinkd.link.intake import Intake
-from uavlinkd.link.key_change import Graces
 from uavlinkd.link.local_endpoints import LocalEndpoints
 from uavlinkd.link.network_budgets import NetworkBudget, budgets_of, follow_rates
 from uavlinkd.link.passage import Passage
@@ -39,13 +41,12 @@ from uavlinkd.link.peer_link import PeerLink, radio_figures
 from uavlinkd.link.peer_owners import PeerOwner
 from uavlinkd.link.peer_sockets import PeerSockets
 from uavlinkd.link.pilot_notes import PilotNotes
-from uavlinkd.link.reachability import ping, views
 from uavlinkd.link.relays import Relays
+from uavlinkd.link.reloads import Reloads
+from uavlinkd.link.roster import Roster
 from uavlinkd.link.shell_reasons import ShellReason
 from uavlinkd.link.status import daemon_status
 from uavlinkd.link.switch import Switch
-from uavlinkd.link.turns import WaitingDatagram
-from uavlinkd.mavlink.frames import Frame
 from uavlinkd.mavlink.radio_status import INTERVAL_S
 from uavlinkd.mavlink.routing import Router
 from uavlinkd.mavlink.screening import screen
@@ -56,7 +57,7 @@ from uavlinkd.ops.sdnotify import Supervisor
 from uavlinkd.relay.service import RelayService
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.signals import on_signal
-from uavlinkd.system.stall import STALL_S, StallWatch
+from uavlinkd.system.stall import StallWatch
 from uavlinkd.system.terminal import printable
 
 if TYPE_CHECKING:
@@ -64,9 +65,6 @@ if TYPE_CHECKING:
 
 LOOP_TICK_S = 0.001
 """A loop may fire a timer up to one tick of its clock early. The timer is set later by this."""
-GATHER_AT_MOST_S = 0.005
-"""If the coalescing delay of every peer is at most this, clients are read only this often: each wake-up costs. With
-longer delays frames wait in the queues, which know what is urgent."""
 HOUSEKEEPING_S = INTERVAL_S
 """How often links are measured, and idle clients forgotten."""
 
@@ -89,7 +87,6 @@ class Daemon:
         self.evidence = Evidence(self.links, config.public_key)
         self.history = History(now)
         self.passage = Passage()
-        self._graces = Graces()
         routing = config.routing
         router = Router[PeerLink | LocalPort](relays=routing.relay, floods_unknown=routing.unknown_targets == "flood")
         self._loop = asyncio.get_running_loop()
@@ -100,13 +97,14 @@ class Daemon:
         self._notes = PilotNotes(router.addresses)
         self._events = EventLog(self.log, limits)
         self.stall = StallWatch(now, self._on_pause)
+        forwarder = Forwarder(self.switch, self.stall, self._drops, self._settle)
         self._intake = Intake(
             self.node,
             self.stall,
             self.switch,
             self._link_of,
             self._perform,
-            self._on_peer_frames,
+            forwarder.on_peer_frames,
             self._settle,
             self._on_superseded,
             self._drop_datagram,
@@ -116,7 +114,7 @@ class Daemon:
         )
         self._events.network_of = self.peer_sockets.network_name
         self.relays = Relays(self.node, self.peer_sockets, self.links, self.owners, self.log, self._arm)
-        self.local = LocalEndpoints(config.name, self.switch, self._events, self.stall, self.on_frames)
+        self.local = LocalEndpoints(config.name, self.switch, self._events, self.stall, forwarder.on_frames)
         self.relay: RelayService | None = None
         if config.relay_server is not None:
             self.relay = RelayService(
@@ -126,22 +124,40 @@ class Daemon:
                 config.relay_server.limits,
                 perform=self._perform,
                 send=self.peer_sockets.send,
+                send_from_new_port=self.peer_sockets.send_from_new_port,
                 on_event=self._events.write,
             )
-            self._intake.take_relayed = self.relay.take
             self.peer_sockets.pause_s = 0.0
+        self._from_relays = FromRelays(self.relays, self.relay, self.owners, self._drop_datagram)
+        self._roster = Roster(
+            config=config,
+            node=self.node,
+            links=self.links,
+            link_of=self._link_of,
+            owners=self.owners,
+            relays=self.relays,
+            relay=self.relay,
+            peer_sockets=self.peer_sockets,
+            switch=self.switch,
+            local=self.local,
+            history=self.history,
+            events=self._events,
+            drops=self._drops,
+            new_link=self._new_link,
+            perform=self._perform,
+            on_due=self._arm,
+        )
         self._timer: asyncio.TimerHandle | None = None
         self._timer_at = NEVER
         self._housekeeping_at = now + HOUSEKEEPING_S
         self._waiting = Schedule[PeerLink]()
         self._budgets: dict[int, NetworkBudget] = {}
         """Of networks, by the number of the socket."""
-        self._reloading = asyncio.Lock()
-        self._hangups: set[asyncio.Task[None]] = set()
         self._control: ControlServer | None = None
         self._metrics: MetricsServer | None = None
         self.recorder: Recorder | None = None
         self.supervisor = Supervisor(os.environ, os.getpid())
+        self.reloads = Reloads(self._reload, self.supervisor)
 
     # Life.
 
@@ -156,7 +172,7 @@ class Daemon:
         for name in ("SIGTERM", "SIGINT"):
             on_signal(name, stop.set)
         self._loop.set_exception_handler(self._drops.on_loop_failure)
-        on_signal("SIGHUP", self._on_hangup)
+        on_signal("SIGHUP", self.reloads.on_hangup)
         await self.start()
         try:
             await stop.wait()
@@ -182,18 +198,15 @@ class Daemon:
 
                 self._metrics = await serve_metrics(self.config.metrics, lambda: daemon_status(self, monotonic()))
             if self.config.control_socket is not None:
-                self._control = ControlServer(self.config.control_socket, self._answer)
+                self._control = ControlServer(self.config.control_socket, partial(answer, self))
                 await self._control.start()
         except Exception:
             self._close_sockets()
             raise
         if self.config.recording is not None:
             self.recorder = Recorder(self.config.recording, self.log)
-        for relay in self.config.relays:
-            self._add_relay(relay)
-        for peer in self.config.peers:
-            self._add_peer(peer)
-        self._follow_members()
+        self._roster.start()
+        self._intake.takers.update(self._from_relays.takers)
         self.peer_sockets.start(self._arm)
         self.local.start(self.config.endpoints)
         self._warn()
@@ -240,25 +253,13 @@ class Daemon:
 
     # Reload.
 
-    async def reload(self) -> None:
+    async def _reload(self) -> None:
         """Read the configuration again and apply its changes. Everything else stays as it is.
-
-        Reloads run one at a time, in the order of the requests. The configuration of the last one stays in force.
 
         Raises:
             ConfigError: the new file is wrong, changes what only a restart can change, or has an endpoint that cannot
                 be opened. The old configuration stays in force, as a whole.
         """
-        async with self._reloading:
-            self.supervisor.reloading()
-            try:
-                await self._reload()
-            except BaseException:
-                self.supervisor.ready("the new configuration was refused")
-                raise
-            self.supervisor.ready()
-
-    async def _reload(self) -> None:
         try:
             config = await load_in_thread(self.config.path, os.environ)
             changes = compare(self.config, config)
@@ -266,33 +267,9 @@ class Daemon:
         except ConfigError as error:
             self.log.error("configuration_refused", problems=[printable(line) for line in str(error).split("\n")])
             raise
-        self._graces.follow(self.config.peers, config.peers)
         self.config = config
-        if config.previous_private_key is None:
-            for link in self.links.values():
-                link.give_up_ours(monotonic())
-            self._map_peers()
-            self.node.forget_previous_key()
-        for name in changes.removed_relays:
-            self._perform(self.relays.remove(name, monotonic()))
-        for name in changes.removed_peers:
-            self._remove_peer(name)
-        # First of all give up names and keys: what is added may have them.
-        if self.relay is not None and config.relay_server is not None:
-            others = {one.settings.public_key for one in config.peers}
-            others |= {one.settings.public_key for one in config.relays}
-            self.relay.release(config.relay_server.by_key, others, monotonic())
-        for relay in changes.changed_relays:
-            self.relays.change(relay)
-        for peer in changes.changed_peers:
-            self._change_peer(peer)
-        for relay in changes.added_relays:
-            self._add_relay(relay)
-        if changes.added_relays:
-            self.relays.follow_links(monotonic())
-        for peer in changes.added_peers:
-            self._add_peer(peer)
-        self._follow_members()
+        self._roster.follow(config, changes)
+        self._intake.takers.update(self._from_relays.takers)
         for name in changes.closed_endpoints:
             self.local.close_one(name)
         for endpoint, endpoint_config in zip(opened, changes.opened_endpoints, strict=True):
@@ -303,100 +280,10 @@ class Daemon:
         self.log.info("configuration_reloaded", **changes.summary())
         self._arm()
 
-    def _on_hangup(self) -> None:
-        if len(self._hangups) < 2:  # otherwise one waits already, which will read the file later
-            task = self._loop.create_task(self._reload_for_signal())
-            self._hangups.add(task)
-            task.add_done_callback(self._hangups.discard)
+    def _new_link(self, config: PeerConfig, now: float) -> PeerLink:
+        return PeerLink(config, self.node, self._perform, now, self.recorder, self._waiting, self._budgets)
 
-    async def _reload_for_signal(self) -> None:
-        with suppress(ConfigError):  # logged already
-            await self.reload()
-
-    def _add_relay(self, config: RelayConfig) -> None:
-        self.relays.add(config, monotonic())
-        self._intake.take_relayed = self._take_relayed
-
-    def _take_relayed(self, socket: int, data: bytes, source: SocketAddress) -> WaitingDatagram | None:
-        taken = self.relays.handles.unwrap(socket, data, source)
-        if isinstance(taken, DropReason):
-            if self.relay is not None:  # of a member of this daemon
-                self.relay.take(socket, data, source)
-            else:
-                self._drop_datagram(taken, path=Path(socket, source))
-            return None
-        return taken
-
-    def _add_peer(self, config: PeerConfig) -> None:
-        now, has_previous = monotonic(), self.config.previous_private_key is not None
-        link = PeerLink(config, self.node, self._perform, now, self.recorder, self._waiting, self._budgets)
-        link.join(now, self._graces, self.config.key_grace_s, has_previous_key=has_previous)
-        self.links[config.name] = link
-        self._map_peers()
-        self.switch.add(link, link.policy)
-        self._note_delays()
-        self.peer_sockets.follow(link, self._arm)
-
-    def _remove_peer(self, name: str) -> None:
-        """End the link at once: nothing of this peer is accepted any more."""
-        self.peer_sockets.stop_following(name)
-        link = self.links[name]
-        self.history.add_former_key(link.config.settings.public_key, name)
-        self.switch.remove(link)
-        link.leave(monotonic())
-        del self.links[name]
-        self._map_peers()
-        self._note_delays()
-        self._events.forget(name)
-        self._drops.forget(name)
-
-    def _change_peer(self, config: PeerConfig) -> None:
-        """Apply other rules or addresses to the same identity. Its session continues."""
-        link = self.links[config.name]
-        self.peer_sockets.stop_following(config.name)
-        link.change(config, monotonic())
-        self._map_peers()
-        self.switch.set_policy(link, link.policy)
-        self._drops.forget(config.name)  # the new policy may withhold other frames
-        self._note_delays()
-        self.peer_sockets.follow(link, self._arm)
-
-    def _map_peers(self) -> None:
-        self._link_of.clear()
-        self._link_of.update((peer, link) for link in self.links.values() for peer in link.peers)
-        self.node.set_point_to_point(self.peer_sockets.serial.peers_at(self.links.values()))
-        self.relays.follow_links(monotonic())
-
-    def _follow_members(self) -> None:
-        """The configuration, or the peers of the core, have changed."""
-        relay, server = self.relay, self.config.relay_server
-        if relay is None or server is None:
-            return
-        peers = {link.config.settings.public_key: link.peers[0] for link in self.links.values()}
-        relay.set_members(server.by_key, peers, monotonic())
-        relay.forwarding.total.set_limits(server.limits)
-        for peer in [peer for peer, owner in self.owners.items() if owner is relay]:
-            del self.owners[peer]
-        self.owners.update((member.peer, relay) for member in relay.members.values())
-
-    def _note_delays(self) -> None:
-        gather_s = min((link.gather_s for link in self.links.values()), default=0.0)
-        self.local.gather(gather_s if gather_s <= GATHER_AT_MOST_S else 0.0)
-
-    # Frames.
-
-    def on_frames(self, port: LocalPort, frames: list[Frame], now: float, epoch: int, waited_s: float = 0.0) -> None:
-        """Forward the frames that a local client sent in one wake-up."""
-        stall = self.stall
-        if epoch == stall.epoch and monotonic() - stall.turned_at <= STALL_S:
-            self.switch.forward(port, frames, now, waited_s)
-        else:
-            self._forward_if_fresh(port, frames, now, epoch, waited_s)
-        self._settle()
-
-    def _on_peer_frames(self, link: PeerLink, frames: list[Frame], now: float, epoch: int) -> None:
-        link.record_received(frames, now)
-        self._forward_if_fresh(link, frames, now, epoch)
+    # Drops.
 
     def _on_superseded(self, link: PeerLink, count: int) -> None:
         self._drops.add("frames_dropped", ShellReason.SUPERSEDED, link.name, count, monotonic())
@@ -406,18 +293,12 @@ class Daemon:
         self.node.drops[reason] += 1
         self._drops.add("datagrams_dropped", reason, name, 1, monotonic(), "" if path is None else ("", path))
 
-    def _forward_if_fresh(
-        self, source: PeerLink | LocalPort, frames: list[Frame], now: float, epoch: int, waited_s: float = 0.0
-    ) -> None:
-        """Drop frames from before a pause, and forward others. The process may have paused after it read them."""
-        if epoch == self.stall.turn(monotonic()):
-            self.switch.forward(source, frames, now, waited_s)
-        else:
-            name = source.name if isinstance(source, PeerLink) else source.endpoint.name
-            self.stall.dropped[name] += len(frames)
-            self._drops.add("frames_dropped", ShellReason.STALE, name, len(frames), now)
-
     # Outputs of the core.
+
+    def perform(self, outputs: list[Output]) -> None:
+        """Execute outputs that a request caused."""
+        self._perform(outputs)
+        self._settle()
 
     def _perform(self, outputs: list[Output]) -> None:
         for output in outputs:
@@ -432,10 +313,7 @@ class Daemon:
                 self._drops.add_dropped(output, now)
                 self.evidence.add_dropped(output, now)
             elif isinstance(output, o.RecordReceived):
-                now = monotonic()
-                if (owner := self.owners.get(output.peer)) is not None:
-                    owner.on_record(output, now)
-                self.relays.on_peer_record(output, now)
+                self._from_relays.on_record(output, monotonic())
             else:
                 self._on_event(output)
 
@@ -459,8 +337,7 @@ class Daemon:
             if isinstance(event, o.SessionEstablished) and path is not None and not path.is_relayed:
                 self.history.add_session(link.name, path.address, now)
             is_current = isinstance(event, o.SessionEstablished) and event.peer is link.peers[0]
-            if is_current and link.confirm(now, self._graces):
-                self._map_peers()
+            if is_current and self._roster.confirm_keys(link, now):
                 self.log.info("key_change_confirmed", peer=link.name)
 
     # Time.
@@ -501,7 +378,7 @@ class Daemon:
         self._events.write_pause(pause_s, monotonic())
 
     def _do_housekeeping(self, now: float) -> None:
-        self.supervisor.turn(self._summary(), now)
+        self.supervisor.turn(self._roster.summary(), now)
         if self.relay is not None:
             self.relay.do_housekeeping(now)
             for reason, name, count in self.relay.count_drops():
@@ -517,8 +394,7 @@ class Daemon:
             link.measure(now)
             link.report_refusals(now)
             self._events.check_link(link, now)
-            if link.end_graces(now, self._graces):
-                self._map_peers()
+            if self._roster.end_graces(link, now):
                 self.log.warning("previous_key_expired", peer=link.name)
         self.passage.add_sample(self.links.values(), self.local.judged)
         self.history.sample(self.links.values(), self.local.judged, now)
@@ -527,32 +403,3 @@ class Daemon:
         self._events.write_findings(find(self, now), now)
         self._drops.check(now)
         self._events.check(now)
-
-    def _summary(self) -> str:
-        up = sum(link.peer.is_up for link in self.links.values())
-        texts = [] if self.config.is_only_relay else [f"{up} of {len(self.links)} peers up"]
-        if self.relay is not None:
-            members = self.relay.members.values()
-            texts.append(f"{sum(member.peer.is_up for member in members)} of {len(members)} members up")
-        return ", ".join(texts)
-
-    # The control socket.
-
-    async def _answer(self, request: str) -> dict[str, object] | None:
-        match request.partition(" "):
-            case ("status", "", ""):
-                return daemon_status(self, monotonic())
-            case ("reload", "", ""):
-                try:
-                    await self.reload()
-                except ConfigError as error:
-                    return {"problems": str(error).splitlines()}
-                return {"problems": [], "name": self.config.name}
-            case ("netcheck", "", ""):
-                return views(self.relays, self.peer_sockets.network_name)
-            case ("ping", " ", name):
-                answer, outputs = ping(self.links, name, self.node, self.peer_sockets.network_name, monotonic())
-                self._perform(outputs)
-                self._settle()
-                return answer
-        return None

@@ -15,6 +15,7 @@ from uavlinkd.link.down_causes import Network, finding, link_down, listed, sole_
 from uavlinkd.link.endpoint_causes import Local, endpoint_findings
 from uavlinkd.link.evidence import EVIDENCE_S
 from uavlinkd.link.line_causes import line_findings
+from uavlinkd.link.member_causes import member_findings
 from uavlinkd.link.other_version import other_version
 from uavlinkd.link.passage import Key, Passage
 from uavlinkd.link.peer_link import PeerLink
@@ -26,6 +27,7 @@ from uavlinkd.mavlink.policy.refusal_totals import CODES
 from uavlinkd.ops.causes import Cause
 from uavlinkd.ops.findings import Finding, Severity, Subject, ranked
 from uavlinkd.ops.recorder import Recorder
+from uavlinkd.relay.service import RelayService
 
 LOAD: Final = 50
 """Refused handshake messages within :data:`EVIDENCE_S` that are reported."""
@@ -35,6 +37,7 @@ class Diagnosed(Network, Local, Switching, Protocol):
     """The parts of a daemon that findings are about."""
 
     passage: Passage
+    relay: RelayService | None
     recorder: Recorder | None
 
 
@@ -107,6 +110,8 @@ def _of_daemon(daemon: Diagnosed, now: float) -> Iterator[Finding]:
             "let the autopilot or ground station send to the port of an [[endpoint]]",
         )
     yield from line_findings(daemon.peer_sockets.serial)
+    if daemon.relay is not None:
+        yield from member_findings(daemon.relay, daemon.evidence, daemon.config.public_key, now)
     yield from _unnamed_version(daemon, now)
     if refused := _load(daemon, now):
         yield _about(

@@ -10,6 +10,7 @@ from typing import Final
 
 from uavlinkd.core import constants as c
 from uavlinkd.core.constants import NEVER
+from uavlinkd.core.drops import DropReason
 from uavlinkd.core.limits import TokenBucket
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Event, Output, PathStateChanged, RecordReceived, SessionEstablished
@@ -66,16 +67,17 @@ class DirectSearch:
         ):
             self.begin(now)
 
-    def on_record(self, received: RecordReceived, now: float) -> None:
-        """The peer named its candidates. An older list is ignored."""
+    def on_record(self, received: RecordReceived, now: float) -> DropReason | None:
+        """The peer named its candidates. Returns why that has no effect; None if it has one."""
         if not isinstance(received.record, Candidates) or not received.path.is_relayed:
-            return
+            return DropReason.UNEXPECTED_RECORD
         if received.order <= self._order:
-            return
+            return DropReason.OLD_RECORD
         self._order = received.order
         if received.record.places != self._theirs:
             self._theirs = received.record.places
             self.begin(now)
+        return None
 
     def do_due(self, now: float) -> list[Output]:
         """Name the own candidates along a relay, and ask those of the peer. Call it at :attr:`next_at`."""

@@ -9,6 +9,7 @@ from typing import Final
 
 from uavlinkd.core import outputs as o
 from uavlinkd.core.constants import NEVER
+from uavlinkd.core.drops import DropReason
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import LinkedPeer, Output
 from uavlinkd.core.peer import Peer
@@ -65,11 +66,13 @@ class DirectSearches:
             search.on_event(event, now)
             self._on_due()
 
-    def on_record(self, received: o.RecordReceived, now: float) -> None:
-        """A record of a peer."""
-        if (search := self._searches.get(received.peer)) is not None:
-            search.on_record(received, now)
-            self._on_due()
+    def on_record(self, received: o.RecordReceived, now: float) -> DropReason | None:
+        """A peer named its candidates. Returns why that has no effect; None if it has one."""
+        if (search := self._searches.get(received.peer)) is None:
+            return DropReason.UNEXPECTED_RECORD
+        reason = search.on_record(received, now)
+        self._on_due()
+        return reason
 
     def handle_timeout(self, now: float) -> list[Output]:
         """Name candidates and ask. Call it at :attr:`next_at`."""

@@ -64,8 +64,7 @@ def link_down(daemon: Network, link: PeerLink, now: float) -> list[Finding]:
 def _configured(daemon: Network, link: PeerLink) -> Iterator[Finding]:
     name, sockets = link.name, daemon.peer_sockets
     if names := sorted(sockets.unresolved(name)):
-        remedy = f"see `getent hosts {names[0]}`, or write an IP address; the daemon tries again each second"
-        yield _about(Cause.NAME_NOT_RESOLVED, name, f"{', '.join(names)} has no address now", remedy)
+        yield _unresolved(name, names)
     for path in link.peers[0].paths.configured:
         if path.host.startswith("fe80:") and path.address[-1] == 0:  # of a name: a file must have the interface
             text = f"{shown(path.address)} is valid on one interface only, and names none"
@@ -78,6 +77,11 @@ def _configured(daemon: Network, link: PeerLink) -> Iterator[Finding]:
             text = f"no network has an address from which to reach {_addresses(link)}"
             remedy = "compare the address families with `ip -brief address`"
         yield _about(Cause.FAMILY_MISSING, name, text, remedy)
+
+
+def _unresolved(peer: str, names: list[str]) -> Finding:
+    remedy = f"see `getent hosts {names[0]}`, or write an IP address; the daemon tries again each second"
+    return _about(Cause.NAME_NOT_RESOLVED, peer, f"{', '.join(names)} has no address now", remedy)
 
 
 def _not_sent(daemon: Network, link: PeerLink, now: float) -> Iterator[Finding]:
@@ -104,21 +108,30 @@ def _relays(daemon: Network, link: PeerLink, now: float) -> Iterator[Finding]:
     if not link.is_overdue(now) or any(relay.state_for(link) == "bound" for relay in relays):
         return
     for relay in relays:
-        relay_name = relay.config.name
+        name = relay.config.name
         if relay.state_for(link) == "waiting":
-            text = f"{link.name} is not bound at the relay {relay_name}: it is off, not a member, or does not use it"
+            text = (
+                f"{link.name} is not bound at the relay {name}: it is off, not a member, does not use it, or keys"
+                " differ"
+            )
             remedy = (
-                f"start {link.name}; write a [[relay]] for {relay_name} into its file, and a [[member]] for it into"
-                " the file of the relay"
+                f"start {link.name}; compare both public_key with `uavlinkd pubkey`; write a [[relay]] for {name}"
+                " into its file, and a [[member]] for it into the file of the relay"
             )
             yield _about(Cause.NOT_BOUND, link.name, text, remedy)
+        elif unresolved := sorted(daemon.peer_sockets.unresolved(relay.name)):
+            yield _unresolved(link.name, unresolved)
+        elif (psk := daemon.evidence.seen_of_relay(DropReason.BAD_HANDSHAKE, name, now)) is not None:
+            yield _other_psk(link.name, f"the relay {name} at {_at(psk)}")
         elif now - relay.silent_since >= RELAY_SILENT_S:
             where = listed(map(str, relay.addresses))
             text = (
-                f"the relay {relay_name} does not answer at {where}: it is off, a firewall drops UDP, or keys differ"
+                f"the relay {name} does not answer at {where}: it is off, a firewall drops UDP, or keys or suites"
+                " differ"
             )
             remedy = (
-                f"run `uavlinkd status` at {relay_name}: it names the cause if datagrams arrive there; this daemon"
+                f"run `uavlinkd status` at {name}: it names the cause if datagrams arrive there; else open its"
+                " firewall. `uavlinkd pubkey` there must print the public_key of the [[relay]] here, and this daemon"
                 " must be a [[member]] there"
             )
             yield _about(Cause.RELAY_NOT_ANSWERING, link.name, text, remedy)
@@ -153,9 +166,7 @@ def _hints(daemon: Network, link: PeerLink, now: float) -> Iterator[Finding]:
         yield _our_key_there(daemon, link, sighting)
     psk = _seen(daemon, DropReason.BAD_HANDSHAKE, link, now)
     if psk is not None:
-        text = f"the response from {_at(psk)} does not authenticate: the PSKs differ, or only one end has one"
-        remedy = "give both ends the same psk_file; never remove a PSK: the message may be forged"
-        yield _about(Cause.WRONG_PSK, link.name, text, remedy)
+        yield _other_psk(link.name, _at(psk))
     if (sighting := _seen(daemon, DropReason.SUITE_NOT_ACCEPTED, link, now)) is not None:
         offered = ", ".join(str(suite) for suite in sighting.details)
         accepted = ", ".join(suite.name for suite in link.config.settings.link.suites)
@@ -169,6 +180,12 @@ def _hints(daemon: Network, link: PeerLink, now: float) -> Iterator[Finding]:
         text = "it initiates, and does not confirm this daemon's responses"
         remedy = f"compare the PSKs; let UDP from this daemon through the firewall at {link.name}"
         yield _about(Cause.NOT_CONFIRMED, link.name, text, remedy)
+
+
+def _other_psk(peer: str, sender: str) -> Finding:
+    text = f"the response from {sender} does not authenticate: the PSKs differ, or only one end has one"
+    remedy = "give both ends the same psk_file; never remove a PSK: the message may be forged"
+    return _about(Cause.WRONG_PSK, peer, text, remedy)
 
 
 def _other_key(daemon: Network, link: PeerLink, sighting: Sighting) -> Iterator[Finding]:
@@ -225,7 +242,10 @@ def _silence(daemon: Network, link: PeerLink) -> Finding:
         )
         return _about(Cause.NO_ANSWER, name, text, remedy)
     text = f"{name} has not connected, and this file has no address of it"
-    remedy = f"start {name}, and write this daemon's address into its file, or its address into this one"
+    remedy = (
+        f"start {name}, and write this daemon's address into its file, or its address into this one, or a [[relay]]"
+        " into both"
+    )
     return _about(Cause.NOT_CONNECTING, name, text, remedy)
 
 

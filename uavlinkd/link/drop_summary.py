@@ -64,7 +64,9 @@ EVERYDAY: Final = frozenset[str](
     {
         *(DropReason.UNEXPECTED_RESPONSE, DropReason.UNEXPECTED_COOKIE, DropReason.UNKNOWN_INDEX, DropReason.LATE),
         *(DropReason.SESSION_EXPIRED, DropReason.UNEXPECTED_ANSWER, DropReason.DOUBTFUL, DropReason.OVER_SHARE),
+        *(DropReason.UNEXPECTED_RECORD, DropReason.OLD_RECORD),
         *("EAGAIN", "ENOBUFS", "ECONNREFUSED", DropReason.RELAY_UNKNOWN_HANDLE, ShellReason.RELAY_HANDLE_GONE),
+        DropReason.RELAY_UNEXPECTED_TOKEN,
     }
 )
 """A lost datagram, a rekey or a restarted peer causes a few of them."""

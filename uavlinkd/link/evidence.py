@@ -13,7 +13,7 @@ from typing import Final
 
 from uavlinkd.core.drops import Detail, DropReason
 from uavlinkd.core.outputs import Dropped
-from uavlinkd.core.path import SocketAddress
+from uavlinkd.core.path import RELAY_HOST, SocketAddress
 from uavlinkd.link.key_change import link_name
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.shown import relay_name
@@ -26,7 +26,7 @@ MAX_DETAILS: Final = 4
 """Different details that one sighting remembers, such as public keys."""
 
 Place = tuple[object, ...]
-"""A configured peer, by name; an address or a host of one; or, empty, any other place."""
+"""A peer, by name; an address of one; a configured host of one; or, empty, any other place."""
 ELSEWHERE: Final[Place] = ()
 
 REPORTED: Final = "icmp_"
@@ -91,21 +91,25 @@ class Evidence:
             if detail == self._own_key and reason is DropReason.UNKNOWN_PEER:
                 self.own_key_elsewhere = now, address
                 return
-            place = self._place(address, now) if peer is None else ("peer", link_name(peer.name))
+            place = self._place(address, now) if peer is None else _place_of(peer.name)
             self._add(reason, place, address, detail, now)
 
     def add_failure(self, error: str, address: SocketAddress | None, now: float) -> None:
         """The kernel refused to send to an address. ``error`` is its name, such as ``EPERM``. This is certain."""
-        self._add(error, self._place(address, now), address, "", now)
+        self._add(error, self._target(address, now), address, "", now)
 
     def add_report(self, number: int, address: SocketAddress, now: float) -> None:
         """An ICMP message says that a datagram did not arrive. ``number``: the error that the kernel derives."""
-        self._add(REPORTED + errno.errorcode.get(number, "OSError"), self._place(address, now), address, "", now)
+        self._add(REPORTED + errno.errorcode.get(number, "OSError"), self._target(address, now), address, "", now)
 
     def seen(self, kind: str, link: PeerLink, now: float) -> Sighting | None:
         """The newest evidence of this kind about a peer, or from its addresses or hosts."""
         places = [("peer", link.name), *_places_of(link)]
         return self._newest(kind, places, now)
+
+    def seen_of_relay(self, kind: str, name: str, now: float) -> Sighting | None:
+        """The newest evidence of this kind about a relay of the configuration."""
+        return self._newest(kind, [("relay", name)], now)
 
     def seen_elsewhere(self, kind: str, now: float) -> Sighting | None:
         """The newest evidence of this kind from a place that is not a configured peer's."""
@@ -127,26 +131,39 @@ class Evidence:
         sighting.add(address, detail, now)
 
     def _place(self, address: SocketAddress | None, now: float) -> Place:
-        """The most exact configured place of an address."""
+        """The most exact place of a sender."""
         if address is None:
             return ELSEWHERE
+        place = self._target(address, now)
+        host = ("host", address[0])
+        return host if place is ELSEWHERE and host in self._places else place
+
+    def _target(self, address: SocketAddress | None, now: float) -> Place:
+        """The place to which this daemon sent. A candidate of one peer may be at the host of another one."""
         if now - self._placed_at >= PLACES_S:
             self._find_places(now)
-        for place in (("address", address), ("host", address[0])):
-            if place in self._places:
-                return place
-        return ELSEWHERE
+        place = ("address", address)
+        return place if place in self._places else ELSEWHERE
 
     def _find_places(self, now: float) -> None:
-        """Look up where the peers are configured to be, and forget the sightings of all other places."""
+        """Look up where the peers are, and forget the sightings of all other places."""
         self._placed_at = now
         self._places = frozenset(place for link in self._links.values() for place in _places_of(link))
         known = {ELSEWHERE, *self._places, *(("peer", name) for name in self._links)}
-        for key in [key for key in self._sightings if key[1] not in known]:
+        for key in [key for key in self._sightings if key[1] not in known and key[1][0] != "relay"]:
             del self._sightings[key]
 
 
+def _place_of(core_name: str) -> Place:
+    """The place of a relay, or of a peer."""
+    if core_name.startswith(RELAY_HOST):
+        return "relay", core_name.removeprefix(RELAY_HOST)
+    return "peer", link_name(core_name)
+
+
 def _places_of(link: PeerLink) -> list[Place]:
-    addresses = [path.address for path in link.peers[0].paths.configured] if link.peers else []
-    hosts = [address[0] for address in addresses if relay_name(address) is None]  # a relay leads to many peers
-    return [*(("address", address) for address in addresses), *(("host", host) for host in hosts)]
+    """The addresses of a peer, and the hosts of those in the configuration."""
+    configured = [path.address for path in link.peers[0].paths.configured] if link.peers else []
+    learned = [state.path.address for peer in link.peers for state in peer.paths.states]
+    hosts = [address[0] for address in configured if relay_name(address) is None]  # a relay leads to many peers
+    return [*(("address", address) for address in (*configured, *learned)), *(("host", host) for host in hosts)]

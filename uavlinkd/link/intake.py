@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from time import thread_time
 
@@ -13,20 +14,23 @@ from uavlinkd.core.path import Path, SocketAddress
 from uavlinkd.core.wire import ENVELOPE_STARTS
 from uavlinkd.endpoints.reader import Datagrams
 from uavlinkd.link.peer_link import PeerLink
-from uavlinkd.link.relay_handles import RELAYED_START
 from uavlinkd.link.switch import Switch
 from uavlinkd.link.turns import TURN_FRAMES, TURN_S, Turns, WaitingDatagram, cost_of
 from uavlinkd.mavlink.frames import Frame, split_payload
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.stall import STALL_S, StallWatch
 
+HANDSHAKES_S = 0.01
+"""CPU time for handshake messages before the envelopes have their turn: about twenty of them."""
+WAITING_HANDSHAKES = 256
+"""Handshake messages that wait, at most: what is handled in a tenth of a second."""
 MAX_PATHS = 1024
 """Paths of received datagrams that are remembered: a frame on one of them costs no new object."""
 
 
-TakeRelayed = Callable[[int, bytes, SocketAddress], WaitingDatagram | None]
-"""Receives the number of a socket, data that begins with 0x50, and its source. Returns the datagram inside with its
-path; or None if the data was forwarded, or dropped and counted."""
+Take = Callable[[int, bytes, SocketAddress], WaitingDatagram | None]
+"""Receives the number of a socket, a datagram, and its source. Returns the datagram inside with its path; or None if
+the datagram needs nothing more, or was dropped and counted."""
 
 
 class Intake:
@@ -61,21 +65,23 @@ class Intake:
         self._settle = settle
         self._on_superseded = on_superseded
         self._on_dropped = on_dropped
-        self.take_relayed: TakeRelayed | None = None
-        """None while this daemon neither uses relays nor is one: the core drops such data."""
+        self.takers: dict[bytes, Take] = {}
+        """Of the datagrams of relays, by first byte. The core gets all others. It drops those of relays while this
+        daemon neither uses relays nor is one."""
         self._loop = asyncio.get_running_loop()
         self._turns = Turns()
+        self._handshakes: deque[WaitingDatagram] = deque()
         self._frames: dict[PeerLink, list[Frame]] = {}
         self._cost = 0
         self._paths: dict[tuple[int, SocketAddress], Path] = {}
 
     def receive(self, socket: int, datagrams: Datagrams, now: float, epoch: int, waited_s: float) -> None:
         """Receive the datagrams of one wake-up from a socket, or let them wait for their senders' turns."""
-        paths, take_relayed = self._paths, self.take_relayed
+        paths, takers = self._paths, self.takers
         arrived: list[WaitingDatagram] = []
         for datagram, address in datagrams:
-            if take_relayed is not None and datagram[:1] == RELAYED_START:
-                if (taken := take_relayed(socket, datagram, address)) is not None:
+            if takers and (take := takers.get(datagram[:1])) is not None:
+                if (taken := take(socket, datagram, address)) is not None:
                     arrived.append(taken)
                 continue
             path = paths.get((socket, address))
@@ -111,29 +117,53 @@ class Intake:
         self._settle()
 
     def _receive_in_turn(self, arrived: list[WaitingDatagram], now: float, epoch: int) -> None:
+        was_busy = self._is_busy
         envelopes = self._receive_handshakes(arrived, now)
         if self._turns.queues:
             self._add_to_turns(envelopes, epoch)
         else:
             arriving = iter(envelopes)
             self._do_turn(arriving, now, epoch)
-            if rest := list(arriving):
-                self._add_to_turns(rest, epoch)
-                self._loop.call_soon(self._do_turns)
+            self._add_to_turns(list(arriving), epoch)
+        if self._is_busy and not was_busy:
+            self._loop.call_soon(self._do_turns)
+
+    @property
+    def _is_busy(self) -> bool:
+        return bool(self._turns.queues or self._handshakes)
 
     def _receive_handshakes(self, arrived: list[WaitingDatagram], now: float) -> list[WaitingDatagram]:
-        """Receive everything but envelopes, which are returned.
+        """Receive everything but envelopes, which are returned, for at most :data:`HANDSHAKES_S`.
 
-        Handshake messages have budgets of their own in the core. If they waited for turns, their senders would repeat
-        them meanwhile, and a busy daemon would be busier.
+        Handshake messages have budgets of their own in the core. If they waited behind frames, their senders would
+        repeat them meanwhile, and a busy daemon would be busier. But when all members of a relay look for it at once,
+        they must not keep the envelopes of the first sessions waiting either, or these sessions would be lost again.
         """
-        envelopes = []
-        for datagram, path in arrived:
-            if datagram[:1] in ENVELOPE_STARTS:
-                envelopes.append((datagram, path))
-            else:
-                self._perform(self._node.receive(datagram, path, now))
+        envelopes: list[WaitingDatagram] = []
+        handshakes: list[WaitingDatagram] = []
+        for waiting in arrived:
+            (envelopes if waiting[0][:1] in ENVELOPE_STARTS else handshakes).append(waiting)
+        ends_at = thread_time() + HANDSHAKES_S if len(handshakes) > 1 else 0.0
+        for number, (datagram, path) in enumerate(handshakes, 1):
+            self._perform(self._node.receive(datagram, path, now))
+            if number < len(handshakes) and thread_time() >= ends_at:
+                self._keep_handshakes(handshakes[number:])
+                break
         return envelopes
+
+    def _keep_handshakes(self, rest: list[WaitingDatagram]) -> None:
+        """Let handshake messages wait. The oldest are dropped: their senders send new ones."""
+        self._handshakes += rest
+        while len(self._handshakes) > WAITING_HANDSHAKES:
+            self._perform([self._node.refuse(*self._handshakes.popleft())])
+
+    def _receive_newest_handshakes(self, now: float) -> None:
+        """Receive handshake messages that wait. The newest is most likely one that its sender still waits for."""
+        ends_at = thread_time() + HANDSHAKES_S
+        while self._handshakes:
+            self._perform(self._node.receive(*self._handshakes.pop(), now))
+            if thread_time() >= ends_at:
+                break
 
     def add(self, delivered: Deliver) -> None:
         """Keep frames that the core delivers until the turn is over. Their cost is charged to it."""
@@ -161,6 +191,7 @@ class Intake:
     def clear(self) -> None:
         """Forget the datagrams that wait."""
         self._turns = Turns()
+        self._handshakes.clear()
 
     def _add_to_turns(self, arrived: list[WaitingDatagram], epoch: int) -> None:
         claimed_sender = self._node.claimed_sender
@@ -174,8 +205,9 @@ class Intake:
         try:
             for turn, epoch in self._turns.round():
                 self._do_turn(turn, monotonic(), epoch)
+            self._receive_newest_handshakes(monotonic())
         finally:
-            if self._turns.queues:
+            if self._is_busy:
                 self._loop.call_soon(self._do_turns)
             self._settle()
 

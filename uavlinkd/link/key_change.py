@@ -14,7 +14,7 @@ from math import inf
 from typing import NamedTuple
 
 from uavlinkd.config import PeerConfig
-from uavlinkd.core.settings import PeerSettings
+from uavlinkd.core.settings import PeerSettings, previous_of
 
 
 class KeyPairing(NamedTuple):
@@ -35,8 +35,7 @@ def pairings(peer: PeerConfig, has_previous_key: bool) -> list[KeyPairing]:
     current = peer.settings
     pairs = [KeyPairing(current)]
     if peer.previous_public_key is not None:
-        theirs = replace(current, name=f"{peer.name} (previous key)", public_key=peer.previous_public_key)
-        pairs.append(KeyPairing(theirs, by_their_previous=True))
+        pairs.append(KeyPairing(previous_of(current, peer.previous_public_key), by_their_previous=True))
     if has_previous_key:
         for settings, by_their_previous, _ in tuple(pairs):
             ours = replace(settings, name=f"{settings.name} (our previous key)")

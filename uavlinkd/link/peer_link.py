@@ -196,6 +196,7 @@ class PeerLink:
             self.give_up_theirs(now)
         for peer in self.peers:
             peer.verify_interval_s = config.settings.link.verify_interval_s
+            self._node.offer(peer, config.settings.link.features, now)
         self.config = config
         self.follow_paths(now)
 

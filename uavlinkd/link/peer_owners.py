@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
+from uavlinkd.core.drops import DropReason
 from uavlinkd.core.outputs import Event, RecordReceived
 
 
@@ -16,5 +17,5 @@ class PeerOwner(Protocol):
     def on_event(self, event: Event, now: float) -> None:
         """An event of the peer."""
 
-    def on_record(self, received: RecordReceived, now: float) -> None:
-        """A record came from the peer."""
+    def on_record(self, received: RecordReceived, now: float) -> DropReason | None:
+        """A record came from the peer. Returns why it has no effect; None if it has one."""

@@ -18,7 +18,7 @@ from uavlinkd.core.peer import Peer
 from uavlinkd.endpoints.error_queue import ErrorReports, send_again
 from uavlinkd.endpoints.ports import failure_name
 from uavlinkd.endpoints.reader import PAUSE_S, Datagrams, Reader
-from uavlinkd.endpoints.sockets import BindError, is_absent, is_here, udp_socket
+from uavlinkd.endpoints.sockets import BindError, is_absent, is_here, send_from_new_port, udp_socket
 from uavlinkd.link.drop_summary import DropSummary
 from uavlinkd.link.evidence import Evidence
 from uavlinkd.link.networks import Networks, SocketStates
@@ -300,6 +300,18 @@ class PeerSockets:
             self._senders[number](datagram, address)
         except OSError as error:
             self._on_send_error(self._slots[number], datagram, address, error)
+
+    def send_from_new_port(self, datagram: bytes, path: Path) -> bool:
+        """Send a datagram along a path, but from another port. Returns whether the kernel accepted it."""
+        sock = self._slots[path.socket].sock
+        if sock is None:
+            return False
+        try:
+            send_from_new_port(sock, datagram, path.address)
+        except OSError as error:
+            self._count_failure(error, path.address)
+            return False
+        return True
 
     def _on_send_error(self, slot: _Slot, datagram: bytes, address: SocketAddress, error: OSError) -> None:
         if slot.sock is None:  # reported as the state of its network

@@ -26,7 +26,8 @@ def ping(
 
 
 def views(relays: Relays, network_of: NetworkOf) -> dict[str, object]:
-    """How each relay sees each socket, and the candidates of this daemon."""
+    """How each relay sees each socket, what the last filter tests showed, and the candidates of this daemon."""
+    own, candidates = relays.places()
     return {
         "relays": {
             name: {"state": state_of(relay.peer), "round_trip_s": relay.peer.round_trip_s}
@@ -43,6 +44,16 @@ def views(relays: Relays, network_of: NetworkOf) -> dict[str, object]:
             for name, relay in relays.by_name.items()
             for path, seen in relay.views()
         ],
-        "candidates": [str(Address(*place)) for place in relays.candidates()],
-        "own": [str(Address(*place)) for place in relays.own_places()],
+        "filtering": [
+            {
+                "relay": result.relay,
+                "relay_address": str(Address.of(result.path.address)),
+                "socket": result.path.socket,
+                "network": network_of(result.path.socket),
+                "other_port_passes": result.passes,
+            }
+            for result in relays.filter_tests.results
+        ],
+        "candidates": [str(Address(*place)) for place in candidates],
+        "own": [str(Address(*place)) for place in own],
     }

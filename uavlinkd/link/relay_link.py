@@ -1,6 +1,7 @@
-"""One relay of this daemon: a peer of the core without frames. uavlinkd/core/README.md, section 21.
+"""One relay of this daemon: a peer of the core. uavlinkd/core/README.md, section 21.
 
-It binds this daemon's peers along each working path to the relay, and knows the handles that the relay assigned.
+It carries no frames, unless it is a peer of the configuration too: then one session serves both. It binds this
+daemon's peers along each working path to the relay, and knows the handles that the relay assigned.
 """
 
 from __future__ import annotations
@@ -12,9 +13,13 @@ from uavlinkd.config import PeerAddress, RelayConfig
 from uavlinkd.core import constants as c
 from uavlinkd.core import outputs as o
 from uavlinkd.core.constants import NEVER
+from uavlinkd.core.drops import DropReason
 from uavlinkd.core.node import Node
 from uavlinkd.core.path import Path, relayed
+from uavlinkd.core.path_state import PathState
+from uavlinkd.core.peer import Peer
 from uavlinkd.core.relay_records import WAITING, Bind, Bound, binds_of
+from uavlinkd.core.settings import previous_of
 from uavlinkd.link.path_status import PathRates
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.relay_handles import RelayHandles
@@ -53,13 +58,15 @@ class _Binding:
         self.due_at = now + min(c.BIND_RETRY_S, BIND_SOON_S * 2.0 ** min(self.tries, 8))
         self.tries += 1
 
-    def receive(self, bound: Bound, order: int, wanted: Iterable[bytes], now: float) -> set[bytes]:
-        """Take the handles of those peers that are wanted. Returns the keys whose handles changed."""
-        named: dict[bytes, tuple[int, ...]] = {
-            key: () for key, _ in bound.handles if key in wanted and order > self.orders.get(key, -1)
-        }
+    def receive(self, bound: Bound, order: int, wanted: Iterable[bytes], now: float) -> set[bytes] | DropReason:
+        """Take the handles of those peers that are wanted.
+
+        Returns the keys whose handles changed, or why the record has no effect.
+        """
+        asked = {key for key, _ in bound.handles if key in wanted}
+        named: dict[bytes, tuple[int, ...]] = {key: () for key in asked if order > self.orders.get(key, -1)}
         if not named:
-            return set()
+            return DropReason.OLD_RECORD if asked else DropReason.UNEXPECTED_RECORD
         self.bound_at, self.seen_as = now, Address(bound.host, bound.port)
         for key, handle in bound.handles:
             if key in named and handle != WAITING and len(named[key]) < c.HANDLES_PER_PAIR:
@@ -82,7 +89,7 @@ class RelayLink:
     """A relay of the configuration. Times are monotonic seconds. It sends in :meth:`do_due` only.
 
     ``on_handles`` is called with the keys of the peers whose handles changed. ``on_due`` is called when
-    :attr:`next_at` may be earlier than before.
+    :attr:`next_at` may be earlier than before. ``link``: the peer that it is too, which is followed by others.
     """
 
     def __init__(
@@ -93,11 +100,17 @@ class RelayLink:
         on_handles: Callable[[set[bytes], float], None],
         on_due: Callable[[], None],
         now: float,
+        link: PeerLink | None = None,
     ) -> None:
         self.config = config
         self.name = config.settings.name
-        """Of its peer in the core: no peer of the configuration has such a name."""
-        self.peer = node.add_peer(config.settings, now)
+        """No peer of the configuration has such a name."""
+        self.link = link
+        self._peers: list[Peer] = []
+        if link is None:
+            self._peers.append(node.add_peer(config.settings, now))
+            if config.previous_public_key is not None:
+                self._peers.append(node.add_peer(previous_of(config.settings, config.previous_public_key), now))
         self.rates = PathRates()
         """Of the paths to it."""
         self.keys: tuple[bytes, ...] = ()
@@ -111,8 +124,22 @@ class RelayLink:
         self._on_handles = on_handles
         self._on_due = on_due
         self._bindings: dict[Path, _Binding] = {}
-        self._asks: set[Path] = set()
+        self._is_confirmed = False
+        self._asks: set[int] = set()  # sockets
+        self._failed: set[Path] = set()
         self._asked_at: dict[int, float] = {}
+
+    @property
+    def peers(self) -> list[Peer]:
+        """In the core: the one of its current key first, then others while a key changes."""
+        return self._peers if self.link is None else self.link.peers
+
+    @property
+    def peer(self) -> Peer:
+        """Its object in the core: that of a previous key while only that works."""
+        if self.link is not None:
+            return self.link.peer
+        return next((peer for peer in self._peers if peer.is_up), self._peers[0])
 
     @property
     def addresses(self) -> tuple[PeerAddress, ...]:
@@ -146,7 +173,8 @@ class RelayLink:
 
     def set_paths(self, paths: Sequence[Path], now: float) -> None:
         """The relay is reached along these paths."""
-        self._node.set_paths(self.peer, paths, now)
+        for peer in reversed(self._peers):  # a hint from an address is for the one that was set last
+            self._node.set_paths(peer, paths, now)
         self._forget_lost(now)
 
     def follow(self, keys: Sequence[bytes]) -> None:
@@ -161,7 +189,12 @@ class RelayLink:
         self._schedule()
 
     def on_event(self, event: o.Event, now: float) -> None:
-        """A path works, or a session began, perhaps because the relay was restarted: bind immediately."""
+        """A path works, or a session began, perhaps because the relay was restarted: bind immediately.
+
+        After a session with its current key, no other one is accepted.
+        """
+        if isinstance(event, o.SessionEstablished) and event.peer is self.peers[0]:
+            self._is_confirmed = True
         for path, binding in self._bindings.items():
             if isinstance(event, o.SessionEstablished) or (
                 isinstance(event, o.PathStateChanged) and event.is_usable and event.path == path
@@ -170,32 +203,39 @@ class RelayLink:
         self._forget_lost(now)
         self._schedule()
 
-    def on_record(self, received: o.RecordReceived, now: float) -> None:
-        """The relay assigned handles."""
+    def on_record(self, received: o.RecordReceived, now: float) -> DropReason | None:
+        """The relay assigned handles. Returns why that has no effect; None if it has one."""
         binding = self._bindings.get(received.path)
         if binding is None or not isinstance(received.record, Bound):
-            return  # a path without a bind; a bind, which is for a relay
+            return DropReason.UNEXPECTED_RECORD  # a path without a bind; a bind, which is for a relay
         changed = binding.receive(received.record, received.order, self.keys, now)
+        if isinstance(changed, DropReason):
+            return changed
         if changed:
             self._assign(binding)
             self._on_handles(changed, now)
         self._schedule()
+        return None
 
-    def ask(self, path: Path) -> None:
+    def ask(self, path: Path, *, binds: bool = True) -> None:
         """A path along the relay failed: ask the relay on its socket, and bind again, as soon as possible.
 
         The relay may answer although it forwards nothing: a NAT has given this daemon another address there.
+        ``binds``: False if that was done since the failure.
         """
-        self._asks.add(path)
+        self._asks.add(path.socket)
+        if binds:
+            self._failed.add(path)
         self._schedule()
 
     def do_due(self, now: float) -> list[o.Output]:
         """Ask and bind. Call it at :attr:`next_at`."""
-        out: list[o.Output] = []
-        failed, self._asks = self._asks, set()
-        sockets = {path.socket for path in failed if now >= self._asked_at.get(path.socket, -NEVER) + ASK_S}
+        out = self.forget_previous_key(now) if self._is_confirmed else []
+        asks, self._asks = self._asks, set()
+        failed, self._failed = self._failed, set()
+        sockets = {socket for socket in asks if now >= self._asked_at.get(socket, -NEVER) + ASK_S}
         self._asked_at |= dict.fromkeys(sockets, now)
-        for path in [state.path for state in self.peer.paths.states if state.path.socket in sockets]:
+        for path in [state.path for state in self._states() if state.path.socket in sockets]:
             out += self._node.ask(self.peer, path, now)
             if keys := self._keys_of(failed, path)[: c.KEYS_PER_BIND]:
                 out += self._node.send_record(self.peer, path, Bind(keys), now)
@@ -215,20 +255,29 @@ class RelayLink:
         self._forget_lost(now)
         self._schedule()
 
+    def forget_previous_key(self, now: float) -> list[o.Output]:
+        """Accept the current key only."""
+        gone, self._peers = self._peers[1:], self._peers[:1]
+        return [output for peer in gone for output in self._node.remove_peer(peer, now)]
+
     def leave(self, now: float) -> list[o.Output]:
-        """End the session with the relay, and forget its handles."""
+        """Forget its handles, and end the session unless it is a peer's."""
         changed = set(self.keys)
         self.keys = ()
         for path in list(self._bindings):
             self._forget(path)
         self._on_handles(changed, now)
-        return self._node.remove_peer(self.peer, now)
+        return [output for peer in self._peers for output in self._node.remove_peer(peer, now)]
 
     # Parts.
 
+    def _states(self) -> Iterator[PathState]:
+        """The paths to it over IP."""
+        return (state for state in self.peer.paths.states if not (state.path.is_relayed or state.path.is_serial))
+
     def _working(self) -> Iterator[_Binding]:
-        for state in self.peer.paths.states:
-            if state.works and self.peer.is_up and not state.path.is_relayed:
+        for state in self._states():
+            if state.works and self.peer.is_up:
                 yield self._bindings.setdefault(state.path, _Binding(state.path))
 
     def _keys_of(self, paths: Collection[Path], at: Path) -> tuple[bytes, ...]:
@@ -262,5 +311,6 @@ class RelayLink:
 
     def _schedule(self) -> None:
         due_at = min((binding.due_at for binding in self._working()), default=NEVER) if self.keys else NEVER
-        self.next_at = -NEVER if self._asks else due_at
+        is_over = self._is_confirmed and len(self._peers) > 1
+        self.next_at = -NEVER if self._asks or is_over else due_at
         self._on_due()

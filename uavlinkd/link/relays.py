@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import zip_longest
 from typing import Final
@@ -11,55 +12,56 @@ from structlog.typing import FilteringBoundLogger
 from uavlinkd.config import RelayConfig
 from uavlinkd.core import outputs as o
 from uavlinkd.core.constants import NEVER
+from uavlinkd.core.crypto import Entropy
+from uavlinkd.core.drops import DropReason
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import LinkedPeer, Output
 from uavlinkd.core.path import RELAY_HOST, Path
+from uavlinkd.core.relay_records import FilterTested
 from uavlinkd.link.candidates import Place, places_of
 from uavlinkd.link.conditions import LineLimits
 from uavlinkd.link.direct_searches import DirectSearches, own_sockets
+from uavlinkd.link.filter_tests import FilterTests
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.peer_owners import PeerOwner
 from uavlinkd.link.peer_sockets import PeerSockets
 from uavlinkd.link.relay_handles import RelayHandles
 from uavlinkd.link.relay_link import RelayLink
 
-LOOK_S: Final = 0.25
-"""How often peers behind relays are looked at."""
 SILENT_S: Final = 0.5
-"""If nothing comes along a relay for so long from a peer that sent :data:`STEADY` envelopes in a second, the relay is
+"""If nothing comes along a relay for so long from a peer that sent :data:`STEADY` envelopes a second, the relay is
 asked whether it still knows this daemon. An end that only receives would not notice otherwise."""
-SILENT_RARE_S: Final = 1.25
-"""The same for a peer that sends less: a ground station may send one heartbeat a second."""
+SILENT_RARE_S: Final = 1.1
+"""The same for a peer that sends less: a ground station may send one heartbeat a second. While the silence lasts, the
+relay is asked again after each such time: a peer that wants to send cannot wake this end."""
 STEADY: Final = 4
-MOST_ASKS: Final = 5
-"""In one silence, each after twice the time of the one before. Then there are keepalives."""
 
 
 class _Silence:
-    """How long a peer behind a relay has been silent, and how often the relay was asked because of that."""
+    """How long a peer behind a relay may be silent, and when its relays were asked because it was."""
 
-    __slots__ = ("asks", "limit_s", "received", "received_at", "second")
+    __slots__ = ("asked_at", "due_at", "limit_s", "second")
 
     def __init__(self, now: float) -> None:
-        self.received = 0
-        self.received_at = now
         self.second = now, 0
         self.limit_s = SILENT_RARE_S
-        self.asks = 0
+        self.asked_at = -NEVER
+        self.due_at = now
+        """When to look again."""
 
-    def look(self, received: int, now: float) -> bool:
-        """Whether the relay is to be asked. ``received``: envelopes until now."""
-        if received != self.received:
-            self.received, self.received_at, self.asks = received, now, 0
+    def look(self, received: int, received_at: float, now: float) -> bool:
+        """Whether the relays are to be asked. ``received``: envelopes until now, the last one at ``received_at``."""
+        if now < received_at + self.limit_s:
             since, before = self.second
             if now >= since + 1.0:
                 is_steady = received - before >= STEADY * (now - since)
                 self.limit_s = SILENT_S if is_steady else SILENT_RARE_S
                 self.second = now, received
-        elif self.asks < MOST_ASKS and now >= self.received_at + self.limit_s * 2.0**self.asks:
-            self.asks += 1
-            return True
-        return False
+        self.due_at = max(received_at + self.limit_s, self.asked_at + SILENT_RARE_S)
+        if now < self.due_at:
+            return False
+        self.asked_at, self.due_at = now, now + SILENT_RARE_S
+        return True
 
 
 class Relays:
@@ -73,6 +75,7 @@ class Relays:
         owners: dict[LinkedPeer, PeerOwner],
         log: FilteringBoundLogger,
         on_due: Callable[[], None],
+        entropy: Entropy = os.urandom,
     ) -> None:
         self.by_name: dict[str, RelayLink] = {}
         self.handles = RelayHandles()
@@ -86,39 +89,48 @@ class Relays:
         self._look_at = NEVER
         self._silences: dict[PeerLink, _Silence] = {}
         self._searches = DirectSearches(node, sockets, links, on_due)
+        self.filter_tests = FilterTests(node, entropy, on_due)
 
     @property
     def next_at(self) -> float:
         """When :meth:`handle_timeout` has something to do."""
-        return min((self._look_at, self._searches.next_at, *(relay.next_at for relay in self.by_name.values())))
+        of_relays = (relay.next_at for relay in self.by_name.values())
+        return min((self._look_at, self._searches.next_at, self.filter_tests.next_at, *of_relays))
 
     # The configuration.
 
     def add(self, config: RelayConfig, now: float) -> None:
         """Use a relay. Call :meth:`follow_links` afterwards."""
-        relay = RelayLink(config, self._node, self.handles, self._on_handles, self._on_due, now)
+        link = None if config.peer is None else self._links[config.peer]
+        relay = RelayLink(config, self._node, self.handles, self._on_handles, self._on_due, now, link)
         self.by_name[config.name] = relay
-        self._owners[relay.peer] = _Logged(relay, self._log, self._limits)
         self._sockets.relayed = self.handles
-        self._sockets.follow(relay, self._on_due)
+        if link is None:
+            self._sockets.follow(relay, self._on_due)
 
     def remove(self, name: str, now: float) -> list[Output]:
         """Do not use a relay any more."""
         relay = self.by_name.pop(name)
         self._sockets.stop_following(relay.name)
-        out = relay.leave(now)
-        del self._owners[relay.peer]
-        return out
+        for peer in relay.peers:
+            del self._owners[peer]
+        return relay.leave(now)
 
-    def change(self, config: RelayConfig) -> None:
-        """Its addresses changed."""
+    def change(self, config: RelayConfig, now: float) -> list[Output]:
+        """Its addresses changed, or its previous key is not accepted any more."""
         relay = self.by_name[config.name]
-        self._sockets.stop_following(relay.name)
         relay.config = config
-        self._sockets.follow(relay, self._on_due)
+        if relay.link is None:
+            self._sockets.stop_following(relay.name)
+            self._sockets.follow(relay, self._on_due)
+        return relay.forget_previous_key(now) if config.previous_public_key is None else []
 
     def follow_links(self, now: float) -> None:
-        """The peers, their keys or their relays changed."""
+        """The relays, the peers, their keys or their relays changed."""
+        for peer in [peer for peer, owner in self._owners.items() if isinstance(owner, _Logged)]:
+            del self._owners[peer]
+        for relay in self.by_name.values():
+            self._owners.update(dict.fromkeys(relay.peers, _Logged(relay, self._log, self._limits)))
         for name, relay in self.by_name.items():
             links = [link for link in self._links.values() if name in link.config.relays]
             relay.follow([key for link in links for key in link.keys])
@@ -126,13 +138,10 @@ class Relays:
 
     # Facts.
 
-    def own_places(self) -> list[Place]:
-        """Addresses and ports of the own sockets in their own networks."""
-        return [place for sock in own_sockets(self._sockets) for place in sock.places]
-
-    def candidates(self) -> tuple[Place, ...]:
-        """Where peers may reach this daemon directly."""
-        return places_of(self._seen(), own_sockets(self._sockets))
+    def places(self) -> tuple[list[Place], tuple[Place, ...]]:
+        """Addresses and ports of the own sockets in their own networks, and where peers may reach this daemon."""
+        sockets = own_sockets(self._sockets)
+        return [place for sock in sockets for place in sock.places], places_of(self._seen(), sockets)
 
     # Time and events.
 
@@ -141,7 +150,7 @@ class Relays:
         if now >= self._look_at:
             self._look(now)
         out = [output for relay in self.by_name.values() if now >= relay.next_at for output in relay.do_due(now)]
-        return out + self._searches.handle_timeout(now)
+        return out + self._searches.handle_timeout(now) + self.filter_tests.do_due(now)
 
     def on_peer_event(self, event: o.Event, now: float) -> None:
         """An event of a peer, whether it uses relays or not."""
@@ -150,13 +159,15 @@ class Relays:
         else:
             self._searches.on_event(event, now)
 
-    def on_peer_record(self, received: o.RecordReceived, now: float) -> None:
-        """A record of a peer, along a relay."""
-        self._searches.on_record(received, now)
+    def on_record(self, received: o.RecordReceived, now: float) -> DropReason | None:
+        """Candidates of a peer, or a relay's answer to a test. Returns why it has no effect; None if it has one."""
+        if isinstance(received.record, FilterTested):
+            return self.filter_tests.on_record(received)
+        return self._searches.on_record(received, now)
 
     def on_suspected(self, path: Path) -> None:
-        """A relayed path of a peer failed a moment ago: ask the relay along the same socket."""
-        if (relay := self.by_name.get(path.host.removeprefix(RELAY_HOST))) is not None:
+        """A relayed path of a peer failed a moment ago: ask the relay on the same socket, and bind the peer again."""
+        if (relay := self._relay_of(path)) is not None:
             relay.ask(path)
 
     def do_housekeeping(self, now: float) -> None:
@@ -180,17 +191,26 @@ class Relays:
         self._searches.follow(seen, at, now)
 
     def _look(self, now: float) -> None:
-        """Ask the relays of peers that have become silent."""
+        """Ask the relays of silent peers, and bind those again: once if they are up.
+
+        A NAT may give this daemon another address meanwhile. While a peer is up, its own echo requests show that.
+        """
         silences, self._silences = self._silences, {}
         for link in self._links.values():
             peer = link.peer
             if not link.relayed or (peer.is_up and peer.path is not None and not peer.path.is_relayed):
                 continue
             silence = self._silences[link] = silences.get(link) or _Silence(now)
-            if silence.look(peer.traffic.envelopes_received, now):
+            received_at = -NEVER if peer.received_at is None else peer.received_at
+            binds = silence.asked_at < received_at or not peer.is_up
+            if silence.look(peer.traffic.envelopes_received, received_at, now):
                 for path in link.relayed:
-                    self.on_suspected(path)
-        self._look_at = now + LOOK_S if self._silences else NEVER
+                    if (relay := self._relay_of(path)) is not None:
+                        relay.ask(path, binds=binds)
+        self._look_at = min((silence.due_at for silence in self._silences.values()), default=NEVER)
+
+    def _relay_of(self, path: Path) -> RelayLink | None:
+        return self.by_name.get(path.host.removeprefix(RELAY_HOST))
 
     def _on_handles(self, keys: set[bytes], now: float) -> None:
         self._set_paths([link for link in self._links.values() if keys & link.keys], now)
@@ -222,8 +242,8 @@ class _Logged:
     def on_event(self, event: o.Event, now: float) -> None:
         """Of :class:`PeerOwner`."""
         self._relay.on_event(event, now)
-        if not isinstance(event, o.PeerUp | o.PeerLost | o.PeerClosed):
-            return
+        if event.peer not in self._relay.peers or not isinstance(event, o.PeerUp | o.PeerLost | o.PeerClosed):
+            return  # also of a previous key that is not accepted any more
         omitted = self._limits.take("relay", self._relay.config.name, now)
         if omitted is None:
             self._limits.omit("relay", self._relay.config.name)
@@ -234,6 +254,6 @@ class _Logged:
         else:
             self._log.info("relay_closed", **omitted)
 
-    def on_record(self, received: o.RecordReceived, now: float) -> None:
+    def on_record(self, received: o.RecordReceived, now: float) -> DropReason | None:
         """Of :class:`PeerOwner`."""
-        self._relay.on_record(received, now)
+        return self._relay.on_record(received, now)

@@ -167,12 +167,14 @@ def state_of(peer: Peer) -> str:
 def used_relay_status(
     relay: RelayLink, links: Iterable[PeerLink], now: float, network_of: NetworkOf = lambda _: None
 ) -> dict[str, object]:
-    """The status of a relay. ``peers``: those that use it, each ``bound``, ``waiting`` for the peer to ask too, or
-    ``unanswered``. ``seen_as``: this daemon's addresses as the relay sees them.
+    """The status of a relay. ``peer``: the peer that it is too, or None. ``peers``: those that use it, each with
+    ``bound``, ``waiting`` for the peer to ask too, or ``unanswered``. ``seen_as``: this daemon's addresses as the
+    relay sees them.
     """
     peer = relay.peer
     return {
         "state": state_of(peer),
+        "peer": relay.config.peer,
         "public_key": encode_key(peer.settings.public_key),
         "addresses": [str(written) for written in relay.addresses],
         "seen_as": [str(address) for address in relay.seen_as],

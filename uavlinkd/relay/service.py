@@ -6,7 +6,7 @@ A member is found by its public key. Its peer in the core may be one that carrie
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Container, Iterator, Mapping
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 from uavlinkd.core import constants as c
@@ -15,10 +15,10 @@ from uavlinkd.core.crypto import Entropy
 from uavlinkd.core.drops import DropReason, Reason
 from uavlinkd.core.limits import TokenBucket
 from uavlinkd.core.node import Node
-from uavlinkd.core.outputs import Output
+from uavlinkd.core.outputs import LinkedPeer, Output
 from uavlinkd.core.path import Path, SocketAddress
 from uavlinkd.core.peer import Peer
-from uavlinkd.core.relay_records import Bind, bounds_of
+from uavlinkd.core.relay_records import Bind, FilterTest, FilterTested, bounds_of, token_datagram
 from uavlinkd.relay.bindings import Bindings, Changes
 from uavlinkd.relay.forwarding import Forwarding, Meter, RelayReason
 from uavlinkd.relay.member_settings import MemberSettings, RelayLimits
@@ -34,19 +34,28 @@ LOOK_S = 0.1
 class RelayMember:
     """A member, and what it does."""
 
-    def __init__(self, settings: MemberSettings, peer: Peer, now: float, *, is_own: bool) -> None:
+    def __init__(self, settings: MemberSettings, peers: Sequence[Peer], now: float, *, is_own: bool) -> None:
         self.settings = settings
-        self.peer = peer
+        self.peers = tuple(peers)
+        """In the core: several while a key changes of the daemon's peer that it is."""
         self.is_own = is_own
         """Whether the relay added its peer to the core: it does not carry frames."""
         self.meter = Meter(settings.limits)
         self.binds = TokenBucket(BINDS_PER_S, BINDS_BURST, now)
         self.binds_ignored = 0
         """Binds above :data:`BINDS_PER_S`."""
+        self.filter_tests = TokenBucket(c.FILTER_TESTS_PER_S, c.FILTER_TESTS, now)
+        self.filter_tests_ignored = 0
+        """Filter tests above this limit, or along a path that is not validated or does not work."""
         self.since = now
         """When it was up or not for the first time, as it is now."""
         self.reported_over_limit = 0
         """Of the meter's count."""
+
+    @property
+    def peer(self) -> Peer:
+        """Its object in the core: one that is up, or the one of the current keys."""
+        return next((peer for peer in self.peers if peer.is_up), self.peers[0])
 
     @property
     def key(self) -> bytes:
@@ -64,8 +73,9 @@ class _Asked(NamedTuple):
 class RelayService:
     """The members of a relay.
 
-    ``perform`` executes outputs of the core, ``send`` passes a datagram to the kernel. ``on_event`` receives the
-    events of the members that are not peers. ``clock`` is monotonic.
+    ``perform`` executes outputs of the core, ``send`` passes a datagram to the kernel. ``send_from_new_port`` does so
+    from a port that sent nothing before, and returns whether the kernel accepted it. ``on_event`` receives the events
+    of the members that are not peers. ``clock`` is monotonic.
     """
 
     def __init__(
@@ -77,44 +87,49 @@ class RelayService:
         *,
         perform: Callable[[list[Output]], None],
         send: Callable[[bytes, Path], None],
+        send_from_new_port: Callable[[bytes, Path], bool],
         on_event: Callable[[o.Event, float], None],
     ) -> None:
         self._node = node
         self._perform = perform
+        self._send_from_new_port = send_from_new_port
         self._on_event = on_event
         self.members: dict[bytes, RelayMember] = {}
         """By public key."""
+        self._member_of: dict[LinkedPeer, RelayMember] = {}
         self.bindings = Bindings(entropy)
         self.forwarding = Forwarding(send, clock, limits)
         self._due: dict[tuple[bytes, Path], dict[bytes, None]] = {}  # reports to members
         self._asked: dict[bytes, dict[Path, _Asked]] = {}
         self._look_at = 0.0
+        self._filter_tests: list[tuple[Peer, Path, bytes]] = []  # tokens to be sent
         self._reported = Counter[Reason]()
-        self._of_removed: list[tuple[Reason, str, int]] = []  # drops of removed members, to be reported
+        self._unreported: list[tuple[Reason, str, int]] = []  # drops of removed members, and of binds that waited
 
     # Members.
 
-    def set_members(self, members: Mapping[bytes, MemberSettings], peers: Mapping[bytes, Peer], now: float) -> None:
-        """These are all members from now on, by public key. ``peers``: the daemon's peers, which carry frames.
+    def set_members(
+        self, members: Mapping[bytes, MemberSettings], peers: Mapping[bytes, Sequence[Peer]], now: float
+    ) -> None:
+        """These are all members from now on, by public key. ``peers``: the daemon's peers, which carry frames, each
+        with the one of the current keys first.
 
         A member that changes from one to the other, or that has another name or PSK, has to make a new session.
         """
         for member in list(self.members.values()):
-            peer = None if member.is_own else member.peer
-            if not _is_same(member, members) or peers.get(member.key) is not peer:
+            peer = None if member.is_own else member.peers[0]
+            if not _is_same(member, members) or next(iter(peers.get(member.key, ())), None) is not peer:
                 self._remove(member, now)
         for key, settings in members.items():
             if key not in self.members:
-                self.members[key] = self._new_member(settings, peers.get(key), now)
+                own = () if key in peers else (self._node.add_peer(settings.peer, now),)
+                self.members[key] = RelayMember(settings, own, now, is_own=bool(own))
             member = self.members[key]
+            member.peers = tuple(peers.get(key, member.peers))
             member.settings = settings
             member.meter.set_limits(settings.limits)
             self.bindings.set_member(key, settings.most_peers)
-
-    def _new_member(self, settings: MemberSettings, peer: Peer | None, now: float) -> RelayMember:
-        if peer is not None:
-            return RelayMember(settings, peer, now, is_own=False)
-        return RelayMember(settings, self._node.add_peer(settings.peer, now), now, is_own=True)
+        self._member_of = {peer: member for member in self.members.values() for peer in member.peers}
 
     def release(self, members: Mapping[bytes, MemberSettings], others: Container[bytes], now: float) -> None:
         """Give up the peers in the core whose name or key another one may have now. ``others``: keys of the daemon's
@@ -128,60 +143,84 @@ class RelayService:
         self._apply(self.bindings.remove_member(member.key, now))
         del self.members[member.key]
         self._asked.pop(member.key, None)
-        self._of_removed += _over_limit(member)
-        if member.is_own:
-            self._perform(self._node.remove_peer(member.peer, now))
+        self._unreported += _over_limit(member)
+        for peer in member.peers:
+            self._member_of.pop(peer, None)
+            if member.is_own:
+                self._perform(self._node.remove_peer(peer, now))
 
     # From the core. Neither method sends.
 
     def on_event(self, event: o.Event, now: float) -> None:
         """An event of a member."""
-        assert isinstance(event.peer, Peer)
-        member = self.members.get(event.peer.settings.public_key)
-        if member is None or member.peer is not event.peer:
+        member = self._member_of.get(event.peer)
+        if member is None:
             return
         self._look_at = now  # a path may be validated
         if isinstance(event, o.PeerUp | o.PeerLost | o.PeerClosed):
             member.since = now
-        if isinstance(event, o.PeerClosed):
+        if isinstance(event, o.PeerClosed) and not member.peer.is_up:  # with any key
             for path in self.bindings.paths_of(member.key):
                 self._apply(self.bindings.end_path(member.key, path, now))
         if member.is_own:
             self._on_event(event, now)
 
-    def on_record(self, received: o.RecordReceived, now: float) -> None:
-        """A record came from a member."""
-        assert isinstance(received.peer, Peer)
-        member = self.members.get(received.peer.settings.public_key)
-        if member is None or member.peer is not received.peer or not isinstance(received.record, Bind):
-            return
-        path, paths = received.path, member.peer.paths
-        if path.is_serial or path.is_relayed or (state := paths.find(path)) is None:
-            return
+    def on_record(self, received: o.RecordReceived, now: float) -> DropReason | None:
+        """A record came from a member. Returns why it has no effect; None if it has one."""
+        member, path, record = self._member_of.get(received.peer), received.path, received.record
+        if member is None or path.is_serial or path.is_relayed:
+            return DropReason.UNEXPECTED_RECORD
+        peer = member.peer  # of those with several keys, the one with a session
+        state = peer.paths.find(path)
+        if state is None:
+            return DropReason.UNEXPECTED_RECORD
+        is_proven = state.is_validated and state.works
+        if isinstance(record, Bind):
+            return self._receive_bind(member, path, record, now, is_proven=is_proven)
+        if not isinstance(record, FilterTest):
+            return DropReason.UNEXPECTED_RECORD
+        if is_proven and member.filter_tests.take(now):
+            self._filter_tests.append((peer, path, record.token))
+            return None
+        member.filter_tests_ignored += 1
+        return DropReason.RECORD_OVER_LIMIT if is_proven else DropReason.UNEXPECTED_RECORD
+
+    def _receive_bind(
+        self, member: RelayMember, path: Path, bind: Bind, now: float, *, is_proven: bool
+    ) -> DropReason | None:
         if not member.binds.take(now):
             member.binds_ignored += 1
-            return
-        if state.is_validated and state.works:
-            self._apply(self.bindings.bind(member.key, path, received.record.keys, now))
-            return
+            return DropReason.RECORD_OVER_LIMIT
+        if is_proven:
+            return self._bind(member, path, bind.keys, now)
         # The first bind comes with the first envelope of a session. Its path is validated one round trip later.
-        asked = {path: one for path, one in self._asked.get(member.key, {}).items() if paths.find(path) is not None}
+        asked = self._asked.setdefault(member.key, {})
+        for gone in [path for path in asked if member.peer.paths.find(path) is None]:
+            del asked[gone]
+            self._count_late(DropReason.UNEXPECTED_RECORD, member)
         keys = asked[path].keys if path in asked else {}
-        for key in received.record.keys:
-            if len(keys) < member.settings.most_peers:
-                keys[key] = None
+        keys |= dict.fromkeys(bind.keys)
+        left_out = list(keys)[member.settings.most_peers :]
+        for key in left_out:
+            del keys[key]
+        member.binds_ignored += len(left_out)
         asked[path] = _Asked(now + c.QUESTION_LIFETIME_S, keys)
-        self._asked[member.key] = asked
+        return DropReason.RECORD_OVER_LIMIT if left_out else None
+
+    def _bind(self, member: RelayMember, path: Path, keys: Sequence[bytes], now: float) -> DropReason | None:
+        before = self.bindings.refused(member.key)
+        self._apply(self.bindings.bind(member.key, path, keys, now))
+        return DropReason.RECORD_OVER_LIMIT if self.bindings.refused(member.key) > before else None
 
     # From the shell.
 
     @property
     def is_due(self) -> bool:
         """Whether :meth:`settle` may have something to do."""
-        return bool(self._due or self._asked)
+        return bool(self._due or self._asked or self._filter_tests)
 
     def settle(self, now: float) -> None:
-        """Bind along paths that are validated now, and report changes to the members."""
+        """Bind along paths that are validated now, report changes to the members, and send what tests filters."""
         if self._asked and now >= self._look_at:
             self._look_at = now + LOOK_S
             self._bind_validated(now)
@@ -193,18 +232,29 @@ class RelayService:
             host, port = path.address[:2]
             for bound in bounds_of(host.partition("%")[0], port, handles):
                 self._perform(self._node.send_record(member.peer, path, bound, now))
+        tests, self._filter_tests = self._filter_tests, []
+        for peer, path, token in tests:
+            if self._send_from_new_port(token_datagram(token), path):
+                self._perform(self._node.send_record(peer, path, FilterTested(token), now))
 
     def _bind_validated(self, now: float) -> None:
         before, self._asked = self._asked, {}
         for key, asked_along in before.items():
+            member = self.members[key]
             for path, asked in asked_along.items():
-                state = self.members[key].peer.paths.find(path)
+                state = member.peer.paths.find(path)
                 if state is None or now >= asked.until:
-                    continue
-                if state.is_validated and state.works:
-                    self._apply(self.bindings.bind(key, path, list(asked.keys), now))
+                    self._count_late(DropReason.UNEXPECTED_RECORD, member)
+                elif state.is_validated and state.works:
+                    if (reason := self._bind(member, path, list(asked.keys), now)) is not None:
+                        self._count_late(reason, member)
                 else:
                     self._asked.setdefault(key, {})[path] = asked
+
+    def _count_late(self, reason: DropReason, member: RelayMember) -> None:
+        """A bind that waited for its path has no effect."""
+        self._node.drops[reason] += 1
+        self._unreported.append((reason, member.settings.name, 1))
 
     def do_housekeeping(self, now: float) -> None:
         """End the wishes that were not renewed, and those along paths that the core has given up."""
@@ -225,8 +275,8 @@ class RelayService:
             if count := self.forwarding.dropped[reason] - self._reported[reason]:
                 yield reason, "", count
         self._reported = self.forwarding.dropped.copy()
-        of_removed, self._of_removed = self._of_removed, []
-        yield from of_removed
+        unreported, self._unreported = self._unreported, []
+        yield from unreported
         for member in self.members.values():
             yield from _over_limit(member)
 

@@ -1,0 +1,232 @@
+"""What a member asks its relays for when it tests filters, and which tokens it takes: with literal times."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from tests.core.harness import AT_B, ELSEWHERE, KEY_B, Pair, quiet
+from uavlinkd.config import RelayConfig
+from uavlinkd.core import constants as c
+from uavlinkd.core import outputs as o
+from uavlinkd.core.drops import DropReason
+from uavlinkd.core.path import Path
+from uavlinkd.core.relay_records import Bind, FilterTest, FilterTested, token_datagram
+from uavlinkd.core.settings import PeerSettings
+from uavlinkd.link.filter_tests import FilterTests
+from uavlinkd.link.relay_handles import RelayHandles
+from uavlinkd.link.relay_link import RelayLink
+
+LINK = quiet(features=c.FEATURE_RECORDS)
+T = 10.0
+OTHER_PORT = Path(AT_B.socket, (AT_B.host, 50_000))
+
+
+def tokens() -> Iterator[bytes]:
+    """Each is another one."""
+    for number in range(256):
+        yield bytes([number]) * c.FILTER_TOKEN_BYTES
+
+
+class Scene:
+    """Alpha is the member, beta the relay: a session, and one path that works."""
+
+    def __init__(self) -> None:
+        self.pair = Pair(LINK, LINK)
+        node, peer = self.pair.a.node, self.pair.a.peer
+        node.remove_peer(peer, 0.0)
+        config = RelayConfig(PeerSettings("relay vps", KEY_B.public, None, LINK), ())
+        self.relay = RelayLink(config, node, RelayHandles(), lambda *_: None, lambda: None, 0.0)
+        self.pair.a.peer_name = self.relay.name
+        self.relay.set_paths([AT_B], 0.0)
+        self.pair.establish()
+        assert self.pair.carries(0.0)
+        self.due = 0
+        drawn = tokens()
+        self.tests = FilterTests(node, lambda size: next(drawn)[:size], self.on_due)
+
+    def on_due(self) -> None:
+        """The daemon's."""
+        self.due += 1
+
+    def asked(self, now: float) -> list[bytes]:
+        """The tokens that the relay is asked for now."""
+        received = [
+            output.record
+            for sent in self.tests.do_due(now)
+            if isinstance(sent, o.Transmit)
+            for output in self.pair.b.receive(sent.datagram, now)
+            if isinstance(output, o.RecordReceived)
+        ]
+        return [record.token for record in received if isinstance(record, FilterTest)]
+
+    def answer(self, token: bytes, path: Path = AT_B) -> None:
+        """The relay says that it sent a token."""
+        self.tests.on_record(o.RecordReceived(self.relay.peer, path, FilterTested(token), 1))
+
+    def ask_all(self, *, answers: int) -> bytes:
+        """Ask in vain, with answers to the first tries. The token."""
+        asked = [self.asked(self.tests.next_at) for _ in range(c.FILTER_TRIES)]
+        ((token,),) = {tuple(one) for one in asked}
+        for _ in range(answers):
+            self.answer(token)
+        return token
+
+    @property
+    def passes(self) -> list[bool | None]:
+        """The results."""
+        return [result.passes for result in self.tests.results]
+
+
+@pytest.fixture
+def scene() -> Scene:
+    """A member with a session, which begins its tests."""
+    scene = Scene()
+    scene.tests.begin([scene.relay], T)
+    return scene
+
+
+def test_relay_is_asked_three_times_for_the_same_token(scene: Scene) -> None:
+    """Then nothing waits."""
+    assert scene.due == 1
+    assert not scene.tests.ended.is_set()
+    (token,) = scene.asked(T)
+    assert scene.tests.next_at == T + c.FILTER_TRY_S
+    assert not scene.asked(T + 0.1)
+    assert scene.asked(scene.tests.next_at) == scene.asked(scene.tests.next_at) == [token]
+    assert scene.tests.next_at == pytest.approx(T + 3 * c.FILTER_TRY_S)
+    assert not scene.asked(scene.tests.next_at)
+    assert scene.tests.ended.is_set()
+    assert scene.tests.next_at == float("inf")
+    assert not scene.asked(T + 60)
+    assert scene.passes == [None]
+
+
+@pytest.mark.parametrize(("answers", "passes"), [(0, None), (1, None), (2, False), (3, False)])
+def test_answers_without_a_token_show_a_filter(answers: int, passes: bool | None, scene: Scene) -> None:
+    """Unless there is one answer only: the token may have been lost."""
+    scene.ask_all(answers=answers)
+    scene.asked(T + 9)
+    assert scene.passes == [passes]
+
+
+def test_token_and_its_answer_end_the_test(scene: Scene) -> None:
+    """Whichever comes first. A second copy of the token is not dropped; a later one is."""
+    (token,) = scene.asked(T)
+    assert scene.tests.take_token(token_datagram(token), OTHER_PORT)
+    assert scene.tests.take_token(token_datagram(token), OTHER_PORT)
+    assert scene.tests.next_at == T + c.FILTER_TRY_S
+    scene.answer(token)
+    assert scene.due == 2
+    assert scene.tests.next_at < T
+    assert not scene.asked(T + 0.01)
+    assert scene.tests.ended.is_set()
+    assert scene.passes == [True]
+    assert not scene.tests.take_token(token_datagram(token), OTHER_PORT)
+
+
+def test_token_after_its_answers_ends_the_test(scene: Scene) -> None:
+    """The network reordered them, or the first token was lost."""
+    (token,) = scene.asked(T)
+    scene.answer(token)
+    scene.asked(scene.tests.next_at)
+    scene.answer(token)
+    assert scene.tests.next_at > T
+    assert scene.tests.take_token(token_datagram(token), OTHER_PORT)
+    assert scene.tests.next_at < T
+    assert not scene.asked(T + 0.5)
+    assert scene.passes == [True]
+
+
+def test_token_without_its_answer_ends_the_test_later(scene: Scene) -> None:
+    """The answer may be under way. The relay is not asked again."""
+    (token,) = scene.asked(T)
+    assert scene.tests.take_token(token_datagram(token), OTHER_PORT)
+    assert not scene.asked(scene.tests.next_at)
+    assert scene.passes == [True]
+
+
+@pytest.mark.parametrize(
+    ("path", "change"),
+    [
+        (AT_B, b""),
+        (ELSEWHERE, b""),
+        (Path(AT_B.socket + 1, OTHER_PORT.address), b""),
+        (OTHER_PORT, b"\0"),
+    ],
+    ids=["the relay's own port", "another host", "another socket", "another length"],
+)
+def test_other_datagrams_with_the_token_show_nothing(path: Path, change: bytes, scene: Scene) -> None:
+    """They are dropped, and the result is as without them."""
+    token = scene.ask_all(answers=3)
+    assert not scene.tests.take_token(token_datagram(token) + change, path)
+    assert not scene.tests.take_token(token_datagram(bytes(c.FILTER_TOKEN_BYTES)[1:] + b"\7"), OTHER_PORT)
+    scene.asked(T + 9)
+    assert scene.passes == [False]
+
+
+def test_answers_of_others_do_not_count(scene: Scene) -> None:
+    """Along another path, for another token, of another peer, and other records."""
+    token = scene.ask_all(answers=1)
+    scene.answer(token, ELSEWHERE)
+    scene.answer(bytes([9]) * c.FILTER_TOKEN_BYTES)
+    for peer, record in ((scene.pair.b.peer, FilterTested(token)), (scene.relay.peer, Bind((KEY_B.public,)))):
+        received = o.RecordReceived(peer, AT_B, record, 1)
+        assert scene.tests.on_record(received) is DropReason.UNEXPECTED_RECORD
+    scene.asked(T + 9)
+    assert scene.passes == [None]
+
+
+def test_tests_that_run_are_not_begun_again(scene: Scene) -> None:
+    """Two people ask at the same time: both get the same results. Later tests have other tokens."""
+    scene.tests.begin([scene.relay], T)
+    token = scene.ask_all(answers=2)
+    scene.tests.begin([scene.relay], T + 1)
+    scene.asked(T + 9)
+    assert scene.passes == [False]
+    scene.tests.begin([scene.relay], T + 10)
+    assert scene.passes == []
+    (other,) = scene.asked(T + 10)
+    assert other != token
+
+
+@pytest.mark.parametrize(("srtt_s", "try_s"), [(0.01, 0.3), (0.25, 0.5), (5.0, 1.2)])
+def test_slow_path_has_more_time(srtt_s: float, try_s: float) -> None:
+    """Within limits: a person waits."""
+    scene = Scene()
+    (state,) = scene.relay.peer.paths.states
+    state.srtt_s = srtt_s
+    scene.tests.begin([scene.relay], T)
+    assert len(scene.asked(T)) == 1
+    assert scene.tests.next_at == T + try_s
+
+
+def test_best_path_from_each_socket_is_tested() -> None:
+    """Others of the same socket lead through the same NAT; serial and relayed ones through none."""
+    scene = Scene()
+    second, third = Path(0, ("192.0.2.8", 5790)), Path(1, AT_B.address)
+    scene.relay.set_paths([AT_B, second, third], 0.0)
+    for path, srtt_s in ((AT_B, 0.2), (second, 0.1), (third, None)):
+        state = scene.relay.peer.paths.find(path)
+        assert state is not None
+        state.srtt_s = srtt_s
+        state.set_usable(T)
+    scene.tests.begin([scene.relay], T)
+    assert {(test.path, test.try_s) for test in scene.tests._tests.values()} == {(second, 0.3), (third, 0.3)}
+
+
+def test_without_a_relay_that_is_up_nothing_is_tested() -> None:
+    """The results are there at once."""
+    scene = Scene()
+    scene.relay.peer.is_up = False
+    scene.tests.begin([scene.relay], T)
+    assert scene.tests.ended.is_set()
+    assert scene.passes == []
+
+
+def test_relay_that_is_removed_meanwhile_is_not_asked(scene: Scene) -> None:
+    """The tests end, and the result is unknown."""
+    scene.relay.leave(T)
+    assert [scene.asked(T + number) for number in range(4)] == [[]] * 4
+    assert scene.passes == [None]

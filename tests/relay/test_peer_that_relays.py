@@ -1,0 +1,159 @@
+"""A ground station that runs the relay: its vehicles have it as a peer and as a relay, in one session."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from typing import Any
+
+import pytest
+
+from tests.daemon.fleet import AN_OPERATOR, a_member, a_vehicle, beat
+from tests.daemon.frames import heartbeat
+from tests.daemon.harness import Stage
+from tests.daemon.process import DaemonProcess, Status
+from tests.daemon.test_reload import reload
+from uavlinkd.config import keys
+
+
+@pytest.fixture
+async def stage() -> AsyncIterator[Stage]:
+    """Ends the daemons of a test, and searches their output for tracebacks and secrets."""
+    async with Stage() as stage:
+        yield stage
+
+
+class Fleet:
+    """Two vehicles that cannot reach each other, and the ground station that both reach."""
+
+    def __init__(self, stage: Stage) -> None:
+        self.station, self.a, self.b = stage.daemon("station"), stage.daemon("drone1", []), stage.daemon("drone2", [])
+        self.station.config |= {"relay_server": {"enabled": True}, "member": []}
+        for number, vehicle in enumerate((self.a, self.b), 1):
+            psk = stage.psk()
+            self.station.add_peer(vehicle, [], psk, **a_vehicle(number))
+            self.station.config["member"].append({"name": vehicle.name, "public_key": vehicle.public_key})
+            vehicle.add_peer(self.station, [self.station.address], psk, **AN_OPERATOR)
+            vehicle.config["link"]["confidential"] = True
+            vehicle.config["relay"] = [relay_section(self.station)]
+        psk = stage.psk()
+        self.a.add_peer(self.b, [], psk, **a_member(2))
+        self.b.add_peer(self.a, [], psk, **a_member(1))
+
+    @property
+    def daemons(self) -> tuple[DaemonProcess, ...]:
+        """All of them."""
+        return self.station, self.a, self.b
+
+
+def relay_section(station: DaemonProcess) -> dict[str, Any]:
+    """The station as a relay: its addresses are in the section of the peer."""
+    return {"name": "gcs", "public_key": station.public_key, "addresses": []}
+
+
+def is_relayed(status: Status, peer: str) -> bool:
+    """Whether frames for a peer go along the relay."""
+    return any(path["relay"] == "gcs" and path["state"] == "usable" for path in status["peers"][peer]["paths"])
+
+
+@pytest.fixture
+def fleet(stage: Stage) -> Fleet:
+    """The fleet, not started."""
+    return Fleet(stage)
+
+
+async def test_vehicles_reach_each_other_through_their_ground_station(stage: Stage, fleet: Fleet) -> None:
+    """One session serves both roles. Frames go to the station and through it, and never to it through itself."""
+    at_station, at_b = await stage.client(), await stage.client()
+    into_a = fleet.a.add_endpoint("autopilot")
+    fleet.station.add_endpoint("qgc", f"udpout:{at_station}")
+    fleet.b.add_endpoint("autopilot", f"udpout:{at_b}")
+    await stage.start(*fleet.daemons)
+    autopilot = await stage.client()
+    autopilot.send(heartbeat(1), into_a)
+    for client in (at_station, at_b):
+        await client.until_received(heartbeat(1))
+    status = await fleet.a.until(lambda status: status["relays"]["gcs"]["peers"] == {"drone2": "bound"})
+    relay, peer = status["relays"]["gcs"], status["peers"]["station"]
+    assert (relay["state"], relay["peer"], peer["state"]) == ("up", "station", "up")
+    assert [path["relay"] for path in peer["paths"]] == [None]
+    assert peer["handshakes"] == 1
+    station = await fleet.station.status()
+    assert station["relay"]["connections"] == 1
+    assert {member["is_up"] for member in station["relay"]["members"].values()} == {True}
+    assert station["drops"] == {}
+    await fleet.a.until_logged("relay_up", relay="gcs")
+    await fleet.a.until_logged("peer_up", peer="station")
+
+
+async def test_roles_come_and_go_while_the_link_is_up(stage: Stage, fleet: Fleet) -> None:
+    """The station stays a peer: both ends make new keys when it becomes a relay, and no link is lost."""
+    relays, peers = fleet.a.config.pop("relay"), fleet.a.config["peer"]
+    fleet.a.config["peer"] = peers[:1]
+    await stage.start(*fleet.daemons, linked=False)
+    await fleet.a.until(lambda status: status["peers"]["station"]["state"] == "up")
+    fleet.a.config |= {"relay": relays, "peer": peers}
+    assert await reload(fleet.a) == []
+    await fleet.a.until(lambda status: is_relayed(status, "drone2"))
+    fleet.a.config |= {"relay": [], "peer": peers[:1]}
+    assert await reload(fleet.a) == []
+    status = await fleet.a.status()
+    assert status["relays"] == {}
+    assert status["peers"]["station"]["state"] == "up"
+    for daemon in (fleet.a, fleet.station):
+        assert len(daemon.events("peer_up", peer=peers[0]["name"] if daemon is fleet.a else "drone1")) == 1
+
+
+async def test_relay_may_stop_to_be_a_peer(stage: Stage, fleet: Fleet) -> None:
+    """Then it carries no frames, whatever it sends, and connects the vehicles as before."""
+    into = fleet.station.add_endpoint("qgc")
+    await stage.start(*fleet.daemons)
+    fleet.a.config["relay"][0]["addresses"] = fleet.a.config["peer"][0]["addresses"]
+    psk_file = fleet.a.config["peer"].pop(0)["psk_file"]
+    fleet.a.config["relay"][0]["psk_file"] = psk_file
+    assert await reload(fleet.a) == []
+    await fleet.a.until(lambda status: is_relayed(status, "drone2") and set(status["peers"]) == {"drone2"})
+    station = await stage.client()
+    station.send(heartbeat(255), into)
+    await fleet.a.until(lambda status: status["drops"].get("frames_not_allowed", 0) > 0)
+
+
+async def test_station_that_starts_again_connects_the_vehicles_again(stage: Stage, fleet: Fleet) -> None:
+    """It remembers nothing: with their next sessions, both vehicles bind each other again."""
+    at_b = await stage.client()
+    into_a = fleet.a.add_endpoint("autopilot")
+    fleet.b.add_endpoint("autopilot", f"udpout:{at_b}")
+    await stage.start(*fleet.daemons)
+    autopilot = await stage.client()
+    beats = asyncio.create_task(beat(lambda _: autopilot.send(heartbeat(1), into_a), 0.2))
+    await at_b.until_received(heartbeat(1))
+    await fleet.station.kill()
+    await fleet.a.until(lambda status: status["peers"]["drone2"]["state"] == "lost")
+    at_b.clear()
+    await fleet.station.start()
+    await at_b.until_received(heartbeat(1))
+    beats.cancel()
+
+
+async def test_key_of_the_station_changes_in_both_roles(stage: Stage, fleet: Fleet) -> None:
+    """The peer's section has the previous key, for the relay too."""
+    await stage.start(*fleet.daemons)
+    before, private = fleet.station.public_key, keys.generate_private_key()
+    stage.secrets.append(private)
+    fleet.station.public_key = keys.public_key_text(private)
+    for vehicle in (fleet.a, fleet.b):
+        vehicle.config["peer"][0] |= {"public_key": fleet.station.public_key, "previous_public_key": before}
+        vehicle.config["relay"] = [relay_section(fleet.station)]
+        assert await reload(vehicle) == []
+    await fleet.a.until(lambda status: is_relayed(status, "drone2"))
+    assert (await fleet.a.status())["peers"]["station"]["accepts_previous_key"]
+
+    await fleet.station.stop()
+    (fleet.station.folder / "daemon.key").rename(fleet.station.folder / "previous.key")
+    keys.write_secret_file(fleet.station.folder / "daemon.key", private)
+    fleet.station.config["previous_private_key_file"] = "previous.key"
+    await fleet.station.start()
+    for vehicle in (fleet.a, fleet.b):
+        await vehicle.until(lambda status: not status["peers"]["station"]["accepts_previous_key"])
+        await vehicle.until(lambda status: set(status["relays"]["gcs"]["peers"].values()) == {"bound"})
+    await fleet.station.until(lambda status: status["relay"]["connections"] == 1)
