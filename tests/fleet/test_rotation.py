@@ -2,131 +2,28 @@
 
 from __future__ import annotations
 
-import asyncio
 import shutil
-import signal
-import sys
-import tempfile
 from collections.abc import AsyncIterator, Sequence
 from itertools import permutations
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from tests.fleet.swarm import end
+from tests.fleet.vehicles import NAMES, Vehicles, flying
 from tests.waiting import until
 from uavlinkd.config import keys
 from uavlinkd.fleet import operations
 from uavlinkd.fleet.manifest import FleetSettings, MemberKind, read_manifest
 from uavlinkd.fleet.transaction import check_members
-from uavlinkd.lab.child_processes import end_with_parent
-from uavlinkd.lab.sim.loopback_ports import free_port
-from uavlinkd.ops.control import ControlError, ask
 
 pytestmark = pytest.mark.long
-
-NAMES = ("drone1", "drone2", "drone3")
-
-
-class Vehicles:
-    """Daemons with their own folders. Files are copied there from the fleet's folder."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self.fleet = folder / "fleet"
-        settings = FleetSettings(
-            address_plan=f"127.0.14.{{n}}:{free_port()}", drone_url=f"udpin:127.0.14.{{n}}:{free_port()}", psk=True
-        )
-        operations.init(self.fleet, settings, len(NAMES), 0, 0)
-        self._processes: dict[str, asyncio.subprocess.Process] = {}
-
-    def place(self, name: str) -> Path:
-        """The folder on the vehicle."""
-        return self._folder / "on" / name
-
-    def carry(self, name: str) -> None:
-        """Replace the files on a vehicle."""
-        for path in self.place(name).glob("*") if self.place(name).exists() else ():
-            if path.suffix != ".sock":
-                path.unlink()
-        shutil.copytree(self.fleet / name, self.place(name), dirs_exist_ok=True)
-
-    async def start(self, name: str) -> None:
-        """Start the daemon with the files on the vehicle."""
-        with (self._folder / f"{name}.log").open("ab") as log:
-            self._processes[name] = await asyncio.create_subprocess_exec(
-                *end_with_parent(sys.executable, "-m", "uavlinkd", "run"),
-                *("--config", str(self.place(name) / f"{name}.toml")),
-                stdout=log,
-                stderr=log,
-            )
-
-    async def stop(self, name: str) -> None:
-        """End a daemon."""
-        assert await end(self._processes.pop(name)) == 0
-
-    async def renew(self, name: str, *, restart: bool) -> None:
-        """Replace the files on a vehicle, and reload or restart the daemon."""
-        self.carry(name)
-        if restart:
-            await self.stop(name)
-            await self.start(name)
-        else:
-            log = self._folder / f"{name}.log"
-            before = log.read_text().count("configuration_reloaded")
-            self._processes[name].send_signal(signal.SIGHUP)
-            await until(lambda: log.read_text().count("configuration_reloaded") > before)
-
-    def status(self, name: str) -> dict[str, Any]:
-        """The status of a daemon; empty if it does not answer."""
-        try:
-            return ask(self.place(name) / f"{name}.sock", "status")
-        except ControlError:
-            return {}
-
-    def peers(self, name: str) -> dict[str, dict[str, Any]]:
-        """The peers in the status of a daemon."""
-        peers: dict[str, dict[str, Any]] = self.status(name).get("peers", {})
-        return peers
-
-    async def until_linked(self, *, by_new_keys: bool = False) -> None:
-        """Wait until both ends of every pair are linked; ``by_new_keys``: and every previous key is revoked."""
-        public = {member.name: member.public_key for member in read_manifest(self.fleet).members}
-
-        def is_linked(name: str) -> bool:
-            peers = self.peers(name)
-            return len(peers) == len(NAMES) - 1 and all(
-                status["state"] == "up"
-                and (not by_new_keys or (status["public_key"] == public[peer] and not status["accepts_previous_key"]))
-                for peer, status in peers.items()
-            )
-
-        await until(lambda: all(map(is_linked, NAMES)))
-
-    async def close(self) -> None:
-        """End all daemons."""
-        statuses = await asyncio.gather(*map(end, self._processes.values()))
-        logs = {path.stem: path.read_text() for path in self._folder.glob("*.log")}
-        for name, text in logs.items():
-            print(f"--- {name}\n{text}")
-        assert set(statuses) <= {0}
-        assert not [name for name, text in logs.items() if "Traceback" in text]
 
 
 @pytest.fixture
 async def vehicles() -> AsyncIterator[Vehicles]:
-    """Three linked drones. Their folder has a short name, because the path of a Unix socket has to be short."""
-    with tempfile.TemporaryDirectory(prefix="uavlinkd-") as folder:
-        vehicles = Vehicles(Path(folder))
-        try:
-            for name in NAMES:
-                vehicles.carry(name)
-                await vehicles.start(name)
-            await vehicles.until_linked()
-            yield vehicles
-        finally:
-            await vehicles.close()
+    """Three linked drones."""
+    async with flying() as vehicles:
+        yield vehicles
 
 
 @pytest.mark.parametrize(

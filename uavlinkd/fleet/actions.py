@@ -10,7 +10,8 @@ from uavlinkd.fleet import operations
 from uavlinkd.fleet.errors import FleetError, FleetFileError
 from uavlinkd.fleet.manifest import FleetSettings, MemberKind
 from uavlinkd.fleet.operations import Result
-from uavlinkd.system.addresses import AddressError, parse_address
+from uavlinkd.fleet.plan import DEFAULT_PLAN, NO_PLAN
+from uavlinkd.system.addresses import Address, AddressError, parse_address
 from uavlinkd.system.terminal import printable
 
 OK, FAILED, WRONG = 0, 1, 2
@@ -28,8 +29,9 @@ def act(options: argparse.Namespace) -> int:
 
 
 def _init(options: argparse.Namespace) -> Result:
+    relays = [_address("--relay", text) for text in options.relay]
     settings = FleetSettings(
-        address_plan=options.address_plan,
+        address_plan=options.address_plan or (NO_PLAN if relays else DEFAULT_PLAN),
         suite=options.suite,
         psk=options.psk,
         control_socket=options.control_socket,
@@ -37,14 +39,19 @@ def _init(options: argparse.Namespace) -> Result:
         ground_station_url=options.ground_station_url,
         observer_url=options.observer_url,
     )
-    return operations.init(options.out, settings, options.drones, options.ground_stations, options.observers)
+    counts = options.drones, options.ground_stations, options.observers
+    return operations.init(options.out, settings, *counts, relays)
+
+
+def _address(option: str, text: str) -> Address:
+    try:
+        return parse_address(text, allow_names=True)
+    except AddressError as error:
+        raise FleetError(f"{option}: {error}") from None
 
 
 def _add(options: argparse.Namespace) -> Result:
-    try:
-        address = None if options.address is None else parse_address(options.address, allow_names=True)
-    except AddressError as error:
-        raise FleetError(f"--address: {error}") from None
+    address = None if options.address is None else _address("--address", options.address)
     return operations.add(
         options.out, options.name, MemberKind(options.kind), address=address, system_id=options.system_id
     )
@@ -84,7 +91,7 @@ def _print_result(options: argparse.Namespace, result: Result) -> None:
     for member in result.fleet.members:
         address = "(initiates)" if member.address is None else str(member.address)
         key = f"{member.public_key[:8]}..." + (" (rotating)" if member.previous_public_key else "")
-        rows.append((member.name, member.kind.value, str(member.system_id), address, key))
+        rows.append((member.name, member.kind.value, str(member.system_id or "-"), address, key))
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
         _print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
@@ -108,7 +115,12 @@ def _print_result(options: argparse.Namespace, result: Result) -> None:
     if options.action == "rotate" and options.at_once:
         _print(f"Restart {options.name}.")
     elif options.action == "rotate" and not options.finish:
-        _print(f"Carry the files in any order, and restart {options.name}. When all members have their files:")
+        order = (
+            f"Carry the others' files and reload them, the relays too; then carry those of {options.name}"
+            if result.fleet.relays
+            else "Carry the files in any order"
+        )
+        _print(f"{order}, and restart {options.name}. When all members have their files:")
         _print(operations.finish_command(options.out, options.name))
     elif options.action == "rotate":
         _print(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-_KINDS = ("drone", "ground-station", "observer")
+_KINDS = ("drone", "ground-station", "observer", "relay")
 
 
 def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -28,10 +28,17 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     )
     init.add_argument("--observers", type=int, default=0, metavar="N", help="members that only receive (default: 0)")
     init.add_argument(
+        "--relay",
+        action="append",
+        default=[],
+        metavar="HOST:PORT",
+        help="a relay with this public address; all links are encrypted (may be repeated, up to three times)",
+    )
+    init.add_argument(
         "--address-plan",
-        default="10.13.0.0/24",
         metavar="PLAN",
-        help="a network, or a template with {n} or {name}: 10.13.0.{n}:5790 (default: %(default)s)",
+        help="a network, or a template with {n} or {name}: 10.13.0.{n}:5790; none: no member has an address"
+        " (default: 10.13.0.0/24, with --relay none)",
     )
     init.add_argument("--psk", action="store_true", help="a pre-shared key for each pair")
     init.add_argument("--suite", default="x25519", metavar="NAME", help="key exchange (default: %(default)s)")

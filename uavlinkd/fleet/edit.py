@@ -2,6 +2,7 @@
 
 The text is changed line by line, which keeps comments and order. The parsed result is then compared with the parsed
 original after the same change. If they differ, the change is refused: a multi-line string may contain a ``[[peer]]``.
+A ``kind`` of section is ``peer``, ``relay`` or ``member``.
 """
 
 from __future__ import annotations
@@ -12,11 +13,13 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from uavlinkd.fleet.errors import FleetError
-from uavlinkd.fleet.files import key_lines, public_key_lines
+from uavlinkd.fleet.files import CONFIDENTIAL, key_lines, public_key_lines
 from uavlinkd.fleet.manifest import Member
 
 _HEADER = re.compile(r"[ \t]*\[")
 _KEY = re.compile(r"[ \t]*(?:\"([^\"]*)\"|'([^']*)'|([A-Za-z0-9_-]+))[ \t]*=")
+_LINK = re.compile(r"[ \t]*\[[ \t]*link[ \t]*\]")
+_KINDS = ("peer", "relay", "member")
 _PUBLIC = ("public_key", "previous_public_key")
 _PRIVATE = ("private_key_file", "previous_private_key_file")
 
@@ -25,67 +28,87 @@ Change = Callable[[str], str]
 
 
 def set_peer(text: str, section: str, name: str) -> str:
-    """Replace the section of a peer, or append it.
+    """Replace the section of a peer, relay or member, or append it.
 
     Raises:
         FleetError: the text cannot be changed safely.
     """
-    (added,) = tomllib.loads(section)["peer"]
+    ((kind, (added,)),) = tomllib.loads(section).items()
 
     def change(table: Table) -> None:
-        table["peer"] = [peer for peer in table.get("peer", []) if peer.get("name") != name] + [added]
+        table[kind] = [peer for peer in table.get(kind, []) if peer.get("name") != name] + [added]
 
-    kept = _without(_sections(text), name)
+    kept = _without(_sections(text), kind, name)
     return _checked(text, "".join(kept).rstrip("\n") + "\n\n" + section, change)
 
 
-def remove_peer(text: str, name: str) -> str:
-    """Delete the section of a peer.
+def remove_peer(text: str, kind: str, name: str) -> str:
+    """Delete the section of a peer, relay or member.
 
     Raises:
         FleetError: the text cannot be changed safely.
     """
 
     def change(table: Table) -> None:
-        left = [peer for peer in table.get("peer", []) if peer.get("name") != name]
-        table.pop("peer", None)
+        left = [peer for peer in table.get(kind, []) if peer.get("name") != name]
+        table.pop(kind, None)
         if left:
-            table["peer"] = left
+            table[kind] = left
 
-    return _checked(text, "".join(_without(_sections(text), name)).rstrip("\n") + "\n", change)
+    return _checked(text, "".join(_without(_sections(text), kind, name)).rstrip("\n") + "\n", change)
+
+
+def set_confidential(text: str) -> str:
+    """Encrypt the frames on all links.
+
+    Raises:
+        FleetError: the text cannot be changed safely.
+    """
+    sections = _sections(text)
+    at = next((number for number, section in enumerate(sections) if _LINK.match(section)), None)
+    if at is None:
+        sections.append("\n[link]\n")
+        at = -1
+    keys = tuple(tomllib.loads(CONFIDENTIAL))
+    sections[at] = _with_lines(sections[at], keys, (CONFIDENTIAL,))
+    return _checked(
+        text, "".join(sections), lambda table: _set_keys(table.setdefault("link", {}), keys, (CONFIDENTIAL,))
+    )
 
 
 def section_with_key(text: str, public_keys: Iterable[str]) -> str | None:
-    """The ``[[peer]]`` that contains one of these keys, as current or previous key; None without one."""
+    """The section that contains one of these keys, as current or previous key; None without one."""
     unwanted = set(public_keys)
     try:
-        peers = tomllib.loads(text).get("peer", [])
+        table = tomllib.loads(text)
     except ValueError:  # a daemon would refuse the file
         return None
-    for number, peer in enumerate(peers if isinstance(peers, list) else []):
-        # A daemon ignores spaces around a key.
-        if isinstance(peer, dict) and unwanted & {str(peer.get(key)).strip() for key in _PUBLIC}:
-            return f"peer[{number}] ({peer.get('name')})"
+    for kind in _KINDS:
+        peers = table.get(kind, [])
+        for number, peer in enumerate(peers if isinstance(peers, list) else []):
+            # A daemon ignores spaces around a key.
+            if isinstance(peer, dict) and unwanted & {str(peer.get(key)).strip() for key in _PUBLIC}:
+                return f"{kind}[{number}] ({peer.get('name')})"
     return None
 
 
-def set_public_keys(text: str, peer: Member) -> str:
-    """Replace the public keys of a peer by its current ones.
+def set_public_keys(text: str, kind: str, peer: Member) -> str:
+    """Replace the public keys of a peer, relay or member by its current ones.
 
     Raises:
-        FleetError: the text cannot be changed safely, or has no such peer.
+        FleetError: the text cannot be changed safely, or has no such section.
     """
     lines = public_key_lines(peer)
 
     def change(table: Table) -> None:
-        for section in table.get("peer", []):
+        for section in table.get(kind, []):
             if section.get("name") == peer.name:
                 _set_keys(section, _PUBLIC, lines)
 
     sections = _sections(text)
-    places = [number for number, section in enumerate(sections) if _peer_name(section) == peer.name]
+    places = [number for number, section in enumerate(sections) if _name(section, kind) == peer.name]
     if len(places) != 1:
-        raise FleetError(f'it has no [[peer]] with the name "{peer.name}": add it, or move the file away')
+        raise FleetError(f'it has no [[{kind}]] with the name "{peer.name}": add it, or move the file away')
     sections[places[0]] = _with_lines(sections[places[0]], _PUBLIC, lines)
     return _checked(text, "".join(sections), change)
 
@@ -135,14 +158,14 @@ def _sections(text: str) -> list[str]:
     return ["".join(piece) for piece in pieces]
 
 
-def _without(sections: Sequence[str], name: str) -> list[str]:
-    return [section for section in sections if _peer_name(section) != name]
+def _without(sections: Sequence[str], kind: str, name: str) -> list[str]:
+    return [section for section in sections if _name(section, kind) != name]
 
 
-def _peer_name(section: str) -> object:
-    """The name in a ``[[peer]]`` section; None for other sections."""
+def _name(section: str, kind: str) -> object:
+    """The name in a section of a kind, such as ``[[peer]]``; None for other sections."""
     try:
-        peer = tomllib.loads(section).get("peer")
+        peer = tomllib.loads(section).get(kind)
     except ValueError:
         return None
     return peer[0].get("name") if isinstance(peer, list) and len(peer) == 1 else None

@@ -6,6 +6,8 @@ from uavlinkd.fleet.manifest import ROLES, Fleet, Member, MemberKind, literal
 from uavlinkd.fleet.plan import listen_address
 from uavlinkd.system.addresses import Address
 
+CONFIDENTIAL = "confidential = true"
+"""In ``[link]`` of a fleet with relays: otherwise their owners could read the frames."""
 _ENDPOINT_NAMES = {
     MemberKind.DRONE: "autopilot",
     MemberKind.GROUND_STATION: "ground-control",
@@ -36,34 +38,49 @@ def psk_file(other: Member) -> str:
 def write_config(fleet: Fleet, member: Member) -> str:
     """The text of a member's configuration."""
     settings = fleet.settings
-    listen = [] if member.address is None else [str(listen_address(member.address))]
+    numbered = "" if member.is_relay else f" with MAVLink system id {member.system_id}"
     lines = [
-        f"# {member.name}, {_DESCRIPTIONS[member.kind]} with MAVLink system id {member.system_id}.",
+        f"# {member.name}, {_DESCRIPTIONS[member.kind]}{numbered}.",
         "# Written by `uavlinkd fleet`. Later commands change keys and peers, and keep your other edits.",
         "",
         f"name = {literal(member.name)}",
         *key_lines(member),
-        f"listen = {literal(listen)}",
+        f"listen = {literal(_listen(member))}",
         f"control_socket = {literal(settings.control_socket_of(member))}",
         "",
         "[link]",
         f"suites = {literal([settings.suite])}",
-        "",
-        "[[endpoint]]",
-        f"name = {literal(_ENDPOINT_NAMES[member.kind])}",
-        f"url = {literal(settings.url_of(member))}",
-        f"system_ids = [{member.system_id}]",
     ]
+    if not member.is_relay:
+        if fleet.relays:
+            lines.append(CONFIDENTIAL)
+        lines += [
+            "",
+            "[[endpoint]]",
+            f"name = {literal(_ENDPOINT_NAMES[member.kind])}",
+            f"url = {literal(settings.url_of(member))}",
+            f"system_ids = [{member.system_id}]",
+        ]
     if member.kind is MemberKind.OBSERVER:
         lines.append('role = "observer"')
     sections = ["\n".join(lines) + "\n", *(peer_section(fleet, member, peer) for peer in fleet.peers_of(member))]
     return "\n".join(sections)
 
 
+def _listen(member: Member) -> list[str]:
+    if member.address is None:
+        return []
+    address = listen_address(member.address)
+    if member.is_relay and address.is_wildcard:  # members may have either family
+        return [f"0.0.0.0:{address.port}", f"[::]:{address.port}"]
+    return [str(address)]
+
+
 _DESCRIPTIONS = {
     MemberKind.DRONE: "a drone",
     MemberKind.GROUND_STATION: "a ground station",
     MemberKind.OBSERVER: "an observer",
+    MemberKind.RELAY: "a relay",
 }
 
 
@@ -76,14 +93,16 @@ def key_lines(member: Member) -> list[str]:
 
 
 def peer_section(fleet: Fleet, member: Member, peer: Member) -> str:
-    """The ``[[peer]]`` section about another member."""
-    addresses: list[Address] = [] if peer.address is None else [peer.address]
-    lines = ["[[peer]]", f"name = {literal(peer.name)}", *public_key_lines(peer)]
+    """The section about another member: ``[[peer]]``, ``[[relay]]`` or ``[[member]]``."""
+    kind = member.section_of(peer)
+    addresses: list[Address] = [] if peer.address is None or kind == "member" else [peer.address]
+    lines = [f"[[{kind}]]", f"name = {literal(peer.name)}", *public_key_lines(peer)]
     if addresses:
         lines.append(f"addresses = {literal([str(address) for address in addresses])}")
     if fleet.settings.psk:
         lines.append(f"psk_file = {literal(psk_file(peer))}")
-    lines += [f"role = {literal(ROLES[member.kind, peer.kind])}", f"system_ids = [{peer.system_id}]"]
+    if kind == "peer":
+        lines += [f"role = {literal(ROLES[member.kind, peer.kind])}", f"system_ids = [{peer.system_id}]"]
     return "\n".join(lines) + "\n"
 
 

@@ -15,9 +15,10 @@ from pathlib import Path
 from typing import Any
 
 from uavlinkd.config.keys import decode_key
+from uavlinkd.config.used_relays import MOST as MOST_RELAYS
 from uavlinkd.core.suites import SUITES_BY_NAME
 from uavlinkd.fleet.errors import FleetError, FleetFileError, no_fleet
-from uavlinkd.fleet.plan import DEFAULT_PLAN, SYSTEM_IDS, AddressPlan
+from uavlinkd.fleet.plan import DEFAULT_PLAN, NO_PLAN, SYSTEM_IDS, AddressPlan
 from uavlinkd.fleet.template import TemplateError, fill
 from uavlinkd.system.addresses import Address, AddressError, parse_address
 from uavlinkd.system.terminal import printable
@@ -33,6 +34,7 @@ class MemberKind(StrEnum):
     DRONE = "drone"
     GROUND_STATION = "ground-station"
     OBSERVER = "observer"
+    RELAY = "relay"
 
 
 ROLES = {
@@ -43,12 +45,18 @@ ROLES = {
     (MemberKind.GROUND_STATION, MemberKind.DRONE): "vehicle",
     (MemberKind.OBSERVER, MemberKind.DRONE): "vehicle",
 }
-"""Which members are linked, and with which role. Ground stations and observers are not linked with each other."""
+"""Which members are linked, and with which role. Ground stations and observers are not linked with each other.
+
+A relay has no role: every other member has it as a ``[[relay]]``, and it has them as ``[[member]]``.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class Member:
-    """One vehicle, ground station or observer. ``previous_public_key`` is also accepted during a rotation."""
+    """One vehicle, ground station, observer or relay. ``previous_public_key`` is also accepted during a rotation.
+
+    ``system_id`` is 0 for a relay, which sends no MAVLink.
+    """
 
     name: str
     kind: MemberKind
@@ -67,6 +75,17 @@ class Member:
     def is_drone(self) -> bool:
         """Whether it is a drone."""
         return self.kind is MemberKind.DRONE
+
+    @property
+    def is_relay(self) -> bool:
+        """Whether it is a relay."""
+        return self.kind is MemberKind.RELAY
+
+    def section_of(self, peer: Member) -> str:
+        """The kind of section that another member has in its configuration; empty if it has none."""
+        if self.is_relay or peer.is_relay:
+            return "" if self.is_relay and peer.is_relay else "member" if self.is_relay else "relay"
+        return "peer" if (self.kind, peer.kind) in ROLES else ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,8 +131,13 @@ class Fleet:
         raise FleetError(f'this fleet has no "{printable(name)}": its members are {names or "none"}')
 
     def peers_of(self, member: Member) -> list[Member]:
-        """The members with which it is linked."""
-        return [peer for peer in self.members if peer.name != member.name and (member.kind, peer.kind) in ROLES]
+        """The members that are in its configuration."""
+        return [peer for peer in self.members if peer.name != member.name and member.section_of(peer)]
+
+    @property
+    def relays(self) -> list[Member]:
+        """The members that are relays."""
+        return [member for member in self.members if member.is_relay]
 
     def with_member(self, member: Member) -> Fleet:
         """Add a member, or replace the member with its name.
@@ -124,7 +148,7 @@ class Fleet:
         for other in self.members:
             if other.name == member.name:
                 continue
-            if other.system_id == member.system_id:
+            if other.system_id == member.system_id and not member.is_relay:
                 raise FleetError(f"{member.name} would have the system id of {other.name}, {other.system_id}")
             if other.address is not None and other.address == member.address:
                 raise FleetError(f"{member.name} would have the address of {other.name}, {other.address}")
@@ -150,7 +174,7 @@ class Fleet:
         """Make a member. By default drones have the next system id from 1 up, others from 255 down.
 
         Raises:
-            FleetError: the name is not valid or is taken, or there is no free system id or address.
+            FleetError: the name is not valid or is taken, there is no free system id or address, or a relay has none.
         """
         if not _NAME.fullmatch(name):
             raise FleetError(
@@ -158,13 +182,19 @@ class Fleet:
             )
         if any(member.name == name for member in self.members):
             raise FleetError(f'this fleet has a "{name}" already')
+        if kind is MemberKind.RELAY:
+            if address is None or system_id is not None:
+                raise FleetError(f"{name}: a relay needs --address HOST:PORT, and has no system id")
+            if len(self.relays) == MOST_RELAYS:
+                raise FleetError(f"a fleet has at most {MOST_RELAYS} relays")
+            return Member(name, kind, 0, public_key, address)
         taken = {member.system_id for member in self.members}
         ids: Iterable[int] = SYSTEM_IDS if kind is MemberKind.DRONE else reversed(SYSTEM_IDS)
         number = next((free for free in ids if free not in taken), None) if system_id is None else system_id
         if number is None or number not in SYSTEM_IDS:
             raise FleetError("a system id is a number from 1 to 255, and each member has its own")
         member = Member(name, kind, number, public_key, address)
-        if kind is not MemberKind.OBSERVER and address is None:
+        if kind is not MemberKind.OBSERVER and address is None and self.settings.address_plan != NO_PLAN:
             planned = AddressPlan.parse(self.settings.address_plan).address_of(member)
             member = Member(name, kind, number, public_key, planned)
         return member
@@ -233,7 +263,8 @@ def check_settings(settings: FleetSettings) -> None:
             raise FleetError(f"{setting.name} has a value of the wrong type")
     if settings.suite not in SUITES_BY_NAME:
         raise FleetError(f'the suite "{settings.suite}" does not exist: use one of {", ".join(SUITES_BY_NAME)}')
-    AddressPlan.parse(settings.address_plan)
+    if settings.address_plan != NO_PLAN:
+        AddressPlan.parse(settings.address_plan)
     for key in _TEMPLATES:
         template = getattr(settings, key)
         try:
@@ -254,7 +285,10 @@ def _member(section: dict[str, Any]) -> Member:
         )
     except AddressError as error:
         raise FleetError(str(error)) from None
-    if not (_NAME.fullmatch(member.name) and member.system_id in SYSTEM_IDS):
+    is_numbered = (
+        member.system_id == 0 and member.address is not None if member.is_relay else (member.system_id in SYSTEM_IDS)
+    )
+    if not (_NAME.fullmatch(member.name) and is_numbered):
         raise ValueError("not a member")
     for key in (member.public_key, member.previous_public_key):
         if key is not None:

@@ -10,9 +10,10 @@ import errno
 import shlex
 import shutil
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from uavlinkd.config import keys
@@ -37,8 +38,17 @@ class Result:
     notes: tuple[str, ...] = ()
 
 
-def init(folder: Path, settings: FleetSettings, drones: int, ground_stations: int, observers: int) -> Result:
+def init(
+    folder: Path,
+    settings: FleetSettings,
+    drones: int,
+    ground_stations: int,
+    observers: int,
+    relays: Sequence[Address] = (),
+) -> Result:
     """Create a fleet in a new folder. If a step fails, the folder is not created.
+
+    ``relays``: the public address of each.
 
     Raises:
         FleetError: what is wrong.
@@ -61,14 +71,17 @@ def init(folder: Path, settings: FleetSettings, drones: int, ground_stations: in
         (MemberKind.GROUND_STATION, ground_stations),
         (MemberKind.OBSERVER, observers),
     ]
-    for kind, count in wanted:
-        for number in range(1, count + 1):
-            private = keys.generate_private_key()
-            # "ground-station" if it is the only one, but always "drone1": most fleets grow.
-            name = kind.value if count == 1 and kind is not MemberKind.DRONE else f"{kind.value}{number}"
-            member = fleet.new_member(name, kind, keys.public_key_text(private))
-            private_keys[member.name] = private
-            fleet = fleet.with_member(member)
+    places: list[tuple[MemberKind, int, int, Address | None]] = [
+        (kind, number, count, None) for kind, count in wanted for number in range(1, count + 1)
+    ]
+    places += [(MemberKind.RELAY, number, len(relays), address) for number, address in enumerate(relays, 1)]
+    for kind, number, count, address in places:
+        private = keys.generate_private_key()
+        # "ground-station" if it is the only one, but always "drone1": most fleets grow.
+        name = kind.value if count == 1 and kind is not MemberKind.DRONE else f"{kind.value}{number}"
+        member = fleet.new_member(name, kind, keys.public_key_text(private), address=address)
+        private_keys[member.name] = private
+        fleet = fleet.with_member(member)
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         building = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
@@ -112,8 +125,7 @@ def add(
         loadable = [peer for peer in peers if is_loadable(folder, peer)]
         _add_psks(changes, folder, fleet, [(member, peer) for peer in peers])
         for peer in peers:
-            section = files.peer_section(fleet, peer, member)
-            _edit(changes, folder, fleet, peer, lambda text, section=section: edit.set_peer(text, section, name))  # type: ignore[misc]
+            _edit(changes, folder, fleet, peer, partial(_with_peer, fleet, peer, member))
         apply(changes, folder, fleet, (member, *loadable))
     return Result(fleet, (name, *(peer.name for peer in peers)), tuple(changes.notes))
 
@@ -130,7 +142,8 @@ def remove(folder: Path, name: str) -> Result:
         changes = FileChanges()
         peers = before.peers_of(member)
         for peer in peers:
-            _edit(changes, folder, fleet, peer, lambda text: edit.remove_peer(text, name))
+            kind = peer.section_of(member)
+            _edit(changes, folder, fleet, peer, lambda text, kind=kind: edit.remove_peer(text, kind, name))  # type: ignore[misc]
             changes.deleted.append(folder / peer.name / files.psk_file(member))
         _check_unused(changes, folder, fleet, name, member.public_keys)
         apply(changes, folder, fleet)
@@ -141,8 +154,8 @@ def rotate(folder: Path, name: str, *, at_once: bool = False) -> Result:
     """Give a member a new key.
 
     The old key stays valid: the member's daemon and the others' files have both keys until a session confirms the
-    new one or the grace period ends. Therefore the files may arrive in any order. ``at_once`` is for a compromised
-    key: it revokes the old key immediately and replaces the member's PSKs.
+    new one or the grace period ends. Therefore the files may arrive in any order; with relays, the member's own files
+    last. ``at_once`` is for a compromised key: it revokes the old key immediately and replaces the member's PSKs.
 
     Raises:
         FleetError: what is wrong. Nothing was changed.
@@ -239,8 +252,15 @@ def _replace_keys(changes: FileChanges, folder: Path, fleet: Fleet, member: Memb
     _edit(changes, folder, fleet, member, lambda text: edit.set_private_keys(text, member))
     peers = fleet.peers_of(member)
     for peer in peers:
-        _edit(changes, folder, fleet, peer, lambda text: edit.set_public_keys(text, member))
+        kind = peer.section_of(member)
+        _edit(changes, folder, fleet, peer, lambda text, kind=kind: edit.set_public_keys(text, kind, member))  # type: ignore[misc]
     return peers
+
+
+def _with_peer(fleet: Fleet, member: Member, peer: Member, text: str) -> str:
+    """A member's configuration with another member in it. Links that may go along a relay are encrypted."""
+    text = edit.set_peer(text, files.peer_section(fleet, member, peer), peer.name)
+    return edit.set_confidential(text) if peer.is_relay else text
 
 
 def _edit(changes: FileChanges, folder: Path, fleet: Fleet, member: Member, change: edit.Change) -> None:

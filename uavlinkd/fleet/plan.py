@@ -11,6 +11,8 @@ from uavlinkd.fleet.template import TemplateError, fill
 from uavlinkd.system.addresses import DEFAULT_PORT, Address, AddressError, parse_address
 
 DEFAULT_PLAN = "10.13.0.0/24"
+NO_PLAN = "none"
+"""Members have no addresses: they reach each other along relays."""
 SYSTEM_IDS = range(1, 256)
 """The system ids of MAVLink."""
 

@@ -1,0 +1,129 @@
+"""The daemons of a fleet, each with the files of its own folder, which are carried there as an operator does."""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+import signal
+import sys
+import tempfile
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+from tests.fleet.swarm import end
+from tests.waiting import until
+from uavlinkd.fleet import operations
+from uavlinkd.fleet.manifest import FleetSettings, read_manifest
+from uavlinkd.fleet.plan import NO_PLAN
+from uavlinkd.lab.child_processes import end_with_parent
+from uavlinkd.lab.sim.loopback_ports import free_port
+from uavlinkd.ops.control import ControlError, ask
+from uavlinkd.system.addresses import Address
+
+NAMES = ("drone1", "drone2", "drone3")
+RELAY = "relay"
+
+
+class Vehicles:
+    """Daemons with their own folders. Files are copied there from the fleet's folder."""
+
+    def __init__(self, folder: Path, *, with_relay: bool = False) -> None:
+        self._folder = folder
+        self.fleet = folder / "fleet"
+        plan = NO_PLAN if with_relay else f"127.0.14.{{n}}:{free_port()}"
+        settings = FleetSettings(address_plan=plan, drone_url=f"udpin:127.0.14.{{n}}:{free_port()}", psk=True)
+        relays = [Address("127.0.0.1", free_port())] if with_relay else []
+        operations.init(self.fleet, settings, len(NAMES), 0, 0, relays)
+        self._processes: dict[str, asyncio.subprocess.Process] = {}
+
+    def place(self, name: str) -> Path:
+        """The folder on the vehicle."""
+        return self._folder / "on" / name
+
+    def carry(self, name: str) -> None:
+        """Replace the files on a vehicle."""
+        for path in self.place(name).glob("*") if self.place(name).exists() else ():
+            if path.suffix != ".sock":
+                path.unlink()
+        shutil.copytree(self.fleet / name, self.place(name), dirs_exist_ok=True)
+
+    async def start(self, name: str) -> None:
+        """Start the daemon with the files on the vehicle."""
+        with (self._folder / f"{name}.log").open("ab") as log:
+            self._processes[name] = await asyncio.create_subprocess_exec(
+                *end_with_parent(sys.executable, "-m", "uavlinkd", "run"),
+                *("--config", str(self.place(name) / f"{name}.toml")),
+                stdout=log,
+                stderr=log,
+            )
+
+    async def stop(self, name: str) -> None:
+        """End a daemon."""
+        assert await end(self._processes.pop(name)) == 0
+
+    async def renew(self, name: str, *, restart: bool) -> None:
+        """Replace the files on a vehicle, and reload or restart the daemon."""
+        self.carry(name)
+        if restart:
+            await self.stop(name)
+            await self.start(name)
+        else:
+            log = self._folder / f"{name}.log"
+            before = log.read_text().count("configuration_reloaded")
+            self._processes[name].send_signal(signal.SIGHUP)
+            await until(lambda: log.read_text().count("configuration_reloaded") > before)
+
+    def status(self, name: str) -> dict[str, Any]:
+        """The status of a daemon; empty if it does not answer."""
+        try:
+            return ask(self.place(name) / f"{name}.sock", "status")
+        except ControlError:
+            return {}
+
+    def peers(self, name: str) -> dict[str, dict[str, Any]]:
+        """The peers in the status of a daemon."""
+        peers: dict[str, dict[str, Any]] = self.status(name).get("peers", {})
+        return peers
+
+    async def until_linked(self, *, by_new_keys: bool = False) -> None:
+        """Wait until both ends of every pair are linked; ``by_new_keys``: and every previous key is revoked."""
+        public = {member.name: member.public_key for member in read_manifest(self.fleet).members}
+
+        def is_linked(name: str) -> bool:
+            peers = self.peers(name)
+            return len(peers) == len(NAMES) - 1 and all(
+                status["state"] == "up"
+                and (not by_new_keys or (status["public_key"] == public[peer] and not status["accepts_previous_key"]))
+                for peer, status in peers.items()
+            )
+
+        await until(lambda: all(map(is_linked, NAMES)))
+
+    async def close(self) -> None:
+        """End all daemons."""
+        statuses = await asyncio.gather(*map(end, self._processes.values()))
+        logs = {path.stem: path.read_text() for path in self._folder.glob("*.log")}
+        for name, text in logs.items():
+            print(f"--- {name}\n{text}")
+        assert set(statuses) <= {0}
+        assert not [name for name, text in logs.items() if "Traceback" in text]
+
+
+@asynccontextmanager
+async def flying(*, with_relay: bool = False) -> AsyncIterator[Vehicles]:
+    """Three linked drones; ``with_relay``: they have no addresses, and meet at a relay.
+
+    Their folder has a short name, because the path of a Unix socket has to be short.
+    """
+    with tempfile.TemporaryDirectory(prefix="uavlinkd-") as folder:
+        vehicles = Vehicles(Path(folder), with_relay=with_relay)
+        try:
+            for name in (*NAMES, *([RELAY] if with_relay else [])):
+                vehicles.carry(name)
+                await vehicles.start(name)
+            await vehicles.until_linked()
+            yield vehicles
+        finally:
+            await vehicles.close()
