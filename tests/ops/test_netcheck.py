@@ -1,14 +1,27 @@
-"""``uavlinkd netcheck``: what it concludes from what relays see."""
+"""``uavlinkd netcheck``: what it concludes from what relays see, and from the tokens that arrived."""
 
 from __future__ import annotations
 
+from itertools import product
 from typing import Any
 
 import pytest
 
-from uavlinkd.ops.netcheck import DEPENDENT, INDEPENDENT, MEANINGS, NO_NAT, UNKNOWN, mappings, report
+from uavlinkd.ops.netcheck import (
+    ANY_PEER,
+    FEW_PEERS,
+    MOST_PEERS,
+    ONE_HOST,
+    ONE_VIEW,
+    STABLE_PEERS,
+    Filtered,
+    Mapped,
+    behaviours,
+    meaning,
+    report,
+)
 
-PRIVATE, PUBLIC = "192.168.1.5:5790", "203.0.113.7:40001"
+PRIVATE, PUBLIC, OTHER = "192.168.1.5:5790", "203.0.113.7:40001", "203.0.113.7:40002"
 
 
 def view(relay: str, at: str, seen_as: str, **more: Any) -> dict[str, Any]:
@@ -16,48 +29,103 @@ def view(relay: str, at: str, seen_as: str, **more: Any) -> dict[str, Any]:
     return {"relay": relay, "relay_address": at, "socket": 0, "network": None, "seen_as": seen_as, **more}
 
 
-def answer(*views: dict[str, Any], state: str = "up") -> dict[str, Any]:
+def shown(passes: bool | None, **more: Any) -> dict[str, Any]:
+    """Whether a token of a relay arrived at a socket."""
+    result = {"relay": "one", "relay_address": "a:1", "socket": 0, "network": None, "other_port_passes": passes}
+    return result | more
+
+
+def answer(*views: dict[str, Any], state: str = "up", filtering: tuple[dict[str, Any], ...] = ()) -> dict[str, Any]:
     """A daemon's answer with these views, of the relays that they name."""
     relays = {name: {"state": state, "round_trip_s": 0.0234} for name in ("one", "two")}
-    return {"relays": relays, "views": list(views), "candidates": [PUBLIC, PRIVATE], "own": [PRIVATE]}
+    return {
+        "relays": relays,
+        "views": list(views),
+        "filtering": list(filtering),
+        "candidates": [PUBLIC, PRIVATE],
+        "own": [PRIVATE],
+    }
 
 
 @pytest.mark.parametrize(
-    ("views", "mapping"),
+    ("seen", "mapped"),
     [
-        ((("one", "a:1", PRIVATE),), NO_NAT),
-        ((("one", "a:1", PRIVATE), ("two", "b:1", PRIVATE)), NO_NAT),
-        ((("one", "a:1", PUBLIC),), UNKNOWN),
-        ((("one", "a:1", PUBLIC), ("two", "b:1", PUBLIC)), INDEPENDENT),
-        ((("one", "a:1", PUBLIC), ("one", "a:2", PUBLIC)), INDEPENDENT),
-        ((("one", "a:1", PUBLIC), ("two", "b:1", "203.0.113.7:40002")), DEPENDENT),
+        ({"a:1": PRIVATE}, Mapped.NO_NAT),
+        ({"a:1": PRIVATE, "b:1": PRIVATE}, Mapped.NO_NAT),
+        ({"a:1": PUBLIC}, Mapped.UNKNOWN),
+        ({"a:1": PUBLIC, "b:1": PUBLIC}, Mapped.INDEPENDENT),
+        ({"a:1": PUBLIC, "a:2": PUBLIC}, Mapped.NOT_BY_PORT),
+        ({"a:1": PUBLIC, "a:2": PUBLIC, "b:1": PUBLIC}, Mapped.INDEPENDENT),
+        ({"a:1": PUBLIC, "b:1": OTHER}, Mapped.BY_EITHER),
+        ({"a:1": PUBLIC, "a:2": PUBLIC, "b:1": OTHER}, Mapped.BY_ADDRESS),
+        ({"a:1": PUBLIC, "a:2": OTHER}, Mapped.BY_PORT),
+        ({"[2001:db8::1]:1": PUBLIC, "[2001:db8::1]:2": OTHER}, Mapped.BY_PORT),
+        ({"[2001:db8::1]:1": PUBLIC, "[2001:db8::2]:1": OTHER}, Mapped.BY_EITHER),
     ],
 )
-def test_mapping_follows_from_the_views(views: tuple[tuple[str, str, str], ...], mapping: str) -> None:
-    """Two addresses of relays, or two ports of one, show whether the NAT assigns another port for each."""
-    assert mappings(answer(*(view(*one) for one in views))) == {None: mapping}
+def test_mapping_follows_from_the_views(seen: dict[str, str], mapped: Mapped) -> None:
+    """Two ports of one relay show whether the NAT maps by port; only two hosts show whether it maps by address."""
+    views = [view("one", at, seen_as) for at, seen_as in seen.items()]
+    assert list(behaviours(answer(*views))) == [(None, mapped, Filtered.UNKNOWN)]
 
 
-def test_each_network_has_its_own_mapping() -> None:
+@pytest.mark.parametrize(
+    ("passes", "filtered"),
+    [
+        ((), Filtered.UNKNOWN),
+        ((None,), Filtered.UNKNOWN),
+        ((False, None), Filtered.BY_PORT),
+        ((True, None), Filtered.NOT_BY_PORT),
+        ((False, True), Filtered.NOT_BY_PORT),
+    ],
+)
+def test_filtering_follows_from_the_tokens(passes: tuple[bool | None, ...], filtered: Filtered) -> None:
+    """One that arrives weighs more than one that does not, which a firewall of the relay may have dropped."""
+    results = tuple(shown(one) for one in passes)
+    assert list(behaviours(answer(view("one", "a:1", PRIVATE), filtering=results))) == [
+        (None, Mapped.NO_NAT, filtered)
+    ]
+
+
+def test_each_network_has_its_own_nat() -> None:
     """LTE behind a symmetric NAT, Wi-Fi without one."""
     views = (
         view("one", "a:1", PUBLIC, network="lte"),
-        view("two", "b:1", "203.0.113.7:40002", network="lte"),
+        view("two", "b:1", OTHER, network="lte"),
         view("one", "a:1", PRIVATE, socket=1, network="wifi"),
     )
-    assert mappings(answer(*views)) == {"lte": DEPENDENT, "wifi": NO_NAT}
+    results = (shown(False, network="lte"), shown(True, socket=1, network="wifi"))
+    assert list(behaviours(answer(*views, filtering=results))) == [
+        ("lte", Mapped.BY_EITHER, Filtered.BY_PORT),
+        ("wifi", Mapped.NO_NAT, Filtered.NOT_BY_PORT),
+    ]
+
+
+def test_meaning_uses_mapping_and_filtering() -> None:
+    """Every pair of them has a sentence."""
+    of_each = {pair: meaning(*pair) for pair in product(Mapped, Filtered)}
+    for mapped in (Mapped.NO_NAT, Mapped.INDEPENDENT):
+        assert of_each[mapped, Filtered.NOT_BY_PORT] == ANY_PEER
+        assert of_each[mapped, Filtered.BY_PORT] == MOST_PEERS
+        assert of_each[mapped, Filtered.UNKNOWN] == STABLE_PEERS
+    for filtered in Filtered:
+        changing = (Mapped.BY_ADDRESS, Mapped.BY_EITHER, Mapped.BY_PORT)
+        assert {of_each[mapped, filtered] for mapped in changing} == {FEW_PEERS}
+        assert of_each[Mapped.NOT_BY_PORT, filtered] == ONE_HOST
+        assert of_each[Mapped.UNKNOWN, filtered] == ONE_VIEW
 
 
 def test_report_of_a_machine_behind_nat() -> None:
     """Line by line."""
-    assert list(report(answer(view("one", "192.0.2.1:5790", PUBLIC, network="lte")))) == [
+    seen = view("one", "192.0.2.1:5790", PUBLIC, network="lte")
+    assert list(report(answer(seen, filtering=(shown(False),)))) == [
         "UDP          gets out: 2 of 2 relays answer",
         "relay        one: up, 23 ms",
         "relay        two: up, 23 ms",
         f"seen as      {PUBLIC} by one at 192.0.2.1:5790 on lte",
         "mapping      unknown on lte",
-        f"             {MEANINGS[UNKNOWN]}",
-        "filtering    unknown: relays do not send from a second address",
+        "filtering    address- and port-dependent on lte",
+        f"             {ONE_VIEW}",
         f"candidates   {PUBLIC}, {PRIVATE}",
     ]
 
@@ -72,5 +140,5 @@ def test_report_without_an_answer_says_what_to_do() -> None:
 
 def test_file_without_relays_is_named() -> None:
     """Netcheck needs one."""
-    (line,) = report({"relays": {}, "views": [], "candidates": [], "own": []})
+    (line,) = report({"relays": {}, "views": [], "filtering": [], "candidates": [], "own": []})
     assert "[[relay]]" in line

@@ -365,10 +365,20 @@ def test_relay_shows_its_members_those_that_are_down_first() -> None:
     assert "endpoint" not in text
 
 
+def test_members_of_a_relay_are_printed_whole_on_80_columns() -> None:
+    """A name or address that was cut is of no use."""
+    member = {"is_up": True, "since_s": 5.0, "addresses": ["203.0.113.255:65535"]}
+    counts = {"bound": 1, "waiting": 0, "datagrams": 1_234_567, "over_limit": 0}
+    relay = {"members": {"ground-station": member | counts}, "dropped": {}}
+    text = printed(render_status(status_of({}, endpoints={}, relay=relay)), 80)
+    assert "…" not in text
+    assert "1,234,567" in text
+
+
 def test_relays_of_a_member_have_a_line_each() -> None:
     """With the state of each peer there."""
-    used = {"state": "up", "round_trip_s": 0.0123, "peers": {"drone1": "bound", "drone2": "waiting"}}
-    lost: dict[str, Any] = {"state": "lost", "round_trip_s": None, "peers": {}}
+    used = {"state": "up", "peer": None, "round_trip_s": 0.0123, "peers": {"drone1": "bound", "drone2": "waiting"}}
+    lost: dict[str, Any] = {"state": "lost", "peer": "station", "round_trip_s": None, "peers": {}}
     text = printed(render_status(status_of({}, endpoints={}, relays={"vps": used, "spare": lost})), 120)
     assert "relay vps: up, 12 ms; drone1 bound, drone2 waiting" in text
-    assert "relay spare: lost; no peer uses it" in text
+    assert "relay spare, also the peer station: lost; no peer uses it" in text

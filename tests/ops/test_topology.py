@@ -320,3 +320,23 @@ def test_standard_output_is_the_default(folder: Path, capsys: pytest.CaptureFixt
     config = _load(folder, _FILE)
     print_topology(config)
     assert capsys.readouterr().out == _printed(config)
+
+
+@pytest.mark.parametrize(
+    ("section", "title"),
+    [
+        pytest.param('[[relay]]\naddresses = ["relay.example.org:5790"]', "Relays", id="relay"),
+        pytest.param(
+            "[relay_server]\nenabled = true\n[[member]]", "Members of this relay, and their limits", id="member"
+        ),
+    ],
+)
+def test_key_of_a_relay_or_member_is_printed_whole(folder: Path, section: str, title: str) -> None:
+    """The user compares it with what the other machine printed. What may be a private key is not printed."""
+    public, private = keys.public_key_text(keys.generate_private_key()), keys.generate_private_key()
+    for key in (public, private):
+        printed = _printed(_load(folder, f'{_FILE}{section}\nname = "vps"\npublic_key = "{key}"\n'))
+        rows = printed.partition(title)[2]
+        assert (public in rows) is (key == public)
+        assert ("(private?)" in rows) is (key == private)
+        assert private[:8] not in printed

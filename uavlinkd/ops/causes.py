@@ -19,7 +19,7 @@ class Cause(Reason):
     # The link is down: this machine.
     LISTEN_ADDRESS_MISSING = "listen_address_missing", "an address in listen is not on this machine"
     NETWORK_ABSENT = "network_absent", "a network has no interface or address now"
-    NAME_NOT_RESOLVED = "name_not_resolved", "the peer's host name has no address"
+    NAME_NOT_RESOLVED = "name_not_resolved", "the host name of the peer, or of its relay, has no address"
     OWN_ADDRESS = "own_address", "the peer's address leads to this daemon itself"
     ZONE_MISSING = "zone_missing", "a link-local IPv6 address lacks its network interface"
     FAMILY_MISSING = "family_missing", "no address in listen, or no network, is of the peer's address family"
@@ -57,6 +57,8 @@ class Cause(Reason):
     CLIENT_UNREACHABLE = "client_unreachable", "no process listens at the client's address"
     CLIENT_SILENT = "client_silent", "the endpoint's client sends no MAVLink"
     GARBAGE = "garbage", "the endpoint's client sends bytes that are not MAVLink"
+    NOT_A_MEMBER = "not_a_member", "a sender that knows the relay here is not one of its members"
+    OTHER_RELAY_KEY = "other_relay_key", "a sender has another public key for the relay here"
     RAW_MAVLINK = "raw_mavlink", "bare MAVLink arrives at the port for peers"
     MODEM_REPORTS = "modem_reports", "a radio modem puts RADIO_STATUS between datagrams: its MAVLINK is not 0"
     LINE_NOISE = "line_noise", "many pieces that arrive on a serial network are damaged"
@@ -79,7 +81,7 @@ _WARNINGS = frozenset(
     {
         *(Cause.OTHER_SYSTEM, Cause.COMMANDS_WITHHELD, Cause.COMMANDS_REFUSED, Cause.NO_CLIENT),
         *(Cause.CLIENT_UNREACHABLE, Cause.CLIENT_SILENT, Cause.GARBAGE, Cause.RAW_MAVLINK, Cause.UNDER_LOAD),
-        *(Cause.MODEM_REPORTS, Cause.LINE_NOISE),
+        *(Cause.NOT_A_MEMBER, Cause.OTHER_RELAY_KEY, Cause.MODEM_REPORTS, Cause.LINE_NOISE),
         *(Cause.REFUSED_THERE, Cause.DAEMON_PAUSED, Cause.RECORDING_STOPPED),
     }
 )

@@ -1,32 +1,60 @@
-"""``uavlinkd netcheck``: which relays answer, how NAT maps this daemon's sockets, and what that means.
+"""``uavlinkd netcheck``: which relays answer, how NATs map and filter, and what that means for direct paths.
 
-The terms are those of RFC 4787 and RFC 5780. Relays report the source address that they see; what they cannot show is
-reported as unknown.
+The terms are those of RFC 4787 and RFC 5780. Relays report the source address that they see, and send a token from
+another port; what they cannot show is reported as unknown.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
-from typing import Any, Final
+from enum import StrEnum
+from itertools import combinations
+from typing import Any
 
-NO_NAT: Final = "no NAT"
-INDEPENDENT: Final = "endpoint-independent"
-DEPENDENT: Final = "address- and port-dependent"
-UNKNOWN: Final = "unknown"
 
-MEANINGS: Final = {
-    NO_NAT: "peers can connect directly, unless a firewall in between drops what it did not ask for",
-    INDEPENDENT: "most peers can connect directly. Two ends whose NATs both map like this always can",
-    DEPENDENT: (
-        "a peer can connect directly only if its own NAT, or none, lets any port in. With most others frames stay on"
-        " the relay"
-    ),
-    UNKNOWN: (
-        "one address of one relay cannot show how the NAT maps. Give the relay a second port in its `listen` and in"
-        " the members' `addresses`, or add a second relay"
-    ),
-}
+class Mapped(StrEnum):
+    """Which address a NAT gives to one socket for different destinations (RFC 4787, section 4.1)."""
+
+    NO_NAT = "no NAT"
+    INDEPENDENT = "endpoint-independent"
+    NOT_BY_PORT = "endpoint-independent or address-dependent"
+    BY_ADDRESS = "address-dependent"
+    BY_EITHER = "address-dependent or address- and port-dependent"
+    BY_PORT = "address- and port-dependent"
+    UNKNOWN = "unknown"
+
+
+class Filtered(StrEnum):
+    """What a NAT or a firewall lets in (RFC 4787, section 5)."""
+
+    NOT_BY_PORT = "endpoint-independent or address-dependent"
+    BY_PORT = "address- and port-dependent"
+    UNKNOWN = "unknown"
+
+
+STABLE = frozenset((Mapped.NO_NAT, Mapped.INDEPENDENT))
+"""Peers see the same port as relays do."""
+CHANGING = frozenset((Mapped.BY_ADDRESS, Mapped.BY_EITHER, Mapped.BY_PORT))
+
+ANY_PEER = "every peer that UDP reaches can connect directly, also from behind a NAT that changes ports"
+MOST_PEERS = "a peer can connect directly, unless its own NAT changes ports for each destination"
+STABLE_PEERS = (
+    "a peer can connect directly, if its own NAT does not change ports for each destination. What is let in here is"
+    " unknown: no relay could show it"
+)
+FEW_PEERS = (
+    "a peer can connect directly only if its own NAT or firewall does not filter by port. With most others, frames"
+    " stay on the relay"
+)
+ONE_VIEW = (
+    "one address of one relay cannot show how the NAT maps. Give the relay a second port in its `listen` and in the"
+    " members' `addresses`, or add a second relay"
+)
+ONE_HOST = (
+    "peers can probably connect directly. One relay cannot show whether the NAT changes ports for each address: add a"
+    " second relay on another host"
+)
 
 Answer = Mapping[str, Any]
 
@@ -45,28 +73,65 @@ def report(answer: Answer) -> Iterator[str]:
     for view in answer["views"]:
         network = f" on {view['network']}" if view["network"] else ""
         yield f"seen as      {view['seen_as']} by {view['relay']} at {view['relay_address']}{network}"
-    for where, mapping in mappings(answer).items():
-        yield f"mapping      {mapping} on {where}" if where else f"mapping      {mapping}"
-        yield f"             {MEANINGS[mapping]}"
-    yield "filtering    unknown: relays do not send from a second address"
+    for where, mapped, filtered in behaviours(answer):
+        on_network = f" on {where}" if where else ""
+        yield f"mapping      {mapped}{on_network}"
+        yield f"filtering    {filtered}{on_network}"
+        yield f"             {meaning(mapped, filtered)}"
     yield f"candidates   {', '.join(answer['candidates']) or 'none'}"
     if not up:
-        yield "No relay answers: compare addresses and public_key with the relay, and let UDP through the firewalls"
+        yield (
+            "No relay answers: compare addresses and public_key with the relay, write a [[member]] for this daemon"
+            " there, and let UDP through the firewalls"
+        )
 
 
-def mappings(answer: Answer) -> dict[str | None, str]:
-    """The mapping behaviour (RFC 4787, section 4.1) in front of each network, as far as the views show it."""
-    by_socket = defaultdict[int, dict[str, str]](dict)
+def behaviours(answer: Answer) -> Iterator[tuple[str | None, Mapped, Filtered]]:
+    """Mapping and filtering in front of each socket, with the name of its network, as far as relays show them."""
+    seen = defaultdict[int, dict[str, str]](dict)
     networks: dict[int, str | None] = {}
+    passes = defaultdict[int, set[bool | None]](set)
     for view in answer["views"]:
-        by_socket[view["socket"]][view["relay_address"]] = view["seen_as"]
+        seen[view["socket"]][view["relay_address"]] = view["seen_as"]
         networks[view["socket"]] = view["network"]
-    return {networks[socket]: _mapping(seen, answer["own"]) for socket, seen in by_socket.items()}
+    for result in answer["filtering"]:
+        passes[result["socket"]].add(result["other_port_passes"])
+    for socket, by_relay in seen.items():
+        yield networks[socket], _mapped(by_relay, answer["own"]), _filtered(passes[socket])
 
 
-def _mapping(seen: Mapping[str, str], own: list[str]) -> str:
+def _mapped(seen: Mapping[str, str], own: list[str]) -> Mapped:
     if all(place in own for place in seen.values()):
-        return NO_NAT
-    if len(seen) < 2:
-        return UNKNOWN
-    return INDEPENDENT if len(set(seen.values())) == 1 else DEPENDENT
+        return Mapped.NO_NAT
+    pairs = [(_host(one) == _host(other), seen[one] == seen[other]) for one, other in combinations(seen, 2)]
+    at_one_host = [is_same for is_one_host, is_same in pairs if is_one_host]
+    at_others = [is_same for is_one_host, is_same in pairs if not is_one_host]
+    if not all(at_one_host):
+        return Mapped.BY_PORT
+    if at_others:
+        return Mapped.INDEPENDENT if all(at_others) else Mapped.BY_ADDRESS if at_one_host else Mapped.BY_EITHER
+    return Mapped.NOT_BY_PORT if at_one_host else Mapped.UNKNOWN
+
+
+def _host(address: str) -> str:
+    return address.rpartition(":")[0]
+
+
+def _filtered(passes: set[bool | None]) -> Filtered:
+    """A token that arrives is evidence. One that does not may have been dropped at the relay."""
+    if True in passes:
+        return Filtered.NOT_BY_PORT
+    return Filtered.BY_PORT if False in passes else Filtered.UNKNOWN
+
+
+def meaning(mapped: Mapped, filtered: Filtered) -> str:
+    """What both mean for direct paths."""
+    if mapped in CHANGING:
+        return FEW_PEERS
+    if mapped in STABLE:
+        return {
+            Filtered.NOT_BY_PORT: ANY_PEER,
+            Filtered.BY_PORT: MOST_PEERS,
+            Filtered.UNKNOWN: STABLE_PEERS,
+        }[filtered]
+    return ONE_HOST if mapped is Mapped.NOT_BY_PORT else ONE_VIEW

@@ -33,7 +33,10 @@ def ping(ask: Callable[[], Answer], count: int, write: Callable[[str], None], sl
             answered |= is_answered(path)
             write(printable(f"{number}: {describe(path)}"))
         if not answer["paths"]:
-            write(f"{number}: no path is known: the peer has not connected, or no relay has bound it")
+            write(
+                f"{number}: no path is known: the peer has not connected, or no relay has bound it;"
+                " `uavlinkd status` names the cause"
+            )
     return answered
 
 

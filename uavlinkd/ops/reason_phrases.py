@@ -49,7 +49,11 @@ DATAGRAMS: Final[Mapping[str, str]] = {
     "frames_not_allowed": "with frames of a relay or a member",
     "relay_malformed": "malformed along a relay",
     "relay_unknown_handle": "of an unknown handle of a relay",
+    "relay_unexpected_token": "with tokens that no relay was asked for",
     "relay_over_limit": "above a member's limit",
+    "record_over_limit": "with wishes above a member's limit",
+    "unexpected_record": "with records that are not for this daemon",
+    "old_record": "with records older than others",
     "relay_over_total": "above the limit of all members together",
 }
 """Of dropped datagrams and outgoing frames (``DropReason``)."""

@@ -21,6 +21,10 @@ _OF_MEMBER: Final = {
         "Members that the member asks for, and that do not ask for it or are absent.",
     ),
     "binds_ignored": ("relay_member_ignored_binds_total", "Binds of the member above its limits."),
+    "filter_tests_ignored": (
+        "relay_member_ignored_filter_tests_total",
+        "Filter tests of the member above its limit, or along a path that is not validated.",
+    ),
     "datagrams": ("relay_member_forwarded_datagrams_total", "Datagrams of the member that were forwarded."),
     "bytes": ("relay_member_forwarded_bytes_total", "Bytes of these datagrams."),
     "over_limit": ("relay_member_over_limit_total", "Datagrams of the member that were dropped above its limits."),

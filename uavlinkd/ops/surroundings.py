@@ -184,7 +184,12 @@ def _named(config: Config) -> list[tuple[str, Address]]:
         for written in peer.addresses
         if not written.is_serial
     ]
-    wanted += [(f'relay "{relay.name}"', written.address) for relay in config.relays for written in relay.addresses]
+    wanted += [
+        (f'relay "{relay.name}"', written.address)
+        for relay in config.relays
+        if relay.peer is None
+        for written in relay.addresses
+    ]
     wanted += [
         (f'endpoint "{endpoint.name}"', endpoint.url.address)
         for endpoint in config.endpoints

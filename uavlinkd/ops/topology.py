@@ -20,7 +20,7 @@ from uavlinkd.core.settings import Link
 from uavlinkd.core.wire import LONG_HEADER_BYTES, SHORT_HEADER_BYTES, initiation_bytes, response_bytes
 from uavlinkd.ops.network_report import NetworkReport
 from uavlinkd.ops.policy_table import review
-from uavlinkd.ops.relay_table import members_configured
+from uavlinkd.ops.relay_table import members_configured, relays_configured
 
 _PLAIN_WIDTH = 100
 """Columns of the output if it is not a terminal: a pipe has no width."""
@@ -60,6 +60,8 @@ def describe(config: Config, lacks: Sequence[str] = (), networks: NetworkReport 
     if config.peers:
         parts += [_heading("Peers"), _peers(config), _heading("Bytes in a datagram"), _sizes(config)]
         parts += [_heading("Sending to a peer"), _pace(config)]
+    if config.relays:
+        parts += [_heading("Relays"), relays_configured(config.relays)]
     if config.endpoints:
         parts += [_heading("Local endpoints"), _endpoints(config)]
     if config.relay_server is not None:

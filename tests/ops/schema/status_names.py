@@ -102,12 +102,14 @@ async def observed() -> Seen:
         ]
         relay.add_peer(b, [b.address])
         b.add_peer(relay, [relay.address])
+        b.config["relay"] = [{"name": "station", "public_key": relay.public_key, "addresses": []}]
         await b.stop()
         await stage.start(far, linked=False)
         statuses.append(await far.status())
         await stage.start(relay, b, linked=False)
         statuses.append(await far.until(lambda status: bool(status["relays"]["vps"]["seen_as"])))
         statuses.append(await relay.until(lambda status: bool(status["relay"]["members"]["drone1"]["addresses"])))
+        statuses.append(await b.until(lambda status: bool(status["peers"][a.name]["refused_there"])))
     findings = [Finding("cause", Severity.FAULT, Subject.PEER, "name", "text", "remedy").as_json()]
     types: dict[str, set[str]] = {name: {kind} for name, kind in ALSO.items()}
     for status in statuses:
