@@ -149,7 +149,7 @@ class TakesAnyKey(dict[tuple[bytes, bytes], Peer]):
 def test_a_victim_without_the_static_key_check_takes_an_impostor_for_its_peer() -> None:
     """The same keys, refused above, get a session and deliver frames as b: the check made the difference."""
     victim = Victim()
-    victim.node._by_keys = TakesAnyKey(victim.node._by_keys)
+    victim.node._handshakes.peers = TakesAnyKey(victim.node._handshakes.peers)
     achieved = victim.suffer(impostor(OWN, PSK), 1.0)
     assert achieved.sessions == 1
     assert achieved.frames_sent > 0

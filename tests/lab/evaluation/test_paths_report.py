@@ -232,6 +232,7 @@ def test_no_text_of_a_figure_covers_another() -> None:
         assert overlaps(boxes) == []
 
 
+@pytest.mark.long
 def test_report_is_made_again_from_the_records(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Figures, HTML, Markdown and page, and the same bytes each time."""
     need(find_spec("matplotlib") is not None, "matplotlib, for the figures")

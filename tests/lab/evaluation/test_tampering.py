@@ -11,7 +11,6 @@ import pytest
 
 from tests.lab.evaluation.quick_runs import run_quickly
 from uavlinkd.lab.evaluation import tampering_plan as plans
-from uavlinkd.lab.evaluation.hostile_relay import RELAY_ATTACKS
 from uavlinkd.lab.evaluation.paper_attacks import CHANGES
 from uavlinkd.lab.evaluation.tampering_bench import TamperingSettings
 from uavlinkd.lab.evaluation.tampering_line import LINE_PLANS
@@ -27,6 +26,7 @@ from uavlinkd.lab.evaluation.tampering_records import (
     read_run,
 )
 from uavlinkd.lab.evaluation.tampering_relay import RELAYED_PLANS
+from uavlinkd.lab.hostile.relay_attacks import RELAY_ATTACKS
 from uavlinkd.lab.mitm.attack import AttackContext
 from uavlinkd.lab.mitm.attacks import ATTACKS, parse_attack
 from uavlinkd.lab.mitm.line_attacks import LINE_ATTACKS, parse_line_attack
@@ -155,6 +155,7 @@ async def test_quick_run(tmp_path: Path) -> None:
         ("relay misdelivers envelopes", "unknown_index"),
         ("relay invents handles", "relay_unknown_handle"),
         ("relay sends frames of its own", "frames_not_allowed"),
+        ("relay lies about filters", "relay_unexpected_token"),
     ):
         assert by_name[name].reasons[reason] > 0
     (flood,) = run.floods

@@ -12,7 +12,7 @@ from uavlinkd.core.cookie import MacKeys
 from uavlinkd.core.suites import SUITES, Suite
 from uavlinkd.lab.mitm import anatomy
 from uavlinkd.lab.mitm.anatomy import DatagramKind, envelope_of, kind_of, message_ids, parts_of, with_mac1
-from uavlinkd.lab.mitm.attacks.forgery import _COMMANDS
+from uavlinkd.lab.mitm.attacks.forgery import COMMAND_FRAMES
 
 CONVERSATION = converse()
 
@@ -88,7 +88,7 @@ def test_cookie_shows_in_mac2() -> None:
 def test_frames_of_the_attackers_own_are_mavlink() -> None:
     """What raw-mavlink and forge-data send is what an autopilot would obey, as pymavlink reads it."""
     parser = mavlink.MAVLink(None)
-    read = {name: parser.decode(bytearray(frame)) for name, frame in _COMMANDS}
+    read = {name: parser.decode(bytearray(frame)) for name, frame in COMMAND_FRAMES}
     assert read["HEARTBEAT"].get_type() == "HEARTBEAT"
     assert (read["disarm"].command, read["disarm"].param1) == (mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0)
     termination = read["flight termination"]

@@ -17,10 +17,10 @@ from uavlinkd.core.drops import Drop
 from uavlinkd.core.drops import DropReason as Reason
 from uavlinkd.core.echo_requests import EchoRequests
 from uavlinkd.core.indices import Indices
-from uavlinkd.core.node import Node
 from uavlinkd.core.path import Path
 from uavlinkd.core.path_state import PathState
 from uavlinkd.core.peer import Peer
+from uavlinkd.core.receive_handshake import HandshakeReceiver
 from uavlinkd.core.replay import ReplayWindow
 from uavlinkd.core.settings import Link, Timers
 from uavlinkd.core.verification import Verification
@@ -217,7 +217,7 @@ def test_receiver_without_mac1_check_answers_strangers(monkeypatch: pytest.Monke
 @pytest.mark.parametrize("origin", ["sender", "stranger"])
 def test_receiver_without_memory_of_initiations_answers_replays(origin: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each replay costs a handshake and an index, but the session in use continues."""
-    monkeypatch.setattr(Node, "_remember", lambda *_: None)
+    monkeypatch.setattr(HandshakeReceiver, "remember", lambda *_: None)
     stage = _stage(FAST)
     answered: list[bytes] = []
 

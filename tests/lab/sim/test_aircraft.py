@@ -17,6 +17,7 @@ from uavlinkd.lab.sim.real_autopilot import Firmware, RealAutopilotError
 from uavlinkd.lab.sim.vehicle import Axes, GeoPoint
 
 
+@pytest.mark.long
 async def test_our_simulator_takes_off_and_follows_a_path(tmp_path: Path) -> None:
     """It climbs to the altitude, then comes near to each point; every frame is reported."""
     frames: list[bytes] = []

@@ -59,8 +59,8 @@ class ThievingNode(Node):
 
     def __init__(self, identity: KeyPair, now: float) -> None:
         super().__init__(Secret(os.urandom(32)), os.urandom, now)
-        self._identity = identity
-        self._mac_keys = MacKeys(identity.public)
+        own = self._handshakes.own
+        own.identity, own.mac_keys = identity, MacKeys(identity.public)
 
 
 @dataclass(frozen=True, slots=True)

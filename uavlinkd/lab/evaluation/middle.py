@@ -207,7 +207,7 @@ class MiddleHere:
         """Replace the attacks."""
         now = monotonic()
         made = [
-            parse_attack(text).make(self.context, f"{self._seed} {position}", now)
+            parse_attack(text).place(self.context, f"{self._seed} {position}", now)
             for position, text in enumerate(specs)
         ]
         self.proxy.change_attacks([*made, *objects])

@@ -191,7 +191,7 @@ class DaemonStage(Stage):
     async def open(self) -> None:
         """Configure and start the daemons, the man in the middle, and a client of each daemon."""
         self._configure()
-        await self.middle.start({name: drone.port for name, drone in self.drones.items()}, self.public_keys)
+        await self.middle.start(*self.attacked())
         loop = asyncio.get_running_loop()
         for name in self.names:
             sock = self._clients[name] = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -201,6 +201,10 @@ class DaemonStage(Stage):
         for drone in self.drones.values():
             await drone.start()
         await self._until_up(*self.names)
+
+    def attacked(self) -> tuple[dict[str, int], dict[str, bytes]]:
+        """The ports and public keys of what the man in the middle is between, by name."""
+        return {name: drone.port for name, drone in self.drones.items()}, self.public_keys
 
     def _configure(self) -> None:
         for one in self.names:
@@ -214,7 +218,7 @@ class DaemonStage(Stage):
                 self.drones[one].share_psk(psk, file)
                 settings = {"addresses": self.addresses(one, other), **self.rules(one, other)}
                 peers.append(self.drones[other].as_peer("", file, **settings))
-            self.drones[one].configure(self._link, peers, self.networks(one), self.relays())
+            self.drones[one].configure(self._link, peers, self.networks(one), self.relays(one))
 
     def addresses(self, one: str, other: str) -> list[object]:
         """The addresses where one drone reaches another: in front of the man in the middle."""
@@ -229,8 +233,9 @@ class DaemonStage(Stage):
         del name
         return []
 
-    def relays(self) -> list[dict[str, object]]:
-        """The relays of every drone; by default it uses no relay."""
+    def relays(self, name: str) -> list[dict[str, object]]:
+        """The relays of a drone; by default it uses none."""
+        del name
         return []
 
     def rules(self, one: str, other: str) -> dict[str, object]:

@@ -19,7 +19,6 @@ from uavlinkd.core.drops import DropReason
 from uavlinkd.lab.child_processes import private_folder
 from uavlinkd.lab.evaluation import tampering_plan as plans
 from uavlinkd.lab.evaluation.flood import run_floods
-from uavlinkd.lab.evaluation.hostile_relay import HostileRelay
 from uavlinkd.lab.evaluation.machine import load, machine_facts
 from uavlinkd.lab.evaluation.member_trial import as_trial, run_attacks
 from uavlinkd.lab.evaluation.middle import MiddleHere, MiddleProcess
@@ -33,7 +32,7 @@ from uavlinkd.lab.evaluation.tampering_log import write_logs
 from uavlinkd.lab.evaluation.tampering_paths import PATH_PLANS, PATHS, TwoPathStage
 from uavlinkd.lab.evaluation.tampering_plan import TrialPlan
 from uavlinkd.lab.evaluation.tampering_records import OURS, PAPER, RELAY, Run, Verdict
-from uavlinkd.lab.evaluation.tampering_relay import RELAYED, RELAYED_PLANS, RelayStage
+from uavlinkd.lab.evaluation.tampering_relay import RELAYED, RELAYED_PLANS, MiddleRelay, RelayStage
 
 NAME = "tampering"
 PAIR = ("drone0", "drone1")
@@ -242,7 +241,7 @@ class Evaluation:
         folder = self._folder / RELAYED
         folder.mkdir()
         self._links[RELAYED] = RELAY_LINK
-        relay = HostileRelay(TRIO, self._log(RELAYED), self.settings.seed)
+        relay = MiddleRelay(TRIO, self._log(RELAYED), self.settings.seed)
         stage = RelayStage(TRIO, folder, relay, RELAY_LINK, rate_hz=self.settings.rate_hz / 4)
 
         async def work(bench: Bench) -> None:

@@ -196,6 +196,9 @@ class Options(BaseModel):
     share: float = Field(1.0, gt=0, le=1, description="share of the matching datagrams that are attacked")
     skip: int = Field(0, ge=0, description="number of matching datagrams that pass first")
     limit: int | None = Field(None, ge=1, description="maximum number of attacked datagrams")
+    inside: bool = Field(
+        False, description="attack what is inside data along a relay, between a member and its relay"
+    )
 
 
 O = TypeVar("O", bound=Options)  # noqa: E741

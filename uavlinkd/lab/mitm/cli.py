@@ -7,21 +7,26 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import math
-import os
 import sys
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TypeVar
 
 from uavlinkd import __version__
 from uavlinkd.endpoints.sockets import BindError
 from uavlinkd.lab.mitm.attack import AttackError
 from uavlinkd.lab.mitm.attacks import list_attacks, parse_attack
-from uavlinkd.lab.mitm.console import FAILED, OK, WRONG, fail, run_until_stopped, send_request
+from uavlinkd.lab.mitm.console import (
+    OK,
+    WRONG,
+    add_attack_options,
+    fail,
+    print_list,
+    read_by,
+    run_until_stopped,
+    send_request,
+)
 from uavlinkd.lab.mitm.modem_cli import modem_main
-from uavlinkd.lab.mitm.proxy import REQUESTS, Proxy
+from uavlinkd.lab.mitm.proxy import Proxy
 from uavlinkd.lab.mitm.proxy_settings import (
     ProxySettings,
     SettingsError,
@@ -42,23 +47,10 @@ the address 127.0.0.1:5801; in drone1's, drone0 has 127.0.0.1:5802:
       --link drone0@127.0.0.1:5801,drone1@127.0.0.1:5802 --attack replay-data,share=0.1 --radio loss=0.05,delay_s=0.02
 
 `uavlink-mitm modem --help`: emulated telemetry modems between two serial ports, and attacks on the line.
+`uavlink-mitm relay --help`: a relay that attacks its members.
 
 Attack only your own links.
 """
-
-_Parsed = TypeVar("_Parsed")
-
-
-def _read_by(parse: Callable[[str], _Parsed]) -> Callable[[str], _Parsed]:
-    """An argparse type that shows the error message of ``parse``."""
-
-    def read(text: str) -> _Parsed:
-        try:
-            return parse(text)
-        except ValueError as error:
-            raise argparse.ArgumentTypeError(str(error)) from None
-
-    return read
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -69,14 +61,13 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"uavlink-mitm {__version__}")
-    parser.add_argument("--list", action="store_true", help="list the attacks and their parameters")
     parser.add_argument(
         "--config", metavar="FILE", type=Path, help="read the settings of the options below from FILE"
     )
     parser.add_argument(
         "--peer",
         metavar="NAME=HOST:PORT[,KEY]",
-        type=_read_by(parse_peer),
+        type=read_by(parse_peer),
         action="append",
         default=[],
         help="a daemon; with its public key, attacks can compute a valid mac1",
@@ -84,36 +75,21 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--link",
         metavar="A@HOST:PORT,B@HOST:PORT",
-        type=_read_by(parse_link),
+        type=read_by(parse_link),
         action="append",
         default=[],
         help="listening addresses: where A reaches B, and where B reaches A",
     )
     parser.add_argument(
-        "--attack",
-        metavar="NAME[,key=value]",
-        type=_read_by(parse_attack),
-        action="append",
-        default=[],
-        help="an attack; repeat it for a chain in which each attack gets the output of the one before",
-    )
-    parser.add_argument(
         "--radio",
         metavar="key=value[,key=value]",
-        type=_read_by(parse_radio),
+        type=read_by(parse_radio),
         action="append",
         default=[],
         help="an emulated radio behind the attacks: loss, delay_s, jitter_s, bits_per_s and so on",
     )
-    parser.add_argument("--seed", type=int, metavar="N", help="equal seeds cause equal attacks (default: 0)")
-    parser.add_argument("--log", metavar="FILE", type=Path, help="append each intervention to FILE, in JSON lines")
     parser.add_argument("--control-socket", metavar="PATH", type=Path, help="answer the requests of --ask at PATH")
-    parser.add_argument("--seconds", type=float, metavar="N", help="stop after N seconds")
-    parser.add_argument(
-        "--ask",
-        metavar="REQUEST",
-        help=f"send a request to the running process by its --control-socket: {REQUESTS}",
-    )
+    add_attack_options(parser, parse_attack)
     return parser
 
 
@@ -124,9 +100,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return modem_main(words[1:])
     options = _parser().parse_args(words)
     if options.list:
-        return _list()
-    if options.seconds is not None and not (math.isfinite(options.seconds) and options.seconds > 0):
-        return fail("--seconds must be a number above 0", WRONG)
+        return print_list(list_attacks())
     try:
         settings = load_proxy_settings(options.config) if options.config is not None else ProxySettings((), ())
         settings = overridden(
@@ -166,13 +140,3 @@ async def run(settings: ProxySettings, seconds: float | None = None) -> None:
     """
     proxy = Proxy(settings)
     await run_until_stopped(proxy, seconds, lambda: None)
-
-
-def _list() -> int:
-    try:
-        print(list_attacks(), flush=True)
-    except BrokenPipeError:  # standard output was closed: `uavlink-mitm --list | head`
-        with suppress(OSError):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return FAILED
-    return OK

@@ -1,21 +1,78 @@
-"""What the commands of ``uavlink-mitm`` share: exit statuses, requests to a running one, and a run until a signal."""
+"""What the commands of ``uavlink-mitm`` share: options, exit statuses, requests, and a run until a signal."""
 
 from __future__ import annotations
 
+import argparse
 import asyncio
 import json
+import math
+import os
 import sys
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Protocol, TypeVar
 
+from uavlinkd.lab.mitm.attack_requests import REQUESTS
+from uavlinkd.lab.mitm.attacks import AttackSpec
 from uavlinkd.ops.control import ControlError, ask
 from uavlinkd.system.signals import on_signal
 from uavlinkd.system.terminal import printable
 
 OK, FAILED, WRONG = 0, 1, 2
 _Result = TypeVar("_Result")
+_Parsed = TypeVar("_Parsed")
+
+
+def read_by(parse: Callable[[str], _Parsed]) -> Callable[[str], _Parsed]:
+    """An argparse type that shows the error message of ``parse``."""
+
+    def read(text: str) -> _Parsed:
+        try:
+            return parse(text)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(str(error)) from None
+
+    return read
+
+
+def add_attack_options(parser: argparse.ArgumentParser, parse: Callable[[str], AttackSpec]) -> None:
+    """Add the options of every attacker. ``parse`` reads an attack."""
+    parser.add_argument("--list", action="store_true", help="list the attacks and their parameters")
+    parser.add_argument(
+        "--attack",
+        metavar="NAME[,key=value]",
+        type=read_by(parse),
+        action="append",
+        default=[],
+        help="an attack; repeat it for a chain in which each attack gets the output of the one before",
+    )
+    parser.add_argument("--seed", type=int, metavar="N", help="equal seeds cause equal attacks (default: 0)")
+    parser.add_argument("--log", metavar="FILE", type=Path, help="append each intervention to FILE, in JSON lines")
+    parser.add_argument("--seconds", metavar="N", type=read_by(_seconds), help="stop after N seconds")
+    parser.add_argument(
+        "--ask",
+        metavar="REQUEST",
+        help=f"send a request to the running process by its control socket: {REQUESTS}",
+    )
+
+
+def _seconds(text: str) -> float:
+    seconds = float(text)
+    if not (math.isfinite(seconds) and seconds > 0):
+        raise ValueError("must be a number above 0")
+    return seconds
+
+
+def print_list(text: str) -> int:
+    """Print to standard output, which may be closed: `uavlink-mitm --list | head`. Returns the exit status."""
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        with suppress(OSError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return FAILED
+    return OK
 
 
 class Service(Protocol):

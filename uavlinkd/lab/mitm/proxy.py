@@ -12,7 +12,7 @@ import socket
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import replace
+from functools import partial
 from time import monotonic
 
 import structlog
@@ -20,8 +20,9 @@ import structlog
 from uavlinkd.endpoints.reader import DATAGRAMS_PER_WAKE_UP, RECEIVE_BYTES
 from uavlinkd.endpoints.sockets import BindError, udp_socket
 from uavlinkd.lab.mitm.amplification import Amplification
-from uavlinkd.lab.mitm.attack import NEVER, Action, AttackContext, AttackError, AttackObject, Direction, Intervention
-from uavlinkd.lab.mitm.attacks import parse_attack
+from uavlinkd.lab.mitm.attack import NEVER, Action, AttackContext, AttackObject, Direction, Intervention
+from uavlinkd.lab.mitm.attack_requests import MAX_REQUEST_BYTES, answer_request
+from uavlinkd.lab.mitm.attacks import AttackSpec, parse_attack
 from uavlinkd.lab.mitm.channel import AttackChannel
 from uavlinkd.lab.mitm.journal import Journal
 from uavlinkd.lab.mitm.proxy_settings import ProxySettings
@@ -29,9 +30,6 @@ from uavlinkd.lab.mitm.radio import RadioSettings
 from uavlinkd.ops.control import ControlServer
 from uavlinkd.system.addresses import Address
 
-REQUESTS = '"statistics", "pause", "resume", "stop", "attack none" or "attack NAME,key=value ..."'
-MAX_REQUEST_BYTES = 4096
-"""Of the control socket: enough for several attacks with all their parameters."""
 LOOP_TICK_S = 0.001
 """An event loop may fire a timer up to one clock tick early."""
 
@@ -83,14 +81,15 @@ class Proxy:
         """
         self._began_at = self._now = monotonic()
         self._loop = asyncio.get_running_loop()
-        attacks = self._make_attacks() if self._attacks is None else self._attacks
+        attacks = self._make(self.settings.attacks) if self._attacks is None else self._attacks
         radios = self.settings.radio_of()
         self.channel = AttackChannel(self.context, attacks, radios, self.settings.seed, self._now)
         try:
             await self._resolve()
             self._bind()
             if self.settings.control_socket is not None:
-                self._control = ControlServer(self.settings.control_socket, self._answer, MAX_REQUEST_BYTES)
+                answer = partial(answer_request, self)
+                self._control = ControlServer(self.settings.control_socket, answer, MAX_REQUEST_BYTES)
                 await self._control.start()
             self.journal = Journal(self.settings.log, self.log, self._now, self.settings.log_detail)
         except BaseException:
@@ -122,10 +121,10 @@ class Proxy:
         self.journal.event("mitm_stopped", monotonic(), **statistics)
         self.journal.close()
 
-    def _make_attacks(self) -> list[AttackObject]:
+    def _make(self, specs: Sequence[AttackSpec]) -> list[AttackObject]:
         return [
-            spec.make(self.context, f"{self.settings.seed} {position}", self._now)
-            for position, spec in enumerate(self.settings.attacks)
+            spec.place(self.context, f"{self.settings.seed} {position}", self._now)
+            for position, spec in enumerate(specs)
         ]
 
     async def _resolve(self) -> None:
@@ -150,6 +149,16 @@ class Proxy:
             sock.close()
         self._sockets.clear()
         self._strangers.clear()
+
+    def attack(self, texts: Sequence[str]) -> list[str]:
+        """Replace the attacks by those that the texts select, and return their names.
+
+        Raises:
+            AttackError: unknown attack or wrong parameters. The former attacks continue.
+        """
+        self._now = monotonic()
+        self.change_attacks(self._make([parse_attack(text) for text in texts]))
+        return self._names()
 
     def change_attacks(self, attacks: Sequence[AttackObject]) -> None:
         """Replace the attacks. Datagrams that the old ones hold are lost."""
@@ -205,32 +214,6 @@ class Proxy:
 
     def _names(self) -> list[str]:
         return [attack.name for attack in self.channel.attacks]
-
-    def _answer(self, request: str) -> dict[str, object]:
-        match request.split():
-            case ["statistics"]:
-                return self.statistics()
-            case ["pause"]:
-                self.pause()
-            case ["resume"]:
-                self.resume()
-            case ["stop"]:
-                self.stopping.set()
-            case ["attack", first, *others]:
-                return self._attack([first, *others])
-            case _:
-                return {"refused": f"there is no request {request!r}: write {REQUESTS}"}
-        return {"done": request}
-
-    def _attack(self, words: list[str]) -> dict[str, object]:
-        try:
-            specs = () if words == ["none"] else tuple(map(parse_attack, words))
-            self._now = monotonic()
-            self.settings = replace(self.settings, attacks=specs)
-            self.change_attacks(self._make_attacks())
-        except AttackError as error:
-            return {"refused": str(error)}
-        return {"done": "attack", "attacks": self._names()}
 
     # Datagrams.
 

@@ -34,6 +34,8 @@ class DroneProcess:
         endpoint_port: the port for its autopilot, on loopback.
     """
 
+    command = "run"
+
     def __init__(self, name: str, folder: Path, port: int, endpoint_port: int) -> None:
         self.name = name
         self.folder = folder
@@ -68,17 +70,22 @@ class DroneProcess:
     ) -> None:
         """Write the configuration: the ``[link]`` section, each ``[[peer]]``, ``[[network]]`` and ``[[relay]]``."""
         has_interfaces = any("serial" not in network for network in networks)
-        top = {
-            "name": self.name,
-            "private_key_file": "drone.key",
-            "listen": [f"{'0.0.0.0' if has_interfaces else '127.0.0.1'}:{self.port}"],
-            "control_socket": self.socket.name,
-        }
         endpoint = {"name": "autopilot", "url": f"udpin:127.0.0.1:{self.endpoint_port}"}
-        tables = [("", top), ("[link]", link), ("[[endpoint]]", endpoint)]
+        tables = [("[link]", link), ("[[endpoint]]", endpoint)]
         tables += [("[[network]]", network) for network in networks]
         tables += [("[[relay]]", relay) for relay in relays]
         tables += [("[[peer]]", peer) for peer in peers]
+        self.write(tables, "0.0.0.0" if has_interfaces else "127.0.0.1")
+
+    def write(self, sections: Sequence[tuple[str, Mapping[str, object]]], host: str = "127.0.0.1") -> None:
+        """Write the configuration: the name, the key, the sockets, then these sections."""
+        top = {
+            "name": self.name,
+            "private_key_file": "drone.key",
+            "listen": [f"{host}:{self.port}"],
+            "control_socket": self.socket.name,
+        }
+        tables = [("", top), *sections]
         lines = [f"{name}\n" + "".join(f"{key} = {_toml(value)}\n" for key, value in t.items()) for name, t in tables]
         (self.folder / "drone.toml").write_text("\n".join(lines).lstrip(), encoding="utf-8")
 
@@ -103,7 +110,7 @@ class DroneProcess:
         with self.log.open("ab") as log:
             self._process = await asyncio.create_subprocess_exec(
                 *end_with_parent(
-                    *_interpreter(), "-m", "uavlinkd", "run", "--config", str(self.folder / "drone.toml")
+                    *_interpreter(), "-m", "uavlinkd", self.command, "--config", str(self.folder / "drone.toml")
                 ),
                 stdin=asyncio.subprocess.DEVNULL,
                 stdout=log,

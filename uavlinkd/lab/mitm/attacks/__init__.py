@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
 from random import Random
@@ -11,8 +11,9 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from uavlinkd.lab.mitm.attack import Attack, AttackContext, AttackError, Options, describe_options
+from uavlinkd.lab.mitm.attack import Attack, AttackContext, AttackError, AttackObject, Options, describe_options
 from uavlinkd.lab.mitm.attacks import floods, forgery, key_exchange, replays, roaming, stretch, withholding
+from uavlinkd.lab.mitm.inside import InsideData
 
 _ALL: tuple[type[Attack[Any]], ...] = (
     key_exchange.TamperKey,
@@ -72,8 +73,13 @@ ATTACKS: Mapping[str, type[Attack[Any]]] = MappingProxyType({attack.name: attack
 class AttackSpec:
     """A selected attack and its validated parameters."""
 
-    name: str
+    kind: type[Attack[Any]]
     options: Options
+
+    @property
+    def name(self) -> str:
+        """The name of the attack."""
+        return self.kind.name
 
     def __str__(self) -> str:
         options = self.options.model_dump(exclude_unset=True)
@@ -85,26 +91,33 @@ class AttackSpec:
         Raises:
             AttackError: the attack needs another peer or a public key.
         """
-        return ATTACKS[self.name](self.options, context, Random(f"{self.name} {seed}"), now)  # noqa: S311  not a secret
+        return self.kind(self.options, context, Random(f"{self.name} {seed}"), now)  # noqa: S311  not a secret
+
+    def place(self, context: AttackContext, seed: int | str = 0, now: float = 0.0) -> AttackObject:
+        """Create the attack for the datagrams that its option ``inside`` selects.
+
+        Raises:
+            AttackError: the attack needs another peer or a public key.
+        """
+        attack = self.make(context, seed, now)
+        return InsideData(attack) if self.options.inside else attack
 
 
-def parse_attack(text: str) -> AttackSpec:
-    """Parse ``NAME`` or ``NAME,key=value,key=value``, as on the command line.
+def parse_attack(text: str, attacks: Mapping[str, type[Attack[Any]]] = ATTACKS) -> AttackSpec:
+    """Parse ``NAME`` or ``NAME,key=value,key=value``, as on the command line. ``attacks``: those to choose from.
 
     Raises:
         AttackError: unknown attack or wrong parameters. The message says what to write instead.
     """
     name, *pairs = text.split(",")
+    attack = _attack(name, attacks)
     values: dict[str, str] = {}
     for pair in pairs:
         key, equals, value = pair.partition("=")
         if not equals or key.strip() in values:
-            raise AttackError(
-                f"{_attack(name).name}: parameters are written key=value, each once, with commas between"
-            )
+            raise AttackError(f"{attack.name}: parameters are written key=value, each once, with commas between")
         values[key.strip()] = value.strip()
-    model = _attack(name).options_model
-    return _spec(name, lambda: model.model_validate_strings(values))
+    return _spec(attack, lambda: attack.options_model.model_validate_strings(values))
 
 
 def attack_from_table(table: Mapping[str, Any]) -> AttackSpec:
@@ -117,23 +130,22 @@ def attack_from_table(table: Mapping[str, Any]) -> AttackSpec:
     name = values.pop("name", None)
     if not isinstance(name, str):
         raise AttackError('the attack has no name: write, for example, name = "replay-data"')
-    model = _attack(name).options_model
-    return _spec(name, lambda: model.model_validate(values, strict=False))
+    attack = _attack(name, ATTACKS)
+    return _spec(attack, lambda: attack.options_model.model_validate(values, strict=False))
 
 
-def _attack(name: str) -> type[Attack[Any]]:
-    attack = ATTACKS.get(name.strip())
+def _attack(name: str, attacks: Mapping[str, type[Attack[Any]]]) -> type[Attack[Any]]:
+    attack = attacks.get(name.strip())
     if attack is None:
-        close = get_close_matches(name.strip(), ATTACKS, n=1)
-        hint = f"did you mean {close[0]}?" if close else f"the attacks are {', '.join(ATTACKS)}"
+        close = get_close_matches(name.strip(), attacks, n=1)
+        hint = f"did you mean {close[0]}?" if close else f"the attacks are {', '.join(attacks)}"
         raise AttackError(f"there is no such attack: {hint}")
     return attack
 
 
-def _spec(name: str, read: Any) -> AttackSpec:
-    attack = _attack(name)
+def _spec(attack: type[Attack[Any]], read: Callable[[], Options]) -> AttackSpec:
     try:
-        return AttackSpec(attack.name, read())
+        return AttackSpec(attack, read())
     except ValidationError as error:
         problems = [_problem(attack, details["loc"], details["type"], details["msg"]) for details in error.errors()]
         raise AttackError(f"{attack.name}: {'; '.join(problems)}") from None
@@ -146,10 +158,10 @@ def _problem(attack: type[Attack[Any]], location: tuple[int | str, ...], kind: s
     return f"{key}: {message[0].lower()}{message[1:]}"
 
 
-def list_attacks() -> str:
-    """All attacks and their parameters, as text for a terminal."""
+def list_attacks(attacks: Mapping[str, type[Attack[Any]]] = ATTACKS) -> str:
+    """All these attacks and their parameters, as text for a terminal."""
     lines: list[str] = []
-    for attack in _ALL:
+    for attack in attacks.values():
         lines.append(attack.name)
         lines.append(f"    {attack.summary()}.")
         for name, default, meaning in describe_options(attack.options_model):

@@ -276,7 +276,7 @@ class TamperTag(InTurn):
 
 # Injected frames.
 
-_COMMANDS: tuple[tuple[str, bytes], ...] = (
+COMMAND_FRAMES: tuple[tuple[str, bytes], ...] = (
     # HEARTBEAT 0: custom mode u32, type 6 (ground station), autopilot 8, base mode, status 4, version 3.
     ("HEARTBEAT", mavlink_frame(0, bytes((0, 0, 0, 0, 6, 8, 192, 4, 3)), 50)),
     # COMMAND_LONG 76: seven floats, command u16, target system and component, confirmation.
@@ -318,7 +318,7 @@ class RawMavlink(FromAnywhere):
 
     def send_next(self, now: float) -> list[Action]:
         """Inject the next frame in the next direction."""
-        name, frame = _COMMANDS[self.sent_count // (2 * len(self.directions)) % len(_COMMANDS)]
+        name, frame = COMMAND_FRAMES[self.sent_count // (2 * len(self.directions)) % len(COMMAND_FRAMES)]
         return self.inject(frame, self.directions[self.sent_count % len(self.directions)], now, name, self.origin())
 
 
@@ -346,7 +346,7 @@ class ForgeData(FromAnywhere):
         direction = directions[self.sent_count % len(directions)]
         index, counter = self._newest[direction]
         counter = (counter + self.rng.randrange(1, 64)) % c.SESSION_ENVELOPE_LIMIT
-        name, frame = _COMMANDS[self.rng.randrange(len(_COMMANDS))]
+        name, frame = COMMAND_FRAMES[self.rng.randrange(len(COMMAND_FRAMES))]
         datagram = wire.envelope_header(index, counter) + frame + self.rng.randbytes(16)
         return self.inject(datagram, direction, now, f"{name} as envelope {counter}", self.origin())
 

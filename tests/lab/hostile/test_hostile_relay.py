@@ -1,0 +1,270 @@
+"""The hostile relay does what its attacks say: members that are nodes of the core see it."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+from collections.abc import AsyncIterator
+from itertools import combinations
+from pathlib import Path
+
+import pytest
+
+from tests.relay.core_member import CoreMember
+from uavlinkd.config import RelayServer
+from uavlinkd.config.used_relays import TIMERS
+from uavlinkd.core import constants as c
+from uavlinkd.core.crypto import KeyPair, Secret
+from uavlinkd.core.outputs import Deliver, Output
+from uavlinkd.core.relay_records import handle_of
+from uavlinkd.core.settings import Link, PeerSettings
+from uavlinkd.endpoints.sockets import BindError
+from uavlinkd.lab.hostile.hostile_relay import HostileRelay, HostileRelaySettings
+from uavlinkd.lab.hostile.relay_attacks import ALL_ATTACKS
+from uavlinkd.lab.mitm.attack import AttackError
+from uavlinkd.lab.mitm.attacks import parse_attack
+from uavlinkd.lab.sim.loopback_ports import free_port
+from uavlinkd.ops.control import ControlError
+from uavlinkd.relay.member_settings import MemberSettings, RelayLimits
+from uavlinkd.system.addresses import Address
+
+NAMES = ("drone0", "drone1", "drone2")
+DATA = b"\x40datagram"
+TOKEN, OTHER_TOKEN = bytes(16), bytes(range(16))
+ANY = Address("127.0.0.1", 0)
+AMPLE = RelayLimits(1_000_000, 10**10)
+LINK = Link(features=c.FEATURE_RECORDS, timers=TIMERS)
+
+
+def settings_of(keys: dict[str, bytes], *attacks: str, **more: object) -> HostileRelaySettings:
+    """A relay with these members on a free port of loopback."""
+    members = (PeerSettings(name, key, None, Link(features=c.FEATURE_RECORDS)) for name, key in keys.items())
+    known: dict[str, object] = {
+        "name": "vps",
+        "private_key": Secret(os.urandom(c.KEY_BYTES)),
+        "listen": (ANY,),
+        "server": RelayServer(tuple(MemberSettings(member, 16, AMPLE) for member in members), AMPLE),
+        "attacks": tuple(parse_attack(text, ALL_ATTACKS) for text in attacks),
+        "seed": 1,
+    }
+    return HostileRelaySettings(**{**known, **more})  # type: ignore[arg-type]
+
+
+def keys_of_absent_members() -> dict[str, bytes]:
+    """Members that do not run."""
+    return {name: KeyPair(os.urandom(c.KEY_BYTES)).public for name in NAMES}
+
+
+class Scene:
+    """A hostile relay, and three members that are bound to each other."""
+
+    def __init__(self) -> None:
+        private = os.urandom(c.KEY_BYTES)
+        port = free_port()
+        at = ("127.0.0.1", port)
+        self.members = [CoreMember(KeyPair(private).public, at, link=LINK) for _ in NAMES]
+        keys = {name: member.key for name, member in zip(NAMES, self.members, strict=True)}
+        self.relay = HostileRelay(settings_of(keys, private_key=Secret(private), listen=(Address(*at),)))
+
+    async def start(self) -> None:
+        """Return when all are bound."""
+        await self.relay.start()
+        await self.bind()
+
+    @property
+    def interventions(self) -> dict[str, int]:
+        """By attack and operation."""
+        counts = self.relay.statistics()["interventions"]
+        assert isinstance(counts, dict)
+        return counts
+
+    async def bind(self) -> None:
+        """All members ask for each other."""
+        for member in self.members:
+            await member.bind(*(other.key for other in self.members if other is not member))
+        for one, other in combinations(self.members, 2):
+            await one.until_bound(other.key)
+            await other.until_bound(one.key)
+
+    async def bind_again(self) -> None:
+        """The relay has forgotten all members: they notice that nothing answers, and make new sessions."""
+        made = [member.peer.traffic.handshakes for member in self.members]
+        for member, count in zip(self.members, made, strict=True):
+            member.bounds.clear()
+            member.send_frames(DATA)
+            await member.until(lambda m=member, n=count: m.peer.traffic.handshakes > n)  # type: ignore[misc]
+        await self.bind()
+
+    def seen_by(self, number: int) -> set[tuple[str, int]]:
+        """The addresses that the relay reported to a member as its own."""
+        return {(bound.host, bound.port) for bound in self.members[number].bounds}
+
+
+@pytest.fixture
+async def scene() -> AsyncIterator[Scene]:
+    """Ends its parts after the test."""
+    scene = Scene()
+    try:
+        await scene.start()
+        yield scene
+    finally:
+        for member in scene.members:
+            member.close()
+        await scene.relay.stop()
+
+
+async def test_without_an_attack_it_is_a_relay(scene: Scene) -> None:
+    """It forwards, and reports what is true."""
+    one, other, _ = scene.members
+    one.send(one.handles(other.key)[0], DATA)
+    await other.until(lambda: bool(other.data))
+    assert other.data == [other.handles(one.key)[0].to_bytes(2, "big") + DATA]
+    assert scene.seen_by(0) == {one.address}
+    assert not scene.interventions
+
+
+async def test_forwarded_datagrams_pass_the_attacks_of_the_man_in_the_middle(scene: Scene) -> None:
+    """Here a copy arrives at the third member, with a valid handle."""
+    one, other, third = scene.members
+    scene.relay.attack(["misroute,kinds=any,direction=drone0>drone1"])
+    one.send(one.handles(other.key)[0], DATA)
+    await third.until(lambda: bool(third.data))
+    assert third.data[0] == third.handles(one.key)[0].to_bytes(2, "big") + DATA
+    assert scene.interventions == {"misroute: misrouted": 1}
+
+
+async def test_lies_about_addresses(scene: Scene) -> None:
+    """Of a victim, which counts what it gets, and of groups."""
+    scene.relay.attack(["relay-lie"])
+    await scene.members[0].until(lambda: len(scene.seen_by(0)) == 5)
+    victim = scene.relay.victim
+    assert scene.seen_by(0) >= {victim, ("224.0.0.1", 5790)}
+    assert scene.relay.statistics()["strangers"] == {"bytes_back": 0, "amplified": {}}
+    scene.members[0].sock.sendto(DATA, victim)
+    assert scene.relay.statistics()["strangers"] == {"bytes_back": len(DATA), "amplified": {}}
+
+
+async def test_binds_wrong_members_and_reports_the_true_ones_at_the_end(scene: Scene) -> None:
+    """The handle for one leads to another."""
+    one, other, third = scene.members
+    right = one.handles(other.key)
+    scene.relay.attack(["relay-bind-wrong"])
+    await one.until(lambda: one.handles(third.key) == right)
+    one.send(one.handles(third.key)[0], DATA)
+    await other.until(lambda: bool(other.data))
+    assert not third.data
+    scene.relay.attack([])
+    await one.until(lambda: one.handles(other.key) == right)
+    await third.until(lambda: bool(third.handles(one.key)))
+
+
+async def test_invents_handles(scene: Scene) -> None:
+    """And sends data inside data."""
+    one, other, _ = scene.members
+    scene.relay.attack(["relay-invent"])
+    one.send(one.handles(other.key)[0], DATA)
+    await other.until(lambda: len(other.data) > 30)
+    invented = {int.from_bytes(data[:2], "big") for data in other.data[1:]}
+    assert len(invented) > 10
+    assert any(handle_of(b"\x50" + data) == 0 for data in other.data), "nothing malformed"
+
+
+async def test_sends_frames_of_its_own(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Members decide what to do with them: here, the core delivers them."""
+    received: list[Output] = []
+    member = scene.members[0]
+    perform = member.perform
+
+    def see(outputs: list[Output]) -> None:
+        received.extend(outputs)
+        perform(outputs)
+
+    monkeypatch.setattr(member, "perform", see)
+    scene.relay.attack(["relay-frames"])
+    await member.until(lambda: any(isinstance(output, Deliver) for output in received))
+
+
+async def test_lies_about_filters(scene: Scene) -> None:
+    """It says that it sent a token from another port. Others come that the member did not ask for."""
+    one = scene.members[0]
+    await one.test_filter(TOKEN)
+    await one.until(lambda: one.tested == [TOKEN] and bool(one.tokens))
+    ((token, source),) = one.tokens
+    assert token == TOKEN
+    assert source != one.path.address
+    scene.relay.attack(["relay-filter"])
+    await one.test_filter(OTHER_TOKEN)
+    await one.until(lambda: (OTHER_TOKEN, one.path.address) in one.tokens and OTHER_TOKEN in one.tested)
+    await one.until(lambda: len(one.tokens) > 5)
+    assert {source for _, source in one.tokens[1:]} == {one.path.address}
+    assert scene.interventions["relay-filter: injected"] > 1
+
+
+async def test_restarts_and_replays(scene: Scene) -> None:
+    """What it recorded comes again along new handles."""
+    one, other, _ = scene.members
+    scene.relay.attack(["relay-restart,limit=1,rate_per_s=10"])
+    one.send(one.handles(other.key)[0], DATA)
+    await scene.bind_again()
+    await other.until(lambda: len(other.data) == 2)
+    assert other.data[1] == other.handles(one.key)[0].to_bytes(2, "big") + DATA
+    assert scene.interventions == {"relay-restart: replayed": 1}
+
+
+async def test_pause_makes_it_honest(scene: Scene) -> None:
+    """It tells the truth until the pause ends."""
+    one = scene.members[0]
+    scene.relay.pause()
+    scene.relay.attack(["relay-lie,rate_per_s=1"])
+    one.bounds.clear()
+    await one.bind(scene.members[1].key)
+    await one.until(lambda: bool(one.bounds))
+    assert scene.seen_by(0) == {one.address}
+    assert not scene.interventions
+    scene.relay.resume()
+    await one.until(lambda: scene.seen_by(0) != {one.address})
+    assert scene.interventions["relay-lie: altered"] > 0
+
+
+async def test_direction_limits_a_lie_to_one_member(scene: Scene) -> None:
+    """The others get the truth as often."""
+    scene.relay.attack(["relay-lie,direction=drone0>drone1"])
+    await scene.members[1].until(lambda: len(scene.seen_by(1)) > 1)
+    assert scene.seen_by(0) == {scene.members[0].address}
+    assert scene.seen_by(2) == {scene.members[2].address}
+
+
+async def test_wrong_attack_leaves_the_former_ones(scene: Scene) -> None:
+    """One is unknown, and one needs another path."""
+    assert scene.relay.attack(["relay-lie"]) == ["relay-lie"]
+    for text in ("relay-ly", "move,onto=2", "relay-lie,direction=a>b"):
+        with pytest.raises(AttackError):
+            scene.relay.attack([text])
+    assert scene.relay.statistics()["attacks"] == ["relay-lie"]
+
+
+async def test_address_in_use_is_reported(tmp_path: Path) -> None:
+    """And no other socket stays open."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        relay = HostileRelay(settings_of(keys_of_absent_members(), listen=(ANY, Address(*taken.getsockname()))))
+        with pytest.raises(BindError, match="cannot listen"):
+            await relay.start()
+    assert all(sock.fileno() == -1 for sock in relay._sockets)
+    relay = HostileRelay(settings_of(keys_of_absent_members(), control_socket=tmp_path / "none" / "control"))
+    with pytest.raises(ControlError):
+        await relay.start()
+
+
+async def test_journal_has_the_attacks(tmp_path: Path) -> None:
+    """And when they changed."""
+    relay = HostileRelay(settings_of(keys_of_absent_members(), "relay-lie", log=tmp_path / "log"))
+    await relay.start()
+    relay.attack([])
+    relay.restart()
+    await relay.stop()
+    lines = [json.loads(line) for line in (tmp_path / "log").read_text().splitlines()]
+    events = ["relay_started", "attacks_changed", "relay_restarted", "relay_stopped"]
+    assert [line["event"] for line in lines] == events
+    assert (lines[0]["attacks"], lines[1]["attacks"], lines[3]["members_up"]) == (["relay-lie"], [], [])

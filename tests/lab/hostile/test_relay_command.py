@@ -1,0 +1,173 @@
+"""The command ``uavlink-mitm relay``: its options, and a process between two real daemons."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import signal
+import sys
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.daemon.fleet import relay_for
+from tests.daemon.harness import Stage, secret_forms
+from tests.daemon.process import DaemonProcess
+from tests.relay.relayed_pair import RelayedPair
+from tests.waiting import until
+from uavlinkd.lab.attacker import main
+from uavlinkd.lab.child_processes import end_with_parent
+from uavlinkd.lab.hostile import relay_cli
+from uavlinkd.lab.hostile.relay_attacks import ALL_ATTACKS
+from uavlinkd.lab.sim.loopback_ports import free_port
+from uavlinkd.ops.control import ask
+
+SOME = ("relay-frames", "relay-invent", "relay-lie", "bit-flip,beside=true", "replay-data,copies=2")
+"""Attacks that withhold nothing."""
+
+
+def test_list_prints_every_attack(capsys: pytest.CaptureFixture[str]) -> None:
+    """The relay's own, and those of the man in the middle."""
+    assert main(["relay", "--list"]) == 0
+    printed = capsys.readouterr().out.splitlines()
+    assert {line.partition(" ")[0] for line in printed} >= set(ALL_ATTACKS)
+
+
+def test_other_words_are_for_the_man_in_the_middle(capsys: pytest.CaptureFixture[str]) -> None:
+    """It has no attack of a relay."""
+    assert main(["--list"]) == 0
+    assert "relay-lie" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("text", "arguments", "message"),
+    [
+        (None, [], "--config"),
+        (None, ["--config=/nowhere.toml"], "/nowhere.toml"),
+        ("", ["--ask=statistics"], "control_socket is missing"),
+        ('control_socket = ""', ["--ask=statistics"], "control_socket"),
+        ("peer", [], "is not the file of a relay"),
+        ("member", ["--attack=relay-lie,direction=a>z"], "direction must be both"),
+    ],
+    ids=["no file", "missing file", "no socket", "wrong socket", "daemon", "direction"],
+)
+def test_wrong_command_line_ends_with_status_2(
+    text: str | None, arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Before anything is opened."""
+    if text is not None:
+        arguments = [f"--config={_file(tmp_path, text)}", *arguments]
+    assert main(["relay", *arguments]) == 2
+    assert message in capsys.readouterr().err
+
+
+def _file(folder: Path, text: str, host: str = "127.0.0.1") -> Path:
+    """A file: of a daemon, of a relay, or these lines."""
+    if text in ("peer", "member"):
+        daemon = DaemonProcess("vps", folder / "vps", [f"{host}:{free_port()}"])
+        one = {"name": "a", "public_key": DaemonProcess("a", folder / "a", []).public_key}
+        other = {"name": "b", "public_key": DaemonProcess("b", folder / "b", []).public_key}
+        more = {"role": "all", "system_ids": "all"} if text == "peer" else {}
+        daemon.config = {key: value for key, value in daemon.config.items() if key not in ("peer", "endpoint")}
+        return _with(daemon, **{text: [{**one, **more}, {**other, **more}]})
+    path = folder / "relay.toml"
+    path.write_text(text)
+    return path
+
+
+def _with(daemon: DaemonProcess, **sections: object) -> Path:
+    daemon.config |= sections
+    return daemon.write_config()
+
+
+@pytest.mark.parametrize("flag", ["--attack=relay-ly", "--seconds=0"])
+def test_flag_that_cannot_be_read_is_explained(flag: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """argparse shows the message of the parser."""
+    with pytest.raises(SystemExit) as caught:
+        main(["relay", flag])
+    assert caught.value.code == 2
+    assert flag.partition("=")[0] in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("log", ["log", "."])
+def test_run_ends_after_its_time(log: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """With status 1 if the journal cannot be written."""
+    at = tmp_path / log
+    status = main(["relay", f"--config={_file(tmp_path, 'member')}", f"--log={at}", "--seconds=0.01"])
+    assert (status, "cannot write the log" in capsys.readouterr().err) == ((1, True) if log == "." else (0, False))
+
+
+def test_too_many_members_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The attacks would need too much memory for all pairs."""
+    monkeypatch.setattr(relay_cli, "MOST_MEMBERS", 1)
+    assert main(["relay", f"--config={_file(tmp_path, 'member')}", "--seconds=0.01"]) == 2
+    assert "more than 1 sections" in capsys.readouterr().err
+
+
+def test_address_of_another_machine_is_status_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """And no traceback."""
+    path = _file(tmp_path, "member", host="192.0.2.1")
+    assert main(["relay", f"--config={path}", "--seconds=0.01"]) == 1
+    assert "cannot listen" in capsys.readouterr().err
+
+
+@asynccontextmanager
+async def _running(relay: DaemonProcess, *arguments: str) -> AsyncIterator[Path]:
+    """The command with a relay's file. Its control socket. At the end it stops on SIGTERM, and said no secret."""
+    process = await asyncio.create_subprocess_exec(
+        *end_with_parent(sys.executable, "-m", "uavlinkd.lab.attacker", "relay"),
+        f"--config={relay.write_config()}",
+        *arguments,
+        stderr=asyncio.subprocess.PIPE,
+    )
+    try:
+        yield relay.folder / "control.sock"
+    finally:
+        process.send_signal(signal.SIGTERM)
+        _, errors = await process.communicate()
+    assert process.returncode == 0
+    assert b"Traceback" not in errors
+    assert not [form for form in secret_forms(relay.private_key) if form in errors.decode()]
+
+
+async def test_process_between_two_daemons(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Without an attack frames pass. With attacks nothing false is accepted, and each attack is counted."""
+    async with Stage() as stage:
+        relay = relay_for(stage)
+        pair = RelayedPair(stage, relay)
+        async with _running(relay, f"--log={tmp_path / 'log'}", "--seed=3") as control:
+            await pair.start()
+            for flow in pair.ends():
+                await flow.pour(range(200))
+            assert await _statistics(control, "interventions") == {}
+            said = await asyncio.to_thread(
+                main, ["relay", f"--config={relay.config_file}", f"--ask=attack {' '.join(SOME)}"]
+            )
+            assert said == 0
+            for flow in pair.ends():
+                await flow.pour(range(200, 2000), window_bytes=4096)
+            wanted = {text.partition(",")[0] for text in SOME}
+            await until(lambda: wanted <= {text.partition(":")[0] for text in _interventions(control)})
+            for flow in pair.ends():
+                await flow.pour([5000])
+            drops = (await pair.one.status())["peers"]["drone1"]["drops"]
+            assert drops.keys() >= {"bad_tag", "duplicate"}
+            daemon_drops = (await pair.one.status())["drops"]
+            assert daemon_drops.keys() >= {"frames_not_allowed", "relay_unknown_handle"}
+    lines = [json.loads(line) for line in (tmp_path / "log").read_text().splitlines()]
+    assert (lines[0]["event"], lines[0]["seed"], lines[-1]["event"]) == ("relay_started", 3, "relay_stopped")
+    assert capsys.readouterr().out.count("attacks") == 1
+
+
+async def _statistics(control: Path, key: str) -> Any:
+    return (await asyncio.to_thread(ask, control, "statistics"))[key]
+
+
+def _interventions(control: Path) -> dict[str, int]:
+    counts: dict[str, int] = ask(control, "statistics")["interventions"]
+    return counts

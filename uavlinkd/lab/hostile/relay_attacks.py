@@ -1,0 +1,296 @@
+"""Attacks on what only a relay does: assigning handles, reporting addresses, sessions with all members, restarting.
+
+They are attacks as those of the man in the middle, which a relay can run too. ``direction=A>B`` limits them to what
+the relay sends to B.
+"""
+
+from __future__ import annotations
+
+import os
+from abc import abstractmethod
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from random import Random
+from types import MappingProxyType
+from typing import Any, ClassVar, Final, Protocol
+
+from pydantic import Field
+
+from uavlinkd.core import constants as c
+from uavlinkd.core.relay_records import Bound, wrap
+from uavlinkd.lab.mitm.anatomy import DatagramKind
+from uavlinkd.lab.mitm.attack import (
+    NEVER,
+    Action,
+    Attack,
+    AttackContext,
+    Direction,
+    Intervention,
+    Operation,
+    Options,
+    Send,
+    Timed,
+    TimedOptions,
+)
+from uavlinkd.lab.mitm.attacks import ATTACKS
+from uavlinkd.lab.mitm.attacks.forgery import COMMAND_FRAMES
+
+RECORDED: Final = 512
+"""Datagrams that a relay keeps, to send them again after its restart."""
+REPLAYS_AT_ONCE: Final = 10
+REPLAY_EVERY_S: Final = 0.01
+
+
+class AttackedRelay(Protocol):
+    """What these attacks may do with the relay that runs them."""
+
+    name: str
+
+    @property
+    def victim(self) -> tuple[str, int]:
+        """An address that is not a member's."""
+
+    def is_connected(self, direction: Direction) -> bool:
+        """Whether members have handles for this direction now."""
+
+    def record(self, done: Intervention) -> None:
+        """Count an attempt."""
+
+    def report_all(self) -> None:
+        """Report to each member the handles of its peers, as after a bind."""
+
+    def send_data(self, member: str, handle: int, inner: bytes) -> None:
+        """Send data to a member with any handle."""
+
+    def send_frames(self, member: str, frame: bytes) -> None:
+        """Send a frame in the relay's session with a member."""
+
+    def claim_token(self, member: str, token: bytes) -> None:
+        """Report to a member that a token was sent from another port, and send it from the relay's own one."""
+
+    def restart(self) -> None:
+        """Forget all sessions, bindings and handles."""
+
+
+@dataclass(frozen=True, slots=True)
+class RelayContext(AttackContext):
+    """What a hostile relay knows, and the relay itself."""
+
+    relay: AttackedRelay = field(kw_only=True)
+
+
+class RelayAttack(Timed[TimedOptions]):
+    """The base class: an attack that does something at a rate."""
+
+    options_model: ClassVar[type[Options]] = TimedOptions
+    reports_after: ClassVar[bool] = False
+    """At its end the relay reports the true handles: its members keep wrong ones otherwise, up to 20 s."""
+
+    def __init__(self, options: TimedOptions, context: AttackContext, rng: Random, now: float) -> None:
+        super().__init__(options, context, rng, now)
+        assert isinstance(context, RelayContext)
+        self.relay = context.relay
+        self.members = tuple(dict.fromkeys(direction.receiver for direction in self.directions))
+
+    def record(self, operation: Operation, member: str, length: int, now: float, detail: str) -> None:
+        """Count an attempt on a member."""
+        direction = Direction(self.relay.name, member)
+        self.relay.record(Intervention(now, self.name, operation, direction, 0, DatagramKind.OTHER, length, detail))
+
+
+class LieOptions(TimedOptions):
+    """The default is a higher rate."""
+
+    rate_per_s: float = Field(20.0, gt=0, le=100_000, description="reports to each member per second")
+
+
+class Lie(RelayAttack):
+    """The base class of attacks that falsify the relay's reports to its members."""
+
+    options_model: ClassVar[type[Options]] = LieOptions
+
+    def report(self, member: str, bound: Bound, now: float) -> Bound:
+        """What the relay reports to a member instead."""
+        is_chosen = member in self.members and self.is_on(now) and self.should_attack()
+        return self.falsify(member, bound, now) if is_chosen else bound
+
+    @abstractmethod
+    def falsify(self, member: str, bound: Bound, now: float) -> Bound:
+        """The false report."""
+
+    def send_next(self, now: float) -> list[Action]:
+        """Report often."""
+        del now
+        self.relay.report_all()
+        return []
+
+
+class LieAboutAddresses(Lie):
+    """Reports addresses of others to members as their own: candidates for a search of direct paths."""
+
+    name = "relay-lie"
+
+    def falsify(self, member: str, bound: Bound, now: float) -> Bound:
+        """The victim's address, or one that no member may ask."""
+        places = [self.relay.victim, ("224.0.0.1", 5790), ("255.255.255.255", 5790), ("240.0.0.1", 53)]
+        host, port = self.rng.choice(places)
+        self.record(Operation.ALTERED, member, len(bound.encode()), now, f"{host}:{port}")
+        return bound._replace(host=host, port=port)
+
+
+class BindWrongMembers(Lie):
+    """Assigns the handle of one peer for another: a member's datagrams arrive at the wrong one."""
+
+    name = "relay-bind-wrong"
+    reports_after = True
+
+    def falsify(self, member: str, bound: Bound, now: float) -> Bound:
+        """Each key has the handles of the next one."""
+        keys = list(dict.fromkeys(key for key, _ in bound.handles))
+        wrong = dict(zip(keys, [*keys[1:], keys[0]], strict=True))
+        self.record(Operation.MISROUTED, member, len(bound.encode()), now, "handles of other peers")
+        return bound._replace(handles=tuple((wrong[key], handle) for key, handle in bound.handles))
+
+
+class InventOptions(TimedOptions):
+    """The default is a higher rate."""
+
+    rate_per_s: float = Field(100.0, gt=0, le=100_000, description="datagrams to each member per second")
+
+
+class InventHandles(Lie):
+    """Sends genuine datagrams with handles that it did not assign, and assigns handles for unknown keys."""
+
+    name = "relay-invent"
+    options_model = InventOptions
+
+    def __init__(self, options: TimedOptions, context: AttackContext, rng: Random, now: float) -> None:
+        super().__init__(options, context, rng, now)
+        self._newest: dict[str, bytes] = {}
+
+    def observe(self, datagram: bytes, direction: Direction, now: float) -> None:
+        """Keep the newest datagram for each member."""
+        del now
+        self._newest[direction.receiver] = datagram
+
+    def falsify(self, member: str, bound: Bound, now: float) -> Bound:
+        """A handle for a key that the member did not ask for."""
+        self.record(Operation.INJECTED, member, len(bound.encode()), now, "unknown key")
+        return bound._replace(handles=(*bound.handles[: c.ENTRIES_PER_BOUND - 1], (os.urandom(c.KEY_BYTES), 7)))
+
+    def send_next(self, now: float) -> list[Action]:
+        """Send the newest datagrams with other handles, or data inside data."""
+        for member, newest in self._newest.items():
+            if self.should_attack():
+                is_nested = self.rng.random() < 0.3
+                inner = wrap(1, newest) if is_nested else newest
+                self.relay.send_data(member, self.rng.randrange(1, 2**16), inner)
+                self.record(Operation.INJECTED, member, len(inner), now, "nested" if is_nested else "invented handle")
+        return []
+
+
+class SendOwnFrames(RelayAttack):
+    """Sends MAVLink frames in its own session with each member: disarm, flight termination, mode changes."""
+
+    name = "relay-frames"
+    options_model = LieOptions
+
+    def send_next(self, now: float) -> list[Action]:
+        """One frame to each member."""
+        name, frame = COMMAND_FRAMES[self.sent_count % len(COMMAND_FRAMES)]
+        for member in self.members:
+            if self.should_attack():
+                self.relay.send_frames(member, frame)
+                self.record(Operation.INJECTED, member, len(frame), now, f"{name} in the relay's own session")
+        return []
+
+
+class LieAboutFilters(RelayAttack):
+    """Claims to send tokens from other ports, and sends them from its own, which the NAT of the member lets in."""
+
+    name = "relay-filter"
+    options_model = LieOptions
+
+    def hides(self, member: str, token: bytes, now: float) -> bool:
+        """Whether the relay sends nothing from another port for a test of this member, but says that it did."""
+        if not (member in self.members and self.is_on(now) and self.should_attack()):
+            return False
+        self.relay.claim_token(member, token)
+        self.record(Operation.ALTERED, member, len(token), now, "from the relay's own port")
+        return True
+
+    def send_next(self, now: float) -> list[Action]:
+        """A token to each member, which did not ask for it."""
+        for member in self.members:
+            if self.should_attack():
+                token = self.rng.randbytes(c.FILTER_TOKEN_BYTES)
+                self.relay.claim_token(member, token)
+                self.record(Operation.INJECTED, member, len(token), now, "invented token")
+        return []
+
+
+class RestartOptions(TimedOptions):
+    """The default leaves time for new sessions."""
+
+    rate_per_s: float = Field(0.4, gt=0, le=10, description="restarts per second; the first after one interval")
+
+
+class RestartAndReplay(RelayAttack):
+    """Forgets everything, and sends what it recorded before along the handles that it assigns afterwards."""
+
+    name = "relay-restart"
+    options_model = RestartOptions
+
+    def __init__(self, options: TimedOptions, context: AttackContext, rng: Random, now: float) -> None:
+        super().__init__(options, context, rng, now)
+        self._next_at += 1 / options.rate_per_s
+        self._recorded: deque[tuple[bytes, Direction]] = deque(maxlen=RECORDED)
+        self._replays: deque[tuple[bytes, Direction]] = deque()
+        self._replay_at = NEVER
+
+    def observe(self, datagram: bytes, direction: Direction, now: float) -> None:
+        """Keep what is forwarded."""
+        del now
+        self._recorded.append((datagram, direction))
+
+    def send_next(self, now: float) -> list[Action]:
+        """Restart."""
+        if self.should_attack():
+            self._replays, self._replay_at = self._recorded.copy(), now + REPLAY_EVERY_S
+            self.relay.restart()
+        return []
+
+    def due(self, now: float) -> list[Action]:
+        """Restart if it is time. When members have handles again, replay, some datagrams at a time."""
+        actions = super().due(now)
+        if now < self._replay_at:
+            return actions
+        is_bound = any(self.relay.is_connected(direction) for direction in self.directions)
+        for _ in range(min(REPLAYS_AT_ONCE, len(self._replays)) if is_bound else 0):
+            datagram, direction = self._replays.popleft()
+            if self.relay.is_connected(direction):
+                note = self.note(
+                    Operation.REPLAYED, datagram, direction, now, "after a restart of the relay", own=True
+                )
+                actions += [Send(datagram, direction), note]
+        self._replay_at = now + REPLAY_EVERY_S if self._replays else NEVER
+        return actions
+
+    def next_deadline(self) -> float:
+        """The time of the next restart, or of the next replay."""
+        return min(super().next_deadline(), self._replay_at)
+
+
+RELAY_ATTACKS: Final[Mapping[str, type[RelayAttack]]] = MappingProxyType(
+    {
+        attack.name: attack
+        for attack in (
+            *(LieAboutAddresses, BindWrongMembers, InventHandles, SendOwnFrames, LieAboutFilters),
+            RestartAndReplay,
+        )
+    }
+)
+"""By name."""
+ALL_ATTACKS: Final[Mapping[str, type[Attack[Any]]]] = MappingProxyType({**RELAY_ATTACKS, **ATTACKS})
+"""All that a relay can do: its own attacks, and those of the man in the middle on what it forwards."""

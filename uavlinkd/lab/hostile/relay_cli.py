@@ -1,0 +1,115 @@
+"""The command ``uavlink-mitm relay``: a relay that attacks its members. It reads the ordinary file of a relay."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+from uavlinkd.config import ConfigError
+from uavlinkd.config.load import load_config, load_control_socket
+from uavlinkd.endpoints.sockets import BindError
+from uavlinkd.lab.hostile.hostile_relay import HostileRelay, HostileRelaySettings
+from uavlinkd.lab.hostile.relay_attacks import ALL_ATTACKS
+from uavlinkd.lab.mitm.attack import AttackError
+from uavlinkd.lab.mitm.attacks import AttackSpec, list_attacks, parse_attack
+from uavlinkd.lab.mitm.console import (
+    OK,
+    WRONG,
+    add_attack_options,
+    fail,
+    print_list,
+    run_until_stopped,
+    send_request,
+)
+from uavlinkd.ops.control import ControlError
+from uavlinkd.ops.log import set_up_logging
+from uavlinkd.system.core_dumps import forbid_core_dumps
+
+MOST_MEMBERS: Final = 100
+"""Attacks know each pair of members in both directions."""
+_EPILOG = """\
+Example, with the file of `uavlinkd relay`, on the relay's host or another one that its members reach by that address:
+
+  uavlink-mitm relay --config relay.toml --attack misroute,kinds=envelope --log relay.jsonl
+  uavlink-mitm relay --config relay.toml --ask "attack relay-lie relay-frames"
+
+The requests go through the control_socket of the file. Attack only your own members.
+"""
+
+
+def _parse(text: str) -> AttackSpec:
+    return parse_attack(text, ALL_ATTACKS)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="uavlink-mitm relay",
+        description="A relay that attacks its members. It has a relay's key, and no key of a member.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--config", metavar="FILE", type=Path, help="the file of the relay")
+    add_attack_options(parser, _parse)
+    return parser
+
+
+def relay_main(arguments: Sequence[str]) -> int:
+    """Run the command and return its exit status."""
+    options = _parser().parse_args(arguments)
+    if options.list:
+        return print_list(list_attacks(ALL_ATTACKS))
+    if options.config is None:
+        return fail("--config must name the file of a relay", WRONG)
+    try:
+        return _ask(options) if options.ask is not None else _run(options)
+    except ConfigError as error:
+        return fail(error, WRONG)
+
+
+def _ask(options: argparse.Namespace) -> int:
+    control_socket = load_control_socket(options.config)
+    if control_socket is None:
+        return fail(f"{options.config}: control_socket is missing: --ask needs it", WRONG)
+    return send_request(control_socket, options.ask)
+
+
+def _run(options: argparse.Namespace) -> int:
+    forbid_core_dumps()
+    config = load_config(options.config, os.environ)
+    if config.relay_server is None or not config.is_only_relay:
+        return fail(f"{options.config}: is not the file of a relay: that has a [[member]], and no [[peer]]", WRONG)
+    if len(config.relay_server.members) > MOST_MEMBERS:
+        return fail(f"{options.config}: member: has more than {MOST_MEMBERS} sections: leave some out", WRONG)
+    settings = HostileRelaySettings(
+        name=config.name,
+        private_key=config.private_key,
+        listen=config.listen,
+        server=config.relay_server,
+        attacks=tuple(options.attack),
+        seed=options.seed or 0,
+        log=options.log,
+        control_socket=config.control_socket,
+    )
+    set_up_logging("info", "auto")
+    try:
+        asyncio.run(run_relay(settings, options.seconds))
+    except AttackError as error:
+        return fail(error, WRONG)
+    except (BindError, ControlError) as error:
+        return fail(error)
+    except OSError as error:
+        return fail(f"cannot write the log {options.log}: {error.strerror or error}")
+    return OK
+
+
+async def run_relay(settings: HostileRelaySettings, seconds: float | None = None) -> None:
+    """Run until SIGTERM, SIGINT, ``stop`` on the control socket, or for ``seconds``.
+
+    Raises:
+        BindError, AttackError, ControlError, OSError: see :meth:`.HostileRelay.start`.
+    """
+    await run_until_stopped(HostileRelay(settings), seconds, lambda: None)
