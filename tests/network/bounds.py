@@ -46,7 +46,7 @@ def measure(node: Node) -> Sizes:
     reports = [len(loss._points) for state in paths for loss in (state._loss_in, state._loss_out)]
     learned = [sum(not state.is_configured for state in peer.paths.states) for peer in peers]
     proven = [sum(state.is_known for state in peer.paths.states) for peer in peers]
-    indices, admission = node._indices, node._admission
+    indices, admission = node._indices, node._handshakes.admission
     return Counter(
         {
             "pending initiations of a peer": max((len(peer.initiator.pending) for peer in peers), default=0),
@@ -92,8 +92,8 @@ def check(node: Node) -> Sizes:
     assert len(owners) == held, f"{len(owners)} indices are owned, {held} by a peer"
     assert all(node.peers.get(peer.name) is peer for peer, _ in owners.values()), "a removed peer owns an index"
     assert not owners.keys() & node._indices._quarantine.keys(), "an index in quarantine is in use"
-    assert len(node._remembered) == sum(len(peer.remembered) for peer in peers)
-    assert len(node._by_keys) == len(node.peers)
+    assert len(node._handshakes.remembered) == sum(len(peer.remembered) for peer in peers)
+    assert len(node._handshakes.peers) == len(node.peers)
     assert all(node.peers.get(peer.name) is peer for peer in node._by_address.values())
     proven = [state.path.place for peer in peers for state in peer.paths.states if state.is_known]
     assert node._last_seen == Counter(proven), f"{node._last_seen} are known, {proven} are proven"

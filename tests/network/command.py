@@ -133,6 +133,7 @@ def table(total: Played, wall_s: float) -> list[str]:
         "damaged pieces on lines": f"{total.damaged:,}",
         "datagrams": f"{total.datagrams:,}, the attackers' too",
         "  forwarded by relays": f"{total.relayed:,}",
+        "filters known to members": f"{total.filters_known:,}",
         "sessions made": f"{total.sessions:,}, counted at each end",
         **{f"  {name}": f"{count:,}" for name, count in sorted(total.events.items())},
         "judged": f"{total.judged:,} times, {total.pairs:,} pairs",

@@ -43,6 +43,9 @@ class World(Protocol):
     def perform(self, drone: Drone, outputs: list[Output]) -> None:
         """Process the outputs of a node."""
 
+    def inject(self, datagram: bytes, source: Address, destination: Address) -> None:
+        """Send a datagram under any source address."""
+
     def note(self, text: str) -> None:
         """Add a line to the log that a failed test prints."""
 

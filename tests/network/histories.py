@@ -227,4 +227,5 @@ class History:
             played.sessions += sum(isinstance(event, SessionEstablished) for _, event in drone.outputs)
             played.largest |= drone.largest
         played.relayed = sum(relay.forwarded for relay in self.fleet.relays if isinstance(relay, Relay))
+        played.filters_known = self.fleet.filters_known if isinstance(self.fleet, RelayFleet) else 0
         played.datagrams = network.datagrams

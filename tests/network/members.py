@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -11,18 +12,20 @@ from typing import Final
 
 import structlog
 
-from tests.network.air import Address
+from tests.network.air import Address, Endpoint
 from tests.network.drone import Drone, World
 from uavlinkd.config import PeerAddress, PeerConfig, RelayConfig
 from uavlinkd.config.used_relays import TIMERS
 from uavlinkd.core import constants as c
 from uavlinkd.core import outputs as o
+from uavlinkd.core.crypto import Entropy
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.path import RELAY_HOST, Path
 from uavlinkd.core.peer import Peer
-from uavlinkd.core.relay_records import Bind
+from uavlinkd.core.relay_records import Bind, Candidates, FilterTest, FilterTested, token_of
 from uavlinkd.core.settings import Link, PeerSettings
 from uavlinkd.link.candidates import OwnSocket
+from uavlinkd.link.filter_tests import TOKEN_START
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.peer_owners import PeerOwner
 from uavlinkd.link.relay_handles import RELAYED_START
@@ -39,6 +42,7 @@ MOST_PEERS: Final = 8
 FEATURES: Final = c.FEATURE_REFUSALS | c.FEATURE_RECORDS
 LINK: Final = Link(features=FEATURES)
 _LIMITS: Final = RelayLimits(datagrams_s=20_000, bits_s=100_000_000)
+_FIRST_NEW_PORT: Final = 32_768
 _REMEMBERED_S: Final = c.BIND_LIFETIME_S + c.QUESTION_LIFETIME_S + HOUSEKEEPING_S
 """A bind has no effect later than this."""
 _QUIET: Final = structlog.make_filtering_bound_logger("critical")
@@ -56,6 +60,9 @@ class Relay(Drone):
         self.forwarded = 0
         """Datagrams from member to member."""
         self._asked: dict[tuple[str, str], float] = {}
+        self.new_ports: set[Address] = set()
+        """From which it sent tokens. Nothing listens there."""
+        self._tests = Counter[tuple[bytes, Path]]()
         self._arrived: tuple[Path, int] | None = None
         self._housekeeping_at = 0.0
 
@@ -71,6 +78,7 @@ class Relay(Drone):
             _LIMITS,
             perform=partial(self._world.perform, self),
             send=self._forward,
+            send_from_new_port=self._send_from_new_port,
             on_event=lambda event, now: None,
         )
         members = {
@@ -104,6 +112,17 @@ class Relay(Drone):
         self.forwarded += 1
         self._world.perform(self, [o.Transmit(datagram, path)])
 
+    def _send_from_new_port(self, datagram: bytes, path: Path) -> bool:
+        """A token goes once for each test, and where the test came from."""
+        token = token_of(datagram)
+        assert self._tests[token, path], f"{self.name} sends a token that was not asked for to {path}"
+        self._tests[token, path] -= 1
+        source = self.addresses[path.socket][0], _FIRST_NEW_PORT + len(self.new_ports)
+        self.new_ports.add(source)
+        self._world.air.endpoints[source] = Endpoint(self.name, path.socket)
+        self._world.inject(datagram, source, path.address[:2])
+        return True
+
     def on_record(self, received: o.RecordReceived) -> None:
         """Members ask for others."""
         assert self.service is not None
@@ -111,6 +130,8 @@ class Relay(Drone):
             for key in received.record.keys:
                 if (name := self.members.get(key)) is not None:
                     self._asked[received.peer.name, name] = self._world.now
+        elif isinstance(received.record, FilterTest):
+            self._tests[received.record.token, received.path] += 1
         self.service.on_record(received, self.local_now)
 
     def on_event(self, event: o.Event) -> None:
@@ -201,6 +222,7 @@ class Member(Drone):
         self.searches = searches
         """Whether it looks for direct paths to its peers."""
         self.links: dict[str, _Link] = {}
+        self.tokens_taken = 0
         self._owners: dict[o.LinkedPeer, PeerOwner] = {}
         self._housekeeping_at = 0.0
 
@@ -216,7 +238,7 @@ class Member(Drone):
         now = self.local_now
         assert self.node is not None
         self.links, self._owners = {}, {}
-        relays = Relays(self.node, _Sockets(self), self.links, self._owners, _LOG, lambda: None)  # type: ignore[arg-type]
+        relays = Relays(self.node, _Sockets(self), self.links, self._owners, _LOG, lambda: None, self._entropy())  # type: ignore[arg-type]
         self.relays = relays
         self._look()
         for name in self.acquaintances:
@@ -251,6 +273,14 @@ class Member(Drone):
             self._link(other.name)
             self.relays.follow_links(self.local_now)
 
+    def _entropy(self) -> Entropy:
+        return Random(self._world.rng.randbytes(16)).randbytes
+
+    def test_filters(self) -> None:
+        """A person runs ``uavlinkd netcheck``."""
+        if self.relays is not None:
+            self.relays.filter_tests.begin(self.relays.by_name.values(), self.local_now)
+
     def absent_ends(self) -> list[int]:
         """The sockets whose networks are gone."""
         return [end.socket for end in self._world.air.absent if end.drone == self.name]
@@ -260,6 +290,7 @@ class Member(Drone):
     def datagram_for(self, datagram: bytes, path: Path) -> tuple[bytes, Address] | None:
         """Along a relayed path, data for the relay."""
         if not path.is_relayed:
+            assert not any(path.address in relay.new_ports for relay in self.uses), "a token is answered"
             return super().datagram_for(datagram, path)
         assert self.relays is not None
         wrapped = self.relays.handles.wrap(datagram, path)
@@ -268,6 +299,9 @@ class Member(Drone):
     def receive(self, datagram: bytes, path: Path) -> None:
         """Data from a relay comes along a relayed path."""
         assert self.relays is not None
+        if datagram[:1] == TOKEN_START:
+            self._receive_token(datagram, path)
+            return
         if datagram[:1] == RELAYED_START:
             taken = self.relays.handles.unwrap(path.socket, datagram, path.address)
             if isinstance(taken, DropReason):
@@ -276,12 +310,26 @@ class Member(Drone):
             datagram, path = taken
         super().receive(datagram, path)
 
+    def _receive_token(self, datagram: bytes, path: Path) -> None:
+        """It is taken only from a new port of a relay, and a NAT that filters by port lets none in."""
+        assert self.relays is not None
+        if not self.relays.filter_tests.take_token(datagram, path):
+            self.drops[DropReason.RELAY_UNEXPECTED_TOKEN] += 1
+            return
+        assert any(path.address in relay.new_ports for relay in self.uses)
+        assert path.socket not in self.nats or not self.nats[path.socket].filters_by_port
+        self.tokens_taken += 1
+
     def on_record(self, received: o.RecordReceived) -> None:
         """Of a relay, or of a peer."""
         assert self.relays is not None
-        if (owner := self._owners.get(received.peer)) is not None:
-            owner.on_record(received, self.local_now)
-        self.relays.on_peer_record(received, self.local_now)
+        owner = self._owners.get(received.peer)
+        if isinstance(received.record, Candidates | FilterTested):
+            reason = self.relays.on_record(received, self.local_now)
+        else:
+            reason = DropReason.UNEXPECTED_RECORD if owner is None else owner.on_record(received, self.local_now)
+        if reason is not None:
+            self.drops[reason] += 1
 
     def on_event(self, event: o.Event) -> None:
         """Of a relay, or of a peer."""
@@ -331,3 +379,4 @@ class Member(Drone):
         assert len(handles._inward) == len(handles._outward)
         to_relays = len(self.uses) * len(self.addresses)
         assert len(handles._outward) <= to_relays * len(self.acquaintances) * c.HANDLES_PER_PAIR
+        assert len(self.relays.filter_tests._tests) <= to_relays

@@ -12,6 +12,7 @@ from tests.network.fleet import Fleet
 from tests.network.path_misfortunes import PathMisfortunes, random_address, random_radio
 from tests.network.relay_fleet import RelayFleet
 from tests.network.relay_misfortunes import RelayMisfortunes
+from uavlinkd.core import constants as c
 
 _KEPT = 2000
 _SHARE_OF_PATHS = 0.85
@@ -46,6 +47,7 @@ class Misfortunes:
             ("clock ahead", self._jump),
             ("peer removed", self._remove),
             ("peer back", self._restore),
+            ("features offered", self._offer),
             ("replays", self._replay),
             ("flood by strangers", partial(self._flood, knows_key=False)),
             ("flood with the public key", partial(self._flood, knows_key=True)),
@@ -118,6 +120,12 @@ class Misfortunes:
             for drone, other in ((a, b), (b, a)):
                 if other.name in drone.removed and self._lot.random() < 0.5:
                     drone.restore(other)
+
+    def _offer(self) -> None:
+        a, b = self._random_peers()
+        if a.node is not None and b.name in a.acquaintances:
+            kept = a.peer(b).settings.link.features & c.FEATURE_RECORDS  # relays need it
+            a.node.offer(a.peer(b), kept | self._lot.randint(0, c.KNOWN_FEATURES), a.local_now)
 
     def _replay(self) -> None:
         if self._recorder.recorded:

@@ -36,6 +36,8 @@ class Played:
     datagrams: int = 0
     relayed: int = 0
     """Datagrams that relays forwarded."""
+    filters_known: int = 0
+    """Tests that showed how a NAT filters."""
     events: Counter[str] = field(default_factory=Counter)
     """Faults by name."""
     judged: int = 0

@@ -33,6 +33,7 @@ SLOWER = RadioSettings(delay_s=0.05, jitter_s=0.005)
 OFF_S = (0.0, 0.5, 3.0, 20.0)
 """How long a relay that was killed is off."""
 _SETTLE_S = 8.0
+_SILENCE_S = 30.0
 _WATCH_S = 10.0
 _RETURN_S = 10.0
 
@@ -74,15 +75,23 @@ class Couple:
         )
 
     def begin(self) -> None:
-        """Start all, and talk: telemetry, heartbeats of both, commands and their acknowledgements."""
-        network, vehicle, station = self.network, self.vehicle, self.station
-        for drone in (*self.relays, vehicle, station):
+        """Start all, and talk."""
+        self.start()
+        self.talk()
+        self.network.run_until(lambda: share_a_session(self.vehicle, self.station), within_s=5)
+
+    def start(self) -> None:
+        """Start all."""
+        for drone in (*self.relays, self.vehicle, self.station):
             drone.start()
+
+    def talk(self) -> None:
+        """Telemetry, heartbeats of both, commands and their acknowledgements."""
+        network, vehicle, station = self.network, self.vehicle, self.station
         network.traffic(vehicle, station, 1 / STREAM_PER_S)
         for sender, receiver in ((vehicle, station), (station, vehicle)):
             for interval_s in (1.0, 0.5):
                 network.traffic(sender, receiver, interval_s, cls=Class.CRITICAL)
-        network.run_until(lambda: share_a_session(vehicle, station), within_s=5)
 
     def is_direct(self) -> bool:
         """Whether both send along a direct path."""
@@ -139,17 +148,26 @@ def _reached_at(member: Member) -> float:
     )
 
 
-def back_s(seed: int, off_s: float = 0.0) -> float:
-    """How long after the start of a relay that was killed until a frame crossed in each direction."""
-    with Network(f"relay restarts {seed}", RADIO) as network:
+def back_s(seed: int, off_s: float = 0.0, *, is_silent: bool = False) -> float:
+    """How long after the start of a relay that was killed until a frame crossed in each direction.
+
+    ``is_silent``: no frames were sent before, and only the vehicle sends then.
+    """
+    with Network(f"relay restarts {seed}{' in silence' * is_silent}", RADIO) as network:
         pair = couple(network)
-        pair.begin()
+        if is_silent:
+            pair.start()
+            network.run(_SILENCE_S)
+        else:
+            pair.begin()
         network.run(_SETTLE_S + network.rng.random())
         pair.relays[0].stop()
         network.run(off_s)
         pair.relays[0].start()
         begin = network.now
-        return _back_at(pair, begin) - begin
+        if is_silent:
+            network.traffic(pair.vehicle, pair.station, 1 / STREAM_PER_S)
+        return _back_at(pair, begin, both=not is_silent) - begin
 
 
 def rebound_s(seed: int, *, of_station: bool = False) -> float:
@@ -163,11 +181,12 @@ def rebound_s(seed: int, *, of_station: bool = False) -> float:
         return _back_at(pair, begin) - begin
 
 
-def _back_at(pair: Couple, since: float) -> float:
-    """When a frame that was sent later had crossed in each direction."""
+def _back_at(pair: Couple, since: float, *, both: bool = True) -> float:
+    """When a frame that was sent later had crossed, in both directions or from the vehicle."""
     (there, _), (_, back) = pair.flows(Class.STREAM), pair.flows(Class.CRITICAL)
+    flows = (there, back) if both else (there,)
     since = math.nextafter(since, math.inf)
-    pair.network.run_until(lambda: all(flow.first_delivery(since) < math.inf for flow in (there, back)), within_s=30)
+    pair.network.run_until(lambda: all(flow.first_delivery(since) < math.inf for flow in flows), within_s=30)
     return pair.network.now
 
 
@@ -269,6 +288,8 @@ def table(tries: int) -> Iterator[str]:
     for off_s in OFF_S:
         times = [back_s(seed, off_s) for seed in range(tries)]
         yield f"  relay killed, started {off_s:>4} s later: back    {spread(times)}"
+    times = [back_s(seed, is_silent=True) for seed in range(tries)]
+    yield f"  the same at once, after a silence: back    {spread(times)}"
     for name, of_station in (("vehicle", False), ("station", True)):
         times = [rebound_s(seed, of_station=of_station) for seed in range(tries)]
         yield f"  NAT of the {name} forgets: back             {spread(times)}"

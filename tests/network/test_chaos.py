@@ -16,6 +16,7 @@ from tests.network.plans import BUSY, HOURS, LARGE, LINES, MANY_PATHS, PATHS, Pl
 from tests.network.played import Played
 from uavlinkd.core import constants as c
 from uavlinkd.core import establish
+from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.indices import Indices
 from uavlinkd.core.initiator import Initiator
 from uavlinkd.core.node import Node
@@ -85,7 +86,7 @@ def _nothing(*_: Any, **__: Any) -> None:
 
 
 def _keeps_a_removed_peer(node: Node, peer: Peer, now: float) -> list[Output]:
-    node._by_keys = {keys: known for keys, known in node._by_keys.items() if known is not peer}
+    node._handshakes.peers = {keys: known for keys, known in node._handshakes.peers.items() if known is not peer}
     del node.peers[peer.name]
     return []
 
@@ -98,8 +99,9 @@ def _returns_zero(*_: Any) -> int:
     return 0
 
 
-def _leads_nowhere(facts: SocketFacts, socket: int, _peer: Any) -> bool:
-    return socket not in facts.peers_at
+def _leads_nowhere(facts: SocketFacts, _peer: Any, path: Path) -> None:
+    if path.socket in facts.peers_at:
+        raise Drop(DropReason.WRONG_NETWORK)
 
 
 _set_routes = PathSet._set_routes
@@ -132,7 +134,7 @@ PLANTS: dict[str, tuple[Any, str, Any, str, Plan]] = {
     "handshakes along one path": (PathSet, "handshake_paths", _tries_one_path, "not within", PATHS),
     "no order": (Session, "order_of", _returns_zero, "the order is unknown", PATHS),
     "order by arrival": (Session, "order_of", _counts_arrivals, "is before", PATHS),
-    "lines lead nowhere": (SocketFacts, "leads_to", _leads_nowhere, "was lost although paths", LINES),
+    "lines lead nowhere": (SocketFacts, "check_network", _leads_nowhere, "was lost although paths", LINES),
     "slots without end": (c, "LEARNED_PATHS", 99, "learned paths of a peer", PATHS),
 }
 

@@ -10,10 +10,13 @@ import pytest
 from tests.network import relayed
 from tests.network.histories import play
 from tests.network.nat import IDLE_S, Nat
+from tests.network.network import Network
 from tests.network.plans import RELAYS
-from tests.network.relayed import FAILURES, back_s, first_frame_s, one_network_of_two_dies, rebound_s
+from tests.network.relayed import FAILURES, RADIO, back_s, couple, first_frame_s, one_network_of_two_dies, rebound_s
 from uavlinkd.core import constants as c
+from uavlinkd.core.drops import DropReason
 from uavlinkd.core.path import Path
+from uavlinkd.link.relay_link import RelayLink
 from uavlinkd.relay.bindings import Bindings, Changes
 
 TRIES = int(os.environ.get("UAVLINKD_RELAY_TRIES", "2"))
@@ -26,13 +29,14 @@ STREAM_GAP_S = 0.5
 
 @pytest.mark.parametrize("batch", range(2))
 def test_links_along_relays_are_back_soon_after_any_history(batch: int) -> None:
-    """Relays die, NATs forget, members roam, data is replayed and forged: links are back, and nothing is violated."""
+    """Relays die, NATs forget, members roam, data is replayed and forged: links are back. Filters hold."""
     for seed in (19, *range(20, 20 + SEEDS // 4))[batch::2]:
         played = play(seed, RELAYS)
         assert not played.violations, played.violations[0][1]
         assert played.judged
         assert played.critical_judged
         assert played.relayed > 100
+        assert played.filters_known > 0
 
 
 @pytest.mark.parametrize("seed", range(TRIES))
@@ -45,6 +49,28 @@ def test_first_frame_crosses_soon_after_both_reached_the_relay(seed: int) -> Non
 def test_link_is_back_soon_after_the_start_of_a_relay_that_was_killed(off_s: float) -> None:
     """The relay has forgotten all."""
     assert max(back_s(seed, off_s) for seed in range(TRIES)) < BACK_S
+
+
+def test_first_frame_after_a_silence_soon_passes_a_relay_that_was_killed() -> None:
+    """The other end sends nothing either, and no keepalive is due."""
+    assert max(back_s(seed, is_silent=True) for seed in range(3 * TRIES)) < BACK_S
+
+
+def test_absent_peer_is_bound_with_each_question_to_the_relay(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No echo request would show that a NAT has given this member another address. One that is up is bound once."""
+    asked: list[bool] = []
+    monkeypatch.setattr(RelayLink, "ask", lambda _link, _path, *, binds=True: asked.append(binds))
+    with Network("asks", RADIO) as network:
+        pair = couple(network)
+        pair.start()
+        network.run(30)
+        assert asked.count(False) > asked.count(True) > 0
+        pair.station.stop()
+        network.run(15)
+        asked.clear()
+        network.run(5)
+        assert asked.count(True) >= 4
+        assert all(asked)
 
 
 @pytest.mark.parametrize("of_station", [False, True], ids=["vehicle", "station"])
@@ -62,6 +88,42 @@ def test_no_critical_frame_is_lost_when_a_relay_or_a_network_dies(name: str) -> 
         assert result.critical_sent > 100
         assert result.was_real
         assert result.stream_gap_s <= STREAM_GAP_S
+
+
+@pytest.mark.parametrize("filters_by_port", [False, True], ids=["by address", "by port"])
+def test_member_sees_how_its_nat_filters(*, filters_by_port: bool) -> None:
+    """Through a relay that loses nothing: in one round trip, or after all tries. No path is made or lost."""
+    with Network(f"filters {filters_by_port}", RADIO) as network:
+        pair = couple(network)
+        pair.vehicle.nats[0].filters_by_port = filters_by_port
+        pair.begin()
+        network.run(2.0)
+        vehicle, (relay,) = pair.vehicle, pair.relays
+        assert vehicle.relays is not None
+        tests = vehicle.relays.filter_tests
+        paths = [state.path for state in vehicle.relays.by_name[relay.name].peer.paths.states]
+        vehicle.test_filters()
+        began = network.now
+        network.run_until(tests.ended.is_set, within_s=c.FILTER_TRIES * c.FILTER_TRY_MOST_S)
+        assert [result.passes for result in tests.results] == [not filters_by_port]
+        assert len(relay.new_ports) == (3 if filters_by_port else 1)
+        assert network.now - began <= (0.95 if filters_by_port else 0.15)
+        assert [state.path for state in vehicle.relays.by_name[relay.name].peer.paths.states] == paths
+        assert not vehicle.drops[DropReason.RELAY_UNEXPECTED_TOKEN]
+
+
+def test_relay_that_does_not_answer_shows_nothing() -> None:
+    """It is killed while the tests run: whether the NAT filters stays unknown."""
+    with Network("filters unknown", RADIO) as network:
+        pair = couple(network)
+        pair.begin()
+        network.run(2.0)
+        assert pair.vehicle.relays is not None
+        tests = pair.vehicle.relays.filter_tests
+        pair.vehicle.test_filters()
+        pair.relays[0].stop()
+        network.run_until(tests.ended.is_set, within_s=c.FILTER_TRIES * c.FILTER_TRY_MOST_S)
+        assert [result.passes for result in tests.results] == [None]
 
 
 def test_one_copy_for_each_relay_is_too_few(monkeypatch: pytest.MonkeyPatch) -> None:
