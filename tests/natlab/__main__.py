@@ -1,6 +1,7 @@
 """``python -m tests.natlab``: connect all pairs of kinds of NAT, and print the table. As root.
 
-Daemons know only a relay on the internet. ``--baseline`` connects the pairs by ICE (the package aioice).
+Daemons know only a relay on the internet. ``--baseline`` connects the pairs by ICE (the package aioice). ``--faults``
+lets NATs, networks and the relay fail instead.
 """
 
 from __future__ import annotations
@@ -13,11 +14,11 @@ from contextlib import redirect_stdout
 from io import StringIO
 from statistics import median
 
-from tests.natlab import daemons, ice, namespaces
+from tests.natlab import daemons, faults, ice, namespaces
 from tests.natlab.daemons import Outcome
 from tests.natlab.kinds import KINDS, PAIRED
 from tests.natlab.laboratory import Laboratory
-from tests.natlab.pairs import Pair, make_pairs, matrix
+from tests.natlab.pairs import Pair, make_ipv6_pairs, make_pairs, matrix, table
 from uavlinkd.lab.child_processes import interrupted_by_signals
 
 
@@ -29,16 +30,26 @@ def main() -> int:
     parser.add_argument("--delay-ms", type=float, default=0, help="of each place's line, in each direction")
     parser.add_argument("--loss-percent", type=float, default=0, help="of each place's line, in each direction")
     parser.add_argument("--direct-s", type=float, default=0, help="wait so long for a direct path")
+    parser.add_argument("--ipv6", action="store_true", help="pairs of which both or one have IPv6")
+    parser.add_argument("--faults", type=int, default=0, metavar="TRIES", help="let each fault happen so often")
     parser.add_argument("--at-once", type=int, default=4, help="pairs of daemons that run at the same time")
     options = parser.parse_args()
     reason = namespaces.why_not() or (ice.why_not() if options.baseline else None)
     if reason is not None:
         print(f"needs {reason}", file=sys.stderr)
         return 1
-    kinds = options.kind or PAIRED
+    if options.faults:
+        with interrupted_by_signals():
+            asyncio.run(_print_faults(options.faults))
+        return 0
+    kinds = () if options.ipv6 else options.kind or PAIRED
+    delay_s, loss = options.delay_ms / 1000, options.loss_percent / 100
     with interrupted_by_signals(), Laboratory() as laboratory:
-        public = laboratory.public()
-        pairs = make_pairs(laboratory, kinds, delay_s=options.delay_ms / 1000, loss=options.loss_percent / 100)
+        public = laboratory.public(has_ipv6=options.ipv6)
+        if options.ipv6:
+            pairs = make_ipv6_pairs(laboratory, delay_s=delay_s, loss=loss)
+        else:
+            pairs = make_pairs(laboratory, kinds, delay_s=delay_s, loss=loss)
         if options.baseline:
             print(_baseline(kinds, pairs, asyncio.run(ice.connect_all(pairs, public))))
         else:
@@ -47,6 +58,12 @@ def main() -> int:
                 outcomes = asyncio.run(run)
             print(_report(kinds, pairs, outcomes))
     return 0
+
+
+async def _print_faults(tries: int) -> None:
+    print(table([("fault", "back: median", "longest", "frames lost: median, most"), ("---", "--:", "--:", "--:")]))
+    async for row in faults.figures(faults.FAULTS, tries):
+        print(table([row]), flush=True)
 
 
 def _baseline(kinds: Sequence[str], pairs: Sequence[Pair], results: Mapping[Pair, float | None]) -> str:
@@ -67,7 +84,7 @@ def _report(kinds: Sequence[str], pairs: Sequence[Pair], outcomes: Mapping[Pair,
 
 def _tables(kinds: Sequence[str], pairs: Sequence[Pair], results: Mapping[Pair, float | None]) -> str:
     cells = {pair: "-" if (seconds := results[pair]) is None else f"{seconds:.2f}" for pair in pairs}
-    lines = [matrix(kinds, {pair.kinds: cells[pair] for pair in pairs if not pair.name}), ""]
+    lines = [matrix(kinds, {pair.kinds: cells[pair] for pair in pairs if not pair.name}), ""] if kinds else []
     return "\n".join(lines + [f"{pair.name}: {cells[pair]}" for pair in pairs if pair.name])
 
 

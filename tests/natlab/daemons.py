@@ -12,8 +12,8 @@ from typing import Final
 
 from tests.daemon.harness import Stage
 from tests.daemon.process import DaemonProcess, Status
-from tests.faults.talk import Talk, prepare
-from tests.natlab.laboratory import Place
+from tests.faults.talk import Talk, Voice, prepare
+from tests.natlab.laboratory import Laboratory, Place
 from tests.natlab.pairs import Pair
 
 NEVER_S: Final = 10.0
@@ -33,13 +33,17 @@ class Outcome:
     """Until each has received a frame of the other."""
     direct_s: float | None = None
     """Until both send along a direct path."""
+    direct_to: str = ""
+    """The address to which the first one sends then."""
     sent: int = 0
     lost: int = 0
     """Of the frames of both, from the first that arrived on."""
 
 
 @dataclass(frozen=True, slots=True)
-class _Ends:
+class Ends:
+    """Two daemons, and their clients."""
+
     daemons: tuple[DaemonProcess, DaemonProcess]
     talk: Talk
 
@@ -50,19 +54,20 @@ async def connect_all(
     """Run a relay on a public host, and two daemons for each pair."""
     turn = asyncio.Semaphore(at_once)
 
-    async def connect(ends: _Ends) -> Outcome:
+    async def connect(ends: Ends) -> Outcome:
         async with turn:
             return await _connect(ends, direct_limit_s)
 
     async with Stage() as stage:
-        relay = _relay(stage, public)
-        ends = [_ends(stage, relay, pair, PORT + number) for number, pair in enumerate(pairs)]
+        relay = make_relay(stage, public)
+        ends = [make_ends(stage, relay, pair.places, PORT + number) for number, pair in enumerate(pairs)]
         await stage.start(relay, linked=False)
         return dict(zip(pairs, await asyncio.gather(*map(connect, ends)), strict=True))
 
 
-def _relay(stage: Stage, public: Place) -> DaemonProcess:
-    relay = stage.daemon(RELAY, [f"{public.address}:{PORT}"])
+def make_relay(stage: Stage, public: Place) -> DaemonProcess:
+    """A relay without members."""
+    relay = stage.daemon(RELAY, _addresses(public, public.address, public.ipv6, PORT))
     relay.command = "relay"
     relay.launcher = public.host.launcher
     del relay.config["endpoint"], relay.config["peer"]
@@ -70,26 +75,60 @@ def _relay(stage: Stage, public: Place) -> DaemonProcess:
     return relay
 
 
-def _ends(stage: Stage, relay: DaemonProcess, pair: Pair, port: int) -> _Ends:
-    """The daemons of a pair. A place has one in each of its pairs, so each pair has its own port."""
+def make_ends(
+    stage: Stage, relay: DaemonProcess, places: tuple[Place, Place], port: int, voice: type[Voice] = Voice
+) -> Ends:
+    """Two members of a relay that are peers. A place has one in each of its pairs, so each pair has its own port."""
     daemons = []
-    for side, place in zip("ab", pair.places, strict=True):
-        daemon = stage.daemon(f"{side}{port}", [f"0.0.0.0:{port}"])
-        daemon.launcher = place.host.launcher
-        daemon.config["relay"] = [
-            {"name": RELAY, "public_key": relay.public_key, "addresses": [relay.address]},
-        ]
-        relay.config["member"].append({"name": daemon.name, "public_key": daemon.public_key})
+    for side, place in zip("ab", places, strict=True):
+        daemon = _member(stage, relay, f"{side}{port}", _addresses(place, "0.0.0.0", "::", port), place)
         daemons.append(daemon)
     one, other = daemons
     psk = stage.psk()
     one.add_peer(other, [], psk)
     other.add_peer(one, [], psk)
-    namespaces = (Path("/run/netns", place.host.name) for place in pair.places)
-    return _Ends((one, other), prepare(one, other, (next(namespaces), next(namespaces))))
+    first, second = (Path("/run/netns", place.host.name) for place in places)
+    return Ends((one, other), prepare(one, other, (first, second), voice))
 
 
-async def _connect(ends: _Ends, direct_limit_s: float) -> Outcome:
+def _member(stage: Stage, relay: DaemonProcess, name: str, listen: Sequence[str], place: Place) -> DaemonProcess:
+    daemon = stage.daemon(name, listen)
+    daemon.launcher = place.host.launcher
+    addresses = relay.config["listen"] if place.ipv6 else [relay.address]
+    daemon.config["relay"] = [{"name": RELAY, "public_key": relay.public_key, "addresses": addresses}]
+    relay.config["member"].append({"name": name, "public_key": daemon.public_key})
+    return daemon
+
+
+async def start_members(stage: Stage, laboratory: Laboratory, kinds: Sequence[str]) -> dict[str, DaemonProcess]:
+    """A daemon at a place of each kind. The relay has two ports at one address and one at another; each was reached.
+
+    Their only peer is absent. Behind ``no-udp`` the daemon has reached nothing.
+    """
+    public = laboratory.public()
+    relay = make_relay(stage, public)
+    relay.config["listen"] = [relay.address, f"{public.address}:{PORT + 1}", f"{public.second_address}:{PORT}"]
+    absent = stage.daemon("absent")
+    members = {}
+    for kind in kinds:
+        place = laboratory.place(kind)
+        daemon = _member(stage, relay, kind, [f"{place.address}:{PORT}"], place)
+        daemon.config["relay"][0]["addresses"] = relay.config["listen"]
+        daemon.add_peer(absent, [], stage.psk())
+        members[kind] = daemon
+    await stage.start(relay, *members.values(), linked=False)
+    for kind, daemon in members.items():
+        if kind != "no-udp":
+            await daemon.until(lambda status: len(status["relays"][RELAY]["seen_as"]) == len(relay.config["listen"]))
+    return members
+
+
+def _addresses(place: Place, ipv4: str, ipv6: str, port: int) -> list[str]:
+    """One, or two on a host with IPv6."""
+    return [f"{ipv4}:{port}", *([f"[{ipv6}]:{port}"] if place.ipv6 else [])]
+
+
+async def _connect(ends: Ends, direct_limit_s: float) -> Outcome:
     talking = asyncio.create_task(ends.talk.start())
     try:
         await asyncio.gather(*(daemon.start() for daemon in ends.daemons))
@@ -103,13 +142,15 @@ async def _connect(ends: _Ends, direct_limit_s: float) -> Outcome:
         except TimeoutError:
             return Outcome()
         first_at = max(min(voice.received_at.values()) for voice in ends.talk.voices)
-        direct_at = await _until_direct(ends.daemons, direct_limit_s)
+        direct_at = await until_direct(ends.daemons, direct_limit_s)
+        (peer,) = (await ends.daemons[0].status())["peers"].values()
         await asyncio.sleep(TALK_S)
         end = monotonic()
         await ends.talk.back(end)
         return Outcome(
             max(0.0, first_at - reached_at),
             None if direct_at is None else max(0.0, direct_at - reached_at),
+            "" if direct_at is None else peer["path"],
             sum(first_at <= at < end for voice in ends.talk.voices for at in voice.sent_at.values()),
             ends.talk.lost(first_at, end),
         )
@@ -123,7 +164,8 @@ async def _connect(ends: _Ends, direct_limit_s: float) -> Outcome:
                 assert await daemon.stop() == 0
 
 
-async def _until_direct(daemons: Sequence[DaemonProcess], limit_s: float) -> float | None:
+async def until_direct(daemons: Sequence[DaemonProcess], limit_s: float) -> float | None:
+    """When all of them send along direct paths; None if they did not in time."""
     end = monotonic() + limit_s
     while monotonic() < end:
         if all([_is_direct(await daemon.status()) for daemon in daemons]):

@@ -68,7 +68,7 @@ async def _connect(pair: Pair, server: str, gathering: asyncio.Lock) -> float | 
         for place in pair.places:
             # Where UDP is blocked, the search for the server would only take its 5 s.
             stun_server = None if place.kind == "no-udp" else (server, STUN_PORT)
-            ends.append(Connection(ice_controlling=not ends, stun_server=stun_server, use_ipv6=False))
+            ends.append(Connection(ice_controlling=not ends, stun_server=stun_server, use_ipv6=bool(place.ipv6)))
             async with gathering:
                 with place.host.entered():
                     await ends[-1].gather_candidates()

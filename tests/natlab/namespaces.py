@@ -70,14 +70,14 @@ class Namespace:
         """Put before a command, it runs the command there."""
 
     def open(self) -> None:
-        """Make it. It forwards, accepts packets from anywhere, and knows only IPv4."""
+        """Make it. It forwards, and accepts packets from anywhere."""
         _run("ip", "netns", "add", self.name)
         with self.entered():
             for name, value in (
                 ("ipv4/ip_forward", 1),
                 ("ipv4/conf/all/rp_filter", 0),
                 ("ipv4/conf/default/rp_filter", 0),
-                ("ipv6/conf/default/disable_ipv6", 1),
+                ("ipv6/conf/all/forwarding", 1),
             ):
                 with suppress(FileNotFoundError):  # a kernel without IPv6
                     Path("/proc/sys/net", name).write_text(str(value))
@@ -108,7 +108,7 @@ class Namespace:
     def udp_socket(self, address: str = "0.0.0.0", port: int = 0, timeout_s: float | None = None) -> socket.socket:
         """A UDP socket of this host. By default it waits without limit."""
         with self.entered():
-            made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            made = socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET, socket.SOCK_DGRAM)
         made.bind((address, port))
         made.settimeout(timeout_s)
         return made
@@ -118,6 +118,8 @@ class Namespace:
         with self.entered():
             tun = os.open("/dev/net/tun", os.O_RDWR | os.O_CLOEXEC)
             fcntl.ioctl(tun, _TUNSETIFF, struct.pack("16sH22x", device.encode(), _IFF_TUN_WITHOUT_HEADER))
+            with suppress(FileNotFoundError):
+                Path("/proc/sys/net/ipv6/conf", device, "disable_ipv6").write_text("1")
         self.ip(f"link set {device} up")
         return tun
 
@@ -131,9 +133,11 @@ class Namespace:
             raise LaboratoryError(f"connection tracking of {self.name} not emptied: {os.strerror(-error)}")
 
 
-def connect(upper: Namespace, device: str, lower: Namespace) -> None:
-    """Lay a cable from an interface of the upper namespace to ``wan`` of the lower one."""
-    lower.ip(f"link add wan type veth peer name {device} netns {upper.name}", "link set wan up")
+def connect(upper: Namespace, device: str, lower: Namespace, lower_device: str = "wan") -> None:
+    """Lay a cable from an interface of the upper namespace to one of the lower one."""
+    lower.ip(
+        f"link add {lower_device} type veth peer name {device} netns {upper.name}", f"link set {lower_device} up"
+    )
     upper.ip(f"link set {device} up")
 
 

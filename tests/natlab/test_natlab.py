@@ -140,6 +140,23 @@ def test_unsolicited_datagrams_are_dropped_silently(kind: str, laboratory: Labor
             assert stranger.recv(64) == b"solicited"  # from the port to which the unsolicited one went
 
 
+@pytest.mark.parametrize("kind", ["firewall", "symmetric", "carrier", "linux"])
+def test_only_answers_come_in_over_ipv6(kind: str, laboratory: Laboratory) -> None:
+    """The address stays as it is."""
+    place, public = laboratory.place(kind, has_ipv6=True), laboratory.public(has_ipv6=True)
+    with (
+        place.host.udp_socket(place.ipv6, timeout_s=PATIENCE_S) as inner,
+        public.host.udp_socket(public.ipv6) as stranger,
+        public.host.udp_socket(public.ipv6, timeout_s=PATIENCE_S) as server,
+    ):
+        stranger.sendto(b"unsolicited", inner.getsockname())
+        inner.sendto(b"question", server.getsockname())
+        source = server.recvfrom(64)[1]
+        assert source == inner.getsockname()
+        server.sendto(b"answer", source)
+        assert inner.recv(64) == b"answer"
+
+
 @pytest.mark.parametrize("kind", ["full-cone", "port-restricted", "symmetric", "carrier", "linux"])
 def test_forgotten_mapping_is_gone(kind: str, laboratory: Laboratory, reflector: Reflector) -> None:
     """The next datagram gets another port, but from a router that keeps ports: there the old one is valid again."""
