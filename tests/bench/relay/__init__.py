@@ -1,0 +1,1 @@
+"""What a relay carries, beside coturn on the same work."""

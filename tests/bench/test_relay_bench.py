@@ -1,0 +1,60 @@
+"""The bench of the relay measures what it says, at a rate that every machine carries."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.bench.relay import turn
+from tests.bench.relay.load import Generator, memory_mb_of
+from tests.bench.relay.members import members
+from tests.needs import need
+
+PAIRS, RATE_S, SECONDS = 3, 20, 1.0
+
+pytestmark = pytest.mark.long
+
+
+def check(generator: Generator) -> None:
+    """All datagrams of six hosts arrive, each after some time, and the relay works for them."""
+    row = generator.run(RATE_S, SECONDS)
+    assert row.lost == 0
+    assert generator.relay.hosts.received >= 2 * PAIRS * RATE_S * SECONDS / 2
+    assert 0 < row.delay_ms <= row.slowest_ms
+    assert memory_mb_of(generator.relay.pid()) > 1
+
+
+def test_members_are_bound_and_again_after_a_restart(tmp_path: Path) -> None:
+    """The hosts of a relay that was killed get other handles, and datagrams pass."""
+    with members(tmp_path, PAIRS) as (relay, generator):
+        check(generator)
+        before = relay.flows
+        after_s = relay.restart(generator)
+        assert len(after_s) == 2 * PAIRS
+        assert relay.flows != before
+        check(generator)
+
+
+def test_what_a_relay_drops_is_lost(tmp_path: Path) -> None:
+    """Datagrams with a handle that belongs to no member."""
+    with members(tmp_path, PAIRS) as (relay, generator):
+        for member in relay.members:
+            member.handle = 0
+        assert generator.run(RATE_S, SECONDS).lost == 1
+
+
+def test_coturn_does_the_same_work(tmp_path: Path) -> None:
+    """One end of each pair has an allocation."""
+    need(turn.is_there(), "coturn")
+    with turn.clients(tmp_path, PAIRS) as (_, generator):
+        check(generator)
+
+
+def test_addresses_in_stun() -> None:
+    """RFC 5769, section 2.2: 192.0.2.1, port 32853."""
+    value = bytes.fromhex("0001a147e112a643")
+    assert turn.xored(("192.0.2.1", 32853)) == value
+    response = turn.message(0x0103, bytes(12), {0x0022: b"test", 0x0016: value})
+    assert turn.relayed_address(response) == ("192.0.2.1", 32853)
+    assert turn.relayed_address(turn.message(0x0103, bytes(12), {0x0022: b"test"})) is None
