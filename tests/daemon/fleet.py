@@ -80,6 +80,23 @@ def drone_and_ground(
     return drone, ground
 
 
+def relay_for(stage: Stage, *members: DaemonProcess, name: str = "vps") -> DaemonProcess:
+    """A relay by which these daemons, which need no addresses of each other, can be peers. It is not started."""
+    relay = stage.daemon(name)
+    make_relay(relay, *members)
+    return relay
+
+
+def make_relay(relay: DaemonProcess, *members: DaemonProcess) -> None:
+    """Make a daemon the relay of others, and nothing else."""
+    relay.command = "relay"
+    del relay.config["endpoint"], relay.config["peer"]
+    relay.config["member"] = [{"name": member.name, "public_key": member.public_key} for member in members]
+    for member in members:
+        section = {"name": relay.name, "public_key": relay.public_key, "addresses": [relay.address]}
+        member.config.setdefault("relay", []).append(section)
+
+
 class Station(Client):
     """A client at a daemon's UDP endpoint that knows when each frame came."""
 

@@ -206,23 +206,31 @@ class DaemonProcess:
 
     # What it says.
 
-    async def status(self) -> Status:
-        """Ask it how it is.
+    async def ask(self, request: str) -> dict[str, Any]:
+        """The answer to a request at its control socket.
 
         Raises:
             OSError: there is no answer.
         """
         reader, writer = await asyncio.open_unix_connection(self.folder / "control.sock", limit=1 << 24)
         try:
-            writer.write(b"status\n")
+            writer.write(f"{request}\n".encode())
             line = await asyncio.wait_for(reader.readline(), PATIENCE_S)
         finally:
             writer.close()
             with suppress(OSError):
                 await writer.wait_closed()
         self.statuses.append(line.decode())
-        status: Status = json.loads(line)
-        return status
+        answer: dict[str, Any] = json.loads(line)
+        return answer
+
+    async def status(self) -> Status:
+        """Ask it how it is.
+
+        Raises:
+            OSError: there is no answer.
+        """
+        return await self.ask("status")
 
     async def until(self, condition: Callable[[Status], bool], timeout_s: float = PATIENCE_S) -> Status:
         """Ask it until what it answers fulfils a condition, and return that."""

@@ -75,6 +75,7 @@ async def test_mavutil_flies_through_a_serial_port(stage: Stage) -> None:
             await check(flight, drone, ground, lambda: scenarios.fly_with_mavutil(stations_end))
 
 
+@pytest.mark.long
 async def test_mavproxy_flies_through_tcp(stage: Stage, tmp_path: Path) -> None:
     """MAVProxy as a TCP client, the autopilot called on UDP: connect, parameters, mission, arm, up, down."""
     scenarios.need("MAVProxy")

@@ -81,6 +81,7 @@ async def test_it_shows_what_happens(short_folder: Path) -> None:
         assert verdict in out.decode()
 
 
+@pytest.mark.long
 async def test_a_daemon_that_dies_fails_the_demo(short_folder: Path) -> None:
     """With one daemon killed in the middle, the demo says so in its exit status."""
     async with demo("--seconds", "30", "--json", folder=short_folder) as process:

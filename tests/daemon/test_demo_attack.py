@@ -7,6 +7,8 @@ import json
 import os
 from pathlib import Path
 
+import pytest
+
 from tests.daemon.test_demo import ENDED_S, demo
 
 
@@ -35,9 +37,10 @@ async def test_a_screen_for_people_ends_with_the_verdict(short_folder: Path) -> 
     assert "replayed" in out.decode()
 
 
+@pytest.mark.long
 async def test_an_attack_that_only_drops_is_noticed_too(short_folder: Path) -> None:
     """No datagram is to blame, and yet the drones count what is missing."""
-    async with demo("--attack", "drop,share=0.5", "--seconds", "5", "--json", folder=short_folder) as process:
+    async with demo("--attack", "drop,share=0.5", "--seconds", "12", "--json", folder=short_folder) as process:
         out, err = await asyncio.wait_for(process.communicate(), ENDED_S)
         assert (process.returncode, err) == (0, b"")
     (attack,) = json.loads(out.splitlines()[-1])["attacks"]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import pytest
+
 from tests.daemon.harness import Stage
 from tests.daemon.lte_and_sik import LteAndSik
 from uavlinkd.lab.mitm.modem import Fate, ModemEnd, ModemSettings
@@ -12,6 +14,7 @@ SIK = ModemSettings(air_bits_s=24_000, line_baud=57_600)
 NOISY = replace(SIK, byte_error_rate=0.001, packet_loss=0.02)
 
 
+@pytest.mark.long
 async def test_no_critical_frame_is_lost_while_lte_or_the_modem_is_gone(stage: Stage) -> None:
     """Heartbeats, commands and answers all arrive, unaltered and once. A bad line alone loses what it damages."""
     pair = LteAndSik(stage, NOISY)

@@ -151,6 +151,7 @@ async def test_flood_of_states_does_not_fill_the_modem(stage: Stage, pair: Conne
     assert max(modems.a.most_held, modems.b.most_held) <= 0.25 * SIK_BITS_S / 8 + 512
 
 
+@pytest.mark.long
 async def test_serial_radio_beside_udp(stage: Stage, pair: Connect) -> None:
     """Either path dies; no critical frame is lost, and none arrives twice."""
     vehicle, ground = stage.pair()

@@ -117,6 +117,7 @@ async def test_reload_is_reported_and_a_refused_one_too(stage: Stage, supervised
     await manager.until_said("STATUS=1 of 1 peers up", 2)
 
 
+@pytest.mark.long
 async def test_watchdog_hears_of_a_loop_that_turns_and_of_no_other(stage: Stage, supervised: Supervised) -> None:
     """A stopped process says nothing for as long as the watchdog waits; one that goes on says so again."""
     a, b = stage.pair()

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from time import monotonic
 
+import pytest
+
 from tests.compose.test_namespaces import can_make_namespaces
 from tests.daemon.harness import Stage
 from tests.daemon.two_networks import LTE, MESH, PORT, TwoNetworks, address_of, interface_of
@@ -154,6 +156,7 @@ async def test_an_interface_and_an_address_of_it_share_a_port(stage: Stage) -> N
         assert "network (exact)" in "\n".join(thief.lines)
 
 
+@pytest.mark.long
 async def test_no_critical_frame_is_lost_while_networks_come_and_go(stage: Stage) -> None:
     """Down and up, removed and plugged in again, another address: one at a time, 50 frames/s in both directions."""
     need_namespaces()
@@ -202,6 +205,7 @@ async def test_network_that_carries_nothing_disturbs_no_traffic(stage: Stage) ->
         networks.talk.check_no_copies()
 
 
+@pytest.mark.long
 async def test_check_shows_what_each_network_reaches(stage: Stage) -> None:
     """Addresses of peers, routes that are missing, strict filters, missing rules."""
     need_namespaces()

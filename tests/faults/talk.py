@@ -54,9 +54,8 @@ class Voice:
         return frame(number, self._system)
 
     async def speak(self) -> None:
-        """Say the next frame, and the next, without end."""
-        loop = asyncio.get_running_loop()
-        loop.add_reader(self._sock, self._on_readable)
+        """Say the next frame, and the next, without end, and listen."""
+        listening = asyncio.create_task(self.listen())
         try:
             while True:
                 number = len(self.sent_at)
@@ -64,6 +63,15 @@ class Voice:
                 with suppress(OSError):  # the daemon's port may be gone for a moment: the frame is lost
                     self._sock.sendto(self.frame(number), self._into)
                 await asyncio.sleep(EVERY_S)
+        finally:
+            listening.cancel()
+
+    async def listen(self) -> None:
+        """Note the other's frames, without end."""
+        loop = asyncio.get_running_loop()
+        loop.add_reader(self._sock, self._on_readable)
+        try:
+            await loop.create_future()
         finally:
             loop.remove_reader(self._sock)
             self._sock.close()
@@ -109,10 +117,15 @@ class Talk:
             Seconds from then, without those in which the machine was busy.
         """
         watch = Stopwatch()
+        elapsed_s = await self.elapsed_until_back(since)
+        return max(0.0, elapsed_s - watch.contended_s)
+
+    async def elapsed_until_back(self, since: float) -> float:
+        """The same, with the seconds in which the machine was busy."""
         async with asyncio.timeout(PATIENCE_S):
             while (back_s := self._back(since)) is None:  # noqa: ASYNC110  two sockets, any of which may bring it
                 await asyncio.sleep(0.005)
-        return max(0.0, back_s - watch.contended_s)
+        return back_s
 
     def _back(self, since: float) -> float | None:
         latest = 0.0

@@ -8,6 +8,9 @@ from dataclasses import dataclass, field
 
 from pymavlink.dialects.v20 import all as mavlink
 
+from uavlinkd.core.settings import Class
+from uavlinkd.mavlink.classes import KINDS, UNKNOWN
+
 STX = (0xFE, 0xFD)
 SETTLED_S = 1.5
 """A frame that has not arrived after this time is lost. The daemon drops frames that waited for 1 s."""
@@ -45,6 +48,16 @@ class Comparison:
         """Whether the same frames arrived once, unaltered and in the order sent."""
         return not (self.missing or self.foreign or self.duplicated or self.reordered)
 
+    def add(self, other: Comparison) -> None:
+        """Add the counts of another comparison."""
+        self.sent += other.sent
+        self.arrived += other.arrived
+        self.missing += other.missing
+        self.foreign += other.foreign
+        self.duplicated += other.duplicated
+        self.reordered += other.reordered
+        self.latencies_s += other.latencies_s
+
     def without(self, withheld: Counter[str]) -> Comparison:
         """The same without the missing frames that a policy withheld, by message."""
         return Comparison(
@@ -80,9 +93,14 @@ def percentile_ms(ordered: Sequence[float], share: float) -> float | None:
 
 def name_of(frame: bytes) -> str:
     """The name of a frame's message, or its number if pymavlink does not know it."""
-    number = frame[5] if frame[0] == 0xFE else int.from_bytes(frame[7:10], "little")
+    number = number_of(frame)
     known = mavlink.mavlink_map.get(number)
     return str(number) if known is None else str(known.msgname)
+
+
+def number_of(frame: bytes) -> int:
+    """The number of a frame's message."""
+    return frame[5] if frame[0] == 0xFE else int.from_bytes(frame[7:10], "little")
 
 
 def split(data: bytes) -> tuple[list[bytes], int]:
@@ -104,6 +122,22 @@ def split(data: bytes) -> tuple[list[bytes], int]:
             stray += 1
             at += 1
     return frames, stray
+
+
+def of_class(passings: Sequence[Passing], cls: Class) -> list[Passing]:
+    """The frames of one class."""
+    return [passing for passing in passings if KINDS.get(number_of(passing.frame), UNKNOWN).cls is cls]
+
+
+def compare_messages(sent: Sequence[Passing], received: Sequence[Passing], begin: float, end: float) -> Comparison:
+    """As :func:`compare`, for links of several paths: there order counts among frames of one message only."""
+    result = Comparison()
+    for number in {number_of(passing.frame) for passing in (*sent, *received)}:
+        before, after = (
+            [passing for passing in passings if number_of(passing.frame) == number] for passings in (sent, received)
+        )
+        result.add(compare(before, after, begin, end))
+    return result
 
 
 def compare(sent: Sequence[Passing], received: Sequence[Passing], begin: float, end: float) -> Comparison:
@@ -130,7 +164,8 @@ def compare(sent: Sequence[Passing], received: Sequence[Passing], begin: float, 
                 else:
                     result.foreign[name_of(passing.frame)] += 1
             continue
-        index = unmatched[0]
+        # Of equal frames, one that keeps the order: those before it were lost.
+        index = next((index for index in unmatched if index > newest), unmatched[-1])
         arrived.add(index)
         if begin <= sent[index].at <= end:
             result.arrived += 1

@@ -95,6 +95,27 @@ def report(records: list[Record]) -> str:
             _two_radios(passed),
         ),
         _section(
+            "Through relays: the ordinary flight",
+            (
+                *("autopilot", "relays", "all parameters", "mission up / down", "flight", "frames down / up"),
+                *("lost / altered / duplicated / reordered", "latency p50 / p99 down", "CPU drone / ground"),
+            ),
+            _relayed(passed),
+            "The daemons have no addresses of each other, and the link is confidential. With two relays, order counts"
+            " among frames of one message: a heartbeat may overtake telemetry.",
+        ),
+        _section(
+            "Relays killed in the air",
+            (
+                *("autopilot", "killed", "absent", "first frame down / up after it listens"),
+                *("longest gap in telemetry", "critical frames lost", "frames lost"),
+                *("altered / duplicated / reordered", "failsafe"),
+            ),
+            _kills(passed),
+            "By SIGKILL, with the failsafe on. Ten requests a second go up, so that critical frames pass in both"
+            " directions. *absent*: from the kill until the relay listens again.",
+        ),
+        _section(
             "Restarts",
             ("autopilot", "", "what", "absent", "first frame down / up after the start"),
             _restarts(passed),
@@ -281,6 +302,40 @@ def _two_radios(records: list[Record]) -> Iterable[Cells]:
             *(record.kind, f"{f['mission_s']} s", f["heartbeats"], f"{f['longest_silence_s']} s"),
             "tripped" if f["other_modes"] else "did not trip",
         )
+
+
+def _relayed(records: list[Record]) -> Iterable[Cells]:
+    for record in records:
+        if "kills" in record.figures:
+            f, tables = record.figures, record.figures["tables"]
+            parts = (tables["frames"], f["frames"])
+            sent = [sum(part[way]["sent"] for part in parts) for way in ("down", "up")]
+            faults = (
+                sum(part[way][fault] for part in parts for way in ("down", "up"))
+                for fault in ("lost", "altered", "duplicated", "reordered")
+            )
+            down, cpu = f["frames"]["down"], f["frames"]["cpu_percent"]
+            yield (
+                *(record.kind, f["relays"], f"{tables['parameters']:,} in {tables['parameters_s']} s"),
+                f"{tables['mission_up_s']} / {tables['mission_down_s']} s",
+                f"{f['guided_s'] + f['mission_s'] + f['return_s']:.1f} s",
+                *(f"{sent[0]:,} / {sent[1]:,}", " / ".join(map(str, faults))),
+                f"{down['p50_ms']} / {down['p99_ms']} ms",
+                f"{cpu['drone1']} / {cpu['ground']} %",
+            )
+
+
+def _kills(records: list[Record]) -> Iterable[Cells]:
+    for record in records:
+        for kill in record.figures.get("kills", ()):
+            back = f"{kill['down_back_s']} / {kill['up_back_s']} s" if "down_back_s" in kill else "-"
+            yield (
+                *(record.kind, kill["what"], _with(kill, "absent_s"), back, f"{kill['stream_gap_s']} s"),
+                f"{kill['critical_lost']} of {kill['critical_sent']:,}",
+                f"{kill['lost']:,} of {kill['sent']:,}",
+                " / ".join(str(kill[fault]) for fault in ("altered", "duplicated", "reordered")),
+                "tripped" if kill["failsafe"] else "did not trip",
+            )
 
 
 def _restarts(records: list[Record]) -> Iterable[Cells]:

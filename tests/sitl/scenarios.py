@@ -14,6 +14,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from tests.sitl.conditions import BY_NAME, CLEAN
 from tests.sitl.flights import flight, follow_me, outages, restarts, two_radios, two_vehicles
 from tests.sitl.pilots import COPTER, OWN, PX4, ROVER, Kind, Pilot
+from tests.sitl.relayed import relayed
 from tests.sitl.simulators import OwnSimulator, RealSimulator, Simulator
 from tests.sitl.station import Station
 from tests.sitl.transfers import Figures, FlightError, log_and_file, parameters_and_mission, signing
@@ -40,8 +41,14 @@ class Scenario:
     can_cut: bool = False
     swarm: bool = False
     two_radios: bool = False
-    """Needs daemons."""
+    relays: int = 0
+    behind_nats: bool = False
     has_maintenance_port: bool = False
+
+    @property
+    def needs_daemons(self) -> bool:
+        """Whether it cannot be flown without daemons."""
+        return self.two_radios or self.relays > 0
 
 
 def _alone(scene: Callable[[World, Pilot], Awaitable[Figures]]) -> Scene:
@@ -69,6 +76,9 @@ SCENARIOS = (
     Scenario("outages", _alone(outages), can_cut=True),
     Scenario("restarts", _alone(restarts)),
     Scenario("two-radios", _alone(two_radios), two_radios=True),
+    Scenario("relay", _alone(relayed), ("ardupilot", "px4", "own"), relays=1),
+    Scenario("relay-nat", _alone(relayed), ("ardupilot", "px4", "own"), relays=1, behind_nats=True),
+    Scenario("two-relays", _alone(relayed), ("ardupilot", "px4", "own"), relays=2),
 )
 SCENARIO_BY_NAME = {scenario.name: scenario for scenario in SCENARIOS}
 
@@ -110,7 +120,7 @@ def runs(kinds: tuple[str, ...]) -> list[Run]:
         if kind in scenario.kinds
         for condition in (scenario.conditions if KINDS[kind].flies else (CLEAN.name,))
         for with_daemons in (True, False)
-        if with_daemons or not (BY_NAME[condition].needs_daemons or scenario.two_radios)
+        if with_daemons or not (BY_NAME[condition].needs_daemons or scenario.needs_daemons)
     ]
 
 
@@ -144,6 +154,8 @@ async def _fly(run: Run, record: Record, folder: Path) -> None:
         can_cut=scenario.can_cut,
         swarm=scenario.swarm,
         two_radios=scenario.two_radios,
+        relays=scenario.relays,
+        behind_nats=scenario.behind_nats,
         maintenance_port=maintenance_port,
     ) as world:
         pilots = [Pilot(world.station, system, kind) for system in systems]

@@ -6,6 +6,7 @@ It decodes with pymavlink, independently of the daemon.
 from __future__ import annotations
 
 import asyncio
+import socket
 import struct
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -53,7 +54,7 @@ class Inbox:
 class Station(asyncio.DatagramProtocol):
     """A ground station. It sends to where it received the target from, and broadcasts to all of these addresses."""
 
-    def __init__(self, system: int = SYSTEM) -> None:
+    def __init__(self, system: int = SYSTEM, sock: socket.socket | None = None) -> None:
         self.system = system
         self.sent: list[Passing] = []
         self.received: list[Passing] = []
@@ -71,7 +72,7 @@ class Station(asyncio.DatagramProtocol):
         self.bad_signatures = 0
         self._inboxes: list[tuple[frozenset[str], int, Inbox]] = []
         self._conditions: list[tuple[Callable[[], bool], asyncio.Future[None]]] = []
-        self._sock = open_socket("127.0.0.1")
+        self._sock = sock or open_socket("127.0.0.1")
         self._transport: asyncio.BaseTransport
         self._beating: asyncio.Task[None]
 

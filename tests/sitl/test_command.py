@@ -39,7 +39,9 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
 
 def test_own_simulator_has_runs() -> None:
     """It needs no binary, and flies what it has the protocols for."""
-    assert {run.scenario for run in runs(("own",))} == {"parameters-mission", "flight", "two-vehicles"}
+    assert {run.scenario for run in runs(("own",))} == {
+        *("parameters-mission", "flight", "two-vehicles", "relay", "relay-nat", "two-relays")
+    }
 
 
 @pytest.mark.parametrize(

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from tests.daemon.frames import frame
+from tests.daemon.frames import frame, heartbeat
 from tests.sitl import scenarios
 from tests.sitl.files import Log
-from tests.sitl.ledger import Passing, compare, split
+from tests.sitl.ledger import Passing, compare, compare_messages, split
+from tests.sitl.relayed import problem_of
 from tests.sitl.report import report
 from tests.sitl.scenarios import Record, Run, fly
 from tests.sitl.transfers import LOG_BYTES, FlightError, check_log, differences, largest
@@ -63,6 +65,43 @@ def test_altered_frame_is_counted() -> None:
     received[7] = Passing(received[7].at, data[:12] + bytes([data[12] ^ 1]) + data[13:])
     result = compare(SENT, received, 10.0, 12.0)
     assert (result.missing.total(), result.foreign.total()) == (1, 1)
+
+
+def test_lost_frame_is_not_mistaken_for_an_equal_later_one() -> None:
+    """Frames of 256 later have the same bytes, such as acknowledgements."""
+    sent = [*SENT[:3], Passing(11.0, SENT[0].frame)]
+    result = compare(sent, [*arrived(1, 2), Passing(11.05, SENT[0].frame)], 10.0, 12.0)
+    assert (result.missing.total(), result.reordered) == (1, 0)
+
+
+def test_frame_of_another_message_may_overtake() -> None:
+    """On a link of several paths, a heartbeat may arrive before telemetry that was sent first."""
+    beat = Passing(SENT[0].at + 0.01, heartbeat(1))
+    sent, received = [SENT[0], beat, SENT[1]], [Passing(beat.at + 0.01, beat.frame), *arrived(0, 1)]
+    assert compare(sent, received, 10.0, 12.0).reordered == 1
+    assert compare_messages(sent, received, 10.0, 12.0).is_exact
+    swapped = [Passing(passing.at + 1, passing.frame) for passing in (SENT[1], SENT[0])]
+    assert compare_messages(sent, swapped, 10.0, 12.0).reordered == 1
+
+
+CALM = {"failsafe": False, "altered": 0, "duplicated": 0, "reordered": 0, "critical_lost": 0, "stream_gap_s": 0.2}
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        ({}, ""),
+        ({"failsafe": True}, "the failsafe tripped"),
+        ({"altered": 1}, "1 frames altered"),
+        ({"critical_lost": 2}, "2 critical frames lost"),
+        ({"stream_gap_s": 0.7}, "0.7 s without telemetry"),
+        ({"critical_lost": 9, "stream_gap_s": 3.0, "down_back_s": 0.1, "up_back_s": 0.2}, ""),
+        ({"down_back_s": 0.1, "up_back_s": 2.1}, "back after 2.1 s"),
+    ],
+)
+def test_dead_relay_is_judged(change: dict[str, Any], problem: str) -> None:
+    """Two relays lose nothing critical. With one, frames are lost until it is back."""
+    assert problem_of(CALM | change) == problem
 
 
 def test_datagram_is_split_into_frames() -> None:

@@ -3,6 +3,7 @@
 ::
 
     with daemons:     autopilot ─ tap ─ uavlinkd ─ radio ─ uavlinkd ─ station
+    with relays:      autopilot ─ tap ─ uavlinkd ─ relay ─ uavlinkd ─ station
     without daemons:  autopilot ─ tap ─ radio ─ station
 
 The taps, the station and our own simulator are in this process, all others are processes of their own. The radio is
@@ -12,26 +13,32 @@ left out where nothing has to be impaired.
 from __future__ import annotations
 
 import asyncio
+import socket
 from collections import Counter
 from collections.abc import AsyncIterator, Sequence
-from contextlib import AsyncExitStack, asynccontextmanager
+from contextlib import AsyncExitStack, ExitStack, asynccontextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from time import monotonic
 
-from tests.daemon.fleet import AN_OPERATOR, a_member, a_vehicle
+from tests.daemon.fleet import AN_OPERATOR, a_member, a_vehicle, make_relay
 from tests.daemon.frames import sender_of
 from tests.daemon.harness import Stage
 from tests.daemon.process import DaemonProcess, Status
 from tests.daemon.udp import shown
 from tests.kernel_queues import cpu_s
+from tests.natlab.laboratory import Laboratory, Place
 from tests.sitl.conditions import CLEAN, Condition
-from tests.sitl.ledger import SETTLED_S, Comparison, compare
+from tests.sitl.ledger import SETTLED_S, Comparison, compare, compare_messages
 from tests.sitl.radio import Radio
 from tests.sitl.simulators import Simulator
 from tests.sitl.station import Station
-from tests.sitl.taps import Tap
+from tests.sitl.taps import Tap, loopback_socket
 
 GROUND, AUTOPILOT_ENDPOINT = "ground", "autopilot"
+NATS = ("carrier", "carrier-symmetric")
+"""Those of the vehicle and of the station. Between these no direct path is found."""
+NAT_PORT = 5790
 LINK_S = 120.0
 """How long a simulator may take to send its first heartbeat."""
 
@@ -46,6 +53,27 @@ class Vehicle:
     daemon: DaemonProcess | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class Places:
+    """Hosts for daemons of both ends, behind NATs, and for a relay that both reach."""
+
+    vehicle: Place
+    ground: Place
+    relay: Place
+
+    @classmethod
+    def behind_nats(cls, stack: ExitStack | AsyncExitStack) -> Places:
+        """They are there until the stack ends."""
+        laboratory = stack.enter_context(Laboratory())
+        vehicle, ground = map(laboratory.place, NATS)
+        return cls(vehicle, ground, laboratory.public())
+
+
+def _socket_at(place: Place) -> socket.socket:
+    with place.host.entered():
+        return loopback_socket()
+
+
 @dataclass(slots=True)
 class World:
     """Everything that a flight consists of."""
@@ -58,8 +86,20 @@ class World:
     radio: Radio | None = None
     second_radio: Radio | None = None
     """Of a vehicle with two radios. Both carry its link all the time."""
+    relays: list[DaemonProcess] = field(default_factory=list)
+    """The only ways from the vehicles to the station, if there are any."""
+    places: Places | None = None
+    """Where the daemons are, if not all on loopback."""
     maintenance: Tap | None = None
     """The other end of the autopilot's second port."""
+
+    def daemon(self, name: str, place: Place | None) -> DaemonProcess:
+        """A daemon at a place, or on loopback; not started."""
+        if place is None:
+            return self.stage.daemon(name)
+        daemon = self.stage.daemon(name, [f"{place.address}:{NAT_PORT}"])
+        daemon.launcher = place.host.launcher
+        return daemon
 
     @property
     def radios(self) -> list[Radio]:
@@ -68,7 +108,7 @@ class World:
 
     @property
     def daemons(self) -> list[DaemonProcess]:
-        """All daemons; empty in a flight without daemons."""
+        """All daemons at the ends of links; empty in a flight without daemons."""
         return [daemon for daemon in (self.ground, *(vehicle.daemon for vehicle in self.vehicles)) if daemon]
 
     async def until_connected(self) -> None:
@@ -134,26 +174,16 @@ class Measurement:
 
     def _compare(self, end: float) -> tuple[Comparison, Comparison]:
         world = self._world
+        compared = compare_messages if len(world.radios) + len(world.relays) > 1 else compare
         down, up = Comparison(), Comparison()
         for vehicle in world.vehicles:
             system, station = vehicle.system, world.station
             received = [passing for passing in station.received if sender_of(passing.frame) == system]
-            add(down, compare(vehicle.tap.from_autopilot, received, self._begin, end))
+            down.add(compared(vehicle.tap.from_autopilot, received, self._begin, end))
             sent = [passing for passing in station.sent if passing.target in (0, system)]
             arrived = [passing for passing in vehicle.tap.to_autopilot if sender_of(passing.frame) == station.system]
-            add(up, compare(sent, arrived, self._begin, end))
+            up.add(compared(sent, arrived, self._begin, end))
         return down, up
-
-
-def add(total: Comparison, other: Comparison) -> None:
-    """Add the counts of another comparison."""
-    total.sent += other.sent
-    total.arrived += other.arrived
-    total.missing += other.missing
-    total.foreign += other.foreign
-    total.duplicated += other.duplicated
-    total.reordered += other.reordered
-    total.latencies_s += other.latencies_s
 
 
 def refused_between(before: Status, after: Status) -> Counter[tuple[str, str]]:
@@ -179,6 +209,8 @@ async def flying(
     can_cut: bool = False,
     swarm: bool = False,
     two_radios: bool = False,
+    relays: int = 0,
+    behind_nats: bool = False,
     maintenance_port: int | None = None,
 ) -> AsyncIterator[World]:
     """Start everything, and wait until the station receives each vehicle.
@@ -188,13 +220,16 @@ async def flying(
         can_cut: whether the radio must be there, to be cut.
         swarm: whether the vehicles are peers of each other, as swarm members.
         two_radios: whether there are two radios to each vehicle. It needs daemons.
+        relays: how many relays are between the vehicles and the station, in place of radios. They need daemons.
+        behind_nats: whether vehicle, station and relay are on three hosts, the first two behind NATs. It needs root.
         maintenance_port: where a simulator sends MAVLink on a second port.
     """
-    assert with_daemons or not (condition.needs_daemons or two_radios)
+    assert with_daemons or not (condition.needs_daemons or two_radios or relays)
     async with AsyncExitStack() as stack:
+        places = Places.behind_nats(stack) if behind_nats else None
         stage = await stack.enter_async_context(Stage())
-        station = await stack.enter_async_context(Station())
-        world = World(stage, condition, station)
+        station = await stack.enter_async_context(Station(sock=_socket_at(places.ground) if places else None))
+        world = World(stage, condition, station, places=places)
         if condition.radio or can_cut or two_radios:
             world.radio = Radio(stage.folder, condition.radio)
             stack.push_async_callback(world.radio.stop)
@@ -206,12 +241,12 @@ async def flying(
             await world.maintenance.open(maintenance_port)
             stack.callback(world.maintenance.close)
         for simulator in simulators:
-            tap = Tap()
+            tap = Tap(partial(_socket_at, places.vehicle)) if places else Tap()
             await tap.open()
             stack.callback(tap.close)
             world.vehicles.append(Vehicle(simulator.system, tap, simulator))
         if with_daemons:
-            await _start_daemons(world, swarm=swarm)
+            await _start_daemons(world, swarm=swarm, relays=relays)
         else:
             await _connect_directly(world, swarm=swarm)
         for vehicle in world.vehicles:
@@ -221,28 +256,33 @@ async def flying(
         yield world
 
 
-async def _start_daemons(world: World, *, swarm: bool) -> None:
-    stage = world.stage
-    ground = world.ground = stage.daemon(GROUND)
+async def _start_daemons(world: World, *, swarm: bool, relays: int) -> None:
+    stage, places = world.stage, world.places
+    ground = world.ground = world.daemon(GROUND, places.ground if places else None)
     ground.add_endpoint("station", f"udpout:{shown(world.station.address)}")
     for vehicle in world.vehicles:
-        drone = vehicle.daemon = stage.daemon(f"drone{vehicle.system}")
+        drone = vehicle.daemon = world.daemon(f"drone{vehicle.system}", places.vehicle if places else None)
         vehicle.tap.onward = drone.add_endpoint(AUTOPILOT_ENDPOINT)
         ways = [radio.connect(drone.name, drone.sockaddr, ground.sockaddr) for radio in world.radios]
         to_ground, to_drone = zip(*(ways or [(ground.sockaddr, drone.sockaddr)]), strict=True)
         psk = stage.psk()
-        drone.add_peer(ground, list(map(shown, to_ground)), psk, **AN_OPERATOR)
-        ground.add_peer(drone, list(map(shown, to_drone)), psk, **a_vehicle(vehicle.system))
+        drone.add_peer(ground, [] if relays else list(map(shown, to_ground)), psk, **AN_OPERATOR)
+        ground.add_peer(drone, [] if relays else list(map(shown, to_drone)), psk, **a_vehicle(vehicle.system))
     for one, other in _pairs(world.vehicles) if swarm else ():
         assert one.daemon is not None
         assert other.daemon is not None
         psk = stage.psk()
         one.daemon.add_peer(other.daemon, [other.daemon.address], psk, **a_member(other.system))
         other.daemon.add_peer(one.daemon, [one.daemon.address], psk, **a_member(one.system))
+    for number in range(1, relays + 1):
+        relay = world.daemon(f"relay{number}", places.relay if places else None)
+        make_relay(relay, *world.daemons)
+        world.relays.append(relay)
     for daemon in world.daemons:
-        daemon.config["link"].update(world.condition.link)
+        daemon.config["link"].update(world.condition.link, **({"confidential": True} if relays else {}))
     for radio in world.radios:
         await radio.start()
+    await stage.start(*world.relays, linked=False)
     await stage.start(*world.daemons)
 
 
