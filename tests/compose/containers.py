@@ -130,11 +130,6 @@ class Containers(Cluster):
             *(f"{self.project}_air", await self.container(name)),
         )
 
-    def health(self, container: str) -> str:
-        """What a container's health check says."""
-        command = ("docker", "inspect", "--format", "{{.State.Health.Status}}", container)
-        return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
-
     def logs(self) -> str:
         return self._logs
 
@@ -151,6 +146,12 @@ class Containers(Cluster):
         """How often an attack did something."""
         counts: dict[str, int] = self.ask_mitm("statistics").get("interventions", {})
         return sum(count for name, count in counts.items() if name.partition(":")[0] == attack)
+
+
+def health(container: str) -> str:
+    """What a container's health check says."""
+    command = ("docker", "inspect", "--format", "{{.State.Health.Status}}", container)
+    return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
 
 
 def replace(path: Path, old: str, new: str) -> None:

@@ -10,9 +10,9 @@ import pytest_asyncio
 
 from tests.compose import outages
 from tests.compose.cluster import Cluster, Conversation, run, until
-from tests.compose.containers import USER, Containers, opened
+from tests.compose.containers import USER, Containers, health, opened
 
-pytestmark = pytest.mark.asyncio(loop_scope="module")
+pytestmark = [pytest.mark.asyncio(loop_scope="module"), pytest.mark.long]
 
 
 @pytest_asyncio.fixture(scope="module", loop_scope="module")
@@ -48,7 +48,7 @@ async def test_containers_are_healthy_confined_and_unprivileged(cluster: Contain
     """The health check passes on live links; the daemon is not root, and its root file system is read-only."""
 
     drone = await cluster.container("drone1")
-    await until(lambda: cluster.health(drone) == "healthy", "drone1 is healthy")
+    await until(lambda: health(drone) == "healthy", "drone1 is healthy")
     assert (await run("docker", "exec", drone, "id", "-u")).strip() == str(USER)
     for path in ("/x", "/tmp/x", "/etc/uavlinkd/x", "/opt/uavlinkd/x"):
         assert "Read-only file system" in await run("docker", "exec", drone, "touch", path, check=False)
