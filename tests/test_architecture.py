@@ -29,9 +29,16 @@ USERS_OF_PYMAVLINK = ("mavlink/dialect", "lab/sim/")
 """The generated tables, and the simulated autopilot with its tools."""
 CORE_WITHOUT_KEYS = {
     f"uavlinkd.core.{name}"
-    for name in ("constants", "drops", "limits", "outputs", "path", "probe", "refusals", "suites", "wire")
+    for name in (
+        *("constants", "drops", "limits", "outputs", "path", "probe", "refusals", "relay_records"),
+        *("suites", "wire"),
+    )
 }
 """The modules of the core that contain no key and cannot use one."""
+HOLDERS_OF_KEYS = ("uavlinkd.lab.hostile", "uavlinkd.lab.evaluation", "uavlinkd.relay", "uavlinkd.config")
+"""The packages that the man in the middle may not use, because they read or use keys."""
+LAB_OF_THE_RELAY = ("uavlinkd.lab.mitm", "uavlinkd.lab.hostile")
+"""The packages of the laboratory that the hostile relay may use: the others hold keys of members."""
 PAPER = ("lab/evaluation/paper.py", "lab/evaluation/paper_protocol.py")
 """The paper's own protocol, which the core must not be able to speak."""
 
@@ -54,10 +61,19 @@ def stray_cryptography(name: str, source: str) -> set[str]:
 
 
 def keys_of_the_attacker(name: str, source: str) -> set[str]:
-    """Boundary 2: imports of the attacker from the core, except its wire format."""
-    modules = {module for module in imports(name, source) if is_inside(module, "uavlinkd.core")}
+    """Boundary 2: imports of the attacker from packages with keys, and from the core, except its wire format."""
+    all_imports = imports(name, source)
+    modules = {module for module in all_imports if is_inside(module, "uavlinkd.core")}
     secret = {module for module in modules if not any(is_inside(module, open_) for open_ in CORE_WITHOUT_KEYS)}
-    return (secret - {"uavlinkd.core"}) | roots(name, source) & {"cryptography"}
+    holders = {module for module in all_imports if any(is_inside(module, holder) for holder in HOLDERS_OF_KEYS)}
+    return (secret - {"uavlinkd.core"}) | holders | roots(name, source) & {"cryptography"}
+
+
+def keys_of_a_member(name: str, source: str) -> set[str]:
+    """Boundary 2: imports with which the hostile relay would get a key that is not a relay's."""
+    of_lab = {module for module in imports(name, source) if is_inside(module, "uavlinkd.lab")}
+    others = {module for module in of_lab if not any(is_inside(module, lab) for lab in LAB_OF_THE_RELAY)}
+    return others | {module for module in imports(name, source) if is_inside(module, "uavlinkd.config.keys")}
 
 
 def laboratory(name: str, source: str) -> set[str]:
@@ -166,8 +182,14 @@ def test_cryptography_has_one_importer() -> None:
 
 
 def test_attacker_holds_no_key() -> None:
-    """The man in the middle imports the wire format and no keys."""
+    """The man in the middle imports the wire format and no keys, nor the relay that holds one."""
     assert violations(keys_of_the_attacker, "lab/mitm/") == {}
+
+
+def test_hostile_relay_holds_only_the_key_of_a_relay() -> None:
+    """It gets its key from the file of a relay, which has the public keys of members. It makes no other key."""
+    assert list(sources("lab/hostile/"))
+    assert violations(keys_of_a_member, "lab/hostile/") == {}
 
 
 def test_laboratory_is_imported_by_its_commands_only() -> None:
@@ -201,6 +223,11 @@ def test_pymavlink_is_for_tables_and_tools() -> None:
         (keys_of_the_attacker, "lab/mitm/attacks.py", "from ...core.node import Node"),
         (keys_of_the_attacker, "lab/mitm/attacks.py", "import uavlinkd.core.session"),
         (keys_of_the_attacker, "lab/mitm/proxy.py", "from cryptography.hazmat.primitives import hashes"),
+        (keys_of_the_attacker, "lab/mitm/cli.py", "from uavlinkd.lab.hostile.relay_cli import relay_main"),
+        (keys_of_the_attacker, "lab/mitm/proxy.py", "from uavlinkd.relay import service"),
+        (keys_of_the_attacker, "lab/mitm/proxy.py", "from uavlinkd.config.keys import read_secret_file"),
+        (keys_of_a_member, "lab/hostile/hostile_relay.py", "from uavlinkd.lab.evaluation.pair import Pair"),
+        (keys_of_a_member, "lab/hostile/hostile_relay.py", "from uavlinkd.config.keys import generate_private_key"),
         (laboratory, "link/daemon.py", "from uavlinkd.lab.evaluation import lab"),
         (laboratory, "link/daemon.py", "from uavlinkd.lab.sim.loopback_ports import free_port"),
         (laboratory, "core/node.py", "import uavlinkd.lab.evaluation.bare_dh"),

@@ -11,6 +11,7 @@ from tests.daemon.harness import Stage
 from tests.daemon.process import DaemonProcess, Status
 from tests.mistakes.file_rows import FILE_ROWS
 from tests.mistakes.link_rows import LINK_ROWS
+from tests.mistakes.relay_rows import RELAY_ROWS
 from tests.mistakes.row import Mistake, Result, Side, Sign, is_in
 from tests.mistakes.scene import Scene
 from tests.waiting import PATIENCE_S, Stopwatch
@@ -27,7 +28,7 @@ def _order(mistake: Mistake) -> tuple[int, str]:
     return int(number), mistake.row
 
 
-MISTAKES = tuple(sorted((*FILE_ROWS, *LINK_ROWS), key=_order))
+MISTAKES = tuple(sorted((*FILE_ROWS, *LINK_ROWS, *RELAY_ROWS), key=_order))
 
 
 async def run_all(mistakes: tuple[Mistake, ...] = MISTAKES) -> dict[str, Result]:

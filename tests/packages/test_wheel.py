@@ -76,7 +76,7 @@ def test_wheel_has_the_whole_package(folder: Path) -> None:
 
     assert {name for name in names if not name.startswith(f"uavlinkd-{__version__}.dist-info/")} == files("uavlinkd")
     assert "uavlinkd = uavlinkd.cli:main" in entry_points
-    assert "uavlink-mitm = uavlinkd.lab.mitm.cli:main" in entry_points
+    assert "uavlink-mitm = uavlinkd.lab.attacker:main" in entry_points
 
 
 def test_source_has_tests_units_and_examples(folder: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from tests.mavlink.parsers.generate import Generator
 from tests.mavlink.parsers.judge import Deliverer, unfiltered
 from tests.mavlink.parsers.receivers import Batch, Delivery, Options, Receiver
@@ -10,6 +12,7 @@ from tests.mavlink.parsers.run import run
 STREAMS = 6000
 
 
+@pytest.mark.long
 def test_no_receiver_accepts_what_policy_forbids() -> None:
     """From any offset and after a random loss; the streams cover every step of the parsers."""
     result = run(STREAMS, seed=15, share=4)
