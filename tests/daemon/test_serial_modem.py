@@ -115,9 +115,14 @@ async def radio(stage: Stage) -> AsyncIterator[Start]:
 
 
 async def test_noisy_modems_and_a_pulled_plug(radio: Start) -> None:
-    """Handshake, heartbeats and commands pass, and again soon after the line is back. No frame is altered."""
+    """Handshake, heartbeats and commands pass, and again soon after the line is back. No frame is altered.
+
+    After the return the noise may take a datagram or two, so the bound is twice that of a line without noise.
+    """
     pair = await radio(NOISY)
     await pair.both_receive(10)
+    statistics = pair.ports.link.bytes
+    await until(lambda: all(statistics[end][Fate.ALTERED] for end in ModemEnd))
     for end in ModemEnd:
         pair.ports.pull(end)
         lost = pair.ports.link.bytes[end.other][Fate.WRITTEN]
@@ -126,10 +131,8 @@ async def test_noisy_modems_and_a_pulled_plug(radio: Start) -> None:
         watch = Stopwatch()
         await pair.both_receive()
         print(f"{end}: {watch.elapsed_s:.2f} s after the return ({watch.calm_s:.2f} s calm)")
-        assert watch.calm_s < BACK_S + INTERVAL_S
+        assert watch.calm_s < 2 * BACK_S + INTERVAL_S
     pair.check()
-    statistics = pair.ports.link.bytes
-    assert all(statistics[end][Fate.ALTERED] for end in ModemEnd)
 
 
 @pytest.mark.long
