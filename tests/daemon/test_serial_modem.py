@@ -117,7 +117,7 @@ async def radio(stage: Stage) -> AsyncIterator[Start]:
 async def test_noisy_modems_and_a_pulled_plug(radio: Start) -> None:
     """Handshake, heartbeats and commands pass, and again soon after the line is back. No frame is altered.
 
-    After the return the noise may take a datagram or two, so the bound is twice that of a line without noise.
+    After the return the noise may destroy a datagram or two, so the bound is twice that of a line without noise.
     """
     pair = await radio(NOISY)
     await pair.both_receive(10)
