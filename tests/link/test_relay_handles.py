@@ -58,6 +58,18 @@ def test_relay_with_two_addresses_may_assign_a_handle_twice() -> None:
     assert paths.wrap(ENVELOPE, relayed(0, "vps", 8)) is None
 
 
+def test_relay_in_the_middle_takes_no_handle_of_another_relay() -> None:
+    """It answers at the address of the other relay for a while. Data along the other one passes then and later."""
+    paths = RelayHandles()
+    paths.assign("vps", LTE, [7])
+    for handles in ([9], [7], []):
+        paths.assign("hostile", LTE, handles)
+        assert paths.wrap(ENVELOPE, relayed(0, "vps", 7)) == (wrap(7, ENVELOPE), LTE.address)
+        assert paths.unwrap(0, wrap(7, ENVELOPE), LTE.address) == (ENVELOPE, relayed(0, "vps", 7))
+        assert paths.wrap(ENVELOPE, relayed(0, "hostile", 7)) is None
+    assert paths.unwrap(0, wrap(9, ENVELOPE), LTE.address) is DropReason.RELAY_UNKNOWN_HANDLE
+
+
 def test_path_to_a_relay_is_never_relayed() -> None:
     """A relay sends its own envelopes along a handle, and assigns more there: they would lead to no address."""
     paths = RelayHandles()

@@ -24,16 +24,18 @@ class RelayHandles:
         """These are all handles on the path ``at`` to the relay of this name from now on.
 
         A path to a relay is never relayed: whatever a relay sends, no datagram goes to a host that is not an address.
+        A relay in the middle answers at the address of another relay. It must not end the handles of that one.
         """
-        for key in [key for key in self._inward if key[:2] == at]:
+        host = relayed(at.socket, relay, 0).host
+        for key in [key for key, path in self._inward.items() if key[:2] == at and path.host == host]:
             del self._outward[self._inward.pop(key)]
         if at.is_relayed:
             return
         for handle in handles:
-            path = relayed(at.socket, relay, handle)
-            if path in self._outward:  # a relay with two addresses gave the same handle there too
+            path, key = relayed(at.socket, relay, handle), (at.socket, at.address, handle)
+            if path in self._outward or key in self._inward:  # a relay with two addresses, or two with one address
                 continue
-            self._inward[at.socket, at.address, handle] = path
+            self._inward[key] = path
             self._outward[path] = at.address, handle
 
     def unwrap(self, socket: int, data: bytes, source: SocketAddress) -> WaitingDatagram | DropReason:
