@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from tests.core.harness import Pair, quiet, run
 from uavlinkd.core import constants as c
+from uavlinkd.core.drops import DropReason
+from uavlinkd.core.outputs import Dropped, Transmit
 
 BOTH = c.FEATURE_REFUSALS | c.FEATURE_RECORDS
 
@@ -46,3 +48,18 @@ def test_same_features_begin_no_handshake() -> None:
     pair = Pair(quiet(), quiet()).establish()
     pair.a.node.offer(pair.a.peer, c.FEATURE_REFUSALS, 10.0)
     assert pair.a.peer.keys_wanted_at() > 10.0
+
+
+def test_handshake_in_flight_does_not_bring_the_features_before() -> None:
+    """Its response, which an attacker may hold, makes no session. The next handshake has the new features."""
+    pair = Pair(quiet(), quiet(features=BOTH))
+    (response,) = [
+        output.datagram for output in pair.b.receive(pair.initiation(0.0), 0.0) if isinstance(output, Transmit)
+    ]
+    pair.a.node.offer(pair.a.peer, BOTH, 0.1)
+    assert [output.reason for output in pair.a.receive(response, 0.2) if isinstance(output, Dropped)] == [
+        DropReason.UNEXPECTED_RESPONSE
+    ]
+    list(run(pair, 0.2, 3.0, lambda *_: True))
+    assert pair.a.session.parameters.features == BOTH
+    assert pair.carries(3.0)

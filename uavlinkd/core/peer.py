@@ -123,9 +123,13 @@ class Peer:
         return None if session is None or session.is_used_up else session
 
     def offer(self, features: int, now: float) -> None:
-        """Offer other features. A session keeps those that it began with, so new keys are wanted."""
+        """Offer other features. A session keeps those that it began with, so new keys are wanted.
+
+        A response to an earlier initiation would make a session with the features before.
+        """
         self.settings = replace(self.settings, link=replace(self.settings.link, features=features))
         self.initiator.settings = self.settings
+        self.initiator.cancel()
         self.paths.reports_single = bool(features & c.FEATURE_RECORDS)
         self.offered_at = now
 
