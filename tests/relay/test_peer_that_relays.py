@@ -157,3 +157,30 @@ async def test_key_of_the_station_changes_in_both_roles(stage: Stage, fleet: Fle
         await vehicle.until(lambda status: not status["peers"]["station"]["accepts_previous_key"])
         await vehicle.until(lambda status: set(status["relays"]["gcs"]["peers"].values()) == {"bound"})
     await fleet.station.until(lambda status: status["relay"]["connections"] == 1)
+
+
+async def test_others_reach_a_vehicle_by_its_previous_key_until_it_has_the_new_one(
+    stage: Stage, fleet: Fleet
+) -> None:
+    """The relay has it as two members meanwhile. Its previous key is no member's once the new one is confirmed."""
+    await stage.start(*fleet.daemons)
+    before, private = fleet.a.public_key, keys.generate_private_key()
+    stage.secrets.append(private)
+    fleet.a.public_key = keys.public_key_text(private)
+    changed = {"public_key": fleet.a.public_key, "previous_public_key": before}
+    fleet.station.config["peer"][0] |= changed
+    fleet.station.config["member"][0]["public_key"] = fleet.a.public_key
+    assert await reload(fleet.station) == []
+    status = await fleet.station.until(lambda status: status["relay"]["connections"] == 1)
+    assert set(status["relay"]["members"]) == {"drone1", "drone1 (previous key)", "drone2"}
+
+    fleet.b.config["peer"][1] |= changed
+    assert await reload(fleet.b) == []
+    await fleet.a.stop()
+    keys.write_secret_file(fleet.a.folder / "new.key", private)
+    fleet.a.config["private_key_file"] = "new.key"
+    await fleet.a.start()
+    status = await fleet.station.until(
+        lambda status: status["relay"]["connections"] == 1 and status["relay"]["members"]["drone1"]["bound"] == 1
+    )
+    assert set(status["relay"]["members"]) == {"drone1", "drone2"}

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from uavlinkd.config import Config, PeerConfig, RelayConfig
 from uavlinkd.config.changes import ConfigChanges
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import LinkedPeer, Output
+from uavlinkd.core.peer import Peer
+from uavlinkd.core.settings import previous_of
 from uavlinkd.link.drop_summary import DropSummary
 from uavlinkd.link.event_log import EventLog
 from uavlinkd.link.history import History
@@ -165,8 +167,15 @@ class Roster:
         relay, server = self.relay, self.config.relay_server
         if relay is None or server is None:
             return
-        peers = {link.config.settings.public_key: link.peers for link in self.links.values()}
-        relay.set_members(server.by_key, peers, monotonic())
+        members, peers = server.by_key, dict[bytes, list[Peer]]()
+        for link in self.links.values():
+            current = link.config.settings.public_key
+            for one in link.peers:
+                key = one.settings.public_key
+                peers.setdefault(key, []).append(one)
+                if current in members and key != current:  # others may know the member by its previous key
+                    members[key] = replace(members[current], peer=previous_of(members[current].peer, key))
+        relay.set_members(members, peers, monotonic())
         relay.forwarding.total.set_limits(server.limits)
         for peer in [peer for peer, owner in self.owners.items() if owner is relay]:
             del self.owners[peer]

@@ -37,7 +37,7 @@ class RelayMember:
     def __init__(self, settings: MemberSettings, peers: Sequence[Peer], now: float, *, is_own: bool) -> None:
         self.settings = settings
         self.peers = tuple(peers)
-        """In the core: several while a key changes of the daemon's peer that it is."""
+        """In the core: several while this daemon's key changes, and the member is a peer too."""
         self.is_own = is_own
         """Whether the relay added its peer to the core: it does not carry frames."""
         self.meter = Meter(settings.limits)
@@ -111,8 +111,8 @@ class RelayService:
     def set_members(
         self, members: Mapping[bytes, MemberSettings], peers: Mapping[bytes, Sequence[Peer]], now: float
     ) -> None:
-        """These are all members from now on, by public key. ``peers``: the daemon's peers, which carry frames, each
-        with the one of the current keys first.
+        """These are all members from now on, by public key. ``peers``: the daemon's peers, which carry frames, by
+        their public key. Of each key the one that knows the current key of this daemon is first.
 
         A member that changes from one to the other, or that has another name or PSK, has to make a new session.
         """
