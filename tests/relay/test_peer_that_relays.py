@@ -162,7 +162,7 @@ async def test_key_of_the_station_changes_in_both_roles(stage: Stage, fleet: Fle
 async def test_others_reach_a_vehicle_by_its_previous_key_until_it_has_the_new_one(
     stage: Stage, fleet: Fleet
 ) -> None:
-    """The relay has two members meanwhile. It removes the one with the previous key after a session with the new key."""
+    """The relay has two members meanwhile, and removes the one with the previous key after a new session."""
     await stage.start(*fleet.daemons)
     before, private = fleet.a.public_key, keys.generate_private_key()
     stage.secrets.append(private)
