@@ -1023,7 +1023,7 @@ def test_daemon_may_be_a_relay_too(load: Load) -> None:
         (_GOOD + "[relay_server]\nenabled = true\n", "relay_server.enabled", "no [[member]]"),
         (_TOP + _MEMBERS, "listen", "no member could reach"),
         (_RELAY.replace("drone2", "drone1"), "member[1].name (drone1)", "write another"),
-        (_RELAY.replace(_TWO, _ONE), "member[1].public_key (drone2)", "each peer has its own"),
+        (_RELAY.replace(_TWO, _ONE), "member[1].public_key (drone2)", "each member has its own"),
         (_RELAY + "max_peers = 0\n", "member[1].max_peers (drone2)", "too small"),
         (_RELAY + "role = 'observer'\n", "member[1].role (drone2)", "does not belong here"),
         (

@@ -27,9 +27,10 @@ MEMBER = f'[relay_server]\nenabled = true\n[[member]]\nname = "b"\npublic_key = 
 Load = Callable[..., Config]
 
 
-def relay(name: str = "vps", *, key: str = "", addresses: str = '["relay.example.org:5790"]', more: str = "") -> str:
+def relay(name: str = "vps", *, key: str = "", addresses: str = "", more: str = "") -> str:
     """A section."""
-    return f'[[relay]]\nname = "{name}"\npublic_key = "{key or KEY[name]}"\naddresses = {addresses}\n{more}\n'
+    at = addresses or f'["{"relay" if name == "vps" else name}.example.org:5790"]'
+    return f'[[relay]]\nname = "{name}"\npublic_key = "{key or KEY[name]}"\naddresses = {at}\n{more}\n'
 
 
 @pytest.fixture
@@ -102,10 +103,18 @@ def test_owner_of_the_relay_could_read_frames(load: Load) -> None:
         (relay(key=KEY["b"], more=MEMBER), "", "relay[0].public_key (vps)", "the key of member[0] (b) too"),
         (relay(addresses="[]"), "", "relay[0].addresses (vps)", "a relay never initiates"),
         (relay(addresses='[{ network = "sik" }]'), "", "relay[0].addresses (vps)", "reached over IP"),
+        (
+            relay() + relay("b", addresses='["b.example.org:5790", "relay.example.org:5790"]'),
+            "",
+            "relay[1].addresses (b)",
+            "relay.example.org:5790, an address of relay[0] (vps) too, which has another key",
+        ),
+        (relay(more='address = "1.2.3.4:5790"'), "", "relay[0].address (vps)", "write addresses, a list"),
+        (relay(key="abc"), "", "relay[0].public_key (vps)", "what `uavlinkd pubkey` prints there"),
         (relay(more="mtu = 1"), "", "relay[0].mtu (vps)", "is not known"),
         (relay(), 'relays = ["other"]', "peer[0].relays (drone1)", 'write one of "vps"'),
         ("", 'relays = ["vps"]', "peer[0].relays (drone1)", "add a [[relay]] of that name"),
-        (relay(), "relays = []", "peer[0].addresses (drone1)", "neither end could initiate"),
+        (relay(), "relays = []", "peer[0].addresses (drone1)", "and remove relays = []"),
     ],
 )
 def test_problem_is_named_with_what_to_write(load: Load, relays: str, peer: str, key: str, says: str) -> None:
@@ -113,6 +122,16 @@ def test_problem_is_named_with_what_to_write(load: Load, relays: str, peer: str,
     with pytest.raises(ConfigError) as caught:
         load(relays, peer)
     assert any(problem.key == key and says in problem.message for problem in caught.value.problems)
+
+
+def test_relay_without_a_peer_has_no_effect(tmp_path: Path) -> None:
+    """A relay does not use others."""
+    keys.write_secret_file(tmp_path / "vps.key", keys.generate_private_key())
+    path = tmp_path / "vps.toml"
+    members = "".join(f'[[member]]\nname = "{name}"\npublic_key = "{KEY[name]}"\n' for name in ("c", "drone1"))
+    top = 'name = "vps"\nprivate_key_file = "vps.key"\nlisten = ["0.0.0.0:5790"]\n'
+    path.write_text(f"{top}{members}{relay('b')}")
+    assert load_config(path, {}).warnings == ('relay "b" has no effect: there is no [[peer]] that it leads to',)
 
 
 def test_own_key_is_not_a_relay(load: Load, tmp_path: Path) -> None:

@@ -101,13 +101,31 @@ async def test_peer_that_does_not_ask_for_this_one_is_waited_for() -> None:
 
 @pytest.mark.long
 async def test_relay_that_does_not_answer_is_named() -> None:
-    """With its addresses, and with each peer that needs it."""
+    """With its addresses, and with each peer that needs it, although the peer was bound there.
+
+    If the cause is here, nothing is said about the relay.
+    """
     async with linked("vps") as line:
         await line.kill_relay("vps")
-        await until(lambda: Cause.RELAY_NOT_ANSWERING in {one.cause for one in find(line.left, monotonic())})
+        await send_until(line, lambda: Cause.RELAY_NOT_ANSWERING in causes(line))
         (finding,) = (one for one in find(line.left, monotonic()) if one.cause is Cause.RELAY_NOT_ANSWERING)
         assert finding.name == "right"
         assert "127.0.0.1" in finding.text
+        assert "no process listens there" in finding.text
+        assert line.left.relays.by_name["vps"].state_for(line.links[0]) == "bound"
+        assert Cause.NO_ANSWER not in causes(line)
+        address = line.left.relays.by_name["vps"].peer.paths.states[0].path.address
+        for error, cause in (("ENETUNREACH", Cause.NO_ROUTE), ("EPERM", Cause.FIREWALL_HERE)):
+            line.left.evidence.add_failure(error, address, monotonic())
+            (finding,) = (one for one in find(line.left, monotonic()) if one.cause is cause)
+            assert finding.name == "right"
+            assert "127.0.0.1" in finding.text
+            assert Cause.RELAY_NOT_ANSWERING not in causes(line)
+
+
+def causes(line: RelayLine) -> set[str]:
+    """What the left daemon finds."""
+    return {finding.cause for finding in find(line.left, monotonic())}
 
 
 async def test_ping_asks_along_each_path() -> None:

@@ -37,12 +37,16 @@ def shown(passes: bool | None, **more: Any) -> dict[str, Any]:
 
 def answer(*views: dict[str, Any], state: str = "up", filtering: tuple[dict[str, Any], ...] = ()) -> dict[str, Any]:
     """A daemon's answer with these views, of the relays that they name."""
-    relays = {name: {"state": state, "round_trip_s": 0.0234} for name in ("one", "two")}
+    relays = {
+        name: {"state": state, "round_trip_s": 0.0234, "addresses": [f"{name}.example.org:5790"], "unresolved": []}
+        for name in ("one", "two")
+    }
     return {
         "relays": relays,
         "views": list(views),
         "filtering": list(filtering),
         "candidates": [PUBLIC, PRIVATE],
+        "is_relay": False,
         "own": [PRIVATE],
     }
 
@@ -132,13 +136,21 @@ def test_report_of_a_machine_behind_nat() -> None:
 
 def test_report_without_an_answer_says_what_to_do() -> None:
     """The relays are down, or UDP is blocked."""
-    lines = list(report(answer(state="waiting")))
-    assert lines[0] == "UDP          gets no answer: 0 of 2 relays answer"
-    assert lines[1] == "relay        one: waiting"
+    silent = answer(view("one", "192.0.2.1:5790", PUBLIC), state="lost")
+    silent["relays"]["two"]["unresolved"] = ["two.example.org"]
+    lines = list(report(silent))
+    assert lines[:-1] == [
+        "UDP          gets no answer: 0 of 2 relays answer",
+        "relay        one: lost; no answer at one.example.org:5790",
+        "relay        two: lost; two.example.org has no address now: see `getent hosts two.example.org`",
+        f"candidates   {PUBLIC}, {PRIVATE}",
+    ]
     assert "public_key" in lines[-1]
 
 
 def test_file_without_relays_is_named() -> None:
     """Netcheck needs one."""
-    (line,) = report({"relays": {}, "views": [], "filtering": [], "candidates": [], "own": []})
+    nothing = {"relays": {}, "views": [], "filtering": [], "candidates": [], "is_relay": False, "own": []}
+    (line,) = report(nothing)
     assert "[[relay]]" in line
+    assert "at its members" in list(report(nothing | {"is_relay": True}))[1]

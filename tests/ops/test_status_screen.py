@@ -359,7 +359,7 @@ def test_relay_shows_its_members_those_that_are_down_first() -> None:
     relay = {"members": {"drone1": member, "drone2": down}, "dropped": {"relay_unknown_handle": 7}}
     text = printed(render_status(status_of({}, endpoints={}, relay=relay)), 120)
     assert "relay: 1 of 2 members up" in text
-    assert text.index("drone2") < text.index("drone1  ")
+    assert text.index("drone2") < text.index("drone1 ")
     assert "203.0.113.7:4000" in text
     assert "not forwarded: 7 of an unknown handle of a relay" in text
     assert "endpoint" not in text
@@ -367,18 +367,22 @@ def test_relay_shows_its_members_those_that_are_down_first() -> None:
 
 def test_members_of_a_relay_are_printed_whole_on_80_columns() -> None:
     """A name or address that was cut is of no use."""
-    member = {"is_up": True, "since_s": 5.0, "addresses": ["203.0.113.255:65535"]}
+    member = {"is_up": False, "since_s": 3540.0, "addresses": ["203.0.113.255:65535", "192.0.2.1:5790"]}
     counts = {"bound": 1, "waiting": 0, "datagrams": 1_234_567, "over_limit": 0}
     relay = {"members": {"ground-station": member | counts}, "dropped": {}}
     text = printed(render_status(status_of({}, endpoints={}, relay=relay)), 80)
     assert "…" not in text
-    assert "1,234,567" in text
+    for whole in ("ground-station", "down 59 min", "203.0.113.255:65535", "1,234,567"):
+        assert whole in text
+    assert all(len(line) <= 80 for line in text.splitlines())
 
 
 def test_relays_of_a_member_have_a_line_each() -> None:
     """With the state of each peer there."""
     used = {"state": "up", "peer": None, "round_trip_s": 0.0123, "peers": {"drone1": "bound", "drone2": "waiting"}}
     lost: dict[str, Any] = {"state": "lost", "peer": "station", "round_trip_s": None, "peers": {}}
-    text = printed(render_status(status_of({}, endpoints={}, relays={"vps": used, "spare": lost})), 120)
+    status = status_of({}, endpoints={}, relays={"vps": used, "spare": lost}, send_failures={"relay_handle_gone": 1})
+    text = printed(render_status(status), 120)
     assert "relay vps: up, 12 ms; drone1 bound, drone2 waiting" in text
     assert "relay spare, also the peer station: lost; no peer uses it" in text
+    assert "not sent: 1, because a relay no longer forwards to the peer" in text

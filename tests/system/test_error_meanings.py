@@ -9,7 +9,7 @@ import pytest
 
 from uavlinkd.system.error_meanings import ERROR_MEANINGS, meaning_of
 
-OWN = {"name_not_resolved", "address_not_here_yet", "folder_in_use"}
+OWN = {"name_not_resolved", "address_not_here_yet", "folder_in_use", "relay_handle_gone"}
 """Names that the daemon made."""
 
 

@@ -28,15 +28,17 @@ def names(problems: Problems, sections: Iterable[Values]) -> None:
     unique(problems, sections, "name", lambda name: name, "the name of {other} too: write another")
 
 
-def public_keys(problems: Problems, peers: Sequence[Values], own: bytes | None, private: bytes | None) -> None:
-    """Each peer has a key of its own, which is not this daemon's public key."""
-    unique(problems, peers, "public_key", bytes, "the key of {other} too: each peer has its own")
+def public_keys(
+    problems: Problems, peers: Sequence[Values], own: bytes | None, private: bytes | None, what: str = "peer"
+) -> None:
+    """Each peer or member has a key of its own, which is not this daemon's public key."""
+    unique(problems, peers, "public_key", bytes, f"the key of {{other}} too: each {what} has its own")
     for peer in peers:
         key = peer.valid.get("public_key")
         if key is not None and key == own and key != private:
             problems.add(
                 peer.place.key("public_key"),
-                "is this daemon's own key: write what `uavlinkd pubkey` prints on the peer",
+                f"is this daemon's own key: write what `uavlinkd pubkey` prints on the {what}",
             )
 
 
@@ -103,11 +105,12 @@ def reachability(problems: Problems, top: Values, peers: Iterable[Values], relay
         if peer in relayed:
             pass
         elif not addresses and not listen and "listen" not in top.invalid and "addresses" not in peer.invalid:
+            or_else = ", and remove relays = []" if peer.valid.get("relays") == [] else ""
             problems.add(
                 peer.place.key("addresses"),
                 "is empty, and so is listen: neither end could initiate; write the peer's address here,"
                 ' or listen = ["0.0.0.0:5790"] at the top so that the peer can initiate, or a [[relay]] that both'
-                " ends use",
+                f" ends use{or_else}",
             )
         for written in addresses:
             if any(_reaches(written.address, own) for own in listen):

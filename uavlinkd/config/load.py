@@ -152,6 +152,7 @@ def load_config(path: Path, environ: Mapping[str, str]) -> Config:
                 is_relay=relay_config is not None,
             ),
             *(() if relay_config is None else relay_rules.advice(relay_config)),
+            *used_relays.advice(relay_configs, peer_configs),
         ),
     )
 

@@ -222,6 +222,7 @@ _OTHERS_CALL_IT_IN: dict[type[Section], dict[str, str]] = {
         "allowed_ips": "role and system_ids: they say what the peer may do",
         **_FILTERS,
     },
+    RelaySection: dict.fromkeys(("address", "endpoint"), 'addresses, a list: addresses = ["relay.example.org:5790"]'),
     EndpointSection: {
         **dict.fromkeys(("address", "port", "server"), _UDP),
         "mode": f"{_UDP}, or udpout",

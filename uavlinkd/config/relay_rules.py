@@ -24,7 +24,7 @@ def members(
 ) -> None:
     """Each member has a key of its own. It may also be a peer: then one session serves both."""
     checks.names(problems, sections)
-    checks.public_keys(problems, sections, own, private)
+    checks.public_keys(problems, sections, own, private, "member")
     by_name = {peer.valid.get("name"): peer for peer in peers}
     by_key = {peer.valid.get("public_key"): peer for peer in peers}
     for section in sections:

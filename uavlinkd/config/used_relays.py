@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Final
 
 from uavlinkd.config.checks import of_peer, unique
-from uavlinkd.config.model import PeerAddress, RelayConfig
+from uavlinkd.config.model import PeerAddress, PeerConfig, RelayConfig
 from uavlinkd.config.problems import Problems, Values
 from uavlinkd.config.schema import LinkSection
 from uavlinkd.core import constants as c
@@ -48,6 +48,7 @@ def relays(
         if peer is not None:
             of_peer(problems, section, peer)
         _addresses(problems, section, peer)
+    _shared_addresses(problems, sections)
     known = {section.valid["name"]: section for section in sections if "name" in section.valid}
     for peer in peers if len(known) == len(sections) else ():
         for name in peer.valid.get("relays") or ():
@@ -76,6 +77,19 @@ def _addresses(problems: Problems, section: Values, peer: Values | None) -> None
         problems.add(place, "names a serial network, but a relay is reached over IP: write its IP address or name")
 
 
+def _shared_addresses(problems: Problems, sections: Sequence[Values]) -> None:
+    """One process answers at an address, with one key."""
+    for number, section in enumerate(sections):
+        for other in sections[:number]:
+            shared = [written for written in _over_ip(section) if written in _over_ip(other)]
+            if shared and section.valid.get("public_key") != other.valid.get("public_key"):
+                problems.add(
+                    section.place.key("addresses"),
+                    f"has {shared[0]}, an address of {other.place.key('')} too, which has another key: write the"
+                    " address of this relay",
+                )
+
+
 def _over_ip(section: Values) -> list[PeerAddress]:
     return [written for written in section.valid.get("addresses", ()) if not written.is_serial]
 
@@ -100,6 +114,12 @@ def addresses_of(peer: Values, sections: Sequence[Values]) -> tuple[PeerAddress,
     """The addresses of a peer: its own, and those of the relay that it is."""
     of_relay = [written for section in sections if peer_of(section, [peer]) for written in _over_ip(section)]
     return tuple(dict.fromkeys((*peer.valid.get("addresses", ()), *of_relay)))
+
+
+def advice(relays: Sequence[RelayConfig], peers: Sequence[PeerConfig]) -> Iterator[str]:
+    """Yield the warnings."""
+    for relay in relays if not peers else ():
+        yield f'relay "{relay.name}" has no effect: there is no [[peer]] that it leads to'
 
 
 def relay_of(section: Values, peers: Sequence[Values], psk: Secret | None, link: Values) -> RelayConfig:

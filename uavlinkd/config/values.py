@@ -52,16 +52,16 @@ def _public_key(value: Any) -> bytes:
     try:
         key = decode_key(_text(value))
     except ValueError as error:
-        raise ValueError(f"{error}: write what `uavlinkd pubkey` prints on the peer") from None
+        raise ValueError(f"{error}: write what `uavlinkd pubkey` prints there") from None
     if not is_usable_public_key(key):
         raise ValueError(
             "is a point of low order, with which everyone knows the shared secret:"
-            " write what `uavlinkd pubkey` prints on the peer"
+            " write what `uavlinkd pubkey` prints there"
         )
     if not is_canonical_public_key(key):
         raise ValueError(
             "is not a public key of X25519, but perhaps a private key, which must stay secret:"
-            " write what `uavlinkd pubkey` prints on the peer"
+            " write what `uavlinkd pubkey` prints there"
         )
     return key
 

@@ -36,7 +36,7 @@ async def answer(daemon: Controlled, request: str) -> dict[str, object] | None:
             tests = daemon.relays.filter_tests
             tests.begin(daemon.relays.by_name.values(), monotonic())
             await tests.ended.wait()
-            return views(daemon.relays, daemon.peer_sockets.network_name)
+            return views(daemon.relays, daemon.peer_sockets, is_relay=daemon.relay is not None)
         case ("ping", " ", name):
             paths, outputs = ping(daemon.links, name, daemon.node, daemon.peer_sockets.network_name, monotonic())
             daemon.perform(outputs)

@@ -114,6 +114,7 @@ class Daemon:
         )
         self._events.network_of = self.peer_sockets.network_name
         self.relays = Relays(self.node, self.peer_sockets, self.links, self.owners, self.log, self._arm)
+        self.evidence.relays = self.relays.by_name
         self.local = LocalEndpoints(config.name, self.switch, self._events, self.stall, forwarder.on_frames)
         self.relay: RelayService | None = None
         if config.relay_server is not None:

@@ -6,7 +6,8 @@ accepts a key, a name or an address because it arrived.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from typing import Final, Protocol
 
 from uavlinkd.config import Config
@@ -17,6 +18,7 @@ from uavlinkd.link.history import History
 from uavlinkd.link.other_version import other_version
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.peer_sockets import PeerSockets
+from uavlinkd.link.relay_link import RelayLink
 from uavlinkd.link.relays import Relays
 from uavlinkd.link.shown import shown
 from uavlinkd.ops.causes import Cause
@@ -51,7 +53,8 @@ def finding(cause: Cause, subject: Subject, name: str, text: str, remedy: str) -
 
 def link_down(daemon: Network, link: PeerLink, now: float) -> list[Finding]:
     """Why a peer is not up: a line for each cause with evidence; without any, one about its silence."""
-    certain = [*_configured(daemon, link), *_not_sent(daemon, link, now), *_relays(daemon, link, now)]
+    not_sent = _not_sent(daemon, link.name, lambda kind: _seen(daemon, kind, link, now))
+    certain = [*_configured(daemon, link), *not_sent, *_relays(daemon, link, now)]
     findings = [*certain, *_reported(daemon, link, now), *_hints(daemon, link, now)]
     if not findings and link.is_overdue(now):
         findings.append(_silence(daemon, link))
@@ -84,28 +87,25 @@ def _unresolved(peer: str, names: list[str]) -> Finding:
     return _about(Cause.NAME_NOT_RESOLVED, peer, f"{', '.join(names)} has no address now", remedy)
 
 
-def _not_sent(daemon: Network, link: PeerLink, now: float) -> Iterator[Finding]:
-    if (sighting := _seen(daemon, "EPERM", link, now)) is not None:
+def _not_sent(daemon: Network, peer: str, seen: Callable[[str], Sighting | None]) -> Iterator[Finding]:
+    """Errors of sending to a peer, or to a relay that it needs. ``seen``: the evidence of a kind."""
+    if (sighting := seen("EPERM")) is not None:
         text = f"this machine refuses to send to {_at(sighting)} (EPERM)"
         remedy = "allow outgoing UDP from the daemon's port: see `sudo nft list ruleset`"
-        yield _about(Cause.FIREWALL_HERE, link.name, text, remedy)
+        yield _about(Cause.FIREWALL_HERE, peer, text, remedy)
     if daemon.peer_sockets.absent_addresses():
         return  # reported once, for the daemon
     for error in _UNROUTED:
-        if (sighting := _seen(daemon, error, link, now)) is not None:
-            yield _about(
-                Cause.NO_ROUTE,
-                link.name,
-                f"this machine cannot send to {_at(sighting)} ({error})",
-                meaning_of(error),
-            )
+        if (sighting := seen(error)) is not None:
+            text = f"this machine cannot send to {_at(sighting)} ({error})"
+            yield _about(Cause.NO_ROUTE, peer, text, meaning_of(error))
             return
 
 
 def _relays(daemon: Network, link: PeerLink, now: float) -> Iterator[Finding]:
     """The relays of a peer that has no other path: one that does not answer, or that the peer does not use."""
     relays = [daemon.relays.by_name[name] for name in link.config.relays if name in daemon.relays.by_name]
-    if not link.is_overdue(now) or any(relay.state_for(link) == "bound" for relay in relays):
+    if not link.is_overdue(now) or any(relay.peer.is_up and relay.state_for(link) == "bound" for relay in relays):
         return
     for relay in relays:
         name = relay.config.name
@@ -124,17 +124,24 @@ def _relays(daemon: Network, link: PeerLink, now: float) -> Iterator[Finding]:
         elif (psk := daemon.evidence.seen_of_relay(DropReason.BAD_HANDSHAKE, name, now)) is not None:
             yield _other_psk(link.name, f"the relay {name} at {_at(psk)}")
         elif now - relay.silent_since >= RELAY_SILENT_S:
-            where = listed(map(str, relay.addresses))
-            text = (
-                f"the relay {name} does not answer at {where}: it is off, a firewall drops UDP, or keys or suites"
-                " differ"
-            )
-            remedy = (
-                f"run `uavlinkd status` at {name}: it names the cause if datagrams arrive there; else open its"
-                " firewall. `uavlinkd pubkey` there must print the public_key of the [[relay]] here, and this daemon"
-                " must be a [[member]] there"
-            )
-            yield _about(Cause.RELAY_NOT_ANSWERING, link.name, text, remedy)
+            here = list(_not_sent(daemon, link.name, partial(_seen_at_relay, daemon, relay, now)))
+            yield from here or [_no_relay(daemon, relay, link.name, now)]
+
+
+def _no_relay(daemon: Network, relay: RelayLink, peer: str, now: float) -> Finding:
+    name = relay.config.name
+    text = f"the relay {name} does not answer at {listed(map(str, relay.addresses))}: "
+    remedy = (
+        f"run `uavlinkd status` at {name}: it names the cause if datagrams arrive there; else open its"
+        " firewall. `uavlinkd pubkey` there must print the public_key of the [[relay]] here, and this daemon"
+        " must be a [[member]] there"
+    )
+    if _seen_at_relay(daemon, relay, now, f"{REPORTED}ECONNREFUSED") is not None:
+        text += "no process listens there, or a firewall there rejects (ICMP)"
+        remedy = f"start the relay, and compare its `listen` with the addresses of the [[relay]] here; or {remedy}"
+    else:
+        text += "it is off, the address is wrong, a firewall drops UDP, or keys or suites differ"
+    return _about(Cause.RELAY_NOT_ANSWERING, peer, text, remedy)
 
 
 # Hints: anything here may be forged.
@@ -256,6 +263,12 @@ def _seen(daemon: Network, kind: str, link: PeerLink, now: float) -> Sighting | 
     """Evidence since the link went down."""
     sighting = daemon.evidence.seen(kind, link, now)
     return None if sighting is None or sighting.last_at < link.silent_since else sighting
+
+
+def _seen_at_relay(daemon: Network, relay: RelayLink, now: float, kind: str) -> Sighting | None:
+    """Evidence since the relay went silent."""
+    sighting = daemon.evidence.seen_at_relay(kind, relay, now)
+    return None if sighting is None or sighting.last_at < relay.silent_since else sighting
 
 
 def _handshake_seen(daemon: Network, reason: DropReason, link: PeerLink, now: float) -> Sighting | None:

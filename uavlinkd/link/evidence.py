@@ -8,14 +8,16 @@ own. All other places share one entry per kind, so that an attacker cannot use u
 from __future__ import annotations
 
 import errno
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 from uavlinkd.core.drops import Detail, DropReason
 from uavlinkd.core.outputs import Dropped
 from uavlinkd.core.path import RELAY_HOST, SocketAddress
+from uavlinkd.core.peer import Peer
 from uavlinkd.link.key_change import link_name
 from uavlinkd.link.peer_link import PeerLink
+from uavlinkd.link.relay_link import RelayLink
 from uavlinkd.link.shown import relay_name
 
 EVIDENCE_S: Final = 30.0
@@ -26,7 +28,7 @@ MAX_DETAILS: Final = 4
 """Different details that one sighting remembers, such as public keys."""
 
 Place = tuple[object, ...]
-"""A peer, by name; an address of one; a configured host of one; or, empty, any other place."""
+"""A peer or relay, by name; an address of one; a configured host of a peer; or, empty, any other place."""
 ELSEWHERE: Final[Place] = ()
 
 REPORTED: Final = "icmp_"
@@ -73,6 +75,8 @@ class Evidence:
 
     def __init__(self, links: Mapping[str, PeerLink], own_key: bytes) -> None:
         self._links = links
+        self.relays: Mapping[str, RelayLink] = {}
+        """The relays that this daemon uses, by name."""
         self._own_key = own_key
         self.own_key_elsewhere: tuple[float, SocketAddress | None] | None = None
         """When an initiation came last that only a holder of this daemon's private key can make, and from where.
@@ -111,6 +115,10 @@ class Evidence:
         """The newest evidence of this kind about a relay of the configuration."""
         return self._newest(kind, [("relay", name)], now)
 
+    def seen_at_relay(self, kind: str, relay: RelayLink, now: float) -> Sighting | None:
+        """The newest evidence of this kind from an address of a relay."""
+        return self._newest(kind, _addresses_of(relay.peers), now)
+
     def seen_elsewhere(self, kind: str, now: float) -> Sighting | None:
         """The newest evidence of this kind from a place that is not a configured peer's."""
         return self._newest(kind, [ELSEWHERE], now)
@@ -148,7 +156,9 @@ class Evidence:
     def _find_places(self, now: float) -> None:
         """Look up where the peers are, and forget the sightings of all other places."""
         self._placed_at = now
-        self._places = frozenset(place for link in self._links.values() for place in _places_of(link))
+        of_links = (place for link in self._links.values() for place in _places_of(link))
+        of_relays = (place for relay in self.relays.values() for place in _addresses_of(relay.peers))
+        self._places = frozenset((*of_links, *of_relays))
         known = {ELSEWHERE, *self._places, *(("peer", name) for name in self._links)}
         for key in [key for key in self._sightings if key[1] not in known and key[1][0] != "relay"]:
             del self._sightings[key]
@@ -164,6 +174,12 @@ def _place_of(core_name: str) -> Place:
 def _places_of(link: PeerLink) -> list[Place]:
     """The addresses of a peer, and the hosts of those in the configuration."""
     configured = [path.address for path in link.peers[0].paths.configured] if link.peers else []
-    learned = [state.path.address for peer in link.peers for state in peer.paths.states]
     hosts = [address[0] for address in configured if relay_name(address) is None]  # a relay leads to many peers
-    return [*(("address", address) for address in (*configured, *learned)), *(("host", host) for host in hosts)]
+    return [*_addresses_of(link.peers), *(("host", host) for host in hosts)]
+
+
+def _addresses_of(peers: Sequence[Peer]) -> list[Place]:
+    """The addresses of a peer or relay: those of the configuration, then learned ones."""
+    configured = [path.address for path in peers[0].paths.configured] if peers else []
+    learned = [state.path.address for peer in peers for state in peer.paths.states]
+    return [("address", address) for address in (*configured, *learned)]

@@ -56,6 +56,11 @@ ONE_HOST = (
     " second relay on another host"
 )
 
+NO_RELAY = (
+    "This file has no [[relay]]: netcheck asks relays how they see this machine. To add one, see"
+    " uavlinkd/relay/README.md"
+)
+
 Answer = Mapping[str, Any]
 
 
@@ -63,13 +68,21 @@ def report(answer: Answer) -> Iterator[str]:
     """The lines of the report for a daemon's answer."""
     relays = answer["relays"]
     if not relays:
-        yield "This file has no [[relay]]: netcheck asks relays how they see this machine. Add one (README, Relays)"
+        yield NO_RELAY
+        if answer.get("is_relay"):
+            yield "This daemon is a relay itself: run netcheck at its members"
         return
     up = [name for name, relay in relays.items() if relay["state"] == "up"]
     yield f"UDP          {'gets out' if up else 'gets no answer'}: {len(up)} of {len(relays)} relays answer"
     for name, relay in relays.items():
-        round_trip = f", {1000 * relay['round_trip_s']:.0f} ms" if relay["round_trip_s"] is not None else ""
-        yield f"relay        {name}: {relay['state']}{round_trip if name in up else ''}"
+        yield f"relay        {name}: {relay['state']}{_about(relay)}"
+    if not up:
+        yield f"candidates   {', '.join(answer['candidates']) or 'none'}"
+        yield (
+            "No relay answers: compare addresses and public_key with the relay, write a [[member]] for this daemon"
+            " there, and let UDP through the firewalls. `uavlinkd status` here and there names the cause"
+        )
+        return
     for view in answer["views"]:
         network = f" on {view['network']}" if view["network"] else ""
         yield f"seen as      {view['seen_as']} by {view['relay']} at {view['relay_address']}{network}"
@@ -79,11 +92,17 @@ def report(answer: Answer) -> Iterator[str]:
         yield f"filtering    {filtered}{on_network}"
         yield f"             {meaning(mapped, filtered)}"
     yield f"candidates   {', '.join(answer['candidates']) or 'none'}"
-    if not up:
-        yield (
-            "No relay answers: compare addresses and public_key with the relay, write a [[member]] for this daemon"
-            " there, and let UDP through the firewalls"
-        )
+
+
+def _about(relay: Answer) -> str:
+    """How fast a relay answers; where it does not."""
+    if relay["state"] == "up":
+        return f", {1000 * relay['round_trip_s']:.0f} ms" if relay["round_trip_s"] is not None else ""
+    if relay.get("unresolved"):
+        names = ", ".join(relay["unresolved"])
+        return f"; {names} has no address now: see `getent hosts {relay['unresolved'][0]}`"
+    where = ", ".join(relay.get("addresses", ()))  # an older daemon has none
+    return f"; no answer at {where}" if where else ""
 
 
 def behaviours(answer: Answer) -> Iterator[tuple[str | None, Mapped, Filtered]]:

@@ -19,17 +19,16 @@ SHOWN_MEMBERS = 30
 
 def members_status(relay: dict[str, Any]) -> Table:
     """A line per member, those that are down first."""
-    table = Table(box=SIMPLE_HEAD, pad_edge=False)
-    for title in ("member", "state", "for", "address", "bound", "waiting", "forwarded", "over limit"):
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=0)
+    for title in ("member", "state", "address", "bound", "waiting", "forwarded", "over\nlimit"):
         justify: JustifyMethod = "left" if title in ("member", "state", "address") else "right"
-        table.add_column(title, justify=justify, overflow="fold")
+        table.add_column(title, justify=justify, overflow="fold", no_wrap=title == "state")
     members = sorted(relay["members"].items(), key=lambda item: (item[1]["is_up"], item[0]))
     for name, member in members[:SHOWN_MEMBERS]:
         table.add_row(
             Text(name),
-            Text("up", style="green") if member["is_up"] else Text("down", style="yellow"),
-            f"{member['since_s']:,.0f} s",
-            Text(", ".join(member["addresses"]) or "-"),
+            Text(f"{'up' if member['is_up'] else 'down'} {age(member['since_s'])}", _style(is_up=member["is_up"])),
+            Text("\n".join(member["addresses"]) or "-"),
             f"{member['bound']:,}",
             f"{member['waiting']:,}",
             f"{member['datagrams']:,}",
@@ -38,6 +37,18 @@ def members_status(relay: dict[str, Any]) -> Table:
     if len(members) > SHOWN_MEMBERS:
         table.add_row(f"and {len(members) - SHOWN_MEMBERS:,} more")
     return table
+
+
+def _style(*, is_up: bool) -> str:
+    return "green" if is_up else "yellow"
+
+
+def age(seconds: float) -> str:
+    """A duration for a column, at most 6 characters long within a year."""
+    if seconds < 100:
+        return f"{seconds:.1f} s"
+    minutes = seconds / 60
+    return f"{minutes:.0f} min" if minutes < 100 else f"{minutes / 60:.0f} h"
 
 
 def relay_drops(relay: dict[str, Any]) -> str:

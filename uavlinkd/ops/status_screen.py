@@ -22,7 +22,7 @@ from uavlinkd.ops.reason_phrases import (
     REFUSALS,
     phrase,
 )
-from uavlinkd.ops.relay_table import members_status, relay_drops, used_relay
+from uavlinkd.ops.relay_table import age, members_status, relay_drops, used_relay
 from uavlinkd.system.error_meanings import meaning_of
 
 Status = dict[str, Any]
@@ -257,12 +257,7 @@ def _repair(name: str, repair: Status) -> str:
 
 
 def _age(seconds: float | None) -> str:
-    if seconds is None:
-        return "never"
-    if seconds < 100:
-        return f"{seconds:.1f} s"
-    minutes = seconds / 60
-    return f"{minutes:.0f} min" if minutes < 100 else f"{minutes / 60:.0f} h"
+    return "never" if seconds is None else age(seconds)
 
 
 def _rate(bytes_s: float) -> str:

@@ -35,6 +35,8 @@ ERROR_MEANINGS: Final[Mapping[str, str]] = {
     " The daemon tries again each second",
     ADDRESS_NOT_HERE_YET: "no interface has the address: write it correctly, or wait."
     ' The socket works as soon as an interface has it. "0.0.0.0" stands for every address',
+    "relay_handle_gone": "a relay no longer forwards to the peer, for example after its restart: the daemon asks it"
+    " again by itself",
     # Files and devices.
     "ENOENT": "there is no such file or device now: plug it in, or correct its name",
     "ENXIO": "the device has gone: plug it in again",
