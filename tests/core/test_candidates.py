@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.core.harness import Pair, datagrams, exchange, of, only, probe_in, quiet, reasons
+from tests.core.harness import Pair, exchange, of, only, probe_in, quiet, reasons
 from uavlinkd.core import constants as c
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.outputs import PathChanged, Transmit
@@ -34,9 +34,21 @@ def pair() -> Pair:
 
 
 def ask(pair: Pair, now: float, *paths: Path) -> list[Transmit]:
-    """Alpha's questions to these candidates."""
+    """Alpha's questions to these candidates. Those along the relay do not arrive."""
+    return [sent for sent in ask_everywhere(pair, now, *paths) if not sent.path.is_relayed]
+
+
+def ask_everywhere(pair: Pair, now: float, *paths: Path) -> list[Transmit]:
+    """The same, with the question along the relay if one is due."""
     pair.a.node.set_candidates(pair.a.peer, paths)
     return of(pair.a.node.ask_candidates(pair.a.peer, now), Transmit)
+
+
+def answer_along_relay(pair: Pair, sent: list[Transmit], now: float) -> int:
+    """Let bravo answer what goes along the relay. Returns how many questions that is."""
+    along = [transmit for transmit in sent if transmit.path.is_relayed]
+    exchange(pair.b, pair.a, along, now)
+    return len(along)
 
 
 def test_each_candidate_gets_one_question(pair: Pair) -> None:
@@ -115,7 +127,8 @@ def test_path_that_came_by_itself_takes_the_question_too(pair: Pair) -> None:
     outputs = pair.b.node.ask_candidates(pair.b.peer, 1.0)
     assert not outputs  # it has none
     pair.b.node.set_candidates(pair.b.peer, [HOME])
-    theirs = only(datagrams(pair.b.node.ask_candidates(pair.b.peer, 1.0)))
+    sent = of(pair.b.node.ask_candidates(pair.b.peer, 1.0), Transmit)
+    theirs = only([transmit.datagram for transmit in sent if transmit.path == HOME])
     answers = of(pair.a.node.receive(theirs, DIRECT, 1.1), Transmit)
     assert DIRECT in {sent.path for sent in answers}
     assert pair.a.peer.paths.find(DIRECT) is not None
@@ -141,8 +154,30 @@ def test_questions_in_vain_are_not_a_loss_of_the_path(pair: Pair) -> None:
     assert best is not None
     for now in (1.0, 2.0, 3.0):
         exchange(pair.b, pair.a, pair.a.node.ask(pair.a.peer, best.path, now), now)
-        assert len(ask(pair, now, *map(at, range(8)))) == 8
+        sent = ask_everywhere(pair, now, *map(at, range(8)))
+        assert len(sent) == 8 + answer_along_relay(pair, sent, now)
     assert best.loss_to_repair() == (0.0, 0)
     pair.a.send(3.5)
     exchange(pair.b, pair.a, pair.a.node.ask(pair.a.peer, best.path, 4.0), 4.0)
     assert best.loss_to_repair()[1] == 1
+
+
+def test_only_path_is_asked_while_candidates_are(pair: Pair) -> None:
+    """One question each 5 s, until no further round can follow: its counts show the peer that gaps are not losses."""
+    asked = []
+    for step in range(200):
+        now = step / 2
+        sent = ask_everywhere(pair, now, DIRECT) if now in (20.0, 21.0) else of(pair.a.timeout(now), Transmit)
+        asked += [now] * answer_along_relay(pair, sent, now)
+    ends = 21.0 + c.CANDIDATE_ROUND_MOST_S
+    assert asked == [20.0 + c.PROBE_INTERVAL_S * number for number in range(100) if 5 * number + 20 < ends]
+
+
+def test_question_of_an_older_session_does_not_delay_that_of_a_new_one(pair: Pair) -> None:
+    """The peer knows no counts of the new one yet."""
+    rekey_at = pair.a.session.created_at + pair.a.peer.durations.rekey_after_s
+    assert answer_along_relay(pair, ask_everywhere(pair, rekey_at - 1.0, DIRECT), rekey_at - 1.0) == 1
+    before = pair.a.session
+    pair.establish(rekey_at)
+    assert pair.a.session is not before
+    assert answer_along_relay(pair, ask_everywhere(pair, rekey_at + 1.0, DIRECT), rekey_at + 1.0) == 1

@@ -63,6 +63,18 @@ def test_a_question_when_a_session_begins_delays_the_first_count_only() -> None:
     assert losses.count(3, FIRST_WAITS_S + 0.1) == 3
 
 
+def test_a_question_delays_the_count_again_once_none_waits() -> None:
+    """A peer that restarted searches for a direct path from the first moment of its session."""
+    losses = MissingEnvelopes()
+    losses.note_report(0, 0.0, OLD_S, asks=True)
+    assert losses.count(3, WAITS_S + 0.1) == 3
+    losses.note_report(0, WAITS_S + 1.0, 0.0, asks=True)
+    assert losses.count(8, WAITS_S + 3.0) == 3
+    losses.note_report(0, WAITS_S + 6.0, OLD_S, asks=True)
+    assert losses.count(8, WAITS_S + 7.0) == 3
+    assert losses.count(8, 2 * WAITS_S + 6.1) == 8
+
+
 Passes = Callable[[Side, Transmit, float], bool]
 
 

@@ -13,9 +13,13 @@ from uavlinkd.core.path import Path, relayed
 from uavlinkd.core.relay_records import Candidates
 from uavlinkd.link.candidates import OwnSocket, Place, is_private, may_be_asked, paths_to, places_of
 from uavlinkd.link.direct_search import LISTS, LISTS_PER_S, DirectSearch
+from uavlinkd.link.link_watch import LinkWatch, is_noteworthy
+from uavlinkd.ops.link_problems import LinkProblem
 
 LINK = quiet(features=c.FEATURE_RECORDS)
 HOME_A, HOME_B = ("198.51.100.1", 4001), ("203.0.113.2", 4002)
+SYMMETRIC_A = ("198.51.100.1", 40_000)
+"""Where a symmetric NAT shows alpha to bravo. The relay sees it at HOME_A."""
 
 
 def leads_to_mesh(host: str) -> bool:
@@ -113,7 +117,7 @@ class Network:
         self.pair.a.peer_at, self.pair.b.peer_at = relayed(0, "vps", 7), relayed(0, "vps", 8)
         for side in (self.pair.a, self.pair.b):
             side.configure_path(0.0)
-        self.pair.establish()
+        self.pair.complete(self.pair.initiation(0.0), 0.0)  # no datagram is lost
         assert self.pair.carries(0.0)
         self.hard = hard
         """Alpha's NAT is symmetric, and bravo's filters by port."""
@@ -121,6 +125,14 @@ class Network:
         self.search = {"a": DirectSearch(self.pair.a.node, self.pair.a.peer, 0.0)}
         self.search["b"] = DirectSearch(self.pair.b.node, self.pair.b.peer, 0.0)
         self.questions = 0
+        self.loses = 0
+        """Of the frames that :meth:`talk` sends, the relay loses one in so many; 0 for none."""
+        self.lost = {"a": 0, "b": 0}
+        """Of the frames of each end."""
+        self.problems: list[str] = []
+        """The ends that found a link problem in each second of :meth:`talk`."""
+        self._watches = {"a": LinkWatch(), "b": LinkWatch()}
+        self._frames = 0
 
     def set_own(self, now: float) -> None:
         """Both ends know how the relay sees them."""
@@ -137,6 +149,24 @@ class Network:
                     outputs += self.search[name].do_due(now)
                 self._perform(name, outputs, now)
             now += 0.05
+
+    def talk(self, until: float, start: float = 0.0) -> None:
+        """Search, while each end sends a heartbeat a second, and looks for problems of its link."""
+        for second in range(int(start), int(until)):
+            self.play(second + 1.0, start=float(second))
+            for name in "ab":
+                now, side = second + 1.0, self._side(name)
+                frame = side.send(now)
+                self._frames += 1
+                if self.loses and not self._frames % self.loses:
+                    self.lost[name] += 1
+                else:
+                    self._perform(name, frame, now)
+                totals = {LinkProblem.ENVELOPES_MISSING: side.peer.missing(now)}
+                grown = self._watches[name].measure(totals, side.peer.traffic.envelopes_received, now)
+                self.problems += [
+                    name for problem in grown if is_noteworthy(problem, grown[problem], is_logged=False)
+                ]
 
     def _perform(self, name: str, outputs: list[Output], now: float) -> None:
         other, side = ("b", self.pair.b) if name == "a" else ("a", self.pair.a)
@@ -156,10 +186,10 @@ class Network:
         if path.is_relayed:
             return self._side("b" if name == "a" else "a").peer_at
         self.questions += 1
-        if name == "a" and self.hard:
-            source = ("198.51.100.1", 40_000)
+        if self.hard:
+            source, target = (SYMMETRIC_A, HOME_B) if name == "a" else (HOME_B, SYMMETRIC_A)
         self.open.add((name, (path.address[0], path.address[1])))
-        is_there = path.address == target or (name == "b" and self.hard and path.address == ("198.51.100.1", 40_000))
+        is_there = path.address == target
         return Path(0, source) if is_there and ("b" if name == "a" else "a", source) in self.open else None
 
     def _side(self, name: str) -> Side:
@@ -186,6 +216,30 @@ def test_impossible_pair_stays_on_the_relay_and_asks_less_and_less() -> None:
     assert 2 * c.CANDIDATE_TRIES <= network.questions < 2 * (c.CANDIDATE_TRIES + 4)  # the relayed path became usable
     network.play(110.0, start=10.0)  # before the next session, with which the tries begin again
     assert network.questions <= 2 * (c.CANDIDATE_TRIES + 7)
+
+
+def test_search_in_vain_is_no_problem_of_the_link() -> None:
+    """Its questions leave gaps in the counters. New keys begin it again."""
+    network = Network(hard=True)
+    network.set_own(0.1)
+    network.talk(200.0)
+    assert network.questions > 4 * c.CANDIDATE_TRIES
+    assert network.pair.b.peer.path == network.pair.b.peer_at
+    assert network.problems == []
+    assert [side.peer.missing(200.0) for side in (network.pair.a, network.pair.b)] == [0, 0]
+
+
+def test_losses_during_a_search_in_vain_count() -> None:
+    """Each frame that the relay loses, and nothing else."""
+    network = Network(hard=True)
+    network.loses = 7
+    network.set_own(0.1)
+    network.talk(100.0)
+    network.loses, lost = 0, network.lost
+    network.talk(130.0, start=100.0)  # the last reports
+    assert set(network.problems) == {"a", "b"}
+    assert network.pair.b.peer.missing(130.0) == lost["a"] > 10
+    assert network.pair.a.peer.missing(130.0) == lost["b"] > 10
 
 
 def test_nothing_is_due_without_a_relay() -> None:

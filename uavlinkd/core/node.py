@@ -221,8 +221,13 @@ class Node:
         peer.paths.set_candidates(paths)
 
     def ask_candidates(self, peer: Peer, now: float) -> list[Output]:
-        """Send a question to each candidate without a slot; to fewer of them if that was done often."""
-        return ask_candidates(peer, now)
+        """Send a question to each candidate without a slot; to fewer of them if that was done often.
+
+        While that goes on, the best path is asked regularly, also if it is the only one.
+        """
+        out = ask_candidates(peer, now)
+        self._schedule.update(peer)
+        return out
 
     def ask(self, peer: Peer, path: Path, now: float) -> list[Output]:
         """Ask along one path now whether the peer is there. Without an answer in time, the node initiates to it."""

@@ -224,6 +224,7 @@ class PathState:
         """Another session carries the traffic: its datagrams are counted from zero."""
         self.sent = self.received = self._reported_lost = 0
         self.repeats = NO_REPEATS
+        self.questioned_at = -NEVER  # the peer knows no counts of this session yet
         self._loss_in, self._loss_out, self._loss_by_echo = PathLoss(), PathLoss(), PathLoss()
         self._waiting = {token: asked._replace(sent=0) for token, asked in self._waiting.items()}
 

@@ -65,6 +65,7 @@ class PathSet(PathSlots):
         "next_at",
         "reports_single",
         "routes",
+        "searched_at",
         "stream_at",
         "stream_route",
     )
@@ -100,6 +101,8 @@ class PathSet(PathSlots):
         """When :meth:`update` has something to do, or a question is due."""
         self.active_at = -NEVER
         """When frames were sent last."""
+        self.searched_at = -NEVER
+        """When a candidate was asked last."""
         self.stream_at = -NEVER
         """When the best path carried stream last."""
         self._stream_times = deque[float](maxlen=c.STREAM_ENVELOPES)  # of envelopes, the oldest first
@@ -345,10 +348,12 @@ class PathSet(PathSlots):
             if age_s < c.DOWN_AFTER_S or (state is self.best and state.condition is PathCondition.UNPROVEN):
                 return c.PROBE_FAST_S
             return c.PROBE_DOWN_S if age_s < c.LONG_DOWN_S else c.PROBE_LONG_DOWN_S
-        if not others:
-            return NEVER  # an echo request is the question
-        if self.is_idle(now):
-            return self._idle_probe_s or NEVER
+        if not others or self.is_idle(now):
+            if state is self.best and now < self.searched_at + c.CANDIDATE_ROUND_MOST_S:
+                return c.PROBE_INTERVAL_S
+            return (
+                others and self._idle_probe_s
+            ) or NEVER  # an echo request is the question of a path without others
         if state.answers < c.SETTLING_ANSWERS:
             return c.PROBE_FAST_S
         if not any(other.condition is PathCondition.USABLE for other in others):

@@ -90,6 +90,9 @@ def ask_candidates(peer: Peer, now: float) -> list[Output]:
             break
         session.candidate_questions += 1
         out += _send(peer, session, state, peer.new_question(), 0, now)
+    if out:
+        peer.paths.searched_at = now
+        out += handle_timeout(peer, now)  # the peer must learn that the paths lost none of them
     return out
 
 
