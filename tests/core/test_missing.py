@@ -70,9 +70,8 @@ def test_a_question_delays_the_count_again_once_none_waits() -> None:
     assert losses.count(3, WAITS_S + 0.1) == 3
     losses.note_report(0, WAITS_S + 1.0, 0.0, asks=True)
     assert losses.count(8, WAITS_S + 3.0) == 3
-    losses.note_report(0, WAITS_S + 6.0, OLD_S, asks=True)
-    assert losses.count(8, WAITS_S + 7.0) == 3
-    assert losses.count(8, 2 * WAITS_S + 6.1) == 8
+    losses.note_report(2, WAITS_S + 6.0, OLD_S, asks=True)
+    assert losses.count(8, WAITS_S + 7.0) == 5
 
 
 Passes = Callable[[Side, Transmit, float], bool]

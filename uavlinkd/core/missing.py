@@ -1,9 +1,9 @@
 """How many envelopes of a peer did not arrive. README.md, section 15.
 
 Gaps in the counters are all that is known of a peer with one path. A peer with several paths also leaves a gap for
-each probe along a path that is down, and a peer that searches for a direct path for each question to a candidate: it
-would look like a loss while every frame arrives. Such a peer reports how many datagrams it sent along each path. So its
-gaps count only as far as the paths that work lost datagrams too.
+each probe along a path that is down, and one that searches for a direct path for each question to a candidate: they
+would look like losses while every frame arrives. Such a peer reports how many datagrams it sent along each path. So
+its gaps count only as far as the paths that work lost datagrams too.
 """
 
 from __future__ import annotations
