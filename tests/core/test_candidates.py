@@ -47,7 +47,7 @@ def ask_everywhere(pair: Pair, now: float, *paths: Path) -> list[Transmit]:
 def answer_along_relay(pair: Pair, sent: list[Transmit], now: float) -> int:
     """Let bravo answer what goes along the relay. Returns how many questions that is."""
     along = [transmit for transmit in sent if transmit.path.is_relayed]
-    exchange(pair.b, pair.a, along, now)
+    exchange(pair.b, pair.a, [*along], now)
     return len(along)
 
 
