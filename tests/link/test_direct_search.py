@@ -218,7 +218,7 @@ def test_impossible_pair_stays_on_the_relay_and_asks_less_and_less() -> None:
     assert network.questions <= 2 * (c.CANDIDATE_TRIES + 7)
 
 
-def test_search_in_vain_is_no_problem_of_the_link() -> None:
+def test_search_in_vain_causes_no_link_problem() -> None:
     """Its questions leave gaps in the counters. New keys begin it again."""
     network = Network(hard=True)
     network.set_own(0.1)
