@@ -11,6 +11,7 @@ from uavlinkd.core import outputs as o
 from uavlinkd.core.constants import NEVER
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.path import Path, relayed
+from uavlinkd.core.peer import Peer
 from uavlinkd.core.relay_records import WAITING, Bind, Bound
 from uavlinkd.core.settings import PeerSettings
 from uavlinkd.link.relay_handles import RelayHandles
@@ -246,3 +247,21 @@ def test_previous_key_of_a_relay_is_accepted_until_the_new_one_is_confirmed() ->
     link.do_due(1.0)
     assert link.peers == [current]
     assert list(node.peers.values()) == [current]
+
+
+def test_records_by_the_new_key_of_a_relay_are_not_old() -> None:
+    """Sessions are counted for each key. The first record by the new key follows the last one by the previous key."""
+    scene = Scene()
+    before, path = scene.link.peer, AT_B
+    assert scene.binds(T)
+    assert scene.bound(T, (ONE, 5), order=(6 << 32) + 10) is None
+    after = scene.pair.a.node.add_peer(PeerSettings("relay vps by its new key", ELSE, None, LINK), T)
+
+    def bound(peer: Peer, handle: int, order: int) -> DropReason | None:
+        record = Bound("198.51.100.1", 4000, ((ONE, handle),))
+        return scene.link.on_record(o.RecordReceived(peer, path, record, order), T + 1)
+
+    assert bound(before, 4, (6 << 32) + 9) is DropReason.OLD_RECORD
+    assert bound(after, 7, (2 << 32) + 1) is None
+    assert bound(after, 6, 2 << 32) is DropReason.OLD_RECORD
+    assert scene.link.paths_to([ONE]) == [[relayed(0, "vps", 7)]]

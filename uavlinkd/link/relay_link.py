@@ -15,6 +15,7 @@ from uavlinkd.core import outputs as o
 from uavlinkd.core.constants import NEVER
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.node import Node
+from uavlinkd.core.outputs import LinkedPeer
 from uavlinkd.core.path import Path, relayed
 from uavlinkd.core.path_state import PathState
 from uavlinkd.core.peer import Peer
@@ -35,7 +36,7 @@ ASK_S: Final = 0.25
 class _Binding:
     """What this daemon asked for along one path to the relay, and what it got."""
 
-    __slots__ = ("at", "bound_at", "due_at", "handles", "orders", "seen_as", "tries", "unanswered")
+    __slots__ = ("at", "bound_at", "due_at", "handles", "orders", "seen_as", "sender", "tries", "unanswered")
 
     def __init__(self, path: Path) -> None:
         self.at = path
@@ -46,7 +47,10 @@ class _Binding:
         """The keys of the last bind that no record has named since."""
         self.handles: dict[bytes, tuple[int, ...]] = {}
         """By key of a peer; empty while the peer is not there."""
+        self.sender: LinkedPeer | None = None
+        """The relay in the core, by the key of its last record."""
         self.orders: dict[bytes, int] = {}
+        """By key of a peer: that of the last record about it, among those of the sender."""
         self.bound_at = -NEVER
         """When the relay answered last."""
         self.seen_as: Address | None = None
@@ -58,11 +62,15 @@ class _Binding:
         self.due_at = now + min(c.BIND_RETRY_S, BIND_SOON_S * 2.0 ** min(self.tries, 8))
         self.tries += 1
 
-    def receive(self, bound: Bound, order: int, wanted: Iterable[bytes], now: float) -> set[bytes] | DropReason:
+    def receive(
+        self, bound: Bound, order: int, sender: LinkedPeer, wanted: Iterable[bytes], now: float
+    ) -> set[bytes] | DropReason:
         """Take the handles of those peers that are wanted.
 
         Returns the keys whose handles changed, or why the record has no effect.
         """
+        if sender is not self.sender:  # the relay has another key: its sessions are counted from the beginning
+            self.sender, self.orders = sender, {}
         asked = {key for key, _ in bound.handles if key in wanted}
         named: dict[bytes, tuple[int, ...]] = {key: () for key in asked if order > self.orders.get(key, -1)}
         if not named:
@@ -208,7 +216,7 @@ class RelayLink:
         binding = self._bindings.get(received.path)
         if binding is None or not isinstance(received.record, Bound):
             return DropReason.UNEXPECTED_RECORD  # a path without a bind; a bind, which is for a relay
-        changed = binding.receive(received.record, received.order, self.keys, now)
+        changed = binding.receive(received.record, received.order, received.peer, self.keys, now)
         if isinstance(changed, DropReason):
             return changed
         if changed:
