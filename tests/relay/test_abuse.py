@@ -289,6 +289,22 @@ def test_data_does_not_make_the_relay_look_at_what_waits(relay: FuzzedRelay, mon
     assert looks == [start + 1.0]
 
 
+def test_removed_member_with_several_paths_is_cut_off(relay: FuzzedRelay) -> None:
+    """Whatever handle it tries afterwards, from any of its addresses."""
+    bindings = relay.service.bindings
+    paths = {member: [Path(0, (f"203.0.113.{member}", port)) for port in (1, 2, 3)] for member in (1, 2)}
+    for one, other in ((1, 2), (2, 1)):
+        for path in paths[one]:
+            relay.service._apply(bindings.bind(KEYS[one], path, [KEYS[other]], relay.now))
+    assert len(relay.service.forwarding) == 2 * c.HANDLES_PER_PAIR
+    relay.set_members(0b110, 3)
+    for path in paths[1]:
+        for handle in range(2**16):
+            relay.service.take(path.socket, wrap(handle, DATA), path.address)
+    assert relay.forwarded == []
+    assert len(relay.service.forwarding) == 0
+
+
 def test_drops_of_a_removed_member_are_reported(relay: FuzzedRelay) -> None:
     """Also those since the last report."""
     to_other, _ = connect(relay)

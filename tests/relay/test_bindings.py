@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import pytest
 from hypothesis import given, settings
@@ -64,6 +64,7 @@ class Model:
 
     def apply(self, changes: Changes, now: float) -> None:
         """Check what changed by itself."""
+        assert not {*changes.opened} & {*changes.closed}
         for connection in changes.closed:
             self.connections.remove(connection)
             for end in connection:
@@ -109,6 +110,7 @@ member_keys = st.sampled_from(MEMBERS)
 steps: st.SearchStrategy[Step] = st.one_of(
     st.tuples(st.just("bind"), member_keys, st.integers(0, 5), st.lists(st.sampled_from((*MEMBERS, STRANGER)))),
     st.tuples(st.just("end"), member_keys, st.integers(0, 5), st.just([])),
+    st.tuples(st.just("leave"), member_keys, st.just(0), st.just([])),
     st.tuples(st.just("wait"), member_keys, st.integers(1, 40), st.just([])),
 )
 
@@ -116,7 +118,7 @@ steps: st.SearchStrategy[Step] = st.one_of(
 @settings(max_examples=150, deadline=None)
 @given(st.integers(0, 1000), st.lists(steps, max_size=40))
 def test_random_histories_follow_the_rules(seed: int, history: list[Step]) -> None:
-    """Whatever members bind, lose and let expire."""
+    """Members bind, lose paths, let wishes expire, and are removed and added again."""
     made, model, now = bindings(seed, most_peers=100), Model(), 0.0
     for kind, member, number, keys in history:
         if kind == "wait":
@@ -128,6 +130,10 @@ def test_random_histories_follow_the_rules(seed: int, history: list[Step]) -> No
             gone = [wish for wish in model.wishes if (wish[0], wish[2]) == (member, path(member, number))]
             for wish in gone:
                 del model.wishes[wish]
+        elif kind == "leave":
+            changes = made.remove_member(member, now)
+            made.set_member(member, 100)
+            model.wishes = {wish: until for wish, until in model.wishes.items() if wish[0] != member}
         else:
             changes = made.bind(member, path(member, number), keys, now)
             for key in dict.fromkeys(keys):
@@ -296,6 +302,24 @@ def test_ten_thousand_requested_bindings_are_bounded() -> None:
     made.expire(c.BIND_LIFETIME_S)
     made.bind(greedy, Path(0, ("192.0.2.1", 1)), [members[-1]], 61.0)
     assert made.peers_of(greedy) == (0, 1)
+
+
+@pytest.mark.parametrize(
+    "end",
+    [lambda made: made.remove_member(A, 1.0), lambda made: made.expire(c.BIND_LIFETIME_S)],
+    ids=["removed", "expired"],
+)
+def test_wishes_that_end_together_open_nothing(end: Callable[[Bindings], Changes]) -> None:
+    """Of two members with three paths each, which have connections to spare."""
+    made = bindings()
+    for number in range(3):
+        made.bind(A, path(A, number), [B], 0.0)
+        made.bind(B, path(B, number), [A], 0.0)
+    assert made.connections == c.HANDLES_PER_PAIR
+    changes = end(made)
+    assert changes.opened == []
+    assert len(changes.closed) == c.HANDLES_PER_PAIR
+    assert made.connections == 0
 
 
 def test_removed_member_leaves_nothing_behind_it() -> None:

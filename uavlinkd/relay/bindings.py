@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping, Sequence
-from itertools import product
+from itertools import product, takewhile
 from typing import NamedTuple
 
 from uavlinkd.core import constants as c
@@ -41,7 +41,10 @@ class MemberConnection(NamedTuple):
 
 
 class Changes(NamedTuple):
-    """What a call changed. ``concerned``: by member and path, the keys whose handles there the member must get."""
+    """What a call changed. ``concerned``: by member and path, the keys whose handles there the member must get.
+
+    No connection is both opened and closed.
+    """
 
     opened: list[MemberConnection]
     closed: list[MemberConnection]
@@ -144,9 +147,7 @@ class Bindings:
 
     def remove_member(self, key: bytes, now: float) -> Changes:
         """End its connections, and forget it. The wishes of others for it stay, as for any key without a member."""
-        changes = Changes.none()
-        for path in self.paths_of(key):
-            self._end(key, path, changes, now)
+        changes = self._end([wish for along in self._members[key].wishes.values() for wish in along.values()], now)
         del self._members[key]
         return changes
 
@@ -164,24 +165,23 @@ class Bindings:
 
     def end_path(self, member: bytes, path: Path, now: float) -> Changes:
         """A path of a member is gone."""
-        changes = Changes.none()
-        self._end(member, path, changes, now)
-        return changes
+        of_member = self._members[member]
+        return self._end([of_member.wishes[key][path] for key in of_member.paths.get(path, ())], now)
 
     def expire(self, now: float) -> Changes:
         """End the wishes that were not renewed."""
-        changes = Changes.none()
-        while self.next_expiry <= now:
-            wish = next(iter(self._by_age))
-            self._remove(wish)
-            self._match(_pair(wish.member, wish.key), changes, now)
-        return changes
+        return self._end(list(takewhile(lambda wish: wish.until <= now, self._by_age)), now)
 
-    def _end(self, member: bytes, path: Path, changes: Changes, now: float) -> None:
-        wanted = self._members[member]
-        for key in list(wanted.paths.get(path, ())):
-            self._remove(wanted.wishes[key][path])
-            self._match(_pair(member, key), changes, now)
+    def _end(self, wishes: Iterable[_Wish], now: float) -> Changes:
+        """End wishes. Then match each pair once: a connection that would be closed again must not be opened."""
+        pairs = dict[_Pair, None]()
+        for wish in wishes:
+            self._remove(wish)
+            pairs[_pair(wish.member, wish.key)] = None
+        changes = Changes.none()
+        for pair in pairs:
+            self._match(pair, changes, now)
+        return changes
 
     def _wish(self, member: bytes, key: bytes, path: Path, now: float) -> bool:
         """Note or renew a wish. Returns whether it is new."""
