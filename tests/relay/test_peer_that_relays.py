@@ -14,6 +14,7 @@ from tests.daemon.harness import Stage
 from tests.daemon.process import DaemonProcess, Status
 from tests.daemon.test_reload import reload
 from uavlinkd.config import keys
+from uavlinkd.core.relay_records import RELAYED, TOKEN
 
 
 @pytest.fixture
@@ -100,6 +101,11 @@ async def test_roles_come_and_go_while_the_link_is_up(stage: Stage, fleet: Fleet
     status = await fleet.a.status()
     assert status["relays"] == {}
     assert status["peers"]["station"]["state"] == "up"
+    stranger, station = await stage.client(), await fleet.station.status()
+    host, _, port = station["relay"]["members"]["drone1"]["addresses"][0].rpartition(":")
+    for start in (RELAYED, TOKEN):  # as at a daemon that never had relays
+        stranger.send(bytes((start,)) + bytes(16), (host, int(port)))
+    await fleet.a.until(lambda status: status["drops"].get("malformed") == 2)
     for daemon in (fleet.a, fleet.station):
         assert len(daemon.events("peer_up", peer=peers[0]["name"] if daemon is fleet.a else "drone1")) == 1
 

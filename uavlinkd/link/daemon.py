@@ -207,7 +207,7 @@ class Daemon:
         if self.config.recording is not None:
             self.recorder = Recorder(self.config.recording, self.log)
         self._roster.start()
-        self._intake.takers.update(self._from_relays.takers)
+        self._intake.takers = self._from_relays.takers
         self.peer_sockets.start(self._arm)
         self.local.start(self.config.endpoints)
         self._warn()
@@ -270,7 +270,7 @@ class Daemon:
             raise
         self.config = config
         self._roster.follow(config, changes)
-        self._intake.takers.update(self._from_relays.takers)
+        self._intake.takers = self._from_relays.takers
         for name in changes.closed_endpoints:
             self.local.close_one(name)
         for endpoint, endpoint_config in zip(opened, changes.opened_endpoints, strict=True):
