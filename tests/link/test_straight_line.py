@@ -13,6 +13,7 @@ from tests.daemon.frames import ground_heartbeat, heartbeat
 from tests.link.relay_line import RelayLine
 from tests.link.test_calls_per_frame import attitude
 from tests.waiting import Stopwatch, until
+from uavlinkd.link import down_causes
 from uavlinkd.link.control_answers import answer
 from uavlinkd.link.diagnosis import find
 from uavlinkd.ops.causes import Cause
@@ -100,10 +101,10 @@ async def test_peer_that_does_not_ask_for_this_one_is_waited_for() -> None:
 
 
 @pytest.mark.long
-async def test_relay_that_does_not_answer_is_named() -> None:
+async def test_relay_that_does_not_answer_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     """With its addresses, and with each peer that needs it, although the peer was bound there.
 
-    If the cause is here, nothing is said about the relay.
+    If the cause is here, the relay and the peer are not blamed.
     """
     async with linked("vps") as line:
         await line.kill_relay("vps")
@@ -114,13 +115,15 @@ async def test_relay_that_does_not_answer_is_named() -> None:
         assert "no process listens there" in finding.text
         assert line.left.relays.by_name["vps"].state_for(line.links[0]) == "bound"
         assert Cause.NO_ANSWER not in causes(line)
+        monkeypatch.setattr(down_causes, "_has_unconfirmed", lambda _: True)
+        assert Cause.NOT_CONFIRMED in causes(line)
         address = line.left.relays.by_name["vps"].peer.paths.states[0].path.address
         for error, cause in (("ENETUNREACH", Cause.NO_ROUTE), ("EPERM", Cause.FIREWALL_HERE)):
             line.left.evidence.add_failure(error, address, monotonic())
             (finding,) = (one for one in find(line.left, monotonic()) if one.cause is cause)
             assert finding.name == "right"
             assert "127.0.0.1" in finding.text
-            assert Cause.RELAY_NOT_ANSWERING not in causes(line)
+            assert not causes(line) & {Cause.RELAY_NOT_ANSWERING, Cause.NOT_CONFIRMED}
 
 
 def causes(line: RelayLine) -> set[str]:

@@ -31,6 +31,7 @@ RELAY_SILENT_S: Final = 5.0
 """A relay that does not answer for this long is reported with the peers that need it."""
 _UNROUTED: Final = ("ENETUNREACH", "EHOSTUNREACH", "ENETDOWN", "EADDRNOTAVAIL", "EINVAL", "EMSGSIZE", "EAFNOSUPPORT")
 """Errors of sending that are certain: this machine's kernel reports them at once."""
+_NOT_SENT: Final = (Cause.FIREWALL_HERE, Cause.NO_ROUTE)
 _UNREACHABLE: Final = ("EHOSTUNREACH", "ENETUNREACH", "EACCES")
 """Errors that ICMP messages report, except a closed port."""
 
@@ -55,7 +56,10 @@ def link_down(daemon: Network, link: PeerLink, now: float) -> list[Finding]:
     """Why a peer is not up: a line for each cause with evidence; without any, one about its silence."""
     not_sent = _not_sent(daemon, link.name, lambda kind: _seen(daemon, kind, link, now))
     certain = [*_configured(daemon, link), *not_sent, *_relays(daemon, link, now)]
-    findings = [*certain, *_reported(daemon, link, now), *_hints(daemon, link, now)]
+    hints = list(_hints(daemon, link, now))
+    if any(one.cause in _NOT_SENT for one in certain):  # then the peer gets no response to confirm
+        hints = [one for one in hints if one.cause is not Cause.NOT_CONFIRMED]
+    findings = [*certain, *_reported(daemon, link, now), *hints]
     if not findings and link.is_overdue(now):
         findings.append(_silence(daemon, link))
     return findings
@@ -105,10 +109,17 @@ def _not_sent(daemon: Network, peer: str, seen: Callable[[str], Sighting | None]
 def _relays(daemon: Network, link: PeerLink, now: float) -> Iterator[Finding]:
     """The relays of a peer that has no other path: one that does not answer, or that the peer does not use."""
     relays = [daemon.relays.by_name[name] for name in link.config.relays if name in daemon.relays.by_name]
-    if not link.is_overdue(now) or any(relay.peer.is_up and relay.state_for(link) == "bound" for relay in relays):
+    if any(relay.peer.is_up and relay.state_for(link) == "bound" for relay in relays):
         return
     for relay in relays:
         name = relay.config.name
+        if not relay.peer.is_up:
+            here = list(_not_sent(daemon, link.name, partial(_seen_at_relay, daemon, relay, now)))
+            if here:
+                yield from here
+                continue
+        if not link.is_overdue(now):
+            continue
         if relay.state_for(link) == "waiting":
             text = (
                 f"{link.name} is not bound at the relay {name}: it is off, not a member, does not use it, or keys"
@@ -124,8 +135,7 @@ def _relays(daemon: Network, link: PeerLink, now: float) -> Iterator[Finding]:
         elif (psk := daemon.evidence.seen_of_relay(DropReason.BAD_HANDSHAKE, name, now)) is not None:
             yield _other_psk(link.name, f"the relay {name} at {_at(psk)}")
         elif now - relay.silent_since >= RELAY_SILENT_S:
-            here = list(_not_sent(daemon, link.name, partial(_seen_at_relay, daemon, relay, now)))
-            yield from here or [_no_relay(daemon, relay, link.name, now)]
+            yield _no_relay(daemon, relay, link.name, now)
 
 
 def _no_relay(daemon: Network, relay: RelayLink, peer: str, now: float) -> Finding:
