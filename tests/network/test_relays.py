@@ -126,6 +126,28 @@ def test_relay_that_does_not_answer_shows_nothing() -> None:
         assert [result.passes for result in tests.results] == [None]
 
 
+def test_relay_that_forges_the_addresses_of_its_members_prevents_no_direct_path() -> None:
+    """Each member receives envelopes of the relay from the address of the other one, from the first session on."""
+    with Network("forged by a relay", RADIO) as network:
+        pair = couple(network, searches=True)
+        pair.start()
+        pair.talk()
+        (relay,), members = pair.relays, (pair.vehicle, pair.station)
+        forged = 0
+        while not pair.is_direct() and network.now < 5.0:
+            network.run(0.01)
+            assert relay.node is not None
+            peers = [relay.node.peers.get(member.name) for member in members]
+            for member, peer, other in zip(members, peers, reversed(peers), strict=True):
+                if peer is not None and (session := peer.sessions.current) is not None and other is not None:
+                    envelope = session.seal(b"", relay.local_now)
+                    for state in other.paths.states:
+                        member.receive(envelope, state.path)
+                        forged += 1
+        assert forged > 20
+        assert pair.is_direct()
+
+
 def test_one_copy_for_each_relay_is_too_few(monkeypatch: pytest.MonkeyPatch) -> None:
     """It goes to one network of the peer: the figures show the loss when that network dies."""
     monkeypatch.setattr(c, "RELAYED_COPIES", 1)

@@ -187,7 +187,9 @@ class Relays:
     def _search(self, now: float) -> None:
         """Have direct paths searched with what is known now."""
         seen = self._seen()
-        at = {state.path.address[:2] for relay in self.by_name.values() for state in relay.peer.paths.states}
+        states = (state for relay in self.by_name.values() for state in relay.peer.paths.states)
+        # Not where its datagrams only seem to come from: a relay could forge the address of a peer, to stay between.
+        at = {state.path.address[:2] for state in states if state.is_configured or state.is_validated}
         self._searches.follow(seen, at, now)
 
     def _look(self, now: float) -> None:
