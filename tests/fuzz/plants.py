@@ -269,8 +269,8 @@ def _reports_at_once(right: Any) -> Any:
 
 
 def _accepts_any_key(right: Any) -> Any:
-    def receive(self: Any, bound: Any, order: int, wanted: Any, now: float) -> Any:
-        return right(self, bound, order, [*wanted, *(key for key, _ in bound.handles)], now)
+    def receive(self: Any, bound: Any, order: int, sender: Any, wanted: Any, now: float) -> Any:
+        return right(self, bound, order, sender, [*wanted, *(key for key, _ in bound.handles)], now)
 
     return receive
 
