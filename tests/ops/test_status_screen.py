@@ -367,13 +367,14 @@ def test_relay_shows_its_members_those_that_are_down_first() -> None:
 
 def test_members_of_a_relay_are_printed_whole_on_80_columns() -> None:
     """A name or address that was cut is of no use."""
-    member = {"is_up": False, "since_s": 3540.0, "addresses": ["203.0.113.255:65535", "192.0.2.1:5790"]}
+    member = {"is_up": False, "since_s": 3540.0, "addresses": ["203.0.113.255:65535", "203.0.113.255:65535"]}
     counts = {"bound": 1, "waiting": 0, "datagrams": 1_234_567, "over_limit": 0}
     relay = {"members": {"ground-station": member | counts}, "dropped": {}}
     text = printed(render_status(status_of({}, endpoints={}, relay=relay)), 80)
     assert "…" not in text
     for whole in ("ground-station", "down 59 min", "203.0.113.255:65535", "1,234,567"):
         assert whole in text
+    assert text.count("203.0.113.255") == 1, "once for all ports of the relay"
     assert all(len(line) <= 80 for line in text.splitlines())
 
 

@@ -28,7 +28,7 @@ def members_status(relay: dict[str, Any]) -> Table:
         table.add_row(
             Text(name),
             Text(f"{'up' if member['is_up'] else 'down'} {age(member['since_s'])}", _style(is_up=member["is_up"])),
-            Text("\n".join(member["addresses"]) or "-"),
+            Text("\n".join(dict.fromkeys(member["addresses"])) or "-"),
             f"{member['bound']:,}",
             f"{member['waiting']:,}",
             f"{member['datagrams']:,}",
