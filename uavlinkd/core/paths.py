@@ -351,9 +351,7 @@ class PathSet(PathSlots):
         if not others or self.is_idle(now):
             if state is self.best and now < self.searched_at + c.CANDIDATE_ROUND_MOST_S:
                 return c.PROBE_INTERVAL_S
-            return (
-                others and self._idle_probe_s
-            ) or NEVER  # an echo request is the question of a path without others
+            return (self._idle_probe_s if others else 0) or NEVER  # echo requests ask along a path without others
         if state.answers < c.SETTLING_ANSWERS:
             return c.PROBE_FAST_S
         if not any(other.condition is PathCondition.USABLE for other in others):
