@@ -260,6 +260,19 @@ def _remembers_every_wish(right: Any) -> Any:
     return _wish
 
 
+def _matches_each_wish(right: Any) -> Any:
+    def _end(self: Any, wishes: Any, now: float) -> Any:
+        changes = bindings.Changes.none()
+        for wish in list(wishes):
+            opened, closed, concerned = right(self, [wish], now)
+            changes.opened.extend(opened)
+            changes.closed.extend(closed)
+            changes.concerned.update(concerned)
+        return changes
+
+    return _end
+
+
 def _reports_at_once(right: Any) -> Any:
     def on_record(self: Any, received: Any, now: float) -> None:
         right(self, received, now)
@@ -369,6 +382,9 @@ PLANTS: Final = {
     ),
     "relay, unbounded wishes": Plant(
         "relay", "a member asks for any number of peers", bindings.Bindings, "_wish", _remembers_every_wish
+    ),
+    "relay, wishes one by one": Plant(
+        "relay", "a connection is opened that ends in the same step", bindings.Bindings, "_end", _matches_each_wish
     ),
     "relay, unproven address": Plant(
         "relay",

@@ -1,11 +1,11 @@
 """A relay: strangers with any datagrams, and members that hold their keys.
 
-The members are nodes of the core with two addresses each. A script lets them bind any keys, seal any payload, restart
-and roam; it changes the relay's members, and lets time pass. After each datagram these properties hold. A stranger
-gets no byte. A token goes once for each filter test, along a validated path, within the limits. No datagram that is
-forwarded is longer than the one that came, and it goes from one address of a connection to the other. A datagram with
-the header 0x50 that is not forwarded is counted once. Tables stay within their bounds. Afterwards two honest members
-connect.
+The members are nodes of the core with three addresses each. A script lets them bind any keys, seal any payload,
+restart and roam; it changes the relay's members, and lets time pass. After each datagram these properties hold. A
+stranger gets no byte. A token goes once for each filter test, along a validated path, within the limits. No datagram
+that is forwarded is longer than the one that came, and it goes from one address of a connection to the other. A
+datagram with the header 0x50 that is not forwarded is counted once. Tables stay within their bounds. Afterwards two
+honest members connect.
 """
 
 from __future__ import annotations
@@ -47,11 +47,21 @@ LIMITS: Final = RelayLimits(200, 400_000)
 TOTAL: Final = RelayLimits(400, 800_000)
 PRIVATE: Final = tuple(bytes([number]) * c.KEY_BYTES for number in (11, 12, 13, 14))
 """Of the relay, and of three members."""
-RELAY_AT: Final = (Path(0, ("192.0.2.100", 5790)), Path(1, ("2001:db8::100", 5790, 0, 0)))
-HOMES: Final = tuple(
-    (Path(0, (f"192.0.2.{number}", 4000)), Path(1, (f"2001:db8::{number}", 4000, 0, 0))) for number in (1, 2, 3)
+RELAY_AT: Final = (
+    Path(0, ("192.0.2.100", 5790)),
+    Path(1, ("2001:db8::100", 5790, 0, 0)),
+    Path(2, ("192.0.2.100", 5790)),
 )
-"""Where the relay sees each member."""
+"""Along each network of a member. The relay has a socket for each family."""
+HOMES: Final = tuple(
+    (
+        Path(0, (f"192.0.2.{number}", 4000)),
+        Path(1, (f"2001:db8::{number}", 4000, 0, 0)),
+        Path(0, (f"198.18.0.{number}", 4000)),
+    )
+    for number in (1, 2, 3)
+)
+"""Where the relay sees each member, by its network."""
 STRANGERS: Final = (Path(0, ("198.51.100.7", 4000)), Path(1, ("2001:db8::7", 9, 0, 0)), Path(1, HOMES[0][0].address))
 """The last one is a member's address on the relay's other socket. No datagram of a member comes from them."""
 LINK: Final = quiet(features=c.FEATURE_RECORDS, suites=(SUITES_BY_NAME["x25519"],))
@@ -281,7 +291,7 @@ class FuzzedRelay:
                 self.arrive(recorded, self._source(script, is_member=True))
             case 13:
                 for _ in range(script.byte() & 31):
-                    self.arrive(self._data(script, member), member.homes[what >> 6 & 1])
+                    self.arrive(self._data(script, member), member.homes[(what >> 6) % 3])
             case _:
                 self.settle()
 
@@ -296,7 +306,9 @@ class FuzzedRelay:
         which = script.byte()
         if which & 8:
             return Path(which >> 4 & 1, (f"203.0.113.{which >> 5}", script.word()))
-        return STRANGERS[which % 3] if which & 4 and not is_member else HOMES[(which >> 4) % 3][which & 1]
+        if which & 4 and not is_member:
+            return STRANGERS[which % 3]
+        return HOMES[(which >> 4) % 3][2 if which & 4 else which & 1]
 
     def _record(self, script: Script, member: _Member) -> None:
         """A member binds any keys, or sends another record, along a path of its choice."""
@@ -361,8 +373,9 @@ class FuzzedRelay:
             sent = len(self.forwarded)
             self.arrive(wrap(handle, b"\x40frame"), member.homes[0])
             ((datagram, path),) = self.forwarded[sent:]
-            (theirs, *_) = other.handles[RELAY_AT[path.socket]][KEYS[1 + member.number]]
-            assert (datagram, path) == (wrap(theirs, b"\x40frame"), other.homes[path.socket])
+            at = RELAY_AT[other.homes.index(path)]
+            (theirs, *_) = other.handles[at][KEYS[1 + member.number]]
+            assert datagram == wrap(theirs, b"\x40frame")
 
 
 def make() -> Run:
@@ -389,14 +402,15 @@ def seeds() -> list[bytes]:
     """Members connect, send, roam, restart and leave."""
 
     def bind(member: int, *keys: int, path: int = 0) -> bytes:
-        return bytes((4 | member << 4, 0x60 | path << 4 | len(keys) - 1, *keys))
+        start = bytes((4 | member << 4, (0x20 if path == 2 else 0x60 | path << 4) | len(keys) - 1, *keys))
+        return start + bytes((4 | member << 4,)) * (path == 2)
 
     def data(member: int, home: int = 0) -> bytes:
         return bytes((0 | member << 4, 0x04, 8, *range(8), home | member << 4))
 
     connect = bind(0, 1) + bind(1, 0)
     every = connect + b"".join(
-        bind(member, 0, 1, 2, 3, 4, 5, 255, path=path) for path in (0, 1) for member in range(3)
+        bind(member, 0, 1, 2, 3, 4, 5, 255, path=path) for path in range(3) for member in range(3)
     )
     passes = b"".join(data(member, home) for member in range(3) for home in (0, 1))
     waits = bytes((8, 80))
