@@ -25,7 +25,7 @@ from uavlinkd.core import constants as c
 from uavlinkd.core import wire
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.outputs import Output, PathChanged, PathStateChanged, Transmit
-from uavlinkd.core.path import Path
+from uavlinkd.core.path import Path, relayed
 from uavlinkd.core.path_state import PathCondition
 from uavlinkd.core.probe import Probe
 from uavlinkd.core.settings import Class
@@ -298,6 +298,16 @@ def test_address_that_answers_nothing_is_forgotten(pair: Pair) -> None:
     assert condition(pair.b, ELSEWHERE) is None
     assert now <= 1.0 + c.QUESTION_LIFETIME_S + c.PROBE_DOWN_S
     assert pair.b.peer.traffic.paths_unproven == 1
+
+
+@pytest.mark.parametrize("path", [ELSEWHERE, relayed(0, "vps", 7)], ids=["address", "handle"])
+def test_configured_path_that_never_answered_does_not_count(path: Path, pair: Pair) -> None:
+    """A name has another address, or a relay changes its handles. No envelope was forwarded."""
+    pair.b.node.set_paths(pair.b.peer, [AT_A, path], 1.0)
+    pair.b.node.set_paths(pair.b.peer, [AT_A], 2.0)
+    pair.b.timeout(2.0)
+    assert condition(pair.b, path) is None
+    assert pair.b.peer.traffic.paths_unproven == 0
 
 
 def test_newer_address_replaces_one_that_never_answered(pair: Pair) -> None:

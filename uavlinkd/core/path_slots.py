@@ -90,8 +90,8 @@ class PathSlots:
             self.by_path[path].is_configured = self.by_path[path].is_proven = True
         for path, state in before.items():
             if path not in self.by_path:
-                state.is_configured = False
                 if not path.is_relayed and (state is self.best or state.works):
+                    state.is_configured = False
                     self.by_path[path] = state
                 else:
                     self._drop(state)
