@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.core.harness import AT_B, ELSEWHERE, KEY_B, Pair, quiet
+from tests.core.harness import AT_B, ELSEWHERE, KEY_B, KEY_C, Pair, quiet
 from uavlinkd.config import RelayConfig
 from uavlinkd.core import constants as c
 from uavlinkd.core import outputs as o
@@ -162,6 +162,16 @@ def test_other_datagrams_with_the_token_show_nothing(path: Path, change: bytes, 
     token = scene.ask_all(answers=3)
     assert not scene.tests.take_token(token_datagram(token) + change, path)
     assert not scene.tests.take_token(token_datagram(bytes(c.FILTER_TOKEN_BYTES)[1:] + b"\7"), OTHER_PORT)
+    scene.asked(T + 9)
+    assert scene.passes == [False]
+
+
+def test_token_from_a_port_of_another_peer_shows_nothing(scene: Scene) -> None:
+    """It shares the relay's host. This daemon sends there, so a NAT lets it in."""
+    other = scene.pair.a.node.add_peer(PeerSettings("other", KEY_C.public, None, LINK), T)
+    scene.pair.a.node.set_paths(other, [OTHER_PORT], T)
+    token = scene.ask_all(answers=3)
+    assert not scene.tests.take_token(token_datagram(token), OTHER_PORT)
     scene.asked(T + 9)
     assert scene.passes == [False]
 
