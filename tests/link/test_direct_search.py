@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from socket import socket
+from types import SimpleNamespace
+
 import pytest
 
 from tests.core.harness import Pair, Side, of, quiet
@@ -13,6 +16,7 @@ from uavlinkd.core.path import Path, relayed
 from uavlinkd.core.relay_records import Candidates
 from uavlinkd.link.candidates import OwnSocket, Place, is_private, may_be_asked, paths_to, places_of
 from uavlinkd.link.direct_search import LISTS, LISTS_PER_S, DirectSearch
+from uavlinkd.link.direct_searches import DirectSearches
 from uavlinkd.link.link_watch import LinkWatch, is_noteworthy
 from uavlinkd.ops.link_problems import LinkProblem
 
@@ -288,6 +292,37 @@ def test_lists_are_limited_too() -> None:
         search.set_own((("203.0.113.9", 4000 + round_),), [], (), now)
         lists += sum(transmit.path.is_relayed for transmit in of(search.do_due(now), Transmit))
     assert LISTS <= lists <= LISTS + 20 * LISTS_PER_S + 1
+
+
+class _Sockets:
+    """Of a daemon without networks of its own."""
+
+    def numbered_sockets(self) -> list[tuple[int, socket]]:
+        """None."""
+        return []
+
+
+def test_relay_that_ends_handles_renews_no_limit() -> None:
+    """It ends the handles and assigns them again ten times a second. The lists are limited, and keep their order."""
+    network = Network()
+    peer, path = network.pair.a.peer, network.pair.a.peer_at
+    link = SimpleNamespace(peer=peer, relayed=[path])
+    links = {"bravo": link}
+    searches = DirectSearches(network.pair.a.node, _Sockets(), links, lambda: None)  # type: ignore[arg-type]
+    searches.follow([HOME_A], set(), 0.0)
+    assert searches.on_record(RecordReceived(peer, path, Candidates((HOME_B,)), 5), 0.0) is None
+    lists = 0
+    for round_ in range(200):
+        now = 0.1 + round_ / 10
+        for link.relayed in ([], [path]):
+            searches.follow([HOME_A], set(), now)
+        lists += sum(transmit.path.is_relayed for transmit in of(searches.handle_timeout(now), Transmit))
+    assert LISTS <= lists <= LISTS + 20 * LISTS_PER_S + 1
+    older = RecordReceived(peer, path, Candidates((HOME_A,)), 4)
+    assert searches.on_record(older, now) is DropReason.OLD_RECORD
+    links.clear()
+    searches.follow([HOME_A], set(), now)
+    assert searches.on_record(older, now) is DropReason.UNEXPECTED_RECORD
 
 
 def test_list_along_a_direct_path_is_dropped() -> None:

@@ -35,6 +35,8 @@ class DirectSearches:
         self._links = links
         self._on_due = on_due
         self._searches: dict[LinkedPeer, DirectSearch] = {}
+        self._paused: dict[LinkedPeer, DirectSearch] = {}
+        # Of peers without a handle now. A relay must not reset limits and orders by ending handles.
         self._looked_at = -NEVER
         self._own: list[OwnSocket] = []
 
@@ -48,9 +50,18 @@ class DirectSearches:
 
         ``seen``: this daemon's addresses as relays see them. ``relays``: where relays are.
         """
-        peers: list[Peer] = [link.peer for link in self._links.values() if link.relayed]
-        self._searches = {peer: self._searches.get(peer) or DirectSearch(self._node, peer, now) for peer in peers}
-        if not peers:
+        before, paused = self._searches, self._paused
+        self._searches, self._paused = {}, {}
+        for link in self._links.values():
+            peer: Peer = link.peer
+            search = before.get(peer) or paused.get(peer)
+            if link.relayed:
+                self._searches[peer] = search or DirectSearch(self._node, peer, now)
+                if peer in paused:
+                    self._searches[peer].begin(now)
+            elif search is not None:
+                self._paused[peer] = search
+        if not self._searches:
             return
         if now >= self._looked_at + LOOK_S:
             self._looked_at = now
