@@ -14,7 +14,7 @@ from uavlinkd.core.drops import DropReason
 from uavlinkd.core.outputs import PathStateChanged, RecordReceived, Transmit
 from uavlinkd.core.path import Path, relayed
 from uavlinkd.core.path_state import PathState
-from uavlinkd.core.relay_records import Bind, Bound, Candidates, FilterTest, Record, wrap
+from uavlinkd.core.relay_records import Bind, Bound, Candidates, FilterTest, Record, token_datagram, wrap
 from uavlinkd.link.candidates import OwnSocket
 from uavlinkd.link.direct_search import DirectSearch
 from uavlinkd.relay.service import BINDS_BURST, LOOK_S
@@ -25,6 +25,8 @@ VICTIM = "203.0.113.99"
 ELSEWHERE = Path(0, ("203.0.113.7", 4000))
 DATA = b"\x40datagram"
 TOKEN = bytes(range(c.FILTER_TOKEN_BYTES))
+IP_BYTES = 48
+"""Of the headers of IPv6 and UDP."""
 
 
 @pytest.fixture
@@ -108,7 +110,8 @@ def test_unproven_address_gets_no_report(relay: FuzzedRelay) -> None:
     session = relay.members[0].peer.sessions.current
     assert session is not None
     relay.members[0].bounds.clear()
-    bind = session.seal_record(Bind((KEYS[2],)).encode(), relay.now)
+    keys = (KEYS[2], *(bytes((number,)) * c.KEY_BYTES for number in range(1, c.KEYS_PER_BIND)))
+    bind = session.seal_record(Bind(keys).encode(), relay.now)
     relay.arrive(bind, ELSEWHERE)
     answers = [datagram for datagram, path in relay._wire if path == ELSEWHERE]
     assert sum(map(len, answers)) <= len(bind)
@@ -166,17 +169,17 @@ def test_captured_member_that_tests_filters_without_end_costs_few_sockets(relay:
     """1,000 tests a second for 20.1 s: 16 sockets, then one in 2 s. Another member has its own limit."""
     session = relay.members[2].peer.sessions.current
     assert session is not None
-    sent_before = sum(len(datagram) for datagram, _ in relay._wire)
-    received = 0
+    wired_before = len(relay._wire)
     for number in range(20_100):
         relay.now += 0.001
         test = session.seal_record(FilterTest(number.to_bytes(c.FILTER_TOKEN_BYTES)).encode(), relay.now)
-        received += len(test)
         relay.arrive(test, HOMES[2][0])
     assert relay.tokens_sent == c.FILTER_TESTS + 20 * c.FILTER_TESTS_PER_S
     assert relay.service.members[KEYS[3]].filter_tests_ignored == 20_100 - relay.tokens_sent
-    answers = sum(len(datagram) for datagram, _ in relay._wire) - sent_before
-    assert answers + relay.tokens_sent * (17 + 48) < received
+    assert len(relay._wire) - wired_before == relay.tokens_sent
+    answers = sum(len(datagram) + IP_BYTES for datagram, _ in relay._wire[wired_before:])
+    tokens = relay.tokens_sent * (len(token_datagram(TOKEN)) + IP_BYTES)
+    assert answers + tokens <= relay.tokens_sent * (len(test) + IP_BYTES), "the tests with an effect are amplified"
     before, one = relay.tokens_sent, relay.members[0]
     relay.send(one, one.node.send_record(one.peer, RELAY_AT[0], FilterTest(TOKEN), relay.now))
     assert relay.tokens_sent == before + 1

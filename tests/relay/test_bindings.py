@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from uavlinkd.core import constants as c
 from uavlinkd.core.path import Path
+from uavlinkd.core.relay_records import wrap
 from uavlinkd.relay.bindings import (
     FEWEST_PEERS,
     QUARANTINED_PER_MEMBER,
@@ -20,10 +21,14 @@ from uavlinkd.relay.bindings import (
     ConnectionEnd,
     MemberConnection,
 )
+from uavlinkd.relay.forwarding import Forwarding, Meter
+from uavlinkd.relay.member_settings import RelayLimits
 
 A, B, C, D = (bytes([number]) * c.KEY_BYTES for number in range(1, 5))
 STRANGER = bytes([9]) * c.KEY_BYTES
 MEMBERS = (A, B, C, D)
+DATA = b"\x40datagram"
+UNLIMITED = RelayLimits(10**9, 10**12)
 PATHS = {
     member: [Path(socket, (f"192.0.2.{1 + MEMBERS.index(member)}", port)) for socket in (0, 1) for port in (1, 2, 3)]
     for member in MEMBERS
@@ -57,6 +62,9 @@ class Model:
         self.wishes: dict[tuple[bytes, bytes, Path], float] = {}
         self.quarantine: dict[tuple[bytes, int], float] = {}
         self.connections: set[MemberConnection] = set()
+        self.sent: list[tuple[bytes, Path]] = []
+        self.forwarding = Forwarding(lambda *sent: self.sent.append(sent), lambda: 0.0, UNLIMITED)
+        self._meters = Meter(UNLIMITED), Meter(UNLIMITED)
 
     def paths(self, member: bytes, key: bytes) -> set[Path]:
         """Along which a member wishes for a key."""
@@ -69,7 +77,9 @@ class Model:
             self.connections.remove(connection)
             for end in connection:
                 self.quarantine[end.member, end.handle] = now + c.HANDLE_QUARANTINE_S
+            self.forwarding.close(connection)
         for connection in changes.opened:
+            self.forwarding.open(connection, self._meters)
             for end in connection:
                 assert 0 < end.handle < 2**16
                 assert now >= self.quarantine.get((end.member, end.handle), 0.0)
@@ -83,7 +93,10 @@ class Model:
         handles: dict[tuple[bytes, Path, bytes], set[int]] = defaultdict(set)
         for connection in self.connections:
             of_pair[frozenset(end.member for end in connection)].append(connection)
+        assert len(self.forwarding) == 2 * len(self.connections), "a route without a connection"
         for end, other in ends(self.connections):
+            self.forwarding.take(end.path.socket, wrap(end.handle, DATA), end.path.address)
+            assert self.sent.pop() == (wrap(other.handle, DATA), other.path)
             assert end.path in self.paths(end.member, other.member)
             handles[end.member, end.path, other.member].add(end.handle)
         every = [(end.member, end.handle) for end, _ in ends(self.connections)]
@@ -118,7 +131,7 @@ steps: st.SearchStrategy[Step] = st.one_of(
 @settings(max_examples=150, deadline=None)
 @given(st.integers(0, 1000), st.lists(steps, max_size=40))
 def test_random_histories_follow_the_rules(seed: int, history: list[Step]) -> None:
-    """Members bind, lose paths, let wishes expire, and are removed and added again."""
+    """Members bind, lose paths, let wishes expire, and are removed and added again. Routes follow."""
     made, model, now = bindings(seed, most_peers=100), Model(), 0.0
     for kind, member, number, keys in history:
         if kind == "wait":
