@@ -19,24 +19,34 @@ class RelayHandles:
     def __init__(self) -> None:
         self._inward: dict[tuple[int, SocketAddress, int], Path] = {}
         self._outward: dict[Path, tuple[SocketAddress, int]] = {}
+        self._waiting: dict[tuple[str, Path], list[int]] = {}  # handles that another relay or address has, by relay
 
     def assign(self, relay: str, at: Path, handles: Iterable[int]) -> None:
         """These are all handles on the path ``at`` to the relay of this name from now on.
 
         A path to a relay is never relayed: whatever a relay sends, no datagram goes to a host that is not an address.
         A relay in the middle answers at the address of another relay. It must not end the handles of that one.
+        A handle that both assign leads along the first one, and along the other one when that ends.
         """
         host = relayed(at.socket, relay, 0).host
         for key in [key for key, path in self._inward.items() if key[:2] == at and path.host == host]:
             del self._outward[self._inward.pop(key)]
+        self._waiting.pop((relay, at), None)
         if at.is_relayed:
             return
+        self._add(relay, at, handles)
+        waiting, self._waiting = self._waiting, {}
+        for (name, path), those in waiting.items():
+            self._add(name, path, those)
+
+    def _add(self, relay: str, at: Path, handles: Iterable[int]) -> None:
         for handle in handles:
             path, key = relayed(at.socket, relay, handle), (at.socket, at.address, handle)
             if path in self._outward or key in self._inward:  # a relay with two addresses, or two with one address
-                continue
-            self._inward[key] = path
-            self._outward[path] = at.address, handle
+                self._waiting.setdefault((relay, at), []).append(handle)
+            else:
+                self._inward[key] = path
+                self._outward[path] = at.address, handle
 
     def unwrap(self, socket: int, data: bytes, source: SocketAddress) -> WaitingDatagram | DropReason:
         """The datagram in data that begins with :data:`RELAYED_START`, and its relayed path; or why it is dropped."""
