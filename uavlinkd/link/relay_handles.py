@@ -19,6 +19,7 @@ class RelayHandles:
     def __init__(self) -> None:
         self._inward: dict[tuple[int, SocketAddress, int], Path] = {}
         self._outward: dict[Path, tuple[SocketAddress, int]] = {}
+        self._assigned: dict[tuple[str, Path], set[int]] = {}  # those that lead somewhere, by relay
         self._waiting: dict[tuple[str, Path], list[int]] = {}  # handles that another relay or address has, by relay
 
     def assign(self, relay: str, at: Path, handles: Iterable[int]) -> None:
@@ -28,13 +29,14 @@ class RelayHandles:
         A relay in the middle answers at the address of another relay. It must not end the handles of that one.
         A handle that both assign leads along the first one, and along the other one when that ends.
         """
-        host = relayed(at.socket, relay, 0).host
-        for key in [key for key, path in self._inward.items() if key[:2] == at and path.host == host]:
-            del self._outward[self._inward.pop(key)]
+        wanted = set[int]() if at.is_relayed else set(handles)
+        own = self._assigned.pop((relay, at), set())
+        for handle in own - wanted:
+            del self._outward[self._inward.pop((at.socket, at.address, handle))]
+        if kept := own & wanted:
+            self._assigned[relay, at] = kept
         self._waiting.pop((relay, at), None)
-        if at.is_relayed:
-            return
-        self._add(relay, at, handles)
+        self._add(relay, at, wanted - kept)
         waiting, self._waiting = self._waiting, {}
         for (name, path), those in waiting.items():
             self._add(name, path, those)
@@ -45,6 +47,7 @@ class RelayHandles:
             if path in self._outward or key in self._inward:  # a relay with two addresses, or two with one address
                 self._waiting.setdefault((relay, at), []).append(handle)
             else:
+                self._assigned.setdefault((relay, at), set()).add(handle)
                 self._inward[key] = path
                 self._outward[path] = at.address, handle
 
