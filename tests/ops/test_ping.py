@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from uavlinkd.ops.path_names import addresses
 from uavlinkd.ops.ping import INTERVAL_S, describe, ping
 
 DIRECT: dict[str, Any] = {
@@ -18,7 +19,15 @@ DIRECT: dict[str, Any] = {
     "loss_out": 0.02,
     "carries": ["critical", "stream", "bulk"],
 }
-RELAYED = {**DIRECT, "address": "relayed via vps", "relay": "vps", "network": None, "carries": ["critical"]}
+RELAYED = {
+    **DIRECT,
+    "number": 1,
+    "address": "relayed via vps",
+    "relay": "vps",
+    "relay_address": "198.51.100.2:5790",
+    "network": None,
+    "carries": ["critical"],
+}
 SILENT = {**RELAYED, "answered_s": 3.0, "carries": []}
 
 
@@ -36,7 +45,7 @@ SILENT = {**RELAYED, "answered_s": 3.0, "carries": []}
 )
 def test_path_in_one_line(path: dict[str, Any], text: str) -> None:
     """Direct or relayed, round trip, loss, and what it carries."""
-    assert describe(path) == text
+    assert describe(path, path["address"]) == text
 
 
 @pytest.mark.parametrize(("paths", "is_answered"), [([DIRECT, SILENT], True), ([SILENT], False), ([], False)])
@@ -48,3 +57,28 @@ def test_each_question_has_a_line_for_each_path(paths: list[dict[str, Any]], is_
     assert slept == [INTERVAL_S] * 3
     assert len(lines) == 3 * max(1, len(paths))
     assert lines[-1].startswith("3: ")
+
+
+def test_paths_along_several_ports_of_a_relay_can_be_told_apart() -> None:
+    """By the address of the relay. If two share that, by their numbers. One that is unique stays short."""
+    other_port = {**RELAYED, "number": 2, "relay_address": "198.51.100.2:5791"}
+    assert addresses([RELAYED, other_port]) == [
+        "relayed via vps at 198.51.100.2:5790",
+        "relayed via vps at 198.51.100.2:5791",
+    ]
+    assert addresses([RELAYED, other_port, {**RELAYED, "number": 3}]) == [
+        "relayed via vps at 198.51.100.2:5790 path 1",
+        "relayed via vps at 198.51.100.2:5791",
+        "relayed via vps at 198.51.100.2:5790 path 3",
+    ]
+    assert addresses([DIRECT, RELAYED, {**RELAYED, "network": "lte"}]) == [
+        "203.0.113.7:5790",
+        "relayed via vps",
+        "relayed via vps",
+    ]
+    lines: list[str] = []
+    ping(lambda: {"paths": [RELAYED, other_port]}, 1, lines.append, lambda _: None)
+    assert [line.split(",")[0] for line in lines] == [
+        "1: relayed via vps at 198.51.100.2:5790",
+        "1: relayed via vps at 198.51.100.2:5791",
+    ]

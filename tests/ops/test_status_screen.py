@@ -37,6 +37,8 @@ def path(**facts: object) -> dict[str, Any]:
         "number": 1,
         "network": None,
         "address": "203.0.113.255:65535",
+        "relay": None,
+        "relay_address": None,
         "is_configured": True,
         "state": "usable",
         "reason": "answered",
@@ -319,6 +321,20 @@ def test_peer_with_several_paths_has_a_line_for_each() -> None:
     assert "lte 203.0.113.255:65535 best all 1234±568 12/100 123/1.2" in lines
     assert "203.0.113.255:65535 suspect: loss critical 1234±568 12/100 123/1.2" in lines
     assert text.count("drone2") == 2
+
+
+def test_paths_along_two_ports_of_a_relay_are_told_apart() -> None:
+    """By the relay's address, on 80 columns too."""
+    relayed = {"address": "relayed via vps", "relay": "vps"}
+    paths = [
+        path(**relayed, relay_address="203.0.113.7:5790"),
+        path(**relayed, relay_address="203.0.113.7:5791", role="standby"),
+    ]
+    text = shown({"drone1": peer("up", paths=paths)}, 80)
+    assert max(map(len, text.splitlines())) <= 80
+    lines = [words(line) for line in text.splitlines()]
+    assert sum(line.startswith("relayed via vps at") for line in lines) == 2
+    assert all(any(port in line for line in lines) for port in ("5790", "5791"))
 
 
 def test_wide_screen_has_lag_and_bytes_of_each_path() -> None:

@@ -123,6 +123,7 @@ async def test_netcheck_of_a_member_shows_what_is_let_in(host: str, stage: Stage
     printed, _ = await process.communicate()
     assert process.returncode == 0
     assert f"filtering    {Filtered.NOT_BY_PORT}\n             {ANY_PEER}\n" in printed.decode()
+    assert (await member.ask("ping vps"))["error"].startswith("vps is a relay, not a peer: `uavlinkd netcheck`")
     assert not (await member.status())["drops"]
     status = await relay.status()
     assert not status["drops"]

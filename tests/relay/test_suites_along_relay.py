@@ -40,6 +40,7 @@ async def test_pair_connects_and_rekeys_without_a_lost_frame(suite: str) -> None
         for status in statuses:
             assert status["session"]["suite"] == suite
             assert status["path"].startswith("relayed via vps")
+            assert status["paths"][0]["relay_address"] == relay.address
             assert set(status["drops"]) <= EVERYDAY
         for daemon, _ in ends:
             assert not daemon.events("peer_lost")

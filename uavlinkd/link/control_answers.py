@@ -38,7 +38,8 @@ async def answer(daemon: Controlled, request: str) -> dict[str, object] | None:
             await tests.ended.wait()
             return views(daemon.relays, daemon.peer_sockets, is_relay=daemon.relay is not None)
         case ("ping", " ", name):
-            paths, outputs = ping(daemon.links, name, daemon.node, daemon.peer_sockets.network_name, monotonic())
+            network_of = daemon.peer_sockets.network_name
+            paths, outputs = ping(daemon.links, daemon.relays, name, daemon.node, network_of, monotonic())
             daemon.perform(outputs)
             return paths
     return None

@@ -5,12 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import Protocol
 
+from uavlinkd.core.path import Path, SocketAddress
 from uavlinkd.core.path_state import PathState
 from uavlinkd.core.peer import Peer
 from uavlinkd.link.shown import relay_name, shown
+from uavlinkd.system.addresses import Address
 
 NetworkOf = Callable[[int], str | None]
 """The name of the network of a socket's number; None if the configuration names no networks."""
+RelayAddressOf = Callable[[Path], SocketAddress | None]
+"""The relay's address along a relayed path; None for another path."""
 
 
 class PathRates:
@@ -52,19 +56,24 @@ class PathsOwner(Protocol):
         """Its object in the core."""
 
 
-def paths_status(link: PathsOwner, network_of: NetworkOf, now: float) -> list[dict[str, object]]:
+def paths_status(
+    link: PathsOwner, network_of: NetworkOf, now: float, relay_address_of: RelayAddressOf = lambda _: None
+) -> list[dict[str, object]]:
     """Each path to a peer as plain values, the best first, then the configured ones.
 
     ``carries`` has the classes of frames that go along it now. Losses are shares of recent datagrams, ``lag_s`` is by
     how much our copies arrive later along it than along the first path. ``number`` stays the same as long as the path
-    is known, and is below 256. ``relay`` is the one through which it leads; null for a direct path.
+    is known, and is below 256. ``relay`` is the one through which it leads, and ``relay_address`` where it is
+    reached; null for a direct path.
     """
     paths = link.peer.paths
     states = sorted(paths.states, key=lambda state: state is not paths.best)
-    return [_path_status(link, state, network_of, now) for state in states]
+    return [_path_status(link, state, network_of, now, relay_address_of(state.path)) for state in states]
 
 
-def _path_status(link: PathsOwner, state: PathState, network_of: NetworkOf, now: float) -> dict[str, object]:
+def _path_status(
+    link: PathsOwner, state: PathState, network_of: NetworkOf, now: float, relay_address: SocketAddress | None
+) -> dict[str, object]:
     peer = link.peer
     bytes_in_s, bytes_out_s = link.rates.of(state)
     return {
@@ -72,6 +81,7 @@ def _path_status(link: PathsOwner, state: PathState, network_of: NetworkOf, now:
         "network": network_of(state.path.socket),
         "address": shown(state.path.address),
         "relay": relay_name(state.path.address),
+        "relay_address": None if relay_address is None else str(Address.of(relay_address)),
         "is_configured": state.is_configured,
         "state": state.condition.value,
         "reason": state.reason,

@@ -15,15 +15,22 @@ from uavlinkd.system.addresses import Address
 
 
 def ping(
-    links: Mapping[str, PeerLink], name: str, node: Node, network_of: NetworkOf, now: float
+    links: Mapping[str, PeerLink],
+    relays: Relays,
+    name: str,
+    node: Node,
+    network_of: NetworkOf,
+    now: float,
 ) -> tuple[dict[str, object], list[Output]]:
     """The paths to a peer, and a question along each of them. The next answer has the results."""
     link = links.get(name)
+    if link is None and name in relays.by_name:
+        return {"error": f"{name} is a relay, not a peer: `uavlinkd netcheck` and `uavlinkd status` show it"}, []
     if link is None:
         peers = f"write one of {', '.join(links)}" if links else "this daemon has no peers"
         return {"error": f"there is no peer of this name: {peers}"}, []
     states = link.peer.paths.states
-    answer: dict[str, object] = {"paths": paths_status(link, network_of, now)}
+    answer: dict[str, object] = {"paths": paths_status(link, network_of, now, relays.handles.address_of)}
     return answer, [output for state in states for output in node.ask(link.peer, state.path, now)]
 
 

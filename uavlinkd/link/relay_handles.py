@@ -51,6 +51,11 @@ class RelayHandles:
                 self._inward[key] = path
                 self._outward[path] = at.address, handle
 
+    def address_of(self, path: Path) -> SocketAddress | None:
+        """The relay's address along a relayed path. None if its handle is gone, or it is another path."""
+        known = self._outward.get(path)
+        return None if known is None else known[0]
+
     def unwrap(self, socket: int, data: bytes, source: SocketAddress) -> WaitingDatagram | DropReason:
         """The datagram in data that begins with :data:`RELAYED_START`, and its relayed path; or why it is dropped."""
         handle = handle_of(data)

@@ -8,7 +8,7 @@ from uavlinkd.config.keys import encode_key
 from uavlinkd.endpoints.ports import Endpoint
 from uavlinkd.link import refused_there
 from uavlinkd.link.diagnosis import find
-from uavlinkd.link.path_status import NetworkOf, paths_status
+from uavlinkd.link.path_status import NetworkOf, RelayAddressOf, paths_status
 from uavlinkd.link.relay_server_status import relay_status
 from uavlinkd.link.shown import shown
 from uavlinkd.mavlink.dialect import command_name, name_of
@@ -73,7 +73,8 @@ def daemon_status(daemon: DaemonParts, now: float) -> dict[str, object]:
         "blocked": [dict(zip(("subject", "name", "direction"), key, strict=True)) for key in blocked],
         "findings": [finding.as_json() for finding in find(daemon, now)],
         "peers": {
-            name: peer_status(link, now, daemon.peer_sockets.network_name) for name, link in daemon.links.items()
+            name: peer_status(link, now, daemon.peer_sockets.network_name, daemon.relays.handles.address_of)
+            for name, link in daemon.links.items()
         },
         "relays": {
             name: used_relay_status(relay, daemon.links.values(), now, daemon.peer_sockets.network_name)
@@ -93,10 +94,16 @@ def daemon_status(daemon: DaemonParts, now: float) -> dict[str, object]:
     }
 
 
-def peer_status(link: PeerLink, now: float, network_of: NetworkOf = lambda _: None) -> dict[str, object]:
+def peer_status(
+    link: PeerLink,
+    now: float,
+    network_of: NetworkOf = lambda _: None,
+    relay_address_of: RelayAddressOf = lambda _: None,
+) -> dict[str, object]:
     """The status of a peer. ``state`` is ``up``, ``lost`` (was up) or ``waiting`` (was never up).
 
-    ``network_of`` returns the name of the network of a socket's number.
+    ``network_of`` returns the name of the network of a socket's number, ``relay_address_of`` the address of the relay
+    along a relayed path.
     """
     peer, figures = link.peer, link.figures
     session = peer.sessions.current
@@ -115,7 +122,7 @@ def peer_status(link: PeerLink, now: float, network_of: NetworkOf = lambda _: No
         "loss_out": figures.loss_out,
         "bytes_in_s": link.bytes_s[0],
         "bytes_out_s": link.bytes_s[1],
-        "paths": paths_status(link, network_of, now),
+        "paths": paths_status(link, network_of, now, relay_address_of),
         "session": None
         if session is None
         else {

@@ -10,6 +10,8 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 from rich.text import Text
 
+from uavlinkd.ops.path_names import addresses
+
 Status = dict[str, Any]
 
 _WIDE: Final = 100
@@ -39,8 +41,8 @@ class PathTable:
             table.add_column(name, no_wrap=True)
         for name, peer in self._peers.items():
             table.add_row(Text(name, style="bold"))
-            for path in peer["paths"]:
-                cells = _cells(path)
+            for path, address in zip(peer["paths"], addresses(peer["paths"]), strict=True):
+                cells = _cells(path, address)
                 table.add_row(*(cells if is_wide else cells[: len(names) + 1]))
         yield table
 
@@ -50,8 +52,8 @@ def has_several_paths(peer: Status) -> bool:
     return len(peer["paths"]) > 1
 
 
-def _cells(path: Status) -> list[Text]:
-    where = f"{path['network']} {path['address']}" if path["network"] else path["address"]
+def _cells(path: Status, address: str) -> list[Text]:
+    where = f"{path['network']} {address}" if path["network"] else address
     return [
         Text(f" {where}", style="bold" if path["role"] == "best" else ""),
         Text(_state(path), style=_STYLES[path["state"]]),

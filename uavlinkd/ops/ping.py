@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Final
 
+from uavlinkd.ops.path_names import addresses
 from uavlinkd.system.terminal import printable
 
 INTERVAL_S: Final = 1.0
@@ -29,9 +30,9 @@ def ping(ask: Callable[[], Answer], count: int, write: Callable[[str], None], sl
         sleep(INTERVAL_S)
         answer = ask()  # also the next questions
         answered = False
-        for path in answer["paths"]:
+        for path, address in zip(answer["paths"], addresses(answer["paths"]), strict=True):
             answered |= is_answered(path)
-            write(printable(f"{number}: {describe(path)}"))
+            write(printable(f"{number}: {describe(path, address)}"))
         if not answer["paths"]:
             write(
                 f"{number}: no path is known: the peer has not connected, or no relay has bound it;"
@@ -45,13 +46,13 @@ def is_answered(path: Answer) -> bool:
     return path["answered_s"] is not None and path["answered_s"] < ANSWERED_S
 
 
-def describe(path: Answer) -> str:
+def describe(path: Answer, address: str) -> str:
     """A path in one line."""
-    return ", ".join(_facts(path))
+    return ", ".join(_facts(path, address))
 
 
-def _facts(path: Answer) -> Iterator[str]:
-    where = path["address"] if path["relay"] is not None else f"direct to {path['address']}"
+def _facts(path: Answer, address: str) -> Iterator[str]:
+    where = address if path["relay"] is not None else f"direct to {address}"
     yield f"{where} on {path['network']}" if path["network"] else where
     if is_answered(path):
         yield f"{1000 * path['round_trip_s']:.1f} ms"

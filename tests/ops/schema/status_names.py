@@ -40,6 +40,7 @@ ALSO = {
     "peers.*.paths[].lag_s": "number",
     "peers.*.paths[].network": "string",
     "peers.*.paths[].relay": "string",
+    "peers.*.paths[].relay_address": "string",
     "relays.*.paths[].lag_s": "number",
     "relays.*.paths[].network": "string",
     "endpoints.*.clients.*.last_received_s": "null",
