@@ -1006,6 +1006,13 @@ def test_relay_needs_members_and_little_else(load: Load) -> None:
     assert one.peer.link.features & c.FEATURE_RECORDS
 
 
+def test_relay_on_loopback_alone_is_noticed(load: Load) -> None:
+    """Members on other machines do not reach it. An address beyond loopback is enough."""
+    (warning,) = load(_TOP + 'listen = ["127.0.0.1:5790", "[::1]:5790"]\n' + _MEMBERS).warnings
+    assert "no member on another machine reaches this relay" in warning
+    assert load(_TOP + 'listen = ["127.0.0.1:5790", "[::]:5790"]\n' + _MEMBERS).warnings == ()
+
+
 def test_daemon_may_be_a_relay_too(load: Load) -> None:
     """A member that is also a peer has one session for both."""
     config = load(_GOOD + _MEMBERS + "[relay_server]\nenabled = true\n")

@@ -109,6 +109,7 @@ def load_config(path: Path, environ: Mapping[str, str]) -> Config:
     assert private is not None  # its absence is a problem, raised above
     listen = tuple(top.valid.get("listen", ()))
     network_configs = tuple(map(network_rules.network_of, networks))
+    own_listen = () if any(network.serial is None for network in network_configs) else listen
     endpoint_configs = tuple(map(_endpoint, endpoints))
     relay_config = relay_rules.relay_server_of(server, members, member_psks, link)
     peer_configs = tuple(_peer(peer, psk, link, members, relays) for peer, psk in zip(peers, psks, strict=True))
@@ -144,14 +145,14 @@ def load_config(path: Path, environ: Mapping[str, str]) -> Config:
                 ),
             ),
             *advice(
-                () if any(network.serial is None for network in network_configs) else listen,
+                own_listen,
                 endpoint_configs,
                 peer_configs,
                 routing_config,
                 metrics.valid.get("listen"),
                 is_relay=relay_config is not None,
             ),
-            *(() if relay_config is None else relay_rules.advice(relay_config)),
+            *(() if relay_config is None else relay_rules.advice(relay_config, own_listen)),
             *used_relays.advice(relay_configs, peer_configs),
         ),
     )

@@ -14,6 +14,7 @@ from uavlinkd.core import constants as c
 from uavlinkd.core.crypto import Secret
 from uavlinkd.core.settings import Link, PeerSettings, previous_of
 from uavlinkd.relay.member_settings import MemberSettings, RelayLimits
+from uavlinkd.system.addresses import Address
 
 MOST_MEMBERS = 4000
 """Each has up to three sessions, of 65,535 indices."""
@@ -96,7 +97,9 @@ def _members(section: Values, psk: Secret | None, link: Link) -> Iterator[Member
         yield MemberSettings(previous_of(peer, keys.previous_public_key), keys.max_peers, limits)
 
 
-def advice(server: RelayServer) -> Iterator[str]:
-    """Yield the warnings."""
+def advice(server: RelayServer, listen: Sequence[Address]) -> Iterator[str]:
+    """Yield the warnings. ``listen``: empty if the relay listens on networks."""
+    if listen and all(address.is_loopback for address in listen):
+        yield "listen names only loopback: no member on another machine reaches this relay"
     if len(server.members) == 1:
         yield "there is only one [[member]]: a relay connects two"
