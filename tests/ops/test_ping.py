@@ -59,7 +59,7 @@ def test_each_question_has_a_line_for_each_path(paths: list[dict[str, Any]], is_
     assert lines[-1].startswith("3: ")
 
 
-def test_paths_along_several_ports_of_a_relay_can_be_told_apart() -> None:
+def test_paths_along_several_ports_of_a_relay_look_different() -> None:
     """By the address of the relay. If two share that, by their numbers. One that is unique stays short."""
     other_port = {**RELAYED, "number": 2, "relay_address": "198.51.100.2:5791"}
     assert addresses([RELAYED, other_port]) == [

@@ -323,7 +323,7 @@ def test_peer_with_several_paths_has_a_line_for_each() -> None:
     assert text.count("drone2") == 2
 
 
-def test_paths_along_two_ports_of_a_relay_are_told_apart() -> None:
+def test_paths_along_two_ports_of_a_relay_are_distinguished() -> None:
     """By the relay's address, on 80 columns too."""
     relayed = {"address": "relayed via vps", "relay": "vps"}
     paths = [
