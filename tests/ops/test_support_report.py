@@ -147,6 +147,17 @@ def test_missing_tools_are_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
         assert part in text
 
 
+def test_log_is_that_of_every_service(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Each unit of a daemon in systemd/ is asked for, that of a relay too."""
+    journalctl = tmp_path / "journalctl"
+    journalctl.write_text('#!/bin/sh\necho "asked for $@"\n')
+    journalctl.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
+    text = report.make_report([], [])
+    for unit in ("uavlinkd", "uavlinkd@*", "uavlinkd-relay"):
+        assert f"--unit {unit} " in text
+
+
 HEX = keys.decode_key(KEY).hex()
 PAIRS = [HEX[at : at + 2] for at in range(0, 64, 2)]
 

@@ -105,9 +105,9 @@ def _as_text(status: dict[str, Any] | str) -> str:
 
 
 def _log() -> str:
-    units = ("--unit", "uavlinkd", "--unit", "uavlinkd@*")
+    units = ("--unit", "uavlinkd", "--unit", "uavlinkd@*", "--unit", "uavlinkd-relay")
     text = _run("journalctl", *units, "--lines", str(LOG_LINES), "--no-pager", "--output", "cat")
-    return text or "the journal has no line of the units uavlinkd and uavlinkd@NAME"
+    return text or "the journal has no line of the units uavlinkd, uavlinkd@NAME and uavlinkd-relay"
 
 
 def _run(*command: str) -> str:
