@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from statistics import median
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -142,8 +143,18 @@ def test_attack_on_the_line_delivers_nothing(name: str) -> None:
 @pytest.mark.parametrize("end", list(ModemEnd))
 @pytest.mark.parametrize("seconds", [2.0, 20.0])
 def test_pulled_plug(end: ModemEnd, seconds: float) -> None:
-    """A command and a heartbeat arrive in each direction within a second of the return, and nothing of before."""
-    talk = Talk(command.NOISY)
+    """A command and a heartbeat arrive in each direction within a second of the return, and nothing of before.
+
+    If the noise destroys the first datagrams, within half a second more.
+    """
+    after_s = [_after_pull(seed, end, seconds) for seed in range(1, 8)]
+    assert median(after_s) <= 1.0, after_s
+    assert max(after_s) <= 1.5, after_s
+
+
+def _after_pull(seed: int, end: ModemEnd, seconds: float) -> float:
+    """How long after the return the first command of the later direction arrives."""
+    talk = Talk(command.NOISY, seed)
     talk.link()
     talk.run(10)
     talk.network.pull(end)
@@ -157,15 +168,9 @@ def test_pulled_plug(end: ModemEnd, seconds: float) -> None:
             frames.append(talk.send(Offered(back_at, system, message)))
         talk.network.run(talk.network.now + 0.1)
     talk.check()
-    first = {
-        system: min(
-            talk.arrivals.sent[frame][0] + talk.arrivals.ages_s[frame]
-            for frame in frames
-            if frame in talk.arrivals.ages_s
-        )
-        for system, frames in sent.items()
-    }
-    assert max(first.values()) - back_at <= 1.0, first
+    sent_at, ages_s = talk.arrivals.sent, talk.arrivals.ages_s
+    first = [min(sent_at[raw][0] + ages_s[raw] for raw in frames if raw in ages_s) for frames in sent.values()]
+    return max(first) - back_at
 
 
 def test_command_prints_a_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
