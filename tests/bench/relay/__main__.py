@@ -58,7 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--rates", type=int, nargs="+", default=RATES_S, help="datagrams/s of each (%(default)s)")
     parser.add_argument("--seconds", type=float, default=SECONDS, help="at each rate (%(default)s)")
     parser.add_argument("--members", type=int, default=MEMBERS, help="of a relay that is restarted (%(default)s)")
-    parser.add_argument("--restarts", type=int, default=5, help="of that relay (%(default)s)")
+    parser.add_argument("--restarts", type=int, default=3, help="of that relay (%(default)s)")
     options = parser.parse_args(arguments)
     os.sched_setaffinity(0, {LOAD_CORE})
     with tempfile.TemporaryDirectory() as folder:

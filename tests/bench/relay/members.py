@@ -28,6 +28,7 @@ from uavlinkd.lab.sim.loopback_ports import free_port
 
 _LINK: Final = Link(timers=TIMERS, features=c.FEATURE_RECORDS)
 _START_S: Final = 120.0
+_SETTLING_ASKS: Final = 30
 AMPLE: Final = {"datagrams_s": 1_000_000, "bits_s": 10_000_000_000}
 
 
@@ -55,10 +56,14 @@ class Member:
         """What it sends to the other member: to a relay, an envelope."""
         return Flow(self.host, self.relay, bytes((RELAYED,)) + self.handle.to_bytes(2, "big") + b"\x40")
 
+    def ask(self) -> None:
+        """Ask the relay whether it is there."""
+        self.perform(self.node.ask(self.peer, self.path, time.monotonic()))
+
     def forget(self) -> None:
         """Ask the relay, which has perhaps been restarted, and bind as soon as it answers."""
         self.handle, self.asked_at = 0, -c.NEVER
-        self.perform(self.node.ask(self.peer, self.path, time.monotonic()))
+        self.ask()
 
     def do_timers(self, now: float) -> None:
         """Do what is due."""
@@ -153,8 +158,20 @@ class Members:
             member.node.set_paths(member.peer, [member.path], time.monotonic())
         generator.until(lambda: self.are_bound, _START_S)
 
+    def settle(self, generator: Generator) -> None:
+        """Have each ask a few times, one after the other.
+
+        While a thousand handshakes wait in one queue, their round trips are seconds, and a member waits for several
+        round trips before it takes the relay for lost.
+        """
+        for _ in range(_SETTLING_ASKS):
+            for member in self.members:
+                member.ask()
+                generator.turn(0.001)
+
     def restart(self, generator: Generator) -> list[float]:
         """Kill the relay and start it again. Returns after how many seconds each was bound again."""
+        self.settle(generator)
         self.end_relay()
         began = time.monotonic()
         self.start_relay()
