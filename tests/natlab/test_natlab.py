@@ -211,15 +211,18 @@ def test_nothing_remains(laboratory: Laboratory) -> None:
 
     def fail() -> None:
         with Laboratory() as other:
-            place = other.place("carrier")
-            processes.append(subprocess.Popen([*place.host.launcher, "sleep", "infinity"]))
+            command = [*other.place("carrier").host.launcher, "sh", "-c", "echo here; exec sleep infinity"]
+            processes.append(subprocess.Popen(command, stdout=subprocess.PIPE))
+            assert processes[0].stdout is not None
+            assert processes[0].stdout.readline() == b"here\n"  # it has entered the namespace
             raise ZeroDivisionError
 
     processes: list[subprocess.Popen[bytes]] = []
     with pytest.raises(ZeroDivisionError):
         fail()
 
-    assert processes[0].wait(PATIENCE_S) == -signal.SIGKILL
+    with processes[0] as process:
+        assert process.wait(PATIENCE_S) == -signal.SIGKILL
     assert set(ours(os.getpid())) == before
 
 

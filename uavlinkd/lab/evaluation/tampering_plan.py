@@ -214,6 +214,7 @@ DATA_PLANS: tuple[TrialPlan, ...] = (
         ("roam,mode=instead",),
         "roam,mode=instead",
         noticed_after_s=QUESTION_LIFETIME_S,
+        needs=("paths_unproven",),
         takes_away=True,
     ),
 )
