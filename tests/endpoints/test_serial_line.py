@@ -208,6 +208,8 @@ async def test_adapter_that_hangs_does_not_stop_the_event_loop(
             other.unplug()
         else:
             monkeypatch.setattr(of, call, hanging(getattr(of, call)))
+            if call == "open":  # a try that began before this must not open the device
+                await until(hangs.is_set)
             other.plug_in()
         await until(hangs.is_set)  # in a turn of the loop
         assert not line.is_open
