@@ -11,8 +11,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, TypeVar
 
 from uavlinkd.core import constants as c
-from uavlinkd.core import wire
-from uavlinkd.core.cookie import MacKeys
+from uavlinkd.core import establish, handshake, wire
+from uavlinkd.core.cookie import MacKeys, mac1_of
 from uavlinkd.core.crypto import AeadKey, KeyPair, MacKey, Secret
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.node import Node
@@ -141,6 +141,11 @@ class Pair:
         response = only(datagrams(self.b.receive(initiation, now), wire.RESPONSE))
         return exchange(self.b, self.a, self.a.receive(response, now), now)
 
+    def rekey(self, now: float) -> list[Output]:
+        """Alpha makes new keys. Bravo receives the confirmation, and nothing after that arrives. Bravo's outputs."""
+        response = only(datagrams(self.b.receive(only(datagrams(establish.initiate(self.a.peer, now))), now)))
+        return self.b.receive(only(datagrams(self.a.receive(response, now))), now)
+
     def carries(self, now: float) -> bool:
         """Whether a frame gets through in both directions."""
         return self.crosses(self.a, self.b, now) and self.crosses(self.b, self.a, now)
@@ -255,6 +260,25 @@ def initiation_of(version: int, receiver_public_key: bytes, length: int = 147) -
     covered = (b"\1" + bytes(range(256)) * (length // 256 + 1))[: length - 2 * c.MAC_BYTES]
     key = hashlib.sha256(b"uavlink/%d mac1" % version + receiver_public_key).digest()
     return covered + hmac.digest(key, covered, "sha256")[: c.MAC_BYTES] + bytes(c.MAC_BYTES)
+
+
+_ENTROPY = seeded(77)
+
+
+def made_initiation(
+    identity: KeyPair = KEY_A, to: KeyPair = KEY_B, link: Link = PLAIN, index: int = 77, psk: Secret | None = None
+) -> bytes:
+    """An initiation by the holder of this identity, made by hand."""
+    initiated = handshake.initiate(identity, PeerSettings("peer", to.public, psk, link), index, 0, _ENTROPY)
+    return with_macs(initiated.message, to.public)
+
+
+def with_cookie(side: Side, initiation: bytes, place: Path, now: float) -> bytes:
+    """An initiation to a side, with the cookie that it gives to its sender at a place."""
+    own, sender_index = side.node._handshakes.own, wire.parse_initiation(initiation).sender_index
+    reply = wire.parse_cookie_reply(own.cookies.reply(initiation, sender_index, place, now))
+    cookie = own.mac_keys.open_cookie(reply, mac1_of(initiation))
+    return with_macs(initiation[: -wire.MACS_BYTES], own.identity.public, cookie)
 
 
 def exhaust(side: Side, now: float) -> None:

@@ -26,8 +26,8 @@ def pair() -> Pair:
     """Linked along a relay, which is fast."""
     made = Pair(LINK, LINK)
     made.a.peer_at, made.b.peer_at = relayed(0, "vps", 7), relayed(0, "vps", 8)
-    made.a.configure_path(0.0)
-    made.b.configure_path(0.0)
+    for side in (made.a, made.b):
+        side.configure_path(0.0)
     made.establish()
     assert made.carries(0.0)
     return made
@@ -44,6 +44,12 @@ def ask_everywhere(pair: Pair, now: float, *paths: Path) -> list[Transmit]:
     return of(pair.a.node.ask_candidates(pair.a.peer, now), Transmit)
 
 
+def answered(pair: Pair) -> Transmit:
+    """Bravo's answer to a question of alpha to the address where it is."""
+    question = only(ask(pair, 1.0, DIRECT)).datagram
+    return only(of(pair.b.node.receive(question, HOME, 1.0), Transmit))
+
+
 def answer_along_relay(pair: Pair, sent: list[Transmit], now: float) -> int:
     """Let bravo answer what goes along the relay. Returns how many questions that is."""
     along = [transmit for transmit in sent if transmit.path.is_relayed]
@@ -51,101 +57,69 @@ def answer_along_relay(pair: Pair, sent: list[Transmit], now: float) -> int:
     return len(along)
 
 
-def test_each_candidate_gets_one_question(pair: Pair) -> None:
-    """Short, and each another one."""
+def test_each_candidate_gets_one_question_and_no_slot(pair: Pair) -> None:
+    """Short, and each another one. It carries nothing. Nothing is asked without a session."""
     sent = ask(pair, 1.0, DIRECT, at(1))
     assert [transmit.path for transmit in sent] == [DIRECT, at(1)]
     questions = {probe_in(pair.b, transmit.datagram).question for transmit in sent}
     assert len(questions) == 2
     assert 0 not in questions
     assert max(len(transmit.datagram) for transmit in sent) < 50
-
-
-def test_candidate_has_no_slot(pair: Pair) -> None:
-    """It carries nothing, and is neither configured nor learned."""
-    ask(pair, 1.0, DIRECT)
     assert pair.a.peer.paths.find(DIRECT) is None
     assert {transmit.path for transmit in of(pair.a.send(1.0), Transmit)} == {pair.a.peer_at}
+    assert ask(Pair(LINK, LINK), 0.0, DIRECT) == []
 
 
 def test_answered_candidate_becomes_the_best_path(pair: Pair) -> None:
-    """At both ends: bravo learns it by the question, asks in its answer, and gets an answer too."""
-    question = only(ask(pair, 1.0, DIRECT)).datagram
-    answered = only(of(pair.b.node.receive(question, HOME, 1.0), Transmit))
-    assert answered.path == HOME
-
-    outputs = pair.a.node.receive(answered.datagram, DIRECT, 1.01)
-    state = pair.a.peer.paths.find(DIRECT)
-    assert state is not None
-    assert state.is_validated
+    """At both ends: bravo learns it by the question, and asks in its answer. Its probes ask it from then on."""
+    answer = answered(pair)
+    assert answer.path == HOME
+    outputs = pair.a.node.receive(answer.datagram, DIRECT, 1.01)
+    assert pair.a.peer.paths.by_path[DIRECT].is_validated
     assert [changed.path for changed in of(outputs, PathChanged)] == [DIRECT]
     back = next(sent for sent in of(outputs, Transmit) if sent.path == DIRECT)
     outputs = pair.b.node.receive(back.datagram, HOME, 1.02)
     assert [changed.path for changed in of(outputs, PathChanged)] == [HOME]
+    assert ask(pair, 1.1, DIRECT, at(1))[0].path == at(1)
 
 
 def test_answer_from_elsewhere_is_asked_there(pair: Pair) -> None:
     """A symmetric NAT: bravo's answer comes from a port that is in no list."""
-    question = only(ask(pair, 1.0, DIRECT)).datagram
-    answered = only(of(pair.b.node.receive(question, HOME, 1.0), Transmit))
-    outputs = pair.a.node.receive(answered.datagram, at(5), 1.01)
+    outputs = pair.a.node.receive(answered(pair).datagram, at(5), 1.01)
     assert DropReason.UNEXPECTED_ANSWER in reasons(outputs)
     assert pair.a.peer.paths.find(DIRECT) is None
-    state = pair.a.peer.paths.find(at(5))
-    assert state is not None
-    assert not state.is_validated
+    assert not pair.a.peer.paths.by_path[at(5)].is_validated
     assert at(5) in {sent.path for sent in of(outputs, Transmit)}
 
 
 def test_peer_that_names_victims_causes_a_bounded_number_of_questions(pair: Pair) -> None:
-    """Whatever lists it sends: 80 at once, then one a second."""
-    at_once = sum(len(ask(pair, 1.0, *(at(16 * round_ + n) for n in range(16)))) for round_ in range(15))
+    """Whatever lists it sends: eight candidates count, and 80 questions at once, then one a second."""
+    sent = ask(pair, 1.0, at(1), at(1), *(at(number) for number in range(1, 20)))
+    assert [transmit.path for transmit in sent] == [at(number) for number in range(1, 9)]
+    at_once = 8 + sum(len(ask(pair, 1.0, *(at(16 * round_ + n) for n in range(16)))) for round_ in range(15))
     assert at_once == c.CANDIDATE_QUESTIONS
     later = sum(len(ask(pair, now / 10, at(now % 200), at(now % 200 + 1))) for now in range(20, 120))
     assert later == pytest.approx(10 * c.CANDIDATE_QUESTIONS_PER_S, abs=1)
 
 
-def test_eight_candidates_count() -> None:
-    """Further ones are ignored, and so are repeated ones."""
-    pair = Pair(LINK, LINK).establish()
-    assert pair.carries(0.0)
-    sent = ask(pair, 1.0, at(1), at(1), *(at(number) for number in range(1, 20)))
-    assert [transmit.path for transmit in sent] == [at(number) for number in range(1, 9)]
-
-
-def test_candidate_with_a_slot_is_not_asked_as_one(pair: Pair) -> None:
-    """The probes of its path ask."""
-    question = only(ask(pair, 1.0, DIRECT)).datagram
-    answered = only(of(pair.b.node.receive(question, HOME, 1.0), Transmit))
-    pair.a.node.receive(answered.datagram, DIRECT, 1.0)
-    assert ask(pair, 1.0, DIRECT, at(1))[0].path == at(1)
-
-
 def test_path_that_came_by_itself_takes_the_question_too(pair: Pair) -> None:
     """Bravo's own question arrives first, from a candidate that was asked."""
     ask(pair, 1.0, DIRECT)
-    outputs = pair.b.node.ask_candidates(pair.b.peer, 1.0)
-    assert not outputs  # it has none
+    assert not pair.b.node.ask_candidates(pair.b.peer, 1.0), "it has none"
     pair.b.node.set_candidates(pair.b.peer, [HOME])
     sent = of(pair.b.node.ask_candidates(pair.b.peer, 1.0), Transmit)
     theirs = only([transmit.datagram for transmit in sent if transmit.path == HOME])
     answers = of(pair.a.node.receive(theirs, DIRECT, 1.1), Transmit)
     assert DIRECT in {sent.path for sent in answers}
-    assert pair.a.peer.paths.find(DIRECT) is not None
+    assert pair.a.peer.paths.by_path[DIRECT].waiting_questions > 1
     assert ask(pair, 1.2, DIRECT) == []
-
-
-def test_nothing_is_asked_without_a_session() -> None:
-    """Nor of a peer that is not up."""
-    assert ask(Pair(LINK, LINK), 0.0, DIRECT) == []
 
 
 def test_forgotten_candidate_answers_in_vain(pair: Pair) -> None:
     """Another list replaced it: its answer is that of an unknown question."""
-    question = only(ask(pair, 1.0, DIRECT)).datagram
-    answered = only(of(pair.b.node.receive(question, HOME, 1.0), Transmit))
+    answer = answered(pair)
     ask(pair, 1.0, at(1))
-    assert DropReason.UNEXPECTED_ANSWER in reasons(pair.a.node.receive(answered.datagram, DIRECT, 1.01))
+    assert DropReason.UNEXPECTED_ANSWER in reasons(pair.a.node.receive(answer.datagram, DIRECT, 1.01))
 
 
 def test_questions_in_vain_are_not_a_loss_of_the_path(pair: Pair) -> None:

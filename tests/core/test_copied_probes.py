@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import pytest
@@ -12,9 +11,8 @@ from uavlinkd.core.drops import DropReason
 from uavlinkd.core.outputs import Output, PathChanged, Transmit
 from uavlinkd.core.path_state import PathCondition, PathState
 from uavlinkd.core.probe import Probe
-from uavlinkd.core.settings import Link
 
-LINKS = [PLAIN, replace(PLAIN, confidential=True)]
+QUESTION = Probe(7, 0, 1, 1).encode()
 
 
 def race(pair: Pair, outputs: list[Output], source: Side, now: float) -> list[Output]:
@@ -28,25 +26,19 @@ def race(pair: Pair, outputs: list[Output], source: Side, now: float) -> list[Ou
     return seen
 
 
-def moments() -> Iterator[float]:
-    """Twelve seconds in steps of 50 ms: longer than a learned path keeps its slot."""
-    return (1.0 + step / 20 for step in range(240))
-
-
 def own_path(side: Side) -> PathState:
     """The configured path, or the one that made the session."""
-    state = side.peer.paths.find(side.peer_at)
-    assert state is not None
-    return state
+    return side.peer.paths.by_path[side.peer_at]
 
 
-@pytest.mark.parametrize("link", LINKS)
-def test_path_of_the_peer_stays_usable_while_another_sender_is_faster(link: Link) -> None:
-    """Every datagram arrives from elsewhere first, in both directions. Nothing answers there."""
+@pytest.mark.parametrize("confidential", [False, True])
+def test_path_of_the_peer_stays_usable_while_another_sender_is_faster(confidential: bool) -> None:
+    """Every datagram arrives from elsewhere first, in both directions, longer than a learned path keeps its slot."""
+    link = replace(PLAIN, confidential=confidential)
     pair = Pair(link, link).establish()
     pair.b.configure_path(0.0)
     changed_at: set[float] = set()
-    for now in moments():
+    for now in (1.0 + step / 20 for step in range(240)):
         for side in (pair.a, pair.b):
             if of(race(pair, [*side.timeout(now), *side.send(now)], side, now), PathChanged):
                 changed_at.add(now)
@@ -63,35 +55,29 @@ def receive_copy(side: Side, datagram: bytes, now: float) -> list[Output]:
     return side.receive(datagram, now)
 
 
-def linked() -> Pair:
+@pytest.fixture
+def pair() -> Pair:
     """A pair whose bravo knows a second address of alpha."""
     pair = Pair(quiet(), quiet()).establish()
     pair.b.receive(pair.a.envelope(0.5), 0.5, ELSEWHERE)
     return pair
 
 
-def test_copied_question_is_answered_once_along_each_path() -> None:
-    """A further copy is only counted."""
-    pair = linked()
-    question = pair.a.envelope(1.0, Probe(7, 0, 1, 1).encode())
+@pytest.mark.parametrize("is_proven", [True, False])
+def test_copied_question_is_answered_once_along_each_path(pair: Pair, is_proven: bool) -> None:
+    """A further copy is only counted. An unproven path gets no more bytes than arrived."""
+    if not is_proven:
+        own_path(pair.b).is_proven = False
+        own_path(pair.b).bytes_sent = 10**6
+    question = pair.a.envelope(1.0, QUESTION)
     answers = of(receive_copy(pair.b, question, 1.0), Transmit)
-    assert [out.path for out in answers] == [AT_A]
+    assert [out.path for out in answers] == [AT_A] * is_proven
     assert datagrams(pair.b.receive(question, 1.0)) == []
     assert pair.b.peer.traffic.drops[DropReason.DUPLICATE] == 2
 
 
-def test_copied_question_gets_no_more_bytes_than_arrived() -> None:
-    """Its path is not proven."""
-    pair = linked()
-    own_path(pair.b).is_proven = False
-    own_path(pair.b).bytes_sent = 10**6
-    question = pair.a.envelope(1.0, Probe(7, 0, 1, 1).encode())
-    assert datagrams(receive_copy(pair.b, question, 1.0)) == []
-
-
-def test_copied_answer_counts_along_the_path_of_its_question() -> None:
+def test_copied_answer_counts_along_the_path_of_its_question(pair: Pair) -> None:
     """Along another path it is unexpected; its counts are not used."""
-    pair = linked()
     state = own_path(pair.b)
     state.make_probe(9, 0, 1.0)
     answer = pair.a.envelope(1.0, Probe(0, 9, 50, 40).encode())
@@ -100,21 +86,23 @@ def test_copied_answer_counts_along_the_path_of_its_question() -> None:
     pair.b.receive(answer, 1.25)
     assert state.answered_at == 1.25
     assert state.loss_in == state.loss_out == 0.0
+    state.make_probe(10, 0, 1.5)
+    answer = pair.a.envelope(1.5, Probe(0, 10, 50, 40).encode())
+    pair.b.receive(answer, 1.5)
+    assert reasons(pair.b.receive(answer, 1.5, ELSEWHERE)) == [], "a copy answers nothing there"
 
 
 @pytest.mark.parametrize("payload", [bytes((0xFD, 8)) + bytes(18), bytes(20), Probe(7, 0, 1, 1).encode(padding=100)])
-def test_other_copies_of_any_length_are_only_counted(payload: bytes) -> None:
+def test_other_copies_of_any_length_are_only_counted(pair: Pair, payload: bytes) -> None:
     """A frame, or another record, of the length of a probe; and a longer probe."""
-    pair = linked()
     assert receive_copy(pair.b, pair.a.envelope(1.0, payload), 1.0) == []
     assert pair.b.peer.traffic.drops[DropReason.DUPLICATE] == 1
 
 
-def test_late_copy_of_a_question_is_not_answered() -> None:
+def test_late_copy_of_a_question_is_not_answered(pair: Pair) -> None:
     """A path that holds datagrams back must not get answers to old questions."""
-    pair = linked()
     own_path(pair.b).answered_at = 1.0
-    question = pair.a.envelope(1.0, Probe(7, 0, 1, 1).encode())
+    question = pair.a.envelope(1.0, QUESTION)
     pair.b.receive(question, 1.0, ELSEWHERE)
     for now in (2.0, 3.0, 4.0, 5.0):
         pair.b.receive(pair.a.envelope(now), now)
@@ -122,31 +110,16 @@ def test_late_copy_of_a_question_is_not_answered() -> None:
     assert pair.b.peer.traffic.drops[DropReason.LATE_COPY] == 1
 
 
-def test_copies_are_recognised_on_the_current_session_if_an_older_one_found_the_address() -> None:
-    """An envelope of the session before, from a new address, begins the memory of arrivals of the current one too."""
+@pytest.mark.parametrize("by", ["older session", "configuration"])
+def test_second_path_begins_the_memory_of_arrivals(by: str) -> None:
+    """Its copies count from then on, not from the next session, also if an older session found the address."""
     pair = Pair(quiet(), quiet()).establish()
     old = pair.a.envelope(1.0)
-    response = datagrams(pair.b.receive(initiation_again(pair, 2.0), 2.0))
-    for datagram in datagrams([out for message in response for out in pair.a.receive(message, 2.0)]):
-        pair.b.receive(datagram, 2.0)
+    pair.rekey(2.0)
     assert pair.b.session.arrivals is None
-    pair.b.receive(old, 2.5, ELSEWHERE)
+    if by == "older session":
+        pair.b.receive(old, 2.5, ELSEWHERE)
+    else:
+        pair.b.node.set_paths(pair.b.peer, [AT_B, ELSEWHERE], 2.5)
+        pair.b.timeout(2.5)
     assert pair.b.session.arrivals is not None
-
-
-def initiation_again(pair: Pair, now: float) -> bytes:
-    """Alpha wants new keys."""
-    pair.a.peer.initiator.retry_at = now
-    pair.a.session.created_at = -1e6
-    pair.a.peer.set_initiate()
-    pair.a.node._schedule.update(pair.a.peer)
-    return pair.initiation(now)
-
-
-def test_second_path_of_the_configuration_begins_the_memory_of_arrivals() -> None:
-    """Its copies count from then on, not from the next session."""
-    pair = Pair(quiet(), quiet()).establish()
-    assert pair.a.session.arrivals is None
-    pair.a.node.set_paths(pair.a.peer, [AT_B, ELSEWHERE], 1.0)
-    pair.a.timeout(1.0)
-    assert pair.a.session.arrivals is not None

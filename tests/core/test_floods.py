@@ -9,25 +9,35 @@ from tests.core.harness import (
     ELSEWHERE,
     KEY_A,
     KEY_B,
+    KEY_C,
     Pair,
     datagrams,
     exhaust,
+    flipped,
+    made_initiation,
+    of,
+    only,
     quiet,
     reasons,
+    repaired,
     seeded,
+    with_cookie,
     with_macs,
 )
 from uavlinkd.core import constants as c
-from uavlinkd.core import handshake, wire
+from uavlinkd.core import wire
+from uavlinkd.core.crypto import KeyPair, Secret
 from uavlinkd.core.drops import DropReason
-from uavlinkd.core.outputs import Output
+from uavlinkd.core.limits import TokenBucket
+from uavlinkd.core.node import Node
+from uavlinkd.core.outputs import Output, SessionEstablished
 from uavlinkd.core.path import Path
 from uavlinkd.core.settings import Link, PeerSettings
 from uavlinkd.core.suites import SUITES_BY_NAME
 
 COSTLY = Link(suites=(SUITES_BY_NAME["ffdhe2048"],))
 UNITS = SUITES_BY_NAME["ffdhe2048"].work
-ENTROPY = seeded(5)
+PLAIN = quiet()
 
 
 def flooding(number: int) -> bytes:
@@ -42,41 +52,122 @@ def prefix(number: int) -> Path:
     return Path(0, (f"10.{number // 256}.{number % 256}.7", 4000))
 
 
-def initiation(pair: Pair, at: Path, now: float, link: Link = COSTLY, *, with_cookie: bool = False) -> list[Output]:
-    """What bravo does about an initiation of alpha's from somewhere."""
-    message = handshake.initiate(KEY_A, PeerSettings("bravo", KEY_B.public, None, link), 77, 0, ENTROPY).message
-    plain = with_macs(message, KEY_B.public)
-    if not with_cookie:
-        return pair.b.receive(plain, now, at)
-    reply = wire.parse_cookie_reply(pair.b.node._handshakes.own.cookies.reply(plain, 77, at, now))
-    cookie = pair.b.node._handshakes.own.mac_keys.open_cookie(reply, plain[-wire.MACS_BYTES : -c.MAC_BYTES])
-    return pair.b.receive(with_macs(message, KEY_B.public, cookie), now, at)
+def initiation(
+    pair: Pair, at: Path, now: float, link: Link = COSTLY, key: KeyPair = KEY_A, *, cookie: bool = False
+) -> list[Output]:
+    """What bravo does about an initiation from somewhere, of alpha by default."""
+    made = made_initiation(key, link=link)
+    return pair.b.receive(with_cookie(pair.b, made, at, now) if cookie else made, now, at)
 
 
-def established() -> Pair:
-    """A link over a suite with a group; bravo was linked from alpha's place, and has no address for it."""
-    link = quiet(suites=COSTLY.suites)
+def established(link: Link = COSTLY) -> Pair:
+    """A link, by default with a group; bravo was linked from alpha's place, and has no address for it."""
+    link = quiet(suites=link.suites)
     return Pair(link_a=link, link_b=link).establish()
 
 
-def spend_group_work(pair: Pair, now: float) -> None:
-    """Use up what alpha may cost without a proof of where it is."""
-    while pair.b.peer.group_share.anywhere.take(now, UNITS):
+def spend(bucket: TokenBucket, now: float, units: float = 1.0) -> None:
+    """Use up a bucket."""
+    while bucket.take(now, units):
         pass
+
+
+# Key exchanges.
+
+
+def test_budget_of_key_exchanges_refills_and_responses_have_their_own() -> None:
+    """Fifty messages at once may cost key exchanges, then fifty a second. A flood leaves our own handshakes alone."""
+    pair = established(PLAIN)
+    forged = [repaired(flipped(made_initiation(), 60), KEY_B.public) for _ in range(3)]
+    for _ in range(c.INITIATIONS_BURST):
+        assert reasons(pair.b.receive(forged[0], 9.0)) == [DropReason.BAD_HANDSHAKE]
+    assert reasons(pair.b.receive(forged[1], 9.0)) == [DropReason.COOKIE_REQUIRED]
+    refilled = 9.0 + 1.001 / c.INITIATIONS_PER_S
+    assert reasons(pair.b.receive(forged[2], refilled)) == [DropReason.BAD_HANDSHAKE]
+    pair = Pair(PLAIN, PLAIN)
+    response = only(datagrams(pair.b.receive(pair.initiation(0.0), 0.0)))
+    spend(pair.a.node._handshakes.admission._initiations, 0.0)
+    assert of(pair.a.receive(response, 0.0), SessionEstablished)
+
+
+def test_one_source_has_its_share_under_load() -> None:
+    """Ten a second with a cookie. Another source, also behind the same router, has its own: so a peer is answered."""
+    pair = established(PLAIN)
+    exhaust(pair.b, 1.0)
+    host, port = AT_A.host, AT_A.address[1]
+    pair.b.node.set_paths(pair.b.peer, [Path(0, (host, port + 1))], 1.0)
+    for place in (AT_A, Path(0, (host, port + 2))):
+        fates = [
+            reasons(initiation(pair, place, 1.0, PLAIN, KEY_C, cookie=True))
+            for _ in range(c.COOKIED_PER_SOURCE_BURST + 1)
+        ]
+        assert fates == [[DropReason.UNKNOWN_PEER]] * c.COOKIED_PER_SOURCE_BURST + [[DropReason.RATE_LIMITED]]
+    for place in (Path(0, (host, port + 1)), ELSEWHERE):
+        assert datagrams(initiation(pair, place, 1.0, PLAIN, cookie=True), wire.RESPONSE)
+
+
+@pytest.mark.parametrize("known_by", ["its path", "its configured address"])
+def test_all_sources_together_have_a_bound(monkeypatch: pytest.MonkeyPatch, known_by: str) -> None:
+    """An attacker with many addresses, and a cookie for each, causes a bounded number of key exchanges.
+
+    A peer at its configured address, or at its last known one, does not queue with the attacker.
+    """
+    pair = established(PLAIN) if known_by == "its path" else Pair(link_a=PLAIN, link_b=PLAIN)
+    node = pair.b.node
+    monkeypatch.setattr(node._handshakes.own.cookies, "has_valid_mac2", lambda *_: True)
+    spend(node._handshakes.admission._initiations, 1.0)
+    fates = [
+        reasons(node.receive(made_initiation(KEY_C), Path(0, (f"10.0.{number // 200}.{number % 200}", 1)), 1.0))
+        for number in range(int(c.COOKIED_PER_S) + 5)
+    ]
+    assert fates.count([DropReason.UNKNOWN_PEER]) == c.COOKIED_PER_S
+    assert fates.count([DropReason.RATE_LIMITED]) == 5
+    assert reasons(pair.b.receive(made_initiation(), 1.0, ELSEWHERE)) == [DropReason.RATE_LIMITED]
+    if known_by == "its configured address":
+        assert reasons(pair.b.receive(made_initiation(), 1.0)) == [DropReason.RATE_LIMITED]
+        node.set_paths(pair.b.peer, [AT_A], 1.0)
+    assert datagrams(pair.b.receive(made_initiation(), 1.0), wire.RESPONSE)
+
+
+# Answers.
+
+
+@pytest.mark.parametrize("is_up", [False, True])
+def test_answers_to_one_peer_are_bounded(is_up: bool) -> None:
+    """A burst is answered at once; after that four a second without a cookie, two while a link is up.
+
+    Recorded initiations may use them up: the peer itself gets one with a cookie, and not without bound.
+    """
+    pair = established(PLAIN) if is_up else Pair(link_a=PLAIN, link_b=PLAIN)
+    rate = c.ANSWERS_WHILE_UP_PER_S if is_up else c.ANSWERS_PER_S
+    assert rate == (2.0 if is_up else 4.0)
+    now = 10.0
+    for _ in range(c.ANSWERS_BURST):
+        assert datagrams(pair.b.receive(made_initiation(), now), wire.RESPONSE)
+    for moment in (now, now + 1 / rate - 0.001):
+        outputs = pair.b.receive(made_initiation(), moment)
+        assert reasons(outputs) == [DropReason.COOKIE_REQUIRED]
+        assert datagrams(outputs, wire.RESPONSE) == []
+    now += 1 / rate
+    assert datagrams(pair.b.receive(made_initiation(), now), wire.RESPONSE)
+    fates = [initiation(pair, prefix(number), now, PLAIN, cookie=True) for number in range(40)]
+    assert sum(len(datagrams(outputs, wire.RESPONSE)) for outputs in fates) == c.COOKIED_ANSWERS_PER_S
 
 
 # Cookie replies.
 
 
 def test_a_network_gets_so_many_cookies() -> None:
-    """All hosts of a /24 share them; another network has its own."""
+    """All hosts of a /24 share them; another network has its own, and so has a known address."""
     pair = established()
     exhaust(pair.b, 1.0)
     sent = [reasons(pair.b.receive(flooding(n), 1.0, Path(0, (f"10.0.0.{n}", 9)))) for n in range(30)]
-
     assert sent.count([DropReason.COOKIE_REQUIRED]) == c.COOKIE_REPLIES_PER_PREFIX_BURST
     assert sent.count([DropReason.RATE_LIMITED]) == 30 - c.COOKIE_REPLIES_PER_PREFIX_BURST
     assert reasons(pair.b.receive(flooding(99), 1.0, Path(0, ("10.0.1.1", 9)))) == [DropReason.COOKIE_REQUIRED]
+    known = [pair.b.receive(flooding(n), 1.0, AT_A) for n in range(80)]
+    expected = c.COOKIE_REPLIES_PER_KNOWN_BURST + c.COOKIE_REPLIES_PER_PREFIX_BURST
+    assert sum(len(datagrams(outputs, wire.COOKIE)) for outputs in known) == expected
 
 
 @pytest.mark.parametrize("known_by", ["where it was last seen", "its configured address"])
@@ -89,28 +180,16 @@ def test_a_flood_from_ten_thousand_networks_leaves_a_known_peer_its_cookie(known
         pair.b.node.set_paths(pair.b.peer, [at], 0.5)
     exhaust(pair.b, 1.0)
     fates = [reasons(pair.b.receive(flooding(n), 1.0 + n / 10_000, prefix(n))) for n in range(10_000)]
-
     # The flood had the first second's budget too, and one more of the messages that need no cookie.
     assert fates.count([DropReason.COOKIE_REQUIRED]) <= 2 * c.COOKIE_REPLIES_PER_S
     assert fates.count([DropReason.BAD_HANDSHAKE]) <= c.INITIATIONS_PER_S
     exhaust(pair.b, 2.0)
-    while pair.b.node._handshakes.admission._cookie_replies.take(2.0):
-        pass
+    spend(pair.b.node._handshakes.admission._cookie_replies, 2.0)
     assert reasons(initiation(pair, Path(0, ("10.99.0.1", 9)), 2.0)) == [DropReason.RATE_LIMITED]
     asked = initiation(pair, at, 2.0)
     assert reasons(asked) == [DropReason.COOKIE_REQUIRED]
     assert len(datagrams(asked, wire.COOKIE)) == 1
-    assert datagrams(initiation(pair, at, 2.0, with_cookie=True), wire.RESPONSE)
-
-
-def test_cookies_to_a_known_address_are_bounded_too() -> None:
-    """One that forges exactly that address fills a slow radio by so many a second, and no more than any network's."""
-    pair = established()
-    exhaust(pair.b, 1.0)
-    sent = [pair.b.receive(flooding(n), 1.0, AT_A) for n in range(80)]
-
-    expected = c.COOKIE_REPLIES_PER_KNOWN_BURST + c.COOKIE_REPLIES_PER_PREFIX_BURST
-    assert sum(len(datagrams(outputs, wire.COOKIE)) for outputs in sent) == expected
+    assert datagrams(initiation(pair, at, 2.0, cookie=True), wire.RESPONSE)
 
 
 def test_only_so_many_initiations_are_read() -> None:
@@ -119,7 +198,6 @@ def test_only_so_many_initiations_are_read() -> None:
     unsealed = flooding(1)[: -wire.MACS_BYTES] + bytes(wire.MACS_BYTES)
     for number in range(c.INITIATIONS_READ_BURST):
         assert reasons(pair.b.receive(unsealed, 1.0, prefix(number))) == [DropReason.BAD_MAC1]
-
     assert reasons(pair.b.receive(unsealed, 1.0, ELSEWHERE)) == [DropReason.RATE_LIMITED]
     assert datagrams(initiation(pair, AT_A, 1.0), wire.RESPONSE)
     for _ in range(c.INITIATIONS_READ_PER_KNOWN_BURST - 1):
@@ -136,66 +214,72 @@ def test_a_peer_may_cause_so_much_group_work() -> None:
     expected = c.GROUP_WORK_PER_PEER_BURST // UNITS
     answered = 0
     for number in range(4 * expected):
-        out = initiation(pair, prefix(number), 9.0 + number, with_cookie=number % 2 == 0)
+        out = initiation(pair, prefix(number), 9.0 + number, cookie=number % 2 == 0)
         answered += len(datagrams(out, wire.RESPONSE))
         assert datagrams(out, wire.RESPONSE) or reasons(out) == [DropReason.GROUP_BUDGET_SPENT]
-
-    refilled = 4 * expected * c.GROUP_WORK_PER_PEER_PER_S // UNITS
-    assert answered <= expected + refilled
+    assert answered <= expected + 4 * expected * c.GROUP_WORK_PER_PEER_PER_S // UNITS
     assert pair.b.peer.traffic.drops[DropReason.GROUP_BUDGET_SPENT] == 4 * expected - answered
 
 
-def test_a_suite_without_a_group_needs_no_budget() -> None:
-    """X25519 is answered when the budget for group work is spent."""
-    plain = quiet()
-    pair = Pair(link_a=plain, link_b=plain).establish()
-    spend_group_work(pair, 1.0)
-
-    assert datagrams(initiation(pair, ELSEWHERE, 1.0, plain), wire.RESPONSE)
-
-
-def test_a_peer_that_proves_where_it_is_has_a_reserve() -> None:
-    """With a cookie for where it is known to be, it is answered; elsewhere no cookie helps."""
+def test_a_peer_that_proves_where_it_is_has_a_bounded_reserve() -> None:
+    """With a cookie for where it is known to be, it is answered; elsewhere no cookie helps. X25519 needs none."""
     pair = established()
-    spend_group_work(pair, 9.0)
-
+    share = pair.b.peer.group_share
+    spend(share.anywhere, 9.0, UNITS)
     assert reasons(initiation(pair, AT_A, 9.0)) == [DropReason.COOKIE_REQUIRED]
-    assert reasons(initiation(pair, ELSEWHERE, 9.0, with_cookie=True)) == [DropReason.GROUP_BUDGET_SPENT]
-    assert datagrams(initiation(pair, AT_A, 9.0, with_cookie=True), wire.RESPONSE)
-
-
-def test_the_reserve_is_bounded() -> None:
-    """A captured peer at its own address spends it, and no more."""
-    pair = established()
-    spend_group_work(pair, 9.0)
-    while pair.b.peer.group_share.proven.take(9.0, UNITS):
-        pass
-
-    assert reasons(initiation(pair, AT_A, 9.0, with_cookie=True)) == [DropReason.GROUP_BUDGET_SPENT]
-    assert datagrams(
-        initiation(pair, AT_A, 9.0 + UNITS / c.GROUP_WORK_PER_PEER_PER_S, with_cookie=True), wire.RESPONSE
-    )
-
-
-def test_a_removed_peer_is_known_nowhere() -> None:
-    """Its address has no share of its own any more."""
-    pair = established()
-    assert pair.b.node.claimed_sender(flooding(1), AT_A) == AT_A.address
-    pair.b.node.remove_peer(pair.b.peer, 1.0)
-
-    assert pair.b.node.claimed_sender(flooding(1), AT_A) is None
+    assert reasons(initiation(pair, ELSEWHERE, 9.0, cookie=True)) == [DropReason.GROUP_BUDGET_SPENT]
+    assert datagrams(initiation(pair, AT_A, 9.0, cookie=True), wire.RESPONSE)
+    spend(share.proven, 9.0, UNITS)
+    assert reasons(initiation(pair, AT_A, 9.0, cookie=True)) == [DropReason.GROUP_BUDGET_SPENT]
+    refilled = 9.0 + UNITS / c.GROUP_WORK_PER_PEER_PER_S
+    assert datagrams(initiation(pair, AT_A, refilled, cookie=True), wire.RESPONSE)
+    pair = established(PLAIN)
+    spend(pair.b.peer.group_share.anywhere, 1.0, UNITS)
+    assert datagrams(initiation(pair, ELSEWHERE, 1.0, PLAIN), wire.RESPONSE)
 
 
 # Which sender a datagram belongs to, for a busy shell.
 
 
 def test_senders_are_distinguished() -> None:
-    """A peer where it is, the same peer elsewhere, a known address, and all others."""
+    """A peer where it is, the same peer elsewhere, a known address, and all others, such as a removed peer."""
     pair = established()
     node, envelope = pair.b.node, pair.a.envelope(1.0)
-
     assert node.claimed_sender(envelope, AT_A) == (pair.b.peer, True)
     assert node.claimed_sender(envelope, ELSEWHERE) == (pair.b.peer, False)
     assert node.claimed_sender(flooding(1), AT_A) == AT_A.address
     strangers = [flooding(1), b"", b"\x40", wire.envelope_header(0, 1) + bytes(20)]
     assert {node.claimed_sender(datagram, ELSEWHERE) for datagram in strangers} == {None}
+    node.remove_peer(pair.b.peer, 1.0)
+    assert node.claimed_sender(flooding(1), AT_A) is None
+
+
+# A daemon with many peers, such as a relay, starts again: all of them initiate at once.
+
+
+@pytest.mark.parametrize(("peers", "expected"), [(1, 50), (25, 50), (26, 52), (1001, 2000)])
+def test_burst_grows_with_the_peers_and_is_bounded(peers: int, expected: int) -> None:
+    """It shrinks with them too."""
+    node = Node(Secret(bytes([200]) * 32), seeded(0), 0.0)
+    added = [
+        node.add_peer(PeerSettings(f"m{number}", KeyPair(number.to_bytes(2, "big") * 16).public), 0.0)
+        for number in range(1, peers + 1)
+    ]
+    bucket = node._handshakes.admission._initiations
+    assert bucket.has(0.0, expected)
+    assert not bucket.has(0.0, expected + 1)
+    for peer in added:
+        node.remove_peer(peer, 0.0)
+    assert not bucket.has(0.0, c.INITIATIONS_BURST + 1)
+
+
+def test_all_peers_are_answered_after_a_restart_although_a_nat_hides_them() -> None:
+    """All initiate at once, from a few addresses. No cookie costs them a round trip."""
+    own = KeyPair(bytes([200]) * 32)
+    relay = Node(Secret(bytes([200]) * 32), seeded(0), 0.0)
+    keys = [KeyPair(number.to_bytes(2, "big") * 16) for number in range(100)]
+    for key in keys:
+        relay.add_peer(PeerSettings(key.public.hex(), key.public), 0.0)
+    for number, key in enumerate(keys * c.INITIATIONS_BURST_PER_PEER):
+        at = Path(0, (f"198.51.100.{number % 4}", 1024 + number))
+        assert datagrams(relay.receive(made_initiation(key, own), at, 0.0), wire.RESPONSE)

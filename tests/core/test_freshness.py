@@ -1,20 +1,30 @@
-"""What was history, and what waits in held."""
+"""Frames that must be new: what waits for a proof, when the peer is asked, and how long a proof lasts."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import cast
 
-from hypothesis import given
-from hypothesis import strategies as st
+import pytest
 
+from tests.core.harness import FRAME, PLAIN, QUIET, Pair, Side, datagrams, lively, of, only, payloads, quiet, reasons
 from uavlinkd.core import constants as c
+from uavlinkd.core import establish, freshness, wire
 from uavlinkd.core.constants import NEVER
-from uavlinkd.core.counter_history import CounterHistory
-from uavlinkd.core.echo_requests import EchoRequests
+from uavlinkd.core.drops import DropReason
+from uavlinkd.core.node import Node
+from uavlinkd.core.outputs import FreshnessUnverified, FreshnessVerified, PeerClosed, PeerLost
 from uavlinkd.core.session import Session
+from uavlinkd.core.sessions import EchoRequests
+from uavlinkd.core.settings import Link, Screen
 from uavlinkd.core.verification import HeldFrames, Verification
 
-GAPS = st.lists(st.sampled_from((0.0, 0.01, 0.1, 0.24, 0.25, 0.3, 1.0, 1.9, 2.0, 2.3, 9.0)), max_size=60)
+COMMAND = FRAME[:-1] + b"!"
+REPORT = FRAME[:-1] + b"."
+WATCHED = replace(PLAIN, timers=QUIET, verify_interval_s=c.VERIFY_INTERVAL_S)
+
+
+# Frames that are held.
 
 
 def entry(counter: int, payload_bytes: int) -> tuple[int, bytes, float]:
@@ -22,153 +32,33 @@ def entry(counter: int, payload_bytes: int) -> tuple[int, bytes, float]:
     return counter, b"\xfd" + bytes(payload_bytes - 1), 0.0
 
 
-@given(GAPS)
-def test_the_past_is_right_to_within_two_steps(gaps: list[float]) -> None:
-    """Of a counter that grows at any moments: never more than it was two seconds ago, nor less than before that."""
-    grown_at: list[float] = []
-    history, now = CounterHistory(0.0), 0.0
-    for gap in gaps:
-        now += gap
-        for moment in (now, now + 0.1, now + 5.0):  # asking changes nothing
-            counter, count = history.past(len(grown_at) - 1, len(grown_at), moment)
-            assert count == counter + 1
-            surely = sum(at <= moment - c.LATE_AFTER_S - 2 * c.LATE_STEP_S for at in grown_at)
-            at_most = sum(at <= moment - c.LATE_AFTER_S for at in grown_at)
-            assert surely <= count <= at_most
-        if now >= history.next_at:
-            history.note(len(grown_at) - 1, len(grown_at), now)
-        grown_at.append(now)
-        assert len(history._steps) <= c.LATE_AFTER_S / c.LATE_STEP_S + 3
-
-
-def test_before_the_first_there_was_nothing() -> None:
-    """Two seconds after the beginning what came first is of the past, and not a moment before."""
-    history = CounterHistory(10.0)
-    history.note(-1, 0, 10.25)
-    assert history.past(7, 8, 10.25) == (-1, 0)
-    assert history.past(7, 8, 10.5 + c.LATE_AFTER_S - 0.001) == (-1, 0)
-    assert history.past(7, 8, 10.5 + c.LATE_AFTER_S) == (7, 8)
-
-
-def test_what_comes_out_of_order_is_no_longer_missing() -> None:
-    """An overtaken counter counts in each step that had passed it, and in none before."""
-    history = CounterHistory(0.0)
-    history.note(3, 3, 1.0)  # one of four is missing since 0.25
-    history.note(9, 9, 2.0)
-    history.add(2)
-    assert history.past(9, 10, 0.25 + c.LATE_AFTER_S) == (3, 4)
-    history.add(7)
-    assert history.past(9, 11, 1.25 + c.LATE_AFTER_S) == (9, 11)
-
-
-def test_held_frames_cause_requests_until_they_expire() -> None:
-    """It begins once, is due each quarter of a second, and is over after one; then another can begin."""
+def test_held_frames_cause_requests_until_each_has_waited_for_a_second() -> None:
+    """A request is due each tenth of a second; an answer saves what still waits, then another wait can begin."""
     held = HeldFrames()
-    assert held.due_at == NEVER
-    held.asked(4.0)  # out of held: measures the round trip
+    held.asked(4.0)  # nothing is held: this measures the round trip
     assert held.due_at == NEVER
     assert not held.is_request_due(4.0)
-    assert held.begin(5.0)
-    assert not held.begin(5.1)
+    assert [held.begin(5.0), held.begin(5.1)] == [True, False]
     held.asked(5.0)
-    assert held.due_at == 5.25
-    held.asked(5.9)
+    assert held.due_at == 5.1
+    held.asked(5.95)
     assert held.due_at == 6.0
     assert held.expire(5.99) == 0
     assert not held.is_request_due(5.99)
     assert held.expire(6.0) == 0
     assert held.due_at == NEVER
     assert held.begin(6.0)
+    held.add(1, b"\xfd\x01", 6.0)
     held.asked(6.0)
-    assert held.release(0) == ([], 0)
-    assert held.due_at == NEVER
-
-
-def test_each_frame_waits_for_a_second_of_its_own() -> None:
-    """The requests go on until the last frame was answered or given up; an answer saves those that still wait."""
-    held = HeldFrames()
-    held.begin(5.0)
-    held.add(1, b"\xfd\x01", 5.0)
-    held.asked(5.0)
-    held.add(2, b"\xfd\x02", 5.5)
-    held.asked(5.75)
-    assert held.due_at == 6.0
-    assert held.expire(6.0) == 1
-    assert held.is_request_due(6.0)
-    held.asked(6.0)
-    assert held.due_at == 6.25
+    held.add(2, b"\xfd\x02", 6.5)
+    held.asked(6.9)
+    assert held.due_at == 7.0
+    assert held.expire(7.0) == 1
+    assert held.is_request_due(7.0)
+    held.asked(7.0)
+    assert held.due_at == 7.1
     assert held.release(0) == ([(2, b"\xfd\x02")], 0)
-
-
-def test_requests_are_remembered_while_a_reply_can_be_in_time() -> None:
-    """However many are asked; a forgotten one was issued all the same, and another token never was."""
-    questions, session = EchoRequests(), cast(Session, None)
-    tokens = [questions.add(session, number / 10) for number in range(30)]
-    questions.expire(3.0)
-    remembered = [token for token in tokens if questions.find(token)]
-    assert remembered == tokens[10:]
-    assert len(questions) == 20
-    assert all(map(questions.was_sent, tokens))
-    assert not questions.was_sent(0)
-    assert not questions.was_sent(tokens[-1] + 1)
-
-
-def test_unanswered_requests_are_counted_once() -> None:
-    """More than two seconds after they were asked; an answered one is not counted."""
-    questions, session = EchoRequests(), cast(Session, None)
-    first, second = questions.add(session, 10.0), questions.add(session, 11.0)
-    question = questions.find(second)
-    assert question is not None
-    question.is_answered = True
-    assert questions.expire(10.0 + c.LATE_AFTER_S) == 0
-    assert questions.find(first) is not None
-    assert questions.expire(20.0) == 1
-    assert questions.expire(20.0) == 0
-
-
-def test_verification_lasts_for_two_intervals_or_two_seconds() -> None:
-    """From the answer on, and no longer than three seconds after the request where the answer is slow."""
-    for interval_s, lifetime_s in ((0.5, c.LATE_AFTER_S), (1.0, 2.0), (5.0, 10.0)):
-        verification = Verification(0.0, interval_s)
-        assert verification.until == lifetime_s
-        verification.answered(10.0, 10.4)
-        assert verification.until == 10.4 + lifetime_s
-        verification.answered(11.0, 12.9)
-        assert verification.until == 11.0 + c.HOLD_S + lifetime_s
-        verification.answered(9.0, 11.0)
-        assert verification.until == 11.0 + c.HOLD_S + lifetime_s
-
-
-def test_request_is_repeated_after_a_quarter_interval_once_an_interval_is_unanswered() -> None:
-    """Not before one interval has passed since the last answer: a slow answer may still arrive."""
-    verification = Verification(0.0, 1.0)
-    verification.asked(0.5)  # by another rule: no frames wait for it
-    assert verification.due_at == NEVER
-    assert verification.look_at == verification.ask_at == 1.0
-    verification.begin()
-    verification.asked(1.0)
-    assert (verification.due_at, verification.ask_at) == (1.25, 2.0)
-    verification.answered(1.0, 1.9)
-    assert verification.due_at == NEVER
-    verification.begin()
-    verification.asked(2.0)
-    assert verification.due_at == 2.9
-    verification.asked(2.9)
-    assert verification.due_at == 3.15
-    verification.stop()
-    assert verification.due_at == NEVER
-
-
-def test_verification_is_extended_only_while_it_lasts() -> None:
-    """A recent echo record proves that what comes after it is new, not that what came before it is."""
-    verification = Verification(0.0, 1.0)
-    verification.extend(1.5)
-    assert verification.until == 3.5
-    verification.extend(3.6)
-    assert verification.until == 3.5
-    verification.refute()
-    verification.extend(3.7)
-    assert verification.until == verification.look_at == -NEVER
+    assert held.due_at == NEVER
 
 
 def test_new_frames_come_out_in_the_order_of_arrival() -> None:
@@ -191,3 +81,255 @@ def test_what_is_held_is_bounded() -> None:
     assert held.add(*entry(5001, 1200)) == left + 1
     assert held.release(0) == ([(5001, entry(5001, 1200)[1])], 0)
     assert held.add(*entry(5002, 1200)) == 0
+
+
+# Requests, and how long their answers count.
+
+
+def test_requests_are_remembered_while_a_reply_can_be_in_time() -> None:
+    """However many are asked. A forgotten one is late until a later one is answered, and is counted once."""
+    questions, session = EchoRequests(bytes), cast(Session, None)
+    tokens = [questions.add(session, number / 10) for number in range(30)]
+    assert questions.expire(c.LATE_AFTER_S) == 0
+    assert questions.answer(tokens[5]) is not None
+    assert [questions.expire(3.0), questions.expire(3.0)] == [9, 0]
+    assert [token for token in tokens if questions.find(token)] == tokens[10:]
+    assert len(questions) == 20
+    assert [token for token in (0, *tokens, tokens[-1] + 1) if questions.is_late(token)] == tokens[6:10]
+    assert questions.answer(tokens[10]) is not None
+    assert questions.answer(tokens[10]) is None
+    assert not any(map(questions.is_late, tokens))
+
+
+def test_answer_to_a_request_from_before_a_restart_answers_none_of_now() -> None:
+    """An attacker held the request. The peer answers it on the new session, with a token that is not in use there."""
+    session = cast(Session, None)
+    held = EchoRequests(bytes).add(session, 0.0)
+    restarted = EchoRequests(lambda size: b"\xff" * size)
+    assert restarted.add(session, 1.0) == 2**31
+    assert restarted.answer(held) is None
+    assert not restarted.is_late(held)
+
+
+@pytest.mark.parametrize(("interval_s", "lifetime_s"), [(0.5, c.LATE_AFTER_S), (1.0, 2.0), (5.0, 10.0)])
+def test_verification_lasts_for_two_intervals_or_two_seconds(interval_s: float, lifetime_s: float) -> None:
+    """From the answer on, and no longer than three seconds after the request where the answer is slow."""
+    verification = Verification(0.0, interval_s)
+    assert verification.until == lifetime_s
+    for asked_at, now, counts_from in ((10.0, 10.4, 10.4), (11.0, 12.9, 12.0), (9.0, 11.0, 12.0)):
+        verification.answered(asked_at, now)
+        assert verification.until == counts_from + lifetime_s
+
+
+def test_request_is_repeated_after_a_tenth_of_a_second_once_an_interval_is_unanswered() -> None:
+    """Not before one interval has passed since the last answer: a slow answer may still arrive."""
+    verification = Verification(0.0, 1.0)
+    verification.asked(0.5)  # by another rule: no frames wait for it
+    assert verification.due_at == NEVER
+    assert verification.look_at == verification.ask_at == 1.0
+    verification.begin()
+    verification.asked(1.0)
+    assert (verification.due_at, verification.ask_at) == (1.1, 2.0)
+    verification.answered(1.0, 1.9)
+    assert verification.due_at == NEVER
+    verification.begin()
+    verification.asked(2.0)
+    assert verification.due_at == 2.9
+    verification.asked(2.9)
+    assert verification.due_at == 3.0
+    verification.stop()
+    assert verification.due_at == NEVER
+
+
+def test_verification_is_extended_only_while_it_lasts() -> None:
+    """A recent echo record proves that what comes after it is new, not that what came before it is."""
+    verification = Verification(0.0, 1.0)
+    verification.extend(1.5)
+    assert verification.until == 3.5
+    verification.extend(3.6)
+    assert verification.until == 3.5
+    verification.refute()
+    verification.extend(3.7)
+    assert verification.until == verification.look_at == -NEVER
+
+
+def test_the_last_proof_lasts_as_long_as_on_the_new_best_path() -> None:
+    """Longer on a slower network, and at most one lifetime from now on a faster one. Slow answers too."""
+    verification = Verification(0.0, 1.0)
+    verification.answered(9.9, 10.0)
+    verification.set_pace(8.0, 2.0, 11.0)
+    assert (verification.until, verification.ask_at) == (26.0, 17.9)
+    verification.set_pace(1.0, 1.0, 12.0)
+    assert (verification.until, verification.ask_at) == (14.0, 13.0)
+    verification.refute()
+    verification.set_pace(8.0, 2.0, 12.5)
+    assert verification.until == verification.look_at == -NEVER
+    verification.answered(20.0, 21.9)
+    assert verification.until == 21.9 + 16.0
+
+
+# A peer whose frames arrive and whose answers do not.
+
+
+def split(payload: bytes) -> tuple[bytes, bytes]:
+    """Commands must be new, reports may be old."""
+    frames = [payload[at : at + len(FRAME)] for at in range(0, len(payload), len(FRAME))]
+    return b"".join(raw for raw in frames if raw == REPORT), b"".join(raw for raw in frames if raw != REPORT)
+
+
+def watched(monkeypatch: pytest.MonkeyPatch, link_b: Link = WATCHED, screen: Screen = split) -> Pair:
+    """A session at second 0 whose end bravo verifies freshness."""
+    genuine = Node.__init__
+
+    def knows_frames(self: Node, *facts: object, **named: object) -> None:
+        genuine(self, *facts, **named, screen=screen)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Node, "__init__", knows_frames)
+    return Pair(link_a=quiet(), link_b=link_b).establish()
+
+
+@pytest.fixture
+def pair(monkeypatch: pytest.MonkeyPatch) -> Pair:
+    """Bravo knows commands from reports."""
+    return watched(monkeypatch)
+
+
+def cross(pair: Pair, now: float, *frames: bytes) -> list[bytes]:
+    """What bravo delivers at once of frames that alpha sends."""
+    return payloads(pair.b.receive(only(datagrams(pair.a.send(now, *frames))), now))
+
+
+def reports(pair: Pair, begin: float, end: float) -> list[tuple[float, bytes]]:
+    """A report each 0.1 s arrives from ``begin`` to before ``end``; when bravo asked, and the requests."""
+    asked = []
+    for tenth in range(round(10 * begin), round(10 * end)):
+        now = tenth / 10
+        outputs = pair.b.timeout(now) + pair.b.receive(only(datagrams(pair.a.send(now, REPORT))), now)
+        assert payloads(outputs) == [REPORT]
+        asked += [(now, request) for request in datagrams(outputs)]
+    return asked
+
+
+def answer(side: Side, question: bytes, now: float) -> bytes:
+    """The reply to an echo request."""
+    return only(datagrams(side.receive(question, now)))
+
+
+def test_command_waits_while_freshness_is_unverified(pair: Pair) -> None:
+    """The handshake is an answer for two seconds. Then reports pass, and a command comes out with the answer."""
+    reports(pair, 0.0, 1.9)
+    assert cross(pair, 2.0, COMMAND) == [COMMAND]
+    outputs = pair.b.receive(only(datagrams(pair.a.send(2.1, REPORT, COMMAND, REPORT))), 2.1)
+    assert payloads(outputs) == [REPORT + REPORT]
+    outputs = pair.b.receive(answer(pair.a, only(datagrams(outputs)), 2.2), 2.3)
+    assert payloads(outputs) == [COMMAND]
+    assert cross(pair, 2.4, COMMAND) == [COMMAND]
+    assert not pair.b.peer.traffic.drops
+
+
+def test_held_command_that_is_old_is_delayed(pair: Pair) -> None:
+    """The answer tells which counters are new: a command that was kept for three seconds is refused by it."""
+    kept = [only(datagrams(pair.a.send(0.5, frame))) for frame in (*[REPORT] * 20, COMMAND)]
+    for number, envelope in enumerate(kept):
+        now = 0.6 + number / 8
+        outputs = pair.b.timeout(now) + pair.b.receive(envelope, now)
+        assert payloads(outputs) == ([] if envelope is kept[-1] else [REPORT])
+    outputs += pair.b.timeout(now + c.HOLD_ASK_S)
+    outputs = pair.b.receive(answer(pair.a, datagrams(outputs)[-1], now + 0.3), now + 0.3)
+    assert payloads(outputs) == []
+    assert reasons(outputs) == [DropReason.DELAYED]
+
+
+@pytest.mark.parametrize("number", [0, 20])
+def test_late_answer_is_late_however_many_requests_were_sent(pair: Pair, number: int) -> None:
+    """All frames are held from then on: an answer that comes after two seconds shows that time is stretched."""
+    asked = reports(pair, 0.0, 12.0)
+    late = answer(pair.a, asked[number][1], 12.0)
+    assert len(asked) > 35
+    assert reasons(pair.b.receive(late, 12.0)) == []
+    assert cross(pair, 12.0, REPORT) == []
+
+
+def test_answer_about_a_session_that_has_ended_measures_the_round_trip(pair: Pair) -> None:
+    """Its question was asked a moment ago, so it is neither late nor proof of anything on the new session."""
+    ((_, question),) = reports(pair, 0.0, 1.1)
+    session = pair.b.session
+    pair.rekey(1.1)
+    assert len(pair.b.peer.sessions.confirmed) == 2
+    freshness.end(pair.b.peer, pair.b.peer.sessions._end([session], 1.2))
+    until = pair.b.session.verification.until
+    pair.b.receive(answer(pair.a, question, 1.2), 1.3)
+    assert pair.b.peer.round_trip_s == pytest.approx(0.3)
+    assert pair.b.session.verification.until == until
+
+
+def test_superseded_session_is_not_asked_about(pair: Pair) -> None:
+    """The peer sends on it no more once its first envelope came on the next; until then it is in use."""
+    old_a, old_b = pair.a.session, pair.b.session
+    response = only(datagrams(pair.b.receive(only(datagrams(establish.initiate(pair.a.peer, 1.0))), 1.0)))
+    confirmation = only(datagrams(pair.a.receive(response, 1.0)))
+    assert pair.a.peer.sessions.is_in_use(old_a)
+    assert datagrams(pair.b.receive(old_a.seal(REPORT, 1.1), 1.1))
+    pair.b.receive(confirmation, 2.2)
+    assert not pair.b.peer.sessions.is_in_use(old_b)
+    assert pair.b.peer.sessions.is_in_use(pair.b.session)
+    assert datagrams(pair.b.receive(old_a.seal(REPORT, 2.3), 2.3)) == []
+    pair.b.node.close(2.4)
+    assert not pair.b.peer.sessions.is_in_use(old_b)
+
+
+@pytest.mark.parametrize("until", [1.5, 2.1], ids=["verified", "unverified"])
+def test_recent_record_of_the_peer_extends_verification_while_it_lasts(pair: Pair, until: float) -> None:
+    """Its echo request shows that it received an envelope of the last second: so what follows it is new.
+
+    It does not end unverified freshness: it tells nothing of the frames before it.
+    """
+    reports(pair, 0.0, until)
+    pair.a.receive(only(datagrams(pair.b.send(until))), until)
+    proof = wire.Echo(False, 7, pair.a.session.received, pair.a.session.expected)
+    assert proof.expected > pair.b.session.fresh(until + 0.1, c.HOLD_S)
+    pair.b.receive(pair.a.envelope(until + 0.1, proof.encode()), until + 0.1)
+    if until > c.LATE_AFTER_S:
+        assert cross(pair, until + 0.2, COMMAND) == []
+        return
+    reports(pair, 1.6, 3.5)
+    assert [cross(pair, now, COMMAND) for now in (3.5, 3.7)] == [[COMMAND], []]
+
+
+@pytest.mark.parametrize("expected_above", [0, 50])
+def test_record_that_proves_nothing_recent_extends_nothing(pair: Pair, expected_above: int) -> None:
+    """Neither one that reports only old envelopes, nor one that reports more than were sent."""
+    reports(pair, 0.0, 1.5)
+    proof = wire.Echo(False, 7, 0, pair.b.session.fresh(1.6, c.HOLD_S) + expected_above)
+    pair.b.receive(pair.a.envelope(1.6, proof.encode()), 1.6)
+    assert pair.b.session.verification.until == c.LATE_AFTER_S
+
+
+def test_unverified_freshness_is_reported_once_and_until_it_ends(pair: Pair) -> None:
+    """After another second of questions in vain; the answer ends it."""
+    events, questions = [], []
+    for tenth in range(60):
+        now = tenth / 10
+        outputs = pair.b.timeout(now) + pair.b.receive(only(datagrams(pair.a.send(now, REPORT))), now)
+        questions += datagrams(outputs)
+        events += [(now, event) for event in of(outputs, FreshnessUnverified)]
+    assert events == [(3.1, FreshnessUnverified(pair.b.peer))]
+    assert pair.b.peer.unverified_since == 3.1
+    outputs = pair.b.receive(answer(pair.a, questions[-1], 6.0), 6.0)
+    assert only(of(outputs, FreshnessVerified)).unverified_s == pytest.approx(2.9)
+    assert pair.b.peer.unverified_since is None
+
+
+@pytest.mark.parametrize("ends_by", [PeerLost, PeerClosed])
+def test_unverified_freshness_ends_with_the_link(monkeypatch: pytest.MonkeyPatch, ends_by: type) -> None:
+    """A peer that is lost or stops has no frames whose age could be in question."""
+    pair = watched(monkeypatch, replace(lively(keepalive_s=1e6), verify_interval_s=1.0))
+    reports(pair, 0.0, 4.0)
+    assert pair.b.peer.unverified_since is not None
+    if ends_by is PeerClosed:
+        outputs = pair.b.receive(pair.a.envelope(4.0, wire.Close().encode()), 4.0)
+    else:
+        pair.b.send(4.0)
+        outputs = pair.b.timeout(8.0)
+    assert of(outputs, ends_by)
+    assert pair.b.peer.unverified_since is None

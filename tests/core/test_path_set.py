@@ -7,16 +7,18 @@ from collections.abc import Set as AbstractSet
 
 import pytest
 
+from tests.core.harness import Named
 from uavlinkd.core import constants as c
 from uavlinkd.core.constants import NEVER
-from uavlinkd.core.path import Path, SocketAddress
+from uavlinkd.core.outputs import Event, PathChanged, PathStateChanged
+from uavlinkd.core.path import Path, SocketAddress, SocketFacts
 from uavlinkd.core.path_state import PathCondition, PathState
-from uavlinkd.core.paths import BestChanged, Change, ConditionChanged, PathSet
+from uavlinkd.core.paths import PathSet
 from uavlinkd.core.probe import Probe
 from uavlinkd.core.settings import Class, Redundancy
-from uavlinkd.core.socket_facts import SocketFacts
 
 LTE, MESH, SIK = (Path(number, (f"192.0.2.{number + 1}", 5790)) for number in range(3))
+PEER = Named("bravo")
 PLACES = [Path(0, (f"203.0.113.{number}", 4000)) for number in range(1, 9)]
 
 
@@ -35,12 +37,10 @@ def path_set(
 
 def of(paths: PathSet, path: Path) -> PathState:
     """The slot of a path."""
-    state = paths.find(path)
-    assert state is not None
-    return state
+    return paths.by_path[path]
 
 
-def answer(paths: PathSet, path: Path, now: float, round_trip_s: float = 0.1) -> list[Change]:
+def answer(paths: PathSet, path: Path, now: float, round_trip_s: float = 0.1) -> list[Event]:
     """A question along a path is answered."""
     state = of(paths, path)
     question = round(now * 1000) + 1
@@ -48,21 +48,20 @@ def answer(paths: PathSet, path: Path, now: float, round_trip_s: float = 0.1) ->
     is_first = not state.is_validated
     assert state.receive_answer(question, state.sent, now) is not None
     paths.note_answer(state, now, is_first=is_first)
-    return paths.update(now)
+    return paths.update(PEER, now)
 
 
-def fail(paths: PathSet, path: Path, now: float) -> list[Change]:
+def fail(paths: PathSet, path: Path, now: float) -> list[Event]:
     """Two questions along a path get no answer, until then."""
-    state = of(paths, path)
     for question, before_s in ((1, 2.0), (2, 1.5)):
-        state.make_probe(question, 0, now - before_s)
-    return paths.update(now)
+        of(paths, path).make_probe(question, 0, now - before_s)
+    return paths.update(PEER, now)
 
 
-def suspect(paths: PathSet, path: Path, now: float) -> list[Change]:
+def suspect(paths: PathSet, path: Path, now: float) -> list[Event]:
     """One question along a path gets no answer, until then."""
     of(paths, path).make_probe(3, 0, now - 0.9)
-    changes = paths.update(now)
+    changes = paths.update(PEER, now)
     assert of(paths, path).condition is PathCondition.SUSPECT
     return changes
 
@@ -86,61 +85,39 @@ def route(paths: PathSet, cls: Class) -> list[Path]:
 # Slots.
 
 
-def test_eight_configured_paths_have_slots() -> None:
-    """Further ones are ignored."""
+def test_slots_of_configured_paths() -> None:
+    """Eight, two of them to one host along one socket; a path that is configured twice is one path."""
     many = [Path(number, ("192.0.2.1", 5790)) for number in range(12)]
-
     assert path_set(*many).configured == tuple(many[: c.CONFIGURED_PATHS])
-
-
-def test_two_paths_to_one_host_along_one_socket_have_slots() -> None:
-    """A host with many ports does not take the slots of others; along another socket it has two more."""
-    same = [Path(0, ("192.0.2.1", port)) for port in (1, 2, 3)]
-    other = Path(1, ("192.0.2.1", 3))
-
+    same, other = [Path(0, ("192.0.2.1", port)) for port in (1, 2, 3)], Path(1, ("192.0.2.1", 3))
     assert path_set(*same, other).configured == (*same[: c.PATHS_PER_HOST], other)
-
-
-def test_configured_twice_is_one_path() -> None:
-    """A name and an address may mean the same."""
     assert path_set(LTE, MESH, LTE).configured == (LTE, MESH)
 
 
-def test_learned_path_that_is_configured_keeps_its_state() -> None:
-    """It needs no proof again."""
-    paths = path_set()
-    paths.prefer(LTE, 0.0)
-    answer(paths, LTE, 1.0)
-    paths.configure([MESH, LTE], 2.0)
-
-    assert of(paths, LTE).is_configured
-    assert of(paths, LTE).is_validated
-    assert paths.configured == (MESH, LTE)
-
-
 def test_path_that_works_outlives_its_configuration() -> None:
-    """As a learned path: a name that resolves to another address does not cut the link."""
+    """As a learned path. One that is configured later keeps its state, and an unproven one goes."""
     paths = linked(LTE, MESH)
     paths.configure([SIK], 2.0)
     assert [state.path for state in paths.states] == [SIK, LTE, MESH]
     assert paths.configured == (SIK,)
-
+    paths.configure([MESH], 3.0)
+    assert [state.path for state in paths.states] == [MESH, LTE]
+    assert paths.configured == (MESH,)
+    assert of(paths, MESH).is_validated
+    assert paths.has_several
+    paths.configure([], 3.0)
     fail(paths, MESH, 5.0)
+    assert paths.find(MESH) is not None
+    paths.update(PEER, 5.0 + c.FORMER_PATH_S)
     assert paths.find(MESH) is None
-
-
-def test_unproven_path_goes_with_its_configuration() -> None:
-    """There is nothing to keep."""
-    paths = path_set(LTE, MESH)
-    paths.configure([MESH], 1.0)
-
-    assert paths.find(LTE) is None
     assert not paths.has_several
 
 
-@pytest.mark.parametrize("kept", ["validated", "working", "recent"])
+@pytest.mark.parametrize("kept", ["validated", "working", "answering", "recent"])
 def test_least_useful_learned_path_makes_room(kept: str) -> None:
-    """First one that was never validated, then one that does not work, then the one that was first for longest."""
+    """First one that was never validated, then one that neither works nor answers again, then the one that answered
+    longest ago, then the one that was first for longest.
+    """
     paths = path_set(LTE)
     paths.prefer(LTE, 0.0)
     answer(paths, LTE, 0.5)
@@ -151,11 +128,16 @@ def test_least_useful_learned_path_makes_room(kept: str) -> None:
             answer(paths, place, 1.1)
     if kept == "working":
         of(paths, PLACES[3]).set_off(is_off=True, now=2.0)
+    if kept == "answering":
+        fail(paths, PLACES[0], 2.9)
+        answer(paths, PLACES[0], 2.95)
+        assert of(paths, PLACES[0]).is_recovering
     paths.learn(PLACES[6], 3.0)
-
-    gone = {"validated": PLACES[2], "working": PLACES[3], "recent": PLACES[0]}[kept]
+    gone = {"validated": PLACES[2], "working": PLACES[3], "answering": PLACES[1], "recent": PLACES[0]}[kept]
     assert paths.find(gone) is None
     assert len(paths.states) == 1 + c.LEARNED_PATHS
+    assert len({state.number for state in paths.states}) == len(paths.states)
+    assert all(paths.with_number(state.number) is state for state in paths.states)
 
 
 def test_best_path_never_makes_room() -> None:
@@ -166,86 +148,41 @@ def test_best_path_never_makes_room() -> None:
         paths.learn(place, 1.0)
         of(paths, place).answered_at = 1.0
     paths.learn(PLACES[6], 2.0)
-
     assert paths.find(PLACES[0]) is not None
     assert len(paths.states) == c.LEARNED_PATHS
 
 
-def test_numbers_of_slots_are_not_shared() -> None:
-    """Each slot in use has a number of its own, also after others made room."""
-    paths = path_set(LTE, MESH)
-    for number, place in enumerate(PLACES):
-        paths.learn(place, float(number))
-        numbers = [state.number for state in paths.states]
-        assert len(set(numbers)) == len(numbers)
-        assert all(paths.with_number(state.number) is state for state in paths.states)
-
-
-def test_only_the_newest_addresses_that_went_down_are_remembered() -> None:
-    """A peer that moves often costs no memory."""
-    paths, now = path_set(LTE), 0.0
-    answer(paths, LTE, now)
-    for place in PLACES[: c.LEARNED_PATHS + 1]:
-        paths.learn(place, now)
-        answer(paths, place, now)
-        now += 3.0
-        answer(paths, LTE, now)
-        fail(paths, place, now)
-        while paths.find(place) is not None:
-            now += 0.5
-            answer(paths, LTE, now)
-    assert [paths.was_validated(place, now - 20.0) for place in PLACES[: c.LEARNED_PATHS + 1]] == [
-        False,
-        *[True] * c.LEARNED_PATHS,
-    ]
-
-
-def test_addresses_where_the_peer_was_are_known() -> None:
-    """From the session or the first answer on, until the slot is free."""
+def test_addresses_where_peers_were_are_known() -> None:
+    """From the session or the first answer on, until the last of them has freed its slot."""
     known = Counter[SocketAddress]()
-    paths = path_set(LTE, known=known)
+    paths, other = path_set(LTE, known=known), path_set(LTE, known=known)
     assert not known
     paths.prefer(MESH, 0.0)
-    answer(paths, LTE, 1.0)
-    assert known == {LTE.address: 1, MESH.address: 1}
+    for peer in (paths, other):
+        answer(peer, LTE, 1.0)
+    assert known == {LTE.address: 2, MESH.address: 1}
     paths.clear()
-    assert not known
-
-
-def test_address_of_two_peers_stays_known_for_the_second() -> None:
-    """Two peers behind one relay: the first one is removed."""
-    known = Counter[SocketAddress]()
-    first, second = path_set(LTE, known=known), path_set(LTE, known=known)
-    for paths in (first, second):
-        answer(paths, LTE, 1.0)
-    first.clear()
-
     assert known == {LTE.address: 1}
+    other.clear()
+    assert not known
 
 
 # The best path.
 
 
-def test_first_answer_makes_the_best_path() -> None:
-    """Without a session along a path."""
+def test_session_or_first_answer_makes_the_best_path() -> None:
+    """New keys do not change the election while the best path works."""
     paths = path_set(LTE, MESH)
-    assert answer(paths, MESH, 1.0) == [ConditionChanged(of(paths, MESH), True, "answered")]
-
+    assert answer(paths, MESH, 1.0) == [PathStateChanged(PEER, MESH, True, "answered")]
     assert paths.best is of(paths, MESH)
-
-
-def test_session_along_a_path_makes_it_the_best_unless_the_best_works() -> None:
-    """New keys do not change the election."""
     paths = linked(LTE, MESH)
     paths.prefer(MESH, 2.0)
     assert paths.best is of(paths, LTE)
-
     for path in (LTE, MESH):
         of(paths, path).set_off(is_off=True, now=3.0)
     of(paths, MESH).set_off(is_off=False, now=3.0)
     paths.prefer(MESH, 4.0)
-    assert paths.best is of(paths, MESH)
-    assert paths.update(4.0)[0] == BestChanged(of(paths, MESH), of(paths, LTE), "session")
+    assert paths.update(PEER, 4.0)[0] == PathChanged(PEER, MESH, LTE, "session")
 
 
 def test_session_along_a_slot_from_before_a_silence_is_not_given_up() -> None:
@@ -254,50 +191,29 @@ def test_session_along_a_slot_from_before_a_silence_is_not_given_up() -> None:
     paths.learn(PLACES[0], 1.0)
     now = 1.0 + 2 * c.FIRST_PATH_S
     best = paths.prefer(PLACES[0], now)
-    paths.update(now + c.FIRST_PATH_S - 0.1)
+    paths.update(PEER, now + c.FIRST_PATH_S - 0.1)
     assert paths.best is best
-    paths.update(now + c.FIRST_PATH_S)
+    paths.update(PEER, now + c.FIRST_PATH_S)
     assert paths.best is None
 
 
-def test_failed_path_is_replaced_at_once() -> None:
-    """By the cheapest that works; both changes have their reason."""
+def test_failed_path_is_replaced_at_once_by_the_cheapest_that_works() -> None:
+    """By a usable one before a suspect one. It stays the best while there is no other: it may come back first."""
     paths = linked(LTE, SIK, MESH)
     of(paths, SIK).srtt_s = 1.0
-
     assert fail(paths, LTE, 4.0) == [
-        BestChanged(of(paths, MESH), of(paths, LTE), "unanswered"),
-        ConditionChanged(of(paths, LTE), False, "unanswered"),
+        PathChanged(PEER, MESH, LTE, "unanswered"),
+        PathStateChanged(PEER, LTE, False, "unanswered"),
     ]
-
-
-def test_path_whose_network_is_gone_is_replaced_at_once() -> None:
-    """Without waiting for questions."""
-    paths = linked(LTE, MESH)
-    paths.set_socket_state(LTE.socket, 2.0, is_up=False)
-
-    assert paths.update(2.0)[0] == BestChanged(of(paths, MESH), of(paths, LTE), "network")
-    assert route(paths, Class.CRITICAL) == [MESH]
-
-
-def test_failed_path_stays_the_best_while_there_is_no_other() -> None:
-    """Frames go along it: it may come back before anything else."""
-    paths = linked(LTE, MESH)
-    fail(paths, MESH, 4.0)
-    fail(paths, LTE, 6.0)
-
-    assert paths.best is of(paths, LTE)
-    assert not paths.works
-    assert route(paths, Class.STREAM) == [LTE]
-
-
-def test_usable_path_replaces_a_failed_one_before_a_suspect_one() -> None:
-    """Even if the suspect one is faster."""
     paths = linked(LTE, MESH, SIK)
     suspect(paths, MESH, 4.0)
     fail(paths, LTE, 4.0)
-
     assert paths.best is of(paths, SIK)
+    fail(paths, MESH, 6.0)
+    fail(paths, SIK, 8.0)
+    assert paths.best is of(paths, SIK)
+    assert not paths.works
+    assert route(paths, Class.STREAM) == [SIK]
 
 
 def test_recovering_path_is_used_at_once_when_the_last_other_fails() -> None:
@@ -306,37 +222,23 @@ def test_recovering_path_is_used_at_once_when_the_last_other_fails() -> None:
     fail(paths, MESH, 4.0)
     answer(paths, MESH, 5.0)
     assert of(paths, MESH).is_recovering
-    changes = fail(paths, LTE, 5.5)
-
+    assert PathChanged(PEER, MESH, LTE, "unanswered") in fail(paths, LTE, 5.5)
     assert of(paths, MESH).condition is PathCondition.USABLE
-    assert paths.best is of(paths, MESH)
-    assert BestChanged(of(paths, MESH), of(paths, LTE), "unanswered") in changes
 
 
 def test_better_path_is_elected_after_two_seconds() -> None:
-    """Not before, and the reason is its delay."""
+    """Not before; one that was better for a moment begins again. A suspect path is not elected."""
     paths = linked(LTE, MESH)
-    of(paths, LTE).srtt_s = 0.4
-    assert paths.update(2.0) == []
-    assert paths.next_at <= 2.0 + c.BETTER_FOR_S
-    assert paths.update(2.0 + c.BETTER_FOR_S - 0.001) == []
-
-    changes = paths.update(2.0 + c.BETTER_FOR_S)
-    assert changes == [BestChanged(of(paths, MESH), of(paths, LTE), "faster")]
-
-
-def test_path_that_was_better_for_a_moment_is_not_elected() -> None:
-    """Its two seconds begin again."""
+    for srtt_s, now in ((0.4, 2.0), (0.1, 3.0), (0.4, 3.5), (0.4, 3.5 + c.BETTER_FOR_S - 0.001)):
+        of(paths, LTE).srtt_s = srtt_s
+        assert paths.update(PEER, now) == []
+    assert paths.next_at <= 3.5 + c.BETTER_FOR_S
+    assert paths.update(PEER, 3.5 + c.BETTER_FOR_S) == [PathChanged(PEER, MESH, LTE, "faster")]
     paths = linked(LTE, MESH)
-    of(paths, LTE).srtt_s = 0.4
-    paths.update(2.0)
-    of(paths, LTE).srtt_s = 0.1
-    paths.update(3.0)
-    of(paths, LTE).srtt_s = 0.4
-    paths.update(3.5)
-
-    assert paths.update(2.0 + c.BETTER_FOR_S) == []
-    assert len(paths.update(3.5 + c.BETTER_FOR_S)) == 1
+    of(paths, LTE).srtt_s = 2.0
+    paths.update(PEER, 2.0)
+    suspect(paths, MESH, 3.0)
+    assert paths.update(PEER, 2.0 + c.BETTER_FOR_S) == []
 
 
 @pytest.mark.parametrize(
@@ -347,9 +249,8 @@ def test_better_is_by_a_fifth_and_by_ten_milliseconds(best_s: float, other_s: fl
     """Of the one-way delay, half of the round trip: two paths of nearly equal delay do not take turns."""
     paths = linked(LTE, MESH)
     of(paths, LTE).srtt_s, of(paths, MESH).srtt_s = best_s, other_s
-    paths.update(2.0)
-
-    assert bool(paths.update(2.0 + c.BETTER_FOR_S)) == is_better
+    paths.update(PEER, 2.0)
+    assert bool(paths.update(PEER, 2.0 + c.BETTER_FOR_S)) == is_better
 
 
 def test_loss_counts_as_delay() -> None:
@@ -362,39 +263,19 @@ def test_loss_counts_as_delay() -> None:
         state.make_probe(7 + number, 0, 2.0 + number / 2)
         state.receive_answer(7 + number, received, 2.1 + number / 2)
     assert state.loss_out == pytest.approx(0.3, abs=0.02)
-    paths.update(2.6)
+    paths.update(PEER, 2.6)
+    assert paths.update(PEER, 2.6 + c.BETTER_FOR_S) == [PathChanged(PEER, MESH, LTE, "loss")]
 
-    assert paths.update(2.6 + c.BETTER_FOR_S) == [BestChanged(of(paths, MESH), state, "loss")]
 
-
-def test_lag_of_copies_counts_instead_of_the_round_trip() -> None:
-    """It compares one-way delays on real traffic: here the path with the longer round trip delivers first."""
+@pytest.mark.parametrize("lags", [{LTE: 80, MESH: 0}, {LTE: 80}])
+def test_lag_of_copies_counts_instead_of_the_round_trip_if_all_are_known(lags: dict[Path, int]) -> None:
+    """It compares one-way delays on real traffic. A lag and a round trip cannot be compared."""
     paths = linked(LTE, MESH)
     for now in (2.0, 4.0):
-        of(paths, LTE).receive_report(Probe(1, 0, 1, 1, 80), now)
-        of(paths, MESH).receive_report(Probe(1, 0, 1, 1, 0), now)
-        changes = paths.update(now)
-
-    assert changes == [BestChanged(of(paths, MESH), of(paths, LTE), "faster")]
-
-
-def test_lag_that_is_not_known_for_each_path_does_not_count() -> None:
-    """A lag and a round trip cannot be compared."""
-    paths = linked(LTE, MESH)
-    for now in (2.0, 4.0):
-        of(paths, LTE).receive_report(Probe(1, 0, 1, 1, 80), now)
-        assert paths.update(now) == []
-
-
-def test_suspect_path_is_not_elected() -> None:
-    """Reports can only make a path worse."""
-    paths = linked(LTE, MESH)
-    of(paths, LTE).srtt_s = 2.0
-    paths.update(2.0)
-    suspect(paths, MESH, 3.0)
-
-    assert paths.update(2.0 + c.BETTER_FOR_S) == []
-    assert paths.best is of(paths, LTE)
+        for path, lag_ms in lags.items():
+            of(paths, path).receive_report(Probe(1, 0, 1, 1, lag_ms), now)
+        changes = paths.update(PEER, now)
+    assert changes == ([PathChanged(PEER, MESH, LTE, "faster")] if len(lags) == 2 else [])
 
 
 # Metered paths.
@@ -404,32 +285,20 @@ def test_metered_path_is_the_best_only_without_another() -> None:
     """However fast it is; when another one works again it is replaced at once."""
     paths = linked(MESH, LTE, metered={LTE.socket})
     of(paths, MESH).srtt_s = 3.0
-    paths.update(2.0)
-    assert paths.update(10.0) == []
+    paths.update(PEER, 2.0)
+    assert paths.update(PEER, 10.0) == []
     assert paths.role(of(paths, LTE)) == "metered"
-
     of(paths, MESH).srtt_s = 0.1
-    assert fail(paths, MESH, 60.0)[0] == BestChanged(of(paths, LTE), of(paths, MESH), "unanswered")
-    assert paths.role(of(paths, LTE)) == "best"
+    assert fail(paths, MESH, 60.0)[0] == PathChanged(PEER, LTE, MESH, "unanswered")
+    assert [paths.role(of(paths, path)) for path in (LTE, MESH)] == ["best", "standby"]
     for number in range(4):
         assert paths.best is of(paths, LTE)
-        changes = answer(paths, MESH, 61.0 + number)
-        if changes:
+        if changes := answer(paths, MESH, 61.0 + number):
             break
-    assert changes[0] == BestChanged(of(paths, MESH), of(paths, LTE), "metered")
-
-
-def test_path_that_becomes_metered_is_replaced() -> None:
-    """The reason says so."""
-    facts = SocketFacts()
-    paths = PathSet(Redundancy.CRITICAL, c.PROBE_IDLE_S, Counter(), facts)
-    paths.configure([LTE, MESH], 0.0)
-    for path in (LTE, MESH):
-        answer(paths, path, 1.0)
-    facts.metered.add(LTE.socket)
+    assert changes[0] == PathChanged(PEER, MESH, LTE, "metered")
+    paths.facts.metered = {MESH.socket}
     paths.set_metered()
-
-    assert paths.update(2.0) == [BestChanged(of(paths, MESH), of(paths, LTE), "metered")]
+    assert paths.update(PEER, 65.0) == [PathChanged(PEER, LTE, MESH, "metered")]
 
 
 def test_initiations_avoid_metered_paths_while_another_works() -> None:
@@ -438,7 +307,7 @@ def test_initiations_avoid_metered_paths_while_another_works() -> None:
     paths.learn(PLACES[0], 1.0)
     paths.prefer(SIK, 1.0)
     assert paths.handshake_paths() == ([MESH, SIK], [])
-
+    assert paths.handshake_paths(is_answering=False) == ([MESH, SIK], [LTE])
     for path in (MESH, SIK):
         fail(paths, path, 5.0)
     assert paths.handshake_paths() == ([MESH, SIK], [LTE])
@@ -458,64 +327,39 @@ def test_initiations_avoid_metered_paths_while_another_works() -> None:
     ],
 )
 def test_routes_of_each_class(redundancy: Redundancy, critical: list[Path], stream: list[Path]) -> None:
-    """The third path is metered: it gets critical frames, and no others."""
+    """The third path is metered: it gets critical frames, and no others. So does one that is down."""
     paths = linked(LTE, MESH, SIK, redundancy=redundancy, metered={SIK.socket})
-
-    assert route(paths, Class.CRITICAL) == critical
-    assert route(paths, Class.STREAM) == stream
-    assert route(paths, Class.BULK) == [LTE]
+    assert [route(paths, cls) for cls in Class] == [critical, stream, [LTE]]
+    assert paths.is_multiple
+    for path in (MESH, SIK):
+        fail(paths, path, 4.0)
+    paths.update(PEER, 600.0)
+    assert [route(paths, cls) for cls in Class] == [critical, [LTE], [LTE]]
     assert paths.is_multiple
 
 
-def test_stream_goes_along_every_path_while_the_best_is_suspect() -> None:
-    """Also along a metered one: the question of the best is late, and it may be down."""
+@pytest.mark.parametrize("reason", ["unanswered", "loss"])
+def test_stream_goes_along_every_path_while_the_best_is_suspect(reason: str) -> None:
+    """Also along a metered one if an answer is late: the best may be down. Loss may last, and metered bytes cost."""
     paths = linked(LTE, MESH, SIK, metered={SIK.socket})
     suspect(paths, LTE, 3.0)
-
-    assert route(paths, Class.STREAM) == [LTE, MESH, SIK]
+    of(paths, LTE).reason = reason
+    paths.update(PEER, 3.0)
+    assert route(paths, Class.STREAM) == ([LTE, MESH, SIK] if reason == "unanswered" else [LTE, MESH])
     assert route(paths, Class.BULK) == [LTE]
 
 
-def test_stream_avoids_metered_paths_while_the_best_loses_datagrams() -> None:
-    """Loss may last for long, and metered bytes are paid for."""
-    paths = linked(LTE, MESH, SIK, metered={SIK.socket})
-    state = of(paths, LTE)
-    state.condition, state.reason = PathCondition.SUSPECT, "loss"
-    paths.update(3.0)
-
-    assert route(paths, Class.STREAM) == [LTE, MESH]
-
-
-def test_path_that_is_down_gets_critical_copies_for_ten_seconds_after_its_last_answer() -> None:
-    """Paths that take turns to fail lose no critical frame."""
-    paths = linked(LTE, MESH)
-    fail(paths, MESH, 4.0)
-    assert route(paths, Class.CRITICAL) == [LTE, MESH]
-    assert paths.next_at <= 1.0 + c.COPIES_AFTER_ANSWER_S
-    paths.update(1.0 + c.COPIES_AFTER_ANSWER_S)
-
-    assert route(paths, Class.CRITICAL) == [LTE]
-    assert not paths.is_multiple
-
-
 def test_unproven_path_carries_nothing() -> None:
-    """A question has to be answered first."""
+    """A question has to be answered first. Without a path there is no route."""
     paths = path_set(LTE, MESH)
     answer(paths, LTE, 1.0)
-
-    assert {cls: route(paths, cls) for cls in Class} == {cls: [LTE] for cls in Class}
+    assert [route(paths, cls) for cls in Class] == [[LTE]] * 3
     assert paths.has_several
     assert not paths.is_multiple
-
-
-def test_without_a_path_there_is_no_route() -> None:
-    """A responder that was not reached yet."""
     paths = path_set()
-    paths.update(1.0)
-
-    assert paths.best is None
-    assert not paths.has_any
-    assert all(not route(paths, cls) for cls in Class)
+    paths.update(PEER, 1.0)
+    assert (paths.best, paths.has_any) == (None, False)
+    assert [route(paths, cls) for cls in Class] == [[]] * 3
 
 
 # Times between questions.
@@ -528,73 +372,45 @@ def busy(paths: PathSet, now: float) -> PathSet:
 
 
 def test_path_of_the_stream_is_asked_often_and_a_standby_rarely() -> None:
-    """If another one is usable; without stream the best path is a standby too."""
+    """A new one is asked often. Without stream the best path is a standby too; if it alone works, it is rarer."""
     paths = busy(linked(LTE, MESH), 2.0)
-    assert paths.interval_s(of(paths, LTE), 2.0) == c.PROBE_FAST_S
-    assert paths.interval_s(of(paths, MESH), 2.0) == c.PROBE_STANDBY_S
+    of(paths, MESH).answers = c.SETTLING_ANSWERS - 1
+    assert [paths.interval_s(of(paths, path), 2.0) for path in (LTE, MESH)] == [c.PROBE_FAST_S] * 2
+    answer(paths, MESH, 2.1)
+    assert paths.interval_s(of(paths, MESH), 2.1) == c.PROBE_STANDBY_S
     assert paths.interval_s(of(paths, LTE), 2.0 + c.STREAM_ENDS_AFTER_S) == c.PROBE_STANDBY_S
+    fail(paths, MESH, 2.5)
+    assert paths.interval_s(of(paths, LTE), 2.5) == c.PROBE_INTERVAL_S
 
 
 def test_stream_begins_with_more_than_four_envelopes_a_second() -> None:
     """The frames of a ground station are rarer: its path is asked as rarely as a standby."""
     paths = linked(LTE, MESH)
     assert not any(paths.note_stream(20.0 + number / 4) for number in range(12))
-
     assert [paths.note_stream(30.0 + number / 5) for number in range(6)] == [False] * 4 + [True, False]
     assert paths.stream_at == 31.0
 
 
-def test_only_usable_path_is_asked_every_five_seconds() -> None:
-    """There is nothing to change to."""
-    paths = busy(linked(LTE, MESH), 2.0)
-    fail(paths, MESH, 2.0)
-
-    assert paths.interval_s(of(paths, LTE), 2.0) == c.PROBE_INTERVAL_S
-
-
 def test_only_path_is_asked_by_echo_requests() -> None:
-    """No probe is sent."""
+    """No probe is sent, but while a session waits for its first answer, for ten seconds at most."""
     paths = busy(linked(LTE), 2.0)
-
     assert paths.interval_s(of(paths, LTE), 2.0) == NEVER
     assert of(paths, LTE).question_at == NEVER
-
-
-def test_suspect_and_recovering_paths_are_asked_often() -> None:
-    """To know soon what they are."""
-    paths = busy(linked(LTE, MESH), 20.0)
-    suspect(paths, MESH, 20.0)
-    assert paths.interval_s(of(paths, MESH), 20.0) == c.PROBE_FAST_S
-
-    fail(paths, MESH, 21.0)
-    answer(paths, MESH, 24.0)
-    assert of(paths, MESH).is_recovering
-    assert paths.interval_s(of(paths, MESH), 24.0) == c.PROBE_FAST_S
+    paths = path_set()
+    assert paths.interval_s(paths.prefer(LTE, 0.0), 9.0) == c.PROBE_FAST_S
 
 
 def test_path_that_is_down_is_asked_ever_less() -> None:
-    """Often at first, then every second, after a minute every five."""
+    """As often as a suspect or a recovering one at first, then every second, after a minute every five."""
     paths = busy(linked(LTE, MESH), 20.0)
-    fail(paths, MESH, 20.0)
+    suspect(paths, MESH, 20.0)
+    assert paths.interval_s(of(paths, MESH), 20.0) == c.PROBE_FAST_S
+    fail(paths, MESH, 21.0)
     for age_s, expected in ((0.0, c.PROBE_FAST_S), (c.DOWN_AFTER_S, c.PROBE_DOWN_S), (60.0, c.PROBE_LONG_DOWN_S)):
-        assert paths.interval_s(of(paths, MESH), 20.0 + age_s) == expected
-
-
-def test_new_path_is_asked_often_until_its_round_trip_is_known_well() -> None:
-    """After a few answers it is a standby."""
-    paths = busy(linked(LTE, MESH), 2.0)
-    of(paths, MESH).answers = c.SETTLING_ANSWERS - 1
-    assert paths.interval_s(of(paths, MESH), 2.0) == c.PROBE_FAST_S
-    answer(paths, MESH, 2.1)
-    assert paths.interval_s(of(paths, MESH), 2.1) == c.PROBE_STANDBY_S
-
-
-def test_path_of_a_new_session_is_asked_often_until_it_answers() -> None:
-    """It carries traffic meanwhile, for ten seconds at most."""
-    paths = path_set()
-    state = paths.prefer(LTE, 0.0)
-
-    assert paths.interval_s(state, 9.0) == c.PROBE_FAST_S
+        assert paths.interval_s(of(paths, MESH), 21.0 + age_s) == expected
+    answer(paths, MESH, 24.0)
+    assert of(paths, MESH).is_recovering
+    assert paths.interval_s(of(paths, MESH), 24.0) == c.PROBE_FAST_S
 
 
 @pytest.mark.parametrize(("idle_probe_s", "expected"), [(15.0, 15.0), (40.0, 40.0), (0.0, NEVER)])
@@ -603,7 +419,6 @@ def test_idle_and_metered_paths_are_asked_as_configured(idle_probe_s: float, exp
     paths = linked(MESH, LTE, idle_probe_s=idle_probe_s, metered={LTE.socket})
     assert paths.interval_s(of(paths, LTE), 2.0) == expected
     assert paths.interval_s(of(paths, MESH), 2.0 + c.IDLE_AFTER_S) == expected
-
     busy(paths, 20.0)
     fail(paths, MESH, 20.0)
     assert paths.interval_s(of(paths, LTE), 20.0) < expected
@@ -614,36 +429,31 @@ def test_next_question_is_counted_from_the_last() -> None:
     paths = busy(linked(LTE, MESH), 2.0)
     of(paths, LTE).questioned_at, of(paths, MESH).questioned_at = 1.9, 1.0
     paths.schedule(2.0)
-
     assert of(paths, LTE).question_at == pytest.approx(1.9 + c.PROBE_FAST_S)
     assert of(paths, MESH).question_at == 1.0 + c.PROBE_STANDBY_S
     assert paths.next_at <= of(paths, LTE).question_at
 
 
-# Networks.
+# Networks, and what is reported.
 
 
-def test_path_of_an_absent_network_is_not_asked() -> None:
-    """Until it is back: then at once."""
+def test_path_of_an_absent_network_is_not_used_until_it_is_back() -> None:
+    """It is replaced without waiting for questions, and asked at once when it is back."""
     paths = busy(linked(LTE, MESH), 2.0)
-    paths.set_socket_state(MESH.socket, 2.0, is_up=False)
-    paths.update(2.0)
-    assert of(paths, MESH).question_at == NEVER
-    assert paths.handshake_paths() == ([LTE], [])
-    assert route(paths, Class.CRITICAL) == [LTE]
-
-    paths.set_socket_state(MESH.socket, 9.0, is_up=True)
-    paths.update(9.0)
-    assert of(paths, MESH).question_at == 9.0
+    paths.set_socket_state(LTE.socket, 2.0, is_up=False)
+    assert paths.update(PEER, 2.0)[0] == PathChanged(PEER, MESH, LTE, "network")
+    assert of(paths, LTE).question_at == NEVER
+    assert paths.handshake_paths() == ([MESH], [])
+    assert route(paths, Class.CRITICAL) == [MESH]
+    paths.set_socket_state(LTE.socket, 9.0, is_up=True)
+    paths.update(PEER, 9.0)
+    assert of(paths, LTE).question_at == 9.0
 
 
 def test_changes_of_one_path_alone_are_not_reported() -> None:
     """The events of the peer say the same; with a second path they are."""
     paths = path_set(LTE)
     paths.prefer(LTE, 0.0)
-    assert answer(paths, LTE, 1.0) == []
-    assert fail(paths, LTE, 5.0) == []
-
-    answer(paths, LTE, 6.0)
+    assert [answer(paths, LTE, 1.0), fail(paths, LTE, 5.0), answer(paths, LTE, 6.0)] == [[]] * 3
     paths.learn(MESH, 6.0)
-    assert paths.update(6.0) == [ConditionChanged(of(paths, LTE), True, "answered")]
+    assert paths.update(PEER, 6.0) == [PathStateChanged(PEER, LTE, True, "answered")]

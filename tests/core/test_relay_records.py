@@ -13,7 +13,6 @@ from tests.core.harness import AT_A, AT_B, ELSEWHERE, Pair, Side, datagrams, of,
 from uavlinkd.core import constants as c
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.outputs import Output, RecordReceived
-from uavlinkd.core.path import relayed
 from uavlinkd.core.relay_records import (
     WAITING,
     Bind,
@@ -36,34 +35,29 @@ BIND = Bind((KEYS[0], KEYS[1]))
 BOUND = Bound("203.0.113.7", 5790, ((KEYS[0], 0x1234), (KEYS[1], WAITING)))
 TOKEN = bytes(range(16))
 LINK = quiet(features=c.FEATURE_RECORDS)
+MAPPED = bytes(10) + b"\xff\xff\xcb\x00\x71\x07" + b"\x16\x9e"
 
 
 # Encodings.
 
 
-def test_encodings_are_the_documented_ones() -> None:
-    """Byte by byte, as the specification draws them."""
-    assert BIND.encode() == b"\x01" + KEYS[0] + KEYS[1]
-    mapped = bytes(10) + b"\xff\xff\xcb\x00\x71\x07"
-    assert BOUND.encode() == b"\x02" + mapped + b"\x16\x9e" + KEYS[0] + b"\x12\x34" + KEYS[1] + b"\x00\x00"
-    places = Candidates((("203.0.113.7", 5790), ("2001:db8::1", 1)))
-    assert places.encode() == b"\x03" + mapped + b"\x16\x9e" + bytes.fromhex("20010db8" + 22 * "0" + "01" + "0001")
-    assert wrap(0x1234, b"\x40abc") == b"\x50\x12\x34\x40abc"
-    assert FilterTest(TOKEN).encode() == b"\x04" + TOKEN + bytes(79)
-    assert FilterTested(TOKEN).encode() == b"\x05" + TOKEN
-    assert token_datagram(TOKEN) == b"\x51" + TOKEN
-
-
 @pytest.mark.parametrize(
-    "record",
+    ("record", "encoded"),
     [
-        *(BIND, BOUND, Bound("2001:db8::1", 1, ((KEYS[2], 7),)), Candidates((("192.0.2.1", 1), ("fe80::1", 2)))),
-        *(FilterTest(TOKEN), FilterTested(TOKEN)),
+        (BIND, b"\x01" + KEYS[0] + KEYS[1]),
+        (BOUND, b"\x02" + MAPPED + KEYS[0] + b"\x12\x34" + KEYS[1] + b"\x00\x00"),
+        (
+            Candidates((("203.0.113.7", 5790), ("2001:db8::1", 1))),
+            b"\x03" + MAPPED + bytes.fromhex("20010db8" + 22 * "0" + "01" + "0001"),
+        ),
+        (FilterTest(TOKEN), b"\x04" + TOKEN + bytes(79)),
+        (FilterTested(TOKEN), b"\x05" + TOKEN),
     ],
 )
-def test_record_is_parsed(record: Record) -> None:
-    """What is encoded comes back."""
-    assert parse_record(record.encode()) == record
+def test_encodings_are_the_documented_ones(record: Record, encoded: bytes) -> None:
+    """Byte by byte, as the specification draws them, and back."""
+    assert record.encode() == encoded
+    assert parse_record(encoded) == record
 
 
 @given(st.binary(max_size=1300))
@@ -82,7 +76,6 @@ def test_any_bytes_parse_or_drop(data: bytes) -> None:
         FilterTested(TOKEN).encode()[:-1],
         FilterTested(TOKEN).encode() + b"\0",
     ],
-    ids=["test short", "test long", "test not padded with zeros", "tested short", "tested long"],
 )
 def test_filter_test_of_another_form_is_dropped(data: bytes) -> None:
     """Each has one length, and the padding is zero."""
@@ -90,17 +83,10 @@ def test_filter_test_of_another_form_is_dropped(data: bytes) -> None:
         parse_record(data)
 
 
-def test_token_has_one_length() -> None:
-    """A datagram of another length contains none."""
-    assert token_of(token_datagram(TOKEN)) == TOKEN
-    assert token_of(token_datagram(TOKEN) + b"\0") == token_of(token_datagram(TOKEN)[:-1]) == token_of(b"\x51") == b""
-
-
 @pytest.mark.parametrize("counter", [0, c.SHORT_COUNTER_LIMIT], ids=["short", "long"])
 def test_filter_test_is_not_shorter_than_what_a_relay_sends_for_it(counter: int) -> None:
     """The token, with IP and UDP header of its own, and the record, whose envelope may have the longer header."""
-    pair = Pair(LINK, LINK).establish()
-    session = pair.a.session
+    session = Pair(LINK, LINK).establish().a.session
     session.send_counter = 0
     asked = session.seal_record(FilterTest(TOKEN).encode(), 0.0)
     session.send_counter = counter
@@ -126,37 +112,28 @@ def test_only_whole_entries_within_the_limits_are_valid(kind: int, size: int) ->
             parse_record(data)
 
 
-@pytest.mark.parametrize("inner", [1, 2, 3, 0x40, 0x41])
-def test_handle_of_data(inner: int) -> None:
-    """Handshake messages, cookie replies and envelopes may be inside."""
-    assert handle_of(wrap(9, bytes([inner]))) == 9
+def test_data_and_tokens_have_one_form() -> None:
+    """Handshake messages, cookie replies and envelopes may be inside data, no relay inside a relay, no bare frame."""
+    assert wrap(0x1234, b"\x40abc") == b"\x50\x12\x34\x40abc"
+    assert [handle_of(wrap(9, bytes([inner]))) for inner in (1, 2, 3, 0x40, 0x41)] == [9] * 5
+    malformed = [b"\x50", wrap(9, b""), wrap(9, b"\x50\x00\x09\x40"), wrap(9, b"\xfd")]
+    assert [handle_of(data) for data in malformed] == [0] * 4
+    token = token_datagram(TOKEN)
+    assert token == b"\x51" + TOKEN
+    assert [token_of(data) for data in (token, token + b"\0", token[:-1], b"\x51")] == [TOKEN, b"", b"", b""]
 
 
-@pytest.mark.parametrize("data", [b"\x50", wrap(9, b""), wrap(9, b"\x50\x00\x09\x40"), wrap(9, b"\xfd")])
-def test_malformed_data_has_no_handle(data: bytes) -> None:
-    """Nothing inside, a relay inside a relay, or a bare frame."""
-    assert handle_of(data) == 0
-
-
-def test_many_keys_need_several_binds() -> None:
-    """Each full but the last."""
+def test_few_records_hold_many_keys_and_handles() -> None:
+    """All handles of a key are in one record: the receiver replaces them. A key without handles waits."""
     assert [len(bind.keys) for bind in binds_of(KEYS)] == [16, 16, 8]
     assert not list(binds_of([]))
-
-
-def test_handles_of_one_key_are_in_one_record() -> None:
-    """The receiver replaces all handles of the keys that a record names. A key without handles waits."""
     handles = {key: [1, 2, 3] for key in KEYS[:11]} | {KEYS[11]: []}
     records = list(bounds_of("2001:db8::1", 5790, handles))
     assert [len(record.handles) for record in records] == [30, 4]
     assert records[1].handles[-1] == (KEYS[11], WAITING)
     assert not list(bounds_of("2001:db8::1", 5790, {}))
-
-
-def test_largest_record_fits_an_envelope() -> None:
-    """The sealed record with its type, in the longest header, with the longest tag."""
     largest = Bound("::1", 1, ((KEYS[0], 1),) * c.ENTRIES_PER_BOUND).encode()
-    assert 7 + 1 + len(largest) + 16 + 32 <= c.DEFAULT_ENVELOPE_LIMIT
+    assert 7 + 1 + len(largest) + 16 + 32 <= c.DEFAULT_ENVELOPE_LIMIT, "sealed, with the longest header and tag"
 
 
 # In a session.
@@ -181,84 +158,63 @@ def received(outputs: list[Output]) -> RecordReceived:
 
 
 @pytest.mark.parametrize("confidential", [False, True])
-def test_record_crosses_in_both_directions(confidential: bool) -> None:
-    """With the path that it came by."""
+def test_record_crosses_in_both_directions_encrypted(confidential: bool) -> None:
+    """With the path that it came by. A listener must not learn the keys of the fleet. It expects no answer."""
     link = replace(LINK, confidential=confidential)
     pair = Pair(link, link).establish()
     assert pair.carries(0.0)
-    there = received(pair.b.receive(only(send(pair.a, BIND, 1.0)), 1.0))
+    pair.a.receive(pair.b.envelope(1.0), 1.0)
+    datagram = only(send(pair.a, BIND, 1.0))
+    assert pair.a.peer.unanswered_since is None
+    payload = unsealed(pair.b.session, datagram)
+    assert payload is not None
+    assert payload[0] == 7
+    assert KEYS[0][:8] not in payload + datagram
+    there = received(pair.b.receive(datagram, 1.0))
     assert (there.peer, there.path, there.record) == (pair.b.peer, AT_A, BIND)
     back = received(pair.a.receive(only(send(pair.b, BOUND, 1.0)), 1.0))
     assert (back.peer, back.path, back.record) == (pair.a.peer, AT_B, BOUND)
 
 
-def test_no_key_is_readable_where_frames_are(pair: Pair) -> None:
-    """A listener must not learn the keys of the fleet."""
-    datagram = only(send(pair.a, BIND, 1.0))
-    payload = unsealed(pair.b.session, datagram)
-    assert payload is not None
-    assert payload[0] == 7
-    assert KEYS[0] not in payload
-    assert KEYS[0][:8] not in datagram
-
-
-def test_order_grows(pair: Pair) -> None:
-    """With each record, and with each session."""
-    first = received(pair.b.receive(only(send(pair.a, BIND, 1.0)), 1.0))
-    second = received(pair.b.receive(only(send(pair.a, BIND, 1.0)), 1.0))
+def test_order_grows_with_each_record_session_and_restart(pair: Pair) -> None:
+    """A peer that closed its sessions, or forgot them, begins its generations again, and not the order."""
+    orders = [received(pair.b.receive(only(send(pair.a, BIND, 1.0)), 1.0)).order for _ in range(2)]
     pair.a.peer.initiator.retry_at = 0.0
     pair.establish(200.0)
     pair.carries(200.0)
-    third = received(pair.b.receive(only(send(pair.a, BIND, 200.5)), 200.5))
-    assert first.order < second.order < third.order
-
-
-def test_order_grows_after_the_peer_was_restarted(pair: Pair) -> None:
-    """It closed its sessions, or forgot them: the generation begins again, and the order does not."""
-    first = received(pair.b.receive(only(send(pair.a, BIND, 1.0)), 1.0))
-    for closed in datagrams(pair.a.node.close(2.0)):
-        pair.b.receive(closed, 2.0)
+    orders.append(received(pair.b.receive(only(send(pair.a, BIND, 200.5)), 200.5)).order)
+    for closed in datagrams(pair.a.node.close(201.0)):
+        pair.b.receive(closed, 201.0)
     assert pair.b.peer.sessions.current is None
-    pair.a.configure_path(10.0)
-    pair.establish(10.0)
-    pair.carries(10.0)
-    second = received(pair.b.receive(only(send(pair.a, BIND, 11.0)), 11.0))
+    pair.a.configure_path(210.0)
+    pair.establish(210.0)
+    pair.carries(210.0)
+    orders.append(received(pair.b.receive(only(send(pair.a, BIND, 211.0)), 211.0)).order)
     assert pair.b.session.parameters.generation == 1
-    assert first.order < second.order
+    assert orders == sorted(set(orders))
 
 
-def test_record_with_altered_bytes_has_no_effect(pair: Pair) -> None:
-    """An envelope with a valid tag whose record does not open, or has another type or length."""
+@pytest.mark.parametrize(("offset", "record"), [(1, BIND.encode()), (0, b"\x09")])
+def test_record_that_does_not_open_or_parse_has_no_effect(pair: Pair, offset: int, record: bytes) -> None:
+    """Although its envelope is authentic: a peer cannot send what it received before as its own."""
     session = pair.a.session
+    assert session._record_keys is not None
+    sealed = session._record_keys[0].seal(session.send_counter + offset, record, b"")
+    assert reasons(pair.b.receive(session.seal(b"\x07" + sealed, 1.0), 1.0)) == [DropReason.BAD_CONTROL]
     for payload in (b"\x07" + bytes(64), b"\x07" + bytes(16), b"\x07"):
         assert reasons(pair.b.receive(session.seal(payload, 1.0), 1.0)) == [DropReason.BAD_CONTROL]
-    assert session._record_keys is not None
-    sealed = session._record_keys[0].seal(session.send_counter, b"\x09", b"")
-    assert reasons(pair.b.receive(session.seal(b"\x07" + sealed, 1.0), 1.0)) == [DropReason.BAD_CONTROL]
 
 
-def test_record_sealed_for_another_counter_does_not_open(pair: Pair) -> None:
-    """A peer cannot send what it received before as its own."""
-    session = pair.a.session
-    assert session._record_keys is not None
-    sealed = session._record_keys[0].seal(session.send_counter + 1, BIND.encode(), b"")
-    assert reasons(pair.b.receive(session.seal(b"\x07" + sealed, 1.0), 1.0)) == [DropReason.BAD_CONTROL]
-
-
-@pytest.mark.parametrize("link_b", [quiet(), quiet(features=c.FEATURE_REFUSALS)])
-def test_record_needs_both_ends(link_b: object) -> None:
+def test_record_needs_both_ends_and_a_path_that_works(pair: Pair) -> None:
     """Without the feature nothing is sent, and what is sent anyway is an invalid control record."""
-    pair = Pair(LINK, link_b).establish()  # type: ignore[arg-type]
+    assert not pair.a.node.send_record(pair.a.peer, ELSEWHERE, BIND, 1.0)
+    assert not send(pair.a, BIND, 500.0)
+    assert not send(Pair(LINK, LINK).a, BIND, 0.0)
+    pair = Pair(LINK, quiet(features=c.FEATURE_REFUSALS)).establish()
     assert pair.carries(0.0)
     assert not send(pair.a, BIND, 1.0)
     datagram = pair.a.session.seal(b"\x07" + bytes(60), 1.0)
     assert reasons(pair.b.receive(datagram, 1.0)) == [DropReason.BAD_CONTROL]
-
-
-def test_nothing_is_sent_without_a_path_that_works(pair: Pair) -> None:
-    """Nor without a session."""
-    assert not pair.a.node.send_record(pair.a.peer, ELSEWHERE, BIND, 1.0)
-    assert not send(Pair(LINK, LINK).a, BIND, 0.0)
 
 
 def test_record_on_a_superseded_session_is_dropped(pair: Pair) -> None:
@@ -269,20 +225,3 @@ def test_record_on_a_superseded_session_is_dropped(pair: Pair) -> None:
     assert pair.carries(121.0)
     assert pair.carries(124.0)
     assert reasons(pair.b.receive(late, 125.0)) == [DropReason.OLD_RECORD]
-
-
-def test_record_expects_no_answer(pair: Pair) -> None:
-    """It does not count as unanswered: a relay answers binds, and that gets no answer."""
-    pair.a.receive(pair.b.envelope(1.0), 1.0)
-    assert send(pair.a, BIND, 1.0)
-    assert pair.a.peer.unanswered_since is None
-
-
-def test_relayed_path_names_relay_and_handle() -> None:
-    """Two handles of one relay are one host and two places."""
-    path, other = relayed(1, "vps", 7), relayed(1, "vps", 8)
-    assert path.is_relayed
-    assert not path.is_serial
-    assert not AT_A.is_relayed
-    assert path.host == other.host == "relay vps"
-    assert path.place != other.place

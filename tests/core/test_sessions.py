@@ -1,29 +1,35 @@
-"""Next, current and previous sessions, and which of them sends."""
+"""The sessions of a peer, which of them sends, and the indices under which they are found."""
 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
+from typing import Any, cast
 
 import pytest
 
 from tests.core.harness import seeded
 from uavlinkd.core import constants as c
 from uavlinkd.core.crypto import Secret
+from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.handshake import Keys
-from uavlinkd.core.indices import Indices
 from uavlinkd.core.path import Path
 from uavlinkd.core.session import Session
-from uavlinkd.core.sessions import Sessions, Unconfirmed
+from uavlinkd.core.sessions import Indices, Sessions, Unconfirmed
 from uavlinkd.core.suites import X25519
 from uavlinkd.core.wire import Parameters
 
 PATH = Path(0, ("192.0.2.1", 1))
+OWNER = cast(Any, object())
+QUARANTINE_S = c.INDEX_QUARANTINE_S
 
 
 def session(index: int, generation: int = 1, *, initiator: bool = True, now: float = 0.0) -> Session:
     """A session with this local index, rejected 180 s after ``now``."""
-    keys = Keys((Secret(bytes(32)), Secret(bytes(32))), bytes(32), Parameters(generation, False, 16, 256, 1232), 1)
-    return Session(X25519, keys, index, now, 180.0, is_initiator=initiator)
+    keys = Keys(
+        X25519, (Secret(bytes(32)), Secret(bytes(32))), bytes(32), Parameters(generation, False, 16, 256, 1232), 1
+    )
+    return Session(keys, index, now, 180.0, is_initiator=initiator)
 
 
 def unconfirmed(index: int, expires_at: float = 10.0, *, is_expected: bool = False) -> Unconfirmed:
@@ -32,10 +38,15 @@ def unconfirmed(index: int, expires_at: float = 10.0, *, is_expected: bool = Fal
     return Unconfirmed(waiting, bytes(16), 147, bytes(60), [PATH], is_expected, bytes(16), expires_at)
 
 
+def empty(*, has_smaller_key: bool = True) -> Sessions:
+    """The sessions of one side."""
+    return Sessions(Indices[object](seeded(1)), "bravo", has_smaller_key=has_smaller_key)
+
+
 @pytest.fixture
 def sessions() -> Sessions:
     """The sessions of the side with the smaller key."""
-    return Sessions(Indices[object](seeded(1)), "bravo", has_smaller_key=True)
+    return empty()
 
 
 def owners(sessions: Sessions) -> list[int]:
@@ -43,17 +54,11 @@ def owners(sessions: Sessions) -> list[int]:
     return sorted([*sessions.unconfirmed, *(session.local_index for session in sessions.confirmed)])
 
 
-def test_without_a_session_there_is_nothing_to_send_on(sessions: Sessions) -> None:
-    """At first there is no session, of generation 0, and nothing expires."""
-    assert sessions.current is None
-    assert sessions.generation == 0
-    assert sessions.next_expiry() == float("inf")
-
-
 def test_the_newest_generation_sends() -> None:
     """Of confirmed sessions, in whatever order they came up, the one of the greatest generation sends."""
     for order in itertools.permutations((1, 2, 3)):
-        sessions = Sessions(Indices[object](seeded(1)), "bravo", has_smaller_key=True)
+        sessions = empty()
+        assert (sessions.current, sessions.generation, sessions.next_expiry()) == (None, 0, c.NEVER)
         for generation in order:
             sessions.confirm(session(generation, generation), 0.0)
         assert [other.parameters.generation for other in sessions.confirmed] == [3, 2, 1]
@@ -64,10 +69,9 @@ def test_the_newest_generation_sends() -> None:
 @pytest.mark.parametrize("own_first", [True, False])
 def test_of_one_generation_the_smaller_keys_initiation_sends(smaller: bool, own_first: bool) -> None:
     """Both ends initiated at once: the session that the smaller key initiated sends, at either end, in any order."""
-    sessions = Sessions(Indices[object](seeded(1)), "bravo", has_smaller_key=smaller)
+    sessions = empty(has_smaller_key=smaller)
     for initiated_here in (own_first, not own_first):
         sessions.confirm(session(1 + initiated_here, 5, initiator=initiated_here), 0.0)
-
     assert sessions.current is not None
     assert sessions.current.is_initiator == smaller
 
@@ -81,90 +85,116 @@ def test_of_equals_the_newest_sends(sessions: Sessions) -> None:
 
 
 def test_confirmed_sessions_are_bounded_and_ended_indices_quarantined(sessions: Sessions) -> None:
-    """The lowest rank goes when there are too many, and its index goes into quarantine."""
-    for generation in range(1, c.USABLE_PER_PEER + 3):
+    """The lowest rank goes when there are too many, also a newcomer of low rank."""
+    for generation in (3, 4, 5, 6, 7, 2):
         sessions.confirm(session(generation, generation), 0.0)
         assert len(sessions.confirmed) <= c.USABLE_PER_PEER
-
-    assert owners(sessions) == [3, 4, 5]
-    assert all(sessions._indices.is_quarantined(index, 0.0) for index in (1, 2))
-
-
-def test_newcomer_of_low_rank_may_be_ended_at_once(sessions: Sessions) -> None:
-    """A session that is older than all that are kept does not push a better one out."""
-    for generation in (5, 6, 7, 4):
-        sessions.confirm(session(generation, generation), 0.0)
-
     assert owners(sessions) == [5, 6, 7]
+    assert all(sessions._indices.is_quarantined(index, 0.0) for index in (2, 3, 4))
 
 
-def test_waiting_sessions_are_bounded_and_the_oldest_goes(sessions: Sessions) -> None:
-    """The sixteen newest wait; the index of a forgotten one is free at once."""
-    for index in range(1, c.UNCONFIRMED_PER_PEER + 3):
-        sessions.wait(unconfirmed(index))
-
-    assert list(sessions.unconfirmed) == list(range(3, 19))
-    assert owners(sessions) == list(range(3, 19))
-    assert not sessions._indices.is_quarantined(1, 0.0)
-
-
-def test_initiator_at_its_own_address_keeps_its_place(sessions: Sessions) -> None:
-    """Calls from elsewhere, such as replayed ones, do not push out one from the peer's own place."""
+def test_waiting_sessions_are_bounded_and_the_oldest_of_its_kind_goes(sessions: Sessions) -> None:
+    """Neither kind pushes out the other. A forgotten index is free at once."""
     sessions.wait(unconfirmed(1))
     sessions.wait(unconfirmed(2, is_expected=True))
-    for index in range(3, c.UNCONFIRMED_PER_PEER + 10):
+    for index in range(3, c.UNCONFIRMED_PER_KIND + 10):
         sessions.wait(unconfirmed(index))
-    assert list(sessions.unconfirmed) == [2, *range(11, 26)]
-    for index in range(30, 30 + c.UNCONFIRMED_PER_PEER):
+    assert list(sessions.unconfirmed) == owners(sessions) == [2, *range(10, 26)]
+    assert not sessions._indices.is_quarantined(1, 0.0)
+    for index in range(30, 30 + c.UNCONFIRMED_PER_KIND):
         sessions.wait(unconfirmed(index, is_expected=True))
-    assert list(sessions.unconfirmed) == list(range(30, 46))
+    assert list(sessions.unconfirmed) == [*range(10, 26), *range(30, 46)]
 
 
-def test_waiting_session_expires(sessions: Sessions) -> None:
-    """An unconfirmed session is forgotten at the end of its lifetime and not before."""
-    sessions.wait(unconfirmed(1, 10.0))
-    sessions.wait(unconfirmed(2, 11.0))
-
-    assert sessions.next_expiry() == 10.0
-    sessions.expire(9.999)
-    assert owners(sessions) == [1, 2]
-    sessions.expire(10.0)
-    assert owners(sessions) == [2]
-
-
-def test_confirmed_session_expires(sessions: Sessions) -> None:
-    """Keys are dropped at their time and not before, and the next session takes over."""
+def test_sessions_expire_at_their_time(sessions: Sessions) -> None:
+    """Not before. The next session takes over from a confirmed one."""
+    sessions.wait(unconfirmed(8, 10.0))
+    sessions.wait(unconfirmed(9, 11.0))
     sessions.confirm(session(1, 2, now=0.0), 0.0)
     sessions.confirm(session(2, 1, now=5.0), 5.0)
-
-    assert sessions.next_expiry() == 180.0
-    sessions.expire(179.999)
-    assert owners(sessions) == [1, 2]
-    sessions.expire(180.0)
-    assert owners(sessions) == [2]
+    for moment, left in ((10.0, [1, 2, 9]), (11.0, [1, 2]), (180.0, [2])):
+        before = owners(sessions)
+        assert sessions.next_expiry() == moment
+        sessions.expire(moment - 0.001)
+        assert owners(sessions) == before
+        sessions.expire(moment)
+        assert owners(sessions) == left
     assert sessions.generation == 1
     assert sessions._indices.is_quarantined(1, 180.0)
 
 
 def test_close_ends_this_session_and_lower_ones(sessions: Sessions) -> None:
-    """A close ends the session that carried it and those before it, not what came after."""
+    """A close ends the session that carried it and those before it, not what came after. Clearing ends all."""
     kept = [session(generation, generation) for generation in (1, 2, 3)]
     for kept_session in kept:
         sessions.confirm(kept_session, 0.0)
-
-    sessions.end_up_to(kept[1], 1.0)
-
+    assert sessions.end_up_to(kept[1], 1.0) == [kept[1], kept[0]]
     assert sessions.confirmed == [kept[2]]
-    assert owners(sessions) == [3]
-
-
-def test_clear_drops_every_key(sessions: Sessions) -> None:
-    """Afterwards no index has an owner; those that carried a session rest."""
-    sessions.wait(unconfirmed(1))
-    sessions.confirm(session(2), 0.0)
-    sessions.confirm(session(3), 0.0)
-
+    sessions.wait(unconfirmed(4))
     sessions.clear(1.0)
+    assert (sessions.confirmed, sessions.unconfirmed, sessions.current) == ([], {}, None)
+    assert [sessions._indices.is_quarantined(index, 1.0) for index in (3, 4)] == [True, False]
 
-    assert (sessions.confirmed, sessions.unconfirmed, owners(sessions)) == ([], {}, [])
-    assert [sessions._indices.is_quarantined(index, 1.0) for index in (1, 2, 3)] == [False, True, True]
+
+# Indices.
+
+
+def drawing(*values: int) -> Callable[[int], bytes]:
+    """Entropy that gives these indices."""
+    left = list(values)
+    return lambda size: left.pop(0).to_bytes(size, "big")
+
+
+def test_picked_index_is_neither_zero_nor_owned() -> None:
+    """A pick alone does not take it. One that never carried a session needs no rest."""
+    indices = Indices[object](drawing(0, 0, 5, 5, 5, 6, 5))
+    assert [indices.pick(0.0), indices.pick(0.0)] == [5, 5]
+    indices.owners[5] = OWNER
+    assert indices.pick(0.0) == 6
+    indices.forget(5)
+    assert not indices.is_quarantined(5, 0.0)
+    assert indices.pick(0.0) == 5
+    indices.forget(5)  # without an owner: nothing happens
+
+
+def test_retired_index_is_quarantined_for_ten_minutes() -> None:
+    """Each for its own time, and then it is forgotten: the quarantine does not grow."""
+    indices = Indices[object](drawing(5, 6, 5, 7, 5, 8))
+    indices.owners[5] = OWNER
+    indices.retire(5, "bravo", 100.0)
+    indices.retire(4, "bravo", 101.0)
+    assert 5 not in indices.owners
+    assert indices.pick(100.0) == 6
+    assert indices.pick(100.0 + QUARANTINE_S - 0.001) == 7
+    assert indices.is_quarantined(5, 100.0 + QUARANTINE_S - 0.001)
+    assert not indices.is_quarantined(5, 100.0 + QUARANTINE_S)
+    assert indices.pick(100.0 + QUARANTINE_S) == 5
+    assert list(indices._quarantine) == [4]
+    indices.pick(101.0 + QUARANTINE_S)
+    assert not indices._quarantine
+
+
+def test_no_index_is_picked_if_all_are_in_use() -> None:
+    """Running out of indices is a drop, not an endless search. With half of them free, one is found."""
+    indices = Indices[object](seeded(1))
+    indices.owners.update(dict.fromkeys(range(1, 2**15), OWNER))
+    assert all(indices.pick(0.0) >= 2**15 for _ in range(1000))
+    indices.owners.update(dict.fromkeys(range(2**15, 2**16), OWNER))
+    with pytest.raises(Drop) as caught:
+        indices.pick(0.0)
+    assert caught.value.reason is DropReason.NO_FREE_INDEX
+
+
+def test_a_peer_that_makes_many_sessions_uses_up_its_own_share() -> None:
+    """The oldest of its indices are free again before their time; those of another peer rest."""
+    indices, share = Indices[object](seeded(1)), c.QUARANTINED_PER_PEER
+    indices.retire(60_000, "charlie", 0.0)
+    for index in range(1, share + 3):
+        indices.retire(index, "bravo", 1.0)
+    assert [index for index in range(1, 2**16) if indices.is_quarantined(index, 2.0)] == [
+        *range(3, share + 3),
+        60_000,
+    ]
+    indices.pick(QUARANTINE_S + 1.0)
+    assert indices._quarantine == {}
+    assert indices._quarantined_of == {}

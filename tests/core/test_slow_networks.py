@@ -1,4 +1,4 @@
-"""Timers by network: handshakes, echoes and waits on networks with a budget. README.md, section 14."""
+"""Networks with a budget: tries, echoes, waits and probes by airtime, and the longest envelopes."""
 
 from __future__ import annotations
 
@@ -6,22 +6,24 @@ from itertools import pairwise
 
 import pytest
 
-from tests.core.harness import Side
+from tests.core.harness import AT_B, FRAME, KEY_C, Pair, Side
 from tests.core.radios import Radios, link
 from uavlinkd.core import constants as c
 from uavlinkd.core import wire
 from uavlinkd.core.outputs import FreshnessUnverified, PeerLost
-from uavlinkd.core.path import SERIAL_HOST, Path
-from uavlinkd.core.settings import Class
-from uavlinkd.core.socket_facts import FREE, Pace, SocketFacts
+from uavlinkd.core.path import FREE, SERIAL_HOST, Pace, Path, SocketFacts
+from uavlinkd.core.path_measures import limit_at
+from uavlinkd.core.probe import ANSWER_BYTES, QUESTION_BYTES
+from uavlinkd.core.settings import Class, PeerSettings
 from uavlinkd.core.suites import SUITES_BY_NAME, X25519
-from uavlinkd.core.verification import Verification
 
 LTE, SIK = 0, 1
 BUDGET_BITS_S = 4_000
 AIRTIME_S = 8 * (147 + 103 + 2 * 48) / BUDGET_BITS_S
 """Of an initiation and its response with `x25519`."""
 ECHO_AIRTIME_S = 8 * (76 + 2 * 48) / BUDGET_BITS_S
+LEAST_TRY_S = c.TRY_AIRTIMES * AIRTIME_S
+PLACE, LINE = Path(SIK, ("192.0.2.1", 1)), Path(SIK, (SERIAL_HOST, 0))
 
 
 def facts(budget_bits_s: float = BUDGET_BITS_S, peers: int = 1) -> SocketFacts:
@@ -32,125 +34,91 @@ def facts(budget_bits_s: float = BUDGET_BITS_S, peers: int = 1) -> SocketFacts:
     return made
 
 
-def slow(*delays_s: float, slow_sockets: tuple[int, ...] = (SIK,)) -> Radios:
+def slow(*delays_s: float, slow_sockets: tuple[int, ...] = (SIK,), dead: bool = False) -> Radios:
     """Radios of which some have a budget at both ends."""
     radios = Radios(delays_s, link(), link(), both_configured=True)
     for side in (radios.a, radios.b):
         side.node.set_budgets(dict.fromkeys(slow_sockets, BUDGET_BITS_S))
+    for radio in radios.radios:
+        radio.is_dead = dead
     return radios
 
 
-def times(radios: Radios, side: Side, radio: int, kind: int, since: float = 0.0) -> list[float]:
-    """When a side sent messages of this kind along a radio."""
-    return [
-        one.at
-        for one in radios.sent
-        if one.side is side and one.path.socket == radio and one.datagram[0] == kind and one.at >= since
-    ]
+def tries(radios: Radios, side: Side, radio: int, since: float = 0.0) -> list[float]:
+    """When a side initiated along a radio."""
+    sent = (one for one in radios.sent if one.side is side and one.at >= since)
+    return [one.at for one in sent if one.path.socket == radio and one.datagram[0] == wire.INITIATION]
 
 
 def echoes(radios: Radios, side: Side, radio: int, since: float, *, is_reply: bool) -> list[float]:
     """When a side sent echo requests, or replies, along a radio."""
     first = wire.Echo(is_reply, 0, 0, 0).encode()[0]
-    return [
-        one.at
-        for one in radios.envelopes(side, since)
-        if one.path.socket == radio and one.datagram[wire.SHORT_HEADER_BYTES] == first
-    ]
+    sent = (one for one in radios.envelopes(side, since) if one.path.socket == radio)
+    return [one.at for one in sent if one.datagram[wire.SHORT_HEADER_BYTES] == first]
 
 
-def test_tries_along_a_slow_network_are_airtimes_apart() -> None:
-    """Those along LTE stay fast, and both ends do so."""
-    radios = slow(0.03, 0.5)
-    for radio in radios.radios:
-        radio.is_dead = True
-    radios.run(30.0)
-    for side in (radios.a, radios.b):
-        gaps = [later - earlier for earlier, later in pairwise(times(radios, side, SIK, wire.INITIATION))]
-        assert gaps
-        assert min(gaps) >= c.TRY_AIRTIMES * AIRTIME_S
-        assert max(gaps) <= (1 + c.RETRY_JITTER) * c.TRY_AIRTIMES * AIRTIME_S + c.RETRY_MAX_S * (1 + c.RETRY_JITTER)
-        assert len(times(radios, side, LTE, wire.INITIATION)) > 25
+def gaps(moments: list[float]) -> list[float]:
+    """The times between them."""
+    return [later - earlier for earlier, later in pairwise(moments)]
 
 
-def test_a_slow_network_alone_is_tried_as_soon_as_it_is_due() -> None:
-    """No other network sets the pace."""
-    radios = slow(0.5, slow_sockets=(0,))
-    radios.radios[0].is_dead = True
-    radios.run(60.0)
-    gaps = [later - earlier for earlier, later in pairwise(times(radios, radios.a, 0, wire.INITIATION))]
-    least_s = c.TRY_AIRTIMES * AIRTIME_S
-    assert all(least_s <= gap <= (1 + c.RETRY_JITTER) * least_s + 1e-6 for gap in gaps)
+# Tries.
 
 
-def test_a_fast_budget_does_not_slow_tries() -> None:
-    """Four airtimes are less than the first wait."""
-    assert facts(1e6).try_interval_s(Path(SIK, ("192.0.2.1", 1)), X25519) < c.RETRY_MIN_S
-    radios = Radios((0.5,), link(), link())
-    radios.a.node.set_budgets({0: 1e6})
-    radios.radios[0].is_dead = True
-    radios.run(2.0)
-    assert len(times(radios, radios.a, 0, wire.INITIATION)) >= 6
-
-
-def test_a_network_that_appears_is_tried_at_once() -> None:
-    """A modem that is plugged in again does not wait for the airtimes of the tries that it did not send."""
-    radios = slow(0.5, slow_sockets=(0,))
-    radios.radios[0].is_dead = True
-    radios.run(0.5)
-    radios.a.node.set_socket_state(0, radios.now, is_up=False)
-    radios.a.node.set_socket_state(0, radios.now, is_up=True)
-    since = radios.now
-    radios.run(0.01)
-    assert len(times(radios, radios.a, 0, wire.INITIATION, since)) == 1
-
-
-def test_a_network_that_flaps_does_not_hasten_the_tries_along_a_slow_one() -> None:
-    """LTE appears every second, and other networks become metered. The radio keeps its pace."""
-    radios = slow(0.03, 0.5)
-    for radio in radios.radios:
-        radio.is_dead = True
+@pytest.mark.parametrize("flaps", [False, True])
+def test_tries_along_a_slow_network_are_airtimes_apart(flaps: bool) -> None:
+    """Those along LTE stay fast, also if it appears every second, and other networks become metered."""
+    radios = slow(0.03, 0.5, dead=True)
     for second in range(30):
         radios.run(1.0)
-        radios.a.node.set_socket_state(LTE, radios.now, is_up=False)
-        radios.a.node.set_metered([LTE] if second % 2 else [], radios.now)
-        radios.a.node.set_socket_state(LTE, radios.now, is_up=True)
-    gaps = [later - earlier for earlier, later in pairwise(times(radios, radios.a, SIK, wire.INITIATION))]
-    assert len(gaps) > 5
-    assert min(gaps) >= c.TRY_AIRTIMES * AIRTIME_S
-    assert len(times(radios, radios.a, LTE, wire.INITIATION)) >= 30
+        if flaps:
+            radios.a.node.set_socket_state(LTE, radios.now, is_up=False)
+            radios.a.node.set_metered([LTE] if second % 2 else [], radios.now)
+            radios.a.node.set_socket_state(LTE, radios.now, is_up=True)
+    for side in (radios.a, radios.b):
+        waits = gaps(tries(radios, side, SIK))
+        assert len(waits) > 5
+        assert min(waits) >= LEAST_TRY_S
+        assert max(waits) <= (1 + c.RETRY_JITTER) * (LEAST_TRY_S + c.RETRY_MAX_S)
+        assert len(tries(radios, side, LTE)) > 25
 
 
-def test_two_paths_of_one_slow_socket_are_tried_together() -> None:
-    """They have one turn."""
-    radios = slow(0.5, slow_sockets=(0,))
+def test_a_slow_network_alone_sets_the_pace() -> None:
+    """Two paths of one socket have one turn. A modem that is plugged in again does not wait for its airtimes."""
+    radios = slow(0.5, slow_sockets=(0,), dead=True)
     paths = [Path(0, (f"10.0.0.{number}", 5790)) for number in (2, 3)]
     radios.a.node.set_paths(radios.a.peer, paths, 0.0)
-    radios.radios[0].is_dead = True
     radios.run(1.0)
     assert [one.path for one in radios.sent if one.side is radios.a] == paths
+    radios = slow(0.5, slow_sockets=(0,), dead=True)
+    radios.run(60.0)
+    waits = gaps(tries(radios, radios.a, 0))
+    assert all(LEAST_TRY_S <= gap <= (1 + c.RETRY_JITTER) * LEAST_TRY_S + 1e-6 for gap in waits)
+    for is_up in (False, True):
+        radios.a.node.set_socket_state(0, radios.now, is_up=is_up)
+    since = radios.now
+    radios.run(0.01)
+    assert len(tries(radios, radios.a, 0, since)) == 1
 
 
-def test_fast_tries_do_not_push_out_the_one_that_the_slow_network_carries() -> None:
-    """LTE loses everything. The response along the radio arrives after more tries along LTE than are remembered."""
+def test_slow_tries_wait_longer_for_their_response() -> None:
+    """LTE loses everything, and its tries do not push out the one that the radio carries. Large suites need more."""
     radios = slow(0.03, 1.6)
     radios.radios[LTE].is_dead = True
     radios.run(3.5)
-    assert len(times(radios, radios.a, LTE, wire.INITIATION)) > c.PENDING_PER_PEER
+    assert len(tries(radios, radios.a, LTE)) > c.PENDING_PER_PEER
     assert radios.a.peer.sessions.current is not None
     assert radios.b.peer.sessions.current is not None
-
-
-def test_a_slow_try_waits_longer_for_its_response() -> None:
-    """With a large suite, airtimes are longer than the usual lifetime of an initiation."""
-    interval_s = facts(400).try_interval_s(Path(SIK, ("192.0.2.1", 1)), SUITES_BY_NAME["mlkem768"])
+    interval_s = facts(400).try_interval_s(PLACE, SUITES_BY_NAME["mlkem768"])
     assert interval_s == pytest.approx(c.TRY_AIRTIMES * 8 * (1347 + 1207 + 96) / 400)
     radios = slow(15.0, slow_sockets=(0,))
-    for side in (radios.a, radios.b):
-        side.node.set_budgets({0: 300.0})
+    radios.a.node.set_budgets({0: 300.0})
     radios.run(0.1)
     (pending,) = radios.a.peer.initiator.pending.values()
     assert pending.expires_at == pytest.approx(c.TRY_AIRTIMES * 8 * (147 + 103 + 96) / 300)
+
+
+# Probes, echoes and freshness.
 
 
 def test_tries_and_probes_follow_the_rate_and_freshness_follows_the_budget() -> None:
@@ -171,57 +139,69 @@ def test_tries_and_probes_follow_the_rate_and_freshness_follows_the_budget() -> 
 
 @pytest.mark.parametrize(
     ("budget", "interval_s", "hold_s", "ask_s"),
-    [(1_600, 8.6, 2.0, 0.86), (4_000, 3.44, 1.376, 0.344), (9_600, 1.4333, 1.0, 0.25), (100_000, 0.1376, 1.0, 0.25)],
+    [
+        (1_600, 8.6, 2.0, 0.86),
+        (4_000, 3.44, 1.376, 0.344),
+        (9_600, 1.4333, 1.0, 0.14333),
+        (100_000, 0.1376, 1.0, 0.1),
+    ],
 )
 def test_pace_of_a_line(budget: float, interval_s: float, hold_s: float, ask_s: float) -> None:
     """As the table in section 11 says."""
-    pace = facts(budget).pace(Path(SIK, (SERIAL_HOST, 0)))
-    assert pace == pytest.approx(Pace(interval_s, hold_s, ask_s), rel=1e-4)
+    assert facts(budget).pace(LINE) == pytest.approx(Pace(interval_s, hold_s, ask_s), rel=1e-4)
 
 
-def test_pace_with_several_peers_and_without_a_budget() -> None:
-    """Peers share the budget, so each is asked less often."""
-    path = Path(SIK, ("192.0.2.1", 1))
-    assert facts(peers=3).pace(path).interval_s == pytest.approx(3 * facts().pace(path).interval_s)
-    assert facts().pace(path).hold_s == facts(peers=3).pace(path).hold_s
-    assert facts().pace(Path(LTE, ("192.0.2.1", 1))) is FREE
-
-
-def test_peers_elsewhere_do_not_slow_a_point_to_point_network() -> None:
-    """One peer is at its other end, however many the node has."""
-    line = Path(SIK, (SERIAL_HOST, 0))
-    alone, crowded = facts(), facts(peers=6)
+def test_peers_share_a_budget_but_not_that_of_a_point_to_point_network() -> None:
+    """So each is asked less often. At the other end of a line is one peer, however many the node has."""
+    alone, three = facts().pace(PLACE), facts(peers=3).pace(PLACE)
+    assert three == pytest.approx(alone._replace(interval_s=3 * alone.interval_s))
+    assert facts().pace(Path(LTE, PLACE.address)) is FREE
+    crowded = facts(peers=6)
     crowded.set_point_to_point({SIK: ["ground-station"]})
-    assert crowded.pace(line) == alone.pace(line)
-    assert crowded.least_probe_s(line) == alone.least_probe_s(line)
+    assert crowded.pace(LINE) == facts().pace(LINE)
+    assert crowded.least_probe_s(LINE) == facts().least_probe_s(LINE)
 
 
-def test_waits_grow_with_the_round_trip() -> None:
-    """A path of 0.6 s: an answer takes longer than the ordinary time until a question."""
+def test_probes_use_at_most_a_twentieth_of_a_budget() -> None:
+    """Of all peers together. On a network that is fast, or without a budget, they are a small part anyway."""
+    echoed = sum(len(wire.Echo(is_reply, 0, 0, 0).encode()) for is_reply in (False, True))
+    around = 2 * (wire.LONG_HEADER_BYTES + 16)
+    assert (QUESTION_BYTES + ANSWER_BYTES + around, echoed + around) == (c.PROBE_BYTES, c.ECHO_BYTES)
+    pair = Pair()
+    node, paths = pair.a.node, pair.a.peer.paths
+    state = paths.by_path[AT_B]
+    free_s = paths.interval_s(state, 0.0)
+    least_s = 8 * (c.PROBE_BYTES + 2 * c.IP_BYTES) / (c.PROBE_BUDGET_SHARE * BUDGET_BITS_S)
+    assert free_s < least_s
+    node.set_budgets({AT_B.socket: BUDGET_BITS_S})
+    assert paths.interval_s(state, 0.0) == pytest.approx(least_s)
+    other = node.add_peer(PeerSettings("other", KEY_C.public), 0.0)
+    assert paths.interval_s(state, 0.0) == pytest.approx(2 * least_s)
+    node.remove_peer(other, 0.0)
+    assert paths.interval_s(state, 0.0) == pytest.approx(least_s)
+    for budgets in ({AT_B.socket + 1: BUDGET_BITS_S}, {AT_B.socket: 10_000_000}):
+        node.set_budgets(budgets)
+        assert paths.interval_s(state, 0.0) == free_s
+
+
+def test_waits_grow_with_the_round_trip_to_a_bound() -> None:
+    """An answer takes longer than the ordinary time until a question. An attacker cannot hide a lost peer."""
     radios = slow(0.4, slow_sockets=())
     radios.run(6.0, 0.5, radios.sender(radios.a), radios.sender(radios.b))
     peer = radios.a.peer
     assert peer.paths.round_trip_s == pytest.approx(0.8)
-    assert peer.echo_after_s == pytest.approx(1.6)
-    assert peer.handshake_after_s == pytest.approx(3.2)
-    assert peer.lost_after_s == pytest.approx(6.4)
+    assert (peer.echo_after_s, peer.handshake_after_s, peer.lost_after_s) == pytest.approx((1.6, 3.2, 6.4))
     since = radios.now
     radios.radios[0].is_dead = True
     radios.run(12.0, 0.5, radios.sender(radios.a))
     ((lost_at, _),) = radios.events(radios.a, PeerLost, since)
     assert lost_at - since >= 6.4 - 0.5
-    assert times(radios, radios.a, 0, wire.INITIATION, since)[0] - since >= 3.2 - 0.5
-
-
-def test_a_slow_round_trip_lengthens_waits_to_a_bound() -> None:
-    """An attacker that slows the path does not hide a lost peer for long."""
-    radios = slow(0.03)
-    radios.run(3.0, 0.5, radios.sender(radios.a), radios.sender(radios.b))
-    best = radios.a.peer.paths.best
-    assert best is not None
-    best.srtt_s = 100.0
-    radios.a.peer.set_waits()
-    assert radios.a.peer.lost_after_s == c.LOST_ROUND_TRIPS * c.LATE_AFTER_S
+    assert tries(radios, radios.a, 0, since)[0] - since >= 3.2 - 0.5
+    radios.radios[0].is_dead = False
+    radios.run(8.0, 0.5, radios.sender(radios.a), radios.sender(radios.b))
+    radios.state(radios.a, 0).srtt_s = 100.0
+    peer.set_waits()
+    assert peer.lost_after_s == c.LOST_ROUND_TRIPS * c.LATE_AFTER_S
 
 
 def test_echoes_along_the_only_path_fit_its_budget() -> None:
@@ -235,41 +215,94 @@ def test_echoes_along_the_only_path_fit_its_budget() -> None:
     assert len(radios.delivered(radios.b)) >= 195
 
 
-def test_the_slow_path_gets_few_copies_of_echoes_when_the_fast_one_dies() -> None:
-    """The requests are repeated four times a second while LTE is suspect. The radio becomes the best path."""
-    radios = slow(0.03, 0.3)
-    radios.run(30.0, 0.5, radios.sender(radios.a), radios.sender(radios.b, Class.CRITICAL))
-    assert radios.a.peer.path == radios.state(radios.a, LTE).path
-    since, radios.radios[LTE].is_dead = radios.now, True
-    radios.run(10.0, 0.5, radios.sender(radios.a), radios.sender(radios.b, Class.CRITICAL))
-    assert radios.a.peer.path == radios.state(radios.a, SIK).path
+# The longest envelopes.
+
+LIMIT = 150
+LONG_FRAME = FRAME[:1] + bytes(279)
+"""As long as the longest MAVLink frame."""
+
+
+def two_radios(limits: dict[int, int]) -> Radios:
+    """Both ends send along LTE and a slow radio, with these limits by socket."""
+    radios = Radios((0.02, 0.2), link(), link(), both_configured=True)
     for side in (radios.a, radios.b):
-        for is_reply in (False, True):
-            gaps = [
-                later - earlier for earlier, later in pairwise(echoes(radios, side, SIK, since, is_reply=is_reply))
-            ]
-            assert len([gap for gap in gaps if gap < c.ASK_AIRTIMES * ECHO_AIRTIME_S - 1e-6]) <= 1
-        assert times(radios, side, SIK, wire.INITIATION, since) == []
-    assert not radios.events(radios.b, FreshnessUnverified, since)
+        side.node.set_envelope_limits(limits)
+    radios.run(8.0, 0.1, radios.sender(radios.a), radios.sender(radios.b))
+    assert all(radios.state(radios.a, radio).works for radio in (LTE, SIK))
+    return radios
 
 
-def test_the_last_proof_lasts_as_long_as_on_the_new_best_path() -> None:
-    """Longer on a slower network, and at most one lifetime from now on a faster one."""
-    verification = Verification(0.0, 1.0)
-    verification.answered(9.9, 10.0)
-    assert verification.until == 12.0
-    verification.set_pace(8.0, 2.0, 11.0)
-    assert (verification.until, verification.ask_at) == (26.0, 17.9)
-    verification.set_pace(1.0, 1.0, 12.0)
-    assert (verification.until, verification.ask_at) == (14.0, 13.0)
-    verification.refute()
-    verification.set_pace(8.0, 2.0, 12.5)
-    assert verification.until == verification.look_at == -c.NEVER
+def sent_lengths(radios: Radios, cls: Class, frames: list[bytes]) -> dict[int, list[int]]:
+    """The lengths of the envelopes along each radio that carry these frames of alpha."""
+    before = len(radios.sent)
+    radios.send(radios.a, cls, *frames)
+    sent = radios.sent[before:]
+    return {radio: [len(one.datagram) for one in sent if one.path.socket == radio] for radio in (LTE, SIK)}
 
 
-def test_an_answer_counts_as_one_that_took_as_long_as_frames_wait() -> None:
-    """On a slow network both are longer."""
-    verification = Verification(0.0, 1.0)
-    verification.set_pace(8.0, 2.0, 0.0)
-    verification.answered(20.0, 21.9)
-    assert verification.until == 21.9 + 16.0
+@pytest.mark.parametrize(
+    ("bits_s", "limit"), [(1_600, 120), (4_000, 120), (4_001, 120), (8_000, 245), (9_600, 295), (40_000, 500)]
+)
+def test_limit_is_what_a_quarter_of_a_second_carries(bits_s: float, limit: int) -> None:
+    """With the framing on the line or the headers of IP, and between 120 and 500 bytes."""
+    assert limit_at(bits_s) == limit
+    assert limit in (c.SLOW_ENVELOPE_LEAST, c.SLOW_ENVELOPE_MOST) or 8 * (limit + c.LINE_BYTES) == bits_s / 4
+    assert limit_at(8_000, 48) == 250 - 48
+
+
+def test_critical_envelopes_fit_the_slowest_path_and_those_of_the_stream_the_best() -> None:
+    """The copies are bit-identical, so the one along LTE is as short. The longest frame goes alone, along both."""
+    radios = two_radios({SIK: LIMIT})
+    lengths = sent_lengths(radios, Class.CRITICAL, [FRAME] * 20)
+    assert lengths[LTE] == lengths[SIK]
+    assert max(lengths[LTE]) <= LIMIT
+    lengths = sent_lengths(radios, Class.CRITICAL, [FRAME, LONG_FRAME, FRAME])
+    assert lengths[LTE] == lengths[SIK]
+    assert [length > LIMIT for length in lengths[SIK]] == [False, True, False]
+    lengths = sent_lengths(radios, Class.STREAM, [FRAME] * 20)
+    assert len(lengths[LTE]) == 1
+    assert lengths[LTE][0] > 20 * len(FRAME)
+    assert lengths[SIK] == []
+
+
+def test_stream_that_is_too_long_for_the_slow_path_is_not_copied_there() -> None:
+    """While the best path is suspect, its envelopes go along the other one too, as far as they fit."""
+    radios = two_radios({SIK: LIMIT})
+    radios.radios[LTE].is_dead = True
+    radios.run(0.35, 0.1, radios.sender(radios.a))
+    assert len(radios.a.peer.paths.stream_route) == 2
+    lengths = sent_lengths(radios, Class.STREAM, [FRAME] * 20)
+    assert (len(lengths[LTE]), lengths[SIK]) == (1, [])
+    lengths = sent_lengths(radios, Class.STREAM, [LONG_FRAME])
+    assert lengths[LTE] == lengths[SIK] != []
+
+
+def test_the_only_path_has_its_limit_too() -> None:
+    """Frames of all classes share its envelopes."""
+    radios = Radios((0.2,), link(), link(), both_configured=True)
+    radios.a.node.set_envelope_limits({0: LIMIT})
+    radios.run(3.0, 0.1, radios.sender(radios.a))
+    assert max(sent_lengths(radios, Class.STREAM, [FRAME] * 20)[0]) <= LIMIT
+    radios.a.node.set_envelope_limits({})
+    assert len(sent_lengths(radios, Class.STREAM, [FRAME] * 20)[0]) == 1
+
+
+def test_a_question_joins_an_envelope_only_within_the_limit() -> None:
+    """The probe in front of frames counts."""
+    radios = two_radios({LTE: LIMIT})
+    fitting = LIMIT - radios.a.session.envelope_bytes(0)
+    for size, joins in ((fitting - QUESTION_BYTES - 2, True), (fitting - QUESTION_BYTES + 1, False)):
+        radios.state(radios.a, LTE).question_at = radios.now
+        lengths = sent_lengths(radios, Class.STREAM, [FRAME[:1] + bytes(size - 1)])
+        assert lengths[LTE] == [radios.a.session.envelope_bytes(size + QUESTION_BYTES * joins)]
+
+
+@pytest.mark.parametrize("limit", [120, LIMIT, 500])
+def test_no_probe_is_longer_than_the_limit(limit: int) -> None:
+    """LTE is tested with the longest envelope, the slow radio never with more than it may carry."""
+    radios = two_radios({SIK: limit})
+    longest = {
+        radio: max(len(one.datagram) for one in radios.sent if one.path.socket == radio) for radio in (LTE, SIK)
+    }
+    assert longest[LTE] == radios.a.session.max_envelope
+    assert longest[SIK] <= max(limit, 147)  # an initiation

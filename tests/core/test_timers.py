@@ -16,8 +16,8 @@ class Stub:
         self.timers = TimerTable()
 
 
-def test_next_is_the_earliest_timer_that_is_set() -> None:
-    """Stopped timers do not count."""
+def test_expired_timers_are_stopped_in_order() -> None:
+    """At the moment itself, not before; one that a handler sets for later in the order is handled too."""
     table = TimerTable()
     assert table.next_at == NEVER
     table.set(Timer.KEEPALIVE, 10.0)
@@ -27,11 +27,6 @@ def test_next_is_the_earliest_timer_that_is_set() -> None:
     assert table.next_at == 10.0
     table.stop_all()
     assert table.next_at == NEVER
-
-
-def test_expired_timers_are_stopped_in_order() -> None:
-    """At the moment itself, not before; one that a handler sets for later in the order is handled too."""
-    table = TimerTable()
     table.set(Timer.KEEPALIVE, 1.0)
     table.set(Timer.SILENCE, 1.0)
     assert list(table.expired(0.999)) == []
@@ -65,6 +60,7 @@ def test_schedule_wakes_every_peer_in_time(steps: list[tuple[str, int, float]]) 
             peer.timers.stop_all()
             schedule.remove(peer)
             removed.add(number)
+            assert all(entry[2] is not peer for entry in schedule._heap)
         else:
             now += moment
             due = schedule.pop(now)
@@ -74,17 +70,6 @@ def test_schedule_wakes_every_peer_in_time(steps: list[tuple[str, int, float]]) 
                 schedule.update(peer)
             assert schedule.next_at == min(peer.timers.next_at for peer in peers)
         assert schedule.next_at <= min(peer.timers.next_at for peer in peers)
-
-
-def test_removed_peer_is_not_kept() -> None:
-    """Not even by entries of moments that were replaced."""
-    schedule, peer = Schedule[Stub](), Stub()
-    for moment in (9.0, 5.0, 1.0):
-        peer.timers.set(Timer.PROBE, moment)
-        schedule.update(peer)
-    schedule.remove(peer)
-    assert schedule.next_at == NEVER
-    assert schedule._heap == []
 
 
 def test_replaced_entries_do_not_gather() -> None:

@@ -1,4 +1,4 @@
-"""The symbolic models confirm the results in README.md, if ProVerif is installed."""
+"""The symbolic models have the results that their files expect, if ProVerif is installed."""
 
 from __future__ import annotations
 
@@ -39,15 +39,6 @@ def test_model_uses_ingredients_that_exist(model: Path) -> None:
     """A misspelt ingredient would silently omit what it names."""
     uses = models.ingredients(model)
     assert uses is None or (uses and uses <= models.known_ingredients())
-
-
-@_each_model
-def test_readme_lists_every_result(model: Path) -> None:
-    """The page lists for each model as many results as it has queries, and the same ones."""
-    page = (models.FOLDER / "README.md").read_text()
-    block = re.search(rf"^{model.stem}: .*\n((?:    RESULT .*\n)+)", page, re.MULTILINE)
-    assert block is not None
-    assert models.results(block[1]) == models.expected(model)
 
 
 def test_ingredients_that_prevent_an_attack_are_in_every_other_model() -> None:

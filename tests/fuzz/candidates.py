@@ -10,16 +10,15 @@ from ipaddress import ip_address, ip_network
 from typing import Final
 
 from tests.core.harness import AT_A, ELSEWHERE, Pair, quiet
-from tests.fuzz.engine import Run, Script
-from tests.fuzz.insiders import CHECKS_THE_SEQUEL, Insider
+from tests.fuzz.engine import Run, Script, play
+from tests.fuzz.insiders import Insider
 from tests.fuzz.stages import NOW, copier, pair_of
 from uavlinkd.core import constants as c
 from uavlinkd.core.outputs import Event, Output, RecordReceived, Transmit
 from uavlinkd.core.path import Path, relayed
 from uavlinkd.core.relay_records import Bind, Bound, Candidates
 from uavlinkd.core.settings import Link, Timers
-from uavlinkd.link.candidates import OwnSocket, Place
-from uavlinkd.link.direct_search import DirectSearch
+from uavlinkd.link.direct_search import DirectSearch, OwnSocket, Place
 
 RELAYED: Final = relayed(0, "vps", 7)
 RELAY: Final = ("192.0.2.77", 5790)
@@ -135,25 +134,4 @@ def make() -> Run:
             side.configure_path(NOW)
         pairs.append(copier(pair.establish(NOW)))
 
-    def run(data: bytes) -> None:
-        script = Script(data)
-        first = script.byte()
-        which = first % len(links)
-        named = Named(pairs[which](), links[which])
-        while script:
-            named.step(script)
-            named.check_bounds()
-        if first & CHECKS_THE_SEQUEL == CHECKS_THE_SEQUEL:
-            named.check_sequel()
-
-    return run
-
-
-def seeds() -> list[bytes]:
-    """Every special address, many lists in a short time, and answers from a candidate."""
-    every = b"".join(bytes((1, 1, 0, which, port >> 8, port & 255)) for which in range(24) for port in (53, 5790))
-    flood = b"".join(
-        bytes((1, 7, 7, *(b for host in range(8) for b in (200 + n % 50, 16, n, host)))) for n in range(30)
-    )
-    answered = bytes((1, 1, 0, 2, 0x0F, 0xA0)) + bytes((0, 0x40 | 4, 3, 1, 9, 9)) * 4 + bytes((0, 6, 255)) * 3
-    return [bytes((CHECKS_THE_SEQUEL | link,)) + part for link in (0, 1) for part in (every, flood, answered)]
+    return play([lambda n=n: Named(pairs[n](), links[n]) for n in range(len(links))])  # type: ignore[misc]

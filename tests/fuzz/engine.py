@@ -1,8 +1,6 @@
 """Fuzz targets, how they read their bytes, and a mutator with a seed.
 
 A target is a function of bytes: the same bytes cause the same run. It asserts properties that hold for any bytes.
-:data:`TALLY` counts the inputs that it offered to the entry point: one input of a fuzzer is a script of many
-datagrams.
 
 The mutator is our own although Atheris (libFuzzer) has one: Atheris has wheels for x86-64 only, and every test run
 needs the same inputs from the same seed.
@@ -14,44 +12,12 @@ import random
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from itertools import chain
+from math import inf
+from typing import Final, NamedTuple, Protocol
 
 Run = Callable[[bytes], None]
 """Runs one script. Raises if a property does not hold; returns nothing."""
-
-SAMPLE: Final = 256
-"""One of so many inputs is remembered by its hash, to estimate the number of different inputs."""
-
-
-class Tally:
-    """The number of inputs to an entry point, and an estimate of the number of different ones."""
-
-    __slots__ = ("_sampled", "offered")
-
-    def __init__(self) -> None:
-        self.offered = 0
-        self._sampled: set[int] = set()
-
-    def add(self, data: bytes) -> None:
-        """Count one more."""
-        self.offered += 1
-        number = hash(data)
-        if number % SAMPLE == 0:
-            self._sampled.add(number)
-
-    @property
-    def distinct(self) -> int:
-        """The number of different inputs, within a few per cent for large numbers."""
-        return min(self.offered, len(self._sampled) * SAMPLE)
-
-    def clear(self) -> None:
-        """Start from zero."""
-        self.offered = 0
-        self._sampled.clear()
-
-
-TALLY: Final = Tally()
-"""The tally of this process, which runs one target."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,13 +28,13 @@ class Target:
     about: str
     make: Callable[[], Run]
     """Creates the stage; returns a function that runs one input."""
-    seeds: Callable[[], list[bytes]]
-    """Inputs to start with, in addition to the kept corpus."""
     max_bytes: int = 2048
     words: tuple[bytes, ...] = ()
     """Words to insert."""
     is_text: bool = False
     """Whether arbitrary bytes are refused immediately: then only variations of known inputs are tried."""
+    shipped: Callable[[], list[bytes]] = list
+    """Files of the repository to start with, beside the kept corpus."""
 
 
 class Script:
@@ -107,6 +73,39 @@ class Script:
         at = self.at
         self.at = at + size
         return self.data[at : at + size]
+
+
+class Actor(Protocol):
+    """A hostile peer or member with its victim: a script decides what it does."""
+
+    def step(self, script: Script) -> None:
+        """One action."""
+
+    def check_bounds(self) -> None:
+        """No table is larger than it may be."""
+
+    def check_sequel(self) -> None:
+        """Whatever was before, an honest exchange works."""
+
+
+CHECKS_THE_SEQUEL: Final = 0xE0
+"""Set in the first byte of an actor's script: then the sequel is checked at its end."""
+
+
+def play(actors: Sequence[Callable[[], Actor]]) -> Run:
+    """A run by one of these actors, which the first byte chooses."""
+
+    def run(data: bytes) -> None:
+        script = Script(data)
+        first = script.byte()
+        actor = actors[first % len(actors)]()
+        while script:
+            actor.step(script)
+            actor.check_bounds()
+        if first & CHECKS_THE_SEQUEL == CHECKS_THE_SEQUEL:
+            actor.check_sequel()
+
+    return run
 
 
 # A hunt without a fuzzer.
@@ -183,7 +182,6 @@ class Hunt(NamedTuple):
     """The result of a hunt."""
 
     executions: int
-    seconds: float
     escape: Exception | None = None
     script: bytes = b""
     """The script that escaped."""
@@ -192,29 +190,22 @@ class Hunt(NamedTuple):
 def hunt(
     target: Target,
     *,
-    seeds: Sequence[bytes] = (),
+    kept: Sequence[bytes],
     seed: int = 0,
-    runs: int | None = None,
-    seconds: float | None = None,
-    on_progress: Callable[[int], None] = lambda executions: None,
+    runs: float = inf,
+    seconds: float = inf,
 ) -> Hunt:
-    """Run the seeds and then variations of them until a script escapes, or the runs or the time are used up."""
+    """Run the kept inputs and then variations of them until a script escapes, or the runs or the time are used up."""
     run = target.make()
-    started = time.monotonic()
-    known = [*target.seeds(), *seeds]
+    ends_at = time.monotonic() + seconds
+    known = [*target.shipped(), *kept]
     executions = 0
-    for data in _chain(known, variations(known, seed, target)):
-        if executions == runs or (seconds is not None and time.monotonic() - started >= seconds):
+    for data in chain(known, variations(known, seed, target)):
+        if executions == runs or time.monotonic() >= ends_at:
             break
         executions += 1
         try:
             run(data)
         except Exception as error:  # whatever escapes is what is looked for
-            return Hunt(executions, time.monotonic() - started, error, data)
-        on_progress(executions)
-    return Hunt(executions, time.monotonic() - started)
-
-
-def _chain(first: Sequence[bytes], then: Iterator[bytes]) -> Iterator[bytes]:
-    yield from first
-    yield from then
+            return Hunt(executions, error, data)
+    return Hunt(executions)

@@ -9,16 +9,14 @@ import tomllib
 from pathlib import Path
 from typing import Final
 
-from tests.core.harness import FRAME, PLAIN
-from tests.fuzz.engine import TALLY, Run, Script
-from tests.fuzz.stages import initiator, session
+from tests.fuzz.engine import Run, Script
 from uavlinkd.config import Config, ConfigError
 from uavlinkd.config.keys import KeyFileError, decode_key, encode_key, read_secret_file
 from uavlinkd.config.load import load_config
 from uavlinkd.core import wire
 from uavlinkd.core.suites import SUITES
-from uavlinkd.fleet.errors import FleetError
 from uavlinkd.fleet.manifest import FILE_NAME, read_manifest, write_manifest
+from uavlinkd.fleet.plan import FleetError
 from uavlinkd.lab.mitm import anatomy
 from uavlinkd.lab.mitm.proxy_settings import ProxySettings, SettingsError, load_proxy_settings
 from uavlinkd.lab.sim.tlog import TlogError, parse_tlog
@@ -62,7 +60,6 @@ def make_config() -> Run:
     file = folder / "fuzz.toml"
 
     def run(data: bytes) -> None:
-        TALLY.add(data)
         file.write_bytes(data)
         try:
             config = load_config(file, {})
@@ -88,7 +85,6 @@ def make_mitm() -> Run:
     file = _folder() / "fuzz.toml"
 
     def run(data: bytes) -> None:
-        TALLY.add(data)
         file.write_bytes(data)
         with contextlib.suppress(SettingsError):
             assert isinstance(load_proxy_settings(file), ProxySettings)
@@ -101,7 +97,6 @@ def make_manifest() -> Run:
     folder = _folder()
 
     def run(data: bytes) -> None:
-        TALLY.add(data)
         (folder / FILE_NAME).write_bytes(data)
         try:
             fleet = read_manifest(folder)
@@ -118,7 +113,6 @@ def make_key() -> Run:
     file = _folder() / "drone0.key"
 
     def run(data: bytes) -> None:
-        TALLY.add(data)
         file.write_bytes(data)
         text = data.decode("ascii", errors="replace")
         try:
@@ -138,7 +132,6 @@ def make_tlog() -> Run:
     """A recorded flight: records that are in the file, in order, or a TlogError; strict is never more lenient."""
 
     def run(data: bytes) -> None:
-        TALLY.add(data)
         try:
             log = parse_tlog(data)
         except TlogError:
@@ -172,7 +165,6 @@ def make_anatomy() -> Run:
                 wanted = (wire.initiation_bytes if size & 2 else wire.response_bytes)(suite)
                 kind = wire.INITIATION if size & 2 else wire.RESPONSE
                 datagram = (bytes((kind, suite.number)) + datagram).ljust(wanted, b"\0")[:wanted]
-            TALLY.add(datagram)
             parts = anatomy.parts_of(datagram)
             if parts is not None:
                 assert parts.join() == datagram, "the parts differ from the datagram"
@@ -210,33 +202,3 @@ def mitm_seeds() -> list[bytes]:
         '[[radio]]\nway = "both"\nloss = 0.5\n',
     ]
     return [*(text.encode() for text in (*small, "".join(small))), (CONFIGS / "mitm.toml").read_bytes()]
-
-
-def manifest_seeds() -> list[bytes]:
-    """A fleet of three."""
-    members = "".join(
-        f'[[member]]\nname = "{name}"\nkind = "{kind}"\nsystem_id = {number}\npublic_key = "{PUBLIC}"\n'
-        f'address = "10.13.0.{number}:5790"\n'
-        for name, kind, number in (("d1", "drone", 1), ("gs", "ground-station", 254), ("o", "observer", 250))
-    )
-    return [f'[fleet]\nsuite = "mlkem768"\npsk = true\n{members}'.encode(), b"[fleet]\n", b"a = " + b"[" * 4000]
-
-
-def key_seeds() -> list[bytes]:
-    """Keys, and texts that are nearly keys."""
-    return [text.encode() for text in (SECRET, SECRET + "\n", f"  {SECRET}\r\n", SECRET[:-1], "A" * 43 + "=", PUBLIC)]
-
-
-def tlog_seeds() -> list[bytes]:
-    """Complete, broken and truncated records."""
-    record = (1_700_000_000_000_000).to_bytes(8, "big") + FRAME
-    v1 = record[:8] + b"\xfe\x09\x01\x01\x01\x00" + bytes(11)
-    return [record * 3, record + v1 + record, record + b"junk" + record * 2, record * 2 + record[:12], b""]
-
-
-def anatomy_seeds() -> list[bytes]:
-    """Datagrams of each kind."""
-    known = [*initiator(PLAIN).templates, *session(PLAIN).templates]
-    return [
-        b"".join((len(datagram) & 0x1FE).to_bytes(2, "big") + datagram[: len(datagram) & 0x1FE] for datagram in known)
-    ]

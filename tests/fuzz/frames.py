@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Final
+from types import SimpleNamespace
+from typing import Final, cast
 
 from fastcrc.crc16 import mcrf4xx
 
-from tests.fuzz.engine import TALLY, Run, Script
+from tests.fuzz.engine import Run, Script
 from tests.link.test_switch import Client, policy
 from uavlinkd.link import switch as switching
+from uavlinkd.link.drop_summary import DropSummary
 from uavlinkd.link.switch import Port, Switch
 from uavlinkd.mavlink import headers, routing
 from uavlinkd.mavlink.dialect import SETUP_SIGNING
@@ -23,6 +25,8 @@ from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.gate import Refusal
 from uavlinkd.mavlink.routing import Router
 from uavlinkd.mavlink.stream_splitter import StreamSplitter
+from uavlinkd.system.clock import monotonic
+from uavlinkd.system.stall import StallWatch
 
 KNOWN: Final = (0, 4, 11, 20, 23, 30, 33, 39, 44, 73, 75, 76, 77, 110, 253, 256)
 """Messages of the frames: telemetry, parameters, missions, commands, files, SETUP_SIGNING."""
@@ -124,7 +128,6 @@ def make_stream() -> Run:
         while position < len(stream):
             size = 1 + (cuts[number % len(cuts)] if cuts else 64)
             chunk = stream[position : position + size]
-            TALLY.add(chunk)
             result += splitter.feed(chunk, 0.0)
             assert splitter.pending_bytes < MAX_FRAME_BYTES, "more is held than a frame"
             position += size
@@ -150,7 +153,6 @@ def make_datagrams() -> Run:
                 datagram = b"".join(made(script) for _ in range(1 + script.byte() % 4))
             else:
                 datagram = script.take(script.byte())
-            TALLY.add(datagram)
             counters = SplitCounters()
             check_split(datagram, split_datagram(datagram, counters), counters)
             counters = SplitCounters()
@@ -214,7 +216,8 @@ def make_switch() -> Run:
         def count(name: str, header: Header, refusal: Refusal, now: float, *, to_them: bool) -> None:
             refused[refusal] += 1
 
-        switch = Switch(router, count)
+        drops = cast("DropSummary", SimpleNamespace(add_refused=count))
+        switch = Switch(router, StallWatch(monotonic(), lambda _: None), drops)
         clients = [Client(str(number)) for number in range(len(POLICIES))]
         policies = [policy(**rules) for rules in POLICIES]
         for client, rules in zip(clients, policies, strict=True):
@@ -228,9 +231,8 @@ def make_switch() -> Run:
                 continue
             number = what % len(clients)
             raw = b"".join(made(script) for _ in range(1 + (what >> 6)))
-            TALLY.add(raw)
             frames = split_datagram(raw, SplitCounters())
-            switch.forward(clients[number].port, frames, now)
+            switch.forward(clients[number].port, frames, now, switch.stall.turn(monotonic()))
             _check_received(clients, number, frames)
         _check_tables(router, switch, policies)
 
@@ -279,7 +281,6 @@ def make_gate() -> Run:
         while script:
             now += script.byte() / 256
             raw = made(script)
-            TALLY.add(raw)
             for frame in split_datagram(raw, SplitCounters()):
                 always = gate.always_passes(frame.header)
                 refusal = gate.check(frame, now)
@@ -292,17 +293,3 @@ def make_gate() -> Run:
         assert len(gate._buckets) <= gates.MAX_BUCKETS
 
     return run
-
-
-def seeds() -> list[bytes]:
-    """Frames of each kind, complete, broken and truncated."""
-    one = b"".join(
-        bytes((2, how, system, 1, 9)) + bytes(range(9)) for how in range(0, 256, 7) for system in (1, 2, 6)
-    )
-    return [
-        bytes(range(16)) + b"\0" + one,
-        b"\xff" * 16 + b"\0" + one,
-        bytes(16) + b"\xff\xfe\xfd" + one,
-        one,
-        one[1:],
-    ]

@@ -11,8 +11,8 @@ from __future__ import annotations
 from typing import Final
 
 from tests.core.harness import AT_A, ELSEWHERE, KEY_A, KEY_C, quiet
-from tests.fuzz.engine import Run, Script
-from tests.fuzz.insiders import CHECKS_THE_SEQUEL, Insider
+from tests.fuzz.engine import Run, Script, play
+from tests.fuzz.insiders import Insider
 from tests.fuzz.stages import NOW, SeededEntropy, copier, pair_of
 from uavlinkd.config import PeerAddress, RelayConfig
 from uavlinkd.core import constants as c
@@ -21,9 +21,8 @@ from uavlinkd.core.outputs import Event, Output, RecordReceived
 from uavlinkd.core.path import Path, relayed
 from uavlinkd.core.relay_records import Bound, FilterTested, token_datagram, wrap
 from uavlinkd.core.settings import Link, PeerSettings, Timers
-from uavlinkd.link.filter_tests import FilterTests
-from uavlinkd.link.relay_handles import RelayHandles
-from uavlinkd.link.relay_link import RelayLink
+from uavlinkd.link.relay_link import RelayHandles, RelayLink
+from uavlinkd.link.relays import FilterTests
 from uavlinkd.system.addresses import Address
 
 WANTED: Final = (KEY_C.public, bytes([5]) * c.KEY_BYTES)
@@ -49,10 +48,10 @@ class Stage:
         settings = PeerSettings(pair.b.peer_name, KEY_A.public, None, link)
         config = RelayConfig(settings, (PeerAddress(Address("192.0.2.1", 14600)),))
         self.handles = RelayHandles()
-        self.relay = RelayLink(config, pair.b.node, self.handles, _ignore, _ignore, NOW)
+        self.relay = RelayLink(config, pair.b.node, self.handles, _ignore, NOW)
         self.relay.set_paths([AT_A], NOW)
         self.relay.follow(WANTED)
-        self.tests = FilterTests(pair.b.node, SeededEntropy(5), _ignore)
+        self.tests = FilterTests(pair.b.node, SeededEntropy(5))
         pair.establish(NOW)
 
 
@@ -141,31 +140,4 @@ def make() -> Run:
     links = [quiet(features=c.FEATURE_RECORDS), Link(features=c.FEATURE_RECORDS, timers=Timers())]
     stages = [copier(Stage(link)) for link in links]
 
-    def run(data: bytes) -> None:
-        script = Script(data)
-        first = script.byte()
-        assigned = Assigned(stages[first % len(stages)]())
-        while script:
-            assigned.step(script)
-            assigned.check_bounds()
-        if first & CHECKS_THE_SEQUEL == CHECKS_THE_SEQUEL:
-            assigned.check_sequel()
-
-    return run
-
-
-def seeds() -> list[bytes]:
-    """Handles for peers that the member asked for and for others, many, repeated, and withdrawn; other addresses."""
-    many = bytes((1, 31)) + b"".join(bytes((number, number)) for number in range(32)) + b"\0\7"
-    same = bytes((1, 3, 0, 9, 1, 9, 2, 9, 3, 10, 0, 7))
-    withdrawn = bytes((1, 1, 0, 0, 1, 0, 0, 7))
-    roams = bytes((0, 12 | 0x40, 1, 0x41, 0, 33, 2, 34, 0, 7)) + bytes((0, 7, 255))
-    asked = bytes((7, 0))
-    tokens = b"".join(bytes((7, how | 8, 0, 6, 40)) for how in (2, 18, 34, 50, 1, 5, 33)) + bytes((7, 3, 1, 2, 3))
-    parts = (
-        asked + tokens + asked + bytes((0, 7, 255)) + tokens,
-        many + same + withdrawn,
-        same * 4 + roams + same,
-        roams * 3 + many * 3,
-    )
-    return [bytes((CHECKS_THE_SEQUEL | link,)) + part for link in (0, 1) for part in parts]
+    return play([lambda stage=stage: Assigned(stage()) for stage in stages])  # type: ignore[misc]

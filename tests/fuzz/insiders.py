@@ -9,11 +9,10 @@ their bounds. Afterwards an honest handshake makes a link that works.
 from __future__ import annotations
 
 from collections import Counter
-from random import Random
 from typing import Final
 
 from tests.core.harness import AT_A, ELSEWHERE, FRAME, KEY_A, KEY_B, Pair, of, unsealed
-from tests.fuzz.engine import TALLY, Run, Script
+from tests.fuzz.engine import Run, Script, play
 from tests.fuzz.stages import LINKS, NOW, SeededEntropy, copier, pair_of
 from uavlinkd.core import constants as c
 from uavlinkd.core import handshake, wire
@@ -26,8 +25,6 @@ from uavlinkd.core.session import Session
 from uavlinkd.core.settings import Link, PeerSettings, Timers
 
 PATHS: Final = (AT_A, AT_A, ELSEWHERE, Path(0, ("2001:db8::9", 5, 0, 0)))
-CHECKS_THE_SEQUEL: Final = 0xE0
-_LIVELY = Timers()
 _PROBE_AND_FRAMES: Final = bytes((PROBE, 1))
 
 
@@ -98,7 +95,7 @@ class Insider:
                 continue
             response = wire.parse_response(sent.datagram)
             keys = handshake.receive_response(initiated, response)
-            session = Session(response.suite, keys, index, self.now, c.REJECT_AFTER_S, is_initiator=True)
+            session = Session(keys, index, self.now, c.REJECT_AFTER_S, is_initiator=True)
             self.sessions.append(session)
             del self.sessions[:-8]
             return session
@@ -177,7 +174,6 @@ class Insider:
 
     def _offer(self, datagram: bytes, what: int) -> list[Output]:
         path = self.places[what >> 5 & 3]
-        TALLY.add(datagram)
         self.credit[path] += len(datagram)
         before = set(self.peer.paths.by_path)
         outputs = self.node.receive(datagram, path, self.now)
@@ -236,7 +232,7 @@ class Insider:
     def check_bounds(self) -> None:
         peer, sessions = self.peer, self.peer.sessions
         assert len(sessions.confirmed) <= c.USABLE_PER_PEER, "too many sessions"
-        assert len(sessions.unconfirmed) <= c.UNCONFIRMED_PER_PEER, "too many unconfirmed sessions"
+        assert len(sessions.unconfirmed) <= 2 * c.UNCONFIRMED_PER_KIND, "too many unconfirmed sessions"
         assert len(peer.initiator.pending) <= c.PENDING_PER_PEER, "too many initiations"
         owned = len(sessions.confirmed) + len(sessions.unconfirmed) + len(peer.initiator.pending)
         assert len(self.node._indices.owners) == owned, "an index without an owner"
@@ -270,36 +266,6 @@ class Insider:
 
 def make_sealed() -> Run:
     """Payloads and control records under genuine keys."""
-    links = [Link(timers=_LIVELY), *LINKS[1:]]
+    links = [Link(timers=Timers()), *LINKS[1:]]
     pairs = [copier(pair_of(link).establish(NOW)) for link in links]
-
-    def run(data: bytes) -> None:
-        script = Script(data)
-        first = script.byte()
-        which = first % len(links)
-        insider = Insider(pairs[which](), links[which])
-        while script:
-            insider.step(script)
-            insider.check_bounds()
-        if first & CHECKS_THE_SEQUEL == CHECKS_THE_SEQUEL:
-            insider.check_sequel()
-
-    return run
-
-
-def sealed_seeds() -> list[bytes]:
-    """Each kind of step, including doubts, closes and roaming."""
-    every = b"".join(
-        bytes((kind | path << 5, record, 1, 2, 3, 4, 5))
-        for path in range(3)
-        for kind in range(16)
-        for record in range(8)
-    )
-    doubt = bytes((6, 200, 3, 5, 1, 2, 3, 4, 5, 4, 0x31, 0, 0, 0, 6, 30, 4, 0x31, 255, 255, 255))
-    calls = bytes((10, 0) * 8 + (6, 64) + (10, 0) * 4 + (6, 64)) + bytes((10, 0) * 4 + (6, 64)) * 3
-    roaming = bytes((12 | 0x40, 5, 4 | 0x40, 4, 9, 3, 12, 9, 2, 10, 1, 12, 4, 6, 7, 255))
-    reports = b"".join(bytes((4, 15, 15)) + Random(number).randbytes(160) for number in range(8))
-    parts = [every[at : at + len(every) // 4] for at in range(0, len(every), len(every) // 4)]
-    shares = [bytes((CHECKS_THE_SEQUEL | link,)) + part for link, part in enumerate(parts)]
-    shares.append(bytes((CHECKS_THE_SEQUEL,)) + reports)
-    return [*shares, bytes((CHECKS_THE_SEQUEL,)) + doubt * 6 + roaming * 4, bytes((0,)) + calls, bytes((1,)) + doubt]
+    return play([lambda n=n: Insider(pairs[n](), links[n]) for n in range(len(links))])  # type: ignore[misc]

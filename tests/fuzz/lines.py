@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from itertools import chain
 from typing import Final
 
-from fastcrc.crc16 import mcrf4xx
-
-from tests.fuzz.engine import TALLY, Run, Script
+from tests.endpoints.test_line_framing import counts, report
+from tests.fuzz.engine import Run, Script
 from uavlinkd.endpoints.line_framing import DELIMITER, MAX_ENCODED, LineDecoder, encode
 
 LONGEST_REPORT: Final = 21
@@ -15,11 +13,7 @@ LONGEST_REPORT: Final = 21
 
 def _report(script: Script) -> bytes:
     """A modem's report with any figures, in MAVLink 1 or 2."""
-    how = script.byte()
-    head = bytes((9, 0, 0, 1, 51, 68, 109, 0, 0)) if how & 1 else bytes((9, 1, 51, 68, 109))
-    payload = script.take(9).ljust(9, b"\0")
-    crc = mcrf4xx(head + payload + b"\xb9")
-    return bytes((0xFE - (how & 1),)) + head + payload + crc.to_bytes(2, "little")
+    return report(1 + (script.byte() & 1), payload=script.take(9).ljust(9, b"\0"))
 
 
 def _stream(script: Script) -> bytes:
@@ -55,13 +49,12 @@ def make() -> Run:
         at, number = 0, 0
         while at < len(stream):
             size = 1 + (cuts[number % len(cuts)] if cuts else 64)
-            TALLY.add(stream[at : at + size])
             datagrams += decoder.feed(stream[at : at + size])
             assert decoder.pending_bytes <= MAX_ENCODED + LONGEST_REPORT + 1, "more is held than a datagram"
             at, number = at + size, number + 1
         whole = LineDecoder()
         assert whole.feed(stream) == datagrams, "the cuts change what is received"
-        assert _counts(whole) == _counts(decoder), "the cuts change what is counted"
+        assert counts(whole) == counts(decoder), "the cuts change what is counted"
         for datagram in datagrams:
             again = LineDecoder()
             assert again.feed(encode(datagram)) == [datagram], "a datagram that is not encoded like this"
@@ -70,20 +63,3 @@ def make() -> Run:
         assert tail[-2:] == later, "the stream is not in step again"
 
     return run
-
-
-def _counts(decoder: LineDecoder) -> tuple[object, ...]:
-    return (
-        decoder.datagrams,
-        decoder.discarded,
-        decoder.discarded_bytes,
-        decoder.reports,
-        decoder.reports_inside,
-        decoder.report,
-    )
-
-
-def seeds() -> list[bytes]:
-    """Some of each kind, cut into different chunks."""
-    kinds = [bytes((kind, 20, *range(1, 41))) for kind in range(8)]
-    return [bytes(range(first, first + 8)) + b"".join(chain(kinds, kinds)) for first in (0, 20, 200)]

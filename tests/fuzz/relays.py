@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from typing import Final
 
 from tests.core.harness import KEY_C, of, quiet
-from tests.fuzz.engine import TALLY, Run, Script
+from tests.fuzz.engine import Run, Script, play
 from tests.fuzz.stages import NOW, SeededEntropy, copier
 from uavlinkd.core import constants as c
 from uavlinkd.core.crypto import KeyPair, Secret
@@ -38,9 +38,8 @@ from uavlinkd.core.settings import PeerSettings
 from uavlinkd.core.suites import SUITES_BY_NAME
 from uavlinkd.relay.bindings import QUARANTINED_PER_MEMBER, ConnectionEnd
 from uavlinkd.relay.member_settings import MemberSettings, RelayLimits
-from uavlinkd.relay.service import RelayService
+from uavlinkd.relay.service import RelayService, RelayShell
 
-CHECKS_THE_SEQUEL: Final = 0xE0
 MOST_PEERS: Final = 3
 """The highest limit that a script sets. It begins with one."""
 LIMITS: Final = RelayLimits(200, 400_000)
@@ -108,16 +107,8 @@ class FuzzedRelay:
         entropy = SeededEntropy(9)
         self.node = Node(Secret(PRIVATE[0]), entropy, NOW)
         self.forwarded: list[tuple[bytes, Path]] = []
-        self.service = RelayService(
-            self.node,
-            entropy,
-            self.clock,
-            TOTAL,
-            perform=self.perform,
-            send=self.forward,
-            send_from_new_port=self.send_token,
-            on_event=self.on_event,
-        )
+        shell = RelayShell(entropy, self.clock, self.perform, self.forward, self.send_token, self.on_event)
+        self.service = RelayService(self.node, TOTAL, shell)
         self.members = [_Member(number) for number in range(3)]
         self.credit: Counter[Path] = Counter()
         """Bytes that came from an address and were not answered with as many."""
@@ -176,7 +167,6 @@ class FuzzedRelay:
 
     def arrive(self, datagram: bytes, path: Path) -> None:
         """A datagram comes to the relay."""
-        TALLY.add(datagram)
         self.credit[path] += len(datagram)
         if datagram[:1] == bytes((RELAYED,)):
             self._take(datagram, path)
@@ -383,49 +373,4 @@ def make() -> Run:
     relay = FuzzedRelay()
     relay.pass_time(2.0)
     assert all(member.peer.is_up for member in relay.members)
-    copy = copier(relay)
-
-    def run(data: bytes) -> None:
-        script = Script(data)
-        first = script.byte()
-        relay = copy()
-        while script:
-            relay.step(script)
-            relay.check_bounds()
-        if first & CHECKS_THE_SEQUEL == CHECKS_THE_SEQUEL:
-            relay.check_sequel()
-
-    return run
-
-
-def seeds() -> list[bytes]:
-    """Members connect, send, roam, restart and leave."""
-
-    def bind(member: int, *keys: int, path: int = 0) -> bytes:
-        start = bytes((4 | member << 4, (0x20 if path == 2 else 0x60 | path << 4) | len(keys) - 1, *keys))
-        return start + bytes((4 | member << 4,)) * (path == 2)
-
-    def data(member: int, home: int = 0) -> bytes:
-        return bytes((0 | member << 4, 0x04, 8, *range(8), home | member << 4))
-
-    connect = bind(0, 1) + bind(1, 0)
-    every = connect + b"".join(
-        bind(member, 0, 1, 2, 3, 4, 5, 255, path=path) for path in range(3) for member in range(3)
-    )
-    passes = b"".join(data(member, home) for member in range(3) for home in (0, 1))
-    waits = bytes((8, 80))
-    roams = bytes((4, 0x00, 1, 0x08, 1, 2)) + bytes((4, 0x00, 1, 0x28, 1, 2)) + waits
-    leaves = bytes((11, 0b110, 2)) + passes + bytes((11, 0b111, 0))
-    greedy = bytes((13, 31)) + bytes((0x02, 31, *range(31))) * 31
-    tests = b"".join(bytes((5 | member << 4, 0xC0, *range(16), 14)) for member in range(3) for _ in range(20))
-    tests += bytes((5, 0xB0, *range(16), 0)) * 3 + bytes((5, 0xA0, *range(16), 0))
-    stranger = bytes((3, 9, *b"\x50\0\1\x40hello", 0, 3, 5, *b"\xfd\0\0\0\0", 1))
-    parts = (
-        every + passes,
-        connect + passes + waits + passes + leaves,
-        every + roams + passes,
-        connect + greedy,
-        connect + tests,
-    )
-    whole = [bytes((CHECKS_THE_SEQUEL,)) + part + stranger for part in parts]
-    return [*whole, b"\0" + connect + bytes((10,)) + connect + passes + bytes((9, 200)) + passes]
+    return play([copier(relay)])

@@ -5,66 +5,56 @@ from __future__ import annotations
 import asyncio
 import atexit
 import json
-from functools import cache
 from pathlib import Path
 
-from tests.fuzz.engine import TALLY, Run
+from tests.fuzz.engine import Run
 from uavlinkd.ops.control import MAX_REQUEST_BYTES, ControlServer
 from uavlinkd.ops.metrics_server import MetricsServer
 from uavlinkd.system.addresses import Address
 
 KNOWN = ("status", "reload")
+LOOP = asyncio.new_event_loop()
+"""Of all scripts; it is closed when the process ends."""
+atexit.register(LOOP.close)
 _STATUSES = {200, 400, 404, 405, 421, 431}
 
 
 class Connection(asyncio.Transport):
     """The server's end of a connection; it records the written bytes."""
 
-    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+    def __init__(self) -> None:
         super().__init__()
         self.written = bytearray()
         self.is_closed = self.is_aborted = False
-        protocol = asyncio.streams.FlowControlMixin(loop)
-        protocol._get_close_waiter = lambda _: loop.create_future()  # type: ignore[attr-defined]
-        self.reader = asyncio.StreamReader(limit=1, loop=loop)
-        self.writer = asyncio.StreamWriter(self, protocol, self.reader, loop)
+        protocol = asyncio.streams.FlowControlMixin(LOOP)
+        protocol._get_close_waiter = lambda _: LOOP.create_future()  # type: ignore[attr-defined]
+        self.reader = asyncio.StreamReader(limit=1, loop=LOOP)
+        self.writer = asyncio.StreamWriter(self, protocol, self.reader, LOOP)
 
     def write(self, data: bytes | bytearray | memoryview) -> None:
-        """Record the bytes."""
         self.written += data
 
     def write_eof(self) -> None:
         """No more bytes follow."""
 
     def is_closing(self) -> bool:
-        """Whether the server has closed it."""
         return self.is_closed
 
     def pause_reading(self) -> None:
         """Not needed here."""
 
-    def resume_reading(self) -> None:
-        """Not needed here."""
+    resume_reading = pause_reading
 
     def close(self) -> None:
-        """The server has finished."""
         self.is_closed = True
 
     def abort(self) -> None:
-        """The server closes the connection early."""
         self.is_aborted = True
 
 
-@cache
-def _loop() -> asyncio.AbstractEventLoop:
-    loop = asyncio.new_event_loop()
-    atexit.register(loop.close)
-    return loop
-
-
-def _reader(data: bytes, limit: int, loop: asyncio.AbstractEventLoop) -> asyncio.StreamReader:
+def _reader(data: bytes, limit: int) -> asyncio.StreamReader:
     """The bytes, and then the end of the stream."""
-    reader = asyncio.StreamReader(limit=limit, loop=loop)
+    reader = asyncio.StreamReader(limit=limit, loop=LOOP)
     reader.feed_data(data)
     reader.feed_eof()
     return reader
@@ -72,7 +62,6 @@ def _reader(data: bytes, limit: int, loop: asyncio.AbstractEventLoop) -> asyncio
 
 def make_control() -> Run:
     """One connection per script: the server answers one line of JSON and closes it; only known requests are asked."""
-    loop = _loop()
     asked: list[str] = []
 
     def answer(request: str) -> dict[str, object] | None:
@@ -83,9 +72,8 @@ def make_control() -> Run:
 
     def run(data: bytes) -> None:
         asked.clear()
-        TALLY.add(data)
-        connection = Connection(loop)
-        loop.run_until_complete(server._serve(_reader(data, MAX_REQUEST_BYTES, loop), connection.writer))
+        connection = Connection()
+        LOOP.run_until_complete(server._serve(_reader(data, MAX_REQUEST_BYTES), connection.writer))
         assert connection.is_closed, "the connection was left open"
         assert server._connections == 0, "a closed connection is counted"
         line = data.partition(b"\n")[0]
@@ -104,13 +92,11 @@ def make_control() -> Run:
 
 def make_metrics() -> Run:
     """One connection per script: one well-formed answer or none; the content only for a request of it."""
-    loop = _loop()
     server = MetricsServer(Address("127.0.0.1", 9000), lambda: b"metric 1\n", "text/plain")
 
     def run(data: bytes) -> None:
-        TALLY.add(data)
-        connection = Connection(loop)
-        loop.run_until_complete(server._serve(_reader(data, 8192, loop), connection.writer))
+        connection = Connection()
+        LOOP.run_until_complete(server._serve(_reader(data, 8192), connection.writer))
         assert connection.is_closed, "the connection was left open"
         assert not server._connections, "a closed connection is counted"
         if not connection.written:
@@ -127,31 +113,3 @@ def make_metrics() -> Run:
             assert int(status) == 200
 
     return run
-
-
-def control_seeds() -> list[bytes]:
-    """Known and unknown requests."""
-    return [
-        b"status\n",
-        b"reload\n",
-        b"  status \r\n",
-        b"peer\n",
-        b"\n",
-        b"",
-        b"x" * 300,
-        b"status",
-        "réload\n".encode(),
-    ]
-
-
-def metrics_seeds() -> list[bytes]:
-    """Requests as Prometheus sends them, and some others."""
-    return [
-        b"GET /metrics HTTP/1.1\r\nHost: 127.0.0.1:9000\r\nAccept: */*\r\n\r\n",
-        b"GET /metrics?x=1 HTTP/1.0\r\n\r\n",
-        b"HEAD /metrics HTTP/1.1\r\nHost: localhost\r\n\r\n",
-        b"POST /metrics HTTP/1.1\r\nHost: [::1]:9000\r\n\r\n",
-        b"GET /other HTTP/1.1\r\nHost: evil.example\r\n\r\n",
-        b"GET / HTTP/1.1\r\n" + b"X: y\r\n" * 1500 + b"\r\n",
-        b"\r\n\r\n",
-    ]

@@ -1,4 +1,4 @@
-"""The entry points accept any bytes: a short run of every target by three generators, and the kept corpus."""
+"""The entry points accept any bytes: a short run of every target by three generators, the kept corpus, plants."""
 
 from __future__ import annotations
 
@@ -6,117 +6,84 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from tests.fuzz import corpus
-from tests.fuzz.command import fuzz, main
-from tests.fuzz.engine import TALLY, Script, hunt
-from tests.fuzz.files import SECRET
+from tests.fuzz.__main__ import fuzz, main
+from tests.fuzz.engine import Script, hunt
+from tests.fuzz.plants import PLANTS, put
 from tests.fuzz.registry import TARGETS
-from tests.fuzz.worker import replay
 from tests.needs import need
+from tests.waiting import PATIENCE_S
 
 names = pytest.mark.parametrize("name", TARGETS)
 SHORT_S = 0.3
 MAX_CORPUS_BYTES = 400_000
-
-
-@names
-def test_kept_corpus_escapes_nowhere(name: str) -> None:
-    """The kept inputs run, and meet the assertions of their targets."""
-    kept = corpus.load(name)
-    assert kept, "a target without a corpus"
-    assert replay(name) > len(kept)
+RUNS = 4000
 
 
 @names
 def test_short_hunt_finds_no_escape(name: str) -> None:
-    """Variations of the corpus, and new scripts, by a seeded generator."""
-    TALLY.clear()
-    result = hunt(TARGETS[name], seeds=corpus.load(name)[-8:], seed=2, seconds=SHORT_S)
-    assert result.escape is None, f"{result.script!r}: {result.escape!r}"
-    assert TALLY.offered >= result.executions > 0
-    assert TALLY.distinct <= TALLY.offered
+    """The kept corpus, variations of it, and new scripts, by a seeded generator."""
+    target, kept = TARGETS[name], corpus.load(name)
+    assert kept, "a target without a corpus"
+    for result in (
+        hunt(target, kept=kept, runs=len(kept) + 20),
+        hunt(target, kept=kept[-8:], seed=2, seconds=SHORT_S),
+    ):
+        assert result.escape is None, f"{result.script!r}: {result.escape!r}"
+        assert result.executions > 0
 
 
-@names
-def test_any_bytes_are_a_script(name: str) -> None:
-    """The same by Hypothesis, whose inputs are small and unusual."""
-    target = TARGETS[name]
-    run = target.make()
+@pytest.mark.parametrize("about", PLANTS)
+def test_planted_fault_is_found(about: str) -> None:
+    """The same scripts fail with the fault, and pass without it."""
+    target = TARGETS[PLANTS[about].target]
+    kept = corpus.load(target.name)
+    take_out = put(about)
+    try:
+        result = hunt(target, kept=kept, seed=1, runs=RUNS, seconds=PATIENCE_S)
+    finally:
+        take_out()
+    assert result.escape is not None, f"{about}: not found in {result.executions} scripts"
+    sound = hunt(target, kept=kept, seed=1, runs=result.executions)
+    assert sound.escape is None, f"{sound.script!r}: {sound.escape!r}"
 
-    @settings(
-        max_examples=15, derandomize=True, database=None, deadline=None, suppress_health_check=list(HealthCheck)
-    )
-    @given(st.binary(max_size=200))
-    def property_of(data: bytes) -> None:
-        run(data)
 
-    property_of()
-
-
-def test_corpus_is_small_and_belongs_to_targets() -> None:
-    """The repository's corpus is bounded, and every file of it belongs to a target."""
-    files = list(corpus.KEPT.iterdir())
-    assert {path.name for path in files} == {f"{name}.txt" for name in TARGETS}
-    assert sum(path.stat().st_size for path in files) < MAX_CORPUS_BYTES
+def test_corpus_and_plants_belong_to_targets() -> None:
+    """Every target has a fault that it finds, and a corpus, which is small."""
+    assert {plant.target for plant in PLANTS.values()} == set(TARGETS)
+    kept = list(corpus.KEPT.iterdir())
+    assert {path.name for path in kept} == {f"{name}.txt" for name in TARGETS}
+    assert sum(path.stat().st_size for path in kept) < MAX_CORPUS_BYTES
 
 
 def test_corpus_is_read_as_it_was_written(tmp_path: Path) -> None:
-    """Smallest first, without duplicates, and no more than fit."""
+    """Smallest first, without duplicates, no more than fit."""
     inputs = [b"longer", b"\0", b"\xff\xfe", b"longer", b"", bytes(corpus.MAX_FILE_BYTES)]
-    assert corpus.save("any", inputs, tmp_path) == 3
+    corpus.save("any", inputs, tmp_path)
     assert corpus.load("any", tmp_path) == [b"\0", b"\xff\xfe", b"longer"]
 
 
-def test_corpus_keeps_inputs_with_new_coverage() -> None:
-    """An input that reaches no new code is left out; a larger one that does is kept."""
-    run = TARGETS["key"].make()
-    empty, longer, good = b"x", b"xx", f"{SECRET}\n".encode()
-    assert corpus.minimised(run, [good, longer, empty]) == [empty, good]
-
-
-def test_script_is_total() -> None:
-    """Behind its end a script reads zeros, and it ends."""
+def test_script_is_total_and_a_seed_is_a_hunt() -> None:
+    """Behind its end a script reads zeros, and it ends. The same seed leads to the same result."""
     script = Script(b"\1\2\3")
     assert (script.byte(), script.word(), script.long(), script.take(9)) == (1, 0x0203, 0, b"")
     assert not script
-
-
-def test_same_seed_is_the_same_hunt() -> None:
-    """The same seed leads to the same result."""
-    offered = []
+    about = "a record of the last three bytes"
+    results = []
     for _ in range(2):
-        TALLY.clear()
-        assert hunt(TARGETS["tlog"], seed=9, runs=200).escape is None
-        offered.append((TALLY.offered, TALLY.distinct))
-    assert offered[0] == offered[1]
+        take_out = put(about)
+        results.append(hunt(TARGETS["tlog"], kept=corpus.load("tlog"), seed=9, runs=RUNS).script)
+        take_out()
+    assert results[0] == results[1] != b""
 
 
 @pytest.mark.long
-def test_libfuzzer_finds_a_planted_bug(tmp_path: Path) -> None:
+def test_libfuzzer_finds_a_planted_fault(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """atheris runs a target in its own process, guided by coverage; an escape is kept, and can be reproduced."""
     need(find_spec("atheris") is not None, "atheris: pip install '.[fuzz]'")
-    result = fuzz(TARGETS["key"], runs=5000, escapes=tmp_path, plant="two spellings of a key")
-    assert result.escape is not None, result.log
-    assert "a key with two spellings" in result.log
-    assert main(["key", "--replay", str(result.escape)]) == 0  # without the plant the input passes
-
-
-def test_command_reports_its_runs(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    """One line per target with its numbers, and exit code 0 without an escape."""
-    assert main(["--list"]) == 0
-    assert len(capsys.readouterr().out.splitlines()) == len(TARGETS)
-    assert main(["tlog", "--runs", "300", "--engine", "seeded", "--escapes", str(tmp_path)]) == 0
-    _, line, total = capsys.readouterr().out.splitlines()
-    assert line.split()[:3] == ["tlog", "300", "300"]
-    assert total.startswith("300 inputs in ")
-
-
-def test_command_fails_after_an_escape(tmp_path: Path) -> None:
-    """The input is kept."""
-    result = fuzz(TARGETS["tlog"], engine="seeded", seed=1, runs=2000, escapes=tmp_path, plant="tlog")
-    assert result.escape is not None, result.log
-    assert result.escape.read_bytes()
-    assert result.executions <= 2000
+    monkeypatch.chdir(tmp_path)
+    assert "a key with two spellings" in fuzz("key", ["-runs=5000", "-seed=1"], plant="two spellings of a key")
+    (escape,) = tmp_path.glob("escape-key-crash-*")
+    assert main(["key", "--replay", str(escape)]) == 0  # without the plant the input passes
+    assert main(["key", "-runs=100"]) == 0

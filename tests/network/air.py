@@ -32,7 +32,6 @@ class Hop(NamedTuple):
 
     @property
     def back(self) -> Hop:
-        """The other direction of the same path."""
         return Hop(self.receiver, self.sender)
 
 
@@ -51,7 +50,6 @@ class Crossing(NamedTuple):
 @dataclass
 class _HopState:
     settings: RadioSettings | None = None
-    """None: as every other."""
     is_cut: bool = False
     is_stalled: bool = False
     waiting: list[Crossing] = field(default_factory=list)
@@ -64,11 +62,9 @@ class Air:
     def __init__(self, seed: int | str, radio: RadioSettings) -> None:
         self.radio = radio
         """For every pair of addresses without an entry of its own."""
-        self.radios_of: dict[tuple[Address, Address], RadioSettings] = {}
         self.cuts: set[tuple[str, str]] = set()
         """Names of sender and receiver between which all datagrams are lost."""
         self.endpoints: dict[Address, Endpoint] = {}
-        """The socket at each address."""
         self.absent: set[Endpoint] = set()
         """Sockets whose network is gone: what is sent there is lost, and nothing arrives."""
         self._seed = seed
@@ -77,12 +73,10 @@ class Air:
         self._radios: dict[tuple[Address, Address], Radio] = {}
         self._arrivals: list[tuple[float, int, Address, Address]] = []
         self._number = 0
-        self._sent: dict[tuple[Address, Address], tuple[int, int]] = {}
 
     # Where drones are.
 
     def place(self, drone: str, before: Iterable[Address], after: Sequence[Address]) -> None:
-        """A drone has other addresses from now on."""
         for address in before:
             self.endpoints.pop(address, None)
         self.endpoints.update((address, Endpoint(drone, socket)) for socket, address in enumerate(after))
@@ -111,7 +105,6 @@ class Air:
                 radio.settings = settings
 
     def settings_of(self, hop: Hop) -> RadioSettings:
-        """The settings of one hop."""
         state = self._hops.get(hop)
         return self.radio if state is None or state.settings is None else state.settings
 
@@ -120,11 +113,9 @@ class Air:
         self._change(hop, now).is_cut = True
 
     def heal(self, hop: Hop, now: float) -> None:
-        """End the cut of one hop."""
         self._change(hop, now).is_cut = False
 
     def heal_all(self, now: float) -> None:
-        """End all cuts."""
         self.cuts.clear()
         self.disturb(None, now)
         for state in self._hops.values():
@@ -141,7 +132,6 @@ class Air:
         return waiting
 
     def release_all(self, now: float) -> list[Crossing]:
-        """End all stalls."""
         return [crossing for hop in list(self._hops) for crossing in self.release(hop, now)]
 
     def disturb(self, scope: Scope, now: float) -> None:
@@ -149,7 +139,6 @@ class Air:
         self._disturbed_at[scope] = now
 
     def disturbed_at(self, scope: Scope) -> float:
-        """When something happened to this last."""
         return self._disturbed_at.get(scope, -math.inf)
 
     def undisturbed_since(self, hop: Hop) -> float:
@@ -172,19 +161,11 @@ class Air:
     # Datagrams.
 
     def send(self, datagram: bytes, source: Address, destination: Address, now: float) -> None:
-        """Send a datagram under any source address."""
-        number, size = self._sent.get((source, destination), (0, 0))
-        self._sent[source, destination] = number + 1, size + len(datagram)
         radio = self._radio(source, destination, now)
         waiting = radio.next_deadline()
         radio.send(datagram, now)
         if radio.next_deadline() < waiting:
             self._expect(radio, source, destination)
-
-    def sent_between(self, one: Address, other: Address) -> tuple[int, int]:
-        """Datagrams and bytes that were sent between two addresses, in both directions together."""
-        there, back = self._sent.get((one, other), (0, 0)), self._sent.get((other, one), (0, 0))
-        return there[0] + back[0], there[1] + back[1]
 
     def next_arrival(self) -> float:
         """When the next datagram arrives; infinity if none is in flight."""
@@ -218,7 +199,7 @@ class Air:
         if radio is None:
             rng = Random(f"radio {self._seed} {key}")
             hop = self.hop(source, destination)
-            settings = self.radios_of.get(key) or (self.radio if hop is None else self.settings_of(hop))
+            settings = self.radio if hop is None else self.settings_of(hop)
             radio = self._radios[key] = Radio(settings, rng, now)
         return radio
 

@@ -25,44 +25,12 @@ class Recorder:
         network.listeners.append(self)
 
     def overhear(self, datagram: bytes, source: Address, destination: Address) -> None:
-        """Record it."""
         self.recorded.append((datagram, source, destination))
         if self._keep is not None and len(self.recorded) >= 2 * self._keep:
             del self.recorded[: -self._keep]
 
     def receive(self, datagram: bytes, source: Address, destination: Address) -> None:
         """A recorder has no address."""
-
-
-class Racer:
-    """Sends each datagram of ``victim`` to ``other`` from its own address, faster than the network does.
-
-    With ``relays`` it carries the answers that come to its address back, and is so a way that works, until it stops.
-    """
-
-    def __init__(self, network: Network, address: Address, victim: Drone, other: Drone, *, relays: bool) -> None:
-        self.address = address
-        self.attracted: list[bytes] = []
-        """Datagrams of drones to its address."""
-        self.is_active = True
-        self._network = network
-        self._victim = victim
-        self._other = other
-        self._relays = relays
-        network.listeners.append(self)
-        network.attackers[address] = self
-
-    def overhear(self, datagram: bytes, source: Address, destination: Address) -> None:
-        """Forward it from another address, before the original arrives."""
-        if self.is_active and source in self._victim.addresses and destination in self._other.addresses:
-            self._network.inject(datagram, self.address, destination)
-
-    def receive(self, datagram: bytes, source: Address, destination: Address) -> None:
-        """Whether a drone sends to this address as the victim's."""
-        self.attracted.append(datagram)
-        if self.is_active and self._relays:
-            to = self._other if source in self._victim.addresses else self._victim
-            self._network.inject(datagram, self.address, to.addresses[0])
 
 
 class Flooder:

@@ -12,7 +12,7 @@ Sizes = Counter[str]
 
 LIMITS: dict[str, int] = {
     "pending initiations of a peer": c.PENDING_PER_PEER,
-    "unconfirmed sessions of a peer": c.UNCONFIRMED_PER_PEER,
+    "unconfirmed sessions of a peer": 2 * c.UNCONFIRMED_PER_KIND,
     "confirmed sessions of a peer": c.USABLE_PER_PEER,
     "remembered initiations of a peer": c.REMEMBERED_INITIATIONS,
     "sources under load": c.SOURCES_TRACKED,

@@ -38,7 +38,6 @@ class CriticalWatch:
         self._network = fleet.network
 
     def begin(self) -> None:
-        """Send from now on, at random intervals, so that frames meet every phase of a failure."""
         for pair in self._fleet.pairs:
             for sender, receiver in ((pair.a, pair.b), (pair.b, pair.a)):
                 self._network.at(self._network.now, partial(self._send, pair, sender, receiver))

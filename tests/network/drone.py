@@ -6,54 +6,32 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from random import Random
-from typing import Protocol
+from typing import TYPE_CHECKING
 
-from tests.network.air import Address, Air, Endpoint, Hop
+from tests.network.air import Address, Endpoint, Hop
 from tests.network.bounds import Sizes, check
-from tests.network.flow import Flow
 from tests.network.nat import Nat
-from tests.network.serial_line import BUDGET_BITS_S, SerialLine
+from tests.network.serial_line import BUDGET_BITS_S
 from uavlinkd.core.cookie import MacKeys
 from uavlinkd.core.crypto import Secret, x25519_public_key
 from uavlinkd.core.drops import Drop
-from uavlinkd.core.envelope_limit import limit_at
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Event, Output, RecordReceived, SessionEstablished
 from uavlinkd.core.path import Path
+from uavlinkd.core.path_measures import limit_at
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.refusals import Refused
 from uavlinkd.core.session import Session
-from uavlinkd.core.settings import Link, PeerSettings, Screen
+from uavlinkd.core.settings import Link, PeerSettings
 
-
-class World(Protocol):
-    """What a drone needs of its network."""
-
-    now: float
-    rng: Random
-    screen: Screen
-    air: Air
-    drones: dict[str, Drone]
-    owners: dict[Address, str]
-    lines: dict[Endpoint, SerialLine]
-
-    def flows_between(self, sender: str, receiver: str) -> Sequence[Flow]:
-        """The frames of every class from one drone to another."""
-
-    def perform(self, drone: Drone, outputs: list[Output]) -> None:
-        """Process the outputs of a node."""
-
-    def inject(self, datagram: bytes, source: Address, destination: Address) -> None:
-        """Send a datagram under any source address."""
-
-    def note(self, text: str) -> None:
-        """Add a line to the log that a failed test prints."""
+if TYPE_CHECKING:
+    from tests.network.network import Network
 
 
 class Drone:
     """A daemon in the simulated network. A restart creates a new :class:`Node` and keeps only the key."""
 
-    def __init__(self, world: World, name: str, addresses: Sequence[Address], clock: float) -> None:
+    def __init__(self, world: Network, name: str, addresses: Sequence[Address], clock: float) -> None:
         self.name = name
         self.addresses: tuple[Address, ...] = ()
         """By the number of the socket; :meth:`move` changes one at any time without notice to the node."""
@@ -64,19 +42,13 @@ class Drone:
         self.nats: dict[int, Nat] = {}
         """Those that have public addresses of their own, by socket."""
         self.metered_sockets: set[int] = set()
-        """Sockets whose network is metered."""
         self.once_metered: set[int] = set()
-        """Those whose network is or was metered."""
         self.lines: dict[int, str] = {}
         """The sockets that are serial lines, with the drone at the other end."""
         self.outputs: list[tuple[float, Output]] = []
         """All outputs but datagrams and frames, with the network's time."""
         self.drops: Counter[str] = Counter()
         self.contacted: set[tuple[Address, Address]] = set()
-        self.datagrams_sent: Counter[int] = Counter()
-        """By socket, as :attr:`bytes_sent`."""
-        self.bytes_sent: Counter[int] = Counter()
-        """Lengths of its datagrams, without headers of UDP and IP."""
         self.private_key = world.rng.randbytes(32)
         self.public_key = x25519_public_key(self.private_key)
         self.acquaintances: dict[str, tuple[PeerSettings, tuple[Path, ...]]] = {}
@@ -95,7 +67,6 @@ class Drone:
 
     @property
     def is_behind_nat(self) -> bool:
-        """Whether each of its sockets is behind a NAT."""
         return len(self.nat_sockets) == len(self.addresses)
 
     @is_behind_nat.setter
@@ -136,7 +107,6 @@ class Drone:
             self.node.set_socket_state(socket, is_up=is_up, now=self.local_now)
 
     def set_metered(self, sockets: Iterable[int]) -> None:
-        """The networks that are metered from now on."""
         self.metered_sockets = set(sockets)
         self.once_metered |= self.metered_sockets
         self._world.note(f"{self.name} has metered networks {sorted(self.metered_sockets)}")
@@ -144,11 +114,9 @@ class Drone:
             self.node.set_metered(self.metered_sockets, self.local_now)
 
     def hop(self, socket: int, other: Drone, other_socket: int) -> Hop:
-        """The direction from here of a path to another drone."""
         return Hop(Endpoint(self.name, socket), Endpoint(other.name, other_socket))
 
     def add_line(self, address: Address, other: Drone) -> None:
-        """Add a socket with a serial line to another drone."""
         self.lines[len(self.addresses)] = other.name
         self._place((*self.addresses, address))
 
@@ -181,7 +149,6 @@ class Drone:
         return socket not in self.nat_sockets or (destination, source) in self.contacted
 
     def forget_mappings(self, socket: int) -> None:
-        """The NAT of a socket forgets all."""
         self._world.air.disturb(Endpoint(self.name, socket), self._world.now)
         self._world.note(f"{self.name}: the NAT of socket {socket} forgets")
         self.nats[socket].forget()
@@ -191,7 +158,6 @@ class Drone:
         return datagram, path.address[:2]
 
     def receive(self, datagram: bytes, path: Path) -> None:
-        """A datagram arrived."""
         assert self.node is not None
         self._world.perform(self, self.node.receive(datagram, path, self.local_now))
 
@@ -206,7 +172,6 @@ class Drone:
         return math.inf if self.node is None else self.node.next_deadline()
 
     def handle_timeout(self) -> None:
-        """Wake the node, if it is due."""
         # A clock far from zero rounds: do not wake the node before its own deadline.
         self._perform_timeout(max(self.local_now, self.next_deadline()))
 
@@ -295,7 +260,6 @@ class Drone:
 
     @property
     def local_now(self) -> float:
-        """The time of its clock."""
         return self._world.now + self.clock
 
     # What it knows.
@@ -306,11 +270,9 @@ class Drone:
         return self.node.peers[other.name]
 
     def session(self, other: Drone) -> Session | None:
-        """The session that sends to another drone."""
         return self.peer(other).sessions.current if self.node is not None else None
 
     def established(self) -> Iterator[tuple[float, SessionEstablished]]:
-        """When sessions came up here."""
         return ((at, output) for at, output in self.outputs if isinstance(output, SessionEstablished))
 
     def check_bounds(self) -> None:

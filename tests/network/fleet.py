@@ -22,7 +22,6 @@ class Pair(NamedTuple):
     a: Drone
     b: Drone
     hops: tuple[Hop, ...]
-    """The paths between them, from the first drone to the second."""
 
 
 Route = tuple[Hop, ...]

@@ -15,7 +15,6 @@ _NAME_BYTES = 14
 _CLASSES = tuple(Class)
 
 FlowKey = tuple[str, str, Class]
-"""Names of sender and receiver, and the class of the frames."""
 
 
 @dataclass
@@ -26,7 +25,6 @@ class Flow:
     receiver: str
     cls: Class = Class.STREAM
     sent_at: list[float] = field(default_factory=list)
-    """By number."""
     delivered: dict[int, float] = field(default_factory=dict)
     """The time of each delivery by number, in order of delivery."""
     orders: dict[int, int] = field(default_factory=dict)
@@ -34,11 +32,9 @@ class Flow:
     reports none while it knows one path."""
     last: int = -1
     overtaken: int = 0
-    """Frames that were delivered after one with a greater number."""
     refused_before: float = 0.0
     """Frames sent earlier must not be delivered: since then the receiver lost its keys, or removed the sender."""
     oldest_s: float = 0.0
-    """The greatest age of a delivered frame."""
 
     def frame(self, now: float) -> bytes:
         """The next frame: a start byte, sender and receiver, class, number."""
@@ -52,7 +48,6 @@ class Flow:
         return _FRAME_START + name + bytes((_CLASSES.index(self.cls),)) + number.to_bytes(8, "big")
 
     def deliver(self, frame: bytes, now: float, order: int = 0) -> None:
-        """Compare a delivered frame with the sent one."""
         number = int.from_bytes(frame[-8:], "big")
         assert number < len(self.sent_at), f"{self.sender} never sent {frame!r} to {self.receiver}"
         assert frame == self.bytes_of(number), f"altered: {frame!r}"
@@ -95,7 +90,6 @@ def class_in(frame: bytes) -> Class:
 
 
 def split_frames(payload: bytes) -> list[bytes]:
-    """The frames of a payload."""
     return [payload[begin : begin + FRAME_BYTES] for begin in range(0, len(payload), FRAME_BYTES)]
 
 

@@ -11,12 +11,14 @@ from __future__ import annotations
 
 import time
 import traceback
-from dataclasses import replace
+from collections import Counter
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from random import Random
 from typing import NamedTuple
 
 from tests.network.air import Hop
+from tests.network.bounds import Sizes
 from tests.network.critical import CriticalWatch
 from tests.network.drone import Drone, share_a_session
 from tests.network.fleet import Fleet, Route
@@ -26,7 +28,6 @@ from tests.network.misfortunes import Misfortunes
 from tests.network.network import Network
 from tests.network.path_misfortunes import random_modems, random_radio
 from tests.network.plans import PLANS, WEIGHTS, Plan
-from tests.network.played import Played
 from tests.network.relay_fleet import RelayFleet
 from uavlinkd.core.outputs import SessionEstablished
 from uavlinkd.core.settings import Class
@@ -46,6 +47,58 @@ OLDEST_ON_LINES_S = 6.4
 """The same where a link may use 24 kbit/s alone."""
 USABLE = RadioSettings(delay_s=0.05)
 _JUDGED_S = 2.0
+
+
+_MAXIMA = ("worst_up_s", "worst_one_path_up_s", "worst_critical_up_s", "oldest_s")
+
+
+@dataclass
+class Played:
+    """The result of a history, or of many."""
+
+    histories: Counter[str] = field(default_factory=Counter)
+    virtual_s: dict[str, float] = field(default_factory=dict)
+    sizes: Counter[int] = field(default_factory=Counter)
+    paths: Counter[int] = field(default_factory=Counter)
+    sent: int = 0
+    delivered: int = 0
+    critical_sent: int = 0
+    critical_judged: int = 0
+    """Critical frames that must not be lost: a path delivered."""
+    critical_on_lines: int = 0
+    """Those of them for which only a serial line did."""
+    damaged: int = 0
+    """Pieces of a serial line's bytes that the framing dropped."""
+    sessions: int = 0
+    """As each end counts them."""
+    datagrams: int = 0
+    relayed: int = 0
+    filters_known: int = 0
+    """Tests that showed how a NAT filters."""
+    events: Counter[str] = field(default_factory=Counter)
+    judged: int = 0
+    """Number of checks that all pairs were up."""
+    pairs: int = 0
+    """Pairs in these checks."""
+    worst_up_s: float = 0.0
+    worst_one_path_up_s: float = 0.0
+    """The same while other paths fail,"""
+    worst_critical_up_s: float = 0.0
+    """and until critical frames cross then."""
+    oldest_s: float = 0.0
+    largest: Sizes = field(default_factory=Counter)
+    cpu_s: float = 0.0
+    violations: list[tuple[int, str]] = field(default_factory=list)
+
+    def add(self, other: Played) -> None:
+        for kind, virtual_s in other.virtual_s.items():
+            self.virtual_s[kind] = self.virtual_s.get(kind, 0.0) + virtual_s
+        self.largest |= other.largest
+        for name in _MAXIMA:
+            setattr(self, name, max(getattr(self, name), getattr(other, name)))
+        for figure in fields(self):
+            if figure.name not in ("virtual_s", "largest", *_MAXIMA):
+                setattr(self, figure.name, getattr(self, figure.name) + getattr(other, figure.name))
 
 
 def play(seed: int, plan: Plan | None = None) -> Played:
@@ -80,8 +133,6 @@ class _Mark(NamedTuple):
 
 
 class History:
-    """One fleet and its history."""
-
     def __init__(self, seed: int, plan: Plan, lot: Random) -> None:
         self.network = Network(f"history {seed}", USABLE)
         self.plan = plan
@@ -94,7 +145,6 @@ class History:
         self.critical = CriticalWatch(self.fleet)
 
     def play(self) -> None:
-        """Play all chapters."""
         network, lot, plan = self.network, self.lot, self.plan
         self.fleet.start()
         if plan.has_paths:
@@ -205,7 +255,6 @@ class History:
         return self.network.run_until(all_are_up, within_s)
 
     def account(self, played: Played) -> None:
-        """Count the result."""
         network, kind = self.network, self.plan.name
         played.histories[kind] += 1
         played.virtual_s[kind] = network.now

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from random import Random
@@ -13,32 +13,29 @@ from typing import Final
 import structlog
 
 from tests.network.air import Address, Endpoint
-from tests.network.drone import Drone, World
+from tests.network.drone import Drone
+from tests.network.network import Network
 from uavlinkd.config import PeerAddress, PeerConfig, RelayConfig
-from uavlinkd.config.used_relays import TIMERS
+from uavlinkd.config.relay_rules import TIMERS
 from uavlinkd.core import constants as c
 from uavlinkd.core import outputs as o
 from uavlinkd.core.crypto import Entropy
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.path import RELAY_HOST, Path
 from uavlinkd.core.peer import Peer
-from uavlinkd.core.relay_records import Bind, Candidates, FilterTest, FilterTested, token_of
+from uavlinkd.core.relay_records import Bind, FilterTest, token_of
 from uavlinkd.core.settings import Link, PeerSettings
-from uavlinkd.link.candidates import OwnSocket
-from uavlinkd.link.filter_tests import TOKEN_START
+from uavlinkd.link.direct_search import OwnSocket
 from uavlinkd.link.peer_link import PeerLink
-from uavlinkd.link.peer_owners import PeerOwner
-from uavlinkd.link.relay_handles import RELAYED_START
-from uavlinkd.link.relay_link import RelayLink
-from uavlinkd.link.relays import Relays
+from uavlinkd.link.relay_link import RELAYED_START, RelayHandles, RelayLink
+from uavlinkd.link.relays import TOKEN_START, Relays
 from uavlinkd.relay.bindings import QUARANTINED_PER_MEMBER
 from uavlinkd.relay.member_settings import MemberSettings, RelayLimits
-from uavlinkd.relay.service import RelayService
+from uavlinkd.relay.service import RelayService, RelayShell
 from uavlinkd.system import addresses
 
 HOUSEKEEPING_S: Final = 1.0
 MOST_PEERS: Final = 8
-"""Of each member at a relay."""
 FEATURES: Final = c.FEATURE_REFUSALS | c.FEATURE_RECORDS
 LINK: Final = Link(features=FEATURES)
 _LIMITS: Final = RelayLimits(datagrams_s=20_000, bits_s=100_000_000)
@@ -52,13 +49,11 @@ _LOG: Final = structlog.wrap_logger(structlog.ReturnLogger(), wrapper_class=_QUI
 class Relay(Drone):
     """A relay with a public address. It is configured with its members, and carries no frames of its own."""
 
-    def __init__(self, world: World, name: str, address: Address, clock: float = 0.0) -> None:
+    def __init__(self, world: Network, name: str, address: Address, clock: float = 0.0) -> None:
         super().__init__(world, name, (address,), clock)
         self.members: dict[bytes, str] = {}
-        """Names by public key."""
         self.service: RelayService | None = None
         self.forwarded = 0
-        """Datagrams from member to member."""
         self._asked: dict[tuple[str, str], float] = {}
         self.new_ports: set[Address] = set()
         """From which it sent tokens. Nothing listens there."""
@@ -67,20 +62,18 @@ class Relay(Drone):
         self._housekeeping_at = 0.0
 
     def start(self, clock: float | None = None) -> None:
-        """A new relay that knows its members, and nothing of what was before."""
         super().start(clock)
         assert self.node is not None
         self._asked.clear()
-        self.service = RelayService(
-            self.node,
-            Random(self._world.rng.randbytes(16)).randbytes,
-            lambda: self.local_now,
-            _LIMITS,
+        shell = RelayShell(
+            entropy=Random(self._world.rng.randbytes(16)).randbytes,
+            clock=lambda: self.local_now,
             perform=partial(self._world.perform, self),
             send=self._forward,
             send_from_new_port=self._send_from_new_port,
             on_event=lambda event, now: None,
         )
+        self.service = RelayService(self.node, _LIMITS, shell)
         members = {
             key: MemberSettings(PeerSettings(name, key, None, LINK), MOST_PEERS, _LIMITS)
             for key, name in self.members.items()
@@ -135,7 +128,6 @@ class Relay(Drone):
         self.service.on_record(received, self.local_now)
 
     def on_event(self, event: o.Event) -> None:
-        """Of a member."""
         assert self.service is not None
         self.service.on_event(event, self.local_now)
 
@@ -154,7 +146,6 @@ class Relay(Drone):
         self.service.settle(now)
 
     def check_bounds(self) -> None:
-        """The tables of the relay too."""
         super().check_bounds()
         if self.node is None:
             return
@@ -180,7 +171,7 @@ class _Link(PeerLink):
         assert node_of.node is not None
         self.config, self.name = config, config.name
         self._node, self.peers = node_of.node, [peer]
-        self._previous = {}
+        self.previous = {}
         self._direct = self.relayed = ()
 
 
@@ -188,10 +179,13 @@ class _Sockets:
     """What relays need of a daemon's sockets: each socket reaches each relay."""
 
     def __init__(self, member: Member) -> None:
-        self.relayed = None
+        self.handles = RelayHandles()
         self._member = member
 
-    def follow(self, relay: RelayLink, _on_resolved: Callable[[], None]) -> None:
+    def use_relays(self) -> None:
+        """As a daemon's."""
+
+    def follow(self, relay: RelayLink) -> None:
         """Connect to a relay from every socket."""
         member = self._member
         relay.set_paths(
@@ -214,7 +208,7 @@ class Member(Drone):
     """A daemon that reaches its peers along relays, and searches direct paths."""
 
     def __init__(
-        self, world: World, name: str, at: Sequence[Address], clock: float = 0.0, *, searches: bool = False
+        self, world: Network, name: str, at: Sequence[Address], clock: float = 0.0, *, searches: bool = False
     ) -> None:
         super().__init__(world, name, at, clock)
         self.uses: list[Relay] = []
@@ -223,7 +217,6 @@ class Member(Drone):
         """Whether it looks for direct paths to its peers."""
         self.links: dict[str, _Link] = {}
         self.tokens_taken = 0
-        self._owners: dict[o.LinkedPeer, PeerOwner] = {}
         self._housekeeping_at = 0.0
 
     def joins(self, relays: Iterable[Relay]) -> None:
@@ -233,12 +226,11 @@ class Member(Drone):
             self.uses.append(relay)
 
     def start(self, clock: float | None = None) -> None:
-        """A new daemon without state."""
         super().start(clock)
         now = self.local_now
         assert self.node is not None
-        self.links, self._owners = {}, {}
-        relays = Relays(self.node, _Sockets(self), self.links, self._owners, _LOG, lambda: None, self._entropy())  # type: ignore[arg-type]
+        self.links = {}
+        relays = Relays(self.node, _Sockets(self), self.links, {}, _LOG, self._entropy())  # type: ignore[arg-type]
         self.relays = relays
         self._look()
         for name in self.acquaintances:
@@ -321,23 +313,14 @@ class Member(Drone):
         self.tokens_taken += 1
 
     def on_record(self, received: o.RecordReceived) -> None:
-        """Of a relay, or of a peer."""
         assert self.relays is not None
-        owner = self._owners.get(received.peer)
-        if isinstance(received.record, Candidates | FilterTested):
-            reason = self.relays.on_record(received, self.local_now)
-        else:
-            reason = DropReason.UNEXPECTED_RECORD if owner is None else owner.on_record(received, self.local_now)
+        reason = self.relays.on_record(received, self.local_now)
         if reason is not None:
             self.drops[reason] += 1
 
     def on_event(self, event: o.Event) -> None:
-        """Of a relay, or of a peer."""
         assert self.relays is not None
-        if (owner := self._owners.get(event.peer)) is not None:
-            owner.on_event(event, self.local_now)
-        else:
-            self.relays.on_peer_event(event, self.local_now)
+        self.relays.on_event(event, self.local_now)
 
     # Time.
 
@@ -361,7 +344,7 @@ class Member(Drone):
             self.relays.do_housekeeping(now)
 
     def _look(self) -> None:
-        """What a daemon reads of its machine for the search of direct paths.."""
+        """What a daemon reads of its machine for the search of direct paths."""
         assert self.relays is not None
         places = enumerate(self.addresses) if self.searches else ()
         self.relays._searches._looked_at = math.inf
@@ -371,7 +354,6 @@ class Member(Drone):
         ]
 
     def check_bounds(self) -> None:
-        """The handles too."""
         super().check_bounds()
         if self.node is None or self.relays is None:
             return

@@ -9,7 +9,7 @@ from functools import partial
 from tests.network.attackers import Flooder, Recorder
 from tests.network.drone import Drone
 from tests.network.fleet import Fleet
-from tests.network.path_misfortunes import PathMisfortunes, random_address, random_radio
+from tests.network.path_misfortunes import Befalling, PathMisfortunes, random_address, random_radio
 from tests.network.relay_fleet import RelayFleet
 from tests.network.relay_misfortunes import RelayMisfortunes
 from uavlinkd.core import constants as c
@@ -18,20 +18,13 @@ _KEPT = 2000
 _SHARE_OF_PATHS = 0.85
 """Of the misfortunes in a fleet with several paths: most concern one path, so that another one works."""
 _SHARE_OF_RELAYS = 0.4
-"""Of the misfortunes in a fleet with relays."""
 
 
-class Misfortunes:
-    """Befalls a fleet with one random misfortune at a time."""
-
+class Misfortunes(Befalling):
     def __init__(self, fleet: Fleet) -> None:
+        super().__init__(fleet)
         self.events: Counter[str] = Counter()
-        """How often each one happened, by name."""
-        self._fleet = fleet
-        self._network = fleet.network
-        self._lot = fleet.lot
         self._recorder = Recorder(fleet.network, keep=_KEPT)
-        self._until = 0.0
         self._of_paths = PathMisfortunes(fleet)
         self._of_relays = RelayMisfortunes(fleet, self._recorder) if isinstance(fleet, RelayFleet) else None
         self._kinds: list[tuple[str, Callable[[], None]]] = [
@@ -99,9 +92,8 @@ class Misfortunes:
             self._start_later(drone)
 
     def _start_later(self, drone: Drone) -> None:
-        clock, after_s = self._fleet.random_clock(), self._lot.choice((0.5, 5.0, 400.0))
-        if self._network.now + after_s < self._until:
-            self._network.at(self._network.now + after_s, lambda: drone.start(clock) if drone.node is None else None)
+        clock = self._fleet.random_clock()
+        self._later(self._lot.choice((0.5, 5.0, 400.0)), lambda: drone.start(clock) if drone.node is None else None)
 
     def _move(self) -> None:
         drone = self._lot.choice(self._fleet.wanderers)

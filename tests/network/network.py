@@ -77,7 +77,6 @@ class Network:
         self.listeners: list[Attacker] = []
         self.steps = 0
         self.datagrams = 0
-        """Number of datagrams sent, by any sender."""
         self.screen: Screen = hold_all
         """The frames that may be delivered while freshness is unverified, for nodes that start from now on."""
         self.checks_bounds = True
@@ -103,12 +102,10 @@ class Network:
     # Set-up.
 
     def add(self, name: str, *addresses: Address, clock: float = 0.0) -> Drone:
-        """Add a drone, without starting it. By default it has an address of its own."""
         at = addresses or ((f"10.0.0.{len(self.drones) + 1}", 5790),)
         return self.add_drone(Drone(self, name, at, clock))
 
     def add_drone(self, drone: DroneKind) -> DroneKind:
-        """Add a drone of any kind."""
         self.drones[drone.name] = drone
         self._in_turn.append(drone)
         return drone
@@ -132,13 +129,25 @@ class Network:
         b.start()
         return a, b
 
+    def linked(
+        self, *, a_knows: bool = True, b_knows: bool = True, interval_s: float = 0.05, clocks: tuple[float, float]
+    ) -> tuple[Drone, Drone]:
+        """Two drones that share a session and talk. Each knows the other's address, or not."""
+        a, b = self.add("a", clock=clocks[0]), self.add("b", clock=clocks[1])
+        a.knows(b, b.addresses if a_knows else ())
+        b.knows(a, a.addresses if b_knows else ())
+        a.start()
+        b.start()
+        self.talk(a, b, interval_s)
+        self.run_until(lambda: share_a_session(a, b), within_s=4)
+        self.run(2.5)
+        return a, b
+
     def at(self, moment: float, action: Callable[[], None]) -> None:
-        """Call a function at a moment of the network's time."""
         self._number += 1
         heapq.heappush(self._actions, (moment, self._number, action))
 
     def flow(self, sender: Drone, receiver: Drone, cls: Class = Class.STREAM) -> Flow:
-        """The frames of one class from one drone to another."""
         key = sender.name, receiver.name, cls
         return self.flows.setdefault(key, Flow(*key))
 
@@ -147,7 +156,6 @@ class Network:
         return [self.flows.setdefault(key, Flow(*key)) for cls in Class for key in ((sender, receiver, cls),)]
 
     def send(self, sender: Drone, receiver: Drone, cls: Class = Class.STREAM) -> bool:
-        """Send one frame now. Returns False if the sender is off or does not have the receiver as a peer."""
         if sender.node is None or receiver.name not in sender.node.peers:
             return False
         frame = self.flow(sender, receiver, cls).frame(self.now)
@@ -194,7 +202,6 @@ class Network:
         self.at(self.now + rng.random() * interval_s, tick)
 
     def talk(self, a: Drone, b: Drone, interval_s: float = 0.05, until: float = math.inf) -> tuple[Flow, Flow]:
-        """Traffic in both directions."""
         return self.traffic(a, b, interval_s, until), self.traffic(b, a, interval_s, until)
 
     # Radios.
@@ -205,13 +212,7 @@ class Network:
         return self.air.radio
 
     @property
-    def radios_of(self) -> dict[tuple[Address, Address], RadioSettings]:
-        """By source and destination, before these are used: addresses of attackers."""
-        return self.air.radios_of
-
-    @property
     def cuts(self) -> set[tuple[str, str]]:
-        """Names of sender and receiver between which all datagrams are lost."""
         return self.air.cuts
 
     def set_radio(self, settings: RadioSettings) -> None:
@@ -229,17 +230,14 @@ class Network:
         self.cut_one_way(b, a)
 
     def cut_one_way(self, a: Drone, b: Drone) -> None:
-        """Drop everything from one drone to another from now on."""
         self.cuts.add((a.name, b.name))
         self.air.disturb(frozenset((a.name, b.name)), self.now)
 
     def cut_path(self, hop: Hop) -> None:
-        """Drop everything on one path from now on, in both directions."""
         self.air.cut(hop, self.now)
         self.air.cut(hop.back, self.now)
 
     def heal_path(self, hop: Hop) -> None:
-        """End the cut of one path."""
         self.air.heal(hop, self.now)
         self.air.heal(hop.back, self.now)
 
@@ -250,12 +248,10 @@ class Network:
             self.set_modems(end, SIK)
 
     def set_modems(self, end: Endpoint, settings: ModemSettings) -> None:
-        """Change the modems of a line from now on."""
         self.air.disturb(end, self.now)
         self.lines[end].set_modems(settings)
 
     def make_noise(self, end: Endpoint, count: int) -> None:
-        """Random bytes appear on a line."""
         self.air.disturb(end, self.now)
         self.lines[end].make_noise(count, self.now)
 
@@ -266,15 +262,12 @@ class Network:
         self.at(self.now + seconds, lambda: self.release_path(hop))
 
     def release_path(self, hop: Hop) -> None:
-        """Deliver at once what one path has kept."""
         self._deliver(self.air.release(hop, self.now) + self.air.release(hop.back, self.now))
 
     def release_all(self) -> None:
-        """Deliver at once what any path has kept."""
         self._deliver(self.air.release_all(self.now))
 
     def inject(self, datagram: bytes, source: Address, destination: Address) -> None:
-        """Send a datagram under any source address."""
         self._send(datagram, source, destination)
 
     def note(self, text: str) -> None:
@@ -304,7 +297,6 @@ class Network:
         return self.now - begin
 
     def step(self) -> None:
-        """Jump to the next event and process it."""
         moment = self._next_event()
         assert moment < math.inf, "there is no further event"
         self._step(moment)
@@ -341,14 +333,11 @@ class Network:
     # Datagrams.
 
     def perform(self, drone: Drone, outputs: list[Output]) -> None:
-        """Process the outputs of a node."""
         for output in outputs:
             match output:
                 case Transmit(datagram, path):
                     if drone.removed and datagram[0] in _HANDSHAKE:
                         drone.check_no_initiation(datagram)
-                    drone.datagrams_sent[path.socket] += 1
-                    drone.bytes_sent[path.socket] += len(datagram)
                     end = Endpoint(drone.name, path.socket)
                     if end in self.air.absent:
                         continue

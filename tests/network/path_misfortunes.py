@@ -17,14 +17,25 @@ _SHARE_OF_MODEMS = 0.5
 """Of what befalls a serial line. The rest may befall any path."""
 
 
-class PathMisfortunes:
-    """Befalls one random path at a time."""
+class Befalling:
+    """What the kinds of misfortunes share."""
 
     def __init__(self, fleet: Fleet) -> None:
         self._fleet = fleet
         self._network = fleet.network
         self._lot = fleet.lot
         self._until = 0.0
+        """What ends by itself ends by then, or not at all."""
+
+    def _later(self, seconds: float, action: Callable[[], None]) -> None:
+        """Do it after some seconds, unless the disruption is over by then."""
+        if self._network.now + seconds < self._until:
+            self._network.at(self._network.now + seconds, action)
+
+
+class PathMisfortunes(Befalling):
+    def __init__(self, fleet: Fleet) -> None:
+        super().__init__(fleet)
         self._kinds: tuple[tuple[str, Callable[[Hop], None]], ...] = (
             ("path dies", self._die),
             ("path dies one way", self._die_one_way),
@@ -47,7 +58,6 @@ class PathMisfortunes:
         )
 
     def befall(self, until: float) -> str:
-        """Let something happen to a random path, and return its name."""
         self._until = until
         kinds = self._kinds
         hop = self._lot.choice(self._lot.choice(self._fleet.pairs).hops)
@@ -74,7 +84,6 @@ class PathMisfortunes:
         self._network.stall_path(hop, self._lot.choice((0.3, 1.0, 3.0, 10.0)))
 
     def _degrade(self, hop: Hop) -> None:
-        """The loss grows step by step."""
         radio, step_s = random_radio(self._fleet), self._lot.choice((0.5, 2.0))
         for step in range(1, 9):
             self._later(step * step_s, partial(self._network.set_path, hop, replace(radio, loss=step / 10)))
@@ -133,12 +142,6 @@ class PathMisfortunes:
         count, step_s = self._lot.choice((1, 60, 600)), self._lot.choice((0.1, 0.7))
         for step in range(10):
             self._later(step * step_s, partial(self._network.make_noise, hop.sender, count))
-
-    def _later(self, seconds: float, action: Callable[[], None]) -> None:
-        """Do it after some seconds, unless the disruption is over by then."""
-        moment = self._network.now + seconds
-        if moment < self._until:
-            self._network.at(moment, action)
 
 
 def random_radio(fleet: Fleet) -> RadioSettings:

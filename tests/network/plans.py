@@ -11,7 +11,6 @@ class Plan:
 
     name: str
     nodes: tuple[int, int]
-    """Minimum and maximum."""
     chapters: tuple[int, int]
     quiet_s: tuple[float, float]
     """The time without faults at the start of a chapter,"""
@@ -33,7 +32,6 @@ class Plan:
 
     @property
     def has_paths(self) -> bool:
-        """Whether nodes may have several paths to one another."""
         return self.networks != (1, 1)
 
 

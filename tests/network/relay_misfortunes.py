@@ -7,25 +7,19 @@ from functools import partial
 
 from tests.network.attackers import Recorder
 from tests.network.members import Member
-from tests.network.path_misfortunes import random_address
+from tests.network.path_misfortunes import Befalling, random_address
 from tests.network.relay_fleet import RelayFleet
 from uavlinkd.core import constants as c
 from uavlinkd.core.relay_records import RELAYED, token_datagram
 
 _FORGED = 50
-"""Datagrams of an attacker at once."""
 _STRANGER = ("198.51.100.66", 4000)
 
 
-class RelayMisfortunes:
-    """Befalls one random relay or member at a time."""
-
+class RelayMisfortunes(Befalling):
     def __init__(self, fleet: RelayFleet, recorder: Recorder) -> None:
-        self._fleet = fleet
-        self._network = fleet.network
-        self._lot = fleet.lot
+        super().__init__(fleet)
         self._recorder = recorder
-        self._until = 0.0
         self._kinds: tuple[tuple[str, Callable[[], None]], ...] = (
             ("relay restarts", self._restart),
             ("relay off for a while", self._off),
@@ -38,7 +32,6 @@ class RelayMisfortunes:
         )
 
     def befall(self, until: float) -> str:
-        """Let something happen, and return its name."""
         self._until = until
         name, befalls = self._lot.choice(self._kinds)
         self._network.note(name)
@@ -112,8 +105,3 @@ class RelayMisfortunes:
     def _data(self) -> list[tuple[bytes, tuple[str, int], tuple[str, int]]]:
         data = [recorded for recorded in self._recorder.recorded if recorded[0][0] == RELAYED]
         return self._lot.choices(data, k=_FORGED) if data else []
-
-    def _later(self, seconds: float, action: Callable[[], None]) -> None:
-        """Do it after some seconds, unless the disruption is over by then."""
-        if self._network.now + seconds < self._until:
-            self._network.at(self._network.now + seconds, action)

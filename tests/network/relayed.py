@@ -1,6 +1,4 @@
-"""``python -m tests.network.relayed``: what relays gain and cost when they or networks fail. In virtual time.
-
-    python -m tests.network.relayed --tries 100
+"""What relays gain and cost when they or networks fail. In virtual time.
 
 A vehicle and a station, both behind NATs that filter by port. One of the two NATs has a mapping for each destination,
 so that without a relay they could not meet; not where a direct path is wanted.
@@ -8,15 +6,12 @@ so that without a relay they could not meet; not where a direct path is wanted.
 
 from __future__ import annotations
 
-import argparse
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from statistics import median
 
 from tests.network.air import Hop
 from tests.network.drone import share_a_session
-from tests.network.failover import STREAM_PER_S
 from tests.network.flow import Flow
 from tests.network.members import LINK, Member, Relay
 from tests.network.nat import Nat
@@ -30,8 +25,8 @@ RADIO = RadioSettings(delay_s=0.0225, jitter_s=0.005)
 """From a member to a relay or back: with both hops, a round trip of 100 ms."""
 SLOWER = RadioSettings(delay_s=0.05, jitter_s=0.005)
 """Of a second network, or of a second relay."""
-OFF_S = (0.0, 0.5, 3.0, 20.0)
-"""How long a relay that was killed is off."""
+STREAM_PER_S = 51.0
+"""Frames of telemetry a second from the vehicle, as PX4's fastest usual mode."""
 _SETTLE_S = 8.0
 _SILENCE_S = 30.0
 _WATCH_S = 10.0
@@ -59,39 +54,27 @@ class Couple:
     station: Member
     relays: list[Relay] = field(default_factory=list)
 
-    def to_relay(self, member: Member, socket: int, relay: Relay) -> Hop:
-        """The hop from a member to a relay."""
-        return member.hop(socket, relay, 0)
-
-    def direct(self) -> Hop:
-        """The direct path between the first networks."""
-        return self.vehicle.hop(0, self.station, 0)
-
     def flows(self, cls: Class) -> tuple[Flow, Flow]:
-        """Both directions."""
         return (
             self.network.flow(self.vehicle, self.station, cls),
             self.network.flow(self.station, self.vehicle, cls),
         )
 
     def begin(self) -> None:
-        """Start all, and talk."""
         self.start()
         self.talk()
         self.network.run_until(lambda: share_a_session(self.vehicle, self.station), within_s=5)
 
     def start(self) -> None:
-        """Start all."""
         for drone in (*self.relays, self.vehicle, self.station):
             drone.start()
 
     def talk(self) -> None:
-        """Telemetry, heartbeats of both, commands and their acknowledgements."""
-        network, vehicle, station = self.network, self.vehicle, self.station
-        network.traffic(vehicle, station, 1 / STREAM_PER_S)
-        for sender, receiver in ((vehicle, station), (station, vehicle)):
+        """Telemetry, and in both directions heartbeats, commands or acknowledgements, each at a random phase."""
+        self.network.traffic(self.vehicle, self.station, 1 / STREAM_PER_S)
+        for sender, receiver in ((self.vehicle, self.station), (self.station, self.vehicle)):
             for interval_s in (1.0, 0.5):
-                network.traffic(sender, receiver, interval_s, cls=Class.CRITICAL)
+                self.network.traffic(sender, receiver, interval_s, cls=Class.CRITICAL)
 
     def is_direct(self) -> bool:
         """Whether both send along a direct path."""
@@ -216,7 +199,7 @@ def one_network_of_two_dies(seed: int, *, of_station: int = 1, relays: int = 1) 
     def kill(pair: Couple) -> Callable[[], None]:
         path = pair.vehicle.peer(pair.station).path
         assert path is not None
-        hops = [pair.to_relay(pair.vehicle, path.socket, relay) for relay in pair.relays]
+        hops = [pair.vehicle.hop(path.socket, relay, 0) for relay in pair.relays]
         return _cut(pair.network, hops)
 
     with Network(f"two networks {seed} {of_station} {relays}", RADIO) as network:
@@ -227,14 +210,14 @@ def station_network_dies(seed: int) -> Relayed:
     """Both have two networks, and the station's first one dies, and returns."""
     with Network(f"station's network {seed}", RADIO) as network:
         pair = couple(network, networks=(2, 2))
-        return _fail(pair, lambda pair: _cut(network, [pair.to_relay(pair.station, 0, pair.relays[0])]))
+        return _fail(pair, lambda pair: _cut(network, [pair.station.hop(0, pair.relays[0], 0)]))
 
 
 def direct_path_dies(seed: int) -> Relayed:
     """The direct path dies, and is found again later."""
     with Network(f"direct path {seed}", RADIO) as network:
         pair = couple(network, searches=True)
-        result = _fail(pair, lambda pair: _cut(network, [pair.direct()]), ready=pair.is_direct)
+        result = _fail(pair, lambda pair: _cut(network, [pair.vehicle.hop(0, pair.station, 0)]), ready=pair.is_direct)
         network.run_until(pair.is_direct, within_s=70)
         return result
 
@@ -279,42 +262,3 @@ FAILURES: dict[str, Callable[[int], Relayed]] = {
     "a network of the station dies": station_network_dies,
     "the direct path dies, and is found again": direct_path_dies,
 }
-
-
-def table(tries: int) -> Iterator[str]:
-    """The figures of many tries, one line for each."""
-    yield f"{tries} tries"
-    yield f"  first frame after both reached the relay   {spread([first_frame_s(seed) for seed in range(tries)])}"
-    for off_s in OFF_S:
-        times = [back_s(seed, off_s) for seed in range(tries)]
-        yield f"  relay killed, started {off_s:>4} s later: back    {spread(times)}"
-    times = [back_s(seed, is_silent=True) for seed in range(tries)]
-    yield f"  the same at once, after a silence: back    {spread(times)}"
-    for name, of_station in (("vehicle", False), ("station", True)):
-        times = [rebound_s(seed, of_station=of_station) for seed in range(tries)]
-        yield f"  NAT of the {name} forgets: back             {spread(times)}"
-    for name, play in FAILURES.items():
-        results = [play(seed) for seed in range(tries)]
-        sent, lost = sum(result.critical_sent for result in results), sum(result.critical_lost for result in results)
-        yield f"  {name}"
-        yield f"    critical frames lost                     {lost} of {sent:,}"
-        yield f"    gap of the stream                        {spread([result.stream_gap_s for result in results])}"
-
-
-def spread(values: Sequence[float]) -> str:
-    """Some quantiles."""
-    ordered = sorted(values)
-    nine = ordered[min(len(ordered) - 1, int(0.9 * len(ordered)))]
-    return f"median {median(values):.3f} s, 90 % {nine:.3f} s, largest {ordered[-1]:.3f} s"
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Print the figures."""
-    parser = argparse.ArgumentParser(prog="python -m tests.network.relayed", description="Relays in virtual time.")
-    parser.add_argument("--tries", type=int, default=20, help="of each failure (20)")
-    for line in table(parser.parse_args(arguments).tries):
-        print(line, flush=True)
-
-
-if __name__ == "__main__":
-    main()

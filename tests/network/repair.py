@@ -1,127 +1,349 @@
-"""How long a mission and parameters take over a path that loses datagrams, with and without repair, and the bytes.
+"""What arrives over paths that lose datagrams, how old it is, and how long a mission and parameters take.
 
-``python -m tests.network.repair`` prints the table.
+The stand-ins for ArduPilot and QGroundControl ask again as these do, and after as long. Times are virtual seconds.
 """
 
 from __future__ import annotations
 
-import argparse
-import sys
 from collections.abc import Callable, Sequence
-from statistics import median
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
-from tests.link.two_radios import Network, Radio
-from tests.network.stand_ins import COUNT_AGAIN_S, Autopilot, Station
-from uavlinkd.core.path import Path
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from tests.link.two_radios import End, Network, Radio
+from tests.samples import attitude, command, heartbeat, manual_control, parameter, read_by_index
 from uavlinkd.core.settings import Link, Redundancy
-from uavlinkd.link.network_budgets import wire_bytes
+from uavlinkd.mavlink.frames import Frame, SplitCounters, split_payload
 
 DELAY_S: Final = 0.01
 ITEMS: Final = 100
 PARAMETERS: Final = 1370
 SETTLING_S: Final = 20.0
-"""The link is in use before the transfer begins, so the daemons know its loss."""
+"""The paths are lossy and in use before anything is measured, so the daemons know their loss."""
+USED_S: Final = 5.0
+"""The clean paths are in use for so long."""
+OFFERED_S: Final = 60.0
 PATIENCE_S: Final = 900.0
-RADIOS: Final = {
-    "clean": Radio(DELAY_S),
-    "5 % loss": Radio(DELAY_S, 0.05),
-    "10 % loss": Radio(DELAY_S, 0.1),
-    "20 % loss": Radio(DELAY_S, 0.2),
-    "30 % loss": Radio(DELAY_S, 0.3),
-    "30 % in bursts of 3": Radio(DELAY_S, 0.3, burst=3.0),
-    "30 % in bursts of 5": Radio(DELAY_S, 0.3, burst=5.0),
+
+Radios = Sequence[Radio]
+"""The paths of two peers."""
+RADIOS: Final[dict[str, Radios]] = {
+    "clean": [Radio(DELAY_S)],
+    "30 % loss": [Radio(DELAY_S, 0.3)],
+    "30 % in bursts of 3": [Radio(DELAY_S, 0.3, burst=3.0)],
+    "30 % in bursts of 5": [Radio(DELAY_S, 0.3, burst=5.0)],
+}
+LOSSES: Final = (0.1, 0.3, 0.5, 0.7)
+BESIDE: Final[dict[str, Radios]] = {"none": [], "drops all": [Radio(DELAY_S, 1.0)], "1.9 s late": [Radio(1.9)]}
+"""The other paths than the lossy one."""
+
+
+class Kind(NamedTuple):
+    """What the station sends, and how often."""
+
+    rate: float
+    make: Callable[[int], Frame]
+    answer: Callable[[int], Frame] | None = None
+    """What the vehicle sends back, if that is what has to arrive."""
+
+
+KINDS: Final = {
+    "command, 1/s": Kind(1.0, command),
+    "request and answer of a parameter, 1/s": Kind(1.0, read_by_index, parameter),
+    "heartbeat, 1/s": Kind(1.0, lambda number: heartbeat(number, 255)),
+    "heartbeat, 25/s": Kind(25.0, lambda number: heartbeat(number, 255)),
+    "manual control, 25/s": Kind(25.0, manual_control),
+    "manual control, 50/s": Kind(50.0, manual_control),
 }
 
 
-class Transfer(NamedTuple):
-    """One transfer."""
+class Crossing(NamedTuple):
+    offered: int
+    ages: list[float]
+    """Of the frames that arrived, in seconds; of an answer since its request."""
 
+
+class Transfer(NamedTuple):
     seconds: float
     """Infinity if it did not end."""
-    bytes: int
-    """Of all datagrams in both directions meanwhile, with IP and UDP headers."""
     repeats: int
     repeat_bytes: int
-    given_up: bool
-    """Whether the station waited so long for a request that QGroundControl would have given the upload up."""
 
 
-def mission(radio: Radio, seed: int, *, has_repair: bool = True) -> Transfer:
+def cross(kind: Kind, radios: Radios, seed: int) -> Crossing:
+    """Offer frames, beside telemetry and heartbeats, along paths that have been lossy for :data:`SETTLING_S`."""
+    network = _clean(radios, seed)
+    vehicle, station = network.alpha, network.bravo
+    sent_at: dict[bytes, float] = {}  # by what has to arrive
+    answers: dict[bytes, Frame] = {}
+    lossy_at = network.now + USED_S
+    begin = lossy_at + SETTLING_S
+    end = begin + OFFERED_S
+
+    def offer(number: int) -> None:
+        sent = awaited = kind.make(number)
+        if kind.answer is not None:
+            awaited = answers[sent.raw] = kind.answer(number)
+        if begin <= network.now < end:
+            sent_at[awaited.raw] = network.now
+        station.send(sent)
+
+    def reply(frame: Frame) -> None:
+        if frame.raw in answers:
+            vehicle.send(answers[frame.raw])
+
+    vehicle.on_frame = reply
+    _every(network, 0.05, lambda number: vehicle.send(attitude(number)))
+    _every(network, 1.0, lambda number: vehicle.send(heartbeat(number)))
+    _every(network, 1.0, lambda number: station.send(heartbeat(number, 255, 190)))
+    _every(network, 1.0 / kind.rate, offer)
+    network.run(lossy_at)
+    network.radios[:] = radios
+    network.run(end + 5.0)
+    receiver = vehicle if kind.answer is None else station
+    arrived = zip(receiver.delivered, receiver.delivered_at, strict=True)
+    return Crossing(len(sent_at), [at - sent_at[frame.raw] for frame, at in arrived if frame.raw in sent_at])
+
+
+def mission(radios: Radios, seed: int, *, has_repair: bool = True) -> Transfer:
     """A mission of :data:`ITEMS` items to the vehicle."""
-    return _transfer(radio, seed, Station.upload, lambda vehicle, _: vehicle.stored_at is not None, has_repair)
+    return _transfer(radios, seed, Station.upload, lambda vehicle, _: vehicle.stored_at is not None, has_repair)
 
 
-def parameters(radio: Radio, seed: int, *, has_repair: bool = True) -> Transfer:
+def parameters(radios: Radios, seed: int, *, has_repair: bool = True) -> Transfer:
     """:data:`PARAMETERS` parameters to the station."""
     return _transfer(
-        radio, seed, Station.read_parameters, lambda _, station: len(station.values) == PARAMETERS, has_repair
+        radios, seed, Station.read_parameters, lambda _, station: len(station.values) == PARAMETERS, has_repair
     )
 
 
 def _transfer(
-    radio: Radio,
+    radios: Radios,
     seed: int,
     begin: Callable[[Station], None],
     is_over: Callable[[Autopilot, Station], bool],
     has_repair: bool,
 ) -> Transfer:
-    redundancy = Redundancy.CRITICAL if has_repair else Redundancy.NONE
-    network = Network([radio], Link(redundancy=redundancy), seed=seed)
-    network.establish()
+    network = _clean(radios, seed, Redundancy.CRITICAL if has_repair else Redundancy.NONE)
     vehicle = Autopilot(network, network.alpha, PARAMETERS)
     station = Station(network, network.bravo, ITEMS)
+    network.radios[:] = radios
     network.run(network.now + SETTLING_S)
-    ends = network.alpha, network.bravo
-    sent = [len(end.sent) for end in ends]
-    repeats = [end.link.output.repeats for end in ends]
-    before = sum(one.sent for one in repeats), sum(one.bytes_sent for one in repeats)
+    repeats = [end.link.output.copies for end in (network.alpha, network.bravo)]
+    before = sum(one.repeats_sent for one in repeats), sum(one.repeat_bytes for one in repeats)
     began_at = network.now
     begin(station)
     while not is_over(vehicle, station) and network.now < began_at + PATIENCE_S:
         network.run(network.now + 0.01)
-    size = sum(
-        wire_bytes(one.datagram, Path(0, ("192.0.2.1", 1)))
-        for end, number in zip(ends, sent, strict=True)
-        for one in end.sent[number:]
-    )
     return Transfer(
         network.now - began_at if is_over(vehicle, station) else float("inf"),
-        size,
-        sum(one.sent for one in repeats) - before[0],
-        sum(one.bytes_sent for one in repeats) - before[1],
-        station.longest_wait_s > COUNT_AGAIN_S,
+        sum(one.repeats_sent for one in repeats) - before[0],
+        sum(one.repeat_bytes for one in repeats) - before[1],
     )
 
 
-def _row(name: str, what: str, transfers: Sequence[Transfer]) -> str:
-    seconds = sorted(one.seconds for one in transfers)
-    given_up = sum(one.given_up for one in transfers)
-    return (
-        f"| {name} | {what} | {median(seconds):.1f} s | {seconds[-1]:.1f} s "
-        f"| {median(one.bytes for one in transfers) / 1000:,.0f} kB "
-        f"| {median(one.repeat_bytes for one in transfers) / 1000:,.0f} kB | {given_up} of {len(transfers)} |"
-    )
+def _clean(radios: Radios, seed: int, redundancy: Redundancy = Redundancy.CRITICAL) -> Network:
+    """A link that is up along as many paths. They lose nothing yet."""
+    network = Network([Radio(DELAY_S)] * len(radios), Link(redundancy=redundancy), seed=seed)
+    network.establish()
+    return network
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Print the table."""
-    parser = argparse.ArgumentParser(prog="python -m tests.network.repair", description=__doc__)
-    parser.add_argument("--seeds", type=int, default=20, help="runs for each row (20)")
-    parser.add_argument("--radio", help="only rows with this text in their name")
-    options = parser.parse_args(arguments)
-    print("| path, each direction | transfer | median | longest | bytes | of them repeats | given up |")
-    print("|---|---|---|---|---|---|---|")
-    for name, radio in RADIOS.items():
-        if options.radio and options.radio not in name:
-            continue
-        for what, run in (("mission", mission), ("parameters", parameters)):
-            for has_repair in (True, False) if radio.loss else (True,):
-                text = what if has_repair else f"{what}, no repair"
-                transfers = [run(radio, seed, has_repair=has_repair) for seed in range(options.seeds)]
-                print(_row(name, text, transfers), flush=True)
-    return 0
+def _every(network: Network, interval_s: float, act: Callable[[int], None], number: int = 0) -> None:
+    """Do something now, and again and again, with the numbers from 0 on."""
+    act(number)
+    network.at(network.now + interval_s, lambda: _every(network, interval_s, act, number + 1))
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+# The stand-ins.
+
+# ArduPilot: MissionItemProtocol::update, GCS_MAVLINK::queued_param_send.
+ITEM_AGAIN_S: Final = 1.0
+"""The vehicle asks again for an item that did not come."""
+UPLOAD_TIMEOUT_S: Final = 8.0
+"""The vehicle cancels an upload after so long without an item."""
+PARAMETERS_S: Final = 300
+"""The vehicle's rate of the list, at 921,600 baud to its companion computer."""
+REPLY_AFTER_S: Final = 0.005
+REPLIES: Final = 20
+"""Requests for single parameters that wait in the vehicle. It ignores more."""
+# QGroundControl: PlanManager, ParameterManager.
+COUNT_AGAIN_S: Final = 1.5
+"""The station sends MISSION_COUNT again if no request comes for so long."""
+LIST_AGAIN_S: Final = 5.0
+"""The station asks for the list again if no parameter comes."""
+SILENCE_S: Final = 3.0
+"""After so long without a parameter it asks for missing ones,"""
+BATCH: Final = 10
+"""so many at a time."""
+TELEMETRY_HZ: Final = 50
+
+Message = Any  # pymavlink has no types
+
+
+class _Client:
+    def __init__(self, network: Network, end: End, system: int) -> None:
+        self.network = network
+        self._end = end
+        self._mav = mavlink.MAVLink(None, srcSystem=system, srcComponent=1)
+        self._parser = mavlink.MAVLink(None)
+        end.on_frame = self._on_frame
+        self.every(1.0, self._heartbeat)
+
+    def send(self, *messages: Message) -> None:
+        raw = b"".join(message.pack(self._mav) for message in messages)
+        self._mav.seq = (self._mav.seq + len(messages)) % 256
+        self._end.send(*split_payload(raw, SplitCounters()))
+
+    def every(self, interval_s: float, action: Callable[[], None]) -> None:
+        action()
+        self.network.at(self.network.now + interval_s, lambda: self.every(interval_s, action))
+
+    def after(self, delay_s: float, action: Callable[[], None]) -> None:
+        self.network.at(self.network.now + delay_s, action)
+
+    def receive(self, message: Message) -> None:
+        """A message came from the other side."""
+
+    def _on_frame(self, frame: Frame) -> None:
+        self.receive(self._parser.decode(bytearray(frame.raw)))
+
+    def _heartbeat(self) -> None:
+        self.send(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3))
+
+
+class Autopilot(_Client):
+    """ArduPilot: telemetry, one upload of a mission, its parameters."""
+
+    def __init__(self, network: Network, end: End, parameters: int) -> None:
+        super().__init__(network, end, 1)
+        self.stored_at: float | None = None
+        self._parameters = parameters
+        self._listed = parameters
+        self._waiting = 0
+        self._count = self._next = 0
+        self._asked_at = self._received_at = 0.0
+        self.every(1 / TELEMETRY_HZ, self._telemetry)
+        self.every(0.1, self._update)
+        self.every(1 / PARAMETERS_S, self._list_next)
+
+    def receive(self, message: Message) -> None:
+        now = self.network.now
+        match message.get_type():
+            case "MISSION_COUNT":
+                if self._next == 0 or not self._count:  # a repeated count does not restart an upload
+                    self._count, self._next, self.stored_at = message.count, 0, None
+                    self._received_at = now
+                    self._ask()
+            case "MISSION_ITEM_INT" if self._count and message.seq == self._next:
+                self._next += 1
+                self._received_at = now
+                if self._next < self._count:
+                    self._ask()
+                else:
+                    self._count, self.stored_at = 0, now
+                    self.send(mavlink.MAVLink_mission_ack_message(255, 1, mavlink.MAV_MISSION_ACCEPTED))
+            case "PARAM_REQUEST_LIST":
+                self._listed = 0
+            case "PARAM_REQUEST_READ" if self._waiting < REPLIES:
+                self._waiting += 1
+                self.after(REPLY_AFTER_S * self._waiting, lambda: self._reply(message.param_index))
+
+    def _ask(self) -> None:
+        self._asked_at = self.network.now
+        self.send(mavlink.MAVLink_mission_request_int_message(255, 1, self._next))
+
+    def _update(self) -> None:
+        now = self.network.now
+        if not self._count:
+            return
+        if now - self._received_at > UPLOAD_TIMEOUT_S:
+            self._count = 0
+            self.send(mavlink.MAVLink_mission_ack_message(255, 1, mavlink.MAV_MISSION_OPERATION_CANCELLED))
+        elif now - self._asked_at > ITEM_AGAIN_S:
+            self._ask()
+
+    def _reply(self, index: int) -> None:
+        self._waiting -= 1
+        self.send(self._value(index))
+
+    def _list_next(self) -> None:
+        if self._listed < self._parameters:
+            self.send(self._value(self._listed))
+            self._listed += 1
+
+    def _value(self, index: int) -> Message:
+        return mavlink.MAVLink_param_value_message(b"P%05d" % index, 1.5, 9, self._parameters, index)
+
+    def _telemetry(self) -> None:
+        now_ms = int(1000 * self.network.now)
+        self.send(mavlink.MAVLink_attitude_message(now_ms, 0.1, 0.2, 0.3, 0.01, 0.02, 0.03))
+
+
+class Station(_Client):
+    """QGroundControl: uploads a mission, or reads all parameters."""
+
+    def __init__(self, network: Network, end: End, items: int) -> None:
+        super().__init__(network, end, 255)
+        self.values: set[int] = set()
+        self._items = items
+        self._is_uploading = False
+        self._parameters = 0
+        self._value_at = 0.0
+        self._wanted: list[int] = []
+
+    def upload(self) -> None:
+        self._is_uploading = False
+        self._count()
+
+    def read_parameters(self) -> None:
+        """Ask for all parameters, and then for missing ones until none is."""
+        self._value_at = self.network.now
+        self.send(mavlink.MAVLink_param_request_list_message(1, 1))
+        self.after(0.1, self._check_parameters)
+
+    def receive(self, message: Message) -> None:
+        now = self.network.now
+        match message.get_type():
+            case "MISSION_REQUEST_INT":
+                self._is_uploading = True
+                self.send(_item(message.seq))
+            case "MISSION_ACK" if message.type == mavlink.MAV_MISSION_ACCEPTED:
+                self._items = 0
+            case "MISSION_ACK":
+                self.upload()  # what its pilot would do
+            case "PARAM_VALUE":
+                self._parameters, self._value_at = message.param_count, now
+                self.values.add(message.param_index)
+                if message.param_index in self._wanted:
+                    self._wanted.remove(message.param_index)
+                    self._fill()
+
+    def _count(self) -> None:
+        if self._items and not self._is_uploading:
+            self.send(mavlink.MAVLink_mission_count_message(1, 1, self._items))
+            self.after(COUNT_AGAIN_S, self._count)
+
+    def _check_parameters(self) -> None:
+        now = self.network.now
+        if self._parameters and len(self.values) == self._parameters:
+            return
+        silence_s = now - self._value_at
+        if self._parameters and silence_s >= SILENCE_S:
+            self._wanted, self._value_at = [], now
+            self._fill()
+        elif not self._parameters and silence_s >= LIST_AGAIN_S:
+            self.read_parameters()
+            return
+        self.after(0.1, self._check_parameters)
+
+    def _fill(self) -> None:
+        missing = (n for n in range(self._parameters) if n not in self.values and n not in self._wanted)
+        asked = [number for number, _ in zip(missing, range(BATCH - len(self._wanted)), strict=False)]
+        self._wanted += asked
+        for index in asked:
+            self.send(mavlink.MAVLink_param_request_read_message(1, 1, b"", index))
+
+
+def _item(sequence: int) -> Message:
+    return mavlink.MAVLink_mission_item_int_message(1, 1, sequence, 3, 16, 0, 1, 0, 0, 0, 0, 473977418, 85455939, 50)

@@ -36,11 +36,9 @@ class SerialLine:
 
     @property
     def is_sound(self) -> bool:
-        """Whether the modems carry every byte that fits."""
         return self._modems.settings == SIK
 
     def set_modems(self, settings: ModemSettings) -> None:
-        """Change the modems and the air from now on."""
         self._modems.settings = settings
 
     def plug(self, endpoint: Endpoint, now: float, *, is_plugged: bool) -> None:
@@ -53,7 +51,6 @@ class SerialLine:
             self._modems.inject(end, self.rng.randbytes(count), now)
 
     def write(self, endpoint: Endpoint, datagram: bytes, now: float) -> None:
-        """A drone writes a datagram."""
         self._modems.write(self._modem_ends[endpoint], encode(datagram), now)
 
     def next_deadline(self) -> float:

@@ -11,11 +11,11 @@ from random import Random
 
 from tests.link.two_radios import End, Network, Radio, path_of
 from uavlinkd.core.constants import LINE_BYTES, NEVER
-from uavlinkd.core.envelope_limit import limit_at
 from uavlinkd.core.path import SERIAL_HOST, Path
+from uavlinkd.core.path_measures import limit_at
 from uavlinkd.endpoints.line_framing import LineDecoder, encode
 from uavlinkd.lab.mitm.modem import ModemEnd, ModemLink, ModemSettings
-from uavlinkd.link.network_budgets import COPIES_SHARE
+from uavlinkd.link.networks import COPIES_SHARE
 from uavlinkd.mavlink.egress.bucket import Bucket
 from uavlinkd.mavlink.frames import Frame
 
@@ -35,7 +35,6 @@ class SlowRadio(Network):
         self.random = Random(f"slow radio {seed}").random
         self.modems = ModemLink(MODEMS, Random(f"modems {seed}"))
         self.most_queued = 0
-        """The most bytes that waited in the queue of a modem."""
         self._decoders = {end: LineDecoder() for end in ModemEnd}
         self._modem_at = NEVER
         self.dead: set[int] = set()
@@ -51,7 +50,6 @@ class SlowRadio(Network):
 
     @property
     def line(self) -> Path:
-        """The path along the radio, at both ends."""
         return Path(self.slow, (SERIAL_HOST, 0))
 
     def transmit(self, sender: End, datagram: bytes, path: Path) -> None:
@@ -92,7 +90,6 @@ class Offered:
     sent_at: dict[bytes, float] = field(default_factory=dict)
 
     def send(self, now: float) -> None:
-        """Send the next one."""
         frame = self.make(len(self.sent_at))
         assert frame.raw not in self.sent_at
         self.sent_at[frame.raw] = now

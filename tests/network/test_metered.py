@@ -1,4 +1,4 @@
-"""Paths that are paid by the byte: used when they are needed, and at once then."""
+"""Paths that are paid by the byte: they carry little, and are used when they are needed, and at once then."""
 
 from __future__ import annotations
 

@@ -47,39 +47,3 @@ def test_rekeying_at_full_traffic_loses_and_reorders_nothing(delay_s: float, at_
             # an echo request about a session that two others have replaced.
             assert set(drone.drops) <= ({"unexpected_response", "late"} if delay_s == 0.3 else set()), drone.drops
             assert drone.drops["late"] <= 2
-
-
-def test_rekeying_both_at_once_makes_sessions_of_both_and_one_is_used() -> None:
-    """If both ends initiate at the same instant, both handshakes complete, and both ends send on one session."""
-    with Network("crossed rekey", RadioSettings(delay_s=0.05)) as network:
-        a, b = network.pair()
-        network.talk(a, b, interval_s=0.002)
-        network.run_until(lambda: share_a_session(a, b), within_s=3)
-        network.run(2)
-        handshakes = a.peer(b).traffic.handshakes
-        _want_new_keys(a, b)
-        _want_new_keys(b, a)
-        network.run(1)
-        assert a.peer(b).traffic.handshakes == handshakes + 2
-        assert share_a_session(a, b)
-
-
-def test_rekeying_over_a_lossy_link_loses_only_what_the_link_lost() -> None:
-    """New keys every two seconds over a link that loses a fifth and reorders: every passing frame is delivered."""
-    settings = RadioSettings(delay_s=0.05, jitter_s=0.02)
-    for seed in range(4):
-        with Network(f"lossy rekey {seed}", settings) as network:
-            a, b = network.pair(EVERY_2_S)
-            network.run_until(partial(share_a_session, a, b), within_s=3)
-            network.run(1)
-            network.set_radio(RadioSettings(delay_s=0.05, jitter_s=0.02, loss=0.2))
-            begin = network.now
-            flows = network.talk(a, b, interval_s=0.01)
-            network.run(20)
-            assert sum(at > begin for at, _ in a.established()) >= 6
-            for flow in flows:
-                sent = sum(begin <= at < network.now - 0.1 for at in flow.sent_at)
-                lost = len(flow.lost(begin, network.now - 0.1))
-                assert 0.16 * sent < lost < 0.24 * sent
-            for drone in (a, b):
-                assert set(drone.drops) <= {"no_session", "late", "unexpected_response"}, drone.drops

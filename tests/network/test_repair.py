@@ -1,27 +1,60 @@
-"""A mission and parameters over one path that loses 30 % of the datagrams in each direction."""
+"""What arrives over paths that lose datagrams at random, as the specification promises; and over bursts of losses."""
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+from typing import Final
+
 import pytest
 
-from tests.network.repair import RADIOS, mission, parameters
+from tests.link.two_radios import Radio
+from tests.network.repair import BESIDE, DELAY_S, KINDS, LOSSES, RADIOS, cross, mission, parameters
 
-LOSSY = ("30 % loss", "30 % in bursts of 3", "30 % in bursts of 5")
-SEEDS = (1, 2)
+MISSION: Final = "mission of 100 items"
+LOSSY: Final = ("30 % loss", "30 % in bursts of 3", "30 % in bursts of 5")
+SEEDS: Final = (1, 2)
+SHORT: Final = {("command, 1/s", 0.3), (MISSION, 0.5)}
 
 
-@pytest.mark.parametrize("seed", SEEDS)
+def promises() -> dict[tuple[str, float], tuple[float, float]]:
+    """Of frames at a loss: the share that arrives, and within what age. From section 15 of the specification."""
+    page = (Path(__file__).parents[2] / "uavlinkd/core/README.md").read_text()
+    promised: dict[tuple[str, float], tuple[float, float]] = {}
+    for what in (*KINDS, MISSION):
+        (row,) = re.findall(rf"^\| {re.escape(what)} \|(.*)\|$", page, re.MULTILINE)
+        for loss, cell in zip(LOSSES, re.findall(r"(\d+) % in ([\d.]+) s", row), strict=True):
+            promised[what, loss] = int(cell[0]) / 100, float(cell[1])
+    return promised
+
+
+@pytest.mark.parametrize(
+    ("what", "loss"),
+    [pytest.param(*key, marks=() if key in SHORT else pytest.mark.long) for key in promises()],
+)
+def test_as_much_arrives_as_promised(what: str, loss: float) -> None:
+    """Alone, and beside a path that drops everything or is 1.9 s late; the latter only up to 50 %."""
+    share, within_s = promises()[what, loss]
+    for name, others in BESIDE.items():
+        if name == "1.9 s late" and loss > 0.5:
+            continue
+        radios = [Radio(DELAY_S, loss), *others]
+        if what == MISSION:
+            assert mission(radios, 1).seconds <= within_s, name
+            continue
+        kind = KINDS[what]
+        crossings = [cross(kind, radios, seed) for seed in (SEEDS if kind.rate == 1.0 else SEEDS[:1])]
+        in_time = sum(age <= within_s for crossing in crossings for age in crossing.ages)
+        assert in_time >= share * sum(crossing.offered for crossing in crossings), name
+
+
+@pytest.mark.long
 @pytest.mark.parametrize("name", LOSSY)
-def test_mission_is_up_within_15_s(name: str, seed: int) -> None:
-    """100 items. Without repair it takes about 100 s."""
-    assert mission(RADIOS[name], seed).seconds <= 15.0
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize("name", LOSSY)
-def test_parameters_are_read_within_20_s(name: str, seed: int) -> None:
-    """1,370 parameters: the list, then the missing ones. Without repair it takes about 150 s."""
-    assert parameters(RADIOS[name], seed).seconds <= 20.0
+def test_mission_and_parameters_cross_in_time(name: str) -> None:
+    """100 items, and 1,370 parameters. Without repair they take about 60 and 150 s."""
+    for seed in SEEDS:
+        assert mission(RADIOS[name], seed).seconds <= 12.0
+    assert parameters(RADIOS[name], SEEDS[0]).seconds <= 20.0
 
 
 def test_clean_path_has_no_repeats() -> None:
@@ -31,6 +64,7 @@ def test_clean_path_has_no_repeats() -> None:
     assert transfer.seconds < 3.0
 
 
+@pytest.mark.long
 def test_mission_without_repair_is_slow() -> None:
     """So the limits above are due to repair."""
     assert mission(RADIOS["30 % loss"], 1, has_repair=False).seconds > 45.0

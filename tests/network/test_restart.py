@@ -11,18 +11,6 @@ BACK_WITHIN_S = 2.0
 CLOCKS = {"zero": 0.0, "1970": 1.0, "2106": 2.0**32 + 0.25}
 
 
-def _linked(network: Network, *, a_knows: bool = True, b_knows: bool = True) -> tuple[Drone, Drone]:
-    a, b = network.add("a", clock=1e9), network.add("b", clock=1e5)
-    a.knows(b, b.addresses if a_knows else ())
-    b.knows(a, a.addresses if b_knows else ())
-    a.start()
-    b.start()
-    network.talk(a, b)
-    network.run_until(lambda: share_a_session(a, b), within_s=3)
-    network.run(2.3)
-    return a, b
-
-
 def _assert_both_hear_within(network: Network, a: Drone, b: Drone, bound_s: float) -> None:
     """Frames sent from now on are delivered at both ends within the bound, and continue to be."""
     begin = network.now
@@ -42,7 +30,7 @@ def test_link_is_back_after_a_restart_without_state(who_knows: str, delay_s: flo
     """One end restarts with only its key and another clock: frames cross again within two seconds."""
     for seed in range(5):
         with Network(f"restart {who_knows} {delay_s} {clock} {seed}", RadioSettings(delay_s=delay_s)) as network:
-            a, b = _linked(network, a_knows=who_knows != "other", b_knows=who_knows != "restarted")
+            a, b = network.linked(clocks=(1e9, 1e5), a_knows=who_knows != "other", b_knows=who_knows != "restarted")
             network.run(network.rng.random())
             a.start(clock)
             _assert_both_hear_within(network, a, b, BACK_WITHIN_S)
@@ -54,7 +42,7 @@ def test_link_is_back_after_both_restart(a_alone_knows: bool, gap_s: float) -> N
     """Both ends restart, together or one after the other: frames cross again within two seconds of the last."""
     for seed in range(5):
         with Network(f"both restart {a_alone_knows} {gap_s} {seed}", RadioSettings(delay_s=0.1)) as network:
-            a, b = _linked(network, b_knows=not a_alone_knows)
+            a, b = network.linked(clocks=(1e9, 1e5), b_knows=not a_alone_knows)
             a.start(0.0)
             network.run(gap_s)
             b.start(0.0)

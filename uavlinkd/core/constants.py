@@ -90,8 +90,9 @@ PROBE_INTERVAL_S = 5.0
 CLOSE_HOLDOFF_S = 1.0
 """After a peer's close no initiation is sent to it for this long: its daemon is stopping."""
 
-UNCONFIRMED_PER_PEER = 16
-"""Sessions that answer an initiation and wait for their first envelope."""
+UNCONFIRMED_PER_KIND = 16
+"""Sessions that answer an initiation and wait for their first envelope: so many to known addresses of the peer, so
+many to others."""
 UNCONFIRMED_LIFETIME_S = 10.0
 """How long they wait: several retries of the initiator, on a slow path."""
 PENDING_LIFETIME_S = 10.0
@@ -217,7 +218,7 @@ PROBE_DOWN_S = 1.0
 PROBE_LONG_DOWN_S = 5.0
 """The same after :data:`LONG_DOWN_S`."""
 FORMER_PATH_S = 30.0
-"""A repeat along a validated path that went down so recently is a late copy."""
+"""A learned path that is down keeps its slot for so long after its last answer."""
 LONG_DOWN_S = 60.0
 """A path that did not work for so long is asked less often."""
 PROBE_IDLE_S = 15.0
@@ -260,7 +261,7 @@ LOSS_WINDOW_S = 4.0
 """The loss of a path is that of this time."""
 LOSS_POINTS = 64
 """Reports that are kept for it."""
-TRANSMISSIONS = 5
+TRANSMISSIONS = 7
 """How often a critical envelope is sent along a path, repeats included, at most."""
 REPAIR_WINDOW_S = 10.0
 """Whether to repeat depends on the loss of this time."""
@@ -270,10 +271,8 @@ LAG_SAMPLES = 64
 """Copies whose lag is kept for a path."""
 LAG_VALID_S = 3.0
 """How long a reported lag counts."""
-COPIES_AFTER_ANSWER_S = 10.0
-"""A path that answered a question this recently gets copies of critical frames even if it is down."""
 CRITICAL_ENVELOPE_LIMIT = 320
-"""The longest critical envelope while two paths work; one frame may be longer. Each path carries it."""
+"""The longest critical envelope while it goes along several paths; one frame may be longer. Each path carries it."""
 SMALLER_LIMITS = (548, 320)
 """Bytes of envelopes that a path may carry if it does not carry longer ones: 576 (RFC 791) less 28, and the least."""
 ENVELOPE_AIR_S = 0.25
@@ -298,12 +297,12 @@ LATE_STEP_S = 0.25
 """Counters of the past are remembered in such steps: what is late is so by up to one of them more."""
 HOLD_S = 1.0
 """How long frames that came after a silence wait for the peer's word on their age, and how old that word may be."""
-HOLD_ASK_S = 0.25
-"""How often the peer is asked meanwhile: as often as for a handshake."""
+HOLD_ASK_S = 0.1
+"""How often the peer is asked meanwhile, and after an interval without an answer."""
 VERIFY_INTERVAL_S = 1.0
 """While frames arrive, the peer is asked for an echo this often. A link with a budget has a longer interval."""
 VERIFY_REPEAT_SHARE = 0.25
-"""After one interval without an answer the request is repeated each time this share of an interval has passed."""
+"""After a longer interval without an answer the request is repeated each time this share of it has passed."""
 VERIFIED_INTERVALS = 2
 """Freshness stays verified for so many intervals after an answer, at least for `LATE_AFTER_S`."""
 REFUSALS_INTERVAL_S = 2.0

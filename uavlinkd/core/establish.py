@@ -6,7 +6,7 @@ from uavlinkd.core import constants as c
 from uavlinkd.core import freshness, handshake, probing, wire
 from uavlinkd.core.cookie import mac1_of
 from uavlinkd.core.drops import Drop
-from uavlinkd.core.handshake import Keys, Received
+from uavlinkd.core.handshake import Received
 from uavlinkd.core.initiator import Pending
 from uavlinkd.core.outputs import Output, PeerClosed, SessionEstablished
 from uavlinkd.core.path import Path
@@ -15,7 +15,6 @@ from uavlinkd.core.send import ask_for_echo, seal, transmit
 from uavlinkd.core.session import Session
 from uavlinkd.core.sessions import Unconfirmed
 from uavlinkd.core.settings import Class
-from uavlinkd.core.suites import Suite
 from uavlinkd.core.timers import Timer
 
 # The initiator's side.
@@ -58,7 +57,8 @@ def receive_response(peer: Peer, pending: Pending, response: wire.Response, path
         Drop: as :meth:`Initiator.receive_response`; then nothing was changed.
     """
     keys = peer.initiator.receive_response(pending, response)
-    session = _session(peer, response.suite, keys, response.receiver_index, now, is_initiator=True)
+    lifetimes = peer.durations.reject_after_s, peer.verify_interval_s
+    session = Session(keys, response.receiver_index, now, *lifetimes, is_initiator=True)
     if path not in pending.paths:  # it was sent on from elsewhere, or our network changed
         path = pending.paths[0]
     events = adopt(peer, session, path, now) + peer.note_received(now)
@@ -104,18 +104,18 @@ def answer(peer: Peer, received: Received, initiation: bytes, path: Path, now: f
     Raises:
         Drop: ``NO_FREE_INDEX`` or ``INVALID_KEY_SHARE``.
     """
-    suite = received.initiation.suite
     index = peer.indices.pick(now)
     response, keys = handshake.respond(received, peer.settings, index, peer.sessions.generation, peer.entropy)
     datagram = peer.initiator.add_macs(response, path, now)
-    session = _session(peer, suite, keys, index, now, is_initiator=False)
+    lifetimes = peer.durations.reject_after_s, peer.verify_interval_s
+    session = Session(keys, index, now, *lifetimes, is_initiator=False)
     is_expected, expires_at = peer.paths.find(path) is not None, now + c.UNCONFIRMED_LIFETIME_S
     macs = mac1_of(initiation), mac1_of(datagram)
     waiting = Unconfirmed(session, macs[0], len(initiation), response, [path], is_expected, macs[1], expires_at)
     peer.sessions.wait(waiting)
     peer.indices.owners[index] = peer, session
     peer.timers.set(Timer.SESSION_EXPIRY, peer.sessions.next_expiry())
-    return transmit(peer, datagram, path)
+    return _transmit_answer(peer, datagram, waiting, path)
 
 
 def answer_copy(peer: Peer, waiting: Unconfirmed, path: Path, now: float) -> list[Output]:
@@ -123,7 +123,14 @@ def answer_copy(peer: Peer, waiting: Unconfirmed, path: Path, now: float) -> lis
     if path in waiting.paths or len(waiting.paths) >= c.COPIES_OF_A_RESPONSE:
         return []
     waiting.paths.append(path)
-    return transmit(peer, peer.initiator.add_macs(waiting.response, path, now), path, is_copy=True)
+    return _transmit_answer(peer, peer.initiator.add_macs(waiting.response, path, now), waiting, path)
+
+
+def _transmit_answer(peer: Peer, datagram: bytes, waiting: Unconfirmed, path: Path) -> list[Output]:
+    if (state := peer.paths.find(path)) is not None:
+        state.datagrams_received += 1
+        state.bytes_received += waiting.initiation_bytes  # that came there: the response is no amplification
+    return transmit(peer, datagram, path, is_copy=path != waiting.paths[0])
 
 
 # Both sides.
@@ -144,7 +151,7 @@ def adopt(peer: Peer, session: Session, path: Path, now: float) -> list[Output]:
         peer.timers.set(Timer.KEEPALIVE, peer.sent_at + peer.durations.keepalive_s)
         agreed = session.parameters
         facts = agreed.generation, session.suite.name, agreed.confidential, session.tag_bytes, session.is_initiator
-        out.append(SessionEstablished(peer, *facts, is_rekey))
+        out.append(SessionEstablished(peer, path, *facts, is_rekey))
         out += probing.begin_session(peer, session, path, now)
     else:
         probing.follow_paths(peer, now)
@@ -177,8 +184,3 @@ def close(peer: Peer, now: float) -> list[Output]:
     peer.is_up = False
     peer.timers.stop_all()
     return out
-
-
-def _session(peer: Peer, suite: Suite, keys: Keys, index: int, now: float, *, is_initiator: bool) -> Session:
-    lifetime_s, interval_s = peer.durations.reject_after_s, peer.verify_interval_s
-    return Session(suite, keys, index, now, lifetime_s, is_initiator=is_initiator, verify_interval_s=interval_s)

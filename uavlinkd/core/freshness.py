@@ -64,14 +64,11 @@ def receive_report(
 def receive_answer(peer: Peer, echo: wire.Echo, now: float) -> list[Output]:
     """The peer tells which counters are new, on the session of the request."""
     peer.traffic.echoes_unanswered += peer.echo_requests.expire(now)
-    request = peer.echo_requests.find(echo.token)
+    if peer.echo_requests.is_late(echo.token):
+        _refute(peer)
+    request = peer.echo_requests.answer(echo.token)
     if request is None:
-        if peer.echo_requests.was_sent(echo.token):
-            _refute(peer)
         return []
-    if request.is_answered:
-        return []
-    request.is_answered = True
     peer.round_trip_s = now - request.sent_at
     peer.paths.note_echo(peer.round_trip_s, now)
     peer.set_waits()

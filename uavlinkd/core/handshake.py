@@ -39,6 +39,7 @@ class Received(NamedTuple):
 class Keys:
     """What a finished handshake gives to each side."""
 
+    suite: Suite
     transport: tuple[Secret, Secret]
     handshake_hash: bytes
     parameters: Parameters
@@ -122,4 +123,4 @@ def _open_payload(payload: bytes, header: bytes) -> Parameters:
 
 
 def _keys(state: HandshakeState, parameters: Parameters, remote_index: int) -> Keys:
-    return Keys(state.symmetric.split(), state.symmetric.h, parameters, remote_index)
+    return Keys(state.suite, state.symmetric.split(), state.symmetric.h, parameters, remote_index)

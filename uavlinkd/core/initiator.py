@@ -10,11 +10,10 @@ from uavlinkd.core import handshake, wire
 from uavlinkd.core.cookie import MacKeys, mac1_of
 from uavlinkd.core.crypto import Entropy, KeyPair
 from uavlinkd.core.handshake import Initiated, Keys
-from uavlinkd.core.indices import Indices
 from uavlinkd.core.kem import OneCiphertext
-from uavlinkd.core.path import Path
+from uavlinkd.core.path import Path, SocketFacts
+from uavlinkd.core.sessions import Indices
 from uavlinkd.core.settings import PeerSettings
-from uavlinkd.core.socket_facts import SocketFacts
 
 
 @dataclass(slots=True)

@@ -1,9 +1,11 @@
-"""Bounds on what others can make us do: a token bucket, and one bucket per source in bounded memory."""
+"""Bounds on what others can make us do: token buckets, one per source in bounded memory, and those for groups."""
 
 from __future__ import annotations
 
 from collections.abc import Hashable
 from ipaddress import IPv6Address
+
+from uavlinkd.core import constants as c
 
 
 class TokenBucket:
@@ -62,3 +64,32 @@ class SourceLimiter:
         if len(self._buckets) > self._capacity:
             del self._buckets[next(iter(self._buckets))]
         return bucket.take(now, count)
+
+
+class GroupShare:
+    """What one peer may cause: from anywhere, and besides where it proves to be at its own address."""
+
+    __slots__ = ("anywhere", "proven")
+
+    def __init__(self, now: float) -> None:
+        self.anywhere = TokenBucket(c.GROUP_WORK_PER_PEER_PER_S, c.GROUP_WORK_PER_PEER_BURST, now)
+        self.proven = TokenBucket(c.GROUP_WORK_PER_PEER_PER_S, c.GROUP_WORK_PER_PEER_BURST, now)
+
+
+class GroupBudget:
+    """Group arithmetic of a responder: one budget for all peers, and in it a share for each source and each peer.
+
+    The unit is a hundredth of an encapsulation of ``ffdhe8192`` (:attr:`Suite.work`).
+    """
+
+    def __init__(self, now: float) -> None:
+        self._total = TokenBucket(c.GROUP_WORK_PER_S, c.GROUP_WORK_BURST, now)
+        self._sources = SourceLimiter(c.GROUP_WORK_PER_SOURCE_PER_S, c.GROUP_WORK_PER_SOURCE_BURST, c.SOURCES_TRACKED)
+
+    def take(self, share: GroupShare, source: Hashable, work: int, now: float) -> bool:
+        """Spend ``work``; False, and nothing is spent, where the total, the peer or the source has less."""
+        if not self._total.has(now, work) or not share.anywhere.has(now, work):
+            return False
+        if not self._sources.take(source, now, work):
+            return False
+        return self._total.take(now, work) and share.anywhere.take(now, work)

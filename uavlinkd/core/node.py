@@ -14,11 +14,10 @@ from uavlinkd.core import establish, probing, wire
 from uavlinkd.core.admission import Admission, CookieRequired
 from uavlinkd.core.crypto import Entropy, Secret
 from uavlinkd.core.drops import Drop, DropReason
-from uavlinkd.core.indices import Indices
 from uavlinkd.core.initiator import Pending
 from uavlinkd.core.outputs import Deliver, Dropped, Output
-from uavlinkd.core.path import Path, SocketAddress
-from uavlinkd.core.peer import Peer
+from uavlinkd.core.path import Path, SocketAddress, SocketFacts
+from uavlinkd.core.peer import Peer, Shared
 from uavlinkd.core.probing import ask_candidates
 from uavlinkd.core.receive import receive_envelope
 from uavlinkd.core.receive_handshake import HandshakeReceiver, OwnKeys
@@ -26,8 +25,8 @@ from uavlinkd.core.refusals import Refused
 from uavlinkd.core.relay_records import Record
 from uavlinkd.core.send import ask_for_echo, note_repeat, recount, report_refusals, send_frames, send_record
 from uavlinkd.core.session import Session
+from uavlinkd.core.sessions import Indices
 from uavlinkd.core.settings import Class, PeerSettings, Screen, hold_all
-from uavlinkd.core.socket_facts import SocketFacts
 from uavlinkd.core.timeouts import handle_timeout
 from uavlinkd.core.timers import Schedule
 
@@ -96,8 +95,8 @@ class Node:
             raise ValueError(f"peer {settings.name} is there already")
         if settings.public_key in (self.public_key, None if previous is None else previous.public):
             raise ValueError(f"peer {settings.name} has this daemon's own key")
-        shared = self._screen, self._last_seen, self._facts
-        peer = Peer(settings, identity, self._indices, self._entropy, now, *shared)
+        shared = Shared(self._indices, self._entropy, self._screen, self._last_seen, self._facts)
+        peer = Peer(settings, identity, shared, now)
         self.peers[settings.name] = handshakes.peers[keys] = peer
         self._facts.share_budgets(len(self.peers))
         self._handshakes.admission.set_peers(len(self.peers))
@@ -156,7 +155,7 @@ class Node:
             self._revise_paths(peer, now)
 
     def set_envelope_limits(self, limits: Mapping[int, int]) -> None:
-        """The longest envelopes for the networks of these sockets, in bytes: :func:`.envelope_limit.limit_at`.
+        """The longest envelopes for the networks of these sockets, in bytes: :func:`.path_measures.limit_at`.
 
         Frames share an envelope up to there; a longer one holds a single frame. The limits of other sockets end.
         """
@@ -245,13 +244,13 @@ class Node:
         try:
             if datagram[:1] not in wire.ENVELOPE_STARTS:
                 return self._handshakes.receive(datagram, path, now)
-            index, counter, header_bytes = wire.parse_envelope_header(datagram)
-            peer, session = self._indices.owners.get(index, (None, None))
+            header = wire.parse_envelope_header(datagram)
+            peer, session = self._indices.owners.get(header[0], (None, None))
             if peer is None or not isinstance(session, Session):
-                return self._receive_stray(datagram, index, path, now)
+                return self._receive_stray(datagram, header[0], path, now)
             if self._facts.peers_at:
                 self._facts.check_network(peer, path)
-            out = receive_envelope(peer, session, datagram, header_bytes, counter, path, now)
+            out = receive_envelope(peer, session, datagram, header, path, now)
             if peer.timers.next_at < peer.timers.scheduled_at:
                 self._schedule.update(peer)
             return out

@@ -80,9 +80,13 @@ class PeerClosed(NamedTuple):
 
 
 class SessionEstablished(NamedTuple):
-    """New keys carry the traffic from now on. ``rekey``: they replace others."""
+    """New keys carry the traffic from now on. ``rekey``: they replace others.
+
+    ``path``: along which the peer proved that it has them. It need not be the best one.
+    """
 
     peer: LinkedPeer
+    path: Path
     generation: int
     suite: str
     confidential: bool

@@ -6,10 +6,8 @@ from collections import Counter
 from collections.abc import Iterable
 
 from uavlinkd.core import constants as c
-from uavlinkd.core.constants import NEVER
-from uavlinkd.core.path import Path, SocketAddress
+from uavlinkd.core.path import Path, SocketAddress, SocketFacts
 from uavlinkd.core.path_state import PathState
-from uavlinkd.core.socket_facts import SocketFacts
 
 
 class PathSlots:
@@ -17,8 +15,6 @@ class PathSlots:
 
     ``known``: how many peers have proved to be at an address. It and ``facts`` are shared by all peers of a node.
     """
-
-    __slots__ = ("_asked", "_former", "_known", "_reported", "_unanswered", "best", "by_path", "candidates", "facts")
 
     def __init__(self, known: Counter[SocketAddress], facts: SocketFacts) -> None:
         self._known = known
@@ -28,7 +24,6 @@ class PathSlots:
         """The slots in use: the configured paths first, then the oldest."""
         self.best: PathState | None = None
         """Where frames go; a path that failed stays the best while there is no other."""
-        self._former: dict[Path, float] = {}  # validated paths that went down, and until when that counts
         self._reported: set[PathState] = set()  # those that were reported as usable
         self._unanswered = 0
         self.candidates: tuple[Path, ...] = ()
@@ -67,10 +62,6 @@ class PathSlots:
         """How many learned paths were given up since the last call, because they answered nothing."""
         unanswered, self._unanswered = self._unanswered, 0
         return unanswered
-
-    def was_validated(self, path: Path, now: float) -> bool:
-        """Whether a path without a slot was validated until recently: what was held back there still arrives."""
-        return now < self._former.get(path, -NEVER)
 
     def configure(self, paths: Iterable[Path], now: float) -> None:
         """The paths of the configuration, the likeliest first. One that works stays, as a learned path.
@@ -170,5 +161,6 @@ class PathSlots:
             self._known[state.path.place] += 1
 
 
-def _usefulness(state: PathState) -> tuple[bool, bool, float]:
-    return state.is_validated, state.works, max(state.received_at, state.since)
+def _usefulness(state: PathState) -> tuple[bool, float, float]:
+    # One that answers again is worth more than one that is suspect, or the honest path loses its slot to former ones.
+    return state.works or state.is_recovering, state.answered_at, max(state.received_at, state.since)

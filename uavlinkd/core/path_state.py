@@ -6,6 +6,7 @@ Only an answered question makes a path usable. What the peer reports can only ma
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import InitVar, dataclass, field
 from enum import StrEnum
 from statistics import median
 from typing import NamedTuple
@@ -13,9 +14,8 @@ from typing import NamedTuple
 from uavlinkd.core import constants as c
 from uavlinkd.core import probe
 from uavlinkd.core.constants import NEVER
-from uavlinkd.core.envelope_limit import EnvelopeLimit
 from uavlinkd.core.path import Path
-from uavlinkd.core.path_loss import NO_REPEATS, PathLoss, Repeats
+from uavlinkd.core.path_measures import NO_REPEATS, EnvelopeLimit, PathLoss, Repeats
 from uavlinkd.core.probe import Probe
 
 
@@ -39,108 +39,76 @@ class Question(NamedTuple):
     repeats: Repeats = NO_REPEATS
 
 
+@dataclass(slots=True, eq=False)
 class PathState:
-    """A slot of a :class:`uavlinkd.core.paths.PathSet`."""
+    """A slot of a :class:`uavlinkd.core.paths.PathSet`. It is compared by identity."""
 
-    __slots__ = (
-        "_lags",
-        "_loss_by_echo",
-        "_loss_in",
-        "_loss_out",
-        "_recovering_answers",
-        "_recovering_since",
-        "_reported_lag",
-        "_reported_lost",
-        "_unanswered",
-        "_unanswered_since",
-        "_waiting",
-        "answered_at",
-        "answers",
-        "bytes_received",
-        "bytes_sent",
-        "condition",
-        "copied_question",
-        "datagrams_received",
-        "datagrams_sent",
-        "duplicates",
-        "echo_at",
-        "envelope_limit",
-        "held_back_s",
-        "is_configured",
-        "is_known",
-        "is_metered",
-        "is_off",
-        "is_proven",
-        "number",
-        "path",
-        "question_at",
-        "questioned_at",
-        "reason",
-        "received",
-        "received_at",
-        "repeats",
-        "returns_at",
-        "round_trip_s",
-        "rttvar_s",
-        "sent",
-        "since",
-        "srtt_s",
-    )
+    path: Path
+    number: int
+    """From 1: names the path in :class:`uavlinkd.core.counters.Arrivals`."""
+    now: InitVar[float]
+    is_configured: bool
+    is_metered: bool
+    is_known: bool = False
+    """Whether the peer was there: a session was made along it, or it is validated."""
+    is_proven: bool = False
+    """Whether it may get more bytes than came from there: it is configured, or validated."""
+    is_off: bool = False
+    """Whether its network is gone: nothing is sent there."""
+    condition: PathCondition = PathCondition.UNPROVEN
+    reason: str = "new"
+    """Why it is in this condition: ``answered``, ``unanswered``, ``loss``, ``network`` or ``new``."""
+    since: float = 0.0
+    """When the condition began."""
+    sent: int = 0
+    """Envelopes of the current session along this path, copies from other paths too, without repeats."""
+    received: int = 0
+    """The same of the peer's."""
+    repeats: Repeats = NO_REPEATS
+    """Of what was sent."""
+    datagrams_sent: int = 0
+    bytes_sent: int = 0
+    datagrams_received: int = 0
+    bytes_received: int = 0
+    duplicates: int = 0
+    """Received copies of envelopes that had arrived already."""
+    echo_at: list[float] = field(default_factory=lambda: [-NEVER, -NEVER])
+    """On a network with a budget: when it may carry a copy of an echo request, and of a reply."""
+    held_back_s: float = 0.0
+    returns_at: float = -NEVER
+    """When it may become the best path again."""
+    received_at: float = -NEVER
+    """When an envelope arrived first along this path."""
+    round_trips: int = 0
+    """How many were measured."""
+    round_trip_s: float | None = None
+    """The last one that was measured. The others are smoothed."""
+    srtt_s: float | None = None
+    rttvar_s: float | None = None
+    envelope_limit: EnvelopeLimit = field(default_factory=EnvelopeLimit)
+    answered_at: float = -NEVER
+    answers: int = 0
+    """How many of its questions were answered."""
+    questioned_at: float = -NEVER
+    question_at: float = NEVER
+    """When the next question is due."""
+    copied_question: int = 0
+    """The last question that was answered here although it had arrived along another path before."""
+    _waiting: dict[int, Question] = field(default_factory=dict)  # the oldest first
+    _unanswered_since: float = NEVER
+    _unanswered: int = 0  # questions since the last answer
+    _recovering_since: float = NEVER
+    _recovering_answers: int = 0
+    _loss_in: PathLoss = field(default_factory=PathLoss)
+    _loss_out: PathLoss = field(default_factory=PathLoss)
+    _loss_by_echo: PathLoss = field(default_factory=PathLoss)
+    _lags: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=c.LAG_SAMPLES))
+    _reported_lag: tuple[float, float] | None = None  # when, seconds
+    _reported_lost: int = 0  # of the peer's datagrams of the current session
 
-    def __init__(self, path: Path, number: int, now: float, *, is_configured: bool, is_metered: bool) -> None:
-        self.path = path
-        self.number = number
-        """From 1: names the path in :class:`uavlinkd.core.arrivals.Arrivals`."""
-        self.is_configured = is_configured
-        self.is_metered = is_metered
-        self.is_known = False
-        """Whether the peer was there: a session was made along it, or it is validated."""
-        self.is_proven = is_configured
-        """Whether it may get more bytes than came from there: it is configured, or validated."""
-        self.is_off = False
-        """Whether its network is gone: nothing is sent there."""
-        self.condition = PathCondition.UNPROVEN
-        self.reason = "new"
-        """Why it is in this condition: ``answered``, ``unanswered``, ``loss``, ``network`` or ``new``."""
-        self.since = now
-        """When the condition began."""
-        self.sent = self.received = 0
-        """Envelopes of the current session along this path, copies from other paths too, without repeats."""
-        self.repeats = NO_REPEATS
-        """Of what was sent."""
-        self.datagrams_sent = self.bytes_sent = 0
-        self.datagrams_received = self.bytes_received = 0
-        self.duplicates = 0
-        """Received copies of envelopes that had arrived already."""
-        self.echo_at = [-NEVER, -NEVER]
-        """On a network with a budget: when it may carry a copy of an echo request, and of a reply."""
-        self.held_back_s = 0.0
-        self.returns_at = -NEVER
-        """When it may become the best path again."""
-        self.received_at = -NEVER
-        """When an envelope arrived first along this path."""
-        self.round_trip_s: float | None = None
-        """The last one that was measured. The others are smoothed."""
-        self.srtt_s: float | None = None
-        self.rttvar_s: float | None = None
-        self.envelope_limit = EnvelopeLimit()
-        self.answered_at = -NEVER
-        self.answers = 0
-        """How many of its questions were answered."""
-        self.questioned_at = -NEVER
-        self.question_at = now
-        """When the next question is due."""
-        self.copied_question = 0
-        """The last question that was answered here although it had arrived along another path before."""
-        self._waiting: dict[int, Question] = {}  # the oldest first
-        self._unanswered_since = NEVER
-        self._unanswered = 0  # questions since the last answer
-        self._recovering_since = NEVER
-        self._recovering_answers = 0
-        self._loss_in, self._loss_out, self._loss_by_echo = PathLoss(), PathLoss(), PathLoss()
-        self._lags: deque[tuple[float, float]] = deque(maxlen=c.LAG_SAMPLES)
-        self._reported_lag: tuple[float, float] | None = None  # when, seconds
-        self._reported_lost = 0  # of the peer's datagrams of the current session
+    def __post_init__(self, now: float) -> None:
+        self.is_proven = self.is_configured
+        self.since = self.question_at = now
 
     def __repr__(self) -> str:
         return f"PathState({self.path}, {self.condition})"
@@ -242,7 +210,7 @@ class PathState:
     def make_test(self, question: int, now: float) -> Probe:
         """The record of a padded probe. It may well get no answer, so it makes no path suspect."""
         self.envelope_limit.asked(question, now)
-        self._waiting[question] = Question(now, 0)
+        self._wait_for(question, Question(now, 0), now)
         return Probe(question, 0, self.sent + 1, self.received, self._lag_ms(now))
 
     def take_questions(self, candidate: PathState) -> None:
@@ -253,14 +221,17 @@ class PathState:
         """The record to be sent along this path now."""
         if question:
             self.questioned_at = now
-            self._expire_questions(now)
-            if len(self._waiting) >= c.QUESTIONS_PER_PATH:
-                del self._waiting[next(iter(self._waiting))]
-            self._waiting[question] = Question(now, self.sent + 1, self.repeats)
+            self._wait_for(question, Question(now, self.sent + 1, self.repeats), now)
             if not self._unanswered:
                 self._unanswered_since = now
             self._unanswered += 1
         return Probe(question, answer, self.sent + 1, self.received, self._lag_ms(now))
+
+    def _wait_for(self, token: int, question: Question, now: float) -> None:
+        self._expire_questions(now)
+        if len(self._waiting) >= c.QUESTIONS_PER_PATH:
+            del self._waiting[next(iter(self._waiting))]
+        self._waiting[token] = question
 
     def receive_report(self, report: Probe, now: float) -> int:
         """The peer's counts, in a probe of the current session.
@@ -309,11 +280,13 @@ class PathState:
 
     def _add_round_trip(self, round_trip_s: float) -> None:
         self.round_trip_s = round_trip_s
+        self.round_trips += 1
         if self.srtt_s is None or self.rttvar_s is None:
             self.srtt_s, self.rttvar_s = round_trip_s, round_trip_s / 2
             return
         self.rttvar_s += (abs(self.srtt_s - round_trip_s) - self.rttvar_s) / 4
-        self.srtt_s += (round_trip_s - self.srtt_s) / 8
+        # At first the mean: a slow first answer (of a radio that slept) must not decide an election for many seconds.
+        self.srtt_s += (round_trip_s - self.srtt_s) / min(8, self.round_trips)
 
     def _expire_questions(self, now: float) -> None:
         expired = [token for token, asked in self._waiting.items() if now >= asked.sent_at + c.QUESTION_LIFETIME_S]

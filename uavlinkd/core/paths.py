@@ -6,69 +6,94 @@ README.md, section 15. The paths share one session. Nothing here sends: :mod:`.p
 from __future__ import annotations
 
 from collections import Counter, deque
-from typing import NamedTuple
+from collections.abc import Iterable
 
 from uavlinkd.core import constants as c
 from uavlinkd.core.constants import NEVER
-from uavlinkd.core.election import Election
-from uavlinkd.core.path import Path, SocketAddress
-from uavlinkd.core.path_loss import Repeats
+from uavlinkd.core.outputs import Event, LinkedPeer, PathChanged, PathStateChanged, PathSuspected
+from uavlinkd.core.path import FREE, Pace, Path, SocketAddress, SocketFacts
+from uavlinkd.core.path_measures import Repeats
 from uavlinkd.core.path_slots import PathSlots
 from uavlinkd.core.path_state import PathCondition, PathState
 from uavlinkd.core.settings import Class, Redundancy
-from uavlinkd.core.socket_facts import FREE, Pace, SocketFacts
+
+
+class Election:
+    """Elects the best path. It remembers which path has been better for how long."""
+
+    __slots__ = ("_better", "_better_since", "_chosen", "_chosen_at")
+
+    def __init__(self) -> None:
+        self._better: PathState | None = None
+        self._better_since = NEVER
+        self._chosen: PathState | None = None  # the best path, and since when
+        self._chosen_at = -NEVER
+
+    @property
+    def due_at(self) -> float:
+        """When a better path has proved itself; infinity without one."""
+        return NEVER if self._better is None else self._better_since + c.BETTER_FOR_S
+
+    def elect(self, best: PathState | None, states: Iterable[PathState], now: float) -> tuple[PathState | None, str]:
+        """The best of these paths, and why it is another one than ``best``.
+
+        A path that failed stays the best while there is no other.
+        """
+        if best is not self._chosen:  # a session was made elsewhere, or its slot is gone
+            self._chosen, self._chosen_at = best, now
+        elected, reason = self._elect(best, states, now)
+        if elected is not best:
+            self._chosen, self._chosen_at, self._better = elected, now, None
+        return elected, reason
+
+    def _elect(self, best: PathState | None, states: Iterable[PathState], now: float) -> tuple[PathState | None, str]:
+        working = [state for state in states if state.works]
+        pool = [state for state in working if not state.is_metered] or working
+        usable = [state for state in pool if state.condition is PathCondition.USABLE]
+        if best is None or best not in pool:
+            self._better = None
+            if not pool:
+                return best, ""
+            elected = min(usable or pool, key=lambda state: _cost(state, None))
+            return elected, "first" if best is None else "metered" if best.works else best.reason
+        rivals = [state for state in usable if state is not best and now >= state.returns_at]
+        if best.path.is_relayed and (direct := [state for state in rivals if not state.path.is_relayed]):
+            elected = min(direct, key=lambda state: _cost(state, None))
+            if _better_than(elected, [best], now) is None:
+                return elected, "direct"
+        rival = _better_than(best, rivals, now) if rivals else None
+        if rival is None or rival is not self._better:
+            self._better, self._better_since = rival, now
+        if rival is None or now < self.due_at:
+            return best, ""
+        if best.loss_out < c.SUSPECT_LOSS:
+            return rival, "faster"
+        # A path that loses only what the best path carries would be elected again and again.
+        best.note_lost_election(now, is_again=now < self._chosen_at + c.HELD_BACK_MOST_S)
+        return rival, "loss"
+
+
+def _better_than(best: PathState, rivals: list[PathState], now: float) -> PathState | None:
+    """The best of the rivals, if its cost is lower by enough."""
+    lags = {state: lag for state in (best, *rivals) if (lag := state.lag_s(now)) is not None}
+    shown = lags if len(lags) > len(rivals) else None  # lags are comparable only if all are known
+    rival = min(rivals, key=lambda state: _cost(state, shown))
+    old, new = _cost(best, shown), _cost(rival, shown)
+    return rival if new <= (1 - c.BETTER_SHARE) * old and new <= old - c.BETTER_BY_S else None
+
+
+def _cost(state: PathState, lags: dict[PathState, float] | None) -> float:
+    """What is compared, in seconds: one-way delay, and a penalty for loss."""
+    delay_s = (state.srtt_s or 0.0) / 2 if lags is None else lags[state]
+    return delay_s + c.LOSS_PENALTY_S * state.loss_out
+
 
 Route = tuple[PathState, ...]
 """The paths along which one envelope goes, the best first."""
 
 
-class BestChanged(NamedTuple):
-    """Another path is the best now."""
-
-    state: PathState
-    before: PathState
-    reason: str
-
-
-class ConditionChanged(NamedTuple):
-    """A path became usable, or went down."""
-
-    state: PathState
-    is_usable: bool
-    reason: str
-
-
-class Suspected(NamedTuple):
-    """A relayed path became suspect: the relay may have failed."""
-
-    state: PathState
-
-
-Change = BestChanged | ConditionChanged | Suspected
-
-
 class PathSet(PathSlots):
     """The paths to one peer."""
-
-    __slots__ = (
-        "_election",
-        "_idle_probe_s",
-        "_redundancy",
-        "_reported_best",
-        "_revised_at",
-        "_stream_times",
-        "active_at",
-        "echo_route",
-        "has_relayed",
-        "has_standby",
-        "is_multiple",
-        "next_at",
-        "reports_single",
-        "routes",
-        "searched_at",
-        "stream_at",
-        "stream_route",
-    )
 
     def __init__(
         self,
@@ -82,7 +107,10 @@ class PathSet(PathSlots):
         self._idle_probe_s = idle_probe_s
         self._election = Election()
         self._reported_best: PathState | None = None
-        self._revised_at = NEVER  # an update is due since then
+        self.revised_at = NEVER
+        """Slots or networks have changed: :meth:`update` is due since then, also while the peer is not up."""
+        self.slots_at = NEVER
+        """When a slot is given up: the same."""
         self.has_relayed = False
         """Whether one of them leads through a relay."""
         self.reports_single = False
@@ -90,7 +118,7 @@ class PathSet(PathSlots):
         self.has_standby = False
         """Whether there is another path than the best one, whatever its condition."""
         self.is_multiple = False
-        """Whether two paths work: then an envelope holds frames of one class."""
+        """Whether critical frames go along several paths: then an envelope holds frames of one class."""
         self.routes: dict[Class, Route] = dict.fromkeys(Class, ())
         """The paths of each class; all empty before a path is known."""
         self.echo_route: Route = ()
@@ -189,15 +217,15 @@ class PathSet(PathSlots):
         self._note_known(state)
         return state
 
-    def update(self, now: float) -> list[Change]:
-        """Judge every path, elect the best one, and set the routes and the next deadline."""
-        self._revised_at = NEVER
-        changes: list[Change] = []
+    def update(self, peer: LinkedPeer, now: float) -> list[Event]:
+        """Judge every path, elect the best one, and set the routes and the next deadline. Returns what changed."""
+        self.revised_at = NEVER
+        changes: list[Event] = []
         for state in self.states:
             was_usable = state.condition is PathCondition.USABLE
             state.check(now)
             if was_usable and state.path.is_relayed and state.condition is not PathCondition.USABLE:
-                changes.append(Suspected(state))
+                changes.append(PathSuspected(peer, state.path))
         if not any(state.works for state in self.by_path.values()):
             for state in self.by_path.values():
                 if state.is_recovering:  # the only one to answer: it need not prove itself for longer
@@ -207,30 +235,30 @@ class PathSet(PathSlots):
             is_usable = state.condition is PathCondition.USABLE
             if is_usable and state not in self._reported:
                 self._reported.add(state)
-                changes.append(ConditionChanged(state, True, state.reason))
+                changes.append(PathStateChanged(peer, state.path, True, state.reason))
             elif state.condition is PathCondition.DOWN and state in self._reported:
                 self._reported.remove(state)
-                changes.append(ConditionChanged(state, False, state.reason))
+                changes.append(PathStateChanged(peer, state.path, False, state.reason))
         for state in self.states:
-            if not state.is_configured and self._is_gone(state, now):
+            if now >= self._gone_at(state):
                 self.remove(state)
-                if state.is_validated:
-                    self._former[state.path] = now + c.FORMER_PATH_S
-                    if len(self._former) > c.LEARNED_PATHS:
-                        del self._former[next(iter(self._former))]
         before, self._reported_best = self._reported_best, self.best
         if self.best is not None and before is not None and self.best is not before:
-            changes.insert(0, BestChanged(self.best, before, reason or "session"))
+            changes.insert(0, PathChanged(peer, self.best.path, before.path, reason or "session"))
         self._set_routes(now)
         self.has_standby = self.has_several
         self.schedule(now)
         return changes
 
-    def _is_gone(self, state: PathState, now: float) -> bool:
-        """Whether a learned path gives up its slot."""
+    def _gone_at(self, state: PathState) -> float:
+        """When a path gives up its slot; infinity for one that is configured, works, or is the best."""
+        if state.is_configured:
+            return NEVER
         if state.condition is PathCondition.UNPROVEN:
-            return now >= state.since + (c.FIRST_PATH_S if state is self.best else c.QUESTION_LIFETIME_S)
-        return state.condition is PathCondition.DOWN and state is not self.best and not state.is_recovering
+            return state.since + (c.FIRST_PATH_S if state is self.best else c.QUESTION_LIFETIME_S)
+        if state.works or state is self.best:
+            return NEVER
+        return max(state.since, state.answered_at) + c.FORMER_PATH_S  # at 50 % loss a path answers, but stays down
 
     def _set_routes(self, now: float) -> None:
         best = self.best
@@ -238,19 +266,18 @@ class PathSet(PathSlots):
             self.routes, self.is_multiple = dict.fromkeys(Class, ()), False
             self.stream_route = self.echo_route = ()
             return
-        others = [state for state in self.by_path.values() if state is not best and not state.is_off]
+        others = [
+            state for state in self.by_path.values() if state is not best and state.is_validated and not state.is_off
+        ]
         self.has_relayed = any(state.path.is_relayed for state in self.by_path.values())
         if self.has_relayed:
             others = self._without_spares(best, others)
-        working = [state for state in others if state.works]
-        recent = [state for state in others if state.works or now < state.answered_at + c.COPIES_AFTER_ANSWER_S]
-        self.is_multiple = bool(recent)
+        self.is_multiple = bool(others)
         alone = (best,)
-        everywhere = (best, *recent)
-        critical = alone if self._redundancy is Redundancy.NONE else everywhere
+        critical = alone if self._redundancy is Redundancy.NONE else (best, *others)
         stream: Route = alone
         if self._redundancy is Redundancy.ALL:
-            stream = (best, *(state for state in working if not state.is_metered))
+            stream = (best, *(state for state in others if state.works and not state.is_metered))
         elif best.condition is not PathCondition.USABLE:
             is_late = best.reason != "loss"
             answering = [state for state in others if state.works or state.is_recovering]
@@ -310,7 +337,7 @@ class PathSet(PathSlots):
 
     def revise(self, now: float) -> None:
         """Slots or networks have changed: :meth:`update` is due, also if frames are sent before it."""
-        self._revised_at = self.next_at = now
+        self.revised_at = self.next_at = now
 
     def is_idle(self, now: float) -> bool:
         """Whether no frames were sent recently."""
@@ -361,14 +388,12 @@ class PathSet(PathSlots):
 
     def schedule(self, now: float) -> None:
         """Set the next deadline: a question, a judgement, or a better path that has proved itself."""
-        moments = [self._revised_at, self._election.due_at]
+        self.slots_at = min(map(self._gone_at, self.by_path.values()), default=NEVER)
+        moments = [self.revised_at, self._election.due_at, self.slots_at]
         for state in self.by_path.values():
             interval_s = NEVER if state.is_off else self.interval_s(state, now)
             state.question_at = NEVER if interval_s == NEVER else max(now, state.questioned_at + interval_s)
-            copies_until = NEVER
-            if not state.works and now < state.answered_at + c.COPIES_AFTER_ANSWER_S:
-                copies_until = state.answered_at + c.COPIES_AFTER_ANSWER_S
-            moments += [state.question_at, state.next_check(), copies_until]
+            moments += [state.question_at, state.next_check()]
             if self.has_several and state.condition is PathCondition.USABLE:
                 moments.append(state.envelope_limit.next_at)
         self.next_at = min(moments)

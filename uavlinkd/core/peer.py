@@ -7,67 +7,90 @@ Functions change it, in modules by topic: :mod:`.send`, :mod:`.receive`, :mod:`.
 from __future__ import annotations
 
 from collections import Counter, deque
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 from uavlinkd.core import constants as c
 from uavlinkd.core.constants import NEVER
 from uavlinkd.core.crypto import Entropy, KeyPair
 from uavlinkd.core.drops import Detail, DropReason
-from uavlinkd.core.echo_requests import EchoRequests
-from uavlinkd.core.group_budget import GroupShare
-from uavlinkd.core.indices import Indices
 from uavlinkd.core.initiator import Initiator, Pending
-from uavlinkd.core.limits import TokenBucket
-from uavlinkd.core.missing import MissingEnvelopes
+from uavlinkd.core.limits import GroupShare, TokenBucket
 from uavlinkd.core.outputs import Dropped, Output, PeerLost, PeerUp
-from uavlinkd.core.path import Path, SocketAddress
+from uavlinkd.core.path import Path, SocketAddress, SocketFacts
+from uavlinkd.core.path_measures import MissingEnvelopes
 from uavlinkd.core.paths import PathSet
 from uavlinkd.core.refusals import OwnRefusals, RefusalClaims
 from uavlinkd.core.session import Session
-from uavlinkd.core.sessions import Sessions
+from uavlinkd.core.sessions import EchoRequests, Indices, Sessions
 from uavlinkd.core.settings import PeerSettings, Screen
-from uavlinkd.core.socket_facts import SocketFacts
 from uavlinkd.core.timers import Timer, TimerTable
-from uavlinkd.core.traffic import Traffic
+
+
+@dataclass(slots=True)
+class Traffic:
+    """Counters that only grow, as long as the daemon runs."""
+
+    datagrams_sent: int = 0
+    """Envelopes and handshake messages; ``bytes_sent`` are theirs."""
+    bytes_sent: int = 0
+    bytes_elsewhere: int = 0
+    """Of responses to addresses where the peer is not known to be. An attacker that replays its handshakes causes
+    them, so ``bytes_sent``, which a link's budget pays for, does not include them."""
+    envelopes_sent: int = 0
+    envelopes_received: int = 0
+    bytes_received: int = 0
+    """Of the envelopes."""
+    handshakes: int = 0
+    drops: Counter[DropReason] = field(default_factory=Counter)
+    missing: int = 0
+    """Envelopes of sessions that have ended, sent by the peer and never accepted here."""
+    out_of_order: int = 0
+    """Envelopes accepted after one that was sent later."""
+    paths_unproven: int = 0
+    """Addresses from which the peer's envelopes came, and from which no question was answered."""
+    echoes_unanswered: int = 0
+    """Own echo requests without an answer in time."""
+    handshakes_unanswered: int = 0
+    """Initiations on a link that is up, without a response before the next try."""
+    cookies_taken: int = 0
+    """Cookies of a peer under load. An attacker that knows both public keys can make them too."""
+    reported: tuple[int, int] = (0, 0)
+    """Of the current session, as the peer last reported: envelopes expected there, and received."""
+
+
+class Shared(NamedTuple):
+    """What all peers of a node have in common."""
+
+    indices: Indices[tuple[Peer, Session | Pending]]
+    entropy: Entropy
+    screen: Screen
+    known: Counter[SocketAddress]
+    """How many peers proved to be at an address."""
+    facts: SocketFacts
 
 
 class Peer:
     """The link with one peer. It is compared by identity; its parts do not refer to it."""
 
-    def __init__(
-        self,
-        settings: PeerSettings,
-        identity: KeyPair,
-        indices: Indices[tuple[Peer, Session | Pending]],
-        entropy: Entropy,
-        now: float,
-        screen: Screen,
-        known: Counter[SocketAddress],
-        facts: SocketFacts,
-    ) -> None:
+    def __init__(self, settings: PeerSettings, identity: KeyPair, shared: Shared, now: float) -> None:
         self.settings = settings
         self.name = settings.name
         self.durations = timers = settings.link.timers
         self.silence_s = min(timers.echo_after_s, timers.handshake_after_s, timers.lost_after_s)
         """A silence is acted on after this, or later."""
-        self.echo_after_s, self.handshake_after_s, self.lost_after_s = (
-            timers.echo_after_s,
-            timers.handshake_after_s,
-            timers.lost_after_s,
-        )
-        """What a silence causes after each of them; longer on a slow path."""
         self.verify_interval_s = settings.link.verify_interval_s
         """Of the sessions that are made from now on."""
-        self.indices = indices
-        self.entropy = entropy
-        self.screen = screen
+        self.indices = shared.indices
+        self.entropy = shared.entropy
+        self.screen = shared.screen
         """Tells frames that may be old from those that must be new."""
         self.timers = TimerTable()
         self.traffic = Traffic()
         self.losses = MissingEnvelopes()
-        self.initiator = Initiator(settings, identity, indices, entropy, facts, now)
-        self.sessions = Sessions(indices, self.name, has_smaller_key=identity.public < settings.public_key)
-        self.echo_requests = EchoRequests()
+        self.initiator = Initiator(settings, identity, shared.indices, shared.entropy, shared.facts, now)
+        self.sessions = Sessions(shared.indices, self.name, has_smaller_key=identity.public < settings.public_key)
+        self.echo_requests = EchoRequests(shared.entropy)
         self.answers = TokenBucket(c.ANSWERS_PER_S, c.ANSWERS_BURST, now)
         """Responses that it may get without a cookie."""
         self.answers_while_up = TokenBucket(c.ANSWERS_WHILE_UP_PER_S, c.ANSWERS_BURST, now)
@@ -79,9 +102,10 @@ class Peer:
         """Of the CPU time for the groups of its suites."""
         self.remembered: deque[bytes] = deque()
         """Ephemerals of its initiations, the oldest first."""
-        self.paths = PathSet(settings.link.redundancy, settings.link.idle_probe_s, known, facts)
+        self.paths = PathSet(settings.link.redundancy, settings.link.idle_probe_s, shared.known, shared.facts)
         """Where the peer is, or may be."""
         self.paths.reports_single = bool(settings.link.features & c.FEATURE_RECORDS)
+        self.set_waits()
         self.is_up = False
         self.offered_at = -NEVER
         """When the features changed that this side offers."""
@@ -183,7 +207,7 @@ class Peer:
         return min(wanted_at, self.unanswered_since + self.handshake_after_s)
 
     def set_waits(self) -> None:
-        """Set how long to wait for an answer: the durations of the configuration, longer on a slow path."""
+        """Set what a silence causes, and after how long: the configured durations, longer on a slow path."""
         durations, round_trip_s = self.durations, self.paths.round_trip_s
         self.echo_after_s = max(durations.echo_after_s, c.ECHO_ROUND_TRIPS * round_trip_s)
         self.handshake_after_s = max(durations.handshake_after_s, c.HANDSHAKE_ROUND_TRIPS * round_trip_s)
@@ -196,7 +220,9 @@ class Peer:
     def set_paths_timer(self) -> None:
         """Set when paths are judged or questioned. A peer that is not up is looked for by handshakes instead."""
         is_probed = self.is_up and self.sending_session() is not None
-        self.timers.set(Timer.PATHS, self.paths.next_at if is_probed else NEVER)
+        self.timers.set(
+            Timer.PATHS, self.paths.next_at if is_probed else min(self.paths.revised_at, self.paths.slots_at)
+        )
 
     def new_question(self) -> int:
         """An unpredictable question, which is not 0."""

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from uavlinkd.core import constants as c
 from uavlinkd.core.drops import DropReason
-from uavlinkd.core.outputs import Output, PathChanged, PathStateChanged, PathSuspected
+from uavlinkd.core.outputs import Output
 from uavlinkd.core.path import Path
 from uavlinkd.core.path_state import PathCondition, PathState
-from uavlinkd.core.paths import BestChanged, Suspected
 from uavlinkd.core.peer import Peer
-from uavlinkd.core.probe import ANSWER_BYTES, PROBE, QUESTION_BYTES, Probe, parse_probe
+from uavlinkd.core.probe import ANSWER_BYTES, QUESTION_BYTES, Probe
 from uavlinkd.core.send import seal
 from uavlinkd.core.session import Session
 from uavlinkd.core.sessions import Unconfirmed
@@ -17,15 +16,7 @@ from uavlinkd.core.sessions import Unconfirmed
 
 def update(peer: Peer, now: float) -> list[Output]:
     """Judge the paths, and set when to do so again."""
-    out: list[Output] = []
-    for change in peer.paths.update(now):
-        path = change.state.path
-        if isinstance(change, Suspected):
-            out.append(PathSuspected(peer, path))
-        elif isinstance(change, BestChanged):
-            out.append(PathChanged(peer, path, change.before.path, change.reason))
-        else:
-            out.append(PathStateChanged(peer, path, change.is_usable, change.reason))
+    out: list[Output] = [*peer.paths.update(peer, now)]
     peer.traffic.paths_unproven += peer.paths.take_unanswered()
     peer.set_paths_timer()
     follow_paths(peer, now)
@@ -79,6 +70,14 @@ def ask(peer: Peer, session: Session, state: PathState, now: float) -> list[Outp
     return _send(peer, session, state, peer.new_question(), 0, now)
 
 
+def wants_question(state: PathState, now: float, least_s: float = 0.0) -> bool:
+    """Whether to ask along a path because an envelope came along it: it does not work here, and may now.
+
+    ``least_s``: between questions that are datagrams of their own, if the network has a budget.
+    """
+    return not state.works and now >= state.questioned_at + max(c.PROBE_FAST_S, least_s)
+
+
 def ask_candidates(peer: Peer, now: float) -> list[Output]:
     """Send a question to each candidate, as far as the peer's bucket allows. README.md, section 22."""
     session = peer.sending_session()
@@ -103,54 +102,37 @@ def learn(peer: Peer, path: Path, now: float) -> PathState:
     return state
 
 
-def receive_probe(peer: Peer, session: Session, probe: Probe, state: PathState, now: float) -> list[Output]:
-    """Note the report, take the answer, and answer the question along the path that it came by."""
+def receive_probe(
+    peer: Peer, session: Session, probe: Probe, state: PathState, now: float, *, is_copy: bool = False
+) -> list[Output]:
+    """Note the report, take the answer, and answer the question along the path that it came by.
+
+    ``is_copy``: it arrived along another path before, because a sender that is faster than the peer copied it. That
+    sender could keep every question along the peer's own path from being answered, so a question is answered once
+    along each path. The counts belong to one path, and it is unknown which: they are ignored.
+    """
     out: list[Output] = []
-    is_current = session is peer.sessions.current
-    if is_current:
+    counts = session is peer.sessions.current and not is_copy
+    if counts:
         lost, age_s = state.receive_report(probe, now), now - session.created_at
         peer.losses.note_report(lost, now, age_s, asks=probe.question != 0)
     if probe.answer:
         is_first = not state.is_validated
-        round_trip_s = state.receive_answer(probe.answer, probe.received if is_current else None, now)
-        if round_trip_s is None:
+        round_trip_s = state.receive_answer(probe.answer, probe.received if counts else None, now)
+        if round_trip_s is not None:
+            if peer.round_trip_s is None or not peer.paths.has_several:
+                peer.round_trip_s = round_trip_s
+            peer.paths.note_answer(state, now, is_first=is_first)
+        elif not is_copy:
             out.append(peer.drop_datagram(DropReason.UNEXPECTED_ANSWER, state.path))
-        else:
-            _note_answer(peer, state, round_trip_s, now, is_first=is_first)
-    if probe.question:
+    if probe.question and not (is_copy and probe.question == state.copied_question):
+        if is_copy:
+            state.copied_question = probe.question
         # A path that does not work here carried a question: it is asked in the answer, if it may get the bytes.
-        asks = not state.works and now >= state.questioned_at + c.PROBE_FAST_S
-        asks = asks and state.allows(session.envelope_bytes(QUESTION_BYTES))
+        asks = not is_copy and wants_question(state, now) and state.allows(session.envelope_bytes(QUESTION_BYTES))
         if asks or state.allows(session.envelope_bytes(ANSWER_BYTES)):
             out += _send(peer, session, state, peer.new_question() if asks else 0, probe.question, now)
     return out + update(peer, now)
-
-
-def receive_copy(peer: Peer, session: Session, payload: bytes, state: PathState, now: float) -> list[Output]:
-    """Take a probe that arrived along another path before: a sender that is faster than the peer copied it.
-
-    Otherwise it could keep every question along the peer's own path from being answered. A question is answered along
-    each path once. The counts belong to one path, and it is unknown which: they are ignored.
-    """
-    parsed = parse_probe(payload) if payload[0] == PROBE else None
-    if parsed is None:
-        return []
-    probe, _ = parsed
-    out: list[Output] = []
-    is_first = not state.is_validated
-    if probe.answer and (round_trip_s := state.receive_answer(probe.answer, None, now)) is not None:
-        _note_answer(peer, state, round_trip_s, now, is_first=is_first)
-    if probe.question and probe.question != state.copied_question:
-        state.copied_question = probe.question
-        if state.allows(session.envelope_bytes(ANSWER_BYTES)):
-            out += _send(peer, session, state, 0, probe.question, now)
-    return out + update(peer, now)
-
-
-def _note_answer(peer: Peer, state: PathState, round_trip_s: float, now: float, *, is_first: bool) -> None:
-    if peer.round_trip_s is None or not peer.paths.has_several:
-        peer.round_trip_s = round_trip_s
-    peer.paths.note_answer(state, now, is_first=is_first)
 
 
 def handle_timeout(peer: Peer, now: float) -> list[Output]:

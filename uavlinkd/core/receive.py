@@ -2,37 +2,58 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+from typing import NamedTuple
+
 from uavlinkd.core import constants as c
 from uavlinkd.core import freshness, probing, wire
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.establish import adopt, receive_close
 from uavlinkd.core.outputs import Deliver, Output, RecordReceived
 from uavlinkd.core.path import Path
-from uavlinkd.core.path_state import PathState
+from uavlinkd.core.path_state import PathCondition, PathState
+from uavlinkd.core.paths import Route
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.probe import ANSWER_BYTES, PROBE, QUESTION_BYTES
 from uavlinkd.core.refusals import RefusalReport
 from uavlinkd.core.relay_records import parse_record
-from uavlinkd.core.send import send_echo
+from uavlinkd.core.send import may_echo, send_echo
 from uavlinkd.core.session import Session
 
 _PROBE = bytes((PROBE,))
+_ANSWERED_BYTES = ANSWER_BYTES, QUESTION_BYTES, wire.ECHO_REQUEST_BYTES
+"""Payloads of these lengths may want an answer along each path by which they come."""
+
+
+class Arrived(NamedTuple):
+    """An authentic control record: where and when it arrived."""
+
+    peer: Peer
+    session: Session
+    counter: int
+    state: PathState
+    now: float
+    is_new: bool
+    """Whether its envelope is known to be new."""
+    is_superseded: bool
+    """Whether the peer has been sending on newer keys for a while."""
 
 
 def receive_envelope(
-    peer: Peer, session: Session, datagram: bytes, header_bytes: int, counter: int, path: Path, now: float
+    peer: Peer, session: Session, datagram: bytes, header: tuple[int, int, int], path: Path, now: float
 ) -> list[Output]:
-    """Open an envelope and act on it.
+    """Open an envelope and act on it. ``header``: as :func:`wire.parse_envelope_header` returns it.
 
     Raises:
         Drop: as :meth:`Session.open`, or ``REPLAYED``; then nothing was changed.
     """
+    _, counter, header_bytes = header
     payload = session.open(datagram, header_bytes, counter, now)
     out: list[Output] = []
     sessions, traffic = peer.sessions, peer.traffic
     state, size = peer.paths.by_path.get(path), len(datagram)
     if payload is None:
-        return _receive_copy(peer, session, path, datagram, header_bytes, counter, now)
+        return _receive_copy(peer, session, datagram, header, path, now)
     traffic.envelopes_received += 1
     traffic.bytes_received += size
     if session.local_index in sessions.unconfirmed:
@@ -65,16 +86,18 @@ def receive_envelope(
 
     if counter != session.window.highest:
         traffic.out_of_order += 1
-    if is_candidate and payload[:1] != _PROBE:
-        if session is sessions.current:
+    if state.condition is not PathCondition.USABLE and payload[:1] != _PROBE:
+        is_asked = peer.paths.has_several or not state.is_configured  # else by echo requests
+        least_s = peer.paths.facts.least_probe_s(path)
+        if is_asked and session is sessions.current and probing.wants_question(state, now, least_s):
             out += probing.ask(peer, session, state, now)
-        out += probing.update(peer, now)
+        if is_candidate:
+            out += probing.update(peer, now)
     if not payload:
         return out
     if payload[0] < wire.FRAMES_FROM:
-        controlled, payload = _receive_control(
-            peer, session, counter, payload, state, now, is_new=is_new, is_superseded=is_superseded
-        )
+        arrived = Arrived(peer, session, counter, state, now, is_new, is_superseded)
+        controlled, payload = _receive_control(arrived, payload)
         out += controlled
         if not payload:
             return out
@@ -90,25 +113,20 @@ def receive_envelope(
 
 
 def _receive_copy(
-    peer: Peer,
-    session: Session,
-    path: Path,
-    datagram: bytes,
-    header_bytes: int,
-    counter: int,
-    now: float,
+    peer: Peer, session: Session, datagram: bytes, header: tuple[int, int, int], path: Path, now: float
 ) -> list[Output]:
     """Count an authentic envelope that was accepted before. Of a recent one, learn how much later its path is.
 
-    A recent probe still asks and answers along this path: see :func:`probing.receive_copy`.
+    A recent probe still asks and answers along this path: see :func:`probing.receive_probe`.
 
     Raises:
         Drop: ``REPLAYED``.
     """
     out: list[Output] = []
+    _, counter, header_bytes = header
     is_recent = session.is_recent(counter, now)
     state = peer.paths.find(path)
-    if not is_recent and not (peer.paths.was_validated(path, now) if state is None else state.is_validated):
+    if not is_recent and (state is None or not state.is_validated):
         raise Drop(DropReason.REPLAYED)
     if state is not None:
         state.datagrams_received += 1
@@ -126,59 +144,60 @@ def _receive_copy(
                     if is_recent and first is not None:
                         first.note_copy(0.0, now)
                         state.note_copy(lag_s, now)
-                if is_recent and len(datagram) - header_bytes - session.tag_bytes in (ANSWER_BYTES, QUESTION_BYTES):
-                    payload = session.reopen(datagram, header_bytes, counter)
-                    out = probing.receive_copy(peer, session, payload, state, now)
+                if is_recent and len(datagram) - header_bytes - session.tag_bytes in _ANSWERED_BYTES:
+                    out = _answer_copy(peer, session, session.reopen(datagram, header_bytes, counter), state, now)
     peer.traffic.drops[DropReason.DUPLICATE if is_recent else DropReason.LATE_COPY] += 1
     return out
 
 
-def _receive_control(
-    peer: Peer,
-    session: Session,
-    counter: int,
-    payload: bytes,
-    state: PathState,
-    now: float,
-    *,
-    is_new: bool,
-    is_superseded: bool,
-) -> tuple[list[Output], bytes]:
+def _answer_copy(peer: Peer, session: Session, payload: bytes, state: PathState, now: float) -> list[Output]:
+    """Answer a request or a probe along each path by which it comes: the others may not carry the answer."""
+    with suppress(Drop):  # it holds frames, or was dropped when it came first
+        match wire.parse_control(payload):
+            case wire.ProbeAndFrames(probe):
+                return probing.receive_probe(peer, session, probe, state, now, is_copy=True)
+            case wire.Echo(is_reply=False) as request if may_echo(peer, state, now, is_reply=True):
+                return _reply(peer, session, request, (state,), now)
+    return []
+
+
+def _receive_control(arrived: Arrived, payload: bytes) -> tuple[list[Output], bytes]:
     """Act on a control record. Returns the frames behind it too."""
+    peer, session, state, now = arrived.peer, arrived.session, arrived.state, arrived.now
     try:
         control = wire.parse_control(payload)
     except Drop as drop:
         return [peer.drop_datagram(drop.reason, state.path)], b""
     match control:
         case wire.Echo() as echo:
-            return _receive_echo(peer, session, echo, now), b""
+            return _receive_echo(peer, session, echo, state, now), b""
         case wire.ProbeAndFrames(probe, frames):
             return probing.receive_probe(peer, session, probe, state, now), frames
         case wire.Close():
             return receive_close(peer, session, now), b""
         case wire.SealedRecord(sealed):
-            return _receive_record(peer, session, counter, sealed, state, is_superseded=is_superseded), b""
+            return _receive_record(arrived, sealed), b""
         case RefusalReport():  # pragma: no branch  # the last kind there is
             if not session.parameters.features & c.FEATURE_REFUSALS:
                 return [peer.drop_datagram(DropReason.BAD_CONTROL, state.path)], b""
-            if is_superseded:
+            if arrived.is_superseded:
                 return [], b""
-            return freshness.receive_report(peer, session, counter, control, now, is_new=is_new), b""
+            out = freshness.receive_report(peer, session, arrived.counter, control, now, is_new=arrived.is_new)
+            return out, b""
 
 
-def _receive_record(
-    peer: Peer, session: Session, counter: int, sealed: bytes, state: PathState, *, is_superseded: bool
-) -> list[Output]:
+def _receive_record(arrived: Arrived, sealed: bytes) -> list[Output]:
+    peer, session, path = arrived.peer, arrived.session, arrived.state.path
     try:
-        record = parse_record(session.open_record(counter, sealed))
+        opened = parse_record(session.open_record(arrived.counter, sealed))
     except Drop as drop:
-        return [peer.drop_datagram(drop.reason, state.path)]
-    if is_superseded:
-        return [peer.drop_datagram(DropReason.OLD_RECORD, state.path)]
-    return [RecordReceived(peer, state.path, record, session.order_base + counter)]
+        return [peer.drop_datagram(drop.reason, path)]
+    if arrived.is_superseded:
+        return [peer.drop_datagram(DropReason.OLD_RECORD, path)]
+    return [RecordReceived(peer, path, opened, session.order_base + arrived.counter)]
 
 
-def _receive_echo(peer: Peer, session: Session, echo: wire.Echo, now: float) -> list[Output]:
+def _receive_echo(peer: Peer, session: Session, echo: wire.Echo, state: PathState, now: float) -> list[Output]:
     # A report of more than was sent, or than was expected, is a lie.
     if echo.received <= echo.expected <= session.send_counter:
         if session is peer.sessions.current:
@@ -190,8 +209,13 @@ def _receive_echo(peer: Peer, session: Session, echo: wire.Echo, now: float) -> 
             session.verification.extend(now)
     if echo.is_reply:
         return freshness.receive_answer(peer, echo, now)
+    route = peer.paths.echo_route
+    return _reply(peer, session, echo, route if state in route else (*route, state), now)
+
+
+def _reply(peer: Peer, session: Session, request: wire.Echo, route: Route, now: float) -> list[Output]:
     # On the session that sends, whichever session the request came on: otherwise a peer that never had our newest
     # session would go on receiving on an older one, and never initiate for what it misses.
     current = peer.sessions.current or session
-    reply = wire.Echo(True, echo.token, current.received, current.expected, session.fresh(now))
-    return send_echo(peer, current, reply, peer.paths.echo_route, now)
+    reply = wire.Echo(True, request.token, current.received, current.expected, session.fresh(now))
+    return send_echo(peer, current, reply, route, now)

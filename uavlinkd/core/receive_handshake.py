@@ -5,18 +5,16 @@ from __future__ import annotations
 from uavlinkd.core import constants as c
 from uavlinkd.core import establish, handshake, wire
 from uavlinkd.core.admission import Admission, CookieRequired, Message
-from uavlinkd.core.cookie import CookieJar, MacKeys, mac1_of
+from uavlinkd.core.cookie import CookieJar, MacKeys, mac1_of, version_of
 from uavlinkd.core.crypto import Entropy, KeyPair, Secret, equal
 from uavlinkd.core.drops import Drop, DropReason
-from uavlinkd.core.indices import Indices
 from uavlinkd.core.initiator import Pending
 from uavlinkd.core.outputs import Output
-from uavlinkd.core.path import Path
+from uavlinkd.core.path import Path, SocketFacts
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.session import Session
-from uavlinkd.core.socket_facts import SocketFacts
+from uavlinkd.core.sessions import Indices
 from uavlinkd.core.timers import Schedule
-from uavlinkd.core.versions import version_of
 
 _MAVLINK_STARTS = frozenset((0xFD, 0xFE))
 _NOT_OUR_VERSION = frozenset((DropReason.MALFORMED, DropReason.BAD_MAC1))
@@ -109,7 +107,7 @@ class HandshakeReceiver:
             self._facts.check_network(sender, path)
             return self._answer_copy(sender, datagram, path, now)
         message = Message(datagram, initiation.sender_index, path, cookies)
-        self.admission.admit_initiation(message, now)
+        self.admission.admit(message, now, is_response=False)
         received = handshake.receive_initiation(identity, initiation)
         peer = self.peers.get((identity.public, received.public_key))
         if peer is None:
@@ -157,7 +155,8 @@ class HandshakeReceiver:
             raise Drop(DropReason.DUPLICATE if is_copy else DropReason.UNEXPECTED_RESPONSE)
         self._facts.check_network(peer, path)
         _, cookies = self._addressed(datagram)
-        self.admission.admit_response(Message(datagram, response.sender_index, path, cookies), now)
+        message = Message(datagram, response.sender_index, path, cookies)
+        self.admission.admit(message, now, is_response=True)
         out = establish.receive_response(peer, pending, response, path, now)
         self._schedule.update(peer)
         return out

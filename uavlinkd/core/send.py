@@ -9,8 +9,8 @@ from uavlinkd.core import wire
 from uavlinkd.core.constants import NEVER
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.outputs import Output, Transmit
-from uavlinkd.core.path import Path
-from uavlinkd.core.path_loss import NO_REPEATS
+from uavlinkd.core.path import FREE, Path
+from uavlinkd.core.path_measures import NO_REPEATS
 from uavlinkd.core.path_state import PathState
 from uavlinkd.core.paths import Route
 from uavlinkd.core.peer import Peer
@@ -19,7 +19,6 @@ from uavlinkd.core.refusals import Refused
 from uavlinkd.core.relay_records import Record
 from uavlinkd.core.session import Session
 from uavlinkd.core.settings import Class
-from uavlinkd.core.socket_facts import FREE
 from uavlinkd.core.timers import Timer
 
 
@@ -93,15 +92,14 @@ def seal(
     now: float,
     *,
     is_answer: bool = False,
-    is_record: bool = False,
 ) -> list[Output]:
-    """Send an envelope along each path of a route, the same bytes. A record is encrypted in every mode.
+    """Send an envelope along each path of a route, the same bytes.
 
     It expects an answer, unless it is one: two ends must not answer each other endlessly.
     """
     if session.send_counter >= c.SESSION_ENVELOPE_LIMIT:
         return peer.drop(DropReason.NO_SESSION, 1)
-    datagram = session.seal_record(payload, now) if is_record else session.seal(payload, now)
+    datagram = session.seal(payload, now)
     peer.sent_at = now
     if peer.unanswered_since is None and not is_answer:
         peer.unanswered_since = now
@@ -132,10 +130,7 @@ def transmit(peer: Peer, datagram: bytes, path: Path, *, is_copy: bool = False) 
     if state is None:
         peer.traffic.bytes_elsewhere += len(datagram)
     else:
-        state.datagrams_sent += 1
-        state.bytes_sent += len(datagram)
-        peer.traffic.datagrams_sent += 1
-        peer.traffic.bytes_sent += len(datagram)
+        _count(peer, state, 1, len(datagram))
     return [Transmit(datagram, path, is_copy)]
 
 
@@ -144,22 +139,23 @@ def recount(peer: Peer, path: Path, datagrams: int, size: int) -> None:
     state = peer.paths.find(path)
     if state is not None:
         state.sent = max(0, state.sent + datagrams)
-        state.datagrams_sent += datagrams
-        state.bytes_sent += size
-        peer.traffic.datagrams_sent += datagrams
-        peer.traffic.bytes_sent += size
+        _count(peer, state, datagrams, size)
+
+
+def _count(peer: Peer, state: PathState, datagrams: int, size: int) -> None:
+    state.datagrams_sent += datagrams
+    state.bytes_sent += size
+    peer.traffic.datagrams_sent += datagrams
+    peer.traffic.bytes_sent += size
 
 
 def note_repeat(peer: Peer, path: Path, number: int, datagram: bytes) -> None:
     """Count one more transmission of an envelope along a path. The loss of a path is that of the current session."""
-    state, session, size = peer.paths.find(path), peer.sessions.current, len(datagram)
+    state, session = peer.paths.find(path), peer.sessions.current
     if state is not None:
         if session is not None and wire.claimed_receiver_index(datagram) == session.remote_index:
             state.note_repeat(number)
-        state.datagrams_sent += 1
-        state.bytes_sent += size
-        peer.traffic.datagrams_sent += 1
-        peer.traffic.bytes_sent += size
+        _count(peer, state, 1, len(datagram))
 
 
 def report_refusals(peer: Peer, changed: Iterable[Refused], now: float) -> list[Output]:
@@ -187,17 +183,18 @@ def send_record(peer: Peer, path: Path, record: Record, now: float) -> list[Outp
         return []
     if state is None or not (state.works or state is peer.paths.best):
         return []
-    return seal(peer, session, record.encode(), (state,), now, is_answer=True, is_record=True)
+    return seal(peer, session, session.sealed_record(record.encode()), (state,), now, is_answer=True)
 
 
 def send_echo(peer: Peer, session: Session, echo: wire.Echo, route: Route, now: float) -> list[Output]:
-    """Send an echo request or a reply. Of its copies, a slow path gets as many as it would as the best path."""
+    """Send an echo request or a reply."""
     if len(route) > 1:
-        route = (route[0], *(state for state in route[1:] if _may_echo(peer, state, now, is_reply=echo.is_reply)))
+        route = (route[0], *(state for state in route[1:] if may_echo(peer, state, now, is_reply=echo.is_reply)))
     return seal(peer, session, echo.encode(), route, now, is_answer=echo.is_reply)
 
 
-def _may_echo(peer: Peer, state: PathState, now: float, *, is_reply: bool) -> bool:
+def may_echo(peer: Peer, state: PathState, now: float, *, is_reply: bool) -> bool:
+    """Whether a path gets a copy of an echo request, or of a reply: a slow one, no more than it would as the best."""
     pace = peer.paths.facts.pace(state.path)
     if pace is FREE:
         return True
@@ -208,13 +205,14 @@ def _may_echo(peer: Peer, state: PathState, now: float, *, is_reply: bool) -> bo
 
 
 def ask_for_echo(peer: Peer, session: Session, now: float, route: Route = ()) -> list[Output]:
-    """Send an echo request about a session on it, along every usable path unless another ``route`` is given.
+    """Send an echo request about a session on it, along every proven path unless another ``route`` is given.
 
     A request that is repeated if it is lost goes along the best path first: ``paths.echo_route``.
     """
     peer.timers.stop(Timer.PROBE)  # until traffic asks for another
     peer.traffic.echoes_unanswered += peer.echo_requests.expire(now)
-    session.held.asked(now)
+    if not route:
+        session.held.asked(now)
     session.verification.asked(now)
     peer.set_freshness()
     repeats = NO_REPEATS if peer.paths.best is None else peer.paths.best.repeats

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from uavlinkd.core import constants as c
 from uavlinkd.core import wire
-from uavlinkd.core.arrivals import Arrivals
 from uavlinkd.core.constants import NEVER
-from uavlinkd.core.counter_history import CounterHistory
+from uavlinkd.core.counters import Arrivals, CounterHistory, ReplayWindow
 from uavlinkd.core.crypto import AeadKey, MacKey, Secret, equal, hkdf_expand
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.handshake import Keys
+from uavlinkd.core.path import Pace
 from uavlinkd.core.refusals import RefusalReport
-from uavlinkd.core.replay import ReplayWindow
-from uavlinkd.core.socket_facts import Pace
-from uavlinkd.core.suites import Suite
 from uavlinkd.core.verification import HeldFrames, Verification
 from uavlinkd.core.wire import Parameters
 
@@ -56,52 +53,21 @@ class Session:
     Every envelope is accepted at most once, and leaves no trace unless its tag verifies.
     """
 
-    __slots__ = (
-        "_floor",
-        "_receive",
-        "_received_history",
-        "_record_keys",
-        "_send",
-        "_sent_history",
-        "arrivals",
-        "candidate_questions",
-        "created_at",
-        "first_received_at",
-        "held",
-        "is_initiator",
-        "local_index",
-        "max_envelope",
-        "order_base",
-        "parameters",
-        "payload_limit",
-        "received",
-        "reject_at",
-        "remote_index",
-        "send_counter",
-        "suite",
-        "tag_bytes",
-        "trusted_until",
-        "unverified_report",
-        "verification",
-        "window",
-    )
-
     def __init__(
         self,
-        suite: Suite,
         keys: Keys,
         local_index: int,
         now: float,
         lifetime_s: float,
+        verify_interval_s: float = c.VERIFY_INTERVAL_S,
         *,
         is_initiator: bool,
-        verify_interval_s: float = c.VERIFY_INTERVAL_S,
     ) -> None:
         first = derive(keys.parameters, keys.transport[0], keys.handshake_hash, from_initiator=True)
         second = derive(keys.parameters, keys.transport[1], keys.handshake_hash, from_initiator=False)
         self._send, self._receive = (first, second) if is_initiator else (second, first)
         self._record_keys = _record_keys(keys, is_initiator=is_initiator)  # to the peer, and from it
-        self.suite = suite
+        self.suite = keys.suite
         self.parameters = keys.parameters
         self.is_initiator = is_initiator
         self.local_index = local_index
@@ -196,14 +162,17 @@ class Session:
         mac.update(signed)
         return signed + mac.finalize()[: self.tag_bytes]
 
-    def seal_record(self, record: bytes, now: float) -> bytes:
-        """The next envelope around a record, which is encrypted in every mode.
+    def sealed_record(self, record: bytes) -> bytes:
+        """The payload of the next envelope around a record, which is encrypted in every mode.
 
-        Both ends must have set :data:`c.FEATURE_RECORDS`. Its counter is the nonce, so it must be sealed at once.
+        Both ends must have set :data:`c.FEATURE_RECORDS`. The counter is the nonce: :meth:`seal` must follow at once.
         """
         assert self._record_keys is not None
-        sealed = self._record_keys[0].seal(self.send_counter, record, b"")
-        return self.seal(wire.SealedRecord(sealed).encode(), now)
+        return wire.SealedRecord(self._record_keys[0].seal(self.send_counter, record, b"")).encode()
+
+    def seal_record(self, record: bytes, now: float) -> bytes:
+        """The next envelope around a record."""
+        return self.seal(self.sealed_record(record), now)
 
     def open_record(self, counter: int, sealed: bytes) -> bytes:
         """The record in an authentic envelope with this counter.

@@ -11,11 +11,72 @@ the highest that they hold, so they settle on the same one without a word about 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Generic, TypeVar
 
 from uavlinkd.core import constants as c
-from uavlinkd.core.indices import Indices
+from uavlinkd.core.constants import INDEX_QUARANTINE_S, QUARANTINED_PER_PEER
+from uavlinkd.core.crypto import Entropy
+from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.path import Path
+from uavlinkd.core.path_measures import NO_REPEATS, Repeats
 from uavlinkd.core.session import Session
+
+_DRAWS = 64  # with half of all indices taken, all draws fail once in 2^64
+
+Owner_co = TypeVar("Owner_co", covariant=True)
+
+
+class Indices(Generic[Owner_co]):
+    """What each index leads to; unpredictable new ones; a quarantine for those that carried a session."""
+
+    def __init__(self, entropy: Entropy) -> None:
+        self.owners: dict[int, Owner_co] = {}
+        self._entropy = entropy
+        self._quarantine: dict[int, tuple[float, str]] = {}  # free again at, and whose; the oldest is first
+        self._quarantined_of: dict[str, dict[int, None]] = {}  # the same by peer
+
+    def pick(self, now: float) -> int:
+        """An index without an owner: 1 to 65535. It stays free until it is put into :attr:`owners`.
+
+        Raises:
+            Drop: ``NO_FREE_INDEX``.
+        """
+        self._release(now)
+        for _ in range(_DRAWS):
+            index = int.from_bytes(self._entropy(2), "big")
+            if index and index not in self.owners and index not in self._quarantine:
+                return index
+        raise Drop(DropReason.NO_FREE_INDEX)
+
+    def retire(self, index: int, peer: str, now: float) -> None:
+        """The session of ``peer`` at ``index`` has ended; what still arrives for it is late."""
+        self.owners.pop(index, None)
+        self._quarantine[index] = now + INDEX_QUARANTINE_S, peer
+        quarantined = self._quarantined_of.setdefault(peer, {})
+        quarantined[index] = None
+        if len(quarantined) > QUARANTINED_PER_PEER:
+            self._free(next(iter(quarantined)))
+
+    def forget(self, index: int) -> None:
+        """Free an index that never carried a session."""
+        self.owners.pop(index, None)
+
+    def is_quarantined(self, index: int, now: float) -> bool:
+        """Whether a session ended at ``index`` recently."""
+        return index in self._quarantine and self._quarantine[index][0] > now
+
+    def _release(self, now: float) -> None:
+        while self._quarantine:
+            oldest = next(iter(self._quarantine))
+            if self._quarantine[oldest][0] > now:
+                return
+            self._free(oldest)
+
+    def _free(self, index: int) -> None:
+        _, peer = self._quarantine.pop(index)
+        del self._quarantined_of[peer][index]
+        if not self._quarantined_of[peer]:
+            del self._quarantined_of[peer]
 
 
 @dataclass(slots=True)
@@ -45,7 +106,7 @@ class Unconfirmed:
 
 
 class Sessions:
-    """At most :data:`c.USABLE_PER_PEER` confirmed and :data:`c.UNCONFIRMED_PER_PEER` unconfirmed sessions.
+    """At most :data:`c.USABLE_PER_PEER` confirmed and twice :data:`c.UNCONFIRMED_PER_KIND` unconfirmed sessions.
 
     The table of indices, shared by all peers, is kept in step: an index that carried a confirmed session goes into
     quarantine, any other is free at once.
@@ -71,11 +132,11 @@ class Sessions:
         return 0 if self.current is None else self.current.parameters.generation
 
     def wait(self, unconfirmed: Unconfirmed) -> None:
-        """Keep a session until it is confirmed; when there are too many, the oldest that was not expected goes."""
-        while len(self.unconfirmed) >= c.UNCONFIRMED_PER_PEER:
-            oldest = next(iter(self.unconfirmed))
-            unexpected = (index for index, waiting in self.unconfirmed.items() if not waiting.is_expected)
-            self._forget(next(unexpected, oldest))
+        """Keep a session until it is confirmed. Too many of its kind, expected or not: the oldest of them goes."""
+        is_expected = unconfirmed.is_expected
+        alike = [index for index, other in self.unconfirmed.items() if other.is_expected == is_expected]
+        if len(alike) >= c.UNCONFIRMED_PER_KIND:
+            self._forget(alike[0])
         self.unconfirmed[unconfirmed.session.local_index] = unconfirmed
 
     def confirm(self, session: Session, now: float) -> list[Session]:
@@ -144,3 +205,69 @@ class Sessions:
     def _forget(self, index: int) -> None:
         del self.unconfirmed[index]
         self._indices.forget(index)
+
+
+@dataclass(slots=True)
+class EchoRequest:
+    """An echo request that was sent."""
+
+    session: Session | None
+    """On which it was sent; None if that has ended."""
+    sent_at: float
+    sent: int
+    """Envelopes of the session until then, the request included, without questions to candidates."""
+    repeats: Repeats
+    """Of them, along the best path."""
+    is_answered: bool = False
+
+
+class EchoRequests:
+    """The echo requests to one peer, on all its sessions.
+
+    A request older than :data:`c.LATE_AFTER_S` is forgotten: an answer to it is late, however many were sent since.
+    Tokens begin at a random one: a request from before a restart, which an attacker held, must not be one of them.
+    """
+
+    __slots__ = ("_by_token", "_last", "_last_answered")
+
+    def __init__(self, entropy: Entropy) -> None:
+        self._last = self._last_answered = int.from_bytes(entropy(4), "big") >> 1
+        self._by_token: dict[int, EchoRequest] = {}  # the oldest first
+
+    def __len__(self) -> int:
+        return len(self._by_token)
+
+    def add(self, session: Session, now: float, sent: int = 0, repeats: Repeats = NO_REPEATS) -> int:
+        """The token of a new request."""
+        self._last += 1
+        token = self._last % 2**32
+        self._by_token[token] = EchoRequest(session, now, sent, repeats)
+        return token
+
+    def expire(self, now: float) -> int:
+        """Forget the requests that can only be answered late. Returns how many of them were not answered."""
+        expired = [token for token, request in self._by_token.items() if request.sent_at < now - c.LATE_AFTER_S]
+        return sum(not self._by_token.pop(token).is_answered for token in expired)
+
+    def find(self, token: int) -> EchoRequest | None:
+        """The request with this token; None if it is forgotten, or never was sent."""
+        return self._by_token.get(token)
+
+    def answer(self, token: int) -> EchoRequest | None:
+        """The request that is answered now, in time; None if it was answered before, or :meth:`find` returns None."""
+        request = self._by_token.get(token)
+        if request is None or request.is_answered:
+            return None
+        request.is_answered = True
+        self._last_answered = max(self._last_answered, token)
+        return request
+
+    def forget(self, session: Session) -> None:
+        """A session has ended: an answer to a request on it measures the round trip only."""
+        for request in self._by_token.values():
+            if request.session is session:
+                request.session = None
+
+    def is_late(self, token: int) -> bool:
+        """Whether a request was sent and forgotten, and no later one was answered in time."""
+        return self._last_answered < token <= self._last and token not in self._by_token

@@ -23,7 +23,7 @@ class Class(StrEnum):
     """What a lost or late frame costs. It decides along which paths the frame goes."""
 
     CRITICAL = "critical"
-    """It must arrive: along every usable path."""
+    """It must arrive: along every proven path."""
     STREAM = "stream"
     """Another one follows: along the best path."""
     BULK = "bulk"
@@ -31,7 +31,7 @@ class Class(StrEnum):
 
 
 class Redundancy(StrEnum):
-    """Which classes are sent along every usable path."""
+    """Which classes are sent along every proven path."""
 
     CRITICAL = "critical"
     ALL = "all"
@@ -90,3 +90,8 @@ class PeerSettings:
 def previous_of(settings: PeerSettings, public_key: bytes) -> PeerSettings:
     """The same peer by its previous key, while its key changes: another peer of the node."""
     return replace(settings, name=f"{settings.name} (previous key)", public_key=public_key)
+
+
+def link_name(core_name: str) -> str:
+    """The peer as the configuration names it, of the name of a pair of keys: configured names have no spaces."""
+    return core_name.partition(" ")[0]

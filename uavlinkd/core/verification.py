@@ -1,7 +1,7 @@
 """The freshness of one session: until when its frames are known to be new, and the frames that wait for a proof.
 
 A man in the middle can hold an authentic envelope and release it when it does harm. Its tag and counter are in order.
-Envelopes that overtook it show its age (:mod:`uavlinkd.core.counter_history`). If the attacker held those back too,
+Envelopes that overtook it show its age (:mod:`uavlinkd.core.counters`). If the attacker held those back too,
 there was a silence, and frames after a silence wait until the peer has reported which of its counters are new.
 """
 
@@ -11,7 +11,7 @@ from collections import deque
 
 from uavlinkd.core import constants as c
 from uavlinkd.core.constants import NEVER
-from uavlinkd.core.socket_facts import FREE
+from uavlinkd.core.path import FREE
 
 
 class Verification:
@@ -56,7 +56,8 @@ class Verification:
         if self.due_at == NEVER:
             return
         self.ask_at = now + self._interval_s
-        repeat_at = now + c.VERIFY_REPEAT_SHARE * self._interval_s
+        is_slow = self._interval_s > c.VERIFY_INTERVAL_S
+        repeat_at = now + (c.VERIFY_REPEAT_SHARE * self._interval_s if is_slow else c.HOLD_ASK_S)
         self.due_at = max(repeat_at, self._answered_at + self._interval_s)
         self.look_at = min(self.ask_at, self.until)
 

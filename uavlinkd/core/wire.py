@@ -298,6 +298,7 @@ FRAMES_FROM = 0xF0
 ECHO_REQUEST, ECHO_REPLY, CLOSE, SEALED_RECORD = 1, 2, 5, 7
 _ECHO_REQUEST = struct.Struct(">BIII")
 _ECHO_REPLY = struct.Struct(">BIIII")
+ECHO_REQUEST_BYTES = _ECHO_REQUEST.size
 
 
 class Echo(NamedTuple):
