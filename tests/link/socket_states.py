@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+
+from uavlinkd.core.node import Node
 
 
-class SocketStateLog:
+class SocketStateLog(Node):
     """The states of sockets in the order in which they were reported, and the numbers of the metered ones."""
 
-    def __init__(self) -> None:
+    def __init__(self) -> None:  # without peers
         self.states: list[tuple[int, bool]] = []
         self.metered: list[int] = []
 
@@ -19,3 +21,9 @@ class SocketStateLog:
     def set_metered(self, sockets: Iterable[int], now: float) -> None:
         """As the core's."""
         self.metered = list(sockets)
+
+    def set_budgets(self, budgets: Mapping[int, float]) -> None:
+        """As the core's."""
+
+    def set_envelope_limits(self, limits: Mapping[int, int]) -> None:
+        """As the core's."""

@@ -30,7 +30,7 @@ from uavlinkd.endpoints.url import EndpointKind, NetworkUrl
 from uavlinkd.link.daemon import Daemon
 from uavlinkd.system.addresses import Address
 
-FROM_CLIENT_LIMIT = 15
+FROM_CLIENT_LIMIT = 13
 FROM_PEER_LIMIT = 15
 FRAMES = 60
 APART_S = 0.003
@@ -99,10 +99,12 @@ class Scene:
         ground = NetworkUrl(EndpointKind.UDPOUT, Address(*self.ground.address))
         self.right = Daemon(config("right", ground, "left", (), VEHICLE))
         await self.right.start()
-        called = tuple(self.right.peer_sockets.addresses)
+        called = tuple(self.right.parts.peer_sockets.addresses)
         self.left = Daemon(config("left", NetworkUrl(EndpointKind.UDPIN, ANY_PORT), "right", called, OPERATOR))
         await self.left.start()
-        await until(lambda: all(link.peer.is_up for link in (self.left.links["right"], self.right.links["left"])))
+        await until(
+            lambda: all(link.peer.is_up for link in (self.left.parts.links["right"], self.right.parts.links["left"]))
+        )
 
     async def stop(self) -> None:
         """Stop everything."""
@@ -131,7 +133,7 @@ def attitude(number: int) -> bytes:
 
 def endpoint_of(daemon: Daemon) -> UdpEndpoint:
     """Its only endpoint."""
-    (endpoint,) = daemon.local.endpoints
+    (endpoint,) = daemon.parts.local.endpoints
     assert isinstance(endpoint, UdpEndpoint)
     return endpoint
 
@@ -154,7 +156,7 @@ async def test_calls_per_frame(scene: Scene) -> None:
         await scene.carry(FRAMES)
     finally:
         sys.setprofile(None)
-    (link_address,) = scene.left.peer_sockets.addresses
+    (link_address,) = scene.left.parts.peer_sockets.addresses
     from_client = counter.usual_path(link_address.port)
     from_peer = counter.usual_path(endpoint_of(scene.right).address[1])
     assert len(from_client) <= FROM_CLIENT_LIMIT, "\n".join(from_client)

@@ -32,8 +32,7 @@ class Written:
             kind,
             limits or LineLimits(),
             self._write,
-            name_of=lambda key: key[1],
-            is_security=lambda key: key[0] == "bad_tag",
+            lambda key: (key[1], key[0] == "bad_tag"),
             counts_events=counts_events,
         )
 
@@ -86,15 +85,6 @@ def test_condition_that_comes_and_goes_settles(interval_s: int) -> None:
     assert len(written.lines) <= 5 + 2 * 7, "the quiet time is doubled six times"
     ended = sum(line[2] for line in written.lines if line[0] is ENDED)
     assert ended == len(range(0, 24 * int(HOUR_S), interval_s)), "the last lines have every count"
-
-
-def test_rare_condition_has_the_short_quiet_time_again() -> None:
-    """What begins again an hour after its end is new."""
-    written = Written()
-    for begin in (0.0, 2 * HOUR_S, 4 * HOUR_S):
-        written.run(("malformed", "b"), begin=begin, end=begin + 1)
-        written.run(begin=begin + 1, end=begin + QUIET_S + 1)
-    assert written.phases() == 3 * [BEGAN, ENDED]
 
 
 def test_attacker_who_changes_its_attack_all_day_causes_a_bounded_number_of_lines() -> None:
@@ -211,10 +201,3 @@ def test_flood_is_not_hidden_by_a_condition_that_is_open_already(reason: str) ->
         if second == 30 and reason == "bad_tag":
             assert written.phases() == [CONTINUED], "the flood has a line soon"
     assert len(written.lines) <= (6 if reason == "bad_tag" else 0)
-
-
-def test_looks_at_a_lasting_condition_are_not_a_flood() -> None:
-    """A finding is noted each second while it lasts."""
-    written = Written()
-    written.run(("bad_tag", "b"), begin=0, end=HOUR_S)
-    assert written.phases() == [BEGAN]

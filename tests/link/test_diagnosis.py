@@ -1,267 +1,529 @@
-"""Each cause of a link that is down is found between real daemons, and a link that works has no finding."""
+"""Each problem has its finding, and no other. Real daemons make the common ones in `tests/mistakes`."""
 
 from __future__ import annotations
 
-import asyncio
-import os
-import signal
-from collections.abc import Iterator
+import errno
+import re
+from collections.abc import Iterable
+from itertools import chain
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from tests.daemon.frames import heartbeat
-from tests.daemon.harness import Stage
-from tests.daemon.process import DaemonProcess
-from tests.daemon.test_reload import reload
-from tests.daemon.udp import Client
-from tests.link.found import findings, until_found, until_gone
-from tests.needs import need
-from uavlinkd.config import keys
-from uavlinkd.core.crypto import KeyPair
-from uavlinkd.core.indices import Indices
-from uavlinkd.core.initiator import Initiator
+from tests.daemon.frames import command_long, ground_heartbeat, heartbeat, numbered
+from tests.link.test_evidence import HOST, OWN_KEY, THERE, Scene
+from tests.samples import pack
+from tests.test_readmes import ROOT
+from uavlinkd.config import EndpointConfig, PeerConfig
+from uavlinkd.config.keys import encode_key
+from uavlinkd.core import constants as c
+from uavlinkd.core.drops import DropReason
+from uavlinkd.core.outputs import Dropped
 from uavlinkd.core.path import Path
-from uavlinkd.core.settings import PeerSettings
-from uavlinkd.core.socket_facts import SocketFacts
-from uavlinkd.lab.sim.loopback_ports import free_port, has_ipv6
-from uavlinkd.ops.causes import Cause
-from uavlinkd.ops.findings import Severity
+from uavlinkd.core.refusals import RefusalReport, Refused
+from uavlinkd.endpoints.url import parse_url
+from uavlinkd.link import diagnosis, down_problems, facts
+from uavlinkd.link.evidence import MAX_SESSIONS, OWN_FRAMES_S, History, SessionBegin
+from uavlinkd.link.peer_link import PeerLink
+from uavlinkd.link.traffic_problems import FLIPS_S, SECURITY_S, alternating
+from uavlinkd.mavlink.frames import split_payload
+from uavlinkd.mavlink.policy.gate import Refusal
+from uavlinkd.mavlink.routing import Router
+from uavlinkd.ops.findings import Finding, Severity
+
+NOW = 1.0
+ARM = mavlink.MAV_CMD_COMPONENT_ARM_DISARM
+STRANGER = ("198.51.100.7", 5790)
 
 
-def initiation(private_key: str, to: DaemonProcess) -> bytes:
-    """An initiation to a daemon by the holder of a key."""
-    settings = PeerSettings("target", keys.decode_key(to.public_key))
-    identity = KeyPair(keys.decode_key(private_key))
-    initiator = Initiator(settings, identity, Indices[object](os.urandom), os.urandom, SocketFacts(), 0.0)
-    _, [(datagram, _)] = initiator.initiate(1, [Path(0, ("127.0.0.1", 1))], 1, 0.0)
-    return datagram
+class Daemon(Scene):
+    """A daemon with the peer drone1, which is down, and no endpoint."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.now = NOW
+        self.sockets: Any = SimpleNamespace(
+            unresolved=lambda name: set[str](),
+            without_socket=set(),
+            absent_addresses=list,
+            absent_networks=dict,
+            networks=None,
+            is_own=lambda address: False,
+            serial=SimpleNamespace(networks=[]),
+        )
+        self.history = History(0.0)
+        self.router = Router[Any]()
+        self.local: list[Any] = []
+        self.parts: Any = SimpleNamespace(
+            config=SimpleNamespace(
+                name="drone0", public_key=OWN_KEY, endpoints=[], routing=SimpleNamespace(relay=False)
+            ),
+            links=self.links,
+            peer_sockets=self.sockets,
+            evidence=self.evidence,
+            history=self.history,
+            relays=SimpleNamespace(by_name={}),
+            relay=None,
+            recorder=None,
+            local=SimpleNamespace(endpoints=self.local),
+            switch=SimpleNamespace(router=self.router),
+        )
+
+    def findings(self, now: float | None = None) -> dict[str, Finding]:
+        """The findings, by cause."""
+        findings = diagnosis.find(self.parts, self.now if now is None else now)
+        assert findings == sorted(findings, key=lambda one: one.severity)
+        return {finding.cause: finding for finding in findings}
+
+    def dropped(self, reason: DropReason, at: tuple[str, int], detail: bytes | str | int = "") -> None:
+        """A datagram from there."""
+        peer = self.link.peers[0] if reason in (DropReason.BAD_HANDSHAKE, DropReason.SUITE_NOT_ACCEPTED) else None
+        self.evidence.add_dropped(Dropped(reason, peer, Path(0, at), 1, detail), self.now)
+
+    def set_up(self, **rules: object) -> PeerLink:
+        """The link is up, with these rules for the peer."""
+        self.link.config = PeerConfig(self.link.config.settings, self.link.config.addresses, rules)
+        self.link.policy = self.link.config.make_policy()
+        self.link.peer.is_up = True
+        self.router.add_port(self.link, is_peer=True)
+        return self.link
+
+    def cross(self, received: Iterable[bytes] = (), sent: Iterable[bytes] = (), seconds: int = 1) -> None:
+        """Frames from and to the peer in one second, which its policy judges; then others without any."""
+        self.now += 1.0
+        for frame in split_payload(b"".join(received), self.link.counters):
+            self.link.policy.incoming.check(frame, self.now)
+        for frame in split_payload(b"".join(sent), self.link.counters):
+            self.link.counters.frames -= 1
+            self.link.frames_sent += self.link.policy.outgoing.check(frame, self.now) is None
+        self.sample()
+        for _ in range(seconds - 1):
+            self.now += 1.0
+            self.sample()
+
+    def sample(self) -> None:
+        """What a daemon does each second."""
+        self.history.sample(self.links.values(), [(one, one.policy) for one in self.local], self.now)
 
 
-async def send_until_found(
-    client: Client, datagrams: Iterator[bytes], daemon: DaemonProcess, cause: Cause, name: str = ""
+@pytest.fixture
+def daemon() -> Daemon:
+    return Daemon()
+
+
+def test_every_cause_is_documented_with_its_severity() -> None:
+    """Each is in one row of the table of README.md, and the row names its severity. Only attacks are security."""
+    section = (ROOT / "uavlinkd/ops/README.md").read_text().partition("### Causes")[2].partition("\n## ")[0]
+    rows = [line.split(" | ") for line in section.splitlines() if line.startswith("| `") and "`cause`" not in line]
+    documented = {name: severity for names, severity, *_ in rows for name in re.findall(r"`(\w+)`", names)}
+    tables = [table.rows for name, table in vars(facts).items() if name.startswith("OF_")]
+    causes: dict[str, Severity] = {row.cause: row.severity for row in chain(*tables)}
+    assert {cause for row in chain(*tables) for cause in row.unless} <= set(causes)
+    assert set(documented) == set(causes)
+    assert all(documented[cause].startswith(severity.name.lower()) for cause, severity in causes.items())
+    assert {cause for cause, severity in causes.items() if severity is Severity.SECURITY} == {
+        *("own_key_elsewhere", "key_on_two_machines", "hidden_frame", "impersonation")
+    }
+
+
+# A peer that is down.
+
+
+@pytest.mark.parametrize(
+    ("error", "cause"), [("EPERM", "firewall_here"), ("ENETUNREACH", "no_route"), ("EINVAL", "no_route")]
+)
+def test_errors_of_this_machine(daemon: Daemon, error: str, cause: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They name the address and the error. Then the peer gets no response to confirm."""
+    monkeypatch.setattr(down_problems, "has_unconfirmed", lambda _: True)
+    daemon.now = 5.0
+    assert set(daemon.findings()) == {"not_confirmed"}
+    daemon.evidence.add_failure(error, THERE, 5.0)
+    assert set(daemon.findings()) == {cause}
+    assert f"{HOST}:5790" in daemon.findings()[cause].text
+    assert error in daemon.findings()[cause].text
+
+
+def test_absent_own_address_explains_that_nothing_can_be_sent(daemon: Daemon) -> None:
+    """It has a line of its own, so the peers have none about routes. It is a warning while all peers are up."""
+    daemon.evidence.add_failure("EINVAL", THERE, NOW)
+    daemon.sockets.absent_addresses = lambda: ["192.0.2.77:5790"]
+    daemon.sockets.absent_networks = lambda: {"lte (wwan0: no interface)": "plug the modem in"}
+    assert set(daemon.findings()) == {"listen_address_missing", "network_absent"}
+    assert {finding.severity for finding in daemon.findings().values()} == {Severity.FAULT}
+    daemon.set_up(role="all", system_ids="all")
+    assert {finding.severity for finding in daemon.findings().values()} == {Severity.WARNING}
+
+
+@pytest.mark.parametrize(
+    ("number", "cause"), [(errno.ECONNREFUSED, "no_listener"), (errno.EHOSTUNREACH, "host_unreachable")]
+)
+def test_reports_of_the_network(daemon: Daemon, number: int, cause: str) -> None:
+    """Each error of ICMP has its cause."""
+    daemon.evidence.add_report(number, THERE, NOW)
+    assert set(daemon.findings()) == {cause}
+
+
+def test_addresses_that_cannot_be_used(daemon: Daemon) -> None:
+    """Names that do not resolve, a link-local address without interface, and another family than that of listen."""
+    daemon.sockets.unresolved = lambda name: {"b.test", "a.test"}
+    assert daemon.findings()["name_not_resolved"].text.startswith("a.test, b.test ")
+    daemon.sockets.unresolved = lambda name: set[str]()
+    daemon.link.set_paths([Path(0, ("fe80::1", 5790, 0, 2))], NOW)
+    assert daemon.findings() == {}
+    daemon.link.set_paths([Path(0, ("fe80::1", 5790, 0, 0))], NOW)
+    assert "[fe80::1%wlan0]:5790" in daemon.findings()["zone_missing"].remedy
+    daemon.sockets.without_socket = {"drone1"}
+    assert "listen" in daemon.findings()["family_missing"].text
+    daemon.sockets.networks = [object()]
+    assert "no network has" in daemon.findings()["family_missing"].text
+
+
+def test_address_of_this_daemon(daemon: Daemon) -> None:
+    """Its own initiations arrive: no other end has a wrong key."""
+    daemon.dropped(DropReason.BAD_MAC1, THERE)
+    assert set(daemon.findings()) == {"wrong_key_there"}
+    assert encode_key(OWN_KEY) in daemon.findings()["wrong_key_there"].remedy
+    daemon.sockets.is_own = lambda address: address == THERE
+    assert set(daemon.findings()) == {"own_address"}
+
+
+def test_evidence_from_before_the_link_went_down_does_not_count(daemon: Daemon) -> None:
+    """Also what an attacker sent while it was up. After a time, the silence is reported."""
+    daemon.dropped(DropReason.BAD_MAC1, THERE)
+    daemon.link.silent_since = NOW + 1.0
+    assert daemon.findings(NOW + 2.0) == {}
+    assert set(daemon.findings(NOW + 20.0)) == {"no_answer"}
+    daemon.set_up(role="all", system_ids="all")
+    daemon.link.silent_since = 0.0
+    assert daemon.findings() == {}, "the link is up"
+
+
+def test_other_version_names_the_older_side(daemon: Daemon) -> None:
+    """It explains the initiations above the limit of comparisons, which count as for another key."""
+    daemon.dropped(DropReason.BAD_MAC1, THERE)
+    older, newer = c.PROTOCOL_VERSION - 1, c.PROTOCOL_VERSION + 1
+    for version, remedy in (
+        (older, "update uavlinkd at drone1:"),
+        (newer, "; update uavlinkd at drone0, this machine"),
+    ):
+        daemon.dropped(DropReason.OTHER_VERSION, THERE, version)
+        findings = daemon.findings()
+        assert set(findings) == {"other_version"}
+        assert f"uavlink/{version}, this daemon uavlink/{c.PROTOCOL_VERSION}" in findings["other_version"].text
+        assert remedy in findings["other_version"].remedy
+    daemon.add("drone2", bytes([3]) * 32, [STRANGER])
+    daemon.dropped(DropReason.OTHER_VERSION, ("203.0.113.1", 9), older)
+    (unnamed,) = [one for one in diagnosis.find(daemon.parts, NOW) if not one.name]
+    assert "update uavlinkd at the sender" in unnamed.remedy
+
+
+def test_keys_that_arrive_are_shown_and_never_advised(daemon: Daemon) -> None:
+    """Of several from one address at least one is not the peer's; the former key has a line of its own."""
+    keys = [bytes([number]) * 32 for number in (11, 12, 13)]
+    daemon.history.add_former_key(keys[0], "drone1")
+    for key in keys:
+        daemon.dropped(DropReason.UNKNOWN_PEER, THERE, key)
+    findings = daemon.findings()
+    assert set(findings) == {"former_key", "wrong_key_here"}
+    assert "2 keys, so at least one is not drone1" in findings["wrong_key_here"].text
+    assert "or an attacker replays an old recording" in findings["former_key"].text
+    assert all(encode_key(key) not in findings["wrong_key_here"].remedy for key in keys)
+
+
+def test_key_of_the_only_peer_without_addresses(daemon: Daemon) -> None:
+    """A ground station that only waits shows the key, unless the sender may be one of several peers."""
+    del daemon.links["drone1"]
+    daemon.link = daemon.add("waited", bytes([3]) * 32, [])
+    daemon.dropped(DropReason.UNKNOWN_PEER, STRANGER, bytes([11]) * 32)
+    assert encode_key(bytes([11]) * 32) in daemon.findings()["wrong_key_here"].text
+    assert set(daemon.findings(20.0)) == {"wrong_key_here"}
+    daemon.add("other", bytes([4]) * 32, [])
+    assert daemon.findings() == {}
+    assert set(daemon.findings(20.0)) == {"not_connecting"}
+
+
+def test_remedies_weaken_nothing_if_the_evidence_is_forged(daemon: Daemon) -> None:
+    """One changed byte of a response, or an old initiation, must not cost a PSK or a strong suite."""
+    daemon.dropped(DropReason.BAD_HANDSHAKE, THERE)
+    daemon.dropped(DropReason.SUITE_NOT_ACCEPTED, THERE, "x25519")
+    findings = daemon.findings()
+    assert set(findings) == {"wrong_psk", "no_common_suite"}
+    assert "never remove a PSK: the message may be forged" in findings["wrong_psk"].remedy
+    assert "write this end's suites at drone1" in findings["no_common_suite"].remedy
+    assert "an old recording can cause this" in findings["no_common_suite"].remedy
+
+
+# The daemon.
+
+
+def test_own_key_on_another_machine(daemon: Daemon) -> None:
+    """It is the first line, and other keys do not hide it."""
+    daemon.dropped(DropReason.UNKNOWN_PEER, STRANGER, OWN_KEY)
+    daemon.dropped(DropReason.UNKNOWN_PEER, THERE, bytes([11]) * 32)
+    first = next(iter(daemon.findings().values()))
+    assert (first.cause, first.severity) == ("own_key_elsewhere", Severity.SECURITY)
+    assert "198.51.100.7:5790 uses this daemon's private key, or an attacker replays an old recording" in first.text
+    assert "own_key_elsewhere" not in daemon.findings(NOW + SECURITY_S + 1)
+
+
+def test_problems_of_the_daemon(daemon: Daemon) -> None:
+    """Bare MAVLink, a flood of handshakes, a pause, and a recording that cannot be written."""
+    daemon.set_up(role="all", system_ids="all")
+    daemon.dropped(DropReason.RAW_MAVLINK, STRANGER)
+    for _ in range(diagnosis.LOAD // 2):
+        daemon.dropped(DropReason.COOKIE_REQUIRED, STRANGER)
+        daemon.dropped(DropReason.RATE_LIMITED, STRANGER)
+    daemon.history.paused = NOW, 4.0
+    daemon.parts.recorder = SimpleNamespace(is_recording=False, failures={"ENOSPC": 1})
+    findings = daemon.findings()
+    assert set(findings) == {"raw_mavlink", "under_load", "daemon_paused", "recording_stopped"}
+    assert {finding.severity for finding in findings.values()} == {Severity.WARNING}
+    assert "198.51.100.7:5790" in findings["raw_mavlink"].text
+    assert "never block a peer's address" in findings["under_load"].remedy
+    assert "ENOSPC" in findings["recording_stopped"].text
+    assert set(daemon.findings(NOW + 31)) == {"recording_stopped"}
+
+
+def test_strangers_at_a_relay(daemon: Daemon) -> None:
+    """One with a key of no member, and one with another key of the relay while a member is down."""
+    member = SimpleNamespace(peer=SimpleNamespace(is_up=True))
+    daemon.set_up(role="all", system_ids="all")
+    daemon.parts.relay = SimpleNamespace(members={"drone1": member})
+    daemon.dropped(DropReason.UNKNOWN_PEER, STRANGER, bytes([11]) * 32)
+    daemon.dropped(DropReason.BAD_MAC1, STRANGER)
+    assert encode_key(bytes([11]) * 32) in daemon.findings()["not_a_member"].text
+    assert set(daemon.findings()) == {"not_a_member"}
+    member.peer.is_up = False
+    assert encode_key(OWN_KEY) in daemon.findings()["other_relay_key"].remedy
+
+
+# A peer that is up.
+
+
+def test_system_of_another(daemon: Daemon) -> None:
+    """It is an attack beside own frames, and trusting it is never advised. A system of no one is a warning."""
+    daemon.set_up(role="all", system_ids=[1])
+    for _ in range(3):
+        daemon.cross([heartbeat(1), heartbeat(7)])
+    findings = daemon.findings()
+    assert set(findings) == {"other_system"}
+    assert "of system 7; its system_ids here are 1" in findings["other_system"].text
+    assert "only if you know that drone1 has this id" in findings["other_system"].remedy
+    client = object()
+    daemon.local.append(SimpleNamespace(name="autopilot", ports=[client], policy=daemon.link.policy, failures={}))
+    daemon.router.add_port(client)
+    daemon.router.route(split_payload(heartbeat(7), daemon.link.counters)[0], client, daemon.now)
+    assert "7 (endpoint autopilot)" in daemon.findings()["impersonation"].text
+    assert "7 is endpoint autopilot's" in daemon.findings()["other_system"].remedy
+    assert "write it into system_ids" not in daemon.findings()["other_system"].remedy
+    assert next(iter(daemon.findings())) == "impersonation"
+
+
+@pytest.mark.parametrize(("pause", "is_found"), [(1, True), (int(OWN_FRAMES_S) + 1, False)])
+def test_own_and_foreign_frames_in_different_seconds(daemon: Daemon, pause: int, is_found: bool) -> None:
+    """Alternating hides nothing; a peer that sent its last own frames long ago only has another id."""
+    daemon.set_up(role="all", system_ids=[1])
+    owner = daemon.add("drone2", bytes([3]) * 32, [STRANGER])
+    owner.policy = PeerConfig(owner.config.settings, (), {"role": "all", "system_ids": [2]}).make_policy()
+    for _ in range(3):
+        daemon.cross([heartbeat(1)], seconds=pause)
+        daemon.cross([heartbeat(2)])
+    assert ("impersonation" in daemon.findings()) is is_found
+
+
+def test_autopilot_with_another_system_id(daemon: Daemon) -> None:
+    """All its frames are refused: a fault, which names the parameters. It goes when the autopilot is corrected."""
+    daemon.set_up(role="all", system_ids=[2])
+    daemon.cross([heartbeat(1)])
+    assert set(daemon.findings()) == {"foreign_system"}
+    assert "SYSID_THISMAV" in daemon.findings()["foreign_system"].remedy
+    daemon.cross([heartbeat(2)])
+    assert set(daemon.findings()) == {"other_system"}
+    daemon.cross([heartbeat(2)], seconds=11)
+    assert daemon.findings() == {}
+
+
+REQUEST = pack(mavlink.MAVLink_param_request_list_message(2, 1), 255, 190)
+
+
+@pytest.mark.parametrize(
+    ("role", "received", "sent", "sign"),
+    [
+        ("vehicle", [ground_heartbeat()], [], "a vehicle, but it sends a ground station's heartbeat"),
+        ("vehicle", [], [numbered(1, 1)], "a vehicle, but the client here sends a vehicle's telemetry"),
+        ("operator", [numbered(1, 255)], [], "a ground station, but it sends a vehicle's telemetry"),
+        ("operator", [], [REQUEST], "a ground station, but the client here sends an operator's requests"),
+    ],
+)
+def test_exchanged_roles(daemon: Daemon, role: str, received: list[bytes], sent: list[bytes], sign: str) -> None:
+    """Frames of the other kind are refused. If the daemon forwards for others, what it sends shows nothing."""
+    daemon.set_up(role=role, system_ids=[255])
+    daemon.cross(received, sent)
+    findings = daemon.findings()
+    assert f'role = "{role}" says that it is {sign}' in findings["roles_exchanged"].text
+    assert findings["roles_exchanged"].severity is Severity.FAULT
+    assert "all_refused" not in findings
+    daemon.parts.config.routing.relay = True
+    assert ("roles_exchanged" in daemon.findings()) is bool(received)
+    daemon.parts.config.routing.relay = False
+    daemon.link.counters.frames += 1  # one that passes
+    daemon.link.frames_sent += 1
+    daemon.cross()
+    assert daemon.findings()["roles_exchanged"].severity is Severity.WARNING
+
+
+@pytest.mark.parametrize(("received", "sent", "which"), [([heartbeat(1)], [], "from"), ([], [heartbeat(1)], "to")])
+def test_policy_that_refuses_everything(daemon: Daemon, received: list[bytes], sent: list[bytes], which: str) -> None:
+    """In either direction."""
+    daemon.set_up(allow_in=["PING"], allow_out=["PING"], system_ids=[1])
+    daemon.cross(received, sent)
+    text = daemon.findings()["all_refused"].text
+    assert text.startswith(f"its policy refuses every frame {which} it: the role, or the lists")
+
+
+def test_hidden_frame_is_the_first_line(daemon: Daemon) -> None:
+    """Of a captured member. Everyday findings do not displace it, and it is not counted as a refusal."""
+    daemon.set_up(role="vehicle", system_ids=[1])
+    daemon.cross([heartbeat(1), heartbeat(9)])
+    daemon.link.policy.incoming.totals[Refusal.HIDDEN_FRAME] += 3
+    daemon.cross()
+    first, *others = daemon.findings().values()
+    assert (first.cause, first.severity) == ("hidden_frame", Severity.SECURITY)
+    assert first.text.startswith("3 of its frames hid")
+    assert [finding.cause for finding in others] == ["other_system"]
+
+
+def test_commands_by_name(daemon: Daemon) -> None:
+    """Those of a flight first, although sixty-four numbers without a name and ten other commands came before."""
+    daemon.set_up(role="swarm-member", system_ids=[1])
+    numbers = (*range(50000, 50064), *range(200, 210), ARM, mavlink.MAV_CMD_NAV_TAKEOFF)
+    daemon.cross([command_long(number, 1) for number in numbers], [command_long(ARM, 255)])
+    findings = daemon.findings()
+    text = findings["commands_refused"].text
+    assert text.startswith("COMMAND_LONG (COMPONENT_ARM_DISARM) 1x, COMMAND_LONG (NAV_TAKEOFF) 1x, ")
+    assert text.endswith(" more refused from it: role swarm-member")
+    withheld = findings["commands_withheld"]
+    assert withheld.text == "COMMAND_LONG (COMPONENT_ARM_DISARM) 1x withheld: role swarm-member"
+    assert withheld.severity is Severity.WARNING
+
+
+def test_unverified_freshness(daemon: Daemon) -> None:
+    """The text has its age and what follows."""
+    daemon.set_up(role="all", system_ids="all").peer.unverified_since = 0.0
+    daemon.now = 12.0
+    finding = daemon.findings()["freshness_unverified"]
+    assert finding.text.startswith("freshness unverified for 12 s: ")
+    assert "reports pass and may be old" in finding.text
+
+
+# What the peer claims to refuse.
+
+
+def test_claims_in_one_sentence(daemon: Daemon) -> None:
+    """Commands first; the remedy is for the owner of this end, or for that of the peer."""
+    claims = daemon.set_up(role="all", system_ids="all").peer.refusal_claims
+    claims.note(RefusalReport((Refused(0, 0, 8, 1), Refused(76, ARM, 2, 3))), NOW)
+    finding = daemon.findings(11.0)["refused_there"]
+    assert finding.text.startswith(
+        "it reports that it refuses COMMAND_LONG COMPONENT_ARM_DISARM"
+        " (the role, or the lists, do not allow the message, 3 frames, 10 s ago); HEARTBEAT ("
+    )
+    assert finding.remedy == "if these frames are needed, change the role or lists of drone0 in drone1's file"
+    claims.note(RefusalReport((Refused(0, 0, 1, 1),)), 12.0)
+    assert daemon.findings(12.0)["refused_there"].remedy.startswith("set SYSID_THISMAV, MAV_SYSID or MAV_SYS_ID of")
+    assert "refused_there" not in daemon.findings(12.0 + 61)
+
+
+def test_a_lying_peer_fills_one_line(daemon: Daemon) -> None:
+    """Claims of unknown messages, commands and reasons are numbers, and their text is bounded."""
+    claims = daemon.set_up(role="all", system_ids="all").peer.refusal_claims
+    for number in range(100):
+        entries = (Refused(0xFFFFFF - number, 60000 + place, 200, 2**32 - 1) for place in range(16))
+        claims.note(RefusalReport(tuple(entries)), NOW)
+    text = daemon.findings()["refused_there"].text
+    assert "16777116 60015 (4,294,967,295 frames, 0 s ago), " in text
+    assert text.endswith(": a reason that this version does not know; and 61 more kinds of frames")
+    assert text.count("a reason that") == 1
+    assert len(text) < 500
+
+
+# Sessions at two places.
+
+A, B, C = (("192.0.2.1", port) for port in (1, 2, 3))
+TWO = ["192.0.2.1:1", "192.0.2.1:2"]
+
+
+@pytest.mark.parametrize(
+    ("begins", "now", "shown"),
+    [
+        ([], 0.0, []),
+        ([(0.0, A), (1.0, B), (2.0, A), (3.0, B)], 4.0, TWO),
+        ([(0.0, A), (1.0, B), (2.0, A), (3.0, B)], 3.0 + SECURITY_S, []),
+        ([(0.0, A), (1.0, B), (2.0, A)], 4.0, []),
+        ([(0.0, A), (1.0, B), (2.0, A), (3.0 + FLIPS_S, B)], 40.0, []),
+        ([(0.0, A), (1.0, B), (2.0, C), (3.0, ("192.0.2.1", 4))], 4.0, []),
+        ([(float(at), A) for at in range(8)], 8.0, []),
+        ([(0.0, A), *((SECURITY_S + at, (B, A)[at % 2]) for at in range(3))], SECURITY_S + 3, TWO),
+    ],
+    ids=["none", "two machines", "long ago", "a change and back", "slow", "roaming", "rekeys", "a long first stay"],
+)
+def test_alternating_sessions(begins: list[tuple[float, tuple[str, int]]], now: float, shown: list[str]) -> None:
+    """Sessions that return to an address again and again, within a short time."""
+    assert alternating([SessionBegin(*begin) for begin in begins], now) == shown
+
+
+def test_many_sessions_of_a_thief_hide_nothing(daemon: Daemon) -> None:
+    """It makes more sessions than are remembered between two of the machine that it copied."""
+    for second in range(3):
+        daemon.history.add_session("drone1", A, float(second))
+        for number in range(1, MAX_SESSIONS + 1):
+            daemon.history.add_session("drone1", B, second + number / 100)
+    finding = daemon.findings(3.0)["key_on_two_machines"]
+    assert all(address in finding.text for address in TWO)
+
+
+# Local endpoints.
+
+
+@pytest.mark.parametrize(
+    ("url", "clients", "failure", "is_garbage", "cause"),
+    [
+        ("udpin:127.0.0.1:1", 0, "", False, "no_client"),
+        ("udpin:127.0.0.1:1", 1, "", False, "client_silent"),
+        ("tcpin:127.0.0.1:1", 1, "", True, "garbage"),
+        ("udpout:127.0.0.1:1", 1, "", False, "client_silent"),
+        ("udpout:127.0.0.1:1", 1, "ECONNREFUSED", False, "client_unreachable"),
+        ("udpout:client.test:1", 0, "", False, "client_unreachable"),
+        ("tcp:127.0.0.1:1", 0, "ECONNREFUSED", False, "client_unreachable"),
+        ("serial:/dev/absent:57600", 0, "ENOENT", False, "device_unavailable"),
+    ],
+)
+def test_each_silent_endpoint_has_its_cause(
+    daemon: Daemon, url: str, clients: int, failure: str, is_garbage: bool, cause: str
 ) -> None:
-    """Send datagrams to a daemon's port for peers until it reports a cause."""
-
-    async def send() -> None:
-        for datagram in datagrams:
-            client.send(datagram, daemon.sockaddr)
-            await asyncio.sleep(0.05)
-
-    task = asyncio.create_task(send())
-    try:
-        await until_found(daemon, cause, name)
-    finally:
-        task.cancel()
-
-
-async def test_wrong_public_key() -> None:
-    """One file has another key: that end shows the key that came, the other end the key that should be written."""
-    async with Stage() as stage:
-        a, b = stage.pair()
-        a.config["peer"][0]["public_key"] = keys.public_key_text(keys.generate_private_key())
-        await stage.start(a, b, linked=False)
-        here = await until_found(a, Cause.WRONG_KEY_HERE, "drone1")
-        assert b.public_key in here["text"]
-        assert "`uavlinkd pubkey` at drone1" in here["remedy"]
-        assert b.public_key not in here["remedy"]  # a key that arrived is never to be copied
-        there = await until_found(b, Cause.WRONG_KEY_THERE, "drone0")
-        assert b.public_key in there["remedy"]
-
-
-async def test_wrong_public_key_without_addresses() -> None:
-    """A ground station that only waits shows the key too, for the one vehicle that it waits for."""
-    async with Stage() as stage:
-        a, b = stage.daemon("drone0"), stage.daemon("drone1")
-        a.add_peer(b, [])
-        a.config["peer"][0]["public_key"] = keys.public_key_text(keys.generate_private_key())
-        b.add_peer(a, [a.address])
-        await stage.start(a, b, linked=False)
-        assert b.public_key in (await until_found(a, Cause.WRONG_KEY_HERE, "drone1"))["text"]
-
-
-async def test_wrong_psk() -> None:
-    """Both ends say that the PSKs differ."""
-    async with Stage() as stage:
-        a, b = stage.daemon("drone0"), stage.daemon("drone1")
-        a.add_peer(b, [b.address], stage.psk())
-        b.add_peer(a, [a.address], stage.psk())
-        await stage.start(a, b, linked=False)
-        await until_found(a, Cause.WRONG_PSK, "drone1")
-        await until_found(b, Cause.WRONG_PSK, "drone0")
-
-
-async def test_wrong_psk_at_an_end_that_only_waits() -> None:
-    """It knows only that its responses are not confirmed."""
-    async with Stage() as stage:
-        a, b = stage.daemon("drone0"), stage.daemon("drone1")
-        a.add_peer(b, [], stage.psk())
-        b.add_peer(a, [a.address], stage.psk())
-        await stage.start(a, b, linked=False)
-        assert "PSKs" in (await until_found(a, Cause.NOT_CONFIRMED, "drone1"))["remedy"]
-        await until_found(b, Cause.WRONG_PSK, "drone0")
-
-
-async def test_no_common_suite() -> None:
-    """Both ends name the suite that the other offers."""
-    async with Stage() as stage:
-        a, b = stage.pair()
-        b.config["link"]["suites"] = ["mlkem768"]
-        await stage.start(a, b, linked=False)
-        assert "offers the suite mlkem768" in (await until_found(a, Cause.NO_COMMON_SUITE, "drone1"))["text"]
-        assert "offers the suite x25519;" in (await until_found(b, Cause.NO_COMMON_SUITE, "drone0"))["text"]
-
-
-@pytest.mark.long
-async def test_peers_that_are_not_there() -> None:
-    """One daemon, and peers each of which is absent in another way: each has its own cause, and no other."""
-    need(has_ipv6(), "IPv6 on loopback")
-    async with Stage() as stage:
-        a = stage.daemon("drone0")
-        silent = await stage.client()
-        closed = f"127.0.0.1:{free_port()}"
-        expected = {
-            Cause.NO_ANSWER: [str(silent)],
-            Cause.NO_LISTENER: [closed],
-            Cause.FAMILY_MISSING: ["[::1]:5790"],
-            Cause.NOT_CONNECTING: [],
-        }
-        for number, addresses in enumerate(expected.values(), 1):
-            a.add_peer(stage.daemon(f"drone{number}"), addresses)
-        await stage.start(a, linked=False)
-        await until_found(a, Cause.NOT_CONNECTING, "drone4")
-        status = await a.status()
-        for number, (cause, addresses) in enumerate(expected.items(), 1):
-            causes = findings(status, "peer", f"drone{number}")
-            assert set(causes) == {cause}
-            assert all(address in causes[cause]["text"] for address in addresses)
-
-
-async def test_listen_address_of_another_machine() -> None:
-    """It is a fault while a link is down, and only a warning while all are up."""
-    async with Stage() as stage:
-        a, b = stage.pair()
-        a.config["listen"].append(f"192.0.2.77:{free_port()}")
-        await stage.start(a, linked=False)
-        missing = await until_found(a, Cause.LISTEN_ADDRESS_MISSING)
-        assert "192.0.2.77" in missing["text"]
-        assert missing["severity"] == "fault"
-        await stage.start(b)
-        await a.until_linked()
-        assert (await until_found(a, Cause.LISTEN_ADDRESS_MISSING))["severity"] == "warning"
-
-
-async def test_key_that_was_replaced() -> None:
-    """The file has a new key of the peer, and the peer still has the former one."""
-    async with Stage() as stage:
-        a, b = stage.pair()
-        await stage.start(a, b)
-        a.config["peer"][0]["public_key"] = keys.public_key_text(keys.generate_private_key())
-        assert await reload(a) == []
-        assert b.public_key in (await until_found(a, Cause.FORMER_KEY, "drone1"))["text"]
-        a.config["peer"][0]["public_key"] = b.public_key
-        assert await reload(a) == []
-        await a.until_linked()
-        await until_gone(a, Cause.FORMER_KEY)
-
-
-@pytest.mark.long
-async def test_copied_card_at_the_other_end() -> None:
-    """Two machines with one private key: their sessions alternate. It is the first line."""
-    async with Stage() as stage:
-        a, b = stage.pair()
-        copy = stage.daemon("drone2")
-        copy.config |= {"name": "drone0", "peer": a.config["peer"]}
-        for name in ("daemon.key", "drone1.psk"):
-            (copy.folder / name).unlink(missing_ok=True)
-            keys.write_secret_file(copy.folder / name, (a.folder / name).read_text().strip())
-        await stage.start(a, b)
-        await stage.start(copy, linked=False)
-        two = await until_found(b, Cause.KEY_ON_TWO_MACHINES, "drone0")
-        assert a.address in two["text"]
-        assert copy.address in two["text"]
-        assert (await b.status())["findings"][0]["cause"] == Cause.KEY_ON_TWO_MACHINES
-
-
-async def test_own_key_on_another_machine() -> None:
-    """An initiation that only the holder of this daemon's private key can make. Other keys do not hide it."""
-    async with Stage() as stage:
-        a = stage.daemon("drone0")
-        stranger = await stage.client()
-        await stage.start(a, linked=False)
-
-        def many() -> Iterator[bytes]:
-            yield initiation(a.private_key, a)
-            for _ in range(20):
-                yield initiation(keys.generate_private_key(), a)
-
-        for datagram in many():
-            stranger.send(datagram, a.sockaddr)
-        finding = await until_found(a, Cause.OWN_KEY_ELSEWHERE)
-        assert str(stranger) in finding["text"]
-        assert "or an attacker replays an old recording" in finding["text"]
-        assert finding["severity"] == Severity.SECURITY.name.lower()
-
-
-async def test_forged_hints() -> None:
-    """A sender on the peer's host adds hints while the link is down, and none while it is up."""
-    async with Stage() as stage:
-        a, b = stage.pair()
-        attacker = await stage.client()
-        await stage.start(a, linked=False)
-        forged = keys.generate_private_key()
-        await send_until_found(attacker, iter(lambda: initiation(forged, a), None), a, Cause.WRONG_KEY_HERE, "drone1")
-        peer = findings(await a.status(), "peer", "drone1")
-        assert keys.public_key_text(forged) not in peer[Cause.WRONG_KEY_HERE]["remedy"]
-        assert Cause.NO_LISTENER in peer  # the genuine cause is still shown
-        await stage.start(b)
-        await a.until_linked()
-        for _ in range(20):
-            attacker.send(initiation(forged, a), a.sockaddr)
-        await a.until(lambda status: status["drops"].get("unknown_peer", 0) > 0)
-        await until_gone(a, Cause.WRONG_KEY_HERE)
-        assert findings(await a.status(), "peer", "drone1") == {}
-
-
-async def test_mavlink_at_the_port_for_peers() -> None:
-    """The line names the sender."""
-    async with Stage() as stage:
-        a = stage.daemon("drone0")
-        autopilot = await stage.client()
-        await stage.start(a, linked=False)
-        autopilot.send(b"\xfd\x09" + bytes(19), a.sockaddr)
-        assert str(autopilot) in (await until_found(a, Cause.RAW_MAVLINK))["text"]
-
-
-async def test_flood_of_initiations() -> None:
-    """More than the daemon accepts: the status says so."""
-    async with Stage() as stage:
-        a = stage.daemon("drone0")
-        attacker = await stage.client()
-        await stage.start(a, linked=False)
-        for _ in range(300):
-            attacker.send(initiation(keys.generate_private_key(), a), a.sockaddr)
-        assert "never block a peer's address" in (await until_found(a, Cause.UNDER_LOAD))["remedy"]
-
-
-async def test_paused_daemon_and_unusable_recording() -> None:
-    """Both are warnings about the daemon."""
-    async with Stage() as stage:
-        a, b = stage.pair()
-        a.config["recording"] = {"folder": "flights", "min_free_bytes": 100_000}
-        (a.folder / "flights").write_text("a file is in the way")
-        into, autopilot = a.add_endpoint("autopilot"), await stage.client()
-        await stage.start(a, b)
-        autopilot.send(heartbeat(), into)
-        await until_found(a, Cause.RECORDING_STOPPED)
-        await a.send_signal(signal.SIGSTOP)
-        await asyncio.sleep(4)
-        await a.send_signal(signal.SIGCONT)
-        assert " s, and dropped" in (await until_found(a, Cause.DAEMON_PAUSED))["text"]
-
-
-async def test_healthy_link_has_no_finding() -> None:
-    """Two linked daemons without endpoints have nothing to report."""
-    async with Stage() as stage:
-        a, b = stage.pair()
-        await stage.start(a, b)
-        assert (await a.status())["findings"] == (await b.status())["findings"] == []
+    """And no other; a device that cannot be opened is a fault, all else a warning."""
+    config = EndpointConfig("autopilot", parse_url(url))
+    counters = SimpleNamespace(frames=0, garbage_bytes=64 * is_garbage)
+    ports = [SimpleNamespace(name=f"client{number}") for number in range(clients)]
+    daemon.local.append(
+        SimpleNamespace(
+            name="autopilot",
+            ports=ports,
+            counters=counters,
+            frames_sent=0,
+            failures={failure: 1} if failure else {},
+            policy=config.make_policy(),
+        )
+    )
+    daemon.parts.config.endpoints.append(config)
+    daemon.set_up(role="all", system_ids="all")
+    daemon.sample()
+    assert daemon.findings() == {}
+    daemon.now += 5.0
+    daemon.sample()
+    (finding,) = daemon.findings().values()
+    assert (finding.cause, finding.name) == (cause, "autopilot")
+    assert finding.severity is (Severity.FAULT if cause == "device_unavailable" else Severity.WARNING)
+    assert not failure or f"({failure})" in finding.text

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import errno
 import os
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from tests.core.harness import PLAIN
+from tests.daemon.frames import heartbeat
 from tests.policies import TRUSTED
 from uavlinkd.config import PeerAddress, PeerConfig
 from uavlinkd.core.crypto import Secret
@@ -17,9 +19,20 @@ from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Dropped
 from uavlinkd.core.path import Path
 from uavlinkd.core.settings import PeerSettings
-from uavlinkd.link.evidence import EVIDENCE_S, MAX_DETAILS, PLACES_S, REPORTED, Evidence
-from uavlinkd.link.history import MAX_FORMER_KEYS, REMEMBERED_S, History, RecentGrowth
-from uavlinkd.link.peer_link import PeerLink
+from uavlinkd.link.evidence import (
+    EVIDENCE_S,
+    MAX_DETAILS,
+    MAX_FORMER_KEYS,
+    PLACES_S,
+    REMEMBERED_S,
+    REPORTED,
+    Evidence,
+    History,
+    RecentGrowth,
+)
+from uavlinkd.link.peer_link import Carriage, PeerLink
+from uavlinkd.mavlink.frames import SplitCounters, split_payload
+from uavlinkd.mavlink.policy.compilation import compile_policy
 from uavlinkd.system.addresses import Address
 
 HOST = "192.0.2.2"
@@ -40,7 +53,7 @@ class Scene:
         """Another peer, at these addresses."""
         written = tuple(PeerAddress(Address(*address)) for address in addresses)
         config = PeerConfig(PeerSettings(name, key, None, PLAIN), written, TRUSTED)
-        link = self.links[name] = PeerLink(config, self.node, lambda outputs: None, 0.0)
+        link = self.links[name] = PeerLink(config, Carriage(self.node, lambda _: None), 0.0)
         link.peers.append(self.node.add_peer(config.settings, 0.0))
         link.set_paths([Path(0, address) for address in addresses], 0.0)
         return link
@@ -82,15 +95,6 @@ def test_evidence_of_a_relay_counts_for_no_peer_of_that_name(scene: Scene) -> No
     seen = scene.evidence.seen_of_relay(DropReason.BAD_HANDSHAKE, "vps", now)
     assert seen is not None
     assert seen.address == THERE
-
-
-def test_evidence_from_elsewhere_counts_for_no_peer(scene: Scene) -> None:
-    """It counts for no configured address."""
-    scene.drop(("198.51.100.1", 5790), 10.0)
-    assert scene.seen(scene.link, 10.0) is None
-    elsewhere = scene.evidence.seen_elsewhere(DropReason.UNKNOWN_PEER, 10.0)
-    assert elsewhere is not None
-    assert elsewhere.address == ("198.51.100.1", 5790)
 
 
 def test_evidence_at_an_address_is_not_that_of_another_peer_of_its_host(scene: Scene) -> None:
@@ -148,13 +152,6 @@ def test_errors_of_a_candidate_are_not_those_of_another_peer_of_its_host(scene: 
         assert scene.evidence.seen_elsewhere(kind, 1.0) is not None
 
 
-def test_errors_of_a_learned_path_are_those_of_its_peer(scene: Scene) -> None:
-    """As after a NAT gave the peer another port."""
-    scene.link.peer.paths.learn(Path(0, (HOST, 40000)), 0.0)
-    scene.evidence.add_report(errno.ECONNREFUSED, (HOST, 40000), 1.0)
-    assert scene.evidence.seen(f"{REPORTED}ECONNREFUSED", scene.link, 1.0) is not None
-
-
 def test_growth_is_remembered_and_begins_again() -> None:
     """A counter that restarts at zero counts from there; one that is quiet for long is forgotten."""
     growth = RecentGrowth[str]()
@@ -177,3 +174,64 @@ def test_former_keys_are_bounded() -> None:
     assert len(history.former_keys) == MAX_FORMER_KEYS
     assert bytes([0]) in history.former_keys
     assert bytes([1]) not in history.former_keys
+
+
+BLOCKED_IN = [("peer", "drone1", "in")]
+
+
+class Traffic:
+    """The history of a peer that may speak as system 2 only, second by second."""
+
+    def __init__(self) -> None:
+        self.history, self.now = History(0.0), 0.0
+        self.link: Any = SimpleNamespace(name="drone1", counters=SplitCounters(), frames_sent=0)
+        self.policy({"role": "all", "system_ids": [2]})
+
+    def policy(self, rules: dict[str, object]) -> None:
+        """Replace it."""
+        self.link.policy = compile_policy(rules, is_local=False)
+
+    def blocked(self, *received: int, sent: bool = False, seconds: int = 1) -> list[tuple[str, str, str]]:
+        """What is blocked after a second with frames of these systems, and further ones without."""
+        for frame in split_payload(b"".join(map(heartbeat, received)), self.link.counters):
+            self.link.policy.incoming.check(frame, self.now)
+        if sent:
+            (frame,) = split_payload(heartbeat(1), SplitCounters())
+            self.link.frames_sent += self.link.policy.outgoing.check(frame, self.now) is None
+        for _ in range(seconds):
+            self.now += 1.0
+            self.history.sample([self.link], [], self.now)
+        return self.history.blocked(self.now)
+
+
+def test_peer_whose_frames_are_all_refused_is_blocked() -> None:
+    """From the first one until one passes, or until none came for ten seconds. An earlier passed frame hides none."""
+    traffic = Traffic()
+    assert traffic.blocked() == []
+    assert traffic.blocked(7) == BLOCKED_IN
+    assert traffic.blocked(7, 2) == []
+    assert traffic.blocked(7, seconds=10) == BLOCKED_IN
+    assert traffic.blocked() == []
+
+
+def test_frames_that_are_all_withheld_are_blocked() -> None:
+    """The same towards the peer."""
+    traffic = Traffic()
+    traffic.policy({"system_ids": "all", "allow_in": ["all"], "allow_out": ["PING"]})
+    assert traffic.blocked(sent=True) == [("peer", "drone1", "out")]
+
+
+def test_policy_that_passes_nothing_is_intended() -> None:
+    """``allow_in = []`` says that no frame of the peer is wanted."""
+    traffic = Traffic()
+    traffic.policy({"system_ids": "all", "allow_in": [], "allow_out": []})
+    assert traffic.blocked(1, sent=True) == []
+
+
+def test_new_policy_starts_its_counts_at_zero() -> None:
+    """What the policy before refused is past at once: the operator has repaired it."""
+    traffic = Traffic()
+    assert traffic.blocked(7, 7, 7) == BLOCKED_IN
+    traffic.policy({"role": "all", "system_ids": [3]})
+    assert traffic.blocked() == []
+    assert traffic.blocked(7) == BLOCKED_IN

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import io
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from rich.console import Console
+import structlog
 
 from tests.policies import TRUSTED
 from uavlinkd.config import Config, ConfigError, keys
@@ -15,11 +14,12 @@ from uavlinkd.config import PeerConfig as Peer
 from uavlinkd.config.changes import compare
 from uavlinkd.config.load import load_config
 from uavlinkd.core.crypto import KeyPair, Secret
-from uavlinkd.core.node import Node
-from uavlinkd.core.settings import PeerSettings
-from uavlinkd.link.key_change import Graces, link_name, pairings
+from uavlinkd.core.settings import PeerSettings, link_name
+from uavlinkd.link import peers as module
+from uavlinkd.link.carrier import FrameCarrier
+from uavlinkd.link.parts import make_parts
 from uavlinkd.link.peer_link import PeerLink
-from uavlinkd.ops.topology import print_topology
+from uavlinkd.link.peers import pairings
 
 OWN, PREVIOUS, THEIRS, THEIRS_BEFORE, OTHER = (keys.generate_private_key() for _ in range(5))
 
@@ -69,53 +69,13 @@ def test_every_pair_of_keys_that_may_be_right_is_tried() -> None:
     assert len(pairings(Peer(PeerSettings("b", now), (), TRUSTED), has_previous_key=False)) == 1
 
 
-def test_the_end_of_their_change_leaves_ours() -> None:
-    """Their previous key is out of the file: the peer is still accepted where it knows us by our previous one."""
-    now, before = (KeyPair(keys.decode_key(text)).public for text in (THEIRS, THEIRS_BEFORE))
-    node = Node(Secret(keys.decode_key(OWN)), bytes, 0.0, Secret(keys.decode_key(PREVIOUS)))
-    config = Peer(PeerSettings("b", now), (), TRUSTED, previous_public_key=before)
-    link = PeerLink(config, node, lambda _: None, 0.0)
-    link.join(0.0, Graces(), 10.0, has_previous_key=True)
-    assert len(node.peers) == 4
-    link.change(replace(config, previous_public_key=None), 1.0)
-    assert list(node.peers) == ["b", "b (our previous key)"]
-    assert link.accepts_previous_keys
-    link.give_up_ours(2.0)
-    assert list(node.peers) == ["b"]
-
-
 def test_previous_keys_are_loaded(tmp_path: Path) -> None:
-    """Both kinds of previous keys, and how long they are good, come from the file."""
-    config = load(tmp_path, f"{OUR_LINE}\nkey_grace_s = 60", was(THEIRS_BEFORE))
+    """Both kinds of previous keys come from the file."""
+    config = load(tmp_path, OUR_LINE, was(THEIRS_BEFORE))
     assert config.previous_private_key is not None
     assert config.previous_private_key.reveal() == keys.decode_key(PREVIOUS)
-    assert config.key_grace_s == 60
     before = keys.decode_key(keys.public_key_text(THEIRS_BEFORE))
     assert [peer.previous_public_key for peer in config.peers] == [before, None]
-
-
-def test_previous_keys_are_shown(tmp_path: Path) -> None:
-    """`uavlinkd check` prints the previous keys that are valid, and for how long."""
-    text = printed(load(tmp_path, f"{OUR_LINE}\nkey_grace_s = 60", was(THEIRS_BEFORE)))
-    assert f"previous key  {keys.public_key_text(PREVIOUS)}" in text
-    assert "valid until the peer confirms the new key, at most 60 s" in text
-    assert f"or {keys.short_form(keys.decode_key(keys.public_key_text(THEIRS_BEFORE)))}" in text
-    assert "at most 7 days" in printed(load(tmp_path, OUR_LINE))
-    assert "before" not in printed(load(tmp_path))
-
-
-def printed(config: Config) -> str:
-    """What `uavlinkd check` prints of it."""
-    file = io.StringIO()
-    print_topology(config, Console(file=file, width=200, force_terminal=False))
-    return file.getvalue()
-
-
-def test_peers_have_no_previous_keys_by_default(tmp_path: Path) -> None:
-    """A file that names none accepts none."""
-    config = load(tmp_path)
-    assert config.previous_private_key is None
-    assert [peer.previous_public_key for peer in config.peers] == [None, None]
 
 
 @pytest.mark.parametrize(
@@ -123,13 +83,12 @@ def test_peers_have_no_previous_keys_by_default(tmp_path: Path) -> None:
     [
         ('previous_private_key_file = "a.key"', "", "previous_private_key_file"),
         ('previous_private_key_file = "none.key"', "", "previous_private_key_file"),
-        ("key_grace_s = 0", "", "key_grace_s"),
         ("", was(THEIRS), "peer[0].previous_public_key (b)"),
         ("", was(OWN), "peer[0].previous_public_key (b)"),
         (OUR_LINE, was(PREVIOUS), "peer[0].previous_public_key (b)"),
         ("", 'previous_public_key = "none"', "peer[0].previous_public_key (b)"),
     ],
-    ids=["own key", "missing file", "no grace", "a peer's key", "our key", "our previous key", "malformed"],
+    ids=["own key", "missing file", "a peer's key", "our key", "our previous key", "malformed"],
 )
 def test_impossible_previous_keys_are_refused(tmp_path: Path, own: str, theirs: str, key: str) -> None:
     """A previous key differs from every current key."""
@@ -170,64 +129,91 @@ def test_a_peers_previous_key_comes_with_a_new_link(tmp_path: Path) -> None:
     assert [peer.name for peer in going.changed_peers] == ["b"]
 
 
-def test_grace_is_fixed(tmp_path: Path) -> None:
-    """It began with the links."""
-    with pytest.raises(ConfigError, match="key_grace_s"):
-        compare(load(tmp_path, OUR_LINE), load(tmp_path, f"{OUR_LINE}\nkey_grace_s = 60"))
+class Scene:
+    """The peers of a daemon that knows one peer by two keys, and has two itself. The time is what a test says."""
+
+    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now, self.psks = 0.0, 0
+        monkeypatch.setattr(module, "monotonic", lambda: self.now)
+        monkeypatch.setattr(module, "KEY_GRACE_S", 10.0)
+        config = load(folder, OUR_LINE, was(THEIRS_BEFORE))
+        self.config = replace(config, peers=config.peers[:1])
+        self.parts = make_parts(self.config, structlog.get_logger(), 0.0, lambda _: None)
+        self.peers = FrameCarrier(self.parts).peers
+        self.peers.start()
+
+    @property
+    def names(self) -> list[str]:
+        """What the core has."""
+        return list(self.parts.node.peers)
+
+    @property
+    def link(self) -> PeerLink:
+        """To the peer."""
+        return self.parts.links["b"]
+
+    def reload(self, peer: Peer, now: float) -> None:
+        """Another configuration of the peer."""
+        self.now = now
+        config = replace(self.parts.config, peers=(peer,))
+        self.peers.follow(config, compare(self.parts.config, config))
+
+    def create_again(self, now: float) -> None:
+        """A reload that creates the link again."""
+        (peer,) = self.parts.config.peers
+        self.psks += 1
+        psk = Secret(bytes([self.psks]) * 32)
+        self.reload(replace(peer, settings=replace(peer.settings, psk=psk)), now)
 
 
-def test_previous_key_may_go_while_the_daemon_runs_and_not_come(tmp_path: Path) -> None:
-    """Its end is a reload; its beginning comes with a new key, and so with a restart."""
-    without, having = load(tmp_path), load(tmp_path, OUR_LINE)
-    compare(having, without)
-    with pytest.raises(ConfigError, match="previous_private_key_file"):
-        compare(without, having)
+@pytest.fixture
+async def scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Scene:
+    """In a running loop."""
+    return Scene(tmp_path, monkeypatch)
 
 
-def test_link_that_is_created_again_gets_no_second_grace() -> None:
+async def test_the_end_of_their_change_leaves_ours(scene: Scene) -> None:
+    """Their previous key is out of the file: the peer is still accepted where it knows us by our previous one."""
+    assert scene.names == ["b", "b (previous key)", "b (our previous key)", "b (previous key) (our previous key)"]
+    scene.reload(replace(scene.config.peers[0], previous_public_key=None), 1.0)
+    assert scene.names == ["b", "b (our previous key)"]
+    assert scene.link.previous
+    config = replace(scene.parts.config, previous_private_key=None)
+    scene.peers.follow(config, compare(scene.parts.config, config))
+    assert scene.names == ["b"]
+
+
+async def test_link_that_is_created_again_gets_no_second_grace(scene: Scene) -> None:
     """A reload that creates a link again revives neither an ended key nor its time; only the operator does."""
-    now, before = (KeyPair(keys.decode_key(text)).public for text in (THEIRS, THEIRS_BEFORE))
-    node = Node(Secret(keys.decode_key(OWN)), bytes, 0.0, Secret(keys.decode_key(PREVIOUS)))
-    config = Peer(PeerSettings("b", now), (), TRUSTED, previous_public_key=before)
-    graces = Graces()
+    scene.create_again(6.0)
+    assert len(scene.names) == 4
+    scene.peers.end_graces(9.9)
+    assert len(scene.names) == 4
+    scene.peers.end_graces(10.0)
+    assert scene.names == ["b"]
+    scene.create_again(11.0)
+    assert not scene.link.previous
 
-    def joined(at: float) -> PeerLink:
-        if "b" in node.peers:
-            for name in list(node.peers):
-                node.remove_peer(node.peers[name], at)
-        link = PeerLink(config, node, lambda _: None, at)
-        link.join(at, graces, 10.0, has_previous_key=True)
-        return link
-
-    joined(0.0)
-    link = joined(6.0)
-    assert len(node.peers) == 4
-    assert not link.end_graces(9.9, graces)
-    assert link.end_graces(10.0, graces)
-    assert list(node.peers) == ["b"]
-    assert not joined(11.0).accepts_previous_keys
-
-    without = replace(config, previous_public_key=None)
-    graces.follow([config], [without])
-    graces.follow([without], [config])
-    link = joined(12.0)
-    assert list(node.peers) == ["b", "b (previous key)"]  # theirs is valid again, not ours
-    assert link.confirm(13.0, graces)
-    assert not joined(14.0).accepts_previous_keys
+    (peer,) = scene.parts.config.peers
+    scene.reload(replace(peer, previous_public_key=None), 12.0)
+    scene.reload(peer, 12.0)
+    assert scene.names == ["b", "b (previous key)"]  # theirs is valid again, not ours
+    scene.peers.confirm_keys(scene.link)
+    scene.create_again(14.0)
+    assert not scene.link.previous
 
 
-def test_our_previous_key_stays_given_up_when_their_key_changes() -> None:
+async def test_our_previous_key_stays_given_up_when_their_key_changes(scene: Scene) -> None:
     """A peer that knows our new key does not bring the one before back by a new key of its own."""
-    first, second = (KeyPair(keys.decode_key(text)).public for text in (THEIRS_BEFORE, THEIRS))
-    graces = Graces()
-    node = Node(Secret(keys.decode_key(OWN)), bytes, 0.0, Secret(keys.decode_key(PREVIOUS)))
-    link = PeerLink(Peer(PeerSettings("b", first), (), TRUSTED), node, lambda _: None, 0.0)
-    link.join(0.0, graces, 10.0, has_previous_key=True)
-    assert list(node.peers) == ["b", "b (our previous key)"]
-    assert link.confirm(1.0, graces)
-    link.leave(2.0)
-    rotated = PeerLink(
-        Peer(PeerSettings("b", second), (), TRUSTED, previous_public_key=first), node, lambda _: None, 2.0
+    (peer,) = scene.config.peers
+    scene.reload(replace(peer, previous_public_key=None), 0.0)
+    scene.peers.confirm_keys(scene.link)
+    assert scene.names == ["b"]
+    newest = KeyPair(keys.decode_key(OTHER)).public
+    rotated = replace(
+        peer,
+        settings=replace(peer.settings, public_key=newest),
+        previous_public_key=peer.settings.public_key,
     )
-    rotated.join(2.0, graces, 10.0, has_previous_key=True)
-    assert list(node.peers) == ["b", "b (previous key)"]
+    scene.reload(rotated, 2.0)
+    assert scene.names == ["b", "b (previous key)"]

@@ -18,11 +18,12 @@ from tests.needs import need
 from tests.waiting import until
 from uavlinkd.config import NetworkConfig, PeerAddress
 from uavlinkd.core.path import Path
-from uavlinkd.endpoints.presence import Presence
+from uavlinkd.endpoints.sockets import Presence
 from uavlinkd.link import networks as module
 from uavlinkd.link.drop_summary import DropSummary
 from uavlinkd.link.evidence import Evidence
-from uavlinkd.link.peer_sockets import REFRESH_S, PeerSockets
+from uavlinkd.link.peer_names import REFRESH_S
+from uavlinkd.link.peer_sockets import PeerSockets
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.resolver import LONGEST_WAIT_S, RELAXED_WAIT_S
 from uavlinkd.system.stall import StallWatch
@@ -59,12 +60,12 @@ class Scene:
         self.drops = DropSummary(structlog.get_logger())
         stall = StallWatch(0.0, lambda seconds: None)
         log = structlog.get_logger()
-        self.sockets = PeerSockets(lambda *read: None, stall, self.drops, Evidence({}, b""), log, self.core)
+        self.sockets = PeerSockets(stall, self.drops, Evidence({}, b""), log, self.core)
         self.changes = 0
 
     def follow(self, link: Link) -> None:
         """Have the names of a link resolved."""
-        self.sockets.follow(cast(Any, link), lambda: None)
+        self.sockets.follow(cast(Any, link))
 
     def count_change(self) -> None:
         """The networks changed."""
@@ -77,7 +78,7 @@ async def scene(monkeypatch: pytest.MonkeyPatch) -> Any:
     made = Scene()
     monkeypatch.setattr(module, "look", lambda interface, address: made.present[interface, address])
     made.sockets.open([], [LTE, MESH])
-    made.sockets.start(made.count_change)
+    made.sockets.start(lambda *read: None, made.count_change)
     yield made
     made.sockets.close()
 
@@ -104,6 +105,7 @@ async def test_paths_of_an_absent_network_stay(scene: Scene) -> None:
     """The core knows that they are down, and why."""
     link = Link(PeerAddress(V4))
     scene.follow(link)
+    scene.changes = 0
     scene.present["lo", None] = Presence(reason="there is no interface lo")
     scene.sockets.check_networks()
     assert link.paths == paths(V4, LTE_V4, MESH_V4)
@@ -146,16 +148,7 @@ async def test_names_are_resolved_as_often_as_paths_need(
     scene.follow(link)
     link.peer.is_up = is_up
     link.states[link.paths[0]] = SimpleNamespace(works=works, is_off=is_off)
-    assert scene.sockets._interval_s(scene.sockets._followed["drone1"], written) == interval_s
-
-
-async def test_datagram_for_an_absent_network_is_counted_and_not_logged(scene: Scene) -> None:
-    """The log has the network already."""
-    scene.present["lo", None] = Presence(reason="there is no interface lo")
-    scene.sockets.check_networks()
-    with capture_logs() as logs:
-        scene.sockets.send(b"lost", Path(LTE_V4, ("127.0.0.9", 9)))
-    assert (scene.sockets.failures, logs) == ({"ENODEV": 1}, [])
+    assert scene.sockets._names["drone1"].interval_s(written) == interval_s
 
 
 class Gone:
@@ -185,7 +178,7 @@ async def test_failed_send_has_the_networks_looked_at(scene: Scene, monkeypatch:
     scene.sockets._checked_at = 0.0
     slot = scene.sockets._slots[LTE_V4]
     genuine_socket, slot.sock = slot.sock, cast(socket.socket, Gone())
-    scene.sockets._senders[LTE_V4] = slot.sock.sendto
+    slot.send = slot.sock.sendto
     for _ in range(5):
         scene.sockets.send(b"lost", Path(LTE_V4, ("127.0.0.9", 9)))
     await until(lambda: scene.changes == 1)

@@ -14,8 +14,7 @@ from structlog.testing import capture_logs
 from tests.link.socket_states import SocketStateLog
 from tests.needs import need
 from uavlinkd.config import NetworkConfig
-from uavlinkd.endpoints.presence import Presence, look
-from uavlinkd.endpoints.sockets import BindError, network_socket
+from uavlinkd.endpoints.sockets import BindError, Presence, look, network_socket
 from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.link import networks as module
 from uavlinkd.link.conditions import LINES_BURST, LINES_PER_S
@@ -36,7 +35,7 @@ class Scene:
         self.core = SocketStateLog()
         self.present = {(config.interface, config.address): Presence() for config in configs}
         listen = [Address("0.0.0.0", port)] if port else []
-        self.networks = Networks(configs, listen, self, self.core, structlog.get_logger())
+        self.networks = Networks(configs, listen, self.put, self.open_sockets, self.core, structlog.get_logger())
 
     def put(self, number: int, sock: socket.socket | None) -> None:
         """As the daemon's sockets."""
@@ -171,19 +170,6 @@ def test_port_of_listen_is_the_port_of_each_network(monkeypatch: pytest.MonkeyPa
         scene.put(number, None)
 
 
-def test_port_that_is_taken_meanwhile(scene: Scene) -> None:
-    """A port that the kernel chose is replaced."""
-    scene.set(LTE, Presence(1, ("127.0.0.1",)))
-    scene.networks.open(0.0)
-    port = scene.port(V4)
-    scene.set(LTE, Presence(reason="gone"))
-    scene.networks.check(1.0)
-    with network_socket(Address("127.0.0.1", port), None, []):
-        scene.set(LTE, Presence(1, ("127.0.0.1",)))
-        scene.networks.check(2.0)
-        assert scene.port(V4) != port
-
-
 def test_port_of_listen_that_is_taken_meanwhile(monkeypatch: pytest.MonkeyPatch) -> None:
     """Peers know that port: the network waits for it, and the status has the reason."""
     need(sys.platform == "linux", "Linux")
@@ -197,7 +183,7 @@ def test_port_of_listen_that_is_taken_meanwhile(monkeypatch: pytest.MonkeyPatch)
         assert not scene.networks.check(1.0)
         (network,) = scene.networks.networks
         assert "Address already in use" in network.presence.reason
-        assert not network.is_present
+        assert not network.presence.hosts
     assert scene.networks.check(2.0)
     assert scene.port(0) == port
     scene.put(0, None)

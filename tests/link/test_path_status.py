@@ -11,9 +11,8 @@ from uavlinkd.config import PeerAddress
 from uavlinkd.config import PeerConfig as Peer
 from uavlinkd.core.outputs import Transmit
 from uavlinkd.core.settings import PeerSettings
-from uavlinkd.link.path_status import PathRates, paths_status
-from uavlinkd.link.peer_link import PeerLink
-from uavlinkd.link.status import peer_status
+from uavlinkd.link.peer_link import PeerLink, Rates
+from uavlinkd.link.status import paths_status
 from uavlinkd.system.addresses import Address
 
 ROUND_TRIP_S = 0.05
@@ -49,15 +48,10 @@ def flown(seconds: float, lost_each: int = 0) -> tuple[Pair, PeerLink]:
     return pair, link
 
 
-def network_of(number: int) -> str:
-    """The name of the only network."""
-    return ["lte"][number]
-
-
 def test_each_path_is_described() -> None:
     """The best one first, with what it carries; the dead one with its reason."""
     pair, link = flown(30.0)
-    best, dead = paths_status(link, network_of, 30.0)
+    best, dead = paths_status(link, lambda _: ("lte", None), 30.0)
     assert (best["network"], best["address"], best["is_configured"]) == ("lte", "192.0.2.2:14600", True)
     assert (best["state"], best["role"], best["carries"]) == ("usable", "best", ["critical", "stream", "bulk"])
     assert best["round_trip_s"] == pytest.approx(ROUND_TRIP_S, abs=0.03)
@@ -70,14 +64,6 @@ def test_each_path_is_described() -> None:
     assert 20 * 42 <= rate <= 20 * 42 + 200
     assert (dead["address"], dead["state"], dead["role"]) == ("198.51.100.9:4000", "unproven", "standby")
     assert (dead["carries"], dead["answered_s"], dead["round_trip_s"]) == ([], None, None)
-    assert peer_status(link, 30.0, network_of)["paths"] == [best, dead]
-
-
-def test_a_peer_that_is_lost_has_paths_that_carry_nothing() -> None:
-    """The last facts stay."""
-    pair, link = flown(5.0)
-    pair.a.peer.is_up = False
-    assert [path["carries"] for path in paths_status(link, lambda _: None, 5.0)] == [[], []]
 
 
 def test_figures_of_a_link_with_several_paths_are_those_of_the_path_in_use() -> None:
@@ -100,22 +86,13 @@ def test_rates_of_paths_that_come_and_go() -> None:
     """A new path has none, one that is gone is forgotten, and a clock that stands still divides nothing by zero."""
     pair = Pair().establish()
     (state,) = pair.a.peer.paths.states
-    rates = PathRates()
-    rates.measure([state], 1.0)
+    rates = Rates(0.0)
+    rates.measure(pair.a.peer, 1.0)
     assert rates.of(state) == (0.0, 0.0)
     state.bytes_received += 100
     state.bytes_sent += 50
-    rates.measure([state], 1.0)
-    rates.measure([state], 3.0)
+    rates.measure(pair.a.peer, 1.0)
+    rates.measure(pair.a.peer, 3.0)
     assert rates.of(state) == (50.0, 25.0)
-    rates.measure([], 4.0)
+    rates.measure(pair.b.peer, 4.0)
     assert rates.of(state) == (0.0, 0.0)
-
-
-def test_a_path_without_a_network_has_no_name() -> None:
-    """The configuration names none."""
-    pair = Pair().establish()
-    config = Peer(PeerSettings("bravo", KEY_B.public, None, PLAIN), (), TRUSTED)
-    (path,) = paths_status(link_of(pair.a, config, lambda _: None), lambda _: None, 1.0)
-    assert path["network"] is None
-    assert path["address"] == str(Address.of(AT_B.address))

@@ -9,12 +9,28 @@ from dataclasses import replace
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
-from tests.core.harness import AT_A, AT_B, ELSEWHERE, KEY_A, KEY_B, PLAIN, QUIET, Pair, Side, exchange, of, payloads
+from tests.core.harness import (
+    AT_A,
+    AT_B,
+    ELSEWHERE,
+    KEY_A,
+    KEY_B,
+    PLAIN,
+    QUIET,
+    Pair,
+    Side,
+    datagrams,
+    exchange,
+    of,
+    payloads,
+)
+from tests.daemon import frames
 from tests.endpoints.clients import PASSES
 from tests.policies import TRUSTED
+from tests.samples import attitude
 from uavlinkd.config import PeerAddress
 from uavlinkd.config import PeerConfig as Peer
-from uavlinkd.config.pace import verify_interval_s
+from uavlinkd.config.link_settings import verify_interval_s
 from uavlinkd.core import handshake
 from uavlinkd.core.constants import NEVER
 from uavlinkd.core.cookie import MacKeys
@@ -22,7 +38,7 @@ from uavlinkd.core.outputs import Output, Transmit
 from uavlinkd.core.path import Path
 from uavlinkd.core.settings import Link, PeerSettings
 from uavlinkd.core.timers import Schedule
-from uavlinkd.link.peer_link import PeerLink, radio_figures
+from uavlinkd.link.peer_link import Carriage, PeerLink, radio_figures
 from uavlinkd.link.status import peer_status
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
 from uavlinkd.mavlink.frames import Frame, SplitCounters, split_payload
@@ -42,7 +58,7 @@ def recorded_initiation(entropy: random.Random) -> bytes:
 
 def link_of(side: Side, config: Peer, perform: Callable[[list[Output]], None]) -> PeerLink:
     """The link to the peer that this side's node has already."""
-    link = PeerLink(config, side.node, perform, 0.0)
+    link = PeerLink(config, Carriage(side.node, perform), 0.0)
     link.peers.append(side.peer)
     return link
 
@@ -102,27 +118,6 @@ def test_a_budget_that_comes_with_a_reload_pays_for_nothing_before_it() -> None:
     assert peer_link.output.egress.shape.payload_limit == pair.b.session.payload_limit
 
 
-def test_new_budget_changes_the_interval_of_the_next_session() -> None:
-    """The session in use goes on with the one that it began with."""
-    link = Link(suites=PLAIN.suites, timers=QUIET)
-    pair = Pair(link_a=link, link_b=link).establish()
-    config = Peer(PeerSettings("alpha", KEY_A.public, None, link), (), TRUSTED)
-    peer_link = link_of(pair.b, config, lambda _: None)
-    slower = replace(config.settings, link=replace(link, verify_interval_s=5.0))
-    peer_link.change(replace(config, settings=slower), 1.0)
-    assert pair.b.peer.verify_interval_s == 5.0
-    assert pair.b.peer.sessions.current is pair.b.session
-
-
-@pytest.mark.parametrize(("since", "shown"), [(None, None), (10.0, 2.5)])
-def test_status_has_the_time_of_unverified_freshness(since: float | None, shown: float | None) -> None:
-    """In seconds until now; nothing while freshness is verified."""
-    pair = Pair().establish()
-    pair.b.peer.unverified_since = since
-    peer_link = link_of(pair.b, Peer(PeerSettings("alpha", KEY_A.public), (), TRUSTED), lambda _: None)
-    assert peer_status(peer_link, 12.5)["freshness_unverified_s"] == shown
-
-
 def test_a_peer_whose_addresses_are_other_ones_is_not_called_at_those_before() -> None:
     """Its new names may have no address yet. The path that is in use goes on being so."""
     pair = Pair(link_a=Link(suites=PLAIN.suites, timers=QUIET), link_b=PLAIN).establish()
@@ -152,7 +147,7 @@ def test_silent_peer_is_reported_in_time(addresses: tuple[PeerAddress, ...], rep
     link.set_paths([AT_B], 300.0)
     pair.establish(300.0)
     assert not link.is_overdue(300.0)
-    link.note_silence(300.0)
+    link.measure(300.0)
     link.peer.is_up = False
     assert not link.is_overdue(304.9)
     assert link.is_overdue(305.0)
@@ -161,7 +156,7 @@ def test_silent_peer_is_reported_in_time(addresses: tuple[PeerAddress, ...], rep
 def measured(config: Peer, figures: LinkFigures) -> PeerLink:
     """A link that measured this."""
     link = link_of(Pair().a, config, lambda _: None)
-    link._figures = figures
+    link.figures = figures
     return link
 
 
@@ -188,21 +183,92 @@ def test_only_links_with_waiting_frames_are_scheduled() -> None:
     config = Peer(
         PeerSettings("alpha", KEY_A.public, None, link), (), TRUSTED, egress=EgressSettings(coalesce_s=0.01)
     )
-    links = [PeerLink(config, pair.b.node, lambda _: None, 0.0, None, schedule) for _ in range(2)]
+    links = [PeerLink(config, Carriage(pair.b.node, lambda _: None, waiting=schedule), 0.0) for _ in range(2)]
     for member in links:
         member.peers.append(pair.b.peer)
         member.follow_paths(0.0)
     assert schedule.next_at == NEVER
 
-    attitude = split_payload(
-        bytes(mavlink.MAVLink_attitude_message(1, 0, 0, 0, 0, 0, 0).pack(mavlink.MAVLink(None))), SplitCounters()
-    )
-    links[0].send(attitude, PASSES, 1.0, 0.0)
+    links[0].send([attitude(1)], PASSES, 1.0, 0.0)
     assert schedule.next_at == 1.01
     assert schedule.pop(1.01) == [links[0]]
     links[0].send_waiting(1.01)
     assert schedule.next_at == NEVER
 
-    links[0].send(attitude, PASSES, 2.0, 0.0)
+    links[0].send([attitude(2)], PASSES, 2.0, 0.0)
     links[0].leave(2.0)
     assert schedule.next_at == NEVER
+
+
+# Reports of what the policy refuses.
+
+ARM = 400
+QUIET_LINK = Link(suites=PLAIN.suites, timers=QUIET)
+
+
+def member_of(pair: Pair, sent: list[Output], budget_bits_s: int = 0) -> PeerLink:
+    """Bravo's link to a swarm member."""
+    rules = {"role": "swarm-member", "system_ids": [1, 255]}
+    settings = PeerSettings("alpha", KEY_A.public, None, QUIET_LINK)
+    return link_of(pair.b, Peer(settings, (), rules, EgressSettings(budget_bits_s=budget_bits_s)), sent.extend)
+
+
+def refuse(link: PeerLink, *raws: bytes) -> None:
+    """Let the policy judge frames of the peer."""
+    for frame in split_payload(b"".join(raws), SplitCounters()):
+        link.policy.incoming.check(frame, 0.0)
+
+
+def test_from_the_refusal_to_the_status() -> None:
+    """Three refused commands and a refused heartbeat: one report, which stays in the status."""
+    pair, sent = Pair().establish(), list[Output]()
+    there = member_of(pair, sent)
+    here = link_of(pair.a, Peer(PeerSettings("bravo", KEY_B.public, None, QUIET_LINK), (), TRUSTED), lambda _: None)
+    refuse(there, frames.ground_heartbeat(), *(frames.command_long(ARM, 255),) * 3, frames.heartbeat(9))
+    for second in range(1, 10):
+        there.report_refusals(float(second))
+        for datagram in datagrams(sent):
+            pair.a.receive(datagram, float(second))
+        sent.clear()
+    claims = peer_status(here, 71.0, lambda _: (None, None))["refused_there"]
+    assert isinstance(claims, list)
+    assert all(claim["last_s"] == 70.0 for claim in claims)
+    assert {(claim["message"], claim["command"], claim["reason"], claim["count"]) for claim in claims} == {
+        ("HEARTBEAT", None, "foreign_system", 1),
+        ("COMMAND_LONG", "MAV_CMD_COMPONENT_ARM_DISARM", "message_not_allowed", 3),
+        ("HEARTBEAT", None, "ground_station_not_allowed", 1),
+    }
+
+
+@pytest.mark.parametrize("budget", [0, 4000])
+def test_reports_leave_room_for_frames(budget: int) -> None:
+    """On a link with a budget, a report is sent while no frame waits and the budget covers it, and it is charged."""
+    pair, sent = Pair().establish(), list[Output]()
+    link = member_of(pair, sent, budget)
+    link.follow_paths(0.0)
+    link.report_refusals(1.0)
+    waiting = split_payload(b"".join(frames.heartbeat(1, seq=number) for number in range(50)), SplitCounters())
+    link.send(waiting, PASSES, 1.0, 0.0)
+    refuse(link, frames.command_long(ARM, 255))
+    sent.clear()
+    link.report_refusals(1.0)
+    assert len(of(sent, Transmit)) == (0 if budget else 1)
+    if budget and link.output.egress is not None:
+        link.output.egress.clear(2.0)
+        before = link.output.egress.demand(30.0)
+        link.report_refusals(30.0)
+        assert len(of(sent, Transmit)) == 1
+        assert link.output.egress.demand(30.0) > before
+
+
+def test_no_report_while_the_peer_is_lost() -> None:
+    """It is sent when the peer is back."""
+    pair, sent = Pair().establish(), list[Output]()
+    link = member_of(pair, sent)
+    refuse(link, frames.command_long(ARM, 255))
+    pair.b.peer.is_up = False
+    link.report_refusals(1.0)
+    assert sent == []
+    pair.b.peer.is_up = True
+    link.report_refusals(2.0)
+    assert len(of(sent, Transmit)) == 1

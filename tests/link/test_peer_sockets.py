@@ -16,10 +16,9 @@ import structlog
 from tests.link.socket_states import SocketStateLog
 from uavlinkd.core.path import Path, relayed
 from uavlinkd.core.relay_records import wrap
-from uavlinkd.link.drop_summary import EVERYDAY, DropSummary
+from uavlinkd.link.drop_summary import EVERYDAY_ERRORS, DropSummary
 from uavlinkd.link.evidence import Evidence
 from uavlinkd.link.peer_sockets import PeerSockets
-from uavlinkd.link.relay_handles import RelayHandles
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.stall import StallWatch
 
@@ -57,9 +56,7 @@ def test_what_is_not_taken_is_counted_and_the_next_is_sent(name: str) -> None:
 
     log = cast(Any, Log())
     stall = StallWatch(0.0, lambda seconds: None)
-    sockets = PeerSockets(
-        lambda *read: None, stall, DropSummary(log), Evidence({}, b""), structlog.get_logger(), SocketStateLog()
-    )
+    sockets = PeerSockets(stall, DropSummary(log), Evidence({}, b""), structlog.get_logger(), SocketStateLog())
     sockets.open([Address("127.0.0.1", 0)])
     sock = Refusing(getattr(errno, name))
     sockets.put(0, cast(socket.socket, sock))
@@ -69,7 +66,7 @@ def test_what_is_not_taken_is_counted_and_the_next_is_sent(name: str) -> None:
     sockets.send(b"there", Path(0, ("127.0.0.1", 9)))
     assert sock.sent == [b"there"]
     assert sockets.failures == {name: 3}
-    logged = [] if name in EVERYDAY else [("sends_failed", name)]
+    logged = [] if name in EVERYDAY_ERRORS else [("sends_failed", name)]
     assert [(event, fields["reason"]) for event, fields in lines] == logged
 
 
@@ -77,15 +74,13 @@ def test_relayed_path_goes_to_the_relay_or_nowhere() -> None:
     """Wrapped, along the same socket. Without its handle nothing is sent: its host is not a name to look up."""
     stall = StallWatch(0.0, lambda seconds: None)
     drops = DropSummary(structlog.get_logger())
-    sockets = PeerSockets(
-        lambda *read: None, stall, drops, Evidence({}, b""), structlog.get_logger(), SocketStateLog()
-    )
+    sockets = PeerSockets(stall, drops, Evidence({}, b""), structlog.get_logger(), SocketStateLog())
     sockets.open([Address("127.0.0.1", 0)])
     sock = Refusing(errno.EPERM)
     sock.is_out = False
     sockets.put(0, cast(socket.socket, sock))
-    sockets.relayed = RelayHandles()
-    sockets.relayed.assign("vps", Path(0, ("127.0.0.1", 9)), [7])
+    sockets.use_relays()
+    sockets.handles.assign("vps", Path(0, ("127.0.0.1", 9)), [7])
     sockets.send(b"inner", relayed(0, "vps", 7))
     sockets.send(b"inner", relayed(0, "vps", 8))
     assert sock.sent == [wrap(7, b"inner")]

@@ -11,8 +11,8 @@ from tests.daemon.frames import command_long, heartbeat
 from uavlinkd.config import PeerConfig
 from uavlinkd.core.refusals import RefusalReport, Refused
 from uavlinkd.core.settings import PeerSettings
-from uavlinkd.link.peer_link import PeerLink
-from uavlinkd.link.pilot_notes import PilotNotes
+from uavlinkd.link.local_endpoints import PilotNotes
+from uavlinkd.link.peer_link import Carriage, PeerLink
 from uavlinkd.mavlink.frames import SplitCounters, split_payload
 from uavlinkd.mavlink.routing import SystemComponent
 from uavlinkd.mavlink.status_text import TEXT_BYTES, Note, TextSeverity
@@ -27,7 +27,7 @@ class Cockpit:
         policy = {"role": "swarm-member", "system_ids": "all"} | policy
         self.pair = Pair().establish()
         config = PeerConfig(PeerSettings(name, KEY_B.public, None, quiet()), (), policy)
-        self.link = PeerLink(config, self.pair.a.node, lambda _: None, 0.0)
+        self.link = PeerLink(config, Carriage(self.pair.a.node, lambda _: None), 0.0)
         self.link.peers.append(self.pair.a.peer)
         self.addresses: list[SystemComponent] = [(1, 1)]
         self.notes = PilotNotes(lambda _: self.addresses)
@@ -121,21 +121,6 @@ def test_only_what_a_pilot_sent_on_purpose(refused: Refused, text: str | None) -
     assert (note and note.text) == text
 
 
-@pytest.mark.parametrize("is_here", [True, False])
-def test_commands_before_the_first_look(is_here: bool) -> None:
-    """A daemon looks once a second: a command may be withheld before it looks for the first time."""
-    cockpit = Cockpit()
-    cockpit.notes = PilotNotes(lambda _: cockpit.addresses)
-    if is_here:
-        cockpit.withhold(command_long(400, 255))
-    else:
-        cockpit.claim(0.5, ARM)
-    assert cockpit.next(1.0) is None
-    note = cockpit.next(2.0)
-    assert note is not None
-    assert "(DIS)ARM withheld" in note.text
-
-
 def test_commands_withheld_here() -> None:
     """This end's own policy: with its role."""
     cockpit = Cockpit()
@@ -175,32 +160,22 @@ def test_a_hostile_peer_cannot_fill_the_screen() -> None:
 def test_the_vehicle_behind_the_link() -> None:
     """Its autopilot's system, as received last; else the only one that the policy allows; else the text waits."""
     cockpit = Cockpit()
-    cockpit.addresses = [(9, 191), (7, 1)]
-    cockpit.set_up(False)
-    note = cockpit.next(1.0)
-    assert note is not None
-    assert note.system == 7
-    cockpit.addresses = []
-    cockpit.set_up(True)
+    for now, addresses in (1.0, [(9, 191), (7, 1)]), (2.0, list[SystemComponent]()):
+        cockpit.addresses = addresses
+        cockpit.set_up(not cockpit.link.peer.is_up)
+        note = cockpit.next(now)
+        assert note is not None
+        assert note.system == 7
+    for systems, expected in ([3], 3), ("all", None):
+        cockpit = Cockpit(system_ids=systems)
+        cockpit.notes = PilotNotes(lambda _, cockpit=cockpit: cockpit.addresses)  # type: ignore[misc]
+        cockpit.addresses = []
+        cockpit.next(0.0)
+        cockpit.set_up(False)
+        note = cockpit.next(1.0)
+        assert (note and note.system) == expected
+    cockpit.addresses = [(4, 154)]
     note = cockpit.next(2.0)
-    assert note is not None
-    assert note.system == 7
-
-    alone = Cockpit(system_ids=[3])
-    alone.addresses = []
-    alone.set_up(False)
-    note = alone.next(1.0)
-    assert note is not None
-    assert note.system == 3
-
-    unknown = Cockpit()
-    unknown.notes = PilotNotes(lambda _: unknown.addresses)
-    unknown.addresses = []
-    unknown.next(0.0)
-    unknown.set_up(False)
-    assert unknown.next(1.0) is None
-    unknown.addresses = [(4, 154)]
-    note = unknown.next(2.0)
     assert note is not None
     assert note.system == 4
 
@@ -215,17 +190,6 @@ def test_a_text_does_not_wait_for_long() -> None:
     assert cockpit.next(1.0) is None
     cockpit.addresses = [(1, 1)]
     assert cockpit.next(11.5) is None
-
-
-def test_removed_peer() -> None:
-    """Nothing about it is shown any more, and a new one of its name begins without history."""
-    cockpit = Cockpit()
-    cockpit.notes.next([], 1.0)
-    cockpit.set_up(False)
-    assert cockpit.next(2.0) is None
-    other = Cockpit()
-    other.set_up(False)
-    assert cockpit.notes.next([other.link], 3.0) is None
 
 
 def test_claims_do_not_hide_what_is_withheld_here() -> None:

@@ -14,8 +14,7 @@ from uavlinkd.core.path import Path, relayed
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.relay_records import WAITING, Bind, Bound
 from uavlinkd.core.settings import PeerSettings
-from uavlinkd.link.relay_handles import RelayHandles
-from uavlinkd.link.relay_link import BIND_SOON_S, RelayLink
+from uavlinkd.link.relay_link import BIND_SOON_S, RelayHandles, RelayLink
 from uavlinkd.link.relays import SILENT_RARE_S, SILENT_S, _Silence
 
 LINK = quiet(features=c.FEATURE_RECORDS)
@@ -34,20 +33,13 @@ class Scene:
         self.changed: list[set[bytes]] = []
         config = RelayConfig(PeerSettings("relay vps", KEY_B.public, None, LINK), ())
         node.remove_peer(peer, 0.0)
-        self.link = RelayLink(
-            config, node, self.handles, lambda keys, _: self.changed.append(keys), lambda: None, 0.0
-        )
+        self.link = RelayLink(config, node, self.handles, lambda keys, _: self.changed.append(keys), 0.0)
         self.pair.a.peer_name = self.link.name
         self.link.set_paths([AT_B], 0.0)
         self.pair.establish()
         assert self.pair.carries(0.0)
         self.link.follow([ONE, TWO])
         self.order = 0
-
-    def on_handles(self, keys: set[bytes], now: float) -> None:
-        """The daemon's."""
-        del now
-        self.changed.append(keys)
 
     def binds(self, now: float) -> list[tuple[bytes, ...]]:
         """The keys of each bind that the relay gets now."""
@@ -136,35 +128,6 @@ def test_handle_for_a_key_that_was_not_asked_for_is_dropped(scene: Scene) -> Non
     assert len(scene.link.paths_to([ONE])[0]) == c.HANDLES_PER_PAIR
 
 
-def test_member_binds_at_once_after_a_session_was_made(scene: Scene) -> None:
-    """The relay may have been restarted."""
-    assert scene.binds(T)
-    scene.bound(T, (ONE, 5), (TWO, 6))
-    assert not scene.binds(T + 1)
-    event = o.SessionEstablished(scene.link.peer, 2, "x25519", False, 16, True, True)
-    scene.link.on_event(event, T + 1)
-    assert scene.binds(T + 1) == [(ONE, TWO)]
-
-
-def test_handles_of_a_relay_that_is_gone_are_forgotten(scene: Scene) -> None:
-    """It has forgotten them too, and its peers are not initiated to through it any more."""
-    assert scene.binds(T)
-    scene.bound(T, (ONE, 5))
-    scene.link.do_housekeeping(T + c.BIND_LIFETIME_S - 0.1)
-    assert scene.link.paths_to([ONE]) == [[relayed(0, "vps", 5)]]
-    scene.link.do_housekeeping(T + c.BIND_LIFETIME_S)
-    assert not any(scene.link.paths_to([ONE]))
-
-
-def test_peer_that_does_not_use_the_relay_any_more_loses_its_handles(scene: Scene) -> None:
-    """The configuration changed."""
-    assert scene.binds(T)
-    scene.bound(T, (ONE, 5), (TWO, 6))
-    scene.link.follow([TWO])
-    assert scene.link.paths_to([ONE, TWO]) == [[relayed(0, "vps", 6)]]
-    assert scene.handles.wrap(b"\x40", relayed(0, "vps", 5)) is None
-
-
 def test_relay_is_asked_along_the_socket_of_the_path_that_failed(scene: Scene) -> None:
     """At most every quarter of a second, however many paths fail."""
     assert scene.binds(T)
@@ -188,18 +151,6 @@ def test_peer_whose_path_failed_is_bound_again(scene: Scene) -> None:
     assert scene.binds(T + 1) == [(TWO,)]
     scene.link.ask(relayed(0, "vps", 99))
     assert scene.binds(T + 2) == []
-
-
-def test_relay_is_asked_again_without_a_bind(scene: Scene) -> None:
-    """While a silence lasts: the first question bound the peer again."""
-    assert scene.binds(T)
-    scene.bound(T, (ONE, 5), (TWO, 6))
-    scene.link.ask(relayed(0, "vps", 6), binds=False)
-    outputs = scene.link.do_due(T + 1)
-    assert len([output for output in outputs if isinstance(output, o.Transmit)]) == 1
-    scene.link.ask(relayed(0, "vps", 6))
-    scene.link.ask(relayed(0, "vps", 6), binds=False)
-    assert scene.binds(T + 2) == [(TWO,)]
 
 
 def test_silence_of_a_steady_peer_is_noticed_sooner() -> None:
@@ -233,7 +184,7 @@ def test_previous_key_of_a_relay_is_accepted_until_the_new_one_is_confirmed() ->
     node = pair.a.node
     node.remove_peer(pair.a.peer, 0.0)
     config = RelayConfig(PeerSettings("relay vps", ONE, None, LINK), (), previous_public_key=KEY_B.public)
-    link = RelayLink(config, node, RelayHandles(), lambda *_: None, lambda: None, 0.0)
+    link = RelayLink(config, node, RelayHandles(), lambda *_: None, 0.0)
     current, previous = link.peers
     assert link.peer is current
     link.set_paths([AT_B], 0.0)
@@ -242,7 +193,7 @@ def test_previous_key_of_a_relay_is_accepted_until_the_new_one_is_confirmed() ->
     assert link.peer is previous
     assert link.next_at > 1.0
 
-    link.on_event(o.SessionEstablished(current, 1, "x25519", False, 16, True, False), 1.0)
+    link.on_event(o.SessionEstablished(current, AT_B, 1, "x25519", False, 16, True, False), 1.0)
     assert link.next_at < 1.0
     link.do_due(1.0)
     assert link.peers == [current]

@@ -19,17 +19,12 @@ from uavlinkd.config import NetworkConfig, PeerAddress
 from uavlinkd.config.model import SERIAL
 from uavlinkd.core.constants import LINE_BYTES
 from uavlinkd.core.path import Path
-from uavlinkd.endpoints import serial_line
+from uavlinkd.endpoints import serial as serial_devices
 from uavlinkd.endpoints.serial_line import SerialLine
 from uavlinkd.endpoints.url import SerialUrl
-from uavlinkd.link import serial_networks
-from uavlinkd.link.conditions import LINES_BURST, LINES_PER_S
-from uavlinkd.link.line_causes import line_findings
-from uavlinkd.link.line_rate import SHARE_UNANSWERED, UNANSWERED
-from uavlinkd.link.network_budgets import NetworkBudget, budgets_of, follow_rates, wire_bytes
-from uavlinkd.link.serial_networks import NOISE_PIECES, PLUG_IN, SerialNetworks
-from uavlinkd.mavlink.egress.bucket import Bucket, Supply
-from uavlinkd.ops.causes import Cause
+from uavlinkd.link.diagnosis import _line_noise, _modem_reports
+from uavlinkd.link.networks import wire_bytes
+from uavlinkd.link.serial_networks import NOISE_PIECES, PLUG_IN, SHARE_UNANSWERED, UNANSWERED, SerialNetworks
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.stall import StallWatch
 
@@ -49,7 +44,7 @@ def serial(tmp_path: FilePath, states: SocketStateLog) -> SerialNetworks:
     line = SerialUrl(str(tmp_path / "absent"), 57600)
     sik = NetworkConfig("sik", budget_bits_s=BITS_S, serial=line, air_bits_s=24_000)
     stall = StallWatch(monotonic(), lambda pause_s: None)
-    return SerialNetworks([sik], NUMBER, lambda *arguments: None, states, stall, structlog.get_logger())
+    return SerialNetworks([sik], NUMBER, states, stall, structlog.get_logger())
 
 
 async def test_path_and_peer_at_the_other_end(serial: SerialNetworks) -> None:
@@ -86,7 +81,7 @@ async def test_absent_device_is_reported(serial: SerialNetworks, states: SocketS
 async def test_remedy_names_what_keeps_the_device_closed(serial: SerialNetworks, error: str, remedy: str) -> None:
     """A missing permission, and another process that has the device, are not mended by the plug."""
     line = serial.networks[0].line
-    with patch.object(serial_line, "open_device", side_effect=OSError(getattr(errno, error), "")):
+    with patch.object(serial_devices, "open_device", side_effect=OSError(getattr(errno, error), "")):
         line.start()
         try:
             await until(lambda: bool(line.failures))
@@ -103,7 +98,7 @@ async def test_change_is_due_at_once(
     """The daemon sets its timer after the core knows: else the first try waits for the housekeeping, up to 1 s."""
     known = list[list[tuple[int, bool]]]()
     monkeypatch.setattr(SerialLine, "start", lambda line: None)
-    serial.start(lambda: known.append(list(states.states)))
+    serial.start(lambda *read: None, lambda: known.append(list(states.states)))
     (network,), is_open = serial.networks, [False]
     monkeypatch.setattr(SerialLine, "is_open", property(lambda line: is_open[0]))
     for is_open[0] in (True, False):
@@ -111,58 +106,31 @@ async def test_change_is_due_at_once(
     assert known == [[(NUMBER, True)], [(NUMBER, True), (NUMBER, False)]]
 
 
-async def test_flapping_device_cannot_fill_the_log(serial: SerialNetworks, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The lines are limited, and the log ends with the state of the device."""
-    now, is_open = [monotonic()], [False]
-    monkeypatch.setattr(serial_networks, "monotonic", lambda: now[0])
-    monkeypatch.setattr(SerialLine, "is_open", property(lambda line: is_open[0]))
-    (network,) = serial.networks
-    with capture_logs() as logs:
-        for number in range(2 * LINES_BURST + 1):
-            is_open[0] = number % 2 == 0
-            network.report_state(is_change=True)
-        assert len(logs) == LINES_BURST
-        assert logs[-1]["event"] == "network_disappeared"
-        now[0] += 2 / LINES_PER_S
-        serial.do_housekeeping()
-        serial.do_housekeeping()
-    assert len(logs) == LINES_BURST + 1
-    assert (logs[-1]["event"], logs[-1]["addresses"]) == ("network_appeared", ["serial"])
-
-
 async def test_late_answers_lower_the_budget_of_the_network(serial: SerialNetworks) -> None:
     """Both that of the frames and that of their copies. An answer counts once."""
     now = monotonic()
-    budgets = budgets_of(None, serial, now)
+    budgets = serial.budgets(now)
     assert budgets[NUMBER].all.rate == BITS_S / 8
     assert budgets[NUMBER].all.burst == pytest.approx(300, abs=5)
     state = SimpleNamespace(path=serial.path_to("sik"), round_trip_s=0.2, answered_at=now, is_off=False)
     traffic, paths = SimpleNamespace(echoes_unanswered=0), SimpleNamespace(states=[state], best=state)
     links = cast(Any, [SimpleNamespace(peer=SimpleNamespace(paths=paths, traffic=traffic))])
-    assert follow_rates(serial, budgets, links, now) == {}
+    assert serial.follow_rates(budgets, links, now) == {}
     state.round_trip_s, state.answered_at = 5.0, now + 6
     for rates in ({NUMBER: BITS_S / 2}, {}):
-        assert follow_rates(serial, budgets, links, now + 6) == rates
+        assert serial.follow_rates(budgets, links, now + 6) == rates
     assert budgets[NUMBER].all.rate == BITS_S / 16
     assert budgets[NUMBER].copies.rate == BITS_S / 32
-    later = [follow_rates(serial, budgets, links, now + at) for at in range(7, 60)]
+    later = [serial.follow_rates(budgets, links, now + at) for at in range(7, 60)]
     reported = [rates[NUMBER] for rates in later if rates]
     assert reported[-1] == BITS_S == 8 * budgets[NUMBER].all.rate
     assert len(reported) == 3  # each a quarter more than the one before, and the full rate
 
 
-def test_core_gets_a_quarter_of_the_budget_at_least() -> None:
-    """A lost peer is tried every few seconds also if the modem's queue was long before."""
-    budget = NetworkBudget(BITS_S, 0.0)
-    assert budget.update_core(BITS_S / 16)
-    assert budget.core_bits_s == BITS_S / 4
-    assert not budget.update_core(BITS_S / 8)
-
-
 async def test_unanswered_questions_lower_the_budget_of_the_best_path(serial: SerialNetworks) -> None:
     """Those along another path do not count, nor while the device is absent, nor does a total that begins again."""
     now = monotonic()
-    budgets = budgets_of(None, serial, now)
+    budgets = serial.budgets(now)
     state = SimpleNamespace(path=serial.path_to("sik"), round_trip_s=None, answered_at=0.0, is_off=False)
     traffic, paths = SimpleNamespace(echoes_unanswered=0), SimpleNamespace(states=[state], best=None)
     links = cast(Any, [SimpleNamespace(peer=SimpleNamespace(paths=paths, traffic=traffic))])
@@ -174,7 +142,7 @@ async def test_unanswered_questions_lower_the_budget_of_the_best_path(serial: Se
         (2 * UNANSWERED - 1, state, SHARE_UNANSWERED),
     ):
         traffic.echoes_unanswered, paths.best, state.is_off = total, state if best == "off" else best, best == "off"
-        follow_rates(serial, budgets, links, now)
+        serial.follow_rates(budgets, links, now)
         assert budgets[NUMBER].all.rate == share * BITS_S / 8
 
 
@@ -182,12 +150,12 @@ async def test_findings_about_modem_and_noise(serial: SerialNetworks) -> None:
     """They name the setting, and end when it stops."""
     decoder = serial.networks[0].line.decoder
     serial.do_housekeeping()
-    assert list(line_findings(serial)) == []
+    moment: Any = SimpleNamespace(daemon=SimpleNamespace(peer_sockets=SimpleNamespace(serial=serial)))
+    assert [*_modem_reports(moment), *_line_noise(moment)] == []
     decoder.feed(report())
     decoder.feed(b"noise\0" * NOISE_PIECES)
     serial.do_housekeeping()
-    modem, noise = line_findings(serial)
-    assert (modem.cause, noise.cause) == (Cause.MODEM_REPORTS, Cause.LINE_NOISE)
+    (modem,), (noise,) = _modem_reports(moment), _line_noise(moment)
     assert "MAVLINK=0" in modem.remedy
     assert "57600" in noise.remedy
     line = cast(Any, serial.networks[0].status(monotonic())["serial"])
@@ -195,18 +163,5 @@ async def test_findings_about_modem_and_noise(serial: SerialNetworks) -> None:
     assert (line["discarded"]["bad_cobs"], line["discarded_bytes"]["bad_cobs"]) == (NOISE_PIECES, 5 * NOISE_PIECES)
     for _ in range(20):
         serial.do_housekeeping()
-    assert list(line_findings(serial)) == []
+    assert [*_modem_reports(moment), *_line_noise(moment)] == []
     assert cast(Any, serial.networks[0].status(monotonic())["serial"])["radio"] is None, "old figures"
-
-
-def test_envelope_above_the_bucket_goes_into_debt() -> None:
-    """One frame always fits: a bucket of a slow network holds less than the longest frame."""
-    bucket = Bucket(1_600, 0.0, 125)
-    supply = Supply(None, [bucket])
-    queue = object()
-    assert supply.room_for(queue, 311, 0.0, is_urgent=False) == 311
-    bucket.spend(311, 0.0)
-    assert supply.room_for(queue, 311, 0.5, is_urgent=False) == 0
-    wait_s = supply.wait_s(queue, 311, 0.5, is_urgent=False)
-    assert 0 < wait_s < 1.1
-    assert supply.room_for(queue, 311, 0.5 + wait_s + 0.01, is_urgent=False) == 311

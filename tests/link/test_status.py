@@ -5,14 +5,16 @@ from __future__ import annotations
 import json
 from typing import Any
 
+from tests.daemon.conftest import stage
 from tests.daemon.frames import frame
 from tests.daemon.harness import Stage
-from tests.daemon.process import DaemonProcess
 from tests.waiting import PATIENCE_S
 
+__all__ = ["stage"]
 
-async def pair_with_traffic(stage: Stage) -> tuple[DaemonProcess, DaemonProcess]:
-    """Two daemons with a client each, and one frame in each direction."""
+
+async def test_the_link_is_described(stage: Stage) -> None:
+    """State, path, suite, mode, tag and ages, as they are, in strict JSON: no NaN, no infinity. A ping asks again."""
     a, b = stage.pair(probe_interval_s=0.1)
     into_a, into_b = a.add_endpoint("autopilot"), b.add_endpoint("autopilot")
     await stage.start(a, b)
@@ -21,70 +23,47 @@ async def pair_with_traffic(stage: Stage) -> tuple[DaemonProcess, DaemonProcess]
     await b.until(lambda status: status["peers"]["drone0"]["frames_received"] == 1)
     other.send(frame(2, 2), into_b)
     await one.until_received(frame(2, 2))
-    return a, b
+    status = await a.until(lambda status: status["peers"]["drone1"]["round_trip_s"] is not None)
+    peer = status["peers"]["drone1"]
+    assert status["name"] == "drone0"
+    assert status["public_key"] == a.public_key
+    assert (peer["state"], peer["public_key"], peer["path"]) == ("up", b.public_key, b.address)
+    session = peer["session"]
+    assert (session["suite"], session["mode"], session["tag_bits"]) == ("x25519", "authenticated", 128)
+    assert session["lost_in"] == session["lost_out"] == 0
+    assert peer["envelopes_missing"] == peer["envelopes_out_of_order"] == 0
+    assert peer["cookies_taken"] == 0
+    for key in ("handshakes_unanswered", "paths_unproven", "echoes_unanswered"):
+        assert peer[key] >= 0  # a busy machine may answer late
+    for key in ("round_trip_s", "last_received_s", "handshake_s"):
+        assert 0 <= peer[key] < PATIENCE_S  # both ends may turn within one tick of the clock
+    assert peer["handshakes"] >= 1
+    (path,) = (await a.ask("ping drone1"))["paths"]
+    (later,) = (await a.ask("ping drone1"))["paths"]
+    assert later["address"] == b.address
+    assert later["datagrams_sent"] > path["datagrams_sent"]
+    assert "there is no peer of this name" in (await a.ask("ping stranger"))["error"]
+    for line in a.statuses:
+        json.loads(line, parse_constant=refuse)
 
 
-async def test_the_link_is_described() -> None:
-    """State, path, suite, mode, tag and ages, as they are."""
-    async with Stage() as stage:
-        a, b = await pair_with_traffic(stage)
-        status = await a.until(lambda status: status["peers"]["drone1"]["round_trip_s"] is not None)
-        peer = status["peers"]["drone1"]
-        assert status["name"] == "drone0"
-        assert status["public_key"] == a.public_key
-        assert (peer["state"], peer["public_key"], peer["path"]) == ("up", b.public_key, b.address)
-        session = peer["session"]
-        assert (session["suite"], session["mode"], session["tag_bits"]) == ("x25519", "authenticated", 128)
-        assert session["lost_in"] == session["lost_out"] == 0
-        assert peer["envelopes_missing"] == peer["envelopes_out_of_order"] == 0
-        assert peer["cookies_taken"] == 0
-        for key in ("handshakes_unanswered", "paths_unproven", "echoes_unanswered"):
-            assert peer[key] >= 0  # a busy machine may answer late
-        for key in ("round_trip_s", "last_received_s", "handshake_s"):
-            assert 0 <= peer[key] < PATIENCE_S  # both ends may turn within one tick of the clock
-        assert peer["handshakes"] >= 1
+def refuse(constant: str) -> Any:
+    """What JSON does not have."""
+    raise AssertionError(constant)
 
 
-async def test_traffic_is_counted_the_same_at_both_ends() -> None:
-    """One daemon received as many frames and bytes from its client as the other sent to its own client."""
-    async with Stage() as stage:
-        a, b = await pair_with_traffic(stage)
-        there, here = await b.status(), await a.status()
-        size = len(frame(1, 1))
-        assert here["endpoints"]["autopilot"]["frames_received"] == 1
-        assert here["endpoints"]["autopilot"]["bytes_received"] == size
-        assert here["endpoints"]["autopilot"]["frames_sent"] == 1
-        assert here["endpoints"]["autopilot"]["bytes_sent"] == len(frame(2, 2))
-        assert there["peers"]["drone0"]["frames_received"] == 1
-        assert here["peers"]["drone1"]["frames_received"] == 1
-
-
-async def test_before_and_after_a_link() -> None:
+async def test_before_and_after_a_link(stage: Stage) -> None:
     """A peer that was never there is ``waiting``, one that went is ``lost``; nothing is made up for either."""
-    async with Stage() as stage:
-        a, b = stage.pair()
-        await stage.start(a, linked=False)
-        waiting = (await a.status())["peers"]["drone1"]
-        assert waiting["state"] == "waiting"
-        assert [waiting[key] for key in ("path", "last_received_s", "handshake_s", "round_trip_s", "session")] == [
-            None
-        ] * 5
-        await stage.start(b)
-        await a.until_linked()
-        await b.stop()
-        lost = (await a.until(lambda status: status["peers"]["drone1"]["state"] == "lost"))["peers"]["drone1"]
-        assert lost["session"] is None
-        assert lost["last_received_s"] >= 0
-
-
-async def test_it_is_strict_json() -> None:
-    """No NaN, no infinity: every reader of JSON takes it."""
-
-    def refuse(constant: str) -> Any:
-        raise AssertionError(constant)
-
-    async with Stage() as stage:
-        a, _ = await pair_with_traffic(stage)
-        await a.status()
-        for status in a.statuses:
-            json.loads(status, parse_constant=refuse)
+    a, b = stage.pair()
+    await stage.start(a, linked=False)
+    waiting = (await a.status())["peers"]["drone1"]
+    assert waiting["state"] == "waiting"
+    assert [waiting[key] for key in ("path", "last_received_s", "handshake_s", "round_trip_s", "session")] == [
+        None
+    ] * 5
+    await stage.start(b)
+    await a.until_linked()
+    await b.stop()
+    lost = (await a.until(lambda status: status["peers"]["drone1"]["state"] == "lost"))["peers"]["drone1"]
+    assert lost["session"] is None
+    assert lost["last_received_s"] >= 0

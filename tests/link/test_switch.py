@@ -2,39 +2,40 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import cast
 
 import pytest
 from fastcrc.crc16 import mcrf4xx
 from pymavlink.dialects.v20 import all as mavlink
 
 from tests.mavlink.policy.smuggling import v2
-from uavlinkd.endpoints.ports import LocalPort
+from uavlinkd.endpoints.ports import Endpoint, LocalPort, PortHandler
 from uavlinkd.link import switch as switch_module
+from uavlinkd.link.drop_summary import DropSummary, ShellReason
 from uavlinkd.link.switch import Switch
 from uavlinkd.mavlink.frames import Frame, SplitCounters, split_datagram
 from uavlinkd.mavlink.headers import Header
 from uavlinkd.mavlink.policy.compilation import Policy, compile_policy
 from uavlinkd.mavlink.policy.delivery import Source
 from uavlinkd.mavlink.policy.gate import Refusal
-from uavlinkd.mavlink.routing import ROUTE_LIFETIME_S, Router, Unrouted
+from uavlinkd.mavlink.routing import Router, Unrouted
+from uavlinkd.system.clock import monotonic
+from uavlinkd.system.stall import STALL_S, StallWatch
 
 
-class Client:
+class Client(Endpoint):
     """An endpoint with one client, which keeps the frames that it receives."""
 
     def __init__(self, name: str) -> None:
-        self.name = name
-        self.counters = SplitCounters()
-        self.failures: Counter[str] = Counter()
-        self.bytes_received = self.bytes_sent = self.frames_sent = 0
+        super().__init__(name, cast(PortHandler, None))
         self.received: list[bytes] = []
-        self.port = LocalPort(self, name, None)
-        self.ports = [self.port]
+        self.port = LocalPort(self, name, None, self.delivered.of(name))
 
-    def gather(self, seconds: float) -> None:
-        """Nothing to read."""
+    @property
+    def ports(self) -> Sequence[LocalPort]:
+        return [self.port]
 
     def start(self) -> None:
         """Nothing to start."""
@@ -57,7 +58,10 @@ class Stage:
         self.refused: list[tuple[str, Refusal]] = []
         self.router = Router[switch_module.Port]()
         self.withheld: list[tuple[str, Refusal]] = []
-        self.switch = Switch(self.router, self.refuse)
+        self.stall = StallWatch(monotonic(), lambda _: None)
+        drops = cast("DropSummary", SimpleNamespace(add_refused=self.refuse, add=self.drop))
+        self.switch = Switch(self.router, self.stall, drops)
+        self.stale = 0
         self.a, self.b, self.c = (Client(name) for name in "abc")
         for client in (self.a, self.b, self.c):
             self.switch.add(client.port, policy())
@@ -65,6 +69,15 @@ class Stage:
     def refuse(self, name: str, header: Header, refusal: Refusal, now: float, *, to_them: bool) -> None:
         """Keep it, by its direction."""
         (self.withheld if to_them else self.refused).append((name, refusal))
+
+    def drop(self, event: str, reason: ShellReason, name: str, count: int, now: float) -> None:
+        """Count frames from before a pause."""
+        assert (event, reason) == ("frames_dropped", ShellReason.STALE)
+        self.stale += count
+
+    def forward(self, source: LocalPort, frames: Sequence[Frame], now: float) -> None:
+        """Frames that were read just now."""
+        self.switch.forward(source, frames, now, self.stall.turn(monotonic()))
 
     def delivered(self) -> tuple[int, int, int]:
         """How many frames each client received since the last call."""
@@ -104,11 +117,11 @@ def stage() -> Stage:
 def test_each_frame_of_a_message_goes_to_the_same_ports_once(stage: Stage) -> None:
     """Remembered or not: to all others, once. A frame that another port sent already is dropped."""
     for number in range(3):
-        stage.switch.forward(stage.a.port, [attitude(number)], 0.1 * number)
+        stage.forward(stage.a.port, [attitude(number)], 0.1 * number)
         assert stage.delivered() == (0, 1, 1)
-    stage.switch.forward(stage.b.port, [attitude(9, system=2)], 0.4)
+    stage.forward(stage.b.port, [attitude(9, system=2)], 0.4)
     assert stage.delivered() == (1, 0, 1)
-    stage.switch.forward(stage.b.port, [attitude(2)], 0.5)  # a's, by another route
+    stage.forward(stage.b.port, [attitude(2)], 0.5)  # a's, by another route
     assert stage.delivered() == (0, 0, 0)
     assert stage.router.unrouted == {Unrouted.DUPLICATE: 1}
 
@@ -118,13 +131,13 @@ def test_duplicates_are_looked_for_where_a_frame_can_arrive_by_two_routes(stage:
     for system, client in enumerate((stage.a, stage.b, stage.c), start=1):
         stage.switch.set_policy(client.port, policy(system_ids=[system]))
     for number in range(3):
-        stage.switch.forward(stage.a.port, [attitude(number)], 0.1)
+        stage.forward(stage.a.port, [attitude(number)], 0.1)
     assert stage.delivered() == (0, 3, 3)
     assert not stage.router._seen
     stage.switch.set_policy(stage.c.port, policy(system_ids=[1, 3]))
     for number in range(3, 6):
-        stage.switch.forward(stage.a.port, [attitude(number)], 0.2)
-        stage.switch.forward(stage.c.port, [attitude(number)], 0.2)
+        stage.forward(stage.a.port, [attitude(number)], 0.2)
+        stage.forward(stage.c.port, [attitude(number)], 0.2)
     assert stage.delivered() == (0, 3, 3)
     assert stage.router.unrouted == {Unrouted.DUPLICATE: 3}
 
@@ -136,7 +149,7 @@ def test_a_new_rule_holds_for_the_next_frame(stage: Stage) -> None:
     def delivered() -> tuple[int, int, int]:
         nonlocal number
         number += 1
-        stage.switch.forward(stage.a.port, [attitude(number)], 0.01 * number)
+        stage.forward(stage.a.port, [attitude(number)], 0.01 * number)
         return stage.delivered()
 
     assert delivered() == (0, 1, 1)
@@ -154,7 +167,7 @@ def test_a_new_rule_holds_for_the_next_frame(stage: Stage) -> None:
 def test_rule_that_depends_on_the_frame_is_checked_for_each_frame(stage: Stage) -> None:
     """A rate limit counts frames, however often the same message came before."""
     stage.switch.set_policy(stage.c.port, policy(rate_out={"ATTITUDE": 4}))
-    stage.switch.forward(stage.a.port, [attitude(number) for number in range(10)], 0.0)
+    stage.forward(stage.a.port, [attitude(number) for number in range(10)], 0.0)
     assert stage.delivered() == (0, 10, 2)
     assert (stage.withheld, stage.refused) == ([("c", Refusal.RATE_LIMITED)] * 8, [])
 
@@ -175,8 +188,8 @@ def test_flow_is_routed_once_even_if_policy_decides_about_each_frame(
         return route(frame, source, now, **options)
 
     monkeypatch.setattr(stage.router, "route", count)
-    stage.switch.forward(stage.a.port, [attitude(number) for number in range(10)], 0.0)
-    stage.switch.forward(stage.c.port, [attitude(0)], 0.1)
+    stage.forward(stage.a.port, [attitude(number) for number in range(10)], 0.0)
+    stage.forward(stage.c.port, [attitude(0)], 0.1)
     assert len(routed) == 2  # once for each source
     assert stage.delivered() == (0, 0, 2)
     assert (len(stage.refused), len(stage.withheld)) == (8, 2)
@@ -189,54 +202,34 @@ def test_clients_of_an_endpoint_each_have_the_rate(stage: Stage) -> None:
     for client in (stage.b, stage.c):
         stage.switch.set_policy(client.port, shared)
     for second in range(30):
-        stage.switch.forward(stage.a.port, [attitude(second)], float(second))
+        stage.forward(stage.a.port, [attitude(second)], float(second))
     assert stage.delivered() == (0, 30, 30)
     stage.switch.remove(stage.b.port)
     stage.switch.add(stage.b.port, shared)
-    stage.switch.forward(stage.a.port, [attitude(number) for number in range(31, 41)], 29.0)
+    stage.forward(stage.a.port, [attitude(number) for number in range(31, 41)], 29.0)
     assert stage.delivered() == (0, 2, 1)
-
-
-def test_target_is_followed_to_where_it_is_received(stage: Stage) -> None:
-    """Flooded while unknown, then only to ports where it was received, and no more to a port where it is silent."""
-    stage.switch.forward(stage.a.port, [request(1, target=2)], 0.0)
-    assert stage.delivered() == (0, 1, 1)
-    stage.switch.forward(stage.b.port, [attitude(1, system=2)], 0.1)
-    stage.delivered()
-    stage.switch.forward(stage.a.port, [request(2, target=2)], 0.2)
-    assert stage.delivered() == (0, 1, 0)
-    stage.switch.forward(stage.c.port, [attitude(2, system=2)], 0.3)
-    stage.delivered()
-    stage.switch.forward(stage.a.port, [request(3, target=2)], 0.4)
-    assert stage.delivered() == (0, 1, 1)
-    # b keeps it by frames of a flow that is remembered; c falls silent.
-    for second in range(1, int(ROUTE_LIFETIME_S) + 10):
-        stage.switch.forward(stage.b.port, [attitude(second, system=2)], 0.4 + second)
-    stage.delivered()
-    stage.switch.forward(stage.a.port, [request(4, target=2)], ROUTE_LIFETIME_S + 10)
-    assert stage.delivered() == (0, 1, 0)
 
 
 def test_system_that_a_port_may_no_longer_send_as_is_not_looked_for_there(stage: Stage) -> None:
     """A reload takes a system from a peer: the peer gets no more copies of frames for that system."""
-    stage.switch.forward(stage.b.port, [attitude(1, system=2), attitude(2, system=3)], 0.0)
-    stage.switch.forward(stage.c.port, [attitude(3, system=2)], 0.0)
+    stage.forward(stage.b.port, [attitude(1, system=2), attitude(2, system=3)], 0.0)
+    stage.forward(stage.c.port, [attitude(3, system=2)], 0.0)
     stage.delivered()
     stage.switch.set_policy(stage.b.port, policy(system_ids=[3]))
-    stage.switch.forward(stage.a.port, [request(1, target=2)], 0.1)
+    stage.forward(stage.a.port, [request(1, target=2)], 0.1)
     assert stage.delivered() == (0, 0, 1)
-    stage.switch.forward(stage.a.port, [request(2, target=3)], 0.2)
+    stage.forward(stage.a.port, [request(2, target=3)], 0.2)
     assert stage.delivered() == (0, 1, 0)
 
 
 def test_switch_notices_clients_that_come_and_go(stage: Stage) -> None:
     """A client that left receives no more frames, a new one receives the next frame."""
-    stage.switch.forward(stage.a.port, [attitude(1)], 0.0)
+    stage.forward(stage.a.port, [attitude(1)], 0.0)
     stage.switch.remove(stage.b.port)
-    stage.switch.forward(stage.a.port, [attitude(2)], 0.1)
+    stage.forward(stage.a.port, [attitude(2)], 0.1)
     assert stage.delivered() == (0, 1, 2)
     stage.switch.add(stage.b.port, policy())
-    stage.switch.forward(stage.a.port, [attitude(3)], 0.2)
+    stage.forward(stage.a.port, [attitude(3)], 0.2)
     assert stage.delivered() == (0, 1, 1)
 
 
@@ -244,7 +237,7 @@ def test_memory_is_bounded(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> Non
     """Frames of invented senders are forwarded, and fill no memory."""
     monkeypatch.setattr(switch_module, "MAX_FLOWS", 16)
     for system in range(1, 200):
-        stage.switch.forward(stage.a.port, [attitude(1, system)], 0.0)
+        stage.forward(stage.a.port, [attitude(1, system)], 0.0)
         assert len(stage.switch._flows[stage.a.port]) <= 16
     assert stage.delivered() == (0, 199, 199)
 
@@ -266,9 +259,9 @@ def test_refused_frame_does_not_make_the_same_frame_of_another_port_a_duplicate(
     scene.switch.set_policy(scene.b.port, policy(role="operator", system_ids=[255], deny_in=["SET_MODE"]))
     beat = made(mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3), 255)
     (opening,) = split_datagram(opening_before(beat.raw), SplitCounters())
-    scene.switch.forward(scene.b.port, [opening, beat], 1.0)
+    scene.forward(scene.b.port, [opening, beat], 1.0)
     assert scene.refused == [("b", Refusal.HIDDEN_FRAME)]
-    scene.switch.forward(scene.c.port, [beat], 1.1)
+    scene.forward(scene.c.port, [beat], 1.1)
     assert scene.a.received == [opening.raw, beat.raw]
 
 
@@ -279,3 +272,14 @@ def opening_before(victim: bytes) -> bytes:
         if mcrf4xx(covered + bytes((89,))).to_bytes(2, "little") == victim[:2]:
             return v2(4, bytes(13) + b"\1", 255, signature=b"\0\xfe" + covered)
     raise AssertionError("one in 65,536 fits")
+
+
+def test_frames_from_before_a_pause_are_dropped_and_counted(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also if the process pauses after it has read them. Those that come later pass."""
+    read_in = stage.stall.turn(monotonic())
+    paused = monotonic() + 2 * STALL_S
+    monkeypatch.setattr(switch_module, "monotonic", lambda: paused)
+    stage.switch.forward(stage.a.port, [attitude(1), attitude(2)], paused, read_in)
+    assert (stage.delivered(), stage.stale, stage.stall.dropped) == ((0, 0, 0), 2, {"a": 2})
+    stage.switch.forward(stage.a.port, [attitude(3)], paused, read_in + 1)
+    assert stage.delivered() == (0, 1, 1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import islice
 
 from uavlinkd.core.path import Path
-from uavlinkd.link.turns import (
+from uavlinkd.link.carrier import (
     SHARED_BYTES,
     STARTS_OF_A_FRAME,
     WAITING_BYTES,
@@ -41,16 +41,6 @@ def test_what_one_sender_has_waiting_is_bounded() -> None:
     assert [[datagram[0] for datagram, _ in turn] for turn, _ in turns.round()] == [[ord("q")], [1, 2, 3, 4]]
 
 
-def test_many_senders_have_at_least_their_own_share() -> None:
-    """However many wait."""
-    turns = Turns()
-    for number in range(20):
-        turns.put(number, b"", HERE, 0)
-    size = WAITING_BYTES // 4 - WAITING_OVERHEAD_BYTES
-    pushed_out = [turns.put("loud", bytes(size), HERE, 0) for _ in range(5)]
-    assert [len(pushed) for pushed in pushed_out] == [0, 0, 0, 0, 1]
-
-
 def test_empty_datagrams_are_bounded_too() -> None:
     """They have no bytes of their own, and anyone can send them."""
     turns = Turns()
@@ -74,14 +64,6 @@ def test_the_largest_datagram_can_wait() -> None:
     turns.put("one", bytes(100), HERE, 0)
     assert turns.put("one", bytes(65507), HERE, 0) == [(bytes(100), HERE)]
     assert [[len(datagram) for datagram, _ in turn] for turn, _ in turns.round()] == [[0]] * rivals + [[65507]]
-
-
-def test_what_a_turn_read_makes_room() -> None:
-    """The bound counts what still waits."""
-    turns = Turns()
-    for _ in range(3):
-        assert turns.put("one", bytes(WAITING_BYTES - WAITING_OVERHEAD_BYTES), HERE, 0) == []
-        assert [len(list(turn)) for turn, _ in turns.round()] == [1]
 
 
 def test_a_turn_is_of_one_epoch() -> None:

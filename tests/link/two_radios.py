@@ -19,8 +19,8 @@ from uavlinkd.core.path import Path
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.settings import Link, PeerSettings
 from uavlinkd.core.timers import Schedule
-from uavlinkd.link.network_budgets import NetworkBudget
-from uavlinkd.link.peer_link import PeerLink
+from uavlinkd.link.networks import NetworkBudget
+from uavlinkd.link.peer_link import Carriage, PeerLink
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
 from uavlinkd.mavlink.frames import Frame, split_payload
 
@@ -62,7 +62,9 @@ class End:
             if radio.budget_bits_s
         }
         self.node.set_budgets({number: budget.bits_s for number, budget in self.budgets.items()})
-        self.link = PeerLink(config, self.node, self.perform, 0.0, schedule=self.schedule, budgets=self.budgets)
+        self.link = PeerLink(
+            config, Carriage(self.node, self.perform, budgets=self.budgets, waiting=self.schedule), 0.0
+        )
         self._housekeeping_at = 1.0
         self.link.peers.append(self.node.add_peer(settings, 0.0))
         self.delivered: list[Frame] = []

@@ -2,22 +2,15 @@
 
 from __future__ import annotations
 
-from itertools import product
 from typing import Any
 
 import pytest
 
 from uavlinkd.ops.netcheck import (
-    ANY_PEER,
-    FEW_PEERS,
-    MOST_PEERS,
-    ONE_HOST,
     ONE_VIEW,
-    STABLE_PEERS,
     Filtered,
     Mapped,
     behaviours,
-    meaning,
     report,
 )
 
@@ -91,34 +84,6 @@ def test_filtering_follows_from_the_tokens(passes: tuple[bool | None, ...], filt
     ]
 
 
-def test_each_network_has_its_own_nat() -> None:
-    """LTE behind a symmetric NAT, Wi-Fi without one."""
-    views = (
-        view("one", "a:1", PUBLIC, network="lte"),
-        view("two", "b:1", OTHER, network="lte"),
-        view("one", "a:1", PRIVATE, socket=1, network="wifi"),
-    )
-    results = (shown(False, network="lte"), shown(True, socket=1, network="wifi"))
-    assert list(behaviours(answer(*views, filtering=results))) == [
-        ("lte", Mapped.BY_EITHER, Filtered.BY_PORT),
-        ("wifi", Mapped.NO_NAT, Filtered.NOT_BY_PORT),
-    ]
-
-
-def test_meaning_uses_mapping_and_filtering() -> None:
-    """Every pair of them has a sentence."""
-    of_each = {pair: meaning(*pair) for pair in product(Mapped, Filtered)}
-    for mapped in (Mapped.NO_NAT, Mapped.INDEPENDENT):
-        assert of_each[mapped, Filtered.NOT_BY_PORT] == ANY_PEER
-        assert of_each[mapped, Filtered.BY_PORT] == MOST_PEERS
-        assert of_each[mapped, Filtered.UNKNOWN] == STABLE_PEERS
-    for filtered in Filtered:
-        changing = (Mapped.BY_ADDRESS, Mapped.BY_EITHER, Mapped.BY_PORT)
-        assert {of_each[mapped, filtered] for mapped in changing} == {FEW_PEERS}
-        assert of_each[Mapped.NOT_BY_PORT, filtered] == ONE_HOST
-        assert of_each[Mapped.UNKNOWN, filtered] == ONE_VIEW
-
-
 def test_report_of_a_machine_behind_nat() -> None:
     """Line by line."""
     seen = view("one", "192.0.2.1:5790", PUBLIC, network="lte")
@@ -132,25 +97,3 @@ def test_report_of_a_machine_behind_nat() -> None:
         f"             {ONE_VIEW}",
         f"candidates   {PUBLIC}, {PRIVATE}",
     ]
-
-
-def test_report_without_an_answer_says_what_to_do() -> None:
-    """The relays are down, or UDP is blocked."""
-    silent = answer(view("one", "192.0.2.1:5790", PUBLIC), state="lost")
-    silent["relays"]["two"]["unresolved"] = ["two.example.org"]
-    lines = list(report(silent))
-    assert lines[:-1] == [
-        "UDP          gets no answer: 0 of 2 relays answer",
-        "relay        one: lost; no answer at one.example.org:5790",
-        "relay        two: lost; two.example.org has no address now: see `getent hosts two.example.org`",
-        f"candidates   {PUBLIC}, {PRIVATE}",
-    ]
-    assert "public_key" in lines[-1]
-
-
-def test_file_without_relays_is_named() -> None:
-    """Netcheck needs one."""
-    nothing = {"relays": {}, "views": [], "filtering": [], "candidates": [], "is_relay": False, "own": []}
-    (line,) = report(nothing)
-    assert "[[relay]]" in line
-    assert "at its members" in list(report(nothing | {"is_relay": True}))[1]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -13,7 +12,7 @@ from tests.needs import need
 from uavlinkd.config import Config, keys
 from uavlinkd.config.load import load_config
 from uavlinkd.ops import network_report
-from uavlinkd.ops.network_report import look_at_networks, needs_privilege
+from uavlinkd.ops.network_report import look_at_networks
 
 Load = Callable[..., Config]
 _LOOPBACK = '[[network]]\nname = "loopback"\ninterface = "lo"\n'
@@ -36,29 +35,6 @@ def load(tmp_path: Path) -> Load:
         return load_config(path, {})
 
     return loading
-
-
-@pytest.mark.parametrize(
-    ("release", "needs"),
-    [("4.19.0-21-amd64", True), ("5.6.19", True), ("5.7.0", False), ("6.1.0-rpi7-rpi-v8", False), ("unknown", False)],
-)
-def test_privilege_follows_from_the_release(release: str, needs: bool) -> None:
-    """A release that says nothing causes no line."""
-    assert needs_privilege(release) is needs
-
-
-def test_old_kernel_is_reported(load: Load, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Once for all networks with an interface; not for an address."""
-    genuine = os.uname()
-    monkeypatch.setattr(os, "uname", lambda: os.uname_result((*genuine[:2], "5.4.0-150-generic", *genuine[3:])))
-    (line,) = look_at_networks(load(), {}).lacks
-    assert "Linux 5.4.0-150-generic lets only a process with CAP_NET_RAW" in line
-    assert look_at_networks(load('[[network]]\nname = "loopback"\naddress = "127.0.0.1"\n'), {}).lacks == []
-
-
-def test_without_networks_there_is_nothing_to_report(load: Load) -> None:
-    """The kernel's routes decide."""
-    assert look_at_networks(load(""), {}) == ([], [], [])
 
 
 def test_without_the_tool_for_routes_nothing_is_said_about_them(load: Load, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import os
-import socket
-import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -42,46 +40,10 @@ def lacks(tmp_path: Path) -> Lacks:
     return loading
 
 
-@pytest.fixture
-def short_folder() -> Iterator[Path]:
-    """A folder whose path is short enough for a socket's."""
-    with tempfile.TemporaryDirectory(prefix="machine-") as folder:
-        yield Path(folder)
-
-
 def test_complete_machine_has_no_line(lacks: Lacks) -> None:
     """Free ports, existing folders, numeric addresses."""
     assert lacks() == []
     assert lacks(listen=f"0.0.0.0:{free_port()}", url=f"tcpin:0.0.0.0:{free_port()}") == []
-
-
-@pytest.mark.parametrize("kind", ["udp", "tcp", "metrics"])
-def test_port_in_use_is_named_with_its_process(lacks: Lacks, kind: str) -> None:
-    """The port is not bound for that: this process holds it all the time."""
-    transport = socket.SOCK_DGRAM if kind == "udp" else socket.SOCK_STREAM
-    with socket.socket(socket.AF_INET, transport) as sock:
-        sock.bind(("127.0.0.1", 0))
-        if kind != "udp":
-            sock.listen()
-        where = f"127.0.0.1:{sock.getsockname()[1]}"
-        if kind == "udp":
-            (line,) = lacks(listen=where)
-        elif kind == "tcp":
-            (line,) = lacks(url=f"tcpin:{where}")
-        else:
-            (line,) = lacks(more=f'[metrics]\nlisten = "{where}"\n')
-    assert f"port {where.rpartition(':')[2]} is in use by" in line
-    assert f"(process {os.getpid()})" in line
-
-
-def test_daemon_that_runs_may_have_its_ports(lacks: Lacks, short_folder: Path) -> None:
-    """It answers on the control socket of the file."""
-    path = short_folder / "c.sock"
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock, socket.socket(socket.AF_UNIX) as control:
-        sock.bind(("127.0.0.1", 0))
-        control.bind(str(path))
-        control.listen()
-        assert lacks(listen=f"127.0.0.1:{sock.getsockname()[1]}", control=str(path)) == []
 
 
 def test_missing_address_and_interface(lacks: Lacks) -> None:
@@ -109,34 +71,6 @@ def test_serial_devices(lacks: Lacks, tmp_path: Path) -> None:
     (line,) = lacks(url=f"serial:{tmp_path}/file:57600")
     assert "is not a serial device" in line
     assert lacks(url="serial:/dev/ptmx:57600") == []
-
-
-def test_device_with_two_names(lacks: Lacks, tmp_path: Path) -> None:
-    """A name below /dev/serial/by-id, and that of the kernel."""
-    (tmp_path / "by-id").symlink_to("/dev/ptmx")
-    named = f'[[network]]\nname = "sik"\nserial = "{tmp_path}/by-id:57600"\n'
-    (line,) = lacks(url="serial:/dev/ptmx:57600", more=named, address="sik")
-    assert line.startswith(f'network "sik": {tmp_path}/by-id is the device of endpoint "autopilot" too')
-
-
-def test_device_without_permission(lacks: Lacks, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The group is named."""
-    monkeypatch.setattr(os, "access", lambda path, _: str(path) != "/dev/ptmx")
-    (line,) = lacks(url="serial:/dev/ptmx:57600")
-    assert "group, often dialout" in line
-
-
-def test_recording_folder(lacks: Lacks, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A file in its place, a missing parent, no permission, and a full disk."""
-    (tmp_path / "file").touch()
-    little = "min_free_bytes = 100000\n"
-    assert lacks(more=f'[recording]\nfolder = "new"\n{little}') == []
-    assert "is not a folder" in lacks(more=f'[recording]\nfolder = "file"\n{little}')[0]
-    assert "mkdir -p" in lacks(more=f'[recording]\nfolder = "a/b"\n{little}')[0]
-    huge = "min_free_bytes = 1_000_000_000_000_000\n"
-    assert "less than min_free_bytes" in lacks(more=f'[recording]\nfolder = "new"\n{huge}')[0]
-    monkeypatch.setattr(os, "access", lambda path, _: path != tmp_path)
-    assert "cannot be written by this user" in lacks(more=f'[recording]\nfolder = "new"\n{little}')[0]
 
 
 def test_control_socket(lacks: Lacks, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,6 +7,7 @@ import os
 from collections.abc import Callable
 from time import monotonic
 
+from tests import waiting
 from tests.daemon.udp import Sockaddr, open_socket
 from tests.waiting import PATIENCE_S
 from uavlinkd.core import constants as c
@@ -16,7 +17,6 @@ from uavlinkd.core.outputs import Output, RecordReceived, Transmit
 from uavlinkd.core.path import Path
 from uavlinkd.core.relay_records import RELAYED, TOKEN, Bind, Bound, FilterTest, FilterTested, Record, token_of, wrap
 from uavlinkd.core.settings import Link, PeerSettings
-from uavlinkd.lab.sim.links import ChangeNotifier
 
 LINK = Link(features=c.FEATURE_RECORDS)
 
@@ -40,7 +40,6 @@ class CoreMember:
         """Those that arrived, with their sources."""
         self.tested: list[bytes] = []
         """Those that the relay says that it sent from another port."""
-        self._changes = ChangeNotifier()
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
         self._loop.add_reader(self.sock, self._on_readable)
@@ -88,7 +87,7 @@ class CoreMember:
 
     async def until(self, condition: Callable[[], bool], timeout_s: float = PATIENCE_S) -> None:
         """Wait for a condition, which a datagram or a timer of this member fulfils."""
-        await self._changes.until(condition, timeout_s)
+        await waiting.until(condition, timeout_s)
 
     def perform(self, outputs: list[Output]) -> None:
         """Send what the core wants to send, and keep what came."""
@@ -128,7 +127,6 @@ class CoreMember:
         self._arm()
 
     def _arm(self) -> None:
-        self._changes.notify()
         if self._timer is not None:
             self._timer.cancel()
         delay_s = max(0.001, min(1.0, self.node.next_deadline() - monotonic()))

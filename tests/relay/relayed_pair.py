@@ -26,7 +26,7 @@ class Flow(NamedTuple):
     async def pour(self, numbers: Iterable[int], window_bytes: int = 32768) -> None:
         """Send frames with these numbers. Assert that they arrive, and nothing else."""
         frames = [frame(number, self.system) for number in numbers]
-        await pour(frames, self.source, self.into, self.sink, per_datagram=4, window_bytes=window_bytes)
+        await pour(frames, self.source, self.into, self.sink, window_bytes=window_bytes)
         self.sink.clear()
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tracemalloc
+from dataclasses import replace
 
 import pytest
 
@@ -11,12 +12,11 @@ from tests.fuzz.relays import HOMES, KEYS, RELAY_AT, STRANGERS, FuzzedRelay
 from tests.link.test_direct_search import HOME_A, LINK, leads_to_mesh
 from uavlinkd.core import constants as c
 from uavlinkd.core.drops import DropReason
-from uavlinkd.core.outputs import PathStateChanged, RecordReceived, Transmit
+from uavlinkd.core.outputs import RecordReceived, Transmit
 from uavlinkd.core.path import Path, relayed
 from uavlinkd.core.path_state import PathState
 from uavlinkd.core.relay_records import Bind, Bound, Candidates, FilterTest, Record, token_datagram, wrap
-from uavlinkd.link.candidates import OwnSocket
-from uavlinkd.link.direct_search import DirectSearch
+from uavlinkd.link.direct_search import DirectSearch, OwnSocket
 from uavlinkd.relay.service import BINDS_BURST, LOOK_S
 
 FLEET = 50
@@ -199,7 +199,8 @@ def test_filter_test_from_an_unproven_address_sends_nothing_there(relay: FuzzedR
 def test_token_that_cannot_be_sent_has_no_answer(relay: FuzzedRelay, monkeypatch: pytest.MonkeyPatch) -> None:
     """Otherwise the member would see a filter that is not there."""
     one = relay.members[0]
-    monkeypatch.setattr(relay.service, "_send_from_new_port", lambda datagram, path: False)
+    refusing = replace(relay.service._shell, send_from_new_port=lambda datagram, path: False)
+    monkeypatch.setattr(relay.service, "_shell", refusing)
     before = len(relay._wire)
     relay.send(one, one.node.send_record(one.peer, RELAY_AT[0], FilterTest(TOKEN), relay.now))
     assert len(relay._wire) == before
@@ -273,25 +274,6 @@ def test_wishes_that_wait_for_their_path_count_when_they_are_too_many(
     assert service.bindings.peers_of(KEYS[3]) == (0, 3)
 
 
-def test_data_does_not_make_the_relay_look_at_what_waits(relay: FuzzedRelay, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It settles after every wake-up. It looks every 0.1 s, and when a path may have been validated."""
-    session = relay.members[0].peer.sessions.current
-    assert session is not None
-    relay.arrive(session.seal_record(Bind((KEYS[2],)).encode(), relay.now), ELSEWHERE)
-    looks = list[float]()
-    monkeypatch.setattr(relay.service, "_bind_validated", looks.append)
-    start = relay.now + LOOK_S
-    for number in range(1000):
-        relay.service.settle(start + number / 1000)
-    assert 9 <= len(looks) <= 11
-    del looks[:]
-    relay.service.on_event(
-        PathStateChanged(relay.service.members[KEYS[1]].peer, ELSEWHERE, True, "answered"), start + 1.0
-    )
-    relay.service.settle(start + 1.0)
-    assert looks == [start + 1.0]
-
-
 def test_removed_member_with_several_paths_is_cut_off(relay: FuzzedRelay) -> None:
     """Whatever handle it tries afterwards, from any of its addresses."""
     bindings = relay.service.bindings
@@ -319,17 +301,3 @@ def test_drops_of_a_removed_member_are_reported(relay: FuzzedRelay) -> None:
     reports = [(DropReason.RELAY_OVER_LIMIT, "member0", over_limit)]
     assert [report for report in relay.service.count_drops() if report[1]] == reports
     assert not list(relay.service.count_drops())
-
-
-def test_member_beyond_its_limits_slows_only_itself(relay: FuzzedRelay) -> None:
-    """Also while its data costs the relay nothing but the drop: the other direction passes all."""
-    to_other, to_one = connect(relay)
-    greedy, modest = relay.service.members[KEYS[1]].meter, relay.service.members[KEYS[2]].meter
-    for _ in range(200):
-        relay.now += 0.01
-        for _ in range(10):
-            relay.arrive(wrap(to_other, DATA), HOMES[0][0])
-        relay.arrive(wrap(to_one, DATA), HOMES[1][0])
-    assert (modest.datagrams, modest.over_limit) == (200, 0)
-    assert greedy.datagrams + greedy.over_limit == 2000
-    assert greedy.over_limit > 1500

@@ -128,7 +128,7 @@ steps: st.SearchStrategy[Step] = st.one_of(
 )
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(st.integers(0, 1000), st.lists(steps, max_size=40))
 def test_random_histories_follow_the_rules(seed: int, history: list[Step]) -> None:
     """Members bind, lose paths, let wishes expire, and are removed and added again. Routes follow."""
@@ -169,35 +169,12 @@ def test_random_histories_follow_the_rules(seed: int, history: list[Step]) -> No
 # Rule by rule.
 
 
-def test_pair_is_connected_once_both_have_asked() -> None:
-    """Each gets a handle of its own, and both are to be notified."""
-    made = bindings()
-    first = made.bind(A, path(A), [B], 0.0)
-    assert first == Changes([], [], {(A, path(A)): {B: None}})
-    assert made.handles(A, path(A), B) == ()
-    changes = made.bind(B, path(B), [A], 0.0)
-    (connection,) = changes.opened
-    assert made.handles(A, path(A), B) == (connection.one.handle,)
-    assert made.handles(B, path(B), A) == (connection.other.handle,)
-    assert changes.concerned == {(A, path(A)): {B: None}, (B, path(B)): {A: None}}
-
-
 @pytest.mark.parametrize("key", [STRANGER, C, A], ids=["unknown", "absent", "its own"])
 def test_answer_does_not_tell_who_exists(key: bytes) -> None:
     """The same for a key that is not a member, for a member that did not ask, and for the member's own."""
     made = bindings()
     assert made.bind(A, path(A), [key], 0.0) == Changes([], [], {(A, path(A)): {key: None}})
     assert made.handles(A, path(A), key) == ()
-
-
-def test_renewal_keeps_the_handles() -> None:
-    """The other member is not notified."""
-    made = bindings()
-    connection = connect(made)
-    changes = made.bind(A, path(A), [B], 30.0)
-    assert (changes.opened, changes.closed) == ([], [])
-    assert changes.concerned == {(A, path(A)): {B: None}}
-    assert made.handles(A, path(A), B) == (connection.one.handle,)
 
 
 def test_connection_ends_with_the_wish_of_either() -> None:
@@ -213,26 +190,6 @@ def test_connection_ends_with_the_wish_of_either() -> None:
     assert made.handles(A, path(A), B) == ()
     made.expire(30.0 + c.BIND_LIFETIME_S)
     assert made.next_expiry == c.NEVER
-
-
-def test_connection_ends_with_its_path() -> None:
-    """Those along other paths stay."""
-    made = bindings()
-    connection = connect(made)
-    made.bind(A, path(A, 1), [B], 0.0)
-    assert made.end_path(A, path(A), 1.0).closed == [connection]
-    assert made.handles(A, path(A, 1), B)
-    assert made.handles(A, path(A), B) == ()
-
-
-def test_two_networks_at_each_end_have_four_connections() -> None:
-    """So copies along both pass whichever of them works."""
-    made = bindings()
-    for member, key in ((A, B), (B, A)):
-        for number in (0, 1):
-            made.bind(member, path(member, number), [key], 0.0)
-    assert made.connections == 4
-    assert [len(made.handles(A, path(A, number), B)) for number in (0, 1)] == [2, 2]
 
 
 def test_new_path_takes_the_place_of_a_spare_connection() -> None:
@@ -252,11 +209,11 @@ def test_fifth_path_replaces_the_one_renewed_least_recently() -> None:
     made = bindings()
     connect(made)
     for number in (1, 2, 3):
-        made.bind(A, path(A, number), [B], float(number))
+        made.bind(A, path(A, number), [B, C], float(number))
     made.bind(A, path(A), [B], 4.0)
     made.bind(A, path(A, 4), [B], 5.0)
     assert [bool(made.handles(A, path(A, number), B)) for number in range(5)] == [True, False, True, True, True]
-    assert made.connections == c.HANDLES_PER_PAIR
+    assert (made.connections, made.peers_of(A)) == (c.HANDLES_PER_PAIR, (1, 1))
 
 
 def test_handle_is_quarantined() -> None:
@@ -299,22 +256,6 @@ def test_member_that_changes_its_paths_fast_does_not_use_up_the_handles_of_anoth
     assert len(used) > 2 * QUARANTINED_PER_MEMBER
     assert made.handles(A, path(A), C)
     assert made.connections == 1
-
-
-def test_ten_thousand_requested_bindings_are_bounded() -> None:
-    """A member has as many wishes as it may; those beyond are waiting, like all that are not there."""
-    members = [number.to_bytes(c.KEY_BYTES, "big") for number in range(1, 10_001)]
-    made = bindings(members=members, most_peers=100)
-    greedy = members[0]
-    answers = [made.bind(greedy, Path(0, ("192.0.2.1", 1)), [key], 0.0) for key in members[1:]]
-    assert made.peers_of(greedy) == (0, 100)
-    assert made.refused(greedy) == 9_899
-    assert all(
-        list(answer.concerned.values()) == [{key: None}] for answer, key in zip(answers, members[1:], strict=True)
-    )
-    made.expire(c.BIND_LIFETIME_S)
-    made.bind(greedy, Path(0, ("192.0.2.1", 1)), [members[-1]], 61.0)
-    assert made.peers_of(greedy) == (0, 1)
 
 
 @pytest.mark.parametrize(

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import AsyncIterator
 from typing import Any
 
 import pytest
 
-from tests.daemon.fleet import AN_OPERATOR, a_member, a_vehicle, beat
+from tests.daemon.fleet import AN_OPERATOR, a_member, a_vehicle
 from tests.daemon.frames import heartbeat
 from tests.daemon.harness import Stage
 from tests.daemon.process import DaemonProcess, Status
@@ -29,7 +28,7 @@ class Fleet:
 
     def __init__(self, stage: Stage) -> None:
         self.station, self.a, self.b = stage.daemon("station"), stage.daemon("drone1", []), stage.daemon("drone2", [])
-        self.station.config |= {"relay_server": {"enabled": True}, "member": []}
+        self.station.config["member"] = []
         for number, vehicle in enumerate((self.a, self.b), 1):
             psk = stage.psk()
             self.station.add_peer(vehicle, [], psk, **a_vehicle(number))
@@ -104,41 +103,15 @@ async def test_roles_come_and_go_while_the_link_is_up(stage: Stage, fleet: Fleet
     stranger, station = await stage.client(), await fleet.station.status()
     host, _, port = station["relay"]["members"]["drone1"]["addresses"][0].rpartition(":")
     for start in (RELAYED, TOKEN):  # as at a daemon that never had relays
-        stranger.send(bytes((start,)) + bytes(16), (host, int(port)))
-    await fleet.a.until(lambda status: status["drops"].get("malformed") == 2)
+        before = (await fleet.a.status())["drops"].get("malformed", 0)
+
+        def is_counted(status: Status, start: int = start, before: int = before) -> bool:
+            stranger.send(bytes((start,)) + bytes(16), (host, int(port)))  # a paused daemon drops it unread
+            return bool(status["drops"].get("malformed", 0) > before)
+
+        await fleet.a.until(is_counted)
     for daemon in (fleet.a, fleet.station):
         assert len(daemon.events("peer_up", peer=peers[0]["name"] if daemon is fleet.a else "drone1")) == 1
-
-
-async def test_relay_may_stop_to_be_a_peer(stage: Stage, fleet: Fleet) -> None:
-    """Then it carries no frames, whatever it sends, and connects the vehicles as before."""
-    into = fleet.station.add_endpoint("qgc")
-    await stage.start(*fleet.daemons)
-    fleet.a.config["relay"][0]["addresses"] = fleet.a.config["peer"][0]["addresses"]
-    psk_file = fleet.a.config["peer"].pop(0)["psk_file"]
-    fleet.a.config["relay"][0]["psk_file"] = psk_file
-    assert await reload(fleet.a) == []
-    await fleet.a.until(lambda status: is_relayed(status, "drone2") and set(status["peers"]) == {"drone2"})
-    station = await stage.client()
-    station.send(heartbeat(255), into)
-    await fleet.a.until(lambda status: status["drops"].get("frames_not_allowed", 0) > 0)
-
-
-async def test_station_that_starts_again_connects_the_vehicles_again(stage: Stage, fleet: Fleet) -> None:
-    """It remembers nothing: with their next sessions, both vehicles bind each other again."""
-    at_b = await stage.client()
-    into_a = fleet.a.add_endpoint("autopilot")
-    fleet.b.add_endpoint("autopilot", f"udpout:{at_b}")
-    await stage.start(*fleet.daemons)
-    autopilot = await stage.client()
-    beats = asyncio.create_task(beat(lambda _: autopilot.send(heartbeat(1), into_a), 0.2))
-    await at_b.until_received(heartbeat(1))
-    await fleet.station.kill()
-    await fleet.a.until(lambda status: status["peers"]["drone2"]["state"] == "lost")
-    at_b.clear()
-    await fleet.station.start()
-    await at_b.until_received(heartbeat(1))
-    beats.cancel()
 
 
 async def test_key_of_the_station_changes_in_both_roles(stage: Stage, fleet: Fleet) -> None:
@@ -163,30 +136,3 @@ async def test_key_of_the_station_changes_in_both_roles(stage: Stage, fleet: Fle
         await vehicle.until(lambda status: not status["peers"]["station"]["accepts_previous_key"])
         await vehicle.until(lambda status: set(status["relays"]["gcs"]["peers"].values()) == {"bound"})
     await fleet.station.until(lambda status: status["relay"]["connections"] == 1)
-
-
-async def test_others_reach_a_vehicle_by_its_previous_key_until_it_has_the_new_one(
-    stage: Stage, fleet: Fleet
-) -> None:
-    """The relay has two members meanwhile, and removes the one with the previous key after a new session."""
-    await stage.start(*fleet.daemons)
-    before, private = fleet.a.public_key, keys.generate_private_key()
-    stage.secrets.append(private)
-    fleet.a.public_key = keys.public_key_text(private)
-    changed = {"public_key": fleet.a.public_key, "previous_public_key": before}
-    fleet.station.config["peer"][0] |= changed
-    fleet.station.config["member"][0]["public_key"] = fleet.a.public_key
-    assert await reload(fleet.station) == []
-    status = await fleet.station.until(lambda status: status["relay"]["connections"] == 1)
-    assert set(status["relay"]["members"]) == {"drone1", "drone1 (previous key)", "drone2"}
-
-    fleet.b.config["peer"][1] |= changed
-    assert await reload(fleet.b) == []
-    await fleet.a.stop()
-    keys.write_secret_file(fleet.a.folder / "new.key", private)
-    fleet.a.config["private_key_file"] = "new.key"
-    await fleet.a.start()
-    status = await fleet.station.until(
-        lambda status: status["relay"]["connections"] == 1 and status["relay"]["members"]["drone1"]["bound"] == 1
-    )
-    assert set(status["relay"]["members"]) == {"drone1", "drone2"}

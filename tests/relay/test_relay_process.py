@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 
-from tests.core.harness import FRAME
 from tests.daemon.fleet import relay_for
 from tests.daemon.frames import heartbeat
 from tests.daemon.harness import Stage
@@ -18,9 +17,7 @@ from tests.daemon.test_reload import reload
 from tests.needs import need
 from tests.relay.core_member import CoreMember
 from uavlinkd.config.keys import decode_key, encode_key
-from uavlinkd.core import constants as c
 from uavlinkd.core.crypto import KeyPair
-from uavlinkd.core.relay_records import Bind, Bound, Candidates
 from uavlinkd.lab.sim.loopback_ports import free_port, has_ipv6
 from uavlinkd.ops.netcheck import ANY_PEER, Filtered, Mapped, behaviours
 from uavlinkd.system.addresses import Address
@@ -70,11 +67,6 @@ def member_of(status: Status, name: str) -> dict[str, Any]:
     """The member in a status."""
     member: dict[str, Any] = status["relay"]["members"][name]
     return member
-
-
-def causes(status: Status) -> list[str]:
-    """Of the findings in a status."""
-    return [finding["cause"] for finding in status["findings"]]
 
 
 async def test_members_reach_each_other_through_the_relay(relay: DaemonProcess, make_member: MakeMember) -> None:
@@ -130,92 +122,6 @@ async def test_netcheck_of_a_member_shows_what_is_let_in(host: str, stage: Stage
     assert member_of(status, "drone1")["filter_tests_ignored"] == 0
 
 
-async def test_relay_ignores_filter_tests_above_the_limit(relay: DaemonProcess, make_member: MakeMember) -> None:
-    """They are counted. Each of the others sends one token, from a port of its own, which is closed."""
-    drone = make_member("drone1")
-    await relay.start()
-    await drone.test_filter(bytes(16))
-    await drone.until(lambda: drone.tested == [bytes(16)] and bool(drone.tokens))
-    for number in range(1, 100):
-        await drone.test_filter(number.to_bytes(16))
-    await relay.until(lambda status: member_of(status, "drone1")["filter_tests_ignored"] > 50)
-    await drone.until(lambda: len(drone.tokens) == len(drone.tested) >= c.FILTER_TESTS)
-    sources = {source for _, source in drone.tokens}
-    assert drone.path.address not in sources
-    assert {host for host, _ in sources} == {drone.path.host}
-    assert [token for token, _ in drone.tokens] == drone.tested
-
-
-async def test_drops_are_counted_and_strangers_get_no_answer(
-    stage: Stage, relay: DaemonProcess, make_member: MakeMember
-) -> None:
-    """A stranger's data, malformed data, and frames of a member."""
-    drone, station = make_member("drone1"), make_member("station")
-    await relay.start()
-    handle, _ = await connect(drone, station)
-    stranger = await stage.client()
-    stranger.send(b"\x50" + handle.to_bytes(2, "big") + INNER, relay.sockaddr)
-    drone.send(handle, b"\x50" + INNER)
-    drone.send_frames(FRAME)
-    status = await relay.until(
-        lambda status: bool(status["drops"].get("frames_not_allowed")) and len(status["relay"]["dropped"]) == 2
-    )
-    assert status["relay"]["dropped"] == {"relay_unknown_handle": 1, "relay_malformed": 1}
-    assert stranger.datagrams == []
-    assert station.data == []
-    await relay.until_logged("datagrams_dropped", reason="frames_not_allowed")
-
-
-async def test_status_names_the_key_of_a_sender_that_is_not_a_member(
-    relay: DaemonProcess, make_member: MakeMember
-) -> None:
-    """Although all members are up. Nothing is accepted because of it."""
-    drone = make_member("drone1")
-    make_member("station")
-    del relay.config["member"][0]
-    await relay.start()
-    status = await relay.until(
-        lambda status: "not_a_member" in causes(status) and member_of(status, "station")["is_up"]
-    )
-    (finding,) = status["findings"]
-    assert encode_key(drone.key) in finding["text"]
-    assert "uavlinkd pubkey" in finding["remedy"]
-    assert finding["severity"] == "warning"
-    assert not drone.peer.is_up
-
-
-async def test_status_names_another_key_for_the_relay_while_a_member_is_down(
-    relay: DaemonProcess, make_member: MakeMember
-) -> None:
-    """Any sender can cause it. So it does not count when all members are up."""
-    make_member("station")
-    absent = KeyPair(bytes([7]) * 32)
-    relay.config["member"].append({"name": "drone1", "public_key": encode_key(absent.public)})
-    stranger = CoreMember(KeyPair(bytes([8]) * 32).public, relay.sockaddr)
-    try:
-        await relay.start()
-        status = await relay.until(lambda status: "other_relay_key" in causes(status))
-        assert relay.public_key in status["findings"][0]["remedy"]
-        del relay.config["member"][1]
-        relay.write_config()
-        assert await reload(relay) == []
-        await relay.until(lambda status: member_of(status, "station")["is_up"] and not causes(status))
-    finally:
-        stranger.close()
-
-
-async def test_member_waits_for_one_that_is_not_there(relay: DaemonProcess, make_member: MakeMember) -> None:
-    """The answer does not tell whether the other is a member. When the other asks, both get handles at once."""
-    drone, station = make_member("drone1"), make_member("station")
-    unknown = bytes(31) + b"\x09"
-    await relay.start()
-    await drone.bind(station.key, unknown)
-    await drone.until(lambda: bool(drone.bounds))
-    assert drone.bounds[-1].handles == ((station.key, 0), (unknown, 0))
-    await station.bind(drone.key)
-    assert await drone.until_bound(station.key)
-
-
 async def test_members_change_while_the_relay_runs(relay: DaemonProcess, make_member: MakeMember) -> None:
     """A new one is accepted, a removed one is cut off, and the connection of the others stays."""
     drone, station, third = make_member("drone1"), make_member("station"), make_member("drone2")
@@ -239,36 +145,9 @@ async def test_members_change_while_the_relay_runs(relay: DaemonProcess, make_me
     await relay.until(lambda status: status["relay"]["dropped"].get("relay_unknown_handle") == 1)
 
 
-async def test_relay_that_starts_again_is_of_use_at_once(relay: DaemonProcess, make_member: MakeMember) -> None:
-    """It remembers nothing. Members make new sessions, and bind again."""
-    drone, station = make_member("drone1"), make_member("station")
-    await relay.start()
-    await connect(drone, station)
-    await relay.kill()
-    await relay.start()
-    await relay.ready()
-    for member in (drone, station):
-        member.bounds.clear()
-        member.send_frames(FRAME)  # so that it notices that nothing answers
-    made = [member.peer.traffic.handshakes for member in (drone, station)]
-    await drone.until(lambda: all(m.peer.traffic.handshakes > n for m, n in zip((drone, station), made, strict=True)))
-    to_station, _ = await connect(drone, station)
-    drone.send(to_station, INNER)
-    await station.until(lambda: len(station.data) == 1)
-
-
-async def test_file_without_members_is_refused(relay: DaemonProcess) -> None:
-    """With what to do."""
-    del relay.config["member"]
-    await relay.start()
-    assert await relay.ended() == 2
-    assert any("[[member]]" in line for line in relay.plain_lines)
-
-
 async def test_member_may_become_a_peer_too(relay: DaemonProcess, make_member: MakeMember) -> None:
     """One session serves both: after a reload its frames are accepted, and it is still connected."""
     drone, station = make_member("drone1"), make_member("station")
-    relay.config["relay_server"] = {"enabled": True}
     await relay.start()
     await connect(drone, station)
     section = {"name": "drone1", "public_key": encode_key(drone.key), "role": "all", "system_ids": "all"}
@@ -286,7 +165,6 @@ async def test_member_may_become_a_peer_too(relay: DaemonProcess, make_member: M
 async def test_names_and_keys_of_members_may_go_to_others(relay: DaemonProcess, make_member: MakeMember) -> None:
     """In one reload: a renamed member's name to a peer with another key, a member's key to a relay."""
     drone, station, vps = make_member("drone1"), make_member("station"), make_member("vps")
-    relay.config["relay_server"] = {"enabled": True}
     await relay.start()
     await connect(drone, station)
     other = encode_key(KeyPair(bytes([7]) * 32).public)
@@ -323,17 +201,3 @@ async def test_relay_with_another_key_is_asked_for_the_same_peers(
     drone.config["relay"][0]["public_key"] = relay.public_key
     assert await reload(drone) == []
     await relay.until(lambda status: member_of(status, "drone0")["waiting"] == 1)
-
-
-async def test_records_without_effect_are_counted(relay: DaemonProcess, make_member: MakeMember) -> None:
-    """Records that are not for a relay, and wishes for more than one peer."""
-    drone, station = make_member("drone1", max_peers=1), make_member("station")
-    await relay.start()
-    await connect(drone, station)
-    drone.send_record(Bound("203.0.113.1", 4000, ((station.key, 1),)))
-    drone.send_record(Candidates((("203.0.113.1", 4000),)))
-    drone.send_record(Bind((bytes(31) + b"\x09",)))
-    status = await relay.until(lambda status: len(status["drops"]) == 2)
-    assert status["drops"] == {"unexpected_record": 2, "record_over_limit": 1}
-    assert member_of(status, "drone1")["binds_ignored"] == 1
-    await relay.until_logged("datagrams_dropped", reason="record_over_limit", who="drone1")

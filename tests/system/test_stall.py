@@ -54,18 +54,6 @@ def test_each_pause_is_reported_once_and_begins_an_epoch() -> None:
     assert pauses == pytest.approx([PAUSED_UNTIL] * 2)
 
 
-def test_queue_is_stale_until_it_was_empty(watch: StallWatch, queue: Queue) -> None:
-    """Time alone does not end staleness."""
-    queue.sender.send(b"old")
-    assert watch.turn(PAUSED_UNTIL) == 1
-    for seconds in range(60):
-        assert queue.backlog.begin(PAUSED_UNTIL + seconds) == STALE
-        queue.backlog.end(1, is_empty=False)
-    assert queue.backlog.begin(PAUSED_UNTIL + 60) == STALE
-    queue.backlog.end(0, is_empty=True)
-    assert queue.backlog.begin(PAUSED_UNTIL + 60) == 1
-
-
 def test_queue_is_stale_until_its_capacity_was_read(watch: StallWatch, queue: Queue) -> None:
     """A sender that always fills the queue does not keep it stale."""
     queue.sender.send(b"old")
@@ -91,21 +79,6 @@ def test_queue_that_is_empty_after_a_pause_is_not_stale(watch: StallWatch, queue
     assert watch.turn(PAUSED_UNTIL) == 1
     queue.sender.send(b"new")
     assert queue.backlog.begin(PAUSED_UNTIL) == 1
-
-
-def test_read_that_detects_the_pause_is_stale(queue: Queue) -> None:
-    """The read needs no earlier turn of the loop."""
-    queue.sender.send(b"old")
-    assert queue.backlog.begin(PAUSED_UNTIL) == STALE
-
-
-def test_closed_socket_is_ignored(watch: StallWatch, queue: Queue) -> None:
-    """Its backlog exists while a reader refers to it."""
-    other = Queue(watch)
-    other.close()
-    queue.sender.send(b"old")
-    watch.turn(PAUSED_UNTIL)
-    assert (queue.backlog.is_stale, other.backlog.is_stale) == (True, False)
 
 
 def test_new_queue_is_stale_while_another_is(watch: StallWatch, queue: Queue) -> None:

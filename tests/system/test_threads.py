@@ -6,22 +6,10 @@ import asyncio
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
-from queue import Empty, SimpleQueue
 
 import pytest
 
-from tests.waiting import PATIENCE_S, until
-from uavlinkd.system import threads
 from uavlinkd.system.threads import Threads
-
-
-async def test_results_and_exceptions_are_returned() -> None:
-    """`run` behaves like a direct call."""
-    some = Threads(2, "test")
-    assert await some.run(divmod, 7, 2) == (3, 1)
-    with pytest.raises(ZeroDivisionError):
-        await some.run(divmod, 7, 0)
 
 
 async def test_calls_beyond_the_limit_wait_for_a_thread() -> None:
@@ -42,42 +30,6 @@ async def test_calls_beyond_the_limit_wait_for_a_thread() -> None:
     for _ in tasks:
         gate.release()
     assert sorted(await asyncio.gather(*tasks)) == [(number, "test-most") for number in range(6)]
-
-
-async def test_idle_threads_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    """New work starts new threads."""
-    monkeypatch.setattr(threads, "IDLE_S", 0.01)
-    some = Threads(3, "test-idle")
-    for _ in range(3):
-        await some.run(int)
-        await until(lambda: all(thread.name != "test-idle" for thread in threading.enumerate()))
-
-
-async def test_work_is_done_if_it_arrives_while_a_thread_becomes_idle(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A thread without work counts as idle before more work can arrive, so no work waits for a thread that ended."""
-    monkeypatch.setattr(threads, "IDLE_S", 0.01)
-    found_none, has_come = threading.Event(), threading.Event()
-
-    class Queue(SimpleQueue[Callable[[], None]]):
-        def get_nowait(self) -> Callable[[], None]:
-            try:
-                return super().get_nowait()
-            except Empty:
-                found_none.set()
-                has_come.wait(0.2)  # it comes in this time, unless it has to wait as well
-                raise
-
-    monkeypatch.setattr(threads, "SimpleQueue", Queue)
-    some = Threads(1, "test-between")
-    await some.run(int)
-    await asyncio.to_thread(found_none.wait)
-    second = asyncio.create_task(some.run(int, "2"))
-    await asyncio.sleep(0)
-    has_come.set()
-    assert await second == 2
-    await until(lambda: all(thread.name != "test-between" for thread in threading.enumerate()))
-    async with asyncio.timeout(PATIENCE_S):
-        assert await some.run(int, "3") == 3
 
 
 async def test_cancelled_run_does_not_wait_for_a_hanging_call() -> None:

@@ -94,18 +94,16 @@ class LineLimits:
     """
 
     def __init__(self) -> None:
-        self._limits: dict[tuple[str, str, bool], TokenBucket] = {}
-        self._totals: dict[tuple[str, bool], TokenBucket] = {}
+        self._limits: dict[tuple[str, str | None, bool], TokenBucket] = {}  # by kind, name (None: all), and security
         self._omitted: Counter[tuple[str, str]] = Counter()
 
     def take(self, kind: str, name: str, now: float, *, is_security: bool = False) -> dict[str, int] | None:
         """The field with the count of omitted lines; None if this line exceeds a limit."""
-        limit = self._limits.get((kind, name, is_security))
-        if limit is None:
-            limit = self._limits[kind, name, is_security] = TokenBucket(LINES_PER_S, LINES_BURST, now)
-        total = self._totals.get((kind, is_security))
-        if total is None:
-            total = self._totals[kind, is_security] = TokenBucket(TOTAL_LINES_PER_S, TOTAL_BURST, now)
+        limits, own, all_of_kind = self._limits, (kind, name, is_security), (kind, None, is_security)
+        limit = limits.get(own) or limits.setdefault(own, TokenBucket(LINES_PER_S, LINES_BURST, now))
+        total = limits.get(all_of_kind) or limits.setdefault(
+            all_of_kind, TokenBucket(TOTAL_LINES_PER_S, TOTAL_BURST, now)
+        )
         if not (limit.has(now) and total.take(now)):
             return None
         limit.take(now)
@@ -122,7 +120,7 @@ class LineLimits:
 
     def forget(self, is_forgotten: Callable[[str], bool]) -> None:
         """Forget the names that the configuration no longer has."""
-        for key in [key for key in self._limits if is_forgotten(key[1])]:
+        for key in [key for key in self._limits if key[1] is not None and is_forgotten(key[1])]:
             del self._limits[key]
         for kind, name in [key for key in self._omitted if is_forgotten(key[1])]:
             del self._omitted[kind, name]
@@ -132,8 +130,9 @@ class Conditions(Generic[K]):
     """The open conditions of one kind, by key. Keys come from closed lists and the configuration: memory is bounded.
 
     ``write`` gets a line that is within the limits: key, phase, condition, and the field of omitted lines.
-    ``name_of`` is the peer or endpoint whose limit applies. The first line of a security condition since the start of
-    the daemon is never omitted. ``counts_events``: counts are of what occurred, not of looks at what lasts.
+    ``limit_of`` returns the peer or endpoint whose limit applies, and whether it is that of security lines. The first
+    line of a security condition since the start of the daemon is never omitted. ``counts_events``: counts are of what
+    occurred, not of looks at what lasts.
     """
 
     def __init__(
@@ -141,17 +140,15 @@ class Conditions(Generic[K]):
         kind: str,
         limits: LineLimits,
         write: Callable[[K, Phase, OpenCondition, dict[str, int]], None],
+        limit_of: Callable[[K], tuple[str, bool]],
         *,
-        name_of: Callable[[K], str],
-        is_security: Callable[[K], bool] = lambda _: False,
         counts_events: bool = False,
         quiet_s: float = QUIET_S,
     ) -> None:
         self._kind = kind
         self._limits = limits
         self._write = write
-        self._name_of = name_of
-        self._is_security = is_security
+        self._limit_of = limit_of
         self._counts_events = counts_events
         self._quiet_s = quiet_s
         self._open: dict[K, OpenCondition] = {}
@@ -192,7 +189,7 @@ class Conditions(Generic[K]):
         for key in [key for key in self._open if is_closed(key)]:
             condition = self._open.pop(key)
             phase = Phase.ENDED if condition.is_logged else Phase.BEGAN
-            self._write(key, phase, condition, self._limits.pop_omitted(self._kind, self._name_of(key)))
+            self._write(key, phase, condition, self._limits.pop_omitted(self._kind, self._limit_of(key)[0]))
         for key in [key for key in self._known if is_closed(key)]:
             self._known.remove(key)
             self._ended.pop(key, None)
@@ -202,8 +199,8 @@ class Conditions(Generic[K]):
         return min(HOUR_S, 2 * quiet_s) if now - ended_at < HOUR_S else self._quiet_s
 
     def _begin(self, key: K, condition: OpenCondition, now: float) -> None:
-        if key not in self._known and self._is_security(key):
-            omitted: dict[str, int] | None = self._limits.pop_omitted(self._kind, self._name_of(key))
+        if key not in self._known and self._limit_of(key)[1]:
+            omitted: dict[str, int] | None = self._limits.pop_omitted(self._kind, self._limit_of(key)[0])
         else:
             omitted = self._take(key, now)
         if omitted is not None:
@@ -213,11 +210,11 @@ class Conditions(Generic[K]):
             self._write(key, Phase.BEGAN, condition, omitted)
 
     def _is_flood(self, key: K, condition: OpenCondition, now: float) -> bool:
-        return self._counts_events and condition.has_grown(now) and self._is_security(key)
+        return self._counts_events and condition.has_grown(now) and self._limit_of(key)[1]
 
     def _end(self, key: K, condition: OpenCondition, now: float) -> None:
         if not condition.is_logged:
-            self._limits.omit(self._kind, self._name_of(key))
+            self._limits.omit(self._kind, self._limit_of(key)[0])
         elif (omitted := self._take(key, now)) is not None:
             self._write(key, Phase.ENDED, condition, omitted)
         else:  # the line waits until the limit permits it
@@ -226,4 +223,5 @@ class Conditions(Generic[K]):
         self._ended[key] = now, condition.quiet_s
 
     def _take(self, key: K, now: float) -> dict[str, int] | None:
-        return self._limits.take(self._kind, self._name_of(key), now, is_security=self._is_security(key))
+        name, is_security = self._limit_of(key)
+        return self._limits.take(self._kind, name, now, is_security=is_security)

@@ -1,33 +1,36 @@
-"""Copies for other paths of one peer: which are sent at once, which wait for a network's budget, which are dropped.
+"""Sealed datagrams that a peer gets beside the first one of each envelope: copies for other paths, and repeats.
 
-A critical envelope goes along every usable path. The first path carries it at once. Each further one carries a copy.
-Copies must not take a slow network from the frames that it alone carries. So the copies of a peer use at most the
-rate of its stream, or 64 kbit/s if that is more. Of a network's budget the copies of all peers use at most half.
+A critical envelope goes along every proven path. The first path carries it at once. Each further one carries a copy.
+On lossy paths critical envelopes are repeated too. Specification, section 15. Neither must take a slow network from
+the frames that it alone carries. So the copies of a peer use at most the rate of its stream, or 64 kbit/s if that is
+more; repeats use what is left of it on average. Of a network's budget the copies of all peers use at most half.
 
-A copy for which there is no room waits, sealed. Commands and heartbeats go first, then other events, then states.
-Newer states replace a waiting copy that has no other frames. A copy that waited for :data:`MAX_WAIT_S` is dropped:
-what it carries has arrived along another path, or comes again. A copy of an envelope of another class does not wait.
-Sans-IO: ``now`` is monotonic seconds.
+One queue has what waits: copies for which there is no room, and envelopes until they were sent often enough. Copies
+go before repeats; then commands and heartbeats, other events, states. Newer states replace older ones that have no
+other frames. What waited for :data:`MAX_WAIT_S` is dropped: it has arrived along another path, or comes again. A copy
+of an envelope that is not critical does not wait. Sans-IO: ``now`` is monotonic seconds.
 """
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Mapping, Sequence
-from math import inf
-from typing import Final
+from collections import Counter, deque
+from collections.abc import Container, Mapping, Sequence
+from math import ceil, inf, log, prod
+from typing import Final, NamedTuple
 
+from uavlinkd.core.constants import TRANSMISSIONS
 from uavlinkd.core.outputs import Transmit
 from uavlinkd.core.path import Path
-from uavlinkd.link.network_budgets import LARGEST_BYTES, NetworkBudget, wire_bytes
-from uavlinkd.link.shell_reasons import ShellReason
+from uavlinkd.core.path_state import PathCondition, PathState
+from uavlinkd.link.drop_summary import ShellReason
+from uavlinkd.link.networks import LARGEST_BYTES, NetworkBudget, wire_bytes
 from uavlinkd.mavlink.classes import Lane
 from uavlinkd.mavlink.egress.bucket import Bucket
 from uavlinkd.mavlink.flows import FlowKey, flow_key
 from uavlinkd.mavlink.frames import Frame
 
 MAX_WAIT_S: Final = 0.5
-"""A copy that waits longer is dropped."""
+"""What waits longer is dropped."""
 DEBT_S: Final = 0.25
 """A copy is sent at once on a network whose budget is in debt by less than this."""
 LEAST_BITS_S: Final = 64_000
@@ -37,25 +40,62 @@ AVERAGE_S: Final = 10
 it. On a network or for a peer with a budget this does not count."""
 MAX_WAITING_BYTES: Final = 8192
 """Of the copies that wait for one path. The least important ones are dropped first, of these the oldest."""
+MAX_ENVELOPES: Final = 256
+"""Of one peer that wait for repeats. The same are dropped first."""
+SPACING_S: Final = 0.005
+"""From an envelope to its first repeat; then each time twice as long. So a state that is sent at 50/s is repeated too
+before a newer one replaces it, and a burst of losses does not hit every repeat."""
 _SLACK_BYTES: Final = 0.5  # a deadline computed in floating point must not come a hair early, over and over
 
+BEGIN_LOSS: Final = 0.02
+"""Repair begins above this loss of all paths together,"""
+END_LOSS: Final = 0.01
+"""and ends below this one."""
+RESIDUAL_LOSS: Final = 0.005
+"""Envelopes are repeated so often that less than this share of them is lost, if losses are random."""
+LEAST_LOST: Final = 3
+"""A path must lose so many envelopes before repair begins: fewer say nothing."""
+HOLD_S: Final = 10.0
+"""The highest loss of this time decides, so that repair does not flap."""
+KNOWN_S: Final = 30.0
+"""A path that does not answer is considered for this time: at 70 % loss in each direction, answers are rare."""
 
-class _WaitingCopy:
-    """A copy that waits for one path."""
 
-    __slots__ = ("datagram", "is_replaceable", "put_at", "rank", "states")
+class Released(NamedTuple):
+    """A transmission to send now, and its number along its path: 1 for a copy that waited, from 2 for repeats."""
 
-    def __init__(self, datagram: bytes, frames: Sequence[Frame], put_at: float) -> None:
+    transmit: Transmit
+    number: int
+
+
+class _Waiting:
+    """A sealed datagram that waits: a copy for one path, or an envelope that is sent again along its paths."""
+
+    __slots__ = ("datagram", "due_at", "is_replaceable", "last", "number", "paths", "put_at", "rank", "states")
+
+    def __init__(
+        self, datagram: bytes, paths: Sequence[Path], frames: Sequence[Frame], last: int, now: float
+    ) -> None:
         self.datagram = datagram
-        self.put_at = put_at
+        self.paths = paths
+        self.number = min(last, 2)
+        """Of the next transmission along each path."""
+        self.last = last
+        self.put_at = now
+        self.due_at = now if last == 1 else now + SPACING_S
         kinds = [frame.header.kind for frame in frames]
         self.is_replaceable = all(kind.is_state for kind in kinds)
         self.states: set[FlowKey] = {flow_key(frame) for frame in frames if frame.header.kind.is_state}
-        self.rank = min(map(rank_of, frames))
+        self.rank = min(map(_rank_of, frames))
+
+    @property
+    def is_copy(self) -> bool:
+        """Whether it waits for its first transmission."""
+        return self.last == 1
 
 
-def rank_of(frame: Frame) -> int:
-    """The importance of a frame in a copy, 0 the highest."""
+def _rank_of(frame: Frame) -> int:
+    """The importance of a frame, 0 the highest."""
     kind = frame.header.kind
     if kind.lane is Lane.URGENT and (not kind.is_state or kind.may_be_old):  # a command or a heartbeat
         return 0
@@ -63,25 +103,27 @@ def rank_of(frame: Frame) -> int:
 
 
 class Copies:
-    """The copies for one peer. ``budgets``: by the number of the socket, of networks with a budget."""
+    """The copies and repeats for one peer. ``budgets``: by the number of the socket, of networks with a budget."""
 
     def __init__(self, budgets: Mapping[int, NetworkBudget], now: float) -> None:
         self.dropped: Counter[ShellReason] = Counter()
-        """Copies that were not sent, by reason."""
+        """Copies and envelopes that were not sent, or not sent as often as they should, by reason."""
+        self.repeats_sent = self.repeat_bytes = 0
+        """Repeats so far, and their bytes with IP and UDP headers."""
         self._budgets = budgets
         self._rate = Bucket(LEAST_BITS_S, now, LARGEST_BYTES)
         self._average = Bucket(LEAST_BITS_S, now, AVERAGE_S * LEAST_BITS_S / 8)  # of copies and repeats
-        self._waiting: dict[Path, list[_WaitingCopy]] = {}  # the oldest first
+        self._waiting: list[_Waiting] = []  # the oldest first
 
     @property
     def is_waiting(self) -> bool:
-        """Whether copies wait."""
+        """Whether copies or repeats wait."""
         return bool(self._waiting)
 
     @property
     def count(self) -> int:
         """How many copies wait."""
-        return sum(map(len, self._waiting.values()))
+        return sum(one.is_copy for one in self._waiting)
 
     def set_stream_rate(self, bytes_s: float, now: float, most_bytes_s: float = inf) -> None:
         """Copies may use as much as the stream of this peer, which has so many bytes a second.
@@ -101,125 +143,201 @@ class Copies:
         picked: list[Transmit] = []
         waiting: list[Transmit] = []
         for transmit in outputs:
-            if self._has_room(transmit, now, is_copy=bool(picked)):
-                picked.append(transmit)
-            else:
-                waiting.append(transmit)
+            is_next = not picked or not self._waits_for(transmit.path)
+            has_room = is_next and self._has_room(transmit, now, self._rate if picked else None)
+            (picked if has_room else waiting).append(transmit)
         if waiting and not picked:
             # No network has room, although one had when the envelope was sealed: the best path pays with debt.
             picked.append(waiting.pop(0))
         for transmit in picked[1:]:
-            self.charge(transmit, now)
+            self._charge(transmit, now, self._rate)
         for transmit in waiting:
             if frames is None:
                 self.dropped[ShellReason.COPY_OVER_BUDGET] += 1
             else:
-                self._put(transmit, frames, now)
+                self._put(_Waiting(transmit.datagram, (transmit.path,), frames, 1, now))
         return picked
 
-    def release(self, now: float) -> list[Transmit]:
-        """The waiting copies for which there is room now. Those that waited too long are dropped."""
-        released: list[Transmit] = []
-        for path, waiting in list(self._waiting.items()):
-            self._drop_old(waiting, now)
-            while waiting:
-                copy = min(waiting, key=_by_rank)
-                transmit = Transmit(copy.datagram, path, is_copy=True)
-                if not self._has_room(transmit, now, is_copy=True, is_next=True):
-                    break
-                waiting.remove(copy)
-                self.charge(transmit, now)
-                released.append(transmit)
-            if not waiting:
-                del self._waiting[path]
+    def repeat(
+        self, datagram: bytes, paths: Sequence[Path], frames: Sequence[Frame], transmissions: int, now: float
+    ) -> None:
+        """An envelope with these frames was sent along these paths; send it up to so many times in all, from 2."""
+        self._put(_Waiting(datagram, paths, frames, transmissions, now))
+
+    def release(self, usable: Container[Path], now: float) -> list[Released]:
+        """What is due and has room. What waited too long is dropped. Repeats go along ``usable`` paths only."""
+        self._drop([one for one in self._waiting if now >= one.put_at + MAX_WAIT_S], ShellReason.COPY_OVER_BUDGET)
+        for one in self._waiting:
+            if not one.is_copy:
+                one.paths = [path for path in one.paths if path in usable]
+        released: list[Released] = []
+        blocked: set[Path] = set()  # copies wait for these
+        for one in sorted((one for one in self._waiting if one.due_at <= now), key=_send_order):
+            number, rate = one.number, self._rate if one.is_copy else self._average
+            for path in one.paths:
+                transmit = Transmit(one.datagram, path, is_copy=True)
+                if path in blocked or not self._has_room(transmit, now, rate):
+                    if one.is_copy:
+                        blocked.add(path)
+                    continue
+                self._charge(transmit, now, rate)
+                if number > 1:
+                    self.repeats_sent += 1
+                    self.repeat_bytes += wire_bytes(transmit.datagram, path)
+                released.append(Released(transmit, number))
+                one.number = number + 1
+                one.due_at = now + SPACING_S * 2 ** (number - 1)
+        self._waiting = [one for one in self._waiting if one.number <= one.last and one.paths]
         return released
 
     def next_deadline(self, now: float) -> float:
-        """When :meth:`release` has something to do; infinity while no copy waits."""
-        return min((self._release_at(path, now) for path in self._waiting), default=inf)
-
-    def _release_at(self, path: Path, now: float) -> float:
-        """When a copy that waits for this path is sent or dropped."""
-        wait_s = max(self._rate.wait_s(0.0, now), self._budget_wait_s(path, now))
-        return min(now + wait_s, self._waiting[path][0].put_at + MAX_WAIT_S)
-
-    def repeat_at(self, path: Path, now: float) -> float:
-        """When there may be room for a repeat along a path: after the copies that wait for it."""
-        at = now + max(self._average.wait_s(0.0, now), self._budget_wait_s(path, now))
-        return max(at, self._release_at(path, now)) if path in self._waiting else at
-
-    def _budget_wait_s(self, path: Path, now: float) -> float:
-        wait_s = 0.0
-        if (budget := self._budgets.get(path.socket)) is not None:
-            wait_s = budget.copies.wait_s(0.0, now)
-            wait_s = max(wait_s, budget.all.wait_s(-DEBT_S * budget.all.rate, now))
-        return wait_s
-
-    def has_room_for_repeat(self, transmit: Transmit, now: float) -> bool:
-        """Whether a repeat may be sent now. Copies that wait for its path go first."""
-        path = transmit.path
-        if path in self._waiting or self._average.level(now) < -_SLACK_BYTES:
-            return False
-        return self._has_budget(transmit, now, is_copy=True)
+        """When :meth:`release` has something to do; infinity while nothing waits."""
+        copies_at: dict[Path, float] = {}
+        for one in self._waiting:
+            if one.is_copy:
+                (path,) = one.paths
+                at = min(one.put_at + MAX_WAIT_S, now + self._wait_s(path, now, self._rate))
+                copies_at[path] = min(at, copies_at.get(path, inf))
+        at = min(copies_at.values(), default=inf)
+        for one in self._waiting:
+            if one.due_at > now:
+                at = min(at, one.due_at)
+            elif not one.is_copy:
+                rooms = [
+                    max(now + self._wait_s(path, now, self._average), copies_at.get(path, now)) for path in one.paths
+                ]
+                at = min(at, one.put_at + MAX_WAIT_S, *rooms)
+        return at
 
     def clear(self) -> None:
-        """Drop all copies that wait: the peer is lost."""
-        if self._waiting:
-            self.dropped[ShellReason.COPY_OVER_BUDGET] += self.count
-            self._waiting.clear()
+        """Drop all that waits: the peer is lost. Repeats are not counted: their envelopes were sent."""
+        self.dropped[ShellReason.COPY_OVER_BUDGET] += self.count
+        self._waiting = []
 
-    def _has_room(self, transmit: Transmit, now: float, *, is_copy: bool, is_next: bool = False) -> bool:
-        """Whether a datagram may be sent now. ``is_next``: it waits already, and its turn has come."""
-        path = transmit.path
-        if is_copy and not is_next and path in self._waiting:
-            return False
-        if is_copy and self._rate.level(now) < -_SLACK_BYTES:
-            return False
-        return self._has_budget(transmit, now, is_copy=is_copy)
+    # Room.
 
-    def _has_budget(self, transmit: Transmit, now: float, *, is_copy: bool) -> bool:
+    def _waits_for(self, path: Path) -> bool:
+        return any(one.is_copy and path in one.paths for one in self._waiting)
+
+    def _wait_s(self, path: Path, now: float, rate: Bucket) -> float:
+        """How long until there may be room along a path."""
+        wait_s = rate.wait_s(0.0, now)
+        if (budget := self._budgets.get(path.socket)) is not None:
+            wait_s = max(wait_s, budget.copies.wait_s(0.0, now), budget.all.wait_s(-DEBT_S * budget.all.rate, now))
+        return wait_s
+
+    def _has_room(self, transmit: Transmit, now: float, rate: Bucket | None) -> bool:
+        """Whether a datagram may be sent now. ``rate``: the limit of copies or repeats; None for a first datagram."""
+        if rate is not None and rate.level(now) < -_SLACK_BYTES:
+            return False
         budget = self._budgets.get(transmit.path.socket)
         if budget is None:
             return True
-        if is_copy and budget.copies.level(now) < -_SLACK_BYTES:
+        if rate is not None and budget.copies.level(now) < -_SLACK_BYTES:
             return False
         level = budget.all.level(now)
         return (
             level >= wire_bytes(transmit.datagram, transmit.path) or level >= -DEBT_S * budget.all.rate - _SLACK_BYTES
         )
 
-    def charge(self, copy: Transmit, now: float) -> None:
-        """Charge a copy that is sent."""
-        self._rate.spend(wire_bytes(copy.datagram, copy.path), now)
-        self.charge_repeat(copy, now)
-
-    def charge_repeat(self, repeat: Transmit, now: float) -> None:
-        """Charge a repeat that is sent."""
-        size = wire_bytes(repeat.datagram, repeat.path)
+    def _charge(self, transmit: Transmit, now: float, rate: Bucket) -> None:
+        size = wire_bytes(transmit.datagram, transmit.path)
         self._average.spend(size, now)
-        if (budget := self._budgets.get(repeat.path.socket)) is not None:
+        if rate is not self._average:
+            rate.spend(size, now)
+        if (budget := self._budgets.get(transmit.path.socket)) is not None:
             budget.copies.spend(size, now)
 
-    def _put(self, transmit: Transmit, frames: Sequence[Frame], now: float) -> None:
-        waiting = self._waiting.setdefault(transmit.path, [])
-        newer = _WaitingCopy(transmit.datagram, frames, now)
-        kept = [copy for copy in waiting if not (copy.is_replaceable and copy.states <= newer.states)]
-        if len(kept) < len(waiting):
-            self.dropped[ShellReason.COPY_REPLACED] += len(waiting) - len(kept)
-        kept.append(newer)
-        size = sum(len(copy.datagram) for copy in kept)
-        while size > MAX_WAITING_BYTES:
-            dropped = max(kept, key=_by_rank)  # of equals the first
-            kept.remove(dropped)
-            size -= len(dropped.datagram)
-            self.dropped[ShellReason.COPY_OVER_BUDGET] += 1
-        waiting[:] = kept
+    # The queue.
 
-    def _drop_old(self, waiting: list[_WaitingCopy], now: float) -> None:
-        while waiting and now >= waiting[0].put_at + MAX_WAIT_S:
-            del waiting[0]
-            self.dropped[ShellReason.COPY_OVER_BUDGET] += 1
+    def _put(self, newer: _Waiting) -> None:
+        """Let it wait. It replaces older states of its kind, and the least important of too many are dropped."""
+        rivals = [
+            one
+            for one in self._waiting
+            if one.is_copy == newer.is_copy and (not newer.is_copy or one.paths == newer.paths)
+        ]
+        replaced = [one for one in rivals if one.is_replaceable and one.states <= newer.states]
+        self._drop(replaced, ShellReason.COPY_REPLACED)
+        self._waiting.append(newer)
+        rivals = [one for one in rivals if one not in replaced] + [newer]
+        size = sum(len(one.datagram) for one in rivals)
+        while size > MAX_WAITING_BYTES if newer.is_copy else len(rivals) > MAX_ENVELOPES:
+            least = max(rivals, key=_drop_order)
+            rivals.remove(least)
+            size -= len(least.datagram)
+            self._drop([least], ShellReason.COPY_OVER_BUDGET)
+
+    def _drop(self, gone: Sequence[_Waiting], reason: ShellReason) -> None:
+        if gone:
+            self._waiting = [one for one in self._waiting if one not in gone]
+            self.dropped[reason] += len(gone)
 
 
-def _by_rank(copy: _WaitingCopy) -> int:
-    return copy.rank
+def _send_order(one: _Waiting) -> tuple[bool, int, int]:
+    return not one.is_copy, one.rank, one.number
+
+
+def _drop_order(one: _Waiting) -> tuple[int, int]:
+    return one.rank, one.number
+
+
+def transmissions_for(loss: float) -> int:
+    """How often to send an envelope along paths that lose this share together, the first time included."""
+    if loss <= RESIDUAL_LOSS:
+        return 1
+    return TRANSMISSIONS if loss >= 1 else min(TRANSMISSIONS, ceil(log(RESIDUAL_LOSS) / log(loss)))
+
+
+class Repair:
+    """Whether critical envelopes to a peer are repeated, how often, and along which paths."""
+
+    def __init__(self) -> None:
+        self.transmissions = 1
+        """How often a critical envelope goes along each path."""
+        self.began_at: float | None = None
+        self.left_out: Sequence[PathState] = ()
+        """Paths without repeats: they do not answer, or are so slow that repeats along another path arrive first."""
+        self._losses: deque[tuple[float, float]] = deque()
+
+    @property
+    def is_on(self) -> bool:
+        """Whether envelopes are repeated."""
+        return self.began_at is not None
+
+    def update(self, paths: Sequence[PathState], now: float, *, is_allowed: bool) -> None:
+        """Judge the paths that carry critical frames. Call it about once a second."""
+        if not is_allowed:
+            self.end()
+            return
+        # A path that delivers everything, but too late, hides no loss. While no path answers, one may be dead.
+        known = [path for path in paths if _answers(path) or now < path.answered_at + KNOWN_S] or paths
+        fastest_s = min((path.srtt_s or 0.0 for path in known), default=0.0)
+        quick = [path for path in known if (path.srtt_s or 0.0) <= fastest_s + 2 * MAX_WAIT_S]
+        answering = [path for path in quick if _answers(path)]
+        if not answering:  # the quick ones may be dead: a slow one that answers, and loses, needs repeats too
+            quick += [path for path in known if _answers(path) and self._loss_of(path) > BEGIN_LOSS]
+        self.left_out = [path for path in paths if path not in quick]
+        losses = [self._loss_of(path) for path in answering or quick]
+        self._losses.append((now, prod(losses) if answering else max(losses, default=0.0)))
+        while self._losses[0][0] <= now - HOLD_S:
+            self._losses.popleft()
+        highest = max(loss for _, loss in self._losses)
+        if self.began_at is None and highest > BEGIN_LOSS:
+            self.began_at = now
+        elif highest < END_LOSS:
+            self.began_at = None
+        self.transmissions = max(2, transmissions_for(highest)) if self.is_on else 1
+
+    def end(self) -> None:
+        """Stop at once: the peer is lost, or its configuration has changed."""
+        self.transmissions, self.began_at = 1, None
+        self._losses.clear()
+
+    def _loss_of(self, path: PathState) -> float:
+        loss, lost = path.loss_to_repair()
+        return max(loss, path.loss_out) if self.is_on or lost >= LEAST_LOST else 0.0
+
+
+def _answers(path: PathState) -> bool:
+    return path.condition is PathCondition.USABLE or path.reason == "loss"

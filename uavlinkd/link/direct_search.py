@@ -1,28 +1,111 @@
-"""The search for direct paths to one peer that is reached along a relay. uavlinkd/core/README.md, section 22.
+"""The search for direct paths to peers that are reached along a relay. uavlinkd/core/README.md, section 22.
 
-Both ends name their candidates in their session, and ask those of the other one at the same time.
+Both ends name their candidates in their session, and ask those of the other one at the same time. A captured member
+may name any address. What :func:`paths_to` refuses gets not even a question.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from typing import Final
+import socket
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from functools import partial
+from ipaddress import ip_address, ip_network
+from typing import Final, NamedTuple
 
 from uavlinkd.core import constants as c
 from uavlinkd.core.constants import NEVER
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.limits import TokenBucket
 from uavlinkd.core.node import Node
-from uavlinkd.core.outputs import Event, Output, PathStateChanged, RecordReceived, SessionEstablished
+from uavlinkd.core.outputs import Event, LinkedPeer, Output, PathStateChanged, RecordReceived, SessionEstablished
+from uavlinkd.core.path import Path
 from uavlinkd.core.path_state import PathCondition
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.relay_records import Candidates
-from uavlinkd.link.candidates import OwnSocket, Place, paths_to
+from uavlinkd.link.peer_link import PeerLink
+from uavlinkd.link.peer_sockets import PeerSockets
+from uavlinkd.system.interfaces import find_interface, interface_names
+from uavlinkd.system.routes import leads_to, specific_routes
 
+Place = tuple[str, int]
+"""Numeric host and port."""
+
+LEAST_PORT: Final = 1024
+_PRIVATE: Final = tuple(
+    map(ip_network, ("10.0.0.0/8", "172.16.0.0/12", "192.168.0.0/16", "100.64.0.0/10", "169.254.0.0/16", "fc00::/7"))
+)
+"""RFC 1918, RFC 6598, RFC 3927, RFC 4193."""
+_PUBLIC: Final = tuple(map(ip_network, ("0.0.0.0/0", "2000::/3", "fc00::/7")))
+_NEVER: Final = tuple(map(ip_network, ("0.0.0.0/8", "240.0.0.0/4", "2001::/32", "2002::/16")))
+"""This network (RFC 1122), reserved and broadcast addresses, and those that contain one of IPv4 (Teredo, 6to4)."""
 LISTS: Final = 20
 LISTS_PER_S: Final = 0.2
 """Lists of candidates that the peer gets at most, whatever a relay or the peer says: first so many, then so many a
 second."""
+LOOK_S: Final = 5.0
+"""How often the addresses and routes of this machine are read, while a peer is reached along a relay."""
+
+
+class OwnSocket(NamedTuple):
+    """A UDP socket of this daemon."""
+
+    number: int
+    is_ipv6: bool
+    places: tuple[Place, ...]
+    """Where it may be reached in its own networks."""
+    leads_to: Callable[[str], bool]
+    """Whether a route that is more specific than the default leads from it to a numeric host."""
+
+
+def is_private(host: str) -> bool:
+    """Whether an address is of a private network: it means different machines in different places."""
+    address = ip_address(host)
+    return any(address in network for network in _PRIVATE)
+
+
+def may_be_asked(place: Place) -> bool:
+    """Whether an address can be that of a peer, wherever this daemon is."""
+    address, port = ip_address(place[0]), place[1]
+    is_special = (
+        address.is_loopback
+        or address.is_multicast
+        or any(address in network for network in _NEVER)
+        or not any(address in network for network in _PUBLIC)
+    )
+    return port >= LEAST_PORT and not is_special
+
+
+def paths_to(
+    places: Iterable[Place], sockets: Collection[OwnSocket], relays: Collection[Place], own: Collection[str] = ()
+) -> Iterator[Path]:
+    """The paths to be asked, at most :data:`c.CANDIDATES`, in the order of the list.
+
+    ``relays``: where relays are, and ``own``: the hosts of this machine, which are not asked.
+    """
+    hosts = Counter[tuple[int, str]]()
+    count = 0
+    for place in dict.fromkeys(places):
+        host, port = place
+        if not may_be_asked(place) or place in relays or host in own:
+            continue
+        for sock in sockets:
+            if sock.is_ipv6 != (":" in host) or (is_private(host) and not sock.leads_to(host)):
+                continue
+            hosts[sock.number, host] += 1
+            if hosts[sock.number, host] > c.CANDIDATES_PER_HOST:
+                continue
+            if count == c.CANDIDATES:
+                return
+            count += 1
+            yield Path(sock.number, (host, port, 0, 0) if sock.is_ipv6 else (host, port))
+
+
+def places_of(seen: Iterable[Place], sockets: Iterable[OwnSocket]) -> tuple[Place, ...]:
+    """This daemon's candidates: where relays see it, then its own addresses; those beyond the limit are left out."""
+    own = (place for sock in sockets for place in sock.places)
+    places = dict.fromkeys(place for place in (*seen, *own) if may_be_asked(place))
+    return tuple(places)[: c.CANDIDATES]
 
 
 class DirectSearch:
@@ -34,17 +117,13 @@ class DirectSearch:
         self._own: tuple[Place, ...] = ()
         self._sockets: Sequence[OwnSocket] = ()
         self._relays: Collection[Place] = ()
-        self._theirs: tuple[Place, ...] = ()
+        self.theirs: tuple[Place, ...] = ()
+        """The candidates that the peer named last."""
         self._order = -1
         self._tries = 0
         self._lists = TokenBucket(LISTS_PER_S, LISTS, now)
         self.next_at = NEVER
         """When :meth:`do_due` has something to do."""
-
-    @property
-    def theirs(self) -> tuple[Place, ...]:
-        """The candidates that the peer named last."""
-        return self._theirs
 
     def set_own(
         self, places: tuple[Place, ...], sockets: Sequence[OwnSocket], relays: Collection[Place], now: float
@@ -74,8 +153,8 @@ class DirectSearch:
         if received.order <= self._order:
             return DropReason.OLD_RECORD
         self._order = received.order
-        if received.record.places != self._theirs:
-            self._theirs = received.record.places
+        if received.record.places != self.theirs:
+            self.theirs = received.record.places
             self.begin(now)
         return None
 
@@ -92,9 +171,9 @@ class DirectSearch:
             for state in states
             if not state.path.is_relayed and state.condition is PathCondition.USABLE
         }
-        sockets = [socket for socket in self._sockets if socket.number not in connected]
-        hosts = {host for socket in self._sockets for host, _ in socket.places}
-        self._node.set_candidates(self._peer, paths_to(self._theirs, sockets, self._relays, hosts))
+        sockets = [sock for sock in self._sockets if sock.number not in connected]
+        hosts = {host for sock in self._sockets for host, _ in sock.places}
+        self._node.set_candidates(self._peer, paths_to(self.theirs, sockets, self._relays, hosts))
         out: list[Output] = []
         if self._own and (sockets or self._tries < c.CANDIDATE_TRIES) and self._lists.take(now):
             named = min(relayed, key=lambda state: state.srtt_s or NEVER)
@@ -110,3 +189,89 @@ class DirectSearch:
         if later < 0:
             return min(c.CANDIDATE_TRY_S * 2.0**self._tries, c.CANDIDATE_TRY_MOST_S)
         return min(c.CANDIDATE_ROUND_S * 2.0 ** min(later, 8), c.CANDIDATE_ROUND_MOST_S)
+
+
+class DirectSearches:
+    """One :class:`.DirectSearch` for each peer that uses relays. Look at :attr:`next_at` after each call."""
+
+    def __init__(self, node: Node, sockets: PeerSockets, links: Mapping[str, PeerLink]) -> None:
+        self._node = node
+        self._sockets = sockets
+        self._links = links
+        self._searches: dict[LinkedPeer, DirectSearch] = {}
+        self._paused: dict[LinkedPeer, DirectSearch] = {}
+        # Of peers without a handle now. A relay must not reset limits and orders by ending handles.
+        self._looked_at = -NEVER
+        self._own: list[OwnSocket] = []
+
+    @property
+    def next_at(self) -> float:
+        """When :meth:`handle_timeout` has something to do."""
+        return min((search.next_at for search in self._searches.values()), default=NEVER)
+
+    def follow(self, seen: Iterable[Place], relays: set[Place], now: float) -> None:
+        """Begin and end searches. Call it about once a second.
+
+        ``seen``: this daemon's addresses as relays see them. ``relays``: where relays are.
+        """
+        before, paused = self._searches, self._paused
+        self._searches, self._paused = {}, {}
+        for link in self._links.values():
+            peer: Peer = link.peer
+            search = before.get(peer) or paused.get(peer)
+            if link.relayed:
+                self._searches[peer] = search or DirectSearch(self._node, peer, now)
+                if peer in paused:
+                    self._searches[peer].begin(now)
+            elif search is not None:
+                self._paused[peer] = search
+        if not self._searches:
+            return
+        if now >= self._looked_at + LOOK_S:
+            self._looked_at = now
+            self._own = own_sockets(self._sockets)
+        places = places_of(seen, self._own)
+        for search in self._searches.values():
+            search.set_own(places, self._own, relays, now)
+
+    def on_event(self, event: Event, now: float) -> None:
+        """An event of a peer."""
+        if (search := self._searches.get(event.peer)) is not None:
+            search.on_event(event, now)
+
+    def on_record(self, received: RecordReceived, now: float) -> DropReason | None:
+        """A peer named its candidates. Returns why that has no effect; None if it has one."""
+        if (search := self._searches.get(received.peer)) is None:
+            return DropReason.UNEXPECTED_RECORD
+        return search.on_record(received, now)
+
+    def handle_timeout(self, now: float) -> list[Output]:
+        """Name candidates and ask. Call it at :attr:`next_at`."""
+        return [out for search in self._searches.values() if now >= search.next_at for out in search.do_due(now)]
+
+
+def own_sockets(sockets: PeerSockets) -> list[OwnSocket]:
+    """The open UDP sockets, with the addresses of this machine that lead to them."""
+    routes, of_machine = specific_routes(), _machine_hosts()
+    own = []
+    for number, sock in sockets.numbered_sockets():
+        host, port = sock.getsockname()[:2]
+        interface = sockets.interface_of(number)
+        is_ipv6 = sock.family == socket.AF_INET6
+        hosts = [host]
+        if host in ("0.0.0.0", "::"):
+            hosts = [
+                own_host
+                for name, those in of_machine.items()
+                if interface in (None, name)
+                for own_host in those
+                if (":" in own_host) == is_ipv6
+            ]
+        places = tuple((own_host, port) for own_host in hosts)
+        own.append(OwnSocket(number, is_ipv6, places, partial(leads_to, routes, interface=interface)))
+    return own
+
+
+def _machine_hosts() -> dict[str, tuple[str, ...]]:
+    states = ((name, find_interface(name)) for name in interface_names())
+    return {name: interface.hosts for name, interface in states if interface is not None and interface.is_up}

@@ -4,24 +4,23 @@ from __future__ import annotations
 
 import asyncio
 from collections import Counter, deque
-from enum import Enum
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 from structlog.typing import FilteringBoundLogger
 
 from uavlinkd.config.keys import encode_key
-from uavlinkd.core.drops import Detail, DropReason, Reason
+from uavlinkd.core.constants import PROTOCOL_VERSION
+from uavlinkd.core.drops import Attention, Detail, Reason
 from uavlinkd.core.outputs import Dropped
 from uavlinkd.core.path import Path
+from uavlinkd.core.settings import link_name
 from uavlinkd.endpoints.ports import failure_name
 from uavlinkd.link.conditions import Conditions, LineLimits, OpenCondition, Phase
-from uavlinkd.link.key_change import link_name
-from uavlinkd.link.other_version import compared
-from uavlinkd.link.shell_reasons import ShellReason
-from uavlinkd.link.shown import shown
 from uavlinkd.mavlink.dialect import name_of
 from uavlinkd.mavlink.headers import Header
 from uavlinkd.mavlink.policy.gate import Refusal
+from uavlinkd.ops.log import shown
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.error_meanings import meaning_of
 
@@ -35,61 +34,53 @@ Key = tuple[str, str, str]
 """Event, reason, name of the peer or endpoint."""
 
 
-class Attention(Enum):
-    """When a kind of drop is logged."""
+class ShellReason(Reason):
+    """Why the daemon drops frames and datagrams outside the core and the policies."""
 
-    SECURITY = "at once, with limits of its own"
-    PROBLEM = "at once"
-    EVERYDAY = "if it persists"
-    DESIGN = "once per start: the policy works as configured"
-    EXPLAINED = "never: another event explains it"
+    STALE = ("stale", "the frames waited while the daemon was stopped or suspended")
+    SUPERSEDED = ("superseded", "newer states arrived first along another path of the peer", "", Attention.EXPLAINED)
+    COPY_OVER_BUDGET = ("copy_over_budget", "copies waited too long for a budget", "", Attention.EXPLAINED)
+    COPY_REPLACED = ("copy_replaced", "newer states replaced copies that waited", "", Attention.EXPLAINED)
+    RELAY_HANDLE_GONE = (
+        "relay_handle_gone",
+        "a datagram for a relay has a handle that the relay assigns no more",
+        "",
+        Attention.EVERYDAY,
+    )
 
 
-SECURITY: Final = frozenset[str](
-    {
-        *(
-            DropReason.BAD_MAC1,
-            DropReason.REPLAYED_INITIATION,
-            DropReason.INVALID_KEY_SHARE,
-            DropReason.BAD_HANDSHAKE,
-        ),
-        *(DropReason.UNKNOWN_PEER, DropReason.HEADER_MISMATCH, DropReason.BAD_PARAMETERS, DropReason.BAD_COOKIE),
-        *(DropReason.TOO_LONG, DropReason.LONG_COUNTER, DropReason.REPLAYED, DropReason.DELAYED),
-        *(DropReason.BAD_TAG, DropReason.BAD_CONTROL, Refusal.HIDDEN_FRAME, Refusal.FOREIGN_SYSTEM),
-        DropReason.FRAMES_NOT_ALLOWED,
-    }
-)
-"""An attack, a captured member, or wrong keys. A healthy link causes none of them."""
-EVERYDAY: Final = frozenset[str](
-    {
-        *(DropReason.UNEXPECTED_RESPONSE, DropReason.UNEXPECTED_COOKIE, DropReason.UNKNOWN_INDEX, DropReason.LATE),
-        *(DropReason.SESSION_EXPIRED, DropReason.UNEXPECTED_ANSWER, DropReason.DOUBTFUL, DropReason.OVER_SHARE),
-        *(DropReason.UNEXPECTED_RECORD, DropReason.OLD_RECORD),
-        *("EAGAIN", "ENOBUFS", "ECONNREFUSED", DropReason.RELAY_UNKNOWN_HANDLE, ShellReason.RELAY_HANDLE_GONE),
-        DropReason.RELAY_UNEXPECTED_TOKEN,
-    }
-)
-"""A lost datagram, a rekey or a restarted peer causes a few of them."""
-
-BY_PATHS: Final = frozenset[str](
-    {
-        *(ShellReason.SUPERSEDED, ShellReason.COPY_OVER_BUDGET, ShellReason.COPY_REPLACED),
-        *(DropReason.DUPLICATE, DropReason.LATE_COPY),
-    }
-)
-"""Several paths with different delays cause them all the time. The status counts them."""
+EVERYDAY_ERRORS: Final = ("EAGAIN", "ENOBUFS", "ECONNREFUSED")
+"""Of the kernel: a short queue, or a peer that restarts, causes a few of them."""
 
 
 def attention(event: str, reason: str) -> Attention:
     """When drops of this kind are logged."""
-    if reason in SECURITY and (event != "frames_withheld" or reason == Refusal.HIDDEN_FRAME):
-        return Attention.SECURITY
-    if event == "frames_withheld":
+    if event == "frames_withheld" and reason != Refusal.HIDDEN_FRAME:
         return Attention.DESIGN
-    if reason in EVERYDAY:
-        return Attention.EVERYDAY
-    # The peer is lost, or does not answer: that is logged, and how long it lasts.
-    return Attention.EXPLAINED if reason == DropReason.NO_SESSION or reason in BY_PATHS else Attention.PROBLEM
+    if isinstance(reason, Reason):
+        return reason.attention
+    return Attention.EVERYDAY if reason in EVERYDAY_ERRORS else Attention.PROBLEM
+
+
+@dataclass(slots=True)
+class _Kind:
+    """Drops of one key."""
+
+    reason: str
+    """With its meaning: an equal key may have a plain string."""
+    attention: Attention
+    last: Fact = ""
+    seconds: deque[float] = field(default_factory=lambda: deque(maxlen=PERSISTENT_S))
+    """In which an everyday drop occurred."""
+    unlogged: int = 0
+    is_said: bool = False
+    """Whether what works as configured was logged."""
+
+    def persists(self, now: float) -> bool:
+        """Whether an everyday drop that occurs now is worth a line."""
+        if not self.seconds or now - self.seconds[-1] >= 1.0:
+            self.seconds.append(now)
+        return len(self.seconds) == PERSISTENT_S and now - self.seconds[0] <= WINDOW_S
 
 
 class DropSummary:
@@ -100,18 +91,12 @@ class DropSummary:
         """All drops by reason since the start, logged or not."""
         self._log = log
         self._limits = limits or LineLimits()
-        self._last: dict[Key, Fact] = {}
-        self._reasons: dict[Key, str] = {}  # with their meanings: equal keys may have plain strings
-        self._attention: dict[Key, Attention] = {}
-        self._seconds: dict[Key, deque[float]] = {}  # in which an everyday drop occurred
-        self._unlogged: Counter[Key] = Counter()
-        self._said: set[Key] = set()  # what works as configured, and was logged
+        self._kinds: dict[Key, _Kind] = {}
         self._conditions = Conditions[Key](
             "drop",
             self._limits,
             self._write,
-            name_of=lambda key: key[2],
-            is_security=lambda key: self._attention[key] is Attention.SECURITY,
+            lambda key: (key[2], self._kinds[key].attention is Attention.SECURITY),
             counts_events=True,
         )
 
@@ -123,23 +108,23 @@ class DropSummary:
         """Count drops of a peer or endpoint. ``name`` is empty if the sender is unknown."""
         self.totals[reason] += count
         key = event, reason, name
-        self._last[key] = last
-        kind = self._attention.get(key)
+        kind = self._kinds.get(key)
         if kind is None:
-            kind = self._attention[key] = attention(event, reason)
-            self._reasons[key] = reason
-        if kind is Attention.SECURITY or kind is Attention.PROBLEM or key in self._conditions:
+            kind = self._kinds[key] = _Kind(reason, attention(event, reason))
+        kind.last = last
+        if kind.attention in (Attention.SECURITY, Attention.PROBLEM) or key in self._conditions:
             self._conditions.note(key, now, count)
-        elif kind is Attention.EVERYDAY:
-            self._unlogged[key] += count
-            if self._persists(key, now):
-                self._conditions.note(key, now, self._unlogged.pop(key))
+        elif kind.attention is Attention.EVERYDAY:
+            kind.unlogged += count
+            if kind.persists(now):
+                self._conditions.note(key, now, kind.unlogged)
+                kind.unlogged = 0
         elif (
-            kind is Attention.DESIGN
-            and key not in self._said
+            kind.attention is Attention.DESIGN
+            and not kind.is_said
             and (omitted := self._limits.take("withheld", name, now)) is not None
         ):
-            self._said.add(key)
+            kind.is_said = True
             self._log.info(event, **self._facts(key), **omitted)
 
     def add_dropped(self, dropped: Dropped, now: float) -> None:
@@ -166,19 +151,7 @@ class DropSummary:
     def forget(self, peer: str) -> None:
         """Forget a peer that was removed or has other rules, under its previous keys too."""
         self._conditions.close(lambda key: link_name(key[2]) == peer)
-        for key in [key for key in self._attention if link_name(key[2]) == peer]:
-            del self._attention[key], self._reasons[key], self._last[key]
-            self._seconds.pop(key, None)
-            self._unlogged.pop(key, None)
-            self._said.discard(key)
-
-    def _persists(self, key: Key, now: float) -> bool:
-        seconds = self._seconds.get(key)
-        if seconds is None:
-            seconds = self._seconds[key] = deque(maxlen=PERSISTENT_S)
-        if not seconds or now - seconds[-1] >= 1.0:
-            seconds.append(now)
-        return len(seconds) == PERSISTENT_S and now - seconds[0] <= WINDOW_S
+        self._kinds = {key: kind for key, kind in self._kinds.items() if link_name(key[2]) != peer}
 
     def _write(self, key: Key, phase: Phase, condition: OpenCondition, omitted: dict[str, int]) -> None:
         if phase is Phase.BEGAN:
@@ -197,12 +170,12 @@ class DropSummary:
         )
 
     def _facts(self, key: Key, *, with_meaning: bool = True) -> dict[str, str]:
-        reason = self._reasons[key]
+        kind = self._kinds[key]
         facts = {
-            "reason": reason,
+            "reason": kind.reason,
             "who": key[2],
-            "meaning": _meaning(reason) if with_meaning else "",
-            "last": _describe(self._last[key]),
+            "meaning": _meaning(kind.reason) if with_meaning else "",
+            "last": _describe(kind.last),
         }
         return {field: fact for field, fact in facts.items() if fact}
 
@@ -234,6 +207,7 @@ def _about(detail: Detail) -> str:
         case bytes():
             return f"key {encode_key(detail)}"
         case int():
-            return compared(detail)
+            age = "older" if detail < PROTOCOL_VERSION else "newer"
+            return f"uavlink/{detail}, {age} than uavlink/{PROTOCOL_VERSION} of this daemon,"
         case _:
             return detail and f"suite {detail}"

@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterable
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Mapping
+from typing import Final, NamedTuple
 
 from structlog.typing import FilteringBoundLogger
 
 from uavlinkd.core import outputs as o
 from uavlinkd.core.path import Path
+from uavlinkd.core.settings import link_name
 from uavlinkd.endpoints.ports import Endpoint
 from uavlinkd.link.conditions import Conditions, LineLimits, OpenCondition, Phase
-from uavlinkd.link.key_change import link_name
-from uavlinkd.link.link_watch import THRESHOLDS, LinkWatch, is_noteworthy
-from uavlinkd.link.path_status import NetworkOf
 from uavlinkd.link.peer_link import PeerLink
-from uavlinkd.link.shown import shown
-from uavlinkd.ops.causes import Cause
 from uavlinkd.ops.findings import Finding, Severity, Subject
 from uavlinkd.ops.link_problems import LinkProblem
+from uavlinkd.ops.log import shown
 
 FINDING_DELAY_S = 2.0
 """A finding is logged if it lasts for so long; one about an attack at once. Three lost answers in a row make a moment
@@ -28,7 +26,7 @@ CLIENT_RESTART_S = 15.0
 FINDING_QUIET_S = 10.0
 """A finding has ended when it was absent for so long, see :data:`uavlinkd.link.conditions.QUIET_S`."""
 
-_OTHER_EVENTS = frozenset[str]({Cause.DAEMON_PAUSED, Cause.RECORDING_STOPPED, Cause.NETWORK_ABSENT})
+_OTHER_EVENTS = frozenset({"daemon_paused", "recording_stopped", "network_absent"})
 """Findings that are logged by events of their own."""
 _State = o.PeerUp | o.PeerLost | o.PeerClosed
 _FindingKey = tuple[str, Subject, str]
@@ -37,11 +35,15 @@ _FindingKey = tuple[str, Subject, str]
 class EventLog:
     """Writes events. The next line of a peer or endpoint has the count of the lines that its limit omitted."""
 
-    def __init__(self, log: FilteringBoundLogger, limits: LineLimits | None = None) -> None:
+    def __init__(
+        self,
+        log: FilteringBoundLogger,
+        limits: LineLimits | None = None,
+        network_of: Callable[[int], str | None] = lambda _: None,
+    ) -> None:
         self._log = log
         self._limits = limits or LineLimits()
-        self.network_of: NetworkOf = lambda _: None
-        """The name of the network of a socket's number."""
+        self._network_of = network_of
         self._states: dict[str, _State] = {}  # of a peer: the latest that was omitted
         self._used: set[str] = set()  # endpoints that have had frames
         self._watches: dict[str, LinkWatch] = {}
@@ -53,18 +55,16 @@ class EventLog:
             "link",
             self._limits,
             self._write_problem,
-            name_of=lambda key: key[0],
-            is_security=lambda key: key[1] is LinkProblem.PATHS_UNPROVEN,
+            lambda key: (key[0], key[1] is LinkProblem.PATHS_UNPROVEN),
         )
-        self._pauses = Conditions[str]("pause", self._limits, self._write_pause, name_of=lambda _: "")
+        self._pauses = Conditions[str]("pause", self._limits, self._write_pause, lambda _: ("", False))
         self._repairs: dict[str, tuple[float, int]] = {}  # by peer: when repair began, and the bytes of repeats then
         self._paused_s = 0.0
         self._finding_conditions = Conditions[_FindingKey](
             "finding",
             self._limits,
             self._write_finding,
-            name_of=lambda key: key[2],
-            is_security=lambda key: self._findings[key].severity is Severity.SECURITY,
+            lambda key: (key[2], self._findings[key].severity is Severity.SECURITY),
             quiet_s=FINDING_QUIET_S,
         )
 
@@ -150,7 +150,7 @@ class EventLog:
 
     def _path_facts(self, address_field: str, network_field: str, path: Path) -> dict[str, str]:
         facts = {address_field: shown(path.address)}
-        network = self.network_of(path.socket)
+        network = self._network_of(path.socket)
         return facts if network is None else {**facts, network_field: network}
 
     def write_client(self, event: str, endpoint: str, client: str, now: float) -> None:
@@ -189,7 +189,7 @@ class EventLog:
                 self._problem_conditions.note(key, now, growth.since if is_open else growth.minute)
 
     def _check_repair(self, link: PeerLink, now: float) -> None:
-        repair, size = link.output.repair, link.output.repeats.bytes_sent
+        repair, size = link.output.repair, link.output.copies.repeat_bytes
         if repair.is_on and link.name not in self._repairs:
             self._repairs[link.name] = now, size
             self._log.info("repair_began", peer=link.name, transmissions=repair.transmissions)
@@ -257,7 +257,7 @@ class EventLog:
             facts = {field: fact for field, fact in finding.as_json().items() if field not in ("text", "remedy")}
             self._log.info("problem_ended", **facts, duration_s=condition.duration_s, **omitted)
             return
-        is_intended = finding.cause == Cause.COMMANDS_WITHHELD  # if the role is right
+        is_intended = finding.cause == "commands_withheld"  # if the role is right
         log = self._log.info if is_intended else self._log.warning
         if finding.severity is Severity.SECURITY:
             log = self._log.error
@@ -276,3 +276,81 @@ def _session_facts(session: o.SessionEstablished) -> dict[str, object]:
         "initiated_by": "us" if session.initiator else "peer",
         "rekey": session.rekey,
     }
+
+
+# When a problem of a link is worth a line: what was lost, reordered or unanswered over the last minute.
+
+WINDOW_S: Final = 60.0
+STEP_S: Final = 5.0
+"""The window moves in steps of this."""
+
+
+class Threshold(NamedTuple):
+    """A problem is logged from this count in a minute, if it is also this share of the envelopes.
+
+    A problem that was logged has ended below half of both.
+    """
+
+    least: int
+    share: float = 0.0
+
+
+THRESHOLDS: Final[Mapping[LinkProblem, Threshold]] = {
+    LinkProblem.ENVELOPES_MISSING: Threshold(10, 0.05),
+    LinkProblem.ENVELOPES_OUT_OF_ORDER: Threshold(50, 0.25),  # jitter reorders frames that were sent in a burst
+    LinkProblem.PATHS_UNPROVEN: Threshold(1),  # no bad radio causes it: an attacker forwards envelopes
+    LinkProblem.ECHOES_UNANSWERED: Threshold(20),
+    LinkProblem.HANDSHAKES_UNANSWERED: Threshold(10),
+    LinkProblem.COOKIES_TAKEN: Threshold(5),
+}
+
+
+class Growth(NamedTuple):
+    """How often a problem occurred."""
+
+    minute: int
+    """In the last minute."""
+    since: int
+    """Since the last measurement."""
+    share: float
+    """Of the envelopes of the last minute."""
+
+
+class LinkWatch:
+    """The totals of one link over the last minute."""
+
+    def __init__(self) -> None:
+        self.totals: Counter[LinkProblem] = Counter()
+        """All problems since the start."""
+        self._before: dict[LinkProblem, int] = {}
+        self._received = self._received_before = 0
+        self._steps: deque[tuple[float, Counter[LinkProblem], int]] = deque()
+
+    def measure(self, totals: Mapping[LinkProblem, int], received: int, now: float) -> dict[LinkProblem, Growth]:
+        """Compare with the totals of a minute ago. Call it about once a second.
+
+        A smaller total means that the counter was reset. It is the new baseline.
+        """
+        grown = {problem: max(0, total - self._before.get(problem, 0)) for problem, total in totals.items()}
+        self.totals.update(grown)
+        self._before = dict(totals)
+        if not self._steps or now - self._steps[-1][0] >= STEP_S:
+            self._steps.append((now, self.totals - Counter(grown), self._received))
+        self._received += max(0, received - self._received_before)
+        self._received_before = received
+        while len(self._steps) > 1 and self._steps[1][0] <= now - WINDOW_S:
+            self._steps.popleft()
+        _, then, received_then = self._steps[0]
+        arrived = self._received - received_then
+        missing = self.totals[LinkProblem.ENVELOPES_MISSING] - then[LinkProblem.ENVELOPES_MISSING]
+        sent = max(1, arrived + missing)
+        return {
+            problem: Growth(minute := self.totals[problem] - then[problem], since, minute / sent)
+            for problem, since in grown.items()
+        }
+
+
+def is_noteworthy(problem: LinkProblem, growth: Growth, *, is_logged: bool) -> bool:
+    """Whether the problem exceeds its threshold, or still exceeds half of it."""
+    threshold, scale = THRESHOLDS[problem], 0.5 if is_logged else 1.0
+    return growth.minute >= threshold.least * scale and growth.share >= threshold.share * scale

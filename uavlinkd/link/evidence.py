@@ -1,24 +1,27 @@
-"""What this end sees of peers that it is not linked with: dropped datagrams, and errors of sending.
+"""What this end sees of peers that it is not linked with, and what its own counters counted recently.
 
-Most of it is not authentic: any sender can forge a datagram or an ICMP message with a peer's address. So it is a hint
-that an operator checks. It counts for :data:`EVIDENCE_S`, and only the place of a configured peer has entries of its
-own. All other places share one entry per kind, so that an attacker cannot use up memory.
+The first is mostly not authentic: any sender can forge a datagram or an ICMP message with a peer's address. So it is
+a hint that an operator checks. It counts for :data:`EVIDENCE_S`, and only the place of a configured peer has entries
+of its own. All other places share one entry per kind, so that an attacker cannot use up memory.
 """
 
 from __future__ import annotations
 
 import errno
-from collections.abc import Mapping, Sequence
-from typing import Final
+from collections import deque
+from collections.abc import Hashable, Iterable, Mapping, Sequence
+from typing import Final, Generic, NamedTuple, TypeVar
 
 from uavlinkd.core.drops import Detail, DropReason
 from uavlinkd.core.outputs import Dropped
-from uavlinkd.core.path import RELAY_HOST, SocketAddress
+from uavlinkd.core.path import RELAY_HOST, SocketAddress, relay_name
 from uavlinkd.core.peer import Peer
-from uavlinkd.link.key_change import link_name
+from uavlinkd.core.settings import link_name
+from uavlinkd.endpoints.ports import Endpoint
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.relay_link import RelayLink
-from uavlinkd.link.shown import relay_name
+from uavlinkd.mavlink.policy.compilation import Policy
+from uavlinkd.mavlink.policy.gate import Gate, Refusal
 
 EVIDENCE_S: Final = 30.0
 """Evidence is forgotten after this time without more of it."""
@@ -46,11 +49,11 @@ _HINTS: Final = frozenset(
 class Sighting:
     """One kind of evidence at one place."""
 
-    __slots__ = ("address", "count", "details", "first_at", "last_at")
+    __slots__ = ("address", "count", "details", "last_at")
 
     def __init__(self, now: float) -> None:
         self.count = 0
-        self.first_at = self.last_at = now
+        self.last_at = now
         self.address: SocketAddress | None = None
         """The latest source or destination."""
         self.details: dict[Detail, None] = {}
@@ -59,7 +62,7 @@ class Sighting:
     def add(self, address: SocketAddress | None, detail: Detail, now: float) -> None:
         """The same was seen again."""
         if now - self.last_at > EVIDENCE_S:
-            self.count, self.first_at = 0, now
+            self.count = 0
             self.details.clear()
         self.count += 1
         self.last_at, self.address = now, address
@@ -73,9 +76,11 @@ class Sighting:
 class Evidence:
     """The latest evidence by kind and place. Times are monotonic seconds."""
 
-    def __init__(self, links: Mapping[str, PeerLink], own_key: bytes) -> None:
+    def __init__(
+        self, links: Mapping[str, PeerLink], own_key: bytes, relays: Mapping[str, RelayLink] | None = None
+    ) -> None:
         self._links = links
-        self.relays: Mapping[str, RelayLink] = {}
+        self.relays = {} if relays is None else relays
         """The relays that this daemon uses, by name."""
         self._own_key = own_key
         self.own_key_elsewhere: tuple[float, SocketAddress | None] | None = None
@@ -183,3 +188,184 @@ def _addresses_of(peers: Sequence[Peer]) -> list[Place]:
     configured = [path.address for path in peers[0].paths.configured] if peers else []
     learned = [state.path.address for peer in peers for state in peer.paths.states]
     return [("address", address) for address in (*configured, *learned)]
+
+
+# What happened recently, from counters that are read once a second: no frame costs anything here.
+
+REMEMBERED_S: Final = 600.0
+"""The growth of a counter is remembered for this time after it stopped."""
+MAX_SESSIONS: Final = 8
+"""Sessions of one peer at another address than the one before that are remembered."""
+OWN_FRAMES_S: Final = 10.0
+"""A foreign system counts as mixed with a peer's own if own frames passed within this time."""
+MAX_FORMER_KEYS: Final = 64
+"""Replaced public keys that are remembered, of all peers."""
+
+BLOCKED_S: Final = 10.0
+"""How far back refusals count for whether frames pass."""
+
+Blocked = tuple[str, str, str]
+"""``peer`` or ``endpoint``, its name, and the direction: ``in`` or ``out``."""
+
+K = TypeVar("K", bound=Hashable)
+
+
+class RecentGrowth(Generic[K]):
+    """The recent growth of counters by key. As bounded as the counters."""
+
+    def __init__(self) -> None:
+        self._before: dict[K, int] = {}
+        self._sum = 0
+        self._recent: dict[K, tuple[int, float]] = {}  # how much each grew without a long pause, and when last
+
+    def update(self, counters: Mapping[K, int], now: float) -> dict[K, int]:
+        """Read the counters. Returns what grew since the last call. A smaller counter began again at zero."""
+        total = sum(counters.values())
+        if total == self._sum:
+            return {}
+        self._sum = total
+        grown: dict[K, int] = {}
+        for key, count in counters.items():
+            before = self._before.get(key, 0)
+            if count != before:
+                grown[key] = count - before if count > before else count
+        self._before = dict(counters)
+        self._recent = {key: recent for key, recent in self._recent.items() if now - recent[1] <= REMEMBERED_S}
+        for key, count in grown.items():
+            self._recent[key] = self._recent.get(key, (0, now))[0] + count, now
+        return grown
+
+    def within(self, seconds: float, now: float) -> dict[K, int]:
+        """The counters that grew within the last ``seconds``, and by how much they grew without a long pause."""
+        return {key: count for key, (count, grew_at) in self._recent.items() if now - grew_at <= seconds}
+
+
+class GateHistory:
+    """What one direction of a policy refused recently, and whether frames passed."""
+
+    def __init__(self) -> None:
+        self.reasons = RecentGrowth[Refusal]()
+        self.commands = RecentGrowth[tuple[int, int, Refusal]]()
+        self.systems = RecentGrowth[int]()
+        self.passed_at = self._refused_at = float("-inf")
+        self._gate: Gate | None = None
+        self._frames = self._refused = 0
+
+    def update(self, gate: Gate, frames: int, now: float, *, frames_may_be_refused: bool) -> dict[int, int]:
+        """Read the counters. ``frames``: all received ones, or those that were sent.
+
+        Returns the foreign systems that sent since the last call.
+        """
+        self.reasons.update(gate.totals, now)
+        self.commands.update(gate.refused_commands, now)
+        if gate is not self._gate:  # a new policy: what the one before refused does not count
+            self._gate, self._refused, self._refused_at = gate, 0, float("-inf")
+        # A hidden frame is counted once for each client that reads it.
+        refused = gate.totals.total() - gate.totals[Refusal.HIDDEN_FRAME]
+        grown = frames - self._frames if frames >= self._frames else frames
+        refused_now = refused - self._refused
+        self._frames, self._refused = frames, refused
+        if refused_now:
+            self._refused_at = now
+        if grown > (refused_now if frames_may_be_refused else 0):
+            self.passed_at = now
+        return self.systems.update(gate.refused_systems, now)
+
+    def is_blocked(self, now: float) -> bool:
+        """Whether frames came within :data:`BLOCKED_S` and all were refused, unless the policy means to."""
+        is_refused = now - self._refused_at < BLOCKED_S <= now - self.passed_at
+        return is_refused and self._gate is not None and not self._gate.passes_nothing
+
+
+class PartHistory:
+    """A peer or an endpoint."""
+
+    def __init__(self, now: float) -> None:
+        self.incoming = GateHistory()
+        self.outgoing = GateHistory()
+        self.failures = RecentGrowth[str]()
+        self.garbage = RecentGrowth[str]()
+        self.silent_since = now
+        """When the last frame was received."""
+        self.mixed: deque[float] = deque(maxlen=3)
+        """The latest seconds in which a foreign system was refused, soon after frames passed."""
+        self._frames = 0
+
+    def update(self, frames: int, frames_sent: int, policy: Policy, now: float) -> None:
+        """Read the counters of received and sent frames, and of the policy."""
+        if frames != self._frames:
+            self._frames, self.silent_since = frames, now
+        foreign = self.incoming.update(policy.incoming, frames, now, frames_may_be_refused=True)
+        self.outgoing.update(policy.outgoing, frames_sent, now, frames_may_be_refused=False)
+        if foreign and now - self.incoming.passed_at <= OWN_FRAMES_S:
+            self.mixed.append(now)
+
+
+class SessionBegin(NamedTuple):
+    """A session with a peer began."""
+
+    at: float
+    address: SocketAddress
+
+
+class History:
+    """The recent past of every peer and endpoint. Times are monotonic seconds."""
+
+    def __init__(self, now: float) -> None:
+        self.began_at = now
+        self.paused: tuple[float, float] | None = None
+        """When the last pause of the process ended, and its duration in seconds."""
+        self.former_keys: dict[bytes, str] = {}
+        """Public keys that the configuration had before, with the peer's name. The oldest first."""
+        self._peers: dict[str, PartHistory] = {}
+        self._endpoints: dict[str, PartHistory] = {}
+        self._sessions: dict[str, deque[SessionBegin]] = {}
+
+    def peer(self, name: str) -> PartHistory:
+        """The history of a peer; an empty one before the first sample."""
+        return self._peers.get(name) or PartHistory(self.began_at)
+
+    def endpoint(self, name: str) -> PartHistory:
+        """The history of an endpoint; an empty one before the first sample."""
+        return self._endpoints.get(name) or PartHistory(self.began_at)
+
+    def blocked(self, now: float) -> list[Blocked]:
+        """The directions in which a policy recently refused all frames."""
+        return [
+            (kind, name, direction)
+            for kind, parts in (("peer", self._peers), ("endpoint", self._endpoints))
+            for name, part in parts.items()
+            for direction, gate in (("in", part.incoming), ("out", part.outgoing))
+            if gate.is_blocked(now)
+        ]
+
+    def sessions(self, name: str) -> list[SessionBegin]:
+        """The latest sessions of a peer that began at another address than the one before, the oldest first."""
+        return list(self._sessions.get(name, ()))
+
+    def add_session(self, name: str, address: SocketAddress, now: float) -> None:
+        """A session with a peer began at this address. Further ones there must not displace other addresses."""
+        begins = self._sessions.setdefault(name, deque(maxlen=MAX_SESSIONS))
+        if not begins or begins[-1].address != address:
+            begins.append(SessionBegin(now, address))
+
+    def add_former_key(self, key: bytes, name: str) -> None:
+        """The configuration no longer has this public key of a peer."""
+        self.former_keys.pop(key, None)
+        if len(self.former_keys) >= MAX_FORMER_KEYS:
+            del self.former_keys[next(iter(self.former_keys))]
+        self.former_keys[key] = name
+
+    def sample(self, links: Iterable[PeerLink], endpoints: Iterable[tuple[Endpoint, Policy]], now: float) -> None:
+        """Read the counters. Call it once a second. Peers and endpoints that are not named are forgotten."""
+        peers, self._peers = self._peers, {}
+        for link in links:
+            history = self._peers[link.name] = peers.get(link.name) or PartHistory(now)
+            history.update(link.counters.frames, link.frames_sent, link.policy, now)
+        before, self._endpoints = self._endpoints, {}
+        for endpoint, policy in endpoints:
+            history = self._endpoints[endpoint.name] = before.get(endpoint.name) or PartHistory(now)
+            history.update(endpoint.counters.frames, endpoint.frames_sent, policy, now)
+            history.failures.update(endpoint.failures, now)
+            history.garbage.update({"bytes": endpoint.counters.garbage_bytes}, now)
+        self._sessions = {name: begins for name, begins in self._sessions.items() if name in self._peers}

@@ -2,46 +2,90 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import Protocol
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Final, NamedTuple
 
-from uavlinkd.config import Config, EndpointConfig
+from uavlinkd.config import Config, ConfigError, EndpointConfig, Problem
 from uavlinkd.config.changes import ConfigChanges
-from uavlinkd.endpoints.ports import Endpoint, LocalPort
+from uavlinkd.core.constants import NEVER
+from uavlinkd.core.refusals import Refused
+from uavlinkd.core.settings import Class
+from uavlinkd.endpoints.ports import Endpoint, LocalPort, PortHandler
+from uavlinkd.endpoints.sockets import BindError, udp_socket
+from uavlinkd.endpoints.udp import UdpClient, UdpServer
+from uavlinkd.endpoints.url import EndpointKind, NetworkUrl, SerialUrl
 from uavlinkd.link.event_log import EventLog
-from uavlinkd.link.opening import open_first, open_new
+from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.switch import Switch
-from uavlinkd.mavlink.frames import Frame, SplitCounters, split_payload
+from uavlinkd.mavlink.classes import KINDS, UNKNOWN
+from uavlinkd.mavlink.dialect import command_name, ids_by_name, name_of
+from uavlinkd.mavlink.frames import SplitCounters, split_payload
 from uavlinkd.mavlink.policy.compilation import Policy, compile_policy
 from uavlinkd.mavlink.policy.delivery import Source
+from uavlinkd.mavlink.policy.gate import Refusal
+from uavlinkd.mavlink.policy.refusal_totals import REFUSALS, TotalsWatch
 from uavlinkd.mavlink.radio_status import LinkFigures, RadioStatusSource
-from uavlinkd.mavlink.status_text import Note, StatusTextSource
+from uavlinkd.mavlink.routing import SystemComponent
+from uavlinkd.mavlink.status_text import TEXT_BYTES, Note, StatusTextSource, TextSeverity
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.stall import StallWatch
 
+# TCP and serial are imported only if configured: a daemon on UDP starts faster and stays smaller.
+# ruff: noqa: PLC0415
 
-class OnFrames(Protocol):
-    """Receives the frames of a local client, as :meth:`uavlinkd.endpoints.ports.PortHandler.on_frames`."""
 
-    def __call__(
-        self, port: LocalPort, frames: list[Frame], now: float, epoch: int, waited_s: float = 0.0
-    ) -> None: ...
+def open_endpoint(config: EndpointConfig, handler: PortHandler, instead_of: Endpoint | None = None) -> Endpoint:
+    """Open the endpoint: a socket that listens is bound. It begins to work when it is started.
+
+    ``instead_of``: an endpoint with the same URL that is about to be closed.
+
+    Raises:
+        BindError: if the daemon cannot listen on its address.
+    """
+    match config.url:
+        case NetworkUrl(EndpointKind.UDPIN, address):
+            sock = (
+                instead_of.share_socket()
+                if isinstance(instead_of, UdpServer)
+                else udp_socket(address, may_come_later=True)
+            )
+            return UdpServer(config.name, sock, handler)
+        case NetworkUrl(EndpointKind.UDPOUT, address):
+            return UdpClient(config.name, address, handler)
+        case NetworkUrl(EndpointKind.TCPIN, address):
+            from uavlinkd.endpoints.tcp import TcpServer, tcp_listener
+
+            sock = instead_of.share_socket() if isinstance(instead_of, TcpServer) else tcp_listener(address)
+            return TcpServer(config.name, sock, handler)
+        case NetworkUrl(EndpointKind.TCP, address):
+            from uavlinkd.endpoints.tcp import TcpClient
+
+            return TcpClient(config.name, address, handler)
+        case SerialUrl() as url:
+            from uavlinkd.endpoints.serial import SerialEndpoint
+
+            return SerialEndpoint(config.name, url, handler)
+    raise AssertionError(f"no endpoint is of the kind {config.url.kind}")
+
+
+def _key(config: EndpointConfig) -> str:
+    return f"endpoint.url ({config.name})"
 
 
 class LocalEndpoints:
     """Opens and closes the endpoints, adds their clients to the switch, and sends them RADIO_STATUS."""
 
-    def __init__(self, name: str, switch: Switch, events: EventLog, stall: StallWatch, on_frames: OnFrames) -> None:
+    def __init__(self, name: str, switch: Switch, events: EventLog, stall: StallWatch) -> None:
         """``name``: the daemon, as the source of its own frames."""
         self.endpoints: list[Endpoint] = []
         self.policies: dict[str, Policy] = {}
         """By the endpoint's name."""
         self.stall = stall
-        self.on_frames = on_frames
+        self.on_frames: Callable[..., None] = switch.forward
+        """Of :class:`uavlinkd.endpoints.ports.PortHandler`, without a call in between."""
         self._switch = switch
         self._events = events
-        self._radio_status: dict[str, RadioStatusSource] = {}
-        self._status_text: dict[str, StatusTextSource] = {}
+        self._sources: dict[str, tuple[RadioStatusSource | None, StatusTextSource | None]] = {}
         self._own = Source(name, compile_policy({}, is_local=True).incoming)
         self._gather_s = 0.0
 
@@ -59,7 +103,10 @@ class LocalEndpoints:
             BindError: if the daemon cannot listen on an address. The message names the key.
         """
         for config in configs:
-            self.endpoints.append(open_first(config, self))
+            try:
+                self.endpoints.append(open_endpoint(config, self))
+            except BindError as error:
+                raise BindError(f"{_key(config)}: {error}") from None
 
     def start(self, configs: Sequence[EndpointConfig]) -> None:
         """Start the endpoints that :meth:`open` has bound."""
@@ -69,6 +116,9 @@ class LocalEndpoints:
     def open_new(self, config: Config, before: Config, changes: ConfigChanges) -> list[Endpoint]:
         """Bind the endpoints that a new configuration adds. :meth:`add` starts them.
 
+        An endpoint that listens at the same address as one that is closed takes over its socket. So endpoints can be
+        renamed, or swap ports.
+
         Raises:
             ConfigError: if one cannot be opened. Then none is, and the others are as they were.
         """
@@ -76,7 +126,18 @@ class LocalEndpoints:
         leaving = {
             urls[endpoint.name]: endpoint for endpoint in self.endpoints if endpoint.name in changes.closed_endpoints
         }
-        return open_new(config, changes.opened_endpoints, leaving, self)
+        opened: list[Endpoint] = []
+        for endpoint_config in changes.opened_endpoints:
+            try:
+                opened.append(open_endpoint(endpoint_config, self, leaving.get(endpoint_config.url)))
+            except (BindError, OSError) as error:
+                for endpoint in opened:
+                    endpoint.close()
+                is_taken = isinstance(error, BindError) and error.is_taken
+                remedy = "; if it is this daemon, restart it" if is_taken else ""
+                problem = Problem(str(config.path), _key(endpoint_config), f"{error}{remedy}")
+                raise ConfigError((problem,)) from None
+        return opened
 
     def add(self, endpoint: Endpoint, config: EndpointConfig) -> None:
         """Start an endpoint that :meth:`open_new` has bound."""
@@ -90,12 +151,10 @@ class LocalEndpoints:
             if endpoint.name == config.name:
                 for port in endpoint.ports:
                     self._switch.set_policy(port, policy)
-        self._radio_status.pop(config.name, None)
-        if config.radio_status:
-            self._radio_status[config.name] = RadioStatusSource()
-        self._status_text.pop(config.name, None)
-        if config.status_text:
-            self._status_text[config.name] = StatusTextSource()
+        self._sources[config.name] = (
+            RadioStatusSource() if config.radio_status else None,
+            StatusTextSource() if config.status_text else None,
+        )
 
     def close_one(self, name: str) -> None:
         """Close an endpoint that is no longer configured."""
@@ -104,10 +163,8 @@ class LocalEndpoints:
         for port in endpoint.ports:
             self._switch.remove(port)
         endpoint.close()
-        del self.policies[name]
+        del self.policies[name], self._sources[name]
         self._events.forget_endpoint(name)
-        self._radio_status.pop(name, None)
-        self._status_text.pop(name, None)
 
     def close(self) -> None:
         """Close all endpoints."""
@@ -152,21 +209,186 @@ class LocalEndpoints:
         for endpoint in self.endpoints:
             endpoint.do_housekeeping(now)
             self._events.note_endpoint(endpoint)
-            source = self._radio_status.get(endpoint.name)
+            source, _ = self._sources[endpoint.name]
             if source is not None and radio is not None:
-                frames = split_payload(source.frame(radio), SplitCounters())
-                for port in endpoint.ports:
-                    endpoint.write(port, frames, self._own, now)
+                self._write(endpoint, source.frame(radio), now)
 
     def write_note(self, note: Note | None, now: float) -> None:
         """Send a text to the clients of the endpoints that have ``status_text``. It goes nowhere else."""
         if note is None:
             return
         for endpoint in self.endpoints:
-            source = self._status_text.get(endpoint.name)
+            _, source = self._sources[endpoint.name]
             if source is not None:
                 raw = source.frame(note)
                 self._switch.router.note_own(raw, now)
-                frames = split_payload(raw, SplitCounters())
-                for port in endpoint.ports:
-                    endpoint.write(port, frames, self._own, now)
+                self._write(endpoint, raw, now)
+
+    def _write(self, endpoint: Endpoint, raw: bytes, now: float) -> None:
+        frames = split_payload(raw, SplitCounters())
+        for port in endpoint.ports:
+            endpoint.write(port, frames, self._own, now)
+
+
+# What the pilot should know about the links, as short texts for the ground station: at most one a second. Texts wait,
+# the most severe first, then the latest. One that waited too long, or that another one made untrue, is dropped.
+
+INTERVAL_S: Final = 1.0
+"""Between two texts, over all peers."""
+WAIT_S: Final = 10.0
+"""A text that waited for longer is dropped."""
+REFUSAL_INTERVAL_S: Final = 10.0
+"""Between two texts about what one peer refuses, and between two about what is withheld from it: a hostile peer can
+invent refusals, and must not hide this end's own ones."""
+
+_AUTOPILOT: Final = 1  # MAV_COMP_ID_AUTOPILOT1
+_STATUSTEXT: Final = ids_by_name()["STATUSTEXT"]
+_LABELS: Final = {400: "(DIS)ARM"}
+_LABEL_CHARACTERS: Final = 20
+_CLAIM: Final = "refused"
+"""The topic of what a peer claims: its texts come after this end's own ones."""
+_REASONS: Final = {
+    Refusal.MESSAGE_NOT_ALLOWED: "role or list",
+    Refusal.COMMAND_NOT_ALLOWED: "role or list",
+    Refusal.FOREIGN_SYSTEM: "system id",
+    Refusal.RATE_LIMITED: "too many",
+}
+
+
+class _Waiting(NamedTuple):
+    severity: TextSeverity
+    text: str
+    since: float
+    link: PeerLink
+
+
+class _Seen:
+    """What was observed of one peer."""
+
+    def __init__(self, link: PeerLink, now: float) -> None:
+        self.link = link
+        self.is_up = link.peer.is_up
+        self.is_lost = False
+        """Whether the loss of the link was reported, or is about to be."""
+        self.is_unverified = False
+        self.claims_until = -NEVER
+        self.quiet_until = {"withheld": now, _CLAIM: now}
+        self.system: int | None = None
+        """Of the vehicle behind the link, when it was seen last."""
+        self.withheld = TotalsWatch()
+
+
+class PilotNotes:
+    """Finds what is new, once a second. ``addresses``: those that were received behind a peer."""
+
+    def __init__(self, addresses: Callable[[PeerLink], list[SystemComponent]]) -> None:
+        self._addresses = addresses
+        self._seen: dict[str, _Seen] = {}
+        self._waiting: dict[tuple[str, str], _Waiting] = {}
+        self._next_at = 0.0
+
+    def next(self, links: Iterable[PeerLink], now: float) -> Note | None:
+        """The text to send now, if there is one. Call it about once a second."""
+        present = {link.name: link for link in links}
+        self._seen = {name: seen for name, seen in self._seen.items() if present.get(name) is seen.link}
+        for name, link in present.items():
+            if name in self._seen:
+                self._observe(self._seen[name], now)
+            else:
+                self._seen[name] = _Seen(link, now)
+        self._waiting = {
+            key: waiting
+            for key, waiting in self._waiting.items()
+            if key[0] in present and now - waiting.since <= WAIT_S
+        }
+        return None if now < self._next_at else self._pop(now)
+
+    def _pop(self, now: float) -> Note | None:
+        def turn(key: tuple[str, str]) -> tuple[TextSeverity, bool, float]:
+            return self._waiting[key].severity, key[1] == _CLAIM, -self._waiting[key].since
+
+        for key in sorted(self._waiting, key=turn):
+            severity, text, _, link = self._waiting[key]
+            system = self._seen[link.name].system
+            if system is not None:  # a ground station shows only texts of a vehicle that it knows
+                del self._waiting[key]
+                self._next_at = now + INTERVAL_S
+                return Note(severity, text, system)
+        return None
+
+    def _observe(self, seen: _Seen, now: float) -> None:
+        link = seen.link
+        name, peer = link.name, link.peer
+        seen.system = _vehicle(self._addresses(link)) or seen.system or _only_system(link)
+        if seen.is_up != peer.is_up:
+            seen.is_up = peer.is_up
+            if not peer.is_up:
+                seen.is_lost = True
+                self._put(link, "link", TextSeverity.CRITICAL, f"link to {name} lost", now)
+            elif seen.is_lost:
+                seen.is_lost = False
+                self._put(link, "link", TextSeverity.NOTICE, f"link to {name} restored", now)
+        if seen.is_unverified != (peer.unverified_since is not None):
+            seen.is_unverified = not seen.is_unverified
+            if seen.is_unverified:
+                text = f"link to {name}: age of commands unverified"
+                self._put(link, "freshness", TextSeverity.ERROR, text, now)
+            else:
+                self._waiting.pop((name, "freshness"), None)
+        for topic, texts in (("withheld", _withheld_here(seen)), (_CLAIM, self._refused_there(seen))):
+            first = next(texts, None)
+            if first is not None and now >= seen.quiet_until[topic]:
+                seen.quiet_until[topic] = now + REFUSAL_INTERVAL_S
+                self._put(link, topic, TextSeverity.WARNING, first, now)
+        seen.claims_until = now
+
+    def _refused_there(self, seen: _Seen) -> Iterator[str]:
+        for claim in seen.link.peer.refusal_claims.recent():
+            if claim.changed_at < seen.claims_until:
+                return
+            if _is_wanted(claim.refused):
+                reason = _REASONS.get(REFUSALS.get(claim.refused.reason, Refusal.HIDDEN_FRAME), "policy")
+                yield _fit(seen.link.name, f": {_label(claim.refused)} withheld there, {reason}")
+
+    def _put(self, link: PeerLink, topic: str, severity: TextSeverity, text: str, now: float) -> None:
+        self._waiting[link.name, topic] = _Waiting(severity, text, now, link)
+
+
+def _withheld_here(seen: _Seen) -> Iterator[str]:
+    link = seen.link
+    role = link.config.policy.get("role")
+    reason = "role or list" if role is None else f"role {role}"
+    for refused in seen.withheld.changed(link.policy.outgoing):
+        if _is_wanted(refused):
+            yield _fit(link.name, f": {_label(refused)} withheld here, {reason}")
+
+
+def _is_wanted(refused: Refused) -> bool:
+    """Whether a pilot sent it on purpose: a command, mission, parameter or setpoint, not a report."""
+    kind = KINDS.get(refused.message, UNKNOWN)
+    is_order = kind.cls is Class.CRITICAL and not kind.may_be_old
+    return bool(refused.command) or (is_order and refused.message != _STATUSTEXT)
+
+
+def _label(refused: Refused) -> str:
+    if not refused.command:
+        return name_of(refused.message)[:_LABEL_CHARACTERS]
+    name = command_name(refused.command).removeprefix("MAV_CMD_")
+    return _LABELS.get(refused.command, name.removeprefix("DO_").removeprefix("NAV_")[:_LABEL_CHARACTERS])
+
+
+def _fit(name: str, rest: str) -> str:
+    """The name is cut, if both are too long together."""
+    return name[: max(0, TEXT_BYTES - len(rest))] + rest
+
+
+def _vehicle(addresses: list[SystemComponent]) -> int | None:
+    """The first autopilot's system, else the first system."""
+    autopilots = [system for system, component in addresses if component == _AUTOPILOT]
+    return next(iter(autopilots or (system for system, _ in addresses)), None)
+
+
+def _only_system(link: PeerLink) -> int | None:
+    """The system of a peer that may send as one only."""
+    systems = [system for system in range(1, 256) if link.policy.incoming.may_speak_as(system)]
+    return systems[0] if len(systems) == 1 else None

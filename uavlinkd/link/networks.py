@@ -1,4 +1,4 @@
-"""The networks of this machine: which of them are there now, and the sockets bound to them.
+"""The networks of this machine: which of them are there now, the sockets bound to them, and their budgets.
 
 A network may be absent at start, appear, disappear, and change its addresses or the number of its interface. Then the
 daemon opens or closes the sockets of that network. The others are not touched. A socket keeps its number.
@@ -14,50 +14,156 @@ of the paths detect a dead radio.
 from __future__ import annotations
 
 import socket
-from collections.abc import Iterable, Sequence
-from typing import Final, Protocol
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Final
 
 from structlog.typing import FilteringBoundLogger
 
 from uavlinkd.config import NetworkConfig
-from uavlinkd.core.path import SocketAddress
-from uavlinkd.endpoints.presence import LINK_LOCAL, Presence, family_of, look
-from uavlinkd.endpoints.sockets import BindError, network_socket
+from uavlinkd.core.constants import LINE_BYTES, RELAY_BYTES
+from uavlinkd.core.node import Node
+from uavlinkd.core.path import Path, SocketAddress
+from uavlinkd.endpoints.reader import Datagrams
+from uavlinkd.endpoints.sockets import LINK_LOCAL, BindError, Presence, family_of, look, network_socket
 from uavlinkd.link.conditions import LineLimits
-from uavlinkd.link.network_log import NetworkLog
-from uavlinkd.system.addresses import Address
+from uavlinkd.mavlink.egress.bucket import Bucket
+from uavlinkd.system.addresses import IPV4_UDP_BYTES, IPV6_UDP_BYTES, Address
 
 BRING_UP: Final = (
     "plug the modem in, or bring the interface up (`ip -brief address`): the daemon uses it within a second"
 )
+COPIES_SHARE: Final = 0.5
+"""The part of a budget that copies may use. The rest is for what only this network carries."""
+LARGEST_BYTES: Final = 400
+"""A bucket holds a largest frame in an envelope, with IP and UDP header."""
+RATE_CHANGE: Final = 0.25
+"""The core gets a rate that differs by more than this share from the last one that it got."""
+LEAST_CORE_SHARE: Final = 0.25
+"""The core gets this part of the budget at least: a peer that is lost must not wait minutes for the next try."""
 _WILDCARDS: Final = {socket.AF_INET: "0.0.0.0", socket.AF_INET6: "::"}
 
 
-class SocketStates(Protocol):
-    """The part of :class:`uavlinkd.core.node.Node` that networks report to."""
-
-    def set_socket_state(self, socket: int, now: float, *, is_up: bool) -> None:
-        """The network behind a socket disappeared; or it appeared or changed its address."""
-
-    def set_metered(self, sockets: Iterable[int], now: float) -> None:
-        """The numbers of the sockets whose network is metered."""
+Receive = Callable[[int, Datagrams, float, int, float], None]
+"""Receives the datagrams of one read: the number of the socket, and the rest as
+:data:`uavlinkd.endpoints.reader.DatagramHandler`."""
 
 
+def carrier_bytes(path: Path) -> int:
+    """What a network adds to each datagram: headers of IP and UDP, or the framing on a line.
+
+    On a relayed path also what the relay adds. Its own address is not in the path: the longer header counts.
+    """
+    if path.is_serial:
+        return LINE_BYTES
+    if path.is_relayed:
+        return RELAY_BYTES + IPV6_UDP_BYTES
+    return IPV6_UDP_BYTES if ":" in path.host else IPV4_UDP_BYTES
+
+
+def wire_bytes(datagram: bytes, path: Path) -> int:
+    """The bytes of a datagram with what its network adds: IP and UDP header, or the framing on a line."""
+    return len(datagram) + carrier_bytes(path)
+
+
+class NetworkBudget:
+    """The budget of one network, and the part of it that copies may use. All peers share both."""
+
+    __slots__ = ("all", "bits_s", "copies", "core_bits_s")
+
+    def __init__(self, budget_bits_s: int, now: float, least_burst: int = LARGEST_BYTES) -> None:
+        self.bits_s = budget_bits_s
+        self.core_bits_s: float = budget_bits_s
+        """The rate that the core has."""
+        self.all = Bucket(budget_bits_s, now, least_burst)
+        self.copies = Bucket(COPIES_SHARE * budget_bits_s, now, least_burst)
+
+    def set_rate(self, bits_s: float, now: float) -> None:
+        """Use another budget from now on."""
+        self.all.set_rate(bits_s / 8, now)
+        self.copies.set_rate(COPIES_SHARE * bits_s / 8, now)
+
+    def update_core(self, bits_s: float) -> bool:
+        """Choose the rate for the core. Returns whether it has changed."""
+        rate = max(bits_s, LEAST_CORE_SHARE * self.bits_s)
+        is_full_again = rate == self.bits_s != self.core_bits_s
+        if not is_full_again and abs(rate - self.core_bits_s) <= RATE_CHANGE * self.core_bits_s:
+            return False
+        self.core_bits_s = rate
+        return True
+
+    def charge(self, datagram: bytes, path: Path, now: float) -> None:
+        """Charge a datagram that is sent: an envelope, a handshake message, a probe or any other."""
+        self.all.spend(wire_bytes(datagram, path), now)
+
+
+class NetworkLog:
+    """Writes a line about one network when what the machine has of it changes."""
+
+    __slots__ = ("_limits", "_log", "_name", "written")
+
+    def __init__(self, name: str, limits: LineLimits, log: FilteringBoundLogger) -> None:
+        self.written: Presence | None = None
+        """What the log says about it."""
+        self._name = name
+        self._limits = limits
+        self._log = log.bind(network=name)
+
+    def note(self, presence: Presence, now: float) -> None:
+        """Write what changed since the last line. If there were too many lines, the next call tries again."""
+        before = self.written
+        if presence == before:
+            return
+        is_worth_a_line = before is None or presence.hosts or before.hosts  # not another reason of absence
+        if not is_worth_a_line:
+            self.written = presence
+            return
+        omitted = self._limits.take("network", self._name, now)
+        if omitted is None:
+            return
+        self.written = presence
+        log = self._log.bind(**omitted)
+        if before is None and not presence.hosts:
+            log.warning("network_not_here_yet", reason=presence.reason)
+        elif not presence.hosts:
+            log.warning("network_disappeared", reason=presence.reason)
+        elif before is None or not before.hosts:
+            log.info("network_appeared", addresses=list(presence.hosts), interface_index=presence.ifindex)
+        else:
+            log.info("network_changed", addresses=list(presence.hosts), interface_index=presence.ifindex)
+
+
+def network_status(
+    config: NetworkConfig, presence: Presence, ports: Sequence[int], serial: dict[str, object] | None = None
+) -> dict[str, object]:
+    """A network as plain values. ``serial``: what only a serial network has."""
+    return {
+        "interface": config.interface,
+        "address": config.address,
+        "is_metered": config.metered,
+        "budget_bits_s": config.budget_bits_s,
+        "is_present": bool(presence.hosts),
+        "absent_because": presence.reason or None,
+        "addresses": list(presence.hosts),
+        "ports": list(ports),
+        "serial": serial,
+    }
+
+
+@dataclass(slots=True, eq=False)
 class NetworkSocket:
     """The socket of one network and one address family, open or not."""
 
-    __slots__ = ("family", "hosts", "index", "is_fixed", "number", "port")
-
-    def __init__(self, number: int, family: socket.AddressFamily, port: int) -> None:
-        self.number = number
-        self.family = family
-        self.port = port
-        """The port to open it with: that of ``listen``, else the one that it had before; 0: any."""
-        self.is_fixed = bool(port)
-        self.index: int | None = None
-        """The interface's number when it was opened; None while it is closed."""
-        self.hosts: tuple[str, ...] = ()
-        """The addresses of its network and family, while it is open."""
+    number: int
+    family: socket.AddressFamily
+    port: int
+    """The port to open it with: that of ``listen``, else the one that it had before; 0: any."""
+    is_fixed: bool
+    """Whether it is that of ``listen``."""
+    index: int | None = None
+    """The interface's number when it was opened; None while it is closed."""
+    hosts: tuple[str, ...] = ()
+    """The addresses of its network and family, while it is open."""
 
 
 class Network:
@@ -74,42 +180,31 @@ class Network:
         """Its name in the configuration."""
         return self.config.name
 
-    @property
-    def is_present(self) -> bool:
-        """Whether one of its sockets is open."""
-        return any(one.index is not None for one in self.sockets)
-
-
-class SocketHolder(Protocol):
-    """Holds the sockets by number."""
-
-    def put(self, number: int, sock: socket.socket | None) -> None:
-        """Use this socket from now on, and close the one before. None: there is no socket."""
-
-    def open_sockets(self) -> list[socket.socket]:
-        """All that are open."""
-
 
 class Networks:
-    """All networks of the configuration. ``listen`` has the ports of their sockets."""
+    """All networks of the configuration. ``listen`` has the ports of their sockets.
+
+    ``put`` has a socket used by its number from now on (None: no socket), and ``opened`` returns all that are open.
+    """
 
     def __init__(
         self,
         configs: Iterable[NetworkConfig],
         listen: Iterable[Address],
-        holder: SocketHolder,
-        states: SocketStates,
+        put: Callable[[int, socket.socket | None], None],
+        opened: Callable[[], list[socket.socket]],
+        states: Node,
         log: FilteringBoundLogger,
     ) -> None:
         ports = {address.family: address.port for address in listen}
         self.networks: list[Network] = []
         self._of_socket: dict[int, tuple[Network, NetworkSocket]] = {}
-        self._holder = holder
+        self._put, self._opened = put, opened
         self._states = states
         limits = LineLimits()
         for config in configs:
             sockets = [
-                NetworkSocket(len(self._of_socket) + place, family, ports.get(family, 0))
+                NetworkSocket(len(self._of_socket) + place, family, ports.get(family, 0), bool(ports.get(family)))
                 for place, family in enumerate(config.families)
             ]
             network = Network(config, sockets, NetworkLog(config.name, limits, log))
@@ -162,7 +257,7 @@ class Networks:
                 try:
                     has_changed |= self._follow(network, one, now)
                 except BindError as error:  # it is tried again at the next call
-                    if not network.is_present:
+                    if all(other.index is None for other in network.sockets):
                         network.presence = Presence(reason=str(error))
             network.log.note(network.presence, now)
         return has_changed
@@ -176,7 +271,7 @@ class Networks:
         if index != one.index:
             if one.index is not None:
                 one.index, one.hosts = None, ()
-                self._holder.put(one.number, None)
+                self._put(one.number, None)
                 self._states.set_socket_state(one.number, now, is_up=False)
             if index is not None:
                 self._open(network.config, one)
@@ -193,7 +288,7 @@ class Networks:
 
     def _open(self, config: NetworkConfig, one: NetworkSocket) -> None:
         host = config.address or _WILDCARDS[one.family]
-        others = self._holder.open_sockets()
+        others = self._opened()
         try:
             sock = network_socket(Address(host, one.port), config.interface, others)
         except BindError as error:
@@ -201,29 +296,21 @@ class Networks:
                 raise
             sock = network_socket(Address(host, 0), config.interface, others)
         one.port = sock.getsockname()[1]
-        self._holder.put(one.number, sock)
+        self._put(one.number, sock)
 
     def absent(self) -> dict[str, str]:
         """The networks that are absent now, each with the reason, and what a person can do."""
         return {
             f"{network.name} ({network.presence.reason})": BRING_UP
             for network in self.networks
-            if not network.is_present
+            if not network.presence.hosts
         }
 
     def status(self) -> dict[str, object]:
         """Each network by name, as plain values."""
         return {
-            network.name: {
-                "interface": network.config.interface,
-                "address": network.config.address,
-                "is_metered": network.config.metered,
-                "budget_bits_s": network.config.budget_bits_s,
-                "is_present": network.is_present,
-                "absent_because": network.presence.reason or None,
-                "addresses": list(network.presence.hosts),
-                "ports": [one.port for one in network.sockets if one.index is not None],
-                "serial": None,
-            }
+            network.name: network_status(
+                network.config, network.presence, [one.port for one in network.sockets if one.index is not None]
+            )
             for network in self.networks
         }

@@ -3,28 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from operator import itemgetter
+from typing import NamedTuple
 
 from uavlinkd.config import PeerAddress, PeerConfig
-from uavlinkd.core.constants import CONFIGURED_PATHS, NEVER
+from uavlinkd.core.constants import CONFIGURED_PATHS
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import LinkedPeer, Output, Transmit
 from uavlinkd.core.path import Path
+from uavlinkd.core.path_state import PathState
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.refusals import LARGEST_REPORT
+from uavlinkd.core.settings import PeerSettings, link_name
 from uavlinkd.core.timers import Deadline, Schedule
-from uavlinkd.link.key_change import Graces, KeyPairing, pairings
-from uavlinkd.link.network_budgets import NetworkBudget
-from uavlinkd.link.path_status import PathRates
+from uavlinkd.link.networks import NetworkBudget
 from uavlinkd.link.peer_output import PeerOutput
 from uavlinkd.mavlink.answers import REQUESTS, ParameterAnswers
+from uavlinkd.mavlink.flows import NewestStates
 from uavlinkd.mavlink.frames import Frame, SplitCounters
-from uavlinkd.mavlink.newest import NewestStates
 from uavlinkd.mavlink.policy.delivery import Source
 from uavlinkd.mavlink.policy.refusal_totals import TotalsWatch
 from uavlinkd.mavlink.radio_status import LinkFigures, worst
 from uavlinkd.ops.link_problems import LinkProblem
-from uavlinkd.ops.recorder import FROM_PEER, TO_PEER, Recorder
+from uavlinkd.ops.recorder import TO_PEER, Recorder
 
 NOT_ANSWERING_S = 5.0
 """The log reports a peer that does not answer our handshakes for this long."""
@@ -34,61 +36,108 @@ NOT_CONNECTING_S = 10.0
 RELAYED_LEAST = 3
 """Slots for configured paths that relayed ones have at least: one for each relay."""
 
-Perform = Callable[[list[Output]], None]
 _RAW = itemgetter(0)
 """The bytes of a frame."""
+
+
+class KeyPairing(NamedTuple):
+    """A pair of keys for a peer of the core: one of the peer's, and one of ours that the peer knows."""
+
+    settings: PeerSettings
+    by_their_previous: bool = False
+    by_our_previous: bool = False
+
+    @property
+    def previous_key(self) -> tuple[str, bytes]:
+        """The peer and the previous key that this pair depends on; an empty key for our own."""
+        return link_name(self.settings.name), b"" if self.by_our_previous else self.settings.public_key
+
+
+class Rates:
+    """Bytes a second of a peer and along each of its paths, between the last two measurements."""
+
+    def __init__(self, now: float) -> None:
+        self._measured_at = now
+        self._totals: dict[Peer | PathState, tuple[int, int]] = {}
+        self._rates: dict[Peer | PathState, tuple[float, float]] = {}
+
+    def measure(self, peer: Peer, now: float) -> None:
+        """Read the totals of a peer and of the paths that it has now. Call it about once a second."""
+        elapsed_s = now - self._measured_at
+        if elapsed_s <= 0:
+            return
+        totals: dict[Peer | PathState, tuple[int, int]] = {
+            state: (state.bytes_received, state.bytes_sent) for state in peer.paths.states
+        }
+        totals[peer] = peer.traffic.bytes_received, peer.traffic.bytes_sent
+        self._rates = {
+            one: ((received - self._totals[one][0]) / elapsed_s, (sent - self._totals[one][1]) / elapsed_s)
+            for one, (received, sent) in totals.items()
+            if one in self._totals
+        }
+        self._measured_at, self._totals = now, totals
+
+    def of(self, one: Peer | PathState) -> tuple[float, float]:
+        """Bytes received and sent a second; 0 until they were measured twice."""
+        return self._rates.get(one, (0.0, 0.0))
+
+
+@dataclass(slots=True)
+class Carriage:
+    """What all links of a daemon share."""
+
+    node: Node
+    perform: Callable[[list[Output]], None]
+    """Executes outputs of the core."""
+    settle: Callable[[], None] = lambda: None
+    """A deadline may be earlier than before."""
+    budgets: Mapping[int, NetworkBudget] = field(default_factory=dict)
+    """Of networks, by the number of the socket."""
+    waiting: Schedule[PeerLink] = field(default_factory=Schedule)
+    """When :meth:`PeerLink.send_waiting` is due."""
 
 
 class PeerLink:
     """Carries frames to one peer of a node. Compared by identity; times are monotonic seconds."""
 
-    def __init__(
-        self,
-        config: PeerConfig,
-        node: Node,
-        perform: Perform,
-        now: float,
-        recorder: Recorder | None = None,
-        schedule: Schedule[PeerLink] | None = None,
-        budgets: Mapping[int, NetworkBudget] | None = None,
-    ) -> None:
+    def __init__(self, config: PeerConfig, carriage: Carriage, now: float, recorder: Recorder | None = None) -> None:
         self.config = config
         self.name = config.name
         self.policy = config.make_policy()
+        self.recorder = recorder
         self.counters = SplitCounters()
         """Frames and faults in its payloads."""
         self.frames_superseded = 0
         """Frames with states older than one already delivered: see :meth:`pick_newest`."""
-        self._newest: dict[LinkedPeer, NewestStates] = {}
-        self._answers = ParameterAnswers()
-        self._refusals = TotalsWatch()
         self.frames_sent = 0
         """Frames for it that its policy let pass."""
-        self.output = PeerOutput(config.egress, node, budgets or {}, self._answers.class_of, self._on_sent, now)
-        """What waits for it."""
+        self.peers: list[Peer] = []
+        """In the core: the one of the current keys first, then those of the pairs with a previous key."""
+        self.previous: dict[Peer, tuple[KeyPairing, float]] = {}
+        """The latter, and until when they are valid: a key is being changed, and the new one is not confirmed yet."""
+        self.silent_since = now
+        """When it was up last, to the second; before that, when the daemon began to expect it."""
+        self.relayed: Sequence[Path] = ()
+        """The paths to it through relays."""
+        self.rates = Rates(now)
+        self.figures = LinkFigures(is_up=False, loss_in=0.0, loss_out=0.0, round_trip_s=None)
+        """The last result of :meth:`measure`."""
         self.is_repairing = False
         """Whether critical frames to it are repeated."""
         self.timers = Deadline()
         """When :meth:`send_waiting` is due."""
-        self._schedule = schedule or Schedule[PeerLink]()
-        self._node = node
-        self._perform = perform
-        self.recorder = recorder
-        self.peers: list[Peer] = []
-        """In the core: the one of the current keys first, then those of the pairs with a previous key."""
-        self._previous: dict[Peer, tuple[KeyPairing, float]] = {}  # the latter, and until when they are valid
-        self.silent_since = now
-        """When it was up last, to the second; before that, when the daemon began to expect it."""
-        self._sample: _Sample | None = None
+        self._carriage = carriage
+        self._node = carriage.node
+        self._perform = carriage.perform
+        self._answers = ParameterAnswers()
+        self._newest: dict[LinkedPeer, NewestStates] = {}
+        self._refusals = TotalsWatch()
         self._direct: Sequence[Path] = ()
-        self.relayed: Sequence[Path] = ()
-        """The paths to it through relays."""
-        self._measured = now, config.name, 0, 0  # when, what, and the bytes received and sent then
-        self.bytes_s = 0.0, 0.0
-        """Bytes received and sent a second, at the last :meth:`measure`."""
-        self.rates = PathRates()
-        """Of its paths."""
-        self._figures = LinkFigures(is_up=False, loss_in=0.0, loss_out=0.0, round_trip_s=None)
+        self._sample: _Sample | None = None
+        self.output = PeerOutput(
+            config.egress, carriage.node, carriage.budgets, self._answers.class_of, self._on_sent, now
+        )
+        """What waits for it."""
 
     def __repr__(self) -> str:
         return f"PeerLink({self.name})"
@@ -96,66 +145,25 @@ class PeerLink:
     @property
     def peer(self) -> Peer:
         """Its object in the core: that of the current keys, or of previous keys while only they work."""
-        if self._previous:
+        if self.previous:
             for peer in self.peers:
                 if peer.is_up:
                     return peer
         return self.peers[0]
 
-    @property
-    def accepts_previous_keys(self) -> bool:
-        """Whether a key is being changed, and the new one is not confirmed yet."""
-        return bool(self._previous)
-
-    def join(self, now: float, graces: Graces, grace_s: float, *, has_previous_key: bool) -> None:
-        """Add the peer to the core, with its previous keys too for the rest of ``grace_s``."""
-        for pairing in pairings(self.config, has_previous_key):
-            until = graces.until(pairing, now, grace_s) if self.peers else NEVER
-            if now >= until:
-                continue
-            peer = self._node.add_peer(pairing.settings, now, by_previous_key=pairing.by_our_previous)
-            if self.peers:
-                self._previous[peer] = pairing, until
-            self.peers.append(peer)
+    def forget(self, peer: Peer) -> None:
+        """A previous key is not accepted any more."""
+        self.peers.remove(peer)
+        del self.previous[peer]
+        self.output.forget(peer)
+        self._newest.pop(peer, None)
 
     def leave(self, now: float) -> None:
         """Cut the peer off at once."""
         for peer in self.peers:
             self._perform(self._node.remove_peer(peer, now))
         self.output.clear(now)
-        self._schedule.remove(self)
-
-    def give_up_theirs(self, now: float) -> None:
-        """Stop accepting the peer's previous key."""
-        self._give_up([peer for peer, (pairing, _) in self._previous.items() if pairing.by_their_previous], now)
-
-    def give_up_ours(self, now: float) -> None:
-        """Stop accepting our own previous key."""
-        self._give_up([peer for peer, (pairing, _) in self._previous.items() if pairing.by_our_previous], now)
-
-    def end_graces(self, now: float, graces: Graces) -> bool:
-        """Stop accepting previous keys whose grace has ended. Returns whether there were any."""
-        return self._end([peer for peer, (_, until) in self._previous.items() if now >= until], now, graces)
-
-    def confirm(self, now: float, graces: Graces) -> bool:
-        """The peer has the current keys: stop accepting all previous ones. Returns whether there were any."""
-        return self._end(list(self._previous), now, graces)
-
-    def _end(self, gone: Sequence[Peer], now: float, graces: Graces) -> bool:
-        """Stop accepting these for as long as the daemon runs: no reload brings them back."""
-        for peer in gone:
-            graces.end(self._previous[peer][0])
-        self._give_up(gone, now)
-        return bool(gone)
-
-    def _give_up(self, gone: Sequence[Peer], now: float) -> None:
-        self.peers = [peer for peer in self.peers if peer not in gone]
-        for peer in gone:
-            del self._previous[peer]
-            self.output.forget(peer)
-            self._newest.pop(peer, None)
-        for peer in gone:  # the outputs of one removal find none of them any more
-            self._perform(self._node.remove_peer(peer, now))
+        self._carriage.waiting.remove(self)
 
     @property
     def keys(self) -> set[bytes]:
@@ -192,8 +200,6 @@ class PeerLink:
         if config.addresses != self.config.addresses:
             self.silent_since = now
             self.set_paths((), now)  # its new names may have no address: do not connect to the old ones
-        if config.previous_public_key is None:
-            self.give_up_theirs(now)
         for peer in self.peers:
             peer.verify_interval_s = config.settings.link.verify_interval_s
             self._node.offer(peer, config.settings.link.features, now)
@@ -206,7 +212,7 @@ class PeerLink:
         ``source``: the port that sent them. ``waited_s``: how long the first of them has waited already.
         """
         self.frames_sent += len(frames)
-        peer = self.peer if self._previous else self.peers[0]
+        peer = self.peer if self.previous else self.peers[0]
         if self.output.egress is not None or peer.paths.is_multiple or self.is_repairing:
             if self.output.send(peer, frames, now, waited_s):
                 self.send_waiting(now)
@@ -214,8 +220,9 @@ class PeerLink:
         raws = list(map(_RAW, frames))
         outputs = self._node.send(peer, raws, now)
         if self.recorder is not None:
-            self._record_sent(raws, outputs, now)
-        self._perform(outputs)
+            self._on_sent(raws, outputs, now)
+        else:
+            self._perform(outputs)
 
     @property
     def gather_s(self) -> float:
@@ -254,24 +261,16 @@ class PeerLink:
             if frame.header.msgid in REQUESTS:
                 self._answers.note(frame, now)
 
-    def record_received(self, frames: Sequence[Frame], now: float) -> None:
-        """Record frames of the peer, if this daemon records."""
-        if self.recorder is not None:
-            self.recorder.add(self.name, list(map(_RAW, frames)), FROM_PEER, now)
-
     def _on_sent(self, frames: list[bytes], outputs: list[Output], now: float) -> None:
-        if self.recorder is not None and frames:
-            self._record_sent(frames, outputs, now)
-        self._perform(outputs)
-
-    def _record_sent(self, frames: list[bytes], outputs: Sequence[Output], now: float) -> None:
         # Without a session no frame crosses the link.
-        if self.recorder is not None and any(isinstance(output, Transmit) for output in outputs):
+        if self.recorder is not None and frames and any(isinstance(output, Transmit) for output in outputs):
             self.recorder.add(self.name, frames, TO_PEER, now)
+        self._perform(outputs)
 
     def _set_deadline(self, now: float) -> None:
         self.timers.next_at = self.output.next_deadline(now)
-        self._schedule.update(self)
+        self._carriage.waiting.update(self)
+        self._carriage.settle()
 
     def follow_paths(self, now: float) -> None:
         """A session began, or other paths are used: envelopes may have another size and other budgets."""
@@ -284,11 +283,6 @@ class PeerLink:
         self.is_repairing = False
         self._set_deadline(now)
 
-    def note_silence(self, now: float) -> None:
-        """Note whether the peer is up. Call it about once a second."""
-        if self.peer.is_up:
-            self.silent_since = now
-
     def is_overdue(self, now: float) -> bool:
         """Whether to report that the peer is silent, after a time by its kind.
 
@@ -300,31 +294,25 @@ class PeerLink:
     def measure(self, now: float) -> LinkFigures:
         """The quality of the link since the last call. Call it once a second or less often."""
         peer = self.peer
-        measured_at, name, received, sent = self._measured
-        if now > measured_at and name == peer.name:
-            elapsed_s = now - measured_at
-            self.bytes_s = (
-                (peer.traffic.bytes_received - received) / elapsed_s,
-                (peer.traffic.bytes_sent - sent) / elapsed_s,
-            )
-        self._measured = now, peer.name, peer.traffic.bytes_received, peer.traffic.bytes_sent
-        before, self._sample = self._sample, _Sample.of(peer)
-        self.rates.measure(peer.paths.states, now)
+        if peer.is_up:
+            self.silent_since = now
+        before, self._sample = self._sample, _sample(peer)
+        self.rates.measure(peer, now)
         loss_in = loss_out = 0.0
         best = peer.paths.best
         if best is not None and peer.paths.has_several:
             loss_in, loss_out = best.loss_in, best.loss_out  # gaps in the counters say nothing about one path
-        elif before is not None and before.index == self._sample.index:
+        elif before is not None and before.session == self._sample.session:
             loss_in = _lost(self._sample.expected - before.expected, self._sample.received - before.received)
             there = self._sample.expected_there - before.expected_there
             # The peer reports now and then. Until the next report the last one is valid.
             loss_out = (
-                _lost(there, self._sample.received_there - before.received_there) if there else self._figures.loss_out
+                _lost(there, self._sample.received_there - before.received_there) if there else self.figures.loss_out
             )
         self.output.measure(peer, now)
         self.is_repairing = self.output.repair.is_on
         self.follow_paths(now)
-        self._figures = LinkFigures(
+        self.figures = LinkFigures(
             is_up=peer.is_up,
             loss_in=loss_in,
             loss_out=loss_out,
@@ -332,7 +320,7 @@ class PeerLink:
             demand=0.0 if self.output.egress is None else self.output.egress.demand(now),
             receive_errors=peer.missing(now),
         )
-        return self._figures
+        return self.figures
 
     @property
     def round_trip_s(self) -> float | None:
@@ -357,11 +345,6 @@ class PeerLink:
             LinkProblem.COOKIES_TAKEN: traffic.cookies_taken,
         }
 
-    @property
-    def figures(self) -> LinkFigures:
-        """The last result of :meth:`measure`."""
-        return self._figures
-
 
 def radio_figures(links: Iterable[PeerLink]) -> LinkFigures | None:
     """The figures for an autopilot's RADIO_STATUS: the worst link to an operator; without roles, the worst of all.
@@ -373,23 +356,21 @@ def radio_figures(links: Iterable[PeerLink]) -> LinkFigures | None:
     return worst(chosen) if chosen else None
 
 
-class _Sample:
-    """Counters of a session at one moment."""
+class _Sample(NamedTuple):
+    """Counters of a session at one moment, here and as the peer reports."""
 
-    __slots__ = ("expected", "expected_there", "index", "received", "received_there")
+    session: int = 0
+    expected: int = 0
+    received: int = 0
+    expected_there: int = 0
+    received_there: int = 0
 
-    def __init__(self, index: int, expected: int, received: int, there: tuple[int, int]) -> None:
-        self.index = index
-        self.expected = expected
-        self.received = received
-        self.expected_there, self.received_there = there
 
-    @classmethod
-    def of(cls, peer: Peer) -> _Sample:
-        session = peer.sessions.current
-        if session is None:
-            return cls(0, 0, 0, (0, 0))
-        return cls(session.local_index, session.expected, session.received, peer.traffic.reported)
+def _sample(peer: Peer) -> _Sample:
+    session = peer.sessions.current
+    if session is None:
+        return _Sample()
+    return _Sample(session.local_index, session.expected, session.received, *peer.traffic.reported)
 
 
 def _lost(expected: int, received: int) -> float:

@@ -1,58 +1,67 @@
-"""Resolves the addresses of one peer, and keeps the last answer of each."""
+"""Resolves the addresses of one peer or relay, and keeps the last answer of each."""
 
 from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from typing import Final
 
 from structlog.typing import FilteringBoundLogger
 
 from uavlinkd.config import PeerAddress
-from uavlinkd.system.resolver import Resolved, keep_resolving, numeric
+from uavlinkd.core.path import Path
+from uavlinkd.link.peer_link import PeerLink
+from uavlinkd.link.relay_link import RelayLink
+from uavlinkd.system.resolver import LONGEST_WAIT_S, RELAXED_WAIT_S, Resolved, keep_resolving, numeric
 from uavlinkd.system.tasks import keep_running
+
+REFRESH_S: Final = 300.0
+"""The names of a peer that is up are resolved this often."""
 
 
 class PeerNames:
-    """The numeric addresses of a peer now. A look-up that fails leaves the last answer of that name.
-
-    ``interval_s`` returns the interval between the look-ups of an address, ``on_change`` is called after each change.
-    """
+    """The numeric addresses of ``link`` now. A look-up that fails leaves the last answer of that name."""
 
     def __init__(
-        self,
-        addresses: Sequence[PeerAddress],
-        interval_s: Callable[[PeerAddress], float],
-        on_change: Callable[[], None],
-        log: FilteringBoundLogger,
+        self, link: PeerLink | RelayLink, on_change: Callable[[PeerNames], None], log: FilteringBoundLogger
     ) -> None:
-        self._answers: dict[PeerAddress, Resolved] = {address: [] for address in addresses}
+        self.link = link
+        self.paths: dict[PeerAddress, Sequence[Path]] | None = None
+        """The paths that the core knows, by address of the configuration; None before it knows any."""
+        self._on_change = on_change
+        self._answers: dict[PeerAddress, Resolved] = {address: [] for address in link.addresses}
         self._failing: list[set[str]] = []
         self._wakes: list[asyncio.Event] = []
         self._tasks: list[asyncio.Task[None]] = []
-        self._on_change = on_change
-        for address in addresses:
+        for address in link.addresses:
             if address.is_serial:
                 continue  # it needs no look-up
             if address.address.ip is not None and "%" not in address.address.host:
                 self._answers[address] = numeric(address.address)
-            else:  # a name; or an interface, whose number may change
-                self._follow(address, interval_s, log)
-
-    def _follow(
-        self, address: PeerAddress, interval_s: Callable[[PeerAddress], float], log: FilteringBoundLogger
-    ) -> None:
-        failing, wake = set[str](), asyncio.Event()
-        on_resolved = partial(self._set, address)
-        work = keep_resolving((address.address,), partial(interval_s, address), on_resolved, log, failing, wake)
-        self._failing.append(failing)
-        self._wakes.append(wake)
-        self._tasks.append(keep_running(work, f"the search for {address}"))
+                continue
+            # A name; or an interface, whose number may change.
+            failing, wake = set[str](), asyncio.Event()
+            interval_s, on_resolved = partial(self.interval_s, address), partial(self._set, address)
+            work = keep_resolving((address.address,), interval_s, on_resolved, log, failing, wake)
+            self._failing.append(failing)
+            self._wakes.append(wake)
+            self._tasks.append(keep_running(work, f"the search for {address}"))
 
     def _set(self, address: PeerAddress, resolved: Resolved) -> bool:
         self._answers[address] = resolved
-        self._on_change()
+        self._on_change(self)
         return True
+
+    def interval_s(self, address: PeerAddress) -> float:
+        """How often an address is resolved now."""
+        peer = self.link.peer
+        if not peer.is_up:
+            return LONGEST_WAIT_S
+        states = [peer.paths.find(path) for path in (self.paths or {}).get(address, ())]
+        # Without its network, an address does not answer anyway. A network that is back has all names resolved.
+        is_down = any(state is not None and not (state.works or state.is_off) for state in states)
+        return RELAXED_WAIT_S if is_down else REFRESH_S
 
     @property
     def unresolved(self) -> set[str]:

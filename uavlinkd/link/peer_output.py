@@ -6,10 +6,9 @@ other paths wait sealed (:mod:`.copies`). Times are monotonic seconds.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from math import inf
 from operator import itemgetter
-from typing import Protocol
 
 from uavlinkd.core.constants import CRITICAL_ENVELOPE_LIMIT, NEVER
 from uavlinkd.core.node import Node
@@ -17,10 +16,8 @@ from uavlinkd.core.outputs import Output, Transmit
 from uavlinkd.core.path import Path
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.settings import Class, Redundancy
-from uavlinkd.link.copies import Copies
-from uavlinkd.link.network_budgets import COPIES_SHARE, NetworkBudget, carrier_bytes
-from uavlinkd.link.repair import Repair
-from uavlinkd.link.repeats import Repeats
+from uavlinkd.link.copies import Copies, Repair
+from uavlinkd.link.networks import COPIES_SHARE, NetworkBudget, carrier_bytes
 from uavlinkd.mavlink.egress.bucket import Bucket
 from uavlinkd.mavlink.egress.budgeted import EgressSettings, EnvelopeShape
 from uavlinkd.mavlink.egress.by_class import ClassOf, PeerEgress, split_by_class
@@ -30,11 +27,8 @@ _RAW = itemgetter(0)
 """The bytes of a frame."""
 
 
-class OnSent(Protocol):
-    """Receives what was sent."""
-
-    def __call__(self, frames: list[bytes], outputs: list[Output], now: float, /) -> None:
-        """Frames, and the outputs of the core for them, which are to be performed."""
+OnSent = Callable[[list[bytes], list[Output], float], None]
+"""Receives frames that were sent, and the outputs of the core for them, which are to be performed."""
 
 
 class PeerOutput:
@@ -59,7 +53,6 @@ class PeerOutput:
         self.copies = Copies(budgets, now)
         self.repair = Repair()
         """Whether critical envelopes are repeated."""
-        self.repeats = Repeats(self.copies)
         self._charged: dict[Peer, tuple[int, int]] = {}  # datagrams and bytes that the budget was charged for
         self._networks: dict[Class, list[Bucket | None]] = {}
         self._critical_limit = CRITICAL_ENVELOPE_LIMIT  # of the payload; set for each session
@@ -76,7 +69,7 @@ class PeerOutput:
             return True
         for cls, part in split_by_class(frames, self._class_of, now):
             self._send_class(peer, part, cls, now)
-        return self.copies.is_waiting or self.repeats.is_waiting
+        return self.copies.is_waiting
 
     def send_waiting(self, peer: Peer, peers: Iterable[Peer], now: float) -> None:
         """Send the waiting frames and copies that are due. ``peers``: all those that the budget is charged for."""
@@ -88,22 +81,21 @@ class PeerOutput:
                 self.charge(peers, now)
                 cls, batch = self.egress.take(now)
         if self.copies.is_waiting:
-            released = self.copies.release(now)
-            for transmit in released:
-                self._node.recount(peer, transmit.path, 1, len(transmit.datagram))
-            self._on_sent([], list(released), now)
-        if self.repeats.is_waiting:
-            repeats = self.repeats.release({state.path for state in peer.paths.states if not state.is_off}, now)
-            for transmit, number in repeats:
-                self._node.note_repeat(peer, transmit.path, number, transmit.datagram)
-            self._on_sent([], [repeat.transmit for repeat in repeats], now)
+            usable = {
+                state.path for state in peer.paths.states if not state.is_off and state not in self.repair.left_out
+            }
+            released = self.copies.release(usable, now)
+            for (datagram, path, _), number in released:
+                if number == 1:
+                    self._node.recount(peer, path, 1, len(datagram))
+                else:
+                    self._node.note_repeat(peer, path, number, datagram)
+            self._on_sent([], [one.transmit for one in released], now)
 
     def next_deadline(self, now: float) -> float:
         """When :meth:`send_waiting` is due."""
         at = NEVER if self.egress is None else self.egress.next_deadline()
-        if self.copies.is_waiting:
-            at = min(at, self.copies.next_deadline(now))
-        return min(at, self.repeats.next_deadline(now)) if self.repeats.is_waiting else at
+        return min(at, self.copies.next_deadline(now)) if self.copies.is_waiting else at
 
     def has_room(self, payload_bytes: int, now: float) -> bool:
         """Whether an envelope with this payload may go out now."""
@@ -176,14 +168,12 @@ class PeerOutput:
             most_bytes_s = COPIES_SHARE * own_budget / 8 if own_budget else inf
             self.copies.set_stream_rate(self._stream_bytes / (now - self._measured_at), now, most_bytes_s)
             self._stream_bytes, self._measured_at = 0, now
-        working = [state for state in peer.paths.routes[Class.CRITICAL] if state.works]
         is_allowed = peer.is_up and peer.settings.link.redundancy is not Redundancy.NONE
-        self.repair.update(working, now, is_allowed=is_allowed)
+        self.repair.update(peer.paths.routes[Class.CRITICAL], now, is_allowed=is_allowed)
 
     def clear(self, now: float) -> None:
         """Drop what waits: the peer is lost."""
         self.copies.clear()
-        self.repeats.clear()
         self.repair.end()
         if self.egress is not None:
             self.egress.clear(now)
@@ -226,41 +216,30 @@ class PeerOutput:
 
     def _repeat(self, outputs: Sequence[Output], frames: Sequence[Frame], now: float) -> None:
         """Have what was sent repeated, along the same paths."""
-        paths: dict[bytes, list[Path]] = {}
-        for output in outputs:
-            if isinstance(output, Transmit):
-                paths.setdefault(output.datagram, []).append(output.path)
-        for datagram, along in paths.items():
-            self.repeats.put(datagram, along, frames, self.repair.transmissions, now)
+        for datagram, sent in _by_datagram(outputs).items():
+            along = [transmit.path for transmit in sent]
+            self.copies.repeat(datagram, along, frames, self.repair.transmissions, now)
 
     def _pick_copies(
         self, peer: Peer, outputs: Sequence[Output], frames: Sequence[Frame] | None, now: float
     ) -> list[Output]:
         """The outputs without the datagrams that have to wait or are dropped."""
-        picked: list[Output] = []
-        envelope: list[Transmit] = []
-        for output in outputs:
-            if not isinstance(output, Transmit):
-                picked.append(output)
-            elif output.is_copy:
-                envelope.append(output)
-            else:
-                picked += self._pick(peer, envelope, frames, now)
-                envelope = [output]
-        picked += self._pick(peer, envelope, frames, now)
-        return picked
+        left_out = set[Transmit]()
+        for envelope in _by_datagram(outputs).values():
+            if len(envelope) > 1:
+                left_out |= {*envelope} - {*self.copies.pick(envelope, frames, now)}
+        for transmit in left_out:
+            self._node.recount(peer, transmit.path, -1, -len(transmit.datagram))
+        return [output for output in outputs if not isinstance(output, Transmit) or output not in left_out]
 
-    def _pick(
-        self, peer: Peer, envelope: Sequence[Transmit], frames: Sequence[Frame] | None, now: float
-    ) -> list[Transmit]:
-        if len(envelope) < 2:
-            return list(envelope)
-        picked = self.copies.pick(envelope, frames, now)
-        if len(picked) < len(envelope):
-            for transmit in envelope:
-                if transmit not in picked:
-                    self._node.recount(peer, transmit.path, -1, -len(transmit.datagram))
-        return picked
+
+def _by_datagram(outputs: Sequence[Output]) -> dict[bytes, list[Transmit]]:
+    """What is sent, with all copies of an envelope together."""
+    transmits: dict[bytes, list[Transmit]] = {}
+    for output in outputs:
+        if isinstance(output, Transmit):
+            transmits.setdefault(output.datagram, []).append(output)
+    return transmits
 
 
 def _split_states(frames: Sequence[Frame]) -> list[Sequence[Frame]]:

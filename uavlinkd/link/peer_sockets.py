@@ -7,35 +7,33 @@ import errno
 import socket
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
-from typing import Final, Protocol
+from typing import Final
 
 from structlog.typing import FilteringBoundLogger
 
 from uavlinkd.config import NetworkConfig, PeerAddress
-from uavlinkd.core.path import Path, SocketAddress
-from uavlinkd.core.peer import Peer
+from uavlinkd.core.node import Node
+from uavlinkd.core.path import Path, SocketAddress, relay_name
 from uavlinkd.endpoints.error_queue import ErrorReports, send_again
 from uavlinkd.endpoints.ports import failure_name
-from uavlinkd.endpoints.reader import PAUSE_S, Datagrams, Reader
+from uavlinkd.endpoints.reader import PAUSE_S, Reader
 from uavlinkd.endpoints.sockets import BindError, is_absent, is_here, send_from_new_port, udp_socket
-from uavlinkd.link.drop_summary import DropSummary
+from uavlinkd.link.drop_summary import DropSummary, ShellReason
 from uavlinkd.link.evidence import Evidence
-from uavlinkd.link.networks import Networks, SocketStates
+from uavlinkd.link.networks import NetworkBudget, Networks, Receive
+from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.peer_names import PeerNames
-from uavlinkd.link.relay_handles import RelayHandles
+from uavlinkd.link.relay_link import RelayHandles, RelayLink
 from uavlinkd.link.serial_networks import SerialNetworks
-from uavlinkd.link.shell_reasons import ShellReason
-from uavlinkd.link.shown import relay_name
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.clock import monotonic
-from uavlinkd.system.resolver import LONGEST_WAIT_S, RELAXED_WAIT_S, Resolved
+from uavlinkd.system.resolver import Resolved
 from uavlinkd.system.stall import StallWatch
 
 _EPHEMERAL = (Address("0.0.0.0", 0), Address("::", 0))
 """Without a listen address the daemon only connects to peers, from any port."""
-REFRESH_S: Final = 300.0
-"""The names of a peer that is up are resolved this often."""
 LOOK_AGAIN_S: Final = 0.1
 """After failed sends, the networks are looked at this often at most."""
 _NETWORK_CHANGED: Final = frozenset(
@@ -47,56 +45,8 @@ _NETWORK_CHANGED: Final = frozenset(
 """Errors of a send that an interface without its address, or a removed one, causes."""
 
 
-class Receive(Protocol):
-    """Receives the datagrams of one read."""
-
-    def __call__(self, socket: int, datagrams: Datagrams, now: float, epoch: int, waited_s: float, /) -> None:
-        """``socket`` is the number of the socket. The rest is as in :class:`uavlinkd.endpoints.reader.Deliver`."""
-
-
-class _Slot:
-    """The place of a socket, by number: the socket may be replaced while the daemon runs."""
-
-    __slots__ = ("family", "number", "reader", "reports", "sock")
-
-    def __init__(self, number: int, family: int, sock: socket.socket | None) -> None:
-        self.number = number
-        self.family = family
-        self.sock = sock
-        self.reader: Reader | None = None
-        """None until the daemon reads it."""
-        self.reports: ErrorReports | None = None
-
-
-class Reached(Protocol):
-    """A peer or a relay, whose addresses are resolved and followed."""
-
-    name: str
-
-    @property
-    def addresses(self) -> tuple[PeerAddress, ...]:
-        """Those of the configuration."""
-
-    @property
-    def peer(self) -> Peer:
-        """Its object in the core."""
-
-    def set_paths(self, paths: Sequence[Path], now: float) -> None:
-        """Connect to it along these paths."""
-
-
-class _Followed:
-    """A peer whose names are resolved, and the paths to it that the core knows."""
-
-    names: PeerNames
-
-    def __init__(self, link: Reached, on_resolved: Callable[[], None]) -> None:
-        self.link = link
-        self.on_resolved = on_resolved
-        self.paths: dict[PeerAddress, list[Path]] = {}
-        """By address of the configuration."""
-        self.is_set = False
-        """Whether the core knows them."""
+Sender = Callable[[bytes, SocketAddress], object]
+"""Sends a datagram to an address. Raises OSError."""
 
 
 def _send_nowhere(datagram: bytes, address: SocketAddress) -> int:
@@ -104,41 +54,52 @@ def _send_nowhere(datagram: bytes, address: SocketAddress) -> int:
     raise OSError(errno.ENODEV, "the network is absent")
 
 
+@dataclass(slots=True, eq=False)
+class _Slot:
+    """The place of a socket, by number: the socket may be replaced while the daemon runs."""
+
+    number: int
+    family: int
+    send: Sender = _send_nowhere
+    sock: socket.socket | None = None
+    reader: Reader | None = None
+    """None until the daemon reads it."""
+    reports: ErrorReports | None = None
+
+
 class PeerSockets:
     """Reads and sends the peers' datagrams. A path's first number is the number of its socket here."""
 
     def __init__(
-        self,
-        receive: Receive,
-        stall: StallWatch,
-        drops: DropSummary,
-        evidence: Evidence,
-        log: FilteringBoundLogger,
-        states: SocketStates,
+        self, stall: StallWatch, drops: DropSummary, evidence: Evidence, log: FilteringBoundLogger, node: Node
     ) -> None:
         self.failures: Counter[str] = Counter()
         """Datagrams to peers that the kernel did not accept, by the name of the error."""
-        self.without_socket: set[str] = set()
+        self.without_socket = set[str]()
         """The peers none of whose addresses is of a socket's family."""
         self.networks: Networks | None = None
         """Those of interfaces and addresses, if the configuration has any."""
         self.serial: SerialNetworks
-        self.relayed: RelayHandles | None = None
-        """Those of this daemon, if it uses relays."""
+        self.handles = RelayHandles()
+        """Those that relays assigned to this daemon."""
+        self.budgets: dict[int, NetworkBudget] = {}
+        """Of networks that have one, by the number of the socket."""
+        self.senders: list[Sender] = []
+        """Send a datagram to an address, by the number of the socket. Relayed paths and budgets are included."""
         self.pause_s = PAUSE_S
         """How long datagrams gather in a busy socket."""
-        self._receive = receive
+        self._receive: Receive = lambda *_: None
         self._stall = stall
         self._drops = drops
         self._evidence = evidence
         self._log = log
-        self._states = states
+        self._node = node
         self._slots: list[_Slot] = []
-        self._senders: list[Callable[[bytes, SocketAddress], int]] = []
+        self._uses_relays = False
         self._is_started = False
         self._checked_at = 0.0
         self._on_change: Callable[[], None] = lambda: None
-        self._followed: dict[str, _Followed] = {}
+        self._names: dict[str, PeerNames] = {}
         self._add_serial(())
 
     @property
@@ -148,7 +109,7 @@ class PeerSockets:
 
     def open_sockets(self) -> list[socket.socket]:
         """The sockets that are open, by number."""
-        return [slot.sock for slot in self._slots if slot.sock is not None]
+        return [sock for _, sock in self.numbered_sockets()]
 
     def numbered_sockets(self) -> list[tuple[int, socket.socket]]:
         """The sockets that are open, each with its number."""
@@ -181,6 +142,10 @@ class PeerSockets:
             return line.name
         return None if self.networks is None else self.networks.network_of(number).name
 
+    def way_of(self, path: Path) -> tuple[str | None, SocketAddress | None]:
+        """The network of a path, and the relay's address if it is relayed and has a handle."""
+        return self.network_name(path.socket), self.handles.address_of(path)
+
     def absent_networks(self) -> dict[str, str]:
         """The networks that are absent now, each with the reason, and what a person can do."""
         return {**({} if self.networks is None else self.networks.absent()), **self.serial.absent()}
@@ -192,8 +157,7 @@ class PeerSockets:
 
     def unresolved(self, name: str) -> set[str]:
         """The host names of a peer that have no address now."""
-        followed = self._followed.get(name)
-        return set() if followed is None else followed.names.unresolved
+        return self._names[name].unresolved if name in self._names else set()
 
     def open(self, addresses: Sequence[Address], networks: Sequence[NetworkConfig] = ()) -> None:
         """Bind a socket to each address, or ephemeral ones without any; with networks, bind those of each network.
@@ -202,13 +166,14 @@ class PeerSockets:
             BindError: if the daemon cannot listen on an address. The message names the key.
         """
         if ip_networks := [network for network in networks if network.serial is None]:
-            self.networks = Networks(ip_networks, addresses, self, self._states, self._log)
+            self.networks = Networks(ip_networks, addresses, self.put, self.open_sockets, self._node, self._log)
             for number, family in enumerate(self.networks.families):
-                self._add_slot(_Slot(number, family, None))
+                self._add_slot(_Slot(number, family))
             self.networks.open(monotonic())
         else:
             self._open_addresses(addresses)
         self._add_serial([network for network in networks if network.serial is not None])
+        self._add_budgets(monotonic())
 
     def _open_addresses(self, addresses: Sequence[Address]) -> None:
         for number, address in enumerate(addresses or _EPHEMERAL):
@@ -216,35 +181,57 @@ class PeerSockets:
                 sock = udp_socket(address, may_come_later=True)
             except BindError as error:
                 raise BindError(f"listen: {error}") from None
-            self._add_slot(_Slot(number, sock.family, None))
+            self._add_slot(_Slot(number, sock.family))
             self.put(number, sock)
 
     def _add_serial(self, configs: Sequence[NetworkConfig]) -> None:
-        self.serial = SerialNetworks(configs, len(self._slots), self._receive, self._states, self._stall, self._log)
+        self.serial = SerialNetworks(configs, len(self._slots), self._node, self._stall, self._log)
         for network in self.serial.networks:
-            self._add_slot(_Slot(network.number, socket.AF_UNSPEC, None))
-            self._senders[network.number] = network.send
+            self._add_slot(_Slot(network.number, socket.AF_UNSPEC, network.send))
+
+    def _add_budgets(self, now: float) -> None:
+        """The sockets of a network share its budget."""
+        self.budgets.update(self.serial.budgets(now))
+        for network in () if self.networks is None else self.networks.networks:
+            if network.config.budget_bits_s:
+                budget = NetworkBudget(network.config.budget_bits_s, now)
+                self.budgets.update({sock.number: budget for sock in network.sockets})
+        self._node.set_budgets({number: budget.bits_s for number, budget in self.budgets.items()})
+        self._node.set_envelope_limits({line.number: line.envelope_limit for line in self.serial.networks})
+        self._choose_senders()
+
+    def use_relays(self) -> None:
+        """Paths may lead along relays from now on."""
+        self._uses_relays = True
+        self._choose_senders()
+
+    def _choose_senders(self) -> None:
+        """A socket without a budget, and without relays, is called directly."""
+        for slot in self._slots:
+            is_plain = slot.number not in self.budgets and not self._uses_relays
+            self.senders[slot.number] = slot.send if is_plain else partial(self._send_charged, slot.number)
 
     def _add_slot(self, slot: _Slot) -> None:
         self._slots.append(slot)
-        self._senders.append(_send_nowhere)
+        self.senders.append(slot.send)
 
     def put(self, number: int, sock: socket.socket | None) -> None:
         """Use this socket under a number from now on, and close the one before. None: there is no socket."""
         slot = self._slots[number]
         self._close(slot)
         slot.sock = sock
-        self._senders[number] = _send_nowhere if sock is None else sock.sendto
+        slot.send = _send_nowhere if sock is None else sock.sendto
+        self._choose_senders()
         if self._is_started:
             self._read(slot)
 
-    def start(self, on_change: Callable[[], None] = lambda: None) -> None:
-        """Start to read. ``on_change`` is called after a change of the networks was reported to the core."""
+    def start(self, receive: Receive, on_change: Callable[[], None] = lambda: None) -> None:
+        """Start to read. ``on_change`` is called after the core got other paths, or other states of networks."""
         self._is_started = True
-        self._on_change = on_change
+        self._receive, self._on_change = receive, on_change
         for slot in self._slots:
             self._read(slot)
-        self.serial.start(on_change)
+        self.serial.start(receive, on_change)
         if self.networks is not None:
             self.check_networks()
 
@@ -274,32 +261,38 @@ class PeerSockets:
         """Open and close the sockets of the networks that changed, and resolve names again."""
         self._checked_at = now = monotonic()
         if self.networks is not None and self.networks.check(now):
-            for followed in self._followed.values():
-                followed.names.wake()
-                self._set_paths(followed)
+            for names in self._names.values():
+                names.wake()
+                self._set_paths(names)
             self._on_change()
 
     def close(self) -> None:
         """Close the sockets and stop resolving names."""
-        for name in list(self._followed):
+        for name in list(self._names):
             self.stop_following(name)
         self.serial.close()
         for slot in self._slots:
             self.put(slot.number, None)
 
     def send(self, datagram: bytes, path: Path) -> None:
-        """Pass a datagram to the kernel."""
-        number, address = path
-        if self.relayed is not None and path.is_relayed:
-            if (wrapped := self.relayed.wrap(datagram, path)) is None:
+        """Pass a datagram to the kernel. A relay forwards with it: no budget is charged."""
+        address = path.address
+        if self._uses_relays and path.is_relayed:
+            if (wrapped := self.handles.wrap(datagram, path)) is None:
                 self._drops.add("sends_failed", ShellReason.RELAY_HANDLE_GONE, "", 1, monotonic())
                 self.failures[ShellReason.RELAY_HANDLE_GONE] += 1
                 return
             datagram, address = wrapped
         try:
-            self._senders[number](datagram, address)
+            self._slots[path.socket].send(datagram, address)
         except OSError as error:
-            self._on_send_error(self._slots[number], datagram, address, error)
+            self.on_send_error(path.socket, datagram, address, error)
+
+    def _send_charged(self, number: int, datagram: bytes, address: SocketAddress) -> None:
+        path = Path(number, address)
+        if (budget := self.budgets.get(number)) is not None:
+            budget.charge(datagram, path, monotonic())
+        self.send(datagram, path)
 
     def send_from_new_port(self, datagram: bytes, path: Path) -> bool:
         """Send a datagram along a path, but from another port. Returns whether the kernel accepted it."""
@@ -313,7 +306,9 @@ class PeerSockets:
             return False
         return True
 
-    def _on_send_error(self, slot: _Slot, datagram: bytes, address: SocketAddress, error: OSError) -> None:
+    def on_send_error(self, number: int, datagram: bytes, address: SocketAddress, error: OSError) -> None:
+        """A datagram could not be sent. Send it again if the error is about an earlier one; count any other."""
+        slot = self._slots[number]
         if slot.sock is None:  # reported as the state of its network
             self.failures[failure_name(error)] += 1
             return
@@ -348,37 +343,18 @@ class PeerSockets:
         self._drops.add("sends_failed", name, "", 1, monotonic())
         self._evidence.add_failure(name, address, monotonic())
 
-    def follow(self, link: Reached, on_resolved: Callable[[], None]) -> None:
-        """Resolve the peer's names, and connect to it at their addresses from every socket that may reach them.
+    def follow(self, link: PeerLink | RelayLink) -> None:
+        """Resolve the peer's names, and connect to it at their addresses from every socket that may reach them."""
+        names = self._names[link.name] = PeerNames(link, self._set_paths, self._log)
+        self._set_paths(names)
 
-        ``on_resolved`` is called after each change of the addresses.
-        """
-        followed = self._followed[link.name] = _Followed(link, on_resolved)
-        followed.names = PeerNames(
-            link.addresses,
-            lambda address: self._interval_s(followed, address),
-            lambda: self._set_paths(followed),
-            self._log,
-        )
-        self._set_paths(followed)
-
-    def _interval_s(self, followed: _Followed, written: PeerAddress) -> float:
-        """How often an address of a peer is resolved now."""
-        peer = followed.link.peer
-        if not peer.is_up:
-            return LONGEST_WAIT_S
-        states = [peer.paths.find(path) for path in followed.paths.get(written, ())]
-        # Without its network, an address does not answer anyway. A network that is back has all names resolved.
-        is_down = any(state is not None and not (state.works or state.is_off) for state in states)
-        return RELAXED_WAIT_S if is_down else REFRESH_S
-
-    def _set_paths(self, followed: _Followed) -> None:
-        link = followed.link
-        paths = {written: list(self._paths_to(written, resolved)) for written, resolved in followed.names}
-        if followed.is_set and paths == followed.paths:
+    def _set_paths(self, names: PeerNames) -> None:
+        link = names.link
+        paths = {written: list(self._paths_to(written, resolved)) for written, resolved in names}
+        if paths == names.paths:
             return
-        followed.paths, followed.is_set = paths, True
-        if any(paths.values()) or not any(resolved for _, resolved in followed.names):
+        names.paths = {**paths}
+        if any(paths.values()) or not any(resolved for _, resolved in names):
             self.without_socket.discard(link.name)
         elif link.name not in self.without_socket:
             self.without_socket.add(link.name)
@@ -386,7 +362,7 @@ class PeerSockets:
             self._log.warning("peer_unreachable", peer=link.name, reason=reason)
         link.set_paths([path for group in paths.values() for path in group], monotonic())
         self.report_absent(monotonic())
-        followed.on_resolved()
+        self._on_change()
 
     def report_absent(self, now: float) -> None:
         """Report the sockets of absent networks to the core. Call it after other paths were set."""
@@ -415,6 +391,5 @@ class PeerSockets:
     def stop_following(self, name: str) -> None:
         """Stop resolving this peer's names."""
         self.without_socket.discard(name)
-        followed = self._followed.pop(name, None)
-        if followed is not None:
-            followed.names.stop()
+        if (names := self._names.pop(name, None)) is not None:
+            names.stop()

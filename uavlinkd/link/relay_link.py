@@ -7,6 +7,7 @@ daemon's peers along each working path to the relay, and knows the handles that 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
 from typing import Final
 
 from uavlinkd.config import PeerAddress, RelayConfig
@@ -16,16 +17,19 @@ from uavlinkd.core.constants import NEVER
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import LinkedPeer
-from uavlinkd.core.path import Path, relayed
+from uavlinkd.core.path import Path, SocketAddress, relayed
 from uavlinkd.core.path_state import PathState
 from uavlinkd.core.peer import Peer
-from uavlinkd.core.relay_records import WAITING, Bind, Bound, binds_of
+from uavlinkd.core.relay_records import RELAYED, WAITING, Bind, Bound, binds_of, handle_of, wrap
 from uavlinkd.core.settings import previous_of
-from uavlinkd.link.path_status import PathRates
-from uavlinkd.link.peer_link import PeerLink
-from uavlinkd.link.relay_handles import RelayHandles
+from uavlinkd.link.peer_link import PeerLink, Rates
 from uavlinkd.system.addresses import Address
 
+WaitingDatagram = tuple[bytes, Path]
+"""A datagram and the path on which it arrived."""
+
+RELAYED_START: Final = bytes((RELAYED,))
+_HEADER_BYTES: Final = 3
 BIND_SOON_S: Final = 0.1
 """The first bind is repeated after this: it may have come before the relay validated the path. Each further wait is
 twice as long, up to ``BIND_RETRY_S``."""
@@ -33,28 +37,86 @@ ASK_S: Final = 0.25
 """A relay is asked this often at most along one socket."""
 
 
+class RelayHandles:
+    """The handles that relays assigned to this daemon, each on its path to the relay."""
+
+    def __init__(self) -> None:
+        self._inward: dict[tuple[int, SocketAddress, int], Path] = {}
+        self._outward: dict[Path, tuple[SocketAddress, int]] = {}
+        self._assigned: dict[tuple[str, Path], set[int]] = {}  # those that lead somewhere, by relay
+        self._waiting: dict[tuple[str, Path], list[int]] = {}  # handles that another relay or address has, by relay
+
+    def assign(self, relay: str, at: Path, handles: Iterable[int]) -> None:
+        """These are all handles on the path ``at`` to the relay of this name from now on.
+
+        A path to a relay is never relayed: whatever a relay sends, no datagram goes to a host that is not an address.
+        A relay in the middle answers at the address of another relay. It must not end the handles of that one.
+        A handle that both assign leads along the first one, and along the other one when that ends.
+        """
+        wanted = set[int]() if at.is_relayed else set(handles)
+        own = self._assigned.pop((relay, at), set())
+        for handle in own - wanted:
+            del self._outward[self._inward.pop((at.socket, at.address, handle))]
+        if kept := own & wanted:
+            self._assigned[relay, at] = kept
+        self._waiting.pop((relay, at), None)
+        self._add(relay, at, wanted - kept)
+        waiting, self._waiting = self._waiting, {}
+        for (name, path), those in waiting.items():
+            self._add(name, path, those)
+
+    def _add(self, relay: str, at: Path, handles: Iterable[int]) -> None:
+        for handle in handles:
+            path, key = relayed(at.socket, relay, handle), (at.socket, at.address, handle)
+            if path in self._outward or key in self._inward:  # a relay with two addresses, or two with one address
+                self._waiting.setdefault((relay, at), []).append(handle)
+            else:
+                self._assigned.setdefault((relay, at), set()).add(handle)
+                self._inward[key] = path
+                self._outward[path] = at.address, handle
+
+    def address_of(self, path: Path) -> SocketAddress | None:
+        """The relay's address along a relayed path. None if its handle is gone, or it is another path."""
+        known = self._outward.get(path)
+        return None if known is None else known[0]
+
+    def unwrap(self, socket: int, data: bytes, source: SocketAddress) -> WaitingDatagram | DropReason:
+        """The datagram in data that begins with :data:`RELAYED_START`, and its relayed path; or why it is dropped."""
+        handle = handle_of(data)
+        if not handle:
+            return DropReason.RELAY_MALFORMED
+        path = self._inward.get((socket, source, handle))
+        return DropReason.RELAY_UNKNOWN_HANDLE if path is None else (data[_HEADER_BYTES:], path)
+
+    def wrap(self, datagram: bytes, path: Path) -> tuple[bytes, SocketAddress] | None:
+        """What is sent instead of a datagram along a relayed path, and where. None if its handle is gone."""
+        known = self._outward.get(path)
+        if known is None:
+            return None
+        address, handle = known
+        return wrap(handle, datagram), address
+
+
+@dataclass(slots=True, eq=False)
 class _Binding:
     """What this daemon asked for along one path to the relay, and what it got."""
 
-    __slots__ = ("at", "bound_at", "due_at", "handles", "orders", "seen_as", "sender", "tries", "unanswered")
-
-    def __init__(self, path: Path) -> None:
-        self.at = path
-        self.due_at = -NEVER
-        self.tries = 0
-        """Binds since the last answer."""
-        self.unanswered: frozenset[bytes] = frozenset()
-        """The keys of the last bind that no record has named since."""
-        self.handles: dict[bytes, tuple[int, ...]] = {}
-        """By key of a peer; empty while the peer is not there."""
-        self.sender: LinkedPeer | None = None
-        """The relay in the core, by the key of its last record."""
-        self.orders: dict[bytes, int] = {}
-        """By key of a peer: that of the last record about it, among those of the sender."""
-        self.bound_at = -NEVER
-        """When the relay answered last."""
-        self.seen_as: Address | None = None
-        """This daemon's address as the relay sees it."""
+    at: Path
+    due_at: float = -NEVER
+    tries: int = 0
+    """Binds since the last answer."""
+    unanswered: frozenset[bytes] = frozenset()
+    """The keys of the last bind that no record has named since."""
+    handles: dict[bytes, tuple[int, ...]] = field(default_factory=dict)
+    """By key of a peer; empty while the peer is not there."""
+    sender: LinkedPeer | None = None
+    """The relay in the core, by the key of its last record."""
+    orders: dict[bytes, int] = field(default_factory=dict)
+    """By key of a peer: that of the last record about it, among those of the sender."""
+    bound_at: float = -NEVER
+    """When the relay answered last."""
+    seen_as: Address | None = None
+    """This daemon's address as the relay sees it."""
 
     def note_sent(self, keys: Sequence[bytes], now: float) -> None:
         """A bind was sent. Sets when the next one is due without an answer."""
@@ -96,8 +158,8 @@ class _Binding:
 class RelayLink:
     """A relay of the configuration. Times are monotonic seconds. It sends in :meth:`do_due` only.
 
-    ``on_handles`` is called with the keys of the peers whose handles changed. ``on_due`` is called when
-    :attr:`next_at` may be earlier than before. ``link``: the peer that it is too, which is followed by others.
+    ``on_handles`` is called with the keys of the peers whose handles changed. ``link``: the peer that it is too.
+    Look at :attr:`next_at` after each call.
     """
 
     def __init__(
@@ -106,7 +168,6 @@ class RelayLink:
         node: Node,
         handles: RelayHandles,
         on_handles: Callable[[set[bytes], float], None],
-        on_due: Callable[[], None],
         now: float,
         link: PeerLink | None = None,
     ) -> None:
@@ -119,8 +180,7 @@ class RelayLink:
             self._peers.append(node.add_peer(config.settings, now))
             if config.previous_public_key is not None:
                 self._peers.append(node.add_peer(previous_of(config.settings, config.previous_public_key), now))
-        self.rates = PathRates()
-        """Of the paths to it."""
+        self.rates = Rates(now)
         self.keys: tuple[bytes, ...] = ()
         """Of the peers that use it."""
         self.next_at = NEVER
@@ -130,7 +190,6 @@ class RelayLink:
         self._node = node
         self._handles = handles
         self._on_handles = on_handles
-        self._on_due = on_due
         self._bindings: dict[Path, _Binding] = {}
         self._is_confirmed = False
         self._asks: set[int] = set()  # sockets
@@ -157,11 +216,6 @@ class RelayLink:
     def views(self) -> list[tuple[Path, Address]]:
         """The paths to the relay, each with this daemon's address as the relay sees it there."""
         return [(path, binding.seen_as) for path, binding in self._bindings.items() if binding.seen_as is not None]
-
-    @property
-    def seen_as(self) -> list[Address]:
-        """This daemon's addresses as the relay sees them, one for each path."""
-        return [seen for _, seen in self.views()]
 
     def state_for(self, link: PeerLink) -> str:
         """Whether a peer is reached along the relay: ``bound``, ``waiting`` for it to ask too, or ``unanswered``."""
@@ -259,7 +313,7 @@ class RelayLink:
         """Call it about once a second."""
         if self.peer.is_up:
             self.silent_since = now
-        self.rates.measure(self.peer.paths.states, now)
+        self.rates.measure(self.peer, now)
         self._forget_lost(now)
         self._schedule()
 
@@ -321,4 +375,3 @@ class RelayLink:
         due_at = min((binding.due_at for binding in self._working()), default=NEVER) if self.keys else NEVER
         is_over = self._is_confirmed and len(self._peers) > 1
         self.next_at = -NEVER if self._asks or is_over else due_at
-        self._on_due()

@@ -2,30 +2,30 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from itertools import zip_longest
 from typing import Final
 
 from structlog.typing import FilteringBoundLogger
 
 from uavlinkd.config import RelayConfig
+from uavlinkd.core import constants as c
 from uavlinkd.core import outputs as o
 from uavlinkd.core.constants import NEVER
 from uavlinkd.core.crypto import Entropy
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.node import Node
-from uavlinkd.core.outputs import LinkedPeer, Output
+from uavlinkd.core.outputs import LinkedPeer, Output, RecordReceived
 from uavlinkd.core.path import RELAY_HOST, Path
-from uavlinkd.core.relay_records import FilterTested
-from uavlinkd.link.candidates import Place, places_of
+from uavlinkd.core.path_state import PathState
+from uavlinkd.core.peer import Peer
+from uavlinkd.core.relay_records import TOKEN, Candidates, FilterTest, FilterTested, token_of
 from uavlinkd.link.conditions import LineLimits
-from uavlinkd.link.direct_searches import DirectSearches, own_sockets
-from uavlinkd.link.filter_tests import FilterTests
+from uavlinkd.link.direct_search import DirectSearches, Place, own_sockets, places_of
 from uavlinkd.link.peer_link import PeerLink
-from uavlinkd.link.peer_owners import PeerOwner
 from uavlinkd.link.peer_sockets import PeerSockets
-from uavlinkd.link.relay_handles import RelayHandles
 from uavlinkd.link.relay_link import RelayLink
 
 SILENT_S: Final = 0.5
@@ -35,6 +35,7 @@ SILENT_RARE_S: Final = 1.1
 """The same for a peer that sends less: a ground station may send one heartbeat a second. While the silence lasts, the
 relay is asked again after each such time: a peer that wants to send cannot wake this end."""
 STEADY: Final = 4
+TOKEN_START: Final = bytes((TOKEN,))
 
 
 class _Silence:
@@ -64,32 +65,144 @@ class _Silence:
         return True
 
 
+class PathTest:
+    """Of one path to a relay. It has one token."""
+
+    __slots__ = ("answers", "has_passed", "next_at", "path", "peer", "relay", "tries", "try_s")
+
+    def __init__(self, relay: str, peer: Peer, state: PathState, now: float) -> None:
+        self.relay = relay
+        """Its name."""
+        self.peer = peer
+        self.path = state.path
+        self.try_s = min(max(c.FILTER_TRY_S, 2 * (state.srtt_s or 0.0)), c.FILTER_TRY_MOST_S)
+        self.next_at = now
+        """When the next try is due, or the test ends; infinity after its end."""
+        self.tries = self.answers = 0
+        self.has_passed = False
+
+    @property
+    def passes(self) -> bool | None:
+        """Whether a token from another port arrived; None if neither it nor enough answers did."""
+        return True if self.has_passed else False if self.answers >= c.FILTER_ANSWERS else None
+
+
+class FilterTests:
+    """Tests of one daemon, all at the same time, when a person asks. Times are monotonic seconds.
+
+    Look at :attr:`next_at` after each call.
+    """
+
+    def __init__(self, node: Node, entropy: Entropy) -> None:
+        self._node = node
+        self._entropy = entropy
+        self._tests: dict[bytes, PathTest] = {}  # by token; empty while none run
+        self.results: tuple[PathTest, ...] = ()
+        """Of the last tests that ended."""
+        self.ended = asyncio.Event()
+        """Set while no tests run."""
+        self.ended.set()
+
+    @property
+    def next_at(self) -> float:
+        """When :meth:`do_due` has something to do."""
+        return min((test.next_at for test in self._tests.values()), default=NEVER)
+
+    def begin(self, relays: Iterable[RelayLink], now: float) -> None:
+        """Test the best path from each socket to each relay that is up. Tests that run are not disturbed."""
+        if self._tests:
+            return
+        for relay in relays:
+            for state in _best_paths(relay.peer):
+                token = self._entropy(c.FILTER_TOKEN_BYTES)
+                self._tests[token] = PathTest(relay.config.name, relay.peer, state, now)
+        self.results = ()
+        if self._tests:
+            self.ended.clear()
+
+    def do_due(self, now: float) -> list[Output]:
+        """Ask relays for tokens, and end the tests. Call it at :attr:`next_at`."""
+        out: list[Output] = []
+        for token, test in self._tests.items():
+            if now < test.next_at:
+                continue
+            if test.has_passed or test.tries == c.FILTER_TRIES:
+                test.next_at = NEVER
+                continue
+            test.tries += 1
+            test.next_at = now + test.try_s
+            out += self._node.send_record(test.peer, test.path, FilterTest(token), now)
+        if self._tests and self.next_at == NEVER:
+            self.results = tuple(self._tests.values())
+            self._tests.clear()
+            self.ended.set()
+        return out
+
+    def on_record(self, received: RecordReceived) -> DropReason | None:
+        """A relay sent a token from another port. Returns why its record has no effect; None if it has one."""
+        test = self._tests.get(received.record.token) if isinstance(received.record, FilterTested) else None
+        if test is None or received.peer is not test.peer or received.path != test.path:
+            return DropReason.UNEXPECTED_RECORD
+        test.answers += 1
+        self._look(test)
+        return None
+
+    def take_token(self, data: bytes, path: Path) -> bool:
+        """Note a datagram that begins with :data:`TOKEN_START`. Returns False if it is to be dropped.
+
+        From a port to which there is a path it shows nothing: a NAT lets it in because this daemon sent there.
+        """
+        test = self._tests.get(token_of(data))
+        if test is None or (path.socket, path.host) != (test.path.socket, test.path.host):
+            return False
+        if any(peer.paths.find(path) is not None for peer in self._node.peers.values()):
+            return False
+        test.has_passed = True
+        self._look(test)
+        return True
+
+    def _look(self, test: PathTest) -> None:
+        """End a test early whose token arrived, with all answers: these are not to come after its end."""
+        if test.has_passed and test.answers >= test.tries:
+            test.next_at = -NEVER
+
+
+def _best_paths(relay: Peer) -> Iterator[PathState]:
+    """The working path with the lowest round trip from each socket to a relay that is up."""
+    best: dict[int, PathState] = {}
+    for state in relay.paths.states if relay.is_up else ():
+        path = state.path
+        if state.works and not (path.is_relayed or path.is_serial):
+            before = best.get(path.socket)
+            if before is None or (state.srtt_s or NEVER) < (before.srtt_s or NEVER):
+                best[path.socket] = state
+    yield from best.values()
+
+
 class Relays:
-    """All relays. ``on_due`` is called when :attr:`next_at` may be earlier than before."""
+    """All relays, ``by_name``. Look at :attr:`next_at` after each call."""
 
     def __init__(
         self,
         node: Node,
         sockets: PeerSockets,
         links: Mapping[str, PeerLink],
-        owners: dict[LinkedPeer, PeerOwner],
+        by_name: dict[str, RelayLink],
         log: FilteringBoundLogger,
-        on_due: Callable[[], None],
         entropy: Entropy = os.urandom,
     ) -> None:
-        self.by_name: dict[str, RelayLink] = {}
-        self.handles = RelayHandles()
+        self.by_name = by_name
+        self.handles = sockets.handles
+        self._of_peer: dict[LinkedPeer, RelayLink] = {}
         self._node = node
         self._sockets = sockets
         self._links = links
-        self._owners = owners
         self._log = log
-        self._on_due = on_due
         self._limits = LineLimits()
         self._look_at = NEVER
         self._silences: dict[PeerLink, _Silence] = {}
-        self._searches = DirectSearches(node, sockets, links, on_due)
-        self.filter_tests = FilterTests(node, entropy, on_due)
+        self._searches = DirectSearches(node, sockets, links)
+        self.filter_tests = FilterTests(node, entropy)
 
     @property
     def next_at(self) -> float:
@@ -102,19 +215,19 @@ class Relays:
     def add(self, config: RelayConfig, now: float) -> None:
         """Use a relay. Call :meth:`follow_links` afterwards."""
         link = None if config.peer is None else self._links[config.peer]
-        relay = RelayLink(config, self._node, self.handles, self._on_handles, self._on_due, now, link)
+        relay = RelayLink(config, self._node, self.handles, self._on_handles, now, link)
         self.by_name[config.name] = relay
-        self._sockets.relayed = self.handles
+        self._sockets.use_relays()
         if link is None:
-            self._sockets.follow(relay, self._on_due)
+            self._sockets.follow(relay)
 
     def remove(self, name: str, now: float) -> list[Output]:
         """Do not use a relay any more."""
         relay = self.by_name.pop(name)
         self._sockets.stop_following(relay.name)
-        for peer in relay.peers:
-            del self._owners[peer]
-        return relay.leave(now)
+        out = relay.leave(now)
+        self._follow_peers()
+        return out
 
     def change(self, config: RelayConfig, now: float) -> list[Output]:
         """Its addresses changed, or its previous key is not accepted any more."""
@@ -122,19 +235,19 @@ class Relays:
         relay.config = config
         if relay.link is None:
             self._sockets.stop_following(relay.name)
-            self._sockets.follow(relay, self._on_due)
+            self._sockets.follow(relay)
         return relay.forget_previous_key(now) if config.previous_public_key is None else []
 
     def follow_links(self, now: float) -> None:
         """The relays, the peers, their keys or their relays changed."""
-        for peer in [peer for peer, owner in self._owners.items() if isinstance(owner, _Logged)]:
-            del self._owners[peer]
-        for relay in self.by_name.values():
-            self._owners.update(dict.fromkeys(relay.peers, _Logged(relay, self._log, self._limits)))
+        self._follow_peers()
         for name, relay in self.by_name.items():
             links = [link for link in self._links.values() if name in link.config.relays]
             relay.follow([key for link in links for key in link.keys])
         self._set_paths(self._links.values(), now)
+
+    def _follow_peers(self) -> None:
+        self._of_peer = {peer: relay for relay in self.by_name.values() for peer in relay.peers}
 
     # Facts.
 
@@ -152,18 +265,40 @@ class Relays:
         out = [output for relay in self.by_name.values() if now >= relay.next_at for output in relay.do_due(now)]
         return out + self._searches.handle_timeout(now) + self.filter_tests.do_due(now)
 
-    def on_peer_event(self, event: o.Event, now: float) -> None:
-        """An event of a peer, whether it uses relays or not."""
+    def on_event(self, event: o.Event, now: float) -> None:
+        """An event of a relay, or of any other peer."""
+        if (relay := self._of_peer.get(event.peer)) is not None:
+            relay.on_event(event, now)
+            if event.peer in relay.peers:  # not of a previous key that is not accepted any more
+                self._write(relay.config.name, event, now)
         if isinstance(event, o.PathSuspected):
             self.on_suspected(event.path)
         else:
             self._searches.on_event(event, now)
 
+    def _write(self, name: str, event: o.Event, now: float) -> None:
+        """Log that a relay is reached or lost."""
+        if not isinstance(event, o.PeerUp | o.PeerLost | o.PeerClosed):
+            return
+        omitted, log = self._limits.take("relay", name, now), self._log.bind(relay=name)
+        if omitted is None:
+            self._limits.omit("relay", name)
+        elif isinstance(event, o.PeerUp):
+            log.info("relay_up", **omitted)
+        elif isinstance(event, o.PeerLost):
+            log.warning("relay_lost", silent_s=round(event.silent_s, 3), **omitted)
+        else:
+            log.info("relay_closed", **omitted)
+
     def on_record(self, received: o.RecordReceived, now: float) -> DropReason | None:
-        """Candidates of a peer, or a relay's answer to a test. Returns why it has no effect; None if it has one."""
+        """A relay's record, or candidates of a peer. Returns why it has no effect; None if it has one."""
         if isinstance(received.record, FilterTested):
             return self.filter_tests.on_record(received)
-        return self._searches.on_record(received, now)
+        if isinstance(received.record, Candidates):
+            return self._searches.on_record(received, now)
+        if (relay := self._of_peer.get(received.peer)) is None:
+            return DropReason.UNEXPECTED_RECORD
+        return relay.on_record(received, now)
 
     def on_suspected(self, path: Path) -> None:
         """A relayed path of a peer failed a moment ago: ask the relay on the same socket, and bind the peer again."""
@@ -224,38 +359,9 @@ class Relays:
             has_changed |= link.set_relayed(list(self._paths_to(link)), now)
         if has_changed:
             self._sockets.report_absent(now)
-            self._on_due()
 
     def _paths_to(self, link: PeerLink) -> Iterator[Path]:
         """The relayed paths to a peer: first one along each path to a relay, then the others."""
         relays = (self.by_name[name] for name in link.config.relays if name in self.by_name)
         groups = [paths for relay in relays for paths in relay.paths_to(link.keys)]
         return (path for row in zip_longest(*groups) for path in row if path is not None)
-
-
-class _Logged:
-    """Passes the events of a relay on, and logs when it is reached and lost."""
-
-    def __init__(self, relay: RelayLink, log: FilteringBoundLogger, limits: LineLimits) -> None:
-        self._relay = relay
-        self._log = log.bind(relay=relay.config.name)
-        self._limits = limits
-
-    def on_event(self, event: o.Event, now: float) -> None:
-        """Of :class:`PeerOwner`."""
-        self._relay.on_event(event, now)
-        if event.peer not in self._relay.peers or not isinstance(event, o.PeerUp | o.PeerLost | o.PeerClosed):
-            return  # also of a previous key that is not accepted any more
-        omitted = self._limits.take("relay", self._relay.config.name, now)
-        if omitted is None:
-            self._limits.omit("relay", self._relay.config.name)
-        elif isinstance(event, o.PeerUp):
-            self._log.info("relay_up", **omitted)
-        elif isinstance(event, o.PeerLost):
-            self._log.warning("relay_lost", silent_s=round(event.silent_s, 3), **omitted)
-        else:
-            self._log.info("relay_closed", **omitted)
-
-    def on_record(self, received: o.RecordReceived, now: float) -> DropReason | None:
-        """Of :class:`PeerOwner`."""
-        return self._relay.on_record(received, now)

@@ -1,28 +1,30 @@
 """The serial networks: their devices, as senders and receivers of datagrams beside the UDP sockets.
 
-Each has one socket number, and one path: to the peer at the other end of the line.
+Each has one socket number, and one path: to the peer at the other end of the line. The file says what its radio
+carries. It may carry less: at a distance, with interference, or because the file is wrong. Then the modem's queue
+grows, and with it the time until an answer. :class:`LineRate` reduces the rate then.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict
 from functools import partial
-from typing import Final, Protocol
+from typing import Final
 
 from structlog.typing import FilteringBoundLogger
 
-from uavlinkd.config import NetworkConfig, PeerConfig
+from uavlinkd.config import NetworkConfig
 from uavlinkd.core.constants import LINE_BYTES
-from uavlinkd.core.envelope_limit import limit_at
+from uavlinkd.core.node import Node
 from uavlinkd.core.path import SERIAL_HOST, Path, SocketAddress
+from uavlinkd.core.path_measures import limit_at
 from uavlinkd.core.peer import Peer
-from uavlinkd.endpoints.presence import Presence
-from uavlinkd.endpoints.reader import Datagrams
+from uavlinkd.endpoints.sockets import Presence
 from uavlinkd.link.conditions import LineLimits
-from uavlinkd.link.line_rate import LineRate
-from uavlinkd.link.network_log import NetworkLog
-from uavlinkd.link.networks import SocketStates
+from uavlinkd.link.networks import NetworkBudget, NetworkLog, Receive, network_status
+from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.error_meanings import meaning_of
 from uavlinkd.system.stall import StallWatch
@@ -33,20 +35,81 @@ NOISE_PIECES: Final = 10
 """Damaged pieces in :data:`RECENT_S` that are reported, if they are more than :data:`NOISE_SHARE` of all."""
 NOISE_SHARE: Final = 0.1
 PLUG_IN: Final = "plug the modem in: the daemon uses it within a second"
+LATER_S: Final = 0.5
+"""A round trip that is longer than the shortest one by more than this shows a queue in a modem."""
+SHORTEST_OF_S: Final = 60.0
+"""The shortest round trip of this time counts."""
+GROWTH: Final = 1.05
+"""Factor per second by which a reduced rate grows."""
+GROWN_AFTER_S: Final = 60.0
+"""It grows from the lowest to the full rate in less. A longer gap, such as a suspend, would overflow the power."""
+LEAST_SHARE: Final = 1 / 16
+"""The rate falls to this part of the full one at most: heartbeats and commands still pass."""
+UNANSWERED: Final = 6
+"""So many echo requests in a row without an answer in time show a queue that is longer than answers may take. A noisy
+radio loses fewer."""
+SHARE_UNANSWERED: Final = 1 / 4
+"""The part of the full rate that is used then, until an answer comes."""
+SHARE_AFTER: Final = 1 / 2
+"""The part from which it grows after that answer."""
+ENVELOPES: Final = 2
+"""So many of the largest envelopes, one at each end, may precede a question or its answer without any queue in a
+modem."""
 
 
-class Receive(Protocol):
-    """Receives the datagrams of one read, as those of a UDP socket."""
+class LineRate:
+    """The rate at which this end sends: less if its modem turns out to queue. Sans-IO: ``now`` is monotonic seconds.
 
-    def __call__(self, socket: int, datagrams: Datagrams, now: float, epoch: int, waited_s: float, /) -> None:
-        """``socket`` is the number of the network. All datagrams have the same address."""
+    ``full_bits_s``: that of the configuration. ``envelope_bytes``: the largest envelope with its framing.
+    """
 
+    __slots__ = ("_at", "_bits_s", "_envelope_bits", "_halved_at", "_shortest", "_unanswered", "full_bits_s")
 
-class Linked(Protocol):
-    """A link, as far as it concerns serial networks."""
+    def __init__(self, full_bits_s: float, envelope_bytes: int, now: float) -> None:
+        self.full_bits_s = full_bits_s
+        self._envelope_bits = 8 * envelope_bytes
+        self._bits_s = full_bits_s
+        self._at = now
+        self._unanswered = 0  # since the last answer
+        self._halved_at = now - SHORTEST_OF_S
+        self._shortest = deque[tuple[float, float]]()  # times and round trips, both ascending
 
-    config: PeerConfig
-    peers: list[Peer]
+    def bits_s(self, now: float) -> float:
+        """The rate now."""
+        if self._bits_s < self.full_bits_s and now > self._at and self._unanswered < UNANSWERED:
+            self._bits_s = min(self.full_bits_s, self._bits_s * GROWTH ** min(now - self._at, GROWN_AFTER_S))
+        self._at = max(self._at, now)
+        return self._bits_s
+
+    def add_round_trip(self, round_trip_s: float, now: float) -> bool:
+        """Note the time until the answer to a probe. Returns whether the rate was halved for it."""
+        if self._unanswered >= UNANSWERED:  # the queue is gone, or the peer is back
+            self._bits_s = SHARE_AFTER * self.full_bits_s
+            self._at = max(self._at, now)
+        self._unanswered = 0
+        shortest = self._shortest
+        while shortest and shortest[0][0] < now - SHORTEST_OF_S:
+            shortest.popleft()
+        is_late = bool(shortest) and round_trip_s > shortest[0][1] + self._allowed_s(now)
+        while shortest and shortest[-1][1] >= round_trip_s:
+            shortest.pop()
+        shortest.append((now, round_trip_s))
+        # The answers to questions from before the last halving still show the queue that caused it.
+        if not is_late or now - self._halved_at <= round_trip_s:
+            return False
+        self._bits_s = max(LEAST_SHARE * self.full_bits_s, self.bits_s(now) / 2)
+        self._halved_at = now
+        return True
+
+    def add_unanswered(self, count: int, now: float) -> None:
+        """Note echo requests that had no answer in time: it may be lost, or late behind a long queue."""
+        self._unanswered += count
+        if self._unanswered >= UNANSWERED:
+            self._bits_s = min(self.bits_s(now), SHARE_UNANSWERED * self.full_bits_s)
+
+    def _allowed_s(self, now: float) -> float:
+        """How much longer a round trip may take. At a low rate, an envelope alone takes longer than 0.5 s."""
+        return LATER_S + ENVELOPES * self._envelope_bits / self.bits_s(now)
 
 
 class SerialNetwork:
@@ -56,11 +119,9 @@ class SerialNetwork:
         self,
         config: NetworkConfig,
         number: int,
-        receive: Receive,
-        states: SocketStates,
+        states: Node,
         stall: StallWatch,
-        log: FilteringBoundLogger,
-        limits: LineLimits,
+        log: NetworkLog,
     ) -> None:
         assert config.serial is not None, "a serial network has a device"
         self.config = config
@@ -68,9 +129,9 @@ class SerialNetwork:
         self.path = Path(number, (SERIAL_HOST, 0))
         self.envelope_limit = limit_at(config.budget_bits_s)
         self.rate = LineRate(config.budget_bits_s, self.envelope_limit + LINE_BYTES, monotonic())
-        self._receive = receive
+        self._receive: Receive = lambda *_: None
         self._states = states
-        self._log = NetworkLog(config.name, limits, log)
+        self._log = log
         self._on_change: Callable[[], None] = lambda: None
         self._answered_at = 0.0
         self._unanswered = 0
@@ -92,9 +153,9 @@ class SerialNetwork:
         """Its name in the configuration."""
         return self.config.name
 
-    def start(self, on_change: Callable[[], None]) -> None:
+    def start(self, receive: Receive, on_change: Callable[[], None]) -> None:
         """Open the device, whenever it is present. ``on_change`` is called after the core got a change."""
-        self._on_change = on_change
+        self._receive, self._on_change = receive, on_change
         self.line.start()
 
     def send(self, datagram: bytes, _address: SocketAddress) -> int:
@@ -112,19 +173,19 @@ class SerialNetwork:
         if is_change or not is_open:
             self._states.set_socket_state(self.number, now, is_up=is_open)
         if is_change:
-            self._note(now)
+            self._log.note(self.presence, now)
             self._on_change()
 
     def do_housekeeping(self) -> None:
         """Note what was received. Write to the log what it does not say yet about the device."""
         decoder = self.line.decoder
         self._seconds.append((decoder.line_noise, decoder.datagrams, decoder.reports))
-        self._note(monotonic())
+        self._log.note(self.presence, monotonic())
 
-    def _note(self, now: float) -> None:
-        """Have the log say whether the device is there."""
-        line = self.line
-        self._log.note(Presence(hosts=(SERIAL_HOST,)) if line.is_open else Presence(reason=line.reason), now)
+    @property
+    def presence(self) -> Presence:
+        """Whether the device is open."""
+        return Presence(hosts=(SERIAL_HOST,)) if self.line.is_open else Presence(reason=self.line.reason)
 
     def add_round_trip(self, round_trip_s: float, answered_at: float) -> None:
         """Note the last round trip along the line. One that was noted before does not count again."""
@@ -163,44 +224,25 @@ class SerialNetwork:
         """As plain values, with the keys of every network."""
         line, decoder = self.line, self.line.decoder
         report = decoder.report if self.recent_reports else None
-        return {
-            "interface": None,
-            "address": None,
-            "is_metered": False,
-            "budget_bits_s": self.config.budget_bits_s,
-            "is_present": line.is_open,
-            "absent_because": line.reason or None,
-            "addresses": [SERIAL_HOST] if line.is_open else [],
-            "ports": [],
-            "serial": {
-                "device": line.url.device,
-                "baud": line.url.baud,
-                "air_bits_s": self.config.air_bits_s,
-                "rate_bits_s": round(self.rate.bits_s(now)),
-                "uses_cts": line.uses_cts,
-                "line_noise": decoder.line_noise,
-                "discarded": {noise.value: count for noise, count in decoder.discarded.items()},
-                "discarded_bytes": {noise.value: size for noise, size in decoder.discarded_bytes.items()},
-                "cts_held_s": line.cts.total_s,
-                "datagrams_received": decoder.datagrams,
-                "bytes_received": line.bytes_received,
-                "bytes_written": line.bytes_written,
-                "failures": dict(line.failures),
-                "reports": decoder.reports,
-                "reports_inside": decoder.reports_inside,
-                "radio": None
-                if report is None
-                else {
-                    "rssi": report.rssi,
-                    "remrssi": report.remrssi,
-                    "txbuf": report.txbuf,
-                    "noise": report.noise,
-                    "remnoise": report.remnoise,
-                    "rxerrors": report.rxerrors,
-                    "fixed": report.fixed,
-                },
-            },
+        serial: dict[str, object] = {
+            "device": line.url.device,
+            "baud": line.url.baud,
+            "air_bits_s": self.config.air_bits_s,
+            "rate_bits_s": round(self.rate.bits_s(now)),
+            "uses_cts": line.uses_cts,
+            "line_noise": decoder.line_noise,
+            "discarded": {noise.value: count for noise, count in decoder.discarded.items()},
+            "discarded_bytes": {noise.value: size for noise, size in decoder.discarded_bytes.items()},
+            "cts_held_s": line.cts.total_s,
+            "datagrams_received": decoder.datagrams,
+            "bytes_received": line.bytes_received,
+            "bytes_written": line.bytes_written,
+            "failures": dict(line.failures),
+            "reports": decoder.reports,
+            "reports_inside": decoder.reports_inside,
+            "radio": None if report is None else asdict(report),
         }
+        return network_status(self.config, self.presence, (), serial)
 
 
 class SerialNetworks:
@@ -210,14 +252,13 @@ class SerialNetworks:
         self,
         configs: Iterable[NetworkConfig],
         first_number: int,
-        receive: Receive,
-        states: SocketStates,
+        states: Node,
         stall: StallWatch,
         log: FilteringBoundLogger,
     ) -> None:
         limits = LineLimits()
         self.networks = [
-            SerialNetwork(config, first_number + place, receive, states, stall, log, limits)
+            SerialNetwork(config, first_number + place, states, stall, NetworkLog(config.name, limits, log))
             for place, config in enumerate(configs)
         ]
         self.of_number = {network.number: network for network in self.networks}
@@ -226,7 +267,7 @@ class SerialNetworks:
         """The path along the serial network of this name."""
         return next((network.path for network in self.networks if network.name == name), None)
 
-    def peers_at(self, links: Iterable[Linked]) -> dict[int, list[Peer]]:
+    def peers_at(self, links: Iterable[PeerLink]) -> dict[int, list[Peer]]:
         """The peers of the core at the other end of each line. The list is empty during a change."""
         return {
             network.number: [
@@ -238,10 +279,42 @@ class SerialNetworks:
             for network in self.networks
         }
 
-    def start(self, on_change: Callable[[], None]) -> None:
+    def start(self, receive: Receive, on_change: Callable[[], None]) -> None:
         """Open the devices, whenever they are present. ``on_change``: see :meth:`SerialNetwork.start`."""
         for network in self.networks:
-            network.start(on_change)
+            network.start(receive, on_change)
+
+    def budgets(self, now: float) -> dict[int, NetworkBudget]:
+        """By the number of the socket. A bucket holds one envelope, so that a modem never gets more at once."""
+        return {
+            line.number: NetworkBudget(line.config.budget_bits_s, now, line.envelope_limit + LINE_BYTES)
+            for line in self.networks
+        }
+
+    def follow_rates(
+        self, budgets: Mapping[int, NetworkBudget], links: Iterable[PeerLink], now: float
+    ) -> dict[int, float]:
+        """Adapt the budgets to the answers along the lines. Call it once a second.
+
+        Returns the rates for the core, by the number of the socket, if one of them has changed.
+        """
+        if not self.networks:
+            return {}
+        for link in links:
+            for state in link.peer.paths.states:
+                if (line := self.of_number.get(state.path.socket)) is None:
+                    continue
+                if state.round_trip_s is not None:
+                    line.add_round_trip(state.round_trip_s, state.answered_at)
+                unanswered = link.peer.traffic.echoes_unanswered
+                is_asked = state is link.peer.paths.best and not state.is_off
+                line.add_unanswered(unanswered, now, is_asked=is_asked)
+        has_changed = False
+        for line in self.networks:
+            budget, bits_s = budgets[line.number], line.bits_s(now)
+            budget.set_rate(bits_s, now)
+            has_changed |= budget.update_core(bits_s)
+        return {line.number: budgets[line.number].core_bits_s for line in self.networks} if has_changed else {}
 
     def report_absent(self) -> None:
         """Report the devices that are not open. Call it after other paths were set: the core knows states by path."""

@@ -1,57 +1,31 @@
-"""The status of a daemon: plain values for JSON, without secrets."""
+"""The status of a daemon: plain values for JSON, without secrets. ``ops/metrics.py`` exports them by their keys."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
 
 from uavlinkd.config.keys import encode_key
+from uavlinkd.core.path import Path, SocketAddress, relay_name
+from uavlinkd.core.path_state import PathState
+from uavlinkd.core.peer import Peer
 from uavlinkd.endpoints.ports import Endpoint
-from uavlinkd.link import refused_there
 from uavlinkd.link.diagnosis import find
-from uavlinkd.link.path_status import NetworkOf, RelayAddressOf, paths_status
-from uavlinkd.link.relay_server_status import relay_status
-from uavlinkd.link.shown import shown
+from uavlinkd.link.parts import DaemonParts
+from uavlinkd.link.peer_link import PeerLink
+from uavlinkd.link.relay_link import RelayLink
 from uavlinkd.mavlink.dialect import command_name, name_of
 from uavlinkd.mavlink.policy.compilation import Policy
-from uavlinkd.mavlink.policy.gate import ANY_OTHER
+from uavlinkd.mavlink.policy.gate import ANY_OTHER, Refusal
+from uavlinkd.mavlink.policy.refusal_totals import REFUSALS
+from uavlinkd.ops.log import shown
+from uavlinkd.ops.recorder import Recorder
 from uavlinkd.ops.schema_versions import STATUS_SCHEMA
+from uavlinkd.relay.service import RelayMember, RelayService
+from uavlinkd.system.addresses import Address
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from uavlinkd.config import Config
-    from uavlinkd.core.node import Node
-    from uavlinkd.core.peer import Peer
-    from uavlinkd.link.evidence import Evidence
-    from uavlinkd.link.history import History
-    from uavlinkd.link.local_endpoints import LocalEndpoints
-    from uavlinkd.link.passage import Passage
-    from uavlinkd.link.peer_link import PeerLink
-    from uavlinkd.link.peer_sockets import PeerSockets
-    from uavlinkd.link.relay_link import RelayLink
-    from uavlinkd.link.relays import Relays
-    from uavlinkd.link.switch import Switch
-    from uavlinkd.ops.recorder import Recorder
-    from uavlinkd.relay.service import RelayService
-    from uavlinkd.system.stall import StallWatch
-
-
-class DaemonParts(Protocol):
-    """The parts of a daemon that its status describes."""
-
-    config: Config
-    node: Node
-    evidence: Evidence
-    history: History
-    passage: Passage
-    links: dict[str, PeerLink]
-    local: LocalEndpoints
-    switch: Switch
-    relays: Relays
-    peer_sockets: PeerSockets
-    stall: StallWatch
-    recorder: Recorder | None
-    relay: RelayService | None
+WayOf = Callable[[Path], tuple[str | None, SocketAddress | None]]
+"""The name of a path's network, if the configuration names any, and the relay's address along a relayed path."""
 
 
 def daemon_status(daemon: DaemonParts, now: float) -> dict[str, object]:
@@ -60,7 +34,7 @@ def daemon_status(daemon: DaemonParts, now: float) -> dict[str, object]:
     ``frames_pass``: every peer is up, and within the last 10 s no traffic was wholly refused. ``blocked`` names it.
     """
     node = daemon.node
-    blocked = daemon.passage.blocked(daemon.links.values(), daemon.local.judged)
+    blocked = daemon.history.blocked(now)
     all_up = (bool(daemon.links) or daemon.config.is_only_relay) and all(
         link.peer.is_up for link in daemon.links.values()
     )
@@ -72,39 +46,32 @@ def daemon_status(daemon: DaemonParts, now: float) -> dict[str, object]:
         "frames_pass": all_up and not blocked,
         "blocked": [dict(zip(("subject", "name", "direction"), key, strict=True)) for key in blocked],
         "findings": [finding.as_json() for finding in find(daemon, now)],
-        "peers": {
-            name: peer_status(link, now, daemon.peer_sockets.network_name, daemon.relays.handles.address_of)
-            for name, link in daemon.links.items()
-        },
-        "relays": {
-            name: used_relay_status(relay, daemon.links.values(), now, daemon.peer_sockets.network_name)
-            for name, relay in daemon.relays.by_name.items()
-        },
+        "peers": {name: peer_status(link, now, daemon.peer_sockets.way_of) for name, link in daemon.links.items()},
+        "relays": {name: used_relay_status(relay, daemon, now) for name, relay in daemon.relays.by_name.items()},
         "networks": daemon.peer_sockets.network_status(now),
         "endpoints": {
             endpoint.name: endpoint_status(endpoint, daemon.local.policies[endpoint.name], now)
             for endpoint in daemon.local.endpoints
         },
-        "drops": {reason.value: count for reason, count in node.drops.items()},
+        "drops": _counts(node.drops),
         "stale": dict(daemon.stall.dropped),
-        "unrouted": {reason.value: count for reason, count in daemon.switch.router.unrouted.items()},
+        "unrouted": _counts(daemon.switch.router.unrouted),
         "send_failures": dict(daemon.peer_sockets.failures),
         "relay": None if daemon.relay is None else relay_status(daemon.relay, now),
         "recording": None if daemon.recorder is None else recording_status(daemon.recorder),
     }
 
 
-def peer_status(
-    link: PeerLink,
-    now: float,
-    network_of: NetworkOf = lambda _: None,
-    relay_address_of: RelayAddressOf = lambda _: None,
-) -> dict[str, object]:
-    """The status of a peer. ``state`` is ``up``, ``lost`` (was up) or ``waiting`` (was never up).
+def _counts(counts: Mapping[Any, int]) -> dict[str, int]:
+    return {reason.value: count for reason, count in counts.items()}
 
-    ``network_of`` returns the name of the network of a socket's number, ``relay_address_of`` the address of the relay
-    along a relayed path.
-    """
+
+def _age(at: float | None, now: float) -> float | None:
+    return None if at is None else now - at
+
+
+def peer_status(link: PeerLink, now: float, way_of: WayOf) -> dict[str, object]:
+    """The status of a peer."""
     peer, figures = link.peer, link.figures
     session = peer.sessions.current
     traffic = peer.traffic
@@ -112,17 +79,17 @@ def peer_status(
     return {
         "state": state_of(peer),
         "public_key": encode_key(peer.settings.public_key),
-        "accepts_previous_key": link.accepts_previous_keys,
+        "accepts_previous_key": bool(link.previous),
         "path": None if peer.path is None else shown(peer.path.address),
-        "last_received_s": None if peer.received_at is None else now - peer.received_at,
-        "handshake_s": None if peer.established_at is None else now - peer.established_at,
+        "last_received_s": _age(peer.received_at, now),
+        "handshake_s": _age(peer.established_at, now),
         "round_trip_s": link.round_trip_s,
-        "freshness_unverified_s": None if peer.unverified_since is None else now - peer.unverified_since,
+        "freshness_unverified_s": _age(peer.unverified_since, now),
         "loss_in": figures.loss_in,
         "loss_out": figures.loss_out,
-        "bytes_in_s": link.bytes_s[0],
-        "bytes_out_s": link.bytes_s[1],
-        "paths": paths_status(link, network_of, now, relay_address_of),
+        "bytes_in_s": link.rates.of(peer)[0],
+        "bytes_out_s": link.rates.of(peer)[1],
+        "paths": paths_status(link, way_of, now),
         "session": None
         if session is None
         else {
@@ -147,23 +114,34 @@ def peer_status(
         "frames_received": link.counters.frames,
         "frames_unknown": link.counters.unknown,
         "frames_superseded": link.frames_superseded,
-        "malformed": {fault.value: count for fault, count in link.counters.faults.items()},
-        "refused": policy_status(link.policy),
-        "refused_commands": commands_status(link.policy),
-        "refused_there": refused_there.as_json(link, now),
-        "waiting_dropped": {}
-        if link.output.egress is None
-        else {reason.value: count for reason, count in link.output.egress.totals.items()},
+        "malformed": _counts(link.counters.faults),
+        **_refusals(link.policy),
+        "refused_there": _claims(link, now),
+        "waiting_dropped": {} if link.output.egress is None else _counts(link.output.egress.totals),
         "repair": {
             "is_on": link.output.repair.is_on,
-            "on_s": 0.0 if link.output.repair.began_at is None else now - link.output.repair.began_at,
+            "on_s": _age(link.output.repair.began_at, now) or 0.0,
             "transmissions": link.output.repair.transmissions,
-            "datagrams": link.output.repeats.sent,
-            "bytes": link.output.repeats.bytes_sent,
+            "datagrams": link.output.copies.repeats_sent,
+            "bytes": link.output.copies.repeat_bytes,
         },
-        "copies_dropped": {reason.value: count for reason, count in link.output.copies.dropped.items()},
-        "drops": {reason.value: count for reason, count in traffic.drops.items()},
+        "copies_dropped": _counts(link.output.copies.dropped),
+        "drops": _counts(traffic.drops),
     }
+
+
+def _claims(link: PeerLink, now: float) -> list[dict[str, object]]:
+    """What the peer reports to refuse: every claim that this end remembers, the latest first."""
+    return [
+        {
+            "message": name_of(claim.refused.message),
+            "command": command_name(claim.refused.command) if claim.refused.command else None,
+            "reason": REFUSALS.get(claim.refused.reason, f"reason_{claim.refused.reason}"),
+            "count": claim.refused.total,
+            "last_s": now - claim.changed_at,
+        }
+        for claim in link.peer.refusal_claims.recent()
+    ]
 
 
 def state_of(peer: Peer) -> str:
@@ -171,9 +149,7 @@ def state_of(peer: Peer) -> str:
     return "up" if peer.is_up else "lost" if peer.received_at is not None else "waiting"
 
 
-def used_relay_status(
-    relay: RelayLink, links: Iterable[PeerLink], now: float, network_of: NetworkOf = lambda _: None
-) -> dict[str, object]:
+def used_relay_status(relay: RelayLink, daemon: DaemonParts, now: float) -> dict[str, object]:
     """The status of a relay. ``peer``: the peer that it is too, or None. ``peers``: those that use it, each with
     ``bound``, ``waiting`` for the peer to ask too, or ``unanswered``. ``seen_as``: this daemon's addresses as the
     relay sees them.
@@ -184,35 +160,35 @@ def used_relay_status(
         "peer": relay.config.peer,
         "public_key": encode_key(peer.settings.public_key),
         "addresses": [str(written) for written in relay.addresses],
-        "seen_as": [str(address) for address in relay.seen_as],
-        "last_received_s": None if peer.received_at is None else now - peer.received_at,
-        "handshake_s": None if peer.established_at is None else now - peer.established_at,
+        "seen_as": [str(seen) for _, seen in relay.views()],
+        "last_received_s": _age(peer.received_at, now),
+        "handshake_s": _age(peer.established_at, now),
         "round_trip_s": peer.round_trip_s,
-        "paths": paths_status(relay, network_of, now),
-        "peers": {link.name: relay.state_for(link) for link in links if relay.config.name in link.config.relays},
+        "paths": paths_status(relay, daemon.peer_sockets.way_of, now),
+        "peers": {
+            link.name: relay.state_for(link)
+            for link in daemon.links.values()
+            if relay.config.name in link.config.relays
+        },
         "bytes_received": peer.traffic.bytes_received,
         "bytes_sent": peer.traffic.bytes_sent,
-        "drops": {reason.value: count for reason, count in peer.traffic.drops.items()},
+        "drops": _counts(peer.traffic.drops),
     }
 
 
 def endpoint_status(endpoint: Endpoint, policy: Policy, now: float) -> dict[str, object]:
     """The status of a local endpoint and its clients."""
     return {
-        "clients": {
-            port.name: {"last_received_s": None if port.received_at is None else now - port.received_at}
-            for port in endpoint.ports
-        },
+        "clients": {port.name: {"last_received_s": _age(port.received_at, now)} for port in endpoint.ports},
         "frames_received": endpoint.counters.frames,
         "frames_unknown": endpoint.counters.unknown,
         "frames_sent": endpoint.frames_sent,
         "bytes_received": endpoint.bytes_received,
         "bytes_sent": endpoint.bytes_sent,
         "garbage_bytes": endpoint.counters.garbage_bytes,
-        "faults": {fault.value: count for fault, count in endpoint.counters.faults.items()},
+        "faults": _counts(endpoint.counters.faults),
         "failures": dict(endpoint.failures),
-        "refused": policy_status(policy),
-        "refused_commands": commands_status(policy),
+        **_refusals(policy),
     }
 
 
@@ -227,24 +203,92 @@ def recording_status(recorder: Recorder) -> dict[str, object]:
     }
 
 
-def policy_status(policy: Policy) -> dict[str, dict[str, dict[str, int]]]:
-    """Refused frames by direction, message and reason."""
-    status: dict[str, dict[str, dict[str, int]]] = {}
+def _refusals(policy: Policy) -> dict[str, object]:
+    """Refused frames by direction, message and reason; COMMAND_LONG and COMMAND_INT also by command."""
+    messages, commands = {}, {}
     for direction, gate in (("in", policy.incoming), ("out", policy.outgoing)):
-        messages = status[direction] = {}
-        for (msgid, refusal), count in gate.refused.items():
-            name = "others" if msgid == ANY_OTHER else name_of(msgid)
-            messages.setdefault(name, {})[refusal.value] = count
-    return status
+        messages[direction] = _by_name((name_of, *key, count) for key, count in gate.refused.items())
+        commands[direction] = _by_name(
+            (command_name, *key[1:], count) for key, count in gate.refused_commands.items()
+        )
+    return {"refused": messages, "refused_commands": commands}
 
 
-def commands_status(policy: Policy) -> dict[str, dict[str, dict[str, int]]]:
-    """Refused COMMAND_LONG and COMMAND_INT by direction, command and reason."""
-    status: dict[str, dict[str, dict[str, int]]] = {}
-    for direction, gate in (("in", policy.incoming), ("out", policy.outgoing)):
-        commands = status[direction] = {}
-        for (_, command, refusal), count in gate.refused_commands.items():
-            name = "others" if command == ANY_OTHER else command_name(command)
-            counts = commands.setdefault(name, {})
-            counts[refusal.value] = counts.get(refusal.value, 0) + count
-    return status
+def _by_name(counts: Iterable[tuple[Callable[[int], str], int, Refusal, int]]) -> dict[str, dict[str, int]]:
+    named: dict[str, dict[str, int]] = {}
+    for name, number, refusal, count in counts:
+        reasons = named.setdefault("others" if number == ANY_OTHER else name(number), {})
+        reasons[refusal.value] = reasons.get(refusal.value, 0) + count
+    return named
+
+
+def relay_status(relay: RelayService, now: float) -> dict[str, object]:
+    """The members, and what was forwarded and dropped. Times are ages in seconds."""
+    return {
+        "members": {member.settings.name: _member(relay, member, now) for member in relay.members.values()},
+        "connections": relay.bindings.connections,
+        "dropped": _counts(relay.forwarding.dropped),
+    }
+
+
+def _member(relay: RelayService, member: RelayMember, now: float) -> dict[str, object]:
+    peer, meter = member.peer, member.meter
+    bound, waiting = relay.bindings.peers_of(member.key)
+    return {
+        "public_key": encode_key(member.key),
+        "is_up": peer.is_up,
+        "since_s": now - member.since,
+        "addresses": [str(Address.of(state.path.address)) for state in peer.paths.states if state.is_validated],
+        "bound": bound,
+        "waiting": waiting,
+        "binds_ignored": member.binds_ignored + relay.bindings.refused(member.key),
+        "filter_tests_ignored": member.filter_tests_ignored,
+        "datagrams": meter.datagrams,
+        "bytes": meter.bytes,
+        "over_limit": meter.over_limit,
+    }
+
+
+def paths_status(link: PeerLink | RelayLink, way_of: WayOf, now: float) -> list[dict[str, object]]:
+    """Each path to a peer, the best first, then the configured ones.
+
+    ``carries`` has the classes of frames that go along it now. Losses are shares of recent datagrams, ``lag_s`` is by
+    how much our copies arrive later along it than along the first path. ``number`` stays the same as long as the path
+    is known, and is below 256. ``relay`` is the one through which it leads, and ``relay_address`` where it is
+    reached; null for a direct path.
+    """
+    paths = link.peer.paths
+    states = sorted(paths.states, key=lambda state: state is not paths.best)
+    return [_path_status(link, state, way_of, now) for state in states]
+
+
+def _path_status(link: PeerLink | RelayLink, state: PathState, way_of: WayOf, now: float) -> dict[str, object]:
+    peer = link.peer
+    bytes_in_s, bytes_out_s = link.rates.of(state)
+    network, relay_address = way_of(state.path)
+    return {
+        "number": state.number,
+        "network": network,
+        "address": shown(state.path.address),
+        "relay": relay_name(state.path.address),
+        "relay_address": None if relay_address is None else str(Address.of(relay_address)),
+        "is_configured": state.is_configured,
+        "state": state.condition.value,
+        "reason": state.reason,
+        "state_s": now - state.since,
+        "role": peer.paths.role(state),
+        "carries": [cls.value for cls, route in peer.paths.routes.items() if peer.is_up and state in route],
+        "answered_s": now - state.answered_at if state.is_validated else None,
+        "round_trip_s": state.srtt_s,
+        "jitter_s": state.rttvar_s,
+        "loss_in": state.loss_in,
+        "loss_out": state.loss_out,
+        "lag_s": state.lag_s(now),
+        "bytes_in_s": bytes_in_s,
+        "bytes_out_s": bytes_out_s,
+        "bytes_received": state.bytes_received,
+        "bytes_sent": state.bytes_sent,
+        "datagrams_received": state.datagrams_received,
+        "datagrams_sent": state.datagrams_sent,
+        "duplicates": state.duplicates,
+    }

@@ -8,29 +8,25 @@ flow costs a look-up. Where a frame can arrive by two routes, it costs the check
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from itertools import count
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 from uavlinkd.endpoints.ports import LocalPort
+from uavlinkd.link.drop_summary import DropSummary, ShellReason
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.mavlink.frames import Frame
 from uavlinkd.mavlink.headers import Header
 from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.delivery import Source
-from uavlinkd.mavlink.policy.gate import Refusal
 from uavlinkd.mavlink.routing import Router
+from uavlinkd.system.clock import monotonic
+from uavlinkd.system.stall import STALL_S, StallWatch
 
 MAX_FLOWS = 2048
 """Flows of one source that are remembered."""
 
 Port = LocalPort | PeerLink
-
-
-class OnRefused(Protocol):
-    """Receives each frame that a policy does not let pass."""
-
-    def __call__(self, name: str, header: Header, refusal: Refusal, now: float, *, to_them: bool) -> None:
-        """``name``: the peer or endpoint that sent the frame, or that does not receive it (``to_them``)."""
 
 
 class Route(NamedTuple):
@@ -44,11 +40,13 @@ class Route(NamedTuple):
 
 
 class Switch:
-    """Knows every port and its policy. All times are monotonic seconds."""
+    """Knows every port and its policy. It drops frames from before a pause. All times are monotonic seconds."""
 
-    def __init__(self, router: Router[Port], on_refused: OnRefused) -> None:
+    def __init__(self, router: Router[Port], stall: StallWatch, drops: DropSummary) -> None:
         self.router = router
-        self._on_refused = on_refused
+        self.stall = stall
+        self._drops = drops
+        self._report = partial(drops.add_refused, to_them=False)
         self._policies: dict[Port, Policy] = {}
         self._sources: dict[Port, Source] = {}
         self._numbers: dict[Port, int] = {}
@@ -92,11 +90,20 @@ class Switch:
         """Whether a local client is silent: then broadcasts of other local clients do not go to it."""
         self.router.set_silent(port, is_silent=is_silent)
 
-    def forward(self, source: Port, frames: Sequence[Frame], now: float, waited_s: float = 0.0) -> None:
+    def forward(self, source: Port, frames: Sequence[Frame], now: float, epoch: int, waited_s: float = 0.0) -> None:
         """Send frames of ``source`` where they belong. A frame that a policy refuses is counted and dropped.
 
-        ``waited_s``: how long the first of them has waited for the others.
+        ``epoch``: when they were read. ``waited_s``: how long the first of them has waited for the others.
         """
+        stall, at = self.stall, monotonic()
+        if at - stall.turned_at > STALL_S:  # the process may have paused after it read them
+            stall.turn(at)
+        else:
+            stall.turned_at = at
+        if epoch != stall.epoch:
+            stall.dropped[_owner(source)] += len(frames)
+            self._drops.add("frames_dropped", ShellReason.STALE, _owner(source), len(frames), now)
+            return
         router = self.router
         if now >= router.refresh_at or router.edition != self._edition:
             router.refresh(now)
@@ -127,7 +134,7 @@ class Switch:
         incoming = self._policies[source].incoming
         refusal = incoming.check(frame, now)
         if refusal is not None:
-            self._on_refused(_owner(source), header, refusal, now, to_them=False)
+            self._report(_owner(source), header, refusal, now)
             return ()
         has_one_route = self._has_one_route(header.system)
         ports = self.router.route(frame, source, now, has_one_route=has_one_route)
@@ -146,7 +153,7 @@ class Switch:
         """The ports of a conditional route to which the policies let this frame pass."""
         refusal = self._policies[source].incoming.check(frame, now)
         if refusal is not None:
-            self._on_refused(_owner(source), frame.header, refusal, now, to_them=False)
+            self._report(_owner(source), frame.header, refusal, now)
             return ()
         if not route.has_one_route and not self.router.is_first(frame.raw, source, now):
             return ()
@@ -159,7 +166,7 @@ class Switch:
             if refusal is None:
                 passed.append(port)
             else:
-                self._on_refused(_owner(port), frame.header, refusal, now, to_them=True)
+                self._drops.add_refused(_owner(port), frame.header, refusal, now, to_them=True)
         return tuple(passed)
 
     def _has_one_route(self, system: int) -> bool:
@@ -169,9 +176,6 @@ class Switch:
             senders = sum(policy.incoming.may_speak_as(system) for policy in self._policies.values())
             self._senders[system] = senders
         return senders == 1
-
-    def _report(self, name: str, header: Header, refusal: Refusal, now: float) -> None:
-        self._on_refused(name, header, refusal, now, to_them=False)
 
     def _forget_flows(self) -> None:
         for flows in self._flows.values():

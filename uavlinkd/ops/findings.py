@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -51,8 +50,3 @@ class Finding:
             "text": self.text,
             "remedy": self.remedy,
         }
-
-
-def ranked(findings: Iterable[Finding]) -> list[Finding]:
-    """Security reasons first, then faults, then warnings; by subject and name among equals."""
-    return sorted(findings, key=lambda finding: (finding.severity, finding.subject, finding.name, finding.cause))

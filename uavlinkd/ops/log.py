@@ -1,7 +1,7 @@
 """The log of a process: the format of its lines, and the file that gets them.
 
 Event names are stable, in ``snake_case`` and past tense; facts are fields. A field never contains a private key, PSK,
-tag or payload. :mod:`uavlinkd.ops.log_events` has the list.
+tag or payload. ``README.md`` has the list.
 """
 
 from __future__ import annotations
@@ -16,12 +16,21 @@ from typing import Final, TextIO, cast
 import structlog
 from structlog.typing import EventDict, Processor
 
+from uavlinkd.core.path import SocketAddress, relay_name
+from uavlinkd.system.addresses import Address
+
 PRIORITIES: Final = {"critical": 2, "error": 3, "warning": 4, "info": 6, "debug": 7}
 """The syslog priority of each level (sd-daemon(3))."""
 _PIPE_BUF: Final = getattr(select, "PIPE_BUF", 512)  # POSIX's lower bound, where Python does not know the system's
 _FIRST: Final = ("event", "level")
 _LAST: Final = ("daemon", "timestamp")
 _SENTENCES: Final = ("text", "remedy")
+
+
+def shown(address: SocketAddress) -> str:
+    """An address of a path as text. That of a relayed one has no handle, which means nothing to a person."""
+    relay = relay_name(address)
+    return str(Address.of(address)) if relay is None else f"relayed via {relay}"
 
 
 def order_fields(_: object, __: str, event: EventDict) -> EventDict:

@@ -32,8 +32,7 @@ _TEXT = "text/plain; charset=utf-8"
 class MetricsServer:
     """Answers Prometheus with the result of ``content``.
 
-    Without a free connection, a new one replaces the oldest that has not sent a request: hung clients do not block
-    others.
+    Without a free connection, a new one replaces the oldest: hung clients do not block others.
     """
 
     def __init__(self, address: Address, content: Callable[[], bytes], content_type: str) -> None:
@@ -43,8 +42,7 @@ class MetricsServer:
         self._content = b""
         self._made_at = -CONTENT_AGE_S
         self._server: asyncio.Server | None = None
-        self._connections: dict[asyncio.StreamWriter, bool] = {}
-        """The open connections, oldest first, and whether each has sent a whole request."""
+        self._connections: dict[asyncio.StreamWriter, None] = {}  # the open ones, oldest first
 
     @property
     def address(self) -> Address:
@@ -72,13 +70,12 @@ class MetricsServer:
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         if len(self._connections) >= MAX_CONNECTIONS:
             self._evict()
-        self._connections[writer] = False
+        self._connections[writer] = None
         try:
             async with asyncio.timeout(REQUEST_TIMEOUT_S):
                 request = await reader.readuntil(b"\r\n\r\n")
                 if writer not in self._connections:  # evicted meanwhile
                     return
-                self._connections[writer] = True
                 writer.write(self._respond(request))
                 await writer.drain()
                 if writer not in self._connections:  # evicted: uvloop raises RuntimeError for a closed transport
@@ -95,8 +92,7 @@ class MetricsServer:
             writer.close()
 
     def _evict(self) -> None:
-        silent = (writer for writer, has_asked in self._connections.items() if not has_asked)
-        oldest = next(silent, next(iter(self._connections)))
+        oldest = next(iter(self._connections))
         del self._connections[oldest]
         oldest.transport.abort()
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import shutil
 import subprocess
 from collections.abc import Iterable, Iterator, Sequence
@@ -17,7 +16,7 @@ from typing import Any, Final, NamedTuple
 
 from uavlinkd.config import Config, NetworkConfig, PeerAddress
 from uavlinkd.config.network_rules import used_networks
-from uavlinkd.endpoints.presence import LINK_LOCAL, Presence, family_of, look
+from uavlinkd.endpoints.sockets import LINK_LOCAL, Presence, family_of, look
 from uavlinkd.endpoints.url import SerialUrl
 from uavlinkd.system.interfaces import find_interface, interface_of
 
@@ -25,8 +24,6 @@ _IP_S = 3.0
 """Limit for one call of ``ip``."""
 _STRICT = 1
 """The value of rp_filter with which the kernel drops what another interface would answer (RFC 3704)."""
-_UNPRIVILEGED_SINCE = (5, 7)
-"""The kernel from which on SO_BINDTODEVICE needs no CAP_NET_RAW on a socket that is not bound yet."""
 _CONF = Path("/proc/sys/net/ipv4/conf")
 _IP = shutil.which("ip", path=f"{os.environ.get('PATH', os.defpath)}:/usr/sbin:/sbin")
 """Not in the path of every user."""
@@ -75,7 +72,7 @@ def look_at_networks(config: Config, answers: dict[str, list[str]]) -> NetworkRe
         for network in config.networks
         if network.serial is None
     }
-    reaches, lacks = [], list(_privilege(config.networks))
+    reaches, lacks = list[Reach](), list[str]()
     if presences and _IP is None:
         lacks.append("there is no `ip` here, so routes were not checked: install iproute2")
     for network in config.networks:
@@ -96,7 +93,6 @@ def look_at_networks(config: Config, answers: dict[str, list[str]]) -> NetworkRe
             lacks.append(f"{start}: it has no route to {', '.join(map(str, unreached))}: {_route_remedy(network)}")
         lacks += _rules(network, reached)
         lacks += _strict(network, presence, reached)
-    lacks += _overlaps(config.networks, presences)
     return NetworkReport(reaches, lacks, list(_unreachable(config.networks, targets, reaches)))
 
 
@@ -223,33 +219,3 @@ def _rp_filter(interface: str) -> int:
         return int((_CONF / interface / "rp_filter").read_text())
     except (OSError, ValueError):
         return 0
-
-
-# The rest.
-
-
-def _privilege(networks: Iterable[NetworkConfig]) -> Iterator[str]:
-    names = [f'"{network.name}"' for network in networks if network.interface is not None]
-    release = os.uname().release
-    if names and needs_privilege(release):
-        yield (
-            f"networks {', '.join(names)}: Linux {release} lets only a process with CAP_NET_RAW bind to an interface,"
-            " from 5.7 on any process: add AmbientCapabilities=CAP_NET_RAW to the unit, or write address instead"
-        )
-
-
-def needs_privilege(release: str) -> bool:
-    """Whether a kernel of this release requires CAP_NET_RAW for SO_BINDTODEVICE."""
-    match = re.match(r"(\d+)\.(\d+)", release)
-    return match is not None and (int(match[1]), int(match[2])) < _UNPRIVILEGED_SINCE
-
-
-def _overlaps(networks: Iterable[NetworkConfig], presences: dict[str, Presence]) -> Iterator[str]:
-    """An ``address`` that is on the interface of another network: that one does not receive its answers there."""
-    for network in networks:
-        for other in networks:
-            if network.interface is not None and other.address in presences[network.name].hosts:
-                yield (
-                    f'networks "{network.name}" and "{other.name}" share {other.address}, an address of'
-                    f' {network.interface}: answers to "{network.name}" arrive at "{other.name}"; write two addresses'
-                )

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Final
 
-from uavlinkd.ops.path_names import addresses
+from uavlinkd.ops.status_screen import addresses
 from uavlinkd.system.terminal import printable
 
 INTERVAL_S: Final = 1.0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Final
 
 from rich.box import SIMPLE_HEAD
@@ -13,13 +13,10 @@ from rich.text import Text
 from uavlinkd.config import Config, PolicyData
 from uavlinkd.mavlink import dialect
 from uavlinkd.mavlink.policy.compilation import Policy, PolicyRow
-from uavlinkd.mavlink.policy.gate import Gate, Refusal
 from uavlinkd.mavlink.policy.roles import ROLES
 
 _IN_THE_SUMMARY: Final = frozenset({"role", "may speak as"})
 _COVERED: Final = frozenset({"urgent"})  # the group sets only the order; each of its messages is in another group
-_LONG = 64  # characters: a cell of two lines
-_MANY = 3  # messages: fewer of them take no more room than the reference to other rows
 _EMPTY: Final = ("-", "-")
 _WHOLE: Final = (("both directions", ("all", "passes")), ("no direction", ("none", "never", "refused")))
 
@@ -78,23 +75,20 @@ def tables(rows: _Rows) -> list[RenderableType]:
 
 
 def table_rows(policy: Policy, data: PolicyData) -> tuple[PolicyRow, ...]:
-    """The rows of the policy, with long cells shortened. ``data`` is the source of the policy.
+    """The rows of the policy, whose source is ``data``.
 
     A message passes in a direction if a row allows its group or its name, and no row refuses a whole group that
     contains it.
     """
     rows = []
     for row in policy.describe():
-        sides = row.incoming, row.outgoing
-        if row.subject in _COVERED or row.subject in _IN_THE_SUMMARY:
-            continue
-        if members := dialect.GROUPS.get(row.subject):
-            sides = _short(sides[0], members, policy.incoming), _short(sides[1], members, policy.outgoing)
-        elif row.subject == "rates":
+        if row.subject == "rates":
             # As in the file: a group may have a hundred messages, each with this rate.
             role = ROLES.get(str(data.get("role")))
             sides = _rates(data.get("rate_in"), role.rate_in if role else {}), _rates(data.get("rate_out"), {})
-        rows.append(PolicyRow(row.subject, *sides))
+            rows.append(PolicyRow(row.subject, *sides))
+        elif row.subject not in _COVERED and row.subject not in _IN_THE_SUMMARY:
+            rows.append(row)
     return tuple(rows)
 
 
@@ -109,35 +103,3 @@ def _rates(written: object, by_role: Mapping[str, float]) -> str:
 def _members(name: str) -> tuple[str, ...]:
     """The messages that a rate applies to."""
     return dialect.GROUPS.get(name, (name,))
-
-
-def _short(text: str, members: Sequence[str], gate: Gate) -> str:
-    """Shorten the cell of a group by the messages that another row lists with the same result.
-
-    Groups overlap. Another row covers a message if a group that contains it passes as a whole, or is refused as a
-    whole.
-    """
-    if len(text) <= _LONG:
-        return text
-    passing = _passing(members, gate)
-    names_passing = text.startswith("only")
-    listed = [name for name in members if (name in passing) == names_passing]
-    covered = _covered(gate, passing=names_passing)
-    rest = [name for name in listed if name not in covered]
-    if len(listed) - len(rest) < _MANY:
-        return text
-    rest.append(f"{len(listed) - len(rest)} listed in other rows")
-    by_command = text[text.index(" (by command") :] if " (by command" in text else ""
-    return f"{'only' if names_passing else 'all but'} {', '.join(rest)}{by_command}"
-
-
-def _passing(members: Sequence[str], gate: Gate) -> set[str]:
-    ids = dialect.ids_by_name()
-    return {name for name in members if not isinstance(gate.decide(ids[name], is_known=True), Refusal)}
-
-
-def _covered(gate: Gate, *, passing: bool) -> set[str]:
-    """The messages of the groups that pass as a whole, or that are refused as a whole."""
-    groups = (members for name, members in dialect.GROUPS.items() if name not in _COVERED)
-    wanted = ((members, _passing(members, gate)) for members in groups)
-    return {name for members, those in wanted if len(those) == (len(members) if passing else 0) for name in members}

@@ -20,35 +20,11 @@ def control_sockets(folder: Path = RUNTIME_FOLDER) -> list[Path]:
     Raises:
         NoSocketError: no daemon has one there, or this user may not look for it.
     """
-    try:
-        names = sorted(os.listdir(folder))
-    except PermissionError:
-        raise NoSocketError(_not_permitted(folder)) from None
-    except OSError:
-        raise NoSocketError(_none(folder)) from None
-    candidates = [folder / SOCKET_NAME, *(folder / name / SOCKET_NAME for name in names if name != SOCKET_NAME)]
-    sockets: list[Path] = []
-    is_hidden = False
-    for path in candidates:
-        try:
-            path.lstat()
-        except PermissionError:
-            is_hidden = True
-        except OSError:
-            continue
-        else:
-            sockets.append(path)
-    if not sockets:
-        raise NoSocketError(_not_permitted(folder) if is_hidden else _none(folder))
+    candidates = [folder / SOCKET_NAME, *sorted(folder.glob(f"*/{SOCKET_NAME}"))]
+    if not (sockets := [path for path in candidates if os.path.lexists(path)]):
+        raise NoSocketError(
+            f"no control socket in {folder} that this user may see: use sudo, start the service (`systemctl start"
+            f' uavlinkd`) with control_socket = "{folder / SOCKET_NAME}" in its file, or name the daemon:'
+            " --config FILE or --socket PATH"
+        )
     return sockets
-
-
-def _none(folder: Path) -> str:
-    return (
-        f"no daemon has a control socket in {folder}: start the service (`systemctl start uavlinkd`) with"
-        f' control_socket = "{folder / SOCKET_NAME}" in its file, or name the daemon: --config FILE or --socket PATH'
-    )
-
-
-def _not_permitted(folder: Path) -> str:
-    return f"no permission to look into {folder}: only root and the daemon's user have it; use sudo"

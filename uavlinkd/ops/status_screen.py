@@ -2,41 +2,67 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import errno
+import os
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import chain
 from typing import Any, Final
 
 from rich.box import SIMPLE_HEAD
-from rich.console import Group, RenderableType
+from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
 from rich.table import Table
 from rich.text import Text
 
-from uavlinkd.core.drops import DropReason
+from uavlinkd.core.drops import DropReason, Reason
+from uavlinkd.mavlink.egress.lanes import EgressDrop
+from uavlinkd.mavlink.frames import FrameFault
 from uavlinkd.mavlink.policy.gate import Refusal
-from uavlinkd.ops.path_table import PathTable, has_several_paths
-from uavlinkd.ops.reason_phrases import (
-    DATAGRAMS,
-    ENDPOINT_FAILURES,
-    FAULTS,
-    LINK_PROBLEMS,
-    QUEUED,
-    REFUSALS,
-    phrase,
-)
-from uavlinkd.ops.relay_table import age, members_status, relay_drops, used_relay
+from uavlinkd.ops.link_problems import LinkProblem
+from uavlinkd.relay.forwarding import RelayReason
 from uavlinkd.system.error_meanings import meaning_of
 
 Status = dict[str, Any]
 _Count = tuple[str, int]
 """A reason in plain words, and how often."""
 
-_STYLES = {"up": "green", "lost": "bold red", "waiting": "bold yellow"}
-_SEVERITY_STYLES: Final = {"security": "bold red", "fault": "bold yellow", "warning": "yellow"}
+ENDPOINT_FAILURES: Final[Mapping[str, str]] = {
+    "unsent": "unsent frames",
+    "outgoing_full": "frames above the queue's limit",
+    "stale": "frames that waited too long",
+    "thinned": "frames replaced by newer ones",
+    "disconnected": "disconnected",
+    "stalled": "stalled connections",
+    "too_many_clients": "clients above the limit",
+    "displaced": "silent clients replaced",
+    "http": "web browsers",
+    "connect_timeout": "attempts without an answer",
+    "not_resolved": "attempts without an address",
+    "family_unavailable": "addresses of an unavailable family",
+    "stranger": "datagrams of another address",
+}
+"""Errors of an endpoint that the daemon names itself; the others are names of the kernel."""
+_STYLES: Final = {
+    "up": "green",
+    "lost": "bold red",
+    "waiting": "bold yellow",
+    "usable": "green",
+    "suspect": "yellow",
+    "down": "bold red",
+    "unproven": "yellow",
+    "security": "bold red",
+    "fault": "bold yellow",
+    "warning": "yellow",
+}
+_NOT_USABLE: Final = {"unanswered": "no answer", "loss": "loss", "network": "no network"}
+"""Why a path is not usable, in plain words."""
 _SHOWN_REASONS: Final = 3
 _SHOWN_FINDINGS: Final = 20
+_SHOWN_MEMBERS: Final = 30
+_WIDE: Final = 100
+"""From so many columns on, the table of paths has lag and bytes too."""
 _COPIES: Final = frozenset[str]({DropReason.DUPLICATE, DropReason.LATE_COPY})
 """What several paths cause all the time."""
-_SHOWN_FIRST: Final = (phrase(Refusal.HIDDEN_FRAME, REFUSALS),)
-"""Reasons that are always shown. A captured member could cause greater counts of other reasons to hide them."""
 
 
 def frames_pass(status: Status) -> bool:
@@ -53,13 +79,13 @@ def render_status(status: Status) -> RenderableType:
     if relay is None or status["peers"] or status["endpoints"]:
         parts += [_peers(status), _endpoints(status)]
     if relay is not None:
-        parts.append(members_status(relay))
-        if text := relay_drops(relay):
+        parts.append(_members(relay))
+        if text := _listed(_by_count(relay["dropped"], DropReason, RelayReason)):
             parts.append(Text(f"not forwarded: {text}", style="yellow"))
-    parts += [used_relay(name, used) for name, used in status.get("relays", {}).items()]
+    parts += [_used_relay(name, used) for name, used in status.get("relays", {}).items()]
     if status["networks"]:
         parts.append(_networks(status))
-    if dropped := _listed(_by_count(status["drops"], DATAGRAMS)):
+    if dropped := _listed(_by_count(status["drops"], DropReason)):
         parts.append(Text(f"dropped, from no known peer: {dropped}", style="yellow"))
     for error, count in _ranked(list(status["send_failures"].items()))[:_SHOWN_REASONS]:
         parts.append(Text(f"not sent: {count:,}, because {meaning_of(error) or error}", style="yellow"))
@@ -101,7 +127,7 @@ def _findings(findings: list[dict[str, str]]) -> Table:
     security = [finding for finding in findings if finding["severity"] == "security"]
     others = [finding for finding in findings if finding["severity"] != "security"]
     for finding in [*security, *others[:_SHOWN_FINDINGS]]:
-        style = _SEVERITY_STYLES[finding["severity"]]
+        style = _STYLES[finding["severity"]]
         label = finding["severity"]
         subject = {"peer": finding["name"], "endpoint": f"endpoint {finding['name']}"}.get(finding["subject"], "")
         line = Text(f"{subject}: " if subject else "", style="bold")
@@ -121,15 +147,8 @@ def _peers(status: Status) -> Group:
 
     The tables fit into 80 columns; long names and IPv6 addresses are folded.
     """
-    health = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
-    health.add_column("peer", overflow="fold")
-    for name in ("state", "silent", "rtt", "loss in/out", "in", "out"):
-        health.add_column(name, no_wrap=True)
-    paths = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
-    for name in ("peer", "path"):
-        paths.add_column(name, overflow="fold")
-    for name in ("suite", "mode", "key age"):
-        paths.add_column(name, no_wrap=True)
+    health = _table("peer", whole=("state", "silent", "rtt", "loss in/out", "in", "out"))
+    paths = _table("peer", "path", whole=("suite", "mode", "key age"))
     problems: list[RenderableType] = []
     for name, peer in _by_state(status):
         health.add_row(
@@ -148,8 +167,8 @@ def _peers(status: Status) -> Group:
         session = peer["session"] or {}
         age = _age(peer["handshake_s"]) if session else "-"
         paths.add_row(Text(name), Text(peer["path"] or "-"), session.get("suite", "-"), session.get("mode", "-"), age)
-    several = {name: peer for name, peer in _by_state(status) if has_several_paths(peer)}
-    return Group(health, paths, *([PathTable(several)] if several else []), *problems)
+    several = {name: peer for name, peer in _by_state(status) if len(peer["paths"]) > 1}
+    return Group(health, paths, *([_PathTable(several)] if several else []), *problems)
 
 
 def _by_state(status: Status) -> list[tuple[str, Status]]:
@@ -158,17 +177,15 @@ def _by_state(status: Status) -> list[tuple[str, Status]]:
 
 
 def _endpoints(status: Status) -> Table:
-    table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
-    for name in ("endpoint", "clients (silent)", "frames in", "frames out", "problems"):
-        table.add_column(name, overflow="fold")
+    table = _table("endpoint", "clients (silent)", "frames in", "frames out", "problems")
     for name, endpoint in status["endpoints"].items():
         clients = endpoint["clients"].items()
         listed = ", ".join(f"{address} ({_age(client['last_received_s'])})" for address, client in clients)
         is_active = bool(clients) and endpoint["frames_received"] > 0
         problems = _listed(
-            _by_count(endpoint["faults"], FAULTS)
-            + _by_count(endpoint["failures"], ENDPOINT_FAILURES)
-            + _by_count(_refused(endpoint), REFUSALS)
+            _by_count(endpoint["faults"], FrameFault)
+            + _by_count(endpoint["failures"])
+            + _by_count(_refused(endpoint), Refusal)
         )
         table.add_row(
             Text(name, style="bold"),
@@ -181,9 +198,7 @@ def _endpoints(status: Status) -> Table:
 
 
 def _networks(status: Status) -> Table:
-    table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
-    for name in ("network", "exit", "metered", "addresses"):
-        table.add_column(name, overflow="fold")
+    table = _table("network", "exit", "metered", "addresses")
     for name, network in status["networks"].items():
         here = Text(", ".join(network["addresses"]))
         if not network["is_present"]:
@@ -210,12 +225,13 @@ def _line(line: Status) -> str:
 
 
 def _drops(peer: Status) -> list[_Count]:
+    """Missing envelopes are in the column of losses."""
     return [
-        *_by_count({reason: count for reason, count in peer["drops"].items() if reason not in _COPIES}, DATAGRAMS),
-        *_by_count(peer["malformed"], FAULTS),
-        *_by_count(peer["waiting_dropped"], QUEUED),
-        *_by_count(_refused(peer), REFUSALS),
-        *((words, peer[problem]) for problem, words in LINK_PROBLEMS.items() if peer[problem]),
+        *_by_count({reason: count for reason, count in peer["drops"].items() if reason not in _COPIES}, DropReason),
+        *_by_count(peer["malformed"], FrameFault),
+        *_by_count(peer["waiting_dropped"], EgressDrop),
+        *_by_count(_refused(peer), Refusal),
+        *((problem.phrase, peer[problem]) for problem in LinkProblem if problem.phrase and peer[problem]),
     ]
 
 
@@ -229,13 +245,24 @@ def _refused(part: Status) -> dict[str, int]:
     return sums
 
 
-def _by_count(counts: dict[str, int], words: Mapping[str, str]) -> list[_Count]:
-    return [(phrase(code, words), count) for code, count in counts.items() if count]
+def phrase(code: str, *lists: Iterable[Reason]) -> str:
+    """A reason in plain words, for a count in front; an error of the kernel in the system's words."""
+    for reason in chain(*lists):
+        if reason == code:
+            return reason.phrase
+    if code in ENDPOINT_FAILURES:
+        return ENDPOINT_FAILURES[code]
+    number = {name: number for number, name in errno.errorcode.items()}.get(code)
+    return code.replace("_", " ") if number is None else os.strerror(number).lower()
+
+
+def _by_count(counts: dict[str, int], *lists: Iterable[Reason]) -> list[_Count]:
+    return [(phrase(code, *lists), count) for code, count in counts.items() if count]
 
 
 def _ranked(counts: list[_Count]) -> list[_Count]:
-    """The most frequent reasons first, after those in `_SHOWN_FIRST`."""
-    return sorted(counts, key=lambda item: (item[0] not in _SHOWN_FIRST, -item[1]))
+    """The most frequent reasons first, after hidden frames: a captured member could hide these by other refusals."""
+    return sorted(counts, key=lambda item: (item[0] != Refusal.HIDDEN_FRAME.phrase, -item[1]))
 
 
 def _listed(counts: list[_Count]) -> str:
@@ -257,8 +284,130 @@ def _repair(name: str, repair: Status) -> str:
 
 
 def _age(seconds: float | None) -> str:
-    return "never" if seconds is None else age(seconds)
+    """A duration for a column, at most 6 characters long within a year."""
+    if seconds is None:
+        return "never"
+    if seconds < 100:
+        return f"{seconds:.1f} s"
+    minutes = seconds / 60
+    return f"{minutes:.0f} min" if minutes < 100 else f"{minutes / 60:.0f} h"
+
+
+def _table(*columns: str, whole: Sequence[str] = ()) -> Table:
+    """Columns that are folded, then those that are not."""
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    for name in columns:
+        table.add_column(name, overflow="fold")
+    for name in whole:
+        table.add_column(name, no_wrap=True)
+    return table
 
 
 def _rate(bytes_s: float) -> str:
     return f"{bytes_s:.0f} B/s" if bytes_s < 1000 else f"{bytes_s / 1000:.1f} kB/s"
+
+
+# Paths.
+
+
+def addresses(paths: Sequence[Mapping[str, Any]]) -> list[str]:
+    """The address of each path. Relayed paths that look alike have the relay's address too, or else their number.
+
+    Two paths along one port of a relay lead to two addresses of the peer, which only the relay knows.
+    """
+    names = [path["address"] for path in paths]
+    for fact, word in (("relay_address", "at"), ("number", "path")):
+        times = Counter((path["network"], name) for path, name in zip(paths, names, strict=True))
+        for at, path in enumerate(paths):
+            if path["relay"] is not None and times[path["network"], names[at]] > 1 and path.get(fact) is not None:
+                names[at] += f" {word} {path[fact]}"
+    return names
+
+
+class _PathTable:
+    """The paths of all peers that have several; it fits into 80 columns. Pairs of numbers are in/out."""
+
+    def __init__(self, peers: Mapping[str, Status]) -> None:
+        self._peers = peers
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """The table with as many columns as have room."""
+        is_wide = options.max_width >= _WIDE
+        names = ["state", "carries", "rtt ms", "loss %", "kB/s"]
+        table = _table("path", whole=names + ["lag ms", "MB"] * is_wide)
+        for name, peer in self._peers.items():
+            table.add_row(Text(name, style="bold"))
+            for path, address in zip(peer["paths"], addresses(peer["paths"]), strict=True):
+                cells = _cells(path, address)
+                table.add_row(*(cells if is_wide else cells[: len(names) + 1]))
+        yield table
+
+
+def _cells(path: Status, address: str) -> list[Text]:
+    where = f"{path['network']} {address}" if path["network"] else address
+    return [
+        Text(f" {where}", style="bold" if path["role"] == "best" else ""),
+        Text(_state(path), style=_STYLES[path["state"]]),
+        Text("all" if len(path["carries"]) == 3 else "+".join(path["carries"]) or "-"),
+        Text("-" if path["round_trip_s"] is None else f"{_ms(path['round_trip_s'])}±{_ms(path['jitter_s'])}"),
+        Text(f"{100 * path['loss_in']:.0f}/{100 * path['loss_out']:.0f}"),
+        Text(f"{_short(path['bytes_in_s'] / 1e3)}/{_short(path['bytes_out_s'] / 1e3)}"),
+        Text("-" if path["lag_s"] is None else _ms(path["lag_s"])),
+        Text(f"{_short(path['bytes_received'] / 1e6)}/{_short(path['bytes_sent'] / 1e6)}"),
+    ]
+
+
+def _state(path: Status) -> str:
+    """The role of a usable path; of another one, what is wrong."""
+    if path["state"] == "usable":
+        return str(path["role"])
+    reason = _NOT_USABLE.get(path["reason"])
+    return f"{path['state']}: {reason}" if reason else str(path["state"])
+
+
+def _ms(seconds: float) -> str:
+    return _short(1000 * seconds)
+
+
+def _short(number: float) -> str:
+    """One digit behind the point below ten, none above."""
+    return f"{number:.1f}" if number < 9.95 else f"{number:.0f}"
+
+
+# Relays.
+
+
+def _members(relay: dict[str, Any]) -> Table:
+    """A line per member, those that are down first."""
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=0)
+    for title in ("member", "state", "address"):
+        table.add_column(title, overflow="fold", no_wrap=title == "state")
+    for title in ("bound", "waiting", "forwarded", "over\nlimit"):
+        table.add_column(title, justify="right", overflow="fold")
+    members = sorted(relay["members"].items(), key=lambda item: (item[1]["is_up"], item[0]))
+    for name, member in members[:_SHOWN_MEMBERS]:
+        table.add_row(
+            Text(name),
+            Text(
+                f"{'up' if member['is_up'] else 'down'} {_age(member['since_s'])}",
+                "green" if member["is_up"] else "yellow",
+            ),
+            Text("\n".join(dict.fromkeys(member["addresses"])) or "-"),
+            f"{member['bound']:,}",
+            f"{member['waiting']:,}",
+            f"{member['datagrams']:,}",
+            Text(f"{member['over_limit']:,}", style="yellow" if member["over_limit"] else ""),
+        )
+    if len(members) > _SHOWN_MEMBERS:
+        table.add_row(f"and {len(members) - _SHOWN_MEMBERS:,} more")
+    return table
+
+
+def _used_relay(name: str, relay: dict[str, Any]) -> Text:
+    """A line about a relay that this daemon uses, with the state of each peer there."""
+    time_s = relay["round_trip_s"]
+    measured = "" if time_s is None else f", {1000 * time_s:.0f} ms"
+    peers = ", ".join(f"{peer} {state}" for peer, state in relay["peers"].items()) or "no peer uses it"
+    is_well = relay["state"] == "up" and "unanswered" not in relay["peers"].values()
+    role = "" if relay["peer"] is None else f", also the peer {relay['peer']}"
+    return Text(f"relay {name}{role}: {relay['state']}{measured}; {peers}", style="" if is_well else "yellow")

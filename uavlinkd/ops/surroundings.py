@@ -8,25 +8,19 @@ from __future__ import annotations
 
 import errno
 import os
-import shutil
 import socket
 import stat
-import struct
 import threading
 from collections.abc import Iterator
 from contextlib import suppress
-from ipaddress import IPv4Address, IPv6Address
 from pathlib import Path
-from typing import NamedTuple
 
 from uavlinkd.config import Config
-from uavlinkd.endpoints.url import EndpointKind, NetworkUrl, SerialUrl
-from uavlinkd.ops.control import is_served
-from uavlinkd.system.addresses import Address, numeric_host, overlaps
+from uavlinkd.endpoints.url import NetworkUrl, SerialUrl
+from uavlinkd.system.addresses import Address, numeric_host
 
 RESOLVE_S = 3.0
 """Limit for the look-ups of all names together."""
-_TCP_LISTENS = "0A"
 _MAX_SOCKET_PATH = 107
 _SERIAL_DEVICES = ("serial/by-id/*", "ttyACM*", "ttyUSB*", "serial0")
 
@@ -35,91 +29,31 @@ Answers = dict[str, list[str]]
 """The numeric hosts of each name; none if it does not resolve."""
 
 
-class _Bound(NamedTuple):
-    kind: str
-    address: Address
-    inode: str
-
-
 def lacks(config: Config, answers: Answers | None = None) -> list[str]:
     """Sentences for a person. The daemon may run in spite of them, now or later.
 
     ``answers``: those of :func:`look_up_names`, if it was called already.
     """
-    running = config.control_socket is not None and is_served(config.control_socket)
     return [
         *_serial(config),
-        *_shared_devices(config),
         *_addresses(config),
-        *(() if running else _ports(config)),
         *_names(config, look_up_names(config) if answers is None else answers),
-        *_recording(config),
         *_control_socket(config),
     ]
 
 
-def _listening(config: Config) -> Iterator[tuple[str, str, Address]]:
-    """Key, transport and address of each socket that listens."""
-    for address in config.listen:
-        yield "listen", "udp", address
+def _listening(config: Config) -> Iterator[tuple[str, Address]]:
+    """Key and address of each socket that listens."""
+    yield from (("listen", address) for address in config.listen)
     for endpoint in config.endpoints:
         if isinstance(endpoint.url, NetworkUrl) and endpoint.url.listens:
-            kind = "udp" if endpoint.url.kind is EndpointKind.UDPIN else "tcp"
-            yield f"endpoint.url ({endpoint.name})", kind, endpoint.url.address
+            yield f"endpoint.url ({endpoint.name})", endpoint.url.address
     if config.metrics is not None:
-        yield "metrics.listen", "tcp", config.metrics
-
-
-def _ports(config: Config) -> Iterator[str]:
-    sockets = _bound_sockets()
-    for key, kind, address in _listening(config):
-        for bound in sockets:
-            if bound.kind == kind and overlaps(bound.address, address):
-                if (owner := _owner(bound.inode, config.path)) is not None:
-                    yield (
-                        f"{key}: {kind.upper()} port {address.port} is in use{owner}: end that process, or write"
-                        " another port; if it is this daemon, all is well"
-                    )
-                break
-
-
-def _bound_sockets(root: Path = Path("/proc/net")) -> list[_Bound]:
-    bound = []
-    for name in ("udp", "udp6", "tcp", "tcp6"):
-        with suppress(OSError):
-            for line in (root / name).read_text().splitlines()[1:]:
-                fields = line.split()
-                if name.startswith("udp") or fields[3] == _TCP_LISTENS:
-                    bound.append(_Bound(name[:3], _address(fields[1]), fields[9]))
-    return bound
-
-
-def _address(text: str) -> Address:
-    """``0100007F:16A6``: the words of the address in the machine's byte order."""
-    host, _, port = text.partition(":")
-    words = [int(host[at : at + 8], 16) for at in range(0, len(host), 8)]
-    packed = struct.pack(f"={len(words)}I", *words)
-    ip = IPv4Address(packed) if len(words) == 1 else IPv6Address(packed)
-    return Address(str(ip), int(port, 16))
-
-
-def _owner(inode: str, config_file: Path) -> str | None:
-    """`` by NAME (process 12)``; empty if unknown; None if the process is a daemon of this configuration."""
-    wanted = f"socket:[{inode}]"
-    for process in Path("/proc").glob("[0-9]*"):
-        with suppress(OSError):
-            if any(os.readlink(descriptor) == wanted for descriptor in (process / "fd").iterdir()):
-                words = (process / "cmdline").read_bytes().decode(errors="replace").split("\0")
-                folder = Path(os.readlink(process / "cwd"))
-                if any(word and (folder / word).resolve() == config_file.resolve() for word in words[1:]):
-                    return None
-                name = (process / "comm").read_text().strip()
-                return f" by {name} (process {process.name})"
-    return ""
+        yield "metrics.listen", config.metrics
 
 
 def _addresses(config: Config) -> Iterator[str]:
-    for key, _, address in _listening(config):
+    for key, address in _listening(config):
         host, _, zone = address.host.partition("%")
         if zone and not _has_interface(zone):
             yield f"{key}: there is no network interface {zone} now: `ip -brief link` lists those of this machine"
@@ -213,15 +147,6 @@ def _serial(config: Config) -> Iterator[str]:
             yield f"{user}: {url.device} {why}"
 
 
-def _shared_devices(config: Config) -> Iterator[str]:
-    """A device that has two names in the file, as those below /dev/serial/by-id. The file itself cannot show that."""
-    users: dict[str, str] = {}
-    for user, url in _serial_users(config):
-        other = users.setdefault(os.path.realpath(url.device), user)
-        if other != user:
-            yield f"{user}: {url.device} is the device of {other} too, and only one can open it: write another"
-
-
 def _serial_users(config: Config) -> Iterator[tuple[str, SerialUrl]]:
     for endpoint in config.endpoints:
         if isinstance(endpoint.url, SerialUrl):
@@ -248,26 +173,6 @@ def _serial_problem(path: Path) -> str | None:
             " (`sudo usermod -aG dialout $USER`, then log in again)"
         )
     return None
-
-
-def _recording(config: Config) -> Iterator[str]:
-    if config.recording is None:
-        return
-    folder = config.recording.folder
-    start = f"recording.folder: {folder}"
-    if folder.exists() and not folder.is_dir():
-        yield f"{start} is not a folder: nothing would be recorded; write the name of a folder"
-    elif not folder.exists() and not folder.parent.is_dir():
-        yield f"{start} cannot be made, because {folder.parent} does not exist: run `mkdir -p {folder.parent}`"
-    elif not os.access(folder if folder.exists() else folder.parent, os.W_OK | os.X_OK):
-        yield f"{start} cannot be written by this user: nothing would be recorded; give it to the daemon's user"
-    else:
-        free = shutil.disk_usage(folder if folder.exists() else folder.parent).free
-        if free < config.recording.min_free_bytes:
-            yield (
-                f"{start} has {free / 1e9:.1f} GB of free space, less than min_free_bytes: nothing would be recorded;"
-                " make room, or write a smaller min_free_bytes"
-            )
 
 
 def _control_socket(config: Config) -> Iterator[str]:

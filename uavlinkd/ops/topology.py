@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console, Group, RenderableType
@@ -10,17 +10,15 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from uavlinkd.config import Config, PeerConfig, Routing
+from uavlinkd.config import Config, PeerConfig, RelayConfig, RelayServer, Routing
 from uavlinkd.config.advice import exposure
 from uavlinkd.config.keys import encode_key, looks_private, short_form
+from uavlinkd.config.model import KEY_GRACE_S
 from uavlinkd.config.network_rules import used_networks
-from uavlinkd.core.constants import AEAD_TAG_BYTES
 from uavlinkd.core.crypto import x25519_public_key
 from uavlinkd.core.settings import Link
-from uavlinkd.core.wire import LONG_HEADER_BYTES, SHORT_HEADER_BYTES, initiation_bytes, response_bytes
 from uavlinkd.ops.network_report import NetworkReport
 from uavlinkd.ops.policy_table import review
-from uavlinkd.ops.relay_table import members_configured, relays_configured
 
 _PLAIN_WIDTH = 100
 """Columns of the output if it is not a terminal: a pipe has no width."""
@@ -58,14 +56,13 @@ def describe(config: Config, lacks: Sequence[str] = (), networks: NetworkReport 
     if config.networks:
         parts += [_heading("Networks"), _networks(config, networks)]
     if config.peers:
-        parts += [_heading("Peers"), _peers(config), _heading("Bytes in a datagram"), _sizes(config)]
-        parts += [_heading("Sending to a peer"), _pace(config)]
+        parts += [_heading("Peers"), _peers(config)]
     if config.relays:
-        parts += [_heading("Relays"), relays_configured(config.relays)]
+        parts += [_heading("Relays"), _relays(config.relays)]
     if config.endpoints:
         parts += [_heading("Local endpoints"), _endpoints(config)]
     if config.relay_server is not None:
-        parts += [_heading("Members of this relay, and their limits"), members_configured(config.relay_server)]
+        parts += [_heading("Members of this relay, and their limits"), _members(config.relay_server)]
     parts += review(config)
     parts.append(_verdict(config, lacks, () if networks is None else networks.errors))
     return Group(*parts)
@@ -84,7 +81,7 @@ def _identity(config: Config) -> Table:
     table.add_row("public key", Text(encode_key(config.public_key)))
     if config.previous_private_key is not None:
         before = encode_key(x25519_public_key(config.previous_private_key.reveal()))
-        table.add_row("previous key", Text(f"{before}\n{_grace(config)}"))
+        table.add_row("previous key", Text(f"{before}\n{_GRACE}"))
     table.add_row("listens on", Text(_listening(config)))
     if not config.is_only_relay:
         table.add_row("routing", Text(_routing(config.routing)))
@@ -96,19 +93,13 @@ def _identity(config: Config) -> Table:
     return table
 
 
-def _grace(config: Config) -> str:
-    """How long previous keys are valid."""
-    days, seconds = divmod(config.key_grace_s, 86400)
-    most = f"{config.key_grace_s:g} s" if seconds or not days else f"{days:g} day{'s' if days > 1 else ''}"
-    return f"valid until the peer confirms the new key, at most {most} from each start"
+_GRACE = f"valid until the peer confirms the new key, at most {KEY_GRACE_S / 86400:g} days from each start"
 
 
 def _routing(routing: Routing) -> str:
-    relay = (
+    return (
         "between peers and endpoints, and from peer to peer" if routing.relay else "between peers and endpoints only"
     )
-    unknown = "goes to all others" if routing.unknown_targets == "flood" else "is dropped"
-    return f"{relay}; a frame for an unknown system {unknown}"
 
 
 def _listening(config: Config) -> str:
@@ -152,23 +143,35 @@ def _networks(config: Config, report: NetworkReport | None) -> Table:
     return table
 
 
-def _peers(config: Config) -> Table:
+def _table(columns: Sequence[str], rows: Iterable[Sequence[str | Text]]) -> Table:
     table = Table(box=SIMPLE_HEAD, pad_edge=False, show_edge=False)
-    for column in ("name", "key", "address", "suites", "mode, at least", "PSK"):
+    for column in columns:
         table.add_column(column, overflow="fold")
-    for peer in config.peers:
-        settings = peer.settings
-        cells = (
-            peer.name,
-            _keys(peer),
-            "\n".join([*map(str, peer.addresses), *(f"relayed via {name}" for name in peer.relays)])
-            or "(it connects)",
-            " ".join(suite.name for suite in settings.link.suites),
-            _mode(settings.link),
-            "yes" if settings.psk is not None else "no",
-        )
-        table.add_row(*map(Text, cells))
+    for cells in rows:
+        table.add_row(*(Text(cell) if isinstance(cell, str) else cell for cell in cells))
     return table
+
+
+def _yes(condition: object) -> str:
+    return "yes" if condition else "no"
+
+
+def _peers(config: Config) -> Table:
+    return _table(
+        ("name", "key", "address", "suites", "mode, at least", "PSK"),
+        (
+            (
+                peer.name,
+                _keys(peer),
+                "\n".join([*map(str, peer.addresses), *(f"relayed via {name}" for name in peer.relays)])
+                or "(it connects)",
+                " ".join(suite.name for suite in peer.settings.link.suites),
+                _mode(peer.settings.link),
+                _yes(peer.settings.psk),
+            )
+            for peer in config.peers
+        ),
+    )
 
 
 def _keys(peer: PeerConfig) -> str:
@@ -186,61 +189,57 @@ def _mode(link: Link) -> str:
     return f"authentic, {8 * link.tag_bytes}-bit tag{key}"
 
 
-def _sizes(config: Config) -> Table:
-    """Bytes on the air."""
-    texts = []
-    for peer in config.peers:
-        link = peer.settings.link
-        tag_bytes = AEAD_TAG_BYTES if link.confidential else link.tag_bytes
-        offered = link.suites[0]
-        texts.append(
-            f"envelopes up to {link.max_envelope:,}, adding"
-            f" {SHORT_HEADER_BYTES + tag_bytes}-{LONG_HEADER_BYTES + tag_bytes} to the frames;"
-            f" handshake {initiation_bytes(offered):,} + {response_bytes(offered):,}"
-        )
-    return _by_peer(config, texts)
-
-
-def _pace(config: Config) -> Table:
-    """Budgets, and how long frames wait."""
-    texts = []
-    for peer in config.peers:
-        egress = peer.egress
-        if not egress.is_needed:
-            texts.append("each frame at once")
-            continue
-        budget = f"up to {egress.budget_bits_s:,} bits/s" if egress.budget_bits_s else "no budget"
-        coalesce = f"; up to {egress.coalesce_s:g} s to share an envelope" if egress.coalesce_s else ""
-        texts.append(f"{budget}{coalesce}; dropped after {egress.max_age_s:g} s")
-    return _by_peer(config, texts)
-
-
-def _by_peer(config: Config, texts: Sequence[str]) -> Table:
-    """One line per text, with the names of the peers that share it."""
-    alike: dict[str, list[str]] = {}
-    for peer, text in zip(config.peers, texts, strict=True):
-        alike.setdefault(text, []).append(peer.name)
-    table = Table.grid(padding=(0, 2))
-    for text, names in alike.items():
-        table.add_row(Text("every peer" if len(alike) == 1 else ", ".join(names)), Text(text))
-    return table
-
-
 def _endpoints(config: Config) -> Table:
-    table = Table(box=SIMPLE_HEAD, pad_edge=False, show_edge=False)
-    for column in ("name", "URL", "keeps frames", "RADIO_STATUS", "STATUSTEXT", "plain MAVLink is open to"):
-        table.add_column(column, overflow="fold")
-    for endpoint in config.endpoints:
-        style = "bold red" if endpoint.url.is_exposed else ""
-        cells = (
-            endpoint.name,
-            str(endpoint.url),
-            f"{endpoint.max_age_s:g} s",
-            "yes" if endpoint.radio_status else "no",
-            "yes" if endpoint.status_text else "no",
-        )
-        table.add_row(*map(Text, cells), Text(exposure(endpoint), style=style))
-    return table
+    return _table(
+        ("name", "URL", "RADIO_STATUS", "STATUSTEXT", "plain MAVLink is open to"),
+        (
+            (
+                endpoint.name,
+                str(endpoint.url),
+                _yes(endpoint.radio_status),
+                _yes(endpoint.status_text),
+                Text(exposure(endpoint), style="bold red" if endpoint.url.is_exposed else ""),
+            )
+            for endpoint in config.endpoints
+        ),
+    )
+
+
+def _members(server: RelayServer) -> Table:
+    return _table(
+        ("name", "public key", "PSK", "members", "datagrams/s", "kbit/s"),
+        (
+            (
+                member.name,
+                _whole(member.peer.public_key),
+                _yes(member.peer.psk),
+                f"{member.most_peers:,}",
+                f"{member.limits.datagrams_s:,}",
+                f"{member.limits.bits_s / 1000:,.0f}",
+            )
+            for member in server.members
+        ),
+    )
+
+
+def _relays(relays: Sequence[RelayConfig]) -> Table:
+    return _table(
+        ("name", "public key", "address", "PSK"),
+        (
+            (
+                relay.name,
+                _whole(relay.settings.public_key),
+                "\n".join(map(str, relay.addresses)),
+                _yes(relay.settings.psk),
+            )
+            for relay in relays
+        ),
+    )
+
+
+def _whole(public_key: bytes) -> str:
+    """Not shortened: the user compares it with what the other machine printed."""
+    return "(private?)" if looks_private(public_key) else encode_key(public_key)
 
 
 def _verdict(config: Config, lacks: Sequence[str], errors: Sequence[str]) -> RenderableType:

@@ -26,7 +26,11 @@ _HEADER_BYTES = 3
 class RelayReason(Reason):
     """Why a relay drops data, beside the reasons of the core."""
 
-    OVER_TOTAL = "relay_over_total", "all members together send more along this relay than its own limit allows"
+    OVER_TOTAL = (
+        "relay_over_total",
+        "all members together send more along this relay than its own limit allows",
+        "above the limit of all members together",
+    )
 
 
 class Meter:
@@ -126,10 +130,6 @@ class Forwarding:
         else:
             meter.over_limit += 1
             self.dropped[DropReason.RELAY_OVER_LIMIT] += 1
-
-    def has(self, socket: int, data: bytes, source: SocketAddress) -> bool:
-        """Whether data is along a connection of the relay."""
-        return (socket, source, data[1:_HEADER_BYTES]) in self._routes
 
 
 def _key(end: ConnectionEnd) -> _Key:

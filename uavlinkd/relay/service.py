@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 from uavlinkd.core import constants as c
@@ -70,35 +71,34 @@ class _Asked(NamedTuple):
     keys: dict[bytes, None]
 
 
+@dataclass(frozen=True, slots=True)
+class RelayShell:
+    """What a relay uses of its daemon."""
+
+    entropy: Entropy
+    clock: Callable[[], float]
+    """Monotonic."""
+    perform: Callable[[list[Output]], None]
+    """Executes outputs of the core."""
+    send: Callable[[bytes, Path], None]
+    """Passes a datagram to the kernel."""
+    send_from_new_port: Callable[[bytes, Path], bool]
+    """Does so from a port that sent nothing before, and returns whether the kernel accepted it."""
+    on_event: Callable[[o.Event, float], None]
+    """Receives the events of the members that are not peers."""
+
+
 class RelayService:
-    """The members of a relay.
+    """The members of a relay."""
 
-    ``perform`` executes outputs of the core, ``send`` passes a datagram to the kernel. ``send_from_new_port`` does so
-    from a port that sent nothing before, and returns whether the kernel accepted it. ``on_event`` receives the events
-    of the members that are not peers. ``clock`` is monotonic.
-    """
-
-    def __init__(
-        self,
-        node: Node,
-        entropy: Entropy,
-        clock: Callable[[], float],
-        limits: RelayLimits,
-        *,
-        perform: Callable[[list[Output]], None],
-        send: Callable[[bytes, Path], None],
-        send_from_new_port: Callable[[bytes, Path], bool],
-        on_event: Callable[[o.Event, float], None],
-    ) -> None:
+    def __init__(self, node: Node, limits: RelayLimits, shell: RelayShell) -> None:
         self._node = node
-        self._perform = perform
-        self._send_from_new_port = send_from_new_port
-        self._on_event = on_event
+        self._shell = shell
         self.members: dict[bytes, RelayMember] = {}
         """By public key."""
         self._member_of: dict[LinkedPeer, RelayMember] = {}
-        self.bindings = Bindings(entropy)
-        self.forwarding = Forwarding(send, clock, limits)
+        self.bindings = Bindings(shell.entropy)
+        self.forwarding = Forwarding(shell.send, shell.clock, limits)
         self._due: dict[tuple[bytes, Path], dict[bytes, None]] = {}  # reports to members
         self._asked: dict[bytes, dict[Path, _Asked]] = {}
         self._look_at = 0.0
@@ -147,7 +147,7 @@ class RelayService:
         for peer in member.peers:
             self._member_of.pop(peer, None)
             if member.is_own:
-                self._perform(self._node.remove_peer(peer, now))
+                self._shell.perform(self._node.remove_peer(peer, now))
 
     # From the core. Neither method sends.
 
@@ -163,7 +163,7 @@ class RelayService:
             for path in self.bindings.paths_of(member.key):
                 self._apply(self.bindings.end_path(member.key, path, now))
         if member.is_own:
-            self._on_event(event, now)
+            self._shell.on_event(event, now)
 
     def on_record(self, received: o.RecordReceived, now: float) -> DropReason | None:
         """A record came from a member. Returns why it has no effect; None if it has one."""
@@ -231,11 +231,11 @@ class RelayService:
             handles = {other: self.bindings.handles(key, path, other) for other in keys}
             host, port = path.address[:2]
             for bound in bounds_of(host.partition("%")[0], port, handles):
-                self._perform(self._node.send_record(member.peer, path, bound, now))
+                self._shell.perform(self._node.send_record(member.peer, path, bound, now))
         tests, self._filter_tests = self._filter_tests, []
         for peer, path, token in tests:
-            if self._send_from_new_port(token_datagram(token), path):
-                self._perform(self._node.send_record(peer, path, FilterTested(token), now))
+            if self._shell.send_from_new_port(token_datagram(token), path):
+                self._shell.perform(self._node.send_record(peer, path, FilterTested(token), now))
 
     def _bind_validated(self, now: float) -> None:
         before, self._asked = self._asked, {}

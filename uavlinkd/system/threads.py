@@ -9,28 +9,24 @@ from __future__ import annotations
 import asyncio
 import errno
 import os
+from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
-from queue import Empty, SimpleQueue
 from threading import Lock, Thread
 from typing import Any, TypeVar
-
-IDLE_S = 10.0
-"""A thread without work ends after this time."""
 
 T = TypeVar("T")
 
 
 class Threads:
-    """At most ``limit`` worker threads, called ``name``. Further calls wait in a queue."""
+    """At most ``limit`` worker threads at a time, called ``name``. Further calls wait in a queue."""
 
     def __init__(self, limit: int, name: str) -> None:
         self._name = name
-        self._work: SimpleQueue[Callable[[], None]] = SimpleQueue()
         self._lock = Lock()
-        """Protects the queue and the two counts below, which change together."""
-        self._idle = 0  # waiting threads that no queued call has claimed
-        self._slots = limit  # threads that may still be started
+        """Protects the two below, which change together."""
+        self._free = limit  # threads that may still be started
+        self._waiting: deque[Callable[[], None]] = deque()
 
     async def run(self, function: Callable[..., T], *arguments: Any) -> T:
         """Run ``function`` in a worker thread and return its result. Cancelling does not stop the thread.
@@ -52,57 +48,30 @@ class Threads:
             with suppress(RuntimeError):  # the loop is closed: no coroutine waits
                 loop.call_soon_threadsafe(_settle, future, *settle)
 
-        if self._put(work):
+        with self._lock:
+            needs_thread = self._free > 0
+            if needs_thread:
+                self._free -= 1
+            else:
+                self._waiting.append(work)
+        if needs_thread:
             try:
-                Thread(target=self._serve, name=self._name, daemon=True).start()
+                Thread(target=self._serve, args=(work,), name=self._name, daemon=True).start()
             except RuntimeError:  # the limit of threads, or no memory
                 with self._lock:
-                    self._slots += 1
-                future.cancel()  # another thread may still take the work from the queue
+                    self._free += 1
                 raise OSError(errno.EAGAIN, os.strerror(errno.EAGAIN)) from None
         return await future
 
-    def _put(self, work: Callable[[], None]) -> bool:
-        """Queue work. Returns whether a new thread is needed for it."""
-        with self._lock:
-            self._work.put(work)
-            if self._idle:
-                self._idle -= 1
-                return False
-            if not self._slots:
-                return False
-            self._slots -= 1
-            return True
-
-    def _serve(self) -> None:
+    def _serve(self, work: Callable[[], None]) -> None:
+        """Do the work, and then what waits."""
         while True:
-            work = self._next()
-            if work is None:
-                try:
-                    work = self._work.get(timeout=IDLE_S)
-                except Empty:
-                    if self._may_end():
-                        return
-                    continue
             work()
-
-    def _next(self) -> Callable[[], None] | None:
-        """The next work; None if the queue is empty, and then the thread counts as idle."""
-        with self._lock:
-            try:
-                return self._work.get_nowait()
-            except Empty:
-                self._idle += 1
-                return None
-
-    def _may_end(self) -> bool:
-        """Whether the idle thread may end, because no queued call has claimed it. Then its slot is free again."""
-        with self._lock:
-            if not self._idle:
-                return False
-            self._idle -= 1
-            self._slots += 1
-            return True
+            with self._lock:
+                if not self._waiting:
+                    self._free += 1
+                    return
+                work = self._waiting.popleft()
 
 
 def _settle(future: asyncio.Future[Any], settle: Callable[[Any], None], result: object) -> None:

@@ -1,14 +1,12 @@
 """The log events and their fields: from the source, and from every daemon that a test starts.
 
-The source has most of them as literals. Fields that are made while the daemon runs are in the lines of daemons:
-:func:`check_lines` compares these, for the events of :data:`COMPARED`.
+The declaration is the closed list of events, each with its levels. The source has most of them as literals. Fields
+that are made while the daemon runs are in the lines of daemons, which :func:`check_lines` compares.
 """
 
 from __future__ import annotations
 
 import ast
-import fcntl
-import os
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
@@ -16,10 +14,6 @@ from typing import Any
 from tests.imports import sources
 from tests.ops.schema import golden
 
-COMPARED = frozenset({"daemon_started", "daemon_stopped", "peer_up", "client_connected", "frames_refused"})
-"""Events that every start shows. A rare event on a busy machine must not fail a test."""
-LEARN = "UAVLINKD_LEARN_LOG"
-"""The variable with which daemons' lines are added to the declaration in place of a failure."""
 _METHODS = frozenset({"debug", "info", "warning", "error", "critical", "exception"})
 _PACKAGES = ("system", "core", "mavlink", "endpoints", "config", "ops", "link")
 _EVENT = re.compile(r"[a-z]+(_[a-z]+)+")
@@ -44,16 +38,18 @@ def _trees() -> Iterator[ast.AST]:
         yield ast.parse(source)
 
 
-def literal_events() -> dict[str, set[str]]:
-    """The events of log calls with a literal name, each with the fields that the calls name."""
-    events: dict[str, set[str]] = {}
+def literal_events() -> dict[str, tuple[set[str], set[str]]]:
+    """The events of log calls with a literal name, each with their levels and the fields that the calls name."""
+    events: dict[str, tuple[set[str], set[str]]] = {}
     for tree in _trees():
         for node in ast.walk(tree):
             match node:
                 case ast.Call(func=ast.Attribute(attr=method), args=[ast.Constant(value=str(event)), *_]) if (
                     method in _METHODS and _EVENT.fullmatch(event)
                 ):
-                    events.setdefault(event, set()).update(word.arg for word in node.keywords if word.arg is not None)
+                    levels, fields = events.setdefault(event, (set(), set()))
+                    levels.add(method)
+                    fields.update(word.arg for word in node.keywords if word.arg is not None)
     return events
 
 
@@ -67,6 +63,8 @@ def words_of_the_source() -> set[str]:
                     words.add(text)
                 case ast.keyword(arg=str(name)):
                     words.add(name)
+                case ast.AnnAssign(target=ast.Name(id=name)):  # the log names `added_peers` in the other order
+                    words.add("_".join(reversed(name.split("_"))))
     return words
 
 
@@ -78,10 +76,12 @@ def observed(declared: Mapping[str, str]) -> dict[str, str]:
         for name, kind in declared.items()
         if name.startswith(f"{EVERYWHERE}.") or all(part in words for part in name.split("."))
     }
-    for event, fields in literal_events().items():
-        for name in (event, *(f"{event}.{field}" for field in fields)):
-            if name.replace(event, EVERYWHERE) not in declared:
-                names.setdefault(name, "event" if name == event else ANY)
+    for event, (levels, fields) in literal_events().items():
+        known = set(names.get(event, "").split("|")) - {""}
+        names[event] = "|".join(sorted(known | levels))
+        for field in fields:
+            if f"{EVERYWHERE}.{field}" not in declared:
+                names.setdefault(f"{event}.{field}", ANY)
     return names
 
 
@@ -90,28 +90,12 @@ def check_lines(lines: Iterable[Mapping[str, Any]]) -> list[str]:
     declared: dict[str, str] = golden.load("log")["names"]
     undeclared: dict[str, str] = {}
     for line in lines:
-        event = str(line["event"])
-        if event not in declared:
-            undeclared[event] = "event"
+        event, level = str(line["event"]), str(line["level"])
+        if level not in declared.get(event, "").split("|"):
+            undeclared[event] = level
         for field, value in line.items():
             kind, name = _TYPES[type(value)], f"{event}.{field}"
             known = declared.get(f"{EVERYWHERE}.{field}", declared.get(name))
-            if known is None or kind not in known.split("|"):
+            if known != ANY and (known is None or kind not in known.split("|")):
                 undeclared[name] = kind
     return [f"{name}: {kind}" for name, kind in undeclared.items()]
-
-
-def learn(lines: Iterable[Mapping[str, Any]]) -> None:
-    """Declare what is undeclared in lines of a daemon, if the environment asks for it."""
-    if os.environ.get(LEARN) and (undeclared := check_lines(lines)):
-        _learn(dict(name.split(": ") for name in undeclared))
-
-
-def _learn(names: Mapping[str, str]) -> None:
-    with (golden.FOLDER / "golden.py").open() as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        declared = golden.load("log")
-        for name, kind in names.items():
-            known = set(declared["names"].get(name, "").split("|")) - {"", ANY}
-            declared["names"][name] = "|".join(sorted({*known, kind}))
-        golden.save("log", declared["version"], declared["names"])

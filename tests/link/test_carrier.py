@@ -1,0 +1,182 @@
+"""From datagrams to frames, and the order of what waits in a busy daemon. The core delivers what a test chooses."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import cast
+
+import pytest
+
+from tests.core.harness import AT_A, KEY_A, Pair
+from tests.link.test_peer_link import link_of
+from tests.policies import TRUSTED
+from tests.samples import attitude, command, raws
+from uavlinkd.config import PeerConfig
+from uavlinkd.core.constants import NEVER
+from uavlinkd.core.drops import DropReason
+from uavlinkd.core.outputs import Deliver, Dropped, Output, SessionEstablished
+from uavlinkd.core.path import Path, relayed
+from uavlinkd.core.relay_records import wrap
+from uavlinkd.core.settings import PeerSettings
+from uavlinkd.core.wire import ENVELOPE_STARTS
+from uavlinkd.link import carrier as module
+from uavlinkd.link.carrier import FrameCarrier
+from uavlinkd.link.parts import DaemonParts
+from uavlinkd.link.peer_link import PeerLink
+from uavlinkd.link.relay_link import RELAYED_START, RelayHandles
+from uavlinkd.link.relays import TOKEN_START
+from uavlinkd.mavlink.frames import Frame
+from uavlinkd.system.clock import monotonic
+from uavlinkd.system.stall import StallWatch
+
+ENVELOPE = min(ENVELOPE_STARTS)
+HANDSHAKES = [bytes((1, number)) for number in range(5)]
+"""Initiations, the oldest first."""
+OLD, NEW = attitude(1), attitude(2)
+COMMANDS = command(1), command(2)
+
+
+class Scene:
+    """A carrier with a core that delivers one envelope for each datagram, in the order of this list."""
+
+    def __init__(self, envelopes: Sequence[tuple[int, Sequence[Frame]]] = ()) -> None:
+        pair = Pair()
+        self.link = link_of(pair.b, PeerConfig(PeerSettings("alpha", KEY_A.public), (), TRUSTED), lambda _: None)
+        self.peer = pair.b.peer
+        self.envelopes = list(envelopes)
+        self.delivered: list[bytes] = []
+        self.received: list[tuple[bytes, Path]] = []
+        self.dropped: list[tuple[str, str, int]] = []
+        self.refused: list[Dropped] = []
+        self.handles = RelayHandles()
+        self.stall = StallWatch(monotonic(), lambda _: None)
+        node = SimpleNamespace(
+            receive=self.receive,
+            refuse=lambda datagram, path: Dropped(DropReason.OVER_SHARE, None, path),
+            claimed_sender=lambda *_: 0,
+            next_deadline=lambda: NEVER,
+            drops=dict.fromkeys(DropReason, 0),
+        )
+        drops = SimpleNamespace(
+            add=lambda event, reason, name, count, *_: self.dropped.append((reason, name, count)),
+            add_dropped=lambda dropped, now: self.refused.append(dropped),
+        )
+        parts = SimpleNamespace(
+            node=node,
+            stall=self.stall,
+            link_of={self.peer: self.link},
+            switch=SimpleNamespace(forward=self.forward),
+            peer_sockets=SimpleNamespace(budgets={}, handles=self.handles),
+            relays=SimpleNamespace(
+                by_name={},
+                filter_tests=SimpleNamespace(take_token=lambda *_: False),
+                next_at=NEVER,
+                on_event=lambda *_: None,
+            ),
+            events=SimpleNamespace(write=lambda *_: None),
+            history=SimpleNamespace(add_session=lambda *_: None),
+            relay=None,
+            drops=drops,
+            evidence=SimpleNamespace(add_dropped=lambda *_: None),
+        )
+        self.relays = parts.relays
+        self.carrier = FrameCarrier(cast("DaemonParts", parts))
+
+    def receive(self, datagram: bytes, path: Path, now: float) -> list[Output]:
+        """The core's."""
+        self.received.append((datagram, path))
+        if not self.envelopes:
+            return []
+        order, frames = self.envelopes.pop(0)
+        return [Deliver(self.peer, b"".join(raws(frames)), order)]
+
+    def forward(self, source: PeerLink, frames: Sequence[Frame], now: float, epoch: int) -> None:
+        """The switch's."""
+        assert source is self.link
+        self.delivered += raws(frames)
+
+    def read(self, *datagrams: bytes) -> None:
+        """One wake-up."""
+        self.carrier.receive(
+            AT_A.socket, [(datagram, AT_A.address) for datagram in datagrams], monotonic(), self.stall.epoch, 0.0
+        )
+
+
+@pytest.mark.parametrize("wake_ups", [(1, 1, 1), (3,), (1, 2)], ids=["alone", "together", "both"])
+async def test_state_of_an_older_envelope_is_dropped_and_counted(wake_ups: tuple[int, ...]) -> None:
+    """However the datagrams are read: the order of each envelope is kept while they wait for one delivery."""
+    scene = Scene([(1, [COMMANDS[0]]), (3, [NEW, COMMANDS[1]]), (2, [OLD, COMMANDS[0]])])
+    for count in wake_ups:
+        scene.read(*[ENVELOPE] * count)
+    assert scene.delivered == raws([COMMANDS[0], NEW, COMMANDS[1], COMMANDS[0]])
+    assert scene.dropped == [("superseded", "alpha", 1)]
+    assert (scene.link.frames_superseded, scene.link.counters.frames) == (1, 5)
+    other = Pair().b.peer  # of another pair of keys: its orders cannot be compared
+    assert scene.link.pick_newest(other, [OLD], 1, monotonic()) == [OLD]
+
+
+@pytest.mark.parametrize("count", [1, 2], ids=["alone", "together"])
+async def test_peer_with_one_path_has_no_order_and_one_without_a_link_no_frames(count: int) -> None:
+    """All frames are delivered as they come. A relay carries no frames of its own, whatever a policy says."""
+    scene = Scene([(0, [NEW]), (0, [OLD])] * 2)
+    for _ in range(2 // count):
+        scene.read(*[ENVELOPE] * count)
+    assert scene.delivered == raws([NEW, OLD])
+    scene.peer = Pair().b.peer
+    for _ in range(2 // count):
+        scene.read(*[ENVELOPE] * count)
+    assert scene.delivered == raws([NEW, OLD])
+    assert scene.dropped == [("frames_not_allowed", "alpha", 1)] * 2
+
+
+async def test_data_along_a_relay_is_unwrapped_or_dropped() -> None:
+    """The core gets the inner datagram with the relayed path; without relays it gets, and drops, all."""
+    scene = Scene()
+    scene.handles.assign("vps", AT_A, [7])
+    data = [wrap(7, ENVELOPE + b"rest"), wrap(8, ENVELOPE), RELAYED_START, TOKEN_START, ENVELOPE]
+    scene.read(*data)
+    assert scene.received == [(datagram, AT_A) for datagram in data]
+    scene.received.clear()
+    scene.relays.by_name = {"vps": None}
+    scene.read(*data)
+    assert scene.received == [(ENVELOPE + b"rest", relayed(AT_A.socket, "vps", 7)), (ENVELOPE, AT_A)]
+    assert [reason for reason, *_ in scene.dropped] == [
+        DropReason.RELAY_UNKNOWN_HANDLE,
+        DropReason.RELAY_MALFORMED,
+        DropReason.RELAY_UNEXPECTED_TOKEN,
+    ]
+
+
+async def handled(*datagrams: bytes) -> tuple[list[bytes], int]:
+    """In what order a core gets datagrams that were read together, and how many are refused."""
+    scene = Scene()
+    scene.read(*datagrams)
+    for _ in range(2 * len(datagrams)):
+        await asyncio.sleep(0)
+    return [datagram for datagram, _ in scene.received], len(scene.refused)
+
+
+async def test_handshakes_do_not_keep_the_first_sessions_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They come before the envelopes while there is time, then the newest first: their senders still wait for them.
+
+    Too many are dropped and counted, the oldest first.
+    """
+    assert await handled(ENVELOPE, *HANDSHAKES) == ([*HANDSHAKES, ENVELOPE], 0)
+    monkeypatch.setattr(module, "HANDSHAKES_S", 0.0)
+    first, *others = HANDSHAKES
+    assert await handled(*HANDSHAKES, ENVELOPE) == ([first, ENVELOPE, *others[::-1]], 0)
+    monkeypatch.setattr(module, "WAITING_HANDSHAKES", 2)
+    assert await handled(*HANDSHAKES) == ([HANDSHAKES[0], HANDSHAKES[4], HANDSHAKES[3]], 2)
+
+
+async def test_timer_follows_what_a_confirmed_key_makes_due(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The relays have other keys to bind then, at once."""
+    scene, due_at = Scene(), monotonic() + 60
+    monkeypatch.setattr(scene.carrier.peers, "confirm_keys", lambda _: setattr(scene.relays, "next_at", due_at))
+    scene.link.peers = [scene.peer]
+    scene.carrier.perform([SessionEstablished(scene.peer, AT_A, 1, "x25519", False, 16, initiator=True, rekey=False)])
+    assert scene.carrier._timer_at == due_at
+    assert scene.carrier._timer is not None
+    scene.carrier._timer.cancel()

@@ -1,0 +1,398 @@
+"""Carries datagrams and frames: reads what peers sent, executes the outputs of the core, and keeps the one timer.
+
+Between reading and sending a frame there is no task, queue, lock or ``await``. Frames wait only for a slow radio's
+budget, for a slow client, or for their sender's turn while the daemon is busy.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from collections.abc import Hashable, Iterable, Iterator
+from time import thread_time
+from typing import Final
+
+from uavlinkd.core import outputs as o
+from uavlinkd.core.constants import NEVER
+from uavlinkd.core.drops import DropReason
+from uavlinkd.core.outputs import Deliver, Output, Transmit
+from uavlinkd.core.path import Path, SocketAddress
+from uavlinkd.core.relay_records import Bind, FilterTest
+from uavlinkd.core.timers import Schedule
+from uavlinkd.core.wire import ENVELOPE_STARTS
+from uavlinkd.endpoints.reader import Datagrams
+from uavlinkd.link.drop_summary import ShellReason
+from uavlinkd.link.parts import DaemonParts
+from uavlinkd.link.peer_link import Carriage, PeerLink
+from uavlinkd.link.peers import Peers
+from uavlinkd.link.relay_link import RELAYED_START, WaitingDatagram
+from uavlinkd.link.relays import TOKEN_START
+from uavlinkd.mavlink.frames import Frame, parse_frames, pass_faults
+from uavlinkd.ops.recorder import FROM_PEER
+from uavlinkd.system.clock import monotonic
+
+HANDSHAKES_S: Final = 0.01
+"""CPU time for handshake messages before the envelopes have their turn: about twenty of them."""
+WAITING_HANDSHAKES: Final = 256
+"""Handshake messages that wait, at most: what is handled in a tenth of a second."""
+MAX_PATHS: Final = 1024
+"""Paths of received datagrams that are remembered: a frame on one of them costs no new object."""
+LOOP_TICK_S: Final = 0.001
+"""A loop may fire a timer up to one tick of its clock early. The timer is set later by this."""
+TURN_S: Final = 0.003
+"""The longest turn of one sender, without the delivery of its frames. Another sender's frames wait for a few turns,
+which is far below a radio's delay. It is CPU time: by the wall clock each turn would end after one datagram when
+other processes use the processor."""
+TURN_FRAMES: Final = 300
+"""Frames that end a turn too, by :func:`cost_of`: the delivery of a frame costs as much as reading it."""
+STARTS_OF_A_FRAME: Final = 4
+"""So many start bytes in payloads cost as much as a frame: each may begin a hidden one
+(:mod:`uavlinkd.mavlink.policy.hidden`)."""
+WAITING_BYTES: Final = 65536
+"""Of one sender's datagrams, at least: the largest one fits, and a burst of fifty of the default size."""
+SHARED_BYTES: Final = 4 * WAITING_BYTES
+"""Divided among the senders that wait, if that is more. Without rivals, a fast log download survives 0.3 s in which
+this process does not run. A longer queue would delay the frames of a sender that always sends too much."""
+WAITING_OVERHEAD_BYTES: Final = 64
+"""Counted with each datagram, so that many small or empty ones are bounded too."""
+_OF_RELAYS: Final = frozenset({RELAYED_START, TOKEN_START})
+
+
+class Turns:
+    """A queue for each sender, first in, first out.
+
+    Bounded: senders are those that :meth:`uavlinkd.core.node.Node.claimed_sender` tells apart.
+    """
+
+    def __init__(self) -> None:
+        self.queues: dict[Hashable, deque[tuple[WaitingDatagram, int]]] = {}
+        """By sender: datagrams that wait, with the epoch of their reading. Empty if none waits."""
+        self._bytes: dict[Hashable, int] = {}
+
+    def put(self, sender: Hashable, datagram: bytes, path: Path, epoch: int) -> list[WaitingDatagram]:
+        """Let a datagram wait. Returns the datagrams that it pushes out, the oldest first: newer frames supersede
+        older ones.
+
+        ``epoch``: that of its reading, as :class:`uavlinkd.system.stall.StallWatch` counts them.
+        """
+        queue = self.queues.setdefault(sender, deque())
+        size = self._bytes.get(sender, 0) + _size(datagram)
+        queue.append(((datagram, path), epoch))
+        pushed_out: list[WaitingDatagram] = []
+        share = max(WAITING_BYTES, SHARED_BYTES // len(self.queues))
+        while size > share and len(queue) > 1:
+            pushed_out.append(queue.popleft()[0])
+            size -= _size(pushed_out[-1][0])
+        self._bytes[sender] = size
+        return pushed_out
+
+    def round(self) -> Iterator[tuple[Iterator[WaitingDatagram], int]]:
+        """One turn of each sender that has datagrams waiting, all of one epoch. The rest waits for the next round."""
+        for sender, queue in list(self.queues.items()):
+            epoch = queue[0][1]
+            yield self._turn(sender, epoch), epoch
+            if not self.queues[sender]:
+                del self.queues[sender], self._bytes[sender]
+
+    def _turn(self, sender: Hashable, epoch: int) -> Iterator[WaitingDatagram]:
+        queue = self.queues[sender]
+        while queue and queue[0][1] == epoch:
+            waiting, _ = queue.popleft()
+            self._bytes[sender] -= _size(waiting[0])
+            yield waiting
+
+
+def cost_of(payload: bytes, frames: int) -> int:
+    """The cost to deliver a payload of so many frames, in frames of the usual kind."""
+    starts = payload.count(b"\xfd") + payload.count(b"\xfe")
+    return frames + max(0, starts - frames) // STARTS_OF_A_FRAME
+
+
+def _size(datagram: bytes) -> int:
+    return len(datagram) + WAITING_OVERHEAD_BYTES
+
+
+class FrameCarrier:
+    """Moves datagrams and frames between the parts of a daemon. It adds the peers to them."""
+
+    def __init__(self, parts: DaemonParts) -> None:
+        self._parts = parts
+        self._node = parts.node
+        self._stall = parts.stall
+        self._links = parts.link_of
+        self._switch = parts.switch
+        self._sockets = parts.peer_sockets
+        self._loop = asyncio.get_running_loop()
+        self._waiting = Schedule[PeerLink]()
+        carriage = Carriage(parts.node, self.perform, self.settle, self._sockets.budgets, self._waiting)
+        self.peers = Peers(parts, carriage)
+        self._turns = Turns()
+        self._handshakes: deque[WaitingDatagram] = deque()
+        self._paths: dict[tuple[int, SocketAddress], Path] = {}
+        self._read_at, self._epoch = 0.0, 0  # of the datagrams that are received now
+        self._frames: dict[PeerLink, list[Frame]] = {}  # delivered, but not forwarded yet
+        self._is_turn = False  # frames gather until its end
+        self._cost = 0
+        self._timer: asyncio.TimerHandle | None = None
+        self._timer_at = NEVER
+
+    # Datagrams in.
+
+    def receive(self, socket: int, datagrams: Datagrams, now: float, epoch: int, waited_s: float) -> None:
+        """Receive the datagrams of one wake-up from a socket, or let them wait for their senders' turns."""
+        paths = self._paths
+        arrived: list[WaitingDatagram] = []
+        for datagram, address in datagrams:
+            if datagram[:1] in _OF_RELAYS:
+                if (inside := self._unwrap(socket, datagram, address)) is not None:
+                    arrived.append(inside)
+                continue
+            path = paths.get((socket, address))
+            if path is None:
+                if len(paths) >= MAX_PATHS:
+                    paths.clear()
+                path = paths[socket, address] = Path(socket, address)
+            arrived.append((datagram, path))
+        if len(arrived) == 1 and not self._turns.queues:  # a turn of one datagram needs no clock
+            self._read_at, self._epoch = now, epoch
+            self.perform(self._node.receive(*arrived[0], now))
+            if epoch != self._stall.epoch:
+                self._drop_held()
+        else:
+            self._receive_several(arrived, now, epoch)
+        if (relay := self._parts.relay) is not None and relay.is_due:
+            relay.settle(monotonic())
+
+    def _unwrap(self, socket: int, data: bytes, source: SocketAddress) -> WaitingDatagram | None:
+        """The datagram inside one of a relay or a member, with its path. None: it was handled, or dropped."""
+        relays, relay, path = self._parts.relays, self._parts.relay, Path(socket, source)
+        if data[:1] == RELAYED_START:
+            inside = self._sockets.handles.unwrap(socket, data, source) if relays.by_name else None
+            if isinstance(inside, tuple):
+                return inside
+            if relay is not None:
+                relay.take(socket, data, source)
+                return None
+            if inside is not None:
+                self._drop_datagram(inside, path=path)
+                return None
+        elif relays.by_name:
+            if not relays.filter_tests.take_token(data, path):
+                self._drop_datagram(DropReason.RELAY_UNEXPECTED_TOKEN, path=path)
+            self.arm()
+            return None
+        return data, path  # the core drops it: this daemon has no relay
+
+    def _receive_several(self, arrived: list[WaitingDatagram], now: float, epoch: int) -> None:
+        was_busy = self._is_busy
+        envelopes = self._receive_handshakes(arrived, now, epoch)
+        if not self._turns.queues:
+            arriving = iter(envelopes)
+            self._do_turn(arriving, now, epoch)
+            envelopes = list(arriving)
+        for datagram, path in envelopes:
+            sender = self._node.claimed_sender(datagram, path)
+            for pushed_out in self._turns.put(sender, datagram, path, epoch):
+                self.perform((self._node.refuse(*pushed_out),))
+        if self._is_busy and not was_busy:
+            self._loop.call_soon(self._do_turns)
+
+    @property
+    def _is_busy(self) -> bool:
+        return bool(self._turns.queues or self._handshakes)
+
+    def _receive_handshakes(self, arrived: list[WaitingDatagram], now: float, epoch: int) -> list[WaitingDatagram]:
+        """Receive everything but envelopes, which are returned, for at most :data:`HANDSHAKES_S`.
+
+        Handshake messages have budgets of their own in the core. If they waited behind frames, their senders would
+        repeat them meanwhile, and a busy daemon would be busier. But when all members of a relay look for it at once,
+        they must not keep the envelopes of the first sessions waiting either, or these sessions would be lost again.
+        """
+        envelopes: list[WaitingDatagram] = []
+        handshakes: list[WaitingDatagram] = []
+        for waiting in arrived:
+            (envelopes if waiting[0][:1] in ENVELOPE_STARTS else handshakes).append(waiting)
+        self._read_at, self._epoch = now, epoch
+        ends_at = thread_time() + HANDSHAKES_S if len(handshakes) > 1 else 0.0
+        for number, (datagram, path) in enumerate(handshakes, 1):
+            self.perform(self._node.receive(datagram, path, now))
+            if number < len(handshakes) and thread_time() >= ends_at:
+                self._handshakes += handshakes[number:]
+                break
+        while len(self._handshakes) > WAITING_HANDSHAKES:  # the oldest: their senders send new ones
+            self.perform((self._node.refuse(*self._handshakes.popleft()),))
+        return envelopes
+
+    def _do_turns(self) -> None:
+        """Do one turn of each sender. Then the sockets, the timer and the control socket have theirs."""
+        self._stall.turn(monotonic())
+        try:
+            for turn, epoch in self._turns.round():
+                self._do_turn(turn, monotonic(), epoch)
+            # The newest handshake message is most likely one that its sender still waits for.
+            self._read_at, self._epoch = monotonic(), self._stall.epoch
+            ends_at = thread_time() + HANDSHAKES_S
+            while self._handshakes:
+                self.perform(self._node.receive(*self._handshakes.pop(), self._read_at))
+                if thread_time() >= ends_at:
+                    break
+        finally:
+            if self._is_busy:
+                self._loop.call_soon(self._do_turns)
+            if (relay := self._parts.relay) is not None and relay.is_due:
+                relay.settle(monotonic())
+
+    def _do_turn(self, arriving: Iterator[WaitingDatagram], now: float, epoch: int) -> None:
+        """Receive datagrams until there are no more, or the turn is over. Then forward their frames."""
+        # Stale datagrams are opened too: their counters must be used up, or an attacker could replay them as new.
+        self._read_at, self._epoch, self._cost, self._is_turn = now, epoch, 0, True
+        ends_at = thread_time() + TURN_S
+        try:
+            for datagram, path in arriving:
+                self.perform(self._node.receive(datagram, path, now))
+                if self._cost >= TURN_FRAMES or thread_time() >= ends_at:
+                    break
+        finally:
+            self._is_turn = False
+        self.perform(())
+        if epoch != self._stall.epoch:
+            self._drop_held()
+
+    def _drop_held(self) -> None:
+        """Frames that the core holds are stale as well, even if the peer reports them as new later."""
+        self.perform(self._node.pop_held())
+
+    # Outputs of the core.
+
+    def perform(self, outputs: Iterable[Output]) -> None:
+        """Execute outputs of the core. Frames that it delivers are forwarded at once, or at the end of the turn."""
+        for output in outputs:
+            if isinstance(output, Transmit):
+                path = output.path
+                try:
+                    self._sockets.senders[path.socket](output.datagram, path.address)
+                except OSError as error:
+                    self._sockets.on_send_error(path.socket, output.datagram, path.address, error)
+            elif isinstance(output, Deliver):
+                peer, payload, order = output
+                link = self._links.get(peer)
+                if link is None:  # whatever a policy says
+                    self._drop_datagram(DropReason.FRAMES_NOT_ALLOWED, peer.name)
+                    continue
+                # As split_payload, without one call.
+                frames: list[Frame] = []
+                position, fault = parse_frames(payload, 0, frames, link.counters, is_expected=True)
+                if fault is not None:
+                    pass_faults(payload, position, fault, frames, link.counters)
+                if self._is_turn:
+                    self._cost += cost_of(payload, len(frames))
+                if order:  # the peer has several paths
+                    frames = self._pick_newest(link, output, frames)
+                elif link.is_repairing:
+                    link.note_requests(frames, self._read_at)
+                if link in self._frames:
+                    self._frames[link] += frames
+                else:
+                    self._frames[link] = frames
+            elif isinstance(output, o.Dropped):
+                now = monotonic()
+                self._parts.drops.add_dropped(output, now)
+                self._parts.evidence.add_dropped(output, now)
+            elif isinstance(output, o.RecordReceived):
+                self._on_record(output)
+            else:
+                self._on_event(output)
+        if self._frames and not self._is_turn:
+            delivered, self._frames = self._frames, {}
+            for link, frames in delivered.items():
+                if link.recorder is not None:
+                    link.recorder.add(link.name, [frame.raw for frame in frames], FROM_PEER, self._read_at)
+                self._switch.forward(link, frames, self._read_at, self._epoch)
+        if self._node.next_deadline() < self._timer_at:
+            self.arm()
+
+    def _pick_newest(self, link: PeerLink, delivered: Deliver, frames: list[Frame]) -> list[Frame]:
+        picked = link.pick_newest(delivered.peer, frames, delivered.order, self._read_at)
+        if count := len(frames) - len(picked):
+            self._parts.drops.add("frames_dropped", ShellReason.SUPERSEDED, link.name, count, monotonic())
+        return picked
+
+    def _drop_datagram(self, reason: DropReason, name: str = "", path: Path | None = None) -> None:
+        """Count a datagram that the core does not drop."""
+        self._node.drops[reason] += 1
+        fact = "" if path is None else ("", path)
+        self._parts.drops.add("datagrams_dropped", reason, name, 1, monotonic(), fact)
+
+    def _on_record(self, received: o.RecordReceived) -> None:
+        relay = self._parts.relay
+        if not isinstance(received.record, Bind | FilterTest):
+            reason = self._parts.relays.on_record(received, monotonic())
+            self.arm()
+        elif relay is None:
+            reason = DropReason.UNEXPECTED_RECORD
+        else:
+            reason = relay.on_record(received, monotonic())
+        if reason is not None:
+            self._drop_datagram(reason, received.peer.name, received.path)
+
+    def _on_event(self, event: o.Event) -> None:
+        now, parts = monotonic(), self._parts
+        if parts.relay is not None:
+            parts.relay.on_event(event, now)
+        parts.relays.on_event(event, now)
+        link = self._links.get(event.peer)
+        if link is not None and not isinstance(event, o.PathSuspected):
+            self._on_link_event(link, event, now)
+        self.arm()
+
+    def _on_link_event(self, link: PeerLink, event: o.Event, now: float) -> None:
+        parts = self._parts
+        parts.events.write(event, now)
+        if isinstance(event, o.PeerLost | o.PeerClosed):
+            if not link.peer.is_up:  # with any key
+                link.on_down(now)
+        elif isinstance(event, o.PathChanged | o.PathStateChanged | o.SessionEstablished):
+            link.follow_paths(now)
+            if isinstance(event, o.SessionEstablished):
+                if not event.path.is_relayed:
+                    parts.history.add_session(link.name, event.path.address, now)
+                if event.peer is link.peers[0]:
+                    self.peers.confirm_keys(link)
+
+    # Time.
+
+    def settle(self) -> None:
+        """The core or a link may have an earlier deadline than the timer."""
+        if self._node.next_deadline() < self._timer_at or self._waiting.next_at < self._timer_at:
+            self.arm()
+
+    def arm(self) -> None:
+        """Set the one timer to the next deadline. It is moved only to an earlier time: firing too early is cheap."""
+        deadline = min(self._node.next_deadline(), self._waiting.next_at, self._parts.relays.next_at)
+        if deadline < self._timer_at:
+            if self._timer is not None:
+                self._timer.cancel()
+            self._timer_at = deadline
+            self._timer = self._loop.call_later(max(0.0, deadline - monotonic()) + LOOP_TICK_S, self._on_timer)
+
+    def _on_timer(self) -> None:
+        now, self._timer_at = monotonic(), -NEVER  # nothing sets the timer meanwhile
+        self._stall.turn(now)
+        try:
+            self.perform(self._node.handle_timeout(now))
+            for link in self._waiting.pop(now):
+                link.send_waiting(now)
+            if now >= self._parts.relays.next_at:
+                self.perform(self._parts.relays.handle_timeout(now))
+        finally:
+            self._timer_at = NEVER
+            self.arm()
+
+    def stop(self) -> None:
+        """Forget the datagrams that wait, close the sessions with the peers, and do nothing more."""
+        self._turns = Turns()
+        self._handshakes.clear()
+        self.perform(self._node.close(monotonic()))
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer_at = -NEVER

@@ -1,0 +1,194 @@
+"""What a daemon knows at one moment, in the words of the problems of :mod:`.diagnosis`. It changes nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final, Generic, NamedTuple, TypeVar
+
+from uavlinkd.config import EndpointConfig
+from uavlinkd.core.drops import DropReason
+from uavlinkd.endpoints.ports import Endpoint
+from uavlinkd.link.evidence import PartHistory, Sighting
+from uavlinkd.link.parts import DaemonParts
+from uavlinkd.link.peer_link import PeerLink
+from uavlinkd.link.relay_link import RelayLink
+from uavlinkd.ops.findings import Severity
+from uavlinkd.ops.log import shown
+
+
+class Found(NamedTuple):
+    """A problem that is there, and what the operator does: one sentence each, without a full stop."""
+
+    text: str
+    remedy: str
+    severity: Severity | None = None
+    """Another one than that of the problem's row."""
+
+
+class Moment:
+    """A daemon. Make one for all findings of a moment."""
+
+    def __init__(self, daemon: DaemonParts, now: float) -> None:
+        self.daemon = daemon
+        self.now = now
+        self.blocked = daemon.history.blocked(now)
+
+    @property
+    def down(self) -> list[PeerLink]:
+        """The peers that are not up."""
+        return [link for link in self.daemon.links.values() if not link.peer.is_up]
+
+    @property
+    def sole_waiting(self) -> PeerLink | None:
+        """The only peer without addresses that is not up: a sender at an unknown address may be this one."""
+        waiting = [link for link in self.down if not link.config.addresses]
+        return waiting[0] if len(waiting) == 1 else None
+
+    def owner(self, system: int, link: PeerLink) -> str | None:
+        """Another peer than this one, or an endpoint here, that has a MAVLink system id."""
+        return next((name for owner, name in self._owners.get(system, ()) if owner is not link), None)
+
+    @cached_property
+    def _owners(self) -> Mapping[int, list[tuple[PeerLink | None, str]]]:
+        """By the file, or because frames of the system were received. Looked up once for all peers."""
+        owners: dict[int, list[tuple[PeerLink | None, str]]] = {}
+        for system, link, name in self._systems():
+            owners.setdefault(system, []).append((link, name))
+        return owners
+
+    def _systems(self) -> Iterator[tuple[int, PeerLink | None, str]]:
+        links, router = self.daemon.links.values(), self.daemon.switch.router
+        for link in links:
+            for system in link.policy.incoming.systems or ():
+                yield system, link, link.name
+        for endpoint in self.daemon.local.endpoints:
+            for system in {system for port in endpoint.ports for system, _ in router.addresses(port)}:
+                yield system, None, f"endpoint {endpoint.name}"
+        for link in links:
+            for system in {system for system, _ in router.addresses(link)}:
+                yield system, link, link.name
+
+
+@dataclass(frozen=True)
+class PartFacts:
+    """A peer or an endpoint."""
+
+    moment: Moment
+    name: str
+    history: PartHistory
+    rules: Mapping[str, object]
+    """Its policy, as the file has it."""
+
+    @property
+    def now(self) -> float:
+        """Monotonic seconds."""
+        return self.moment.now
+
+    @property
+    def rule(self) -> str:
+        """Its policy in two words."""
+        return f"role {self.rules['role']}" if "role" in self.rules else "its policy"
+
+    @property
+    def blocked(self) -> set[str]:
+        """The directions, ``in`` and ``out``, in which its policy recently refused all frames."""
+        kind = "peer" if isinstance(self, PeerFacts) else "endpoint"
+        return {direction for one, name, direction in self.moment.blocked if (one, name) == (kind, self.name)}
+
+
+@dataclass(frozen=True)
+class PeerFacts(PartFacts):
+    """A peer."""
+
+    link: PeerLink
+
+    @property
+    def addresses(self) -> str:
+        """Those of the file."""
+        return listed(map(str, self.link.config.addresses))
+
+    def seen(self, kind: str) -> Sighting | None:
+        """Evidence since the link went down."""
+        return _since(self.moment.daemon.evidence.seen(kind, self.link, self.now), self.link.silent_since)
+
+    def handshake_seen(self, reason: DropReason) -> Sighting | None:
+        """The same; of a peer without addresses, from any sender while it is the only such peer that is not up."""
+        if self.link.config.addresses or self.link.relayed:
+            return self.seen(reason)
+        if self.moment.sole_waiting is None:
+            return None
+        return _since(self.moment.daemon.evidence.seen_elsewhere(reason, self.now), self.link.silent_since)
+
+    def seen_at(self, relay: RelayLink, kind: str) -> Sighting | None:
+        """Evidence at an address of a relay since that went silent."""
+        return _since(self.moment.daemon.evidence.seen_at_relay(kind, relay, self.now), relay.silent_since)
+
+
+@dataclass(frozen=True)
+class EndpointFacts(PartFacts):
+    """A local endpoint."""
+
+    endpoint: Endpoint
+    config: EndpointConfig
+
+
+def _since(sighting: Sighting | None, since: float) -> Sighting | None:
+    return None if sighting is None or sighting.last_at < since else sighting
+
+
+def at(sighting: Sighting) -> str:
+    """Where it was seen."""
+    return "its address" if sighting.address is None else shown(sighting.address)
+
+
+def listed(names: Iterable[str], most: int = 4) -> str:
+    """The first names of a list that an attacker may make long."""
+    first = list(names)
+    return ", ".join(first[:most]) + (f" and {len(first) - most} more" if len(first) > most else "")
+
+
+# The table of problems.
+
+F = TypeVar("F")
+L = TypeVar("L", bound=Callable[..., Iterator[Found]])
+
+
+class ProblemRow(NamedTuple, Generic[F]):
+    """A problem."""
+
+    cause: str
+    """Its code in ``status --json``, in the log and in the label of the metric ``finding``."""
+    severity: Severity
+    """By this the alerts select."""
+    look: Callable[[F], Iterator[Found]]
+    """Yields the problem if it is there: the condition, the text and the remedy."""
+    unless: tuple[str, ...]
+    """Causes that explain it: if one of them is there too, it is not reported."""
+
+
+class ProblemTable(Generic[F]):
+    """The problems of one kind of subject."""
+
+    def __init__(self) -> None:
+        self.rows: list[ProblemRow[F]] = []
+
+    def add(self, severity: Severity, unless: tuple[str, ...] = ()) -> Callable[[L], L]:
+        """Make a function a row. Its name, without the underscore, is the cause."""
+
+        def adding(look: L) -> L:
+            self.rows.append(ProblemRow(look.__name__[1:], severity, look, unless))
+            return look
+
+        return adding
+
+
+OF_DAEMON: Final = ProblemTable[Moment]()
+OF_PEER: Final = ProblemTable[PeerFacts]()
+"""Of any peer."""
+OF_PEER_UP: Final = ProblemTable[PeerFacts]()
+OF_PEER_DOWN: Final = ProblemTable[PeerFacts]()
+OF_PEER_SILENT: Final = ProblemTable[PeerFacts]()
+"""Of one that is down, without any other problem."""
+OF_ENDPOINT: Final = ProblemTable[EndpointFacts]()

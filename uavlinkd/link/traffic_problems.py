@@ -1,0 +1,370 @@
+"""What is wrong with traffic: attacks with a valid key, frames that policies refuse, local clients that are silent.
+
+All of it is authentic, or happens on this machine. Without a peer's key, an attacker on the path can cause two of
+these problems: it can forward handshakes from its own address (``key_on_two_machines``), and withhold answers
+(``freshness_unverified``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import cache
+from itertools import pairwise
+from typing import Final
+
+from uavlinkd.core.refusals import Claim
+from uavlinkd.endpoints.url import EndpointKind
+from uavlinkd.link.evidence import GateHistory, SessionBegin
+from uavlinkd.link.facts import (
+    OF_ENDPOINT,
+    OF_PEER,
+    OF_PEER_UP,
+    EndpointFacts,
+    Found,
+    PartFacts,
+    PeerFacts,
+    listed,
+)
+from uavlinkd.mavlink.dialect import GROUPS, command_name, ids_by_name, name_of
+from uavlinkd.mavlink.policy.gate import ANY_OTHER, Gate, Refusal
+from uavlinkd.mavlink.policy.refusal_totals import REFUSALS
+from uavlinkd.mavlink.policy.roles import ROLES
+from uavlinkd.ops.findings import Severity
+from uavlinkd.ops.log import shown
+from uavlinkd.system.error_meanings import meaning_of
+
+SECURITY_S: Final = 600.0
+"""A finding about an attack stays for this time after the last evidence."""
+COMMANDS_S: Final = 300.0
+"""A refused command stays in the findings for this time: a person looks some time after the press of a button."""
+CLAIMS_S: Final = 60.0
+"""A peer's claim whose count grew within this time is a present problem."""
+REFUSED_S: Final = 10.0
+"""Other refusals stay for this time."""
+FLIPS: Final = 3
+"""Sessions of one peer that began at another address than the one before, within :data:`FLIPS_S`."""
+FLIPS_S: Final = 30.0
+SILENT_S: Final = 5.0
+"""An endpoint without frames for this time is reported: MAVLink clients send a heartbeat every second. Its errors
+count for the same time. It is opened again more often."""
+
+_BY_RULE: Final = frozenset({Refusal.MESSAGE_NOT_ALLOWED, Refusal.COMMAND_NOT_ALLOWED, Refusal.RATE_LIMITED})
+_FLIGHT_COMMANDS: Final = frozenset(
+    {"MAV_CMD_COMPONENT_ARM_DISARM", "MAV_CMD_NAV_TAKEOFF", "MAV_CMD_NAV_LAND", "MAV_CMD_NAV_RETURN_TO_LAUNCH"}
+)
+_EVERYDAY_COMMANDS: Final = frozenset({"MAV_CMD_REQUEST_MESSAGE", "MAV_CMD_SET_MESSAGE_INTERVAL"})
+"""Commands that a vehicle's own components send too."""
+_CLAIMS_SHOWN: Final = 3
+_NOT_LISTENING: Final = ("ECONNREFUSED", "connect_timeout", "EHOSTUNREACH", "ENETUNREACH")
+
+
+# Signs that a key is in wrong hands.
+
+
+@OF_PEER.add(Severity.SECURITY)
+def _key_on_two_machines(peer: PeerFacts) -> Iterator[Found]:
+    if addresses := alternating(peer.moment.daemon.history.sessions(peer.name), peer.now):
+        yield Found(
+            f"its sessions alternate between {listed(addresses)}: two machines may have its private key, such as a"
+            " copied SD card or a stolen key",
+            "run `uavlinkd pubkey` on both machines; rotate the key only if a second machine has it: the network may"
+            " also switch addresses, or an attacker forward packets",
+        )
+
+
+def alternating(begins: Sequence[SessionBegin], now: float) -> list[str]:
+    """The addresses between which the sessions of a peer alternate; none if they do not.
+
+    A peer that roams leaves an address. One whose sessions return to it again and again is in two places.
+    """
+    moves = [
+        (before, here)
+        for before, here in pairwise(begins)
+        if here.address != before.address and now - here.at <= SECURITY_S
+    ]
+    addresses = dict.fromkeys(shown(begin.address) for move in moves for begin in move)
+    for (_, first), (_, last) in zip(moves, moves[FLIPS - 1 :], strict=False):
+        if last.at - first.at <= FLIPS_S and len(addresses) < len(moves) + 1:
+            return list(addresses)
+    return []
+
+
+@OF_PEER.add(Severity.SECURITY)
+@OF_ENDPOINT.add(Severity.SECURITY)
+def _hidden_frame(part: PartFacts) -> Iterator[Found]:
+    if count := part.history.incoming.reasons.within(SECURITY_S, part.now).get(Refusal.HIDDEN_FRAME):
+        yield Found(
+            f"{count:,} of its frames hid a forbidden frame, and were refused: an attack, or a file with such frames",
+            f"if no file transfer of yours explains it, treat {part.name} as captured",
+        )
+
+
+@OF_PEER.add(Severity.SECURITY)
+def _impersonation(peer: PeerFacts) -> Iterator[Found]:
+    mixed = peer.history.mixed
+    is_mixed = len(mixed) == mixed.maxlen and peer.now - mixed[0] <= SECURITY_S
+    owned = _owned(peer, peer.history.incoming.systems.within(SECURITY_S, peer.now)) if is_mixed else {}
+    if owned:
+        whose = listed(f"{system} ({owner})" for system, owner in owned.items())
+        yield Found(
+            f"beside its own frames it sends as system {whose}: it may be captured, relay without leave, or have the"
+            " same id by mistake",
+            f"inspect {peer.name}; if it is captured, delete its [[peer]] and run `uavlinkd reload`",
+        )
+
+
+@OF_PEER_UP.add(Severity.FAULT)
+def _freshness_unverified(peer: PeerFacts) -> Iterator[Found]:
+    if (since := peer.link.peer.unverified_since) is not None:
+        yield Found(
+            f"freshness unverified for {peer.now - since:.0f} s: the peer's frames arrive, its echo replies do not:"
+            " the direction back is blocked, or an attacker delays frames. Commands, missions, parameters and manual"
+            " control are held and dropped; reports pass and may be old",
+            "fly by other means until answers return; look for a bad radio in the direction to it",
+        )
+
+
+# What a policy refuses.
+
+
+def _foreign(peer: PeerFacts) -> tuple[Mapping[int, int], bool]:
+    """The foreign systems that the peer sent as; whether nothing else arrived from it."""
+    incoming = peer.history.incoming
+    foreign = incoming.systems.within(REFUSED_S, peer.now)
+    return foreign, "in" in peer.blocked and set(incoming.reasons.within(REFUSED_S, peer.now)) == {
+        Refusal.FOREIGN_SYSTEM
+    }
+
+
+@OF_PEER_UP.add(Severity.FAULT)
+def _foreign_system(peer: PeerFacts) -> Iterator[Found]:
+    foreign, is_all = _foreign(peer)
+    if foreign and is_all:
+        yield _about_systems(peer, foreign, "all its frames are")
+
+
+@OF_PEER_UP.add(Severity.WARNING)
+def _other_system(peer: PeerFacts) -> Iterator[Found]:
+    foreign, _ = _foreign(peer)
+    if foreign and "in" not in peer.blocked:
+        yield _about_systems(peer, foreign, "some of its frames are")
+
+
+def _about_systems(peer: PeerFacts, systems: Mapping[int, int], which: str) -> Found:
+    allowed = peer.rules.get("system_ids")
+    ids = listed(map(str, allowed)) if isinstance(allowed, list | tuple) else str(allowed)
+    text = f"{which} of system {listed(map(str, sorted(systems)), 8)}; its system_ids here are {ids}"
+    own = f"set SYSID_THISMAV or MAV_SYSID (ArduPilot), or MAV_SYS_ID (PX4), of its autopilot to {ids}"
+    if owned := _owned(peer, systems):  # never advise to trust one peer as another
+        whose = listed(f"{system} is {owner}'s" for system, owner in owned.items())
+        return Found(text, f"{own}: {whose}")
+    return Found(text, f"{own}; or, only if you know that {peer.name} has this id, write it into system_ids")
+
+
+def _owned(peer: PeerFacts, systems: Iterable[int]) -> dict[int, str]:
+    """Those of the systems that belong to another than this peer, with its name."""
+    owners = {system: peer.moment.owner(system, peer.link) for system in sorted(systems)}
+    return {system: owner for system, owner in owners.items() if owner is not None}
+
+
+@OF_PEER_UP.add(Severity.FAULT, unless=("roles_exchanged",))
+@OF_ENDPOINT.add(Severity.FAULT)
+def _all_refused(part: PartFacts) -> Iterator[Found]:
+    is_foreign = isinstance(part, PeerFacts) and _foreign(part)[1]  # foreign_system explains it
+    blocked = part.blocked - {"in"} if is_foreign else part.blocked
+    for direction, gate in (("in", part.history.incoming), ("out", part.history.outgoing)):
+        reasons = gate.reasons.within(REFUSED_S, part.now)
+        if reasons and direction in blocked:
+            which = "from it" if direction == "in" else "to it"
+            yield Found(
+                f"{part.rule} refuses every frame {which}: {'; '.join(reason.meaning for reason in reasons)}",
+                "`uavlinkd check` prints what passes: write the role that the other end has, or allow what it needs",
+            )
+
+
+@OF_PEER_UP.add(Severity.WARNING)
+@OF_ENDPOINT.add(Severity.WARNING)
+def _commands_refused(part: PartFacts) -> Iterator[Found]:
+    yield from _commands(part, part.history.incoming, "refused from it")
+
+
+@OF_PEER_UP.add(Severity.WARNING)
+@OF_ENDPOINT.add(Severity.WARNING)
+def _commands_withheld(part: PartFacts) -> Iterator[Found]:
+    yield from _commands(part, part.history.outgoing, "withheld")
+
+
+def _commands(part: PartFacts, gate: GateHistory, what: str) -> Iterator[Found]:
+    counts = [(key, count) for key, count in gate.commands.within(COMMANDS_S, part.now).items() if key[2] in _BY_RULE]
+    counts.sort(key=lambda entry: _rank(entry[0][1]))
+    if counts:
+        names = listed(f"{_command(msgid, number)} {count:,}x" for (msgid, number, _), count in counts)
+        remedy = f"intended, if {part.rule} is right; else write another role, or allow the command"
+        yield Found(f"{names} {what}: {part.rule}", remedy)
+
+
+def _rank(number: int) -> int:
+    """What a person looks for comes first: a list shows only its beginning, and others can make it long."""
+    return 2 if number == ANY_OTHER else int(command_name(number) not in _FLIGHT_COMMANDS)
+
+
+def _command(msgid: int, number: int) -> str:
+    if number == ANY_OTHER:
+        return "other commands"
+    return f"{name_of(msgid)} ({command_name(number).removeprefix('MAV_CMD_')})"
+
+
+# Roles that seem to be exchanged: a guess from the kind of frames.
+
+
+@OF_PEER_UP.add(Severity.FAULT)
+def _roles_exchanged(peer: PeerFacts) -> Iterator[Found]:
+    role, gates = peer.rules.get("role"), peer.link.policy
+    refused = peer.history.incoming.reasons.within(REFUSED_S, peer.now)
+    withheld = peer.history.outgoing.reasons.within(REFUSED_S, peer.now)
+    is_withheld = Refusal.MESSAGE_NOT_ALLOWED in withheld
+    if peer.moment.daemon.config.routing.relay:  # then the frames may be those of other peers
+        is_withheld = False
+    sign = ""
+    if role == "vehicle":
+        is_one = "a vehicle"
+        if Refusal.GROUND_STATION_NOT_ALLOWED in refused:
+            sign = "it sends a ground station's heartbeat"
+        elif is_withheld and _has(gates.outgoing, _only("vehicle", "operator")):
+            sign = "the client here sends a vehicle's telemetry"
+        remedy = 'write role = "operator" if it is a ground station, "swarm-member" if both ends are vehicles'
+    elif role == "operator":
+        is_one = "a ground station"
+        if Refusal.MESSAGE_NOT_ALLOWED in refused and _has(gates.incoming, _only("vehicle", "operator")):
+            sign = "it sends a vehicle's telemetry"
+        elif is_withheld and _has(gates.outgoing, _only("operator", "vehicle")):
+            sign = "the client here sends an operator's requests"
+        remedy = 'write role = "vehicle" if it is a vehicle: a role says what the peer is, not what this end is'
+    if sign:
+        text = f'role = "{role}" says that it is {is_one}, but {sign}: the roles may be exchanged'
+        yield Found(text, remedy, None if peer.blocked else Severity.WARNING)
+
+
+def _has(gate: Gate, messages: frozenset[int]) -> bool:
+    """Whether the gate refused one of these messages because of its rules."""
+    carriers = frozenset(ids_by_name()[name] for name in ("COMMAND_LONG", "COMMAND_INT"))
+    plain = {msgid for msgid, refusal in gate.refused if refusal is Refusal.MESSAGE_NOT_ALLOWED}
+    if plain & messages - carriers:
+        return True
+    numbers = {number for _, number, refusal in gate.refused_commands if refusal is Refusal.MESSAGE_NOT_ALLOWED}
+    sent = {command_name(number) for number in numbers if number != ANY_OTHER}
+    return bool(carriers & messages and sent - _EVERYDAY_COMMANDS)
+
+
+@cache
+def _only(role: str, other: str) -> frozenset[int]:
+    """Messages that one role sends and the other does not: a vehicle's telemetry, or an operator's requests."""
+    sent = {entry: {*GROUPS.get(entry, (entry,))} for name in (role, other) for entry in ROLES[name].allow_in}
+    names = {name for entry in ROLES[role].allow_in for name in sent[entry]}
+    others = {name for entry in ROLES[other].allow_in for name in sent[entry]}
+    ids = ids_by_name()
+    return frozenset(ids[name] for name in names - others if name in ids)
+
+
+# What the peer reports to refuse of this end's frames: a claim of its own. Nothing acts on it.
+
+
+@OF_PEER.add(Severity.WARNING)
+def _refused_there(peer: PeerFacts) -> Iterator[Found]:
+    claims = [claim for claim in peer.link.peer.refusal_claims.recent() if peer.now - claim.changed_at <= CLAIMS_S]
+    if not claims:
+        return
+    claims.sort(key=lambda claim: not claim.refused.command)
+    here, remedies = peer.moment.daemon.config.name, []
+    foreign = {REFUSALS.get(claim.refused.reason) is Refusal.FOREIGN_SYSTEM for claim in claims}
+    if True in foreign:
+        remedies.append(
+            "set SYSID_THISMAV, MAV_SYSID or MAV_SYS_ID of the client here to an id in system_ids for"
+            f" {here} in {peer.name}'s file, or add the id there"
+        )
+    if False in foreign:
+        remedies.append(f"if these frames are needed, change the role or lists of {here} in {peer.name}'s file")
+    by_meaning: dict[str, list[Claim]] = {}
+    for claim in claims[:_CLAIMS_SHOWN]:
+        refusal = REFUSALS.get(claim.refused.reason)
+        meaning = "a reason that this version does not know" if refusal is None else refusal.meaning
+        by_meaning.setdefault(meaning, []).append(claim)
+    kinds = "; ".join(_kinds(meaning, several, peer.now) for meaning, several in by_meaning.items())
+    more = f"; and {len(claims) - _CLAIMS_SHOWN} more kinds of frames" if len(claims) > _CLAIMS_SHOWN else ""
+    yield Found(f"it reports that it refuses {kinds}{more}", "; ".join(remedies))
+
+
+def _kinds(meaning: str, claims: Sequence[Claim], now: float) -> str:
+    """Claims that share a reason, which is written once."""
+    if len(claims) == 1:
+        return _kind(claims[0], now, f"{meaning}, ")
+    return f"{', '.join(_kind(claim, now) for claim in claims)}: {meaning}"
+
+
+def _kind(claim: Claim, now: float, meaning: str = "") -> str:
+    refused = claim.refused
+    command = f" {command_name(refused.command).removeprefix('MAV_CMD_')}" if refused.command else ""
+    frames = "frame" if refused.total == 1 else "frames"
+    age = now - claim.changed_at
+    return f"{name_of(refused.message)}{command} ({meaning}{refused.total:,} {frames}, {age:.0f} s ago)"
+
+
+# A local endpoint whose client is silent: in the table, the first of these that fits.
+
+
+def _is_silent(endpoint: EndpointFacts) -> bool:
+    return endpoint.now - endpoint.history.silent_since >= SILENT_S
+
+
+def _failures(endpoint: EndpointFacts) -> Mapping[str, int]:
+    return endpoint.history.failures.within(SILENT_S, endpoint.now)
+
+
+@OF_ENDPOINT.add(Severity.WARNING)
+def _garbage(endpoint: EndpointFacts) -> Iterator[Found]:
+    if _is_silent(endpoint) and endpoint.history.garbage.within(SILENT_S, endpoint.now):
+        yield Found(
+            f"bytes arrive at {endpoint.config.url}, and none of them is MAVLink",
+            "correct the baud rate, set the port of the autopilot to MAVLink, and let only this daemon read it",
+        )
+
+
+@OF_ENDPOINT.add(Severity.WARNING, unless=("garbage",))
+def _client_silent(endpoint: EndpointFacts) -> Iterator[Found]:
+    ports, kind = endpoint.endpoint.ports, endpoint.config.url.kind
+    is_there = kind is not EndpointKind.UDPOUT or not _failures(endpoint).keys() & {*_NOT_LISTENING}
+    if _is_silent(endpoint) and ports and is_there:
+        silent_s = endpoint.now - endpoint.history.silent_since
+        yield Found(
+            f"the client {listed(port.name for port in ports)} has sent no MAVLink for {silent_s:.0f} s",
+            "check that it runs, speaks MAVLink here and sends, not only listens; then power, wiring and baud rate",
+        )
+
+
+@OF_ENDPOINT.add(Severity.FAULT, unless=("garbage", "client_silent"))
+def _device_unavailable(endpoint: EndpointFacts) -> Iterator[Found]:
+    if _is_silent(endpoint) and endpoint.config.url.kind is EndpointKind.SERIAL:
+        error = next(iter(_failures(endpoint)), "")
+        text = f"{endpoint.config.url} cannot be opened{f' ({error})' if error else ''}"
+        yield Found(text, meaning_of(error) or "plug the device in")
+
+
+@OF_ENDPOINT.add(Severity.WARNING, unless=("garbage", "client_silent", "device_unavailable"))
+def _no_client(endpoint: EndpointFacts) -> Iterator[Found]:
+    if _is_silent(endpoint) and endpoint.config.url.listens:
+        silent_s = endpoint.now - endpoint.history.silent_since
+        text = f"no client has sent MAVLink to {endpoint.config.url} within {silent_s:.0f} s"
+        yield Found(text, "let the autopilot or ground station send there")
+
+
+@OF_ENDPOINT.add(Severity.WARNING, unless=("garbage", "client_silent", "device_unavailable", "no_client"))
+def _client_unreachable(endpoint: EndpointFacts) -> Iterator[Found]:
+    url, failures = endpoint.config.url, _failures(endpoint)
+    if not _is_silent(endpoint):
+        return
+    if "not_resolved" in failures or (url.kind is EndpointKind.UDPOUT and not endpoint.endpoint.ports):
+        yield Found(f"the host of {url} has no address now", "write an IP address, or see `getent hosts NAME`")
+    else:
+        error = next((error for error in _NOT_LISTENING if error in failures), "")
+        text = f"no process listens at {url}{f' ({error})' if error else ''}"
+        yield Found(text, "start the client there, or correct the port")
