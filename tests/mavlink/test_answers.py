@@ -5,28 +5,13 @@ from __future__ import annotations
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
-from tests.mavlink.egress.samples import attitude, command, frame
+from tests.samples import attitude, command, frame, frames_of, read_by_index, read_by_name, value
 from uavlinkd.core.settings import Class
 from uavlinkd.mavlink.answers import ANSWERED_S, MAX_REQUESTS, ParameterAnswers
-from uavlinkd.mavlink.frames import Frame, SplitCounters, split_payload
+from uavlinkd.mavlink.frames import Frame
 
 STATION = 255
 AT_S = 100.0
-
-
-def value(name: bytes, index: int = 65535, system: int = 1) -> Frame:
-    """A parameter of a vehicle."""
-    return frame(mavlink.MAVLink_param_value_message(name, 1.5, 9, 999, index), system)
-
-
-def read_by_name(name: bytes, system: int = 1) -> Frame:
-    """A ground station's request."""
-    return frame(mavlink.MAVLink_param_request_read_message(system, 1, name, -1), STATION)
-
-
-def read_by_index(index: int, system: int = 1) -> Frame:
-    """The same, for a parameter that was missing in a list."""
-    return frame(mavlink.MAVLink_param_request_read_message(system, 1, b"", index), STATION)
 
 
 def set_to(name: bytes, system: int = 1) -> Frame:
@@ -102,7 +87,7 @@ def of_another_definition(known: Frame) -> Frame:
     """The same bytes with a checksum of another CRC_EXTRA."""
     for checksum in range(65536):
         raw = known.raw[:-2] + checksum.to_bytes(2, "little")
-        read = split_payload(raw, SplitCounters())
+        read = frames_of([raw])
         if read and not read[0].header.is_known:
             return read[0]
     raise AssertionError("no checksum fits another definition")

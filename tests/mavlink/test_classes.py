@@ -2,41 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from pathlib import Path
+from collections import Counter
 
 import pytest
+from pymavlink.dialects.v20 import all as mavlink
 
+from tests.samples import ID, attitude, build, command, heartbeat
 from uavlinkd.core.settings import Class
-from uavlinkd.mavlink.classes import KINDS, Lane, MessageKind
-from uavlinkd.mavlink.dialect import GROUPS, ids_by_name, name_of
-
-PINNED = Path(__file__).parent / "message_kinds.txt"
-"""One line for each message, in the order of the names."""
-ID = ids_by_name()
-
-
-def lines() -> Iterator[str]:
-    """The table as the file has it."""
-    for name in sorted(ID):
-        kind = KINDS[ID[name]]
-        age = "may-be-old" if kind.may_be_old else "must-be-new"
-        waits = "state" if kind.is_state else "event"
-        instance = f" {kind.instance_at}+{kind.instance_bytes}" if kind.instance_bytes else ""
-        yield f"{name} {kind.cls} {age} {kind.lane.name.lower()} {waits}{instance}"
+from uavlinkd.mavlink.classes import INSTANCES, KINDS, Lane, MessageKind
+from uavlinkd.mavlink.dialect import GROUPS, name_of
+from uavlinkd.mavlink.screening import screen
 
 
 def test_table_has_the_reviewed_facts_about_every_message() -> None:
-    """A change of a group, or a new message of the dialect, shows here as the lines that it changes."""
-    pinned = PINNED.read_text(encoding="utf-8").splitlines()
-    actual = list(lines())
-    assert sorted(set(pinned) ^ set(actual)) == []
-    assert pinned == actual
-
-
-def test_every_message_of_the_dialect_is_in_the_table() -> None:
-    """None is left to a default."""
+    """A change of a group, or a new message of the dialect, changes a count: then review the messages that moved."""
     assert set(KINDS) == set(ID.values())
+    facts = Counter((kind.cls.value, kind.may_be_old, kind.lane.name, kind.is_state) for kind in KINDS.values())
+    assert facts == {
+        ("critical", False, "URGENT", False): 7,
+        ("critical", False, "URGENT", True): 2,
+        ("critical", False, "EVENTS", False): 43,
+        ("critical", False, "STATES", True): 7,
+        ("critical", True, "URGENT", True): 1,
+        ("critical", True, "EVENTS", False): 1,
+        ("stream", False, "EVENTS", False): 81,
+        ("stream", False, "STATES", True): 31,
+        ("stream", True, "EVENTS", False): 47,
+        ("stream", True, "STATES", True): 139,
+        ("bulk", False, "EVENTS", False): 15,
+    }
+    assert {name for name in ID if KINDS[ID[name]].instance_bytes} == set(INSTANCES)
 
 
 @pytest.mark.parametrize("group", ["commands", "parameters", "manual", "setpoints", "heartbeat"])
@@ -64,17 +59,6 @@ def test_mission_transactions_must_be_new_and_reports_about_a_mission_need_not()
     assert not may_be_old & {"MISSION_ITEM_INT", "MISSION_COUNT", "MISSION_SET_CURRENT", "SET_HOME_POSITION"}
 
 
-def test_urgent_lane_is_a_part_of_the_critical_class() -> None:
-    """What a slow link sends first is what must arrive."""
-    assert {kind.cls for kind in KINDS.values() if kind.lane is Lane.URGENT} == {Class.CRITICAL}
-
-
-def test_states_lane_has_states_only() -> None:
-    """And a state is in no lane of events."""
-    lanes = {(kind.lane, kind.is_state) for kind in KINDS.values()}
-    assert lanes == {(Lane.URGENT, True), (Lane.URGENT, False), (Lane.EVENTS, False), (Lane.STATES, True)}
-
-
 @pytest.mark.parametrize(
     ("name", "expected"),
     [
@@ -90,3 +74,36 @@ def test_states_lane_has_states_only() -> None:
 def test_facts_about_a_message(name: str, expected: MessageKind) -> None:
     """One of each kind."""
     assert KINDS[ID[name]] == expected
+
+
+# Which frames of a payload may be delivered while their age is not known.
+
+VEHICLE = heartbeat().raw
+GROUND_STATION = heartbeat(kind=mavlink.MAV_TYPE_GCS).raw
+ATTITUDE = attitude().raw
+COMMAND = command(1).raw
+
+
+def test_screen_splits_a_payload_and_keeps_the_order() -> None:
+    """Reports pass; a command and a ground station's heartbeat wait."""
+    passing, waiting = screen(ATTITUDE + COMMAND + VEHICLE + GROUND_STATION + ATTITUDE)
+    assert passing == ATTITUDE + VEHICLE + ATTITUDE
+    assert waiting == COMMAND + GROUND_STATION
+
+
+def test_ground_station_in_mavlink_1_waits_too() -> None:
+    """The type is at another offset there."""
+    old = heartbeat(kind=mavlink.MAV_TYPE_GCS, version=1).raw
+    assert screen(old) == (b"", old)
+
+
+def test_unknown_message_must_be_new() -> None:
+    """What the dialect does not have, or has in another form, may do anything."""
+    for unknown in (build(11_999, b"x"), build(30, bytes(28), crc_extra=1)):
+        assert screen(unknown + ATTITUDE) == (ATTITUDE, unknown)
+
+
+@pytest.mark.parametrize("garbage", [b"\x00", ATTITUDE[:-1], b"\xfd" + bytes(20)])
+def test_payload_with_garbage_waits_as_a_whole(garbage: bytes) -> None:
+    """It is not split here: the code that delivers it counts what is wrong."""
+    assert screen(ATTITUDE + garbage) == (b"", ATTITUDE + garbage)

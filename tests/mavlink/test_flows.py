@@ -1,13 +1,16 @@
-"""Flows: the instances of a state are separated by the right bytes, and commands keep their order."""
+"""Flows: instances of a state are separated by the right bytes, commands keep their order, states never go back."""
 
 from __future__ import annotations
 
+from hypothesis import given
+from hypothesis import strategies as st
 from pymavlink.dialects.v20 import all as mavlink
 
-from tests.mavlink.egress.samples import ID, frame
-from uavlinkd.mavlink import dialect_generate
+from tests.mavlink import dialect_generate
+from tests.samples import ID, attitude, battery, command, frame, heartbeat, parameter
 from uavlinkd.mavlink.classes import INSTANCES, KINDS
-from uavlinkd.mavlink.flows import flow_key
+from uavlinkd.mavlink.flows import MAX_FLOWS, FlowKey, NewestStates, flow_key
+from uavlinkd.mavlink.frames import Frame
 
 
 def layouts() -> dict[str, tuple[str | None, list[tuple[str, int, int]]]]:
@@ -71,3 +74,56 @@ def test_states_for_different_targets_are_different_flows() -> None:
     """A ground station may steer two vehicles with one joystick each."""
     keys = [flow_key(frame(mavlink.MAVLink_manual_control_message(n % 2, 1, 2, 3, 4, 5), 255)) for n in range(4)]
     assert keys[0] == keys[2] != keys[1] == keys[3]
+
+
+# States of a peer with several paths never go back, and no event is dropped.
+
+
+def test_copies_of_one_flow_in_one_envelope_are_all_delivered() -> None:
+    """They have one order, and are in the order of their sender."""
+    together = [attitude(1), attitude(2), command(1), attitude(3)]
+    assert NewestStates().pick(together, 7) is together
+
+
+def test_other_flows_of_an_older_envelope_are_delivered() -> None:
+    """The newer envelope had another battery, and neither the other vehicle nor the parameter."""
+    newest = NewestStates()
+    newest.pick([attitude(9), battery(9, 0)], 10)
+    late = [attitude(1), attitude(1, 2), battery(1, 0), battery(1, 1), parameter(1), heartbeat(1)]
+    assert newest.pick(late, 9) == [attitude(1, 2), battery(1, 1), parameter(1), heartbeat(1)]
+
+
+ENVELOPES = st.lists(
+    st.tuples(
+        st.integers(1, 30),
+        st.lists(
+            st.one_of(
+                st.builds(attitude, st.integers(0, 3), st.integers(1, 2)),
+                st.builds(battery, st.integers(0, 3), st.integers(0, 1)),
+                st.builds(command, st.integers(0, 3)),
+            ),
+            max_size=4,
+        ),
+    ),
+    max_size=20,
+)
+
+
+@given(ENVELOPES)
+def test_picks_what_the_rule_says(envelopes: list[tuple[int, list[Frame]]]) -> None:
+    """The rule, written down once more without any speed: for each flow the last delivered order."""
+    newest = NewestStates()
+    last: dict[FlowKey, int] = {}
+    for order, frames in envelopes:
+        expected = [one for one in frames if not one.header.kind.is_state or order >= last.get(flow_key(one), 0)]
+        last |= {flow_key(one): order for one in expected}
+        assert newest.pick(frames, order) == expected
+
+
+def test_invented_flows_use_bounded_memory_and_a_flow_in_use_is_kept() -> None:
+    """A member can invent components and instances. The rule still holds for the flow that goes on."""
+    newest = NewestStates()
+    for number in range(1, 4 * MAX_FLOWS):
+        newest.pick([attitude(number), heartbeat(0, 1 + number % 250, 1 + number // 250)], 2 * number)
+        assert len(newest) <= 2 * MAX_FLOWS
+        assert newest.pick([attitude(number - 1)], 2 * number - 1) == []

@@ -7,7 +7,8 @@ from itertools import pairwise
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.mavlink.samples import SHAPES, UNKNOWN, mixtures, raws
+from tests.mavlink.shapes import SHAPES, UNKNOWN, mixtures
+from tests.samples import raws
 from uavlinkd.mavlink.frames import MAX_FRAME_BYTES, Frame, FrameFault
 from uavlinkd.mavlink.stream_splitter import StreamSplitter
 
@@ -64,7 +65,7 @@ def test_stream_forgets_at_its_end() -> None:
 
 
 @given(data=mixtures, cuts=st.lists(st.integers(0, 400), max_size=12))
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=400)
 def test_chunks_change_nothing(data: bytes, cuts: list[int]) -> None:
     """A stream in chunks leads to the same frames, counters and rest as in one chunk."""
     whole = StreamSplitter()

@@ -11,29 +11,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cache
-from typing import Final, NamedTuple
+from typing import Final
 
 from uavlinkd.mavlink.dialect_table import COMMANDS, MESSAGES
 
 ALL: Final = "all"
-
-
-class MessageFacts(NamedTuple):
-    """The dialect's facts about one message. Lengths and offsets in bytes of the payload; None: no such field."""
-
-    name: str
-    crc_extra: int
-    min_length: int
-    max_length: int
-    target_system_at: int | None
-    target_component_at: int | None
-    command_at: int | None
-
-
-def facts(msgid: int) -> MessageFacts | None:
-    """The facts about a message, or None if the dialect lacks it."""
-    row = MESSAGES.get(msgid)
-    return MessageFacts(*row) if row else None
 
 
 def name_of(msgid: int) -> str:

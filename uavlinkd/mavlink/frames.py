@@ -26,11 +26,12 @@ from __future__ import annotations
 import re
 from collections import Counter
 from dataclasses import dataclass, field
-from enum import StrEnum
+from struct import Struct
 from typing import Final, NamedTuple, final
 
 from fastcrc.crc16 import mcrf4xx
 
+from uavlinkd.core.drops import Reason
 from uavlinkd.mavlink.dialect_table import MESSAGES
 from uavlinkd.mavlink.headers import (
     OTHER_DEFINITION,
@@ -49,19 +50,21 @@ MAX_FALSE_STARTS: Final = 64
 """After so many false starts in a row the rest of a datagram is not searched: each costs a checksum."""
 
 _START = re.compile(rb"[\xfd\xfe]")
+_HEADER: Final = Struct("<BBBBBBHB")
+"""Length, incompat_flags, compat_flags, sequence, system, component, message id in 16 and 8 bits."""
 
 CHECKSUM_STEP: Final = tuple(mcrf4xx(bytes([byte]), 0) for byte in range(256))
 """The effect of one more byte on a checksum: new = (old >> 8) ^ CHECKSUM_STEP[(old ^ byte) & 0xFF]."""
 _STEPS = frozenset(CHECKSUM_STEP)
 
 
-class FrameFault(StrEnum):
+class FrameFault(Reason):
     """Why bytes are not a frame."""
 
-    NOT_MAVLINK = "not_mavlink"  # no start byte: boot text of an autopilot, for example
-    BAD_CRC = "bad_crc"
-    UNKNOWN_FLAGS = "unknown_flags"  # incompat_flags other than signing: even the frame's length is unknown
-    TRUNCATED = "truncated"  # the bytes end before the frame does
+    NOT_MAVLINK = "not_mavlink", "no start byte: boot text of an autopilot, for example", "not MAVLink"
+    BAD_CRC = "bad_crc", "the checksum is wrong", "wrong checksums"
+    UNKNOWN_FLAGS = "unknown_flags", "incompat_flags other than signing: its length is unknown", "unknown flags"
+    TRUNCATED = "truncated", "the bytes end before the frame does", "truncated frames"
 
 
 @final
@@ -108,6 +111,16 @@ def split_payload(payload: bytes, counters: SplitCounters) -> list[Frame]:
     """
     frames: list[Frame] = []
     position, fault = parse_frames(payload, 0, frames, counters, is_expected=True)
+    if fault is not None:
+        pass_faults(payload, position, fault, frames, counters)
+    return frames
+
+
+def pass_faults(
+    payload: bytes, position: int, reason: FrameFault, frames: list[Frame], counters: SplitCounters
+) -> None:
+    """Continue :func:`split_payload` at the first fault."""
+    fault: FrameFault | None = reason
     while fault is not None:
         counters.faults[fault] += 1
         skipped = len(payload) - position
@@ -115,7 +128,6 @@ def split_payload(payload: bytes, counters: SplitCounters) -> list[Frame]:
             skipped = _length_of_frame(payload, position)
         counters.garbage_bytes += skipped
         position, fault = parse_frames(payload, position + skipped, frames, counters, is_expected=True)
-    return frames
 
 
 def parse_frame(raw: bytes) -> Frame | None:
@@ -239,3 +251,11 @@ def _length_of_frame(data: bytes, position: int) -> int:
     if data[position] == MAVLINK1:
         return 8 + data[position + 1]
     return 12 + data[position + 1] + (13 if data[position + 2] else 0)
+
+
+def pack(msgid: int, payload: bytes, seq: int, system: int, component: int) -> bytes:
+    """A MAVLink 2 frame of the daemon's own, of a message of the dialect. Zeros at the payload's end are cut off."""
+    body = payload.rstrip(b"\0") or b"\0"
+    header = _HEADER.pack(len(body), 0, 0, seq % 256, system, component, msgid & 0xFFFF, msgid >> 16)
+    checksum = mcrf4xx(header + body + bytes((MESSAGES[msgid][1],)))
+    return bytes((MAVLINK2,)) + header + body + checksum.to_bytes(2, "little")

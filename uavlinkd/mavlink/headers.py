@@ -6,9 +6,10 @@ sender and message, and for each target and command where a message carries them
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field, replace
 from typing import Final, NamedTuple, final
 
-from uavlinkd.mavlink.classes import KINDS, UNKNOWN
+from uavlinkd.mavlink.classes import KINDS, UNKNOWN, MessageKind
 from uavlinkd.mavlink.dialect_table import MESSAGES
 
 MAX_SENDER_MESSAGES: Final = 2048
@@ -19,6 +20,7 @@ commands to each of 250 systems stays below."""
 
 
 @final
+@dataclass(slots=True, eq=False)
 class Header:
     """What a frame's header, its target and its command say. Frames with the same facts share one object.
 
@@ -26,43 +28,24 @@ class Header:
     every receiver.
     """
 
-    __slots__ = (
-        "command",
-        "component",
-        "is_known",
-        "is_mavlink1",
-        "kind",
-        "msgid",
-        "system",
-        "target_component",
-        "target_system",
-    )
+    msgid: int
+    system: int
+    """The sender's system id."""
+    component: int
+    """The sender's component id."""
+    target_system: int = 0
+    """0 in both targets: all, or the message has no target."""
+    target_component: int = 0
+    command: int | None = None
+    """The MAV_CMD that the frame requests or that a mission item carries; None for a message without one."""
+    is_known: bool = True
+    """Whether the checksum fits the dialect's definition. Otherwise target and command could not be read."""
+    is_mavlink1: bool = False
+    kind: MessageKind = field(init=False)
+    """All other facts about the message: looked up once for all frames with this header."""
 
-    def __init__(
-        self,
-        msgid: int,
-        system: int,
-        component: int,
-        target: tuple[int, int] = (0, 0),
-        command: int | None = None,
-        *,
-        is_known: bool = True,
-        is_mavlink1: bool = False,
-    ) -> None:
-        self.msgid = msgid
-        self.system = system
-        """The sender's system id."""
-        self.component = component
-        """The sender's component id."""
-        self.target_system, self.target_component = target
-        """0 in each: all, or the message has no target."""
-        self.command = command
-        """The MAV_CMD that the frame requests or that a mission item carries; None for a message without one."""
-        self.is_known = is_known
-        """Whether the checksum fits the dialect's definition. Otherwise target and command could not be read."""
-        self.is_mavlink1 = is_mavlink1
-        self.kind = KINDS.get(msgid, UNKNOWN) if is_known else UNKNOWN
-        """All other facts about the message: looked up once for all frames with this header."""
+    def __post_init__(self) -> None:
+        self.kind = KINDS.get(self.msgid, UNKNOWN) if self.is_known else UNKNOWN
 
 
 class SenderMessage(NamedTuple):
@@ -94,10 +77,9 @@ def add_sender_message(key: bytes) -> SenderMessage:
     msgid = key[2] if is_mavlink1 else int.from_bytes(key[2:5], "little")
     definition = None if len(key) in (4, 6) else MESSAGES.get(msgid)
     longest = 255 if definition is None else definition[3]
-    known = None
-    if definition is not None and definition[4] is None and definition[6] is None:
-        known = Header(msgid, system, component, is_mavlink1=is_mavlink1)
     unknown = Header(msgid, system, component, is_known=False, is_mavlink1=is_mavlink1)
+    has_target = definition is None or definition[4] is not None or definition[6] is not None
+    known = None if has_target else replace(unknown, is_known=True)
     if len(sender_messages) >= MAX_SENDER_MESSAGES:
         del sender_messages[next(iter(sender_messages))]
     message = sender_messages[key] = SenderMessage(definition, longest, known, unknown)
@@ -121,8 +103,10 @@ def targeted_header(key: bytes, message: SenderMessage, payload: bytes) -> Heade
     facts = key, target_system, target_component, command
     header = targeted_headers.get(facts)
     if header is None:
-        like, target = message.unknown, (target_system, target_component)
-        header = Header(like.msgid, like.system, like.component, target, command, is_mavlink1=like.is_mavlink1)
+        like = message.unknown
+        header = replace(
+            like, target_system=target_system, target_component=target_component, command=command, is_known=True
+        )
         if len(targeted_headers) >= MAX_TARGETED_HEADERS:
             del targeted_headers[next(iter(targeted_headers))]
         targeted_headers[facts] = header

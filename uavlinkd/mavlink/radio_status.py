@@ -18,7 +18,7 @@ RADIO_STATUS once a second, and autopilots slow down by it. How receivers read i
 
 Neither autopilot looks at the sender (ArduPilot exempts the message from the check of its ground station's system id,
 and does not forward it). SiK radios send as system 51, component 68 ('3', 'D'; MAV_COMP_ID_TELEMETRY_RADIO is 68),
-wfb-ng as 3, 68. The default here is 51 and 68, because clients know it as a radio and show a scale that rises with
+wfb-ng as 3, 68. This daemon sends as 51, 68, because clients know it as a radio and show a scale that rises with
 the signal.
 
 The fields that this daemon sends:
@@ -45,8 +45,8 @@ from dataclasses import dataclass
 from struct import Struct
 from typing import Final, NamedTuple
 
-from uavlinkd.mavlink import own_frames
 from uavlinkd.mavlink.dialect import ids_by_name
+from uavlinkd.mavlink.frames import pack
 
 SYSTEM: Final = 51
 COMPONENT: Final = 68
@@ -108,11 +108,9 @@ def worst(figures: Sequence[LinkFigures]) -> LinkFigures:
 class RadioStatusSource:
     """RADIO_STATUS frames for one endpoint, with a MAVLink sequence of their own."""
 
-    __slots__ = ("_base_round_trip_s", "_component", "_seq", "_system")
+    __slots__ = ("_base_round_trip_s", "_seq")
 
-    def __init__(self, system: int = SYSTEM, component: int = COMPONENT) -> None:
-        self._system = system
-        self._component = component
+    def __init__(self) -> None:
         self._seq = 0
         self._base_round_trip_s: float | None = None
 
@@ -124,7 +122,7 @@ class RadioStatusSource:
         txbuf = _txbuf(figures, queueing_s) if figures.is_up else TXBUF_LOST
         payload = _PAYLOAD.pack(figures.receive_errors % 65536, 0, rssi, remrssi, txbuf, UNKNOWN, UNKNOWN)
         seq, self._seq = self._seq, (self._seq + 1) % 256
-        return own_frames.pack(_MSGID, payload, seq, self._system, self._component)
+        return pack(_MSGID, payload, seq, SYSTEM, COMPONENT)
 
     def _queueing_s(self, round_trip_s: float | None) -> float:
         """How much longer a round trip is than the best one: the wait in buffers along the path.

@@ -10,8 +10,7 @@ A *port* is one local client or one peer, named by any hashable value. The rules
 * A frame never goes back to its own port.
 * A frame whose target was received nowhere else, or behind its own port alone, goes to all other ports, as in a
   network switch that has not learnt an address. A link must carry the first message to a system that is silent
-  until it is asked, and a port that mirrors both sides of a conversation. mavlink-router drops such frames;
-  ``floods_unknown=False`` does too.
+  until it is asked, and a port that mirrors both sides of a conversation. mavlink-router drops such frames.
 
 Two more rules keep a mesh of daemons from multiplying frames:
 
@@ -69,19 +68,9 @@ class Unrouted(StrEnum):
 class Router(Generic[P]):
     """Learns which addresses are behind which port, and says where frames go. All times are monotonic seconds."""
 
-    def __init__(
-        self,
-        *,
-        relays: bool = False,
-        floods_unknown: bool = True,
-        route_lifetime_s: float = ROUTE_LIFETIME_S,
-        duplicate_window_s: float = DUPLICATE_WINDOW_S,
-    ) -> None:
+    def __init__(self, *, relays: bool = False) -> None:
         self.unrouted: Counter[Unrouted] = Counter()
         self._relays = relays
-        self._floods_unknown = floods_unknown
-        self._lifetime_s = route_lifetime_s
-        self._window_s = duplicate_window_s
         self._is_peer: dict[P, bool] = {}
         """Every port, in the order in which they were added."""
         self._silent: set[P] = set()
@@ -138,10 +127,10 @@ class Router(Generic[P]):
         As long as :attr:`edition` stays the same, the ports that :meth:`route` returned for a frame are valid for all
         frames from that source with its header that are not duplicates (:meth:`is_first`).
         """
-        self.refresh_at = now + self._lifetime_s / LIFETIME_PARTS
+        self.refresh_at = now + ROUTE_LIFETIME_S / LIFETIME_PARTS
         self._forget_decisions()
         for port, received_at in self._received_at.items():
-            for address in [a for a, at in received_at.items() if now - at >= self._lifetime_s]:
+            for address in [a for a, at in received_at.items() if now - at >= ROUTE_LIFETIME_S]:
                 del received_at[address]
                 self._unlink(port, address)
 
@@ -219,11 +208,11 @@ class Router(Generic[P]):
 
     def _turn_window(self, now: float) -> None:
         """Forget the older half of the frames: each is remembered for one to two windows."""
-        is_gap = now >= self._window_ends_at + self._window_s
+        is_gap = now >= self._window_ends_at + DUPLICATE_WINDOW_S
         self._seen_before = {} if is_gap else self._seen
         self._seen = {}
         is_early = now < self._window_ends_at
-        self._window_ends_at = (now if is_gap or is_early else self._window_ends_at) + self._window_s
+        self._window_ends_at = (now if is_gap or is_early else self._window_ends_at) + DUPLICATE_WINDOW_S
 
     def _learn(self, port: P, address: SystemComponent) -> None:
         received_at = self._received_at[port]
@@ -261,7 +250,7 @@ class Router(Generic[P]):
         # Component 0 is not an id of its own, even if a sender uses it: it means the whole system.
         of_component = components.get(target_component) if target_component != 0 else None
         matches = of_component or set().union(*components.values())
-        if self._floods_unknown and not matches - {source}:
+        if not matches - {source}:
             return tuple(others)
         return tuple(port for port in others if port in matches)
 

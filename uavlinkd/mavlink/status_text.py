@@ -13,8 +13,8 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import Final, NamedTuple
 
-from uavlinkd.mavlink import own_frames
 from uavlinkd.mavlink.dialect import ids_by_name
+from uavlinkd.mavlink.frames import pack
 
 COMPONENT: Final = 240
 TEXT_BYTES: Final = 50
@@ -52,4 +52,4 @@ class StatusTextSource:
         seq = self._sequences.get(note.system, 0)
         self._sequences[note.system] = (seq + 1) % 256
         text = note.text.encode("ascii", "replace")[:TEXT_BYTES]
-        return own_frames.pack(_MSGID, bytes((note.severity,)) + text, seq, note.system, COMPONENT)
+        return pack(_MSGID, bytes((note.severity,)) + text, seq, note.system, COMPONENT)

@@ -23,18 +23,6 @@ class StreamSplitter:
     With ``gives_up``, the rest of a chunk of false starts is garbage, as in a datagram. This bounds its cost.
     """
 
-    __slots__ = (
-        "_fed_at",
-        "_fresh_bytes",
-        "_gives_up",
-        "_held_since",
-        "_in_garbage",
-        "_max_gap_s",
-        "_max_hold_s",
-        "_rest",
-        "counters",
-    )
-
     def __init__(
         self,
         counters: SplitCounters | None = None,

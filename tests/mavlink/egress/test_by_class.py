@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable
 from itertools import pairwise
 
@@ -11,28 +10,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import all as mavlink
 
-from tests.mavlink.egress.samples import SHAPE, attitude, battery, command, frame, heartbeat, parameter, raws
+from tests.mavlink.egress.links import CLASS_OF, SHAPE, Link
+from tests.samples import attitude, battery, command, frame, heartbeat, log_data, parameter, raws
 from uavlinkd.core.constants import CRITICAL_ENVELOPE_LIMIT
 from uavlinkd.core.settings import Class
-from uavlinkd.mavlink.answers import ParameterAnswers
 from uavlinkd.mavlink.egress.bucket import Bucket
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
-from uavlinkd.mavlink.egress.by_class import (
-    PeerEgress,
-    split_by_class,
-)
+from uavlinkd.mavlink.egress.by_class import split_by_class
 from uavlinkd.mavlink.egress.lanes import EgressDrop
 from uavlinkd.mavlink.frames import Frame
 
-Envelope = tuple[float, Class, list[bytes]]
-CLASS_OF = ParameterAnswers().class_of
 NO_BUDGET = EgressSettings()
 SLOW_BITS_S, FAST_BITS_S = 8000, 80_000
-
-
-def log_data(number: int) -> Frame:
-    """A part of a log."""
-    return frame(mavlink.MAVLink_log_data_message(1, 90 * number, 90, [number % 256] * 90))
 
 
 def status_text(number: int) -> Frame:
@@ -40,57 +29,24 @@ def status_text(number: int) -> Frame:
     return frame(mavlink.MAVLink_statustext_message(6, f"text {number}".encode()))
 
 
-class Radio:
-    """The networks of one peer: each envelope is charged to the networks along which its class goes, at once."""
+class Radio(Link):
+    """A peer with these networks, the best path's first."""
 
     def __init__(self, settings: EgressSettings, *networks: Bucket | None, is_split: bool = True) -> None:
-        """``networks``: the best path's first."""
-        self.egress = PeerEgress(settings, 0.0, CLASS_OF)
-        self.egress.shape = SHAPE
-        self.is_split = is_split
-        self.networks = networks
-        first = networks[:1]
-        along = {Class.CRITICAL: networks, Class.STREAM: first, Class.BULK: first}
-        self.egress.set_networks(along, 0.0)
-        self.envelopes: list[Envelope] = []
+        super().__init__(settings, SHAPE, *networks, is_split=is_split)
 
-    def put(self, *frames: Frame, now: float) -> None:
-        """Frames that arrive together."""
-        self.egress.put(frames, now, is_split=self.is_split)
-        self.flush(now)
-
-    def flush(self, now: float) -> None:
-        """Send what is due."""
-        while True:
-            cls, batch = self.egress.take(now)
-            if not batch:
-                return
-            self.envelopes.append((now, cls, raws(batch)))
-            size = SHAPE.seal_bytes + sum(len(raw) for raw, _ in batch)
-            self.egress.spend(size, now)
-            for network in self.networks if cls is Class.CRITICAL else self.networks[:1]:
-                if network is not None:
-                    network.spend(size + SHAPE.carrier_bytes, now)
-
-    def run(self, until: float) -> None:
-        """Let time pass: the egress is called at its deadlines and never else."""
-        for _ in range(100_000):
-            deadline = self.egress.next_deadline()
-            if deadline > until:
-                return
-            self.flush(deadline)
-        raise AssertionError("deadlines without end")
+    @property
+    def by_class(self) -> list[tuple[float, Class, list[bytes]]]:
+        """The envelopes: when each was sent, its class, its frames."""
+        return [(now, cls, batch) for (now, batch), cls in zip(self.envelopes, self.classes, strict=True)]
 
     def of(self, cls: Class) -> list[bytes]:
         """The frames that were sent in envelopes of this class."""
-        return [raw for _, sent_as, batch in self.envelopes if sent_as is cls for raw in batch]
+        return [raw for _, sent_as, batch in self.by_class if sent_as is cls for raw in batch]
 
-    def sizes(self) -> Counter[Class]:
-        """Bytes sent by class."""
-        sizes = Counter[Class]()
-        for _, cls, batch in self.envelopes:
-            sizes[cls] += sum(map(len, batch))
-        return sizes
+    def size(self, cls: Class) -> int:
+        """Bytes sent in envelopes of this class."""
+        return sum(map(len, self.of(cls)))
 
 
 def test_batch_is_split_critical_first_and_keeps_the_order_within_a_class() -> None:
@@ -108,7 +64,7 @@ def test_without_a_budget_each_class_leaves_at_once() -> None:
     """The queues add nothing but the split."""
     radio = Radio(NO_BUDGET, None)
     radio.put(attitude(1), command(1), log_data(1), now=1.0)
-    assert [(now, cls) for now, cls, _ in radio.envelopes] == [
+    assert [(now, cls) for now, cls, _ in radio.by_class] == [
         (1.0, Class.CRITICAL),
         (1.0, Class.STREAM),
         (1.0, Class.BULK),
@@ -120,7 +76,7 @@ def test_together_frames_share_envelopes_whatever_their_class() -> None:
     """A peer with one path, on a network with a budget."""
     radio = Radio(NO_BUDGET, Bucket(FAST_BITS_S, 0.0), is_split=False)
     radio.put(attitude(1), command(1), parameter(1), now=0.0)
-    ((_, _, batch),) = radio.envelopes
+    ((_, batch),) = radio.envelopes
     assert len(batch) == 3
 
 
@@ -130,7 +86,7 @@ def test_coalescing_waits_for_each_class_alone() -> None:
     radio.put(attitude(1), command(1), now=0.0)
     radio.put(attitude(2), now=0.05)
     radio.run(1.0)
-    assert [(now, cls, len(batch)) for now, cls, batch in radio.envelopes] == [
+    assert [(now, cls, len(batch)) for now, cls, batch in radio.by_class] == [
         (0.0, Class.CRITICAL, 1),
         (0.1, Class.STREAM, 2),
     ]
@@ -141,9 +97,9 @@ def test_envelope_has_one_class_and_critical_ones_are_short() -> None:
     radio = Radio(NO_BUDGET, Bucket(1e9, 0.0))
     frames = [make(n) for n in range(40) for make in (attitude, command, log_data, status_text)]
     radio.put(*frames, now=0.0)
-    assert sorted(raw for _, _, batch in radio.envelopes for raw in batch) == sorted(raws(frames))
+    assert sorted(raw for _, raw in radio.sent) == sorted(raws(frames))
     by_raw = {made.raw: CLASS_OF(made, 0.0) for made in frames}
-    for _, cls, batch in radio.envelopes:
+    for _, cls, batch in radio.by_class:
         assert {by_raw[raw] for raw in batch} == {cls}
         if cls is Class.CRITICAL:
             assert SHAPE.seal_bytes + sum(map(len, batch)) <= CRITICAL_ENVELOPE_LIMIT
@@ -181,11 +137,11 @@ def test_two_peers_share_the_budget_of_a_network() -> None:
         for radio in radios:
             radio.put(attitude(tick), battery(tick, 1), now=tick / 20)
             radio.run(tick / 20)
-    wire = [SHAPE.overhead + sum(map(len, batch)) for radio in radios for _, _, batch in radio.envelopes]
+    wire = [SHAPE.overhead + sum(map(len, batch)) for radio in radios for _, batch in radio.envelopes]
     assert 0.9 * SLOW_BITS_S / 8 * seconds < sum(wire) <= SLOW_BITS_S / 8 * (seconds + 0.25)
     assert network.demand(seconds) > 1
     assert radios[0].egress.demand(seconds) == network.demand(seconds)
-    first, second = (radio.sizes().total() for radio in radios)
+    first, second = (sum(len(raw) for _, raw in radio.sent) for radio in radios)
     assert first == pytest.approx(second, rel=0.1)
 
 
@@ -200,7 +156,7 @@ def test_commands_pass_a_flood_of_another_class(offered: Callable[[int], Frame])
             radio.put(command(tick), now=now)
         radio.run(now)
     radio.run(11.0)
-    sent_at = {raw: now for now, _, batch in radio.envelopes for raw in batch}
+    sent_at = {raw: now for now, raw in radio.sent}
     waits = [sent_at[command(tick).raw] - tick / 40 for tick in range(0, 400, 20)]
     assert max(waits) <= (SHAPE.overhead + SHAPE.payload_limit) * 8 / SLOW_BITS_S
     assert radio.egress.totals[EgressDrop.CLOSED] == 0
@@ -212,8 +168,19 @@ def test_stream_and_bulk_have_equal_shares_while_both_wait() -> None:
     for tick in range(600):
         radio.put(attitude(tick), battery(tick, tick % 3), log_data(tick), log_data(1000 + tick), now=tick / 20)
         radio.run(tick / 20)
-    sizes = radio.sizes()
-    assert sizes[Class.STREAM] / sizes[Class.BULK] == pytest.approx(1, abs=0.1)
+    assert radio.size(Class.STREAM) / radio.size(Class.BULK) == pytest.approx(1, abs=0.1)
+
+
+def test_stream_that_comes_while_bulk_is_in_line_goes_first() -> None:
+    """Both wait for the same budget. In line one behind the other, neither would leave."""
+    network = Bucket(SLOW_BITS_S, 0.0)
+    radio = Radio(NO_BUDGET, network)
+    network.spend(250, 0.0)
+    radio.put(parameter(1), now=0.0)
+    radio.put(attitude(1), now=0.01)
+    radio.run(1.0)
+    assert [cls for _, cls, _ in radio.by_class] == [Class.STREAM, Class.BULK]
+    assert radio.egress.queued_frames == 0
 
 
 def test_change_of_paths_keeps_what_waits_with_its_age() -> None:
@@ -229,7 +196,7 @@ def test_change_of_paths_keeps_what_waits_with_its_age() -> None:
     assert radio.egress.queued_frames == 4
     assert radio.egress.totals == {EgressDrop.THINNED: 1}
     radio.run(1.0)
-    sent = [raw for _, _, batch in radio.envelopes for raw in batch]
+    sent = [raw for _, raw in radio.sent]
     assert [raw for raw in sent if raw != attitude(2).raw] == raws([parameter(1), parameter(2), parameter(3)])
     radio.run(10.0)
     assert radio.egress.queued_frames == 0
@@ -277,7 +244,7 @@ def test_each_frame_leaves_once_and_in_the_order_of_its_flow(
         offered.append(made.raw)
         radio.put(made, now=now)
     radio.run(now + 60)
-    sent = [raw for _, _, batch in radio.envelopes for raw in batch]
+    sent = [raw for _, raw in radio.sent]
     assert len(sent) == len(set(sent))
     assert len(sent) + radio.egress.totals.total() == len(offered)
     for make in MAKERS:

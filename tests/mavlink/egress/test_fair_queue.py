@@ -8,10 +8,9 @@ from collections.abc import Callable
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from pymavlink.dialects.v20 import all as mavlink
 
-from tests.mavlink.egress.samples import attitude, battery, command, frame, heartbeat, parameter
 from tests.policies import TRUSTED
+from tests.samples import attitude, battery, command, file_part, heartbeat, parameter
 from uavlinkd.mavlink.egress.fair_queue import (
     LANE_BYTES,
     MAX_SOURCES,
@@ -37,14 +36,7 @@ def make() -> tuple[FairQueue, Counter[EgressDrop]]:
     def on_drop(reason: EgressDrop) -> None:
         dropped[reason] += 1
 
-    return FairQueue(1.0, on_drop), dropped
-
-
-def part(number: int, size: int = 239) -> Frame:
-    """A part of a file: an event of this size."""
-    return frame(
-        mavlink.MAVLink_file_transfer_protocol_message(0, 255, 1, [number % 256] * (size - 1) + [1] * (252 - size))
-    )
+    return FairQueue(on_drop), dropped
 
 
 def popped(queue: FairQueue, byte_count: float = 1e9, now: float = 0.0) -> list[tuple[Frame, Source]]:
@@ -85,7 +77,7 @@ def test_frame_that_does_not_fit_stays() -> None:
 
 
 @pytest.mark.parametrize(
-    "flood", [lambda n: attitude(n, n % 200 + 1), lambda n: battery(n, n % 250), parameter, part]
+    "flood", [lambda n: attitude(n, n % 200 + 1), lambda n: battery(n, n % 250), parameter, file_part]
 )
 def test_sources_share_by_bytes(flood: Callable[[int], Frame]) -> None:
     """Half of the bytes each, however large the frames are, and however many flows one of the sources invents."""
@@ -115,7 +107,7 @@ def test_flood_of_urgent_frames_leaves_a_part_to_the_rest() -> None:
 
 
 def test_burst_of_commands_is_not_interrupted() -> None:
-    """The rest gets its part only after the urgent frames' head start."""
+    """The rest gets its file_part only after the urgent frames' head start."""
     queue, _ = make()
     queue.put([parameter(number) for number in range(100)], HONEST, 0.0)
     commands = [command(number) for number in range(URGENT_LEAD_BYTES // len(command(0).raw))]
@@ -140,7 +132,7 @@ def test_source_that_empties_its_queue_again_and_again_gains_nothing() -> None:
     sums: Counter[Source] = Counter()
     for number in range(100):
         if CAPTURED not in waiting_sources(queue):
-            queue.put([part(number)], CAPTURED, 0.0)
+            queue.put([file_part(number)], CAPTURED, 0.0)
         sums += bytes_by_source(popped(queue, 1))
     assert abs(sums[HONEST] - sums[CAPTURED]) <= 300
 
@@ -148,7 +140,7 @@ def test_source_that_empties_its_queue_again_and_again_gains_nothing() -> None:
 def test_source_that_left_the_line_pays_for_what_it_was_sent() -> None:
     """A stream that waits for room looks whose turn it is: an idle source leaves the line, and keeps its debt."""
     queue, _ = make()
-    queue.put([part(number) for number in range(40)], HONEST, 0.0)
+    queue.put([file_part(number) for number in range(40)], HONEST, 0.0)
     sums: Counter[Source] = Counter()
     for number in range(200):
         queue.next_bytes(0.0)
@@ -203,7 +195,7 @@ def test_queue_is_bounded_over_all_sources() -> None:
     queue.put(honest, HONEST, 0.0)
     for captured in range(10):
         flooding = Source(f"captured{captured}", GATE)
-        for lane in (lambda n: heartbeat(n, 2, n % 250 + 1), part, lambda n: attitude(n, n % 250 + 1)):
+        for lane in (lambda n: heartbeat(n, 2, n % 250 + 1), file_part, lambda n: attitude(n, n % 250 + 1)):
             queue.put([lane(number) for number in range(1500)], flooding, 0.0)
             assert queue.size <= QUEUE_BYTES
     assert [item for item, source in popped(queue) if source is HONEST] == honest
@@ -212,8 +204,8 @@ def test_queue_is_bounded_over_all_sources() -> None:
 def test_stale_frames_are_dropped_when_their_turn_comes() -> None:
     """They are counted as stale, not as overflow, and take no turn."""
     queue, dropped = make()
-    queue.put([part(number) for number in range(100)], CAPTURED, 0.0)
-    queue.put([part(number) for number in range(100)], CAPTURED, 1.5)
+    queue.put([file_part(number) for number in range(100)], CAPTURED, 0.0)
+    queue.put([file_part(number) for number in range(100)], CAPTURED, 1.5)
     assert dropped == {EgressDrop.STALE: 100}
     queue.put([parameter(0)], HONEST, 2.6)
     assert queue.pop(1e9, 2.6) == (parameter(0), HONEST)
@@ -237,7 +229,7 @@ FRAMES: list[Callable[[int], Frame]] = [
     lambda n: command(n, 255 - n % 2),
     lambda n: battery(n, n % 5),
     parameter,
-    part,
+    file_part,
 ]
 STEPS = st.lists(
     st.tuples(st.just("put"), st.integers(0, 2), st.integers(0, 5), st.integers(1, 40))

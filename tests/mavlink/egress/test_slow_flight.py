@@ -11,20 +11,8 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
-from tests.mavlink.egress.samples import (
-    ID,
-    SLOW,
-    Link,
-    attitude,
-    battery,
-    command,
-    every,
-    frame,
-    heartbeat,
-    id_of,
-    parameter,
-    play,
-)
+from tests.mavlink.egress.links import SLOW, Link, every, id_of, play
+from tests.samples import ID, attitude, battery, command, frame, heartbeat, parameter
 from uavlinkd.mavlink.classes import KINDS
 from uavlinkd.mavlink.dialect import name_of
 from uavlinkd.mavlink.egress.lanes import EgressDrop

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.mavlink.parsers.build import compiler
+from tests.mavlink.parsers.receivers import compiler
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -7,25 +7,13 @@ from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Final, NamedTuple
 
-from tests.mavlink.parsers.build import PRIVATE_EXTRAS
-from uavlinkd.lab.evaluation.captured_member import GOALS, command_long, heartbeat_of, set_mode
-from uavlinkd.lab.evaluation.hidden_frames import SIGNATURE_BYTES, Carrier, crc_extra, frame, hide, msgid_of
+from tests.mavlink.parsers.captured_member import CAST, GOALS, command_long, heartbeat_of, set_mode
+from tests.mavlink.parsers.hidden_frames import SIGNATURE_BYTES, Carrier, crc_extra, frame, hide, msgid_of
+from tests.mavlink.parsers.receivers import PRIVATE_EXTRAS
 from uavlinkd.mavlink.dialect_table import COMMANDS, MESSAGES, OTHER_EXTRAS
 from uavlinkd.mavlink.policy.compilation import compile_policy
 from uavlinkd.mavlink.policy.gate import Refusal
 
-EVERYTHING: Final[Mapping[str, object]] = {"role": "all", "system_ids": "all"}
-CAST: Final[Mapping[str, Mapping[str, object]]] = {
-    "member": {"role": "swarm-member", "system_ids": [2]},
-    "other member": {"role": "swarm-member", "system_ids": [3]},
-    "vehicle": {"role": "vehicle", "system_ids": [2]},
-    "observer": {"role": "observer", "system_ids": [200], "allow_in": ["REQUEST_EVENT"]},
-    "operator": {"role": "operator", "system_ids": [255], "deny_in": ["MAV_CMD_DO_FLIGHTTERMINATION"]},
-    "operator without MAVLink 1": {"role": "operator", "system_ids": [255], "mavlink1": False},
-    "private dialect": {"role": "swarm-member", "system_ids": [7], "allow_in": [54321, 150]},
-    "everything": EVERYTHING,
-}
-"""The sources of a client's frames, with the policies that the daemon has for them."""
 LETS_UNKNOWN_PASS: Final = frozenset({"private dialect"})
 """For these every CRC_EXTRA counts."""
 CLIENTS: Final[Sequence[Mapping[str, object]]] = ({}, {"deny_out": ["HEARTBEAT", "MAV_CMD_COMPONENT_ARM_DISARM"]})

@@ -12,9 +12,10 @@ from typing import NamedTuple
 
 from fastcrc.crc16 import mcrf4xx
 
-from tests.mavlink.parsers.generate import CAST, CLIENTS, LETS_UNKNOWN_PASS, Recipe
+from tests.mavlink.parsers.captured_member import CAST
+from tests.mavlink.parsers.generate import CLIENTS, LETS_UNKNOWN_PASS, Recipe
+from tests.mavlink.parsers.hidden_frames import SIGNATURE_BYTES, crc_extra, msgid_of
 from tests.mavlink.parsers.receivers import Accepted, Batch, Delivery, Receiver
-from uavlinkd.lab.evaluation.hidden_frames import SIGNATURE_BYTES, crc_extra, msgid_of
 from uavlinkd.mavlink.dialect_table import OTHER_EXTRAS
 from uavlinkd.mavlink.frames import MAVLINK2, Frame, SplitCounters, parse_frame, split_payload
 from uavlinkd.mavlink.policy.compilation import compile_policy
@@ -105,14 +106,11 @@ class Breach(NamedTuple):
 class Verdicts:
     """The verdicts on the frames that receivers accepted in addition to the delivered ones."""
 
-    harmless: int = 0
-    spanning: int = 0
-    spanning_forbidden: int = 0
-    private: int = 0
-    """Forbidden frames by a private definition, from sources without unknown messages in their lists: a limit."""
+    counts: Counter[str] = field(default_factory=Counter)
+    """``harmless``; ``spanning`` a loss, and ``spanning_forbidden`` of these; ``private``: forbidden frames by a
+    private definition, from sources without unknown messages in their lists, a limit; ``truncated``: not judged,
+    because there were too many."""
     breaches: list[Breach] = field(default_factory=list)
-    truncated: int = 0
-    """Accepted frames that were not judged, because there were too many."""
 
 
 def is_private(raw: bytes) -> bool:
@@ -165,14 +163,13 @@ class Judge:
             senders = _authors(stream.authors, accepted.start, end)
             is_forbidden = self.is_forbidden(accepted.raw, senders, stream.client)
             if accepted.spans:
-                into.spanning += 1
-                into.spanning_forbidden += is_forbidden
+                into.counts.update(spanning=1, spanning_forbidden=int(is_forbidden))
             elif is_forbidden and is_private(accepted.raw) and not LETS_UNKNOWN_PASS.intersection(senders):
-                into.private += 1
+                into.counts["private"] += 1
             elif is_forbidden:
                 into.breaches.append(Breach(receiver.name, accepted.raw, senders, accepted, stream.delivery.stream))
             else:
-                into.harmless += 1
+                into.counts["harmless"] += 1
 
 
 def _authors(authors: Sequence[tuple[int, str | None]], start: int, end: int) -> tuple[str, ...]:
@@ -199,11 +196,6 @@ def judge_all(
     batch = Batch([stream.delivery for stream in streams])
     for receiver in receivers:
         total, accepted = receiver.judge(batch, every_offset=every_offset, losses=losses, seed=seed)
-        verdicts.truncated += total - len(accepted)
+        verdicts.counts["truncated"] += total - len(accepted)
         judge.examine(receiver, streams, accepted, verdicts)
     return verdicts
-
-
-def by_message(breaches: Iterable[Breach]) -> Counter[str]:
-    """The number of breaches of each receiver."""
-    return Counter(breach.receiver for breach in breaches)

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from tests.mavlink.parsers.build import DIALECTS
+from tests.mavlink.parsers.captured_member import MemberAttack, attacks_on
 from tests.mavlink.parsers.judge import judge_all
-from tests.mavlink.parsers.receivers import EVERY_LOSS, Batch, Receiver, all_receivers
-from tests.mavlink.parsers.targets import attacks_on, concatenated, deliver, judge_of
-from uavlinkd.lab.evaluation.captured_member import MemberAttack
+from tests.mavlink.parsers.receivers import DIALECTS, EVERY_LOSS, Batch, Receiver, all_receivers
+from tests.mavlink.parsers.targets import concatenated, deliver, judge_of
 
 # Receivers that accept the hidden frame in simply concatenated frames, from the stream's first byte on.
 _RESUMES = frozenset(
@@ -98,8 +97,8 @@ def test_attack_succeeds_with_concatenated_frames_after_a_loss(name: str) -> Non
 def test_filter_stops_it(dialect: str, name: str) -> None:
     """No receiver accepts a forbidden frame: from any offset, after any loss of up to 300 bytes."""
     attack = named(dialect, name)
-    once, _ = deliver(attack)
-    repeated, _ = deliver(attack, times=REPEATED)
+    once = deliver(attack)
+    repeated = deliver(attack, times=REPEATED)
     receivers, judge = all_receivers([dialect]), judge_of(attack)
     verdicts = judge_all([once], receivers, judge, losses=EVERY_LOSS)
     assert not verdicts.breaches

@@ -11,13 +11,13 @@ from typing import Any
 import pytest
 
 from tests.lab.sim import scenarios
-from tests.mavlink.parsers.build import DIALECTS
-from tests.mavlink.parsers.generate import CAST, Generator
+from tests.mavlink.parsers.captured_member import CAST, MemberAttack, attacks_on, lacking, signed_unknown, within
+from tests.mavlink.parsers.generate import Generator
+from tests.mavlink.parsers.hidden_frames import Carrier, frame, msgid_of
 from tests.mavlink.parsers.judge import Deliverer, Judge, Stream, unfiltered
-from tests.mavlink.parsers.targets import attacks_on, concatenated, deliver, lacking
+from tests.mavlink.parsers.receivers import DIALECTS
+from tests.mavlink.parsers.targets import concatenated, deliver
 from tests.waiting import PATIENCE_S
-from uavlinkd.lab.evaluation.captured_member import MemberAttack, signed_unknown, within
-from uavlinkd.lab.evaluation.hidden_frames import Carrier, frame, msgid_of
 from uavlinkd.mavlink.dialect import ids_by_name, name_of
 
 STREAMS = 400
@@ -145,7 +145,7 @@ def smuggled() -> list[MemberAttack]:
 def test_mavsdk_accepts_what_policy_passed(mavsdk: MavsdkReceiver) -> None:
     """From the start of a stream and from each start byte in it."""
     for attack in (*smuggled(), *attacks_on("common")):
-        delivery = deliver(attack)[0].delivery
+        delivery = deliver(attack).delivery
         delivered = {meaning(delivery.stream[start:end]) for start, end in delivery.frames}
         for offset, byte in enumerate(delivery.stream):
             if byte in (0xFD, 0xFE) or offset == 0:

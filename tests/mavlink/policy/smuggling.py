@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 
 from fastcrc.crc16 import mcrf4xx
 
+from tests.samples import build
 from uavlinkd.mavlink.dialect_table import MESSAGES, OTHER_EXTRAS
-from uavlinkd.mavlink.frames import Frame, SplitCounters, split_payload
 from uavlinkd.mavlink.policy.compilation import compile_policy
 from uavlinkd.mavlink.policy.delivery import Source
 
@@ -16,19 +17,8 @@ HOME_POSITION, SETUP_SIGNING = 242, 256
 SIGNATURE = bytes(range(13))
 
 
-def v2(msgid: int, payload: bytes, system: int = 1, *, signature: bytes = b"", extra: int | None = None) -> bytes:
-    """A MAVLink 2 frame, with the CRC_EXTRA of the table by default."""
-    header = bytes((len(payload), bool(signature), 0, 7, system, 1)) + msgid.to_bytes(3, "little")
-    covered = header + payload
-    crc = mcrf4xx(covered + bytes((MESSAGES[msgid][1] if extra is None else extra,)))
-    return b"\xfd" + covered + crc.to_bytes(2, "little") + signature
-
-
-def v1(msgid: int, payload: bytes, system: int = 1, *, extra: int | None = None) -> bytes:
-    """The same as MAVLink 1."""
-    covered = bytes((len(payload), 7, system, 1, msgid)) + payload
-    crc = mcrf4xx(covered + bytes((MESSAGES[msgid][1] if extra is None else extra,)))
-    return b"\xfe" + covered + crc.to_bytes(2, "little")
+v2 = build
+v1 = partial(build, version=1)
 
 
 def hidden_header(msgid: int, payload_bytes: int, system: int = 255) -> bytes:
@@ -52,12 +42,6 @@ def split_over(middle: bytes = b"", msgid: int = COMMAND_LONG, system: int = 1) 
 def source(role: str = "swarm-member", systems: object = (1,), **more: object) -> Source:
     """A policy of a peer with this role and these systems."""
     return Source(role, compile_policy({"role": role, "system_ids": systems, **more}).incoming)
-
-
-def parsed(raw: bytes) -> Frame:
-    """The only frame in these bytes."""
-    (frame,) = split_payload(raw, SplitCounters())
-    return frame
 
 
 def valid_frames(stream: bytes, *, any_extra: bool = False) -> Iterator[tuple[int, bytes]]:

@@ -7,6 +7,7 @@ import random
 import pytest
 from fastcrc.crc16 import mcrf4xx
 
+from tests.mavlink.parsers.captured_member import restart_in_mavlink1
 from tests.mavlink.policy.smuggling import (
     ATTITUDE,
     COMMAND_LONG,
@@ -16,14 +17,13 @@ from tests.mavlink.policy.smuggling import (
     SET_MODE,
     SETUP_SIGNING,
     hidden_header,
-    parsed,
     source,
     split_over,
     v1,
     v2,
     valid_frames,
 )
-from uavlinkd.lab.evaluation.captured_member import restart_in_mavlink1
+from tests.samples import read
 from uavlinkd.mavlink.dialect_table import MESSAGES
 from uavlinkd.mavlink.frames import Frame
 from uavlinkd.mavlink.headers import Header
@@ -50,7 +50,7 @@ class Client:
 
     def send(self, raw: bytes | Frame, sender: Source) -> bool:
         """Whether a frame was delivered."""
-        frame = raw if isinstance(raw, Frame) else parsed(raw)
+        frame = raw if isinstance(raw, Frame) else read(raw)
         data = self.delivered.admit(frame, sender, 1.0)
         if data:
             assert data.endswith(frame.raw)
@@ -63,7 +63,7 @@ class Client:
         """Whether a valid frame may begin there: it was delivered, or each source of its bytes may send it."""
         whole = raw + bytes(13) if raw[0] == 0xFD and raw[2] else raw
         authors = {source for source in self.authors[at : at + len(raw)] if source is not None}
-        return at in self.passed or all(source.gate.permits(parsed(whole)) for source in authors)
+        return at in self.passed or all(source.gate.permits(read(whole)) for source in authors)
 
 
 def carrying(hidden: bytes, before: int = 0, msgid: int = ATTITUDE, system: int = 1) -> bytes:
@@ -85,18 +85,18 @@ def test_frame_that_contains_a_forbidden_one_is_refused(before: int) -> None:
 def test_hidden_frame_counts_by_every_crc_extra_of_its_number(extra: int | None) -> None:
     """Message 150 has two definitions, and receivers that lack it use 0."""
     client, member = Client(), source()
-    assert not client.send(carrying(v1(150, b"abcd", extra=extra)), member)
+    assert not client.send(carrying(v1(150, b"abcd", crc_extra=extra)), member)
 
 
 def test_hidden_frame_that_no_definition_fits_is_delivered() -> None:
     """A checksum by a CRC_EXTRA of no definition is noise, unless unknown messages pass."""
-    assert Client().send(carrying(v1(150, b"abcd", extra=99)), source())
+    assert Client().send(carrying(v1(150, b"abcd", crc_extra=99)), source())
 
 
 def test_every_crc_extra_counts_where_unknown_messages_pass() -> None:
     """A receiver with a private dialect may be the reason for the list's unknown numbers."""
     member = source(allow_in=[54321])
-    assert not Client().send(carrying(v1(150, b"abcd", 255, extra=99)), member)
+    assert not Client().send(carrying(v1(150, b"abcd", 255, crc_extra=99)), member)
 
 
 @pytest.mark.parametrize(
@@ -170,7 +170,7 @@ def test_refusal_is_reported_with_its_source() -> None:
         reported.append((name, header.msgid, refusal, now))
 
     member = Source("drone1", compile_policy({"role": "swarm-member", "system_ids": [1]}).incoming, report)
-    assert DeliveredStream().admit(parsed(carrying(MODE_V1)), member, 7.0) == b""
+    assert DeliveredStream().admit(read(carrying(MODE_V1)), member, 7.0) == b""
     assert reported == [("drone1", ATTITUDE, Refusal.HIDDEN_FRAME, 7.0)]
 
 
@@ -309,10 +309,10 @@ def test_client_that_returns_continues_its_stream() -> None:
     """Its parser may have kept the first half of a hidden frame. The client that is away longest is forgotten."""
     streams, member = DeliveredStreams(), source()
     opening, closing = split_over()
-    assert streams.of("/dev/ttyACM0").admit(parsed(opening), member, 1.0) == opening
+    assert streams.of("/dev/ttyACM0").admit(read(opening), member, 1.0) == opening
     for number in range(MAX_STREAMS - 1):
         streams.of(f"127.0.0.1:{number}")
-    assert streams.of("/dev/ttyACM0").admit(parsed(closing), member, 2.0) == b""
+    assert streams.of("/dev/ttyACM0").admit(read(closing), member, 2.0) == b""
     first = streams.of("127.0.0.1:0")
     streams.of("[::1]:14550")
     assert streams.of("127.0.0.1:0") is first

@@ -32,10 +32,9 @@ from math import inf
 from typing import Final
 
 from uavlinkd.mavlink.classes import Lane
-from uavlinkd.mavlink.egress.bucket import Bucket, Supply
-from uavlinkd.mavlink.egress.lanes import EgressDrop, Lanes, by_number
-from uavlinkd.mavlink.egress.queue import Waiting
-from uavlinkd.mavlink.frames import MAX_FRAME_BYTES, Frame
+from uavlinkd.mavlink.egress.bucket import Supply
+from uavlinkd.mavlink.egress.lanes import EgressDrop, Lanes, Waiting, by_number
+from uavlinkd.mavlink.frames import Frame
 
 URGENT_SHARING_S: Final = 0.4
 """While the budget is short, an urgent frame waits at most this long for others to share the cost of its envelope."""
@@ -94,28 +93,25 @@ class Egress:
     """The frames that wait for one peer, and the budget they wait for.
 
     :meth:`put` adds frames. :meth:`take` pops those of one envelope, to be sent at once; call it until it returns
-    none. Report every datagram that is sent to the peer by :meth:`spend` before the next take: taking alone costs
+    none. Charge every datagram that is sent to the peer to its buckets before the next take: taking alone costs
     nothing. Call :meth:`take` again at :meth:`next_deadline`, which any call may change.
 
-    ``supply``: what the frames may use, if that is not a bucket of the settings' budget alone. ``totals``: counts
-    dropped frames, for several queues together. ``is_critical``: all its frames are.
+    ``supply``: what the frames may use. ``totals``: counts dropped frames, for several queues together.
+    ``is_critical``: all its frames are.
     """
 
     def __init__(
         self,
         settings: EgressSettings,
         now: float,
-        shape: EnvelopeShape | None = None,
-        supply: Supply | None = None,
-        totals: Counter[EgressDrop] | None = None,
+        shape: EnvelopeShape,
+        supply: Supply,
+        totals: Counter[EgressDrop],
         *,
         is_critical: bool = False,
     ) -> None:
-        shape = shape or EnvelopeShape()
-        if supply is None:
-            supply = Supply(own_bucket(settings, now, shape))
         self.settings = settings
-        self.totals: Counter[EgressDrop] = Counter() if totals is None else totals
+        self.totals = totals
         self.supply = supply
         self._is_critical = is_critical
         self._now = now
@@ -135,8 +131,6 @@ class Egress:
     def shape(self, shape: EnvelopeShape) -> None:
         self._shape = shape
         self._overhead = shape.overhead
-        if self.supply.own is not None:
-            self.supply.own.set_least_burst(shape.overhead + MAX_FRAME_BYTES)
 
     @property
     def queued_frames(self) -> int:
@@ -147,10 +141,6 @@ class Egress:
     def queued_bytes(self) -> int:
         """How many bytes of frames wait."""
         return self._lanes.size
-
-    def demand(self, now: float) -> float:
-        """The bytes sent and dropped over the last seconds, as a share of the budget; 0 without a budget."""
-        return self.supply.demand(now)
 
     def has_room(self, payload_bytes: int, now: float) -> bool:
         """Whether an envelope with this payload may go out now: no frame waits, and the budget covers it."""
@@ -193,11 +183,6 @@ class Egress:
         # The turns decide which frames go. Within the envelope they are in the order of arrival.
         batch.sort(key=by_number)
         return [popped.frame for popped in batch]
-
-    def spend(self, datagram_bytes: int, now: float, datagrams: int = 1) -> None:
-        """Charge datagrams to the peer, of so many bytes together: envelopes, handshakes and all others."""
-        if self.supply.own is not None:
-            self.supply.own.spend(datagram_bytes + datagrams * self._shape.carrier_bytes, now)
 
     def next_deadline(self) -> float:
         """When :meth:`take` is due next; infinity while no frame waits."""
@@ -269,8 +254,94 @@ class Egress:
         self.totals[reason] += 1
 
 
-def own_bucket(settings: EgressSettings, now: float, shape: EnvelopeShape) -> Bucket | None:
-    """The bucket of the peer's own budget; None without one."""
-    if not settings.budget_bits_s:
-        return None
-    return Bucket(settings.budget_bits_s, now, shape.overhead + MAX_FRAME_BYTES)
+class Coalescer:
+    """A coalescing delay alone, for a peer without a budget. It has the interface of an :class:`Egress`.
+
+    An :class:`Egress` without a budget sends the same envelopes, but its lanes and flows cost more: a frame takes 11
+    to 14 µs of CPU time there, and 0.6 to 1.9 µs here (Python 3.11).
+    """
+
+    is_blocked = False
+    """Frames never wait for a budget here."""
+
+    def __init__(self, settings: EgressSettings, shape: EnvelopeShape, totals: Counter[EgressDrop]) -> None:
+        self.settings = settings
+        self.shape = shape
+        self.totals = totals
+        self._waiting: list[Frame] = []
+        self._size = 0
+        self._put_at = 0.0
+        self._due_at = inf
+
+    @property
+    def queued_frames(self) -> int:
+        """How many frames wait."""
+        return len(self._waiting)
+
+    def has_room(self, payload_bytes: int, now: float) -> bool:
+        """Whether an envelope with this payload may go out now: always, without a budget."""
+        return True
+
+    def put(self, frames: Sequence[Frame], now: float) -> None:
+        """Let frames for the peer wait, in their order. ``now`` is when the first of them arrived."""
+        if self._waiting and now - self._put_at > self.settings.max_age_s:
+            self._drop_all(EgressDrop.STALE)  # no take was due in time; the new frames are fresh
+        if not self._waiting:
+            self._put_at = now
+            self._due_at = now + self.settings.coalesce_s
+        self._waiting += frames
+        for frame in frames:
+            self._size += len(frame.raw)
+        if self._size >= self.shape.payload_limit or any(map(_is_urgent, frames)):
+            self._due_at = -inf
+
+    def take(self, now: float) -> list[Frame]:
+        """Pop the frames of the next envelope, in order. Empty if none is due now."""
+        if now < self._due_at:
+            return []
+        if now - self._put_at > self.settings.max_age_s:
+            self._drop_all(EgressDrop.STALE)
+            return []
+        waiting = self._waiting
+        room, count = self.shape.payload_limit, 0
+        for raw, _ in waiting:
+            if len(raw) > room and count:
+                break
+            count += 1
+            room -= len(raw)
+        batch = waiting[:count]
+        del waiting[:count]
+        self._size -= self.shape.payload_limit - room
+        if not self._waiting:
+            self._due_at = inf
+        elif self._size < self.shape.payload_limit and not any(map(_is_urgent, self._waiting)):
+            # They arrived with those that filled the envelope. Their delay begins now.
+            self._put_at = now
+            self._due_at = now + self.settings.coalesce_s
+        return batch
+
+    def next_deadline(self) -> float:
+        """When :meth:`take` is due next; infinity while no frame waits."""
+        return self._due_at
+
+    def clear(self, now: float) -> None:
+        """Drop all frames that wait: the peer is lost."""
+        self._drop_all(EgressDrop.CLOSED)
+
+    def pop_all(self) -> list[tuple[Frame, float]]:
+        """Take out all frames that wait, each with the time since when."""
+        frames, self._waiting = self._waiting, []
+        self._size = 0
+        self._due_at = inf
+        return [(frame, self._put_at) for frame in frames]
+
+    def _drop_all(self, reason: EgressDrop) -> None:
+        if self._waiting:
+            self.totals[reason] += len(self._waiting)
+        self._waiting.clear()
+        self._size = 0
+        self._due_at = inf
+
+
+def _is_urgent(frame: Frame) -> bool:
+    return frame.header.kind.lane is Lane.URGENT

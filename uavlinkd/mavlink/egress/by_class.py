@@ -1,9 +1,7 @@
 """All frames that wait for one peer: together while it has one path, by class while it has several.
 
-With several paths, an envelope has frames of one class, because each class goes along other paths. Critical frames go
-first. Stream and bulk divide the rest of the budget equally, by bytes, while both wait. A class waits for the budget
-of its own paths: a stream frame for the best path's network, a critical frame for the first network with room.
-Sans-IO: ``now`` is monotonic seconds.
+With several paths, an envelope has frames of one class, because each class goes along other paths, and waits for the
+budget of these. Critical frames go first. Stream and bulk divide the rest equally, by bytes, while both wait.
 """
 
 from __future__ import annotations
@@ -18,10 +16,9 @@ from uavlinkd.core.constants import CRITICAL_ENVELOPE_LIMIT
 from uavlinkd.core.settings import Class
 from uavlinkd.mavlink.answers import VALUE_KIND
 from uavlinkd.mavlink.egress.bucket import Bucket, Supply
-from uavlinkd.mavlink.egress.budgeted import Egress, EgressSettings, EnvelopeShape, own_bucket
-from uavlinkd.mavlink.egress.coalescing import Coalescer
+from uavlinkd.mavlink.egress.budgeted import Coalescer, Egress, EgressSettings, EnvelopeShape
 from uavlinkd.mavlink.egress.lanes import EgressDrop
-from uavlinkd.mavlink.frames import Frame
+from uavlinkd.mavlink.frames import MAX_FRAME_BYTES, Frame
 
 ClassOf = Callable[[Frame, float], Class]
 """The class of a frame that is sent at this time. It differs from the table's for PARAM_VALUE only."""
@@ -60,7 +57,9 @@ class PeerEgress:
         """Whether frames wait by class."""
         self._class_of = class_of
         self._shape = EnvelopeShape()
-        self._own = own_bucket(settings, now, self._shape)
+        self._own: Bucket | None = None
+        if settings.budget_bits_s:
+            self._own = Bucket(settings.budget_bits_s, now, self._shape.overhead + MAX_FRAME_BYTES)
         self._supplies = dict.fromkeys(_TURNS, Supply(self._own))
         self._lead = 0  # bytes of the stream sent beyond those of bulk, while both wait
         self._queues: dict[Class, Egress | Coalescer] = {}  # of each class, if it is split
@@ -75,6 +74,8 @@ class PeerEgress:
     @shape.setter
     def shape(self, shape: EnvelopeShape) -> None:
         self._shape = shape
+        if self._own is not None:
+            self._own.set_least_burst(shape.overhead + MAX_FRAME_BYTES)
         for cls, queue in self._all:
             queue.shape = self._shape_of(cls)
 
@@ -120,6 +121,7 @@ class PeerEgress:
                 self._note_turn(cls, batch)
                 return cls, batch
             if queue.is_blocked:
+                self._leave_line(cls)
                 break  # what is sent in its place would use up what it waits for
         return Class.STREAM, []
 
@@ -151,11 +153,17 @@ class PeerEgress:
     def _turns(self) -> tuple[Class, Class, Class]:
         return _BULK_TURNS if self._lead > 0 else _TURNS
 
+    def _leave_line(self, blocked: Class) -> None:
+        """Take the class behind the blocked one out of the line for the networks: each would wait for the other."""
+        if blocked is not Class.CRITICAL:
+            behind = _other(blocked)
+            self._supplies[behind].leave(self._queues[behind])
+
     def _note_turn(self, cls: Class, batch: Sequence[Frame]) -> None:
         if cls is Class.CRITICAL:
             return
         size = sum(len(raw) for raw, _ in batch)
-        other = self._queues[Class.BULK if cls is Class.STREAM else Class.STREAM]
+        other = self._queues[_other(cls)]
         self._lead = (self._lead + (size if cls is Class.STREAM else -size)) if other.queued_frames else 0
 
     def _shape_of(self, cls: Class) -> EnvelopeShape:
@@ -186,6 +194,11 @@ class PeerEgress:
         for frame, put_at in waiting:
             queue = self._together or self._queues[self._class_of(frame, now)]
             queue.put([frame], put_at)
+
+
+def _other(cls: Class) -> Class:
+    """Stream and bulk take turns."""
+    return Class.BULK if cls is Class.STREAM else Class.STREAM
 
 
 def _put_at(waiting: tuple[Frame, float]) -> float:

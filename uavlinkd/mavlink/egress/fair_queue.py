@@ -11,8 +11,8 @@ depends on its *source* first, and on lane and flow within the source after that
 * Within a source the lanes and flows take turns (:mod:`.lanes`).
 * A newer state replaces an older one that has waited for ``SUPERSEDED_S``: counted as THINNED. Up to then both are
   delivered, since one envelope may carry several of a flow and the client may have room for all.
-* A frame that waited longer than ``max_age_s`` is dropped as STALE. Bytes are bounded for each source, and together:
-  the source that holds most loses its own oldest frame, as OVERFLOW.
+* A frame that waited longer than :data:`MAX_AGE_S` is dropped as STALE. Bytes are bounded for each source, and
+  together: the source that holds most loses its own oldest frame, as OVERFLOW.
 
 Within a flow the order is never reversed. Sans-IO: `now` is monotonic seconds.
 """
@@ -24,13 +24,14 @@ from heapq import heappop, heappush, heapreplace
 from typing import Final
 
 from uavlinkd.mavlink.classes import Lane
-from uavlinkd.mavlink.egress.lanes import EgressDrop, Lanes, OnDrop
-from uavlinkd.mavlink.egress.queue import Waiting
+from uavlinkd.mavlink.egress.lanes import EgressDrop, Lanes, OnDrop, Waiting
 from uavlinkd.mavlink.frames import Frame
 from uavlinkd.mavlink.policy.delivery import Source
 
 SUPERSEDED_S: Final = 0.1
 """A state that waited so long is replaced by a newer one of its flow."""
+MAX_AGE_S: Final = 1.0
+"""A frame that waited longer is dropped."""
 LANE_BYTES: Final = 64 * 1024
 """Bounds what waits in each of the three lanes of one source: a second of the fastest telemetry."""
 QUEUE_BYTES: Final = 256 * 1024
@@ -122,12 +123,11 @@ class FairQueue:
     Each frame leaves once: by :meth:`pop`, or reported to ``on_drop``.
     """
 
-    def __init__(self, max_age_s: float, on_drop: Callable[[EgressDrop], None]) -> None:
+    def __init__(self, on_drop: Callable[[EgressDrop], None]) -> None:
         self.count = 0
         """Frames that wait."""
         self.size = 0
         """Their bytes."""
-        self._max_age_s = max_age_s
         self._report = on_drop
         self._sources: dict[Source, _SourceFrames] = {}
         self._sources_limit = MAX_SOURCES
@@ -139,7 +139,7 @@ class FairQueue:
         """Have frames of one source wait, in their order."""
         waiting = self._sources.get(source) or self._add(source)
         lanes = waiting.lanes
-        lanes.drop_stale(now, self._max_age_s)
+        lanes.drop_stale(now, MAX_AGE_S)
         for frame in frames:
             self.count += 1
             self.size += len(frame.raw)
@@ -180,7 +180,7 @@ class FairQueue:
     def drop_stale(self, now: float) -> None:
         """Drop the frames that have waited too long."""
         for source in self._sources.values():
-            source.lanes.drop_stale(now, self._max_age_s)
+            source.lanes.drop_stale(now, MAX_AGE_S)
 
     def clear(self) -> None:
         """Drop all frames that wait: the client is gone."""
@@ -192,9 +192,9 @@ class FairQueue:
         while True:
             turn = self._rest.next() if self._lead >= URGENT_LEAD_BYTES else None
             turn = turn or self._urgent.next() or self._rest.next()
-            if turn is None or now - turn[1].put_at <= self._max_age_s:
+            if turn is None or now - turn[1].put_at <= MAX_AGE_S:
                 return turn
-            turn[0].frames.lanes.drop_stale(now, self._max_age_s)
+            turn[0].frames.lanes.drop_stale(now, MAX_AGE_S)
 
     def _add(self, source: Source) -> _SourceFrames:
         if len(self._sources) >= self._sources_limit:

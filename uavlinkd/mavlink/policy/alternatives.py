@@ -31,135 +31,107 @@ class OpenEffect(NamedTuple):
     open: tuple[str, ...]
 
 
-def _commands(names: str) -> tuple[str, ...]:
-    return tuple(f"MAV_CMD_{name}" for name in names.split())
+def _full_names(names: str) -> tuple[str, ...]:
+    """The names of a text; what is not a message is a command, without MAV_CMD_."""
+    messages = dialect.ids_by_name()
+    return tuple(name if name in messages else f"MAV_CMD_{name}" for name in names.split())
 
 
 # A joystick and an overridden transmitter control the sticks and, by RCx_OPTION or a button's function, every switch.
-_REMOTE_CONTROL: Final = ("RC_CHANNELS_OVERRIDE", "MANUAL_CONTROL")
-_PARAMETERS: Final = ("PARAM_SET", "PARAM_EXT_SET", "PARAM_MAP_RC", *_commands("DO_SET_PARAMETER PREFLIGHT_STORAGE"))
+_REMOTE: Final = "RC_CHANNELS_OVERRIDE MANUAL_CONTROL"
+_PARAMETERS: Final = "PARAM_SET PARAM_EXT_SET PARAM_MAP_RC DO_SET_PARAMETER PREFLIGHT_STORAGE"
 _SETPOINTS: Final = (
-    *("SET_POSITION_TARGET_GLOBAL_INT", "SET_POSITION_TARGET_LOCAL_NED", "SET_ATTITUDE_TARGET"),
-    "SET_ACTUATOR_CONTROL_TARGET",
+    "SET_POSITION_TARGET_GLOBAL_INT SET_POSITION_TARGET_LOCAL_NED SET_ATTITUDE_TARGET SET_ACTUATOR_CONTROL_TARGET"
 )
-_MODES: Final = ("SET_MODE", *_commands("DO_SET_MODE DO_SET_STANDARD_MODE DO_AUX_FUNCTION"))
-_MISSION_ITEMS: Final = ("MISSION_ITEM_INT", "MISSION_ITEM")
-_MISSION_RUN: Final = (
-    "MISSION_SET_CURRENT",
-    *_commands("MISSION_START DO_SET_MISSION_CURRENT DO_JUMP DO_JUMP_TAG DO_LAND_START"),
-)
-_FILES: Final = ("FILE_TRANSFER_PROTOCOL",)  # parameters, missions and scripts are files
-_MOVES: Final = _commands(
+_MODES: Final = "SET_MODE DO_SET_MODE DO_SET_STANDARD_MODE DO_AUX_FUNCTION"
+_ITEMS: Final = "MISSION_ITEM_INT MISSION_ITEM"
+_RUN: Final = "MISSION_SET_CURRENT MISSION_START DO_SET_MISSION_CURRENT DO_JUMP DO_JUMP_TAG DO_LAND_START"
+_FILES: Final = "FILE_TRANSFER_PROTOCOL"  # parameters, missions and scripts are files
+_MOVES: Final = (
     "DO_REPOSITION DO_ORBIT DO_FOLLOW NAV_WAYPOINT NAV_LOITER_UNLIM NAV_LOITER_TIME OVERRIDE_GOTO DO_CHANGE_ALTITUDE"
     " GUIDED_CHANGE_ALTITUDE DO_CHANGE_SPEED GUIDED_CHANGE_SPEED GUIDED_CHANGE_HEADING"
 )
-_LANDINGS: Final = _commands("NAV_LAND NAV_LAND_LOCAL NAV_VTOL_LAND DO_LAND_START DO_RALLY_LAND")
-_TAKEOFFS: Final = _commands("NAV_TAKEOFF NAV_TAKEOFF_LOCAL NAV_VTOL_TAKEOFF")
-_OUTPUTS: Final = _commands(
+_LANDINGS: Final = "NAV_LAND NAV_LAND_LOCAL NAV_VTOL_LAND DO_LAND_START DO_RALLY_LAND"
+_TAKEOFFS: Final = "NAV_TAKEOFF NAV_TAKEOFF_LOCAL NAV_VTOL_TAKEOFF"
+_OUTPUTS: Final = (
     "DO_SET_SERVO DO_REPEAT_SERVO DO_SET_RELAY DO_REPEAT_RELAY DO_SET_ACTUATOR ACTUATOR_TEST DO_MOTOR_TEST"
 )
-_STOPS: Final = _commands("DO_FLIGHTTERMINATION COMPONENT_ARM_DISARM DO_PARACHUTE PREFLIGHT_REBOOT_SHUTDOWN")
+_STOPS: Final = "DO_FLIGHTTERMINATION COMPONENT_ARM_DISARM DO_PARACHUTE PREFLIGHT_REBOOT_SHUTDOWN"
+_RETURN: Final = "NAV_RETURN_TO_LAUNCH"
+_HOME: Final = "DO_SET_HOME DO_SET_GLOBAL_ORIGIN"
+_FLIGHT: Final = f"{_RUN} {_SETPOINTS} {_MOVES}"
 
-EFFECTS: Final = (
-    Effect(
+# The effect; its commands; its alternatives.
+_EFFECTS: Final = (
+    # ArduPilot terminates by the parameter AFS_TERMINATE, disarms in flight by force, and kills by a switch.
+    (
         "ending the flight",
-        _commands("DO_FLIGHTTERMINATION"),
-        # ArduPilot terminates by the parameter AFS_TERMINATE, disarms in flight by force, and kills by a switch.
-        (*_PARAMETERS, *_STOPS, *_commands("DO_AUX_FUNCTION"), *_REMOTE_CONTROL, *_OUTPUTS, *_FILES),
+        "DO_FLIGHTTERMINATION",
+        f"{_PARAMETERS} {_STOPS} DO_AUX_FUNCTION {_REMOTE} {_OUTPUTS} {_FILES}",
     ),
-    Effect(
+    (
         "arming and disarming",
-        _commands("COMPONENT_ARM_DISARM"),
-        (*_REMOTE_CONTROL, *_commands("DO_AUX_FUNCTION MISSION_START"), *_STOPS, *_PARAMETERS, *_FILES),
+        "COMPONENT_ARM_DISARM",
+        f"{_REMOTE} DO_AUX_FUNCTION MISSION_START {_STOPS} {_PARAMETERS} {_FILES}",
     ),
-    Effect(
+    (
         "changing the mode",
-        _commands("DO_SET_MODE DO_SET_STANDARD_MODE"),
-        (
-            *(*_MODES, *_REMOTE_CONTROL, *_PARAMETERS, *_MISSION_RUN, *_LANDINGS, *_TAKEOFFS, *_SETPOINTS, *_MOVES),
-            *_commands(
-                "NAV_RETURN_TO_LAUNCH DO_PAUSE_CONTINUE NAV_GUIDED_ENABLE SOLO_BTN_FLY_CLICK SOLO_BTN_FLY_HOLD"
-            ),
-            *_FILES,
-        ),
+        "DO_SET_MODE DO_SET_STANDARD_MODE",
+        f"{_MODES} {_REMOTE} {_PARAMETERS} {_RUN} {_LANDINGS} {_TAKEOFFS} {_SETPOINTS} {_MOVES} {_RETURN}"
+        f" DO_PAUSE_CONTINUE NAV_GUIDED_ENABLE SOLO_BTN_FLY_CLICK SOLO_BTN_FLY_HOLD {_FILES}",
     ),
-    Effect(
-        "landing",
-        _LANDINGS,
-        (
-            *(*_MODES, *_LANDINGS, *_commands("NAV_RETURN_TO_LAUNCH"), *_REMOTE_CONTROL, *_MISSION_ITEMS),
-            *(*_MISSION_RUN, *_SETPOINTS, *_MOVES, *_PARAMETERS, *_FILES),
-        ),
-    ),
-    Effect(
+    ("landing", _LANDINGS, f"{_MODES} {_LANDINGS} {_RETURN} {_REMOTE} {_ITEMS} {_FLIGHT} {_PARAMETERS} {_FILES}"),
+    (
         "returning home",
-        _commands("NAV_RETURN_TO_LAUNCH"),
-        (
-            *(*_MODES, *_commands("NAV_RETURN_TO_LAUNCH DO_RALLY_LAND"), *_REMOTE_CONTROL, *_MISSION_ITEMS),
-            *(*_MISSION_RUN, *_SETPOINTS, *_MOVES, *_PARAMETERS, *_FILES),
-        ),
+        _RETURN,
+        f"{_MODES} {_RETURN} DO_RALLY_LAND {_REMOTE} {_ITEMS} {_FLIGHT} {_PARAMETERS} {_FILES}",
     ),
-    Effect(
-        "taking off",
-        _TAKEOFFS,
-        (*_TAKEOFFS, *_MODES, *_REMOTE_CONTROL, *_MISSION_ITEMS, *_MISSION_RUN, *_SETPOINTS, *_MOVES, *_FILES),
-    ),
-    Effect(
+    ("taking off", _TAKEOFFS, f"{_TAKEOFFS} {_MODES} {_REMOTE} {_ITEMS} {_FLIGHT} {_FILES}"),
+    (
         "flying elsewhere",
-        (*_MOVES, *_commands("DO_FIGURE_EIGHT DO_PAUSE_CONTINUE")),
-        (
-            *(*_MOVES, *_commands("DO_FIGURE_EIGHT NAV_RETURN_TO_LAUNCH"), *_SETPOINTS, *_REMOTE_CONTROL),
-            *(*_MISSION_ITEMS, *_MISSION_RUN, *_MODES, "FOLLOW_TARGET", *_PARAMETERS, *_FILES),
-        ),
+        f"{_MOVES} DO_FIGURE_EIGHT DO_PAUSE_CONTINUE",
+        f"{_MOVES} DO_FIGURE_EIGHT {_RETURN} {_SETPOINTS} {_REMOTE} {_ITEMS} {_RUN} {_MODES} FOLLOW_TARGET"
+        f" {_PARAMETERS} {_FILES}",
     ),
-    Effect(
+    (
         "running a mission",
-        _commands("MISSION_START DO_SET_MISSION_CURRENT DO_JUMP DO_JUMP_TAG"),
-        (*_MISSION_RUN, *_MODES, *_REMOTE_CONTROL, *_MISSION_ITEMS, *_PARAMETERS, *_FILES),
+        "MISSION_START DO_SET_MISSION_CURRENT DO_JUMP DO_JUMP_TAG",
+        f"{_RUN} {_MODES} {_REMOTE} {_ITEMS} {_PARAMETERS} {_FILES}",
     ),
-    Effect(
+    (
         "setting parameters",
-        _commands("DO_SET_PARAMETER PREFLIGHT_STORAGE"),
-        (*_PARAMETERS, "OSD_PARAM_CONFIG", "SET_MAG_OFFSETS", *_FILES),
+        "DO_SET_PARAMETER PREFLIGHT_STORAGE",
+        f"{_PARAMETERS} OSD_PARAM_CONFIG SET_MAG_OFFSETS {_FILES}",
     ),
-    Effect(
+    (
         "moving home or the origin",
-        _commands("DO_SET_HOME DO_SET_GLOBAL_ORIGIN"),
-        (
-            *_commands("DO_SET_HOME DO_SET_GLOBAL_ORIGIN"),
-            *("SET_HOME_POSITION", "SET_GPS_GLOBAL_ORIGIN", *_MISSION_ITEMS, *_FILES),
-        ),
+        _HOME,
+        f"{_HOME} SET_HOME_POSITION SET_GPS_GLOBAL_ORIGIN {_ITEMS} {_FILES}",
     ),
-    Effect(
+    (
         "opening the fence",
-        _commands("DO_FENCE_ENABLE"),
-        (
-            *(*_PARAMETERS, *_commands("DO_AUX_FUNCTION"), *_REMOTE_CONTROL),
-            *(
-                "MISSION_CLEAR_ALL",
-                "MISSION_COUNT",
-                *_MISSION_ITEMS,
-                "FENCE_POINT",
-                "SAFETY_SET_ALLOWED_AREA",
-                *_FILES,
-            ),
-        ),
+        "DO_FENCE_ENABLE",
+        f"{_PARAMETERS} DO_AUX_FUNCTION {_REMOTE} MISSION_CLEAR_ALL MISSION_COUNT {_ITEMS} FENCE_POINT"
+        f" SAFETY_SET_ALLOWED_AREA {_FILES}",
     ),
-    Effect(
+    (
         "releasing the parachute",
-        _commands("DO_PARACHUTE"),
-        (*_commands("DO_AUX_FUNCTION DO_FLIGHTTERMINATION"), *_REMOTE_CONTROL, *_OUTPUTS, *_PARAMETERS, *_FILES),
+        "DO_PARACHUTE",
+        f"DO_AUX_FUNCTION DO_FLIGHTTERMINATION {_REMOTE} {_OUTPUTS} {_PARAMETERS} {_FILES}",
     ),
-    Effect(
+    (
         "restarting the autopilot",
-        _commands("PREFLIGHT_REBOOT_SHUTDOWN"),
-        (*_commands("PREFLIGHT_REBOOT_SHUTDOWN"), "SERIAL_CONTROL", *_FILES),
+        "PREFLIGHT_REBOOT_SHUTDOWN",
+        f"PREFLIGHT_REBOOT_SHUTDOWN SERIAL_CONTROL {_FILES}",
     ),
-    Effect(
+    (
         "driving servos, relays and motors",
         _OUTPUTS,
-        (*_OUTPUTS, *_REMOTE_CONTROL, "SET_ACTUATOR_CONTROL_TARGET", *_PARAMETERS, *_FILES),
+        f"{_OUTPUTS} {_REMOTE} SET_ACTUATOR_CONTROL_TARGET {_PARAMETERS} {_FILES}",
     ),
+)
+EFFECTS: Final = tuple(
+    Effect(name, _full_names(commands), _full_names(others)) for name, commands, others in _EFFECTS
 )
 
 

@@ -15,11 +15,8 @@
     ground_station = true                whether its HEARTBEAT may claim to be a ground station's
 
 A peer's policy fails closed: it needs `system_ids`, and a role or both `allow_in` and `allow_out` ([] passes
-nothing). All keys are optional for a local endpoint, whose wire is trusted: without a role and a list everything
-passes.
-
-Denial is best effort. Most functions of an autopilot have several commands (`alternatives` lists the known ones), and
-its next release may add one. To block an effect, allow only the messages that are needed.
+nothing). All keys are optional for a local endpoint, whose wire is trusted. The reasons are in
+`uavlinkd/config/README.md`.
 
 The entries of a list add to those of the role. A denied entry is denied even if another entry allows it. An entry is
 
@@ -28,26 +25,18 @@ The entries of a list add to those of the role. A denied entry is denied even if
 ``files-read``           a group that allows only the reading requests of FILE_TRANSFER_PROTOCOL (READING_OPCODES)
 ``30``                   a message by its number, for messages that the dialect does not know
 ``MAV_CMD_NAV_TAKEOFF``  a command by its name; ``command:22`` by its number. An allowed command passes in
-                         COMMAND_LONG and COMMAND_INT. An allowed MAV_CMD_REQUEST_MESSAGE passes only for a message
-                         that may pass in the other direction. A denied command is refused in all messages that carry
-                         commands, including mission items and cancellations. So are messages and commands with the
-                         same effect: SET_MODE is MAV_CMD_DO_SET_MODE, a mission item to fly to now is
-                         MAV_CMD_DO_REPOSITION, and MAV_CMD_DO_AUX_FUNCTION can arm (`settings.DONE_BY`).
+                         COMMAND_LONG and COMMAND_INT; MAV_CMD_REQUEST_MESSAGE only for a message that may pass in the
+                         other direction. A denied command is refused in all messages that carry commands, and with it
+                         messages and commands with the same effect (`gate.SAME_AS_COMMAND`, `settings.DONE_BY`).
 
-Each component has a rate of its own. An autopilot and its gimbal both send HEARTBEAT: with a common rate, the first
-sender of each second would silence the other for minutes. An incoming frame may name any component, so all components
-of a system together have SYSTEM_SHARE times the rate: invented components do not raise it further. Requests for the
-list of all parameters have one rate for all of them. Outgoing frames have passed another gate already, so there each
-flow to each client has the rate, as in the egress (`uavlinkd.mavlink.flows`).
-The rate of a group of repeated reports, such as `telemetry`, does not apply to its messages that are sent once or in
-parts: a missing line of text is never repeated. A rate for such a message by name applies.
+Each component has a rate of its own: with a common rate, an autopilot and its gimbal would silence each other. An
+incoming frame may name any component, so all components of a system together have SYSTEM_SHARE times the rate.
+Outgoing frames have passed another gate already, so there each flow to each client has the rate. The rate of a group
+of repeated reports does not apply to its messages that are sent once: a missing line of text is never repeated.
 
-A policy cannot inspect the content of files, shells, tunnels and raw buses: it passes or refuses these messages as a
-whole. A policy that denies a command and passes one of them causes a warning, because the message may contain the
-command. A message that the dialect does not know, or that has another definition than the dialect's, passes only if
-``all`` or its number is allowed.
-
-SETUP_SIGNING carries a signing key in clear. No policy passes it.
+A policy cannot inspect the content of files, shells, tunnels and raw buses. A message that the dialect does not know,
+or has in another definition, passes only if ``all`` or its number is allowed. No policy passes SETUP_SIGNING, which
+carries a signing key in clear.
 """
 
 from __future__ import annotations

@@ -4,9 +4,8 @@ The invariant: *in the byte stream delivered to a client, no byte offset other t
 passed begins a valid MAVLink frame that policy would not pass from the same source.* What is valid is in
 :mod:`.hidden`. The stream counts, not the datagram: a parser keeps its state from one datagram to the next.
 
-Without it a captured peer gets past its role. It puts a forbidden frame into the payload of an allowed one. A parser
-that reads bytes differently than this daemon (another dialect, MAVLink 1 only, a byte lost) then accepts the
-forbidden frame. Every filter that reads frames with one dialect and feeds a parser with another has this hole.
+Without it a captured peer puts a forbidden frame into the payload of an allowed one. A parser that reads bytes
+differently than this daemon (another dialect, MAVLink 1 only, a byte lost) then accepts the forbidden frame.
 
 A frame is refused (:attr:`Refusal.HIDDEN_FRAME`) where it
 
@@ -46,17 +45,8 @@ MAX_STREAMS: Final = 64
 Report = Callable[[str, Header, Refusal, float], None]
 """Receives each refusal: the source's name, the header of the frame that was not delivered, why, and when."""
 
-
 Forget = Callable[[bytes], None]
 """Receives the bytes of a frame that was not delivered: the same frame from another source is not its duplicate."""
-
-
-def _forget_nothing(raw: bytes) -> None:
-    """For a source whose frames no other source sends."""
-
-
-def _report_nothing(name: str, header: Header, refusal: Refusal, now: float) -> None:
-    """The source's gate has counted it."""
 
 
 @final
@@ -65,9 +55,7 @@ class Source:
 
     __slots__ = ("_forget", "_report", "gate", "name")
 
-    def __init__(
-        self, name: str, gate: Gate, report: Report = _report_nothing, forget: Forget = _forget_nothing
-    ) -> None:
+    def __init__(self, name: str, gate: Gate, report: Report | None = None, forget: Forget | None = None) -> None:
         self.name = name
         """The peer or endpoint, as the configuration names it."""
         self.gate = gate
@@ -81,8 +69,10 @@ class Source:
     def refuse(self, frame: Frame, now: float) -> None:
         """Count and report a frame that carries hidden ones."""
         self.gate.count(frame.header, Refusal.HIDDEN_FRAME)
-        self._forget(frame.raw)
-        self._report(self.name, frame.header, Refusal.HIDDEN_FRAME, now)
+        if self._forget is not None:
+            self._forget(frame.raw)
+        if self._report is not None:
+            self._report(self.name, frame.header, Refusal.HIDDEN_FRAME, now)
 
 
 class DeliveredStream:

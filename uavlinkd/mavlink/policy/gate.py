@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from uavlinkd.core.drops import Reason
+from uavlinkd.core.drops import Attention, Reason
 from uavlinkd.mavlink import dialect
 from uavlinkd.mavlink.dialect_table import COMMANDS, MESSAGES
 from uavlinkd.mavlink.flows import FlowKey, flow_key
@@ -24,18 +24,17 @@ MAX_DECISIONS: Final = 1024  # message ids whose decision is remembered
 BURST_S: Final = 0.5  # how much of a second's frames may come at once
 SYSTEM_SHARE: Final = 16  # what all components of a system may send of a message, in rates of one
 
+_IDS: Final = dialect.ids_by_name()
 HEARTBEAT: Final = 0
 TYPE_IN_HEARTBEAT: Final = 4  # offset in its payload
 MAV_TYPE_GCS: Final = 6
 
 NAMED_COMMANDS: Final = frozenset(COMMANDS.values())
 COMMAND_CARRIERS: Final = frozenset(msgid for msgid, row in MESSAGES.items() if row[6] is not None)
-DIRECT_COMMANDS: Final = frozenset(dialect.ids_by_name()[name] for name in ("COMMAND_LONG", "COMMAND_INT"))
+DIRECT_COMMANDS: Final = frozenset((_IDS["COMMAND_LONG"], _IDS["COMMAND_INT"]))
 
 # An autopilot answers these with hundreds of frames: components of a system share one rate.
-REQUESTS_OF_LISTS: Final = frozenset(
-    dialect.ids_by_name()[name] for name in ("PARAM_REQUEST_LIST", "PARAM_EXT_REQUEST_LIST")
-)
+REQUESTS_OF_LISTS: Final = frozenset((_IDS["PARAM_REQUEST_LIST"], _IDS["PARAM_EXT_REQUEST_LIST"]))
 
 # A request for one message, by its number in the first parameter, a float at the payload's start. Some autopilots do
 # more than answer: PX4 adds parameters to its list if it is asked for UAVIONIX_ADSB_OUT_CFG.
@@ -43,7 +42,7 @@ REQUEST_MESSAGE: Final = COMMANDS["MAV_CMD_REQUEST_MESSAGE"]
 
 # Messages that do what a command does.
 SAME_AS_COMMAND: Final[Mapping[int, int]] = {
-    dialect.ids_by_name()[message]: number
+    _IDS[message]: COMMANDS[f"MAV_CMD_{command}"]
     for message, command in (
         ("SET_MODE", "DO_SET_MODE"),
         ("MISSION_SET_CURRENT", "DO_SET_MISSION_CURRENT"),
@@ -63,11 +62,10 @@ SAME_AS_COMMAND: Final[Mapping[int, int]] = {
         ("SET_MAG_OFFSETS", "PREFLIGHT_SET_SENSOR_OFFSETS"),
         ("UAVIONIX_ADSB_OUT_CONTROL", "DO_ADSB_OUT_IDENT"),
     )
-    if (number := dialect.command_number(command)) is not None
 }
 
 # ArduPilot executes such a mission item at once, by the value of `current` and not by its command.
-MISSION_ITEMS: Final = frozenset(dialect.ids_by_name()[name] for name in ("MISSION_ITEM", "MISSION_ITEM_INT"))
+MISSION_ITEMS: Final = frozenset((_IDS["MISSION_ITEM"], _IDS["MISSION_ITEM_INT"]))
 CURRENT_IN_MISSION_ITEM: Final = 35  # offset in the payload of both
 DONE_AT_ONCE: Final[Mapping[int, int]] = {
     2: COMMANDS["MAV_CMD_DO_REPOSITION"],
@@ -78,33 +76,55 @@ DONE_AT_ONCE: Final[Mapping[int, int]] = {
 OPCODE_IN_FILE_TRANSFER: Final = 6
 
 # Carries five command numbers at once, which are not looked at: refused where any command is denied.
-CARRIES_MANY_COMMANDS: Final = frozenset({dialect.ids_by_name()["TRAJECTORY_REPRESENTATION_WAYPOINTS"]})
+CARRIES_MANY_COMMANDS: Final = frozenset({_IDS["TRAJECTORY_REPRESENTATION_WAYPOINTS"]})
 
 
 class Refusal(Reason):
     """Why a policy refuses a frame. How a frame can hide another one: see `delivery`."""
 
-    FOREIGN_SYSTEM = "foreign_system", "the system id of the frame is not in system_ids"
-    MESSAGE_NOT_ALLOWED = "message_not_allowed", "the role, or the lists, do not allow the message"
+    FOREIGN_SYSTEM = (
+        "foreign_system",
+        "the system id of the frame is not in system_ids",
+        "from a system not in system_ids",
+        Attention.SECURITY,
+    )
+    MESSAGE_NOT_ALLOWED = (
+        "message_not_allowed",
+        "the role, or the lists, do not allow the message",
+        "not allowed by role or lists",
+    )
     UNKNOWN_MESSAGE = (
         "unknown_message",
         "the dialect does not define the message, or not with this length: a list may allow its number",
+        "unknown to the dialect",
     )
-    COMMAND_NOT_ALLOWED = "command_not_allowed", "the role, or the lists, do not allow the command"
+    COMMAND_NOT_ALLOWED = (
+        "command_not_allowed",
+        "the role, or the lists, do not allow the command",
+        "commands not allowed by role or lists",
+    )
     FILE_WRITE_NOT_ALLOWED = (
         "file_write_not_allowed",
         "the file transfer writes, where the policy allows only reading",
+        "file writes",
     )
-    SETUP_SIGNING = "setup_signing", "the message contains a MAVLink signing key in clear, which never crosses a link"
-    MAVLINK1_NOT_ALLOWED = "mavlink1_not_allowed", "the policy does not allow MAVLink 1"
+    SETUP_SIGNING = (
+        "setup_signing",
+        "the message contains a MAVLink signing key in clear, which never crosses a link",
+        "with a signing key (SETUP_SIGNING)",
+    )
+    MAVLINK1_NOT_ALLOWED = ("mavlink1_not_allowed", "the policy does not allow MAVLink 1", "MAVLink 1 frames")
     GROUND_STATION_NOT_ALLOWED = (
         "ground_station_not_allowed",
         "the heartbeat is that of a ground station, which the role does not allow",
+        "heartbeats of a ground station",
     )
-    RATE_LIMITED = "rate_limited", "the messages exceed rate_in or rate_out"
+    RATE_LIMITED = ("rate_limited", "the messages exceed rate_in or rate_out", "above the rate limit")
     HIDDEN_FRAME = (
         "hidden_frame",
         "the frame hides another frame that the policy refuses: an attack, or a file with such frames",
+        "that hide a forbidden frame",
+        Attention.SECURITY,
     )
 
 
@@ -132,24 +152,6 @@ class Condition:
 class Gate:
     """One direction of one policy."""
 
-    __slots__ = (
-        "_buckets",
-        "_decisions",
-        "_ground_station",
-        "_is_incoming",
-        "_mavlink1",
-        "_of_systems",
-        "_passes_unknown",
-        "_rates",
-        "_rules",
-        "_systems",
-        "opposite",
-        "refused",
-        "refused_commands",
-        "refused_systems",
-        "totals",
-    )
-
     def __init__(
         self,
         rules: Rules,
@@ -164,14 +166,9 @@ class Gate:
         self.opposite: Gate | None = None  # the gate of the other direction, in which requested messages go
         self._rates = rates
         self._is_incoming = is_incoming
-        self._systems = systems
+        self.systems = systems  # whose frames are let pass; None: any
         self._mavlink1 = mavlink1
         self._ground_station = ground_station
-        rules_pass_unknown = (rules.allows_all or bool(rules.allowed_numbers)) and not rules.denies_all
-        passes_everything = (
-            rules.allows_all and not rules.denied and not rules.denied_commands and mavlink1 and ground_station
-        )
-        self._passes_unknown = rules_pass_unknown and not (passes_everything and systems is None)
         self._decisions: dict[int, Refusal | Condition | None] = {}
         self._buckets: _Buckets = {}
         self._of_systems: _Buckets = {}
@@ -220,7 +217,11 @@ class Gate:
 
         Then a frame is valid by any CRC_EXTRA. If every frame may pass, the difference does not matter.
         """
-        return self._passes_unknown
+        rules = self._rules
+        has_limits = rules.denied or rules.denied_commands or not (self._mavlink1 and self._ground_station)
+        passes_everything = rules.allows_all and not has_limits and self.systems is None
+        passes = rules.allows_all or bool(rules.allowed_numbers)
+        return passes and not rules.denies_all and not passes_everything
 
     @property
     def passes_nothing(self) -> bool:
@@ -229,14 +230,9 @@ class Gate:
         allows = (rules.allows_all, rules.allowed, rules.allowed_numbers, rules.allowed_commands, rules.reads_files)
         return rules.denies_all or not any(allows)
 
-    @property
-    def systems(self) -> frozenset[int] | None:
-        """The systems whose frames are let pass; None: any."""
-        return self._systems
-
     def may_speak_as(self, system: int) -> bool:
         """Whether frames of this system are let pass at all."""
-        return self._systems is None or system in self._systems
+        return self.systems is None or system in self.systems
 
     def always_passes(self, header: Header) -> bool:
         """Whether every frame with this header passes, at any rate: `check` need not be asked."""
@@ -249,10 +245,12 @@ class Gate:
             return Refusal.MAVLINK1_NOT_ALLOWED
         # A message in another definition than the dialect's is another message under the same number.
         key = header.msgid if header.is_known else ~header.msgid
-        try:
-            return self._decisions[key]
-        except KeyError:
-            return self._remember(key, self.decide(header.msgid, is_known=header.is_known))
+        decisions = self._decisions
+        if key not in decisions:
+            if len(decisions) >= MAX_DECISIONS:
+                decisions.clear()  # only a sender of random message ids causes this
+            decisions[key] = self.decide(header.msgid, is_known=header.is_known)
+        return decisions[key]
 
     def decide(self, msgid: int, *, is_known: bool) -> Refusal | Condition | None:
         """What holds for every frame of a message: it passes, is refused, or has conditions to meet."""
@@ -295,7 +293,7 @@ class Gate:
     def lets_act(self, name: str) -> bool:
         """Whether a frame of this message passes that changes something; with MAV_CMD_ in front, of this command."""
         if not name.startswith("MAV_CMD_"):
-            verdict = self.decide(dialect.ids_by_name()[name], is_known=True)
+            verdict = self.decide(_IDS[name], is_known=True)
             return verdict is None or (isinstance(verdict, Condition) and not verdict.only_reads_files)
         verdicts = (self.decide(msgid, is_known=True) for msgid in DIRECT_COMMANDS)
         return any(
@@ -303,20 +301,10 @@ class Gate:
             for verdict in verdicts
         )
 
-    def _remember(self, key: int, verdict: Refusal | Condition | None) -> Refusal | Condition | None:
-        if len(self._decisions) >= MAX_DECISIONS:
-            self._decisions.clear()  # only a sender of random message ids causes this
-        self._decisions[key] = verdict
-        return verdict
-
     def _unmet(self, condition: Condition, frame: Frame, now: float, to: int) -> Refusal | None:
         breach = self._breach(condition, frame)
         # The rate comes last, so that only frames which would pass use it up.
-        if (
-            breach is not None
-            or condition.per_second is None
-            or self._takes_token(frame, condition.per_second, now, to)
-        ):
+        if breach or condition.per_second is None or self._takes_token(frame, condition.per_second, now, to):
             return breach
         return Refusal.RATE_LIMITED
 

@@ -8,19 +8,8 @@ from typing import Final
 from uavlinkd.core.refusals import Refused
 from uavlinkd.mavlink.policy.gate import ANY_OTHER, Gate, Refusal
 
-CODES: Final[Mapping[Refusal, int]] = {
-    Refusal.FOREIGN_SYSTEM: 1,
-    Refusal.MESSAGE_NOT_ALLOWED: 2,
-    Refusal.UNKNOWN_MESSAGE: 3,
-    Refusal.COMMAND_NOT_ALLOWED: 4,
-    Refusal.FILE_WRITE_NOT_ALLOWED: 5,
-    Refusal.SETUP_SIGNING: 6,
-    Refusal.MAVLINK1_NOT_ALLOWED: 7,
-    Refusal.GROUND_STATION_NOT_ALLOWED: 8,
-    Refusal.RATE_LIMITED: 9,
-    Refusal.HIDDEN_FRAME: 10,
-}
-"""Part of the protocol: a code never changes its meaning."""
+CODES: Final[Mapping[Refusal, int]] = {refusal: code for code, refusal in enumerate(Refusal, 1)}
+"""Part of the protocol: a code never changes its meaning. New reasons follow the others."""
 REFUSALS: Final[Mapping[int, Refusal]] = {code: refusal for refusal, code in CODES.items()}
 
 

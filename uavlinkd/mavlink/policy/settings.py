@@ -25,41 +25,29 @@ KEYS: Final = (
 
 # Commands with the same effect as another: a policy that denies a command denies these too. DO_AUX_FUNCTION has the
 # effect of a switch of the remote control (ArduPilot's RCx_OPTION): modes, arming, a stop.
-_DONE_BY: Final[Mapping[str, tuple[str, ...]]] = {
-    "COMPONENT_ARM_DISARM": ("DO_AUX_FUNCTION",),
-    "DO_FLIGHTTERMINATION": ("DO_AUX_FUNCTION",),
-    "DO_PARACHUTE": ("DO_AUX_FUNCTION",),
-    "DO_FENCE_ENABLE": ("DO_AUX_FUNCTION",),
-    "DO_SET_MODE": ("DO_AUX_FUNCTION", "DO_SET_STANDARD_MODE"),
-    "DO_SET_STANDARD_MODE": ("DO_AUX_FUNCTION", "DO_SET_MODE"),
-    "NAV_RETURN_TO_LAUNCH": ("DO_AUX_FUNCTION",),
-    "NAV_LAND": ("DO_AUX_FUNCTION",),
-    "DO_CHANGE_ALTITUDE": ("GUIDED_CHANGE_ALTITUDE",),
-    "GUIDED_CHANGE_ALTITUDE": ("DO_CHANGE_ALTITUDE",),
-}
 DONE_BY: Final[Mapping[int, frozenset[int]]] = {
-    COMMANDS[f"MAV_CMD_{name}"]: frozenset(COMMANDS[f"MAV_CMD_{other}"] for other in others)
-    for name, others in _DONE_BY.items()
+    COMMANDS[f"MAV_CMD_{name}"]: frozenset(COMMANDS[f"MAV_CMD_{other}"] for other in others.split())
+    for name, others in (
+        ("COMPONENT_ARM_DISARM", "DO_AUX_FUNCTION"),
+        ("DO_FLIGHTTERMINATION", "DO_AUX_FUNCTION"),
+        ("DO_PARACHUTE", "DO_AUX_FUNCTION"),
+        ("DO_FENCE_ENABLE", "DO_AUX_FUNCTION"),
+        ("NAV_LAND", "DO_AUX_FUNCTION"),
+        ("NAV_RETURN_TO_LAUNCH", "DO_AUX_FUNCTION"),
+        ("DO_SET_MODE", "DO_AUX_FUNCTION DO_SET_STANDARD_MODE"),
+        ("DO_SET_STANDARD_MODE", "DO_AUX_FUNCTION DO_SET_MODE"),
+        ("DO_CHANGE_ALTITUDE", "GUIDED_CHANGE_ALTITUDE"),
+        ("GUIDED_CHANGE_ALTITUDE", "DO_CHANGE_ALTITUDE"),
+    )
 }
-
 
 FILES_READ: Final = "files-read"
 FILE_TRANSFER: Final = dialect.ids_by_name()["FILE_TRANSFER_PROTOCOL"]
 # MAVLink's MAV_FTP_OPCODE (https://mavlink.io/en/services/ftp.html). The others create, write, truncate, rename or
 # remove; a number outside the definition may have any effect.
-READING_OPCODES: Final = frozenset(
-    {
-        1,  # TerminateSession
-        2,  # ResetSessions
-        3,  # ListDirectory
-        4,  # OpenFileRO
-        5,  # ReadFile
-        14,  # CalcFileCRC32
-        15,  # BurstReadFile
-        128,  # ACK, of either kind of request
-        129,  # NAK
-    }
-)
+# In this order: TerminateSession, ResetSessions, ListDirectory, OpenFileRO, ReadFile, CalcFileCRC32, BurstReadFile;
+# ACK and NAK, of either kind of request.
+READING_OPCODES: Final = frozenset((1, 2, 3, 4, 5, 14, 15, 128, 129))
 
 
 class PolicyProblem(NamedTuple):

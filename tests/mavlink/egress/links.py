@@ -1,86 +1,78 @@
-"""Frames that wait, and a link with a budget on virtual time."""
+"""A link with a budget on virtual time."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from uavlinkd.mavlink.dialect import ids_by_name, name_of
-from uavlinkd.mavlink.egress.budgeted import Egress, EgressSettings, EnvelopeShape
+from tests.samples import attitude, battery, command, frame, heartbeat, parameter, raws, read
+from uavlinkd.core.settings import Class
+from uavlinkd.mavlink.answers import ParameterAnswers
+from uavlinkd.mavlink.dialect import name_of
+from uavlinkd.mavlink.egress.bucket import Bucket
+from uavlinkd.mavlink.egress.budgeted import EgressSettings, EnvelopeShape
+from uavlinkd.mavlink.egress.by_class import PeerEgress
 from uavlinkd.mavlink.flows import FlowKey, flow_key
-from uavlinkd.mavlink.frames import Frame, SplitCounters, split_datagram
+from uavlinkd.mavlink.frames import Frame
 
 SHAPE = EnvelopeShape(payload_limit=1200, seal_bytes=23, carrier_bytes=28)
-
-
 SLOW = EgressSettings(budget_bits_s=4000)
-
-
-ID = ids_by_name()
-
-
-def frame(message: Any, system: int = 1, component: int = 1) -> Frame:
-    """The message as this daemon would read it from a local client."""
-    sender = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
-    (made,) = split_datagram(message.pack(sender), SplitCounters())
-    return made
-
-
-def raws(frames: Iterable[Frame]) -> list[bytes]:
-    """The bytes of frames."""
-    return [raw for raw, _ in frames]
-
-
-def attitude(number: int, system: int = 1) -> Frame:
-    return frame(mavlink.MAVLink_attitude_message(number, 1.5, 0.5, 0.25, 0.1, 0.1, 0.1), system)
-
-
-def heartbeat(number: int, system: int = 1, component: int = 1) -> Frame:
-    return frame(mavlink.MAVLink_heartbeat_message(2, 3, 81, number, 4, 3), system, component)
-
-
-def command(number: int, system: int = 255) -> Frame:
-    return frame(mavlink.MAVLink_command_long_message(1, 1, 400, 0, number, 1, 1, 1, 1, 1, 1), system)
-
-
-def parameter(number: int) -> Frame:
-    return frame(mavlink.MAVLink_param_value_message(b"SERVO_FUNCTION", float(number), 9, 999, number))
-
-
-def battery(number: int, which: int) -> Frame:
-    return frame(mavlink.MAVLink_battery_status_message(which, 1, 1, 2500, [4000] * 10, 120, number, 9, 77))
+CLASS_OF = ParameterAnswers().class_of
 
 
 class Link:
-    """One egress, and the wire behind it: each envelope is sent and accounted for at once. Time is virtual."""
+    """One egress, and the wire behind it: each envelope is sent and accounted for at once."""
 
-    def __init__(self, options: EgressSettings, shape: EnvelopeShape = SHAPE) -> None:
-        self.egress = Egress(options, 0.0, shape)
+    def __init__(
+        self, settings: EgressSettings, shape: EnvelopeShape = SHAPE, *networks: Bucket | None, is_split: bool = False
+    ) -> None:
+        """``networks``: the best path's first; ``is_split``: the peer has several paths."""
+        self.egress = PeerEgress(settings, 0.0, CLASS_OF)
+        self.egress.shape = shape
         self.shape = shape
+        self.is_split = is_split
+        self.networks = networks
+        if networks:
+            first = networks[:1]
+            along = {Class.CRITICAL: networks, Class.STREAM: first, Class.BULK: first}
+            self.egress.set_networks(along, 0.0)
+        self.classes: list[Class] = []
+        """Of the envelopes."""
         self.sent: list[tuple[float, bytes]] = []
         self.envelopes: list[tuple[float, list[bytes]]] = []
         self.wire: list[tuple[float, int]] = []
         self.offered: dict[bytes, float] = {}
 
     def put(self, *frames: Frame, now: float) -> None:
+        """Offer frames, and send what is due."""
         for raw in raws(frames):
             assert raw not in self.offered, "frames of a test differ in their bytes"
             self.offered[raw] = now
-        self.egress.put(frames, now)
+        self.egress.put(frames, now, is_split=self.is_split)
         self.flush(now)
 
     def flush(self, now: float) -> None:
-        while batch := self.egress.take(now):
+        cls, batch = self.egress.take(now)
+        while batch:
             sent = raws(batch)
+            self.classes.append(cls)
             self.envelopes.append((now, sent))
             self.sent += [(now, raw) for raw in sent]
-            self.transmit(self.shape.seal_bytes + sum(map(len, sent)), now)
+            along = self.networks if cls is Class.CRITICAL else self.networks[:1]
+            self.transmit(self.shape.seal_bytes + sum(map(len, sent)), now, along)
+            cls, batch = self.egress.take(now)
 
-    def transmit(self, datagram_bytes: int, now: float) -> None:
+    def transmit(self, datagram_bytes: int, now: float, along: Sequence[Bucket | None] = ()) -> None:
         self.egress.spend(datagram_bytes, now)
         self.wire.append((now, datagram_bytes + self.shape.carrier_bytes))
+        for network in along:
+            if network is not None:
+                network.spend(datagram_bytes + self.shape.carrier_bytes, now)
+
+    def fill(self, now: float) -> None:
+        """Empty the bucket, so that what comes has to wait."""
+        self.transmit(331 - 28, now)
 
     def run(self, until: float) -> None:
         """Let time pass: the egress is called at its deadlines and never else."""
@@ -100,8 +92,7 @@ def id_of(raw: bytes) -> int:
 
 
 def flow_of(raw: bytes) -> FlowKey:
-    (made,) = split_datagram(raw, SplitCounters())
-    return flow_key(made)
+    return flow_key(read(raw))
 
 
 def play(link: Link, offers: Iterable[tuple[float, Frame | Callable[[], None]]], until: float) -> None:

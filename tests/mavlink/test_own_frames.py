@@ -1,29 +1,22 @@
-"""RADIO_STATUS: what pymavlink reads, and what it makes the autopilots do."""
+"""The daemon's own frames: what pymavlink reads of RADIO_STATUS and STATUSTEXT, and what autopilots do by them."""
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 from typing import Any
 
 import pytest
-
-os.environ.setdefault("MAVLINK20", "1")
 from pymavlink.dialects.v20 import all as mavlink
 
-from uavlinkd.mavlink.frames import SplitCounters, split_datagram
+from tests.samples import read, unpacked
 from uavlinkd.mavlink.radio_status import TXBUF_FULL, LinkFigures, RadioStatusSource
+from uavlinkd.mavlink.status_text import COMPONENT, Note, StatusTextSource, TextSeverity
 
 GOOD = LinkFigures(is_up=True, loss_in=0.0, loss_out=0.0, round_trip_s=0.04)
 
 
-def decoded(raw: bytes) -> Any:
-    (message,) = mavlink.MAVLink(None).parse_buffer(raw)
-    return message
-
-
 def said(figures: LinkFigures) -> Any:
-    return decoded(RadioStatusSource().frame(figures))
+    return unpacked(RadioStatusSource().frame(figures))
 
 
 def test_pymavlink_reads_the_values() -> None:
@@ -32,7 +25,7 @@ def test_pymavlink_reads_the_values() -> None:
         is_up=True, loss_in=0.25, loss_out=0.1, round_trip_s=0.04, demand=0.9, receive_errors=65536 + 7
     )
     raw = RadioStatusSource().frame(figures)
-    message = decoded(raw)
+    message = unpacked(raw)
     assert raw[0] == 0xFD
     assert message.to_dict() == {
         "mavpackettype": "RADIO_STATUS",
@@ -45,16 +38,14 @@ def test_pymavlink_reads_the_values() -> None:
         "fixed": 0,
     }
     assert (message.get_srcSystem(), message.get_srcComponent()) == (51, 68)
-    (frame,) = split_datagram(raw, SplitCounters())
-    assert frame.header.is_known
+    assert read(raw).header.is_known
 
 
-def test_sender_is_a_choice_and_the_sequence_its_own() -> None:
-    """Each frame has the next sequence number, which wraps; the sender is what was asked for."""
-    source = RadioStatusSource(system=3, component=69)
-    messages = [decoded(source.frame(GOOD)) for _ in range(257)]
+def test_sequence_is_its_own_and_wraps() -> None:
+    """Each frame has the next sequence number of a component of its own."""
+    source = RadioStatusSource()
+    messages = [unpacked(source.frame(GOOD)) for _ in range(257)]
     assert [message.get_seq() for message in messages] == [n % 256 for n in range(257)]
-    assert {(message.get_srcSystem(), message.get_srcComponent()) for message in messages} == {(3, 69)}
 
 
 @pytest.mark.parametrize(
@@ -87,7 +78,7 @@ def test_full_buffers_along_the_path_slow_autopilots_down(round_trip_s: float, t
     """A round trip that grows beyond its best is time spent in buffers."""
     source = RadioStatusSource()
     source.frame(GOOD)
-    assert decoded(source.frame(replace(GOOD, round_trip_s=round_trip_s))).txbuf == txbuf
+    assert unpacked(source.frame(replace(GOOD, round_trip_s=round_trip_s))).txbuf == txbuf
 
 
 def test_long_path_does_not_look_like_a_full_buffer_indefinitely() -> None:
@@ -96,8 +87,8 @@ def test_long_path_does_not_look_like_a_full_buffer_indefinitely() -> None:
     assert said(slow).txbuf == 100
     source = RadioStatusSource()
     source.frame(GOOD)
-    assert decoded(source.frame(slow)).txbuf == 30
-    assert decoded([source.frame(slow) for _ in range(240)][-1]).txbuf == 100
+    assert unpacked(source.frame(slow)).txbuf == 30
+    assert unpacked([source.frame(slow) for _ in range(240)][-1]).txbuf == 100
 
 
 def test_lost_peer_is_said_to_be_lost() -> None:
@@ -113,6 +104,40 @@ def test_peer_that_is_up_has_a_signal(loss: float, rssi: int) -> None:
     assert (message.rssi, message.remrssi) == (rssi, rssi)
 
 
-def test_counter_of_errors_wraps() -> None:
-    """rxerrors has 16 bits and wraps, like a radio's own."""
-    assert [said(replace(GOOD, receive_errors=n)).rxerrors for n in (0, 65535, 65536)] == [0, 65535, 0]
+# STATUSTEXT.
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("link to drone1 lost", "link to drone1 lost"),
+        ("x" * 50, "x" * 50),
+        ("x" * 51, "x" * 50),
+        ("dróne", "dr?ne"),
+        ("", ""),
+    ],
+)
+def test_pymavlink_reads_the_text(text: str, shown: str) -> None:
+    """Text, severity and sender; a longer text is cut, and it is ASCII."""
+    raw = StatusTextSource().frame(Note(TextSeverity.CRITICAL, text, 7))
+    message = unpacked(raw)
+    assert (message.get_type(), message.text, message.severity) == (
+        "STATUSTEXT",
+        shown,
+        mavlink.MAV_SEVERITY_CRITICAL,
+    )
+    assert (message.id, message.chunk_seq) == (0, 0)
+    assert (message.get_srcSystem(), message.get_srcComponent()) == (7, mavlink.MAV_COMP_ID_UDP_BRIDGE)
+    assert COMPONENT == mavlink.MAV_COMP_ID_UDP_BRIDGE
+    assert all(severity == getattr(mavlink, f"MAV_SEVERITY_{severity.name}") for severity in TextSeverity)
+    assert read(raw).header.is_known
+
+
+def test_each_vehicle_has_a_sequence() -> None:
+    """A ground station counts lost messages by sender: numbers of one system have no gaps."""
+    source = StatusTextSource()
+    notes = [Note(TextSeverity.NOTICE, "text", system) for system in (1, 2) * 300]
+    messages = [unpacked(source.frame(note)) for note in notes]
+    for system in (1, 2):
+        numbers = [message.get_seq() for message in messages if message.get_srcSystem() == system]
+        assert numbers == [number % 256 for number in range(300)]
