@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
-import re
 import shutil
 import subprocess
 import sys
@@ -14,10 +12,11 @@ import pytest
 
 from tests.needs import need
 from uavlinkd import __version__
-from uavlinkd.cli import FAILED, OK, WRONG, main
+from uavlinkd.cli import FAILED, OK, WRONG, main, mitm
 from uavlinkd.config import keys
 from uavlinkd.core.constants import PROTOCOL_NAME
-from uavlinkd.lab.sim import demo, demo_results
+
+pytestmark = pytest.mark.usefixtures("undone_settings")
 
 
 def test_keygen_writes_a_key_that_only_its_owner_reads(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -45,19 +44,10 @@ def test_a_key_is_never_overwritten(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert err.count("\n") == 1
 
 
-def test_keygen_without_a_file_is_a_filter(capsys: pytest.CaptureFixture[str]) -> None:
-    """The private key alone goes to standard output, so that it can go into a pipe."""
-    assert main(["keygen"]) == OK
-    out, err = capsys.readouterr()
-    private = out.removesuffix("\n")
-    assert keys.public_key_text(private) in err
-    assert private not in err
-
-
 def test_pubkey_reads_a_file_or_standard_input(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Both print the public key that keygen printed."""
+    """Both print the public key that keygen printed. Without a file, keygen is a filter too."""
     path = tmp_path / "drone0.key"
     main(["keygen", "--out", str(path)])
     printed = capsys.readouterr().out
@@ -66,25 +56,25 @@ def test_pubkey_reads_a_file_or_standard_input(
     monkeypatch.setattr(sys, "stdin", io.StringIO(path.read_text()))
     assert main(["pubkey"]) == OK
     assert capsys.readouterr().out == printed
+    assert main(["pubkey", str(tmp_path / "absent.key")]) == FAILED
+    assert "absent.key" in capsys.readouterr().err
+    assert main(["keygen"]) == OK
+    private, err = capsys.readouterr()
+    assert keys.public_key_text(private) in err
+    assert private.strip() not in err
 
 
-@pytest.mark.parametrize("text", ["", "hunter2", "A" * 43, "A" * 45, "-" * 44])
+@pytest.mark.parametrize("text", [b"", b"hunter2", b"A" * 43, b"A" * 45, b"-" * 44, b"\xff\xfe" + bytes(30)])
 def test_pubkey_of_an_invalid_key_is_refused(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, text: str
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, text: bytes
 ) -> None:
     """One line, which does not repeat the input: it may be almost a key."""
-    monkeypatch.setattr(sys, "stdin", io.StringIO(text))
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(text), encoding="utf-8"))
     assert main(["pubkey"]) == FAILED
     out, err = capsys.readouterr()
     assert out == ""
     assert err.count("\n") == 1
-    assert not text or text not in err
-
-
-def test_pubkey_of_an_absent_file_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The message has the file's name."""
-    assert main(["pubkey", str(tmp_path / "absent.key")]) == FAILED
-    assert "absent.key" in capsys.readouterr().err
+    assert not text or text.decode(errors="replace") not in err
 
 
 def test_keys_are_those_of_wireguard(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -146,81 +136,6 @@ def test_an_absent_file_gives_status_2(tmp_path: Path, capsys: pytest.CaptureFix
     assert err.count("\n") == 1
 
 
-def test_sim_flies_and_ends(capsys: pytest.CaptureFixture[str]) -> None:
-    """With ``--seconds`` it ends by itself, with status 0 and a report."""
-    assert main(["sim", "--url", "udpout:127.0.0.1:9", "--seconds", "0.1"]) == OK
-    first, *_, last = capsys.readouterr().out.splitlines()
-    assert first == "copter with system ID 1, sends to udpout:127.0.0.1:9; Ctrl-C ends it"
-    assert re.fullmatch(r"sent \d+ frames, received 0 in \d+\.\d s", last)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "names", "status"),
-    [
-        (["--url", "nowhere"], "nowhere", WRONG),
-        (["--url", "udp:127.0.0.1:14550"], "write udpin:127.0.0.1:14550 to listen there", WRONG),
-        (["--tlog", "absent.tlog"], "cannot read absent.tlog: No such file or directory", FAILED),
-        (["--system-id", "256"], "256", WRONG),
-        (["--seconds", "nan"], "--seconds", WRONG),
-    ],
-)
-def test_sim_that_cannot_fly_reports_the_reason(
-    capsys: pytest.CaptureFixture[str], arguments: list[str], names: str, status: int
-) -> None:
-    """One line names the wrong value; status 2 if the command line is wrong."""
-    assert main(["sim", *arguments]) == status
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert names in err
-    assert err.count("\n") == 1
-
-
-PERFECT = demo_results.Summary(1.0, 100, 100, 0, 2, {}, 0.2)
-
-
-@pytest.mark.parametrize(
-    ("summary", "status"),
-    [
-        (PERFECT, OK),
-        (demo_results.Summary(1.0, 100, 99, 0, 2, {}, 0.2), FAILED),
-        (demo_results.Summary(1.0, 100, 100, 1, 2, {}, 0.2), FAILED),
-        (demo_results.Summary(1.0, 0, 0, 0, 2, {}, None), FAILED),
-    ],
-)
-def test_the_demo_succeeds_only_if_every_frame_arrived(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, summary: demo_results.Summary, status: int
-) -> None:
-    """A frame lost, a frame altered, or no frame sent: status 1. The last line is always the summary."""
-
-    async def run_demo(seconds: float, *, show: bool, attack: str | None) -> demo_results.Summary:
-        assert (seconds, show, attack) == (7.0, False, None)
-        return summary
-
-    monkeypatch.setattr(demo, "run_demo", run_demo)
-    assert main(["demo", "--seconds", "7", "--json"]) == status
-    assert json.loads(capsys.readouterr().out.splitlines()[-1])["frames_sent"] == summary.frames_sent
-
-
-def test_a_demo_that_cannot_start_reports_the_reason(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Status 1 and the reason."""
-
-    async def run_demo(seconds: float, *, show: bool, attack: str | None) -> demo_results.Summary:
-        raise demo.DemoError("no room")
-
-    monkeypatch.setattr(demo, "run_demo", run_demo)
-    assert main(["demo", "--json"]) == FAILED
-    assert capsys.readouterr() == ("", "no room\n")
-
-
-def test_pubkey_of_bytes_is_refused(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    """A key as raw bytes is not text: one line, no traceback."""
-    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(b"\xff\xfe" + bytes(30)), encoding="utf-8"))
-    assert main(["pubkey"]) == FAILED
-    assert capsys.readouterr().err.startswith("standard input: is not a key")
-
-
 _SERVICE = """
 name = "drone0"
 private_key_file = "drone0.key"
@@ -265,21 +180,16 @@ def test_status_needs_only_the_control_socket_of_a_configuration(
     assert "control_socket" in capsys.readouterr().err
 
 
-def test_evaluate_lists_its_evaluations(capsys: pytest.CaptureFixture[str]) -> None:
-    """The parser imports their definitions only now, and its help has them."""
-    with pytest.raises(SystemExit) as ended:
-        main(["evaluate", "--help"])
-    assert ended.value.code == OK
-    assert "tampering" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("command", ["demo", "sim"])
-def test_missing_pymavlink_is_reported(command: str) -> None:
-    """The Debian package has no pymavlink: the message names the remedy."""
-    hide = "import sys; sys.modules['pymavlink'] = None"
-    code = f"{hide}; from uavlinkd.cli import main; sys.exit(main(['{command}']))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-
-    assert done.returncode == FAILED
-    assert "pip install ." in done.stderr
-    assert "Traceback" not in done.stderr
+@pytest.mark.parametrize("command", ["demo", "sim", "evaluate timing", "evaluate --help"])
+@pytest.mark.parametrize("module", ["pymavlink", "uavlinkd.lab"])
+def test_a_command_without_the_laboratory_names_the_extra(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, module: str, command: str
+) -> None:
+    """A plain installation has no pymavlink, and the Debian package no ``uavlinkd.lab``: one line says what to do."""
+    monkeypatch.setitem(sys.modules, module, None)
+    assert main(command.split()) == FAILED
+    assert mitm([]) == FAILED
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert [line.count("needs the extra `lab`") for line in err.splitlines()] == [1, 1]
+    assert err.count("pip install '.[lab]'") == 2

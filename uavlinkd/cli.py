@@ -23,11 +23,6 @@ from uavlinkd.system.terminal import printable
 
 OK, FAILED, WRONG = 0, 1, 2
 _LINE_LIMIT = 4096
-_NEEDS_PYMAVLINK = (
-    "sim, demo and evaluate need pymavlink, which is not installed: the Debian package leaves it out. In a checkout:"
-    " python3 -m venv .venv && .venv/bin/pip install ."
-)
-
 _NOT_A_RELAY = (
     "is not the file of a relay: that has a [[member]] for each daemon that may use it, no [[peer]] and no"
     " [[endpoint]]. A daemon that is also a relay is started with `uavlinkd run`"
@@ -36,22 +31,75 @@ _NOT_A_RELAY = (
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command and return its exit status."""
-    options = _parser().parse_args(arguments)
-    command: Callable[[argparse.Namespace], int] = options.command
+    return _to_the_end(lambda: _main(arguments))
+
+
+def _to_the_end(command: Callable[[], int]) -> int:
+    """Run a command, and write what it printed: a reader may leave (``uavlinkd check | head``), a disk be full."""
     try:
+        try:
+            return command()
+        finally:
+            _flush()
+    except BrokenPipeError:
+        return FAILED
+    except CommandError as error:
+        return _fail(*error.args)
+
+
+def _flush() -> None:
+    """Write what is buffered: at exit a failure would be the interpreter's own message."""
+    try:
+        if sys.stdout is not None:  # as with `>&-`
+            sys.stdout.flush()
+    except OSError as error:
+        with suppress(OSError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if isinstance(error, BrokenPipeError):
+            raise
+        raise CommandError(f"standard output: {error.strerror}") from None
+
+
+def _main(arguments: Sequence[str] | None) -> int:
+    command: Callable[[argparse.Namespace], int] | None = None
+    try:
+        options = _parser().parse_args(arguments)
+        command = options.command
         return command(options)
     except CommandError as error:
         return _fail(*error.args)
-    except ModuleNotFoundError as error:
-        if (error.name or "").partition(".")[0] != "pymavlink":
-            raise
-        return _fail(_NEEDS_PYMAVLINK)
     except KeyboardInterrupt:
         return OK if command in (_run, _sim) else FAILED  # these run until a signal
-    except BrokenPipeError:  # standard output was closed: `uavlinkd check | head`
-        with suppress(OSError):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return FAILED
+
+
+def mitm(arguments: Sequence[str] | None = None) -> int:
+    """Run ``uavlink-mitm``: a man in the middle, an emulated radio, or a hostile relay. Return the exit status."""
+    return _to_the_end(lambda: _mitm(sys.argv[1:] if arguments is None else arguments))
+
+
+def _mitm(words: Sequence[str]) -> int:
+    try:
+        _need_lab("uavlink-mitm")
+    except CommandError as error:
+        return _fail(*error.args)
+    if words[:1] == ["relay"]:
+        from uavlinkd.lab.hostile.relay_cli import relay_main  # the man in the middle itself cannot import a key
+
+        return relay_main(words[1:])
+    from uavlinkd.lab.mitm.cli import main as mitm_main
+
+    return mitm_main(words)
+
+
+def _need_lab(command: str) -> None:
+    """Raise a CommandError if the extra ``lab`` is not installed. The Debian package has no ``uavlinkd.lab``."""
+    from importlib.util import find_spec
+
+    if find_spec("uavlinkd.lab") is None or find_spec("pymavlink") is None:
+        raise CommandError(
+            f"{command} needs the extra `lab`, which is not installed. In a checkout:"
+            " python3 -m venv .venv && .venv/bin/pip install '.[lab]'"
+        )
 
 
 class _Parser(argparse.ArgumentParser):
@@ -123,7 +171,7 @@ def _parser() -> argparse.ArgumentParser:
     sim.add_argument("--tlog", type=Path, metavar="FILE", help="play this recorded flight instead")
     sim.add_argument("--speed", type=float, default=1.0, metavar="N", help="N times as fast; 0: as fast as possible")
 
-    demo = add("demo", _demo, "run two daemons on this machine, each with a simulated autopilot")
+    demo = add("demo", _demo, "run two daemons on this machine that exchange frames")
     demo.add_argument("--seconds", type=float, metavar="N", help="of traffic (default: 15, or 3 for each attack)")
     demo.add_argument(
         "--attack",
@@ -140,18 +188,10 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _add_evaluations(parser: argparse.ArgumentParser) -> None:
-    from uavlinkd.lab.evaluation.commands import add_report_parser, add_timing_parser
-    from uavlinkd.lab.evaluation.flight_commands import add_flight_parser
-    from uavlinkd.lab.evaluation.paths_commands import add_paths_parser
-    from uavlinkd.lab.evaluation.tampering_commands import add_member_parser, add_tampering_parser
+    _need_lab("uavlinkd evaluate")
+    from uavlinkd.lab.evaluation.commands import add_evaluations
 
-    evaluations = parser.add_subparsers(title="evaluations", metavar="WHAT", required=True)
-    add_timing_parser(evaluations)
-    add_tampering_parser(evaluations)
-    add_member_parser(evaluations)
-    add_flight_parser(evaluations)
-    add_paths_parser(evaluations)
-    add_report_parser(evaluations)
+    add_evaluations(parser.add_subparsers(title="evaluations", metavar="WHAT", required=True))
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -274,10 +314,11 @@ def _write_secret(path: Path, text: str) -> int:
 
 
 def _sim(options: argparse.Namespace) -> int:
+    _need_lab("uavlinkd sim")
     import asyncio
 
+    from uavlinkd.lab.sim.flight import SimOptions, run_sim
     from uavlinkd.lab.sim.links import LinkError, parse_url
-    from uavlinkd.lab.sim.sim_command import SimOptions, run_sim
     from uavlinkd.lab.sim.tlog import TlogError
 
     if not (math.isfinite(options.speed) and options.speed >= 0):
@@ -306,11 +347,12 @@ def _sim(options: argparse.Namespace) -> int:
 
 
 def _demo(options: argparse.Namespace) -> int:
+    _need_lab("uavlinkd demo")
     import asyncio
 
     from uavlinkd.lab.child_processes import interrupted_by_signals
     from uavlinkd.lab.mitm.attack import AttackError
-    from uavlinkd.lab.sim.demo import DemoError, run_demo
+    from uavlinkd.lab.sim.demo import DEMO_ERRORS, run_demo
 
     _check_seconds(options)
     try:
@@ -318,7 +360,7 @@ def _demo(options: argparse.Namespace) -> int:
             summary = asyncio.run(run_demo(options.seconds, show=not options.json, attack=options.attack))
     except AttackError as error:
         return _fail(error, WRONG)
-    except DemoError as error:
+    except DEMO_ERRORS as error:
         return _fail(error)
     if options.json:
         print(summary.to_json())

@@ -15,7 +15,7 @@ class Pair(StreamEndpoint):
     """An endpoint of one connection, the other end of which is in the test's hand."""
 
     def __init__(self, handler: Recorder) -> None:
-        super().__init__("pair", handler, 1.0)
+        super().__init__("pair", handler)
         ours, self.other = socket.socketpair()
         for sock in (ours, self.other):
             sock.setblocking(False)

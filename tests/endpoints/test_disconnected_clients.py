@@ -9,17 +9,19 @@ from collections.abc import AsyncIterator, Callable
 from typing import Any, cast
 
 import pytest
+import structlog
 import uvloop
 
 from tests.daemon.udp import open_socket
-from tests.endpoints.clients import PASSES, Recorder, frame, frames_of, heartbeat, write
+from tests.endpoints.clients import Recorder, frame, heartbeat, write
 from tests.needs import need
 from tests.waiting import until
 from uavlinkd.endpoints.error_queue import SEND_ATTEMPTS
 from uavlinkd.endpoints.ports import LocalPort
 from uavlinkd.endpoints.sockets import udp_socket
-from uavlinkd.endpoints.udp import CLIENT_SILENT_S, UdpServer
+from uavlinkd.endpoints.udp import UdpServer
 from uavlinkd.lab.sim.loopback_ports import has_ipv6
+from uavlinkd.link.drop_summary import DropSummary
 from uavlinkd.link.switch import Switch
 from uavlinkd.mavlink.frames import Frame
 from uavlinkd.mavlink.policy.compilation import compile_policy
@@ -56,7 +58,7 @@ class Hub:
     def __init__(self, host: str = "127.0.0.1") -> None:
         self.host = host
         self.stall = StallWatch(monotonic(), lambda seconds: None)
-        self.switch = Switch(Router[Any](), lambda *arguments, **options: None)
+        self.switch = Switch(Router[Any](), self.stall, DropSummary(structlog.get_logger()))
         self.sock = CountingSocket(udp_socket(Address(host, 0)))
         self.endpoint = UdpServer("clients", cast(socket.socket, self.sock), self)
         self.clients: list[socket.socket] = []
@@ -74,7 +76,7 @@ class Hub:
         self.switch.set_silent(port, is_silent=False)
 
     def on_frames(self, port: LocalPort, frames: list[Frame], now: float, epoch: int, waited_s: float = 0.0) -> None:
-        self.switch.forward(port, frames, now, waited_s)
+        self.switch.forward(port, frames, now, epoch, waited_s)
 
     async def connect(self) -> socket.socket:
         """A client that has sent a frame."""
@@ -161,83 +163,11 @@ def test_a_pending_error_costs_no_other_client_a_frame(new_loop: NewLoop) -> Non
         runner.run(run())
 
 
-@LOOPS
-def test_frames_are_read_while_errors_are_pending(new_loop: NewLoop) -> None:
-    """libuv stops to watch a socket with a pending error. No datagram stays unread."""
-
-    async def run() -> None:
-        async with Hub() as hub:
-            sender = await hub.connect()
-            for number in range(300):
-                gone = await hub.connect()
-                port = hub.endpoint.ports[-1]
-                gone.close()
-                write(hub.endpoint, port, [frame(number)], 1.0)
-                sender.send(frame(number))
-            await until(lambda: hub.endpoint.counters.frames == 601)
-            await until(lambda: len(hub.endpoint.ports) == 1)
-
-    with asyncio.Runner(loop_factory=new_loop) as runner:
-        runner.run(run())
-
-
 @pytest.fixture
 async def hub() -> AsyncIterator[Hub]:
     """On IPv4, in the loop of the test."""
     async with Hub() as hub:
         yield hub
-
-
-async def test_a_client_that_comes_back_is_served_again(hub: Hub) -> None:
-    """With the same port, as of a ground station that was restarted."""
-    client, sender = await hub.connect(), await hub.connect()
-    address = client.getsockname()
-    client.close()
-    await hub.send(sender, frame(1))
-    await until(lambda: len(hub.endpoint.ports) == 1)
-    again = open_socket("127.0.0.1", address[1])
-    again.connect(hub.endpoint.address)
-    hub.clients.append(again)
-    await hub.send(again, heartbeat())
-    await hub.send(sender, frame(2))
-    assert received(again) == [frame(2)]
-
-
-async def test_an_endpoint_that_is_closed_forgets_no_client_after_that() -> None:
-    """The daemon has removed the endpoint's ports already."""
-    async with Hub() as hub:
-        gone = await hub.connect()
-        (port,) = hub.endpoint.ports
-        gone.close()
-        write(hub.endpoint, port, [frame(1), frame(2)], 1.0)
-        hub.endpoint._take_errors()
-        hub.switch.remove(port)
-    await asyncio.sleep(0)
-
-
-async def test_errors_of_the_send_itself_are_counted_once(hub: Hub) -> None:
-    """Without the record of an earlier error there is one more attempt, and none while the send buffer is full."""
-    await hub.connect()
-    (port,) = hub.endpoint.ports
-    for number, sent in ((errno.ENETUNREACH, 2), (errno.EAGAIN, 1)):
-        hub.sock.sent, hub.sock.fails_with = 0, [number] * 100
-        write(hub.endpoint, port, [frame(1)], 1.0)
-        assert (hub.sock.sent, hub.endpoint.failures[errno.errorcode[number]]) == (sent, 1)
-
-
-async def test_a_pending_error_costs_no_frame_while_the_receive_buffer_is_full(hub: Hub) -> None:
-    """The kernel has no room for the record of the error, and reports it at the next call all the same."""
-    gone, receiver, flooder = await hub.connect(), await hub.connect(), await hub.connect()
-    received(receiver)
-    of_gone, of_receiver, _ = hub.endpoint.ports
-    gone.close()
-    hub.endpoint._sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-    for _ in range(200):
-        flooder.send(bytes(100))
-    for number in range(10):
-        write(hub.endpoint, of_gone, [frame(number)], 1.0)
-        write(hub.endpoint, of_receiver, [frame(number)], 1.0)
-    assert received(receiver) == [frame(number) for number in range(10)]
 
 
 async def test_attempts_to_send_are_bounded(hub: Hub, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -261,31 +191,6 @@ async def test_other_errors_of_earlier_datagrams_forget_no_client(hub: Hub, monk
     await asyncio.sleep(0)
     assert hub.endpoint.failures == {"EHOSTUNREACH": 1, "ECONNREFUSED": 1}
     assert len(hub.endpoint.ports) == 1
-
-
-async def test_a_read_error_without_an_earlier_datagram_is_counted(hub: Hub) -> None:
-    """Such as a lack of memory."""
-    hub.endpoint._on_read_error(OSError(errno.ENOMEM, "no memory"))
-    assert hub.endpoint.failures == {"ENOMEM": 1}
-
-
-async def test_a_silent_client_gets_no_broadcasts_of_other_clients(hub: Hub) -> None:
-    """It gets them again with its next frame, and meanwhile what others send to its system."""
-    silent, sender = await hub.connect(), await hub.connect()
-    received(silent)
-    hub.endpoint.do_housekeeping(monotonic() + CLIENT_SILENT_S - 1.0)
-    await hub.send(sender, frame(1))
-    assert received(silent) == [frame(1)]
-    of_silent, of_sender = hub.endpoint.ports
-    of_sender.received_at = monotonic() + 10.0
-    hub.endpoint.do_housekeeping(monotonic() + CLIENT_SILENT_S)
-    await hub.send(sender, frame(2))
-    assert received(silent) == []
-    of_silent.send(frames_of([frame(3)]), PASSES, 1.0, 0.0)
-    assert received(silent) == [frame(3)]
-    await hub.send(silent, heartbeat())
-    await hub.send(sender, frame(4))
-    assert received(silent) == [frame(4)]
 
 
 async def test_silence_is_reported_once() -> None:

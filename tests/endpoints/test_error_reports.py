@@ -8,25 +8,18 @@ import socket
 from collections.abc import Callable
 
 import pytest
-import structlog
 import uvloop
 
 from tests.daemon.udp import open_socket
 from tests.endpoints.clients import Recorder, frame, write
-from tests.link.socket_states import SocketStateLog
 from tests.needs import need
 from tests.waiting import until
-from uavlinkd.core.path import Path
 from uavlinkd.endpoints.error_queue import REPORTS_PER_S, ErrorReports
 from uavlinkd.endpoints.sockets import udp_socket
 from uavlinkd.endpoints.udp import UdpClient
 from uavlinkd.lab.sim.loopback_ports import free_port, has_ipv6
-from uavlinkd.link.drop_summary import DropSummary
-from uavlinkd.link.evidence import REPORTED, Evidence
-from uavlinkd.link.peer_sockets import PeerSockets
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.clock import monotonic
-from uavlinkd.system.stall import StallWatch
 
 NewLoop = Callable[[], asyncio.AbstractEventLoop]
 LOOPS = pytest.mark.parametrize("new_loop", [asyncio.SelectorEventLoop, uvloop.new_event_loop])
@@ -53,48 +46,6 @@ def test_reports_are_limited_until_they_are_renewed(host: str) -> None:
         sock.sendto(b"x", (host, closed))
         ((address, number),) = reports.take()
         assert (address[:2], number) == ((host, closed), errno.ECONNREFUSED)
-
-
-@LOOPS
-def test_refusing_peer_delays_no_datagram_of_another(new_loop: NewLoop) -> None:
-    """Each datagram to a peer arrives, while another peer's port refuses, and the socket is still read."""
-
-    async def run() -> None:
-        arrived: list[bytes] = []
-        stall = StallWatch(monotonic(), lambda seconds: None)
-        evidence = Evidence({}, b"")
-        log = structlog.get_logger()
-        sockets = PeerSockets(
-            lambda number, datagrams, *read: arrived.extend(datagram for datagram, _ in datagrams),
-            stall,
-            DropSummary(log),
-            evidence,
-            log,
-            SocketStateLog(),
-        )
-        sockets.open([Address("127.0.0.1", 0)])
-        sockets.start()
-        peer = open_socket("127.0.0.1")
-        refusing = Path(0, ("127.0.0.1", free_port()))
-        for number in range(5 * REPORTS_PER_S):
-            sockets.send(b"lost", refusing)
-            sockets.send(b"%d" % number, Path(0, peer.getsockname()))
-            if number % 10 == 0:
-                peer.sendto(b"%d" % number, ("127.0.0.1", sockets.addresses[0].port))
-                await asyncio.sleep(0.001)
-            if number == 4 * REPORTS_PER_S:
-                sockets.do_housekeeping()
-        assert [peer.recv(100) for _ in range(5 * REPORTS_PER_S)] == [b"%d" % n for n in range(5 * REPORTS_PER_S)]
-        await until(lambda: len(arrived) == REPORTS_PER_S // 2)
-        assert sockets.failures == {}
-        sighting = evidence.seen_elsewhere(f"{REPORTED}ECONNREFUSED", monotonic())
-        assert sighting is not None
-        assert sighting.address == refusing.address
-        sockets.close()
-        peer.close()
-
-    with asyncio.Runner(loop_factory=new_loop) as runner:
-        runner.run(run())
 
 
 @LOOPS

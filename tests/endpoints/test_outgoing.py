@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.endpoints.clients import PASSES, frame, frames_of, heartbeat, large_frame, source
+from tests.endpoints.clients import PASSES, frame, heartbeat, large_frame, source
+from tests.samples import frames_of
 from uavlinkd.endpoints.outgoing import OutgoingFrames
 from uavlinkd.mavlink.frames import SplitCounters
 from uavlinkd.mavlink.policy.delivery import DeliveredStream
@@ -20,19 +21,7 @@ SIZE = len(A)
 
 def outgoing() -> tuple[OutgoingFrames, Counter[str]]:
     dropped: Counter[str] = Counter()
-    return OutgoingFrames(1.0, dropped, DeliveredStream()), dropped
-
-
-def test_frames_leave_whole_and_in_order() -> None:
-    """Frames that fit are committed together, and stay until they are marked as written."""
-    waiting, dropped = outgoing()
-    waiting.put(frames_of([A, B, C]), PASSES, now=0.0)
-    waiting.commit_next(0, 2 * SIZE, now=0.5)
-    assert (waiting.committed, waiting.waiting, len(waiting)) == (A + B, 1, 3)
-    waiting.commit_next(0, 2 * SIZE, now=0.5)
-    assert waiting.committed == A + B
-    assert waiting.mark_written(2 * SIZE) == 2
-    assert (waiting.committed, len(waiting), +dropped) == (b"", 1, Counter())
+    return OutgoingFrames(dropped, DeliveredStream()), dropped
 
 
 @pytest.mark.parametrize("written", [1, SIZE - 1, SIZE, SIZE + 1])

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import asyncio
-import errno
 import socket
 from collections.abc import Callable, Iterator
-from typing import Any, cast
 
 import pytest
-import uvloop
 
-from tests.waiting import PATIENCE_S, until
 from uavlinkd.endpoints.reader import (
     BUSY_S,
     DATAGRAM_OVERHEAD_BYTES,
@@ -153,25 +148,6 @@ def test_a_socket_with_bursts_is_read_to_the_end_in_one_wake_up(pair: Pair) -> N
         assert pair.wake_up() == burst
 
 
-def test_a_datagram_alone_costs_one_system_call(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
-    """FIONREAD is called only after a read that found several datagrams."""
-    asked: list[int] = []
-    monkeypatch.setattr("uavlinkd.endpoints.reader.fcntl.ioctl", lambda *arguments: asked.append(1))
-    for _ in range(10):
-        pair.now += 2 * BUSY_S
-        pair.send(b"alone")
-        assert pair.wake_up() == [b"alone"]
-    assert asked == []
-
-
-def test_one_read_takes_no_more_than_its_share(pair: Pair) -> None:
-    """The other sockets have their turn. Behind a full batch there is no pause."""
-    sent = [bytes([number]) for number in range(DATAGRAMS_PER_WAKE_UP + 3)]
-    pair.send(*sent)
-    read = [pair.wake_up() for _ in range(3)]
-    assert read == [sent[:1], sent[1 : DATAGRAMS_PER_WAKE_UP + 1], sent[-2:]]
-
-
 def test_a_busy_socket_is_read_by_a_timer(pair: Pair) -> None:
     """A third datagram soon after the second waits for others. The loop does not watch the socket meanwhile."""
     pair.make_busy()
@@ -207,15 +183,6 @@ def test_a_socket_that_is_no_longer_busy_is_watched_again(pair: Pair, count: int
     assert pair.wake_up() == [b"four"]
 
 
-def test_a_full_batch_is_followed_without_a_pause(pair: Pair) -> None:
-    """More datagrams have gathered already. The other callbacks of the loop have their turn."""
-    pair.make_busy()
-    pair.send(*[b"full"] * (DATAGRAMS_PER_WAKE_UP + 1))
-    assert len(pair.fire()) == DATAGRAMS_PER_WAKE_UP
-    assert [timer.delay_s for timer in pair.loop.timers] == [0.0]
-    assert pair.fire() == [b"full", b"full"]
-
-
 def test_a_handler_that_fails_does_not_end_the_reading(pair: Pair) -> None:
     """The loop reports the exception and watches the socket again."""
 
@@ -231,15 +198,6 @@ def test_a_handler_that_fails_does_not_end_the_reading(pair: Pair) -> None:
     assert pair.loop.watched is not None
     pair.now += 2 * BUSY_S
     assert pair.wake_up() == [b"next"]
-
-
-def test_a_reader_stops_while_datagrams_gather(pair: Pair) -> None:
-    """Its timer is cancelled, and stopping again does nothing."""
-    pair.make_busy()
-    (timer,) = pair.loop.timers
-    pair.reader.stop()
-    pair.reader.stop()
-    assert (timer.is_cancelled, pair.loop.watched) == (True, None)
 
 
 @pytest.mark.parametrize("is_busy", [False, True])
@@ -284,28 +242,6 @@ def test_a_failure_is_reported_and_the_socket_watched_again(pair: Pair, is_burst
     reader.stop()
 
 
-class OutOfMemory:
-    """A socket whose first read fails for want of memory."""
-
-    def __init__(self) -> None:
-        self.errors: list[OSError] = [OSError(errno.ENOBUFS, "no buffers")]
-
-    def fileno(self) -> int:
-        return -1
-
-    def recvfrom_into(self, buffer: memoryview) -> tuple[int, tuple[str, int]]:
-        raise self.errors.pop() if self.errors else BlockingIOError
-
-
-@pytest.mark.parametrize("drains", [False, True])
-def test_a_read_that_fails_for_want_of_memory_is_reported_and_repeated(pair: Pair, drains: bool) -> None:
-    """Nothing is raised into the loop."""
-    pair.loop.watched = None
-    reader = pair.make_reader(cast(socket.socket, OutOfMemory()))
-    assert reader.read(pair.now, drains=drains) == 0
-    assert [failure.errno for failure in pair.failures] == [errno.ENOBUFS]
-
-
 def pause_process(pair: Pair) -> None:
     """This process stood still until now."""
     pair.now += 2 * STALL_S
@@ -324,15 +260,6 @@ def test_datagrams_that_waited_during_a_pause_are_stale_however_slowly_they_are_
     assert pair.epochs[-1] == 1
 
 
-def test_a_read_reports_its_turn(pair: Pair) -> None:
-    """While datagrams arrive, a late timer of the loop is not a pause."""
-    for _ in range(5):
-        pair.now += STALL_S
-        pair.send(b"new")
-        pair.wake_up()
-    assert pair.epochs == [0] * 5
-
-
 def test_empty_datagrams_do_not_pass_for_an_empty_socket(pair: Pair) -> None:
     """FIONREAD reports 0 for them too, and an old frame may be behind them."""
     pair.send(b"old", *[b""] * DATAGRAMS_PER_WAKE_UP, b"old")
@@ -340,19 +267,6 @@ def test_empty_datagrams_do_not_pass_for_an_empty_socket(pair: Pair) -> None:
     pair.wake_up()
     pair.wake_up()
     assert pair.epochs == [STALE, STALE]
-
-
-def test_socket_that_never_becomes_empty_is_stale_for_a_receive_buffer(pair: Pair) -> None:
-    """A flood does not keep frames from being delivered for long after a pause."""
-    pair.send(b"old")
-    pause_process(pair)
-    buffer_bytes = pair.receiver.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
-    batches = 0
-    while not batches or pair.reader.backlog.is_stale:
-        pair.send(*[bytes(1000)] * (DATAGRAMS_PER_WAKE_UP + 1))
-        pair.wake_up()
-        batches += 1
-    assert batches == -(-buffer_bytes // (DATAGRAMS_PER_WAKE_UP * (1000 + DATAGRAM_OVERHEAD_BYTES)))
 
 
 @pytest.mark.parametrize("size", [0, 1, 60, 300, 1200, 9000, 60000])
@@ -369,41 +283,3 @@ def test_a_full_socket_counts_as_no_more_than_its_receive_buffer(pair: Pair, siz
     with pytest.raises(BlockingIOError):
         pair.receiver.recv(1)
     assert 0 < read <= buffer_bytes + one
-
-
-@pytest.mark.parametrize("new_loop", [asyncio.SelectorEventLoop, uvloop.new_event_loop])
-def test_a_flood_does_not_hold_up_the_loop(
-    new_loop: Callable[[], asyncio.AbstractEventLoop], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Every datagram arrives, in order. The loop runs other callbacks while datagrams of a busy socket gather."""
-    count = 400
-    monkeypatch.setattr("uavlinkd.endpoints.reader.BUSY_S", PATIENCE_S)  # a slow machine sends more rarely
-
-    async def flood() -> tuple[list[int], int]:
-        delivered: list[int] = []
-        turns_in_pauses = 0
-        receiver, sender = udp_socket(Address("127.0.0.1", 0)), udp_socket(Address("127.0.0.1", 0))
-        stall = StallWatch(monotonic(), lambda seconds: None)
-
-        def deliver(datagrams: Datagrams, *_: Any) -> None:
-            delivered.extend(int.from_bytes(datagram) for datagram, _ in datagrams)
-
-        reader = Reader(receiver, deliver, failures.append, stall)
-        reader.start()
-        for number in range(count):
-            sender.sendto(number.to_bytes(2), receiver.getsockname())
-            await asyncio.sleep(0)
-            await asyncio.sleep(0)
-            turns_in_pauses += reader.is_paused
-        await until(lambda: len(delivered) == count)
-        reader.stop()
-        receiver.close()
-        sender.close()
-        return delivered, turns_in_pauses
-
-    failures: list[OSError] = []
-    with asyncio.Runner(loop_factory=new_loop) as runner:
-        delivered, turns_in_pauses = runner.run(flood())
-    assert delivered == list(range(count))
-    assert turns_in_pauses > 0
-    assert failures == []

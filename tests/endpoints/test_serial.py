@@ -5,14 +5,12 @@ from __future__ import annotations
 import asyncio
 import os
 import select
-import socket
 import termios
-import threading
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from time import monotonic
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import cast
 
 import pytest
 from serialx import BaseSerial
@@ -20,20 +18,13 @@ from serialx import BaseSerial
 from tests.endpoints.clients import (
     Recorder,
     frame,
-    large_frame,
-    measure_udp_delivery,
     recorder,
-    unused_address,
     write,
 )
-from tests.waiting import PATIENCE_S, until
+from tests.waiting import until
 from uavlinkd.endpoints import serial
 from uavlinkd.endpoints.serial import SerialChannel, SerialEndpoint
-from uavlinkd.endpoints.stream_endpoint import STALLED_S
-from uavlinkd.endpoints.tcp import TcpServer, tcp_listener
-from uavlinkd.endpoints.udp import UdpClient
 from uavlinkd.endpoints.url import SerialUrl
-from uavlinkd.system.addresses import Address
 
 
 class Autopilot:
@@ -102,17 +93,10 @@ async def test_frames_go_in_both_directions(autopilot: Autopilot, endpoint: Seri
     assert autopilot.read() == b"".join(from_autopilot)
 
 
-async def test_device_may_be_missing_at_first(autopilot: Autopilot, endpoint: SerialEndpoint) -> None:
-    """The endpoint looks for it repeatedly, and has no port until it is present."""
+async def test_unplugged_device_is_opened_again(autopilot: Autopilot, endpoint: SerialEndpoint) -> None:
+    """It is missing at first, and may return as another terminal. The endpoint opens its permanent name again."""
     await until(lambda: endpoint.failures["ENOENT"] >= 3)
     assert list(endpoint.ports) == []
-    autopilot.plug_in()
-    await opened(endpoint)
-    assert endpoint.failures.keys() == {"ENOENT"}
-
-
-async def test_unplugged_device_is_opened_again(autopilot: Autopilot, endpoint: SerialEndpoint) -> None:
-    """It may return as another terminal. The endpoint opens its permanent name again."""
     for number in range(3):
         autopilot.plug_in()
         await opened(endpoint)
@@ -126,18 +110,6 @@ async def test_unplugged_device_is_opened_again(autopilot: Autopilot, endpoint: 
         assert list(endpoint.ports) == []
     assert recorder(endpoint).received == [frame(0), frame(1), frame(2)]
     assert endpoint.failures["unsent"] == 3
-
-
-async def test_unplugged_device_is_noticed_by_writing(autopilot: Autopilot, endpoint: SerialEndpoint) -> None:
-    """An error of a write ends the connection. The write raises and reports nothing."""
-    autopilot.plug_in()
-    await opened(endpoint)
-    (port,) = endpoint.ports
-    autopilot.unplug()
-    write(endpoint, port, [frame(1)], monotonic())
-    assert recorder(endpoint).closed == []
-    await until(lambda: recorder(endpoint).closed == [port])
-    assert (endpoint.failures["EIO"], endpoint.failures["unsent"]) == (1, 1)
 
 
 async def test_device_is_opened_exclusively(autopilot: Autopilot, endpoint: SerialEndpoint) -> None:
@@ -191,35 +163,6 @@ async def test_only_serial_devices_are_opened(
         assert place.read_text() == "precious"
 
 
-async def test_boot_text_and_noise_are_skipped(autopilot: Autopilot, endpoint: SerialEndpoint) -> None:
-    """An autopilot writes text while it boots, and a wrong baud rate causes noise. Later frames are received."""
-    autopilot.plug_in()
-    await opened(endpoint)
-    noise = b"\r\nInit ArduCopter V4.6\r\nFree RAM: 21345\r\n" + bytes(range(256)) * 4 + b"GET / HTTP/1.1"
-    os.write(autopilot.master, noise + b"".join(map(frame, range(20))))
-    await until(lambda: recorder(endpoint).received[-1:] == [frame(19)])
-    assert endpoint.counters.garbage_bytes >= len(noise) - 1
-    assert recorder(endpoint).closed == []
-
-
-async def test_device_that_accepts_no_bytes_for_long_is_opened_again(
-    autopilot: Autopilot, endpoint: SerialEndpoint
-) -> None:
-    """Closing may end the problem. The kernel's unsent bytes are discarded."""
-    autopilot.plug_in()
-    await opened(endpoint)
-    (port,) = endpoint.ports
-    (connection,) = endpoint._connections.values()
-    began = monotonic()
-    while not connection._awaits_writable:
-        write(endpoint, port, [large_frame(0)], began)
-    endpoint.do_housekeeping(began + STALLED_S - 0.01)
-    assert endpoint.failures["stalled"] == 0
-    endpoint.do_housekeeping(began + STALLED_S)
-    assert endpoint.failures["stalled"] == 1
-    await until(lambda: recorder(endpoint).closed == [port] and len(endpoint.ports) == 1)
-
-
 def device_with(in_kernel: int) -> BaseSerial:
     """A device whose kernel queue holds so many bytes."""
     return cast(BaseSerial, SimpleNamespace(fileno=lambda: -1, num_unwritten_bytes=lambda: in_kernel))
@@ -256,19 +199,6 @@ def test_bytes_that_the_line_cannot_have_carried_count(monkeypatch: pytest.Monke
     assert channel.held(now + 98 / 5760) == 0
 
 
-def test_timer_waits_until_a_quarter_of_the_limit_is_free() -> None:
-    """At a high rate the next small frame would fit in less than a millisecond."""
-    channel = SerialChannel(device_with(1843), 921600)
-    assert channel.drain_s(1843 - 21, now=0.0) == pytest.approx(0.005 + serial.LATE_S, abs=0.0003)
-
-
-def test_device_without_line_rate_is_bounded_in_bytes() -> None:
-    """Its baud rate has no meaning. Only the kernel's count is used."""
-    channel = SerialChannel(device_with(4000), None)
-    assert (channel.held(now=0.0), channel.limit_bytes) == (4000, serial.IN_FLIGHT_BYTES)
-    assert channel.drain_s(0, now=0.0) == serial.POLL_S
-
-
 @pytest.mark.parametrize(
     ("device", "is_uart"),
     [
@@ -287,66 +217,6 @@ def test_line_rate_is_that_of_the_device_behind_a_link(tmp_path: Path, device: s
     assert serial.has_line_rate(str(link)) is serial.has_line_rate(str(tmp_path / device)) is is_uart
 
 
-async def test_pseudo_terminal_is_not_paced(autopilot: Autopilot, endpoint: SerialEndpoint) -> None:
-    """It has no line: a second of line time at 57,600 baud is written at once."""
-    autopilot.plug_in()
-    await opened(endpoint)
-    write(endpoint, endpoint.ports[0], [frame(number) for number in range(100)], monotonic())
-    assert endpoint.frames_sent == 100
-
-
-async def test_dead_endpoints_delay_no_other_endpoint(
-    autopilot: Autopilot, endpoint: SerialEndpoint, tmp_path: Path
-) -> None:
-    """Beside a blocked and an unplugged device, a TCP client that never reads, and an absent UDP client."""
-    alone = await measure_udp_delivery()
-    autopilot.plug_in()
-    await opened(endpoint)
-    unplugged = SerialEndpoint("unplugged", SerialUrl(str(tmp_path / "absent"), 57600), Recorder())
-    server = TcpServer("server", tcp_listener(Address("127.0.0.1", 0)), Recorder())
-    absent = UdpClient("absent", unused_address(), Recorder())
-    others = (unplugged, server, absent)
-    with socket.create_connection(server.address) as never_reads:
-        never_reads.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-        for other in others:
-            other.start()
-        try:
-            await until(lambda: len(server.ports) == 1 and unplugged.failures["ENOENT"] > 0)
-            beside = await measure_udp_delivery(endpoint, *others)
-        finally:
-            for other in others:
-                other.close()
-    assert endpoint.failures["outgoing_full"] > 0
-    assert server.failures["outgoing_full"] > 0
-    assert absent.frames_sent > 0
-    assert beside.frames == alone.frames
-    assert len(beside.frames) == beside.sent
-    assert beside.usual_s < alone.usual_s + 0.1
-
-
-async def test_device_that_hangs_delays_no_other_device(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Opening waits for the hardware, in a thread for each device."""
-    pipe_read, pipe_write = os.pipe()
-
-    def hang(*_: Any, **__: Any) -> BaseSerial:
-        os.read(pipe_read, 1)
-        raise OSError(5, "at last")
-
-    monkeypatch.setattr(serial, "serial_for_url", hang)
-    hanging = [SerialEndpoint(f"hangs-{n}", SerialUrl("/dev/x", 57600), Recorder()) for n in range(10)]
-    for endpoint in hanging:
-        endpoint.start()
-    try:
-        beside = await measure_udp_delivery(*hanging, batches=20)
-        assert len(beside.frames) == beside.sent
-    finally:
-        os.close(pipe_write)
-        await until(lambda: all(endpoint.failures["EIO"] for endpoint in hanging))
-        for endpoint in hanging:
-            endpoint.close()
-        os.close(pipe_read)
-
-
 async def test_closed_endpoint_leaves_the_device_to_others(autopilot: Autopilot, endpoint: SerialEndpoint) -> None:
     """Closed while open, while opening or while waiting: no report follows, and the device is free."""
     autopilot.plug_in()
@@ -363,17 +233,3 @@ async def test_closed_endpoint_leaves_the_device_to_others(autopilot: Autopilot,
     finally:
         last.close()
     assert recorder(endpoint).closed == recorder(opening).open == []
-
-
-async def test_device_that_opens_after_all_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An endpoint closed while its device is being opened does not keep the device."""
-    may_open, done = threading.Event(), threading.Event()
-    device = SimpleNamespace(open=lambda: may_open.wait(PATIENCE_S), close=done.set)
-    monkeypatch.setattr(serial, "serial_for_url", lambda *_, **__: device)
-    endpoint = SerialEndpoint("serial", SerialUrl("/dev/x", 57600), Recorder())
-    endpoint.start()
-    await asyncio.sleep(0)
-    endpoint.close()
-    may_open.set()
-    await until(done.is_set)
-    assert recorder(endpoint).open == []

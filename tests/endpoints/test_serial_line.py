@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import termios
 import threading
@@ -15,9 +14,9 @@ from serialx import serial_for_url
 
 from tests.endpoints.test_serial import Autopilot
 from tests.waiting import PATIENCE_S, until
-from uavlinkd.endpoints import serial_line
+from uavlinkd.endpoints import serial, serial_line
 from uavlinkd.endpoints.line_framing import LineDecoder, encode
-from uavlinkd.endpoints.serial_line import CTS_STUCK, LINE_FULL, TOO_LONG, SerialLine
+from uavlinkd.endpoints.serial_line import CTS_STUCK, LINE_FULL, CtsHold, SerialLine
 from uavlinkd.endpoints.url import SerialUrl
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.stall import StallWatch
@@ -56,7 +55,7 @@ class Received:
 @pytest.fixture
 def other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Other]:
     """Not plugged in yet."""
-    monkeypatch.setattr(serial_line, "RETRY_S", 0.02)
+    monkeypatch.setattr(serial, "RETRY_S", 0.02)
     end = Other(tmp_path / "usb-modem")
     yield end
     if end.master >= 0:
@@ -129,16 +128,6 @@ async def test_line_is_written_at_the_rate_of_the_air(other: Other, line: Serial
     assert [datagram[0] for datagram in other.datagrams()] == [1, 2, 3, 4, 5]
 
 
-async def test_datagram_that_is_longer_than_a_moment_of_the_air_passes(other: Other, line: SerialLine) -> None:
-    """Alone: a handshake on a very slow radio. One above the limit of framing is dropped and counted."""
-    await plugged_in(other, line)
-    line.set_rate(100)
-    line.send(bytes(147))
-    await until(lambda: other.datagrams() == [bytes(147)])
-    line.send(bytes(3000))
-    assert line.failures[TOO_LONG] == 1
-
-
 async def test_modem_that_withholds_cts_for_good_is_ignored(
     other: Other, line: SerialLine, received: Received, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -161,21 +150,6 @@ async def test_modem_that_withholds_cts_for_good_is_ignored(
     await plugged_in(other, line)
     assert [line.uses_cts] == [True]
     assert received.changes == 5
-
-
-async def test_plug_that_is_pulled_before_a_look_at_the_queue(
-    other: Other, line: SerialLine, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The error of TIOCOUTQ is that of a lost device: counted, and the device is opened again."""
-    await plugged_in(other, line)
-
-    def lost() -> int:
-        raise OSError(errno.EIO, "unplugged")
-
-    monkeypatch.setattr(line._device, "num_unwritten_bytes", lost)
-    line.send(b"lost with the plug")
-    assert (line.is_open, line.failures["EIO"]) == (False, 1)
-    await until(lambda: line.is_open)
 
 
 HANGS = ("open", "get_modem_pins", "tcsetattr", "reset_write_buffer", "close")
@@ -246,3 +220,13 @@ async def test_end_of_the_daemon_does_not_wait_for_an_adapter_that_hangs(
     await until(lambda: other.datagrams() == [b"first", b"waits for the radio"])
     may_close.set()
     await until(closed.is_set)
+
+
+def test_time_counts_between_looks_that_find_bytes() -> None:
+    """From the first look that finds them to the one that finds none."""
+    cts = CtsHold()
+    for now, is_held in ((1.0, False), (2.0, True), (2.5, True), (4.0, False), (9.0, False)):
+        cts.note(now, is_held=is_held)
+    assert cts.total_s == 2.0
+    cts.note(10.0, is_held=True)
+    assert (cts.total_s, cts.lasts_s(13.0)) == (2.0, 3.0)

@@ -1,17 +1,18 @@
-"""The options and errors of UDP sockets."""
+"""Sockets: their options and errors, and addresses that are not there yet."""
 
 from __future__ import annotations
 
 import socket
-import sys
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable
+from functools import partial
 
 import pytest
+from structlog.testing import capture_logs
 
 from tests.needs import need
 from tests.waiting import PATIENCE_S
-from uavlinkd.endpoints.sockets import BUFFER_BYTES, BindError, network_socket, send_from_new_port, udp_socket
+from uavlinkd.endpoints.sockets import BindError, send_from_new_port, udp_socket
+from uavlinkd.endpoints.tcp import tcp_listener
 from uavlinkd.lab.sim.loopback_ports import free_port, has_ipv6
 from uavlinkd.system.addresses import Address
 
@@ -25,43 +26,12 @@ def test_socket_is_bound_and_does_not_block() -> None:
             sock.recv(1)
 
 
-def test_there_is_room_for_bursts() -> None:
-    """The buffers have the requested size, or the system's maximum. Linux doubles the value (socket(7))."""
-    limits = {socket.SO_RCVBUF: "rmem_max", socket.SO_SNDBUF: "wmem_max"}
-    with udp_socket(Address("127.0.0.1", 0)) as sock:
-        for option, name in limits.items():
-            limit = Path("/proc/sys/net/core", name)
-            most = int(limit.read_text()) if limit.exists() else 0  # older kernels do not tell in a namespace
-            assert sock.getsockopt(socket.SOL_SOCKET, option) >= 2 * min(BUFFER_BYTES, most)
-
-
 def test_the_wildcard_of_ipv6_takes_no_ipv4() -> None:
     """[::]:P and 0.0.0.0:P are two sockets."""
     need(has_ipv6(), "an IPv6 loopback")
     port = free_port()
     with udp_socket(Address("::", port)), udp_socket(Address("0.0.0.0", port)):
         pass
-
-
-def test_an_address_in_use_is_an_error() -> None:
-    """One line with the address and the reason; the failed socket is closed."""
-    with udp_socket(Address("127.0.0.1", 0)) as first:
-        address = Address(*first.getsockname())
-        with pytest.raises(BindError, match=rf"^cannot listen on {address}: Address already in use: .*another port$"):
-            udp_socket(address)
-
-
-def test_an_address_of_another_machine_is_an_error() -> None:
-    """An address that this machine does not have."""
-    with pytest.raises(BindError, match=r"^cannot listen on 192\.0\.2\.1:5790: "):
-        udp_socket(Address("192.0.2.1", 5790))
-
-
-@pytest.mark.parametrize("host", ["drone1.local", "fe80::1%no-such-if"])
-def test_names_and_unknown_zones_are_errors(host: str) -> None:
-    """Names are never looked up, and a zone must be an interface of this machine."""
-    with pytest.raises(BindError, match=r"^cannot use "):
-        udp_socket(Address(host, 5790))
 
 
 @pytest.mark.parametrize("host", ["127.0.0.2", "::1"])
@@ -79,20 +49,28 @@ def test_datagram_from_a_new_port_comes_from_the_same_address(host: str) -> None
             assert receiver.recvfrom(64)[1][1] != source[1]
 
 
-def test_datagram_from_a_new_port_leaves_by_the_same_interface(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A relay's networks may be bound to interfaces."""
-    need(sys.platform == "linux", "Linux, to bind to interfaces")
-    interfaces: list[bytes] = []
+# An address that is not there yet: a drone's network comes up after its daemon, or never.
 
-    class Watched(socket.socket):
-        """Notes its interface when it sends."""
 
-        def sendto(self, *args: Any) -> int:
-            interfaces.append(self.getsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, 16))
-            return super().sendto(*args)
+@pytest.mark.parametrize("listen", [partial(udp_socket, may_come_later=True), tcp_listener])
+def test_absent_address_is_logged_once(listen: Callable[[Address], socket.socket]) -> None:
+    """The address may also be a mistake. Without ``may_come_later`` it is an error."""
+    address = Address("192.0.2.1", free_port())
+    with capture_logs() as logs, listen(address) as sock:
+        assert sock.getsockname() == address.sockaddr
+    assert [(line["event"], line["address"]) for line in logs] == [("address_not_here_yet", str(address))]
+    with capture_logs() as logs, listen(Address("127.0.0.1", 0)):
+        assert logs == []
+    with pytest.raises(BindError, match=r"^cannot listen on 192\.0\.2\.1:5790: "):
+        udp_socket(Address("192.0.2.1", 5790))
 
-    with network_socket(Address("127.0.0.1", 0), "lo", ()) as bound, udp_socket(Address("127.0.0.1", 0)) as free:
-        monkeypatch.setattr(socket, "socket", Watched)
-        for sock in (bound, free):
-            send_from_new_port(sock, b"one", free.getsockname())
-    assert [interface.rstrip(b"\0") for interface in interfaces] == [b"lo", b""]
+
+def test_an_address_in_use_goes_to_no_other_socket() -> None:
+    """Waiting for an address does not bypass the socket that has it, whether the address is there or not."""
+    for host in ("127.0.0.1", "192.0.2.1"):
+        address = Address(host, free_port())
+        with (
+            udp_socket(address, may_come_later=True),
+            pytest.raises(BindError, match=rf"^cannot listen on {address}: Address already in use: "),
+        ):
+            udp_socket(address, may_come_later=True)

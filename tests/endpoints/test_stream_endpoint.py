@@ -8,20 +8,14 @@ import socket
 from time import monotonic
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from tests.endpoints.clients import Recorder, frame, heartbeat, large_frame, recorder, source, write
-from tests.endpoints.stream_pair import Pair
+from tests.endpoints.clients import frame, heartbeat, large_frame, recorder, source, write
+from tests.endpoints.stream_pair import CAPACITY, Pair, RationedChannel
 from tests.waiting import until
-from uavlinkd.endpoints.stream_endpoint import (
-    READ_BYTES,
-    STALLED_S,
-)
-from uavlinkd.mavlink.egress.fair_queue import LANE_BYTES
-from uavlinkd.mavlink.egress.lanes import FLOWS_PER_LANE
-from uavlinkd.mavlink.frames import SplitCounters
+from uavlinkd.endpoints.stream_endpoint import READ_BYTES, STALLED_S, Connection
 from uavlinkd.mavlink.stream_splitter import StreamSplitter
+from uavlinkd.system.clock import monotonic as boot_time
+from uavlinkd.system.stall import STALE, STALL_S
 
 
 def fill(pair: Pair, now: float) -> int:
@@ -41,13 +35,6 @@ def read_all(sock: socket.socket) -> bytes:
     except BlockingIOError:
         pass
     return got
-
-
-async def test_frames_are_sent_at_once(pair: Pair) -> None:
-    """While the kernel has room, ``write`` sends at once, without the event loop."""
-    write(pair, pair.connection.port, [frame(1), frame(2)], now=0.0)
-    assert pair.other.recv(4096) == frame(1) + frame(2)
-    assert (pair.frames_sent, pair.bytes_sent) == (2, len(frame(1) + frame(2)))
 
 
 async def test_one_wake_up_delivers_one_batch(pair: Pair) -> None:
@@ -71,24 +58,6 @@ async def test_one_connection_reads_no_more_than_its_turn(pair: Pair) -> None:
     assert pair.bytes_received == READ_BYTES
 
 
-async def test_frame_before_the_end_is_delivered(pair: Pair) -> None:
-    """A frame directly before the end of a connection is delivered."""
-    pair.other.send(frame(1))
-    pair.other.close()
-    await until(lambda: bool(recorder(pair).closed))
-    assert recorder(pair).received == [frame(1)]
-    assert pair.failures == {"disconnected": 1}
-    assert pair.channel.aborted is False
-
-
-async def test_frame_behind_a_false_start_is_delivered_at_the_end(pair: Pair) -> None:
-    """The bytes that the splitter held are parsed again at the end of the stream."""
-    pair.other.send(b"\xfd\xff\x00" + frame(1))
-    pair.other.close()
-    await until(lambda: bool(recorder(pair).closed))
-    assert recorder(pair).received == [frame(1)]
-
-
 async def test_write_to_a_closed_connection_reports_later(pair: Pair) -> None:
     """The daemon may be in the middle of a batch. The port is reported as closed in the loop's next turn."""
     pair.other.close()
@@ -101,35 +70,6 @@ async def test_write_to_a_closed_connection_reports_later(pair: Pair) -> None:
     assert pair.failures == {"EPIPE": 1, "unsent": 3}
     assert pair.channel.aborted is True
     assert list(pair.ports) == []
-
-
-async def test_slow_reader_gets_whole_frames_and_the_newest(pair: Pair) -> None:
-    """A slow reader misses whole frames only, and each is counted."""
-    count = 1000
-    for number in range(count):
-        write(pair, pair.connection.port, [large_frame(number)], monotonic())
-    assert pair.failures["outgoing_full"] > 0
-    got = bytearray()
-    while pair.connection.outgoing:
-        got += read_all(pair.other)
-        await asyncio.sleep(0)
-    got += read_all(pair.other)
-    counters = SplitCounters()
-    frames = [frame.raw for frame in StreamSplitter(counters).feed(bytes(got), 0.0)]
-    assert (counters.garbage_bytes, len(b"".join(frames))) == (0, len(got))
-    assert frames[-100:] == [large_frame(number) for number in range(count - 100, count)]
-    assert count == len(frames) + pair.failures.total()
-    assert pair.frames_sent == len(frames)
-    assert pair.bytes_sent == len(got)
-
-
-async def test_bytes_held_back_are_bounded(pair: Pair) -> None:
-    """For a client that does not read, no more frames wait than the limit of one flow."""
-    for number in range(0, 4000, 40):
-        write(pair, pair.connection.port, [large_frame(n) for n in range(number, number + 40)], now=0.0)
-    held = pair.connection.outgoing.waiting * len(large_frame(0))
-    assert LANE_BYTES // FLOWS_PER_LANE - 300 < held <= LANE_BYTES // FLOWS_PER_LANE
-    assert pair.frames_sent + len(pair.connection.outgoing) + pair.failures["outgoing_full"] == 4000
 
 
 async def test_stale_frames_are_not_sent_after_an_outage(pair: Pair) -> None:
@@ -189,41 +129,6 @@ async def test_channel_that_never_gets_room_has_stalled(pair: Pair) -> None:
     assert pair.failures == {"stale": 1, "stalled": 1}
 
 
-async def test_channel_that_got_room_with_nothing_to_send_has_not_stalled(pair: Pair) -> None:
-    """There were no bytes to send, so no progress is normal."""
-    pair.channel.left = 0
-    write(pair, pair.connection.port, [frame(1)], now := monotonic())
-    pair.do_housekeeping(now + 5)
-    pair.channel.left = pair.channel.limit_bytes
-    await until(lambda: pair.connection._room_timer is None)
-    pair.do_housekeeping(now + 10 * STALLED_S)
-    assert pair.failures == {"stale": 1}
-
-
-async def test_stuck_channel_that_holds_less_than_its_limit_has_stalled(pair: Pair) -> None:
-    """Flow control may stop a line below its limit. The stall is detected even when no frame waits any more."""
-    pair.channel.left = 10
-    write(pair, pair.connection.port, [frame(1)], now := monotonic())
-    pair.do_housekeeping(now + 5)
-    rounds = 0
-    while rounds < 3:
-        before = pair.connection._room_timer
-        await until(lambda before=before: pair.connection._room_timer is not before)  # type: ignore[misc]
-        rounds += 1
-    pair.do_housekeeping(now + STALLED_S)
-    assert pair.failures == {"stale": 1, "stalled": 1}
-
-
-async def test_frame_that_does_not_fit_waits_for_an_empty_kernel(pair: Pair) -> None:
-    """A frame larger than the room is sent only while the kernel holds no bytes, and then whole."""
-    pair.channel.left = len(large_frame(0)) - 1
-    write(pair, pair.connection.port, [large_frame(0)], monotonic())
-    assert read_all(pair.other) == b""
-    pair.channel.left = pair.channel.limit_bytes
-    await until(lambda: pair.frames_sent == 1)
-    assert read_all(pair.other) == large_frame(0)
-
-
 async def test_command_overtakes_waiting_frames(pair: Pair) -> None:
     """An urgent frame of one source is sent before earlier frames of another source."""
     pair.channel.left = len(large_frame(0))
@@ -251,38 +156,6 @@ async def test_error_of_the_kernel_ends_the_connection(pair: Pair, noticed_by: s
     assert pair.channel.sock.fileno() == -1
 
 
-@given(st.binary(max_size=600), st.integers(1, 100))
-async def test_any_bytes_are_accepted(data: bytes, cut: int) -> None:
-    """No bytes raise an exception. Garbage is counted, and genuine frames after it are delivered."""
-    handler = Recorder()
-    pair = Pair(handler)
-    pair.start()
-    try:
-        for at in range(0, len(data), cut):
-            pair.other.send(data[at : at + cut])
-            pair.connection.on_readable(now=0.0)
-        # After a silence, a possible start of a frame is garbage.
-        pair.connection.on_readable(now=0.1)
-        pair.other.send(frame(1))
-        pair.connection.on_readable(now=1.0)
-        assert handler.received[-1:] == [frame(1)]
-        assert pair.counters.garbage_bytes + sum(map(len, handler.received)) == len(data) + len(frame(1))
-        assert handler.closed == []
-    finally:
-        pair.close()
-        pair.other.close()
-
-
-async def test_endpoint_may_be_closed_while_it_reports(pair: Pair) -> None:
-    """A handler may close the endpoint while it receives frames."""
-    recorder(pair).on_batch = pair.close
-    pair.other.send(frame(1))
-    pair.other.close()
-    await until(lambda: bool(recorder(pair).received))
-    assert pair.channel.sock.fileno() == -1
-    assert recorder(pair).closed == []
-
-
 async def test_closed_endpoint_reports_nothing_more(pair: Pair) -> None:
     """It reports no port as closed, neither a lost one nor an open one."""
     pair.other.close()
@@ -293,3 +166,87 @@ async def test_closed_endpoint_reports_nothing_more(pair: Pair) -> None:
     assert pair.channel.sock.fileno() == -1
     write(pair, pair.connection.port, [frame(2)], now=0.0)
     assert pair.failures == {"EPIPE": 1, "unsent": 2}
+
+
+# After a pause of the process, what waited in the kernel is stale, and the stream stays in step.
+
+
+def pause(pair: Pair) -> None:
+    """This process stood still until now."""
+    pair.handler.stall.turn(boot_time() + 2 * STALL_S)
+
+
+def said(pair: Pair, data: bytes) -> list[tuple[list[bytes], int]]:
+    """What the other side writes and the endpoint then reads: frames, and the epoch of each batch."""
+    before = len(recorder(pair).batches)
+    pair.other.send(data)
+    pair.connection.on_readable(now=0.0)
+    return list(zip(recorder(pair).batches[before:], recorder(pair).epochs[before:], strict=True))
+
+
+async def test_bytes_that_waited_during_a_pause_are_stale(pair: Pair) -> None:
+    """All that is read until the stream was empty, and nothing after it."""
+    pair.other.send(frame(1))
+    pause(pair)
+    assert said(pair, frame(2)) == [([frame(1), frame(2)], STALE)]
+    assert said(pair, frame(3)) == [([frame(3)], 1)]
+
+
+async def test_stale_bytes_keep_the_stream_in_step(pair: Pair) -> None:
+    """A frame that began in them is stale, its rest is not a frame, and the next frame is new."""
+    old = large_frame(1)
+    pair.other.send(old[:100])
+    pause(pair)
+    pair.connection.on_readable(now=0.0)
+    assert said(pair, old[100:]) == [([old], STALE)]
+    assert said(pair, frame(2)) == [([frame(2)], 1)]
+    assert pair.counters.garbage_bytes == 0
+
+
+async def test_stream_that_is_never_empty_is_stale_for_what_the_kernel_can_hold(pair: Pair) -> None:
+    """A client that writes without end is listened to again after so many bytes."""
+    frames = [large_frame(number) for number in range(2 * CAPACITY // 263)]
+    pair.other.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 18)
+    pair.other.send(b"".join(frames))
+    pause(pair)
+    while pair.bytes_received < 2 * READ_BYTES:
+        pair.connection.on_readable(now=0.0)
+    assert recorder(pair).epochs == [STALE, STALE]
+    pair.connection.on_readable(now=0.0)
+    # One frame began in the last of the stale bytes.
+    assert recorder(pair).epochs == [STALE, STALE, STALE]
+    assert said(pair, frame(1)) == [([frame(1)], 1)]
+
+
+async def test_connection_that_was_being_opened_during_a_pause_is_stale(pair: Pair) -> None:
+    """What came before the endpoint could read it may be old."""
+    connection = Connection(pair, pair.channel, "late", opened_at=0.0, opened_in=pair.handler.stall.epoch - 1)
+    pair.handler.on_port_opened(connection.port)
+    pair.other.send(frame(1))
+    connection.on_readable(now=0.0)
+    assert recorder(pair).epochs == [STALE]
+
+
+async def test_device_that_is_opened_again_has_the_same_stream(pair: Pair) -> None:
+    """The parser behind it may have kept its state."""
+    before = pair.connection.port.delivered
+    pair.connection.lose("unplugged")
+    await pair.connection.lost.wait()
+    ours, other = socket.socketpair()
+    pair.channel = RationedChannel(ours)
+    with other:
+        again = pair.open_now()
+        assert again.port.delivered is before
+        again.lose("unplugged")
+        await again.lost.wait()
+
+
+async def test_frame_behind_a_false_start_from_before_a_pause_is_stale(pair: Pair) -> None:
+    """It was read before the pause, though the endpoint knows only after it that it is one."""
+    pair.other.send(b"\xfd\xff\0" + frame(1))
+    pair.connection.on_readable(now=0.0)
+    assert recorder(pair).batches == []
+    pause(pair)
+    pair.connection.check(now=1.0)
+    assert recorder(pair).batches == [[frame(1)]]
+    assert recorder(pair).epochs == [STALE]

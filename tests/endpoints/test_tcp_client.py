@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import os
 import socket
 from collections.abc import AsyncIterator
 from time import monotonic
@@ -36,19 +35,6 @@ async def tcp_client(server: TcpServer) -> AsyncIterator[TcpClient]:
     endpoint = TcpClient("tcp_client", Address(*server.address), Recorder())
     yield endpoint
     endpoint.close()
-
-
-async def test_frames_go_in_both_directions(server: TcpServer, tcp_client: TcpClient) -> None:
-    """`tcp` and `tcpin` endpoints are each other's clients."""
-    server.start()
-    tcp_client.start()
-    await until(lambda: len(server.ports) == len(tcp_client.ports) == 1)
-    assert tcp_client.ports[0].name == str(Address(*server.address))
-    write(tcp_client, tcp_client.ports[0], [frame(1), frame(2)], monotonic())
-    write(server, server.ports[0], [frame(3)], monotonic())
-    await until(
-        lambda: recorder(server).received == [frame(1), frame(2)] and recorder(tcp_client).received == [frame(3)]
-    )
 
 
 async def test_client_waits_for_a_server_that_is_not_there_yet() -> None:
@@ -153,40 +139,6 @@ async def test_name_is_looked_up_at_each_attempt(server: TcpServer, monkeypatch:
         tcp_client.close()
 
 
-async def test_next_address_of_a_name_is_tried(server: TcpServer, monkeypatch: pytest.MonkeyPatch) -> None:
-    """After an address that refuses, or of an unsupported family, the next one is tried."""
-    server.start()
-    answers = [
-        (socket.AF_INET, socket.SOCK_STREAM, 6, "", unused_address().sockaddr),
-        (12345, socket.SOCK_STREAM, 6, "", ("::1", 1, 0, 0)),
-        (socket.AF_INET, socket.SOCK_STREAM, 6, "", server.address),
-    ]
-    monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: answers)
-    tcp_client = TcpClient("tcp_client", Address("autopilot.test", 5760), Recorder())
-    tcp_client.start()
-    try:
-        await until(lambda: len(tcp_client.ports) == 1)
-        assert tcp_client.failures == {"ECONNREFUSED": 1, "EAFNOSUPPORT": 1}
-    finally:
-        tcp_client.close()
-
-
-async def test_address_that_does_not_answer_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    """There is no answer and no refusal: a firewall, or a machine that is off."""
-    monkeypatch.setattr(tcp, "CONNECT_TIMEOUT_S", 0.05)
-    with socket.socket() as deaf:
-        deaf.bind(("127.0.0.1", 0))
-        deaf.listen(0)
-        with socket.create_connection(
-            deaf.getsockname()
-        ):  # the one place in the queue of a listener who never accepts
-            tcp_client = TcpClient("tcp_client", Address(*deaf.getsockname()), Recorder())
-            tcp_client.start()
-            await until(lambda: tcp_client.failures["connect_timeout"] > 0)
-            tcp_client.close()
-    assert tcp_client.failures.keys() == {"connect_timeout"}
-
-
 async def test_connection_to_oneself_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """If no process listens, the kernel may pick the same port for our side, and TCP connects to itself."""
     address = unused_address()
@@ -203,27 +155,3 @@ async def test_connection_to_oneself_is_refused(monkeypatch: pytest.MonkeyPatch)
     await until(lambda: tcp_client.failures["ECONNREFUSED"] > 0)
     assert recorder(tcp_client).open == []
     tcp_client.close()
-
-
-async def test_sockets_hold_little_and_notice_the_end(server: TcpServer, tcp_client: TcpClient) -> None:
-    """Both sides send at once, hold few bytes, and probe the other side."""
-    server.start()
-    tcp_client.start()
-    await until(lambda: len(server.ports) == len(tcp_client.ports) == 1)
-    for endpoint in (server, tcp_client):
-        (connection,) = endpoint._connections.values()
-        assert not os.get_blocking(connection.channel.fileno())
-        with socket.socket(fileno=os.dup(connection.channel.fileno())) as sock:
-            assert sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY) == 1
-            assert sock.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE) == 1
-            assert sock.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF) <= 32768
-
-
-async def test_closed_client_leaves_nothing_behind(tcp_client: TcpClient) -> None:
-    """Closed before it was started, while it connects or while it waits: no port, and no socket (a warning here)."""
-    tcp_client.start()
-    await asyncio.sleep(0)
-    tcp_client.close()
-    await asyncio.sleep(0)
-    assert list(tcp_client.ports) == []
-    assert recorder(tcp_client).open == []

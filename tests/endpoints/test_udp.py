@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import socket
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from contextlib import ExitStack
-from typing import Any
 
 import pytest
 
-from tests.daemon.frames import frame, heartbeat
 from tests.daemon.udp import open_socket
-from tests.endpoints.clients import write
-from tests.waiting import until
+from tests.endpoints.clients import Recorder, frame, heartbeat, write
 from uavlinkd.endpoints.ports import LocalPort
 from uavlinkd.endpoints.reader import Datagrams, Reader
 from uavlinkd.endpoints.sockets import udp_socket
@@ -23,45 +20,10 @@ from uavlinkd.endpoints.udp import (
     LOCAL_DATAGRAM_BYTES,
     UdpServer,
 )
-from uavlinkd.mavlink import frames
-from uavlinkd.mavlink.frames import Frame
 from uavlinkd.mavlink.stream_splitter import MAX_GAP_S
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.clock import monotonic
-from uavlinkd.system.stall import STALE, STALL_S, StallWatch
-
-
-class Recorder:
-    """The reports of an endpoint."""
-
-    def __init__(self) -> None:
-        self.opened: list[str] = []
-        self.closed: list[str] = []
-        self.silent: list[str] = []
-        self.received: list[tuple[str, list[bytes]]] = []
-        self.waited: list[float] = []
-        self.epochs: list[int] = []
-        self.stall = StallWatch(monotonic(), lambda seconds: None)
-
-    def on_port_opened(self, port: LocalPort) -> None:
-        """A client connected."""
-        self.opened.append(port.name)
-
-    def on_port_closed(self, port: LocalPort) -> None:
-        """It disconnected."""
-        self.closed.append(port.name)
-
-    def on_port_silent(self, port: LocalPort) -> None:
-        self.silent.append(port.name)
-
-    def on_port_active(self, port: LocalPort) -> None:
-        self.silent.remove(port.name)
-
-    def on_frames(self, port: LocalPort, frames: list[Frame], now: float, epoch: int, waited_s: float = 0.0) -> None:
-        """Its frames."""
-        self.received.append((port.name, [frame.raw for frame in frames]))
-        self.waited.append(waited_s)
-        self.epochs.append(epoch)
+from uavlinkd.system.stall import STALE, STALL_S
 
 
 @pytest.fixture
@@ -99,23 +61,22 @@ def name_of(sock: socket.socket) -> str:
     return str(Address(*sock.getsockname()))
 
 
+def names(ports: Sequence[LocalPort]) -> list[str]:
+    return [port.name for port in ports]
+
+
 def reader_of(server: UdpServer, now: float = 1.0) -> Reader:
     """A reader whose datagrams arrive at this time."""
 
     def take(datagrams: Datagrams, _: float, epoch: int, waited_s: float) -> None:
         server.take(datagrams, now, epoch, waited_s)
 
-    return Reader(server._sock, take, server._on_read_error, server._handler.stall)
+    return Reader(server._sock, take, server._on_read_error, server.handler.stall)
 
 
 def read(server: UdpServer, now: float = 1.0) -> None:
     """Read the socket as the loop does."""
     reader_of(server, now).read(monotonic())
-
-
-def is_gathering(server: UdpServer) -> bool:
-    """Whether a timer reads the socket next."""
-    return server._reader is not None and server._reader.is_paused
 
 
 async def test_all_datagrams_are_delivered_in_one_batch(server: UdpServer, recorder: Recorder, client: Make) -> None:
@@ -125,8 +86,8 @@ async def test_all_datagrams_are_delivered_in_one_batch(server: UdpServer, recor
     other.send(frame(2))
     one.send(frame(3) + frame(4))
     read(server)
-    assert recorder.received == [(name_of(one), [frame(1), frame(3), frame(4)]), (name_of(other), [frame(2)])]
-    assert recorder.opened == [name_of(one), name_of(other)]
+    assert recorder.by_client == [(name_of(one), [frame(1), frame(3), frame(4)]), (name_of(other), [frame(2)])]
+    assert names(recorder.open) == [name_of(one), name_of(other)]
     assert server.counters.frames == 4
     assert server.bytes_received == len(frame(1) + frame(2) + frame(3) + frame(4))
 
@@ -138,62 +99,8 @@ async def test_garbage_does_not_make_its_sender_a_client(
     """Only a genuine frame does."""
     client().send(datagram)
     read(server)
-    assert (list(server.ports), recorder.received, recorder.opened) == ([], [], [])
+    assert (list(server.ports), recorder.by_client, recorder.open) == ([], [], [])
     assert server.counters.garbage_bytes == len(datagram) == server.bytes_received
-
-
-async def test_a_bridge_may_cut_frames_apart(server: UdpServer, recorder: Recorder, client: Make) -> None:
-    """Bytes of a serial line, 24 per datagram: after a whole frame, all but a few frames arrive."""
-    bridge, other = client(), client()
-    sent = [heartbeat(), *(frame(number) for number in range(50))]
-    stream = b"".join(sent)
-    for position in range(0, len(stream), 24):
-        bridge.send(stream[position : position + 24])
-        other.send(frame(1000 + position))
-        read(server)
-    received = [raw for name, frames in recorder.received if name == name_of(bridge) for raw in frames]
-    assert received == [sent[0], *sent[len(sent) + 1 - len(received) :]]
-    assert len(received) >= len(sent) - 3
-    whole = sum(len(frames) for name, frames in recorder.received if name == name_of(other))
-    assert whole == -(-len(stream) // 24)
-    carried = sum(len(raw) for _, frames in recorder.received for raw in frames)
-    assert carried + server.counters.garbage_bytes == server.bytes_received
-
-
-async def test_a_bridge_is_forgotten_when_idle(server: UdpServer, client: Make) -> None:
-    """The part of a frame that was held is forgotten with its client. Other garbage is not held at all."""
-    bridge = client()
-    for datagram in (heartbeat(), b"no frame", frame(1)[:20]):
-        bridge.send(datagram)
-        read(server)
-    assert list(server._splitters) == list(server._ports)
-    server.do_housekeeping(2.0 + CLIENT_IDLE_S)
-    assert (server._splitters, server._ports) == ({}, {})
-
-
-@pytest.mark.parametrize("start", [b"\xfd\x00\x00", b"\xfe\x00", b"\xfe\xff"])
-async def test_false_starts_in_what_a_bridge_sends_cost_a_bounded_time(
-    server: UdpServer, client: Make, start: bytes, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Only the first false starts of a datagram are examined."""
-    bridge = client()
-    for datagram in (heartbeat(), frame(1)[:20], frame(1)[20:]):
-        bridge.send(datagram)
-        read(server)
-    assert server._splitters
-    genuine, looked_at = frames.parse_frames, 0
-
-    def look(*arguments: Any, **options: Any) -> Any:
-        nonlocal looked_at
-        looked_at += 1
-        return genuine(*arguments, **options)
-
-    monkeypatch.setattr(frames, "parse_frames", look)
-    for _ in range(20):
-        bridge.send(start * (60000 // len(start)))
-        read(server)
-    assert 20 < looked_at <= 20 * (frames.MAX_FALSE_STARTS + 1)
-    assert server.counters.garbage_bytes > 20 * 59000
 
 
 @pytest.mark.parametrize("start", [b"\xfd\xff\x00", b"\xfe\xff", frame(7)[:1] + b"\xf0" + frame(7)[2:], b"\xfd"])
@@ -210,15 +117,15 @@ async def test_a_broken_beginning_doubles_nothing_and_holds_nothing_back(
         for datagram in (frame(8)[:20], frame(9)[:20], frame(9)[20:]):
             bridge.send(datagram)
             read(server, 1.0)
-        recorder.received[1:] = []
+        recorder.by_client[1:] = []
     assert bool(server._splitters) == cuts
     bridge.send(start + sent[1] + sent[2])
     read(server, 1.1)
     server.do_housekeeping(1.1 + MAX_GAP_S + 1.0)
-    assert [raw for _, raws in recorder.received for raw in raws] == sent[:3]
+    assert [raw for _, raws in recorder.by_client for raw in raws] == sent[:3]
     bridge.send(sent[3])
     read(server, 3.0)
-    assert [raw for _, raws in recorder.received for raw in raws] == sent
+    assert [raw for _, raws in recorder.by_client for raw in raws] == sent
     assert bool(server._splitters) == cuts
     carried = server.counters.garbage_bytes + sum(map(len, sent))
     assert carried + (len(frame(9)) if cuts else 0) == server.bytes_received
@@ -251,8 +158,8 @@ async def test_idle_clients_are_forgotten(
     speaking.send(heartbeat())
     read(server, 101.0)
     server.do_housekeeping(now)
-    assert [port.name for port in server.ports] == [*[name_of(silent)] * is_there, name_of(speaking)]
-    assert recorder.closed == ([] if is_there else [name_of(silent)])
+    assert names(server.ports) == [*[name_of(silent)] * is_there, name_of(speaking)]
+    assert names(recorder.closed) == ([] if is_there else [name_of(silent)])
 
 
 async def test_a_forgotten_client_is_not_sent_to(server: UdpServer, client: Make) -> None:
@@ -282,7 +189,7 @@ async def test_new_clients_cannot_displace_active_ones(server: UdpServer, record
     assert len(server.ports) == CLIENTS_PER_ENDPOINT
     assert server.failures["too_many_clients"] == 1
     assert recorder.closed == []
-    assert name_of(newcomer) not in [name for name, _ in recorder.received]
+    assert name_of(newcomer) not in [name for name, _ in recorder.by_client]
 
 
 async def test_a_new_client_displaces_the_one_that_is_silent_longest(
@@ -298,25 +205,9 @@ async def test_a_new_client_displaces_the_one_that_is_silent_longest(
     newcomer = client()
     newcomer.send(heartbeat())
     read(server, 100.0 + CLIENT_SILENT_S)
-    assert recorder.closed == [name_of(clients[1])]
-    assert [port.name for port in server.ports][-1] == name_of(newcomer)
+    assert names(recorder.closed) == [name_of(clients[1])]
+    assert names(server.ports)[-1] == name_of(newcomer)
     assert len(server.ports) == CLIENTS_PER_ENDPOINT
-
-
-async def test_frames_that_may_wait_are_read_in_one_wake_up(
-    server: UdpServer, recorder: Recorder, client: Make
-) -> None:
-    """Frames that arrive after the first one are delivered with it, with the time that they waited; repeatedly."""
-    server.gather(0.2)
-    server.start()
-    one = client()
-    for first, second in ((1, 2), (3, 4)):
-        one.send(frame(first))
-        await until(lambda: is_gathering(server))
-        one.send(frame(second))
-        await until(lambda: not is_gathering(server))
-    assert [frames for _, frames in recorder.received] == [[frame(1), frame(2)], [frame(3), frame(4)]]
-    assert recorder.waited == [0.2, 0.2]
 
 
 async def test_frame_that_a_bridge_began_before_a_pause_is_stale(
@@ -333,5 +224,5 @@ async def test_frame_that_a_bridge_began_before_a_pause_is_stale(
     for datagram in (cut[10:], frame(3)):
         one.send(datagram)
         reader.read(monotonic())
-    assert [frames for _, frames in recorder.received] == [[frame(1)], [frame(1)], [cut], [frame(3)]]
+    assert [frames for _, frames in recorder.by_client] == [[frame(1)], [frame(1)], [cut], [frame(3)]]
     assert recorder.epochs == [0, 0, STALE, 1]

@@ -12,9 +12,8 @@ from tests.waiting import until
 from uavlinkd.config import Config
 from uavlinkd.config.load import load_config
 from uavlinkd.fleet import operations
-from uavlinkd.fleet.errors import FleetError
 from uavlinkd.fleet.manifest import FleetSettings, MemberKind, read_manifest
-from uavlinkd.fleet.plan import NO_PLAN
+from uavlinkd.fleet.plan import NO_PLAN, FleetError
 from uavlinkd.fleet.transaction import check_members
 from uavlinkd.system.addresses import Address
 

@@ -12,8 +12,8 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
-from tests.fleet.swarm import end
 from tests.waiting import until
+from uavlinkd.config.model import KEY_GRACE_S
 from uavlinkd.fleet import operations
 from uavlinkd.fleet.manifest import FleetSettings, read_manifest
 from uavlinkd.fleet.plan import NO_PLAN
@@ -24,19 +24,26 @@ from uavlinkd.system.addresses import Address
 
 NAMES = ("drone1", "drone2", "drone3")
 RELAY = "relay"
+END_S = 120.0
+"""A daemon ends within a fraction of this."""
 
 
 class Vehicles:
     """Daemons with their own folders. Files are copied there from the fleet's folder."""
 
-    def __init__(self, folder: Path, *, with_relay: bool = False) -> None:
+    def __init__(self, folder: Path, drones: int, *, with_relay: bool = False) -> None:
         self._folder = folder
         self.fleet = folder / "fleet"
         plan = NO_PLAN if with_relay else f"127.0.14.{{n}}:{free_port()}"
         settings = FleetSettings(address_plan=plan, drone_url=f"udpin:127.0.14.{{n}}:{free_port()}", psk=True)
         relays = [Address("127.0.0.1", free_port())] if with_relay else []
-        operations.init(self.fleet, settings, len(NAMES), 0, 0, relays)
+        operations.init(self.fleet, settings, drones, 0, 0, relays)
         self._processes: dict[str, asyncio.subprocess.Process] = {}
+
+    @property
+    def pids(self) -> dict[str, int]:
+        """The processes of the daemons that run."""
+        return {name: process.pid for name, process in self._processes.items()}
 
     def place(self, name: str) -> Path:
         """The folder on the vehicle."""
@@ -49,11 +56,13 @@ class Vehicles:
                 path.unlink()
         shutil.copytree(self.fleet / name, self.place(name), dirs_exist_ok=True)
 
-    async def start(self, name: str) -> None:
+    async def start(self, name: str, *, grace_s: float = KEY_GRACE_S) -> None:
         """Start the daemon with the files on the vehicle."""
+        grace = f"from uavlinkd.config import model; model.KEY_GRACE_S = {grace_s}"
+        code = f"{grace}; from uavlinkd.cli import main; main()"
         with (self._folder / f"{name}.log").open("ab") as log:
             self._processes[name] = await asyncio.create_subprocess_exec(
-                *end_with_parent(sys.executable, "-m", "uavlinkd", "run"),
+                *end_with_parent(sys.executable, "-c", code, "run"),
                 *("--config", str(self.place(name) / f"{name}.toml")),
                 stdout=log,
                 stderr=log,
@@ -111,19 +120,33 @@ class Vehicles:
         assert not [name for name, text in logs.items() if "Traceback" in text]
 
 
+async def end(process: asyncio.subprocess.Process) -> int:
+    """End a daemon; its exit status. Kill it if it ignores SIGTERM."""
+    if process.returncode is None:
+        process.terminate()
+    try:
+        return await asyncio.wait_for(process.wait(), END_S)
+    except TimeoutError:
+        process.kill()
+        return await process.wait()
+
+
 @asynccontextmanager
-async def flying(*, with_relay: bool = False) -> AsyncIterator[Vehicles]:
-    """Three linked drones; ``with_relay``: they have no addresses, and meet at a relay.
+async def flying(
+    *, drones: int = len(NAMES), with_relay: bool = False, started: bool = True
+) -> AsyncIterator[Vehicles]:
+    """Linked drones; ``with_relay``: they have no addresses, and meet at a relay.
 
     Their folder has a short name, because the path of a Unix socket has to be short.
     """
     with tempfile.TemporaryDirectory(prefix="uavlinkd-") as folder:
-        vehicles = Vehicles(Path(folder), with_relay=with_relay)
+        vehicles = Vehicles(Path(folder), drones, with_relay=with_relay)
         try:
-            for name in (*NAMES, *([RELAY] if with_relay else [])):
+            for name in (*NAMES, *([RELAY] if with_relay else [])) if started else ():
                 vehicles.carry(name)
                 await vehicles.start(name)
-            await vehicles.until_linked()
+            if started:
+                await vehicles.until_linked()
             yield vehicles
         finally:
             await vehicles.close()

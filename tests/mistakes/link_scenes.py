@@ -89,7 +89,6 @@ async def port_in_use(scene: Scene) -> None:
     host, port = scene.here.sockaddr
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         sock.bind((host, port))
-        scene.check = checked(scene.here)
         scene.command = await said_by_process("run", "--config", str(scene.here.write_config()))
 
 
@@ -244,7 +243,6 @@ async def recording(scene: Scene) -> None:
     (scene.here.folder / "file").touch()
     scene.here.config["recording"] = {"folder": "file"}
     into = scene.here.add_endpoint("autopilot")
-    scene.check = checked(scene.here)
     await _linked(scene)
     await scene.send(into, _vehicle(1))
 

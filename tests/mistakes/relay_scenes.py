@@ -140,7 +140,6 @@ async def port_in_use(scene: Scene) -> None:
     _member(scene.there, scene.here)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         sock.bind(scene.here.sockaddr)
-        scene.check = checked(scene.here)
         scene.command = await said_by_process("relay", "--config", str(scene.here.write_config()))
 
 

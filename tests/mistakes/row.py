@@ -10,9 +10,6 @@ from typing import TYPE_CHECKING, Literal
 if TYPE_CHECKING:
     from tests.mistakes.scene import Scene
 
-Grade = Literal["exact", "partial", "not needed"]
-Before = Literal["yes", "half", "no", "-", "new"]
-"""Whether the remedy was shown before `status` had causes; ``-``: none is needed; ``new``: not tried then."""
 Side = Literal["here", "there"]
 
 
@@ -31,14 +28,11 @@ class Mistake:
 
     row: str
     name: str
-    before: Before
-    grade: Grade = "exact"
+    make: Callable[[Scene], Awaitable[None]]
+    """Makes the mistake. If it needs no remedy, this waits for the link, which works in spite of it."""
     check: str = ""
     command: str = ""
     signs: tuple[Sign, ...] = ()
-    make: Callable[[Scene], Awaitable[None]] | None = None
-    is_up: bool = False
-    """Whether the link works in spite of the mistake."""
 
 
 @dataclass(slots=True)
@@ -50,20 +44,8 @@ class Result:
     causes: dict[Side, set[str]] = field(default_factory=lambda: {"here": set(), "there": set()})
     logged: dict[Side, set[str]] = field(default_factory=lambda: {"here": set(), "there": set()})
     shown: list[Sign] = field(default_factory=list)
-    within_s: float = 0.0
-    calm_s: float = 0.0
-    was_up: bool = False
     problem: str = ""
     """Why the mistake could not be made, or what was missing."""
-
-    def remedy(self, mistake: Mistake) -> str:
-        """``exact``: check, command or status name the mistake and what to do. ``partial``: an event without it."""
-        if mistake.grade == "not needed":
-            return "not needed" if self.was_up or (mistake.check and is_in(mistake.check, self.check)) else "no"
-        texts = ((mistake.check, self.check), (mistake.command, self.command))
-        if self.shown or any(pattern and is_in(pattern, text) for pattern, text in texts):
-            return "exact"
-        return "partial" if self.causes["here"] | self.causes["there"] else "no"
 
 
 def is_in(pattern: str, text: str) -> bool:

@@ -12,9 +12,9 @@ from tests.daemon.process import DaemonProcess, Status
 from tests.mistakes.file_rows import FILE_ROWS
 from tests.mistakes.link_rows import LINK_ROWS
 from tests.mistakes.relay_rows import RELAY_ROWS
-from tests.mistakes.row import Mistake, Result, Side, Sign, is_in
+from tests.mistakes.row import Mistake, Result, Side, is_in
 from tests.mistakes.scene import Scene
-from tests.waiting import PATIENCE_S, Stopwatch
+from tests.waiting import PATIENCE_S
 
 STARTS = 4
 """Daemons that start at the same time: each needs a core for a third of a second."""
@@ -41,17 +41,14 @@ async def run_all(mistakes: tuple[Mistake, ...] = MISTAKES) -> dict[str, Result]
 
 async def _run(mistake: Mistake, stage: Stage, starting: asyncio.Semaphore) -> Result:
     result, scene = Result(), Scene(stage, mistake.row, starting)
-    assert mistake.make is not None
     try:
         await mistake.make(scene)
-        stopwatch, begun = Stopwatch(), monotonic()
+        begun = monotonic()
         result.check, result.command = scene.check, scene.command
-        result.was_up = mistake.is_up  # `make` waited for the link
         while mistake.signs:
             for side, daemon in (("here", scene.here), ("there", scene.there)):
                 if daemon.is_running:
                     _note(result, mistake, side, daemon, await daemon.status())  # type: ignore[arg-type]
-            result.within_s, result.calm_s = stopwatch.elapsed_s, stopwatch.calm_s
             is_logged = all(sign.cause in result.logged[sign.side] for sign in mistake.signs)
             if len(result.shown) == len(mistake.signs) and is_logged:
                 break
@@ -73,14 +70,10 @@ def _note(result: Result, mistake: Mistake, side: Side, daemon: DaemonProcess, s
     for finding in status["findings"]:
         result.causes[side].add(finding["cause"])
         for sign in mistake.signs:
-            if (sign.side, sign.cause) == (side, finding["cause"]) and is_in(sign.remedy, finding["remedy"]):
-                _show(result, sign)
+            is_shown = (sign.side, sign.cause) == (side, finding["cause"]) and is_in(sign.remedy, finding["remedy"])
+            if is_shown and sign not in result.shown:
+                result.shown.append(sign)
     if any(sign.side == side for sign in result.shown):
         result.logged[side] |= {line["cause"] for line in daemon.events("problem_began")}
         # A few causes have an event of their own, by the same name.
         result.logged[side] |= {sign.cause for sign in mistake.signs if daemon.events(sign.cause)}
-
-
-def _show(result: Result, sign: Sign) -> None:
-    if sign not in result.shown:
-        result.shown.append(sign)

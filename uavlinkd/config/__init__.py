@@ -4,26 +4,25 @@
 not need.
 """
 
-from uavlinkd.config.errors import ConfigError, Problem
 from uavlinkd.config.model import (
     Config,
+    ConfigError,
     EndpointConfig,
     Log,
     NetworkConfig,
     PeerAddress,
     PeerConfig,
     PolicyData,
+    Problem,
     Recording,
     RelayConfig,
     RelayServer,
     Routing,
 )
-from uavlinkd.mavlink.egress.budgeted import EgressSettings
 
 __all__ = [
     "Config",
     "ConfigError",
-    "EgressSettings",
     "EndpointConfig",
     "Log",
     "NetworkConfig",

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from itertools import combinations
 from math import ceil
 
-from uavlinkd.config.model import EndpointConfig, PeerAddress, PeerConfig, Routing
+from uavlinkd.config.model import Config, EndpointConfig, PeerAddress, PeerConfig, Routing
 from uavlinkd.core import constants as c
 from uavlinkd.core.settings import Link
 from uavlinkd.core.wire import initiation_bytes, response_bytes
@@ -20,31 +20,23 @@ IPV6_LEAST_PAYLOAD = 1280 - 40 - 8
 ETHERNET_PAYLOAD = 1500 - 40 - 8
 """Over IPv6; IPv4 has 20 bytes more."""
 _SHORT_TAG_BYTES = 8
-_HASH_BLOCK_BITS = 512
 
 
-def advice(
-    listen: Sequence[Address],
-    endpoints: Sequence[EndpointConfig],
-    peers: Sequence[PeerConfig],
-    routing: Routing,
-    metrics: Address | None,
-    *,
-    is_relay: bool = False,
-) -> Iterator[str]:
+def advice(config: Config) -> Iterator[str]:
     """Yield the warnings, those about safety first."""
+    endpoints, peers = config.endpoints, config.peers
     yield from _policies(endpoints, peers)
-    yield from _relayed(peers, routing)
+    yield from _relayed(peers, config.routing)
     yield from _exposed(endpoints)
-    yield from _exposed_metrics(metrics)
+    yield from _exposed_metrics(config.metrics)
     yield from _shared_secrets(peers)
     yield from _readable(peers)
-    yield from _lengths(peers)
+    yield from _links(peers)
     yield from _slow(peers)
-    yield from _reach(listen, peers)
-    if is_relay and not endpoints and not peers:
+    yield from _reach(() if config.has_ip_networks else config.listen, peers)
+    if config.is_only_relay:
         return
-    if not endpoints and not (routing.relay and len(peers) > 1):
+    if not endpoints and not (config.routing.relay and len(peers) > 1):
         yield "there is no [[endpoint]]: no MAVLink client can connect to this daemon"
     if not peers:
         yield "there is no [[peer]]: this daemon makes no link"
@@ -107,29 +99,22 @@ def _exposed(endpoints: Sequence[EndpointConfig]) -> Iterator[str]:
         url = endpoint.url
         if not isinstance(url, NetworkUrl) or not url.is_exposed:
             continue
-        may = "the messages that its policy passes" if endpoint.policy else "any message, as any system"
-        if url.kind is EndpointKind.TCP:
-            yield (
-                f'endpoint "{endpoint.name}" connects beyond this machine ({url}): between these machines MAVLink is'
-                f" neither authentic nor secret; an attacker on that path can send to every peer {may}"
-            )
-        elif url.listens and endpoint.policy:
+        may = (
+            "what its policy passes"
+            if endpoint.policy
+            else "commands (arm, disarm, take-off, flight termination), missions and parameters to every peer, as if"
+            " this vehicle had sent them"
+        )
+        if url.listens:
             yield (
                 f'endpoint "{endpoint.name}" listens beyond loopback ({url}): any sender that reaches that port can'
-                " send and receive what its policy passes; unless that is intended, write"
+                f" send {may}, and read what the peers send; unless that is intended, write"
                 f" {url.kind}:127.0.0.1:{url.address.port}"
-            )
-        elif url.listens:
-            yield (
-                f'endpoint "{endpoint.name}" listens beyond loopback ({url}): any sender that reaches that port can'
-                " send commands (arm, disarm, take-off, flight termination), missions and parameters to every peer"
-                " as if this vehicle had sent them, and can read what the peers send;"
-                f" unless that is intended, write {url.kind}:127.0.0.1:{url.address.port}"
             )
         else:
             yield (
-                f'endpoint "{endpoint.name}" sends beyond this machine ({url}): between these machines MAVLink is'
-                f" neither authentic nor secret; an attacker that forges that address can send to every peer {may}"
+                f'endpoint "{endpoint.name}" sends beyond this machine ({url}): MAVLink there is neither authentic'
+                f" nor secret; an attacker on that path can send {may}"
             )
 
 
@@ -161,31 +146,17 @@ def _readable(peers: Sequence[PeerConfig]) -> Iterator[str]:
         )
 
 
-def _lengths(peers: Sequence[PeerConfig]) -> Iterator[str]:
-    short = _peers_with(peers, lambda link: not link.confidential and link.tag_bytes <= _SHORT_TAG_BYTES)
-    if short:
+def _links(peers: Sequence[PeerConfig]) -> Iterator[str]:
+    if names := _peers_with(peers, lambda link: not link.confidential and link.tag_bytes <= _SHORT_TAG_BYTES):
         yield (
-            f"tags of 64 bits with {short}: each forged envelope is accepted with probability 2^-64; use them on"
-            " slow radios only, otherwise write tag_bits = 128"
+            f"tags of 64 bits with {names}: each forged envelope is accepted with probability 2^-64; use them on slow"
+            " radios only, otherwise write tag_bits = 128"
         )
-    long_keys = _peers_with(peers, lambda link: not link.confidential and link.mac_key_bits > _HASH_BLOCK_BITS)
-    if long_keys:
+    if names := _peers_with(peers, lambda link: link.max_envelope > ETHERNET_PAYLOAD):
         yield (
-            f"MAC keys over 512 bits with {long_keys}: HMAC hashes a key longer than its block first (RFC 2104),"
-            " so they add no security over mac_key_bits = 512"
-        )
-    unused = _peers_with(peers, lambda link: link.confidential and (link.tag_bytes, link.mac_key_bits) != (16, 256))
-    if unused:
-        yield (
-            f"tag_bits and mac_key_bits have no effect with {unused}: a confidential link has the tag and the key of"
-            " ChaCha20-Poly1305, 128 and 256 bits"
-        )
-    split = _peers_with(peers, lambda link: link.max_envelope > ETHERNET_PAYLOAD)
-    if split:
-        yield (
-            f"envelopes over {ETHERNET_PAYLOAD:,} bytes with {split}: most networks split them, and losing one part"
-            " loses all; unless the path is known to carry them whole, write"
-            f" max_envelope_bytes = {c.DEFAULT_ENVELOPE_LIMIT}"
+            f"envelopes over {ETHERNET_PAYLOAD:,} bytes with {names}: most networks split them, and losing one part"
+            " loses all; unless the path is known to carry them whole, write max_envelope_bytes ="
+            f" {c.DEFAULT_ENVELOPE_LIMIT}"
         )
     for suite in dict.fromkeys(suite for peer in peers for suite in peer.settings.link.suites):
         size = initiation_bytes(suite)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from typing import Protocol, TypeVar
 
-from uavlinkd.config.errors import ConfigError, Problem
-from uavlinkd.config.model import Config, EndpointConfig, PeerConfig, RelayConfig
+from uavlinkd.config.model import Config, ConfigError, EndpointConfig, PeerConfig, Problem, RelayConfig
 from uavlinkd.relay.member_settings import MemberSettings
 
 _FIXED = {
@@ -18,15 +19,22 @@ _FIXED = {
     "routing": "routing",
     "metrics": "metrics",
     "recording": "recording",
-    "key_grace_s": "key_grace_s",
 }
 """Fields that cannot change while the daemon runs, with the key of each in the file."""
 _NEEDS_RESTART = "cannot change while the daemon runs: restart it, or put the old value back"
 
 
+class _Named(Protocol):
+    @property
+    def name(self) -> str: ...
+
+
+_Section = TypeVar("_Section", bound=_Named)
+
+
 @dataclass(frozen=True, slots=True)
 class ConfigChanges:
-    """Added, removed and changed peers, endpoints and relays.
+    """Removed, added and changed peers, endpoints, members and relays.
 
     A peer or relay with new keys or link settings is removed and added.
     """
@@ -37,30 +45,21 @@ class ConfigChanges:
     closed_endpoints: tuple[str, ...]
     opened_endpoints: tuple[EndpointConfig, ...]
     changed_endpoints: tuple[EndpointConfig, ...]
-    added_members: tuple[str, ...] = ()
-    removed_members: tuple[str, ...] = ()
-    changed_members: tuple[str, ...] = ()
-    removed_relays: tuple[str, ...] = ()
-    added_relays: tuple[RelayConfig, ...] = ()
-    changed_relays: tuple[RelayConfig, ...] = ()
+    removed_members: tuple[str, ...]
+    added_members: tuple[MemberSettings, ...]
+    changed_members: tuple[MemberSettings, ...]
+    removed_relays: tuple[str, ...]
+    added_relays: tuple[RelayConfig, ...]
+    changed_relays: tuple[RelayConfig, ...]
 
     def summary(self) -> dict[str, list[str]]:
         """Names by kind of change, for a log, without kinds that did not occur."""
-        named = {
-            "peers_removed": list(self.removed_peers),
-            "peers_added": [peer.name for peer in self.added_peers],
-            "peers_changed": [peer.name for peer in self.changed_peers],
-            "endpoints_closed": list(self.closed_endpoints),
-            "endpoints_opened": [endpoint.name for endpoint in self.opened_endpoints],
-            "endpoints_changed": [endpoint.name for endpoint in self.changed_endpoints],
-            "members_removed": list(self.removed_members),
-            "members_added": list(self.added_members),
-            "members_changed": list(self.changed_members),
-            "relays_removed": list(self.removed_relays),
-            "relays_added": [relay.name for relay in self.added_relays],
-            "relays_changed": [relay.name for relay in self.changed_relays],
-        }
-        return {kind: names for kind, names in named.items() if names}
+        summary = {}
+        for field in self.__slots__:
+            verb, noun = field.split("_")
+            if sections := getattr(self, field):
+                summary[f"{noun}_{verb}"] = [one if isinstance(one, str) else one.name for one in sections]
+        return summary
 
 
 def compare(old: Config, new: Config) -> ConfigChanges:
@@ -69,72 +68,47 @@ def compare(old: Config, new: Config) -> ConfigChanges:
     Raises:
         ConfigError: every key whose change needs a restart.
     """
-    fixed = tuple(
-        Problem(str(new.path), key, _NEEDS_RESTART)
-        for field, key in _FIXED.items()
-        if getattr(old, field) != getattr(new, field)
-    )
+    fixed = [key for field, key in _FIXED.items() if getattr(old, field) != getattr(new, field)]
     if (old.relay_server is None) != (new.relay_server is None):
-        fixed += (Problem(str(new.path), "relay_server", _NEEDS_RESTART),)
+        fixed.append("member")
     if new.previous_private_key not in (None, old.previous_private_key):
-        fixed += (Problem(str(new.path), "previous_private_key_file", _NEEDS_RESTART),)
-    endpoints_before = {endpoint.name: endpoint for endpoint in old.endpoints}
-    endpoints_now = {endpoint.name: endpoint for endpoint in new.endpoints}
-    same_endpoints = [
-        name
-        for name, endpoint in endpoints_now.items()
-        if name in endpoints_before and endpoints_before[name].url == endpoint.url
-    ]
-    fixed += tuple(
-        Problem(str(new.path), f"endpoint.max_age_s ({name})", _NEEDS_RESTART)
-        for name in same_endpoints
-        if endpoints_before[name].max_age_s != endpoints_now[name].max_age_s
-    )
+        fixed.append("previous_private_key_file")
     if fixed:
-        raise ConfigError(fixed)
-    peers_before = {peer.name: peer for peer in old.peers}
-    peers_now = {peer.name: peer for peer in new.peers}
-    same_peers = {
-        name
-        for name, peer in peers_now.items()
-        if name in peers_before and _is_accepted_already(peer, peers_before[name])
-    }
-    members_before, members_now = _members(old), _members(new)
-    relays_before = {relay.name: relay for relay in old.relays}
-    relays_now = {relay.name: relay for relay in new.relays}
-    same_relays = {
-        name
-        for name, relay in relays_now.items()
-        if name in relays_before
-        and (relay.settings, relay.peer) == (relays_before[name].settings, relays_before[name].peer)
-        and relay.previous_public_key in (None, relays_before[name].previous_public_key)
-        and (relay.peer is None or relay.peer in same_peers)
-    }
+        raise ConfigError(tuple(Problem(str(new.path), key, _NEEDS_RESTART) for key in fixed))
+    peers = _compare(old.peers, new.peers, _is_accepted_already)
+    new_peers = {peer.name for peer in peers[1]}
+
+    def is_same_relay(before: RelayConfig, relay: RelayConfig) -> bool:
+        is_known = relay.previous_public_key in (None, before.previous_public_key)
+        is_same = (relay.settings, relay.peer) == (before.settings, before.peer)
+        return is_same and is_known and relay.peer not in new_peers
+
     return ConfigChanges(
-        removed_peers=tuple(name for name in peers_before if name not in same_peers),
-        added_peers=tuple(peer for name, peer in peers_now.items() if name not in same_peers),
-        changed_peers=tuple(peers_now[name] for name in same_peers if peers_now[name] != peers_before[name]),
-        closed_endpoints=tuple(name for name in endpoints_before if name not in same_endpoints),
-        opened_endpoints=tuple(endpoint for name, endpoint in endpoints_now.items() if name not in same_endpoints),
-        changed_endpoints=tuple(
-            endpoints_now[name] for name in same_endpoints if endpoints_now[name] != endpoints_before[name]
-        ),
-        added_members=tuple(name for name in members_now if name not in members_before),
-        removed_members=tuple(name for name in members_before if name not in members_now),
-        changed_members=tuple(
-            name for name in members_now if members_before.get(name, members_now[name]) != members_now[name]
-        ),
-        removed_relays=tuple(name for name in relays_before if name not in same_relays),
-        added_relays=tuple(relay for name, relay in relays_now.items() if name not in same_relays),
-        changed_relays=tuple(relays_now[name] for name in same_relays if relays_now[name] != relays_before[name]),
+        *peers,
+        *_compare(old.endpoints, new.endpoints, lambda before, endpoint: before.url == endpoint.url),
+        *_compare(_members(old), _members(new), lambda before, member: True),
+        *_compare(old.relays, new.relays, is_same_relay),
     )
 
 
-def _members(config: Config) -> dict[str, MemberSettings]:
-    return {} if config.relay_server is None else {member.name: member for member in config.relay_server.members}
+def _compare(
+    before: Iterable[_Section], now: Iterable[_Section], is_same: Callable[[_Section, _Section], bool]
+) -> tuple[tuple[str, ...], tuple[_Section, ...], tuple[_Section, ...]]:
+    """Names of the removed sections, the added ones, and those that are the same with other settings."""
+    old = {section.name: section for section in before}
+    kept = {section.name: section for section in now if section.name in old and is_same(old[section.name], section)}
+    return (
+        tuple(name for name in old if name not in kept),
+        tuple(section for section in now if section.name not in kept),
+        tuple(section for name, section in kept.items() if section != old[name]),
+    )
 
 
-def _is_accepted_already(peer: PeerConfig, before: PeerConfig) -> bool:
+def _members(config: Config) -> tuple[MemberSettings, ...]:
+    return () if config.relay_server is None else config.relay_server.members
+
+
+def _is_accepted_already(before: PeerConfig, peer: PeerConfig) -> bool:
     """Whether a link made for ``before`` accepts this peer with every key that it may have now."""
     link = replace(peer.settings.link, features=before.settings.link.features)  # new keys are enough for others
     is_same = replace(peer.settings, link=link) == before.settings

@@ -1,123 +1,108 @@
-"""Rules between the values of a configuration. A check uses the valid values and ignores the others."""
+"""Rules between the values of a configuration. Each yields the place of a key, what is wrong there and what to do.
+
+A rule uses the valid values and ignores the others.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from itertools import combinations
 from typing import Any
 
-from uavlinkd.config.model import PeerAddress
-from uavlinkd.config.problems import Problems, Values
-from uavlinkd.config.schema import LinkSection, RecordingSection
+from uavlinkd.config import network_rules, pasted_keys, policies, relay_rules
+from uavlinkd.config.problems import Found, Sections, Values, unique
+from uavlinkd.config.schema import LinkSection
 from uavlinkd.endpoints.url import EndpointKind, EndpointUrl, NetworkUrl, SerialUrl
 from uavlinkd.system.addresses import Address, overlaps
 
-LINK_KEYS = frozenset(LinkSection.model_fields)
-
-# Smaller, larger, and why the order matters.
-_ASCENDING = (
-    ("echo_after_s", "handshake_after_s", "the daemon sends an echo request before it tries a handshake"),
-    ("coalesce_s", "max_age_s", "a frame that waits for others must not become too old"),
-    ("handshake_after_s", "lost_after_s", "the daemon tries a handshake before it reports the peer as lost"),
-)
 _RETRIES_BEFORE_REJECT = 2
+_OWN_KEY = "is this daemon's own key: write what `uavlinkd pubkey` prints on the {what}"
 
 
-def names(problems: Problems, sections: Iterable[Values]) -> None:
-    """Two sections of a kind have different names."""
-    unique(problems, sections, "name", lambda name: name, "the name of {other} too: write another")
+def check(file: Sections) -> Found:
+    """Yield every problem between the values of a file."""
+    for sections in (file.endpoints, file.peers, file.members):
+        yield from unique(sections, "name", "the name of {other} too: write another")
+    yield from _public_keys(file)
+    yield from relay_rules.members(file)
+    yield from pasted_keys.check(file)
+    yield from _previous_keys(file)
+    yield from _reachability(file)
+    yield from relay_rules.relays(file)
+    yield from network_rules.networks(file)
+    yield from _endpoints(file)
+    yield from _timers(file.link)
+    for endpoint in file.endpoints:
+        yield from policies.check(endpoint, is_local=True)
+    for peer in file.peers:
+        yield from _timers(peer, file.link)
+        yield from policies.check(peer, is_local=False)
 
 
-def public_keys(
-    problems: Problems, peers: Sequence[Values], own: bytes | None, private: bytes | None, what: str = "peer"
-) -> None:
-    """Each peer or member has a key of its own, which is not this daemon's public key."""
-    unique(problems, peers, "public_key", bytes, f"the key of {{other}} too: each {what} has its own")
-    for peer in peers:
-        key = peer.valid.get("public_key")
-        if key is not None and key == own and key != private:
-            problems.add(
-                peer.place.key("public_key"),
-                f"is this daemon's own key: write what `uavlinkd pubkey` prints on the {what}",
-            )
+def _public_keys(file: Sections) -> Found:
+    """Each peer, member and relay has a key of its own, which is not this daemon's."""
+    private, own = file.secret(file.top, "private_key_file"), file.own_key()
+    for what, sections in (("peer", file.peers), ("member", file.members), ("relay", file.relays)):
+        yield from unique(sections, "public_key", f"the key of {{other}} too: each {what} has its own")
+        for section in sections:
+            key, psk = section.get("public_key"), file.secret(section, "psk_file")
+            if key is not None and key == own and not (private is not None and key == private.reveal()):
+                yield section.at("public_key"), _OWN_KEY.format(what=what)
+            if psk is not None and psk == private:
+                yield (
+                    section.at("psk_file"),
+                    "holds this daemon's private key, which must stay secret: make a PSK with `uavlinkd psk`",
+                )
 
 
-def previous_keys(
-    problems: Problems, top: Values, sections: Sequence[Values], own: bytes | None, previous: bytes | None
-) -> None:
-    """Each previous key belongs to one daemon. ``sections``: the peers, members and relays."""
+def _previous_keys(file: Sections) -> Found:
+    """Each previous key belongs to one daemon."""
+    own, previous = file.own_key(), file.own_key("previous_private_key_file")
     if previous is not None and previous == own:
-        problems.add("previous_private_key_file", "holds the key of private_key_file: leave it out")
-    owners = {section.valid.get("public_key"): section for section in sections}
-    for section in sections:
-        if previous is not None and section.valid.get("public_key") == previous:
-            problems.add(
-                section.place.key("public_key"),
+        yield "previous_private_key_file", "holds the key of private_key_file: leave it out"
+    owners = {section.get("public_key"): section for section in file.others}
+    for section in file.others:
+        key = section.get("previous_public_key")
+        if previous is not None and section.get("public_key") == previous:
+            yield (
+                section.at("public_key"),
                 "is this daemon's own previous key: write what `uavlinkd pubkey` prints on the other daemon",
             )
-        key = section.valid.get("previous_public_key")
         if key is None:
             continue
-        place = section.place.key("previous_public_key")
+        place = section.at("previous_public_key")
         if key in (own, previous):
-            problems.add(place, "is this daemon's own key: write the other daemon's previous key, or leave it out")
-        elif key == section.valid.get("public_key"):
-            problems.add(place, "is its current key: leave it out")
+            yield place, "is this daemon's own key: write the other daemon's previous key, or leave it out"
+        elif key == section.get("public_key"):
+            yield place, "is its current key: leave it out"
         elif key in owners:
-            problems.add(place, f"is the key of {owners[key].place.key('')}: write its own, or leave it out")
-    unique(problems, sections, "previous_public_key", bytes, "the previous key of {other} too: write its own")
+            yield place, f"is the key of {owners[key].at()}: write its own, or leave it out"
+    yield from unique(file.others, "previous_public_key", "the previous key of {other} too: write its own")
 
 
-def of_peer(problems: Problems, section: Values, peer: Values) -> None:
-    """A member or relay that is a peer too leaves to the peer what belongs to their one session."""
-    for key in ("psk_file", "previous_public_key"):
-        if key in section.valid:
-            problems.add(
-                section.place.key(key),
-                f"has no effect, because {peer.place.key('')} has the same public_key: write it there only",
-            )
-
-
-def unique(
-    problems: Problems, sections: Iterable[Values], key: str, as_hashable: Callable[[Any], Hashable], message: str
-) -> None:
-    """No two sections have the same value of a key. ``message`` says what to do, with the place of the ``other``."""
-    first: dict[Hashable, Values] = {}
-    for section in sections:
-        if (value := section.valid.get(key)) is None:
-            continue
-        other = first.setdefault(as_hashable(value), section)
-        if other is not section:
-            problems.add(section.place.key(key), "is " + message.format(other=other.place.key("")))
-
-
-def reachability(problems: Problems, top: Values, peers: Iterable[Values], relayed: Collection[Values] = ()) -> None:
-    """One of the two ends must be able to initiate, and a daemon does not initiate to itself.
-
-    ``relayed``: the peers that need no address, because they are reached along a relay.
-    """
-    listen: list[Address] = top.valid.get("listen", [])
+def _reachability(file: Sections) -> Found:
+    """One of the two ends must be able to initiate, and a daemon does not initiate to itself."""
+    listen: list[Address] = file.top.get("listen", [])
     for a, b in combinations(listen, 2):
         if overlaps(a, b):
-            problems.add("listen", f"names {a} and {b}, which one machine cannot listen on at once: write one")
-    for peer in peers:
-        addresses: list[PeerAddress] = peer.valid.get("addresses", [])
-        if peer in relayed:
-            pass
-        elif not addresses and not listen and "listen" not in top.invalid and "addresses" not in peer.invalid:
-            or_else = ", and remove relays = []" if peer.valid.get("relays") == [] else ""
-            problems.add(
-                peer.place.key("addresses"),
+            yield "listen", f"names {a} and {b}, which one machine cannot listen on at once: write one"
+    for peer in file.peers:
+        if (
+            peer.lacks("addresses")
+            and file.top.lacks("listen")
+            and not relay_rules.needs_no_address(peer, file.relays)
+        ):
+            or_else = ", and remove relays = []" if peer.get("relays") == [] else ""
+            yield (
+                peer.at("addresses"),
                 "is empty, and so is listen: neither end could initiate; write the peer's address here,"
                 ' or listen = ["0.0.0.0:5790"] at the top so that the peer can initiate, or a [[relay]] that both'
                 f" ends use{or_else}",
             )
-        for written in addresses:
+    for section in (*file.peers, *file.relays):
+        for written in section.get("addresses", ()):
             if any(_reaches(written.address, own) for own in listen):
-                problems.add(
-                    peer.place.key("addresses"),
-                    f"names {written.address}, where this daemon listens: write the peer's",
-                )
+                yield section.at("addresses"), f"names {written.address}, where this daemon listens: write the peer's"
 
 
 def _reaches(target: Address, listening: Address) -> bool:
@@ -127,23 +112,28 @@ def _reaches(target: Address, listening: Address) -> bool:
     return target.ip == listening.ip or (listening.is_wildcard and target.is_loopback)
 
 
-def endpoints(problems: Problems, top: Values, sections: Iterable[Values]) -> None:
+def _endpoints(file: Sections) -> Found:
     """Each endpoint has a port of its own, which is not a port for peers, and does not feed another endpoint."""
-    listen: list[Address] = top.valid.get("listen", [])
+    listen: list[Address] = file.top.get("listen", [])
+    metrics: Address | None = file.metrics.get("listen")
     seen: list[tuple[Values, EndpointUrl]] = []
-    for section in sections:
-        url = section.valid.get("url")
-        key = section.place.key("url")
-        if url is None:
+    for section in file.endpoints:
+        if (url := section.get("url")) is None:
             continue
+        key = section.at("url")
         if url.kind is EndpointKind.UDPIN and any(own.port == url.address.port for own in listen):
-            problems.add(key, f"has the port that `listen` has for peers, {url.address.port}: write another")
+            yield key, f"has the port that `listen` has for peers, {url.address.port}: write another"
         if url.kind is EndpointKind.UDPOUT and any(_reaches(url.address, own) for own in listen):
-            problems.add(key, "sends to this daemon's own port for peers: write the address of the MAVLink client")
+            yield key, "sends to this daemon's own port for peers: write the address of the MAVLink client"
+        if metrics and url.kind is EndpointKind.TCPIN and overlaps(metrics, url.address):
+            yield file.metrics.at("listen"), f"is where {section.at()} listens: write another port"
         for other, other_url in seen:
             if message := _clash(url, other_url):
-                problems.add(key, message.format(other=other.place.key("")))
+                yield key, message.format(other=other.at())
         seen.append((section, url))
+
+
+_FEEDS = {(EndpointKind.UDPOUT, EndpointKind.UDPIN), (EndpointKind.TCP, EndpointKind.TCPIN)}
 
 
 def _clash(a: EndpointUrl, b: EndpointUrl) -> str | None:
@@ -160,38 +150,12 @@ def _clash(a: EndpointUrl, b: EndpointUrl) -> str | None:
     return None
 
 
-def metrics(problems: Problems, section: Values, endpoints: Iterable[Values]) -> None:
-    """The server for Prometheus has a TCP port of its own."""
-    address: Address | None = section.valid.get("listen")
-    for endpoint in endpoints:
-        url = endpoint.valid.get("url")
-        if address and url and url.kind is EndpointKind.TCPIN and overlaps(address, url.address):
-            problems.add(
-                section.place.key("listen"), f"is where {endpoint.place.key('')} listens: write another port"
-            )
-
-
-def recording(problems: Problems, section: Values, peers: Sequence[Values]) -> None:
-    """Each peer has a file that the daemon writes, and at least one more file is kept."""
-    if "folder" not in section.valid or "max_files" in section.invalid:
-        return
-    kept = section.valid.get("max_files", RecordingSection.model_fields["max_files"].default)
-    if kept <= len(peers):
-        problems.add(
-            section.place.key("max_files"),
-            f"must be more than the number of peers, each of which has a file: write {len(peers) + 1} or more",
-        )
-
-
-_FEEDS = {(EndpointKind.UDPOUT, EndpointKind.UDPIN), (EndpointKind.TCP, EndpointKind.TCPIN)}
-
-
 def inherited(link: Values, peer: Values) -> dict[str, Any]:
     """The link keys that apply to a peer: its own, else those of ``[link]``, without defaults."""
-    return {key: value for key, value in {**link.valid, **peer.valid}.items() if key in LINK_KEYS}
+    return {key: value for key, value in {**link.valid, **peer.valid}.items() if key in LinkSection.model_fields}
 
 
-def timers(problems: Problems, section: Values, link: Values | None = None) -> None:
+def _timers(section: Values, link: Values | None = None) -> Found:
     """The timers of ``[link]``, or of a peer that inherits from it, are in order."""
     given = inherited(link, section) if link else section.valid
     values = {name: field.default for name, field in LinkSection.model_fields.items()} | given
@@ -200,19 +164,13 @@ def timers(problems: Problems, section: Values, link: Values | None = None) -> N
         involved = {key, *others}
         # A problem that a peer only inherits is reported once, for [link].
         if not involved & unknown and (link is None or involved & set(section.valid)):
-            problems.add(section.place.key(key), message)
+            yield section.at(key), message
 
 
 def _disorder(values: Mapping[str, Any]) -> Iterator[tuple[str, tuple[str, ...], str]]:
-    for smaller, larger, reason in _ASCENDING:
-        if values[smaller] >= values[larger]:
-            yield larger, (smaller,), f"must be more than {smaller} ({values[smaller]:g}): {reason}"
-    if values["retry_min_s"] > values["retry_max_s"]:
-        yield (
-            "retry_max_s",
-            ("retry_min_s",),
-            f"must be at least retry_min_s ({values['retry_min_s']:g}): the wait grows from one to the other",
-        )
+    if values["coalesce_s"] >= values["max_age_s"]:
+        text = f"must be more than coalesce_s ({values['coalesce_s']:g}): a frame that waits for others must not"
+        yield "max_age_s", ("coalesce_s",), f"{text} become too old"
     least = values["rekey_after_s"] + _RETRIES_BEFORE_REJECT * values["retry_max_s"]
     if values["reject_after_s"] < least:
         yield (

@@ -207,21 +207,11 @@ def read_secret_file(path: Path, *, credential: bool = False) -> Secret:
 
 
 def _check_access(path: Path, status: os.stat_result, allowed: int) -> None:
-    if status.st_uid not in (0, os.geteuid()):
-        raise KeyFileError(f"{path}: {_owned_by_another(path, status.st_uid)}")
-    if excess := stat.S_IMODE(status.st_mode) & 0o777 & ~allowed:
-        raise KeyFileError(f"{path}: {_excess_text(excess)}: run `chmod 600 {shlex.quote(str(path))}`")
-
-
-def _owned_by_another(path: Path, owner: int) -> str:
     quoted = shlex.quote(str(path))
-    return (
-        f"belongs to another user (uid {owner}), who can read and replace it: if you are sure that the key is yours,"
-        f" run `chown {os.geteuid()} {quoted}` as root, or run this command as that user"
-    )
-
-
-def _excess_text(excess: int) -> str:
-    users = " and ".join(name for name, bits in (("its group", 0o070), ("others", 0o007)) if excess & bits)
-    right = "read" if excess & 0o044 else "change" if excess & 0o022 else "execute"
-    return f"{users} may {right} it"
+    if status.st_uid not in (0, os.geteuid()):
+        raise KeyFileError(
+            f"{path}: belongs to another user (uid {status.st_uid}), who can read and replace it: if you are sure"
+            f" that the key is yours, run `chown {os.geteuid()} {quoted}` as root, or run this command as that user"
+        )
+    if stat.S_IMODE(status.st_mode) & 0o777 & ~allowed:
+        raise KeyFileError(f"{path}: its group or others have access to it: run `chmod 600 {quoted}`")

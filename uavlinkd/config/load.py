@@ -5,36 +5,29 @@ from __future__ import annotations
 import os
 import shlex
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from uavlinkd.config import checks, network_rules, pasted_keys, policies, relay_rules, used_relays
+from uavlinkd.config import checks, network_rules, pasted_keys, policies, relay_rules, schema
 from uavlinkd.config.advice import advice
-from uavlinkd.config.errors import ConfigError, Problem
 from uavlinkd.config.keys import CREDENTIALS, KeyFileError, find_secret_file, read_secret_file
 from uavlinkd.config.link_settings import link_of
-from uavlinkd.config.model import Config, EndpointConfig, Log, PeerConfig, Recording, Routing
-from uavlinkd.config.problems import Problems, Values
-from uavlinkd.config.schema import (
-    EndpointSection,
-    FileSection,
-    LinkSection,
-    LogSection,
-    MemberSection,
-    MetricsSection,
-    NetworkSection,
-    PeerSection,
-    RecordingSection,
-    RelaySection,
-    RelayServerSection,
-    RoutingSection,
-    Section,
+from uavlinkd.config.model import (
+    Config,
+    ConfigError,
+    EndpointConfig,
+    Log,
+    PeerConfig,
+    Problem,
+    Recording,
+    Routing,
 )
+from uavlinkd.config.problems import Problems, Sections, Values
 from uavlinkd.config.syntax import at, syntax_problem
 from uavlinkd.core import constants as c
-from uavlinkd.core.crypto import Secret, x25519_public_key
+from uavlinkd.core.crypto import Secret
 from uavlinkd.core.settings import PeerSettings
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
 from uavlinkd.system.threads import Threads
@@ -51,110 +44,67 @@ def load_config(path: Path, environ: Mapping[str, str]) -> Config:
     """
     table = _read_toml(path)
     problems = Problems(str(path))
-    top = problems.read(FileSection, table, "")
-    link = problems.read(LinkSection, _table(problems, table, "link"), "link")
-    log = problems.read(LogSection, _table(problems, table, "log"), "log")
-    routing = problems.read(RoutingSection, _table(problems, table, "routing"), "routing")
-    metrics = problems.read(MetricsSection, _table(problems, table, "metrics"), "metrics")
-    recording = problems.read(RecordingSection, _table(problems, table, "recording"), "recording")
-    networks = _sections(problems, table, "network", NetworkSection)
-    endpoints = _sections(problems, table, "endpoint", EndpointSection)
-    peers = _sections(problems, table, "peer", PeerSection)
-    members = _sections(problems, table, "member", MemberSection)
-    server = problems.read(RelayServerSection, _table(problems, table, "relay_server"), "relay_server")
-    relays = _sections(problems, table, "relay", RelaySection)
 
-    private = _secret(problems, top, "private_key_file", path, environ)
-    previous = _secret(problems, top, "previous_private_key_file", path, environ)
-    psks = [_secret(problems, peer, "psk_file", path, environ) for peer in peers]
-    member_psks = [_secret(problems, member, "psk_file", path, environ) for member in members]
-    relay_psks = [_secret(problems, relay, "psk_file", path, environ) for relay in relays]
-    public = _public(private) if private else None
+    def one(key: str, model: type[schema.Section]) -> Values:
+        return problems.read(model, _table(problems, table, key), key)
 
-    checks.names(problems, endpoints)
-    checks.names(problems, peers)
-    checks.public_keys(problems, peers, public, private.reveal() if private else None)
-    relay_rules.members(problems, members, peers, public, private.reveal() if private else None)
-    relay_rules.relay_server(problems, top, server, members, has_frames=bool(peers or endpoints))
-    pasted_keys.check(
-        problems,
-        [*peers, *members, *relays],
-        private.reveal() if private else None,
-        [psk.reveal() if psk else None for psk in (*psks, *member_psks, *relay_psks)],
-        path.absolute().parent,
+    def many(key: str, model: type[schema.Section]) -> list[Values]:
+        return _sections(problems, table, key, model)
+
+    file = Sections(
+        folder=path.absolute().parent,
+        top=problems.read(schema.FileSection, table, ""),
+        link=one("link", schema.LinkSection),
+        log=one("log", schema.LogSection),
+        routing=one("routing", schema.RoutingSection),
+        metrics=one("metrics", schema.MetricsSection),
+        recording=one("recording", schema.RecordingSection),
+        relay_server=one("relay_server", schema.RelayServerSection),
+        networks=many("network", schema.NetworkSection),
+        endpoints=many("endpoint", schema.EndpointSection),
+        peers=many("peer", schema.PeerSection),
+        members=many("member", schema.MemberSection),
+        relays=many("relay", schema.RelaySection),
     )
-    previous_public = _public(previous) if previous else None
-    checks.previous_keys(problems, top, [*peers, *members, *relays], public, previous_public)
-    checks.reachability(problems, top, peers, [peer for peer in peers if used_relays.needs_no_address(peer, relays)])
-    checks.reachability(problems, top, relays, relays)
-    used_relays.relays(problems, relays, peers, members, public)
-    network_rules.networks(problems, top, networks, [*peers, *relays], endpoints)
-    checks.endpoints(problems, top, endpoints)
-    checks.metrics(problems, metrics, endpoints)
-    checks.recording(problems, recording, peers)
-    checks.timers(problems, link)
-    for endpoint in endpoints:
-        policies.check(problems, endpoint, is_local=True)
-    for peer in peers:
-        checks.timers(problems, peer, link)
-        policies.check(problems, peer, is_local=False)
-    for section, psk in zip((*peers, *members, *relays), (*psks, *member_psks, *relay_psks), strict=True):
-        if psk is not None and psk == private:
-            problems.add(
-                section.place.key("psk_file"),
-                "holds this daemon's private key, which must stay secret: make a PSK with `uavlinkd psk`",
-            )
+    for section, key in (
+        (file.top, "private_key_file"),
+        (file.top, "previous_private_key_file"),
+        *((section, "psk_file") for section in file.others),
+    ):
+        if (secret := _secret(problems, section, key, path, environ)) is not None:
+            file.secrets[section.at(key)] = secret
+    for place, message in checks.check(file):
+        problems.add(place, message)
     problems.raise_any()
+    config = _config(path, file)
+    warnings = (*pasted_keys.advice(config.private_key.reveal(), file.others), *advice(config))
+    return replace(config, warnings=warnings)
 
-    assert private is not None  # its absence is a problem, raised above
-    listen = tuple(top.valid.get("listen", ()))
-    network_configs = tuple(map(network_rules.network_of, networks))
-    own_listen = () if any(network.serial is None for network in network_configs) else listen
-    endpoint_configs = tuple(map(_endpoint, endpoints))
-    relay_config = relay_rules.relay_server_of(server, members, member_psks, link)
-    peer_configs = tuple(_peer(peer, psk, link, members, relays) for peer, psk in zip(peers, psks, strict=True))
-    relay_configs = tuple(
-        used_relays.relay_of(relay, peers, psk, link) for relay, psk in zip(relays, relay_psks, strict=True)
-    )
-    routing_config = Routing(**RoutingSection.model_construct(**routing.valid).model_dump())
+
+def _config(path: Path, file: Sections) -> Config:
+    """The configuration in a file without problems, without its warnings."""
+    private, public = file.secret(file.top, "private_key_file"), file.own_key()
+    assert private is not None  # their absence is a problem
+    assert public is not None
+    top, recording = file.top, schema.RecordingSection.model_construct(**file.recording.valid)
+    folder = _beside(path, recording.folder)
     return Config(
         path=path,
         name=top.valid["name"],
         private_key=private,
-        public_key=_public(private),
-        listen=listen,
-        endpoints=endpoint_configs,
-        peers=peer_configs,
-        routing=routing_config,
-        control_socket=_beside(path, top.valid.get("control_socket")),
-        metrics=metrics.valid.get("listen"),
-        recording=_recording(path, recording),
-        log=Log(**LogSection.model_construct(**log.valid).model_dump()),
-        previous_private_key=previous,
-        key_grace_s=FileSection.model_construct(**top.valid).key_grace_s,
-        networks=network_configs,
-        relay_server=relay_config,
-        relays=relay_configs,
-        warnings=(
-            *pasted_keys.advice(
-                private.reveal(),
-                (
-                    (what, section.valid["name"], section.valid["public_key"])
-                    for what, sections in (("peer", peers), ("member", members), ("relay", relays))
-                    for section in sections
-                ),
-            ),
-            *advice(
-                own_listen,
-                endpoint_configs,
-                peer_configs,
-                routing_config,
-                metrics.valid.get("listen"),
-                is_relay=relay_config is not None,
-            ),
-            *(() if relay_config is None else relay_rules.advice(relay_config, own_listen)),
-            *used_relays.advice(relay_configs, peer_configs),
-        ),
+        public_key=public,
+        listen=tuple(top.get("listen", ())),
+        endpoints=tuple(_endpoint(endpoint) for endpoint in file.endpoints),
+        peers=tuple(_peer(file, peer) for peer in file.peers),
+        routing=Routing(**schema.RoutingSection.model_construct(**file.routing.valid).model_dump()),
+        control_socket=_beside(path, top.get("control_socket")),
+        metrics=file.metrics.get("listen"),
+        recording=Recording(folder, recording.max_files, recording.min_free_bytes) if folder else None,
+        log=Log(**schema.LogSection.model_construct(**file.log.valid).model_dump()),
+        previous_private_key=file.secret(top, "previous_private_key_file"),
+        networks=tuple(network_rules.network_of(network) for network in file.networks),
+        relay_server=relay_rules.relay_server_of(file),
+        relays=tuple(relay_rules.relay_of(file, relay) for relay in file.relays),
     )
 
 
@@ -180,14 +130,10 @@ def load_control_socket(path: Path) -> Path | None:
     """
     table = _read_toml(path)
     problems = Problems(str(path))
-    top = problems.read(FileSection, table, "")
+    top = problems.read(schema.FileSection, table, "")
     if "control_socket" in top.invalid:
         problems.raise_any()
-    return _beside(path, top.valid.get("control_socket"))
-
-
-def _public(private: Secret) -> bytes:
-    return x25519_public_key(private.reveal())
+    return _beside(path, top.get("control_socket"))
 
 
 def _beside(path: Path, name: str | None) -> Path | None:
@@ -195,47 +141,24 @@ def _beside(path: Path, name: str | None) -> Path | None:
     return None if name is None else path.absolute().parent / name
 
 
-def _recording(path: Path, section: Values) -> Recording | None:
-    keys = RecordingSection.model_construct(**section.valid)
-    folder = _beside(path, keys.folder)
-    if folder is None:
-        return None
-    return Recording(folder, keys.max_file_bytes, keys.max_files, keys.min_free_bytes)
-
-
 def _endpoint(section: Values) -> EndpointConfig:
-    keys = EndpointSection.model_construct(**section.valid)
-    return EndpointConfig(
-        name=keys.name,
-        url=keys.url,
-        policy=policies.data(section),
-        max_age_s=keys.max_age_s,
-        radio_status=keys.radio_status,
-        status_text=keys.status_text,
-    )
+    keys = schema.EndpointSection.model_construct(**section.valid)
+    return EndpointConfig(keys.name, keys.url, policies.data(section), keys.radio_status, keys.status_text)
 
 
-def _peer(
-    peer: Values, psk: Secret | None, link: Values, members: Sequence[Values], relays: Sequence[Values]
-) -> PeerConfig:
-    keys = LinkSection.model_construct(**checks.inherited(link, peer))
-    link_settings, used = link_of(keys), used_relays.relays_of(peer, relays)
-    served = {section.valid["public_key"] for section in (*members, *relays)}
-    if used or peer.valid["public_key"] in served:  # they exchange records
-        link_settings = replace(link_settings, features=link_settings.features | c.FEATURE_RECORDS)
+def _peer(file: Sections, peer: Values) -> PeerConfig:
+    keys = schema.LinkSection.model_construct(**checks.inherited(file.link, peer))
+    link, used = link_of(keys), relay_rules.relays_of(peer, file.relays)
+    if used or relay_rules.peer_of(peer, (*file.members, *file.relays)):  # they exchange records
+        link = replace(link, features=link.features | c.FEATURE_RECORDS)
+    psk = file.secret(peer, "psk_file")
     return PeerConfig(
-        settings=PeerSettings(
-            name=peer.valid["name"], public_key=peer.valid["public_key"], psk=psk, link=link_settings
-        ),
-        addresses=used_relays.addresses_of(peer, relays),
-        previous_public_key=peer.valid.get("previous_public_key"),
+        settings=PeerSettings(peer.valid["name"], peer.valid["public_key"], psk, link),
+        addresses=relay_rules.addresses_of(peer, file.relays),
+        previous_public_key=peer.get("previous_public_key"),
         relays=used,
         policy=policies.data(peer),
-        egress=EgressSettings(
-            budget_bits_s=keys.budget_bits_s,
-            coalesce_s=keys.coalesce_s,
-            max_age_s=keys.max_age_s,
-        ),
+        egress=EgressSettings(keys.budget_bits_s, keys.coalesce_s, keys.max_age_s),
     )
 
 
@@ -266,7 +189,6 @@ def _read_toml(path: Path) -> dict[str, Any]:
 
 
 def _table(problems: Problems, table: Mapping[str, Any], key: str) -> Mapping[str, Any]:
-    """A section that a file has at most once."""
     value = table.get(key, {})
     if isinstance(value, dict):
         return value
@@ -274,8 +196,7 @@ def _table(problems: Problems, table: Mapping[str, Any], key: str) -> Mapping[st
     return {}
 
 
-def _sections(problems: Problems, table: Mapping[str, Any], key: str, model: type[Section]) -> list[Values]:
-    """The sections of a kind that a file may have many times."""
+def _sections(problems: Problems, table: Mapping[str, Any], key: str, model: type[schema.Section]) -> list[Values]:
     value = table.get(key, [])
     sections = value if isinstance(value, list) else [value]
     if key == "relay" and isinstance(value, bool):
@@ -291,11 +212,10 @@ def _sections(problems: Problems, table: Mapping[str, Any], key: str, model: typ
 
 def _secret(problems: Problems, section: Values, key: str, config: Path, environ: Mapping[str, str]) -> Secret | None:
     """The content of the key file that a section names, if it names one."""
-    name = section.valid.get(key)
-    if name is None:
+    if (name := section.get(key)) is None:
         return None
     path, is_credential = find_secret_file(name, config.parent, environ)
-    place = section.place.key(key)
+    place = section.at(key)
     is_service = bool(environ.get(CREDENTIALS))
     if not os.path.lexists(path):
         credential = " and no systemd credential of that name" if is_service else ""

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import Literal
+from typing import Final, NamedTuple
 
 from uavlinkd.core.crypto import Secret
 from uavlinkd.core.path import RELAY_HOST, SERIAL_HOST
@@ -24,6 +24,32 @@ PolicyData = Mapping[str, object]
 """A policy as immutable plain data. :mod:`uavlinkd.mavlink.policy.compilation` documents its keys."""
 
 
+KEY_GRACE_S: Final = 7 * 24 * 3600.0
+"""How long previous keys stay valid after the start or reload in which the daemon read them."""
+
+
+class Problem(NamedTuple):
+    """One problem: its file, its key (empty: the file itself), what is wrong and what to do."""
+
+    file: str
+    key: str
+    message: str
+
+    def __str__(self) -> str:
+        return ": ".join(part for part in self if part)
+
+
+class ConfigError(Exception):
+    """Every problem of a file. ``str()`` has one line for each."""
+
+    def __init__(self, problems: tuple[Problem, ...]) -> None:
+        super().__init__(problems)
+        self.problems = problems
+
+    def __str__(self) -> str:
+        return "\n".join(map(str, self.problems))
+
+
 def _trust_all() -> PolicyData:
     return MappingProxyType({})
 
@@ -32,15 +58,13 @@ def _trust_all() -> PolicyData:
 class EndpointConfig:
     """A local MAVLink port.
 
-    ``max_age_s``: a frame that waited longer for the port is dropped. ``radio_status``: whether this daemon reports
-    the state of the link to the client there, by a RADIO_STATUS every second. ``status_text``: whether it reports
-    lost links and withheld commands to the pilot there.
+    ``radio_status``: whether this daemon reports the state of the link to the client there, by a RADIO_STATUS every
+    second. ``status_text``: whether it reports lost links and withheld commands to the pilot there.
     """
 
     name: str
     url: EndpointUrl
     policy: PolicyData = field(default_factory=_trust_all)
-    max_age_s: float = 1.0
     radio_status: bool = False
     status_text: bool = False
 
@@ -166,14 +190,9 @@ class RelayConfig:
 
 @dataclass(frozen=True, slots=True)
 class Routing:
-    """``relay``: whether frames from a peer may go to other peers.
-
-    ``unknown_targets``: where a frame goes whose target was never seen. ``flood``: to every other port, as a network
-    switch does; ``drop``: nowhere.
-    """
+    """``relay``: whether frames from a peer may go to other peers."""
 
     relay: bool = False
-    unknown_targets: Literal["flood", "drop"] = "flood"
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,9 +203,9 @@ class Recording:
     """
 
     folder: Path
-    max_file_bytes: int
     max_files: int
     min_free_bytes: int
+    max_file_bytes: int = 64_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,9 +221,8 @@ class Config:
     """The complete configuration of a daemon. Its secrets do not print.
 
     ``listen`` is empty if the daemon only initiates. ``metrics`` is the address of the server for Prometheus.
-    ``warnings`` are sentences for a person; the daemon runs in spite of them. Previous keys are valid for
-    ``key_grace_s``, or until the new ones are confirmed. If ``networks`` has no interface or address, the
-    kernel's routes decide how to reach peers over IP.
+    ``warnings`` are sentences for a person; the daemon runs in spite of them. If ``networks`` has no interface or
+    address, the kernel's routes decide how to reach peers over IP.
     """
 
     path: Path
@@ -219,12 +237,11 @@ class Config:
     metrics: Address | None
     recording: Recording | None
     log: Log
-    warnings: tuple[str, ...]
     previous_private_key: Secret | None = None
-    key_grace_s: float = 0.0
     networks: tuple[NetworkConfig, ...] = ()
     relay_server: RelayServer | None = None
     relays: tuple[RelayConfig, ...] = ()
+    warnings: tuple[str, ...] = ()
 
     @property
     def is_only_relay(self) -> bool:

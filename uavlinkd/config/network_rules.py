@@ -1,60 +1,67 @@
-"""Rules about ``[[network]]``: between its keys, ``listen``, and the addresses of peers."""
+"""Rules about ``[[network]]``: its keys, ``listen``, the addresses of peers, and the other end of a serial line."""
 
 from __future__ import annotations
 
 import socket
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
+from typing import Final
 
-from uavlinkd.config import serial_rules
-from uavlinkd.config.checks import unique
 from uavlinkd.config.model import NetworkConfig, PeerAddress
-from uavlinkd.config.problems import Problems, Values
+from uavlinkd.config.problems import Found, Sections, Values, unique
 from uavlinkd.config.schema import NetworkSection
+from uavlinkd.endpoints.url import SerialUrl
 from uavlinkd.system.addresses import Address
 
+USUAL_BAUD: Final = 57600
+"""The baud rate of SiK modems as they are sold."""
+USUAL_AIR_BITS_S: Final = 24_000
+"""What such a modem carries by radio, in both directions together, beside its own overhead and turn-around times."""
+SLOW_LINE_SHARE: Final = 0.4
+"""Of the baud rate of a slower line: what is assumed that its radio carries."""
+SENDING_SHARE: Final = 0.4
+"""The part of the radio's rate that each end uses. The rest is for collisions, turn-around times and noise."""
+_BITS_PER_BYTE: Final = 10
+"""On a wire, with start and stop bit."""
 _FAMILIES = {socket.AF_INET: "IPv4", socket.AF_INET6: "IPv6"}
 
 
-def networks(
-    problems: Problems,
-    top: Values,
-    sections: Sequence[Values],
-    peers: Sequence[Values],
-    endpoints: Iterable[Values],
-) -> None:
+def networks(file: Sections) -> Found:
     """Each network is one exit of its own, and each address of a peer can be reached along a network."""
-    unique(problems, sections, "name", str, "the name of {other} too: write another")
+    sections, peers = file.networks, (*file.peers, *file.relays)
+    yield from unique(sections, "name", "the name of {other} too: write another")
     for key in ("interface", "address"):
-        unique(problems, sections, key, str, f"the {key} of {{other}} too: write another, or remove one network")
+        yield from unique(sections, key, f"the {key} of {{other}} too: write another, or remove one network")
     for section in sections:
-        _exit(problems, section)
-        serial_rules.serial_network(problems, section)
-    serial_rules.devices(problems, sections, endpoints)
+        yield from _exit(section)
+        if (line := section.get("serial")) is not None:
+            yield from _serial(section, line)
+    yield from _devices(file)
     if any({"interface", "address"} & _exits(section) for section in sections):
-        _listen(problems, top)
+        yield from _listen(file.top)
     known = {section.valid["name"] for section in sections if "name" in section.valid}
     if len(known) < len(sections) or any(len(_exits(section)) != 1 or section.invalid for section in sections):
         return  # the rest would follow from the problems so far
     configs = [config for config in map(network_of, sections) if config.serial is None]
-    serial_rules.other_ends(problems, sections, peers)
+    serial = known - {config.name for config in configs}
+    yield from _other_ends(sections, serial, peers)
     for peer in peers:
-        key = peer.place.key("addresses")
-        for written in peer.valid.get("addresses", ()):
-            if written.is_serial or known - {config.name for config in configs} >= {written.network}:
-                continue  # with a serial network
-            if written.network and written.network not in known:
-                problems.add(
-                    key, f"names a network for {written.address} that this file does not have: {_known(known)}"
-                )
+        for written in peer.get("addresses", ()):
+            message = None
+            if written.is_serial or written.network in serial:
+                message = _wrong_serial(written, serial)
+            elif written.network and written.network not in known:
+                message = f"names a network for {written.address} that this file does not have: {_known(known)}"
             elif configs and not any(used_networks(configs, written)):
-                problems.add(key, f"names {written}, which no network can reach: {_why(written)}")
+                message = f"names {written}, which no network can reach: {_why(written)}"
+            if message:
+                yield peer.at("addresses"), message
 
 
 def network_of(section: Values) -> NetworkConfig:
     """The network of a valid section."""
     keys = NetworkSection.model_construct(**section.valid)
-    air_bits_s = serial_rules.air_bits_s(section)
-    budget_bits_s = int(serial_rules.SENDING_SHARE * air_bits_s) if air_bits_s else keys.budget_bits_s
+    air_bits_s = 0 if keys.serial is None else _air_bits_s(section, keys.serial)
+    budget_bits_s = int(SENDING_SHARE * air_bits_s) if air_bits_s else keys.budget_bits_s
     return NetworkConfig(
         keys.name, keys.interface, keys.address, keys.metered, budget_bits_s, keys.serial, air_bits_s
     )
@@ -63,10 +70,8 @@ def network_of(section: Values) -> NetworkConfig:
 def used_networks(networks: Iterable[NetworkConfig], written: PeerAddress) -> Iterator[NetworkConfig]:
     """The networks along which the daemon uses an address of a peer."""
     for network in networks:
-        if written.is_serial != (network.serial is not None):
-            continue
-        if written.is_serial:
-            if written.network == network.name:
+        if written.is_serial or network.serial is not None:
+            if written.is_serial and network.serial is not None and written.network == network.name:
                 yield network
         elif written.network in ("", network.name) and _may_reach(network, written.address):
             yield network
@@ -76,40 +81,123 @@ def _exits(section: Values) -> set[str]:
     return {"interface", "address", "serial"} & (set(section.valid) | section.invalid)
 
 
-def _exit(problems: Problems, section: Values) -> None:
+def _exit(section: Values) -> Found:
+    """A network has one exit."""
     written = _exits(section)
-    if "serial" in written:
-        return  # see serial_rules
-    if len(written) > 1:
-        problems.add(
-            section.place.key("interface"),
-            "and address are both written, but a network has one exit: remove one of them, or write two networks",
-        )
-    elif not written:
-        problems.add(
-            section.place.key("interface"),
-            'is missing: write interface = "wwan0", address = "10.0.0.5" with an address of this machine, or'
+    if len(written) != 1:
+        yield (
+            section.at(next((key for key in ("serial", "address") if key in written), "interface")),
+            f"{'is missing' if not written else 'is one of several exits, but a network has one'}: write one of"
+            ' interface = "wwan0", address = "10.0.0.5" with an address of this machine, or'
             ' serial = "/dev/ttyUSB0:57600"',
         )
+    if "serial" not in written and "air_bits_s" in section.valid:
+        yield (
+            section.at("air_bits_s"),
+            'is for a radio behind a serial device: write serial = "/dev/ttyUSB0:57600" too, or budget_bits_s'
+            " instead",
+        )
 
 
-def _listen(problems: Problems, top: Values) -> None:
+def _serial(section: Values, line: SerialUrl) -> Found:
+    """A serial network has a rate that its line carries."""
+    if section.get("metered"):
+        yield section.at("metered"), "is for networks that cost money, and this is a serial line: leave it out"
+    if section.get("budget_bits_s"):
+        text = f"does not go with serial: write air_bits_s, of which this end sends {SENDING_SHARE:.0%}"
+        yield section.at("budget_bits_s"), text
+    if "air_bits_s" in section.invalid:
+        return
+    if not (air := _air_bits_s(section, line)):
+        yield (
+            section.at("air_bits_s"),
+            f"is missing: at {line.baud} baud the line does not show what the radio carries. Write the bits per"
+            f" second of both directions together, about half of the modem's air rate, such as {USUAL_AIR_BITS_S}",
+        )
+    elif SENDING_SHARE * air / 8 > line.baud / _BITS_PER_BYTE:
+        text = f"is more than a line of {line.baud} baud carries: write less, or raise the baud rate"
+        yield section.at("air_bits_s"), text
+
+
+def _air_bits_s(section: Values, line: SerialUrl) -> int:
+    """What the radio carries, or is assumed to carry; 0 if the file must say."""
+    if written := section.get("air_bits_s"):
+        return int(written)
+    if line.baud == USUAL_BAUD:
+        return USUAL_AIR_BITS_S
+    return int(SLOW_LINE_SHARE * line.baud) if line.baud < USUAL_BAUD else 0
+
+
+def _devices(file: Sections) -> Found:
+    """A device has one user: a network or an endpoint."""
+    users: dict[str, str] = {}
+    for endpoint in file.endpoints:
+        if isinstance(url := endpoint.get("url"), SerialUrl):
+            users.setdefault(url.device, endpoint.at())
+    for section in file.networks:
+        if (line := section.get("serial")) is None:
+            continue
+        if line.device in users:
+            yield (
+                section.at("serial"),
+                f"names {line.device}, the device of {users[line.device]} too, and only one can open it: write"
+                " another",
+            )
+        users.setdefault(line.device, section.at())
+
+
+def _other_ends(sections: Iterable[Values], serial: set[str], peers: Iterable[Values]) -> Found:
+    """Each serial network has one peer, which names it without an address."""
+    users: dict[str, Values] = {}
+    complete = True
+    for peer in peers:
+        complete &= "addresses" not in peer.invalid
+        for written in peer.get("addresses", ()):
+            if not written.is_serial or written.network not in serial:
+                continue
+            other = users.setdefault(written.network, peer)
+            if other is not peer:
+                yield (
+                    peer.at("addresses"),
+                    f'names the serial network "{written.network}", whose other end is {other.at()}: a line has one'
+                    " peer; write it for one of them",
+                )
+    for section in sections if complete else ():
+        if (name := section.valid["name"]) in serial - set(users):
+            text = f'has no peer at its other end: write addresses = [{{ network = "{name}" }}] in its [[peer]]'
+            yield section.at("serial"), text
+
+
+def _wrong_serial(written: PeerAddress, serial: set[str]) -> str | None:
+    if written.is_serial and written.network not in serial:
+        names = " or ".join(f'"{name}"' for name in sorted(serial))
+        return (
+            f'names "{written.network}" without an address, which only a serial network may have: write'
+            f' {{ address = "10.13.0.2:5790", network = "{written.network}" }}'
+            + (f", or the serial network {names}" if names else "")
+        )
+    if written.network in serial and not written.is_serial:
+        return (
+            f'names {written.address} on "{written.network}", a serial network, which has no addresses: write'
+            f' {{ network = "{written.network}" }}'
+        )
+    return None
+
+
+def _listen(top: Values) -> Found:
     """With networks, ``listen`` has only the ports of their sockets."""
     families = list[socket.AddressFamily]()
-    for address in top.valid.get("listen", ()):
+    for address in top.get("listen", ()):
         if not address.is_wildcard:
             wildcard = Address("::" if address.family == socket.AF_INET6 else "0.0.0.0", address.port)
-            problems.add(
+            yield (
                 "listen",
                 f"names {address}, but the networks of this file decide where the daemon listens: write"
                 f' "{wildcard}" for this port on each network',
             )
         elif address.family in families:
-            problems.add(
-                "listen",
-                f"names two ports for {_FAMILIES[address.family]}, but each network has one socket of a family:"
-                " write one",
-            )
+            text = f"names two ports for {_FAMILIES[address.family]}, but each network has one socket of a family"
+            yield "listen", f"{text}: write one"
         families.append(address.family)
 
 
@@ -129,6 +217,6 @@ def _known(known: Iterable[str]) -> str:
 def _why(written: PeerAddress) -> str:
     if zone := written.address.host.partition("%")[2]:
         return f"it is valid on the interface {zone} only; write that network"
-    family = _FAMILIES[written.address.family]
     which = "that network has" if written.network else "the networks of this file have"
+    family = _FAMILIES[written.address.family]
     return f"{which} no address of {family}; write another address, or a network with an interface"

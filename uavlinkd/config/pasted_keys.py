@@ -7,12 +7,12 @@ the remedy is always a new key.
 from __future__ import annotations
 
 import stat
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 
 from uavlinkd.config.keys import KEY_TEXT_LENGTH, decode_key, encode_key, looks_private
-from uavlinkd.config.problems import Problems, Values
+from uavlinkd.config.problems import Found, Sections, Values
 from uavlinkd.core.crypto import x25519_public_key
 
 EXAMPLE_KEYS = frozenset(
@@ -28,46 +28,37 @@ _MAX_FILES = 512
 _EXPOSED = "it is exposed: make a new one there with `uavlinkd keygen`, and write here the public key that it prints"
 
 
-def check(
-    problems: Problems, peers: Sequence[Values], private: bytes | None, psks: Sequence[bytes | None], folder: Path
-) -> None:
-    """Add a problem for each key that is certainly in the wrong place."""
-    files = _key_files(folder)
-    owners = {peer.valid["public_key"]: peer.valid.get("name", "") for peer in peers if "public_key" in peer.valid}
-    for peer in peers:
-        key = peer.valid.get("public_key")
-        if key is None:
+def check(file: Sections) -> Found:
+    """Yield a problem for each key that is certainly in the wrong place."""
+    files = _key_files(file.folder)
+    owners = {peer.valid["public_key"]: peer.get("name", "") for peer in file.others if "public_key" in peer.valid}
+    psks = [file.secret(peer, "psk_file") for peer in file.others]
+    private, public = file.secret(file.top, "private_key_file"), file.own_key()
+    for peer in file.others:
+        if (key := peer.get("public_key")) is None:
             continue
-        place = peer.place.key("public_key")
-        if key == private:
-            _add_own(problems, place, peer, is_private=looks_private(key))
-        elif key in [psk for psk in psks if psk is not None]:
-            problems.add(
+        place, half = peer.at("public_key"), x25519_public_key(key) if private else None
+        if private and key == private.reveal() and not looks_private(key):
+            text = f"holds the public key of {peer.at()}, not a private key: make this daemon's own with"
+            yield "private_key_file", f"{text} `uavlinkd keygen`"
+        elif private and key == private.reveal():
+            yield (
+                place,
+                "is this daemon's private key, which must stay secret, and is exposed: move its file away, make a new"
+                " one with `uavlinkd keygen`, and write here what `uavlinkd pubkey` prints on the peer",
+            )
+        elif any(psk is not None and key == psk.reveal() for psk in psks):
+            yield (
                 place,
                 "is a PSK, which must stay secret: make a new PSK with `uavlinkd psk`, and write here what"
                 " `uavlinkd pubkey` prints on the peer",
             )
-        elif private is not None and (half := x25519_public_key(key)) == x25519_public_key(private):
-            problems.add(place, f"is this daemon's private key, which must stay secret; {_EXPOSED}")
-        elif private is not None and half in owners:
-            problems.add(place, f'is the private key of peer "{owners[half]}", which must stay secret; {_EXPOSED}')
+        elif half is not None and half == public:
+            yield place, f"is this daemon's private key, which must stay secret; {_EXPOSED}"
+        elif half in owners:
+            yield place, f'is the private key of peer "{owners[half]}", which must stay secret; {_EXPOSED}'
         elif key in files:
-            problems.add(place, f"is the secret key in {files[key]}, which must stay secret; {_EXPOSED}")
-
-
-def _add_own(problems: Problems, place: str, peer: Values, *, is_private: bool) -> None:
-    if is_private:
-        problems.add(
-            place,
-            "is this daemon's private key, which must stay secret, and is exposed: move its file away, make a new one"
-            " with `uavlinkd keygen`, and write here what `uavlinkd pubkey` prints on the peer",
-        )
-    else:
-        problems.add(
-            "private_key_file",
-            f"holds the public key of {peer.place.key('').removeprefix('.')}, not a private key: make this daemon's"
-            " own with `uavlinkd keygen`",
-        )
+            yield place, f"is the secret key in {files[key]}, which must stay secret; {_EXPOSED}"
 
 
 def _key_files(folder: Path) -> Mapping[bytes, str]:
@@ -86,25 +77,24 @@ def _key_files(folder: Path) -> Mapping[bytes, str]:
     return keys
 
 
-def advice(private: bytes, owners: Iterable[tuple[str, str, bytes]]) -> Iterator[str]:
-    """Yield a warning for each key that is probably in the wrong place.
-
-    ``owners``: for each public key what it is the key of, such as a peer, and that one's name.
-    """
+def advice(private: bytes, owners: Iterable[Values]) -> Iterator[str]:
+    """Yield a warning for each key that is probably in the wrong place. ``owners``: the sections with public keys."""
     if not looks_private(private):
         yield (
             "private_key_file holds a key without the form of a private key, perhaps a public key: make one with"
             " `uavlinkd keygen`, unless software other than `uavlinkd` and `wg` made it"
         )
-    for what, name, key in owners:
+    for owner in owners:
+        key, what = owner.valid["public_key"], owner.section.partition("[")[0]
+        name = f'{what} "{owner.valid["name"]}": public_key'
         if encode_key(key) in EXAMPLE_KEYS:
             yield (
-                f'{what} "{name}": public_key is the key of an example, whose private key does not exist: write'
-                f" what `uavlinkd keygen` or `uavlinkd pubkey` printed on the {what}"
+                f"{name} is the key of an example, whose private key does not exist: write what `uavlinkd keygen` or"
+                f" `uavlinkd pubkey` printed on the {what}"
             )
         elif looks_private(key):
             yield (
-                f'{what} "{name}": public_key has the form of a private key. `uavlinkd keygen` makes no such'
-                f" public key, `wg` one of 16: compare it with what `uavlinkd pubkey FILE` prints on the {what}."
-                f" If it is its private key, {_EXPOSED}"
+                f"{name} has the form of a private key. `uavlinkd keygen` makes no such public key, `wg` one of 16:"
+                f" compare it with what `uavlinkd pubkey FILE` prints on the {what}. If it is its private key,"
+                f" {_EXPOSED}"
             )

@@ -7,7 +7,7 @@ from types import MappingProxyType
 from typing import Any
 
 from uavlinkd.config.model import PolicyData
-from uavlinkd.config.problems import Problems, Values
+from uavlinkd.config.problems import Found, Values
 from uavlinkd.config.schema import PolicySection
 from uavlinkd.mavlink.policy.compilation import PolicyError, compile_policy
 
@@ -25,13 +25,13 @@ def data(section: Values) -> PolicyData:
     )
 
 
-def check(problems: Problems, section: Values, *, is_local: bool) -> None:
-    """Add every problem of the section's policy."""
+def check(section: Values, *, is_local: bool) -> Found:
+    """Yield every problem of the section's policy."""
     try:
         compile_policy(data(section), is_local=is_local)
     except PolicyError as error:
         for problem in error.problems:
-            problems.add(section.place.key(problem.key), f"{problem.problem}; {problem.remedy}")
+            yield section.at(problem.key), f"{problem.problem}; {problem.remedy}"
 
 
 def _frozen(key: str, value: Any) -> object:

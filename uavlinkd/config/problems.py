@@ -7,50 +7,88 @@ the wrong place may be a secret.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
 from difflib import get_close_matches
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from pydantic import ValidationError
+from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
-from uavlinkd.config.errors import ConfigError, Problem
-from uavlinkd.config.schema import (
-    EndpointSection,
-    FileSection,
-    LinkSection,
-    LogSection,
-    MemberSection,
-    MetricsSection,
-    NetworkSection,
-    PeerSection,
-    PolicySection,
-    RecordingSection,
-    RelaySection,
-    RelayServerSection,
-    RoutingSection,
-    Section,
-)
-
-
-class SectionName(NamedTuple):
-    """A section of the file: ``peer[1]``, and the name that it has there."""
-
-    section: str
-    name: str = ""
-
-    def key(self, key: str) -> str:
-        """``peer[1].public_key (drone1)``."""
-        path = ".".join(part for part in (self.section, key) if part)
-        return f"{path} ({self.name})" if self.name else path
+from uavlinkd.config import schema
+from uavlinkd.config.model import ConfigError, Problem
+from uavlinkd.core.crypto import Secret, x25519_public_key
 
 
 class Values(NamedTuple):
-    """The valid values of a section by key, and the keys whose values are invalid."""
+    """The valid values of one section by key, and the keys whose values are invalid."""
 
-    place: SectionName
+    section: str
+    """``peer[1]``; empty for the top of the file."""
     valid: dict[str, Any]
     invalid: frozenset[str]
+
+    def get(self, key: str, default: Any = None) -> Any:
+        """The valid value of a key, else the default."""
+        return self.valid.get(key, default)
+
+    def at(self, key: str = "") -> str:
+        """The place of a key, or of the section: ``peer[1].public_key (drone1)``."""
+        path = ".".join(part for part in (self.section, key) if part)
+        name = self.valid.get("name") if self.section else None
+        return f"{path} ({name})" if name else path
+
+    def lacks(self, key: str) -> bool:
+        """Whether the key is not written, or its value is empty. False if the value is invalid."""
+        return not self.valid.get(key) and key not in self.invalid
+
+
+@dataclass(frozen=True, slots=True)
+class Sections:
+    """The values of one file in ``folder``. ``secrets``: content of its key files, by the place of the key."""
+
+    folder: Path
+    top: Values
+    link: Values
+    log: Values
+    routing: Values
+    metrics: Values
+    recording: Values
+    relay_server: Values
+    networks: list[Values]
+    endpoints: list[Values]
+    peers: list[Values]
+    members: list[Values]
+    relays: list[Values]
+    secrets: dict[str, Secret] = field(default_factory=dict)
+
+    @property
+    def others(self) -> list[Values]:
+        """The sections with public keys."""
+        return [*self.peers, *self.members, *self.relays]
+
+    def secret(self, section: Values, key: str) -> Secret | None:
+        """The content of the key file that a section names under a key."""
+        return self.secrets.get(section.at(key))
+
+    def own_key(self, key: str = "private_key_file") -> bytes | None:
+        """This daemon's public key, or with ``previous_private_key_file`` the previous one."""
+        secret = self.secret(self.top, key)
+        return None if secret is None else x25519_public_key(secret.reveal())
+
+
+Found = Iterator[tuple[str, str]]
+"""The problems that a rule finds: the place of a key, what is wrong there and what to do."""
+
+
+def unique(sections: Iterable[Values], key: str, message: str) -> Found:
+    """No two sections have the same value of a key. ``message`` says what to do, with the place of the ``other``."""
+    first: dict[object, Values] = {}
+    for section in sections:
+        if (value := section.get(key)) is not None and (other := first.setdefault(value, section)) is not section:
+            yield section.at(key), "is " + message.format(other=other.at())
 
 
 class Problems:
@@ -69,23 +107,19 @@ class Problems:
         if self._found:
             raise ConfigError(tuple(self._found))
 
-    def read(self, model: type[Section], table: Mapping[str, Any], section: str) -> Values:
+    def read(self, model: type[schema.Section], table: Mapping[str, Any], section: str) -> Values:
         """Check one section by its model and add its problems."""
         valid: dict[str, Any] = {}
         invalid: set[str] = set()
         try:
             model.model_validate(table, context=valid)
         except ValidationError as error:
-            place = SectionName(section, valid.get("name", "") if section else "")
+            values = Values(section, valid, frozenset())
             for details in error.errors(include_url=False, include_input=False):
                 invalid.add(str(details["loc"][0]))
-                self.add(place.key(_path(details["loc"])), _message(details, model))
+                self.add(values.at(_path(details["loc"])), _message(details, model))
         # The context has no list with an invalid item, but it may have a value that a later check refused.
-        return Values(
-            SectionName(section, valid.get("name", "") if section else ""),
-            {key: value for key, value in valid.items() if key not in invalid},
-            frozenset(invalid),
-        )
+        return Values(section, {key: valid[key] for key in valid if key not in invalid}, frozenset(invalid))
 
 
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]{1,32}")
@@ -93,56 +127,47 @@ _BARE_KEY = re.compile(r"[A-Za-z0-9_-]{1,32}")
 
 def _path(location: tuple[int | str, ...]) -> str:
     """``suites[0]``. Only a plain word is repeated: another key may be a secret, or control a terminal."""
-    parts = [
+    return "".join(
         f"[{part}]" if isinstance(part, int) else part if _BARE_KEY.fullmatch(part) else "…" for part in location
-    ]
-    return "".join(parts)
+    )
 
 
-def _message(details: ErrorDetails, model: type[Section]) -> str:
-    """The problem and its remedy, for each kind of error that the schema can raise."""
-    key = str(details["loc"][0])
-    context = details.get("ctx", {})
-    match details["type"]:
-        case "missing":
-            return f"is missing: write {key} = {_example(model, key)}"
-        case "extra_forbidden":
-            return unknown_key(key, model)
-        case "value_error":
-            return str(context["error"])
-        case "bool_type":
-            # A person who writes the key wants another value than the default.
-            other = str(not model.model_fields[key].default).lower()
-            return f"must be true or false, without quotes: write {key} = {other}"
-        case "int_type":
-            return f"must be a whole number, without quotes: write {key} = {_example(model, key)}"
-        case "finite_number":
-            return f"must be a finite number: write {key} = {_example(model, key)}"
-        case "float_type":
-            return f"must be a number, without quotes: write {key} = {_example(model, key)}"
-        case "greater_than_equal":
-            return f"is too small: write {_number(context['ge'])} or more"
-        case "less_than_equal":
-            return f"is too large: write {_number(context['le'])} or less"
-        case "literal_error":
-            return f"must be {context['expected']}"
-        case "list_type":
-            return f"must be a list: write {key} = {_example(model, key)}"
-        case _:  # a kind of error that the schema does not raise today
-            return f"cannot be used: write {key} = {_example(model, key)}"
+_MESSAGES = {
+    "missing": "is missing: write {key} = {example}",
+    "bool_type": "must be true or false, without quotes: write {key} = {example}",
+    "int_type": "must be a whole number, without quotes: write {key} = {example}",
+    "float_type": "must be a number, without quotes: write {key} = {example}",
+    "finite_number": "must be a finite number: write {key} = {example}",
+    "greater_than_equal": "is too small: write {limit} or more",
+    "less_than_equal": "is too large: write {limit} or less",
+    "literal_error": "must be {expected}",
+    "list_type": "must be a list: write {key} = {example}",
+}
+"""The problem and its remedy, for each kind of error that the schema raises."""
 
 
-def _number(limit: object) -> str:
-    """As text for the file: a whole number has no decimal point."""
-    return f"{limit:g}" if isinstance(limit, float) else str(limit)
+def _message(details: ErrorDetails, model: type[schema.Section]) -> str:
+    key, context = str(details["loc"][0]), details.get("ctx", {})
+    if details["type"] == "extra_forbidden":
+        return unknown_key(key, model)
+    if details["type"] == "value_error":
+        return str(context["error"])
+    limit = context.get("ge", context.get("le"))
+    return _MESSAGES.get(details["type"], "cannot be used: write {key} = {example}").format(
+        key=key,
+        example=_example(model.model_fields[key]),
+        limit=f"{limit:g}" if isinstance(limit, float) else limit,
+        expected=context.get("expected"),
+    )
 
 
-def _example(model: type[Section], key: str) -> str:
-    """A value as it is written in TOML: the schema's example, else the default."""
-    field = model.model_fields[key]
+def _example(field: FieldInfo) -> str:
+    """A value as it is written in TOML. A person who writes a boolean wants another value than the default."""
     if field.examples:
         return str(field.examples[0])
-    return f"{field.default:g}"
+    if isinstance(field.default, bool):
+        return str(not field.default).lower()
+    return f"{field.default:g}" if isinstance(field.default, int | float) else f'"{field.default}"'
 
 
 # The policy's keys are checked by the policy itself, so the schema has no examples of them.
@@ -161,78 +186,54 @@ def example_of(key: str) -> str | None:
         return _EXAMPLES[key]
     for model in _SECTIONS.values():
         if key in model.model_fields and (field := model.model_fields[key]).annotation is not Any:
-            if field.examples:
-                return str(field.examples[0])
-            if isinstance(field.default, bool):
-                return str(field.default).lower()
-            return f'"{field.default}"' if isinstance(field.default, str) else f"{field.default:g}"
+            return _example(field)
     return None
 
 
-_SECTIONS: dict[str, type[Section]] = {
-    "at the top, before the first [section]": FileSection,
-    "in [link] or in a [[peer]]": LinkSection,
-    "in a [[peer]] or an [[endpoint]]": PolicySection,
-    "in a [[peer]]": PeerSection,
-    "in a [[relay]]": RelaySection,
-    "in a [[network]]": NetworkSection,
-    "in an [[endpoint]]": EndpointSection,
-    "in a [[member]]": MemberSection,
-    "in [relay_server]": RelayServerSection,
-    "in [log]": LogSection,
-    "in [routing]": RoutingSection,
-    "in [metrics]": MetricsSection,
-    "in [recording]": RecordingSection,
+_SECTIONS: dict[str, type[schema.Section]] = {
+    "at the top, before the first [section]": schema.FileSection,
+    "in [link] or in a [[peer]]": schema.LinkSection,
+    "in a [[peer]] or an [[endpoint]]": schema.PolicySection,
+    "in a [[peer]]": schema.PeerSection,
+    "in a [[relay]]": schema.RelaySection,
+    "in a [[network]]": schema.NetworkSection,
+    "in an [[endpoint]]": schema.EndpointSection,
+    "in a [[member]]": schema.MemberSection,
+    "in [relay_server]": schema.RelayServerSection,
+    "in [log]": schema.LogSection,
+    "in [routing]": schema.RoutingSection,
+    "in [metrics]": schema.MetricsSection,
+    "in [recording]": schema.RecordingSection,
 }
 
-# Names that WireGuard, mavlink-router and common usage have for these keys.
-_OTHERS_CALL_IT = {
-    "private_key": "private_key_file, the name of a file that holds the key: this file never contains a key",
-    "key": "private_key_file, or public_key in a [[peer]]",
-    "psk": "psk_file, the name of a file that holds the key: this file never contains a key",
-    "preshared_key": "psk_file, the name of a file that holds the key: this file never contains a key",
-    "listen_port": 'listen, with an address: listen = ["0.0.0.0:5790"]',
-    "port": 'listen, with an address: listen = ["0.0.0.0:5790"]',
-    "persistent_keepalive": "keepalive_s, in seconds",
-    "mtu": "max_envelope_bytes, the size of the UDP payload",
-    "encrypt": "confidential = true",
-    "encryption": "confidential = true",
-    "suite": 'suites, a list: suites = ["x25519"]',
-    "udp_endpoint": "[[endpoint]], with name and url",
-    "uart_endpoint": "[[endpoint]], with name and url",
-}
-_FILTERS = {
-    "block_msg_id_in": "deny_in, a list of messages by name",
-    "block_msg_id_out": "deny_out, a list of messages by name",
-    "allow_msg_id_in": "allow_in, a list of messages by name",
-    "allow_msg_id_out": "allow_out, a list of messages by name",
-    "allow_src_sys_in": "system_ids, a list",
-}
+# Names that WireGuard and common usage have for these keys, where the most similar key is another one.
+_IN_A_FILE = "{} the name of a file that holds the key: this file never contains a key"
 _UDP, _SERIAL = 'url = "udpin:127.0.0.1:14550"', 'url = "serial:/dev/ttyACM0:57600"'
-_OTHERS_CALL_IT_IN: dict[type[Section], dict[str, str]] = {
-    FileSection: {
-        "log_level": '[log] at the end of the file, and below it level = "info"',
-        "interface": "name, private_key_file and listen here, or interface in a [[network]]",
-    },
-    PeerSection: {
-        "address": 'addresses, a list: addresses = ["10.13.0.2:5790"]',
+_OTHERS_CALL_IT = {
+    "private_key": _IN_A_FILE.format("private_key_file,"),
+    "psk": _IN_A_FILE.format("psk_file,"),
+    "preshared_key": _IN_A_FILE.format("psk_file,"),
+    "listen_port": 'listen, with an address: listen = ["0.0.0.0:5790"]',
+    "mtu": "max_envelope_bytes, the size of the UDP payload",
+    "encryption": "confidential = true",
+}
+_OTHERS_CALL_IT_IN: dict[type[schema.Section], dict[str, str]] = {
+    schema.FileSection: {"log_level": '[log] at the end of the file, and below it level = "info"'},
+    schema.PeerSection: {
+        **dict.fromkeys(("address", "endpoint"), 'addresses, a list: addresses = ["10.13.0.2:5790"]'),
         "interface": 'addresses = [{ address = "10.13.0.2:5790", network = "mesh" }], and a [[network]] "mesh" with'
         " this interface",
-        "endpoint": 'addresses, a list: addresses = ["10.13.0.2:5790"]',
         "allowed_ips": "role and system_ids: they say what the peer may do",
-        **_FILTERS,
     },
-    RelaySection: dict.fromkeys(("address", "endpoint"), 'addresses, a list: addresses = ["relay.example.org:5790"]'),
-    EndpointSection: {
-        **dict.fromkeys(("address", "port", "server"), _UDP),
-        "mode": f"{_UDP}, or udpout",
-        **dict.fromkeys(("device", "baud", "serial"), _SERIAL),
-        **_FILTERS,
+    schema.RelaySection: {"address": 'addresses, a list: addresses = ["relay.example.org:5790"]'},
+    schema.EndpointSection: {
+        **dict.fromkeys(("address", "port"), _UDP),
+        **dict.fromkeys(("device", "baud"), _SERIAL),
     },
 }
 
 
-def unknown_key(key: str, model: type[Section]) -> str:
+def unknown_key(key: str, model: type[schema.Section]) -> str:
     """What to write for a key that the section does not have."""
     plain = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|[ -]", "_", key).lower()
     here = _OTHERS_CALL_IT_IN.get(model, {})
@@ -245,10 +246,6 @@ def unknown_key(key: str, model: type[Section]) -> str:
             return f"does not belong here: write it {where}"
     known = list(model.model_fields)
     if close := get_close_matches(plain, known, n=1, cutoff=0.7):
-        written = (
-            f"[[{close[0]}]]"
-            if model is FileSection and close[0] in ("peer", "endpoint", "network", "member", "relay")
-            else close[0]
-        )
-        return f"is not known: did you mean {written}?"
+        is_repeated = model is schema.FileSection and close[0] in ("peer", "endpoint", "network", "member", "relay")
+        return f"is not known: did you mean {f'[[{close[0]}]]' if is_repeated else close[0]}?"
     return f"is not known here: the keys are {', '.join(known)}"

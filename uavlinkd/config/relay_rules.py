@@ -1,105 +1,177 @@
-"""Rules for a relay: ``[[member]]`` and ``[relay_server]``."""
+"""Rules about relays: ``[[member]]`` of a relay, ``[[relay]]``, and which peers use which relays."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import Final
 
-from uavlinkd.config import checks
 from uavlinkd.config.link_settings import link_of
-from uavlinkd.config.model import RelayServer
-from uavlinkd.config.problems import Problems, Values
+from uavlinkd.config.model import PeerAddress, RelayConfig, RelayServer
+from uavlinkd.config.problems import Found, Sections, Values, unique
 from uavlinkd.config.schema import LinkSection, MemberSection, RelayServerSection
 from uavlinkd.core import constants as c
-from uavlinkd.core.crypto import Secret
-from uavlinkd.core.settings import Link, PeerSettings, previous_of
+from uavlinkd.core.path import RELAY_HOST
+from uavlinkd.core.settings import Link, PeerSettings, Timers, previous_of
 from uavlinkd.relay.member_settings import MemberSettings, RelayLimits
-from uavlinkd.system.addresses import Address
 
-MOST_MEMBERS = 4000
+MOST_MEMBERS: Final = 4000
 """Each has up to three sessions, of 65,535 indices."""
+MOST: Final = 3
+"""Relays of one daemon. A peer has room for the paths along so many."""
+TIMERS: Final = Timers(echo_after_s=0.1, handshake_after_s=0.2, lost_after_s=1.0, retry_max_s=0.5)
+"""A relay is asked when a path along it fails or its peer is silent, and answers at once unless it was restarted. A
+try costs 0.3 kB: while a relay is down, 5 kbit/s. When it is lost, its name is resolved again: it may have moved."""
 
 
-def members(
-    problems: Problems, sections: Sequence[Values], peers: Sequence[Values], own: bytes | None, private: bytes | None
-) -> None:
-    """Each member has a key of its own. It may also be a peer: then one session serves both."""
-    checks.names(problems, sections)
-    checks.public_keys(problems, sections, own, private, "member")
-    by_name = {peer.valid.get("name"): peer for peer in peers}
-    by_key = {peer.valid.get("public_key"): peer for peer in peers}
-    for section in sections:
-        name, key = section.valid.get("name"), section.valid.get("public_key")
+def members(file: Sections) -> Found:
+    """Members can reach the relay. One may also be a peer, with the same key: then one session serves both."""
+    by_name = {peer.get("name"): peer for peer in file.peers}
+    for section in file.members:
+        name, key = section.get("name"), section.get("public_key")
         if name is None or key is None:
             continue
-        peer = by_key.get(key)
+        peer = peer_of(section, file.peers)
         if peer is not None:
-            checks.of_peer(problems, section, peer)
+            yield from _of_peer(section, peer)
         if (other := by_name.get(name)) is not None and other is not peer:
-            problems.add(
-                section.place.key("name"),
-                f"is the name of {other.place.key('')} too, which has another key: write another name",
+            yield (
+                section.at("name"),
+                f"is the name of {other.at()} too, which has another key: write another name",
             )
-    if len(sections) > MOST_MEMBERS:
-        problems.add(
-            "member", f"has more than {MOST_MEMBERS:,} sections: run several relays, each on a port of its own"
-        )
-
-
-def relay_server(
-    problems: Problems, top: Values, server: Values, sections: Sequence[Values], *, has_frames: bool
-) -> None:
-    """A relay has members, which can reach it. A daemon that carries frames is a relay only if its file says so."""
-    is_enabled = server.valid.get("enabled")
-    if sections and not is_enabled and (has_frames or is_enabled is False) and "enabled" not in server.invalid:
-        problems.add(
-            server.place.key("enabled"),
-            "is not true, but the file has a [[member]]: write [relay_server] and below it enabled = true,"
-            " or remove the members",
-        )
-    if is_enabled and not sections:
-        problems.add(
-            server.place.key("enabled"),
-            "is true, but the file has no [[member]]: write one with name and public_key for each daemon"
+    if len(file.members) > MOST_MEMBERS:
+        yield "member", f"has more than {MOST_MEMBERS:,} sections: run several relays, each on a port of its own"
+    if file.members and file.top.lacks("listen"):
+        yield "listen", 'is empty, so no member could reach this relay: write listen = ["0.0.0.0:5790", "[::]:5790"]'
+    elif file.relay_server.valid and not file.members:
+        yield (
+            "relay_server",
+            "has no effect, because the file has no [[member]]: write one with name and public_key for each daemon"
             " that may use this relay",
         )
-    if sections and not top.valid.get("listen") and "listen" not in top.invalid:
-        problems.add(
-            "listen",
-            'is empty, so no member could reach this relay: write listen = ["0.0.0.0:5790", "[::]:5790"]',
-        )
 
 
-def relay_server_of(
-    server: Values, sections: Sequence[Values], psks: Sequence[Secret | None], link: Values
-) -> RelayServer | None:
-    """The relay of a valid configuration; None if it is not one."""
-    if not sections:
-        return None
-    keys = RelayServerSection.model_construct(**server.valid)
-    common = link_of(LinkSection.model_construct(**link.valid))
-    common = replace(common, features=c.FEATURE_RECORDS)
-    return RelayServer(
-        members=tuple(
-            member for section, psk in zip(sections, psks, strict=True) for member in _members(section, psk, common)
-        ),
-        limits=RelayLimits(keys.datagrams_s, keys.bits_s),
+def _of_peer(section: Values, peer: Values) -> Found:
+    """A member or relay that is a peer too leaves to the peer what belongs to their one session."""
+    for key in ("psk_file", "previous_public_key"):
+        if key in section.valid:
+            text = f"has no effect, because {peer.at()} has the same public_key: write it there only"
+            yield section.at(key), text
+
+
+def relays(file: Sections) -> Found:
+    """Each relay has an address, and a key of its own or a peer's. Each relay that a peer names is in the file."""
+    if len(file.relays) > MOST:
+        yield "relay", f"has {len(file.relays)} sections: write at most {MOST}, the most reliable ones"
+    yield from unique(file.relays, "name", "the name of {other} too: write another")
+    by_member = {member.get("public_key"): member for member in file.members}
+    for number, section in enumerate(file.relays):
+        key, peer = section.get("public_key"), peer_of(section, file.peers)
+        if key is not None and key in by_member:
+            yield (
+                section.at("public_key"),
+                f"is the key of {by_member[key].at()} too, and two daemons cannot be relays of each other:"
+                " run the relay with a key of its own (`uavlinkd keygen`)",
+            )
+        if peer is not None:
+            yield from _of_peer(section, peer)
+        yield from _addresses(section, peer, file.relays[:number])
+    known = {section.get("name"): section for section in file.relays}
+    names = ", ".join(f'"{name}"' for name in sorted(name for name in known if name is not None))
+    for peer in file.peers if len(known) == len(file.relays) and None not in known else ():
+        for name in peer.get("relays") or ():
+            if name not in known:
+                remedy = f"write one of {names}" if names else "add a [[relay]] of that name"
+                yield peer.at("relays"), f"names a relay that this file does not have: {remedy}"
+            elif peer_of(known[name], [peer]) is not None:
+                yield peer.at("relays"), f"names {name}, which has this peer's key: leave it out"
+
+
+def _addresses(section: Values, peer: Values | None, others: Sequence[Values]) -> Found:
+    """At least one over IP. One process answers at an address, with one key."""
+    place = section.at("addresses")
+    has_peers = peer is not None and ("addresses" in peer.invalid or bool(_over_ip(peer)))
+    if section.lacks("addresses") and not has_peers:
+        yield place, 'is empty, and a relay never initiates: write its address, such as ["relay.example.org:5790"]'
+    if any(written.is_serial for written in section.get("addresses", ())):
+        yield place, "names a serial network, but a relay is reached over IP: write its IP address or name"
+    for other in others:
+        shared = [written for written in _over_ip(section) if written in _over_ip(other)]
+        if shared and section.get("public_key") != other.get("public_key"):
+            yield (
+                place,
+                f"has {shared[0]}, an address of {other.at()} too, which has another key: write the address of this"
+                " relay",
+            )
+
+
+def _over_ip(section: Values) -> list[PeerAddress]:
+    return [written for written in section.get("addresses", ()) if not written.is_serial]
+
+
+def peer_of(section: Values, peers: Sequence[Values]) -> Values | None:
+    """The peer with the key of a relay or member."""
+    key = section.get("public_key")
+    return next((peer for peer in peers if key is not None and peer.get("public_key") == key), None)
+
+
+def needs_no_address(peer: Values, sections: Sequence[Values]) -> bool:
+    """Whether a peer uses a relay of the file, or is one, which has an address."""
+    uses_relays = bool(sections) and peer.get("relays") != [] and "relays" not in peer.invalid
+    return uses_relays or any(peer_of(section, [peer]) is not None for section in sections)
+
+
+# In a file without problems:
+
+
+def relays_of(peer: Values, sections: Sequence[Values]) -> tuple[str, ...]:
+    """The names of the relays that a peer uses. It is not reached along itself."""
+    names: list[str] | None = peer.get("relays")
+    return tuple(
+        section.valid["name"]
+        for section in sections
+        if peer_of(section, [peer]) is None and (names is None or section.valid["name"] in names)
     )
 
 
-def _members(section: Values, psk: Secret | None, link: Link) -> Iterator[MemberSettings]:
+def addresses_of(peer: Values, sections: Sequence[Values]) -> tuple[PeerAddress, ...]:
+    """The addresses of a peer: its own, and those of the relay that it is."""
+    of_relay = [written for section in sections if peer_of(section, [peer]) for written in _over_ip(section)]
+    return tuple(dict.fromkeys((*peer.get("addresses", ()), *of_relay)))
+
+
+def relay_of(file: Sections, section: Values) -> RelayConfig:
+    """A relay. It inherits the suites of ``[link]``."""
+    suites = tuple(LinkSection.model_construct(**file.link.valid).suites)
+    peer = peer_of(section, file.peers)
+    return RelayConfig(
+        settings=PeerSettings(
+            name=RELAY_HOST + section.valid["name"],
+            public_key=section.valid["public_key"],
+            psk=file.secret(section, "psk_file"),
+            link=Link(suites, timers=TIMERS, features=c.FEATURE_REFUSALS | c.FEATURE_RECORDS),
+        ),
+        addresses=tuple(dict.fromkeys((*([] if peer is None else _over_ip(peer)), *_over_ip(section)))),
+        previous_public_key=section.get("previous_public_key"),
+        peer=None if peer is None else peer.valid["name"],
+    )
+
+
+def relay_server_of(file: Sections) -> RelayServer | None:
+    """The relay that this daemon is; None if it has no members."""
+    if not file.members:
+        return None
+    keys = RelayServerSection.model_construct(**file.relay_server.valid)
+    link = replace(link_of(LinkSection.model_construct(**file.link.valid)), features=c.FEATURE_RECORDS)
+    every = tuple(settings for section in file.members for settings in _member(file, section, link))
+    return RelayServer(every, RelayLimits(keys.datagrams_s, keys.bits_s))
+
+
+def _member(file: Sections, section: Values, link: Link) -> Iterator[MemberSettings]:
     """One, or two while its key changes: others ask for it by the key that they know."""
     keys = MemberSection.model_construct(**section.valid)
-    peer = PeerSettings(keys.name, keys.public_key, psk, link, initiates=False)
+    peer = PeerSettings(keys.name, keys.public_key, file.secret(section, "psk_file"), link, initiates=False)
     limits = RelayLimits(keys.datagrams_s, keys.bits_s)
     yield MemberSettings(peer, keys.max_peers, limits)
     if keys.previous_public_key is not None:
         yield MemberSettings(previous_of(peer, keys.previous_public_key), keys.max_peers, limits)
-
-
-def advice(server: RelayServer, listen: Sequence[Address]) -> Iterator[str]:
-    """Yield the warnings. ``listen``: empty if the relay listens on networks."""
-    if listen and all(address.is_loopback for address in listen):
-        yield "listen names only loopback: no member on another machine reaches this relay"
-    if len(server.members) == 1:
-        yield "there is only one [[member]]: a relay connects two"

@@ -29,8 +29,6 @@ from uavlinkd.mavlink.egress.budgeted import EgressSettings
 
 _LEAST_AIR = 1000
 _EGRESS = EgressSettings()
-_AGES = (0.1, 60.0)
-_KEY_GRACE_S = 7 * 24 * 3600.0
 
 
 def _seconds(default: float, least: float, most: float) -> Any:
@@ -72,10 +70,8 @@ class LinkSection(Section):
     (28 for IPv4) the network splits datagrams, and losing one part loses all."""
 
     keepalive_s: float = _seconds(c.KEEPALIVE_S, 0.1, 3600)
-    echo_after_s: float = _seconds(c.ECHO_AFTER_S, 0.05, 300)
-    handshake_after_s: float = _seconds(c.HANDSHAKE_AFTER_S, 0.1, 600)
     lost_after_s: float = _seconds(c.LOST_AFTER_S, 0.2, 1200)
-    retry_min_s: float = _seconds(c.RETRY_MIN_S, 0.05, 60)
+    """The daemon asks for an echo after a sixth of it, and tries a handshake after a third."""
     retry_max_s: float = _seconds(c.RETRY_MAX_S, 0.05, 60)
     rekey_after_s: float = _seconds(c.REKEY_AFTER_S, 1, 3600)
     reject_after_s: float = _seconds(c.REJECT_AFTER_S, 1, 7200)
@@ -85,10 +81,10 @@ class LinkSection(Section):
     """Most bits per second to the peer, including the headers of IP and UDP. 0: no limit."""
     coalesce_s: float = _seconds(_EGRESS.coalesce_s, 0, 0.5)
     """How long a frame may wait for others to share its envelope. 0: it shares only with frames that already wait."""
-    max_age_s: float = _seconds(_EGRESS.max_age_s, *_AGES)
+    max_age_s: float = _seconds(_EGRESS.max_age_s, 0.1, 60)
     """A frame that waited longer for its turn is dropped as stale."""
     redundancy: Literal["critical", "all", "none"] = "critical"
-    """Which classes of frames are sent along every usable path."""
+    """Which classes of frames are sent along every proven path."""
     idle_probe_s: float = _seconds(c.PROBE_IDLE_S, 0, 3600)
     """Interval of the probes along a metered path that is not needed, and while no frames are sent. 0: none."""
 
@@ -138,8 +134,7 @@ class PeerSection(LinkSection, PolicySection):
     """Where this daemon reaches it. Empty: the peer initiates."""
     psk_file: FileName | None = Field(default=None, examples=['"drone0-drone1.psk"'])
     previous_public_key: PublicKey | None = Field(default=None, examples=['"…", what its public key was'])
-    """Also accepted while the peer's key changes, until the first session with the new key or ``key_grace_s``."""
-
+    """Also accepted while the peer's key changes, until the first session with the new key, or for a week."""
     relays: list[Name] | None = Field(default=None, examples=["[]"])
     """The relays along which to reach it, by name. By default all of the file."""
 
@@ -173,10 +168,8 @@ class MemberSection(Section):
 
 
 class RelayServerSection(Section):
-    """``[relay_server]``: whether this daemon is a relay, and what it carries for all members together."""
+    """``[relay_server]``: what a relay carries for all members together."""
 
-    enabled: bool = False
-    """A file with members, and without peers and endpoints, is a relay without this key."""
     datagrams_s: int = Field(default=10**6, ge=1, le=10**6, examples=["100_000"])
     bits_s: int = Field(default=10**10, ge=LEAST_BUDGET, le=10**10, examples=["100_000_000"])
 
@@ -186,8 +179,6 @@ class EndpointSection(PolicySection):
 
     name: Name = Field(examples=['"autopilot"'])
     url: Url = Field(examples=['"udpin:127.0.0.1:14550"'])
-    max_age_s: float = _seconds(_EGRESS.max_age_s, *_AGES)
-    """A frame that waited longer for a TCP connection or a serial port is dropped."""
     radio_status: bool = False
     """Whether this endpoint gets a RADIO_STATUS every second, from the link's own loss and round-trip figures."""
     status_text: bool = False
@@ -199,8 +190,6 @@ class RoutingSection(Section):
 
     relay: bool = False
     """Whether frames from a peer may go to other peers."""
-    unknown_targets: Literal["flood", "drop"] = "flood"
-    """Where a frame goes whose target was never seen: to every other port, or nowhere."""
 
 
 class MetricsSection(Section):
@@ -215,7 +204,6 @@ class RecordingSection(Section):
 
     folder: FileName | None = Field(default=None, examples=['"recordings"'])
     """Folder for telemetry logs of the frames on the link, relative to the file. Off by default."""
-    max_file_bytes: int = Field(default=64_000_000, ge=10_000, le=10**12, examples=["64_000_000"])
     max_files: int = Field(default=100, ge=2, le=100_000)
     min_free_bytes: int = Field(default=1_000_000_000, ge=100_000, le=10**15, examples=["1_000_000_000"])
     """Free space to keep on the disk: the daemon deletes the oldest recordings for it."""
@@ -237,8 +225,6 @@ class FileSection(Section):
     """Where peers reach this daemon. Empty: it only initiates."""
     previous_private_key_file: FileName | None = Field(default=None, examples=['"drone0.previous.key"'])
     """The old key while this daemon's key changes, for peers that do not know the new one yet."""
-    key_grace_s: float = _seconds(_KEY_GRACE_S, 1, 365 * 24 * 3600)
-    """How long previous keys stay valid after the start or reload in which the daemon read them."""
     control_socket: FileName | None = Field(default=None, examples=['"drone0.sock"'])
     """A Unix socket for status and commands, relative to the file. Off by default."""
     link: Any = None

@@ -19,10 +19,7 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}")
 _INTERFACE = re.compile(r"[^\s/:]{1,15}")  # as dev_valid_name() of Linux
 # A complete or nearly complete key in base64 or hex: no message repeats it.
 _LIKE_A_KEY = re.compile(r"[A-Za-z0-9+/_-]{40,}={0,2}")
-_FINITE_FIELD = re.compile(r"(?:modp|ffdhe?|dhe?)?[-_ ]?(\d{1,5})(?:[-_ ]?bits?)?")
-# IKE's numbers for small groups: RFC 2409 section 6, RFC 5114 section 2.1.
-_SMALL_IKE_GROUPS = {"group1": 768, "group2": 1024, "group22": 1024}
-_BREAKABLE_BITS = 1024
+_SMALL_GROUP = re.compile(r"(?:modp|ffdhe?|dhe?)?[-_ ]?(?:512|768|1024)")
 LEAST_BUDGET = 1000
 
 
@@ -72,14 +69,10 @@ def _suite(value: Any) -> Suite:
     text = _text(value).strip().lower()
     if (suite := SUITES_BY_NAME.get(text)) and text == value:
         return suite
-    sized = _FINITE_FIELD.fullmatch(text)
-    bits = _SMALL_IKE_GROUPS.get(text) or (int(sized[1]) if sized else None)
-    if bits is not None and 0 < bits <= _BREAKABLE_BITS:
+    if _SMALL_GROUP.fullmatch(text):
         raise ValueError(
-            f"is a Diffie-Hellman group of {bits} bits: groups of {_BREAKABLE_BITS} bits and less are refused."
-            " One long computation in advance, which a state can afford, breaks every exchange in such a group"
-            " (Logjam, 2015), so they are for measurements only;"
-            ' write "x25519", or "ffdhe2048" and above'
+            "is a Diffie-Hellman group of 1024 bits or less: one long computation in advance, which a state"
+            ' can afford, breaks every exchange in it (Logjam, 2015); write "x25519", or "ffdhe2048" and above'
         )
     names = ", ".join(SUITES_BY_NAME)
     raise ValueError(f"is not a suite: write one of {names}")

@@ -7,6 +7,15 @@
 COBS (Consistent Overhead Byte Stuffing) removes the byte 0x00 from its input, so 0x00 always ends a datagram. The one
 in front ends noise from before it. The CRC is CRC-16/CCITT with the initial value 0xFFFF. It only keeps line noise
 out of the core's counters: envelopes have their own tags. Sans-IO.
+
+A SiK modem with ``MAVLINK=1`` or ``2`` puts a RADIO_STATUS frame a second between the bytes that it received by radio
+(message 109; old firmware 166)::
+
+    MAVLink 1   0xFE | 9 | seq | system | component | message | payload 9 | checksum 2            17 bytes
+    MAVLink 2   0xFD | 9 | 0 | 0 | seq | system | component | message 3 | payload 9 | checksum 2  21 bytes
+    payload     rxerrors u16 | fixed u16 | rssi | remrssi | txbuf | noise | remnoise
+
+It takes part in no security: any device on the line can forge it. It is for people only.
 """
 
 from __future__ import annotations
@@ -14,12 +23,14 @@ from __future__ import annotations
 import re
 from binascii import crc_hqx
 from collections import Counter
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
 from cobs import cobs
+from fastcrc.crc16 import mcrf4xx
 
-from uavlinkd.endpoints.radio_reports import REPORT_STARTS, RadioReport, parse_report, report_bytes
+from uavlinkd.mavlink.frames import MAVLINK1, MAVLINK2
 
 DELIMITER: Final = b"\0"
 CRC_BYTES: Final = 2
@@ -31,7 +42,59 @@ MAX_ENCODED: Final = MAX_DATAGRAM + CRC_BYTES + (MAX_DATAGRAM + CRC_BYTES + 253)
 REPORTS_CUT_OUT: Final = 2
 """So many reports are cut out of one broken datagram: a modem sends one a second, an attacker could fill the line."""
 
+REPORT_STARTS: Final = bytes((MAVLINK1, MAVLINK2))
+"""A report starts with one of these bytes."""
+_PAYLOAD_BYTES = 9
+_CRC_EXTRA: Final = {109: 185, 166: 21}
+"""By message: RADIO_STATUS, and RADIO of old firmware."""
+_FIXED: Final = {MAVLINK1: {1: 9}, MAVLINK2: {1: 9, 2: 0, 3: 0, 8: 0, 9: 0}}
+"""Bytes of the header with one value, by their places."""
+_SIZES: Final = {MAVLINK1: 17, MAVLINK2: 21}
+_MESSAGE_AT: Final = {MAVLINK1: 5, MAVLINK2: 7}
 _REPORT_START: Final = re.compile(b"[" + re.escape(REPORT_STARTS) + b"]")
+
+
+@dataclass(frozen=True, slots=True)
+class RadioReport:
+    """What a modem says about the radio link. Units as in MAVLink: rssi and noise as the modem counts them.
+
+    ``txbuf``: free room in the modem's send buffer, in per cent. 255 in ``rssi`` and others: unknown.
+    """
+
+    rssi: int
+    remrssi: int
+    txbuf: int
+    noise: int
+    remnoise: int
+    rxerrors: int
+    fixed: int
+
+
+def report_bytes(data: bytes, at: int) -> int | None:
+    """The length of the report that begins at a place; 0 if no report begins there; None if too few bytes follow."""
+    start = data[at]
+    if start not in _SIZES:
+        return 0
+    size, left = _SIZES[start], len(data) - at
+    for place, value in _FIXED[start].items():
+        if place < left and data[at + place] != value:
+            return 0
+    message_at = _MESSAGE_AT[start]
+    if message_at < left and data[at + message_at] not in _CRC_EXTRA:
+        return 0
+    if left < size:
+        return None
+    extra = _CRC_EXTRA[data[at + message_at]]
+    checksum = mcrf4xx(data[at + 1 : at + size - 2] + bytes((extra,)))
+    return size if int.from_bytes(data[at + size - 2 : at + size], "little") == checksum else 0
+
+
+def parse_report(frame: bytes) -> RadioReport:
+    """The figures of a whole report."""
+    payload = frame[-2 - _PAYLOAD_BYTES : -2]
+    rxerrors, fixed = (int.from_bytes(payload[at : at + 2], "little") for at in (0, 2))
+    rssi, remrssi, txbuf, noise, remnoise = payload[4:]
+    return RadioReport(rssi, remrssi, txbuf, noise, remnoise, rxerrors, fixed)
 
 
 class Noise(StrEnum):
@@ -60,7 +123,7 @@ def _crc(datagram: bytes) -> bytes:
 class LineDecoder:
     """Finds the datagrams in a byte stream, however it is cut into chunks. Any bytes are accepted.
 
-    After an error, the next delimiter ends what is broken. Reports of the modem (:mod:`.radio_reports`) between
+    After an error, the next delimiter ends what is broken. Reports of the modem between
     datagrams are skipped. If a datagram is broken because the modem put a report into it, the report is cut out.
     """
 

@@ -26,10 +26,10 @@ class OutgoingFrames:
     The source of a frame counts it if the delivered stream refuses it.
     """
 
-    def __init__(self, max_age_s: float, dropped: Counter[str], delivered: DeliveredStream) -> None:
+    def __init__(self, dropped: Counter[str], delivered: DeliveredStream) -> None:
         self._dropped = dropped
         self._admit = delivered.admit
-        self._queue = FairQueue(max_age_s, self._on_drop)
+        self._queue = FairQueue(self._on_drop)
         self._committed = b""
         self._ends: deque[int] = deque()  # sizes of the committed frames; for the first, of its unwritten rest
 

@@ -7,12 +7,13 @@ exception because of what a client does, and queues a bounded count of bytes.
 from __future__ import annotations
 
 import errno
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Sequence
 from typing import Protocol
 
 from uavlinkd.mavlink.frames import Frame, SplitCounters
-from uavlinkd.mavlink.policy.delivery import DeliveredStream, Source
+from uavlinkd.mavlink.policy.delivery import DeliveredStream, DeliveredStreams, Source
 from uavlinkd.system.stall import StallWatch
 
 
@@ -21,15 +22,13 @@ class LocalPort:
 
     __slots__ = ("delivered", "endpoint", "name", "received_at")
 
-    def __init__(
-        self, endpoint: Endpoint, name: str, received_at: float | None, delivered: DeliveredStream | None = None
-    ) -> None:
+    def __init__(self, endpoint: Endpoint, name: str, received_at: float | None, delivered: DeliveredStream) -> None:
         self.endpoint = endpoint
         self.name = name
         """Its address, for people: ``127.0.0.1:14550``, ``/dev/ttyACM0``."""
         self.received_at = received_at
         """When its last frame was received, in monotonic seconds; None before the first frame."""
-        self.delivered = delivered or DeliveredStream()
+        self.delivered = delivered
         """The byte stream that it reads. It decides which bytes a frame becomes, in the order of delivery."""
 
     def __repr__(self) -> str:
@@ -65,34 +64,40 @@ class PortHandler(Protocol):
         """
 
 
-class Endpoint(Protocol):
+class Endpoint(ABC):
     """A local MAVLink endpoint of the daemon, with no, one or many clients."""
 
-    name: str
-    counters: SplitCounters
-    """Frames and garbage in the received bytes."""
-    failures: Counter[str]
-    """Errors by name: the kernel's (``ECONNREFUSED``), and the endpoint's own reasons."""
-    bytes_received: int
-    bytes_sent: int
-    frames_sent: int
+    def __init__(self, name: str, handler: PortHandler) -> None:
+        self.name = name
+        self.handler = handler
+        self.counters = SplitCounters()
+        """Frames and garbage in the received bytes."""
+        self.failures: Counter[str] = Counter()
+        """Errors by name: the kernel's (``ECONNREFUSED``), and the endpoint's own reasons."""
+        self.bytes_received = self.bytes_sent = self.frames_sent = 0
+        self.delivered = DeliveredStreams()
 
     @property
+    @abstractmethod
     def ports(self) -> Sequence[LocalPort]:
         """The present clients."""
 
-    def gather(self, seconds: float) -> None:
-        """From now on, frames may wait this long before they are read: all peers make them wait anyway."""
+    def gather(self, seconds: float) -> None:  # noqa: B027
+        """From now on, frames may wait this long before they are read. The bytes of a stream gather anyway."""
 
+    @abstractmethod
     def start(self) -> None:
         """Begin to work, in the running event loop. Sockets that listen are bound already."""
 
+    @abstractmethod
     def write(self, port: LocalPort, frames: Sequence[Frame], source: Source, now: float) -> None:
-        """Send frames of one source to one client, or drop and count them. Returns at once."""
+        """Send frames of one source to one client, or drop and count them. Returns at once and reports no event."""
 
+    @abstractmethod
     def do_housekeeping(self, now: float) -> None:
         """Forget clients that have gone. The daemon calls this each second."""
 
+    @abstractmethod
     def close(self) -> None:
         """Stop and close everything. Reports no port as closed any more."""
 

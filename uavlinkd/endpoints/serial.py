@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import asyncio
 import os
+from collections.abc import Awaitable, Callable
 from contextlib import suppress
-from functools import partial
 from math import inf
 
 from serialx import BaseSerial, serial_for_url
 
 from uavlinkd.endpoints.ports import PortHandler, failure_name
-from uavlinkd.endpoints.stream_endpoint import MAX_AGE_S, Connection, StreamEndpoint
+from uavlinkd.endpoints.stream_endpoint import Connection, StreamEndpoint
 from uavlinkd.endpoints.url import SerialUrl
 from uavlinkd.system.clock import monotonic
+from uavlinkd.system.stall import StallWatch
 from uavlinkd.system.tasks import keep_running
 from uavlinkd.system.threads import Threads
 
@@ -59,6 +60,57 @@ def open_device(url: SerialUrl) -> BaseSerial:
     except Exception as error:  # exceptions of the library and of termios
         raise OSError(*error.args) from error
     return device
+
+
+def discard(device: BaseSerial) -> None:
+    """Close a device and discard unsent bytes: otherwise the kernel waits up to half a minute for them."""
+    with suppress(OSError):
+        device.reset_write_buffer()
+    with suppress(OSError):
+        device.close()
+
+
+class Opener:
+    """Opens a device whenever it is present, and closes it after use.
+
+    Both may block: a thread does it, and a device that hangs occupies this thread only.
+    """
+
+    def __init__(self, name: str, url: SerialUrl, prepare: Callable[[BaseSerial], None] | None = None) -> None:
+        """``prepare`` is called in the thread with a device that was opened. It may raise an OSError."""
+        self.is_closed = False
+        self._url = url
+        self._prepare = prepare
+        self._thread = Threads(1, name)
+
+    async def keep_open(
+        self,
+        stall: StallWatch,
+        use: Callable[[BaseSerial, int], Awaitable[None]],
+        on_failure: Callable[[str], None],
+    ) -> None:
+        """``use`` gets the device and the epoch in which opening it began, and returns when it is lost."""
+        while True:
+            epoch = stall.epoch
+            try:
+                device = await self._thread.run(self._open)
+            except OSError as error:
+                on_failure(failure_name(error))
+            else:
+                await use(device, epoch)
+                with suppress(OSError):  # no thread can be started: freeing the object closes it
+                    await self._thread.run(discard, device)
+                del device  # freeing it closes it
+            await asyncio.sleep(RETRY_S)
+
+    def _open(self) -> BaseSerial:
+        device = open_device(self._url)
+        if self.is_closed:  # while it was being opened
+            discard(device)
+            raise OSError("closed")
+        if self._prepare is not None:
+            self._prepare(device)
+        return device
 
 
 class SerialChannel:
@@ -117,11 +169,8 @@ class SerialChannel:
         return max(0.0, self.held(now) - to_bytes) / self._bytes_per_s + LATE_S
 
     def close(self, *, abort: bool) -> None:
-        """Close the device and discard unsent bytes: otherwise the kernel waits up to half a minute for them."""
-        with suppress(OSError):
-            self.device.reset_write_buffer()
-        with suppress(OSError):
-            self.device.close()
+        """Close the device at once in any case."""
+        discard(self.device)
 
 
 class SerialEndpoint(StreamEndpoint):
@@ -131,52 +180,29 @@ class SerialEndpoint(StreamEndpoint):
     permitted; ``EBUSY``: in use by another process).
     """
 
-    def __init__(self, name: str, url: SerialUrl, handler: PortHandler, *, max_age_s: float = MAX_AGE_S) -> None:
-        super().__init__(name, handler, max_age_s)
+    def __init__(self, name: str, url: SerialUrl, handler: PortHandler) -> None:
+        super().__init__(name, handler)
         self._url = url
+        self._opener = Opener(f"serial-{name}", url)
         self._task: asyncio.Task[None] | None = None
-        self._is_closed = False
-        # Opening and closing may block. A device that hangs occupies this thread only.
-        self._thread = Threads(1, f"serial-{name}")
 
     def start(self) -> None:
         """Open the device as soon as it is present."""
-        self._task = keep_running(self._keep_open(), f"the endpoint {self.name}")
+        opening = self._opener.keep_open(self.handler.stall, self._use, self.could_not_open)
+        self._task = keep_running(opening, f"the endpoint {self.name}")
 
     def close(self) -> None:
         """Stop, and close the device."""
-        self._is_closed = True
+        self._opener.is_closed = True
         if self._task is not None:
             self._task.cancel()
+            self._task = None  # it may hold a lost device, and freeing that closes it
         super().close()
 
     def dispose(self, connection: Connection) -> None:
-        """Do nothing: closing may block, so the worker thread does it."""
+        """Do nothing: closing may block, so the opener's thread does it."""
 
-    async def _keep_open(self) -> None:
-        while True:
-            epoch = self.handler.stall.epoch
-            try:
-                device = await self._thread.run(self._open_device)
-            except OSError as error:
-                self.could_not_open(failure_name(error))
-            else:
-                baud = self._url.baud if has_line_rate(self._url.device) else None
-                channel = SerialChannel(device, baud)
-                connection = self.open(channel, self._url.device, monotonic(), epoch)
-                await connection.lost.wait()
-                with suppress(OSError):  # no thread can be started: freeing the object closes it
-                    await self._thread.run(partial(channel.close, abort=True))
-            await asyncio.sleep(RETRY_S)
-
-    def _open_device(self) -> BaseSerial:
-        """Open the device; in a thread.
-
-        Raises:
-            OSError: any failure, an unsupported baud rate included.
-        """
-        device = open_device(self._url)
-        if self._is_closed:  # while it was being opened
-            device.close()
-            raise OSError("closed")
-        return device
+    async def _use(self, device: BaseSerial, epoch: int) -> None:
+        baud = self._url.baud if has_line_rate(self._url.device) else None
+        connection = self.open(SerialChannel(device, baud), self._url.device, monotonic(), epoch)
+        await connection.lost.wait()

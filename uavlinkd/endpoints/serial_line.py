@@ -17,22 +17,19 @@ import termios
 from collections import Counter, deque
 from collections.abc import Callable
 from contextlib import suppress
-from functools import partial
 from math import inf
 from threading import Thread
-from typing import Final, Protocol
+from typing import Final
 
 from serialx import BaseSerial, PinState
 
-from uavlinkd.endpoints.cts_hold import CtsHold
 from uavlinkd.endpoints.line_framing import LineDecoder, encode
 from uavlinkd.endpoints.ports import failure_name
-from uavlinkd.endpoints.serial import LATE_S, RETRY_S, TERMINAL_BYTES, open_device
+from uavlinkd.endpoints.serial import LATE_S, TERMINAL_BYTES, Opener
 from uavlinkd.endpoints.url import SerialUrl
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.stall import STALE, Backlog, StallWatch
 from uavlinkd.system.tasks import keep_running
-from uavlinkd.system.threads import Threads
 
 MODEM_S: Final = 0.25
 """The modem gets no more than the air carries in this time, or one datagram."""
@@ -56,11 +53,38 @@ _BITS_PER_BYTE: Final = 10  # with start and stop bit
 TOO_LONG: Final = "EMSGSIZE"
 
 
-class OnDatagrams(Protocol):
-    """Receives what one read completed."""
+class CtsHold:
+    """Looks at a line in which the modem can stop this end by the CTS wire."""
 
-    def __call__(self, datagrams: list[bytes], now: float, epoch: int, /) -> None:
-        """The datagrams, the monotonic time of the read, and its epoch (:mod:`uavlinkd.system.stall`)."""
+    __slots__ = ("_noted_at", "_since", "total_s")
+
+    def __init__(self) -> None:
+        self.total_s = 0.0
+        """The time for which the modem held this end, until the last look."""
+        self._since: float | None = None
+        self._noted_at = 0.0
+
+    def note(self, now: float, *, is_held: bool) -> None:
+        """A look: ``is_held`` if the kernel has bytes that the wire should have carried by now."""
+        if self._since is not None:
+            self.total_s += now - self._noted_at
+        if not is_held:
+            self._since = None
+        elif self._since is None:
+            self._since = now
+        self._noted_at = now
+
+    def lasts_s(self, now: float) -> float:
+        """How long it has lasted; 0 if the last look found nothing held."""
+        return 0.0 if self._since is None else now - self._since
+
+    def end(self) -> None:
+        """The device is closed."""
+        self._since = None
+
+
+OnDatagrams = Callable[[list[bytes], float, int], None]
+"""Receives the datagrams that one read completed, its monotonic time and epoch (:mod:`uavlinkd.system.stall`)."""
 
 
 class SerialLine:
@@ -103,9 +127,7 @@ class SerialLine:
         self._ignores_cts = False
         self._timer: asyncio.TimerHandle | None = None
         self._task: asyncio.Task[None] | None = None
-        self._is_closed = False
-        # Opening and closing may block. A device that hangs occupies this thread only.
-        self._thread = Threads(1, f"line-{name}")
+        self._opener = Opener(f"line-{name}", url, self._prepare)
 
     @property
     def is_open(self) -> bool:
@@ -118,19 +140,21 @@ class SerialLine:
 
     def start(self) -> None:
         """Open the device as soon as it is present."""
-        self._task = keep_running(self._keep_open(), f"the serial network {self._name}")
+        opening = self._opener.keep_open(self._stall, self._use, self._could_not_open)
+        self._task = keep_running(opening, f"the serial network {self._name}")
 
     def close(self) -> None:
         """Write what waits, as far as the kernel takes it at once, and close the device. Call it at the end only."""
-        self._is_closed = True
+        self._opener.is_closed = True
         if self._task is not None:
             self._task.cancel()
+            self._task = None  # it may hold a lost device, and freeing that closes it
         device = self._device
         if device is not None:
             with suppress(OSError):
                 os.write(device.fileno(), b"".join(self._queue))
             self._detach("closed")
-            # Not in `_thread`, for which the event loop would have to go on. At exit, Python leaves it behind.
+            # Not in the opener's thread, for which the event loop would have to go on. Python leaves this one behind.
             closing = Thread(target=_close, args=(device,), name=f"line-{self._name}-close", daemon=True)
             with suppress(RuntimeError):  # no thread can be started: freeing the object closes it
                 closing.start()
@@ -204,35 +228,20 @@ class SerialLine:
 
     # The device.
 
-    async def _keep_open(self) -> None:
-        while True:
-            epoch = self._stall.epoch
-            try:
-                device, self.uses_cts = await self._thread.run(self._open_device)
-            except OSError as error:
-                self.error = failure_name(error)
-                self.reason = f"{self.url.device} cannot be opened ({self.error})"
-                self.failures[self.error] += 1
-            else:
-                self._lost.clear()
-                self._attach(device, epoch)
-                await self._lost.wait()
-                with suppress(OSError):  # no thread can be started: freeing the object closes it
-                    await self._thread.run(partial(_abort, device))
-            await asyncio.sleep(RETRY_S)
+    async def _use(self, device: BaseSerial, epoch: int) -> None:
+        self._lost.clear()
+        self._attach(device, epoch)
+        await self._lost.wait()
 
-    def _open_device(self) -> tuple[BaseSerial, bool]:
-        """Open the device, and use CTS if the modem has it; in a thread.
+    def _could_not_open(self, error: str) -> None:
+        self.error = error
+        self.reason = f"{self.url.device} cannot be opened ({error})"
+        self.failures[error] += 1
 
-        Raises:
-            OSError: any failure.
-        """
-        device = open_device(self.url)
-        if self._is_closed:  # while it was being opened
-            _abort(device)
-            raise OSError("closed")
+    def _prepare(self, device: BaseSerial) -> None:
+        """Use CTS if the modem has it; in the opener's thread."""
         os.set_blocking(device.fileno(), False)
-        return device, not self._ignores_cts and _has_cts(device) and _set_cts(device, on=True)
+        self.uses_cts = not self._ignores_cts and _has_cts(device) and _set_cts(device, on=True)
 
     def _attach(self, device: BaseSerial, epoch: int) -> None:
         self._device = device
@@ -311,13 +320,5 @@ def _set_cts(device: BaseSerial, *, on: bool) -> bool:
 def _close(device: BaseSerial) -> None:
     """Close the device once the kernel has written what it holds."""
     _set_cts(device, on=False)  # otherwise the kernel waits up to half a minute for the modem
-    with suppress(OSError):
-        device.close()
-
-
-def _abort(device: BaseSerial) -> None:
-    """Close the device at once."""
-    with suppress(OSError):
-        device.reset_write_buffer()
     with suppress(OSError):
         device.close()

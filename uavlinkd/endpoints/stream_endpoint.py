@@ -8,25 +8,21 @@ neither dropped nor overtaken.
 from __future__ import annotations
 
 import asyncio
-from abc import ABC, abstractmethod
-from collections import Counter
 from collections.abc import Sequence
 from math import inf
+from typing import Protocol
 
 import structlog
 
-from uavlinkd.endpoints.byte_channel import ByteChannel
 from uavlinkd.endpoints.outgoing import OutgoingFrames
-from uavlinkd.endpoints.ports import LocalPort, PortHandler, failure_name
-from uavlinkd.mavlink.frames import Frame, SplitCounters
-from uavlinkd.mavlink.policy.delivery import DeliveredStreams, Source
+from uavlinkd.endpoints.ports import Endpoint, LocalPort, PortHandler, failure_name
+from uavlinkd.mavlink.frames import Frame
+from uavlinkd.mavlink.policy.delivery import Source
 from uavlinkd.mavlink.stream_splitter import MAX_GAP_S, StreamSplitter
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.error_meanings import NAME_NOT_RESOLVED, meaning_of
 from uavlinkd.system.stall import STALE, Backlog
 
-MAX_AGE_S = 1.0
-"""A frame that waited longer than this is dropped."""
 READ_BYTES = 4096
 """Read from one connection in a wake-up. Then the other connections have their turn. The costliest bytes take some
 10 ms."""
@@ -45,6 +41,43 @@ _MEANINGS = {
 """Why an endpoint is not open, where the common table does not say it. The daemon tries again indefinitely."""
 
 
+class ByteChannel(Protocol):
+    """The kernel's side of one connection. No method blocks."""
+
+    def fileno(self) -> int:
+        """The file descriptor, for the event loop."""
+
+    def read(self, size: int) -> bytes:
+        """The received bytes, up to ``size``; no bytes at the end of the stream.
+
+        Raises:
+            BlockingIOError: no bytes are there now.
+        """
+
+    def write(self, data: bytes) -> int:
+        """Pass bytes to the kernel. Returns how many it accepted.
+
+        Raises:
+            BlockingIOError: it accepts no bytes now.
+        """
+
+    def capacity(self) -> int:
+        """How many received bytes the kernel can hold now."""
+
+    @property
+    def limit_bytes(self) -> int:
+        """The kernel gets no more than this, except for a single larger frame while it holds no bytes."""
+
+    def held(self, now: float) -> int:
+        """How many of the kernel's bytes count towards the limit."""
+
+    def drain_s(self, to_bytes: int, now: float) -> float:
+        """After how many seconds the kernel should hold no more than ``to_bytes``."""
+
+    def close(self, *, abort: bool) -> None:
+        """Close it; ``abort`` discards the kernel's unsent bytes."""
+
+
 class Connection:
     """One open byte stream and the client at its other end."""
 
@@ -54,7 +87,7 @@ class Connection:
         self.port = LocalPort(endpoint, name, None, endpoint.delivered.of(name))
         self.channel = channel
         self.opened_at = opened_at
-        self.outgoing = OutgoingFrames(endpoint.max_age_s, endpoint.failures, self.port.delivered)
+        self.outgoing = OutgoingFrames(endpoint.failures, self.port.delivered)
         self.lost = asyncio.Event()
         """Set when the port has been reported as closed."""
         self._endpoint = endpoint
@@ -65,7 +98,8 @@ class Connection:
         self._backlog = Backlog(self._stall, self._fd, channel.capacity, opened_in)
         self._epoch = opened_in  # of the last read
         self._is_open = True
-        self._lost_by = ""
+        self.ended_well = False
+        """Whether the client ended it, and may still read the kernel's bytes."""
         self._has_read = False
         self._awaits_writable = False
         self._room_timer: asyncio.TimerHandle | None = None
@@ -76,11 +110,6 @@ class Connection:
     def silent_since(self) -> float:
         """When it last sent a genuine frame; if it never did, when it was opened."""
         return self.opened_at if self.port.received_at is None else self.port.received_at
-
-    @property
-    def ended_well(self) -> bool:
-        """Whether the client ended it, and may still read the kernel's bytes."""
-        return self._lost_by == DISCONNECTED
 
     def on_readable(self, now: float) -> None:
         """Read the received bytes and deliver their frames."""
@@ -157,7 +186,7 @@ class Connection:
         """Stop, count the reason, and report the port as closed in the loop's next turn: never within ``write``."""
         if self._is_open:
             self._endpoint.failures[reason] += 1
-            self._lost_by = reason
+            self.ended_well = reason == DISCONNECTED
             self.stop()
             self._loop.call_soon(self._endpoint.forget, self)
 
@@ -272,7 +301,7 @@ class Connection:
         self._flush(now)
 
 
-class StreamEndpoint(ABC):
+class StreamEndpoint(Endpoint):
     """An endpoint whose clients are connected by byte streams.
 
     Every frame passed to ``write`` is counted in ``frames_sent``, or waits, or was refused
@@ -286,17 +315,8 @@ class StreamEndpoint(ABC):
     max_hold_s = inf
     """How long a frame may take as a whole. Serial lines have no limit."""
 
-    def __init__(self, name: str, handler: PortHandler, max_age_s: float) -> None:
-        self.name = name
-        self.handler = handler
-        self.max_age_s = max_age_s
-        self.counters = SplitCounters()
-        """Frames and garbage in the bytes of all connections."""
-        self.failures: Counter[str] = Counter()
-        self.bytes_received = 0
-        self.bytes_sent = 0
-        self.frames_sent = 0
-        self.delivered = DeliveredStreams()
+    def __init__(self, name: str, handler: PortHandler) -> None:
+        super().__init__(name, handler)
         self._connections: dict[LocalPort, Connection] = {}
         self._logged: set[str] = set()  # reasons of failures to open it, since it was last open for long
 
@@ -305,15 +325,8 @@ class StreamEndpoint(ABC):
         """The present clients."""
         return list(self._connections)
 
-    @abstractmethod
-    def start(self) -> None:
-        """Begin to listen or to connect, in the running event loop."""
-
-    def gather(self, seconds: float) -> None:  # noqa: B027
-        """Do nothing: the bytes of a stream gather in the kernel anyway."""
-
     def write(self, port: LocalPort, frames: Sequence[Frame], source: Source, now: float) -> None:
-        """Send frames to one client, now or when it has room. Returns at once and reports no event."""
+        """Send frames to one client, now or when it has room."""
         connection = self._connections.get(port)
         if connection is None:
             self.failures["unsent"] += len(frames)
@@ -326,7 +339,7 @@ class StreamEndpoint(ABC):
             connection.check(now)
 
     def close(self) -> None:
-        """Stop and close everything. Reports no port as closed any more."""
+        """Stop and close every connection."""
         connections = list(self._connections.values())
         self._connections.clear()
         for connection in connections:

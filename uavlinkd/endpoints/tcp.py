@@ -16,7 +16,7 @@ from secrets import SystemRandom
 
 from uavlinkd.endpoints.ports import PortHandler, failure_name
 from uavlinkd.endpoints.sockets import bind, cannot_listen, unbound_socket
-from uavlinkd.endpoints.stream_endpoint import MAX_AGE_S, STALLED_S, StreamEndpoint
+from uavlinkd.endpoints.stream_endpoint import STALLED_S, StreamEndpoint
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.stall import Backlog
@@ -116,10 +116,8 @@ class TcpServer(StreamEndpoint):
 
     max_gap_s = max_hold_s = MAX_GAP_S
 
-    def __init__(
-        self, name: str, listener: socket.socket, handler: PortHandler, *, max_age_s: float = MAX_AGE_S
-    ) -> None:
-        super().__init__(name, handler, max_age_s)
+    def __init__(self, name: str, listener: socket.socket, handler: PortHandler) -> None:
+        super().__init__(name, handler)
         self._listener = listener
         self._resume: asyncio.TimerHandle | None = None
         self._backlog = Backlog(handler.stall, listener.fileno(), lambda: _BACKLOG + 1)
@@ -201,8 +199,8 @@ class TcpClient(StreamEndpoint):
 
     max_gap_s = max_hold_s = MAX_GAP_S
 
-    def __init__(self, name: str, address: Address, handler: PortHandler, *, max_age_s: float = MAX_AGE_S) -> None:
-        super().__init__(name, handler, max_age_s)
+    def __init__(self, name: str, address: Address, handler: PortHandler) -> None:
+        super().__init__(name, handler)
         self._address = address
         self._task: asyncio.Task[None] | None = None
         # An own thread: a silent name server must not delay the look-ups of others.

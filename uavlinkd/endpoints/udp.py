@@ -8,8 +8,7 @@ from __future__ import annotations
 import asyncio
 import errno
 import socket
-from abc import ABC, abstractmethod
-from collections import Counter
+from abc import abstractmethod
 from collections.abc import Sequence
 from math import inf
 from typing import Any
@@ -17,11 +16,11 @@ from typing import Any
 import structlog
 
 from uavlinkd.endpoints.error_queue import ErrorReports, enable_error_queue, read_error_queue, send_again
-from uavlinkd.endpoints.ports import LocalPort, PortHandler, failure_name
+from uavlinkd.endpoints.ports import Endpoint, LocalPort, PortHandler, failure_name
 from uavlinkd.endpoints.reader import Datagrams, Reader
 from uavlinkd.endpoints.sockets import BindError, udp_socket
 from uavlinkd.mavlink.frames import MIN_FRAME_BYTES, Frame, SplitCounters, split_datagram
-from uavlinkd.mavlink.policy.delivery import DeliveredStreams, Source
+from uavlinkd.mavlink.policy.delivery import Source
 from uavlinkd.mavlink.stream_splitter import MAX_GAP_S, StreamSplitter
 from uavlinkd.system.addresses import Address, numeric_host
 from uavlinkd.system.clock import monotonic
@@ -81,24 +80,15 @@ class UdpPort(LocalPort):
             self._udp.send(b"".join(batch), self.address, len(batch))
 
 
-class UdpEndpoint(ABC):
+class UdpEndpoint(Endpoint):
     """A UDP socket and the clients at its other side."""
 
     def __init__(self, name: str, sock: socket.socket, handler: PortHandler) -> None:
-        self.name = name
-        self.counters = SplitCounters()
-        """Frames and garbage in the datagrams."""
-        self.failures: Counter[str] = Counter()
-        """Errors by the kernel's name, and ``stranger`` and ``too_many_clients``."""
-        self.bytes_received = 0
-        self.bytes_sent = 0
-        self.frames_sent = 0
+        super().__init__(name, handler)
         self._sock = sock
-        self._handler = handler
         self._epoch = handler.stall.epoch  # of the last read
         self._gather_s = 0.0
         self._reader: Reader | None = None
-        self.delivered = DeliveredStreams()
         self._ports: dict[SocketAddress, UdpPort] = {}
         self._silent: set[LocalPort] = set()
         self._splitters: dict[SocketAddress, StreamSplitter] = {}  # of clients that cut frames apart
@@ -116,7 +106,7 @@ class UdpEndpoint(ABC):
 
     def start(self) -> None:
         """Read whenever datagrams are there."""
-        self._reader = Reader(self._sock, self.take, self._on_read_error, self._handler.stall)
+        self._reader = Reader(self._sock, self.take, self._on_read_error, self.handler.stall)
         self._reader.gather(self._gather_s)
         self._reader.start()
 
@@ -156,8 +146,8 @@ class UdpEndpoint(ABC):
                 port.received_at = now
                 if port in self._silent:
                     self._silent.remove(port)
-                    self._handler.on_port_active(port)
-                self._handler.on_frames(port, frames, now, STALE if address in stale else epoch, waited_s)
+                    self.handler.on_port_active(port)
+                self.handler.on_frames(port, frames, now, STALE if address in stale else epoch, waited_s)
 
     def _follow_cuts(self, address: SocketAddress, datagram: bytes, complete: int, now: float) -> None:
         """Read a known client's datagrams as a stream from now on, if this one ends within a frame.
@@ -174,13 +164,12 @@ class UdpEndpoint(ABC):
 
     def _age(self, epoch: int) -> None:
         """Mark the parts of frames that arrived before a pause: the whole frames are not new."""
-        if epoch != self._epoch:
-            self._epoch = epoch
-            for splitter in self._splitters.values():
-                splitter.age()
+        self._epoch = epoch
+        for splitter in self._splitters.values():
+            splitter.age()
 
     def write(self, port: LocalPort, frames: Sequence[Frame], source: Source, now: float) -> None:
-        """Send frames of one source to one client."""
+        """Send frames of one source to one client, at once."""
         port.send(frames, source, now, 0.0)
 
     def send(self, datagram: bytes, address: SocketAddress, frames: int) -> None:
@@ -199,11 +188,12 @@ class UdpEndpoint(ABC):
 
     def do_housekeeping(self, now: float) -> None:
         """Give up incomplete frames whose rest does not arrive."""
-        self._age(self._handler.stall.epoch)
+        if self.handler.stall.epoch != self._epoch:
+            self._age(self.handler.stall.epoch)
         for address, splitter in self._splitters.items():
             epoch = self._epoch if splitter.is_fresh else STALE
             if frames := splitter.give_up(now):
-                self._handler.on_frames(self._ports[address], frames, now, epoch)
+                self.handler.on_frames(self._ports[address], frames, now, epoch)
 
     def close(self) -> None:
         """Close the socket."""
@@ -218,14 +208,14 @@ class UdpEndpoint(ABC):
     def _open(self, address: SocketAddress, received_at: float | None) -> UdpPort:
         port = UdpPort(self, str(Address(numeric_host(address), address[1])), address, received_at)
         self._ports[address] = port
-        self._handler.on_port_opened(port)
+        self.handler.on_port_opened(port)
         return port
 
     def _forget(self, port: UdpPort) -> None:
         del self._ports[port.address]
         self._silent.discard(port)
         self._splitters.pop(port.address, None)
-        self._handler.on_port_closed(port)
+        self.handler.on_port_closed(port)
 
     def _on_read_error(self, error: OSError) -> None:
         if not self._take_errors():
@@ -267,7 +257,7 @@ class UdpServer(UdpEndpoint):
                 self._forget(port)
             elif silent_s >= CLIENT_SILENT_S and port not in self._silent:
                 self._silent.add(port)
-                self._handler.on_port_silent(port)
+                self.handler.on_port_silent(port)
 
     def _admit(self, address: SocketAddress, now: float) -> UdpPort | None:
         if len(self._ports) >= CLIENTS_PER_ENDPOINT:

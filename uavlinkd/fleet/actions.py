@@ -7,10 +7,9 @@ import os
 import sys
 
 from uavlinkd.fleet import operations
-from uavlinkd.fleet.errors import FleetError, FleetFileError
 from uavlinkd.fleet.manifest import FleetSettings, MemberKind
 from uavlinkd.fleet.operations import Result
-from uavlinkd.fleet.plan import DEFAULT_PLAN, NO_PLAN
+from uavlinkd.fleet.plan import DEFAULT_PLAN, NO_PLAN, FleetError, FleetFileError
 from uavlinkd.system.addresses import Address, AddressError, parse_address
 from uavlinkd.system.terminal import printable
 
@@ -37,7 +36,6 @@ def _init(options: argparse.Namespace) -> Result:
         control_socket=options.control_socket,
         drone_url=options.drone_url,
         ground_station_url=options.ground_station_url,
-        observer_url=options.observer_url,
     )
     counts = options.drones, options.ground_stations, options.observers
     return operations.init(options.out, settings, *counts, relays)

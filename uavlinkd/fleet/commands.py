@@ -58,13 +58,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         "--ground-station-url",
         default="udpout:127.0.0.1:14550",
         metavar="URL",
-        help="of the ground control station (default: %(default)s)",
-    )
-    init.add_argument(
-        "--observer-url",
-        default="udpout:127.0.0.1:14550",
-        metavar="URL",
-        help="of an observer's ground control station (default: %(default)s)",
+        help="of each ground control station, observers' too (default: %(default)s)",
     )
     init.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder")
 

@@ -12,9 +12,9 @@ import tomllib
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-from uavlinkd.fleet.errors import FleetError
 from uavlinkd.fleet.files import CONFIDENTIAL, key_lines, public_key_lines
 from uavlinkd.fleet.manifest import Member
+from uavlinkd.fleet.plan import FleetError
 
 _HEADER = re.compile(r"[ \t]*\[")
 _KEY = re.compile(r"[ \t]*(?:\"([^\"]*)\"|'([^']*)'|([A-Za-z0-9_-]+))[ \t]*=")

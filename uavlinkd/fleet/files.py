@@ -8,10 +8,11 @@ from uavlinkd.system.addresses import Address
 
 CONFIDENTIAL = "confidential = true"
 """In ``[link]`` of a fleet with relays: otherwise their owners could read the frames."""
-_ENDPOINT_NAMES = {
-    MemberKind.DRONE: "autopilot",
-    MemberKind.GROUND_STATION: "ground-control",
-    MemberKind.OBSERVER: "ground-control",
+_DESCRIPTIONS = {
+    MemberKind.DRONE: "a drone",
+    MemberKind.GROUND_STATION: "a ground station",
+    MemberKind.OBSERVER: "an observer",
+    MemberKind.RELAY: "a relay",
 }
 
 
@@ -57,7 +58,7 @@ def write_config(fleet: Fleet, member: Member) -> str:
         lines += [
             "",
             "[[endpoint]]",
-            f"name = {literal(_ENDPOINT_NAMES[member.kind])}",
+            f"name = {literal('autopilot' if member.is_drone else 'ground-control')}",
             f"url = {literal(settings.url_of(member))}",
             f"system_ids = [{member.system_id}]",
         ]
@@ -74,14 +75,6 @@ def _listen(member: Member) -> list[str]:
     if member.is_relay and address.is_wildcard:  # members may have either family
         return [f"0.0.0.0:{address.port}", f"[::]:{address.port}"]
     return [str(address)]
-
-
-_DESCRIPTIONS = {
-    MemberKind.DRONE: "a drone",
-    MemberKind.GROUND_STATION: "a ground station",
-    MemberKind.OBSERVER: "an observer",
-    MemberKind.RELAY: "a relay",
-}
 
 
 def key_lines(member: Member) -> list[str]:

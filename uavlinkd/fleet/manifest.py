@@ -15,16 +15,23 @@ from pathlib import Path
 from typing import Any
 
 from uavlinkd.config.keys import decode_key
-from uavlinkd.config.used_relays import MOST as MOST_RELAYS
+from uavlinkd.config.relay_rules import MOST as MOST_RELAYS
 from uavlinkd.core.suites import SUITES_BY_NAME
-from uavlinkd.fleet.errors import FleetError, FleetFileError, no_fleet
-from uavlinkd.fleet.plan import DEFAULT_PLAN, NO_PLAN, SYSTEM_IDS, AddressPlan
-from uavlinkd.fleet.template import TemplateError, fill
+from uavlinkd.fleet.plan import (
+    DEFAULT_PLAN,
+    NO_PLAN,
+    SYSTEM_IDS,
+    AddressPlan,
+    FleetError,
+    FleetFileError,
+    fill,
+    no_fleet,
+)
 from uavlinkd.system.addresses import Address, AddressError, parse_address
 from uavlinkd.system.terminal import printable
 
 FILE_NAME = "fleet.toml"
-_TEMPLATES = ("control_socket", "drone_url", "ground_station_url", "observer_url")
+_TEMPLATES = ("control_socket", "drone_url", "ground_station_url")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}")
 
 
@@ -99,12 +106,10 @@ class FleetSettings:
     control_socket: str = "{name}.sock"
     drone_url: str = "udpin:127.0.0.1:14550"
     ground_station_url: str = "udpout:127.0.0.1:14550"
-    observer_url: str = "udpout:127.0.0.1:14550"
 
     def url_of(self, member: Member) -> str:
         """The URL of a member's endpoint."""
-        template: str = getattr(self, f"{member.kind.value.replace('-', '_')}_url")
-        return fill(template, member.system_id, member.name)
+        return fill(self.drone_url if member.is_drone else self.ground_station_url, member.system_id, member.name)
 
     def control_socket_of(self, member: Member) -> str:
         """The control socket of a member's daemon."""
@@ -152,11 +157,8 @@ class Fleet:
                 raise FleetError(f"{member.name} would have the system id of {other.name}, {other.system_id}")
             if other.address is not None and other.address == member.address:
                 raise FleetError(f"{member.name} would have the address of {other.name}, {other.address}")
-        if any(other.name == member.name for other in self.members):
-            members = tuple(member if other.name == member.name else other for other in self.members)
-        else:
-            members = (*self.members, member)
-        return Fleet(self.settings, members)
+        by_name = {other.name: other for other in self.members} | {member.name: member}
+        return Fleet(self.settings, tuple(by_name.values()))
 
     def without(self, name: str) -> Fleet:
         """Remove a member."""
@@ -193,11 +195,10 @@ class Fleet:
         number = next((free for free in ids if free not in taken), None) if system_id is None else system_id
         if number is None or number not in SYSTEM_IDS:
             raise FleetError("a system id is a number from 1 to 255, and each member has its own")
-        member = Member(name, kind, number, public_key, address)
         if kind is not MemberKind.OBSERVER and address is None and self.settings.address_plan != NO_PLAN:
-            planned = AddressPlan.parse(self.settings.address_plan).address_of(member)
-            member = Member(name, kind, number, public_key, planned)
-        return member
+            plan = AddressPlan.parse(self.settings.address_plan)
+            address = plan.address_of(name, number, is_drone=kind is MemberKind.DRONE)
+        return Member(name, kind, number, public_key, address)
 
 
 def write_manifest(fleet: Fleet) -> str:
@@ -269,7 +270,7 @@ def check_settings(settings: FleetSettings) -> None:
         template = getattr(settings, key)
         try:
             fill(template, 1, "drone1")
-        except TemplateError as error:
+        except FleetError as error:
             option = f"--{key.replace('_', '-')}"
             raise FleetError(f'{option}: "{printable(template)}": {error}') from None
 

@@ -14,15 +14,15 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import combinations
 from pathlib import Path
 
 from uavlinkd.config import keys
 from uavlinkd.core.crypto import x25519_public_key
 from uavlinkd.fleet import edit, files
-from uavlinkd.fleet.errors import FleetError, FleetFileError
-from uavlinkd.fleet.lock import lock
 from uavlinkd.fleet.manifest import Fleet, FleetSettings, Member, MemberKind, check_settings, read_manifest
-from uavlinkd.fleet.transaction import FileChanges, apply, check_members, is_loadable
+from uavlinkd.fleet.plan import FleetError, FleetFileError
+from uavlinkd.fleet.transaction import FileChanges, apply, check_members, is_loadable, lock
 from uavlinkd.system.addresses import Address
 
 
@@ -66,22 +66,19 @@ def init(
         raise _exists(folder)
     fleet = Fleet(settings)
     private_keys: dict[str, str] = {}
-    wanted = [
-        (MemberKind.DRONE, drones),
-        (MemberKind.GROUND_STATION, ground_stations),
-        (MemberKind.OBSERVER, observers),
-    ]
-    places: list[tuple[MemberKind, int, int, Address | None]] = [
-        (kind, number, count, None) for kind, count in wanted for number in range(1, count + 1)
-    ]
-    places += [(MemberKind.RELAY, number, len(relays), address) for number, address in enumerate(relays, 1)]
-    for kind, number, count, address in places:
-        private = keys.generate_private_key()
-        # "ground-station" if it is the only one, but always "drone1": most fleets grow.
-        name = kind.value if count == 1 and kind is not MemberKind.DRONE else f"{kind.value}{number}"
-        member = fleet.new_member(name, kind, keys.public_key_text(private), address=address)
-        private_keys[member.name] = private
-        fleet = fleet.with_member(member)
+    for kind, places in (
+        (MemberKind.DRONE, [None] * drones),
+        (MemberKind.GROUND_STATION, [None] * ground_stations),
+        (MemberKind.OBSERVER, [None] * observers),
+        (MemberKind.RELAY, relays),
+    ):
+        for number, address in enumerate(places, 1):
+            # "ground-station" if it is the only one, but always "drone1": most fleets grow.
+            is_only = len(places) == 1 and kind is not MemberKind.DRONE
+            name = kind.value if is_only else f"{kind.value}{number}"
+            private_keys[name] = keys.generate_private_key()
+            public = keys.public_key_text(private_keys[name])
+            fleet = fleet.with_member(fleet.new_member(name, kind, public, address=address))
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         building = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
@@ -90,8 +87,7 @@ def init(
     try:
         changes = FileChanges()
         for member in fleet.members:
-            changes.secrets[building / member.name / files.key_file(member)] = private_keys[member.name]
-            changes.texts[building / member.name / files.config_file(member)] = files.write_config(fleet, member)
+            _write(changes, building, fleet, member, private_keys[member.name])
         _add_psks(changes, building, fleet, _pairs(fleet))
         apply(changes, building, fleet)
         check_members(building, fleet.members)
@@ -119,8 +115,7 @@ def add(
         member = before.new_member(name, kind, keys.public_key_text(private), address=address, system_id=system_id)
         fleet = before.with_member(member)
         changes = FileChanges()
-        changes.secrets[folder / name / files.key_file(member)] = private
-        changes.texts[folder / name / files.config_file(member)] = files.write_config(fleet, member)
+        _write(changes, folder, fleet, member, private)
         peers = fleet.peers_of(member)
         loadable = [peer for peer in peers if is_loadable(folder, peer)]
         _add_psks(changes, folder, fleet, [(member, peer) for peer in peers])
@@ -230,14 +225,14 @@ def _open_fleet(folder: Path) -> Iterator[Fleet]:
         yield read_manifest(folder)
 
 
-def _pairs(fleet: Fleet) -> list[tuple[Member, Member]]:
-    order = {member.name: number for number, member in enumerate(fleet.members)}
-    return [
-        (member, peer)
-        for member in fleet.members
-        for peer in fleet.peers_of(member)
-        if order[member.name] < order[peer.name]
-    ]
+def _pairs(fleet: Fleet) -> Iterator[tuple[Member, Member]]:
+    return ((one, other) for one, other in combinations(fleet.members, 2) if one.section_of(other))
+
+
+def _write(changes: FileChanges, folder: Path, fleet: Fleet, member: Member, private: str) -> None:
+    """Write the key and the configuration of a new member."""
+    changes.secrets[folder / member.name / files.key_file(member)] = private
+    changes.texts[folder / member.name / files.config_file(member)] = files.write_config(fleet, member)
 
 
 def _add_psks(changes: FileChanges, folder: Path, fleet: Fleet, pairs: Iterable[tuple[Member, Member]]) -> None:

@@ -1,13 +1,12 @@
-"""The address plan: which address each member of a fleet has."""
+"""The errors of the fleet commands, their templates, and the address plan: which address each member has."""
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from ipaddress import IPv4Network, IPv6Network, ip_network
-from typing import Protocol
+from pathlib import Path
 
-from uavlinkd.fleet.errors import FleetError
-from uavlinkd.fleet.template import TemplateError, fill
 from uavlinkd.system.addresses import DEFAULT_PORT, Address, AddressError, parse_address
 
 DEFAULT_PLAN = "10.13.0.0/24"
@@ -17,17 +16,42 @@ SYSTEM_IDS = range(1, 256)
 """The system ids of MAVLink."""
 
 
-class Numbered(Protocol):
-    """The part of a member that determines its address."""
+_BRACES = re.compile(r"\{n\}|\{name\}|[{}]")
 
-    @property
-    def name(self) -> str: ...
 
-    @property
-    def system_id(self) -> int: ...
+class FleetError(Exception):
+    """The command line, the manifest or a configuration is wrong. The command changed nothing.
 
-    @property
-    def is_drone(self) -> bool: ...
+    Each message is for a person and contains no secret.
+    """
+
+
+class FleetFileError(FleetError):
+    """A file or folder cannot be read or written."""
+
+
+def no_fleet(folder: Path) -> FleetError:
+    """The error for a folder without a manifest."""
+    return FleetError(
+        f"{folder} contains no fleet: name its folder with --out DIR,"
+        f" or create one with `uavlinkd fleet init --out {folder}`"
+    )
+
+
+def fill(template: str, number: int, name: str) -> str:
+    """Replace ``{n}`` and ``{name}``. ``str.format`` would give access to attributes.
+
+    Raises:
+        FleetError: the template contains other braces.
+    """
+    values = {"{n}": str(number), "{name}": name}
+
+    def value(match: re.Match[str]) -> str:
+        if match[0] not in values:
+            raise FleetError("the only braces in a template are {n} and {name}")
+        return values[match[0]]
+
+    return _BRACES.sub(value, template)
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,24 +89,24 @@ class AddressPlan:
                 " nor a template such as 10.13.0.{n}:5790"
             ) from None
 
-    def address_of(self, member: Numbered) -> Address:
+    def address_of(self, name: str, system_id: int, *, is_drone: bool) -> Address:
         """The address of a member.
 
         Raises:
             FleetError: the network is too small.
         """
         if self.network is None:
-            return self._fill(member.system_id if member.is_drone else member.system_id - 1, member.name)
+            return self._fill(system_id if is_drone else system_id - 1, name)
         size = min(self.network.num_addresses, 256)
-        offset = member.system_id if member.is_drone else size - 1 - (256 - member.system_id)
+        offset = system_id if is_drone else size - 1 - (256 - system_id)
         if not 0 < offset < size - 1:
-            raise FleetError(f"the network {self.network} has no address for {member.name}: use a larger one")
+            raise FleetError(f"the network {self.network} has no address for {name}: use a larger one")
         return Address(str(self.network[offset]), DEFAULT_PORT)
 
     def _fill(self, number: int, name: str) -> Address:
         try:
             return parse_address(fill(self.text, number, name), allow_names=True)
-        except (AddressError, TemplateError) as error:
+        except (AddressError, FleetError) as error:
             raise FleetError(f'the address plan "{self.text}" has no address for {name}: {error}') from None
 
 

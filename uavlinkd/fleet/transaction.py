@@ -1,19 +1,21 @@
-"""Changes of a fleet's files, made as a whole: if a step fails, all files are as before."""
+"""Changes of a fleet's files: one command at a time, and if a step fails, all files are as before."""
 
 from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from uavlinkd.config import ConfigError, keys
 from uavlinkd.config.load import load_config
-from uavlinkd.fleet.errors import FleetError, FleetFileError
 from uavlinkd.fleet.files import config_file
 from uavlinkd.fleet.manifest import FILE_NAME, Fleet, Member, write_manifest
+from uavlinkd.fleet.plan import FleetError, FleetFileError, no_fleet
+from uavlinkd.system.terminal import printable
 
 
 @dataclass(slots=True)
@@ -172,3 +174,43 @@ def check_members(folder: Path, members: Iterable[Member]) -> None:
         except ConfigError as error:
             problems = "\n".join(f"{member.name}: {problem.key}: {problem.message}" for problem in error.problems)
             raise FleetError(f"the resulting configuration is not valid:\n{problems}") from None
+
+
+@contextmanager
+def lock(folder: Path) -> Iterator[None]:
+    """Hold the lock of a fleet's folder. If another command holds it, say so on standard error and wait: neither must
+    overwrite the other's change.
+
+    The lock is on the folder itself: no lock file remains, and the kernel releases it when the process ends,
+    however it ends.
+
+    Raises:
+        FleetError: the folder does not exist.
+        FleetFileError: it cannot be locked.
+    """
+    try:
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    except FileNotFoundError:
+        raise no_fleet(folder) from None
+    except OSError as error:
+        raise FleetFileError(f"{folder} cannot be read: {error.strerror}") from None
+    try:
+        _acquire(descriptor, folder)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _acquire(descriptor: int, folder: Path) -> None:
+    import fcntl  # noqa: PLC0415  Windows has no such module
+
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            print(printable(f"waiting for another fleet command in {folder}"), file=sys.stderr, flush=True)
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+    except OSError as error:  # NFS, for one, locks no folders
+        raise FleetFileError(
+            f"{folder} cannot be locked: {error.strerror}: keep the fleet on a local file system"
+        ) from None

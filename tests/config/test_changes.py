@@ -1,0 +1,107 @@
+"""A reload: which changes of a file a running daemon makes, and which need a restart."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.config.files import (
+    BY_MESH,
+    GCS,
+    GOOD,
+    HEAD,
+    KEY,
+    LTE,
+    MESH,
+    OTHER_PEER,
+    SIK,
+    URL,
+    load,
+    member,
+    networks,
+    relay,
+    relays,
+)
+from uavlinkd.config import ConfigError, keys
+from uavlinkd.config.changes import compare
+
+_AT = 'addresses = ["10.13.0.9:5790"]'
+_AS_PEER = relay(key=KEY["drone1"], addresses="[]")
+_ROWS = [
+    (GOOD, GOOD, {}),
+    (GOOD, GOOD + OTHER_PEER, {"peers_added": ["drone2"]}),
+    (GOOD + OTHER_PEER, GOOD, {"peers_removed": ["drone2"]}),
+    (GOOD, GOOD + 'deny_in = ["PING"]\n', {"peers_changed": ["drone1"]}),
+    (GOOD, GOOD + "tag_bits = 96\n", {"peers_removed": ["drone1"], "peers_added": ["drone1"]}),
+    (GOOD, GOOD + 'redundancy = "all"\n', {"peers_removed": ["drone1"], "peers_added": ["drone1"]}),
+    (networks(LTE + MESH), networks(LTE + MESH, f"[{BY_MESH}]"), {"peers_changed": ["drone1"]}),
+    (GOOD + GCS.replace("14550", "1"), GOOD, {"endpoints_closed": ["gcs"]}),
+    (
+        GOOD,
+        GOOD.replace(URL, "udpin:127.0.0.1:1"),
+        {"endpoints_closed": ["autopilot"], "endpoints_opened": ["autopilot"]},
+    ),
+    (GOOD, GOOD.replace("[[peer]]", "radio_status = true\n[[peer]]"), {"endpoints_changed": ["autopilot"]}),
+    (
+        HEAD + member("b") + member("c"),
+        HEAD + member("drone1", KEY["b"]) + member("c", more="bits_s = 5000") + member("d"),
+        {"members_removed": ["b"], "members_added": ["drone1", "d"], "members_changed": ["c"]},
+    ),
+    (
+        relays(relay() + relay("b")),
+        relays(relay(addresses='["other.example.org:5790"]') + relay("c")),
+        {"relays_removed": ["b"], "relays_added": ["c"], "relays_changed": ["vps"], "peers_changed": ["drone1"]},
+    ),
+    # A relay that accepts one more key is another one, and one that accepts one less is not.
+    (
+        relays(relay()),
+        relays(relay(more=f'previous_public_key = "{KEY["c"]}"')),
+        {"relays_removed": ["vps"], "relays_added": ["vps"]},
+    ),
+    (relays(relay(more=f'previous_public_key = "{KEY["c"]}"')), relays(relay()), {"relays_changed": ["vps"]}),
+    # A relay of a peer follows it. Other features need no new link.
+    (relays("", _AT), relays(_AS_PEER, _AT), {"relays_added": ["vps"], "peers_changed": ["drone1"]}),
+    (relays(_AS_PEER, _AT), relays("", _AT), {"relays_removed": ["vps"], "peers_changed": ["drone1"]}),
+    (
+        relays(_AS_PEER, _AT),
+        relays(_AS_PEER, f"{_AT}\nretry_max_s = 3"),
+        {
+            "peers_removed": ["drone1"],
+            "peers_added": ["drone1"],
+            "relays_removed": ["vps"],
+            "relays_added": ["vps"],
+        },
+    ),
+]
+
+
+@pytest.mark.parametrize(("before", "after", "changes"), _ROWS, ids=[" ".join(changes) for *_, changes in _ROWS])
+def test_changes_are_found(tmp_path: Path, before: str, after: str, changes: dict[str, list[str]]) -> None:
+    """Of peers, endpoints, members and relays, by name."""
+    assert compare(load(tmp_path, before), load(tmp_path, after)).summary() == changes
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "key"),
+    [
+        (GOOD, GOOD.replace('"drone0"', '"other"'), "name"),
+        (GOOD, GOOD.replace("drone0.key", "other.key"), "private_key_file"),
+        (GOOD, GOOD.replace("0.0.0.0:5790", "0.0.0.0:5791"), "listen"),
+        (networks(SIK, '["a:1", { network = "sik" }]'), GOOD, "network"),
+        (GOOD, f'control_socket = "a"\n{GOOD}', "control_socket"),
+        (GOOD, GOOD + '[log]\nlevel = "debug"\n', "log"),
+        (GOOD, GOOD + "[routing]\nrelay = true\n", "routing"),
+        (GOOD, GOOD + '[metrics]\nlisten = "127.0.0.1:9790"\n', "metrics"),
+        (GOOD, GOOD + '[recording]\nfolder = "a"\n', "recording"),
+        (GOOD, GOOD + member("c"), "member"),
+        (GOOD, f'previous_private_key_file = "other.key"\n{GOOD}', "previous_private_key_file"),
+    ],
+)
+def test_other_changes_need_a_restart(tmp_path: Path, before: str, after: str, key: str) -> None:
+    """The problem names the key and the remedy."""
+    keys.write_secret_file(tmp_path / "other.key", keys.generate_private_key())
+    with pytest.raises(ConfigError) as caught:
+        compare(load(tmp_path, before), load(tmp_path, after))
+    assert [problem.key for problem in caught.value.problems] == [key]
+    assert "restart it" in str(caught.value)
