@@ -1,32 +1,29 @@
 """What a frame costs: uavlinkd beside what else carries MAVLink between two hosts. Takes root, Linux, iproute2.
 
-``python -m tests.bench report DIR`` draws the table and the figure again from the records in DIR.
+``python -m tests.bench report DIR`` writes the table again from the records in DIR.
 """
 
 from __future__ import annotations
 
 import argparse
-import signal
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import FrameType
 
 from tests.bench.contenders import Contender, all_contenders
 from tests.bench.daemons import Uavlinkd
 from tests.bench.frames import FrameSet, load_frames
 from tests.bench.measure import NO_LOSS
-from tests.bench.namespaces import CableKind, NamespaceError, why_not
 from tests.bench.report import write_report
 from tests.bench.run import QUICK, SCALES, Plan, Run, laboratory
 from tests.bench.traffic import TrafficError
-from uavlinkd.lab.evaluation.machine import machine_facts
-from uavlinkd.lab.evaluation.records import RecordsError, RecordWriter, Value
+from tests.namespaces import NamespaceError, why_not
+from uavlinkd.lab.child_processes import interrupted_by_signals
+from uavlinkd.lab.evaluation.records import RecordsError, RecordWriter, Value, machine_facts
 
 OK, FAILED = 0, 1
 RECORDS = "records"
-_ENDING = (signal.SIGINT, signal.SIGTERM)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -40,7 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _report(arguments: Sequence[str]) -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.bench report", description="Draw again what was measured.")
     parser.add_argument("folder", type=Path, help="where the records are")
-    parser.add_argument("--page", type=Path, help="write it there (RESULTS.md in the folder), the figure beside it")
+    parser.add_argument("--page", type=Path, help="write it there (RESULTS.md in the folder)")
     options = parser.parse_args(arguments)
     try:
         print(write_report(options.folder, RECORDS, options.page))
@@ -54,7 +51,7 @@ def _measure(arguments: Sequence[str]) -> int:
     contenders = {contender.name: contender for contender in all_contenders()}
     names = [*contenders, *SCALES]
     parser = argparse.ArgumentParser(prog="python -m tests.bench", description=__doc__)
-    parser.add_argument("--out", type=Path, default=Path("bench-results"), help="where records, table and figure go")
+    parser.add_argument("--out", type=Path, default=Path("bench-results"), help="where records and table go")
     parser.add_argument("--rounds", type=int, help=f"how often each is measured, in turn ({Plan().rounds})")
     parser.add_argument("--only", nargs="+", choices=names, metavar="NAME", help=f"of {', '.join(names)}")
     parser.add_argument(
@@ -64,16 +61,8 @@ def _measure(arguments: Sequence[str]) -> int:
         help="measure uavlinkd with the code there as well, in turn with this one: before and after in one run",
     )
     parser.add_argument("--quick", action="store_true", help="one short round, without the highest rates")
-    parser.add_argument(
-        "--cable",
-        type=CableKind,
-        choices=list(CableKind),
-        default=CableKind.PLAIN,
-        help="what becomes of datagrams that are sent in one call: cut up before the cable (plain), merged again on"
-        " receipt as network cards' drivers do (card), or left in one piece as between virtual machines (whole)",
-    )
     options = parser.parse_args(arguments)
-    plan = replace(QUICK if options.quick else Plan(), cable=options.cable)
+    plan = QUICK if options.quick else Plan()
     if options.rounds is not None:
         if options.rounds < 1:
             parser.error("--rounds must be 1 or more")
@@ -106,16 +95,14 @@ def _command(options: argparse.Namespace) -> str:
     words += ["--only", *options.only] if options.only else []
     words += ["--against CHECKOUT"] if options.against else []
     words += ["--quick"] if options.quick else []
-    words += [f"--cable {options.cable}"] if options.cable is not CableKind.PLAIN else []
     return " ".join(words)
 
 
 def _run(plan: Plan, out: Path, contenders: Sequence[Contender], scales: Sequence[str], command: str) -> int:
-    previous = {number: signal.signal(number, _interrupt) for number in _ENDING}
     frames = load_frames()
     facts = {**machine_facts(), **_facts(plan, frames, contenders), "command": command}
     try:
-        with laboratory(frames, plan.cable) as bench, RecordWriter(out, RECORDS, facts) as writer:
+        with interrupted_by_signals(), laboratory(frames) as bench, RecordWriter(out, RECORDS, facts) as writer:
             Run(plan, bench, writer, lambda line: print(line, flush=True)).all(contenders, scales)
     except KeyboardInterrupt:
         print(f"interrupted: what was measured until then is in {out}", file=sys.stderr)
@@ -123,9 +110,6 @@ def _run(plan: Plan, out: Path, contenders: Sequence[Contender], scales: Sequenc
     except (NamespaceError, TrafficError) as error:
         print(f"cannot measure: {error}", file=sys.stderr)
         return FAILED
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
     print(write_report(out, RECORDS))
     return OK
 
@@ -139,7 +123,6 @@ def _facts(plan: Plan, frames: FrameSet, contenders: Sequence[Contender]) -> dic
         "frames": frames.source,
         "frames_distinct": len(set(frames.frames)),
         "frame_bytes": round(frames.mean_bytes, 1),
-        "cable": plan.cable.value,
         "rounds": plan.rounds,
         "seconds_at_rate": list(plan.seconds),
         "step_s": plan.step_s,
@@ -147,9 +130,3 @@ def _facts(plan: Plan, frames: FrameSet, contenders: Sequence[Contender]) -> dic
         "net_core_rmem_max": int(limit.read_text()) if limit.exists() else None,
         **{name: version for name, version in versions.items() if version is not None},
     }
-
-
-def _interrupt(number: int, frame: FrameType | None) -> None:
-    for ending in _ENDING:  # do not interrupt the cleanup
-        signal.signal(ending, signal.SIG_IGN)
-    raise KeyboardInterrupt

@@ -14,7 +14,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
 
-from tests.bench.namespaces import Cable, Host
+from tests.bench.cable import Cable, Host
 from tests.bench.traffic import REPOSITORY, SINK_PORT
 
 INTO_PORT: Final = 14550
@@ -41,9 +41,8 @@ class Running:
 class Contender(ABC):
     """A path from a client on the left to a client on the right."""
 
-    def __init__(self, name: str, about: str) -> None:
+    def __init__(self, name: str) -> None:
         self.name = name
-        self.about = about
 
     def why_not(self) -> str | None:
         """The reason why it cannot be measured here, or None."""
@@ -65,8 +64,8 @@ class Contender(ABC):
 class Relay(Contender):
     """An empty relay of :mod:`tests.bench.relays`, a process on each side."""
 
-    def __init__(self, kind: str, about: str) -> None:
-        super().__init__(f"relay-{kind}", about)
+    def __init__(self, kind: str) -> None:
+        super().__init__(f"relay-{kind}")
         self._kind = kind
 
     def why_not(self) -> str | None:
@@ -86,7 +85,7 @@ class Direct(Contender):
     """No relay: the generator sends directly to the sink, over the cable. The cost of plain UDP."""
 
     def __init__(self) -> None:
-        super().__init__("plain-udp", "no relay: generator, cable, sink")
+        super().__init__("plain-udp")
 
     def start(self, cable: Cable, folder: Path) -> Running:
         return Running([], [], (cable.right.address, SINK_PORT))
@@ -130,17 +129,14 @@ def until(condition: Callable[[], bool], what: str, timeout_s: float = 20.0) -> 
 
 
 def all_contenders() -> Sequence[Contender]:
-    """All contenders, the baselines first."""
     from tests.bench.daemons import DAEMONS
     from tests.bench.routers import ROUTERS
     from tests.bench.tunnels import TUNNELS
 
     return (
         Direct(),
-        Relay("uvloop", "empty relay: uvloop, DatagramProtocol"),
-        Relay("blocking", "empty relay: blocking sockets"),
-        Relay("add-reader", "empty relay: asyncio, add_reader, socket drained"),
-        Relay("asyncio", "empty relay: asyncio, DatagramProtocol"),
+        Relay("uvloop"),
+        Relay("blocking"),
         *DAEMONS,
         *TUNNELS,
         *ROUTERS,

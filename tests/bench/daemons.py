@@ -12,9 +12,9 @@ from copy import copy
 from pathlib import Path
 from typing import Final
 
+from tests.bench.cable import Cable, Host
 from tests.bench.contenders import INTO_PORT, LINK_PORT, LOCAL_SINK, Contender, Running, needs_module, until
 from tests.bench.frames import SYSTEM
-from tests.bench.namespaces import Cable, Host
 from tests.daemon.process import WITHOUT_UVLOOP
 from tests.policies import TRUSTED
 from uavlinkd.config import keys
@@ -32,9 +32,9 @@ class Uavlinkd(Contender):
     """
 
     def __init__(
-        self, name: str, about: str, *, uvloop: bool = True, has_roles: bool = True, paths: int = 1, **link: str
+        self, name: str, *, uvloop: bool = True, has_roles: bool = True, paths: int = 1, **link: str
     ) -> None:
-        super().__init__(name, about)
+        super().__init__(name)
         self._uvloop = uvloop
         self._has_roles = has_roles
         self._paths = paths
@@ -112,21 +112,10 @@ class Uavlinkd(Contender):
         """Role and systems of a peer."""
         if self._has_roles:
             return {"role": role, "system_ids": [system]}
-        trusted = dict(TRUSTED)
-        return trusted if self._knows(trusted) else {}
-
-    def _knows(self, policy: Mapping[str, object]) -> bool:
-        """Whether there is such a policy. A checkout from before a word was needed passes everything without one."""
-        asks = (
-            "try: from uavlinkd.mavlink.policy.compilation import compile_policy\n"
-            "except ImportError: from uavlinkd.mavlink.policy import compile_policy\n"
-            f"compile_policy({policy!r})"
-        )
-        return subprocess.run([self._python, "-c", asks], capture_output=True, check=False).returncode == 0
+        return dict(TRUSTED)
 
 
 def peer(name: str, public: str, rules: Mapping[str, object], addresses: Sequence[str] = ()) -> str:
-    """A ``[[peer]]``."""
     said = "".join(f"{key} = {json.dumps(value)}\n" for key, value in rules.items())
     said += f"addresses = {json.dumps(addresses)}\n" if addresses else ""
     return f'\n[[peer]]\nname = "{name}"\npublic_key = "{public}"\n{said}'
@@ -145,7 +134,6 @@ def configuration(
 
 
 def daemon_command(config: Path, *, python: Path = Path(sys.executable), uvloop: bool = True) -> list[str]:
-    """How a daemon is run."""
     command = ["-m", "uavlinkd"] if uvloop else ["-c", WITHOUT_UVLOOP]
     return [str(python), *command, "run", "--config", str(config)]
 
@@ -156,11 +144,10 @@ def start_daemon(
     *,
     python: Path = Path(sys.executable),
     uvloop: bool = True,
-    environ: Mapping[str, str] | None = None,
 ) -> subprocess.Popen[bytes]:
     """Start a daemon on a host; its log is beside its file."""
     command = daemon_command(config, python=python, uvloop=uvloop)
-    return host.start(command, folder=config.parent, log=config.with_suffix(".log"), environ=environ)
+    return host.start(command, folder=config.parent, log=config.with_suffix(".log"))
 
 
 def peers_up(control_socket: Path) -> int:
@@ -173,11 +160,11 @@ def peers_up(control_socket: Path) -> int:
 
 
 DAEMONS: Final = (
-    Uavlinkd("uavlinkd", "authenticated"),
-    Uavlinkd("uavlinkd-confidential", "encrypted too", confidential="true"),
-    Uavlinkd("uavlinkd-coalesced", "authenticated, coalesce_s = 0.002", coalesce_s="0.002"),
-    Uavlinkd("uavlinkd-all", "authenticated, without roles: policy passes everything", has_roles=False),
-    Uavlinkd("uavlinkd-paths", "authenticated, two paths: stream along one of them", paths=2),
-    Uavlinkd("uavlinkd-copies", "authenticated, two paths: every frame along both", paths=2, redundancy='"all"'),
-    Uavlinkd("uavlinkd-asyncio", "authenticated, without uvloop", uvloop=False),
+    Uavlinkd("uavlinkd"),  # authenticated
+    Uavlinkd("uavlinkd-confidential", confidential="true"),  # encrypted too
+    Uavlinkd("uavlinkd-coalesced", coalesce_s="0.002"),  # authenticated, coalesce_s = 0.002
+    Uavlinkd("uavlinkd-all", has_roles=False),  # authenticated, without roles: policy passes everything
+    Uavlinkd("uavlinkd-paths", paths=2),  # authenticated, two paths: stream along one of them
+    Uavlinkd("uavlinkd-copies", paths=2, redundancy='"all"'),  # authenticated, two paths: every frame along both
+    Uavlinkd("uavlinkd-asyncio", uvloop=False),  # authenticated, without uvloop
 )

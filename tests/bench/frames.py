@@ -149,7 +149,6 @@ def write_frames(path: Path, frames: Sequence[bytes]) -> None:
 
 
 def read_frames(path: Path) -> list[bytes]:
-    """What :func:`write_frames` wrote."""
     data, frames, offset = path.read_bytes(), [], 0
     while offset < len(data):
         size = length_at(data, offset)

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from tests.bench.cable import Cable
 from tests.bench.contenders import NotMeasuredError, Running
-from tests.bench.namespaces import Cable
 from tests.bench.traffic import Flow, Traffic
-from uavlinkd.lab.evaluation.machine import CpuTimeError, cpu_seconds
-from uavlinkd.lab.evaluation.records import Value
+from uavlinkd.lab.evaluation.records import CpuTimeError, Value, cpu_seconds
 
 NO_LOSS: Final = 0.001
 """Up to this share of loss, a rate passes: one pause of the machine is not the contender's limit."""

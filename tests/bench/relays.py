@@ -1,4 +1,4 @@
-"""Empty relays: each receives from one socket and sends from another, in four ways, and does nothing else.
+"""Empty relays: each receives from one socket and sends from another, in two ways, and does nothing else.
 
 They are what a figure is compared with: nothing that carries frames in Python can do less with them.
 ``relays KIND PORT HOST PORT``: from this port on all addresses to that address.
@@ -14,7 +14,6 @@ from typing import Final, cast
 
 Address = tuple[str, int]
 
-DATAGRAMS_PER_WAKE_UP: Final = 128
 BUFFER_BYTES: Final = 1 << 20
 """As uavlinkd requests; the kernel may allow less (net.core.rmem_max)."""
 RECEIVE_BYTES: Final = 65536
@@ -31,7 +30,6 @@ def bound(port: int, *, blocking: bool) -> socket.socket:
 
 
 def relay_blocking(port: int, to: Address) -> None:
-    """One blocking receive, one send."""
     into, out = bound(port, blocking=True), bound(0, blocking=True)
     out.connect(to)
     receive, send = into.recv, out.send
@@ -56,7 +54,7 @@ class _Into(asyncio.DatagramProtocol):
 
 
 async def relay_protocol(port: int, to: Address) -> None:
-    """A DatagramProtocol on each side, on whatever loop runs."""
+    """A DatagramProtocol on each side."""
     loop = asyncio.get_running_loop()
     sock = bound(0, blocking=False)
     sock.connect(to)
@@ -65,36 +63,11 @@ async def relay_protocol(port: int, to: Address) -> None:
     await asyncio.Event().wait()
 
 
-async def relay_add_reader(port: int, to: Address) -> None:
-    """asyncio's loop wakes the relay, which drains the socket."""
-    into, out = bound(port, blocking=False), bound(0, blocking=False)
-    out.connect(to)
-    receive, send = into.recv, out.send
-
-    def drain() -> None:
-        for _ in range(DATAGRAMS_PER_WAKE_UP):
-            try:
-                datagram = receive(RECEIVE_BYTES)
-            except BlockingIOError:
-                return
-            try:
-                send(datagram)
-            except OSError:  # no listener yet, or a full queue
-                continue
-
-    asyncio.get_running_loop().add_reader(into, drain)
-    await asyncio.Event().wait()
-
-
 def main() -> None:
     """Run one until it is ended."""
     kind, port, to = sys.argv[1], int(sys.argv[2]), (sys.argv[3], int(sys.argv[4]))
     if kind == "blocking":
         relay_blocking(port, to)
-    elif kind == "asyncio":
-        asyncio.run(relay_protocol(port, to))
-    elif kind == "add-reader":
-        asyncio.run(relay_add_reader(port, to))
     elif kind == "uvloop":
         import uvloop
 

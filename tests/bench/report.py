@@ -1,20 +1,26 @@
-"""The results page: tables, checks and the figure, from the records of a run."""
+"""The results page: medians over the rounds of a run, from its records."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 from typing import Final
 
-from tests.bench.checks import all_checks
 from tests.bench.daemons import OF_OTHER
-from tests.bench.findings import LOSES, SIDES, Findings
 from tests.bench.measure import DISTURBED_MOST, EVEN_S
+from uavlinkd.lab.evaluation.frame import ReportSection, Table, percentile, to_markdown
+from uavlinkd.lab.evaluation.records import Record, Value, read_records
 
 PAGE: Final = "RESULTS.md"
-FIGURE: Final = "costs.svg"
 RATES: Final = (1_000, 10_000)
+SIDES: Final = ("left", "right")
+BASELINE: Final = "relay-uvloop"
+"""The contender with which others are compared."""
+LOSES: Final = 0.001
+"""Loss above this share at a rate is marked."""
+_CPU_HEAD: Final = [f"CPU {rate:,}/s, {side}" for rate in RATES for side in ("sending", "receiving")]
 _MEASURED: Final = """\
 Two network namespaces with a veth cable between them; generator → contender → cable → contender → sink. Every
 contender is restarted in every round, one after another, another one first each time. Medians over the rounds; in
@@ -35,119 +41,139 @@ else it did.
 """
 
 
+@dataclass(frozen=True, slots=True)
+class Findings:
+    """The records of a run."""
+
+    facts: Mapping[str, Value]
+    records: Sequence[Record]
+
+    @property
+    def contenders(self) -> list[str]:
+        """All contenders with a measurement, in the order of the first round."""
+        measured = (record.point for record in self.records if record.is_ok and "contender" in record.point)
+        return list(dict.fromkeys(str(point["contender"]) for point in measured))
+
+    def of(self, kind: str, **point: Value) -> list[Record]:
+        """The measurements of this kind whose points have these values."""
+        return [
+            record
+            for record in self.records
+            if record.kind == kind and record.is_ok and record.point.items() >= point.items()
+        ]
+
+    def numbers(self, kind: str, value: str, **point: Value) -> list[float]:
+        return [record.number(value) for record in self.of(kind, **point) if value in record.values]
+
+    def median(self, kind: str, value: str, **point: Value) -> float | None:
+        """The median over the rounds, or None without a measurement."""
+        numbers = self.numbers(kind, value, **point)
+        return median(numbers) if numbers else None
+
+    def cpu_us(self, contender: str) -> list[float | None]:
+        """The processor time of a frame, by rate and side."""
+        return [
+            self.median("rate", f"cpu_{side}_us", contender=contender, rate=rate) for rate in RATES for side in SIDES
+        ]
+
+    def latencies_s(self, contender: str, rate: int) -> list[list[float]]:
+        """The latencies of each round."""
+        return [record.values["latencies_s"] for record in self.of("rate", contender=contender, rate=rate)]
+
+
 def write_report(folder: Path, name: str, page: Path | None = None) -> str:
-    """Write the page (by default ``RESULTS.md`` in the folder) and the figure beside it; returns the page's text.
+    """Write the page (by default ``RESULTS.md`` in the folder); returns its text.
 
     Raises:
         RecordsError: there are no records in the folder.
     """
-    findings = Findings.read(folder, name)
-    path = folder / PAGE if page is None else page
-    has_figure = _draw(findings, path.with_name(FIGURE))
-    text = page_text(findings, FIGURE if has_figure else None)
-    path.write_text(text, encoding="utf-8")
+    text = page_text(Findings(*read_records(folder / f"{name}.jsonl")))
+    (folder / PAGE if page is None else page).write_text(text, encoding="utf-8")
     return text
 
 
-def _draw(findings: Findings, path: Path) -> bool:
-    """Whether there is a figure: matplotlib is optional, and there may be no measurement."""
-    if not findings.contenders:
-        return False
-    try:
-        from tests.bench.figure import draw
-    except ImportError:
-        return False
-    path.write_bytes(draw(findings))
-    return True
-
-
-def page_text(findings: Findings, figure: str | None) -> str:
-    """The page."""
+def page_text(findings: Findings) -> str:
     facts = findings.facts
+    head = [
+        f"Made by `{facts.get('command', 'python -m tests.bench')}`, written by `python -m tests.bench report DIR`.",
+        _MEASURED.strip(),
+    ]
     parts = [
-        "# What a frame costs",
-        f"Made by `{facts.get('command', 'python -m tests.bench')}`, drawn by `python -m tests.bench report DIR`.",
-        _MEASURED,
+        ReportSection("CPU and highest rate", tables=[_costs(findings)]),
+        ReportSection("Latency, memory, bytes", tables=[_rest(findings)]),
     ]
-    if figure is not None:
-        parts.append(f"![What a frame costs, and how late it comes]({figure})")
-    parts += ["## What has to be reached", _checks(findings)]
-    if findings.contenders:
-        parts += ["## CPU and highest rate", _costs(findings), "## Latency, memory, bytes", _rest(findings)]
     if against := [name for name in findings.contenders if name.endswith(OF_OTHER)]:
-        parts += ["## Against the other checkout", _against(findings, against)]
-    parts += ["## uavlinkd alone", _alone(findings)]
-    missing = findings.not_measured()
+        said = f"There → here, and the ratio. There: `{facts.get(f'version_{against[0]}', 'not known')}`."
+        parts.append(ReportSection("Against the other checkout", [said], [_against(findings, against)]))
+    parts.append(ReportSection("uavlinkd alone", tables=[Table(("", ""), _alone(findings))]))
+    failed = [record for record in findings.records if not record.is_ok]
+    missing = {f"{record.kind}: {_point(record)}": record.reason for record in failed}
     if missing:
-        parts += ["## Not measured", "\n".join(f"- {what}: {why}" for what, why in missing.items())]
-    parts += [
-        "## The run",
-        _table(("", ""), [(name, _plain(value)) for name, value in facts.items()]),
-        _evenness(findings),
-    ]
-    return "\n\n".join(part.strip() for part in parts if part) + "\n"
+        parts.append(ReportSection("Not measured", ["\n".join(f"- {what}: {why}" for what, why in missing.items())]))
+    late = findings.numbers("rate", "late_p99_s")
+    disturbed = (
+        f"{sum(latency > EVEN_S for latency in late)} of {len(late)} measurements at fixed rates were still disturbed"
+        f" (a datagram in a hundred left more than {EVEN_S * 1e3:.0f} ms late) when they had been made"
+        f" {DISTURBED_MOST} times."
+    )
+    run = Table(("", ""), [(name, _plain(value)) for name, value in facts.items()])
+    parts.append(ReportSection("The run", [disturbed], [run]))
+    return to_markdown("What a frame costs", head, parts, (), "")
 
 
-def _checks(findings: Findings) -> str:
-    rows = [
-        (check.what, _unit(check.figure, check.unit), _unit(check.limit, check.unit), check.verdict)
-        for check in all_checks(findings)
-    ]
-    return _table(("", "measured", "limit", ""), rows)
+def _point(record: Record) -> str:
+    return ", ".join(f"{name} {value}" for name, value in record.point.items() if name != "round")
 
 
-def _costs(findings: Findings) -> str:
-    heads = ["", *(f"CPU {rate:,}/s, {side}" for rate in RATES for side in ("sending", "receiving"))]
+def _costs(findings: Findings) -> Table:
+    base = findings.cpu_us(BASELINE)
     rows = []
     for name in findings.contenders:
         cells = [name]
-        for rate in RATES:
-            for side in SIDES:
-                cpu, ratio = findings.cpu_us(name, rate, side), findings.ratio(name, rate, side)
-                cells.append("-" if not cpu else f"{cpu:.1f} µs" + (f" ({ratio:.2f})" if ratio else ""))
-        loss = findings.loss(name, RATES[1])
+        for cpu, least in zip(findings.cpu_us(name), base, strict=True):
+            cells.append("-" if not cpu else f"{cpu:.1f} µs" + (f" ({cpu / least:.2f})" if least else ""))
+        loss = findings.median("rate", "loss", contender=name, rate=RATES[1])
         cells.append("-" if loss is None else f"{loss:.1%}" if loss > LOSES else "none")
-        cells += [_count(findings.highest(name, count)) for count in (1, 8)]
+        for count in (1, 8):
+            highest = findings.median("highest", "highest", contender=name, per_datagram=count)
+            cells.append("-" if highest is None else f"{highest:,.0f}/s")
         rows.append(cells)
-    return _table((*heads, "loss", "highest", "highest, 8 a datagram"), rows)
+    return Table(["", *_CPU_HEAD, "loss", "highest", "highest, 8 a datagram"], rows)
 
 
-def _against(findings: Findings, others: Sequence[str]) -> str:
-    heads = ["", *(f"CPU {rate:,}/s, {side}" for rate in RATES for side in ("sending", "receiving"))]
+def _against(findings: Findings, others: Sequence[str]) -> Table:
     rows = []
     for other in others:
-        cells = [other.removesuffix(OF_OTHER)]
-        for rate in RATES:
-            for side in SIDES:
-                before, after = (findings.cpu_us(name, rate, side) for name in (other, cells[0]))
-                cells.append(f"{before:.1f} → {after:.1f} µs ({after / before:.2f})" if before and after else "-")
-        rows.append(cells)
-    said = f"There → here, and the ratio. There: `{findings.facts.get(f'version_{others[0]}', 'not known')}`."
-    return f"{said}\n\n{_table(heads, rows)}"
+        name = other.removesuffix(OF_OTHER)
+        pairs = zip(findings.cpu_us(other), findings.cpu_us(name), strict=True)
+        cells = [
+            f"{there:.1f} → {here:.1f} µs ({here / there:.2f})" if there and here else "-" for there, here in pairs
+        ]
+        rows.append([name, *cells])
+    return Table(["", *_CPU_HEAD], rows)
 
 
-def _rest(findings: Findings) -> str:
+def _rest(findings: Findings) -> Table:
     heads = ["", *(f"{part} {rate:,}/s" for rate in RATES for part in ("p50", "p99", "p99.9"))]
     heads += ["memory, sending", "memory, receiving", *(f"bytes of a frame, {rate:,}/s" for rate in RATES)]
     rows = []
     for name in findings.contenders:
         cells = [name]
         for rate in RATES:
-            late = (
-                findings.latency_s(name, rate, 0.5),
-                findings.latency_s(name, rate, 0.99),
-                findings.pooled_latency_s(name, rate, 0.999),
-            )
-            cells += [_micro(latency) for latency in late]
+            rounds = [latencies for latencies in findings.latencies_s(name, rate) if latencies]
+            together = [latency for latencies in rounds for latency in latencies]
+            late = [median(percentile(one, part) for one in rounds) for part in (0.5, 0.99)] if rounds else []
+            late += [percentile(together, 0.999)] if rounds else []
+            cells += [f"{latency * 1e6:,.0f} µs" for latency in late] or ["-"] * 3
         cells += [_mega(findings.median("rate", f"rss_{side}", contender=name, rate=RATES[0])) for side in SIDES]
         for rate in RATES:
             size = findings.median("rate", "wire_bytes_per_frame", contender=name, rate=rate)
             cells.append("-" if size is None else f"{size:.1f}")
         rows.append(cells)
-    return _table(heads, rows)
+    return Table(heads, rows)
 
 
-def _alone(findings: Findings) -> str:
+def _alone(findings: Findings) -> list[tuple[str, str]]:
     rows = []
     for peers, rate in dict.fromkeys(
         (record.point["peers"], record.point["rate_each"]) for record in findings.of("peers")
@@ -172,44 +198,11 @@ def _alone(findings: Findings) -> str:
         extremes = f"{min(starts) * 1e3:.0f} to {max(starts) * 1e3:.0f} ms"
         rows.append(("from exec to ready", f"{ready * 1e3:.0f} ms ({extremes}, n = {len(starts)})"))
         rows.append(("of that, processor time", f"{cpu_s * 1e3:.0f} ms"))
-    return _table(("", ""), rows) if rows else "Not measured in this run."
+    return rows
 
 
-def _evenness(findings: Findings) -> str:
-    late = [record.number("late_p99_s") for record in findings.of("rate")]
-    most = [record.number("late_most_s") for record in findings.of("rate")]
-    if not late:
-        return ""
-    together = max(record.number("together_most") for record in findings.of("rate"))
-    disturbed = sum(latency > EVEN_S for latency in late)
-    return (
-        "How evenly the generator sent, at fixed rates: 99 of 100 datagrams left within"
-        f" {median(late) * 1e6:.0f} µs of their time in the middle measurement,"
-        f" {max(late) * 1e6:,.0f} µs in the worst; the latest was"
-        f" {max(most) * 1e3:.1f} ms late, and at most {together:.0f} left in one go. {disturbed} of {len(late)}"
-        f" measurements were still disturbed (more than {EVEN_S * 1e3:.0f} ms) when they had been made"
-        f" {DISTURBED_MOST} times."
-    )
-
-
-def _table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    lines = [heads, ["---"] * len(heads), *rows]
-    return "\n".join("| " + " | ".join(cell.replace("|", "/") for cell in line) + " |" for line in lines)
-
-
-def _or_dash(form: Callable[[float], str]) -> Callable[[float | None], str]:
-    return lambda value: "-" if value is None else form(value)
-
-
-_count = _or_dash(lambda value: f"{value:,.0f}/s")
-_micro = _or_dash(lambda value: f"{value * 1e6:,.0f} µs")
-_mega = _or_dash(lambda value: f"{value / 1e6:.1f} MB" if value else "-")
-
-
-def _unit(value: float | None, unit: str) -> str:
-    if value is None:
-        return "-"
-    return f"{value:,.0f} {unit}" if value >= 1_000 else f"{value:.3g} {unit}"
+def _mega(value: float | None) -> str:
+    return f"{value / 1e6:.1f} MB" if value else "-"
 
 
 def _plain(value: object) -> str:

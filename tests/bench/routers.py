@@ -1,4 +1,4 @@
-"""MAVLink routers: mavlink-router, MAVProxy, and a typical script that signs frames with pymavlink."""
+"""MAVLink routers: MAVProxy, and a typical script that signs frames with pymavlink."""
 
 from __future__ import annotations
 
@@ -10,54 +10,22 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Final
 
+from tests.bench.cable import Cable, Host
 from tests.bench.contenders import (
-    INTO,
     INTO_PORT,
     LINK_PORT,
     Contender,
     Running,
-    command_version,
-    needs_command,
     needs_module,
 )
-from tests.bench.namespaces import Cable, Host
 from tests.bench.traffic import REPOSITORY, SINK_PORT
-
-
-class MavlinkRouter(Contender):
-    """mavlink-router on both hosts. Debian has no package of it: it is measured if it was built locally."""
-
-    def __init__(self) -> None:
-        super().__init__("mavlink-router", "mavlink-router, without security")
-
-    def why_not(self) -> str | None:
-        return needs_command("mavlink-routerd")
-
-    def version(self) -> str | None:
-        return command_version("mavlink-routerd", "--version")
-
-    def start(self, cable: Cable, folder: Path) -> Running:
-        right = self._side(cable.right, folder / "right", ("0.0.0.0", LINK_PORT), ("127.0.0.1", SINK_PORT))
-        left = self._side(cable.left, folder / "left", INTO, (cable.right.address, LINK_PORT))
-        return Running([left], [right])
-
-    @staticmethod
-    def _side(host: Host, folder: Path, into: tuple[str, int], out: tuple[str, int]) -> subprocess.Popen[bytes]:
-        folder.mkdir()
-        config = folder / "main.conf"
-        config.write_text(
-            "[General]\nTcpServerPort=0\nReportStats=false\n"
-            f"[UdpEndpoint into]\nMode=Server\nAddress={into[0]}\nPort={into[1]}\n"
-            f"[UdpEndpoint out]\nMode=Normal\nAddress={out[0]}\nPort={out[1]}\n"
-        )
-        return host.start(["mavlink-routerd", "--conf-file", str(config)], folder=folder, log=folder / "router.log")
 
 
 class Mavproxy(Contender):
     """MAVProxy on both hosts, without console, map and modules; it logs as it always does."""
 
     def __init__(self) -> None:
-        super().__init__("mavproxy", "MAVProxy, without security")
+        super().__init__("mavproxy")
 
     def why_not(self) -> str | None:
         return needs_module("MAVProxy")
@@ -87,7 +55,7 @@ class PymavlinkSigning(Contender):
     """The relays of :mod:`tests.bench.signing`: the left one signs, the right one accepts only signed frames."""
 
     def __init__(self) -> None:
-        super().__init__("pymavlink-signing", "a pymavlink relay that signs, and one that verifies")
+        super().__init__("pymavlink-signing")
 
     def why_not(self) -> str | None:
         return needs_module("pymavlink")
@@ -110,4 +78,4 @@ class PymavlinkSigning(Contender):
         return host.start(command, folder=REPOSITORY, log=log, environ={"MAVLINK20": "1"})
 
 
-ROUTERS: Final = (MavlinkRouter(), Mavproxy(), PymavlinkSigning())
+ROUTERS: Final = (Mavproxy(), PymavlinkSigning())

@@ -10,11 +10,12 @@ from functools import partial
 from pathlib import Path
 
 from tests.bench import scale
+from tests.bench.cable import Cable
 from tests.bench.contenders import Contender, NotMeasuredError, Running, last_words
 from tests.bench.frames import FrameSet, write_frames
 from tests.bench.measure import Bench, at_rate, highest_rate, rotated, until_carried
-from tests.bench.namespaces import Cable, CableKind, NamespaceError
 from tests.bench.traffic import SINK_PORT, Traffic, Worker
+from tests.namespaces import NamespaceError
 from uavlinkd.lab.evaluation.records import Record, RecordWriter, Status, Value
 
 Say = Callable[[str], None]
@@ -39,7 +40,6 @@ class Plan:
     """With how many peers the memory is looked at."""
     starts: int = 3
     """In each round."""
-    cable: CableKind = CableKind.PLAIN
 
 
 PATIENCE = 20
@@ -50,9 +50,9 @@ SCALES = ("peers", "memory", "start")
 
 
 @contextmanager
-def laboratory(frames: FrameSet, kind: CableKind = CableKind.PLAIN) -> Iterator[Bench]:
+def laboratory(frames: FrameSet) -> Iterator[Bench]:
     """Two hosts, the generator and the sink."""
-    with tempfile.TemporaryDirectory(prefix="uavbench-") as folder, Cable(kind) as cable:
+    with tempfile.TemporaryDirectory(prefix="uavbench-") as folder, Cable() as cable:
         path = Path(folder) / "frames"
         write_frames(path, frames.frames)
         sink = Worker(cable.right, "sink", str(SINK_PORT))

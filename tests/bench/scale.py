@@ -14,14 +14,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
+from tests.bench.cable import END_S
 from tests.bench.contenders import LINK_PORT, NotMeasuredError, Running, last_words, until
 from tests.bench.daemons import configuration, daemon_command, peer, peers_up, start_daemon
 from tests.bench.measure import Bench, at_rate, resident_bytes
-from tests.bench.namespaces import END_S
 from tests.bench.traffic import Traffic, TrafficError, Worker
 from uavlinkd.config import keys
-from uavlinkd.lab.evaluation.machine import cpu_seconds
-from uavlinkd.lab.evaluation.records import Value
+from uavlinkd.lab.evaluation.records import Value, cpu_seconds
 
 SINK_PORT: Final = 14601
 """Port of the sink that counts the frames of all systems."""

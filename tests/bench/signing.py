@@ -10,7 +10,6 @@ from pathlib import Path
 
 
 def main() -> None:
-    """Run until ended."""
     what, into_url, out_url, key_file = sys.argv[1:]
     from pymavlink import mavutil
 

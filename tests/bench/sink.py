@@ -34,7 +34,6 @@ class Count:
         self.reset()
 
     def reset(self) -> None:
-        """Start from zero."""
         self.frames = self.others = self.garbage = self.datagrams = 0
         self.latencies_ns: list[int] = []
 
@@ -59,7 +58,6 @@ class Count:
             offset += length
 
     def facts(self) -> dict[str, Any]:
-        """The counts as numbers."""
         return {name: getattr(self, name) for name in ("frames", "others", "garbage", "datagrams")}
 
 

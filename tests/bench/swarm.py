@@ -59,15 +59,12 @@ class Member:
 
     @property
     def is_up(self) -> bool:
-        """Whether it is linked."""
         return self._peer.is_up
 
     def take(self, frames: Iterable[bytes]) -> None:
-        """The next frames to send."""
         self._frames = [bytearray(said_by(frame, self.system)) for frame in frames]
 
     def send(self) -> None:
-        """Its next frame."""
         frame = self._frames[self._next]
         self._next = (self._next + 1) % len(self._frames)
         if is_probe(frame):
@@ -75,7 +72,6 @@ class Member:
         self._perform(self._node.send(self._peer, [bytes(frame)], time.monotonic()))
 
     def hear(self) -> None:
-        """Read the daemon's datagrams."""
         while True:
             try:
                 datagram = self.sock.recv(RECEIVE_BYTES)
@@ -84,7 +80,6 @@ class Member:
             self._perform(self._node.receive(datagram, self._path, time.monotonic()))
 
     def be_in_time(self, now: float) -> None:
-        """Process the due timers."""
         if self._node.next_deadline() <= now:
             self._perform(self._node.handle_timeout(now))
 

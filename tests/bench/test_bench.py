@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import socket
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
 from typing import cast
@@ -18,19 +16,17 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from tests.bench import scale
-from tests.bench.checks import Check
+from tests.bench.cable import Cable
 from tests.bench.contenders import Contender, NotMeasuredError, Running, all_contenders
 from tests.bench.daemons import Uavlinkd
-from tests.bench.findings import Findings
 from tests.bench.frames import PROBE_EVERY, SYSTEM, is_probe, load_frames, probe, said_by
 from tests.bench.generator import pack, send_evenly
 from tests.bench.measure import Bench, at_rate, highest_rate
-from tests.bench.namespaces import Cable, why_not
-from tests.bench.report import page_text, write_report
+from tests.bench.report import write_report
 from tests.bench.run import at_work, laboratory
 from tests.bench.sink import Count
 from tests.bench.traffic import REPOSITORY, Flow, Traffic
-from tests.needs import need
+from tests.namespaces import need_namespaces
 from uavlinkd.lab.child_processes import end_with_parent
 from uavlinkd.lab.evaluation.records import Record, RecordWriter, Status, Value
 
@@ -47,22 +43,15 @@ def messages(data: bytes) -> list[str]:
     return [message.get_type() for message in parsed]
 
 
-def namespaces() -> set[str]:
-    """Namespaces of this bench on this machine."""
-    listed = subprocess.run(["ip", "netns", "list"], capture_output=True, text=True, check=True).stdout
-    return {line.split()[0] for line in listed.splitlines() if line.startswith("uavbench-")}
-
-
 @pytest.fixture(scope="module")
 def bench() -> Iterator[Bench]:
     """Two hosts, which are removed afterwards."""
-    reason = why_not()
-    need(reason is None, f"root and iproute2: {reason}")
+    need_namespaces()
     with laboratory(load_frames()) as made:
-        ours = {made.cable.left.name, made.cable.right.name}
-        assert ours <= namespaces()
+        ours = (made.cable.left.path, made.cable.right.path)
+        assert all(path.exists() for path in ours)
         yield made
-    assert not ours & namespaces()
+    assert not any(path.exists() for path in ours)
 
 
 @pytest.mark.parametrize("name", ["relay-blocking", "uavlinkd"])
@@ -85,15 +74,6 @@ def test_frames_arrive_and_figures_are_plausible(bench: Bench, name: str) -> Non
     assert isinstance(latencies, list)
     assert 0 < len(latencies) <= 1_000 // PROBE_EVERY
     assert 0 < min(latencies) <= max(latencies) < 60
-
-
-def test_plain_udp_has_the_bytes_of_its_headers(bench: Bench) -> None:
-    """The counters of the cable count IP's bytes: without a relay, those of the frames and one header each."""
-    with at_work(CONTENDERS["plain-udp"], bench) as running:
-        values = at_rate(bench, running, 1_000, 1.0)
-    sizes = [len(frame) for frame in load_frames().frames[:1_000]]
-    expected = sum(sizes) + len(sizes) * PLAIN_HEADERS
-    assert values["wire_bytes"] == pytest.approx(expected, rel=0.01)  # ARP, now and then
 
 
 def test_many_peers_into_one_daemon(bench: Bench) -> None:
@@ -131,17 +111,15 @@ def test_contender_that_carries_nothing_is_not_measured(
             return Running([process], [])
 
     pids: list[int] = []
-    with pytest.raises(NotMeasuredError, match="carries no frame"), at_work(Deaf("deaf", ""), bench):
+    with pytest.raises(NotMeasuredError, match="carries no frame"), at_work(Deaf("deaf"), bench):
         pytest.fail("it was measured")
     assert pids
     assert not any(Path("/proc", str(pid)).exists() for pid in pids)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_interrupted_run_leaves_nothing(tmp_path: Path, number: signal.Signals) -> None:
+def test_interrupted_run_leaves_nothing(tmp_path: Path) -> None:
     """All namespaces and processes are removed; the measurements so far are kept."""
-    reason = why_not()
-    need(reason is None, f"root and iproute2: {reason}")
+    need_namespaces()
     command = [sys.executable, "-m", "tests.bench", "--only", "relay-blocking", "--out", str(tmp_path)]
     with subprocess.Popen(
         end_with_parent(*command), cwd=REPOSITORY, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
@@ -149,22 +127,13 @@ def test_interrupted_run_leaves_nothing(tmp_path: Path, number: signal.Signals) 
         assert run.stdout is not None
         said = run.stdout.readline()  # the first contender begins
         assert b"relay-blocking" in said
-        inside = {name for name in namespaces() if f"-{run.pid}-" in name}
+        inside = list(Path("/run/netns").glob(f"uavns-{run.pid}-*"))
         assert len(inside) == 2
-        run.send_signal(number)
+        run.send_signal(signal.SIGINT)
         assert run.wait(30) == 1
         assert b"interrupted" in run.stdout.read()
-    assert not inside & namespaces()
+    assert not any(path.exists() for path in inside)
     assert (tmp_path / "records.jsonl").exists()
-
-
-def test_it_reports_that_it_needs_root(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """It starts nothing."""
-    from tests.bench.command import main
-
-    monkeypatch.setattr(os, "geteuid", lambda: 1000)
-    assert main(["--quick"]) == 1
-    assert "root" in capsys.readouterr().err
 
 
 class Leaky:
@@ -175,7 +144,6 @@ class Leaky:
         self._buffer = buffer
 
     def flow(self, target: tuple[str, int], rate: float, seconds: float, per_datagram: int = 1) -> Flow:
-        """All that fits."""
         sent, came = round(rate * seconds), round(self._capacity * seconds)
         received = min(sent, came + self._buffer)
         return Flow(sent, received, 0, 0, 0, seconds, min(sent, came), (), {})
@@ -259,8 +227,8 @@ def records_of(contender: str, cpu_us: float, latency_s: float) -> Iterator[Reco
         yield Record("rate", {"contender": contender, "round": number, "rate": 1_000, "per_datagram": 1}, values)
 
 
-def test_page_says_what_was_measured_reached_and_not(tmp_path: Path) -> None:
-    """Medians, ratios to the relay of the run, verdicts with the difference, and reasons for missing figures."""
+def test_page_says_what_was_measured_and_what_not(tmp_path: Path) -> None:
+    """Medians, ratios to the relay of the run, and reasons for missing figures."""
     with RecordWriter(tmp_path, "records", {"cpu": "one"}) as writer:
         for record in (*records_of("relay-uvloop", 20.0, 1e-4), *records_of("uavlinkd", 50.0, 2e-4)):
             writer.add(record)
@@ -269,24 +237,7 @@ def test_page_says_what_was_measured_reached_and_not(tmp_path: Path) -> None:
     text = write_report(tmp_path, "records")
     assert text == (tmp_path / "RESULTS.md").read_text()
     assert "| uavlinkd | 55.0 µs (2.50) |" in text
-    assert "at most 1.3 times the uvloop relay | 55 µs | 28.6 µs | not reached: 1.92 times too much |" in text
     assert "- contender: contender nebula: not installed: nebula" in text
-    assert "not measured" in text
-    need(find_spec("matplotlib") is not None, "matplotlib, for the figure")
-    drawn = (tmp_path / "costs.svg").read_text()
-    assert drawn.lstrip().startswith("<?xml")
-    write_report(tmp_path, "records")
-    assert (tmp_path / "costs.svg").read_text() == drawn
-
-
-def test_page_compares_two_checkouts(tmp_path: Path) -> None:
-    """The medians of both, their ratio, and the revision of the other checkout."""
-    with RecordWriter(tmp_path, "records", {"version_uavlinkd-against": "296bd4d"}) as writer:
-        for record in (*records_of("uavlinkd", 60.0, 1e-4), *records_of("uavlinkd-against", 50.0, 1e-4)):
-            writer.add(record)
-    text = write_report(tmp_path, "records")
-    assert "There: `296bd4d`" in text
-    assert "| uavlinkd | 55.0 → 66.0 µs (1.20) | 55.0 → 66.0 µs (1.20) | - | - |" in text
 
 
 def test_checkout_that_cannot_be_measured_is_reported(tmp_path: Path) -> None:
@@ -299,33 +250,3 @@ def test_checkout_that_cannot_be_measured_is_reported(tmp_path: Path) -> None:
     python.write_text(f'#!/bin/sh\nexec {sys.executable} "$@"\n')
     python.chmod(0o755)
     assert f"{python} runs {REPOSITORY / 'uavlinkd'}" in str(ours.of(tmp_path).why_not())
-
-
-def test_daemons_without_roles_carry_frames(bench: Bench) -> None:
-    """Their configuration passes everything, in the syntax of this checkout."""
-    with at_work(CONTENDERS["uavlinkd-all"], bench) as running:
-        assert at_rate(bench, running, 1_000, 0.5)["received"] == pytest.approx(500, abs=20)
-
-
-def test_page_of_nothing_can_be_read() -> None:
-    """A run that was interrupted immediately."""
-    assert "not measured" in page_text(Findings({}, []), None)
-
-
-@pytest.mark.parametrize(
-    ("check", "verdict"),
-    [
-        (Check("", 1.0, 1.0, "µs"), "reached"),
-        (Check("", 1.0, 1.0, "µs", strictly=True), "not reached: 1.00 times too much"),
-        (Check("", 2.0, 1.0, "µs"), "not reached: 2.00 times too much"),
-        (Check("", 2.0, 8.0, "/s", at_least=True), "not reached: 4.00 times too little"),
-        (Check("", 8.0, 2.0, "/s", at_least=True), "reached"),
-        (Check("", 0.5, 0.0, "%"), "not reached"),
-        (Check("", 0.0, 0.0, "%"), "reached"),
-        (Check("", None, 1.0, "µs"), "not measured"),
-        (Check("", 1.0, None, "µs"), "not measured"),
-    ],
-)
-def test_verdicts(check: Check, verdict: str) -> None:
-    """Reached, missed by how much, or not measured."""
-    assert check.verdict == verdict

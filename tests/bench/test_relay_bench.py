@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from tests.bench.measure import resident_bytes
 from tests.bench.relay import turn
-from tests.bench.relay.load import Generator, memory_mb_of
+from tests.bench.relay.load import Generator
 from tests.bench.relay.members import members
 from tests.needs import need
 
@@ -22,7 +23,7 @@ def check(generator: Generator) -> None:
     assert row.lost == 0
     assert generator.relay.hosts.received >= 2 * PAIRS * RATE_S * SECONDS / 2
     assert 0 < row.delay_ms <= row.slowest_ms
-    assert memory_mb_of(generator.relay.pid()) > 1
+    assert resident_bytes(generator.relay.pid()) > 1e6
 
 
 def test_members_are_bound_and_again_after_a_restart(tmp_path: Path) -> None:

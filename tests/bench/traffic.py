@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from tests.bench.namespaces import Host
+from tests.bench.cable import Host
 
 REPOSITORY: Final = Path(__file__).parents[2]
 SINK_PORT: Final = 14600
@@ -84,7 +84,6 @@ class Worker:
         return self.answer()
 
     def answer(self) -> dict[str, Any]:
-        """The next line."""
         assert self.process.stdout is not None
         line = self.process.stdout.readline()
         if not line:

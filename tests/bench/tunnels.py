@@ -9,6 +9,7 @@ from abc import abstractmethod
 from pathlib import Path
 from typing import Final
 
+from tests.bench.cable import Cable, Host
 from tests.bench.contenders import (
     LINK_PORT,
     Contender,
@@ -18,7 +19,6 @@ from tests.bench.contenders import (
     needs_command,
     until,
 )
-from tests.bench.namespaces import Cable, Host
 from tests.bench.traffic import SINK_PORT
 
 LEFT_TUNNEL: Final = "10.214.0.1"
@@ -29,8 +29,8 @@ TUN: Final = Path("/dev/net/tun")
 class Tunnel(Contender):
     """A VPN between the two hosts."""
 
-    def __init__(self, name: str, about: str, *commands: str) -> None:
-        super().__init__(name, about)
+    def __init__(self, name: str, *commands: str) -> None:
+        super().__init__(name)
         self._commands = commands
 
     def why_not(self) -> str | None:
@@ -60,7 +60,7 @@ class WireguardGo(Tunnel):
     """WireGuard in user space."""
 
     def __init__(self) -> None:
-        super().__init__("wireguard-go", "WireGuard in user space", "wireguard-go", "wg")
+        super().__init__("wireguard-go", "wireguard-go", "wg")
 
     def version(self) -> str | None:
         return command_version("wireguard-go", "--version")
@@ -97,7 +97,7 @@ class Nebula(Tunnel):
     """Nebula, an overlay with certificates, the right host as lighthouse."""
 
     def __init__(self) -> None:
-        super().__init__("nebula", "Nebula: an overlay with certificates", "nebula", "nebula-cert")
+        super().__init__("nebula", "nebula", "nebula-cert")
 
     def version(self) -> str | None:
         return command_version("nebula", "-version")
@@ -130,7 +130,7 @@ class Openvpn(Tunnel):
     """OpenVPN over UDP, point to point, each side knowing the other's certificate."""
 
     def __init__(self) -> None:
-        super().__init__("openvpn", "OpenVPN: UDP, TLS, AES-256-GCM, in user space", "openvpn")
+        super().__init__("openvpn", "openvpn")
 
     def version(self) -> str | None:
         return command_version("openvpn", "--version")

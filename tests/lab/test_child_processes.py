@@ -8,7 +8,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 from pathlib import Path
 
 import pytest
@@ -16,7 +15,7 @@ import pytest
 from tests.daemon.test_demo import is_running
 from tests.imports import sources
 from tests.waiting import until
-from uavlinkd.lab.child_processes import end_with_parent, interrupted_by_signals, private_folder
+from uavlinkd.lab.child_processes import end_with_parent, private_folder
 
 SLEEP = "import time; print(flush=True); time.sleep(600)"
 PARENT = f"""
@@ -69,30 +68,6 @@ async def test_nothing_outlives_a_killed_parent() -> None:
         await until(lambda: not folder.exists())
 
 
-async def test_folder_is_removed_although_a_process_still_writes() -> None:
-    """A daemon may create files while its folder is removed."""
-    with started() as parent:
-        assert parent.stdout is not None
-        _, name = json.loads(parent.stdout.readline())
-        ended = threading.Event()
-
-        def write() -> None:
-            while not ended.wait(0.01):
-                try:
-                    (Path(name) / "more").write_text("")
-                except OSError:
-                    return
-
-        writer = threading.Thread(target=write)
-        writer.start()
-        parent.kill()
-        try:
-            await until(lambda: not Path(name).exists())
-        finally:
-            ended.set()
-            writer.join()
-
-
 def test_child_of_a_parent_that_has_ended_does_not_start() -> None:
     """If the parent ends before the child has asked the kernel for the signal, the kernel sends none."""
     command = [*end_with_parent(sys.executable, "-c", "print('started')")]
@@ -103,16 +78,7 @@ def test_child_of_a_parent_that_has_ended_does_not_start() -> None:
     assert "the parent has ended" in done.stderr
 
 
-def test_the_command_keeps_its_process_and_its_status() -> None:
-    """It replaces the process that asked for the signal."""
-    code = "import os, sys; print(os.getpid()); sys.exit(7)"
-    process = subprocess.Popen(end_with_parent(sys.executable, "-c", code), stdout=subprocess.PIPE, text=True)
-    out, _ = process.communicate()
-    assert (out.split(), process.returncode) == ([str(process.pid)], 7)
-
-
 def test_folder_is_private_and_removed_at_the_end() -> None:
-    """Also after an exception."""
     folders = []
 
     def fail() -> None:
@@ -150,13 +116,3 @@ def test_every_process_of_the_laboratory_ends_with_its_parent() -> None:
         starts = [call for call in calls if call.startswith(("subprocess.Popen(", "asyncio.create_subprocess_"))]
         unbound += [name for call in starts if "end_with_parent(" not in call]
     assert unbound == ["lab/child_processes.py"]
-
-
-def test_an_ignored_hang_up_remains_ignored() -> None:
-    """As after ``nohup``."""
-    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    try:
-        with interrupted_by_signals():
-            signal.raise_signal(signal.SIGHUP)
-    finally:
-        signal.signal(signal.SIGHUP, before)

@@ -13,9 +13,11 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
+from tests.bench.measure import resident_bytes
 from tests.bench.relay import turn
-from tests.bench.relay.load import LOAD_CORE, Generator, cpu_s_of, memory_mb_of
+from tests.bench.relay.load import LOAD_CORE, Generator
 from tests.bench.relay.members import members
+from uavlinkd.lab.evaluation.records import cpu_seconds
 
 PAIRS, RATES_S, SECONDS, MEMBERS = 400, (5, 25, 50, 75), 10.0, 1000
 
@@ -23,7 +25,7 @@ PAIRS, RATES_S, SECONDS, MEMBERS = 400, (5, 25, 50, 75), 10.0, 1000
 def measure(generator: Generator, rates_s: Sequence[int], seconds: float) -> None:
     """Print the figures of each rate."""
     relay = generator.relay
-    print(f"{relay.name}: {len(relay.flows)} hosts, {memory_mb_of(relay.pid()):.0f} MB", flush=True)
+    print(f"{relay.name}: {len(relay.flows)} hosts, {resident_bytes(relay.pid()) / 1e6:.0f} MB", flush=True)
     print("   offered/s     lost   delay p50       p99   CPU/datagram   fits one core")
     for rate_s in rates_s:
         row = generator.run(rate_s, seconds)
@@ -40,10 +42,10 @@ def restart(folder: Path, pairs: int, times: int) -> None:
     They share a core, on which the handshakes of 1,000 members take longer than on the relay's.
     """
     with members(folder, pairs) as (relay, generator):
-        print(f"{2 * pairs} members: {memory_mb_of(relay.pid()):.0f} MB", flush=True)
+        print(f"{2 * pairs} members: {resident_bytes(relay.pid()) / 1e6:.0f} MB", flush=True)
         for _ in range(times):
             after_s = relay.restart(generator)
-            half, last, cpu_s = statistics.median(after_s), after_s[-1], cpu_s_of(relay.pid())
+            half, last, cpu_s = statistics.median(after_s), after_s[-1], cpu_seconds(relay.pid())
             print(
                 f"killed and started: half are bound after {half:.2f} s, all after {last:.2f} s;"
                 f" processor time of the relay {cpu_s:.2f} s",
@@ -52,7 +54,6 @@ def restart(folder: Path, pairs: int, times: int) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure, and print."""
     parser = argparse.ArgumentParser(prog="python -m tests.bench.relay", description=__doc__)
     parser.add_argument("--pairs", type=int, default=PAIRS, help="of members (%(default)s)")
     parser.add_argument("--rates", type=int, nargs="+", default=RATES_S, help="datagrams/s of each (%(default)s)")

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-import os
 import select
 import statistics
 import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Final, NamedTuple, Protocol
 
 from tests.bench.relay.volleys import Flow, Hosts, Load, Received
+from uavlinkd.lab.evaluation.records import cpu_seconds
 
 PAYLOAD_BYTES: Final = 100
 """An envelope with a few frames of telemetry."""
@@ -86,7 +85,6 @@ class Generator:
             relay.do_timers(now)
 
     def until(self, condition: Callable[[], bool], timeout_s: float) -> None:
-        """Turn until a condition holds."""
         began = time.monotonic()
         while not condition():
             if time.monotonic() > began + timeout_s:
@@ -98,7 +96,7 @@ class Generator:
         hosts, flows = self.relay.hosts, self.relay.flows
         load = Load(hosts, flows, PAYLOAD_BYTES)
         hosts.received, hosts.delays_ns = 0, []
-        cpu_s, began, sent = cpu_s_of(self.relay.pid()), time.monotonic(), 0
+        cpu_s, began, sent = cpu_seconds(self.relay.pid()), time.monotonic(), 0
         while (now := time.monotonic()) < began + seconds:
             due = int((now - began) * rate_s * len(flows)) - sent
             if due > 0:
@@ -109,20 +107,8 @@ class Generator:
         while time.monotonic() < end and hosts.received < sent:
             self.turn(0.01)
         delays_ms = statistics.quantiles((delay / 1e6 for delay in hosts.delays_ns or (math.nan, math.nan)), n=100)
-        cpu_us = (cpu_s_of(self.relay.pid()) - cpu_s) / max(1, hosts.received) * 1e6
+        cpu_us = (cpu_seconds(self.relay.pid()) - cpu_s) / max(1, hosts.received) * 1e6
         return Measured(sent / elapsed_s, 1 - hosts.received / sent, delays_ms[49], delays_ms[98], cpu_us)
-
-
-def cpu_s_of(pid: int) -> float:
-    """The processor time of a process so far."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
-
-def memory_mb_of(pid: int) -> float:
-    """Its resident memory."""
-    pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 def host(number: int) -> str:

@@ -15,7 +15,7 @@ from tests.bench.relay.load import RELAY_CORE, Generator, host
 from tests.bench.relay.volleys import Address, Flow, Hosts, Received
 from tests.daemon.toml import to_toml
 from uavlinkd.config.keys import decode_key, encode_key, generate_private_key, public_key_text, write_secret_file
-from uavlinkd.config.used_relays import TIMERS
+from uavlinkd.config.relay_rules import TIMERS
 from uavlinkd.core import constants as c
 from uavlinkd.core.crypto import KeyPair, Secret
 from uavlinkd.core.node import Node
@@ -66,7 +66,6 @@ class Member:
         self.ask()
 
     def do_timers(self, now: float) -> None:
-        """Do what is due."""
         if self.node.next_deadline() <= now:
             self.perform(self.node.handle_timeout(now))
         if not self.handle and self.peer.paths.works and now >= self.asked_at + c.BIND_RETRY_S:
@@ -80,7 +79,6 @@ class Member:
             self.do_timers(now)
 
     def perform(self, outputs: Sequence[Output]) -> None:
-        """Send, and note handles."""
         for output in outputs:
             if isinstance(output, Transmit):
                 self.hosts.send(self.host, output.datagram, self.relay)
@@ -125,25 +123,20 @@ class Members:
         os.sched_setaffinity(self._process.pid, {RELAY_CORE})
 
     def end_relay(self) -> None:
-        """As if its power failed."""
         self._process.kill()
         self._process.wait()
 
     def pid(self) -> int:
-        """Of :class:`Relayed`."""
         return self._process.pid
 
     @property
     def flows(self) -> Sequence[Flow]:
-        """Of :class:`Relayed`."""
         return [member.flow for member in self.members]
 
     def take(self, received: Received, now: float) -> None:
-        """Of :class:`Relayed`."""
         self._by_host[received.host].receive(received.data, now)
 
     def do_timers(self, now: float) -> None:
-        """Of :class:`Relayed`."""
         for member in self.members:
             member.do_timers(now)
 

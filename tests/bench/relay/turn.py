@@ -48,7 +48,6 @@ def xored(address: Address) -> bytes:
 
 
 def relayed_address(data: bytes) -> Address | None:
-    """The XOR-RELAYED-ADDRESS of a response."""
     at = _HEADER.size
     while at + _ATTRIBUTE.size <= len(data):
         number, size = _ATTRIBUTE.unpack_from(data, at)
@@ -100,18 +99,15 @@ class Clients:
         os.sched_setaffinity(self._process.pid, {RELAY_CORE})
 
     def end(self) -> None:
-        """End coturn."""
         self._process.kill()
         self._process.wait()
         self.hosts.close()
 
     def pid(self) -> int:
-        """Of :class:`Relayed`."""
         return self._process.pid
 
     @property
     def are_bound(self) -> bool:
-        """Whether all channels are there."""
         return all(client.is_bound for client in self._clients.values())
 
     @property
@@ -128,7 +124,6 @@ class Clients:
             yield Flow(client.other, client.relayed, start)
 
     def take(self, received: Received, now: float) -> None:
-        """Of :class:`Relayed`: a response."""
         client = self._clients.get(received.host)
         if client is None:
             return
@@ -140,7 +135,6 @@ class Clients:
         self._ask(client, now)
 
     def do_timers(self, now: float) -> None:
-        """Of :class:`Relayed`."""
         for client in self._clients.values():
             self._ask(client, now)
 
@@ -159,7 +153,6 @@ class Clients:
 
 
 def is_there() -> bool:
-    """Whether coturn is installed."""
     return shutil.which(COTURN) is not None
 
 

@@ -110,7 +110,6 @@ class Hosts:
         self._fresh = bytes(self._messages)  # the kernel overwrites lengths
 
     def close(self) -> None:
-        """Close the socket."""
         self.sock.close()
 
     def send(self, host: str, data: bytes, to: Address) -> None:

@@ -1,89 +1,98 @@
-"""The commands of the evaluation."""
+"""The commands of the evaluations, and the frame that they share."""
 
 from __future__ import annotations
 
 import argparse
 import subprocess
 import sys
-from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 
-from tests.needs import need
 from uavlinkd.cli import main
-from uavlinkd.lab.evaluation.commands import add_report_parser, add_timing_parser
-from uavlinkd.lab.evaluation.timing import TimingSettings
+from uavlinkd.lab.evaluation import commands
+from uavlinkd.lab.evaluation.commands import EVALUATIONS, STAGES, add_evaluations, evaluation_of, settings_of
+from uavlinkd.lab.evaluation.frame import command
+from uavlinkd.lab.evaluation.records import Record, RecordWriter
+from uavlinkd.lab.evaluation.tampering_plan import STAGES as PLANNED
+from uavlinkd.lab.evaluation.tampering_plan import TamperingSettings
 
 
 def parse(*arguments: str) -> argparse.Namespace:
-    """As the command line does."""
     parser = argparse.ArgumentParser()
-    commands = parser.add_subparsers(required=True)
-    add_timing_parser(commands)
-    add_report_parser(commands)
+    add_evaluations(parser.add_subparsers(required=True))
     return parser.parse_args(arguments)
 
 
-def test_defaults_are_those_of_the_settings() -> None:
-    """Written twice, because the settings' module is too heavy to import for a parser."""
-    options, settings = parse("timing", "--out", "x"), TimingSettings()
-    assert (options.repeats, options.limit, options.seed) == (settings.repeats, settings.limit_s, settings.seed)
-    assert (options.watts_per_core, options.quick, options.paper) == (settings.watts_per_core, False, False)
+@pytest.mark.parametrize("name", EVALUATIONS)
+def test_defaults_are_those_of_the_settings(name: str) -> None:
+    """Written twice, because the settings' modules are too heavy to import for a parser."""
+    evaluation = evaluation_of(name)
+    assert settings_of(evaluation, parse(name, "--out", "x")) == evaluation.settings()
+    assert STAGES == PLANNED
+
+
+def test_command_of_a_run_has_the_options_that_were_given() -> None:
+    options = ["--quick", "--seed", "3", "--only", "line", "--only", "relay"]
+    settings = settings_of(evaluation_of("tampering"), parse("tampering", "--out", "x", *options))
+    assert settings == TamperingSettings(quick=True, seed=3, only=("line", "relay"))
+    assert (
+        command("tampering", settings)
+        == "uavlinkd evaluate tampering --out DIR --quick --seed 3 --only line --only relay"
+    )
 
 
 @pytest.mark.parametrize(
-    "arguments",
-    [("--repeats", "0"), ("--repeats", "x"), ("--limit", "0"), ("--limit", "nan"), ("--limit", "inf"),
-     ("--watts-per-core", "-1"), ("--watts-per-core", "nan")],
+    ("name", "option", "value"),
+    [("timing", "--repeats", "0"), ("timing", "--limit", "nan"), ("timing", "--limit", "0"),
+     ("tampering", "--attempts-data", "0"), ("tampering", "--only", "x"), ("paths", "--repeats", "x")],
 )  # fmt: skip
-def test_senseless_numbers_are_refused(arguments: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
-    """By name, before anything starts."""
+def test_senseless_values_are_refused(name: str, option: str, value: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """By the option's name, before anything starts."""
     with pytest.raises(SystemExit) as ended:
-        parse("timing", "--out", "x", *arguments)
+        parse(name, "--out", "x", option, value)
     assert ended.value.code == 2
-    assert arguments[0] in capsys.readouterr().err
+    assert option in capsys.readouterr().err
 
 
-def test_a_report_of_nothing_fails_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """No traceback."""
-    need(find_spec("matplotlib") is not None, "matplotlib, for the figures")
-    options = parse("report", str(tmp_path))
-    assert options.command(options) == 1
+@pytest.mark.parametrize("arguments", [("report", "{}"), ("flight", "--quick", "--out", "{}/file")])
+def test_failure_is_one_line(arguments: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A folder without records, and results that cannot be written."""
+    (tmp_path / "file").write_text("")
+    assert main(["evaluate", *(text.format(tmp_path) for text in arguments)]) == 1
     assert len(capsys.readouterr().err.splitlines()) == 1
 
 
-def test_without_matplotlib_the_report_says_what_to_install(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("arguments", [("report", "{}"), ("tampering", "--quick", "--out", "{}")])
+def test_without_matplotlib_one_line_says_what_to_install(
+    arguments: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Plotting is an extra."""
-    for name in [*sys.modules]:
-        if name.partition(".")[0] == "matplotlib" or name in (
-            "uavlinkd.lab.evaluation.report",
-            "uavlinkd.lab.evaluation.figures",
-        ):
-            monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
-    options = parse("report", str(tmp_path))
-    assert options.command(options) == 1
-    assert "'.[evaluation]'" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("name", ["timing", "tampering", "flight", "paths", "report", "captured-member"])
-def test_help_says_what_to_install_before_the_command(name: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """A reader learns of matplotlib before a run fails for lack of it. One evaluation has no figures."""
-    with pytest.raises(SystemExit):
-        main(["evaluate", name, "--help"])
-    assert ("'.[evaluation]'" in capsys.readouterr().out) == (name != "captured-member")
+    monkeypatch.setattr(commands, "find_spec", lambda _name: None)
+    assert main(["evaluate", *(text.format(tmp_path) for text in arguments)]) == 1
+    assert "'.[lab]'" in capsys.readouterr().err
 
 
 def test_the_parsers_and_the_measurements_import_nothing_of_the_figures() -> None:
     """The parsers import no large modules; the measurements run without matplotlib."""
     script = (
-        "import sys; import uavlinkd.lab.evaluation.commands\n"
-        "heavy = {'matplotlib', 'rich', 'cryptography', 'asyncio', 'pydantic'} & set(sys.modules)\n"
+        "import sys; import uavlinkd.lab.evaluation.commands as commands\n"
+        "heavy = {'matplotlib', 'rich', 'cryptography', 'pydantic'} & set(sys.modules)\n"
         "assert not heavy, heavy\n"
-        "import uavlinkd.lab.evaluation.timing\n"
+        "for name in commands.EVALUATIONS:\n    commands.evaluation_of(name)\n"
         "assert 'matplotlib' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", script], check=True)
+
+
+def test_report_of_an_interrupted_run_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """It is written in the folder, or as a page."""
+    with RecordWriter(tmp_path, "tampering", {"command": "uavlinkd evaluate", "cores": 2}) as writer:
+        assert main(["evaluate", "report", str(tmp_path)]) == 0
+        assert "Not as expected: the run was interrupted." in (tmp_path / "tampering.md").read_text()
+        writer.add(Record("end", {}, {"load_after": 2.5}))
+    page = tmp_path / "docs" / "RESULTS.md"
+    assert main(["evaluate", "report", str(tmp_path), "--page", str(page)]) == 0
+    assert capsys.readouterr().out.splitlines() == [str(tmp_path / "tampering.md"), str(page)]
+    assert "Not as expected" not in page.read_text()
+    assert "Made by `uavlinkd evaluate`." in page.read_text()
+    assert "| load after | 2.5 |" in page.read_text()

@@ -15,7 +15,6 @@ from uavlinkd.core.outputs import Deliver, Transmit
 from uavlinkd.core.path import Path
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.settings import PeerSettings
-from uavlinkd.core.suites import X25519
 from uavlinkd.lab.evaluation.impostors import Achieved, Disguise, Impostor, SealedCookies, StolenIdentity
 from uavlinkd.lab.evaluation.ledger import numbered_frame
 from uavlinkd.lab.mitm.attack import Action, Direction, Send
@@ -63,7 +62,6 @@ class Victim:
 
     @property
     def drops(self) -> set[DropReason]:
-        """All reasons counted."""
         result = set(self.node.drops)
         for peer in self.node.peers.values():
             result |= set(peer.traffic.drops)
@@ -71,8 +69,7 @@ class Victim:
 
 
 def impostor(identity: KeyPair, psk: bytes | None) -> Impostor:
-    """Initiate to a as b."""
-    return Impostor("impostor", [Disguise("a", A.public, "b", identity, psk)], (X25519,), 0.0, frames=(FRAME,))
+    return Impostor("impostor", [Disguise("a", A.public, "b", identity, psk)], 0.0, frames=(FRAME,))
 
 
 @pytest.mark.parametrize(
@@ -118,7 +115,7 @@ def test_a_captured_drone_floods_only_its_own_claims() -> None:
     """Invented refusals fill the bounded table of c; nothing is claimed for b, and no frame is refused by them."""
     victim = Victim()
     itself = [Disguise("a", A.public, "b", C, PSK_C)]
-    attack = Impostor("impostor", itself, (X25519,), 0.0, frames=(FRAME,), claims=True)
+    attack = Impostor("impostor", itself, 0.0, frames=(FRAME,))
     achieved = victim.suffer(attack, 1.0)
     claims = victim.node.peers["c"].refusal_claims.recent()
     assert len(claims) == c.REFUSALS_KEPT
@@ -161,7 +158,7 @@ def test_the_relay_lets_nothing_genuine_pass() -> None:
     """A full relay replaces the other side; otherwise genuine datagrams pass."""
     genuine = b"\x40" + bytes(40)
     for relays in (True, False):
-        middle = Impostor("x", [Disguise("a", A.public, "b", OWN)], (X25519,), 0.0, relays=relays)
+        middle = Impostor("x", [Disguise("a", A.public, "b", OWN)], 0.0, relays=relays)
         passes = Send(genuine, Direction("a", "b")) in middle.on_datagram(genuine, Direction("a", "b"), 0.0)
         assert passes is not relays
         # What concerns others goes its way.

@@ -1,41 +1,12 @@
-"""Medians, spreads, and durations as a person reads them."""
+"""Medians, durations as a person reads them, quantiles, and the test for whether a time depends on something."""
 
 from __future__ import annotations
 
+import random
+
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from uavlinkd.lab.evaluation.spread import duration, spread
-
-
-@given(st.lists(st.floats(1e-9, 1e6), min_size=1))
-def test_a_spread_is_in_order(values: list[float]) -> None:
-    """Least, first quartile, median, third quartile, most."""
-    times = spread(values)
-    tolerance = 1e-9 * times.most
-    assert times.least == min(values)
-    assert times.most == max(values)
-    assert times.least <= times.low + tolerance <= times.median + 2 * tolerance
-    assert times.median <= times.high + tolerance <= times.most + 2 * tolerance
-
-
-def test_a_spread_of_known_values() -> None:
-    """By hand."""
-    times = spread([4.0, 1.0, 3.0, 2.0, 5.0])
-    assert (times.count, times.low, times.median, times.high, times.ratio) == (5, 2.0, 3.0, 4.0, 5.0)
-
-
-def test_a_single_measurement_is_its_own_spread() -> None:
-    """A single value has no quartiles."""
-    times = spread([2.0])
-    assert (times.least, times.low, times.median, times.high, times.most) == (2.0,) * 5
-
-
-def test_nothing_has_no_median() -> None:
-    """A point without measurements must not get a number."""
-    with pytest.raises(ValueError, match="no measurement"):
-        spread([])
+from uavlinkd.lab.evaluation.frame import _ranks, duration, p_value, percentile
 
 
 @pytest.mark.parametrize(
@@ -46,3 +17,19 @@ def test_nothing_has_no_median() -> None:
 def test_a_duration_has_three_digits_and_the_fitting_unit(seconds: float, shown: str) -> None:
     """A table of these can be read."""
     assert duration(seconds) == shown
+
+
+@pytest.mark.parametrize(("share", "value"), [(0.0, 1), (0.01, 1), (0.5, 50), (0.501, 51), (0.99, 99), (1.0, 100)])
+def test_a_percentile_is_one_of_the_values(share: float, value: float) -> None:
+    """The least that so many do not exceed."""
+    assert percentile(range(100, 0, -1), share) == value
+
+
+def test_samples_that_differ_are_distinguished_by_ranks() -> None:
+    """Twice as long on the average is enough at thirty measurements each; a very long time decides nothing."""
+    rng = random.Random(5)
+    samples = [[rng.expovariate(1 / mean) for _ in range(30)] for mean in (1.0, 1.0, 3.0)]
+    assert p_value(samples) < 0.01
+    assert p_value([[1.0, 2.0, 3.0, 4.0], [1.5, 2.5, 3.5, 1e9]]) > 0.1
+    assert _ranks([2.0, 1.0, 2.0, 3.0]) == [2.5, 1.0, 2.5, 4.0]
+    assert p_value([[1.0] * 5, [1.0] * 5]) == pytest.approx(1.0)

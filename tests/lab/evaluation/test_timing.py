@@ -1,110 +1,103 @@
-"""The whole evaluation, quick: every kind of measurement, real daemons, in less than a minute."""
+"""``uavlinkd evaluate timing``: the measurements, and a quick run."""
 
 from __future__ import annotations
 
-import io
+import hmac
+import json
 from collections import Counter
-from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
-from rich.console import Console
 
-from tests.needs import need
-from tests.waiting import Stopwatch
-from uavlinkd.core.suites import SUITES
-from uavlinkd.lab.evaluation.records import Record, Status, read_records
-from uavlinkd.lab.evaluation.timing import MAC_KEY_BITS, TimingSettings, run_timing
-from uavlinkd.lab.evaluation.timing_paper import paper_points
-
-pytestmark = pytest.mark.long
-
-QUICK_S = 240.0
-"""A full run takes hours, a quick one less than a minute on two idle cores of a server."""
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Record], str, float]:
-    """One quick run: its folder, its records, its progress bars as text, and its time without that of other work."""
-    folder = tmp_path_factory.mktemp("timing")
-    screen = io.StringIO()
-    watch = Stopwatch()
-    records = run_timing(folder, TimingSettings(quick=True, seed=3), Console(file=screen, width=120))
-    return folder, records, screen.getvalue(), watch.calm_s
+from tests.lab.evaluation.quick_runs import run_quickly
+from uavlinkd.core.suites import SUITES, X25519
+from uavlinkd.lab.evaluation.records import Status, Value
+from uavlinkd.lab.evaluation.timing_daemons import (
+    MESSAGE_BYTES,
+    TAG_KEY_BITS,
+    LinkChoice,
+    measure_core,
+    measure_tags,
+    measured,
+    tag_makers,
+    time_frames,
+    time_handshake,
+)
+from uavlinkd.lab.evaluation.timing_run import MAC_KEY_BITS, TIMING, measure_paper, paper_points
 
 
-def test_a_quick_run_is_quick(run: tuple[Path, list[Record], str, float]) -> None:
-    """Also on a slow machine."""
-    assert run[3] < QUICK_S
+def test_both_variants_make_the_same_tag_and_every_key_is_measured() -> None:
+    """RFC 2104, section 2: what the two are compared for is one and the same function."""
+    for bits in TAG_KEY_BITS:
+        key = bytes(range(256))[: bits // 8]
+        assert {make() for make in tag_makers(key, b"message").values()} == {hmac.digest(key, b"message", "sha256")}
+    points = {tuple(record.point.values()) for record in measure_tags(5) if record.number("tag_least_s") > 0}
+    states = ("prepared", "from the key")
+    assert points == {(bits, way, size) for bits in TAG_KEY_BITS for way in states for size in MESSAGE_BYTES}
 
 
-def test_every_point_of_both_grids_has_a_record(run: tuple[Path, list[Record], str, float]) -> None:
-    """Measured, or with the reason why it is not: never left out."""
-    records = run[1]
-    points = {
-        (record.point.get("suite"), record.point.get("mac_key_bits"))
-        for record in records
-        if record.kind == "handshake"
-    }
-    assert points == {(suite.name, bits) for suite in SUITES.values() for bits in MAC_KEY_BITS}
-    papers = [dict(note.point) for note in records if note.kind == "paper"]
-    assert all(point in papers for point in paper_points())
-    for record in records:
-        assert record.is_ok or record.reason
+@pytest.mark.parametrize("number", SUITES)
+@pytest.mark.parametrize("confidential", [False, True])
+def test_every_suite_carries_a_frame_between_two_nodes(number: int, confidential: bool) -> None:
+    """The steps add up to the total, and the frame was delivered."""
+    record = measure_core(LinkChoice(SUITES[number], 1024, confidential))
+    steps = [record.number(f"{name}_s") for name in ("initiate", "respond", "finish", "confirm", "frame")]
+    assert min(steps) > 0
+    assert record.number("total_s") == pytest.approx(sum(steps))
 
 
-def test_every_suite_made_a_link_between_real_daemons(run: tuple[Path, list[Record], str, float]) -> None:
-    """No measurement failed, and no suite was skipped."""
-    assert [record for record in run[1] if record.status is Status.FAILED] == []
-    linked = {note.point["suite"] for note in run[1] if note.kind == "handshake" and note.is_ok}
+async def test_handshake_and_frames_of_daemons_are_timed() -> None:
+    """From the initiation to the delivered frame; each frame arrives after it was sent."""
+    handshake = await time_handshake(LinkChoice(X25519, 512, confidential=True))
+    assert handshake["total_s"] > 0
+    assert min(handshake["cpu_initiator_s"], handshake["cpu_responder_s"]) > 0
+    assert handshake["bytes"] > [200, 100]
+    assert handshake["datagrams"][0] >= 3
+    frames = await time_frames(LinkChoice(X25519), 20, with_proxy=False)
+    assert len(frames["latency_s"]) == 20
+    assert min(frames["latency_s"]) > 0
+
+
+async def test_failed_measurement_is_a_record_with_its_reason() -> None:
+    """Here a length that the daemon refuses: the log of the process names the key."""
+    record = await measured("handshake", {}, time_handshake(LinkChoice(X25519, 257)))
+    assert (record.status, record.values) == (Status.FAILED, {})
+    assert "mac_key_bits" in record.reason
+
+
+def point(dh_bits: int, group: str = "made") -> dict[str, Value]:
+    return {"dh_bits": dh_bits, "mac_key_bits": 512, "group": group}
+
+
+async def test_exchange_of_the_paper_is_measured_between_two_processes(capfd: pytest.CaptureFixture[str]) -> None:
+    """Or recorded with the limit, or with the status of a process that failed: RFC 7919 has no group of 512 bits."""
+    done = await measure_paper(point(512), 60, b"data")
+    assert 0 < done.number("parameters_s") < done.number("total_s")
+    late = await measure_paper(point(4096), 0.6, b"data")
+    assert (late.status, late.reason) == (Status.NOT_FINISHED, "not finished in 0.6 s")
+    failed = await measure_paper(point(512, "standard"), 60, b"data")
+    assert failed.status is Status.FAILED
+    assert "ended with status 1" in failed.reason
+    assert "KeyError" in capfd.readouterr().err
+
+
+@pytest.mark.long
+async def test_quick_run(tmp_path: Path) -> None:
+    """Every point of both grids has a record: measured, or with the reason why it is not."""
+    result = await run_quickly("timing", tmp_path, "--seed", "3")
+    assert (result.status, result.err) == (0, "")
+    findings = TIMING.read(tmp_path)
+    assert json.loads(result.out.splitlines()[-1]) == TIMING.summary(findings)
+    handshakes = {(record.point["suite"], record.point["mac_key_bits"]) for record in findings.of("handshake")}
+    assert handshakes == {(suite.name, bits) for suite in SUITES.values() for bits in MAC_KEY_BITS}
+    papers = [dict(record.point) for record in findings.of("paper")]
+    assert all(planned in papers for planned in paper_points())
+    assert all(record.is_ok or record.reason for record in findings.records)
+    linked = {record.point["suite"] for record in findings.of("handshake") if record.is_ok}
     assert linked == {suite.name for suite in SUITES.values()}
-
-
-def test_each_kind_of_measurement_was_made(run: tuple[Path, list[Record], str, float]) -> None:
-    """The paper's method, handshakes, rekeys, frames, the core, tags."""
-    measured = Counter(record.kind for record in run[1] if record.is_ok)
-    assert all(measured[kind] for kind in ("paper", "handshake", "rekey", "frames", "core", "mac"))
-
-
-def test_4096_bits_of_the_papers_method_wait_to_be_asked_for(run: tuple[Path, list[Record], str, float]) -> None:
-    """Skipped, with the option's name."""
-    large = [r for r in run[1] if r.kind == "paper" and r.point["dh_bits"] == 4096 and r.point["group"] == "made"]
+    measured_kinds = Counter(record.kind for record in findings.records if record.is_ok)
+    assert all(measured_kinds[kind] for kind in ("paper", "handshake", "frames", "core", "mac"))
+    large = findings.of("paper", dh_bits=4096, group="made")
     assert {(record.status, record.reason) for record in large} == {(Status.SKIPPED, "runs only with --paper")}
-
-
-def test_the_files_hold_the_run(run: tuple[Path, list[Record], str, float]) -> None:
-    """JSON lines that give the same records, the seed and the versions; and a CSV as long."""
-    facts, records = read_records(run[0] / "timing.jsonl")
-    assert records == run[1]
-    assert facts["seed"] == 3
-    assert facts["openssl"]
-    assert len((run[0] / "timing.csv").read_text(encoding="utf-8").splitlines()) == 1 + len(records)
-
-
-def test_progress_is_shown(run: tuple[Path, list[Record], str, float]) -> None:
-    """A bar for each kind of work, at its end in the end."""
-    for work in ("handshakes, daemons", "the paper's method", "rekeys", "frames"):
-        assert work in run[2]
-
-
-def test_the_run_can_be_reported(run: tuple[Path, list[Record], str, float]) -> None:
-    """Records of a real run, not of a sample, give every figure."""
-    need(find_spec("matplotlib") is not None, "matplotlib, for the figures")
-    from uavlinkd.lab.evaluation.report import write_report
-
-    html = write_report(run[0]).read_text(encoding="utf-8")
-    assert html.count("data:image/svg+xml") == 5
-
-
-def test_the_large_group_is_tried_when_asked_for_and_given_up_at_the_limit(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Once a point, last, with the limit in the record."""
-    for name in ("macs", "core", "frames", "rekeys"):
-        monkeypatch.setattr(f"uavlinkd.lab.evaluation.timing._Run.{name}", lambda self: None)
-    monkeypatch.setattr("uavlinkd.lab.evaluation.timing._grid", lambda: iter(()))
-    large = [point for point in paper_points() if point["dh_bits"] == 4096 and point["group"] == "made"]
-    monkeypatch.setattr("uavlinkd.lab.evaluation.timing.paper_points", lambda: large)
-    records = run_timing(tmp_path, TimingSettings(paper=True, limit_s=0.4), Console(file=io.StringIO()))
-    late = [record for record in records if record.kind == "paper"]
-    assert [(record.status, record.reason) for record in late] == [(Status.NOT_FINISHED, "not finished in 0.4 s")] * 3
+    report = (tmp_path / "timing.md").read_text()
+    assert all(f"({name}.svg)" in report and (tmp_path / f"{name}.svg").exists() for name in ("scatter", "histogram"))

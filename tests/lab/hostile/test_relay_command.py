@@ -18,28 +18,16 @@ from tests.daemon.harness import Stage, secret_forms
 from tests.daemon.process import DaemonProcess
 from tests.relay.relayed_pair import RelayedPair
 from tests.waiting import until
-from uavlinkd.lab.attacker import main
+from uavlinkd.cli import mitm as main
 from uavlinkd.lab.child_processes import end_with_parent
-from uavlinkd.lab.hostile import relay_cli
-from uavlinkd.lab.hostile.relay_attacks import ALL_ATTACKS
 from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.ops.control import ask
 
+pytestmark = pytest.mark.usefixtures("undone_settings")
+
+_COMMAND = "import sys; from uavlinkd.cli import mitm; sys.exit(mitm())"
 SOME = ("relay-frames", "relay-invent", "relay-lie", "bit-flip,beside=true", "replay-data,copies=2")
 """Attacks that withhold nothing."""
-
-
-def test_list_prints_every_attack(capsys: pytest.CaptureFixture[str]) -> None:
-    """The relay's own, and those of the man in the middle."""
-    assert main(["relay", "--list"]) == 0
-    printed = capsys.readouterr().out.splitlines()
-    assert {line.partition(" ")[0] for line in printed} >= set(ALL_ATTACKS)
-
-
-def test_other_words_are_for_the_man_in_the_middle(capsys: pytest.CaptureFixture[str]) -> None:
-    """It has no attack of a relay."""
-    assert main(["--list"]) == 0
-    assert "relay-lie" not in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -57,7 +45,6 @@ def test_other_words_are_for_the_man_in_the_middle(capsys: pytest.CaptureFixture
 def test_wrong_command_line_ends_with_status_2(
     text: str | None, arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Before anything is opened."""
     if text is not None:
         arguments = [f"--config={_file(tmp_path, text)}", *arguments]
     assert main(["relay", *arguments]) == 2
@@ -83,15 +70,6 @@ def _with(daemon: DaemonProcess, **sections: object) -> Path:
     return daemon.write_config()
 
 
-@pytest.mark.parametrize("flag", ["--attack=relay-ly", "--seconds=0"])
-def test_flag_that_cannot_be_read_is_explained(flag: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """argparse shows the message of the parser."""
-    with pytest.raises(SystemExit) as caught:
-        main(["relay", flag])
-    assert caught.value.code == 2
-    assert flag.partition("=")[0] in capsys.readouterr().err
-
-
 @pytest.mark.parametrize("log", ["log", "."])
 def test_run_ends_after_its_time(log: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """With status 1 if the journal cannot be written."""
@@ -100,27 +78,11 @@ def test_run_ends_after_its_time(log: str, tmp_path: Path, capsys: pytest.Captur
     assert (status, "cannot write the log" in capsys.readouterr().err) == ((1, True) if log == "." else (0, False))
 
 
-def test_too_many_members_are_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """The attacks would need too much memory for all pairs."""
-    monkeypatch.setattr(relay_cli, "MOST_MEMBERS", 1)
-    assert main(["relay", f"--config={_file(tmp_path, 'member')}", "--seconds=0.01"]) == 2
-    assert "more than 1 sections" in capsys.readouterr().err
-
-
-def test_address_of_another_machine_is_status_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """And no traceback."""
-    path = _file(tmp_path, "member", host="192.0.2.1")
-    assert main(["relay", f"--config={path}", "--seconds=0.01"]) == 1
-    assert "cannot listen" in capsys.readouterr().err
-
-
 @asynccontextmanager
 async def _running(relay: DaemonProcess, *arguments: str) -> AsyncIterator[Path]:
     """The command with a relay's file. Its control socket. At the end it stops on SIGTERM, and said no secret."""
     process = await asyncio.create_subprocess_exec(
-        *end_with_parent(sys.executable, "-m", "uavlinkd.lab.attacker", "relay"),
+        *end_with_parent(sys.executable, "-c", _COMMAND, "relay"),
         f"--config={relay.write_config()}",
         *arguments,
         stderr=asyncio.subprocess.PIPE,

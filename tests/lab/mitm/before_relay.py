@@ -53,17 +53,14 @@ class StageBeforeRelay(DaemonStage):
         self._relay.configure_members(link, {name: drone.public_key for name, drone in self.drones.items()})
 
     async def open(self) -> None:
-        """Start the relay too."""
         await self._relay.start()
         await super().open()
 
     async def close(self) -> None:
-        """Stop it too."""
         await super().close()
         await self._relay.stop()
 
     def attacked(self) -> tuple[dict[str, int], dict[str, bytes]]:
-        """The relay too."""
         ports, keys = super().attacked()
         return {**ports, RELAY: self._relay.port}, {**keys, RELAY: decode_key(self._relay.public_key)}
 

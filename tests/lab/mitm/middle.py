@@ -9,6 +9,7 @@ from tests.network.network import Address, Drone, Network
 from uavlinkd.core.settings import Link
 from uavlinkd.lab.mitm.attack import NEVER, Action, AttackContext, AttackObject, Direction, Intervention
 from uavlinkd.lab.mitm.channel import AttackChannel
+from uavlinkd.lab.mitm.proxy import Amplification
 
 Make = Callable[[AttackContext, float], Sequence[AttackObject]]
 
@@ -24,8 +25,7 @@ class Middle:
         self.channel = AttackChannel(self.context)
         self.interventions: list[Intervention] = []
         self.to_strangers: list[tuple[str, int, bytes]] = []
-        self.bytes_to_strangers: dict[tuple[str, int], int] = {}
-        self.bytes_from_strangers: dict[tuple[str, int], int] = {}
+        self.amplification = Amplification()
         self._listeners: dict[Address, Direction] = {}
         self._waits_until = NEVER
         for number, direction in enumerate(self.context.directions):
@@ -62,7 +62,6 @@ class Middle:
             self.drones[one].knows(self.drones[other], known, link)
 
     def attack(self, *attacks: AttackObject) -> None:
-        """Do this from now on."""
         self.channel.attacks = attacks
         self._wait()
 
@@ -78,9 +77,8 @@ class Middle:
             return
         peer = next(name for name, drone in self.drones.items() if source in drone.addresses)
         stranger = int(destination[0].rpartition(".")[2])
-        key = (peer, stranger)
         self.to_strangers.append((peer, stranger, datagram))
-        self.bytes_to_strangers[key] = self.bytes_to_strangers.get(key, 0) + len(datagram)
+        self.amplification.received(peer, stranger, len(datagram), now)
         self._perform(self.channel.on_answer(datagram, peer, stranger, now))
 
     def _perform(self, actions: list[Action]) -> None:
@@ -91,8 +89,7 @@ class Middle:
             datagram, direction, stranger = action
             source = self.listener(*direction.reverse) if stranger is None else (f"198.51.100.{stranger}", 6000)
             if stranger is not None:
-                key = (direction.receiver, stranger)
-                self.bytes_from_strangers[key] = self.bytes_from_strangers.get(key, 0) + len(datagram)
+                self.amplification.sent(direction.receiver, stranger, len(datagram), self.network.now)
             self.network.inject(datagram, source, self.drones[direction.receiver].addresses[0])
         self._wait()
 

@@ -29,12 +29,10 @@ class Conversation:
 
     @property
     def initiation(self) -> bytes:
-        """Of a."""
         return next(datagram for datagram, direction in self.said if datagram[0] == 1 and direction == AB)
 
     @property
     def response(self) -> bytes:
-        """Of b."""
         return next(datagram for datagram, direction in self.said if datagram[0] == 2 and direction == BA)
 
     def envelopes(self, direction: Direction = AB) -> list[bytes]:
@@ -78,12 +76,10 @@ def converse(seed: int = 0, suite: Suite = X25519, frames: int = 40, *, confiden
 
 
 def sends(actions: list[Action]) -> list[Send]:
-    """Only what is sent."""
     return [action for action in actions if isinstance(action, Send)]
 
 
 def notes(actions: list[Action]) -> list[Intervention]:
-    """Only the log entries."""
     return [action for action in actions if isinstance(action, Intervention)]
 
 

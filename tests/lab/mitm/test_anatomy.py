@@ -5,36 +5,18 @@ from __future__ import annotations
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from tests.lab.mitm.samples import ATTITUDE, HEARTBEAT, converse
+from tests.core.harness import Pair, datagrams, only, quiet
+from tests.lab.mitm.samples import ATTITUDE, HEARTBEAT, Conversation, converse
+from uavlinkd.core import constants as c
 from uavlinkd.core.cookie import MacKeys
+from uavlinkd.core.refusals import Refused
 from uavlinkd.core.suites import SUITES, Suite
+from uavlinkd.core.wire import TAG_LENGTHS
 from uavlinkd.lab.mitm import anatomy
-from uavlinkd.lab.mitm.anatomy import DatagramKind, envelope_of, kind_of, message_ids, parts_of, with_mac1
-from uavlinkd.lab.mitm.attacks.forgery import COMMAND_FRAMES
+from uavlinkd.lab.mitm.anatomy import envelope_of, is_refusal_report, message_ids, parts_of, with_mac1
 
 CONVERSATION = converse()
-
-
-@pytest.mark.parametrize(
-    ("datagram", "kind"),
-    [
-        (b"", DatagramKind.EMPTY),
-        (b"\x01", DatagramKind.INITIATION),
-        (b"\x02x", DatagramKind.RESPONSE),
-        (b"\x03", DatagramKind.COOKIE),
-        (b"\x40", DatagramKind.ENVELOPE),
-        (b"\x41", DatagramKind.ENVELOPE),
-        (b"\xfd", DatagramKind.MAVLINK),
-        (b"\xfe", DatagramKind.MAVLINK),
-        (b"\x00", DatagramKind.OTHER),
-        (b"\x42", DatagramKind.OTHER),
-    ],
-)
-def test_first_byte_determines_the_kind(datagram: bytes, kind: DatagramKind) -> None:
-    """The first byte only, for any following bytes."""
-    assert kind_of(datagram) is kind
 
 
 @pytest.mark.parametrize("suite", SUITES.values(), ids=lambda suite: suite.name)
@@ -78,24 +60,6 @@ def test_frames_are_read_where_they_are_readable() -> None:
     assert not any(map(message_ids, converse(2, confidential=True).envelopes()))
 
 
-def test_cookie_shows_in_mac2() -> None:
-    """Without a cookie mac2 is zero."""
-    assert not anatomy.has_cookie(CONVERSATION.initiation)
-    assert anatomy.has_cookie(CONVERSATION.initiation[:-1] + b"\x01")
-    assert not anatomy.has_cookie(b"\x40" * 40)
-
-
-def test_frames_of_the_attackers_own_are_mavlink() -> None:
-    """What raw-mavlink and forge-data send is what an autopilot would obey, as pymavlink reads it."""
-    parser = mavlink.MAVLink(None)
-    read = {name: parser.decode(bytearray(frame)) for name, frame in COMMAND_FRAMES}
-    assert read["HEARTBEAT"].get_type() == "HEARTBEAT"
-    assert (read["disarm"].command, read["disarm"].param1) == (mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0)
-    termination = read["flight termination"]
-    assert (termination.command, termination.param1) == (mavlink.MAV_CMD_DO_FLIGHTTERMINATION, 1)
-    assert read["SET_MODE"].custom_mode == 6
-
-
 @given(st.binary(max_size=1400), st.sampled_from([None, bytes(32)]))
 def test_nothing_raises_whatever_the_bytes(data: bytes, key: bytes | None) -> None:
     """The functions accept any bytes, and unchanged parts join to the same bytes."""
@@ -105,3 +69,25 @@ def test_nothing_raises_whatever_the_bytes(data: bytes, key: bytes | None) -> No
     message_ids(data)
     anatomy.has_cookie(data)
     assert len(with_mac1(data, key)) == len(data)
+
+
+def report(tag_bytes: int = 16, entries: int = 3, *, confidential: bool = False) -> bytes:
+    link = quiet(tag_bytes=tag_bytes, confidential=confidential)
+    pair = Pair(link_a=link, link_b=link).establish()
+    refused = [Refused(76, 400 + number, 4, 1) for number in range(entries)]
+    return only(datagrams(pair.b.node.report_refusals(pair.b.peer, refused, 1.0)))
+
+
+@pytest.mark.parametrize("tag_bytes", TAG_LENGTHS)
+@pytest.mark.parametrize("entries", [1, c.REFUSALS_PER_REPORT])
+def test_reports_are_recognised(tag_bytes: int, entries: int) -> None:
+    """With every tag, from the smallest to the largest."""
+    assert is_refusal_report(report(tag_bytes, entries))
+
+
+@pytest.mark.parametrize("conversation", [converse(), converse(confidential=True)], ids=["clear", "confidential"])
+def test_nothing_else_is_a_report(conversation: Conversation) -> None:
+    """No other datagram of a conversation, and no truncated report."""
+    assert not any(is_refusal_report(datagram) for datagram, _ in conversation.said)
+    assert not is_refusal_report(b"")
+    assert not is_refusal_report(report()[:-1])

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import math
-
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.lab.mitm.samples import AB, BA, converse, notes, play, sends
-from uavlinkd.lab.mitm.attack import CATCH_UP_LIMIT, NEVER, AttackContext, AttackError, Operation, Send
+from tests.lab.mitm.samples import AB, converse, play, sends
+from uavlinkd.lab.mitm.attack import CATCH_UP_LIMIT, NEVER, AttackContext, Send
 from uavlinkd.lab.mitm.attacks import ATTACKS, parse_attack
 
 CONVERSATION = converse()
@@ -25,13 +23,6 @@ def test_same_seed_gives_the_same_actions(name: str) -> None:
     assert runs[0] == runs[1]
 
 
-@pytest.mark.parametrize("text", ["bit-flip,share=0.5", "replay-data,origin=stranger", "flood-garbage", "forge-data"])
-def test_another_seed_gives_another_attack(text: str) -> None:
-    """The seed determines all random choices."""
-    one, other = (play(parse_attack(text).make(AMONG_THREE, seed), CONVERSATION.said) for seed in (1, 2))
-    assert one != other
-
-
 @pytest.mark.parametrize("name", ATTACKS)
 def test_attack_that_has_ended_lets_everything_pass(name: str) -> None:
     """After its end, datagrams pass unaltered, and none is injected."""
@@ -43,54 +34,11 @@ def test_attack_that_has_ended_lets_everything_pass(name: str) -> None:
     assert attack.next_deadline() == NEVER
 
 
-@pytest.mark.parametrize("name", ATTACKS)
-def test_attack_that_has_not_begun_lets_everything_pass(name: str) -> None:
-    """Before begin_s it only watches."""
-    attack = parse_attack(f"{name},begin_s=100").make(AMONG_THREE, 1)
-    for datagram, direction in CONVERSATION.said:
-        assert attack.on_datagram(datagram, direction, 1.0) == [Send(datagram, direction)]
-    assert attack.due(1.0) == []
-    assert attack.attempts == 0
-
-
 def test_way_leaves_the_other_direction_alone() -> None:
     """One direction is attacked, the other passes untouched."""
     attack = parse_attack("drop,direction=b>a").make(CONVERSATION.context)
     passed = [(send.datagram, send.direction) for send in sends(play(attack, CONVERSATION.said))]
     assert passed == [item for item in CONVERSATION.said if item[1] == AB]
-
-
-def test_way_that_is_not_there_is_refused() -> None:
-    """The message names those that are."""
-    with pytest.raises(AttackError, match="a>b, b>a"):
-        parse_attack("drop,direction=a>c").make(CONVERSATION.context)
-
-
-def test_skip_and_limit_choose_exactly() -> None:
-    """skip=3,limit=2: the fourth and the fifth of those that could be attacked, no other."""
-    attack = parse_attack("drop,kinds=envelope,skip=3,limit=2").make(CONVERSATION.context)
-    actions = play(attack, CONVERSATION.said)
-    passed = {send.datagram for send in sends(actions)}
-    envelopes = [datagram for datagram, _ in CONVERSATION.said if datagram[0] == 0x40]
-    assert [envelope for envelope in envelopes if envelope not in passed] == envelopes[3:5]
-    assert [note.number for note in notes(actions)] == [6, 7]  # behind the two messages of the handshake
-
-
-def test_share_attacks_that_share() -> None:
-    """Of 2,000 datagrams about a quarter, within five standard deviations."""
-    attack = parse_attack("drop,share=0.25").make(CONVERSATION.context, 3)
-    for number in range(2000):
-        attack.on_datagram(b"\x40" + number.to_bytes(20, "big"), AB, 0.0)
-    assert abs(attack.attempts - 500) < 5 * math.sqrt(2000 * 0.25 * 0.75)
-
-
-def test_intervention_names_the_datagram() -> None:
-    """Number, kind, length and moment are those of what was attacked."""
-    attack = parse_attack("tamper-key,message=response").make(CONVERSATION.context)
-    (note,) = notes(play(attack, CONVERSATION.said))
-    seen = (note.attack, note.operation, note.direction, note.number, note.kind, note.length, note.at)
-    assert seen == ("tamper-key", Operation.ALTERED, BA, 2, "response", 103, 0.01)
-    assert note.to_dict()["direction"] == "b>a"
 
 
 def test_flood_keeps_its_rate_and_makes_up_for_little() -> None:
@@ -105,7 +53,7 @@ def test_flood_keeps_its_rate_and_makes_up_for_little() -> None:
 
 
 @pytest.mark.parametrize("name", ATTACKS)
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(data=st.data())
 def test_no_datagram_raises(name: str, data: st.DataObject) -> None:
     """Any datagram and any answer are handled."""

@@ -5,17 +5,18 @@ Once on the datagrams of that way, once on those of the two members inside. The 
 
 from __future__ import annotations
 
+import asyncio
 from dataclasses import replace
 from pathlib import Path
+from statistics import median
 
 import pytest
 
 from tests.lab.mitm.before_relay import MiddleBeforeRelay, StageBeforeRelay
 from uavlinkd.lab.evaluation import tampering_plan as plans
-from uavlinkd.lab.evaluation.tampering_bench import Bench, TamperingSettings, TrialRecorder
-from uavlinkd.lab.evaluation.tampering_paths import PATH_PLANS
-from uavlinkd.lab.evaluation.tampering_plan import LOAD, TrialPlan
-from uavlinkd.lab.evaluation.tampering_records import Verdict
+from uavlinkd.lab.evaluation.tampering_bench import Bench
+from uavlinkd.lab.evaluation.tampering_plan import LOAD, PATH_PLANS, TamperingSettings, TrialPlan
+from uavlinkd.lab.evaluation.tampering_records import NOT_IN_TIME, RECOVERY_LIMIT_S, Trial, Verdict
 from uavlinkd.lab.mitm.attacks import ATTACKS
 
 LINK = {"suites": ["ffdhe2048", "x25519"], "rekey_after_s": 1.0, "reject_after_s": 6.0}
@@ -55,22 +56,36 @@ def test_every_attack_is_tried() -> None:
     assert tried == set(ATTACKS)
 
 
+@pytest.fixture
+def folders(tmp_path: Path) -> dict[str, Path]:
+    """One for each place of the attacks."""
+    made = {where: tmp_path / where for where in (OUTSIDE, INSIDE)}
+    for folder in made.values():
+        folder.mkdir()
+    return made
+
+
 @pytest.mark.long
-@pytest.mark.parametrize("where", [OUTSIDE, INSIDE])
-async def test_attacks_before_the_relay(where: str, tmp_path: Path) -> None:
-    """Each has targets, and none of them succeeds."""
-    middle = MiddleBeforeRelay(tmp_path / "journal", 1)
-    stage = StageBeforeRelay(tmp_path, middle, LINK, rate_hz=100.0)
-    with (tmp_path / "records").open("w") as file:
-        recorder = TrialRecorder(file, lambda trial: print(trial.to_json()))
-        bench = Bench(stage, recorder, TamperingSettings(quick=True))
-        async with stage:
-            await bench.run_control()
-            for plan in _plans(where):
-                await bench.run(plan)
+async def test_attacks_before_the_relay(folders: dict[str, Path]) -> None:
+    """Each has targets, and none of them succeeds. Outside and inside at the same time: each needs five minutes."""
+    both = await asyncio.gather(*(_attack(where, folder) for where, folder in folders.items()))
+    trials = [trial for trials in both for trial in trials]
     failed = [
         (trial.attack, trial.verdict, trial.successes)
-        for trial in recorder.run.trials
-        if trial.verdict in (Verdict.SUCCEEDED, Verdict.BROKEN)
+        for trial in trials
+        if trial.verdict is Verdict.BROKEN or (trial.recovery_s is None or set(trial.successes) - {NOT_IN_TIME})
     ]
     assert failed == []
+    # A busy machine may recover late once: the evaluation limits each.
+    assert median(trial.recovery_s or 0.0 for trial in trials) <= RECOVERY_LIMIT_S
+
+
+async def _attack(where: str, folder: Path) -> list[Trial]:
+    stage = StageBeforeRelay(folder, MiddleBeforeRelay(folder / "journal", 1), LINK, rate_hz=100.0)
+    trials: list[Trial] = []
+    bench = Bench(stage, TamperingSettings(quick=True), trials.append)
+    async with stage:
+        await bench.run_control()
+        for plan in _plans(where):
+            await bench.run(plan)
+    return trials

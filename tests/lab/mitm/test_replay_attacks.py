@@ -5,9 +5,8 @@ from __future__ import annotations
 import pytest
 
 from tests.lab.mitm.samples import AB, BA, converse, notes, play, sends
-from uavlinkd.lab.mitm.attack import NEVER, Action, AttackContext, AttackObject, Direction, Operation, Send
+from uavlinkd.lab.mitm.attack import Action, Direction, Operation, Send
 from uavlinkd.lab.mitm.attacks import parse_attack
-from uavlinkd.lab.mitm.attacks.replays import RECORD_LIMIT
 
 CONVERSATION = converse()
 SAID = CONVERSATION.said
@@ -15,7 +14,6 @@ COOKIE = b"\x03" + bytes(51)
 
 
 def _again(actions: list[Action], said: list[tuple[bytes, Direction]]) -> list[Send]:
-    """The injected datagrams only."""
     sent = sends(actions)
     for datagram, direction in said:
         sent.remove(Send(datagram, direction))
@@ -39,81 +37,22 @@ def test_replays_send_again_what_they_name(name: str, first_bytes: set[int]) -> 
     assert again == [Send(datagram, direction) for datagram, direction in said if datagram[0] in first_bytes]
 
 
-def test_reflection_goes_back_to_the_sender() -> None:
-    """Along the other way, from where the other peer is for it."""
-    again = _again(play(parse_attack("reflect").make(CONVERSATION.context), SAID), SAID)
-    assert again == [Send(datagram, direction.reverse) for datagram, direction in SAID]
+ENVELOPE = CONVERSATION.envelopes()[3]
+ANSWER = b"\x40answer"
 
 
-def test_misrouted_datagrams_go_to_a_third_peer() -> None:
-    """Under the sender's address."""
-    attack = parse_attack("misroute").make(AttackContext.between("a", "b", "c"))
-    actions = play(attack, SAID)
-    assert _again(actions, SAID) == [Send(datagram, Direction(direction.sender, "c")) for datagram, direction in SAID]
-    assert {note.operation for note in notes(actions)} == {Operation.MISROUTED}
-
-
-def test_copies_and_strangers() -> None:
-    """Five copies, each from an address of the attacker's own."""
-    attack = parse_attack("replay-initiation,copies=5,origin=stranger").make(CONVERSATION.context)
-    again = _again(play(attack, SAID), SAID)
-    assert [send.datagram for send in again] == [CONVERSATION.initiation] * 5
-    assert all(send.stranger is not None for send in again)
-
-
-def test_stolen_cookie_replays_only_handshakes_with_mac2() -> None:
-    """Only messages with a cookie are replayed, from a stranger."""
-    with_cookie = CONVERSATION.initiation[:-16] + bytes(range(16))
-    said = [(CONVERSATION.initiation, AB), (with_cookie, AB)]
-    (again,) = _again(play(parse_attack("stolen-cookie").make(CONVERSATION.context), said), said)
-    assert again.datagram == with_cookie
-    assert again.stranger is not None
-
-
-def test_later_is_that_much_later() -> None:
-    """Not before, and once."""
-    attack = parse_attack("replay-data,when=later,delay_s=10").make(CONVERSATION.context)
-    envelope = CONVERSATION.envelopes()[0]
-    assert attack.on_datagram(envelope, AB, 1.0) == [Send(envelope, AB)]
-    assert attack.next_deadline() == 11.0
-    assert attack.due(10.99) == []
-    assert sends(attack.due(11.0)) == [Send(envelope, AB)]
-    assert attack.next_deadline() == NEVER
-
-
-def _drain(attack: AttackObject) -> list[Send]:
-    result: list[Send] = []
-    while attack.next_deadline() < NEVER:
-        result += sends(attack.due(attack.next_deadline()))
-    return result
-
-
-def test_rekey_is_the_next_response() -> None:
-    """Datagrams under the old keys are replayed after the next response."""
-    attack = parse_attack("replay-data,when=rekey").make(CONVERSATION.context)
-    play(attack, SAID, after_s=0)
-    assert attack.next_deadline() == NEVER
-    attack.on_datagram(converse(9).response, BA, 100.0)
-    assert attack.next_deadline() == 100.5
-    assert _drain(attack) == [Send(datagram, direction) for datagram, direction in SAID if datagram[0] == 0x40]
-
-
-def test_restart_is_an_initiation_after_silence() -> None:
-    """Its sent and received datagrams are replayed; a peer without a silence did not restart."""
-    attack = parse_attack("replay-data,when=restart").make(CONVERSATION.context)
-    play(attack, SAID, interval_s=0.001, after_s=0)
-    initiation = converse(9).initiation
-    attack.on_datagram(initiation, AB, 0.2)
-    assert attack.next_deadline() == NEVER
-    attack.on_datagram(initiation, AB, 5.0)
-    assert attack.next_deadline() == 5.5
-    assert _drain(attack) == [Send(datagram, direction) for datagram, direction in SAID if datagram[0] == 0x40]
-
-
-def test_memory_of_a_recorder_is_bounded() -> None:
-    """Beyond the limit the oldest are forgotten, and no more wait to be sent than that."""
-    attack = parse_attack("replay-data,when=rekey").make(CONVERSATION.context)
-    for number in range(RECORD_LIMIT + 10):
-        attack.on_datagram(b"\x40" + number.to_bytes(20, "big"), AB, 0.0)
-    attack.on_datagram(CONVERSATION.response, BA, 1.0)
-    assert len(_drain(attack)) == RECORD_LIMIT
+@pytest.mark.parametrize(
+    ("mode", "expected", "carried"),
+    [
+        ("race", [Send(ENVELOPE, AB, 0), Send(ENVELOPE, AB)], []),
+        ("instead", [Send(ENVELOPE, AB, 0)], []),
+        ("relay", [Send(ENVELOPE, AB, 0)], [Send(ANSWER, BA, 1)]),
+    ],
+)
+def test_roam_forwards_from_a_third_address(mode: str, expected: list[Send], carried: list[Send]) -> None:
+    """One stranger per direction; only a relay returns answers, from the stranger of the other direction."""
+    attack = parse_attack(f"roam,mode={mode}").make(CONVERSATION.context)
+    assert sends(attack.on_datagram(ENVELOPE, AB, 0.0)) == expected
+    answered = attack.on_answer(ANSWER, "b", 0, 0.1)
+    assert sends(answered) == carried
+    assert [note.operation for note in notes(answered)] == [Operation.ANSWERED]

@@ -13,15 +13,14 @@ from tests.lab.mitm.middle import Middle
 from tests.network.network import Drone, Flow, Network
 from uavlinkd.core import handshake, probing, session, wire
 from uavlinkd.core.cookie import CookieJar, MacKeys
+from uavlinkd.core.counters import ReplayWindow
 from uavlinkd.core.drops import Drop
 from uavlinkd.core.drops import DropReason as Reason
-from uavlinkd.core.echo_requests import EchoRequests
-from uavlinkd.core.indices import Indices
 from uavlinkd.core.path import Path
 from uavlinkd.core.path_state import PathState
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.receive_handshake import HandshakeReceiver
-from uavlinkd.core.replay import ReplayWindow
+from uavlinkd.core.sessions import EchoRequests, Indices
 from uavlinkd.core.settings import Link, Timers
 from uavlinkd.core.verification import Verification
 from uavlinkd.lab.mitm.anatomy import DatagramKind, kind_of
@@ -73,17 +72,6 @@ def test_receiver_without_tag_check_delivers_forged_frames(attack: str, monkeypa
     with pytest.raises(AssertionError) as caught:
         stage.network.run(5)
     assert caught.traceback[-1].name in ("deliver", "perform"), "the delivered payload was never sent"
-
-
-def test_receiver_without_tag_check_accepts_a_false_tag(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A tag of zeros is as good as any."""
-    monkeypatch.setattr(session, "equal", lambda _one, _other: True)
-    stage = _stage()
-    stage.begin("tamper-tag,tag=zero")
-    stage.network.run(3)
-    assert [intervention for intervention in stage.middle.interventions if intervention.attack == "tamper-tag"]
-    assert stage.a.drops[Reason.BAD_TAG] == stage.b.drops[Reason.BAD_TAG] == 0
-    assert not stage.flows[0].lost(1.0, stage.network.now - 0.1)
 
 
 def test_receiver_that_marks_before_it_verifies_loses_the_link_to_one_counter(
@@ -157,11 +145,11 @@ def test_receiver_that_needs_no_answers_delivers_stretched_frames(
         self.until = self.look_at = float("inf")
 
     monkeypatch.setattr(Verification, "__init__", lasts)
-    monkeypatch.setattr(EchoRequests, "was_sent", lambda _self, _token: False)
+    monkeypatch.setattr(EchoRequests, "is_late", lambda _self, _token: False)
     stage = _stage()
     stage.begin(f"{attack},direction=a>b")
     stage.network.run(30)
-    assert stage.flows[0].oldest_s > 25.0
+    assert stage.flows[0].oldest_s > 20.0
 
 
 def test_receiver_with_one_key_for_both_directions_takes_its_own_frames(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -245,6 +233,7 @@ def test_receiver_that_follows_every_address_loses_its_traffic(monkeypatch: pyte
         state = peer.paths.best = genuine_learn(peer, path, now)
         state.is_proven = True
         state.set_usable(now)
+        peer.paths.update(peer, now)
         return state
 
     monkeypatch.setattr(probing, "learn", follow)
@@ -257,9 +246,9 @@ def test_receiver_that_follows_every_address_loses_its_traffic(monkeypatch: pyte
 
 
 def test_receiver_with_long_cookie_replies_is_found_by_the_probe(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The probe reports that a stranger received more bytes than it sent."""
+    """A stranger received more bytes than it sent."""
     monkeypatch.setattr(CookieJar, "reply", lambda *_: b"\x03" + bytes(2000))
     stage = _stage()
     stage.begin("amplification-probe,rate_per_s=1000")
     stage.network.run(3)
-    assert any("amplified" in intervention.detail for intervention in stage.middle.interventions)
+    assert stage.middle.amplification.excess

@@ -9,6 +9,8 @@ import pytest
 
 from tests.lab.mitm.two_paths import CRITICAL_S, TwoPaths
 from uavlinkd.core.constants import LATE_AFTER_S
+from uavlinkd.lab.evaluation.ledger import IN_TIME_S
+from uavlinkd.lab.evaluation.tampering_plan import SPOILED_PLANS
 
 pytestmark = pytest.mark.long
 
@@ -68,6 +70,18 @@ def test_no_critical_frame_is_lost_while_one_path_works(name: str, learns: bool)
     if name not in RELAYS:
         assert pair.amplified() == []
     assert all(flow.first_delivery(pair.ended_at) - pair.ended_at < 1.0 for flow in pair.stream)
+
+
+@pytest.mark.parametrize("learns", [False, True], ids=["configured", "learned"])
+def test_critical_frames_arrive_in_time_once_one_of_two_spoiled_paths_works(learns: bool) -> None:
+    """The other one was the best path until then, and holds everything from then on."""
+    (plan,) = SPOILED_PLANS
+    pair = TwoPaths("spoiled", learns=learns, streams=False)
+    pair.attack(plan.phases[0], plan.least_s, spoils_s=plan.spoils_s)
+    pair.network.run(4.0)
+    assert pair.lost(pair.critical) == 0
+    assert pair.longest_gap_s(pair.critical) < CRITICAL_S + IN_TIME_S
+    assert pair.stayed_up
 
 
 @pytest.mark.parametrize("learns", [False, True], ids=["configured", "learned"])

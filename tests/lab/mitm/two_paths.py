@@ -22,10 +22,11 @@ SETTLE_S = 6.0
 class TwoPaths:
     """A linked pair. The first path is the faster one.
 
-    ``learns``: b has no address of a, so that its paths are learned ones.
+    ``learns``: b has no address of a, so that its paths are learned ones. ``streams``: there are other frames than
+    critical ones.
     """
 
-    def __init__(self, name: str, *, learns: bool = False, starts: bool = True) -> None:
+    def __init__(self, name: str, *, learns: bool = False, starts: bool = True, streams: bool = True) -> None:
         self.network = Network(f"two paths {name}", RadioSettings(delay_s=0.01))
         self.network.checks_bounds = False
         self.a, self.b = self.network.add("a"), self.network.add("b")
@@ -36,7 +37,7 @@ class TwoPaths:
         self.middle.introduce(Link())
         if learns:
             self.b.acquaintances["a"] = self.b.acquaintances["a"][0], ()
-        self.stream = self._flows(Class.STREAM, STREAM_S)
+        self.stream = self._flows(Class.STREAM, STREAM_S) if streams else ()
         self.critical = self._flows(Class.CRITICAL, CRITICAL_S)
         self.begun_at = self.ended_at = 0.0
         self._before: Counter[str] = Counter()
@@ -49,23 +50,27 @@ class TwoPaths:
         self.b.start()
         self.network.run(SETTLE_S)
 
-    def attack(self, line: str, seconds: float, *others: AttackObject) -> list[Attack]:  # type: ignore[type-arg]
-        """Attack for some seconds, as the line for the man in the middle says."""
+    def attack(self, line: str, seconds: float, *others: AttackObject, spoils_s: float = 0.0) -> list[Attack]:
+        """Attack for some seconds, as the line for the man in the middle says. What ``spoils_s`` before loses is not
+        counted.
+        """
         now = self.network.now
         made = [
-            parse_attack(f"{text},seconds={seconds}").make(self.middle.context, position, now)
+            parse_attack(text if "seconds=" in text else f"{text},seconds={seconds}").make(
+                self.middle.context, position, now
+            )
             for position, text in enumerate(line.split())
         ]
         self._before = self.drops
-        self.begun_at = now
         self.middle.attack(*made, *others)
+        self.network.run(spoils_s)
+        self.begun_at = self.network.now
         self.network.run(seconds)
         self.ended_at = self.network.now
         return made
 
     @property
     def drops(self) -> Counter[str]:
-        """What both have counted."""
         counts: Counter[str] = Counter()
         for drone, other in self._ends():
             counts.update(drone.peer(other).traffic.drops)
@@ -77,7 +82,7 @@ class TwoPaths:
         """What both have counted since the attack began."""
         return self.drops - self._before
 
-    def lost(self, flows: tuple[Flow, Flow]) -> int:
+    def lost(self, flows: tuple[Flow, ...]) -> int:
         """How many frames that were sent during the attack were never delivered."""
         return sum(len(flow.lost(self.begun_at, self.ended_at)) for flow in flows)
 
@@ -123,8 +128,7 @@ class TwoPaths:
 
     def amplified(self) -> list[tuple[str, int]]:
         """The strangers that received more than they sent."""
-        sent = self.middle.bytes_from_strangers
-        return [key for key, size in self.middle.bytes_to_strangers.items() if size > sent[key]]
+        return list(self.middle.amplification.excess)
 
     def _ends(self) -> tuple[tuple[Drone, Drone], ...]:
         return (self.a, self.b), (self.b, self.a)

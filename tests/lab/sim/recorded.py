@@ -1,8 +1,15 @@
-"""Frames and telemetry logs made for tests."""
+"""Frames and telemetry logs made for tests, and a connection that stores frames."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from types import TracebackType
+from typing import Self
+
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from tests import waiting
+from uavlinkd.lab.sim.links import MavlinkConnection, open_connection
 
 START_US = 1_700_000_000_000_000
 
@@ -21,5 +28,33 @@ def frames(count: int, system_id: int = 1) -> list[bytes]:
 
 
 def log_of(parts: list[bytes], step_us: int = 10_000) -> bytes:
-    """A log of frames."""
     return b"".join((START_US + number * step_us).to_bytes(8) + part for number, part in enumerate(parts))
+
+
+class Collector:
+    """A connection that stores each received frame, as on the wire."""
+
+    def __init__(self, url: str) -> None:
+        self._url = url
+        self.link: MavlinkConnection
+        self.frames: list[bytes] = []
+
+    @property
+    def address(self) -> tuple[str, int]:
+        return self.link.url.host, self.link.url.port
+
+    async def until(self, condition: Callable[[], bool]) -> None:
+        await waiting.until(condition)
+
+    def send(self, frame: bytes) -> bool:
+        """Send to all receivers; False if there is no receiver."""
+        return self.link.send(frame)
+
+    async def __aenter__(self) -> Self:
+        self.link = await open_connection(self._url, self.frames.append)
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self.link.close()

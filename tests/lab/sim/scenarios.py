@@ -19,6 +19,7 @@ from typing import Any
 
 import pytest
 
+from tests import waiting
 from uavlinkd.lab.child_processes import end_with_parent
 from uavlinkd.lab.sim.flight import Flight
 
@@ -71,7 +72,7 @@ def check(seen: Seen, *, system_id: int, parameters: dict[str, float]) -> None:
 
 def check_flown(flight: Flight) -> None:
     """The vehicle did all that, once."""
-    events = flight.autopilot.counters.events
+    events = flight.autopilot.events
     wanted = ("mission_received", "armed", "takeoff_started", "landed", "disarmed")
     assert {name: events[name] for name in wanted} == dict.fromkeys(wanted, 1)
     assert [flight.autopilot.parameters[name] for name in ("WPNAV_SPEED_UP", "LAND_SPEED")] == [500, 200]
@@ -85,7 +86,6 @@ async def fly_with_mavsdk(url: str) -> Seen:
 
 
 async def fly_with_mavutil(url: str) -> Seen:
-    """pymavlink's mavutil flies the vehicle."""
     return await _run_client("mavutil", url)
 
 
@@ -113,7 +113,6 @@ class Terminal:
         self.text = ""
 
     def type(self, line: str) -> None:
-        """Type one line."""
         assert self._process.stdin is not None
         self._process.stdin.write(line.encode() + b"\n")
 
@@ -181,7 +180,7 @@ async def fly_with_mavproxy(url: str, folder: Path, flight: Flight) -> Seen:
         await terminal.see("ARMED")
         terminal.type("takeoff 3")
         await terminal.see("NAV_TAKEOFF: ACCEPTED")
-        await flight.until(lambda: flight.autopilot.vehicle.altitude_m > 2.7, timeout_s=240)
+        await waiting.until(lambda: flight.autopilot.vehicle.altitude_m > 2.7)
         top_m = flight.autopilot.vehicle.altitude_m
         terminal.type("mode land")
         await terminal.see("DISARMED")

@@ -18,13 +18,11 @@ class Station:
         self._codec = mavlink.MAVLink(None, system_id, component_id)
 
     def encode(self, message: Any) -> bytes:
-        """A frame of this station's."""
         frame = bytes(message.pack(self._codec))
         self._codec.seq = (self._codec.seq + 1) % 256
         return frame
 
     def tell(self, message: Any) -> list[Any]:
-        """Send a message; the answers."""
         return decode(self.autopilot.receive(self.encode(message), self.now))
 
     def heartbeat(self) -> list[Any]:
@@ -37,7 +35,6 @@ class Station:
         return self.tell(mavlink.MAVLink_command_long_message(*target, number, 0, *seven))
 
     def result(self, number: int, *parameters: float) -> int:
-        """Send a COMMAND_LONG; its MAV_RESULT."""
         acknowledgement = self.command(number, *parameters)[-1]
         assert acknowledgement.get_type() == "COMMAND_ACK"
         assert acknowledgement.command == number
@@ -71,5 +68,4 @@ def decode(frames: list[bytes]) -> list[Any]:
 
 
 def of_type(messages: list[Any], name: str) -> list[Any]:
-    """Those with one name."""
     return [message for message in messages if message.get_type() == name]

@@ -58,16 +58,6 @@ async def run_until_failure(autopilot: RealAutopilot) -> None:
             await asyncio.sleep(0.01)
 
 
-async def test_binary_in_a_wrong_format_is_reported(tmp_path: Path) -> None:
-    """The error says why it cannot be executed, such as a binary of another architecture."""
-    binary = tmp_path / "arducopter"
-    binary.write_bytes(bytes(100))
-    binary.chmod(0o700)
-    settings = RealAutopilotSettings(firmware=Firmware.ARDUPILOT, binary=binary, udp_port=14550, home=HOME)
-    with pytest.raises(RealAutopilotError, match=r"status 1:\n.*arducopter: Exec format error"):
-        await run_until_failure(RealAutopilot(settings, tmp_path / "flight"))
-
-
 @pytest.mark.parametrize("missing", ["../etc/init.d-posix/rcS", "px4-mavlink"])
 async def test_px4_outside_its_build_folder_is_refused(missing: str, tmp_path: Path) -> None:
     """The error names what is missing. No other folder called ``etc`` is copied."""

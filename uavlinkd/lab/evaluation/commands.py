@@ -1,141 +1,90 @@
-"""The commands ``uavlinkd evaluate timing`` and ``uavlinkd evaluate report``: arguments in, exit status out.
+"""The commands ``uavlinkd evaluate NAME``: arguments in, exit status out. Large modules are imported when one runs.
 
-Large modules are imported only when a command runs.
+Exit status 0: the results are as expected. 1: otherwise; standard error has the reasons. The last line of standard
+output is one JSON object with the results.
 """
 
 from __future__ import annotations
 
 import argparse
-import importlib.util
+import asyncio
+import importlib
+import json
 import math
 import sys
-from collections.abc import Callable
+from dataclasses import fields
+from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
 
-from uavlinkd.lab.evaluation.energy import DEFAULT_WATTS_PER_CORE
+if TYPE_CHECKING:
+    from uavlinkd.lab.evaluation.frame import Evaluation
 
 OK, FAILED = 0, 1
-NEEDS_EXTRA = "the figures need matplotlib: pip install '.[evaluation]'"
+NEEDS_EXTRA = "the figures need matplotlib: pip install '.[lab]'"
+EVALUATIONS = {
+    "timing": "time the paper's method and uavlinkd's",
+    "tampering": "attack the paper's protocol and real daemons",
+    "flight": "let two aircraft exchange positions in flight under attack",
+    "paths": "let radios between a vehicle and its station fail: two paths, one path, and duplicated frames",
+}
+STAGES = ("handshake", "data", "keys", "paper", "reports", "paths", "spoiled", "line", "relay")
+
+_Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 
-def add_timing_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add ``timing`` to the subcommands of ``evaluate``."""
-    parser = add_command(
-        commands,
-        "timing",
-        _timing,
-        "time the paper's method and uavlinkd's, and write records, figures and a report",
-    )
-    parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder for the results")
-    parser.add_argument(
-        "--repeats",
-        metavar="N",
-        type=positive_int,
-        default=30,
-        help="repetitions of every point (default: %(default)s)",
-    )
-    parser.add_argument("--quick", action="store_true", help="some points, once: less than a minute")
-    parser.add_argument(
-        "--paper", action="store_true", help="also the paper's 4096 bits: three exchanges, each up to the limit"
-    )
-    parser.add_argument(
+def add_evaluations(commands: _Commands) -> None:
+    """Add the evaluations, and ``report``."""
+    timing, tampering, _, paths = (_add(commands, name) for name in EVALUATIONS)
+    _number(timing, "--repeats", 30, "repetitions of every point")
+    timing.add_argument("--paper", action="store_true", help="also the paper's 4096 bits: three exchanges")
+    timing.add_argument(
         "--limit",
+        dest="limit_s",
         metavar="SECONDS",
         type=_positive,
         default=600.0,
         help="time limit of one exchange of the paper's method, at most 2 in a quick run (default: %(default)s)",
     )
-    parser.add_argument(
-        "--watts-per-core",
-        metavar="W",
-        type=_positive,
-        default=DEFAULT_WATTS_PER_CORE,
-        help="power of a busy core, to estimate energy; the report has typical values (default: %(default)s)",
+    _number(tampering, "--attempts-data", 10_000, "attempts of each attack on data; a tenth on the paper's protocol")
+    _number(tampering, "--attempts-handshake", 200, "attempts of each attack on the handshake; likewise")
+    tampering.add_argument(
+        "--only",
+        metavar="STAGE",
+        choices=STAGES,
+        action="append",
+        help=f"run this stage alone; may be repeated: {', '.join(STAGES)} (default: all, and floods)",
     )
-    parser.add_argument(
-        "--seed",
-        metavar="N",
-        type=int,
-        default=0,
-        help="seed of the order and the data, not of keys (default: %(default)s)",
+    _number(paths, "--repeats", 100, "how often a path dies for each round trip and jitter; not in a quick run")
+    paths.add_argument(
+        "--tlog",
+        metavar="FILE",
+        type=Path,
+        action="append",
+        help="also measure the redundancy of this recorded flight; may be repeated, but not with --quick",
     )
-
-
-def add_report_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add ``report`` to the subcommands of ``evaluate``."""
-    parser = add_command(commands, "report", _report, "write the figures and the report again, from the records")
-    parser.add_argument("folder", metavar="DIR", type=Path, help="folder with the records")
-    parser.add_argument(
-        "--page", metavar="FILE", type=Path, help="also write a Markdown page, with the figures in results/ beside it"
+    report = commands.add_parser("report", help="write the figures and the report again, from the records")
+    report.add_argument("folder", metavar="DIR", type=Path, help="folder with the records")
+    report.add_argument(
+        "--page", metavar="FILE", type=Path, help="write it there, with the figures in results/ beside"
     )
+    report.set_defaults(command=_report)
 
 
-def add_command(
-    commands: argparse._SubParsersAction[argparse.ArgumentParser],
-    name: str,
-    function: Callable[[argparse.Namespace], int],
-    text: str,
-    needs: str | None = NEEDS_EXTRA,
-) -> argparse.ArgumentParser:
-    """Add a command with its help text, which ends with what the command needs."""
-    hint = "" if needs is None else f" {needs[0].upper()}{needs[1:]}"
-    parser = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + "." + hint)
-    parser.set_defaults(command=function)
+def _add(commands: _Commands, name: str) -> argparse.ArgumentParser:
+    text = EVALUATIONS[name]
+    parser = commands.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")
+    parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder for the results")
+    parser.add_argument("--quick", action="store_true", help="a part of it: about a minute")
+    parser.add_argument(
+        "--seed", metavar="N", type=int, default=0, help="seed of the choices, not of keys (default: %(default)s)"
+    )
+    parser.set_defaults(command=_evaluate, evaluation=name)
     return parser
 
 
-def _timing(options: argparse.Namespace) -> int:
-    from uavlinkd.lab.child_processes import interrupted_by_signals  # noqa: PLC0415
-    from uavlinkd.lab.evaluation.timing import TimingSettings, run_timing  # noqa: PLC0415
-
-    if importlib.util.find_spec("matplotlib") is None:
-        return fail(NEEDS_EXTRA)  # before hours of measurements
-    settings = TimingSettings(
-        repeats=options.repeats,
-        quick=options.quick,
-        paper=options.paper,
-        limit_s=options.limit,
-        seed=options.seed,
-        watts_per_core=options.watts_per_core,
-    )
-    try:
-        with interrupted_by_signals():
-            run_timing(options.out, settings)
-    except OSError as error:
-        return fail(error)
-    return _report(argparse.Namespace(folder=options.out, page=None))
-
-
-def _report(options: argparse.Namespace) -> int:
-    from uavlinkd.lab.evaluation.records import RecordsError  # noqa: PLC0415
-
-    try:
-        from uavlinkd.lab.evaluation.flight_report import FLIGHT_REPORT  # noqa: PLC0415
-        from uavlinkd.lab.evaluation.paths_report import PATHS_REPORT  # noqa: PLC0415
-        from uavlinkd.lab.evaluation.report import write_page, write_report  # noqa: PLC0415
-        from uavlinkd.lab.evaluation.tampering_records import TamperingRecordsError  # noqa: PLC0415
-        from uavlinkd.lab.evaluation.tampering_report import (  # noqa: PLC0415
-            has_tampering,
-            write_tampering_page,
-            write_tampering_report,
-        )
-    except ModuleNotFoundError as error:
-        if error.name is None or error.name.partition(".")[0] != "matplotlib":
-            raise
-        return fail(NEEDS_EXTRA)
-    report, page = write_report, write_page
-    if has_tampering(options.folder):
-        report, page = write_tampering_report, write_tampering_page
-    for writer in (FLIGHT_REPORT, PATHS_REPORT):
-        if writer.has_records(options.folder):
-            report, page = writer.write, writer.write_page
-    try:
-        print(report(options.folder))
-        if options.page is not None:
-            print(page(options.folder, options.page))
-    except (RecordsError, TamperingRecordsError, OSError) as error:
-        return fail(error)
-    return OK
+def _number(parser: argparse.ArgumentParser, option: str, default: int, text: str) -> None:
+    parser.add_argument(option, metavar="N", type=_count, default=default, help=f"{text} (default: %(default)s)")
 
 
 def _positive(text: str) -> float:
@@ -145,15 +94,75 @@ def _positive(text: str) -> float:
     return number
 
 
-def positive_int(text: str) -> int:
-    """The type of an argument: an integer above 0."""
+def _count(text: str) -> int:
     number = int(text)
     if number < 1:
         raise argparse.ArgumentTypeError("must be 1 or more")
     return number
 
 
-def fail(problem: object) -> int:
-    """Print a problem on standard error, and return the exit status."""
+def evaluation_of(name: str) -> Evaluation[Any, Any]:
+    module = importlib.import_module(f"uavlinkd.lab.evaluation.{name}_run")
+    evaluation: Evaluation[Any, Any] = getattr(module, name.upper())
+    return evaluation
+
+
+def settings_of(evaluation: Evaluation[Any, Any], options: argparse.Namespace) -> Any:
+    values = {item.name: getattr(options, item.name) for item in fields(evaluation.settings)}
+    repeated: dict[str, Any] = {name: tuple(values[name] or ()) for name in ("only", "tlog") if name in values}
+    return evaluation.settings(**{**values, **repeated})
+
+
+def _evaluate(options: argparse.Namespace) -> int:
+    if find_spec("matplotlib") is None:
+        return _fail(NEEDS_EXTRA)  # before minutes of measurements
+    from uavlinkd.lab.child_processes import interrupted_by_signals  # noqa: PLC0415
+
+    evaluation = evaluation_of(options.evaluation)
+    try:
+        with interrupted_by_signals():
+            asyncio.run(evaluation.measure(options.out, settings_of(evaluation, options), _show))
+        print(evaluation.write(options.out))
+        findings = evaluation.read(options.out)
+    except _errors() as error:
+        return _fail(error)
+    problems = evaluation.deviations(findings)
+    for line in problems:
+        print(line, file=sys.stderr)
+    print(json.dumps(evaluation.summary(findings)))
+    return FAILED if problems else OK
+
+
+def _report(options: argparse.Namespace) -> int:
+    if find_spec("matplotlib") is None:
+        return _fail(NEEDS_EXTRA)
+    for name in EVALUATIONS:
+        evaluation = evaluation_of(name)
+        if (options.folder / f"{name}.jsonl").exists():
+            try:
+                print(evaluation.write(options.folder, options.page))
+            except _errors() as error:
+                return _fail(error)
+            return OK
+    return _fail(f"{options.folder}: has no records of an evaluation")
+
+
+def _errors() -> tuple[type[Exception], ...]:
+    """What a run may raise; the message is for the operator."""
+    from uavlinkd.lab.evaluation.records import EvaluationError  # noqa: PLC0415
+    from uavlinkd.lab.sim.aircraft import PilotError  # noqa: PLC0415
+    from uavlinkd.lab.sim.drone_process import DroneError  # noqa: PLC0415
+    from uavlinkd.lab.sim.real_autopilot import RealAutopilotError  # noqa: PLC0415
+    from uavlinkd.lab.sim.tlog import TlogError  # noqa: PLC0415
+    from uavlinkd.ops.control import ControlError  # noqa: PLC0415
+
+    return (EvaluationError, DroneError, PilotError, RealAutopilotError, TlogError, ControlError, OSError)
+
+
+def _show(line: str) -> None:
+    print(line, flush=True)
+
+
+def _fail(problem: object) -> int:
     print(problem, file=sys.stderr)
     return FAILED

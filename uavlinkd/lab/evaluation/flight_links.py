@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import socket
-from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -17,18 +16,20 @@ from random import Random
 from time import monotonic
 
 from uavlinkd.config.keys import decode_key, generate_psk
-from uavlinkd.lab.evaluation.flight_attacks import DisplaceOptions, DisplacePositions, Drift, ExchangeWatch
 from uavlinkd.lab.evaluation.flight_plan import (
     ALTERED_SHARE,
     PAIR,
     SYSTEM_IDS,
     AttackPhase,
+    DisplacePositions,
+    Drift,
+    ExchangeWatch,
     FlightSettings,
     LinkKind,
 )
 from uavlinkd.lab.evaluation.middle import HOST, MiddleHere
 from uavlinkd.lab.evaluation.paper_attacks import PaperRelay
-from uavlinkd.lab.evaluation.paper_protocol import VERIFIED, PaperEnd
+from uavlinkd.lab.evaluation.paper_protocol import PaperEnd
 from uavlinkd.lab.mitm.attack import AttackObject, Direction
 from uavlinkd.lab.sim.drone_process import DroneProcess
 from uavlinkd.lab.sim.loopback_ports import free_ports
@@ -39,7 +40,8 @@ OnDelivered = Callable[[str, bytes], None]
 """Called with the name of the receiver and a frame."""
 
 _DATAGRAM_BYTES = 65536
-_DRIFT = DisplaceOptions.model_validate({"share": ALTERED_SHARE})
+_HALF = DisplacePositions.options_model.model_validate({"share": ALTERED_SHARE})
+_WAYS = (PAIR, PAIR[::-1])
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,28 +54,51 @@ class LinkNotice:
     """What a daemon reports of its link at this moment; empty if nothing is wrong, or if an end cannot tell."""
 
 
-class PositionLink(ABC):
-    """A link with its man in the middle. ``open`` it in flight, ``close`` it last."""
+class PlainLink:
+    """Frames as they are, over UDP. ``open`` it in flight, ``close`` it last. The other links derive from it."""
 
-    kind: LinkKind
+    kind = LinkKind.PLAIN
 
-    def __init__(self, settings: FlightSettings, log: Path) -> None:
+    def __init__(self, settings: FlightSettings, log: Path, on_delivered: OnDelivered) -> None:
         log.unlink(missing_ok=True)  # of an earlier run
         self.settings = settings
         self.middle = MiddleHere(PAIR, log, settings.seed)
         self.watch = ExchangeWatch()
+        self._on_delivered = on_delivered
+        self._clients: dict[str, socket.socket] = {}
 
-    @abstractmethod
     async def open(self) -> None:
         """Start the link, and in a secured one the exchange of keys."""
+        self._open_clients()
+        await self.middle.start({name: int(sock.getsockname()[1]) for name, sock in self._clients.items()}, {})
 
-    @abstractmethod
+    def _open_clients(self) -> None:
+        for name in PAIR:
+            sock = self._clients[name] = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            sock.setblocking(False)
+            sock.bind((HOST, 0))
+            asyncio.get_running_loop().add_reader(sock, self._on_readable, name, sock)
+
+    def _on_readable(self, name: str, sock: socket.socket) -> None:
+        with suppress(OSError):
+            # A daemon may deliver several frames in one datagram.
+            for frame in split_datagram(sock.recv(_DATAGRAM_BYTES), SplitCounters()):
+                self._on_delivered(name, frame.raw)
+
     async def close(self) -> None:
-        """Stop."""
+        for sock in self._clients.values():
+            asyncio.get_running_loop().remove_reader(sock)
+            sock.close()
+        await self.middle.stop()
 
-    @abstractmethod
     def send(self, name: str, frame: bytes) -> None:
         """An aircraft sends a frame to the other."""
+        with suppress(OSError):  # an earlier one was refused: the other end is starting
+            self._clients[name].sendto(frame, (HOST, self._port(name)))
+
+    def _port(self, name: str) -> int:
+        (other,) = set(PAIR) - {name}
+        return self.middle.ports[Direction(name, other)]
 
     async def notice(self) -> LinkNotice:
         """What both ends noticed so far."""
@@ -81,24 +106,21 @@ class PositionLink(ABC):
 
     async def attack(self, phase: AttackPhase) -> None:
         """Begin a phase. The attacks of the phase before end; what they hold is lost."""
-        specs: dict[AttackPhase, str] = {
-            AttackPhase.REPLAY: f"duplicate,when=later,delay_s={self.settings.replay_delay_s:g}",
-            AttackPhase.HOLD: f"hold,kinds=any,hold_s={self.settings.hold_s:g}",
-            AttackPhase.DROP: "drop",
+        specs = {
+            AttackPhase.REPLAY: [f"duplicate,when=later,delay_s={self.settings.replay_delay_s:g}"],
+            AttackPhase.HOLD: [f"hold,kinds=any,hold_s={self.settings.hold_s:g}"],
+            AttackPhase.DROP: ["drop"],
         }
-        if phase in specs:
-            await self.middle.attack([specs[phase]])
-        elif phase is AttackPhase.ALTER:
-            await self.middle.attack([], [self.displacement()])
-        elif phase is AttackPhase.KEYS:
+        if phase is AttackPhase.KEYS:
             await self.replace_keys()
         else:
-            await self.middle.attack([])
+            await self.middle.attack(
+                specs.get(phase, []), [self.displacement()] if phase is AttackPhase.ALTER else []
+            )
 
     def displacement(self) -> AttackObject:
-        """The attack that moves positions, without a key."""
         rng = Random(f"displace {self.settings.seed}")  # noqa: S311  not a secret
-        return DisplacePositions(_DRIFT, self.middle.context, rng, monotonic())
+        return DisplacePositions(_HALF, self.middle.context, rng, monotonic())
 
     async def replace_keys(self) -> None:
         """Attack the exchange of keys, if there is one, and move positions."""
@@ -109,109 +131,39 @@ class PositionLink(ABC):
         return sum((await self.middle.statistics()).counts.values())
 
 
-class _Clients:
-    """One UDP socket for each aircraft."""
-
-    def __init__(self, on_delivered: OnDelivered) -> None:
-        self._deliver = on_delivered
-        self._split = SplitCounters()
-        self._loop = asyncio.get_running_loop()
-        self._sockets: dict[str, socket.socket] = {}
-        for name in PAIR:
-            sock = self._sockets[name] = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-            sock.setblocking(False)
-            sock.bind((HOST, 0))
-            self._loop.add_reader(sock, self._on_readable, name, sock)
-
-    @property
-    def ports(self) -> dict[str, int]:
-        """By aircraft."""
-        return {name: int(sock.getsockname()[1]) for name, sock in self._sockets.items()}
-
-    def send(self, name: str, frame: bytes, port: int) -> None:
-        """Send a datagram to a port of loopback."""
-        with suppress(OSError):  # an earlier one was refused: the other end is starting
-            self._sockets[name].sendto(frame, (HOST, port))
-
-    def close(self) -> None:
-        """Close the sockets."""
-        for sock in self._sockets.values():
-            self._loop.remove_reader(sock)
-            sock.close()
-
-    def _on_readable(self, name: str, sock: socket.socket) -> None:
-        with suppress(OSError):
-            # A daemon may deliver several frames in one datagram.
-            for frame in split_datagram(sock.recv(_DATAGRAM_BYTES), self._split):
-                self._deliver(name, frame.raw)
-
-
-class PlainLink(PositionLink):
-    """Frames as they are, over UDP."""
-
-    kind = LinkKind.PLAIN
-
-    def __init__(self, settings: FlightSettings, log: Path, on_delivered: OnDelivered) -> None:
-        super().__init__(settings, log)
-        self._clients = _Clients(on_delivered)
-
-    async def open(self) -> None:
-        """Start the man in the middle."""
-        await self.middle.start(self._clients.ports, {})
-
-    async def close(self) -> None:
-        """Close the sockets."""
-        self._clients.close()
-        await self.middle.stop()
-
-    def send(self, name: str, frame: bytes) -> None:
-        """Send a frame."""
-        (other,) = set(PAIR) - {name}
-        self._clients.send(name, frame, self.middle.ports[Direction(name, other)])
-
-
-class PaperLink(PositionLink):
+class PaperLink(PlainLink):
     """The paper's protocol: one exchange of keys in flight, then an HMAC for each frame."""
 
     kind = LinkKind.PAPER
+    _ends: Mapping[str, PaperEnd] = {}
+    _is_relayed = False
 
-    def __init__(self, settings: FlightSettings, log: Path, on_delivered: OnDelivered) -> None:
-        super().__init__(settings, log)
-        self._is_relayed = False
+    async def open(self) -> None:
+        """Start both ends; the first one initiates."""
         self._ends = {
             name: PaperEnd(
                 name,
                 is_initiator=name == PAIR[0],
-                on_frame=lambda frame, name=name: on_delivered(name, frame),  # type: ignore[misc]
-                report=lambda _reason, _meaning: None,
+                on_frame=lambda frame, name=name: self._on_delivered(name, frame),  # type: ignore[misc]
                 renew_s=None,
             )
             for name in PAIR
         }
-
-    async def open(self) -> None:
-        """Start both ends; the first one initiates."""
         await self.middle.start({name: end.port for name, end in self._ends.items()}, {})
         await self.middle.attack([], [self.watch])
-        for one, other in (PAIR, PAIR[::-1]):
-            self._ends[one].start((HOST, self.middle.ports[Direction(one, other)]))
+        for name, end in self._ends.items():
+            end.start((HOST, self._port(name)))
 
     async def close(self) -> None:
-        """Stop both ends."""
         for end in self._ends.values():
             end.close()
-        await self.middle.stop()
+        await super().close()
 
     def send(self, name: str, frame: bytes) -> None:
-        """Send a frame with its HMAC."""
         self._ends[name].send(frame)
 
     async def notice(self) -> LinkNotice:
-        """The counters of both ends."""
-        counts = Counter[str]()
-        for end in self._ends.values():
-            counts.update({reason: count for reason, count in end.counters.items() if reason != VERIFIED})
-        return LinkNotice(counts)
+        return LinkNotice(sum((end.counters for end in self._ends.values()), Counter[str]()))
 
     async def attack(self, phase: AttackPhase) -> None:
         """After an attack on an exchange, exchange keys again: otherwise no frame would be accepted any more."""
@@ -222,56 +174,46 @@ class PaperLink(PositionLink):
 
     async def replace_keys(self) -> None:
         """Exchange keys again, with the attacker between both ends."""
-        drift = Drift(_DRIFT.step_m, _DRIFT.limit_m)
-        await self.middle.attack([], [PaperRelay(drift.move)])
+        await self.middle.attack([], [PaperRelay(Drift().move)])
         self._is_relayed = True
         self._ends[PAIR[0]].renew()
 
 
-class DaemonLink(PositionLink):
+class DaemonLink(PlainLink):
     """Two daemons, each a process. They start in flight, and exchange keys again and again."""
 
     kind = LinkKind.OURS
 
     def __init__(self, settings: FlightSettings, log: Path, on_delivered: OnDelivered, folder: Path) -> None:
-        super().__init__(settings, log)
-        self._clients = _Clients(on_delivered)
+        super().__init__(settings, log, on_delivered)
         ports = free_ports(2 * len(PAIR))
-        self._drones = {
-            name: DroneProcess(name, folder / name, ports[2 * number], ports[2 * number + 1])
-            for number, name in enumerate(PAIR)
-        }
+        self._drones = {name: DroneProcess(name, folder / name, *ports[2 * n :][:2]) for n, name in enumerate(PAIR)}
 
     async def open(self) -> None:
         """Start both daemons, which then link."""
+        self._open_clients()
         keys = {name: decode_key(drone.public_key) for name, drone in self._drones.items()}
         await self.middle.start({name: drone.port for name, drone in self._drones.items()}, keys)
         await self.middle.attack([], [self.watch])
         psk = generate_psk()
-        link: Mapping[str, object] = {"rekey_after_s": self.settings.rekey_after_s}
-        for one, other in (PAIR, PAIR[::-1]):
-            drone, peer = self._drones[one], self._drones[other]
+        for one, other in _WAYS:
+            drone = self._drones[one]
             drone.share_psk(psk, "pair.psk")
-            address = f"{HOST}:{self.middle.ports[Direction(one, other)]}"
             rules: dict[str, object] = {"role": "swarm-member", "system_ids": [SYSTEM_IDS[other]]}
-            drone.configure(link, [peer.as_peer(address, "pair.psk", **rules)])
-        for drone in self._drones.values():
+            peer = self._drones[other].as_peer(f"{HOST}:{super()._port(one)}", "pair.psk", **rules)
+            drone.configure({"rekey_after_s": self.settings.rekey_after_s}, [peer])
             await drone.start()
 
     async def close(self) -> None:
-        """Stop both daemons."""
         await asyncio.gather(*(drone.stop() for drone in self._drones.values()))
-        self._clients.close()
-        await self.middle.stop()
+        await super().close()
 
-    def send(self, name: str, frame: bytes) -> None:
-        """Send a frame to the daemon's endpoint."""
-        self._clients.send(name, frame, self._drones[name].endpoint_port)
+    def _port(self, name: str) -> int:
+        return self._drones[name].endpoint_port
 
     async def notice(self) -> LinkNotice:
-        """The counters of both daemons, and the worst state of their links."""
-        counts = Counter[str]()
-        states = []
+        """The counters of both daemons, and the state of their link."""
+        counts, states = Counter[str](), []
         for drone in self._drones.values():
             status = await drone.ask()
             counts.update(status.get("drops", {}))

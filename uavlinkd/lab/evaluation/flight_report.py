@@ -1,194 +1,230 @@
-"""The report of the flight evaluation, in HTML and Markdown, made from the records only."""
+"""The findings and tables of the flight evaluation."""
 
 from __future__ import annotations
 
-from uavlinkd.lab.evaluation.flight_figures import flight_figures
-from uavlinkd.lab.evaluation.flight_findings import REPORTED_WITHIN_S, FlightFindings, flight_problems, read_flight
+from collections.abc import Sequence
+from itertools import pairwise
+from statistics import median
+
 from uavlinkd.lab.evaluation.flight_plan import (
     ATTACKS,
     LINK_NAMES,
     MEANINGS,
-    NAME,
     AttackPhase,
     FlightSettings,
     LinkKind,
+    Provenance,
 )
-from uavlinkd.lab.evaluation.flight_positions import Provenance
-from uavlinkd.lab.evaluation.page import THE_PAPER, ReportSection, ReportWriter, Table
-from uavlinkd.lab.evaluation.spread import duration
+from uavlinkd.lab.evaluation.frame import NOTHING, THE_PAPER, ReportSection, Table, duration
+from uavlinkd.lab.evaluation.records import Record, RunRecords, Value
 
-TITLE = "Two aircraft exchange positions in flight under attack"
-_FACTS = ("aircraft", "began", "cpu", "cores", "load_before", "system", "python", "uavlinkd", "commit")
+_DELIVERED = (AttackPhase.QUIET, AttackPhase.REPLAY, AttackPhase.ALTER, AttackPhase.KEYS)
+"""In these phases, frames must arrive: the attacker passes some of them in time."""
+REPORTED_WITHIN_S = 10.0
+"""Within this time a daemon must report that its link is down or its freshness unverified."""
+_FALSE = (Provenance.REPLAYED, Provenance.ALTERED)
+_WITHOUT_EFFECT = (
+    (LinkKind.PLAIN, AttackPhase.ALTER, Provenance.ALTERED),
+    (LinkKind.PLAIN, AttackPhase.REPLAY, Provenance.REPLAYED),
+    (LinkKind.PAPER, AttackPhase.REPLAY, Provenance.REPLAYED),
+    (LinkKind.PAPER, AttackPhase.KEYS, Provenance.ALTERED),
+)
+"""Attacks that must succeed: otherwise the evaluation shows nothing."""
 
 
-def make_sections(findings: FlightFindings) -> list[ReportSection]:
-    """All sections of the report."""
+class FlightFindings(RunRecords):
+    """The records of one flight."""
+
+    @property
+    def spans(self) -> list[tuple[AttackPhase, float, float]]:
+        """Every phase in order, with begin and end in seconds after take-off."""
+        return [
+            (AttackPhase(str(record.point["phase"])), record.number("begin_s"), record.number("end_s"))
+            for record in self.of("phase", link=LinkKind.OURS)
+        ]
+
+    @property
+    def duration_s(self) -> float:
+        """From take-off to the last measurement; 0 if the run was interrupted."""
+        ends = self.of("end")
+        return ends[0].number("duration_s") if ends else 0.0
+
+    def count(self, name: str, **point: Value) -> int:
+        return round(sum(record.number(name) for record in self.of("phase", **point)))
+
+    def noticed(self, link: LinkKind, phase: AttackPhase) -> str:
+        """What the ends of a link counted in a phase."""
+        return "; ".join(str(record.values["noticed"]) for record in self.of("phase", link=link, phase=phase))
+
+    def is_reported(self, at: float) -> bool:
+        """Whether a daemon reports at this time that its link is not well."""
+        return any(begin_s <= at < end_s for _, begin_s, end_s in self.states(LinkKind.OURS))
+
+    def unnoticed_errors_m(self, link: LinkKind) -> list[float]:
+        """The errors of believed positions, without those after which an end reported a problem."""
+        states = self.states(link)
+        return [
+            sample.number("error_m")
+            for sample in self.of("sample", link=link)
+            if not any(
+                begin_s <= sample.number("at_s") and sample.number("accepted_at_s") < end_s
+                for _, begin_s, end_s in states
+            )
+        ]
+
+    def states(self, link: LinkKind) -> list[tuple[str, float, float]]:
+        """The reported states of a link that are not well, with begin and end in seconds."""
+        changes = [(str(record.values["state"]), record.number("at_s")) for record in self.of("state", link=link)]
+        changes.append(("", self.duration_s))
+        return [(state, at, end) for (state, at), (_, end) in pairwise(changes) if state]
+
+
+def summary(findings: FlightFindings) -> dict[str, Value]:
+    ends = findings.of("end")
+    facts: dict[str, Value] = {
+        "aircraft": ends[0].values.get("aircraft") if ends else None,
+        "quick": findings.run.get("quick"),
+        "duration_s": findings.duration_s,
+    }
+    for link, name in ((LinkKind.PLAIN, "plain"), (LinkKind.PAPER, "paper"), (LinkKind.OURS, "ours")):
+        facts |= {f"{name}_{kind.value}_accepted": findings.count(kind.value, link=link) for kind in _FALSE}
+        facts[f"{name}_max_error_m"] = max(findings.numbers("sample", "error_m", link=link), default=None)
+        facts[f"{name}_max_unnoticed_error_m"] = max(findings.unnoticed_errors_m(link), default=None)
+        for phase in AttackPhase:
+            errors = findings.numbers("sample", "error_m", link=link, phase=phase)
+            facts[f"{name}_max_error_m_{phase.name.lower()}"] = max(errors, default=None)
+        for took_s in findings.numbers("exchange", "took_s", link=link):
+            facts[f"{name}_key_exchange_s"] = took_s
+    return facts
+
+
+def flight_problems(findings: FlightFindings) -> list[str]:
+    """The deviations from the expected results: an accepted false frame, or an attack without effect."""
+    lines = [
+        f"uavlinkd accepted {count} {kind.value} frames"
+        for kind in _FALSE
+        if (count := findings.count(kind, link=LinkKind.OURS))
+    ]
+    lines += [
+        f'the attack "{phase}" had no effect on {link}: the attack does not work'
+        for link, phase, kind in _WITHOUT_EFFECT
+        if not findings.count(kind, link=link, phase=phase)
+    ]
+    lines += [
+        f'uavlinkd delivered no frame during "{phase}"'
+        for phase in _DELIVERED
+        if not findings.count(Provenance.GENUINE, link=LinkKind.OURS, phase=phase)
+    ]
+    lines += [
+        f'uavlinkd did not report within {REPORTED_WITHIN_S:g} s of "{phase}"'
+        for phase, begin_s, end_s in findings.spans
+        if phase not in _DELIVERED
+        and end_s - begin_s > REPORTED_WITHIN_S
+        and not findings.is_reported(begin_s + REPORTED_WITHIN_S)
+    ]
+    return lines
+
+
+def sections(findings: FlightFindings) -> list[ReportSection]:
+    settings = FlightSettings(bool(findings.run.get("quick")))
+    details = {AttackPhase.REPLAY: f": {settings.replay_delay_s:.0f} s", AttackPhase.HOLD: f": {settings.hold_s:g} s"}
+    meanings = [[phase, MEANINGS[phase] + details.get(phase, "")] for phase in ATTACKS]
     return [
+        ReportSection("Positions believed and positions flown", _ON_FIGURE, [_overview(findings)], "flight"),
         ReportSection(
-            "Positions believed and positions flown", "flight", _on_figure(findings), [_overview(findings)]
+            "Each attack on each link",
+            _ON_ATTACKS,
+            [Table(["attack", "what the attacker does"], meanings), _by_phase(findings)],
         ),
-        ReportSection("Each attack on each link", "", _ON_ATTACKS, [_meanings(findings), _by_phase(findings)]),
-        ReportSection("Keys exchanged in flight", "", _ON_KEYS, [_exchanges(findings)]),
-        ReportSection("What uavlinkd reported", "", _on_states(findings), [_noticed(findings), _states(findings)]),
-        ReportSection("Run", "", _on_run(findings), [_run(findings)]),
+        ReportSection("Keys exchanged in flight", _ON_KEYS, [_exchanges(findings)]),
+        ReportSection("What uavlinkd reported", _on_states(settings), [_noticed(findings), _states(findings)]),
     ]
 
 
-def _on_figure(findings: FlightFindings) -> list[str]:
-    return [
-        THE_PAPER,
-        *(f"Not as expected: {problem}." for problem in flight_problems(findings)),
-        "The figure shows the first aircraft, as the second one believes it to be. A thin line joins each believed "
-        "position to the one flown at that time. A receiver believes the last position that its link delivered.",
-        "All links carried the same flight at the same time. Positions are sent ten times a second: without an "
-        "attack, the error is the distance flown in up to 0.1 s. An attacker that drops everything causes a large "
-        "error on every link. The daemons also drop what arrives too late. The last column leaves out a position "
-        "from the moment when a daemon reports that its link is down, or that it cannot verify that frames are new. "
-        "The other ends report nothing.",
-    ]
+_ON_FIGURE = [
+    THE_PAPER,
+    "The figure shows the first aircraft, as the second one believes it to be: at the last position that the link "
+    "delivered. A thin line joins it to the position flown at that time. All links carried the same flight at the "
+    "same time, ten positions a second: without an attack, the error is the distance flown in up to 0.1 s. The last "
+    "column leaves out a position from the moment when a daemon reports that its link is down, or that it cannot "
+    "verify that frames are new. The other ends report nothing.",
+]
+_ON_ATTACKS = [
+    "Error and age of the believed positions of both aircraft, ten samples a second. The age is the time since the "
+    "aircraft sent the position; of an altered one, since it was accepted. An attacker on the path can always drop "
+    "or delay frames. Then the receiver of every link believes an old position: also uavlinkd's, if the delay is "
+    "shorter than a few seconds. Samples after an attack count for it until a position after its end is accepted."
+]
+_ON_KEYS = [
+    "Both aircraft fly when the exchange begins. It lasts from the public key that was answered to the first "
+    "data. The paper's ends exchange keys once, and again when the attack on the exchange begins and "
+    "ends. The daemons start in flight, and repeat their handshake on their own."
+]
 
 
 def _overview(findings: FlightFindings) -> Table:
     rows = []
     for link in LinkKind:
-        spread = findings.spread(link)
-        unnoticed = findings.unnoticed_error_m(link)
-        errors = ["-"] * 2 if spread is None else [_metres(spread.median_error_m), _metres(spread.max_error_m)]
-        errors.append("-" if unnoticed is None else _metres(unnoticed))
-        accepted = [f"{findings.count(link, kind):,}" for kind in Provenance]
-        rows.append([LINK_NAMES[link], f"{findings.count(link, 'sent'):,}", *accepted, *errors])
+        errors = findings.numbers("sample", "error_m", link=link)
+        counts = [f"{findings.count(name, link=link):,}" for name in ("sent", *Provenance)]
+        rows.append([LINK_NAMES[link], *counts, *_extent(errors), _metres(findings.unnoticed_errors_m(link))])
     head = ["link", "positions sent", "accepted: genuine", "replayed", "altered", "median error", "largest error"]
     return Table([*head, "largest error that no end reported"], rows)
 
 
-_ON_ATTACKS = [
-    "Error and age of the believed positions of both aircraft, ten samples a second. The age is the time since the "
-    "aircraft sent the position; of an altered one, since it was accepted. An attacker on the path can always drop "
-    "or delay frames. Then the receiver of every link believes an old position: also uavlinkd's, if the delay is "
-    "shorter than a few seconds. Samples after an attack count for it until the first position after its end is "
-    "accepted."
-]
+def _extent(errors: Sequence[float]) -> list[str]:
+    return [f"{median(errors):.1f} m", _metres(errors)] if errors else [NOTHING] * 2
 
 
-def _meanings(findings: FlightFindings) -> Table:
-    settings = _settings(findings)
-    details = {
-        AttackPhase.REPLAY: f"{settings.replay_delay_s:.0f} s earlier",
-        AttackPhase.HOLD: f"{settings.hold_s:g} s later",
-    }
-    rows = [[phase, MEANINGS[phase], details.get(phase, "-")] for phase in ATTACKS]
-    return Table(["attack", "what the attacker does", "here"], rows)
+def _metres(errors: Sequence[float]) -> str:
+    return f"{max(errors):.1f} m" if errors else NOTHING
 
 
 def _by_phase(findings: FlightFindings) -> Table:
     rows = []
     for phase in AttackPhase:
         for link in LinkKind:
-            spread = findings.spread(link, phase)
-            if spread is None:
-                continue
-            rows.append(
-                [
-                    phase,
-                    LINK_NAMES[link],
-                    *(f"{findings.count(link, name, phase):,}" for name in ("sent", *Provenance)),
-                    f"{_metres(spread.median_error_m)} / {_metres(spread.max_error_m)}",
-                    f"{duration(spread.median_age_s)} / {duration(spread.max_age_s)}",
-                ]
-            )
-    head = [
-        "attack",
-        "link",
-        "sent",
-        "genuine",
-        "replayed",
-        "altered",
-        "error: median / largest",
-        "age: median / largest",
-    ]
+            errors = findings.numbers("sample", "error_m", link=link, phase=phase)
+            ages = findings.numbers("sample", "age_s", link=link, phase=phase)
+            counts = [f"{findings.count(name, link=link, phase=phase):,}" for name in ("sent", *Provenance)]
+            if errors:
+                age = f"{duration(median(ages))} / {duration(max(ages))}"
+                rows.append([phase, LINK_NAMES[link], *counts, " / ".join(_extent(errors)), age])
+    head = ["attack", "link", "sent", *Provenance, "error: median / largest", "age: median / largest"]
     return Table(head, rows)
 
 
-_ON_KEYS = [
-    "Both aircraft fly when the exchange begins. Its duration is the time from the public key that was answered to "
-    "the first data, at the man in the middle. uavlinkd's processes start in flight too. The paper's ends exchange "
-    "keys once, and again when the attack on the exchange begins and when it ends. The daemons repeat their "
-    "handshake on their own."
-]
-
-
 def _exchanges(findings: FlightFindings) -> Table:
-    rows = []
-    for record in findings.of("exchange"):
-        if "took_s" not in record.values:
-            continue
-        link = LinkKind(str(record.point["link"]))
-        rows.append(
-            [
-                LINK_NAMES[link],
-                f"{record.number('began_s'):.2f} s",
-                duration(record.number("took_s")),
-                f"{record.number('first_position_s'):.2f} s",
-            ]
-        )
+    rows = [_exchange(record) for record in findings.of("exchange") if "took_s" in record.values]
     return Table(["link", "began after take-off", "took", "both aircraft had a position after"], rows)
 
 
-_ON_STATES = [
-    "Counters of both ends, by attack. A daemon drops frames that are too late (`doubtful`, `delayed`). It reports "
-    "that its link is down, or that no answer shows that frames are new; in the latter case positions still pass. "
-    "The ends of the paper's protocol and of plain MAVLink cannot tell that a position is old or missing."
-]
+def _exchange(record: Record) -> list[str]:
+    began, first = (f"{record.number(name):.2f} s" for name in ("began_s", "first_position_s"))
+    return [LINK_NAMES[LinkKind(str(record.point["link"]))], began, duration(record.number("took_s")), first]
 
 
-def _on_states(findings: FlightFindings) -> list[str]:
-    settings = _settings(findings)
-    if settings.attack_s > REPORTED_WITHIN_S:
-        return _ON_STATES
-    unchecked = (
-        f"This quick run does not check that the daemons report an attack within {REPORTED_WITHIN_S:g} s: each "
-        f"attack lasts {settings.attack_s:g} s only."
+def _on_states(settings: FlightSettings) -> list[str]:
+    text = (
+        "Counters of both ends, by attack. A daemon drops frames that are too late (`doubtful`, `delayed`). It "
+        "reports that its link is down, or that no answer shows that frames are new; in the latter case positions "
+        "still pass. The other ends cannot tell that a position is old or missing."
     )
-    return [*_ON_STATES, unchecked]
+    if settings.attack_s <= REPORTED_WITHIN_S:
+        text += (
+            f" This quick run does not check that the daemons report an attack within {REPORTED_WITHIN_S:g} s: each "
+            f"attack lasts {settings.attack_s:g} s only."
+        )
+    return [text]
 
 
 def _noticed(findings: FlightFindings) -> Table:
-    rows = [
-        [phase, *(findings.noticed(link, phase) or "-" for link in (LinkKind.PAPER, LinkKind.OURS))]
-        for phase in ATTACKS
-    ]
-    return Table(["attack", LINK_NAMES[LinkKind.PAPER], LINK_NAMES[LinkKind.OURS]], rows)
+    links = (LinkKind.PAPER, LinkKind.OURS)
+    rows = [[phase, *(findings.noticed(link, phase) or NOTHING for link in links)] for phase in ATTACKS]
+    return Table(["attack", *(LINK_NAMES[link] for link in links)], rows)
 
 
 def _states(findings: FlightFindings) -> Table:
-    rows = [
-        [f"{begin_s:.1f} s", state, f"{end_s - begin_s:.1f} s"]
-        for state, begin_s, end_s in findings.states(LinkKind.OURS)
-    ]
+    states = findings.states(LinkKind.OURS)
+    rows = [[f"{begin_s:.1f} s", state, f"{end_s - begin_s:.1f} s"] for state, begin_s, end_s in states]
     return Table(["time", "report", "lasted"], rows)
-
-
-def _settings(findings: FlightFindings) -> FlightSettings:
-    return FlightSettings(bool(findings.run.get("quick")), int(str(findings.run.get("seed", 0))))
-
-
-def _on_run(findings: FlightFindings) -> list[str]:
-    settings = _settings(findings)
-    quick = " --quick" if settings.quick else ""
-    return [
-        f"Made by `uavlinkd evaluate flight --out DIR{quick} --seed {settings.seed}`. `uavlinkd evaluate report DIR` "
-        "writes this report again from the records. The seed determines the attacker's choices, but no key. For real "
-        "aircraft, `UAVLINKD_ARDUPILOT` or `UAVLINKD_PX4` names the binary of a simulator."
-    ]
-
-
-def _run(findings: FlightFindings) -> Table:
-    facts = {name: findings.run.get(name) for name in _FACTS} | {"flight": f"{findings.duration_s:.1f} s"}
-    return Table(["fact", "value"], [[name, str(value)] for name, value in facts.items() if value is not None])
-
-
-def _metres(metres: float) -> str:
-    return f"{metres:.1f} m"
-
-
-FLIGHT_REPORT = ReportWriter(NAME, TITLE, read_flight, flight_figures, make_sections)

@@ -9,35 +9,31 @@ from __future__ import annotations
 
 import asyncio
 from collections import Counter
-from collections.abc import Callable
 from contextlib import AsyncExitStack
-from dataclasses import asdict
-from datetime import UTC, datetime
-from pathlib import Path
+from functools import partial
 from time import monotonic
+from typing import Any
 
-from uavlinkd.lab.child_processes import private_folder
-from uavlinkd.lab.evaluation.flight_links import DaemonLink, LinkNotice, PaperLink, PlainLink, PositionLink
+from uavlinkd.lab.evaluation.flight_links import DaemonLink, PaperLink, PlainLink
 from uavlinkd.lab.evaluation.flight_plan import (
-    NAME,
     PAIR,
     POSITION_RATE_HZ,
     SAMPLE_S,
     SYSTEM_IDS,
     AttackPhase,
     FlightSettings,
-    LinkKind,
-)
-from uavlinkd.lab.evaluation.flight_positions import (
     Flown,
+    LinkKind,
     Origin,
+    PositionSample,
     Provenance,
     Receiver,
     samples,
 )
-from uavlinkd.lab.evaluation.machine import load, machine_facts
-from uavlinkd.lab.evaluation.records import Record, RecordWriter, Value
-from uavlinkd.lab.sim.aircraft import Aircraft, AircraftChoice
+from uavlinkd.lab.evaluation.flight_report import FlightFindings, flight_problems, sections, summary
+from uavlinkd.lab.evaluation.frame import Evaluation, Work
+from uavlinkd.lab.evaluation.records import EvaluationError, Record, Value
+from uavlinkd.lab.sim.aircraft import Aircraft, AircraftChoice, choice_of
 from uavlinkd.lab.sim.autopilot import HOME
 
 LINK_UP_S = 120.0
@@ -45,144 +41,115 @@ LINK_UP_S = 120.0
 _LOOK_S = 0.02
 _NOTICE_S = 0.25
 
-Show = Callable[[str], None]
+
+async def run_flight(work: Work[FlightSettings]) -> dict[str, Any]:
+    """Fly, and write the records.
+
+    Raises:
+        EvaluationError, PilotError, RealAutopilotError, DroneError: an aircraft or a link failed.
+    """
+    return await _Run(work).fly(AircraftChoice() if work.settings.quick else choice_of())
 
 
-class FlightError(Exception):
-    """The flight failed. The message is for the operator."""
-
-
-class FlightEvaluation:
-    """One run, with its records in ``out``."""
-
-    def __init__(self, out: Path, settings: FlightSettings, choice: AircraftChoice, show: Show) -> None:
-        self.out = out
-        self.settings = settings
-        self._choice = choice
-        self._show = show
+class _Run:
+    def __init__(self, work: Work[FlightSettings]) -> None:
+        self._work = work
+        self._settings = work.settings
         self._origin = Origin(HOME.latitude_deg, HOME.longitude_deg)
         self._flown = {name: Flown() for name in PAIR}
         self._sent: dict[str, dict[bytes, float]] = {name: {} for name in PAIR}
-        self._receivers: dict[LinkKind, dict[str, Receiver]] = {
+        self._receivers = {
             kind: {name: Receiver(self._origin, self._sent[_other(name)]) for name in PAIR} for kind in LinkKind
         }
-        self._links: list[PositionLink] = []
+        self._links: list[PlainLink] = []
         self._began_at = 0.0
         self._phases: list[tuple[AttackPhase, float, float]] = []
 
-    async def run(self) -> None:
-        """Fly, and write the records.
-
-        Raises:
-            FlightError, PilotError, RealAutopilotError, DroneError: an aircraft or a link failed.
-            OSError: the results cannot be written.
-        """
-        self.out.mkdir(parents=True, exist_ok=True)
-        facts = {**machine_facts(), **asdict(self.settings), "began": datetime.now(UTC).isoformat()}
-        with private_folder("uavlinkd-") as folder:
-            async with AsyncExitStack() as stack:
-                aircraft = {
-                    name: await stack.enter_async_context(self._aircraft(name, folder / f"aircraft-{name}"))
-                    for name in PAIR
-                }
-                self._show(f"{aircraft[PAIR[0]].name}: both aircraft take off")
-                await asyncio.gather(*(self._take_off(one) for one in aircraft.values()))
-                self._began_at = monotonic()
-                facts["aircraft"] = aircraft[PAIR[0]].name
-                with RecordWriter(self.out, NAME, facts) as writer:
-                    async with AsyncExitStack() as links:
-                        await self._fly(aircraft, links, folder, writer)
-                    for record in self._samples():
-                        writer.add(record)
-                    duration_s = round(self._now(), 1)
-                    writer.add(Record("end", {}, {"duration_s": duration_s, "load_after": load()}))
-
-    def _aircraft(self, name: str, folder: Path) -> Aircraft:
-        def on_frame(frame: bytes) -> None:
-            self._on_frame(name, frame)
-
-        return Aircraft(self._choice, SYSTEM_IDS[name], HOME, folder, on_frame)
-
-    async def _take_off(self, aircraft: Aircraft) -> None:
-        await aircraft.pilot.take_off(self.settings.altitude_m, POSITION_RATE_HZ)
+    async def fly(self, choice: AircraftChoice) -> dict[str, Any]:
+        async with AsyncExitStack() as stack:
+            aircraft = {
+                name: await stack.enter_async_context(
+                    Aircraft(
+                        choice,
+                        SYSTEM_IDS[name],
+                        HOME,
+                        self._work.folder / f"aircraft-{name}",
+                        partial(self._on_frame, name),
+                    )
+                )
+                for name in PAIR
+            }
+            self._work.show(f"{aircraft[PAIR[0]].name}: both aircraft take off")
+            await asyncio.gather(
+                *(one.pilot.take_off(self._settings.altitude_m, POSITION_RATE_HZ) for one in aircraft.values())
+            )
+            self._began_at = monotonic()
+            paths = self._settings.paths()
+            following = [asyncio.create_task(aircraft[name].pilot.follow(paths[name])) for name in PAIR]
+            attacking = asyncio.create_task(self._exchange_and_attack())
+            try:
+                done, _ = await asyncio.wait({*following, attacking}, return_when=asyncio.FIRST_COMPLETED)
+                for task in done:
+                    task.result()  # an aircraft that does not fly on has raised
+            finally:
+                for task in (*following, attacking):
+                    task.cancel()
+                await asyncio.gather(*following, attacking, return_exceptions=True)
+            self._add_samples()
+            return {"aircraft": aircraft[PAIR[0]].name, "duration_s": round(self._now(), 1)}
 
     def _now(self) -> float:
-        """Seconds since both aircraft have taken off."""
         return monotonic() - self._began_at
 
-    async def _fly(
-        self, aircraft: dict[str, Aircraft], stack: AsyncExitStack, folder: Path, writer: RecordWriter
-    ) -> None:
-        paths = self.settings.paths()
-        following = [asyncio.create_task(aircraft[name].pilot.follow(paths[name])) for name in PAIR]
-        attacking = asyncio.create_task(self._exchange_and_attack(stack, folder, writer))
-        try:
-            done, _ = await asyncio.wait({*following, attacking}, return_when=asyncio.FIRST_COMPLETED)
-            for task in done:
-                task.result()  # an aircraft that does not fly on has raised
-        finally:
-            for task in (*following, attacking):
-                task.cancel()
-            await asyncio.gather(*following, attacking, return_exceptions=True)
-
-    async def _exchange_and_attack(self, stack: AsyncExitStack, folder: Path, writer: RecordWriter) -> None:
-        await self._open_links(stack, folder)
-        for link in self._links:
-            writer.add(self._exchange(link))
-        noticing = asyncio.create_task(self._watch_states(writer))
-        try:
-            for number, (phase, duration_s) in enumerate(self.settings.phases()):
-                # The attacker records for the replay during the first phase, which is otherwise quiet.
+    async def _exchange_and_attack(self) -> None:
+        async with AsyncExitStack() as stack:
+            await self._open_links(stack)
+            for link in self._links:
+                self._add_exchange(link)
+            watching = asyncio.create_task(self._watch_states())
+            stack.callback(watching.cancel)
+            for number, (phase, duration_s) in enumerate(self._settings.phases()):
+                # The attacker records for the replay during the first phase, which is otherwise quiet. It goes on.
                 attack = AttackPhase.REPLAY if number == 0 else phase
-                await self._run_phase(phase, attack, duration_s, writer)
-        finally:
-            noticing.cancel()
-            await asyncio.gather(noticing, return_exceptions=True)
+                await self._run_phase(phase, None if phase is AttackPhase.REPLAY else attack, duration_s)
 
-    async def _open_links(self, stack: AsyncExitStack, folder: Path) -> None:
-        def log(kind: LinkKind) -> Path:
-            return self.out / f"mitm-{NAME}-{kind}.jsonl"
+    async def _open_links(self, stack: AsyncExitStack) -> None:
+        def place(kind: LinkKind) -> tuple[FlightSettings, Any, Any]:
+            log = self._work.out / f"mitm-flight-{kind}.jsonl"
+            return self._settings, log, lambda name, frame: self._receivers[kind][name].accept(frame, self._now())
 
-        def deliver(kind: LinkKind) -> Callable[[str, bytes], None]:
-            return lambda name, frame: self._receivers[kind][name].accept(frame, self._now())
-
-        settings = self.settings
-        links: tuple[PositionLink, ...] = (
-            PlainLink(settings, log(LinkKind.PLAIN), deliver(LinkKind.PLAIN)),
-            PaperLink(settings, log(LinkKind.PAPER), deliver(LinkKind.PAPER)),
-            DaemonLink(settings, log(LinkKind.OURS), deliver(LinkKind.OURS), folder),
-        )
-        for link in links:
+        for link in (
+            PlainLink(*place(LinkKind.PLAIN)),
+            PaperLink(*place(LinkKind.PAPER)),
+            DaemonLink(*place(LinkKind.OURS), self._work.folder),
+        ):
             stack.push_async_callback(link.close)
             await link.open()
             self._links.append(link)
-        until = monotonic() + LINK_UP_S
-        while not all(receiver.beliefs for both in self._receivers.values() for receiver in both.values()):
-            if monotonic() > until:
-                missing = [
-                    kind for kind, both in self._receivers.items() if not all(r.beliefs for r in both.values())
-                ]
-                raise FlightError(f"no position arrived within {LINK_UP_S:g} s over {', '.join(missing)}")
+        begin = monotonic()
+        while missing := [
+            kind for kind, both in self._receivers.items() if not all(one.beliefs for one in both.values())
+        ]:
+            if monotonic() > begin + LINK_UP_S:
+                raise EvaluationError(f"no position arrived within {LINK_UP_S:g} s over: {', '.join(missing)}")
             await asyncio.sleep(_LOOK_S)
 
-    def _exchange(self, link: PositionLink) -> Record:
-        """The exchange of keys in flight: when it began, and how long it took."""
+    def _add_exchange(self, link: PlainLink) -> None:
+        """Record the exchange of keys in flight: when it began, and how long it took."""
         first = max(receiver.beliefs[0].accepted_at for receiver in self._receivers[link.kind].values())
         values: dict[str, Value] = {"first_position_s": round(first, 3)}
         key_at, data_at = link.watch.key_at, link.watch.data_at
         if key_at is not None and data_at is not None:
             values |= {"began_s": round(key_at - self._began_at, 3), "took_s": round(data_at - key_at, 4)}
-            self._show(f"{link.kind}: keys exchanged in flight in {1e3 * (data_at - key_at):.1f} ms")
-        return Record("exchange", {"link": link.kind.value}, values)
+            self._work.show(f"{link.kind}: keys exchanged in flight in {1e3 * (data_at - key_at):.1f} ms")
+        self._work.add(Record("exchange", {"link": link.kind.value}, values))
 
-    async def _run_phase(
-        self, phase: AttackPhase, attack: AttackPhase, duration_s: float, writer: RecordWriter
-    ) -> None:
+    async def _run_phase(self, phase: AttackPhase, attack: AttackPhase | None, duration_s: float) -> None:
+        """One phase; ``attack``: what begins with it, None if the attack before goes on."""
         before = [(await link.notice(), await link.interventions()) for link in self._links]
         begin_s = self._phases[-1][2] if self._phases else self._now()  # each accepted frame is in a phase
-        self._show(f"{begin_s:6.1f} s  {phase}")
-        # The replay that was recorded in the first phase goes on.
-        if phase is not AttackPhase.REPLAY:
+        self._work.show(f"{begin_s:6.1f} s  {phase}")
+        if attack is not None:
             for link in self._links:
                 await link.attack(attack)
         await asyncio.sleep(max(0.0, begin_s + duration_s - self._now()))
@@ -196,7 +163,7 @@ class FlightEvaluation:
                 for at, provenance in receiver.frames
                 if begin_s <= at < end_s
             )
-            values: dict[str, Value] = {
+            values = {
                 "begin_s": round(begin_s, 3),
                 "end_s": round(end_s, 3),
                 "sent": sum(begin_s <= at < end_s for sent in self._sent.values() for at in sent.values()),
@@ -204,18 +171,18 @@ class FlightEvaluation:
                 **{provenance.value: frames[provenance] for provenance in Provenance},
                 "noticed": ", ".join(f"{count} {reason}" for reason, count in sorted(counts.items())),
             }
-            writer.add(Record("phase", {"link": link.kind.value, "phase": phase.value}, values))
+            self._work.add(Record("phase", {"link": link.kind.value, "phase": phase.value}, values))
 
-    async def _watch_states(self, writer: RecordWriter) -> None:
+    async def _watch_states(self) -> None:
         """Record what the daemons report of their link, at each change."""
         last = {link.kind: "" for link in self._links}
         while True:
             for link in self._links:
-                notice: LinkNotice = await link.notice()
-                if notice.state != last[link.kind]:
-                    last[link.kind] = notice.state
-                    values: dict[str, Value] = {"at_s": round(self._now(), 3), "state": notice.state}
-                    writer.add(Record("state", {"link": link.kind.value}, values))
+                state = (await link.notice()).state
+                if state != last[link.kind]:
+                    last[link.kind] = state
+                    values = {"at_s": round(self._now(), 3), "state": state}
+                    self._work.add(Record("state", {"link": link.kind.value}, values))
             await asyncio.sleep(_NOTICE_S)
 
     def _on_frame(self, name: str, frame: bytes) -> None:
@@ -228,34 +195,47 @@ class FlightEvaluation:
         for link in self._links:
             link.send(name, frame)
 
-    def _samples(self) -> list[Record]:
-        records = []
+    def _add_samples(self) -> None:
         for kind, receivers in self._receivers.items():
             for name, receiver in receivers.items():
-                flown = self._flown[_other(name)]
-                before = AttackPhase.QUIET
+                sender, before = _other(name), AttackPhase.QUIET
                 for phase, begin_s, end_s in self._phases:
-                    for sample in samples(flown, receiver.beliefs, begin_s, end_s, SAMPLE_S):
+                    for sample in samples(self._flown[sender], receiver.beliefs, begin_s, end_s, SAMPLE_S):
                         # An attack has an effect until a position is accepted after its end.
                         is_over = sample.belief.accepted_at >= begin_s
                         cause = before if phase is AttackPhase.QUIET and not is_over else phase
-                        point = {"link": kind.value, "aircraft": _other(name), "phase": cause.value}
-                        values: dict[str, Value] = {
-                            "at_s": round(sample.at, 3),
-                            "flown_east_m": round(sample.flown.east_m, 2),
-                            "flown_north_m": round(sample.flown.north_m, 2),
-                            "believed_east_m": round(sample.belief.place.east_m, 2),
-                            "believed_north_m": round(sample.belief.place.north_m, 2),
-                            "error_m": round(sample.error_m, 2),
-                            "age_s": round(sample.age_s, 3),
-                            "accepted_at_s": round(sample.belief.accepted_at, 3),
-                            "provenance": sample.belief.provenance.value,
-                        }
-                        records.append(Record("sample", point, values))
+                        point: dict[str, Value] = {"link": kind.value, "aircraft": sender, "phase": cause.value}
+                        self._work.add(Record("sample", point, _values(sample)))
                     before = phase
-        return records
+
+
+def _values(sample: PositionSample) -> dict[str, Value]:
+    return {
+        "at_s": round(sample.at, 3),
+        "flown_east_m": round(sample.flown.east_m, 2),
+        "flown_north_m": round(sample.flown.north_m, 2),
+        "believed_east_m": round(sample.belief.place.east_m, 2),
+        "believed_north_m": round(sample.belief.place.north_m, 2),
+        "error_m": round(sample.error_m, 2),
+        "age_s": round(sample.age_s, 3),
+        "accepted_at_s": round(sample.belief.accepted_at, 3),
+        "provenance": sample.belief.provenance.value,
+    }
 
 
 def _other(name: str) -> str:
     (other,) = set(PAIR) - {name}
     return other
+
+
+FLIGHT = Evaluation(
+    name="flight",
+    title="Two aircraft exchange positions in flight under attack",
+    settings=FlightSettings,
+    run=run_flight,
+    findings=FlightFindings,
+    sections=sections,
+    problems=flight_problems,
+    summary=summary,
+    draw="draw_flight",
+)

@@ -1,77 +1,61 @@
-"""The cost of spoofed initiations for a daemon: processor time and memory, sampled while genuine frames flow.
-
-The flood comes from another process directly to the daemon's port. The genuine frames pass the man in the middle.
-"""
+"""The cost of spoofed initiations for a daemon: processor time and memory, while genuine frames flow."""
 
 from __future__ import annotations
 
 import asyncio
 import os
-import sys
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
+from statistics import median
 from time import monotonic
 
-from uavlinkd.lab.child_processes import end_with_parent
-from uavlinkd.lab.evaluation.machine import cpu_seconds
+from uavlinkd.lab.evaluation.records import Record, cpu_seconds
 from uavlinkd.lab.evaluation.stage import DaemonStage
-from uavlinkd.lab.evaluation.tampering_records import FloodSamples
 
 SAMPLE_S = 0.25
+_INJECTED = "flood-initiations: injected"
 
 
-SOURCES = 256
-"""Source addresses of the initiations."""
-
-
-async def run_floods(stage: DaemonStage, rates: Sequence[float], phase_s: float) -> list[FloodSamples]:
-    """For each rate: ``phase_s`` without, twice that with, and ``phase_s`` without a flood of the first drone."""
+async def run_floods(stage: DaemonStage, rates: Sequence[float], phase_s: float) -> list[Record]:
+    """For each rate: ``phase_s`` without, and twice that with a flood of the first drone."""
     return [await _run_flood(stage, rate, phase_s) for rate in rates]
 
 
-async def _run_flood(stage: DaemonStage, rate: float, phase_s: float) -> FloodSamples:
-    names, target = stage.names, stage.drones[stage.names[0]]
-    flooder = await asyncio.create_subprocess_exec(
-        *end_with_parent(sys.executable, "-m", "uavlinkd.lab.evaluation.flooder"),
-        *(str(target.port), target.public_key, f"{rate:g}", f"{2 * phase_s:g}", str(SOURCES)),
-        stdin=asyncio.subprocess.PIPE,
-        stdout=asyncio.subprocess.PIPE,
-    )
-    try:
-        assert flooder.stdin is not None
-        assert flooder.stdout is not None
-        await flooder.stdout.readline()  # it is ready
-        begin_at = monotonic()
-        flood = FloodSamples(
-            rate, phase_s, 3 * phase_s, [], {n: [] for n in names}, {n: [] for n in names}, [], [], 0
-        )
-        last_at, cpu = begin_at, {name: cpu_seconds(stage.drones[name].pid) for name in names}
-        sent, delivered = sum(stage.ledger.mark().values()), stage.ledger.delivered_total()
-        begin_s: float | None = None
-        while last_at < begin_at + 4 * phase_s:
-            await asyncio.sleep(max(0.0, last_at + SAMPLE_S - monotonic()))
-            now = monotonic()
-            if begin_s is None and now - begin_at >= phase_s:
-                flooder.stdin.write(b"\n")
-                begin_s = now - begin_at
-            flood.at_s.append(round(now - begin_at, 3))
-            for name in names:
-                used = cpu_seconds(stage.drones[name].pid)
-                flood.cpu_share[name].append(round((used - cpu[name]) / (now - last_at), 4))
-                flood.memory_bytes[name].append(_resident_bytes(stage.drones[name].pid))
-                cpu[name] = used
-            total_sent, total_delivered = sum(stage.ledger.mark().values()), stage.ledger.delivered_total()
-            flood.sent_hz.append(round((total_sent - sent) / (now - last_at), 1))
-            flood.delivered_hz.append(round((total_delivered - delivered) / (now - last_at), 1))
-            sent, delivered, last_at = total_sent, total_delivered, now
-        assert begin_s is not None, "the loop is longer than the first phase"
-        count = int(await flooder.stdout.readline())
-        return replace(flood, begin_s=round(begin_s, 3), end_s=round(begin_s + 2 * phase_s, 3), initiations=count)
-    finally:
-        if flooder.returncode is None:
-            flooder.kill()
-        await flooder.wait()
+async def _run_flood(stage: DaemonStage, rate: float, phase_s: float) -> Record:
+    """One record: medians of the shares of a core, and resident memory, by drone."""
+    target, other = stage.names
+    quiet = await _observe(stage, phase_s)
+    memory = {name: _resident_bytes(stage.drones[name].pid) for name in stage.names}
+    flood = f"flood-initiations,direction={other}>{target},rate_per_s={rate:g},sources=256"
+    before, begin = (await stage.middle.statistics()).counts.get(_INJECTED, 0), stage.ledger.mark()
+    await stage.middle.attack([flood])
+    busy = await _observe(stage, 2 * phase_s)
+    after, end = (await stage.middle.statistics()).counts.get(_INJECTED, 0), stage.ledger.mark()
+    await stage.middle.attack([])
+    await asyncio.sleep(1.0)  # frames sent at the end of the flood arrive after it
+    sent, delivered = stage.ledger.count(begin, end)
+    values = {
+        "seconds": 2 * phase_s,
+        "initiations": after - before,
+        "sent": sent,
+        "delivered": delivered,
+        "cpu_before": {name: median(quiet[name]) for name in stage.names},
+        "cpu_under": {name: median(busy[name]) for name in stage.names},
+        "memory_before": memory,
+        "memory_after": {name: _resident_bytes(stage.drones[name].pid) for name in stage.names},
+    }
+    return Record("flood", {"rate_per_s": rate}, values)
+
+
+async def _observe(stage: DaemonStage, seconds: float) -> dict[str, list[float]]:
+    shares: dict[str, list[float]] = {name: [] for name in stage.names}
+    end = monotonic() + seconds
+    while monotonic() < end:
+        begin, cpu = monotonic(), {name: cpu_seconds(stage.drones[name].pid) for name in stage.names}
+        await asyncio.sleep(SAMPLE_S)
+        for name in stage.names:
+            shares[name].append((cpu_seconds(stage.drones[name].pid) - cpu[name]) / (monotonic() - begin))
+    return shares
 
 
 def _resident_bytes(pid: int) -> int:

@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import os
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from time import monotonic
 
+from uavlinkd.config.keys import decode_key
 from uavlinkd.core import wire
 from uavlinkd.core.constants import REFUSALS_PER_REPORT
 from uavlinkd.core.cookie import CookieJar, MacKeys
@@ -23,15 +26,29 @@ from uavlinkd.core.refusals import RefusalReport, Refused
 from uavlinkd.core.send import seal
 from uavlinkd.core.session import Session
 from uavlinkd.core.settings import Class, Link, PeerSettings, Timers
-from uavlinkd.core.suites import Suite
+from uavlinkd.core.suites import X25519
+from uavlinkd.lab.evaluation.ledger import numbered_frame
+from uavlinkd.lab.evaluation.paper_attacks import PaperRelay
+from uavlinkd.lab.evaluation.stage import DaemonStage
+from uavlinkd.lab.evaluation.tampering_bench import Bench, KeyHolder
+from uavlinkd.lab.evaluation.tampering_plan import HANDSHAKE, KEYS, TrialPlan
+from uavlinkd.lab.evaluation.tampering_records import RELAY
 from uavlinkd.lab.mitm.anatomy import DatagramKind, kind_of
-from uavlinkd.lab.mitm.attack import NEVER, Action, Direction, Intervention, Operation, PassiveAttack, Send
+from uavlinkd.lab.mitm.attack import (
+    NEVER,
+    Action,
+    AttackObject,
+    Direction,
+    Intervention,
+    Operation,
+    PassiveAttack,
+    Send,
+)
 
 RETRY_S = 0.02
 """How often the attacker initiates, much faster than a daemon, and how often it sends frames."""
 REPORTS_AT_ONCE = 4
 _PATH = Path(0, ("192.0.2.1", 1))
-"""The attacker's path to its victim."""
 
 
 class StolenIdentity(KeyPair):
@@ -81,7 +98,6 @@ class Achieved:
 
     initiations: int = 0
     answers: int = 0
-    """Responses of the victim."""
     sessions: int = 0
     frames_read: int = 0
     frames_sent: int = 0
@@ -93,31 +109,27 @@ class Impostor(PassiveAttack):
     """Initiates to each victim with a false identity. With ``relays``, genuine datagrams do not pass.
 
     Args:
-        frames: the frames to send on a session, if it gets one.
-        claims: whether it also reports refusals that it invents.
+        frames: the frames to send on a session, if it gets one. Then it also reports refusals that it invents.
     """
 
     def __init__(
         self,
         name: str,
-        disguises: list[Disguise],
-        suites: tuple[Suite, ...],
+        disguises: Sequence[Disguise],
         now: float,
         *,
         relays: bool = False,
         frames: tuple[bytes, ...] = (),
-        claims: bool = False,
     ) -> None:
         self.name = name
         self.achieved = {disguise.victim: Achieved() for disguise in disguises}
         self.relays = relays
         self._frames = frames
-        self._claims = claims
         self._claimed = 0
         self._speaks_at = now
         self._directions = {disguise.victim: Direction(disguise.pose, disguise.victim) for disguise in disguises}
         self._nodes: dict[str, Node] = {}
-        link = Link(suites=suites, timers=Timers(retry_min_s=RETRY_S, retry_max_s=RETRY_S))
+        link = Link(suites=(X25519,), timers=Timers(retry_min_s=RETRY_S, retry_max_s=RETRY_S))
         for disguise in disguises:
             node = self._nodes[disguise.victim] = ThievingNode(disguise.identity, now)
             psk = None if disguise.psk is None else Secret(disguise.psk)
@@ -141,7 +153,6 @@ class Impostor(PassiveAttack):
         return actions + self._perform(direction.sender, outputs, now)
 
     def due(self, now: float) -> list[Action]:
-        """Initiate repeatedly, and send frames on sessions."""
         actions: list[Action] = []
         for victim, node in self._nodes.items():
             actions += self._perform(victim, node.handle_timeout(now), now)
@@ -149,8 +160,7 @@ class Impostor(PassiveAttack):
             if self._frames and now >= self._speaks_at and peer.sessions.current is not None:
                 self.achieved[victim].frames_sent += len(self._frames)
                 actions += self._perform(victim, node.send(peer, self._frames, now), now)
-                if self._claims:
-                    actions += self._perform(victim, self._invent(peer, peer.sessions.current, now), now)
+                actions += self._perform(victim, self._invent(peer, peer.sessions.current, now), now)
         if now >= self._speaks_at:
             self._speaks_at = now + RETRY_S
         return actions
@@ -161,18 +171,11 @@ class Impostor(PassiveAttack):
         for _ in range(REPORTS_AT_ONCE):
             self._claimed += 1
             entries = (Refused(self._claimed % 2**24, 400, place, 2**32 - 1) for place in range(REFUSALS_PER_REPORT))
-            out += seal(
-                peer,
-                session,
-                RefusalReport(tuple(entries)).encode(),
-                peer.paths.routes[Class.BULK],
-                now,
-                is_answer=True,
-            )
+            report = RefusalReport(tuple(entries)).encode()
+            out += seal(peer, session, report, peer.paths.routes[Class.BULK], now, is_answer=True)
         return out
 
     def next_deadline(self) -> float:
-        """The time of the next action."""
         deadlines = [node.next_deadline() for node in self._nodes.values()]
         return min([*deadlines, *([self._speaks_at] if self._frames else [])], default=NEVER)
 
@@ -208,24 +211,103 @@ class SealedCookies(PassiveAttack):
         self._jars = {name: CookieJar(MacKeys(key), os.urandom, now) for name, key in public_keys.items()}
 
     def on_datagram(self, datagram: bytes, direction: Direction, now: float) -> list[Action]:
-        """Pass the datagram and answer it."""
         actions: list[Action] = [Send(datagram, direction)]
         jar = self._jars.get(direction.receiver)
-        if (
-            jar is None
-            or kind_of(datagram) not in (DatagramKind.INITIATION, DatagramKind.RESPONSE)
-            or len(datagram) < 4
-        ):
+        is_answered = kind_of(datagram) in (DatagramKind.INITIATION, DatagramKind.RESPONSE) and len(datagram) >= 4
+        if jar is None or not is_answered:
             return actions
         reply = jar.reply(datagram, int.from_bytes(datagram[2:4], "big"), _PATH, now)
-        note = Intervention(
-            now,
-            self.name,
-            Operation.INJECTED,
-            direction.reverse,
-            0,
-            DatagramKind.COOKIE,
-            len(reply),
-            "valid cookie reply",
-        )
-        return [*actions, Send(reply, direction.reverse), note]
+        back, kind = direction.reverse, DatagramKind.COOKIE
+        note = Intervention(now, self.name, Operation.INJECTED, back, 0, kind, len(reply), "valid cookie reply")
+        return [*actions, Send(reply, back), note]
+
+
+@dataclass(frozen=True, slots=True)
+class KeyAttack:
+    """One attacker with keys against the first two drones of three."""
+
+    name: str
+    notes: str
+    disguises: Sequence[Disguise]
+    relays: bool = False
+    frames: tuple[bytes, ...] = ()
+
+    def make(self) -> Impostor:
+        return Impostor(self.name, self.disguises, monotonic(), relays=self.relays, frames=self.frames)
+
+
+def key_attacks(stage: DaemonStage) -> list[KeyAttack]:
+    """The attacks with own or stolen keys on the first two drones of three."""
+    (a, b, c), keys = stage.names, stage.public_keys
+    own, key_of_a, captured = KeyPair(os.urandom(32)), *(KeyPair(stage.drones[name].private_key) for name in (a, c))
+    pair, with_c = (decode_key(stage.psks[frozenset((a, other))]) for other in (b, c))
+    number = stage.names.index(b) + 1
+    of_b = (numbered_frame(number, 2**31), numbered_frame(number, 0))
+
+    def to_a(identity: KeyPair, psk: bytes | None = None) -> Disguise:
+        return Disguise(a, keys[a], b, identity, psk)
+
+    def to_both(psk: bytes | None = None) -> list[Disguise]:
+        return [to_a(own, psk), Disguise(b, keys[b], a, own, psk)]
+
+    return [
+        KeyAttack(RELAY, "handshakes with its own keys, with both sides", to_both(), relays=True),
+        KeyAttack("impostor, unknown key", "genuine traffic continues", to_both()),
+        KeyAttack("impostor, stolen PSK", "the pair's PSK, but no static key", to_both(pair)),
+        KeyAttack(
+            "key compromise impersonation",
+            f"holds the static key of {a} and the PSK, and poses as {b} to {a}",
+            [to_a(StolenIdentity(keys[b], own, key_of_a), pair)],
+        ),
+        KeyAttack(
+            "captured drone, as another",
+            f"holds all keys of {c}, and claims the identity of {b}",
+            [to_a(StolenIdentity(keys[b], captured, None), with_c)],
+        ),
+        KeyAttack(
+            "captured drone, as itself",
+            f"holds all keys of {c}, has a session as {c}, sends frames that only {b} may send, and reports invented "
+            "refusals",
+            [to_a(captured, with_c)],
+            frames=of_b,
+        ),
+    ]
+
+
+async def run_key_attack(bench: Bench, attack: KeyAttack) -> None:
+    impostor: list[Impostor] = []
+
+    def objects() -> list[AttackObject]:
+        impostor.append(attack.make())
+        return [*impostor]
+
+    def total(name: str) -> int:
+        return sum(getattr(achieved, name) for achieved in impostor[0].achieved.values())
+
+    attacker = KeyHolder(
+        objects,
+        # As itself, a captured drone has a genuine session: only its frames matter.
+        sessions=lambda: 0 if attack.frames else total("sessions"),
+        achieved=lambda: {name: total(name) for name in ("initiations", "answers", "sessions", "frames_read")},
+    )
+    least_s = 2.0 if attack.relays else 0.5
+    plan = TrialPlan(attack.name, KEYS, (), restarts=attack.relays, least_s=least_s, notes=attack.notes)
+    await bench.run(plan, attacker)
+
+
+async def run_paper_relay(bench: Bench) -> None:
+    """Run the full relay between the two ends of the paper's protocol."""
+    relay = PaperRelay()
+    attacker = KeyHolder(
+        lambda: [relay],
+        sessions=lambda: relay.exchanges,
+        achieved=lambda: {"sessions": relay.exchanges, "frames_read": relay.read, "frames_altered": relay.altered},
+    )
+    notes = "a key exchange with each side; every second frame altered"
+    await bench.run(TrialPlan(RELAY, KEYS, (), least_s=1.0, notes=notes), attacker)
+
+
+async def run_sealed_cookies(bench: Bench, public_keys: dict[str, bytes]) -> None:
+    """Run the attacker with the public keys that sends valid cookie replies."""
+    attacker = KeyHolder(lambda: [SealedCookies(public_keys, monotonic())])
+    await bench.run(TrialPlan("sealed-cookies", HANDSHAKE, (), least_s=1.0), attacker)

@@ -19,11 +19,14 @@ _HEARTBEAT, _HEARTBEAT_CRC_EXTRA = 0, 50
 _HEARTBEAT_EVERY = 20
 STALE_S = 8.0
 """The maximum age of a delivered frame, with a large margin for busy machines."""
+IN_TIME_S = 0.5
+"""While one path is honest, a critical frame arrives within this time."""
 _NUMBER = struct.Struct("<I")
 _HEADER_BYTES = 10
-# Roll, pitch and yaw in radians, and their rates; type, autopilot, base mode, status, version.
+# Roll, pitch and yaw in radians, and their rates.
 _ANGLES = struct.pack("<6f", 0.1, -0.05, 1.5, 0.01, 0.02, -0.01)
-_COPTER = bytes((2, 3, 81, 4, 3))
+# Type, autopilot, base mode, status, version: a ground station's heartbeat must be new, unlike that of a copter.
+_GROUND_STATION = bytes((6, 8, 0, 4, 3))
 
 
 class Fault(StrEnum):
@@ -39,11 +42,11 @@ class Fault(StrEnum):
     """Not delivered either: a drone shows a claim that its peer did not make."""
 
 
-def numbered_frame(system: int, number: int) -> bytes:
+def numbered_frame(system: int, number: int, heartbeat_every: int = _HEARTBEAT_EVERY) -> bytes:
     """An ATTITUDE, or regularly a HEARTBEAT; each of a system is unique."""
     payload = _NUMBER.pack(number)
-    if number % _HEARTBEAT_EVERY == 0:
-        return mavlink_frame(_HEARTBEAT, payload + _COPTER, _HEARTBEAT_CRC_EXTRA, system, number)
+    if number % heartbeat_every == 0:
+        return mavlink_frame(_HEARTBEAT, payload + _GROUND_STATION, _HEARTBEAT_CRC_EXTRA, system, number)
     return mavlink_frame(_ATTITUDE, payload + _ANGLES, _ATTITUDE_CRC_EXTRA, system, number)
 
 
@@ -62,21 +65,21 @@ class Ledger:
         self.split = SplitCounters()
         self.sent_at = {name: array("d") for name in self.names}
         """When each frame of a drone was sent, by its number."""
+        self.heartbeat_every = _HEARTBEAT_EVERY
+        """The position of the heartbeats among the frames; 1: all frames are heartbeats."""
         self._directions = [(sender, to) for sender in self.names for to in sorted(self.audience[sender])]
         self._delivered = {direction: bytearray() for direction in self._directions}
         self._arrived_at: dict[tuple[str, str], float] = {}
         self._newest: dict[tuple[str, str], tuple[float, float]] = {}
 
     def next_frame(self, sender: str, now: float) -> bytes:
-        """The next frame of a drone, sent at ``now``."""
         times = self.sent_at[sender]
         times.append(now)
         for to in self.audience[sender]:
             self._delivered[sender, to].append(0)
-        return numbered_frame(self.names.index(sender) + 1, len(times) - 1)
+        return numbered_frame(self.names.index(sender) + 1, len(times) - 1, self.heartbeat_every)
 
     def on_received(self, receiver: str, datagram: bytes, now: float) -> None:
-        """The client of a drone received a datagram."""
         frames = split_datagram(datagram, self.split)
         if sum(len(frame.raw) for frame in frames) != len(datagram):
             self.faults[Fault.FALSE] += 1
@@ -87,7 +90,8 @@ class Ledger:
         system = raw[5] if raw[0] == 0xFD and len(raw) >= _HEADER_BYTES + _NUMBER.size else 0
         sender = self.names[system - 1] if 0 < system <= len(self.names) else None
         number = _NUMBER.unpack_from(raw, _HEADER_BYTES)[0] if sender else 0
-        if sender is None or number >= len(self.sent_at[sender]) or raw != numbered_frame(system, number):
+        is_sent = sender is not None and number < len(self.sent_at[sender])
+        if sender is None or not is_sent or raw != numbered_frame(system, number, self.heartbeat_every):
             self.faults[Fault.FALSE] += 1
         elif sender == receiver:
             self.faults[Fault.REFLECTED] += 1
@@ -96,7 +100,8 @@ class Ledger:
         elif self._delivered[sender, receiver][number]:
             self.faults[Fault.REPLAYED] += 1
         else:
-            self._delivered[sender, receiver][number] = 1
+            is_late = now > self.sent_at[sender][number] + IN_TIME_S
+            self._delivered[sender, receiver][number] = 1 + is_late
             self._gap_s = max(self._gap_s, now - self._arrived_at.get((sender, receiver), now))
             self._arrived_at[sender, receiver] = now
             sent_at = self.sent_at[sender][number]
@@ -116,21 +121,20 @@ class Ledger:
         for sender, to in self._directions:
             part = self._delivered[sender, to][begin[sender] : end[sender]]
             sent += len(part)
-            delivered += sum(part)
+            delivered += len(part) - part.count(0)
         return sent, delivered
 
-    def count_critical(self, begin: dict[str, int], end: dict[str, int]) -> tuple[int, int]:
-        """The same of the heartbeats alone."""
+    def count_critical(self, begin: dict[str, int], end: dict[str, int], *, in_time: bool = False) -> tuple[int, int]:
+        """The same of the heartbeats alone. ``in_time``: later ones than :data:`IN_TIME_S` are not delivered."""
         sent = delivered = 0
         for sender, to in self._directions:
-            first = -(-begin[sender] // _HEARTBEAT_EVERY) * _HEARTBEAT_EVERY
-            part = self._delivered[sender, to][first : end[sender] : _HEARTBEAT_EVERY]
+            first = -(-begin[sender] // self.heartbeat_every) * self.heartbeat_every
+            part = self._delivered[sender, to][first : end[sender] : self.heartbeat_every]
             sent += len(part)
-            delivered += sum(part)
+            delivered += part.count(1) if in_time else len(part) - part.count(0)
         return sent, delivered
 
     def await_gap(self, since: float) -> None:
-        """Measure the longest silence from now on."""
         self._arrived_at = dict.fromkeys(self._directions, since)
         self._gap_s = 0.0
 
@@ -140,12 +144,7 @@ class Ledger:
 
     _gap_s = 0.0
 
-    def delivered_total(self) -> int:
-        """The number of correctly delivered frames."""
-        return sum(sum(flags) for flags in self._delivered.values())
-
     def await_recovery(self, since: float) -> None:
-        """Measure when frames sent after ``since`` are delivered."""
         self._since = since
         self._recovered: dict[tuple[str, str], float] = {}
 

@@ -22,24 +22,20 @@ Change = Callable[[bytes, Random], tuple[bytes, str]]
 
 
 def tamper(public: bytes, rng: Random) -> tuple[bytes, str]:
-    """Alter four bytes of the key."""
     at = rng.randrange(len(public) - 4)
     part = bytes(byte ^ rng.randrange(1, 256) for byte in public[at : at + 4])
     return public[:at] + part + public[at + 4 :], f"bytes {at} to {at + 3} of the public key altered"
 
 
 def replace(public: bytes, rng: Random) -> tuple[bytes, str]:
-    """Replace the key by the attacker's."""
     return paper.PaperKey().public, "public key replaced"
 
 
 def tamper_or_replace(public: bytes, rng: Random) -> tuple[bytes, str]:
-    """Alter or replace the key at random."""
     return tamper(public, rng) if rng.random() < 0.5 else replace(public, rng)
 
 
 def invalid(public: bytes, rng: Random) -> tuple[bytes, str]:
-    """Replace the key by an invalid one."""
     name = rng.choice(sorted(ELEMENTS))
     return ELEMENTS[name].to_bytes(paper.KEY_BYTES, "big"), f"public key is {name}"
 
@@ -62,7 +58,6 @@ class AlterKeys(PassiveAttack):
         self._seen = 0
 
     def on_datagram(self, datagram: bytes, direction: Direction, now: float) -> list[Action]:
-        """Change the datagram if it is a public key."""
         self._seen += 1
         if not paper.is_key(datagram):
             return [Send(datagram, direction)]

@@ -26,6 +26,7 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 
 from uavlinkd.core import wire
 from uavlinkd.core.crypto import hmac_sha256
@@ -40,18 +41,6 @@ RENEW_S = 0.25
 _DATAGRAM_BYTES = 65536
 _DATAGRAMS_PER_WAKE_UP = 128
 
-Report = Callable[[str, str], None]
-"""An event, and its explanation for the operator."""
-
-VERIFIED = "hmac_verified"
-MEANINGS = {
-    VERIFIED: "data with a valid HMAC",
-    "hmac_mismatch": "data with an invalid HMAC: altered by an attacker, or made with another key",
-    "bad_public_key": "an invalid public key",
-    "unexpected_key": "a public key that was not requested",
-    "malformed": "a datagram that is not a message of this protocol",
-}
-
 
 class PaperKey:
     """A key pair in RFC 7919's ffdhe2048."""
@@ -64,7 +53,6 @@ class PaperKey:
 
     @property
     def public(self) -> bytes:
-        """The public key as sent."""
         return self._key.public.to_bytes(KEY_BYTES, "big")
 
     def mac_key(self, public: bytes) -> bytes:
@@ -85,18 +73,12 @@ def _ffdh() -> Iterator[None]:
         yield
 
 
-_group: list[Parameters] = []
-
-
+@cache
 def parameters() -> Parameters:
-    """The group, loaded once."""
-    if not _group:
-        _group.append(make_parameters(GROUP_BITS, standard=True))
-    return _group[0]
+    return make_parameters(GROUP_BITS, standard=True)
 
 
 def seal(key: bytes, number: int, frame: bytes) -> bytes:
-    """A datagram with data."""
     signed = wire.envelope_header(1, number) + frame
     return signed + hmac_sha256(key, signed)
 
@@ -132,25 +114,19 @@ class PaperEnd:
 
     Args:
         on_frame: called with each frame that has a valid HMAC.
-        report: called with each event for the operator.
         renew_s: seconds between two exchanges; None for one exchange, and others by :meth:`renew`.
     """
 
     def __init__(
-        self,
-        name: str,
-        *,
-        is_initiator: bool,
-        on_frame: Callable[[bytes], None],
-        report: Report,
-        renew_s: float | None = RENEW_S,
+        self, name: str, *, is_initiator: bool, on_frame: Callable[[bytes], None], renew_s: float | None = RENEW_S
     ) -> None:
         self.name = name
         self.counters: Counter[str] = Counter()
+        """Refused datagrams by reason: ``hmac_mismatch``, ``bad_public_key``, ``malformed``, ``unexpected_key`` (that
+        was not requested)."""
         self.exchanges = 0
         self._is_initiator = is_initiator
         self._on_frame = on_frame
-        self._report = report
         self._renew_s = renew_s
         self._keys: list[bytes] = []  # of the HMAC, the newest first
         self._waiting: PaperKey | None = None
@@ -165,24 +141,20 @@ class PaperEnd:
 
     @property
     def port(self) -> int:
-        """The port for the other end."""
         return int(self._sock.getsockname()[1])
 
     def start(self, to: tuple[str, int]) -> None:
-        """Exchange keys and data with this address."""
         self._to = to
         if self._is_initiator:
             self.renew()
 
     def renew(self) -> None:
-        """Start an exchange, as the initiator."""
         self._waiting = PaperKey()
         self._send(bytes((HELLO,)) + self._waiting.public)
         if self._renew_s is not None:
             self._timer = self._loop.call_at(self._loop.time() + self._renew_s, self.renew)
 
     def close(self) -> None:
-        """Stop."""
         if self._timer is not None:
             self._timer.cancel()
         self._loop.remove_reader(self._sock)
@@ -198,8 +170,8 @@ class PaperEnd:
         assert self._to is not None
         try:
             self._sock.sendto(datagram, self._to)
-        except OSError as error:
-            self._count("send_failed", error.strerror or str(error))
+        except OSError:
+            self.counters["send_failed"] += 1
 
     def _on_readable(self) -> None:
         for _ in range(_DATAGRAMS_PER_WAKE_UP):
@@ -217,17 +189,17 @@ class PaperEnd:
         elif is_key(datagram):
             self._receive_key(datagram[0], datagram[1:])
         else:
-            self._count("malformed")
+            self.counters["malformed"] += 1
 
     def _receive_key(self, kind: int, public: bytes) -> None:
         ours = PaperKey() if kind == HELLO else self._waiting
         if ours is None or (kind == HELLO) is self._is_initiator:
-            self._count("unexpected_key")
+            self.counters["unexpected_key"] += 1
             return
         try:
             key = ours.mac_key(public)
         except ValueError:
-            self._count("bad_public_key")
+            self.counters["bad_public_key"] += 1
             return
         if kind == HELLO:
             self._send(bytes((ANSWER,)) + ours.public)
@@ -239,11 +211,6 @@ class PaperEnd:
         for key in self._keys:
             frame = unseal(key, datagram)
             if frame is not None:
-                self._report(VERIFIED, MEANINGS[VERIFIED])
                 self._on_frame(frame)
                 return
-        self._count("hmac_mismatch")
-
-    def _count(self, reason: str, meaning: str = "") -> None:
-        self.counters[reason] += 1
-        self._report(reason, meaning or MEANINGS[reason])
+        self.counters["hmac_mismatch"] += 1

@@ -8,13 +8,11 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from pathlib import Path
 from typing import Final
 
 from uavlinkd.core.settings import Class
 from uavlinkd.lab.evaluation.paths_plan import (
     JITTER_MS,
-    NAME,
     RTT_MS,
     STALE_S,
     STATION,
@@ -23,7 +21,7 @@ from uavlinkd.lab.evaluation.paths_plan import (
     PathFailure,
     Scenario,
 )
-from uavlinkd.lab.evaluation.records import Record, RunRecords, Value, read_records
+from uavlinkd.lab.evaluation.records import Record, RunRecords, Value
 
 GAP_LIMIT_S: Final = 0.5
 """The longest gap of the stream when a path dies, at a round trip of 100 ms."""
@@ -44,7 +42,6 @@ class FlowView:
     """The frames of one flow, and their deliveries in order."""
 
     sender: str
-    message: str
     cls: Class
     is_state: bool
     sent_s: Sequence[float]
@@ -92,7 +89,7 @@ class FailureView:
     critical_lost: int
     critical_gap_s: float
     stream_gap_s: float
-    detect_s: float | None
+    detection_s: float | None
     """From the failure until the vehicle's stream used the other path."""
     return_s: float | None
     """From the end of the failure until both ends sent critical frames along the path again."""
@@ -105,20 +102,20 @@ class TrialView:
         self.point = trial.point
         self.scenario = Scenario(str(trial.point["scenario"]))
         self.means = Means(str(trial.point["means"]))
+        self.flight = str(trial.point["flight"]) if "flight" in trial.point else None
         self.duration_s = trial.number("duration_s")
         self.sender_late_s = trial.number("sender_late_s")
         mine = [record for record in records if record.point.items() >= trial.point.items()]
         self.flows = [_flow(record) for record in mine if record.kind == "frames"]
-        self.radios = {int(record.number_at("radio")): record for record in mine if record.kind == "radio"}
+        self.radios = {_radio(record): record for record in mine if record.kind == "radio"}
         self.outages = [
-            PathFailure(int(record.number_at("radio")), record.number("at_s"), record.number("until_s"))
+            PathFailure(_radio(record), record.number("at_s"), record.number("until_s"))
             for record in mine
             if record.kind == "failure"
         ]
 
-    def of(self, cls: Class, sender: str | None = None) -> list[FlowView]:
-        """The flows of a class, of both ends or of one."""
-        return [flow for flow in self.flows if flow.cls is cls and sender in (None, flow.sender)]
+    def of(self, cls: Class) -> list[FlowView]:
+        return [flow for flow in self.flows if flow.cls is cls]
 
     @property
     def stale(self) -> int:
@@ -126,13 +123,7 @@ class TrialView:
         return sum(age_s > STALE_S for flow in self.flows for age_s in flow.ages())
 
     @property
-    def oldest_s(self) -> float:
-        """The age of the oldest delivery."""
-        return max((age_s for flow in self.flows for age_s in flow.ages()), default=0.0)
-
-    @property
     def twice(self) -> int:
-        """Deliveries of frames that were delivered before."""
         return sum(len(flow.deliveries) - len(flow.first_arrivals) for flow in self.flows)
 
     @property
@@ -174,15 +165,10 @@ class TrialView:
         chosen = [radio for number, radio in self.radios.items() if number in radios]
         return sum(radio.number("bytes") + header_bytes * radio.number("datagrams") for radio in chosen)
 
-    def bytes_of(self, radio: int) -> dict[str, float]:
-        """Bytes on a radio by class of the frames, and of datagrams without frames."""
-        record, end = self.radios[radio], "_bytes"
-        return {name.removesuffix(end): record.number(name) for name in record.values if name.endswith(end)}
-
     def carried(self, radio: int, sender: str, cls: Class) -> list[float]:
         """When a radio carried frames of a class from one end."""
-        times = self.radios[radio].values.get(f"{sender}_{cls.value}_s", [])
-        return times if isinstance(times, list) else []
+        times: list[float] = self.radios[radio].values.get(f"{sender}_{cls.value}_s", [])
+        return times
 
     @cached_property
     def failures(self) -> list[FailureView]:
@@ -227,15 +213,15 @@ class TrialView:
         return max(times) if len(times) == len(used) else None
 
 
+def _radio(record: Record) -> int:
+    return int(str(record.point["radio"]))
+
+
 def _flow(record: Record) -> FlowView:
-    numbers, arrived_s = record.list_of("numbers"), record.list_of("arrived_s")
+    values = record.values
+    deliveries = list(zip(values["numbers"], values["arrived_s"], strict=True))
     return FlowView(
-        str(record.point["sender"]),
-        str(record.point["message"]),
-        Class(str(record.values["class"])),
-        bool(record.values["is_state"]),
-        record.list_of("sent_s"),
-        [(int(number), at_s) for number, at_s in zip(numbers, arrived_s, strict=True)],
+        str(record.point["sender"]), Class(values["class"]), values["is_state"], values["sent_s"], deliveries
     )
 
 
@@ -271,23 +257,13 @@ class PathsFindings(RunRecords):
 
     def redundancy(self, means: Means, header_bytes: int = 0, flight: str | None = None) -> float | None:
         """The additional bytes, compared to one path, as a share of these; None without the trials."""
-        chosen = [trial for trial in self.trials if trial.point.get("flight") == flight]
+        chosen = [trial for trial in self.trials if trial.flight == flight]
         scenario = Scenario.RECORDED if flight else Scenario.QUIET
         sizes = {trial.means: trial.bytes(header_bytes) for trial in chosen if trial.scenario is scenario}
         return sizes[means] / sizes[Means.ONE] - 1 if {means, Means.ONE} <= sizes.keys() else None
 
     def flights(self) -> list[str]:
-        """The recorded flights that were played."""
-        return list(dict.fromkeys(str(trial.point["flight"]) for trial in self.trials if "flight" in trial.point))
-
-
-def read_paths(folder: Path) -> PathsFindings:
-    """The records in a folder.
-
-    Raises:
-        RecordsError: there are no records, or they cannot be read.
-    """
-    return PathsFindings(*read_records(folder / f"{NAME}.jsonl"))
+        return list(dict.fromkeys(trial.flight for trial in self.trials if trial.flight is not None))
 
 
 def paths_summary(findings: PathsFindings) -> dict[str, Value]:
@@ -342,8 +318,6 @@ def paths_problems(findings: PathsFindings) -> list[str]:
         lines.append(
             f"the machine paused this process for up to {late_s:.2f} s: the times are not those of the daemons"
         )
-    if not findings.of("end"):
-        lines.append("the run was interrupted")
     return lines
 
 

@@ -8,14 +8,12 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Final
 
+from uavlinkd.lab.evaluation.frame import EvaluationSettings
 from uavlinkd.lab.evaluation.records import Value
 from uavlinkd.lab.mitm.radio import RadioSettings
 
-NAME: Final = "paths"
 VEHICLE, STATION = "vehicle", "station"
 BOTH: Final = "both"
-VEHICLE_TO_STATION: Final = f"{VEHICLE}>{STATION}"
-STATION_TO_VEHICLE: Final = f"{STATION}>{VEHICLE}"
 STALL_S: Final = 10.0
 STALE_S: Final = 2.75
 """The maximum age of a delivered frame where two paths carry traffic: section 11 of the specification."""
@@ -29,11 +27,11 @@ DEAD_S: Final = 4.0
 class Means(StrEnum):
     """What carries the frames."""
 
-    OURS = "uavlinkd, two paths"
-    ALL = "uavlinkd, everything on two paths"
-    ONE = "uavlinkd, one path"
-    OTHER = "uavlinkd, the other path"
-    DUPLICATES = "plain MAVLink, duplicated"
+    OURS = "two paths"
+    ALL = "everything twice"
+    ONE = "one path"
+    OTHER = "the other path"
+    DUPLICATES = "plain duplicates"
 
 
 MEANINGS: Final = {
@@ -41,8 +39,8 @@ MEANINGS: Final = {
     Means.ALL: 'the same with `redundancy = "all"`',
     Means.ONE: "two daemons, and only the path that fails",
     Means.OTHER: "two daemons, and only the path that does not fail",
-    Means.DUPLICATES: "no daemon: each frame is sent along both paths, and each copy is delivered, as "
-    "mavlink-router and MAVProxy do with two endpoints",
+    Means.DUPLICATES: "no daemon: plain MAVLink along both paths, and each copy is delivered, as mavlink-router and "
+    "MAVProxy do with two endpoints",
 }
 RADIOS: Final[Mapping[Means, tuple[int, ...]]] = {Means.ONE: (0,), Means.OTHER: (1,)}
 """The radios of means that do not use both."""
@@ -102,6 +100,8 @@ QUICK_MEANS: Final[Mapping[Scenario, tuple[Means, ...]]] = {
 }
 _AT_ONCE: Final = 2
 """How many scenarios run at the same time: one core carries them."""
+_RECORDED_S: Final = 300.0
+"""How much of a recorded flight is played."""
 _OFF_S: Final = 240.0
 """How long the datagrams to a station that is off are counted."""
 
@@ -146,7 +146,6 @@ class PathsPlan:
 
     @property
     def point(self) -> dict[str, Value]:
-        """Where its records are in the grid."""
         delay_s, jitter_s = self.radios[0].delay_s, self.radios[0].jitter_s
         point: dict[str, Value] = {
             "scenario": self.scenario.value,
@@ -157,17 +156,12 @@ class PathsPlan:
 
 
 @dataclass(frozen=True, slots=True)
-class PathsSettings:
+class PathsSettings(EvaluationSettings):
     """The settings of one run."""
 
-    quick: bool = False
-    seed: int = 0
     repeats: int = 100
     """Deaths for each of :data:`CONDITIONS`; a quick run has none."""
-    tlogs: tuple[Path, ...] = ()
-    """Recorded flights whose redundancy is measured."""
-    recorded_s: float = 300.0
-    """How much of each is played."""
+    tlog: tuple[Path, ...] = ()
 
     def rounds(self) -> list[list[tuple[PathsPlan, Means]]]:
         """What runs at the same time. A quick run has one round."""
@@ -176,44 +170,44 @@ class PathsSettings:
         slow = (Scenario.DEATHS, Scenario.OFF, Scenario.RECORDED)
         plans = [self.plan(scenario) for scenario in Scenario if scenario not in slow]
         rounds = [plans[begin : begin + _AT_ONCE] for begin in range(0, len(plans), _AT_ONCE)]
-        if self.tlogs:
-            rounds.append([replace(_flat(Scenario.RECORDED, self.recorded_s), tlog=tlog) for tlog in self.tlogs])
-        if self.repeats:
-            deaths = [
-                replace(_flat(Scenario.DEATHS, 0.0, *condition), deaths=self.repeats) for condition in CONDITIONS
-            ]
-            rounds.append([*deaths, _flat(Scenario.OFF, _OFF_S)])
+        rounds.append([replace(_flat(Scenario.RECORDED, _RECORDED_S), tlog=tlog) for tlog in self.tlog])
+        deaths = [replace(_flat(Scenario.DEATHS, 0.0, *condition), deaths=self.repeats) for condition in CONDITIONS]
+        rounds.append([*deaths, _flat(Scenario.OFF, _OFF_S)])
         return [
             [(plan, means) for plan in chosen for means in MEANS_OF.get(plan.scenario, MEANS_ELSEWHERE)]
             for chosen in rounds
+            if chosen
         ]
 
     def plan(self, scenario: Scenario) -> PathsPlan:
         """The plan of a scenario. Its times are twice as long in a full run, except the stall itself."""
         unit_s = 1.0 if self.quick else 2.0
-        begin_s = 3 * unit_s
+        dead = {"loss": 1.0}
+
+        def failing(duration: float, *outages: tuple[int, float, float]) -> PathsPlan:
+            """Dead radios: number, begin and end. All times in units."""
+            timed = [(radio, begin * unit_s, end * unit_s) for radio, begin, end in outages]
+            return _failing(_flat(scenario, duration * unit_s), timed, dead)
+
         match scenario:
             case Scenario.DIES | Scenario.METERED:
-                return _failing(_flat(scenario, 14 * unit_s), [(0, begin_s, 9 * unit_s)], {"loss": 1.0})
+                return failing(14, (0, 3, 9))
             case Scenario.STALLS:
-                end_s = begin_s + STALL_S
-                return _failing(_flat(scenario, end_s + begin_s), [(0, begin_s, end_s)], {"is_stalled": True})
+                begin_s = 3 * unit_s
+                stall = (0, begin_s, begin_s + STALL_S)
+                return _failing(_flat(scenario, 2 * begin_s + STALL_S), [stall], {"is_stalled": True})
             case Scenario.DEGRADES:
-                return _degrading(_flat(scenario, 17 * unit_s), begin_s, unit_s)
+                return _degrading(_flat(scenario, 17 * unit_s), 3 * unit_s, unit_s)
             case Scenario.FLAPS:
-                times = [begin_s + 3 * unit_s * number for number in range(4)]
-                outages = [(0, at_s, at_s + 1.5 * unit_s) for at_s in times]
-                return _failing(_flat(scenario, 17 * unit_s), outages, {"loss": 1.0})
+                return failing(17, *((0, 3 + 3 * number, 4.5 + 3 * number) for number in range(4)))
             case Scenario.ALTERNATES:
-                outages = [(0, begin_s, 6 * unit_s), (1, 10 * unit_s, 13 * unit_s)]
-                return _failing(_flat(scenario, 16 * unit_s), outages, {"loss": 1.0})
+                return failing(16, (0, 3, 6), (1, 10, 13))
             case Scenario.SWAPS:
-                outages = [(number % 2, (3 + 3 * number) * unit_s, (6 + 3 * number) * unit_s) for number in range(4)]
-                return _failing(_flat(scenario, 17 * unit_s), outages, {"loss": 1.0})
+                return failing(17, *((number % 2, 3 + 3 * number, 6 + 3 * number) for number in range(4)))
             case Scenario.ASYMMETRIC:
                 changes = (
-                    RadioChange(0.0, 0, {"loss": 0.3}, VEHICLE_TO_STATION),
-                    RadioChange(0.0, 1, {"loss": 0.3}, STATION_TO_VEHICLE),
+                    RadioChange(0.0, 0, {"loss": 0.3}, f"{VEHICLE}>{STATION}"),
+                    RadioChange(0.0, 1, {"loss": 0.3}, f"{STATION}>{VEHICLE}"),
                 )
                 return replace(_flat(scenario, 12 * unit_s), changes=changes)
             case Scenario.MANUAL:

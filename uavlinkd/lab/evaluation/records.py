@@ -1,24 +1,37 @@
-"""The records of a run: one JSON line per measurement, and the same as CSV.
+"""The records of a run: JSON lines. The first line has the facts of the run, each other line one record.
 
-The first line has the machine, the versions and the seed. A measurement that failed, did not finish in time or was
-not requested is a record too, with the reason.
+A measurement that failed, did not finish in time or was not requested is a record too, with the reason.
 """
 
 from __future__ import annotations
 
-import csv
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import os
+import platform
+import subprocess
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import StrEnum
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, Self, TypeVar
 
+from uavlinkd import __version__
+
 T = TypeVar("T")
 
 Value = str | int | float | bool | None | list[float]
-"""A value in a record. Durations are in seconds, sizes in bytes or bits, as the name says."""
+"""A value of a point, or a measured one. Durations are in seconds, sizes in bytes or bits, as the name says."""
+
+
+class EvaluationError(Exception):
+    """An evaluation failed. The message is for the operator."""
+
+
+class RecordsError(EvaluationError):
+    """The records cannot be read."""
 
 
 class Status(StrEnum):
@@ -27,25 +40,22 @@ class Status(StrEnum):
     OK = "ok"
     FAILED = "failed"
     NOT_FINISHED = "not finished"
-    """The time limit passed."""
     SKIPPED = "skipped"
-    """It was not requested."""
 
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """One measurement: its ``kind``, the ``point`` of the grid, and the measured ``values``."""
+    """One measurement: its ``kind``, the ``point`` of the grid, and the measured ``values``, as JSON has them."""
 
     kind: str
     point: Mapping[str, Value]
-    values: Mapping[str, Value] = field(default_factory=dict)
+    values: Mapping[str, Any] = field(default_factory=dict)
     status: Status = Status.OK
     reason: str = ""
     """The reason for missing values; empty if there are values."""
 
     @property
     def is_ok(self) -> bool:
-        """Whether the measurement succeeded."""
         return self.status is Status.OK
 
     def number(self, name: str) -> float:
@@ -54,33 +64,10 @@ class Record:
         Raises:
             KeyError: the record has no such number.
         """
-        return _number(self.values, name)
-
-    def number_at(self, name: str) -> float:
-        """A number of the point.
-
-        Raises:
-            KeyError: the point has no such number.
-        """
-        return _number(self.point, name)
-
-    def list_of(self, name: str) -> list[float]:
-        """A list of measured numbers.
-
-        Raises:
-            KeyError: the record has no such list.
-        """
         value = self.values[name]
-        if isinstance(value, list):
-            return value
+        if isinstance(value, int | float):
+            return float(value)
         raise KeyError(name)
-
-
-def _number(values: Mapping[str, Value], name: str) -> float:
-    value = values[name]
-    if isinstance(value, int | float):
-        return float(value)
-    raise KeyError(name)
 
 
 class RunRecords:
@@ -91,43 +78,35 @@ class RunRecords:
         self.records = records
 
     def of(self, kind: str, **point: Value) -> list[Record]:
-        """The records of a kind at a point."""
         return [
             record
             for record in self.records
             if record.kind == kind and all(record.point.get(name) == value for name, value in point.items())
         ]
 
-
-class RecordsError(Exception):
-    """The records cannot be read. The message is for the operator."""
+    def numbers(self, kind: str, name: str, **point: Value) -> list[float]:
+        """One number of each successful record of a kind that has it."""
+        return [
+            record.number(name)
+            for record in self.of(kind, **point)
+            if record.is_ok and record.values.get(name) is not None
+        ]
 
 
 class RecordWriter:
-    """Appends records to ``NAME.jsonl``, and writes ``NAME.csv`` at the end.
-
-    Each line is flushed, so that an interrupted run keeps its records.
-    """
+    """Writes records to ``NAME.jsonl``. Each line is flushed, so that an interrupted run keeps its records."""
 
     def __init__(self, folder: Path, name: str, run: Mapping[str, Value]) -> None:
         folder.mkdir(parents=True, exist_ok=True)
-        self._csv = folder / f"{name}.csv"
         self._file: IO[str] = (folder / f"{name}.jsonl").open("w", encoding="utf-8")
-        self._run = run
-        self.records: list[Record] = []
-        """All records so far."""
         self._line({"run": dict(run)})
 
     def add(self, record: Record) -> None:
-        """Write a record."""
-        self.records.append(record)
         line = {"kind": record.kind, "status": record.status.value, "reason": record.reason}
         self._line({**line, "point": dict(record.point), "values": dict(record.values)})
 
     def close(self) -> None:
-        """Write the CSV, and close."""
         self._file.close()
-        write_csv(self._csv, self._run, self.records)
 
     def _line(self, content: Mapping[str, object]) -> None:
         self._file.write(json.dumps(content) + "\n")
@@ -140,30 +119,6 @@ class RecordWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-
-def write_csv(path: Path, run: Mapping[str, Value], records: Iterable[Record]) -> None:
-    """Write one row per record: kind, status, reason, point, numbers, and the facts of the run.
-
-    Lists (the latency of each frame) are only in the JSON lines.
-    """
-    rows = [
-        {
-            "kind": record.kind,
-            "status": record.status.value,
-            "reason": record.reason,
-            **_scalars(record.point),
-            **_scalars(record.values),
-            **{f"run_{name}": value for name, value in _scalars(run).items()},
-        }
-        for record in records
-    ]
-    columns = list(dict.fromkeys(name for row in rows for name in row))
-    columns.sort(key=lambda name: name.startswith("run_"))  # stable: the facts of the run come last
-    with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.DictWriter(file, columns)
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 def read_records(path: Path) -> tuple[dict[str, Value], list[Record]]:
@@ -180,9 +135,8 @@ def read_records(path: Path) -> tuple[dict[str, Value], list[Record]]:
         raise RecordsError(f"{path}: is not text") from None
     if not lines:
         raise RecordsError(f"{path}: is empty")
-    return _parse(path, 1, lines[0], _run_facts), [
-        _parse(path, number, line, _record) for number, line in enumerate(lines[1:], 2)
-    ]
+    facts = _parse(path, 1, lines[0], lambda content: dict[str, Value](content["run"]))
+    return facts, [_parse(path, number, line, _record) for number, line in enumerate(lines[1:], 2)]
 
 
 def _parse(path: Path, number: int, line: str, read: Callable[[Any], T]) -> T:
@@ -192,14 +146,89 @@ def _parse(path: Path, number: int, line: str, read: Callable[[Any], T]) -> T:
         raise RecordsError(f"{path}: line {number} is not a record of an evaluation") from None
 
 
-def _run_facts(content: Any) -> dict[str, Value]:
-    return dict(content["run"])
-
-
 def _record(content: Any) -> Record:
     point, values = dict(content["point"]), dict(content["values"])
     return Record(str(content["kind"]), point, values, Status(content["status"]), str(content["reason"]))
 
 
-def _scalars(values: Mapping[str, Value]) -> dict[str, Value]:
-    return {name: value for name, value in values.items() if not isinstance(value, list)}
+def machine_facts() -> dict[str, Value]:
+    """The facts for comparing results: processor, cores, system, versions, and the load before the run."""
+    from uavlinkd.lab.evaluation.paper import openssl_version  # noqa: PLC0415  only there the library may be imported
+
+    return {
+        "cpu": _cpu_name(),
+        "cores": os.cpu_count(),
+        "load_before": load(),
+        "system": f"{platform.system()} {platform.release()} {platform.machine()}",
+        "python": platform.python_version(),
+        "uavlinkd": __version__,
+        "commit": _commit(),
+        "cryptography": _version_of("cryptography"),
+        "openssl": openssl_version(),  # that of cryptography, which computes; not that of Python's ssl
+        "uvloop": _version_of("uvloop"),
+    }
+
+
+def load() -> float | None:
+    """The load average of the last minute; None if the system does not provide it."""
+    return round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None
+
+
+def _cpu_name() -> str:
+    with suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            name, _, value = line.partition(":")
+            if name.strip() in ("model name", "Model", "Hardware"):  # x86; boards such as a Raspberry Pi
+                return value.strip()
+    return platform.processor() or platform.machine()
+
+
+def _commit() -> str | None:
+    """The measured commit, with "changed" if files differ from it; None outside a checkout of this project."""
+    answers = []
+    for question in (
+        ("ls-files", "--error-unmatch", __file__),
+        ("rev-parse", "--short", "HEAD"),
+        ("status", "--porcelain", "--", ".."),
+    ):
+        git = ("git", "-C", str(Path(__file__).parent), *question)
+        try:
+            done = subprocess.run(git, capture_output=True, text=True, check=True, timeout=10)  # noqa: S603  constants
+        except (OSError, subprocess.SubprocessError):
+            return None
+        answers.append(done.stdout.strip())
+    _, commit, changes = answers
+    return f"{commit}, changed" if changes else commit
+
+
+def _version_of(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+class CpuTimeError(Exception):
+    """The processor time of a process cannot be read: it has ended, or the system is not Linux."""
+
+
+def cpu_seconds(pid: int) -> float:
+    """The processor time of all threads of a process.
+
+    It comes from the scheduler, in nanoseconds (``/proc/PID/task/*/schedstat``), or if the kernel does not provide
+    that, from ``/proc/PID/stat`` in steps of 10 ms.
+
+    Raises:
+        CpuTimeError: it cannot be read.
+    """
+    threads = Path(f"/proc/{pid}/task")
+    try:
+        return sum(int((thread / "schedstat").read_bytes().split()[0]) for thread in threads.iterdir()) / 1e9
+    except (OSError, IndexError, ValueError):
+        pass
+    try:
+        # After the name, which may have any characters: fields 14 and 15 of proc(5).
+        fields = Path(f"/proc/{pid}/stat").read_bytes().rpartition(b")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    except (OSError, IndexError, ValueError) as error:
+        raise CpuTimeError(f"the processor time of process {pid} cannot be read") from error

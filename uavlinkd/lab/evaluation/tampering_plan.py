@@ -7,14 +7,45 @@ is the attack, the others help it (for example a flood, so that daemons require 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, Final
 
 from uavlinkd.core.constants import QUESTION_LIFETIME_S
+from uavlinkd.lab.evaluation.frame import EvaluationSettings
+from uavlinkd.lab.evaluation.tampering_records import PAPER
 
 HANDSHAKE, DATA, FLOOD, TRAFFIC, KEYS = "handshake", "data", "flood", "traffic", "keys"
-STAGES = ("handshake", "data", "keys", "member", "paper", "reports", "paths", "line", "relay")
+PATHS, SPOILED, LINE, RELAYED = "paths", "spoiled", "line", "relay"
+STAGES = (HANDSHAKE, DATA, KEYS, "paper", "reports", PATHS, SPOILED, LINE, RELAYED)
 """What a run may be limited to. Each has its own daemons."""
-LOAD = "flood-initiations,rate_per_s=600"
+LOAD: Final = "flood-initiations,rate_per_s=600"
 """The load at which daemons require cookies."""
+
+
+@dataclass(frozen=True, slots=True)
+class TamperingSettings(EvaluationSettings):
+    """The extent of the evaluation."""
+
+    attempts_data: int = 10_000
+    attempts_handshake: int = 200
+    only: tuple[str, ...] = ()
+    """The stages that run; empty: all of them, and the floods."""
+
+    @property
+    def rate_hz(self) -> float:
+        """Frames per second of each client on a stage for attacks on data."""
+        return 100.0 if self.quick else 250.0
+
+    def target(self, group: str, system: str) -> int:
+        """The number of attempts of an attack. On the paper's protocol a tenth is sufficient."""
+        if self.quick:
+            return 5 if group in (HANDSHAKE, KEYS) else 60
+        wanted = self.attempts_handshake if group in (HANDSHAKE, KEYS) else self.attempts_data
+        return max(1, wanted // 10) if system == PAPER else wanted
+
+    def most_s(self, group: str) -> float:
+        if self.quick:
+            return 8.0
+        return 300.0 if group in (HANDSHAKE, KEYS) else 60.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +65,9 @@ class TrialPlan:
     validates: bool = False
     """Its strangers relay answers and so become validated addresses: they may receive more than they sent."""
     least_s: float = 0.3
-    """The minimum duration."""
+    spoils_s: float = 0.0
+    """How long its attacks spoil every path first. Frames of that time do not count. Then one path is honest: each
+    critical frame must arrive in time."""
     after_s: float = 0.0
     """How long it continues after the last attempt, to release held datagrams."""
     targeted: bool = True
@@ -62,302 +95,305 @@ def with_target(phase: str, target: int) -> str:
     return phase.replace("{target}", str(target)).replace("{more}", str(target + target // 5))
 
 
-def _alter(name: str, *, on_paper: bool) -> TrialPlan:
-    """An alteration in place: the genuine message is lost, and the peer retries."""
-    phases = (f"{name},message=initiation", f"{name},message=response")
-    return TrialPlan(name, HANDSHAKE, phases, paper=name if on_paper else None)
+def _rows(group: str, table: str, **common: bool | float | str) -> tuple[TrialPlan, ...]:
+    """The plans in a table: attack, line of attacks (by default the attack's name), and what differs from ``common``.
+
+    ``-NAME`` is false. ``paper=same``: the same line on the paper's protocol; ``paper=none``: there is none. An
+    indented line continues the row before it.
+    """
+    plans = []
+    for row in table.strip().replace("\n    ", " ").splitlines():
+        for short, meaning in _SHORT.items():
+            row = row.replace(short, meaning)  # noqa: PLW2901  the same row
+        attack, line, words, *_ = (*(part.strip() for part in row.split("|")), "", "")
+        facts: dict[str, Any] = {"paper": "none", **common}
+        facts |= dict(_fact(word) for word in words.split())
+        facts["paper"] = {"none": None, "same": line or attack}.get(facts["paper"], facts["paper"])
+        plans.append(TrialPlan(attack, group, (line or attack,), **facts))
+    return tuple(plans)
 
 
-HANDSHAKE_PLANS: tuple[TrialPlan, ...] = (
-    _alter("tamper-key", on_paper=True),
-    _alter("replace-key", on_paper=True),
-    _alter("random", on_paper=True),
-    _alter("invalid-element", on_paper=True),
-    _alter("suite-downgrade", on_paper=False),
-    _alter("corrupt-share", on_paper=False),
-    _alter("alter-indices", on_paper=False),
-    _alter("alter-macs", on_paper=False),
-    TrialPlan("alter-macs, mac2 under load", HANDSHAKE, (f"alter-macs,mac=mac2,message=initiation {LOAD}",)),
-    _alter("splice-handshake", on_paper=False),
-    TrialPlan(
-        "replay-initiation", HANDSHAKE, ("replay-initiation,copies=20",), "replay-initiation,copies=5", least_s=1.2
+def _fact(word: str) -> tuple[str, object]:
+    name, _, value = word.partition("=")
+    if name == "paper":
+        return name, value
+    if name == "needs":
+        return name, tuple(value.split(","))
+    return (name, float(value)) if value else (name.removeprefix("-"), not name.startswith("-"))
+
+
+_SHORT: Final = {"<load>": LOAD, "<first>": "direction=both/1", "<question>": str(QUESTION_LIFETIME_S)}
+
+HANDSHAKE_PLANS: Final = (
+    # Alterations of both messages in place: the genuine message is lost, and the peer retries.
+    *(
+        TrialPlan(name, HANDSHAKE, (f"{name},message=initiation", f"{name},message=response"), paper)
+        for names, has_paper in (
+            (("tamper-key", "replace-key", "random", "invalid-element"), True),
+            (("suite-downgrade", "corrupt-share", "alter-indices", "alter-macs", "splice-handshake"), False),
+        )
+        for name in names
+        for paper in ([name] if has_paper else [None])
     ),
-    TrialPlan(
-        "replay-initiation, later",
+    *_rows(
         HANDSHAKE,
-        ("replay-initiation,copies=20,when=later,delay_s=1",),
-        after_s=1.1,
-        is_variant=True,
-    ),
-    TrialPlan(
-        "replay-initiation, after rekey",
-        HANDSHAKE,
-        ("replay-initiation,copies=20,when=rekey",),
-        least_s=3.0,
-        is_variant=True,
-    ),
-    TrialPlan(
-        "replay-initiation, after restart",
-        HANDSHAKE,
-        ("replay-initiation,copies=20,when=restart",),
-        restarts=True,
-        least_s=3.0,
-        is_variant=True,
-    ),
-    TrialPlan("replay-response", HANDSHAKE, ("replay-response,copies=20",), "replay-response,copies=5", least_s=1.2),
-    TrialPlan("replay-cookie", HANDSHAKE, (f"replay-cookie,copies=100 {LOAD}",), restarts=True, least_s=1.5),
-    TrialPlan("stolen-cookie", HANDSHAKE, (f"stolen-cookie,copies=20 {LOAD}",), least_s=1.5),
-    TrialPlan("forge-cookie", HANDSHAKE, ("forge-cookie,copies=20",), least_s=1.2),
-    TrialPlan(
-        "reflect handshakes",
-        HANDSHAKE,
-        ("reflect,kinds=handshake,copies=20",),
-        "reflect,kinds=handshake",
-        least_s=1.2,
-    ),
-    TrialPlan("bit-flip handshakes", HANDSHAKE, ("bit-flip,kinds=handshake",), "bit-flip,kinds=handshake"),
-    TrialPlan(
-        "bit-flip handshakes, mac1 repaired",
-        HANDSHAKE,
-        ("bit-flip,kinds=handshake,repair_mac1=true",),
-        is_variant=True,
-    ),
-    TrialPlan("truncate handshakes", HANDSHAKE, ("truncate,kinds=handshake",), "truncate,kinds=handshake"),
-    TrialPlan("extend handshakes", HANDSHAKE, ("extend,kinds=handshake",), "extend,kinds=handshake"),
-    TrialPlan("drop initiations", HANDSHAKE, ("drop-message,message=initiation",), "drop,kinds=initiation"),
-    TrialPlan("drop responses", HANDSHAKE, ("drop-message,message=response",), "drop,kinds=response"),
-    TrialPlan("drop confirmations", HANDSHAKE, ("drop-message,message=confirmation",), least_s=1.2, is_variant=True),
-    TrialPlan("drop cookies", HANDSHAKE, (f"drop-message,message=cookie {LOAD}",), restarts=True, least_s=1.5),
-    TrialPlan("block-rekey", HANDSHAKE, ("block-rekey",), "block-rekey"),
-    TrialPlan("hold handshakes", HANDSHAKE, ("hold,kinds=handshake,hold_s=0.3",), "hold,kinds=handshake,hold_s=0.1"),
-    TrialPlan("roam with handshakes", HANDSHAKE, ("roam,kinds=handshake",), least_s=1.2),
-    TrialPlan(
-        "cross-initiations",
-        HANDSHAKE,
-        ("cross-initiations drop-message,message=response,share=0.97",),
-        least_s=2.5,
-        notes="most responses are dropped too, so that both peers continue to initiate",
+        """
+alter-macs, mac2 under load | alter-macs,mac=mac2,message=initiation <load>
+replay-initiation | replay-initiation,copies=20 | paper=replay-initiation,copies=5 least_s=1.2
+replay-initiation, later | replay-initiation,copies=20,when=later,delay_s=1 | after_s=1.1 is_variant
+replay-initiation, after rekey | replay-initiation,copies=20,when=rekey | least_s=3 is_variant
+replay-initiation, after restart | replay-initiation,copies=20,when=restart | restarts least_s=3 is_variant
+replay-response | replay-response,copies=20 | paper=replay-response,copies=5 least_s=1.2
+replay-cookie | replay-cookie,copies=100 <load> | restarts least_s=1.5
+stolen-cookie | stolen-cookie,copies=20 <load> | least_s=1.5
+forge-cookie | forge-cookie,copies=20 | least_s=1.2
+reflect handshakes | reflect,kinds=handshake,copies=20 | paper=reflect,kinds=handshake least_s=1.2
+bit-flip handshakes | bit-flip,kinds=handshake | paper=same
+truncate handshakes | truncate,kinds=handshake | paper=same
+extend handshakes | extend,kinds=handshake | paper=same
+bit-flip handshakes, mac1 repaired | bit-flip,kinds=handshake,repair_mac1=true | is_variant
+drop initiations | drop-message,message=initiation | paper=drop,kinds=initiation
+drop responses | drop-message,message=response | paper=drop,kinds=response
+drop confirmations | drop-message,message=confirmation | least_s=1.2 is_variant
+drop cookies | drop-message,message=cookie <load> | restarts least_s=1.5
+block-rekey |  | paper=same
+hold handshakes | hold,kinds=handshake,hold_s=0.3 | paper=hold,kinds=handshake,hold_s=0.1
+roam with handshakes | roam,kinds=handshake | least_s=1.2
+cross-initiations | cross-initiations drop-message,message=response,share=0.97 | least_s=2.5
+""",
     ),
 )
-"""On a link with a rekey per second and fast retries."""
+"""On a link with a rekey per second and fast retries. With cross-initiations, most responses are dropped too, so that
+both peers continue to initiate."""
 
-STALE_PLANS: tuple[TrialPlan, ...] = tuple(
-    TrialPlan(
-        f"{name}, peer restarted",
-        HANDSHAKE,
-        (f"{name}{options}",),
-        restarts=True,
-        least_s=2.0,
-        targeted=False,
-        is_variant=is_variant,
-        notes="without a session during the attack; default retry timers",
-    )
-    for name, options, is_variant in (
-        ("tamper-key", "", False),
-        ("replace-key", "", True),
-        ("random", "", True),
-        ("drop-message", ",message=response", True),
-        ("block-rekey", "", True),
-    )
+STALE_PLANS: Final = _rows(
+    HANDSHAKE,
+    """
+tamper-key, peer restarted | tamper-key | -is_variant
+replace-key, peer restarted | replace-key
+random, peer restarted | random
+drop-message, peer restarted | drop-message,message=response
+block-rekey, peer restarted | block-rekey
+""",
+    restarts=True,
+    least_s=2.0,
+    targeted=False,
+    is_variant=True,
 )
-"""On a link with the default timers: the link recovers after the attack."""
+"""Without a session during the attack, on a link with the default timers: the link recovers after the attack."""
 
-DATA_PLANS: tuple[TrialPlan, ...] = (
-    TrialPlan("bit-flip", DATA, ("bit-flip,beside=true",), "bit-flip,beside=true"),
-    TrialPlan("bit-flip, in place", DATA, ("bit-flip",), "bit-flip", is_variant=True),
-    TrialPlan("truncate", DATA, ("truncate,beside=true",), "truncate,beside=true"),
-    TrialPlan("extend", DATA, ("extend,beside=true",), "extend,beside=true"),
-    TrialPlan("splice", DATA, ("splice,beside=true",), "splice,beside=true"),
-    TrialPlan("counter-jump", DATA, ("counter-jump",), "counter-jump"),
-    TrialPlan("alter-frame", DATA, ("alter-frame,beside=true",), "alter-frame,beside=true"),
-    TrialPlan("alter-frame, in place", DATA, ("alter-frame",), "alter-frame", is_variant=True),
-    TrialPlan("tamper-tag", DATA, ("tamper-tag,beside=true",), "tamper-tag,beside=true"),
-    TrialPlan("forge-data", DATA, ("forge-data,rate_per_s=1500",), "forge-data,rate_per_s=1500", is_silent=True),
-    TrialPlan("raw-mavlink", DATA, ("raw-mavlink,rate_per_s=1500",), "raw-mavlink,rate_per_s=1500", is_silent=True),
-    TrialPlan("replay-data", DATA, ("replay-data,copies=2",), "replay-data,copies=2"),
-    TrialPlan(
-        "replay-data, later",
-        DATA,
-        ("replay-data,when=later,delay_s=1",),
-        "replay-data,when=later,delay_s=1",
-        least_s=1.5,
-        is_variant=True,
-    ),
-    TrialPlan(
-        "replay-data, after rekey", DATA, ("replay-data,when=rekey,rate_per_s=3000",), least_s=3.0, is_variant=True
-    ),
-    TrialPlan(
-        "replay-data, after restart",
-        DATA,
-        ("replay-data,when=restart,rate_per_s=3000,copies=24",),
-        restarts=True,
-        least_s=3.0,
-        is_variant=True,
-    ),
-    TrialPlan("replay-data, from elsewhere", DATA, ("replay-data,origin=stranger",), "replay-data,origin=stranger"),
-    TrialPlan("duplicate", DATA, ("duplicate",), "duplicate,kinds=envelope"),
-    TrialPlan("reflect", DATA, ("reflect,kinds=envelope",), "reflect,kinds=envelope"),
-    TrialPlan(
-        "hold",
-        DATA,
-        ("hold,hold_s=2.6,share=0.5,limit={target}",),
-        "hold,hold_s=2.6,share=0.5,limit={target}",
-        after_s=2.8,
-        takes_away=True,
-        notes="longer than the maximum delay: released frames are refused as delayed",
-    ),
-    TrialPlan("reorder", DATA, ("reorder,limit={more}",), "reorder,limit={more}", after_s=3.0),
-    TrialPlan("roam, racing", DATA, ("roam",), "roam"),
-    TrialPlan(
-        "roam, then gone",
-        DATA,
-        ("roam,mode=instead",),
-        "roam,mode=instead",
-        noticed_after_s=QUESTION_LIFETIME_S,
-        needs=("paths_unproven",),
-        takes_away=True,
-    ),
+DATA_PLANS: Final = _rows(
+    DATA,
+    """
+bit-flip | bit-flip,beside=true
+truncate | truncate,beside=true
+extend | extend,beside=true
+splice | splice,beside=true
+alter-frame | alter-frame,beside=true
+tamper-tag | tamper-tag,beside=true
+bit-flip, in place | bit-flip | is_variant
+alter-frame, in place | alter-frame | is_variant
+counter-jump
+forge-data | forge-data,rate_per_s=1500 | is_silent
+raw-mavlink | raw-mavlink,rate_per_s=1500 | is_silent
+replay-data | replay-data,copies=2
+replay-data, later | replay-data,when=later,delay_s=1 | least_s=1.5 is_variant
+replay-data, after rekey | replay-data,when=rekey,rate_per_s=3000 | paper=none least_s=3 is_variant
+replay-data, after restart | replay-data,when=restart,rate_per_s=3000,copies=24
+    | paper=none restarts least_s=3 is_variant
+replay-data, from elsewhere | replay-data,origin=stranger
+duplicate |  | paper=duplicate,kinds=envelope
+reflect | reflect,kinds=envelope
+hold | hold,hold_s=2.6,share=0.5,limit={target} | after_s=2.8 takes_away
+reorder | reorder,limit={more} | after_s=3
+roam, racing | roam
+roam, then gone | roam,mode=instead | noticed_after_s=<question> takes_away needs=paths_unproven
+""",
+    paper="same",
 )
-"""On a link with a rekey every two seconds."""
+"""On a link with a rekey every two seconds. What is held is refused as delayed when it is released."""
 
-REPORT_PLANS: tuple[TrialPlan, ...] = (
-    TrialPlan(
-        "bit-flip reports",
-        DATA,
-        ("bit-flip,kinds=report,beside=true",),
-        targeted=False,
-        least_s=5.0,
-        notes="refusal reports, one in 2 s: each claim that a drone shows is compared with the refused frames",
-    ),
-    TrialPlan("duplicate reports", DATA, ("duplicate,kinds=report",), targeted=False, least_s=5.0, is_variant=True),
-    TrialPlan(
-        "drop reports",
-        DATA,
-        ("drop,kinds=report",),
-        targeted=False,
-        least_s=5.0,
-        takes_away=True,
-        is_variant=True,
-        notes="a reason is hidden; frames are not affected",
-    ),
+REPORT_PLANS: Final = _rows(
+    DATA,
+    """
+bit-flip reports | bit-flip,kinds=report,beside=true
+duplicate reports | duplicate,kinds=report | is_variant
+drop reports | drop,kinds=report | takes_away is_variant
+""",
+    targeted=False,
+    least_s=5.0,
 )
-"""On a link whose ends refuse frames of each other, and report them."""
+"""On a link whose ends refuse frames of each other, and report them, one report in 2 s."""
 
-FLOOD_PLANS: tuple[TrialPlan, ...] = (
-    TrialPlan(
-        "flood-envelopes",
-        FLOOD,
-        ("flood-envelopes,rate_per_s=3000",),
-        "flood-envelopes,rate_per_s=3000",
-        is_silent=True,
-    ),
-    TrialPlan("flood-initiations", FLOOD, ("flood-initiations,rate_per_s=1500",)),
-    TrialPlan(
-        "flood-initiations, no public key",
-        FLOOD,
-        ("flood-initiations,mac1=bad,rate_per_s=1500",),
-        is_silent=True,
-        is_variant=True,
-    ),
-    TrialPlan("flood-replays", FLOOD, ("flood-replays,rate_per_s=1500",), least_s=1.3),
-    TrialPlan(
-        "flood-garbage", FLOOD, ("flood-garbage,rate_per_s=1500",), "flood-garbage,rate_per_s=1500", is_silent=True
-    ),
-    TrialPlan(
-        "stranger-scan", FLOOD, ("stranger-scan,rate_per_s=1500",), "stranger-scan,rate_per_s=1500", is_silent=True
-    ),
-    TrialPlan("amplification-probe", FLOOD, ("amplification-probe,rate_per_s=1500",)),
-    TrialPlan("forge-hints", FLOOD, ("forge-hints,rate_per_s=1500",)),
+FLOOD_PLANS: Final = _rows(
+    FLOOD,
+    """
+flood-envelopes | flood-envelopes,rate_per_s=3000 | paper=same is_silent
+flood-initiations | flood-initiations,rate_per_s=1500
+flood-initiations, no public key | flood-initiations,mac1=bad,rate_per_s=1500 | is_silent is_variant
+flood-replays | flood-replays,rate_per_s=1500 | least_s=1.3
+flood-garbage | flood-garbage,rate_per_s=1500 | paper=same is_silent
+stranger-scan | stranger-scan,rate_per_s=1500 | paper=same is_silent
+amplification-probe | amplification-probe,rate_per_s=1500
+forge-hints | forge-hints,rate_per_s=1500
+""",
 )
 """On the same link as the attacks on data."""
 
-TRAFFIC_PLANS: tuple[TrialPlan, ...] = (
-    TrialPlan("drop, half", TRAFFIC, ("drop,share=0.5",), "drop,share=0.5", takes_away=True),
-    TrialPlan(
-        "drop, one way",
-        TRAFFIC,
-        ("drop,direction=drone0>drone1",),
-        "drop,direction=drone0>drone1",
-        targeted=False,
-        least_s=1.0,
-        is_variant=True,
-    ),
-    TrialPlan(
-        "drop-heartbeats",
-        TRAFFIC,
-        ("drop-heartbeats",),
-        "drop-heartbeats",
-        targeted=False,
-        least_s=1.0,
-        takes_away=True,
-        needs=("envelopes_missing",),
-    ),
-    TrialPlan(
-        "stretch",
-        TRAFFIC,
-        ("stretch,direction=drone0>drone1,interval_s=0.4",),
-        "stretch,direction=drone0>drone1,interval_s=0.4",
-        targeted=False,
-        least_s=5.0,
-        takes_away=True,
-        notes="the delay grows with each envelope",
-    ),
-    TrialPlan(
-        "stretch-one-way",
-        TRAFFIC,
-        ("stretch-one-way,direction=drone0>drone1,interval_s=0.4",),
-        targeted=False,
-        least_s=5.0,
-        takes_away=True,
-        notes="the same, and the echo records of the other direction are dropped",
-    ),
-    TrialPlan(
-        "blackout, 1 s",
-        TRAFFIC,
-        ("blackout,seconds=60",),
-        "blackout,seconds=60",
-        targeted=False,
-        least_s=1.0,
-        takes_away=True,
-        needs=("envelopes_missing",),
-    ),
+TRAFFIC_PLANS: Final = _rows(
+    TRAFFIC,
+    """
+drop, half | drop,share=0.5 | least_s=0.3 targeted takes_away
+drop, one way | drop,direction=drone0>drone1 | is_variant
+drop-heartbeats |  | takes_away needs=envelopes_missing
+stretch | stretch,direction=drone0>drone1,interval_s=0.4 | least_s=5 takes_away
+stretch-one-way | stretch-one-way,direction=drone0>drone1,interval_s=0.4 | paper=none least_s=5 takes_away
+blackout, 1 s | blackout,seconds=60 | takes_away needs=envelopes_missing
+""",
+    paper="same",
+    targeted=False,
+    least_s=1.0,
 )
-"""Between three drones, with a rekey per second."""
+"""Between three drones, with a rekey per second. In ``stretch`` the delay grows with each envelope; one way, the echo
+records of the other direction are dropped."""
 
-LONG_PLANS: tuple[TrialPlan, ...] = (
-    TrialPlan("blackout, 4 s", TRAFFIC, ("blackout,seconds=60",), targeted=False, least_s=4.0, is_variant=True),
-    TrialPlan("blackout, 12 s", TRAFFIC, ("blackout,seconds=60",), targeted=False, least_s=12.0, is_variant=True),
-    TrialPlan(
-        "blackout, kept and let go",
-        TRAFFIC,
-        ("hold,kinds=any,hold_s=10,seconds=10",),
-        "hold,kinds=any,hold_s=10,seconds=10",
-        targeted=False,
-        least_s=10.0,
-        after_s=10.5,
-        is_variant=True,
-        notes="all datagrams are held for 10 s, then released",
-    ),
+LONG_PLANS: Final = _rows(
+    TRAFFIC,
+    """
+blackout, 4 s | blackout,seconds=60 | least_s=4
+blackout, 12 s | blackout,seconds=60 | least_s=12
+blackout, kept and let go | hold,kinds=any,hold_s=10,seconds=10 | paper=same least_s=10 after_s=10.5
+""",
+    targeted=False,
+    is_variant=True,
 )
 """Likewise, only in a full run."""
 
-LAST_PLANS: tuple[TrialPlan, ...] = (
-    TrialPlan("wander", DATA, ("wander",), "wander", validates=True),
-    TrialPlan(
-        "roam, relaying",
-        DATA,
-        ("roam,mode=relay",),
-        "roam,mode=relay",
-        validates=True,
-        targeted=False,
-        least_s=2.0,
-        is_variant=True,
-    ),
+LAST_PLANS: Final = _rows(
+    DATA,
+    """
+wander
+roam, relaying | roam,mode=relay | least_s=2 -targeted is_variant
+""",
+    paper="same",
+    validates=True,
 )
 """They validate strangers, so they run after the attacks that count bytes to strangers."""
 
-MISROUTE_PLANS: tuple[TrialPlan, ...] = (
-    TrialPlan("misroute", DATA, ("misroute,kinds=envelope",)),
-    TrialPlan("misroute handshakes", HANDSHAKE, ("misroute,kinds=handshake,copies=20",), least_s=1.2),
+MISROUTE_PLANS: Final = (
+    *_rows(DATA, "misroute | misroute,kinds=envelope"),
+    *_rows(HANDSHAKE, "misroute handshakes | misroute,kinds=handshake,copies=20 | least_s=1.2"),
 )
-"""Between three drones."""
+
+PAPER_PLANS: Final = tuple(
+    plan
+    for rows in (HANDSHAKE_PLANS, DATA_PLANS, FLOOD_PLANS, TRAFFIC_PLANS, LONG_PLANS, LAST_PLANS)
+    for plan in rows
+    if plan.paper is not None
+)
+
+_ON_PATHS: Final[dict[str, Any]] = {"takes_away": True, "keeps_link": True, "targeted": False}
+
+PATH_PLANS: Final = _rows(
+    PATHS,
+    """
+copies on the other path | replay-data,<first>,onto=2 | least_s=0.3 targeted -is_variant needs=duplicate
+copies on the other path, after 3 s | replay-data,<first>,onto=2,when=later,delay_s=3
+    | least_s=0.3 targeted needs=late_copy
+copies on the other path, after 10 s | replay-data,<first>,onto=2,when=later,delay_s=10
+    | least_s=0.3 targeted needs=late_copy
+moved to the other path | move,<first>,onto=2 | least_s=3 -is_variant needs=unexpected_answer
+one path dropped | drop,<first> | least_s=3 -is_variant needs=path_changed
+one path dropped, long | drop,<first> | needs=path_changed
+one path slowed | hold,kinds=any,<first>,hold_s=0.2 | needs=path_changed
+frames dropped, probes pass | drop,kinds=frames,<first> | least_s=5 -is_variant needs=path_changed
+frames dropped, probes pass, long | drop,kinds=frames,<first> | needs=path_changed
+stream dropped, copies pass | drop-heartbeats,message_id=30,<first> | needs=path_changed
+frames delayed, probes pass | hold,kinds=frames,<first>,hold_s=3 | after_s=3.5 needs=path_changed,delayed
+frames replaced by those of the other path | drop,kinds=frames,<first> move,direction=both/2,onto=1,beside=true
+    | needs=unexpected_answer
+one path held and let go | hold,kinds=any,<first>,hold_s=10,at_once=true,seconds=10
+    | least_s=10 after_s=2 needs=path_changed,late_copy
+probes copied to the other path | duplicate,kinds=probe,<first>,onto=2 | least_s=3 -is_variant needs=duplicate
+probes of one path, faster along the other | move,kinds=probe,direction=both/2,onto=1,beside=true
+    | needs=unexpected_answer
+probes replayed later | duplicate,kinds=probe,<first>,when=later,delay_s=1 | needs=duplicate
+bit-flip probes | bit-flip,kinds=probe,<first> | least_s=3 -is_variant needs=bad_tag
+bit-flip probes beside genuine ones | bit-flip,kinds=probe,beside=true | needs=bad_tag
+responses dropped on one path | drop-message,message=response,<first> | needs=handshakes_unanswered
+responses dropped on one path, peer restarted | drop-message,message=response,<first> | restarts -keeps_link
+roam on one path, racing | roam,<first> | needs=duplicate,paths_unproven
+roam on one path, then gone | roam,<first>,mode=instead | noticed_after_s=<question> needs=paths_unproven
+many spoofed sources | wander,mode=race | least_s=3 -is_variant needs=paths_unproven
+many spoofed sources, long | wander,mode=race | needs=paths_unproven
+many relayed sources | wander,<first> | validates needs=paths_unproven
+roam on one path, relaying | roam,<first>,mode=relay | validates needs=path_changed
+""",
+    # A path that is down gets copies for 10 s after its last answer: longer attacks show what happens then.
+    least_s=14.0,
+    is_variant=True,
+    **_ON_PATHS,
+)
+"""The first path is the faster one, so it is the best when an attack begins. The last rows validate strangers."""
+
+SPOILED_PLANS: Final = _rows(
+    PATHS,
+    """
+both paths spoiled, then one held | hold,kinds=any,direction=both/2,begin_s=7,hold_s=10
+    drop,share=0.5,<first>,seconds=7 drop,kinds=probe,<first>,seconds=7
+    hold,kinds=any,direction=both/2,hold_s=1.9,seconds=7
+    | least_s=12 spoils_s=7 needs=path_changed,late_copy
+""",
+    is_variant=True,
+    **_ON_PATHS,
+)
+"""For 7 s the first path loses half, and all probes; the second one is 1.9 s slow, and becomes the best. With
+heartbeats alone: a stream would show sooner that the best path carries nothing."""
+
+LINE_PLANS: Final = _rows(
+    LINE,
+    """
+bytes injected on the line | line-noise,interval_s=0.1 | needs=line_noise
+line frames with one altered byte | line-bad-crc,interval_s=0.025 | needs=line_noise
+line frames cut at every offset | line-cut,interval_s=0.1 | needs=line_noise
+datagrams replayed on the line | line-replay,interval_s=0.025 | needs=duplicate
+datagrams forged on the line | line-forge,interval_s=0.025 | needs=bad_tag,unknown_index
+line held for 3 s and let go | line-hold,hold_s=3,interval_s=1000,end=both | least_s=3 after_s=3 -targeted
+line held for 10 s and let go | line-hold,hold_s=10,interval_s=1000,end=both
+    | least_s=10 after_s=3 -targeted is_variant needs=peer_lost
+line held for 10 s in one direction | line-hold,hold_s=10,interval_s=1000,end=right
+    | least_s=10 after_s=3 -targeted is_variant
+""",
+    takes_away=True,
+)
+"""On a serial line, with a rekey every ten seconds. The first three add no whole datagram to the recorded ones, from
+which the fourth one selects."""
+
+RELAYED_PLANS: Final = _rows(
+    RELAYED,
+    """
+relay drops half | drop,kinds=any,share=0.5 | needs=envelopes_missing
+relay drops everything for 1 s | blackout,seconds=60 | least_s=1 -targeted
+relay drops everything for 14 s | blackout,seconds=60 | least_s=14 -targeted is_variant needs=peer_lost
+relay delays by 3 s | hold,hold_s=3,share=0.5,limit={target} | after_s=3.2 needs=delayed
+relay duplicates | duplicate | needs=duplicate
+relay reorders | reorder,limit={more} | after_s=3 needs=envelopes_out_of_order
+relay misdelivers envelopes | misroute,kinds=envelope | needs=unknown_index
+relay misdelivers handshakes | misroute,kinds=handshake,copies=100 | least_s=3 needs=bad_mac1
+relay alters | bit-flip,beside=true | needs=bad_tag
+relay forges | forge-data,rate_per_s=1500 | needs=bad_tag
+relay replays | replay-data,copies=2 | needs=duplicate
+relay replays later | replay-data,when=later,delay_s=3 | least_s=4 is_variant
+relay replays after a member's restart | replay-data,when=restart,rate_per_s=3000,copies=24
+    | restarts least_s=3 -targeted is_variant
+relay lies about addresses | relay-lie,rate_per_s=100 | is_silent
+relay invents handles | relay-invent | least_s=3 needs=relay_unknown_handle,relay_malformed
+relay sends frames of its own | relay-frames,rate_per_s=100 | needs=frames_not_allowed
+relay lies about filters | relay-filter,rate_per_s=100 | needs=relay_unexpected_token
+relay binds the wrong members | relay-bind-wrong,rate_per_s=100 | least_s=5 needs=unknown_index
+relay restarts, then replays | relay-restart | least_s=6
+""",
+    takes_away=True,
+)
+"""On three daemons that reach each other only along a hostile relay. The last two leave gaps in the counters, which
+the daemons report later."""

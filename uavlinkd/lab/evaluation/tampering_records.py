@@ -1,31 +1,26 @@
 """The records of trials, with a verdict derived from the evidence.
 
-One JSON line per trial. A trial may have thousands of attempts; the log of the man in the middle has each
-intervention.
+A trial may have thousands of attempts; the log of the man in the middle has each intervention.
 """
 
 from __future__ import annotations
 
-import json
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
-from pathlib import Path
+from functools import cached_property
 from typing import Any
 
+from uavlinkd.lab.evaluation.records import Record, RunRecords
 from uavlinkd.lab.mitm.attack import Operation
 
 PAPER, OURS = "paper", "uavlinkd"
-"""The systems."""
 RELAY = "two-sided-relay"
 """The attack that must succeed against the paper's protocol and fail against uavlinkd."""
 RECOVERY_LIMIT_S = 2.0
 """If a link does not recover by itself within this time, the attack succeeded."""
 NOT_IN_TIME = "the link did not recover in time"
-
-
-EFFECT_HEAD = ("attack", "duration", "attempts", "false frames accepted", "genuine frames lost")
-"""The heads of the columns of :attr:`Trial.effect`."""
 _WITHHELD = (Operation.DROPPED, Operation.HELD, Operation.REORDERED)
 
 
@@ -33,18 +28,24 @@ class Verdict(StrEnum):
     """The result of an attack."""
 
     SUCCEEDED = "succeeded"
-    """A forged, altered, replayed, reflected or misrouted frame was delivered; or the attacker shares keys with a
-    drone; or a drone answered where it must be silent, or amplified; or the link did not recover."""
     DETECTED = "detected"
-    """The attack did not succeed, and the drones noticed it: a counter beyond its rate without an attack, and a line
-    in the log."""
     BLOCKED = "blocked"
-    """The attack did not succeed, but frames were lost or late meanwhile. Dropping and delaying shows no datagram
-    that a drone could refuse."""
     HARMLESS = "harmless"
-    """The attack did not succeed, all frames were delivered, and there was nothing to notice."""
     BROKEN = "broken"
-    """The attack never reached the network."""
+
+
+MEANINGS = {
+    Verdict.SUCCEEDED: "a forged, altered, replayed, reflected or misrouted frame was delivered, or the attacker has "
+    "session keys with a drone that believes it to be another, or a drone answered where it must be silent, or the "
+    f"link did not carry frames again within {RECOVERY_LIMIT_S:g} s after the attack",
+    Verdict.DETECTED: "the attack did not succeed, and the drones noticed it: a counter grew more than without an "
+    "attack, or the log has the loss of a peer or a change of path. A bad radio also drops and delays frames: such "
+    "attacks look like loss",
+    Verdict.BLOCKED: "the attack did not succeed, but frames were lost or late meanwhile. Dropping and delaying show "
+    "no datagram to refuse",
+    Verdict.HARMLESS: "the attack did not succeed, all frames were delivered, and there was nothing to notice",
+    Verdict.BROKEN: "the attack never reached the network",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,44 +54,37 @@ class Trial:
 
     system: str
     attack: str
-    """The row of the table."""
     group: str
-    seed: int
-    parameters: tuple[str, ...]
-    """The line of attacks for the man in the middle, per phase."""
-    begin_s: float
-    """Since the run began."""
-    duration_s: float
     attempts: int
     """Datagrams forged, altered, replayed, held back and so on, including those for a stopped drone."""
-    interventions: Mapping[str, int]
+    parameters: Sequence[str] = field(default_factory=list)
+    """The line of attacks for the man in the middle, per phase."""
+    duration_s: float = 0.0
+    interventions: Mapping[str, int] = field(default_factory=dict)
     """By "attack: operation"."""
-    target: int
-    """The requested number of attempts; 0 if the duration was limited."""
-    faults: Mapping[str, int]
+    faults: Mapping[str, int] = field(default_factory=dict)
     """False frames delivered to clients, by kind."""
-    sessions: int
+    sessions: int = 0
     """Sessions of the attacker with a drone that believes it to be another."""
-    achieved: Mapping[str, Any]
-    """Of attackers with keys: initiations, answers, frames read."""
-    bytes_to_strangers: int
-    must_be_silent: bool
-    amplified: tuple[str, ...]
-    frames_sent: int
+    achieved: Mapping[str, int] = field(default_factory=dict)
+    """Of attackers with keys: initiations, answers, sessions, frames read."""
+    bytes_to_strangers: int = 0
+    must_be_silent: bool = False
+    amplified: Sequence[str] = field(default_factory=list)
+    frames_sent: int = 0
     """During the attack, counted per receiver."""
-    frames_delivered: int
-    noticed: Mapping[str, Mapping[str, int]]
-    """By drone: counters of drops and link problems that grew."""
-    events: Mapping[str, Mapping[str, int]]
-    """By drone: events in its log meanwhile."""
-    recovery_s: float | None
+    frames_delivered: int = 0
+    noticed: Mapping[str, int] = field(default_factory=dict)
+    """Counters of drops and link problems that grew, of all drones together."""
+    events: Mapping[str, int] = field(default_factory=dict)
+    """Events in their logs meanwhile."""
+    recovery_s: float | None = None
     """From the attack's end until all receivers got frames sent after it; None: not within 5 s."""
     notes: str = ""
     observed_s: float = 0.0
     """How long the drones' counters were observed: longer than the attack."""
     control: Mapping[str, float] = field(default_factory=dict)
     """The counters of all drones of this stage per second without an attack."""
-
     critical_sent: int = 0
     critical_lost: int = 0
     """Heartbeats, of those sent during the attack."""
@@ -98,17 +92,16 @@ class Trial:
     """The longest time without a frame at any receiver during the attack."""
     must_stay_up: bool = False
     """Whether a path worked that was not attacked."""
-    needs: tuple[str, ...] = ()
+    needs: Sequence[str] = field(default_factory=list)
     """The counters and events that must show the attack."""
 
     @property
     def stayed_up(self) -> bool:
         """Whether no drone lost its peer, or was silent for as long as a recovery may take."""
-        return self.gap_s <= RECOVERY_LIMIT_S and not any(events.get("peer_lost") for events in self.events.values())
+        return self.gap_s <= RECOVERY_LIMIT_S and not self.events.get("peer_lost")
 
     @property
     def unseen(self) -> list[str]:
-        """What should have shown the attack, and did not."""
         return unseen(self.needs, self.noticed, self.events)
 
     @property
@@ -122,22 +115,15 @@ class Trial:
         return self.frames_sent - self.frames_delivered
 
     @property
-    def effect(self) -> list[str]:
-        """What it did and achieved, as the first cells of a row."""
-        return [
-            self.attack,
-            f"{self.duration_s:.0f} s",
-            f"{self.attempts:,}",
-            str(sum(self.faults.values())),
-            f"{self.frames_lost:,} of {self.frames_sent:,}",
-        ]
+    def false_frames(self) -> int:
+        return sum(self.faults.values())
 
     @property
     def is_noticed(self) -> bool:
         """Whether an operator can notice it: an event that attacks cause, or a counter beyond its usual rate."""
-        logged = {name.partition(":")[0] for events in self.events.values() for name in events}
+        logged = {name.partition(":")[0] for name in self.events}
         is_logged = bool(logged & {"peer_lost", "path_changed"})
-        return is_logged or any(count > self._usual(reason) for reason, count in self.reasons.items())
+        return is_logged or any(count > self._usual(reason) for reason, count in self.noticed.items())
 
     def _usual(self, reason: str) -> float:
         """The maximum count that is usual without an attack."""
@@ -145,17 +131,7 @@ class Trial:
         return 2 + 2 * rate * self.observed_s if rate else 0.0
 
     @property
-    def reasons(self) -> dict[str, int]:
-        """The sums of all drones' counters."""
-        total: dict[str, int] = {}
-        for counts in self.noticed.values():
-            for reason, count in counts.items():
-                total[reason] = total.get(reason, 0) + count
-        return dict(sorted(total.items(), key=lambda pair: -pair[1]))
-
-    @property
     def successes(self) -> list[str]:
-        """The successes of the attacker, as text."""
         successes = [f"{count} frames {kind}" for kind, count in self.faults.items() if count]
         if self.sessions:
             successes.append(f"{self.sessions} key exchanges with the drones")
@@ -173,7 +149,6 @@ class Trial:
 
     @property
     def verdict(self) -> Verdict:
-        """The verdict, derived from the evidence."""
         if self.attempts == 0:
             return Verdict.BROKEN
         if self.successes:
@@ -182,90 +157,52 @@ class Trial:
             return Verdict.DETECTED
         return Verdict.BLOCKED if self.frames_lost else Verdict.HARMLESS
 
-    def to_json(self) -> str:
-        """One line, with the verdict."""
-        facts = {**asdict(self), "frames_lost": self.frames_lost, "verdict": self.verdict.value}
-        return json.dumps({**facts, "successes": self.successes})
+    def to_record(self) -> Record:
+        return Record("trial", {"verdict": self.verdict.value, "attack": self.attack}, asdict(self))
 
 
-def unseen(
-    needs: Sequence[str], noticed: Mapping[str, Mapping[str, int]], events: Mapping[str, Mapping[str, int]]
-) -> list[str]:
+def unseen(needs: Sequence[str], noticed: Mapping[str, int], events: Mapping[str, int]) -> list[str]:
     """The counters and events of ``needs`` that no drone shows."""
-    shown = {name.partition(":")[0] for logged in events.values() for name in logged}
-    shown.update(reason for counts in noticed.values() for reason, count in counts.items() if count)
+    shown = {name.partition(":")[0] for name in events} | {reason for reason, count in noticed.items() if count}
     return [name for name in needs if name not in shown]
 
 
-@dataclass(frozen=True, slots=True)
-class FloodSamples:
-    """Samples of the drones' load under spoofed initiations. Times are seconds since the first sample."""
+class TamperingFindings(RunRecords):
+    """The trials of one run."""
 
-    rate_per_s: float
-    begin_s: float
-    end_s: float
-    """The start and end of the flood."""
-    at_s: list[float]
-    cpu_share: dict[str, list[float]]
-    """Share of one core since the last sample, by daemon."""
-    memory_bytes: dict[str, list[int]]
-    """Resident memory, by daemon."""
-    sent_hz: list[float]
-    delivered_hz: list[float]
-    """Genuine frames per second, both directions."""
-    initiations: int
+    @cached_property
+    def trials(self) -> list[Trial]:
+        return [Trial(**record.values) for record in self.of("trial")]
 
-    def to_json(self) -> str:
-        """One line."""
-        return json.dumps({"flood": asdict(self)})
-
-
-@dataclass(slots=True)
-class Run:
-    """The facts, trials and floods of a run."""
-
-    facts: dict[str, Any] = field(default_factory=dict)
-    trials: list[Trial] = field(default_factory=list)
-    floods: list[FloodSamples] = field(default_factory=list)
-
-    def of(self, system: str) -> list[Trial]:
-        """The trials against one system."""
+    def on(self, system: str) -> list[Trial]:
         return [trial for trial in self.trials if trial.system == system]
 
+    def of_group(self, group: str) -> list[Trial]:
+        return [trial for trial in self.trials if trial.group == group]
 
-class TamperingRecordsError(Exception):
-    """The records cannot be read. The message is for the operator."""
+    def problems(self) -> list[str]:
+        lines = [
+            f"{trial.attack}: {trial.verdict.value}: {'; '.join(trial.successes) or MEANINGS[Verdict.BROKEN]}"
+            for trial in self.on(OURS)
+            if trial.verdict in (Verdict.SUCCEEDED, Verdict.BROKEN)
+        ]
+        lines += [f"{trial.attack}: not noticed: {', '.join(trial.unseen)}" for trial in self.trials if trial.unseen]
+        lines += [f"{trial.attack} on the paper's protocol: broken" for trial in self.on(PAPER) if not trial.attempts]
+        relay = [trial for trial in self.on(PAPER) if trial.attack == RELAY and trial.false_frames]
+        if self.on(PAPER) and [trial.verdict for trial in relay] != [Verdict.SUCCEEDED]:
+            lines.append("the two-sided relay did not succeed against the paper's protocol: the relay does not work")
+        unlogged = [item for end in self.of("end") for item in end.values.get("unlogged", [])]
+        return lines + [f"counted and never logged: {item}" for item in unlogged]
 
-
-def read_run(path: Path) -> Run:
-    """Read the records of a run.
-
-    Raises:
-        TamperingRecordsError: there are no records, or a line is malformed.
-    """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except OSError as error:
-        raise TamperingRecordsError(f"{path}: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise TamperingRecordsError(f"{path}: is not text") from None
-    run = Run()
-    for number, line in enumerate(lines, 1):
-        try:
-            fields = json.loads(line)
-            if "run" in fields:
-                run.facts = dict(fields["run"])
-            elif "flood" in fields:
-                run.floods.append(FloodSamples(**fields["flood"]))
-            else:
-                run.trials.append(_trial(fields))
-        except (ValueError, TypeError, KeyError, AttributeError):
-            raise TamperingRecordsError(f"{path}: line {number} is not a record of an evaluation") from None
-    return run
-
-
-def _trial(fields: dict[str, Any]) -> Trial:
-    for derived in ("frames_lost", "verdict", "successes"):
-        fields.pop(derived)
-    lists = ("parameters", "amplified", "needs")
-    return Trial(**{**fields, **{name: tuple(fields[name]) for name in lists if name in fields}})
+    def summary(self) -> dict[str, Any]:
+        facts: dict[str, Any] = {"quick": self.run.get("quick")}
+        for system in (OURS, PAPER):
+            trials = self.on(system)
+            verdicts = Counter(trial.verdict.value for trial in trials)
+            facts |= {
+                f"{system}_attacks": len(trials),
+                f"{system}_attempts": sum(trial.attempts for trial in trials),
+                f"{system}_false_frames": sum(trial.false_frames for trial in trials),
+                **{f"{system}_{verdict.value}": verdicts[verdict.value] for verdict in Verdict},
+            }
+        return facts

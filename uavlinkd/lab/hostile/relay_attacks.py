@@ -11,11 +11,8 @@ from abc import abstractmethod
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from random import Random
 from types import MappingProxyType
-from typing import Any, ClassVar, Final, Protocol
-
-from pydantic import Field
+from typing import ClassVar, Final, Protocol
 
 from uavlinkd.core import constants as c
 from uavlinkd.core.relay_records import Bound, wrap
@@ -28,10 +25,8 @@ from uavlinkd.lab.mitm.attack import (
     Direction,
     Intervention,
     Operation,
-    Options,
     Send,
     Timed,
-    TimedOptions,
 )
 from uavlinkd.lab.mitm.attacks import ATTACKS
 from uavlinkd.lab.mitm.attacks.forgery import COMMAND_FRAMES
@@ -80,38 +75,27 @@ class RelayContext(AttackContext):
     relay: AttackedRelay = field(kw_only=True)
 
 
-class RelayAttack(Timed[TimedOptions]):
+class RelayAttack(Timed):
     """The base class: an attack that does something at a rate."""
 
-    options_model: ClassVar[type[Options]] = TimedOptions
     reports_after: ClassVar[bool] = False
     """At its end the relay reports the true handles: its members keep wrong ones otherwise, up to 20 s."""
 
-    def __init__(self, options: TimedOptions, context: AttackContext, rng: Random, now: float) -> None:
-        super().__init__(options, context, rng, now)
-        assert isinstance(context, RelayContext)
-        self.relay = context.relay
+    def prepare(self) -> None:
+        super().prepare()
+        assert isinstance(self.context, RelayContext)
+        self.relay = self.context.relay
         self.members = tuple(dict.fromkeys(direction.receiver for direction in self.directions))
 
     def record(self, operation: Operation, member: str, length: int, now: float, detail: str) -> None:
-        """Count an attempt on a member."""
         direction = Direction(self.relay.name, member)
         self.relay.record(Intervention(now, self.name, operation, direction, 0, DatagramKind.OTHER, length, detail))
 
 
-class LieOptions(TimedOptions):
-    """The default is a higher rate."""
-
-    rate_per_s: float = Field(20.0, gt=0, le=100_000, description="reports to each member per second")
-
-
-class Lie(RelayAttack):
+class Lie(RelayAttack, rate_per_s=20.0):
     """The base class of attacks that falsify the relay's reports to its members."""
 
-    options_model: ClassVar[type[Options]] = LieOptions
-
     def report(self, member: str, bound: Bound, now: float) -> Bound:
-        """What the relay reports to a member instead."""
         is_chosen = member in self.members and self.is_on(now) and self.should_attack()
         return self.falsify(member, bound, now) if is_chosen else bound
 
@@ -120,67 +104,49 @@ class Lie(RelayAttack):
         """The false report."""
 
     def send_next(self, now: float) -> list[Action]:
-        """Report often."""
         del now
         self.relay.report_all()
         return []
 
 
-class LieAboutAddresses(Lie):
+class LieAboutAddresses(Lie, name="relay-lie"):
     """Reports addresses of others to members as their own: candidates for a search of direct paths."""
 
-    name = "relay-lie"
-
     def falsify(self, member: str, bound: Bound, now: float) -> Bound:
-        """The victim's address, or one that no member may ask."""
         places = [self.relay.victim, ("224.0.0.1", 5790), ("255.255.255.255", 5790), ("240.0.0.1", 53)]
         host, port = self.rng.choice(places)
         self.record(Operation.ALTERED, member, len(bound.encode()), now, f"{host}:{port}")
         return bound._replace(host=host, port=port)
 
 
-class BindWrongMembers(Lie):
+class BindWrongMembers(Lie, name="relay-bind-wrong"):
     """Assigns the handle of one peer for another: a member's datagrams arrive at the wrong one."""
 
-    name = "relay-bind-wrong"
     reports_after = True
 
     def falsify(self, member: str, bound: Bound, now: float) -> Bound:
-        """Each key has the handles of the next one."""
         keys = list(dict.fromkeys(key for key, _ in bound.handles))
         wrong = dict(zip(keys, [*keys[1:], keys[0]], strict=True))
         self.record(Operation.MISROUTED, member, len(bound.encode()), now, "handles of other peers")
         return bound._replace(handles=tuple((wrong[key], handle) for key, handle in bound.handles))
 
 
-class InventOptions(TimedOptions):
-    """The default is a higher rate."""
-
-    rate_per_s: float = Field(100.0, gt=0, le=100_000, description="datagrams to each member per second")
-
-
-class InventHandles(Lie):
+class InventHandles(Lie, name="relay-invent", rate_per_s=100.0):
     """Sends genuine datagrams with handles that it did not assign, and assigns handles for unknown keys."""
 
-    name = "relay-invent"
-    options_model = InventOptions
-
-    def __init__(self, options: TimedOptions, context: AttackContext, rng: Random, now: float) -> None:
-        super().__init__(options, context, rng, now)
+    def prepare(self) -> None:
+        super().prepare()
         self._newest: dict[str, bytes] = {}
 
     def observe(self, datagram: bytes, direction: Direction, now: float) -> None:
-        """Keep the newest datagram for each member."""
         del now
         self._newest[direction.receiver] = datagram
 
     def falsify(self, member: str, bound: Bound, now: float) -> Bound:
-        """A handle for a key that the member did not ask for."""
         self.record(Operation.INJECTED, member, len(bound.encode()), now, "unknown key")
         return bound._replace(handles=(*bound.handles[: c.ENTRIES_PER_BOUND - 1], (os.urandom(c.KEY_BYTES), 7)))
 
     def send_next(self, now: float) -> list[Action]:
-        """Send the newest datagrams with other handles, or data inside data."""
         for member, newest in self._newest.items():
             if self.should_attack():
                 is_nested = self.rng.random() < 0.3
@@ -190,14 +156,10 @@ class InventHandles(Lie):
         return []
 
 
-class SendOwnFrames(RelayAttack):
+class SendOwnFrames(RelayAttack, name="relay-frames", rate_per_s=20.0):
     """Sends MAVLink frames in its own session with each member: disarm, flight termination, mode changes."""
 
-    name = "relay-frames"
-    options_model = LieOptions
-
     def send_next(self, now: float) -> list[Action]:
-        """One frame to each member."""
         name, frame = COMMAND_FRAMES[self.sent_count % len(COMMAND_FRAMES)]
         for member in self.members:
             if self.should_attack():
@@ -206,11 +168,8 @@ class SendOwnFrames(RelayAttack):
         return []
 
 
-class LieAboutFilters(RelayAttack):
+class LieAboutFilters(RelayAttack, name="relay-filter", rate_per_s=20.0):
     """Claims to send tokens from other ports, and sends them from its own, which the NAT of the member lets in."""
-
-    name = "relay-filter"
-    options_model = LieOptions
 
     def hides(self, member: str, token: bytes, now: float) -> bool:
         """Whether the relay sends nothing from another port for a test of this member, but says that it did."""
@@ -221,7 +180,6 @@ class LieAboutFilters(RelayAttack):
         return True
 
     def send_next(self, now: float) -> list[Action]:
-        """A token to each member, which did not ask for it."""
         for member in self.members:
             if self.should_attack():
                 token = self.rng.randbytes(c.FILTER_TOKEN_BYTES)
@@ -230,39 +188,30 @@ class LieAboutFilters(RelayAttack):
         return []
 
 
-class RestartOptions(TimedOptions):
-    """The default leaves time for new sessions."""
+class RestartAndReplay(RelayAttack, name="relay-restart", rate_per_s=0.4):
+    """Forgets everything, and sends what it recorded before along the handles that it assigns afterwards.
 
-    rate_per_s: float = Field(0.4, gt=0, le=10, description="restarts per second; the first after one interval")
+    The first restart is after one interval.
+    """
 
-
-class RestartAndReplay(RelayAttack):
-    """Forgets everything, and sends what it recorded before along the handles that it assigns afterwards."""
-
-    name = "relay-restart"
-    options_model = RestartOptions
-
-    def __init__(self, options: TimedOptions, context: AttackContext, rng: Random, now: float) -> None:
-        super().__init__(options, context, rng, now)
-        self._next_at += 1 / options.rate_per_s
+    def prepare(self) -> None:
+        super().prepare()
+        self._next_at += 1 / self.options.rate_per_s
         self._recorded: deque[tuple[bytes, Direction]] = deque(maxlen=RECORDED)
         self._replays: deque[tuple[bytes, Direction]] = deque()
         self._replay_at = NEVER
 
     def observe(self, datagram: bytes, direction: Direction, now: float) -> None:
-        """Keep what is forwarded."""
         del now
         self._recorded.append((datagram, direction))
 
     def send_next(self, now: float) -> list[Action]:
-        """Restart."""
         if self.should_attack():
             self._replays, self._replay_at = self._recorded.copy(), now + REPLAY_EVERY_S
             self.relay.restart()
         return []
 
     def due(self, now: float) -> list[Action]:
-        """Restart if it is time. When members have handles again, replay, some datagrams at a time."""
         actions = super().due(now)
         if now < self._replay_at:
             return actions
@@ -270,27 +219,18 @@ class RestartAndReplay(RelayAttack):
         for _ in range(min(REPLAYS_AT_ONCE, len(self._replays)) if is_bound else 0):
             datagram, direction = self._replays.popleft()
             if self.relay.is_connected(direction):
-                note = self.note(
-                    Operation.REPLAYED, datagram, direction, now, "after a restart of the relay", own=True
-                )
+                note = self.own(Operation.REPLAYED, datagram, direction, now, "after a restart of the relay")
                 actions += [Send(datagram, direction), note]
         self._replay_at = now + REPLAY_EVERY_S if self._replays else NEVER
         return actions
 
     def next_deadline(self) -> float:
-        """The time of the next restart, or of the next replay."""
         return min(super().next_deadline(), self._replay_at)
 
 
-RELAY_ATTACKS: Final[Mapping[str, type[RelayAttack]]] = MappingProxyType(
-    {
-        attack.name: attack
-        for attack in (
-            *(LieAboutAddresses, BindWrongMembers, InventHandles, SendOwnFrames, LieAboutFilters),
-            RestartAndReplay,
-        )
-    }
+_ALL: tuple[type[RelayAttack], ...] = (
+    *(LieAboutAddresses, BindWrongMembers, InventHandles, SendOwnFrames, LieAboutFilters, RestartAndReplay),
 )
-"""By name."""
-ALL_ATTACKS: Final[Mapping[str, type[Attack[Any]]]] = MappingProxyType({**RELAY_ATTACKS, **ATTACKS})
+RELAY_ATTACKS: Final[Mapping[str, type[RelayAttack]]] = MappingProxyType({one.name: one for one in _ALL})
+ALL_ATTACKS: Final[Mapping[str, type[Attack]]] = MappingProxyType({**RELAY_ATTACKS, **ATTACKS})
 """All that a relay can do: its own attacks, and those of the man in the middle on what it forwards."""

@@ -6,6 +6,7 @@ import argparse
 import asyncio
 import os
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -15,19 +16,19 @@ from uavlinkd.endpoints.sockets import BindError
 from uavlinkd.lab.hostile.hostile_relay import HostileRelay, HostileRelaySettings
 from uavlinkd.lab.hostile.relay_attacks import ALL_ATTACKS
 from uavlinkd.lab.mitm.attack import AttackError
-from uavlinkd.lab.mitm.attacks import AttackSpec, list_attacks, parse_attack
+from uavlinkd.lab.mitm.attack_service import REQUESTS
+from uavlinkd.lab.mitm.attacks import list_attacks, parse_attack
 from uavlinkd.lab.mitm.console import (
     OK,
     WRONG,
     add_attack_options,
     fail,
     print_list,
-    run_until_stopped,
     send_request,
 )
 from uavlinkd.ops.control import ControlError
 from uavlinkd.ops.log import set_up_logging
-from uavlinkd.system.core_dumps import forbid_core_dumps
+from uavlinkd.system import core_dumps
 
 MOST_MEMBERS: Final = 100
 """Attacks know each pair of members in both directions."""
@@ -41,10 +42,6 @@ The requests go through the control_socket of the file. Attack only your own mem
 """
 
 
-def _parse(text: str) -> AttackSpec:
-    return parse_attack(text, ALL_ATTACKS)
-
-
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="uavlink-mitm relay",
@@ -53,7 +50,7 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--config", metavar="FILE", type=Path, help="the file of the relay")
-    add_attack_options(parser, _parse)
+    add_attack_options(parser, partial(parse_attack, attacks=ALL_ATTACKS), REQUESTS)
     return parser
 
 
@@ -65,20 +62,18 @@ def relay_main(arguments: Sequence[str]) -> int:
     if options.config is None:
         return fail("--config must name the file of a relay", WRONG)
     try:
-        return _ask(options) if options.ask is not None else _run(options)
+        if options.ask is None:
+            return _run(options)
+        control_socket = load_control_socket(options.config)
+        if control_socket is None:
+            return fail(f"{options.config}: control_socket is missing: --ask needs it", WRONG)
+        return send_request(control_socket, options.ask)
     except ConfigError as error:
         return fail(error, WRONG)
 
 
-def _ask(options: argparse.Namespace) -> int:
-    control_socket = load_control_socket(options.config)
-    if control_socket is None:
-        return fail(f"{options.config}: control_socket is missing: --ask needs it", WRONG)
-    return send_request(control_socket, options.ask)
-
-
 def _run(options: argparse.Namespace) -> int:
-    forbid_core_dumps()
+    core_dumps.forbid_core_dumps()
     config = load_config(options.config, os.environ)
     if config.relay_server is None or not config.is_only_relay:
         return fail(f"{options.config}: is not the file of a relay: that has a [[member]], and no [[peer]]", WRONG)
@@ -96,7 +91,7 @@ def _run(options: argparse.Namespace) -> int:
     )
     set_up_logging("info", "auto")
     try:
-        asyncio.run(run_relay(settings, options.seconds))
+        asyncio.run(HostileRelay(settings).run(options.seconds))
     except AttackError as error:
         return fail(error, WRONG)
     except (BindError, ControlError) as error:
@@ -104,12 +99,3 @@ def _run(options: argparse.Namespace) -> int:
     except OSError as error:
         return fail(f"cannot write the log {options.log}: {error.strerror or error}")
     return OK
-
-
-async def run_relay(settings: HostileRelaySettings, seconds: float | None = None) -> None:
-    """Run until SIGTERM, SIGINT, ``stop`` on the control socket, or for ``seconds``.
-
-    Raises:
-        BindError, AttackError, ControlError, OSError: see :meth:`.HostileRelay.start`.
-    """
-    await run_until_stopped(HostileRelay(settings), seconds, lambda: None)

@@ -8,7 +8,8 @@ from __future__ import annotations
 import hashlib
 import hmac
 from enum import StrEnum
-from typing import NamedTuple
+from random import Random
+from typing import Final, Literal, NamedTuple
 
 import fastcrc
 
@@ -28,7 +29,6 @@ class DatagramKind(StrEnum):
     COOKIE = "cookie"
     ENVELOPE = "envelope"
     MAVLINK = "mavlink"
-    """A bare MAVLink frame."""
     EMPTY = "empty"
     OTHER = "other"
 
@@ -47,7 +47,6 @@ _HEADER_BYTES = {DatagramKind.INITIATION: 4, DatagramKind.RESPONSE: 6}
 
 
 def kind_of(datagram: bytes) -> DatagramKind:
-    """The kind that the first byte claims."""
     return _KINDS.get(datagram[0], DatagramKind.OTHER) if datagram else DatagramKind.EMPTY
 
 
@@ -66,7 +65,6 @@ class Parts(NamedTuple):
     macs: bytes
 
     def join(self) -> bytes:
-        """The message."""
         return self.header + self.ephemeral + self.share + self.rest + self.macs
 
 
@@ -121,11 +119,11 @@ def with_mac1(datagram: bytes, public_key: bytes | None) -> bytes:
     return covered + hmac.digest(key, covered, "sha256")[: c.MAC_BYTES] + mac2
 
 
-def initiation(suite: Suite, index: int, noise: bytes, public_key: bytes | None) -> bytes:
-    """An initiation with ``noise`` as its body, cut or padded to the length of the suite; ``mac2`` is zero."""
-    room = wire.initiation_bytes(suite) - _HEADER_BYTES[DatagramKind.INITIATION] - wire.MACS_BYTES
-    body = wire.initiation_header(suite, index) + noise[:room].ljust(room, b"\0")
-    return with_mac1(body + bytes(wire.MACS_BYTES), public_key)
+def random_initiation(rng: Random, suite: Suite, public_key: bytes | None) -> bytes:
+    """An initiation of random bytes; ``mac2`` is zero. With a key, its ``mac1`` is valid."""
+    header = wire.initiation_header(suite, rng.randrange(1, 2**16))
+    body = rng.randbytes(wire.initiation_bytes(suite) - len(header) - wire.MACS_BYTES)
+    return with_mac1(header + body + bytes(wire.MACS_BYTES), public_key)
 
 
 # Envelopes.
@@ -207,6 +205,37 @@ def _frame_at(data: bytes, at: int) -> tuple[int, int]:
     if data[at] == 0xFE:
         return 8 + data[at + 1], data[at + 5]
     return 0, 0
+
+
+# The kinds of datagrams that an attack can be limited to.
+
+KindFilter = Literal["any", "handshake", "initiation", "response", "cookie", "envelope", "report", "probe", "frames"]
+KINDS: Final = (
+    "any, handshake, initiation, response, cookie, envelope, report (a refusal report in the clear), probe (by its"
+    " length, or in the clear before frames), or frames (envelopes that are neither probes nor echoes)"
+)
+
+
+def matches_kind(kinds: KindFilter, datagram: bytes) -> bool:
+    """Whether a datagram is of the kinds that the parameter names."""
+    kind = kind_of(datagram)
+    match kinds:
+        case "any":
+            return True
+        case "handshake":
+            return kind in HANDSHAKE
+        case "report":
+            return is_refusal_report(datagram)
+        case "probe":
+            return is_probe(datagram)
+        case "frames":
+            return kind is DatagramKind.ENVELOPE and not is_probe(datagram) and not is_echo(datagram)
+        case _:
+            return kind.value == kinds
+
+
+def with_changed_byte(data: bytes, at: int, rng: Random) -> bytes:
+    return data[:at] + bytes((data[at] ^ rng.randrange(1, 256),)) + data[at + 1 :]
 
 
 # Bare frames need no key.

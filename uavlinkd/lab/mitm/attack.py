@@ -10,18 +10,15 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from enum import StrEnum
 from random import Random
-from typing import Any, ClassVar, Generic, NamedTuple, Protocol, TypeVar
-
-from pydantic import BaseModel, ConfigDict, Field
+from typing import ClassVar, NamedTuple, Protocol
 
 from uavlinkd.lab.mitm.anatomy import DatagramKind, kind_of
+from uavlinkd.lab.mitm.options import Options, options_with
 
 NEVER = math.inf
-STRANGERS = 256
-"""Addresses of the attacker, numbered from 0. To a peer, each is an unknown sender."""
 CATCH_UP_LIMIT = 256
 """Datagrams that one call of ``due`` may send. After a pause, those beyond this count are never sent."""
 
@@ -40,11 +37,9 @@ class Direction(NamedTuple):
 
     @property
     def reverse(self) -> Direction:
-        """The opposite direction of the same path."""
         return Direction(self.receiver, self.sender, self.path)
 
     def along(self, path: int) -> Direction:
-        """The same direction along another path."""
         return Direction(self.sender, self.receiver, path)
 
     def __str__(self) -> str:
@@ -77,7 +72,6 @@ class Operation(StrEnum):
     FORWARDED = "forwarded"
     """From a stranger's address."""
     INJECTED = "injected"
-    """Made by the attacker."""
     ANSWERED = "answered"
     """A peer sent a datagram to a stranger."""
 
@@ -99,17 +93,7 @@ class Intervention:
     detail: str = ""
 
     def to_dict(self) -> dict[str, object]:
-        """The fields of its log line."""
-        return {
-            "at": round(self.at, 6),
-            "attack": self.attack,
-            "operation": self.operation.value,
-            "direction": str(self.direction),
-            "number": self.number,
-            "kind": self.kind.value,
-            "length": self.length,
-            "detail": self.detail,
-        }
+        return {**asdict(self), "at": round(self.at, 6), "direction": str(self.direction)}
 
 
 Action = Send | Intervention
@@ -158,7 +142,6 @@ class AttackContext:
 
     @property
     def peers(self) -> tuple[str, ...]:
-        """The names of all peers."""
         return tuple(dict.fromkeys(direction.sender for direction in self.directions))
 
     def select(self, text: str) -> tuple[Direction, ...]:
@@ -185,55 +168,42 @@ class AttackContext:
             raise AttackError(f"there is no path {number}: configure another link between the same two peers")
 
 
-class Options(BaseModel):
-    """The parameters of every attack. Unknown ones are refused."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, hide_input_in_errors=True, allow_inf_nan=False)
-
-    begin_s: float = Field(0.0, ge=0, description="seconds before the attack begins")
-    seconds: float | None = Field(None, gt=0, description="duration of the attack in seconds")
-    direction: str = Field("both", description="both, or one direction: A>B; of one path: both/2, A>B/2")
-    share: float = Field(1.0, gt=0, le=1, description="share of the matching datagrams that are attacked")
-    skip: int = Field(0, ge=0, description="number of matching datagrams that pass first")
-    limit: int | None = Field(None, ge=1, description="maximum number of attacked datagrams")
-    inside: bool = Field(
-        False, description="attack what is inside data along a relay, between a member and its relay"
-    )
-
-
-O = TypeVar("O", bound=Options)  # noqa: E741
-
-
 class PassiveAttack:
-    """The base class of attacks that by default ignore answers and inject nothing."""
+    """The base class of attacks that by default ignore answers and inject nothing. See :class:`AttackObject`."""
 
     def on_answer(self, datagram: bytes, peer: str, stranger: int, now: float) -> list[Action]:
-        """A peer sent a datagram to a stranger."""
         del datagram, peer, stranger, now
         return []
 
     def due(self, now: float) -> list[Action]:
-        """The actions that are due at ``now``."""
         del now
         return []
 
     def next_deadline(self) -> float:
-        """The time of the next call of :meth:`due`."""
         return NEVER
 
 
-class Attack(PassiveAttack, ABC, Generic[O]):
+class Attack(PassiveAttack, ABC):
     """The base class of all attacks: when they are active, in which direction, and how often.
 
-    ``uavlink-mitm --list`` shows the first line of a subclass's docstring.
+    A class is a row of the catalogue if it has a name: ``class Truncate(Forgery, name="truncate", catalogue=("H18",
+    "D7"), kinds="envelope")``. The further arguments are parameters that it takes, with their defaults.
+    ``uavlink-mitm --list`` shows the first line of its docstring.
     """
 
-    name: ClassVar[str]
-    catalogue: ClassVar[tuple[str, ...]]
+    name: ClassVar[str] = ""
+    catalogue: ClassVar[tuple[str, ...]] = ()
     """IDs of the threat catalogue: H for the handshake, D for data."""
-    options_model: ClassVar[type[Options]]
+    takes: ClassVar[Mapping[str, object]] = {}
+    options_model: ClassVar[type[Options]] = options_with({})
 
-    def __init__(self, options: O, context: AttackContext, rng: Random, now: float) -> None:
+    def __init_subclass__(cls, name: str = "", catalogue: tuple[str, ...] = (), **takes: object) -> None:
+        cls.name = name or cls.name
+        cls.catalogue = catalogue or cls.catalogue
+        cls.takes = {**cls.takes, **takes}
+        cls.options_model = options_with(cls.takes)
+
+    def __init__(self, options: Options, context: AttackContext, rng: Random, now: float) -> None:
         self.options = options
         self.context = context
         self.rng = rng
@@ -241,20 +211,21 @@ class Attack(PassiveAttack, ABC, Generic[O]):
         self.begins_at = now + options.begin_s
         self.ends_at = NEVER if options.seconds is None else self.begins_at + options.seconds
         self.seen = 0
-        """Datagrams received."""
         self.attempts = 0
-        """Datagrams attacked or injected."""
-        self._eligible = 0
+        self.prepare()
+
+    def prepare(self) -> None:
+        """Make the state of a subclass.
+
+        Raises:
+            AttackError: the peers do not allow this attack.
+        """
 
     @classmethod
     def summary(cls) -> str:
-        """A description in one line."""
         return (cls.__doc__ or "").partition("\n")[0].removesuffix(".")
 
-    # The interface for a channel.
-
     def on_datagram(self, datagram: bytes, direction: Direction, now: float) -> list[Action]:
-        """A peer sent a datagram to another."""
         self.seen += 1
         if direction not in self.directions:
             return [Send(datagram, direction)]
@@ -267,66 +238,51 @@ class Attack(PassiveAttack, ABC, Generic[O]):
         """Learn from a datagram, also while the attack is inactive."""
 
     def intercept(self, datagram: bytes, direction: Direction, now: float) -> list[Action]:
-        """Handle a datagram while the attack is active."""
+        """Handle a datagram while the attack is active: by default it passes."""
         del now
         return [Send(datagram, direction)]
 
     def is_on(self, now: float) -> bool:
-        """Whether the attack is active."""
         return self.begins_at <= now < self.ends_at and not self.is_exhausted
 
     @property
     def is_exhausted(self) -> bool:
-        """Whether the limit is reached."""
         return self.options.limit is not None and self.attempts >= self.options.limit
 
     def should_attack(self) -> bool:
-        """Whether to attack a matching datagram, by ``skip``, ``share`` and ``limit``. Counts the attempt."""
-        self._eligible += 1
-        is_chosen = self.rng.random() < self.options.share
-        if self._eligible <= self.options.skip or not is_chosen or self.is_exhausted:
+        """Whether to attack a matching datagram, by ``share`` and ``limit``. Counts the attempt."""
+        if self.rng.random() >= self.options.share or self.is_exhausted:
             return False
         self.attempts += 1
         return True
 
     def note(
-        self,
-        operation: Operation,
-        datagram: bytes,
-        direction: Direction,
-        now: float,
-        detail: str = "",
-        *,
-        own: bool = False,
+        self, operation: Operation, datagram: bytes, direction: Direction, now: float, detail: str = ""
     ) -> Intervention:
-        """The log entry of an intervention. ``own``: the attack injected the datagram."""
-        number = 0 if own else self.seen
-        return Intervention(now, self.name, operation, direction, number, kind_of(datagram), len(datagram), detail)
+        """The log entry of an intervention with the datagram that passes."""
+        kind = kind_of(datagram)
+        return Intervention(now, self.name, operation, direction, self.seen, kind, len(datagram), detail)
+
+    def own(
+        self, operation: Operation, datagram: bytes, direction: Direction, now: float, detail: str = ""
+    ) -> Intervention:
+        """The log entry of a datagram that the attack sends by itself, or that was sent to a stranger."""
+        return replace(self.note(operation, datagram, direction, now, detail), number=0)
 
 
-class Alteration(Attack[O]):
+class Alteration(Attack):
     """An attack that alters datagrams. With the option ``beside``, the genuine datagram passes too."""
 
     def intercept(self, datagram: bytes, direction: Direction, now: float) -> list[Action]:
-        """Alter the datagram, if it matches."""
         if not self.is_target(datagram) or not self.should_attack():
             return [Send(datagram, direction)]
         altered, detail = self.alter(datagram, direction)
         if altered == datagram:  # for example, a header replaced by an equal one
             self.attempts -= 1
             return [Send(datagram, direction)]
-        actions: list[Action] = [
-            Send(altered, direction),
-            self.note(Operation.ALTERED, datagram, direction, now, detail),
-        ]
-        if self.lets_pass:
-            actions.append(Send(datagram, direction))
-        return actions
-
-    @property
-    def lets_pass(self) -> bool:
-        """Whether the genuine datagram follows the altered one."""
-        return bool(getattr(self.options, "beside", False))
+        note = self.note(Operation.ALTERED, datagram, direction, now, detail)
+        beside = [Send(datagram, direction)] if "beside" in self.takes and self.options.beside else []
+        return [Send(altered, direction), note, *beside]
 
     @abstractmethod
     def is_target(self, datagram: bytes) -> bool:
@@ -337,25 +293,14 @@ class Alteration(Attack[O]):
         """The altered datagram, and a description of the change."""
 
 
-class TimedOptions(Options):
-    """The parameters of attacks that inject datagrams at a rate."""
-
-    rate_per_s: float = Field(10.0, gt=0, le=100_000, description="datagrams per second")
-
-
-T = TypeVar("T", bound=TimedOptions)
-
-
-class Timed(Attack[T]):
+class Timed(Attack, rate_per_s=10.0):
     """An attack that injects datagrams at a rate."""
 
-    def __init__(self, options: T, context: AttackContext, rng: Random, now: float) -> None:
-        super().__init__(options, context, rng, now)
+    def prepare(self) -> None:
         self._next_at = self.begins_at
         self.sent_count = 0
 
     def due(self, now: float) -> list[Action]:
-        """Send the datagrams that are due."""
         actions: list[Action] = []
         interval_s = 1.0 / self.options.rate_per_s
         for _ in range(CATCH_UP_LIMIT):
@@ -368,7 +313,6 @@ class Timed(Attack[T]):
         return actions
 
     def next_deadline(self) -> float:
-        """The time of the next datagram."""
         return NEVER if self.is_exhausted or self._next_at >= self.ends_at else self._next_at
 
     @abstractmethod
@@ -378,20 +322,9 @@ class Timed(Attack[T]):
     def inject(
         self, datagram: bytes, direction: Direction, now: float, detail: str = "", stranger: int | None = None
     ) -> list[Action]:
-        """Send a datagram made by the attacker."""
         self.attempts += 1
         origin = "" if stranger is None else f"{detail and ', '}from stranger {stranger}"
         return [
             Send(datagram, direction, stranger),
-            self.note(Operation.INJECTED, datagram, direction, now, detail + origin, own=True),
+            self.own(Operation.INJECTED, datagram, direction, now, detail + origin),
         ]
-
-
-def describe_options(model: type[Options]) -> list[tuple[str, Any, str]]:
-    """Name, default and description of each parameter. The common parameters come last."""
-    own = [name for name in model.model_fields if name not in Options.model_fields]
-    rows: list[tuple[str, Any, str]] = []
-    for name in (*own, *Options.model_fields):
-        field_info = model.model_fields[name]
-        rows.append((name, field_info.default, field_info.description or ""))
-    return rows

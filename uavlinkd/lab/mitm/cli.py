@@ -1,4 +1,4 @@
-"""The command ``uavlink-mitm``: a man in the middle between daemons, and an emulated radio.
+"""The command ``uavlink-mitm``: a man in the middle between daemons, an emulated radio, or emulated modems.
 
 Exit status 0: success. 1: failure, and standard error has the reason. 2: wrong command line or configuration.
 """
@@ -7,44 +7,33 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import json
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from uavlinkd import __version__
 from uavlinkd.endpoints.sockets import BindError
 from uavlinkd.lab.mitm.attack import AttackError
+from uavlinkd.lab.mitm.attack_service import REQUESTS
 from uavlinkd.lab.mitm.attacks import list_attacks, parse_attack
-from uavlinkd.lab.mitm.console import (
-    OK,
-    WRONG,
-    add_attack_options,
-    fail,
-    print_list,
-    read_by,
-    run_until_stopped,
-    send_request,
-)
-from uavlinkd.lab.mitm.modem_cli import modem_main
+from uavlinkd.lab.mitm.console import OK, WRONG, add_attack_options, fail, print_list, send_request
+from uavlinkd.lab.mitm.line_attacks import list_line_attacks, parse_line_attack
+from uavlinkd.lab.mitm.modem import ModemSettings
+from uavlinkd.lab.mitm.modem_ports import MODEM_REQUESTS, ModemPorts, PortSettings, parse_modem
 from uavlinkd.lab.mitm.proxy import Proxy
 from uavlinkd.lab.mitm.proxy_settings import (
     ProxySettings,
     SettingsError,
     load_proxy_settings,
-    overridden,
-    parse_link,
-    parse_peer,
-    parse_radio,
 )
 from uavlinkd.ops.control import ControlError
 from uavlinkd.ops.log import set_up_logging
 
 _EPILOG = """\
-Example: drone0 listens on port 5791 of this machine and drone1 on port 5792. In drone0's configuration, drone1 has
-the address 127.0.0.1:5801; in drone1's, drone0 has 127.0.0.1:5802:
-
-  uavlink-mitm --peer drone0=127.0.0.1:5791 --peer drone1=127.0.0.1:5792 \\
-      --link drone0@127.0.0.1:5801,drone1@127.0.0.1:5802 --attack replay-data,share=0.1 --radio loss=0.05,delay_s=0.02
+Example: `uavlink-mitm --config mitm.toml --attack replay-data,share=0.1`. configs/mitm.toml of this project explains
+peers, links and radios.
 
 `uavlink-mitm modem --help`: emulated telemetry modems between two serial ports, and attacks on the line.
 `uavlink-mitm relay --help`: a relay that attacks its members.
@@ -61,35 +50,9 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"uavlink-mitm {__version__}")
-    parser.add_argument(
-        "--config", metavar="FILE", type=Path, help="read the settings of the options below from FILE"
-    )
-    parser.add_argument(
-        "--peer",
-        metavar="NAME=HOST:PORT[,KEY]",
-        type=read_by(parse_peer),
-        action="append",
-        default=[],
-        help="a daemon; with its public key, attacks can compute a valid mac1",
-    )
-    parser.add_argument(
-        "--link",
-        metavar="A@HOST:PORT,B@HOST:PORT",
-        type=read_by(parse_link),
-        action="append",
-        default=[],
-        help="listening addresses: where A reaches B, and where B reaches A",
-    )
-    parser.add_argument(
-        "--radio",
-        metavar="key=value[,key=value]",
-        type=read_by(parse_radio),
-        action="append",
-        default=[],
-        help="an emulated radio behind the attacks: loss, delay_s, jitter_s, bits_per_s and so on",
-    )
+    parser.add_argument("--config", metavar="FILE", type=Path, help="peers, links, attacks and radios")
     parser.add_argument("--control-socket", metavar="PATH", type=Path, help="answer the requests of --ask at PATH")
-    add_attack_options(parser, parse_attack)
+    add_attack_options(parser, parse_attack, REQUESTS)
     return parser
 
 
@@ -97,24 +60,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command and return its exit status."""
     words = sys.argv[1:] if arguments is None else arguments
     if words[:1] == ["modem"]:
-        return modem_main(words[1:])
+        return _modem(words[1:])
     options = _parser().parse_args(words)
     if options.list:
         return print_list(list_attacks())
+    if options.config is None and options.ask is None:
+        return fail("--config must name a file: configs/mitm.toml of this project explains it", WRONG)
     try:
         settings = load_proxy_settings(options.config) if options.config is not None else ProxySettings((), ())
-        settings = overridden(
-            settings,
-            peers=tuple(options.peer),
-            links=tuple(options.link),
-            attacks=tuple(options.attack),
-            radios=tuple(options.radio),
-            seed=options.seed,
-            log=options.log,
-            control_socket=options.control_socket,
-        )
     except SettingsError as error:
         return fail(error, WRONG)
+    given = {name: getattr(options, name) for name in ("seed", "log", "control_socket")}
+    given["attacks"] = tuple(options.attack) or None
+    settings = replace(settings, **{name: value for name, value in given.items() if value is not None})
     if options.ask is not None:
         if settings.control_socket is None:
             return fail("--ask needs --control-socket, or a --config that names one", WRONG)
@@ -124,7 +82,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return fail("\n".join(problems), WRONG)
     set_up_logging("info", "auto")
     try:
-        asyncio.run(run(settings, options.seconds))
+        asyncio.run(Proxy(settings).run(options.seconds))
     except (BindError, ControlError, AttackError) as error:
         return fail(error)
     except OSError as error:
@@ -132,11 +90,71 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return OK
 
 
-async def run(settings: ProxySettings, seconds: float | None = None) -> None:
-    """Run until SIGTERM, SIGINT, ``stop`` on the control socket, or for ``seconds``.
+_MODEM_EPILOG = """\
+Example: two daemons with serial = "/tmp/air/left:57600" and "/tmp/air/right:57600", and modems between them that lose
+packets and alter bytes:
 
-    Raises:
-        BindError, AttackError, ControlError, OSError: see :meth:`Proxy.start`.
-    """
-    proxy = Proxy(settings)
-    await run_until_stopped(proxy, seconds, lambda: None)
+  uavlink-mitm modem --left /tmp/air/left --right /tmp/air/right --control-socket /tmp/air/control \\
+      --set packet_loss=0.05,byte_error_rate=0.0005
+  uavlink-mitm modem --control-socket /tmp/air/control --ask "pull left"
+"""
+
+
+def _modem_parser() -> argparse.ArgumentParser:
+    defaults = ModemSettings()
+    names = ", ".join(f"{name}={getattr(defaults, name)}" for name in ModemSettings.__slots__)
+    parser = argparse.ArgumentParser(
+        prog="uavlink-mitm modem",
+        description="Two emulated telemetry modems and the air between them, on pseudo-terminals.",
+        epilog=_MODEM_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--left", metavar="PATH", type=Path, help="make the left device here, a symbolic link")
+    parser.add_argument("--right", metavar="PATH", type=Path, help="make the right device here")
+    parser.add_argument(
+        "--set",
+        metavar="key=value[,key=value]",
+        action="append",
+        default=[],
+        help=f"the modems and the air; by default {names}",
+    )
+    parser.add_argument("--control-socket", metavar="PATH", type=Path, help="answer the requests of --ask at PATH")
+    add_attack_options(parser, parse_line_attack, MODEM_REQUESTS)
+    return parser
+
+
+def _modem(arguments: Sequence[str]) -> int:
+    """Run the command and return its exit status."""
+    options = _modem_parser().parse_args(arguments)
+    if options.list:
+        return print_list(list_line_attacks())
+    if options.ask is not None:
+        if options.control_socket is None:
+            return fail("--ask needs --control-socket", WRONG)
+        return send_request(options.control_socket, options.ask)
+    if options.left is None or options.right is None or options.left == options.right:
+        return fail("--left and --right must name two paths for the devices", WRONG)
+    try:
+        modem = ModemSettings()
+        for text in options.set:
+            modem = parse_modem(text, modem)
+    except ValueError as error:
+        return fail(error, WRONG)
+    settings = PortSettings(
+        options.left,
+        options.right,
+        modem,
+        tuple(options.attack),
+        seed=options.seed or 0,
+        log=options.log,
+        control_socket=options.control_socket,
+    )
+    set_up_logging("info", "auto")
+    try:
+        statistics = asyncio.run(ModemPorts(settings).run(options.seconds))
+    except ControlError as error:
+        return fail(error)
+    except OSError as error:
+        return fail(f"cannot make {error.filename2 or error.filename}: {error.strerror or error}")
+    print(json.dumps(statistics, indent=2))
+    return OK

@@ -1,26 +1,19 @@
-"""What the commands of ``uavlink-mitm`` share: options, exit statuses, requests, and a run until a signal."""
+"""What the commands of ``uavlink-mitm`` share: options, exit statuses and requests."""
 
 from __future__ import annotations
 
 import argparse
-import asyncio
 import json
 import math
-import os
 import sys
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
-from uavlinkd.lab.mitm.attack_requests import REQUESTS
-from uavlinkd.lab.mitm.attacks import AttackSpec
 from uavlinkd.ops.control import ControlError, ask
-from uavlinkd.system.signals import on_signal
 from uavlinkd.system.terminal import printable
 
 OK, FAILED, WRONG = 0, 1, 2
-_Result = TypeVar("_Result")
 _Parsed = TypeVar("_Parsed")
 
 
@@ -36,8 +29,8 @@ def read_by(parse: Callable[[str], _Parsed]) -> Callable[[str], _Parsed]:
     return read
 
 
-def add_attack_options(parser: argparse.ArgumentParser, parse: Callable[[str], AttackSpec]) -> None:
-    """Add the options of every attacker. ``parse`` reads an attack."""
+def add_attack_options(parser: argparse.ArgumentParser, parse: Callable[[str], object], requests: str) -> None:
+    """Add the options of every attacker. ``parse`` reads an attack; ``requests`` lists those of ``--ask``."""
     parser.add_argument("--list", action="store_true", help="list the attacks and their parameters")
     parser.add_argument(
         "--attack",
@@ -53,7 +46,7 @@ def add_attack_options(parser: argparse.ArgumentParser, parse: Callable[[str], A
     parser.add_argument(
         "--ask",
         metavar="REQUEST",
-        help=f"send a request to the running process by its control socket: {REQUESTS}",
+        help=f"send a request to the running process by its control socket: {requests}",
     )
 
 
@@ -65,43 +58,9 @@ def _seconds(text: str) -> float:
 
 
 def print_list(text: str) -> int:
-    """Print to standard output, which may be closed: `uavlink-mitm --list | head`. Returns the exit status."""
-    try:
-        print(text, flush=True)
-    except BrokenPipeError:
-        with suppress(OSError):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return FAILED
+    """Print to standard output. Returns the exit status."""
+    print(text)
     return OK
-
-
-class Service(Protocol):
-    """A proxy, or a pair of modems."""
-
-    stopping: asyncio.Event
-
-    async def start(self) -> None:
-        """Begin."""
-
-    async def stop(self) -> None:
-        """End, whatever has begun."""
-
-
-async def run_until_stopped(service: Service, seconds: float | None, result: Callable[[], _Result]) -> _Result:
-    """Run until SIGTERM, SIGINT, ``stop`` on the control socket, or for ``seconds``.
-
-    ``result`` is called before the service stops. Raises what its ``start`` raises.
-    """
-    for name in ("SIGTERM", "SIGINT"):
-        on_signal(name, service.stopping.set)
-    await service.start()
-    try:
-        with suppress(TimeoutError):
-            async with asyncio.timeout(seconds):
-                await service.stopping.wait()
-        return result()
-    finally:
-        await service.stop()
 
 
 def send_request(path: Path, request: str) -> int:

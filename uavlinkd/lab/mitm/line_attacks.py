@@ -43,7 +43,6 @@ class LineAttack(BaseModel):
 
     @property
     def ends(self) -> tuple[ModemEnd, ...]:
-        """The hosts that are attacked."""
         return tuple(ModemEnd) if self.end == "both" else (ModemEnd(self.end),)
 
 
@@ -67,7 +66,6 @@ class LineAttacker:
 
     @property
     def names(self) -> list[str]:
-        """The attacks that run."""
         return [running.attack.name for running in self._attacks]
 
     def recorded(self, end: ModemEnd) -> Sequence[bytes]:
@@ -75,7 +73,6 @@ class LineAttacker:
         return self._recorded[end]
 
     def observe(self, end: ModemEnd, data: bytes) -> None:
-        """Bytes came out at an end."""
         self._recorded[end].extend(self._decoders[end].feed(data))
 
     def change(self, attacks: Sequence[LineAttack], now: float) -> None:
@@ -83,11 +80,9 @@ class LineAttacker:
         self._attacks = [_Running(attack, now + attack.begin_s) for attack in attacks]
 
     def next_deadline(self) -> float:
-        """The time of the next call of :meth:`due`."""
         return min((running.next_at for running in self._attacks), default=NEVER)
 
     def due(self, now: float) -> None:
-        """Do what is due at ``now``."""
         for _ in range(CATCH_UP_LIMIT):
             running = min(self._attacks, key=lambda one: one.next_at, default=None)
             if running is None or running.next_at > now:
@@ -97,13 +92,13 @@ class LineAttacker:
                 self.attack(running.attack, end, now)
 
     def attack(self, attack: LineAttack, end: ModemEnd, now: float) -> None:
-        """Make one intervention at an end."""
-        if attack.name == "line-hold":
+        make = _ROWS[attack.name][1]
+        if make is None:
             self._link.hold(end, now + attack.hold_s, now)
             self._note(attack.name, Operation.HELD, end, b"", now, f"for {attack.hold_s:g} s")
             return
         number = self._numbers[attack.name, end]
-        data, detail = _MAKERS[attack.name](attack, self._recorded[end], self._rng, number)
+        data, detail = make(attack, self._recorded[end], self._rng, number)
         if data:
             self._link.inject(end, data, now)
             self._note(attack.name, Operation.INJECTED, end, data, now, detail)
@@ -123,7 +118,6 @@ class _Running:
         self._left = math.inf if attack.limit is None else attack.limit
 
     def schedule(self, now: float) -> None:
-        """It acts now."""
         self._left -= 1
         # After a pause of the process, do not catch up on more than one call allows.
         earliest = now - CATCH_UP_LIMIT * self.attack.interval_s
@@ -139,6 +133,7 @@ def _kind_in(data: bytes) -> DatagramKind:
 # What is put on the line. Each maker returns bytes, none if it needs a recorded datagram first, and a detail.
 
 Made = tuple[bytes, str]
+Maker = Callable[[LineAttack, Sequence[bytes], Random, int], Made]
 
 
 def _noise(attack: LineAttack, recorded: Sequence[bytes], rng: Random, number: int) -> Made:
@@ -190,25 +185,17 @@ def damaged(framed: bytes, rng: Random) -> bytes:
     return bytes(data)
 
 
-_MAKERS: Final = MappingProxyType(
+_ROWS: Final[Mapping[str, tuple[str, Maker | None]]] = MappingProxyType(
     {
-        "line-noise": _noise,
-        "line-bad-crc": _bad_crc,
-        "line-forge": _forge,
-        "line-replay": _replay,
-        "line-cut": _cut,
+        "line-noise": ("random bytes between and inside the frames of the line", _noise),
+        "line-bad-crc": ("frames of the line with one altered byte", _bad_crc),
+        "line-forge": ("forged and altered datagrams in frames with a valid CRC", _forge),
+        "line-replay": ("datagrams that were received before, in frames with a valid CRC", _replay),
+        "line-cut": ("genuine frames cut off, after one byte more each time", _cut),
+        "line-hold": ("everything is held back in the modem, and then released", None),
     }
 )
-LINE_ATTACKS: Final[Mapping[str, str]] = MappingProxyType(
-    {
-        "line-noise": "random bytes between and inside the frames of the line",
-        "line-bad-crc": "frames of the line with one altered byte",
-        "line-forge": "forged and altered datagrams in frames with a valid CRC",
-        "line-replay": "datagrams that were received before, in frames with a valid CRC",
-        "line-cut": "genuine frames cut off, after one byte more each time",
-        "line-hold": "everything is held back in the modem, and then released",
-    }
-)
+LINE_ATTACKS: Final[Mapping[str, str]] = MappingProxyType({name: text for name, (text, _) in _ROWS.items()})
 """What each attack puts on the line."""
 
 

@@ -22,8 +22,6 @@ from typing import Final, NamedTuple
 
 BITS_PER_BYTE: Final = 10
 """On the line, with start and stop bit."""
-MAVLINK_START: Final = b"\xfe"
-"""The byte before which a modem with ``cuts_at_start`` ends an air packet."""
 HELD_BYTES: Final = 1 << 20
 """Most bytes that a modem holds back. More are lost. It bounds memory and does not model a modem."""
 _ROUNDING: Final = 1e-6
@@ -38,7 +36,6 @@ class ModemEnd(StrEnum):
 
     @property
     def other(self) -> ModemEnd:
-        """The other one."""
         return ModemEnd.RIGHT if self is ModemEnd.LEFT else ModemEnd.LEFT
 
 
@@ -51,7 +48,7 @@ class ModemSettings:
     """
 
     air_bits_s: float = 24_000.0
-    """What the air carries in both directions together."""
+    """What the air carries of the hosts' bytes, in both directions together."""
     line_baud: float = 57_600.0
     turn_around_s: float = 0.01
     """The air is silent for this time before the other modem sends."""
@@ -61,10 +58,6 @@ class ModemSettings:
     """A modem waits so long for more bytes before it sends less than a whole packet."""
     queue_bytes: int = 2048
     packet_bytes: int = 240
-    packet_overhead_bytes: int = 0
-    """Additional bytes on air for each packet. 0: ``air_bits_s`` is what remains for the hosts' bytes."""
-    cuts_at_start: bool = False
-    """A SiK with ``MAVLINK=1``: a packet ends before each byte 0xFE."""
     has_flow_control: bool = False
     """RTS/CTS: the host's kernel keeps the bytes for which the queue has no room."""
     host_bytes: int = 4096
@@ -85,7 +78,7 @@ class ModemSettings:
         for name in ("air_bits_s", "line_baud", "turn_s"):
             if not 0 < getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must be more than 0, not {getattr(self, name)}")
-        for name in ("turn_around_s", "gather_s", "packet_overhead_bytes"):
+        for name in ("turn_around_s", "gather_s"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must be 0 or more, not {getattr(self, name)}")
         for name in ("queue_bytes", "packet_bytes", "host_bytes", "chunk_bytes"):
@@ -103,7 +96,6 @@ class Fate(StrEnum):
     UNPLUGGED = "unplugged"
     """Lost at this end because its modem was not plugged in."""
     ON_AIR = "on_air"
-    """Sent by this end's modem."""
     PACKET_LOST = "packet_lost"
     """Sent by this end's modem, in packets that were lost."""
     ALTERED = "altered"
@@ -111,11 +103,9 @@ class Fate(StrEnum):
     LOST_ON_LINE = "lost_on_line"
     """On the line to this end's host."""
     HELD = "held"
-    """Held back before this end's host."""
     INJECTED = "injected"
     """On the line to this end's host."""
     DELIVERED = "delivered"
-    """To the host of this end."""
 
 
 class Transmission(NamedTuple):
@@ -164,7 +154,6 @@ class ModemLink:
         self.bytes: dict[ModemEnd, Counter[Fate]] = {end: Counter() for end in ModemEnd}
         """The number of bytes, by end and fate."""
         self.packets: Counter[ModemEnd] = Counter()
-        """Air packets, by the sender."""
         self._rng = rng
         self._watch = watch
         self._modems = {end: _Modem() for end in ModemEnd}
@@ -232,7 +221,6 @@ class ModemLink:
         self._modems[end].is_plugged = True
 
     def is_plugged(self, end: ModemEnd) -> bool:
-        """Whether a modem is plugged in."""
         return self._modems[end].is_plugged
 
     def hold(self, end: ModemEnd, until: float, now: float) -> None:
@@ -337,16 +325,13 @@ class ModemLink:
     def _begin_packet(self, sender: ModemEnd, at: float) -> None:
         modem, settings = self._modems[sender], self.settings
         size = min(len(modem.queue), settings.packet_bytes)
-        if settings.cuts_at_start:
-            cut = modem.queue.find(MAVLINK_START, 1, size)
-            size = size if cut < 0 else cut
         data = bytes(modem.queue[:size])
         del modem.queue[:size]
         modem.oldest_at = -math.inf
         if modem.is_waiting_for_room:
             modem.is_waiting_for_room = False
             modem.next_at = max(modem.next_at, at + self._byte_s)
-        duration_s = 8 * (size + settings.packet_overhead_bytes) / settings.air_bits_s
+        duration_s = 8 * size / settings.air_bits_s
         self._on_air = Transmission(sender, at, at + duration_s, data)
         self.packets[sender] += 1
         self.bytes[sender][Fate.ON_AIR] += size

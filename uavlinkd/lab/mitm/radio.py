@@ -30,11 +30,9 @@ class Bursts:
     """Probability that a burst begins, for each datagram outside one."""
     to_good: float
     """Probability that a burst ends, for each datagram inside one."""
-    loss_in_bad: float = 1.0
-    loss_in_good: float = 0.0
 
     def __post_init__(self) -> None:
-        _check_shares(self, "to_bad", "to_good", "loss_in_bad", "loss_in_good")
+        _check_shares(self, "to_bad", "to_good")
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +76,6 @@ class RadioSettings:
     duplication: float = 0.0
     """Share of datagrams that arrive twice. The copy has its own jitter."""
     delay_s: float = 0.0
-    """The minimum delay."""
     jitter_s: float = 0.0
     """The maximum additional delay, uniformly distributed."""
     keeps_order: bool = False
@@ -116,10 +113,8 @@ class Outcome(StrEnum):
     SENT = "sent"
     DELIVERED = "delivered"
     DUPLICATED = "duplicated"
-    """Copies made."""
     HELD_BACK = "held_back"
     LOST = "lost"
-    """By independent loss."""
     LOST_IN_BURST = "lost_in_burst"
     LOST_IN_OUTAGE = "lost_in_outage"
     QUEUE_FULL = "queue_full"
@@ -151,15 +146,13 @@ class Radio:
         """Send a datagram. ``now`` must not decrease."""
         settings, outcomes = self.settings, self.outcomes
         outcomes[Outcome.SENT] += 1
-        turn, burst_draw, loss_draw, copy_draw, hold_draw, jitter, copy_jitter = (
-            self._rng.random() for _ in range(7)
-        )
+        turn, loss_draw, copy_draw, hold_draw, jitter, copy_jitter = (self._rng.random() for _ in range(6))
         if not self._has_room(len(datagram), now):
             outcomes[Outcome.QUEUE_FULL] += 1
             return
         begun_at = max(now, self._idle_at)
         sent_at = self._idle_at = begun_at + self._airtime_s(len(datagram))
-        is_lost_in_burst = self._is_lost_in_burst(turn, burst_draw)
+        is_lost_in_burst = self._is_lost_in_burst(turn)
         if self._is_down(begun_at, sent_at):
             outcomes[Outcome.LOST_IN_OUTAGE] += 1
         elif is_lost_in_burst:
@@ -189,7 +182,6 @@ class Radio:
 
     @property
     def in_flight(self) -> int:
-        """The number of datagrams in flight."""
         return len(self._in_flight)
 
     def _airtime_s(self, size: int) -> float:
@@ -207,13 +199,13 @@ class Radio:
         begin_s, end_s = begin_at - self._began_at, end_at - self._began_at
         return any(outage.overlaps(begin_s, end_s) for outage in self.settings.outages)
 
-    def _is_lost_in_burst(self, turn: float, loss_draw: float) -> bool:
+    def _is_lost_in_burst(self, turn: float) -> bool:
         bursts = self.settings.bursts
         if bursts is None:
             return False
         if turn < (bursts.to_good if self._is_in_burst else bursts.to_bad):
             self._is_in_burst = not self._is_in_burst
-        return loss_draw < (bursts.loss_in_bad if self._is_in_burst else bursts.loss_in_good)
+        return self._is_in_burst
 
     def _carry(self, datagram: bytes, arrival_at: float, *, is_held_back: bool) -> None:
         if len(self._in_flight) >= self.settings.in_flight_limit:

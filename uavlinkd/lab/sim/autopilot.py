@@ -11,17 +11,15 @@ from __future__ import annotations
 import math
 from collections import Counter, OrderedDict, deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from uavlinkd.lab.sim.mav_commands import Command, Commands
-from uavlinkd.lab.sim.message_rates import MAX_RATE_HZ, Streams, default_rates
-from uavlinkd.lab.sim.mission import PLAN, Missions
+from uavlinkd.lab.sim.mission import MissionPilot, Missions
 from uavlinkd.lab.sim.parameters import ParameterTable
-from uavlinkd.lab.sim.pilot import MissionPilot, point_of
-from uavlinkd.lab.sim.telemetry import Telemetry
+from uavlinkd.lab.sim.telemetry import MAX_RATE_HZ, Streams, Telemetry, default_rates
 from uavlinkd.lab.sim.vehicle import GeoPoint, Landed, Mode, Vehicle
 from uavlinkd.mavlink.frames import SplitCounters, split_datagram
 
@@ -29,6 +27,7 @@ MOVE_EVERY_S: Final = 0.05
 # The complete list at once would overload a radio. ArduPilot limits the rate too.
 PARAMETERS_PER_S: Final = 200.0
 MAX_STATIONS: Final = 32
+COMPONENT_ID: Final = mavlink.MAV_COMP_ID_AUTOPILOT1
 HOME: Final = GeoPoint(47.397742, 8.545594, 488.0)
 
 FTP_NAK: Final = 129
@@ -43,32 +42,15 @@ class AutopilotSettings:
     """The settings of one simulated copter. Rates are messages per second until a ground station requests others."""
 
     system_id: int = 1
-    component_id: int = 1
     attitude_rate_hz: float = 10.0
-    position_rate_hz: float = 5.0
     home: GeoPoint = HOME
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name, value in (("system_id", self.system_id), ("component_id", self.component_id)):
-            if not 1 <= value <= 255:
-                raise ValueError(f"{name} is {value}: it must be 1 to 255")
-        for name, rate in (("attitude_rate_hz", self.attitude_rate_hz), ("position_rate_hz", self.position_rate_hz)):
-            if not 0 <= rate <= MAX_RATE_HZ:
-                raise ValueError(f"{name} is {rate}: it must be 0 to {MAX_RATE_HZ:g}")
-
-
-@dataclass(slots=True)
-class Counters:
-    """The counters of the autopilot."""
-
-    frames_sent: int = 0
-    bytes_sent: int = 0
-    frames_received: int = 0
-    undecodable: int = 0
-    for_others: int = 0
-    commands: Counter[int] = field(default_factory=Counter)
-    events: Counter[str] = field(default_factory=Counter)
+        if not 1 <= self.system_id <= 255:
+            raise ValueError(f"system_id is {self.system_id}: it must be 1 to 255")
+        if not 0 <= self.attitude_rate_hz <= MAX_RATE_HZ:
+            raise ValueError(f"attitude_rate_hz is {self.attitude_rate_hz}: it must be 0 to {MAX_RATE_HZ:g}")
 
 
 class Autopilot:
@@ -83,24 +65,22 @@ class Autopilot:
         on_event: Event | None = None,
     ) -> None:
         self.settings = settings or AutopilotSettings()
-        self.counters = Counters()
+        self.frames_received = 0
+        self.events: Counter[str] = Counter()
         self.split = SplitCounters()
         self.vehicle = Vehicle(self.settings.home)
         self.parameters = ParameterTable(self.settings.system_id)
-        self.missions = Missions(self.send, self._missions_changed)
+        self.missions = Missions(self.send, self._plan_changed)
         self.pilot = MissionPilot(self.vehicle, self.missions)
-        self.streams = Streams(
-            default_rates(self.settings.attitude_rate_hz, self.settings.position_rate_hz), started_at
-        )
+        self.streams = Streams(default_rates(self.settings.attitude_rate_hz), started_at)
         self.commands = Commands(self)
         self._telemetry = Telemetry(
             self.vehicle,
             self.missions,
             seed=self.settings.seed,
-            identity=(self.settings.seed & 0xFFFF_FFFF) << 8 | self.settings.system_id,
             unix_epoch_us=unix_epoch_us,
         )
-        self._codec = mavlink.MAVLink(None, self.settings.system_id, self.settings.component_id)
+        self._codec = mavlink.MAVLink(None, self.settings.system_id, COMPONENT_ID)
         self._on_event = on_event
         self._started_at = started_at
         self._moved_at = started_at
@@ -112,8 +92,6 @@ class Autopilot:
         self._gcs_lost = False
         self._handlers: dict[str, Callable[[Message, float], None]] = {
             "HEARTBEAT": self._on_heartbeat,
-            "PING": self._on_ping,
-            "TIMESYNC": self._on_timesync,
             "PARAM_REQUEST_LIST": self._on_param_request_list,
             "PARAM_REQUEST_READ": self._on_param_request_read,
             "PARAM_SET": self._on_param_set,
@@ -122,8 +100,8 @@ class Autopilot:
             "SET_MODE": self._on_set_mode,
             "REQUEST_DATA_STREAM": self._on_request_data_stream,
             "MISSION_SET_CURRENT": self._on_mission_set_current,
-            "SET_POSITION_TARGET_GLOBAL_INT": self._on_position_target,
             "FILE_TRANSFER_PROTOCOL": self._on_file_transfer,
+            "TIMESYNC": self._on_timesync,
             **dict.fromkeys(
                 (
                     "MISSION_REQUEST_LIST",
@@ -131,7 +109,6 @@ class Autopilot:
                     "MISSION_REQUEST",
                     "MISSION_COUNT",
                     "MISSION_ITEM_INT",
-                    "MISSION_ITEM",
                     "MISSION_CLEAR_ALL",
                     "MISSION_ACK",
                 ),
@@ -145,11 +122,6 @@ class Autopilot:
         parameters = self._parameter_due_at if self._parameters_to_send else math.inf
         moving = self._moved_at + MOVE_EVERY_S
         return min(self.streams.next_due_at, self.missions.next_due_at, parameters, moving)
-
-    @property
-    def stations(self) -> list[tuple[int, int]]:
-        """The known ground stations: system and component IDs."""
-        return list(self._stations)
 
     def advance(self, now: float) -> list[bytes]:
         """Move the vehicle, and return the frames that are due."""
@@ -182,11 +154,8 @@ class Autopilot:
         return self._take()
 
     def send(self, message: Message) -> None:
-        """Put a message among what is to go out."""
         frame = bytes(message.pack(self._codec))
         self._codec.seq = (self._codec.seq + 1) % 256
-        self.counters.frames_sent += 1
-        self.counters.bytes_sent += len(frame)
         self._out.append(frame)
 
     def send_by_number(self, number: int, now: float) -> bool:
@@ -197,8 +166,7 @@ class Autopilot:
         return message is not None
 
     def emit(self, event: str, **fields: object) -> None:
-        """Report an event of the vehicle."""
-        self.counters.events[event] += 1
+        self.events[event] += 1
         if self._on_event:
             self._on_event(event, fields)
 
@@ -207,17 +175,15 @@ class Autopilot:
         return out
 
     def _receive(self, frame: bytes, now: float) -> None:
-        self.counters.frames_received += 1
+        self.frames_received += 1
         try:
             message = self._codec.decode(bytearray(frame))
         except Exception:  # pymavlink raises MAVError, and its constructors raise others
-            self.counters.undecodable += 1
             return
-        ours = (self.settings.system_id, self.settings.component_id)
+        ours = (self.settings.system_id, COMPONENT_ID)
         source = (message.get_srcSystem(), message.get_srcComponent())
         target = getattr(message, "target_system", 0), getattr(message, "target_component", 0)
         if source == ours or target[0] not in (0, ours[0]) or target[1] not in (0, ours[1]):
-            self.counters.for_others += 1
             return
         handle = self._handlers.get(message.get_type())
         if handle is not None:
@@ -249,16 +215,6 @@ class Autopilot:
         self._stations.move_to_end(station)
         if len(self._stations) > MAX_STATIONS:
             self._stations.popitem(last=False)
-
-    def _on_ping(self, message: Message, _now: float) -> None:
-        # A ping with a target is an answer.
-        if message.target_system == 0 and message.target_component == 0:
-            source = message.get_srcSystem(), message.get_srcComponent()
-            self.send(mavlink.MAVLink_ping_message(message.time_usec, message.seq, *source))
-
-    def _on_timesync(self, message: Message, now: float) -> None:
-        if message.tc1 == 0:
-            self.send(mavlink.MAVLink_timesync_message(round((now - self._started_at) * 1e9), message.ts1))
 
     def _on_param_request_list(self, _message: Message, now: float) -> None:
         if not self._parameters_to_send:
@@ -297,6 +253,10 @@ class Autopilot:
         speeds.land_m_s = _between(parameters["LAND_SPEED"] / 100, 0.3, 2)
         self.vehicle.return_altitude_m = _between(parameters["RTL_ALT"] / 100, 2, 300)
 
+    def _on_timesync(self, message: Message, now: float) -> None:
+        if message.tc1 == 0:
+            self.send(mavlink.MAVLink_timesync_message(round((now - self._started_at) * 1e9), message.ts1))
+
     def _on_command_long(self, message: Message, now: float) -> None:
         four = (message.param1, message.param2, message.param3, message.param4)
         x, y = (_degrees_e7(value) for value in (message.param5, message.param6))
@@ -308,9 +268,7 @@ class Autopilot:
         self._run(message, Command(message.command, four, message.frame, message.x, message.y, message.z), now)
 
     def _run(self, message: Message, command: Command, now: float) -> None:
-        self.counters.commands[command.number] += 1
-        result = self.commands.run(command, now)
-        self._acknowledge(message, command.number, result)
+        self._acknowledge(message, command.number, self.commands.run(command, now))
 
     def _acknowledge(self, message: Message, command: int, result: int) -> None:
         source = message.get_srcSystem(), message.get_srcComponent()
@@ -329,13 +287,6 @@ class Autopilot:
             self.pilot.restart()
         self.send_by_number(mavlink.MAVLINK_MSG_ID_MISSION_CURRENT, now)
 
-    def _on_position_target(self, message: Message, _now: float) -> None:
-        ignores_position = message.type_mask & 0b111
-        guided = self.vehicle.mode is Mode.GUIDED and self.vehicle.landed is not Landed.ON_GROUND
-        if guided and not ignores_position and math.isfinite(message.alt):
-            frame = message.coordinate_frame
-            self.vehicle.go_to(point_of(self.vehicle, frame, message.lat_int, message.lon_int, message.alt))
-
     def _on_file_transfer(self, message: Message, _now: float) -> None:
         """Refuse, because there are no files: a ground station then uses the parameter protocol immediately."""
         request = bytes(message.payload)
@@ -349,12 +300,11 @@ class Autopilot:
         source = message.get_srcSystem(), message.get_srcComponent()
         self.send(mavlink.MAVLink_file_transfer_protocol_message(0, *source, list(answer)))
 
-    def _missions_changed(self, kind: int, partner: tuple[int, int]) -> None:
-        items = len(self.missions.items(kind))
-        if kind == PLAN:
-            self.parameters.preset("MIS_TOTAL", items)
-            self.pilot.restart()
-        self.emit("mission_received", kind=kind, items=items, system_id=partner[0])
+    def _plan_changed(self, partner: tuple[int, int]) -> None:
+        items = len(self.missions.plan)
+        self.parameters.preset("MIS_TOTAL", items)
+        self.pilot.restart()
+        self.emit("mission_received", items=items, system_id=partner[0])
 
 
 def _between(value: float, lowest: float, highest: float) -> float:

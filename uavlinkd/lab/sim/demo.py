@@ -1,37 +1,37 @@
-"""``uavlinkd demo``: two real daemons on loopback, each with an autopilot; every frame is checked."""
+"""``uavlinkd demo``: two real daemons on loopback, each with a client; every frame is checked.
+
+With ``--attack``, the man in the middle between the two runs one attack after the other.
+"""
 
 from __future__ import annotations
 
 import asyncio
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import AsyncExitStack, contextmanager
-from pathlib import Path
+from collections.abc import Callable
+from contextlib import ExitStack
+from time import monotonic
+from typing import Any
 
 from rich.console import Console
 from rich.live import Live
 
-from uavlinkd.config.keys import decode_key, generate_psk
+from uavlinkd.core.constants import LATE_AFTER_S, LATE_STEP_S
 from uavlinkd.lab.child_processes import private_folder
-from uavlinkd.lab.sim.autopilot import AutopilotSettings
-from uavlinkd.lab.sim.demo_attacks import ATTACKED_LINK, AttackCourse
-from uavlinkd.lab.sim.demo_results import Drone, FrameCounts, Summary
-from uavlinkd.lab.sim.demo_screen import render, render_summary
+from uavlinkd.lab.evaluation.middle import MiddleHere
+from uavlinkd.lab.evaluation.records import EvaluationError
+from uavlinkd.lab.evaluation.stage import DaemonStage
+from uavlinkd.lab.mitm.attack import AttackContext
+from uavlinkd.lab.mitm.attacks import ATTACKS, AttackSpec, parse_attack
+from uavlinkd.lab.sim.demo_screen import AttackResult, Summary, render, render_summary
 from uavlinkd.lab.sim.drone_process import DroneError
-from uavlinkd.lab.sim.flight import Flight
-from uavlinkd.lab.sim.loopback_ports import free_ports
 from uavlinkd.ops.link_problems import LinkProblem
 
-DemoError = DroneError
+DEMO_ERRORS = (DroneError, EvaluationError)
 """The demo failed. The message is for the operator."""
-
-LINK_UP_S = 120.0
-"""How long the daemons may take to start and link. They need about half a second."""
+NAMES = ("drone0", "drone1")
 DRAIN_S = 15.0
 """How long the last frames may take to arrive."""
-ATTITUDE_HZ = 50.0
-REKEY_AFTER_S = 4.0
-"""The rekey interval, instead of two minutes, so that the demo shows some rekeys."""
+RATE_HZ = 70.0
 SCREEN_S = 0.25
 SECONDS = 15.0
 ATTACK_SECONDS = 3.0
@@ -39,6 +39,44 @@ ATTACKED_SHARE = 2 / 3
 """Share of each attack's time in which it is active. In the rest the link recovers."""
 RECOVERY_S = 2.0
 """Within this time after the last attack, frames must be delivered again."""
+ALL = "all"
+LINK: dict[str, object] = {"rekey_after_s": 4.0, "probe_interval_s": 1.0}
+"""A rekey in seconds instead of two minutes, so that the demo shows some."""
+ATTACKED_LINK: dict[str, object] = {
+    "suites": ["ffdhe2048", "x25519"],
+    "rekey_after_s": 1.0,
+    "reject_after_s": 10.0,
+    "retry_max_s": 1.0,
+}
+"""Frequent rekeys with a group's share in each handshake, so that every attack finds a target."""
+
+_LOAD = "flood-initiations,rate_per_s=600"
+_NEEDS_LOAD = ("replay-cookie", "stolen-cookie")
+"""These attacks need cookies, which daemons require only under load."""
+_NEEDS_MORE = ("misroute", "move")
+"""These attacks need a third peer, or a second path."""
+_WITHHOLDS = ("drop", "drop-heartbeats", "blackout", "hold", "truncate", "tamper-tag")
+_DETECTION_S = LATE_AFTER_S + 2 * LATE_STEP_S + 0.2
+"""A drone counts a missing envelope when it is too late to arrive."""
+_OPTIONS = {
+    "replay-cookie": ",copies=3",
+    "drop": ",share=0.5",
+    "hold": ",hold_s=0.5,share=0.5",
+    "blackout": ",seconds=60",
+}
+
+
+def attacks_of(text: str) -> list[AttackSpec]:
+    """The attacks that ``--attack`` names: one as for ``uavlink-mitm``, or ``all``.
+
+    Raises:
+        AttackError: there is no such attack, or it needs more than two peers or one path.
+    """
+    names = [name + _OPTIONS.get(name, "") for name in ATTACKS if name not in _NEEDS_MORE] if text == ALL else [text]
+    specs = [parse_attack(name) for name in names]
+    for spec in specs:
+        spec.make(AttackContext.between(*NAMES, public_keys=dict.fromkeys(NAMES, bytes(32))))
+    return specs
 
 
 async def run_demo(
@@ -51,155 +89,125 @@ async def run_demo(
         attack: an attack between the drones, as for ``uavlink-mitm``, or ``all``.
 
     Raises:
-        DemoError: the daemons do not start or do not link.
+        DroneError, EvaluationError: the daemons do not start or do not link.
         AttackError: there is no such attack, or it needs more than two drones.
     """
     console = console or Console()
-    course = None if attack is None else AttackCourse(attack)
+    specs = None if attack is None else attacks_of(attack)
     if seconds is None:
-        seconds = SECONDS if course is None else ATTACK_SECONDS * len(course.specs)
-    try:
-        summary = await _run(seconds, console if show else None, course)
-    except asyncio.CancelledError:
-        if show:
-            console.print("Interrupted. The daemons have stopped, and their keys are deleted.")
-        raise
-    if show:
-        console.print(render_summary(summary))
+        seconds = SECONDS if specs is None else ATTACK_SECONDS * len(specs)
+    link = LINK if specs is None else {**LINK, **ATTACKED_LINK}
+    with private_folder("uavlinkd-demo-") as folder, ExitStack() as stack:
+        # The summary replaces the live screen; after Ctrl-C it remains.
+        live = stack.enter_context(Live(console=console, auto_refresh=False)) if show else None
+        try:
+            async with DaemonStage(NAMES, folder, MiddleHere(NAMES, None, 0), link, rate_hz=RATE_HZ) as stage:
+                summary = await _Demo(stage, live).run(seconds, specs)
+        except asyncio.CancelledError:
+            if show:
+                console.print("Interrupted. The daemons have stopped, and their keys are deleted.")
+            raise
+        if live is not None:
+            live.update(render_summary(summary), refresh=True)
     return summary
 
 
-async def _run(seconds: float, console: Console | None, course: AttackCourse | None) -> Summary:
-    with private_folder("uavlinkd-demo-") as folder:
-        drones = await _make_drones(folder, course)
-        try:
-            for drone in drones:
-                await drone.start()
-            return await _fly(drones, seconds, console, course)
-        finally:
-            for drone in drones:
-                await drone.stop()
-            if course is not None:
-                await course.leave()
+class _Demo:
+    def __init__(self, stage: DaemonStage, live: Live | None) -> None:
+        self._stage = stage
+        self._live = live
+        self._began = stage.ledger.mark()
+        self._drops_before = Counter[str]()
+        self._noticed_before = Counter[str]()
+        self._results: list[AttackResult] = []
 
-
-@contextmanager
-def _screen(console: Console) -> Iterator[Live]:
-    """The live screen. The summary replaces it; after Ctrl-C it remains."""
-    with Live(console=console, auto_refresh=False, transient=True) as live:
-        try:
-            yield live
-        except asyncio.CancelledError:
-            live.transient = False
-            raise
-
-
-async def _make_drones(folder: Path, course: AttackCourse | None) -> tuple[Drone, Drone]:
-    ports = free_ports(4)
-    first = Drone("drone0", folder / "drone0", ports[0], ports[1])
-    second = Drone("drone1", folder / "drone1", ports[2], ports[3])
-    psk = generate_psk()
-    at = {first.name: first.port, second.name: second.port}
-    link: dict[str, object] = {"rekey_after_s": REKEY_AFTER_S, "probe_interval_s": 1.0}
-    if course is not None:
-        keys = {drone.name: decode_key(drone.public_key) for drone in (first, second)}
-        at = await course.stand_between(at, keys)
-        link |= ATTACKED_LINK
-    for drone, peer in ((first, second), (second, first)):
-        drone.share_psk(psk, "pair.psk")
-        drone.configure(link, [peer.as_peer(f"127.0.0.1:{at[peer.name]}", "pair.psk")])
-    return first, second
-
-
-async def _fly(
-    drones: tuple[Drone, Drone], seconds: float, console: Console | None, course: AttackCourse | None
-) -> Summary:
-    there, back = FrameCounts(), FrameCounts()
-    loop = asyncio.get_running_loop()
-    async with AsyncExitStack() as stack:
-        for drone, out, into, system_id in ((drones[0], there, back, 1), (drones[1], back, there, 2)):
-            settings = AutopilotSettings(system_id=system_id, attitude_rate_hz=ATTITUDE_HZ)
-            flight = Flight(drone.endpoint_url, settings, on_sent=out.on_sent, on_received=into.on_received)
-            await stack.enter_async_context(flight)
-        live = stack.enter_context(_screen(console)) if console else None
-
-        async def until(done_at: float, is_done: Callable[[], bool]) -> bool:
-            while loop.time() < done_at:
-                for drone in drones:
-                    await drone.ask()
-                if course is not None:
-                    course.look(noticed_by(drones))
-                if live is not None:
-                    live.update(render(drones, (there, back), done_at - loop.time(), course), refresh=True)
-                if is_done():
-                    return True
-                await asyncio.sleep(min(SCREEN_S, max(0.0, done_at - loop.time())))
-            return is_done()
-
-        if not await until(loop.time() + LINK_UP_S, lambda: all(drone.is_ready() for drone in drones)):
-            lines = "\n".join(line for drone in drones for line in drone.last_lines(5))
-            raise DemoError(f"the two daemons did not link within {LINK_UP_S:g} s; their last log lines:\n{lines}")
-        started_at = loop.time()
-        for drone in drones:
-            drone.begin()
-        there.counting = back.counting = True
-        if course is None:
-            await until(started_at + seconds, lambda: False)
+    async def run(self, seconds: float, specs: list[AttackSpec] | None) -> Summary:
+        stage, ledger, began_at = self._stage, self._stage.ledger, monotonic()
+        await self._look(began_at + seconds)
+        self._drops_before, self._began = self.drops(), ledger.mark()  # before, there was no session
+        is_recovered = True
+        if specs is None:
+            await self._until(began_at + seconds)
+        for spec in specs or ():
+            await self._attack(spec, seconds / len(specs or ()))
+        end, elapsed_s = ledger.mark(), monotonic() - began_at
+        if specs is None:
+            await self._until(monotonic() + DRAIN_S, lambda: len(set(ledger.count(self._began, end))) == 1)
         else:
-            share_s = seconds / len(course.specs)
-            for number in range(len(course.specs)):
-                begin_at = loop.time()
-                course.begin(number, noticed_by(drones))
-                await until(begin_at + ATTACKED_SHARE * share_s, lambda: False)
-                more_s = course.end()
-                await until(begin_at + share_s + more_s, lambda: False)
-                course.finish()
-        there.counting = back.counting = False
-        elapsed = loop.time() - started_at
-        if course is None:
-            await until(loop.time() + DRAIN_S, lambda: there.outstanding == back.outstanding == 0)
-        else:
-            # Dropped frames do not arrive. Wait until the link carries frames again.
-            there_before, back_before = there.arrived, back.arrived
-            course.is_recovered = await until(
-                loop.time() + RECOVERY_S, lambda: there.arrived > there_before and back.arrived > back_before
+            ledger.await_recovery(monotonic())
+            is_recovered = await self._until(monotonic() + RECOVERY_S, lambda: ledger.recovery_s is not None)
+        sent, delivered = ledger.count(self._began, end)
+        peers = [peer for drone in stage.drones.values() for peer in drone.peer_statuses]
+        round_trips = [peer["round_trip_s"] for peer in peers if peer["round_trip_s"] is not None]
+        return Summary(
+            seconds=round(elapsed_s, 3),
+            frames_sent=sent,
+            frames_delivered=delivered,
+            frames_altered=ledger.faults.total(),
+            handshakes=peers[0]["handshakes"],
+            drops=dict(self.drops() - self._drops_before),
+            rtt_ms=round(1000 * min(round_trips), 3) if round_trips else None,
+            attacks=None if specs is None else self._results,
+            is_recovered=is_recovered,
+        )
+
+    def drops(self) -> Counter[str]:
+        """What the daemons dropped, by reason: datagrams, outgoing frames, and frames that they refused."""
+        drops = Counter[str]()
+        for status in (drone.status for drone in self._stage.drones.values()):
+            drops.update({**status["drops"], **status["send_failures"], "stale": sum(status["stale"].values())})
+            for sender in (*status["endpoints"].values(), *status["peers"].values()):
+                drops.update(sender.get("drops", {}))
+                for reasons in sender["refused"]["in"].values():
+                    drops.update({f"refused_{reason}": count for reason, count in reasons.items()})
+        return +drops
+
+    async def _attack(self, spec: AttackSpec, share_s: float) -> None:
+        """Attack for a part of this time, and let the link recover in the rest."""
+        middle, begin_at = self._stage.middle, monotonic()
+        needs_load = spec.name in _NEEDS_LOAD or "cookie" in str(spec.options)
+        before = sum((await middle.statistics()).of([spec.name]).values())
+        self._noticed_before = self._noticed()
+        self._results.append(AttackResult(str(spec), -before))
+        await middle.attack([*([_LOAD] if needs_load else []), str(spec)])
+        await self._until(begin_at + ATTACKED_SHARE * share_s)
+        self._results[-1].interventions += sum((await middle.statistics()).of([spec.name]).values())
+        await middle.attack([])
+        await self._until(begin_at + share_s + (_DETECTION_S if spec.name in _WITHHOLDS else 0.0))
+
+    def _noticed(self) -> Counter[str]:
+        """The counters of dropped datagrams and of link problems, of both drones."""
+        noticed = self.drops()
+        for drone in self._stage.drones.values():
+            for peer in drone.peer_statuses:
+                noticed.update({sign: peer[sign] for sign in LinkProblem})
+        return noticed
+
+    async def _until(self, done_at: float, is_done: Callable[[], bool] = lambda: False) -> bool:
+        while not is_done() and monotonic() < done_at:
+            await self._look(done_at)
+            await asyncio.sleep(min(SCREEN_S, max(0.0, done_at - monotonic())))
+        await self._look(done_at)
+        return is_done()
+
+    async def _look(self, done_at: float) -> None:
+        for drone in self._stage.drones.values():
+            await drone.ask()
+        if self._results:
+            self._results[-1].noticed = dict(self._noticed() - self._noticed_before)
+        if self._live is not None:
+            ledger = self._stage.ledger
+            frames: dict[str, Any] = dict(
+                zip(("sent", "delivered"), ledger.count(self._began, ledger.mark()), strict=True)
             )
-    return _summary(drones, (there, back), elapsed, course)
-
-
-def noticed_by(drones: tuple[Drone, Drone]) -> Counter[str]:
-    """The counters of dropped datagrams and of link problems, of both drones."""
-    noticed = drops_of(drones)
-    for drone in drones:
-        noticed.update({sign: drone.peer_status.get(sign, 0) for sign in LinkProblem})
-    return noticed
-
-
-def drops_of(drones: tuple[Drone, Drone]) -> Counter[str]:
-    """The counters of dropped datagrams of both daemons, by reason."""
-    drops: Counter[str] = Counter()
-    for drone in drones:
-        drops.update(drone.status.get("drops", {}))
-        drops.update(drone.peer_status.get("drops", {}))
-    return drops
-
-
-def _summary(
-    drones: tuple[Drone, Drone],
-    directions: tuple[FrameCounts, FrameCounts],
-    seconds: float,
-    course: AttackCourse | None,
-) -> Summary:
-    drops = sum((drone.drops for drone in drones), Counter[str]())
-    round_trips = [s for drone in drones if (s := drone.peer_status["round_trip_s"]) is not None]
-    return Summary(
-        seconds=round(seconds, 3),
-        frames_sent=sum(counts.sent for counts in directions),
-        frames_delivered=sum(counts.delivered for counts in directions),
-        frames_altered=sum(counts.altered for counts in directions),
-        handshakes=drones[0].peer_status["handshakes"],
-        drops=dict(drops),
-        rtt_ms=round(1000 * min(round_trips), 3) if round_trips else None,
-        attacks=None if course is None else course.results(),
-        is_recovered=course is None or course.is_recovered,
-    )
+            drops = self.drops() - self._drops_before
+            self._live.update(
+                render(
+                    self._stage.drones.values(),
+                    {**frames, "altered": ledger.faults.total()},
+                    drops,
+                    done_at - monotonic(),
+                    self._results,
+                ),
+                refresh=True,
+            )

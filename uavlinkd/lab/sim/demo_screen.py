@@ -1,8 +1,11 @@
-"""The screen of ``uavlinkd demo``, and its summary."""
+"""The results of ``uavlinkd demo``, and its screen."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Literal
 
 from rich.console import Group, RenderableType
 from rich.panel import Panel
@@ -10,58 +13,106 @@ from rich.table import Table
 from rich.text import Text
 
 if TYPE_CHECKING:
-    from uavlinkd.lab.sim.demo_attacks import AttackCourse, AttackResult
-    from uavlinkd.lab.sim.demo_results import Drone, FrameCounts, Summary
+    from uavlinkd.lab.sim.drone_process import DroneProcess
+
+_SHOWN = 4
+_NOTHING = "none: all datagrams were genuine, some perhaps lost or late"
+
+
+@dataclass(slots=True)
+class AttackResult:
+    """One attack of the demo: the number of its interventions, and the drones' counters meanwhile."""
+
+    name: str
+    interventions: int = 0
+    noticed: dict[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """The result of the demo."""
+
+    seconds: float
+    frames_sent: int
+    frames_delivered: int
+    frames_altered: int
+    handshakes: int
+    drops: dict[str, int]
+    rtt_ms: float | None
+    attacks: list[AttackResult] | None = None
+    """The attacks on the link; None for a demo without attacks."""
+    is_recovered: bool = True
+    """Whether frames were delivered in both directions after the last attack."""
+
+    @property
+    def is_good(self) -> bool:
+        """Whether all frames, and at least one, arrived unaltered; under attack, whether only genuine ones did.
+
+        Then each attack must have attacked something, and the link must have recovered. An attacker can always drop
+        frames, so lost frames are allowed.
+        """
+        if not self.frames_delivered or self.frames_altered:
+            return False
+        if self.attacks is None:
+            return self.frames_delivered == self.frames_sent
+        return self.is_recovered and all(attack.interventions for attack in self.attacks)
+
+    def to_json(self) -> str:
+        facts = asdict(self)
+        if self.attacks is None:
+            del facts["attacks"], facts["is_recovered"]
+        return json.dumps(facts)
 
 
 def render(
-    drones: tuple[Drone, Drone],
-    directions: tuple[FrameCounts, FrameCounts],
+    drones: Iterable[DroneProcess],
+    frames: Mapping[str, int],
+    drops: Mapping[str, int],
     seconds_left: float,
-    course: AttackCourse | None = None,
+    attacks: Sequence[AttackResult],
 ) -> RenderableType:
-    """The live screen: a column per drone, then a row per direction. Fits 80 columns and 24 lines."""
+    """The live screen: a column per drone, and the frames. Fits 80 columns and 24 lines."""
+    table = Table(box=None, padding=(0, 2), expand=True)
+    columns = [{"": drone.name, **_facts(drone)} for drone in drones]
+    for name, text in columns[0].items():
+        if not name:
+            table.add_column("", style="dim", no_wrap=True)
+            for column in columns:
+                table.add_column(str(column[name]), ratio=1, no_wrap=True, overflow="ellipsis")
+        else:
+            table.add_row(name, text, *(column[name] for column in columns[1:]))
+    counts = ", ".join(f"{count:,} {name}" for name, count in frames.items())
+    lines = Text(f"frames: {counts}\ndropped: {_counts(drops) or 'none'}", no_wrap=True, overflow="ellipsis")
     return Group(
-        Panel(
-            _drones(drones, _FACTS if course is None else _FACTS_UNDER_ATTACK),
-            title="two daemons on this machine, each with an autopilot",
-            border_style="dim",
-        ),
-        Panel(_crossing(drones, directions), title="every frame, byte for byte", border_style="dim"),
-        *([] if course is None else [Panel(_attacks(course), title="the man in the middle", border_style="red")]),
+        Panel(table, title="two daemons on this machine, each with a client", border_style="dim"),
+        Panel(lines, title="every frame, byte for byte", border_style="dim"),
+        *([Panel(_results(attacks[-_SHOWN:]), title="the man in the middle", border_style="red")] if attacks else []),
         Text(f"{max(0.0, seconds_left):.1f} s left", style="dim", justify="center"),
     )
 
 
 def render_summary(summary: Summary) -> RenderableType:
-    """The summary at the end."""
     rate = summary.frames_sent / summary.seconds if summary.seconds else 0.0
+    handshakes = f"{summary.handshakes} handshakes, all but the first under traffic"
     lines = [
         f"{summary.frames_delivered:,} of {summary.frames_sent:,} frames delivered"
         f" in {summary.seconds:.1f} s ({rate:,.0f} a second), {summary.frames_altered:,} altered",
-        f"{summary.handshakes} handshakes, all but the first under traffic"
-        if summary.handshakes != 1
-        else "1 handshake",
+        handshakes if summary.handshakes != 1 else "1 handshake",
         f"round trip {summary.rtt_ms:.2f} ms" if summary.rtt_ms is not None else "round trip not measured",
     ]
     if summary.drops:
-        by_count = sorted(summary.drops, key=summary.drops.__getitem__, reverse=True)
-        lines.append("dropped: " + ", ".join(f"{summary.drops[reason]:,} {reason}" for reason in by_count))
-    if summary.attacks is not None:
-        lines.append(_verdict(summary))
-    elif summary.is_perfect:
-        lines.append("Every frame arrived unaltered.")
-    else:
-        lines.append("Some frames did not arrive, or arrived altered.")
+        lines.append(f"dropped: {_counts(summary.drops)}")
+    lines.append(_verdict(summary))
     panel = Panel(Text("\n".join(lines)), border_style="green" if summary.is_good else "red", title="summary")
-    return panel if summary.attacks is None else Group(_results(summary.attacks), panel)
+    return panel if summary.attacks is None else Group(_results(summary.attacks, wrap=True), panel)
 
 
 def _verdict(summary: Summary) -> str:
-    idle = [attack.name for attack in summary.attacks or () if not attack.interventions]
+    if summary.attacks is None:
+        return "Every frame arrived unaltered." if summary.is_good else "Frames did not arrive, or arrived altered."
     if summary.frames_altered:
         return "Forged, altered or replayed frames were delivered."
-    if idle:
+    if idle := [attack.name for attack in summary.attacks if not attack.interventions]:
         return f"Only genuine frames were delivered, but these attacks found no target: {'; '.join(idle)}."
     if not summary.is_recovered:
         return "Only genuine frames were delivered, but the link did not recover."
@@ -70,86 +121,33 @@ def _verdict(summary: Summary) -> str:
     )
 
 
-def _results(attacks: list[AttackResult]) -> Table:
-    table = Table(box=None, padding=(0, 2), title="attacks", title_justify="left")
-    table.add_column("attack")
-    table.add_column("attempts", justify="right")
-    table.add_column("counted by the drones")
-    for attack in attacks:
-        table.add_row(attack.name, f"{attack.interventions:,}", _reasons(attack.noticed))
-    return table
-
-
-def _attacks(course: AttackCourse) -> Table:
-    """The running attack, and the last finished ones."""
-    table = Table(box=None, padding=(0, 2), expand=True)
-    table.add_column("attack", no_wrap=True)
+def _results(attacks: Iterable[AttackResult], *, wrap: bool = False) -> Table:
+    table = Table(box=None, padding=(0, 2), title="attacks" if wrap else None, title_justify="left", expand=not wrap)
+    table.add_column("attack", no_wrap=not wrap)
     table.add_column("attempts", justify="right", no_wrap=True)
-    table.add_column("counted by the drones", no_wrap=True, overflow="ellipsis", ratio=1)
-    for result in course.results()[-_SHOWN:]:
-        table.add_row(result.name, f"{result.interventions:,}", _reasons(result.noticed), style="dim")
-    current = course.current
-    if current is not None:
-        spec, attempts, noticed = current
-        table.add_row(Text(str(spec), style="bold red"), f"{attempts:,}", _reasons(noticed))
+    overflow: Literal["fold", "ellipsis"] = "fold" if wrap else "ellipsis"
+    table.add_column("counted by the drones", no_wrap=not wrap, overflow=overflow, ratio=None if wrap else 1)
+    for attack in attacks:
+        table.add_row(attack.name, f"{max(0, attack.interventions):,}", _counts(attack.noticed) or _NOTHING)
     return table
 
 
-_SHOWN = 3
-"""Finished attacks on the screen."""
-
-_NOTHING = "none: all datagrams were genuine, some perhaps lost or late"
-
-
-def _reasons(noticed: dict[str, int]) -> str:
-    return ", ".join(f"{count:,} {reason}" for reason, count in noticed.items()) or _NOTHING
+def _counts(counts: Mapping[str, int]) -> str:
+    """The largest first."""
+    by_count = sorted(counts.items(), key=lambda item: item[1], reverse=True)
+    return ", ".join(f"{count:,} {reason}" for reason, count in by_count)
 
 
-_FACTS = ("autopilot", "to peers", "link", "suite", "mode", "keys", "round trip", "envelopes", "dropped")
-_FACTS_UNDER_ATTACK = ("link", "keys", "round trip", "envelopes", "dropped")
-"""The attacks need the other lines."""
-
-
-def _drones(drones: tuple[Drone, Drone], names: tuple[str, ...]) -> Table:
-    table = Table(box=None, padding=(0, 2), expand=True)
-    table.add_column("", style="dim", no_wrap=True)
-    for drone in drones:
-        table.add_column(drone.name, ratio=1, no_wrap=True, overflow="ellipsis")
-    columns = [_facts(drone, system_id) for system_id, drone in enumerate(drones, 1)]
-    for name in names:
-        table.add_row(name, *(column[name] for column in columns))
-    return table
-
-
-def _facts(drone: Drone, system_id: int) -> dict[str, str | Text]:
-    status = drone.peer_status
-    state = status.get("state", "starting")
-    session = status.get("session") or {}
-    round_trip_s = status.get("round_trip_s")
+def _facts(drone: DroneProcess) -> dict[str, str | Text]:
+    status = next(iter(drone.peer_statuses), {})
+    state, session, round_trip_s = (
+        status.get("state", "starting"),
+        status.get("session") or {},
+        status.get("round_trip_s"),
+    )
     return {
-        "autopilot": f"system {system_id}, {drone.endpoint_url.removeprefix('udpout:')}",
-        "to peers": f"127.0.0.1:{drone.port}",
-        "link": Text(state, style="bold green" if state == "up" else "bold yellow"),
-        "suite": session.get("suite", "-"),
-        "mode": f"{session['mode']}, {session['tag_bits']} bits" if session else "-",
+        "link": Text(f"{state} {session.get('suite', '')}", style="bold green" if state == "up" else "bold yellow"),
         "keys": f"no. {session['generation']}, {status['handshake_s']:.1f} s old" if session else "-",
         "round trip": "-" if round_trip_s is None else f"{1000 * round_trip_s:.2f} ms",
         "envelopes": f"{status.get('envelopes_sent', 0):,} out, {status.get('envelopes_received', 0):,} in",
-        "dropped": ", ".join(f"{count:,} {reason}" for reason, count in drone.drops.most_common()) or "none",
     }
-
-
-def _crossing(drones: tuple[Drone, Drone], directions: tuple[FrameCounts, FrameCounts]) -> Table:
-    table = Table(box=None, padding=(0, 2), expand=True)
-    for column in ("frames", "sent", "delivered", "in flight", "lost", "altered"):
-        table.add_column(column, justify="left" if column == "frames" else "right")
-    for (one, other), counts in zip((drones, drones[::-1]), directions, strict=True):
-        table.add_row(
-            f"{one.name} → {other.name}",
-            f"{counts.sent:,}",
-            f"{counts.delivered:,}",
-            f"{counts.in_flight:,}",
-            f"{counts.lost:,}",
-            Text(f"{counts.altered:,}", style="bold red" if counts.altered else ""),
-        )
-    return table

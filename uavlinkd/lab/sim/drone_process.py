@@ -57,7 +57,6 @@ class DroneProcess:
 
     @property
     def pid(self) -> int:
-        """The process ID."""
         assert self._process is not None
         return self._process.pid
 
@@ -102,7 +101,6 @@ class DroneProcess:
         }
 
     def share_psk(self, psk: str, file: str) -> None:
-        """Write a pre-shared key."""
         write_secret_file(self.folder / file, psk)
 
     async def start(self) -> None:
@@ -146,13 +144,7 @@ class DroneProcess:
         """The status of its peers; empty before the first answer."""
         return list(self.status.get("peers", {}).values())
 
-    def is_ready(self) -> bool:
-        """Whether its links are up and its autopilot is connected."""
-        clients = self.status.get("endpoints", {}).get("autopilot", {}).get("clients", {})
-        return bool(clients) and all(peer["state"] == "up" for peer in self.peer_statuses)
-
     def last_lines(self, count: int) -> list[str]:
-        """The last lines of its log."""
         return self.log.read_text(errors="replace").splitlines()[-count:]
 
 

@@ -1,36 +1,33 @@
-"""The simulated autopilot on a MAVLink connection: sockets and a clock around ``Autopilot``."""
+"""``uavlinkd sim``: the simulated autopilot on a MAVLink connection, or a recorded flight."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 from uavlinkd.lab.sim.autopilot import Autopilot, AutopilotSettings, Event
-from uavlinkd.lab.sim.links import ConnectionOwner, LinkError, OnFrame, open_connection
+from uavlinkd.lab.sim.links import LinkError, LinkURL, MavlinkConnection, OnFrame, open_connection
+from uavlinkd.lab.sim.tlog import PlaybackReport, play_tlog, read_tlog
 
 
 @dataclass(frozen=True, slots=True)
 class FlightReport:
-    """The result of a simulated flight."""
+    """The counters of a simulated flight."""
 
     seconds: float
     frames_sent: int
-    bytes_sent: int
     frames_received: int
-    bytes_received: int
     bad_bytes: int  # received outside frames
     frames_unsent: int  # without a receiver
-    commands: int
-    stations: list[tuple[int, int]] = field(default_factory=list)
-    events: dict[str, int] = field(default_factory=dict)
 
 
-class Flight(ConnectionOwner):
+class Flight:
     """One simulated autopilot at a MAVLink URL, as an asynchronous context.
 
     ``on_sent`` is called once with each sent frame, for any number of receivers; ``on_received`` with each genuine
@@ -48,7 +45,8 @@ class Flight(ConnectionOwner):
         on_received: OnFrame | None = None,
         on_event: Event | None = None,
     ) -> None:
-        super().__init__(url)
+        self._url = url
+        self.link: MavlinkConnection
         self._on_sent = on_sent
         self._on_received = on_received
         self._loop = asyncio.get_running_loop()
@@ -61,46 +59,37 @@ class Flight(ConnectionOwner):
         )
         self._timer: asyncio.TimerHandle | None = None
         self._deadline = self._started_at
-        self._frames_sent = self._bytes_sent = self._bytes_received = self._frames_unsent = 0
+        self._frames_sent = self._frames_unsent = 0
         self._failure: asyncio.Future[None] = self._loop.create_future()
 
     def report(self) -> FlightReport:
-        """The counters so far."""
-        counters = self.autopilot.counters
         return FlightReport(
             seconds=self._loop.time() - self._started_at,
             frames_sent=self._frames_sent,
-            bytes_sent=self._bytes_sent,
-            frames_received=counters.frames_received,
-            bytes_received=self._bytes_received,
+            frames_received=self.autopilot.frames_received,
             bad_bytes=self.link.split.garbage_bytes,
             frames_unsent=self._frames_unsent,
-            commands=counters.commands.total(),
-            stations=self.autopilot.stations,
-            events=dict(counters.events),
         )
 
-    async def run(self, seconds: float | None = None, stop: asyncio.Event | None = None) -> None:
-        """Fly for ``seconds``, until ``stop`` is set, or until cancelled.
+    async def run(self, seconds: float | None = None) -> None:
+        """Fly for ``seconds``, or until cancelled.
 
         Raises:
             LinkError: The other end closed a TCP connection.
         """
-        ends = [asyncio.ensure_future(event.wait()) for event in (stop or asyncio.Event(), self.link.lost)]
-        awaited: list[asyncio.Future[Any]] = [*ends, self._failure]
+        end = asyncio.ensure_future(self.link.lost.wait())
         try:
-            await asyncio.wait(awaited, timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
+            await asyncio.wait((end, self._failure), timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
         finally:
-            for end in ends:
-                end.cancel()
-            await asyncio.gather(*ends, return_exceptions=True)
+            end.cancel()
+            await asyncio.gather(end, return_exceptions=True)
         if self._failure.done():
             self._failure.result()
         if self.link.lost.is_set():
-            raise LinkError(f"{self.url}: the other end closed the connection")
+            raise LinkError(f"{self._url}: the other end closed the connection")
 
     async def __aenter__(self) -> Self:
-        self._link = await open_connection(self._asked_url, self._receive)
+        self.link = await open_connection(self._url, self._receive)
         self._on_timer()
         return self
 
@@ -115,12 +104,10 @@ class Flight(ConnectionOwner):
         self._failure.cancel()
 
     def _receive(self, frame: bytes) -> None:
-        self._bytes_received += len(frame)
         with self._failing():
             if self._on_received:
                 self._on_received(frame)
             self._transmit(self.autopilot.receive(frame, self._loop.time()))
-            self._changes.notify()
 
     def _on_timer(self) -> None:
         with self._failing():
@@ -129,7 +116,6 @@ class Flight(ConnectionOwner):
             self._transmit(self.autopilot.advance(now))
             self._deadline = self.autopilot.next_due_at
             self._timer = self._loop.call_at(self._deadline, self._on_timer)
-            self._changes.notify()
 
     @contextlib.contextmanager
     def _failing(self) -> Iterator[None]:
@@ -146,26 +132,93 @@ class Flight(ConnectionOwner):
                 self._frames_unsent += 1
                 continue
             self._frames_sent += 1
-            self._bytes_sent += len(frame)
             if self._on_sent:
                 self._on_sent(frame)
 
 
-async def fly(
-    url: str,
-    settings: AutopilotSettings | None = None,
-    *,
-    seconds: float | None = None,
-    stop: asyncio.Event | None = None,
-    on_sent: OnFrame | None = None,
-    on_received: OnFrame | None = None,
-    on_event: Event | None = None,
-) -> FlightReport:
-    """Fly a simulated copter at a MAVLink URL for ``seconds``, until ``stop`` is set, or until cancelled.
+Write = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class SimOptions:
+    """The command line."""
+
+    url: LinkURL
+    system_id: int = 1
+    rate_hz: float = 10.0
+    seconds: float | None = None
+    seed: int = 0
+    tlog: Path | None = None
+    speed: float = 1.0
+
+
+async def run_sim(options: SimOptions, write: Write) -> None:
+    """Fly or play until the end, or until cancelled, then write the counters.
 
     Raises:
-        LinkError: The connection cannot be opened, or the other end closed it.
+        OSError, TlogError: the log cannot be read.
+        LinkError: the connection cannot be opened, or the other end closed it.
+        ValueError: a setting is out of range.
     """
-    async with Flight(url, settings, on_sent=on_sent, on_received=on_received, on_event=on_event) as flight:
-        await flight.run(seconds, stop)
-        return flight.report()
+    if options.tlog is None:
+        await _fly(options, write)
+    else:
+        await _play(options, options.tlog, write)
+
+
+async def _fly(options: SimOptions, write: Write) -> None:
+    settings = AutopilotSettings(system_id=options.system_id, attitude_rate_hz=options.rate_hz, seed=options.seed)
+
+    def on_event(name: str, fields: dict[str, object]) -> None:
+        write(" ".join([name.replace("_", " ") + ":" * bool(fields), *(f"{k} {v}" for k, v in fields.items())]))
+
+    async with Flight(str(options.url), settings, on_event=on_event) as flight:
+        write(f"copter with system ID {options.system_id}, {_where(flight.link.url)}; Ctrl-C ends it")
+        watching = asyncio.create_task(_watch(flight.link, lambda: flight.report().frames_received > 0, write))
+        try:
+            await flight.run(options.seconds)
+        finally:
+            watching.cancel()
+            report = flight.report()
+            write(
+                f"sent {report.frames_sent:,} frames, received {report.frames_received:,} in {report.seconds:.1f} s"
+            )
+            if report.frames_unsent:
+                write(f"{report.frames_unsent:,} frames had no receiver")
+
+
+async def _play(options: SimOptions, path: Path, write: Write) -> None:
+    log = await asyncio.to_thread(read_tlog, path)
+    write(f"{path}: {len(log.records):,} frames of {log.seconds:.0f} s, {_where(options.url)}; Ctrl-C ends it")
+    if log.skipped_bytes:
+        write(f"{log.skipped_bytes:,} bytes of the file are not MAVLink frames with timestamps: skipped")
+    report = PlaybackReport()
+    watching: list[asyncio.Task[None]] = []
+
+    def on_open(link: MavlinkConnection, counters: PlaybackReport) -> None:
+        nonlocal report
+        report = counters
+        watching.append(asyncio.create_task(_watch(link, lambda: counters.frames_received > 0, write)))
+
+    try:
+        await play_tlog(log, str(options.url), speed=options.speed, seconds=options.seconds, on_open=on_open)
+    finally:
+        for task in watching:
+            task.cancel()
+        write(f"sent {report.frames_sent:,} frames, received {report.frames_received:,} in {report.seconds:.1f} s")
+
+
+def _where(url: LinkURL) -> str:
+    return f"sends to {url}" if url.kind in ("udpout", "tcp") else f"waits for clients at {url}"
+
+
+async def _watch(link: MavlinkConnection, is_answered: Callable[[], bool], write: Write) -> None:
+    """Report the first client, or that nothing listens."""
+    if link.url.kind in ("udpin", "tcpin"):
+        await link.joined.wait()
+        write("a client connected")
+        return
+    await link.refused.wait()
+    if not is_answered():
+        place = str(link.url).partition(":")[2]
+        write(f"nothing listens at {place}: start a client there, or uavlinkd with an endpoint udpin:{place}")

@@ -7,14 +7,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import math
 import re
 import socket
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
-from types import TracebackType
-from typing import Final, Self
+from typing import Final
 
 from uavlinkd.mavlink.frames import SplitCounters, split_datagram
 from uavlinkd.mavlink.stream_splitter import StreamSplitter
@@ -87,7 +85,6 @@ class MavlinkConnection:
     def __init__(self, url: LinkURL, on_frame: OnFrame) -> None:
         self.url = url
         self.split = SplitCounters()
-        self.frames_unsent = 0
         self._on_frame = on_frame
         self._loop = asyncio.get_running_loop()
         self._udp: asyncio.DatagramTransport | None = None
@@ -101,21 +98,18 @@ class MavlinkConnection:
 
     @property
     def receivers(self) -> int:
-        """The number of receivers."""
         if self._udp is not None:
             return len(self._clients) if self.url.kind == "udpin" else 1
         return len(self._streams)
 
     def send(self, frame: bytes) -> bool:
-        """Send to all receivers; False if there is no receiver."""
+        """Send to all receivers; False if there is none that reads."""
         if self._udp is not None:
             return self._send_datagram(self._udp, frame)
-        for transport in self._streams:
-            if transport.get_write_buffer_size() > MAX_UNSENT_BYTES:
-                self.frames_unsent += 1
-            else:
-                transport.write(frame)
-        return bool(self._streams)
+        ready = [one for one in self._streams if one.get_write_buffer_size() <= MAX_UNSENT_BYTES]
+        for transport in ready:
+            transport.write(frame)
+        return bool(ready)
 
     async def close(self) -> None:
         """Close the sockets. Frames already sent to a TCP receiver are still written."""
@@ -223,97 +217,6 @@ async def open_connection(url: str | LinkURL, on_frame: OnFrame) -> MavlinkConne
         await link.close()
         raise LinkError(f"{link.url}: {error.strerror or error}") from error
     return link
-
-
-class ChangeNotifier:
-    """Lets tasks wait for a condition without polling."""
-
-    def __init__(self) -> None:
-        self._waiting: list[tuple[Callable[[], bool], asyncio.Future[None]]] = []
-
-    def notify(self) -> None:
-        """Resume the tasks whose conditions hold now."""
-        for condition, future in self._waiting:
-            if not future.done() and condition():
-                future.set_result(None)
-
-    async def until(self, condition: Callable[[], bool], timeout_s: float) -> None:
-        """Wait for a condition.
-
-        Raises:
-            TimeoutError: The condition does not hold after ``timeout_s``.
-        """
-        if condition():
-            return
-        future: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        entry = (condition, future)
-        self._waiting.append(entry)
-        try:
-            await asyncio.wait_for(future, None if math.isinf(timeout_s) else timeout_s)
-        finally:
-            self._waiting.remove(entry)
-
-
-class ConnectionOwner:
-    """Opens a connection when its asynchronous context begins."""
-
-    def __init__(self, url: str) -> None:
-        self._asked_url = url
-        self._changes = ChangeNotifier()
-        self._link: MavlinkConnection | None = None
-
-    @property
-    def link(self) -> MavlinkConnection:
-        """The open connection."""
-        if self._link is None:
-            raise RuntimeError("the connection is not open")
-        return self._link
-
-    @property
-    def url(self) -> str:
-        """The URL, with the actual port in place of port 0."""
-        return str(self.link.url)
-
-    @property
-    def address(self) -> SocketAddress:
-        """Host and port of ``url``."""
-        return self.link.url.host, self.link.url.port
-
-    async def until(self, condition: Callable[[], bool], timeout_s: float = 240.0) -> None:
-        """Wait for a condition, which is checked after each event.
-
-        Raises:
-            TimeoutError: The condition does not hold after ``timeout_s``.
-        """
-        await self._changes.until(condition, timeout_s)
-
-
-class Collector(ConnectionOwner):
-    """A connection that stores each received frame, as on the wire, for tests.
-
-    Memory grows with the frames: use it for some minutes.
-    """
-
-    def __init__(self, url: str) -> None:
-        super().__init__(url)
-        self.frames: list[bytes] = []
-
-    def send(self, frame: bytes) -> bool:
-        """Send to all receivers; False if there is no receiver."""
-        return self.link.send(frame)
-
-    async def __aenter__(self) -> Self:
-        self._link = await open_connection(self._asked_url, self._collect)
-        return self
-
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        await self.link.close()
-
-    def _collect(self, frame: bytes) -> None:
-        self.frames.append(frame)
-        self._changes.notify()
 
 
 def _widen(transport: asyncio.DatagramTransport) -> None:

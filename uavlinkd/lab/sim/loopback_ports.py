@@ -73,7 +73,6 @@ def _is_free(port: int) -> bool:
 
 
 def _bind(family: socket.AddressFamily, kind: socket.SocketKind, address: tuple[str, int]) -> None:
-    """Bind an address for a moment."""
     with socket.socket(family, kind) as sock:
         if family is socket.AF_INET6:
             sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)

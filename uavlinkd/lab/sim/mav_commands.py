@@ -9,9 +9,8 @@ from typing import Final, Protocol
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from uavlinkd.lab.sim.message_rates import Streams
-from uavlinkd.lab.sim.mission import Missions
-from uavlinkd.lab.sim.pilot import MissionPilot, point_of
+from uavlinkd.lab.sim.mission import MissionPilot, Missions, point_of
+from uavlinkd.lab.sim.telemetry import Streams
 from uavlinkd.lab.sim.vehicle import Landed, Mode, Vehicle
 
 ACCEPTED: Final[int] = mavlink.MAV_RESULT_ACCEPTED
@@ -71,7 +70,6 @@ class Commands:
             mavlink.MAV_CMD_MISSION_START: self._start_mission,
             mavlink.MAV_CMD_DO_SET_MISSION_CURRENT: self._set_current,
             mavlink.MAV_CMD_SET_MESSAGE_INTERVAL: self._set_interval,
-            mavlink.MAV_CMD_GET_MESSAGE_INTERVAL: self._send_interval,
             mavlink.MAV_CMD_REQUEST_MESSAGE: self._send_message,
             mavlink.MAV_CMD_GET_HOME_POSITION: self._send_home,
             mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: self._send_version,
@@ -166,15 +164,6 @@ class Commands:
             return DENIED
         rate = None if interval_us == 0 else 0.0 if interval_us < 0 else 1e6 / max(interval_us, 1.0)
         return ACCEPTED if self._autopilot.streams.set_rate(message, rate, now) else FAILED
-
-    def _send_interval(self, command: Command, _now: float) -> int:
-        message = int(command.parameters[0])
-        rate = self._autopilot.streams.rate_hz(message)
-        if rate is None:
-            return FAILED
-        interval_us = -1 if rate == 0 else min(round(1e6 / rate), 2**31 - 1)
-        self._autopilot.send(mavlink.MAVLink_message_interval_message(message, interval_us))
-        return ACCEPTED
 
     def _send_message(self, command: Command, now: float) -> int:
         return ACCEPTED if self._autopilot.send_by_number(int(command.parameters[0]), now) else UNSUPPORTED

@@ -1,4 +1,4 @@
-"""The mission protocol of the vehicle: one upload at a time, any number of downloads.
+"""Missions: their transfer (one upload at a time, any number of downloads), and the flight along them in AUTO.
 
 Source of the exchange: https://mavlink.io/en/services/mission.html
 """
@@ -12,6 +12,8 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from uavlinkd.lab.sim.vehicle import Axes, GeoPoint, Landed, Mode, Vehicle
+
 # A bound on memory.
 MAX_ITEMS: Final = 1000
 # mavlink.io recommends 250 ms and 5 retries; a lossy radio link needs more.
@@ -19,8 +21,6 @@ REQUEST_AGAIN_AFTER_S: Final = 0.5
 MAX_REQUESTS_AGAIN: Final = 10
 
 PLAN: Final = mavlink.MAV_MISSION_TYPE_MISSION
-KINDS: Final = (PLAN, mavlink.MAV_MISSION_TYPE_FENCE, mavlink.MAV_MISSION_TYPE_RALLY)
-
 Partner = tuple[int, int]  # system id, component id
 Message = Any  # a pymavlink message: pymavlink has no types
 Send = Callable[[Message], None]
@@ -43,7 +43,6 @@ class Item:
 @dataclass(slots=True)
 class _Upload:
     partner: Partner
-    kind: int
     count: int
     items: list[Item]
     asked_at: float
@@ -51,27 +50,17 @@ class _Upload:
 
 
 class Missions:
-    """The plan, the fence and the rally points, and their transfer.
+    """The plan and its transfer; there are no fences and rally points, and new ones are refused.
 
-    ``send`` is called with each message to send, ``changed`` with the kind of each new list.
+    ``send`` is called with each message to send, ``changed`` with the sender of each new plan.
     """
 
-    def __init__(self, send: Send, changed: Callable[[int, Partner], None]) -> None:
+    def __init__(self, send: Send, changed: Callable[[Partner], None]) -> None:
         self._send = send
         self._changed = changed
-        self._stored: dict[int, list[Item]] = {kind: [] for kind in KINDS}
+        self.plan: list[Item] = []
         self._upload: _Upload | None = None
         self.current = 0
-        self.timed_out = 0
-
-    @property
-    def plan(self) -> list[Item]:
-        """The current mission items."""
-        return self._stored[PLAN]
-
-    def items(self, kind: int) -> list[Item]:
-        """The items of a MAV_MISSION_TYPE."""
-        return self._stored[kind]
 
     @property
     def next_due_at(self) -> float:
@@ -85,8 +74,7 @@ class Missions:
             return
         if upload.asked_again >= MAX_REQUESTS_AGAIN:
             self._upload = None
-            self.timed_out += 1
-            self._acknowledge(upload.partner, upload.kind, mavlink.MAV_MISSION_OPERATION_CANCELLED)
+            self._acknowledge(upload.partner, mavlink.MAV_MISSION_OPERATION_CANCELLED)
             return
         upload.asked_again += 1
         self._ask(upload, now)
@@ -96,29 +84,25 @@ class Missions:
         partner = (message.get_srcSystem(), message.get_srcComponent())
         kind = int(getattr(message, "mission_type", PLAN))
         name = message.get_type()
-        if name == "MISSION_CLEAR_ALL" and kind == mavlink.MAV_MISSION_TYPE_ALL:
-            for stored_kind in KINDS:
-                self._store(stored_kind, [], partner)
-            self._acknowledge(partner, kind, mavlink.MAV_MISSION_ACCEPTED)
-            return
-        if kind not in self._stored:
-            if name != "MISSION_ACK":
-                self._acknowledge(partner, kind, mavlink.MAV_MISSION_UNSUPPORTED)
+        is_for_all = name == "MISSION_CLEAR_ALL" and kind == mavlink.MAV_MISSION_TYPE_ALL
+        if kind != PLAN and not is_for_all:
+            if name == "MISSION_REQUEST_LIST":
+                self._send(mavlink.MAVLink_mission_count_message(*partner, 0, kind))
+            elif name != "MISSION_ACK":
+                self._acknowledge(partner, mavlink.MAV_MISSION_UNSUPPORTED, kind)
             return
         match name:
             case "MISSION_REQUEST_LIST":
-                self._send(
-                    mavlink.MAVLink_mission_count_message(*partner, count=len(self._stored[kind]), mission_type=kind)
-                )
+                self._send(mavlink.MAVLink_mission_count_message(*partner, count=len(self.plan)))
             case "MISSION_REQUEST_INT" | "MISSION_REQUEST":
-                self._send_item(partner, kind, message.seq, as_float=name == "MISSION_REQUEST")
+                self._send_item(partner, message.seq, as_float=name == "MISSION_REQUEST")
             case "MISSION_COUNT":
-                self._begin(partner, kind, message.count, now)
-            case "MISSION_ITEM_INT" | "MISSION_ITEM":
-                self._receive_item(partner, kind, message, now)
+                self._begin(partner, message.count, now)
+            case "MISSION_ITEM_INT":
+                self._receive_item(partner, message, now)
             case "MISSION_CLEAR_ALL":
-                self._store(kind, [], partner)
-                self._acknowledge(partner, kind, mavlink.MAV_MISSION_ACCEPTED)
+                self._store([], partner)
+                self._acknowledge(partner, mavlink.MAV_MISSION_ACCEPTED, kind)
             case "MISSION_ACK":
                 # The ground station cancelled its upload. The end of a download needs no answer.
                 if self._upload and self._upload.partner == partner and message.type:
@@ -131,48 +115,46 @@ class Missions:
         self.current = sequence
         return True
 
-    def _send_item(self, partner: Partner, kind: int, sequence: int, *, as_float: bool) -> None:
-        items = self._stored[kind]
-        if sequence >= len(items):
-            self._acknowledge(partner, kind, mavlink.MAV_MISSION_INVALID_SEQUENCE)
+    def _send_item(self, partner: Partner, sequence: int, *, as_float: bool) -> None:
+        if sequence >= len(self.plan):
+            self._acknowledge(partner, mavlink.MAV_MISSION_INVALID_SEQUENCE)
             return
-        item = items[sequence]
-        current = int(kind == PLAN and sequence == self.current)
+        item = self.plan[sequence]
+        current = int(sequence == self.current)
         head = (*partner, sequence, item.frame, item.command, current, item.autocontinue, *item.parameters)
         if as_float:
-            x, y = _to_float(item)
-            self._send(mavlink.MAVLink_mission_item_message(*head, x, y, item.z, mission_type=kind))
+            # The integers for one degree, or for one metre in a local frame.
+            scale = 1e4 if item.frame in LOCAL_FRAMES else 1e7
+            self._send(mavlink.MAVLink_mission_item_message(*head, item.x / scale, item.y / scale, item.z))
         else:
-            self._send(mavlink.MAVLink_mission_item_int_message(*head, item.x, item.y, item.z, mission_type=kind))
+            self._send(mavlink.MAVLink_mission_item_int_message(*head, item.x, item.y, item.z))
 
-    def _begin(self, partner: Partner, kind: int, count: int, now: float) -> None:
+    def _begin(self, partner: Partner, count: int, now: float) -> None:
         running = self._upload
         if running is not None and running.partner != partner:
-            self._acknowledge(partner, kind, mavlink.MAV_MISSION_DENIED)
+            self._acknowledge(partner, mavlink.MAV_MISSION_DENIED)
         elif count > MAX_ITEMS:
-            self._acknowledge(partner, kind, mavlink.MAV_MISSION_NO_SPACE)
+            self._acknowledge(partner, mavlink.MAV_MISSION_NO_SPACE)
         elif count == 0:
             self._upload = None
-            self._store(kind, [], partner)
-            self._acknowledge(partner, kind, mavlink.MAV_MISSION_ACCEPTED)
+            self._store([], partner)
+            self._acknowledge(partner, mavlink.MAV_MISSION_ACCEPTED)
         else:
-            self._upload = _Upload(partner, kind, count, [], now)
+            self._upload = _Upload(partner, count, [], now)
             self._ask(self._upload, now)
 
-    def _receive_item(self, partner: Partner, kind: int, message: Message, now: float) -> None:
+    def _receive_item(self, partner: Partner, message: Message, now: float) -> None:
         upload = self._upload
-        is_finite = all(map(math.isfinite, (message.x, message.y, message.z)))
-        if upload is None or upload.partner != partner or upload.kind != kind:
+        if upload is None or upload.partner != partner:
             # The last acknowledgement was lost: acknowledge again, so that the ground station stops waiting.
-            is_last = is_finite and message.seq + 1 == len(self._stored[kind])
-            if is_last and _item(message) == self._stored[kind][-1]:
-                self._acknowledge(partner, kind, mavlink.MAV_MISSION_ACCEPTED)
+            if message.seq + 1 == len(self.plan) and _item(message) == self.plan[-1]:
+                self._acknowledge(partner, mavlink.MAV_MISSION_ACCEPTED)
             return
         if message.seq != len(upload.items):
             return  # repeated or reordered; the expected item is already requested
-        if not is_finite:
+        if not math.isfinite(message.z):
             self._upload = None
-            self._acknowledge(partner, kind, mavlink.MAV_MISSION_INVALID)
+            self._acknowledge(partner, mavlink.MAV_MISSION_INVALID)
             return
         upload.items.append(_item(message))
         upload.asked_again = 0
@@ -180,46 +162,26 @@ class Missions:
             self._ask(upload, now)
             return
         self._upload = None
-        self._store(kind, upload.items, partner)
-        self._acknowledge(partner, kind, mavlink.MAV_MISSION_ACCEPTED)
+        self._store(upload.items, partner)
+        self._acknowledge(partner, mavlink.MAV_MISSION_ACCEPTED)
 
-    def _store(self, kind: int, items: list[Item], partner: Partner) -> None:
-        self._stored[kind] = items
-        if kind == PLAN:
-            self.current = 0
-        self._changed(kind, partner)
+    def _store(self, items: list[Item], partner: Partner) -> None:
+        self.plan = items
+        self.current = 0
+        self._changed(partner)
 
     def _ask(self, upload: _Upload, now: float) -> None:
         upload.asked_at = now
-        self._send(
-            mavlink.MAVLink_mission_request_int_message(
-                *upload.partner, seq=len(upload.items), mission_type=upload.kind
-            )
-        )
+        self._send(mavlink.MAVLink_mission_request_int_message(*upload.partner, seq=len(upload.items)))
 
-    def _acknowledge(self, partner: Partner, kind: int, result: int) -> None:
+    def _acknowledge(self, partner: Partner, result: int, kind: int = PLAN) -> None:
         self._send(mavlink.MAVLink_mission_ack_message(*partner, type=result, mission_type=kind))
 
 
 def _item(message: Message) -> Item:
-    """The item of a message. MISSION_ITEM has degrees or metres, MISSION_ITEM_INT scaled integers."""
-    x, y = message.x, message.y
-    if message.get_type() == "MISSION_ITEM":
-        scale = _scale(message.frame)
-        x, y = (max(-(2**31), min(2**31 - 1, round(value * scale))) for value in (x, y))
     four = (message.param1, message.param2, message.param3, message.param4)
     # The vehicle decides which item is current.
-    return Item(message.frame, message.command, 0, message.autocontinue, four, x, y, message.z)
-
-
-def _to_float(item: Item) -> tuple[float, float]:
-    scale = _scale(item.frame)
-    return item.x / scale, item.y / scale
-
-
-def _scale(frame: int) -> float:
-    """The integer in a message for one degree, or for one metre in a local frame."""
-    return 1e4 if frame in LOCAL_FRAMES else 1e7
+    return Item(message.frame, message.command, 0, message.autocontinue, four, message.x, message.y, message.z)
 
 
 LOCAL_FRAMES: Final = (
@@ -227,3 +189,80 @@ LOCAL_FRAMES: Final = (
     mavlink.MAV_FRAME_LOCAL_ENU,
     mavlink.MAV_FRAME_LOCAL_OFFSET_NED,
 )
+
+
+ABSOLUTE_FRAMES: Final = (mavlink.MAV_FRAME_GLOBAL, mavlink.MAV_FRAME_GLOBAL_INT)
+# A copter flies to each of these.
+WAYPOINTS: Final = (
+    mavlink.MAV_CMD_NAV_WAYPOINT,
+    mavlink.MAV_CMD_NAV_SPLINE_WAYPOINT,
+    mavlink.MAV_CMD_NAV_LOITER_TIME,
+    mavlink.MAV_CMD_NAV_LOITER_UNLIM,
+)
+
+
+def point_of(vehicle: Vehicle, frame: int, x: int, y: int, z: float) -> Axes:
+    """The target of an item or a command, relative to home. Zero x and y mean the vehicle's position."""
+    if frame in LOCAL_FRAMES:
+        up = z if frame == mavlink.MAV_FRAME_LOCAL_ENU else -z
+        return Axes(x / 1e4, y / 1e4, up)
+    altitude = z if frame in ABSOLUTE_FRAMES else vehicle.home.altitude_m + z
+    if x == 0 and y == 0:
+        return Axes(vehicle.position.north, vehicle.position.east, altitude - vehicle.home.altitude_m)
+    return vehicle.point_of(GeoPoint(x / 1e7, y / 1e7, altitude))
+
+
+class MissionPilot:
+    """Follows the plan while the mode is AUTO. As in ArduPilot, item 0 is home and not a waypoint."""
+
+    def __init__(self, vehicle: Vehicle, missions: Missions) -> None:
+        self._vehicle = vehicle
+        self._missions = missions
+        self._begun: int | None = None
+
+    def restart(self) -> None:
+        """Start the current item again, after a change of the mode, the plan or the current item."""
+        self._begun = None
+
+    def advance(self) -> list[int]:
+        """Continue the mission, and return the reached items."""
+        vehicle, missions = self._vehicle, self._missions
+        reached: list[int] = []
+        # If all items are skipped, the loop ends at the last one.
+        while vehicle.armed and vehicle.mode is Mode.AUTO and missions.plan:
+            sequence = missions.current
+            if self._begun != sequence:
+                self._begun = sequence
+                self._begin(sequence, missions.plan[sequence])
+            if not self._is_done(sequence, missions.plan[sequence]):
+                break
+            if sequence > 0:
+                reached.append(sequence)
+            if not missions.set_current(sequence + 1) and vehicle.mode is Mode.AUTO:
+                # The end of the plan: hold the position, unless the last item was to return or land.
+                vehicle.set_mode(Mode.LOITER)
+        return reached
+
+    def _begin(self, sequence: int, item: Item) -> None:
+        vehicle = self._vehicle
+        if sequence == 0:
+            return
+        point = point_of(vehicle, item.frame, item.x, item.y, item.z)
+        if item.command == mavlink.MAV_CMD_NAV_TAKEOFF:
+            vehicle.take_off(max(point.up, 0.5))
+        elif vehicle.landed is Landed.ON_GROUND:
+            return
+        elif item.command in WAYPOINTS:
+            vehicle.go_to(point)
+        elif item.command == mavlink.MAV_CMD_NAV_LAND:
+            vehicle.land()
+        elif item.command == mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH:
+            vehicle.set_mode(Mode.RTL)
+
+    def _is_done(self, sequence: int, item: Item) -> bool:
+        if sequence == 0 or item.command not in (*WAYPOINTS, mavlink.MAV_CMD_NAV_TAKEOFF, mavlink.MAV_CMD_NAV_LAND):
+            return True
+        # As in ArduCopter, a waypoint without a take-off before it never starts.
+        if item.command == mavlink.MAV_CMD_NAV_LAND:
+            return self._vehicle.landed is Landed.ON_GROUND
+        return self._vehicle.landed is not Landed.ON_GROUND and self._vehicle.has_arrived()

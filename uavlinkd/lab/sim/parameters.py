@@ -18,18 +18,12 @@ class ParameterType(IntEnum):
     REAL32 = 9
 
 
-LARGEST_FLOAT32: Final = (2 - 2**-23) * 2.0**127
-
-_RANGES: Final = {
-    ParameterType.INT8: (-(2**7), 2**7 - 1),
-    ParameterType.INT16: (-(2**15), 2**15 - 1),
-    ParameterType.INT32: (-(2**31), 2**31 - 1),
+_FORMATS: Final = {
+    ParameterType.INT8: "<b",
+    ParameterType.INT16: "<h",
+    ParameterType.INT32: "<i",
+    ParameterType.REAL32: "<f",
 }
-
-
-def _float32(value: float) -> float:
-    """The nearest float32 value."""
-    return float(struct.unpack("<f", struct.pack("<f", value))[0])
 
 
 @dataclass(slots=True)
@@ -48,49 +42,26 @@ def _defaults(system_id: int) -> list[Parameter]:
         Parameter("FORMAT_VERSION", i16, 120, read_only=True),
         Parameter("SYSID_THISMAV", i16, system_id, read_only=True),
         Parameter("SYSID_MYGCS", i16, 255),
-        Parameter("SYSID_ENFORCE", i8, 0),
         Parameter("FRAME_CLASS", i8, 1),
         Parameter("FRAME_TYPE", i8, 1),
         Parameter("ARMING_CHECK", i32, 1),
         Parameter("AHRS_ORIENTATION", i8, 0),
-        Parameter("ANGLE_MAX", i16, 3000),
         Parameter("BATT_MONITOR", i8, 4),
         Parameter("BATT_CAPACITY", i32, 5200),
-        Parameter("BATT_LOW_VOLT", real, 14.0),
-        Parameter("BATT_FS_LOW_ACT", i8, 0),
         Parameter("COMPASS_USE", i8, 1),
-        Parameter("COMPASS_OFS_X", real, 4.2),
-        Parameter("COMPASS_OFS_Y", real, -17.25),
-        Parameter("COMPASS_OFS_Z", real, 8.5),
-        Parameter("DISARM_DELAY", i8, 10),
         Parameter("FENCE_ENABLE", i8, 0),
-        Parameter("FENCE_ALT_MAX", real, 100.0),
         Parameter("FENCE_RADIUS", real, 300.0),
-        Parameter("FLTMODE1", i8, 0),
-        Parameter("FLTMODE2", i8, 2),
-        Parameter("FLTMODE3", i8, 5),
-        Parameter("FLTMODE4", i8, 4),
-        Parameter("FLTMODE5", i8, 6),
-        Parameter("FLTMODE6", i8, 9),
         Parameter("FS_GCS_ENABLE", i8, 1),
         Parameter("FS_GCS_TIMEOUT", real, 5.0),
-        Parameter("GPS_TYPE", i8, 1),
-        Parameter("INS_ACCOFFS_X", real, 0.012),
         Parameter("LAND_SPEED", i16, 100),
         Parameter("LOG_BITMASK", i32, 176_126),
         Parameter("MIS_TOTAL", i16, 0, read_only=True),
-        Parameter("MOT_SPIN_ARM", real, 0.1),
         Parameter("PILOT_TKOFF_ALT", real, 500.0),
-        Parameter("RC1_MIN", i16, 1100),
-        Parameter("RC1_MAX", i16, 1900),
-        Parameter("RC2_MIN", i16, 1100),
-        Parameter("RC2_MAX", i16, 1900),
         Parameter("RTL_ALT", i32, 1500),
         Parameter("STAT_BOOTCNT", i16, 1, read_only=True),
         Parameter("WPNAV_SPEED", real, 800.0),
         Parameter("WPNAV_SPEED_DN", real, 150.0),
         Parameter("WPNAV_SPEED_UP", real, 250.0),
-        Parameter("WPNAV_RADIUS", real, 200.0),
     ]
 
 
@@ -99,8 +70,6 @@ class ParameterTable:
 
     def __init__(self, system_id: int) -> None:
         self.table = _defaults(system_id)
-        for parameter in self.table:
-            parameter.value = _float32(parameter.value)
         self._index = {parameter.name: index for index, parameter in enumerate(self.table)}
 
     def __len__(self) -> int:
@@ -127,16 +96,12 @@ class ParameterTable:
         if index is None or self.table[index].read_only or not math.isfinite(value):
             return False
         parameter = self.table[index]
-        if parameter.kind is ParameterType.REAL32:
-            if abs(value) > LARGEST_FLOAT32:
-                return False
-            parameter.value = _float32(value)
-            return True
-        lowest, highest = _RANGES[parameter.kind]
-        rounded = math.floor(value + 0.5)
-        if not lowest <= rounded <= highest:
+        is_real = parameter.kind is ParameterType.REAL32
+        try:
+            packed = struct.pack(_FORMATS[parameter.kind], value if is_real else math.floor(value + 0.5))
+        except (struct.error, OverflowError):
             return False
-        parameter.value = rounded
+        (parameter.value,) = struct.unpack(_FORMATS[parameter.kind], packed)
         return True
 
     def preset(self, name: str, value: float) -> None:

@@ -62,7 +62,6 @@ class Firmware(StrEnum):
 
 
 _MODELS = {Firmware.ARDUPILOT: "quad", Firmware.ROVER: "rover"}
-"""What ArduPilot's simulator simulates."""
 
 
 class RealAutopilotError(Exception):
@@ -117,7 +116,6 @@ class RealAutopilot:
         self.settings = settings
         self.folder = folder
         self.log = folder / "autopilot.log"
-        """Its output."""
         self._process: asyncio.subprocess.Process | None = None
 
     async def start(self) -> None:

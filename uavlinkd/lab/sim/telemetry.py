@@ -1,4 +1,4 @@
-"""The telemetry of the simulated copter: one function per message."""
+"""The telemetry of the simulated copter: one function per message, and when each message is due."""
 
 from __future__ import annotations
 
@@ -11,6 +11,96 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from uavlinkd.lab.sim.mission import Missions
 from uavlinkd.lab.sim.vehicle import Landed, Vehicle
+
+MAX_RATE_HZ: Final = 1000.0
+# Messages later than this are skipped, so that a pause is not followed by a burst of outdated messages.
+MAX_LATE_S: Final = 0.25
+
+# The groups of REQUEST_DATA_STREAM, as in ArduCopter (only simulated messages).
+GROUPS: Final[dict[int, tuple[int, ...]]] = {
+    mavlink.MAV_DATA_STREAM_EXTENDED_STATUS: (
+        mavlink.MAVLINK_MSG_ID_SYS_STATUS,
+        mavlink.MAVLINK_MSG_ID_GPS_RAW_INT,
+        mavlink.MAVLINK_MSG_ID_MISSION_CURRENT,
+    ),
+    mavlink.MAV_DATA_STREAM_POSITION: (
+        mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
+        mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
+    ),
+    mavlink.MAV_DATA_STREAM_EXTRA1: (mavlink.MAVLINK_MSG_ID_ATTITUDE,),
+    mavlink.MAV_DATA_STREAM_EXTRA2: (mavlink.MAVLINK_MSG_ID_VFR_HUD,),
+    mavlink.MAV_DATA_STREAM_EXTRA3: (mavlink.MAVLINK_MSG_ID_SYSTEM_TIME,),
+}
+
+
+def default_rates(attitude_rate_hz: float) -> dict[int, float]:
+    """Messages per second until a ground station requests other rates. 0: only on request."""
+    return {
+        mavlink.MAVLINK_MSG_ID_HEARTBEAT: 1.0,
+        mavlink.MAVLINK_MSG_ID_ATTITUDE: attitude_rate_hz,
+        mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 5.0,
+        mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: 5.0,
+        mavlink.MAVLINK_MSG_ID_VFR_HUD: 2.0,
+        mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 2.0,
+        mavlink.MAVLINK_MSG_ID_SYS_STATUS: 1.0,
+        mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: 1.0,
+        mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: 1.0,
+        mavlink.MAVLINK_MSG_ID_HOME_POSITION: 0.5,
+        mavlink.MAVLINK_MSG_ID_MISSION_CURRENT: 1.0,
+    }
+
+
+class Streams:
+    """The schedule of periodic messages. Times are monotonic seconds."""
+
+    def __init__(self, rates: dict[int, float], now: float) -> None:
+        self._default = dict(rates)
+        self._rate = dict(rates)
+        self._due_at = {message: now for message, rate in rates.items() if rate > 0}
+        self.next_due_at = min(self._due_at.values())
+
+    def set_rate(self, message: int, rate_hz: float | None, now: float) -> bool:
+        """Change a rate; 0 stops the message, None restores the default. False if it is not a periodic message.
+
+        The heartbeat keeps its rate: without it, ground stations lose the vehicle.
+        """
+        if message not in self._rate or message == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
+            return False
+        rate = self._default[message] if rate_hz is None else min(max(rate_hz, 0.0), MAX_RATE_HZ)
+        self._rate[message] = rate
+        if rate == 0:
+            self._due_at.pop(message, None)
+        else:
+            self._due_at[message] = min(self._due_at.get(message, now), now + 1 / rate)
+        self.next_due_at = min(self._due_at.values())
+        return True
+
+    def set_group(self, group: int, rate_hz: float, now: float) -> bool:
+        """Change the rates of a MAV_DATA_STREAM, or of all of them. False if it is unknown."""
+        groups = list(GROUPS) if group == mavlink.MAV_DATA_STREAM_ALL else [group]
+        if not GROUPS.keys() >= set(groups):
+            return False
+        for message in (message for number in groups for message in GROUPS[number]):
+            self.set_rate(message, rate_hz, now)
+        return True
+
+    def take_due(self, now: float) -> list[int]:
+        """The messages to send now, in the order they were due. Schedules their next times."""
+        if now < self.next_due_at:
+            return []
+        due: list[tuple[float, int]] = []
+        for message, at in self._due_at.items():
+            interval = 1 / self._rate[message]
+            next_at = at
+            if now - next_at > max(MAX_LATE_S, interval):
+                next_at = now
+            while next_at <= now:
+                due.append((next_at, message))
+                next_at += interval
+            self._due_at[message] = next_at
+        self.next_due_at = min(self._due_at.values())
+        return [message for _, message in sorted(due)]
+
 
 Message = Any  # a pymavlink message: pymavlink has no types
 
@@ -30,40 +120,30 @@ CAPABILITIES: Final = (
     | mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT
     | mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST
     | mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_INT
-    | mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_FENCE
-    | mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_RALLY
     | mavlink.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
-    | mavlink.MAV_PROTOCOL_CAPABILITY_SET_POSITION_TARGET_GLOBAL_INT
 )
 # 4.6.0, official release: the fields of AUTOPILOT_VERSION.flight_sw_version.
 FLIGHT_VERSION: Final = 4 << 24 | 6 << 16 | 0 << 8 | mavlink.FIRMWARE_VERSION_TYPE_OFFICIAL
-CELL_UNKNOWN_MV: Final = 0xFFFF
 
 
 class Telemetry:
     """Creates messages from the vehicle's state. The seed determines the sensor noise."""
 
-    def __init__(self, vehicle: Vehicle, missions: Missions, *, seed: int, identity: int, unix_epoch_us: int) -> None:
+    def __init__(self, vehicle: Vehicle, missions: Missions, *, seed: int, unix_epoch_us: int) -> None:
         self._vehicle = vehicle
         self._missions = missions
         self._random = Random(seed)  # noqa: S311  seeded noise of a simulated sensor
         self._unix_epoch_us = unix_epoch_us
-        self._identity = identity
         self._messages: dict[int, Callable[[float], Message]] = {
             mavlink.MAVLINK_MSG_ID_HEARTBEAT: self._heartbeat,
             mavlink.MAVLINK_MSG_ID_SYS_STATUS: self._sys_status,
             mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: self._system_time,
             mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: self._gps_raw_int,
-            mavlink.MAVLINK_MSG_ID_RAW_IMU: self._raw_imu,
-            mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE: self._scaled_pressure,
             mavlink.MAVLINK_MSG_ID_ATTITUDE: self._attitude,
-            mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: self._attitude_quaternion,
             mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: self._local_position_ned,
             mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: self._global_position_int,
             mavlink.MAVLINK_MSG_ID_MISSION_CURRENT: self._mission_current,
-            mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN: self._gps_global_origin,
             mavlink.MAVLINK_MSG_ID_VFR_HUD: self._vfr_hud,
-            mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: self._battery_status,
             mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: self._autopilot_version,
             mavlink.MAVLINK_MSG_ID_HOME_POSITION: self._home_position,
             mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: self._extended_sys_state,
@@ -106,10 +186,7 @@ class Telemetry:
             battery_remaining=vehicle.battery_percent,
             drop_rate_comm=0,
             errors_comm=0,
-            errors_count1=0,
-            errors_count2=0,
-            errors_count3=0,
-            errors_count4=0,
+            **{f"errors_count{number}": 0 for number in range(1, 5)},
         )
 
     def _system_time(self, up_s: float) -> Message:
@@ -132,26 +209,6 @@ class Telemetry:
             satellites_visible=14,
         )
 
-    def _raw_imu(self, up_s: float) -> Message:
-        vehicle = self._vehicle
-        return mavlink.MAVLink_raw_imu_message(
-            round(up_s * 1e6),
-            xacc=round(1000 * math.sin(vehicle.pitch_rad) + self._noise(5)),
-            yacc=round(-1000 * math.sin(vehicle.roll_rad) + self._noise(5)),
-            zacc=round(-1000 + self._noise(5)),
-            xgyro=round(self._noise(2)),
-            ygyro=round(self._noise(2)),
-            zgyro=round(self._noise(2)),
-            xmag=round(220 * math.cos(vehicle.yaw_rad)),
-            ymag=round(-220 * math.sin(vehicle.yaw_rad)),
-            zmag=430,
-        )
-
-    def _scaled_pressure(self, up_s: float) -> Message:
-        # The barometric formula of the standard atmosphere, near the ground.
-        hectopascal = 1013.25 * (1 - 2.25577e-5 * self._vehicle.place.altitude_m) ** 5.25588
-        return mavlink.MAVLink_scaled_pressure_message(_ms(up_s), hectopascal + self._noise(0.02), 0.0, 2100)
-
     def _attitude(self, up_s: float) -> Message:
         vehicle = self._vehicle
         tremble = 0.01 if vehicle.landed is not Landed.ON_GROUND else 0.0005
@@ -163,21 +220,6 @@ class Telemetry:
             self._noise(tremble),
             self._noise(tremble),
             self._noise(tremble / 2),
-        )
-
-    def _attitude_quaternion(self, up_s: float) -> Message:
-        vehicle = self._vehicle
-        turned = [angle / 2 for angle in (vehicle.roll_rad, vehicle.pitch_rad, vehicle.yaw_rad)]
-        (cr, cp, cy), (sr, sp, sy) = map(math.cos, turned), map(math.sin, turned)
-        return mavlink.MAVLink_attitude_quaternion_message(
-            _ms(up_s),
-            cr * cp * cy + sr * sp * sy,
-            sr * cp * cy - cr * sp * sy,
-            cr * sp * cy + sr * cp * sy,
-            cr * cp * sy - sr * sp * cy,
-            self._noise(0.001),
-            self._noise(0.001),
-            self._noise(0.001),
         )
 
     def _local_position_ned(self, up_s: float) -> Message:
@@ -203,12 +245,6 @@ class Telemetry:
     def _mission_current(self, _up_s: float) -> Message:
         return mavlink.MAVLink_mission_current_message(self._missions.current, total=len(self._missions.plan))
 
-    def _gps_global_origin(self, up_s: float) -> Message:
-        home = self._vehicle.home
-        return mavlink.MAVLink_gps_global_origin_message(
-            _e7(home.latitude_deg), _e7(home.longitude_deg), round(1000 * home.altitude_m), round(up_s * 1e6)
-        )
-
     def _vfr_hud(self, _up_s: float) -> Message:
         vehicle = self._vehicle
         flying = vehicle.armed and vehicle.landed is not Landed.ON_GROUND
@@ -221,25 +257,10 @@ class Telemetry:
             vehicle.velocity.up,
         )
 
-    def _battery_status(self, _up_s: float) -> Message:
-        vehicle = self._vehicle
-        cells = [round(250 * vehicle.battery_v)] * 4 + [CELL_UNKNOWN_MV] * 6
-        return mavlink.MAVLink_battery_status_message(
-            id=0,
-            battery_function=mavlink.MAV_BATTERY_FUNCTION_ALL,
-            type=mavlink.MAV_BATTERY_TYPE_LIPO,
-            temperature=2800,
-            voltages=cells,
-            current_battery=round(100 * vehicle.current_a),
-            current_consumed=round(vehicle.used_mah),
-            energy_consumed=-1,
-            battery_remaining=vehicle.battery_percent,
-        )
-
     def _autopilot_version(self, _up_s: float) -> Message:
         nothing = [0] * 8
         return mavlink.MAVLink_autopilot_version_message(
-            CAPABILITIES, FLIGHT_VERSION, 0, 0, 0, list(b"uavlinkd"), nothing, nothing, 0, 0, self._identity
+            CAPABILITIES, FLIGHT_VERSION, 0, 0, 0, list(b"uavlinkd"), nothing, nothing, 0, 0, 0
         )
 
     def _home_position(self, up_s: float) -> Message:

@@ -1,12 +1,16 @@
-"""Telemetry logs (.tlog), as MAVProxy, QGroundControl and Mission Planner write them."""
+"""Telemetry logs (.tlog), as MAVProxy, QGroundControl and Mission Planner write them: read, and played."""
 
 from __future__ import annotations
 
+import asyncio
+import math
 import re
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
+from uavlinkd.lab.sim.links import LinkError, MavlinkConnection, open_connection
 from uavlinkd.mavlink.frames import MAVLINK1, MAVLINK2, SplitCounters, split_datagram
 
 STAMP_BYTES: Final = 8
@@ -34,7 +38,6 @@ class TlogRecord:
 
     @property
     def system_id(self) -> int:
-        """The system that sent the frame."""
         return self.frame[3] if self.frame[0] == MAVLINK1 else self.frame[5]
 
 
@@ -150,3 +153,79 @@ def _is_genuine(frame: bytes) -> bool:
     """Whether the checksum is valid."""
     frames = split_datagram(frame, SplitCounters())
     return len(frames) == 1 and frames[0].raw == frame
+
+
+# A local socket receives this rate without loss.
+MAX_FRAMES_PER_S: Final = 5000.0
+# Frames due within this time are sent immediately: it is the resolution of the loop's timer.
+TICK_S: Final = 0.002
+
+
+@dataclass(slots=True)
+class PlaybackReport:
+    """The result of a playback."""
+
+    frames_sent: int = 0
+    frames_received: int = 0
+    seconds: float = 0.0
+
+
+async def play_tlog(
+    log: Tlog,
+    url: str,
+    *,
+    speed: float = 1.0,
+    system_ids: Collection[int] | None = None,
+    seconds: float | None = None,
+    on_open: Callable[[MavlinkConnection, PlaybackReport], None] = lambda link, report: None,
+) -> PlaybackReport:
+    """Play a log, ``speed`` times as fast as it was recorded, but at most :data:`MAX_FRAMES_PER_S`.
+
+    At speed 0 or infinity, only that limit applies. With ``system_ids``, play only the frames of these systems. The
+    playback ends with the log, or after ``seconds``. A listening URL waits for its first client. ``on_open`` gets the
+    connection and the counters, which then grow. A decreasing timestamp, as in joined logs, causes no pause.
+
+    Raises:
+        LinkError: The connection cannot be opened, or the other end closed it.
+    """
+    report = PlaybackReport()
+
+    def receive(frame: bytes) -> None:
+        report.frames_received += 1
+
+    link = await open_connection(url, receive)
+    on_open(link, report)
+    ended = asyncio.ensure_future(link.lost.wait())
+    playing = asyncio.ensure_future(_play(log, link, report, 0.0 if math.isinf(speed) else speed, system_ids))
+    try:
+        await asyncio.wait({playing, ended}, timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
+        if playing.done():
+            playing.result()
+        elif link.lost.is_set():
+            raise LinkError(f"{link.url}: the other end closed the connection")
+    finally:
+        for task in (playing, ended):
+            task.cancel()
+        await asyncio.gather(playing, ended, return_exceptions=True)
+        await link.close()
+    return report
+
+
+async def _play(
+    log: Tlog, link: MavlinkConnection, report: PlaybackReport, speed: float, system_ids: Collection[int] | None
+) -> None:
+    loop = asyncio.get_running_loop()
+    await link.joined.wait()
+    started_at = due_at = loop.time()
+    records = [record for record in log.records if system_ids is None or record.system_id in system_ids]
+    latest_us = first_us = records[0].time_us if records else 0
+    for record in records:
+        latest_us = max(latest_us, record.time_us)
+        by_log = started_at + (latest_us - first_us) / 1e6 / speed if speed else started_at
+        due_at = max(by_log, due_at)
+        if due_at - loop.time() > TICK_S:
+            await asyncio.sleep(due_at - loop.time())
+        # After a delay, do not catch up in a burst beyond the limit.
+        due_at = max(due_at, loop.time() - TICK_S) + 1 / MAX_FRAMES_PER_S
+        report.frames_sent += link.send(record.frame)
+        report.seconds = loop.time() - started_at

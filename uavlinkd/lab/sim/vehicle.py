@@ -96,22 +96,18 @@ class Vehicle:
 
     @property
     def altitude_m(self) -> float:
-        """Metres above home."""
         return self.position.up
 
     @property
     def place(self) -> GeoPoint:
-        """The position on the globe."""
         return self.place_of(self.position)
 
     @property
     def ground_speed_m_s(self) -> float:
-        """Speed over ground."""
         return math.hypot(self.velocity.north, self.velocity.east)
 
     @property
     def current_a(self) -> float:
-        """The current of the battery."""
         return HOVER_CURRENT_A if self.armed and self.landed is not Landed.ON_GROUND else IDLE_CURRENT_A
 
     @property
@@ -142,7 +138,6 @@ class Vehicle:
         )
 
     def arm(self) -> None:
-        """Start the motors."""
         self.armed = True
         self.target = Axes(self.position.north, self.position.east, self.position.up)
 
@@ -182,14 +177,12 @@ class Vehicle:
         self.target = Axes(point.north, point.east, max(point.up, 0.5))
 
     def has_arrived(self, within_m: float = 1.0) -> bool:
-        """Whether the target is within this distance."""
         return math.dist(
             (self.position.north, self.position.east, self.position.up),
             (self.target.north, self.target.east, self.target.up),
         ) <= max(within_m, 0.1)
 
     def step(self, duration_s: float) -> None:
-        """Simulate ``duration_s`` seconds."""
         left = min(max(duration_s, 0.0), MAX_CATCH_UP_S)
         while left > 0:
             step_s = min(left, MAX_STEP_S)

@@ -5,67 +5,27 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
+from inspect import isclass
 from random import Random
 from types import MappingProxyType
 from typing import Any
 
 from pydantic import ValidationError
 
-from uavlinkd.lab.mitm.attack import Attack, AttackContext, AttackError, AttackObject, Options, describe_options
-from uavlinkd.lab.mitm.attacks import floods, forgery, key_exchange, replays, roaming, stretch, withholding
-from uavlinkd.lab.mitm.inside import InsideData
+from uavlinkd.lab.mitm.attack import Attack, AttackContext, AttackError, AttackObject
+from uavlinkd.lab.mitm.attacks import floods, forgery, key_exchange, replays, withholding
+from uavlinkd.lab.mitm.channel import InsideData
+from uavlinkd.lab.mitm.options import COMMON, Options, describe_options
 
-_ALL: tuple[type[Attack[Any]], ...] = (
-    key_exchange.TamperKey,
-    key_exchange.ReplaceKey,
-    key_exchange.RandomKey,
-    key_exchange.SuiteDowngrade,
-    key_exchange.InvalidElement,
-    key_exchange.CorruptShare,
-    key_exchange.AlterIndices,
-    key_exchange.AlterMacs,
-    key_exchange.SpliceHandshake,
-    replays.ReplayInitiation,
-    replays.ReplayResponse,
-    replays.ReplayCookie,
-    replays.StolenCookie,
-    replays.ReplayData,
-    replays.Duplicate,
-    replays.Reflect,
-    replays.Misroute,
-    forgery.BitFlip,
-    forgery.Truncate,
-    forgery.Extend,
-    forgery.Splice,
-    forgery.CounterJump,
-    forgery.AlterFrame,
-    forgery.TamperTag,
-    forgery.ForgeData,
-    forgery.FloodEnvelopes,
-    forgery.RawMavlink,
-    floods.FloodInitiations,
-    floods.FloodReplays,
-    floods.FloodGarbage,
-    floods.StrangerScan,
-    floods.AmplificationProbe,
-    floods.ForgeHints,
-    floods.ForgeCookie,
-    roaming.Roam,
-    roaming.Wander,
-    withholding.DropAny,
-    withholding.DropMessage,
-    withholding.DropHeartbeats,
-    withholding.BlockRekey,
-    withholding.Blackout,
-    withholding.Hold,
-    withholding.Move,
-    withholding.Cross,
-    withholding.Reorder,
-    stretch.Stretch,
-    stretch.StretchOneWay,
-)
+_MODULES = (key_exchange, replays, forgery, floods, withholding)
+_ALL: list[type[Attack]] = [
+    value
+    for module in _MODULES
+    for value in vars(module).values()
+    if isclass(value) and issubclass(value, Attack) and value.name
+]
 
-ATTACKS: Mapping[str, type[Attack[Any]]] = MappingProxyType({attack.name: attack for attack in _ALL})
+ATTACKS: Mapping[str, type[Attack]] = MappingProxyType({attack.name: attack for attack in _ALL})
 """By name, in the order of the list."""
 
 
@@ -73,19 +33,18 @@ ATTACKS: Mapping[str, type[Attack[Any]]] = MappingProxyType({attack.name: attack
 class AttackSpec:
     """A selected attack and its validated parameters."""
 
-    kind: type[Attack[Any]]
+    kind: type[Attack]
     options: Options
 
     @property
     def name(self) -> str:
-        """The name of the attack."""
         return self.kind.name
 
     def __str__(self) -> str:
         options = self.options.model_dump(exclude_unset=True)
         return ",".join([self.name, *(f"{key}={value}" for key, value in options.items())])
 
-    def make(self, context: AttackContext, seed: int | str = 0, now: float = 0.0) -> Attack[Any]:
+    def make(self, context: AttackContext, seed: int | str = 0, now: float = 0.0) -> Attack:
         """Create the attack. Equal seeds create equal attacks.
 
         Raises:
@@ -103,7 +62,7 @@ class AttackSpec:
         return InsideData(attack) if self.options.inside else attack
 
 
-def parse_attack(text: str, attacks: Mapping[str, type[Attack[Any]]] = ATTACKS) -> AttackSpec:
+def parse_attack(text: str, attacks: Mapping[str, type[Attack]] = ATTACKS) -> AttackSpec:
     """Parse ``NAME`` or ``NAME,key=value,key=value``, as on the command line. ``attacks``: those to choose from.
 
     Raises:
@@ -134,7 +93,7 @@ def attack_from_table(table: Mapping[str, Any]) -> AttackSpec:
     return _spec(attack, lambda: attack.options_model.model_validate(values, strict=False))
 
 
-def _attack(name: str, attacks: Mapping[str, type[Attack[Any]]]) -> type[Attack[Any]]:
+def _attack(name: str, attacks: Mapping[str, type[Attack]]) -> type[Attack]:
     attack = attacks.get(name.strip())
     if attack is None:
         close = get_close_matches(name.strip(), attacks, n=1)
@@ -143,7 +102,7 @@ def _attack(name: str, attacks: Mapping[str, type[Attack[Any]]]) -> type[Attack[
     return attack
 
 
-def _spec(attack: type[Attack[Any]], read: Callable[[], Options]) -> AttackSpec:
+def _spec(attack: type[Attack], read: Callable[[], Options]) -> AttackSpec:
     try:
         return AttackSpec(attack, read())
     except ValidationError as error:
@@ -151,35 +110,29 @@ def _spec(attack: type[Attack[Any]], read: Callable[[], Options]) -> AttackSpec:
         raise AttackError(f"{attack.name}: {'; '.join(problems)}") from None
 
 
-def _problem(attack: type[Attack[Any]], location: tuple[int | str, ...], kind: str, message: str) -> str:
+def _problem(attack: type[Attack], location: tuple[int | str, ...], kind: str, message: str) -> str:
     key = str(location[0]) if location else ""
     if kind == "extra_forbidden":
         return f"has no such parameter; its parameters are {', '.join(attack.options_model.model_fields)}"
     return f"{key}: {message[0].lower()}{message[1:]}"
 
 
-def list_attacks(attacks: Mapping[str, type[Attack[Any]]] = ATTACKS) -> str:
+def list_attacks(attacks: Mapping[str, type[Attack]] = ATTACKS) -> str:
     """All these attacks and their parameters, as text for a terminal."""
     lines: list[str] = []
     for attack in attacks.values():
         lines.append(attack.name)
         lines.append(f"    {attack.summary()}.")
         for name, default, meaning in describe_options(attack.options_model):
-            if name not in Options.model_fields or default != Options.model_fields[name].default:
+            if name not in COMMON or default != Options.model_fields[name].default:
                 lines.append(f"      {name}={_shown(default)}  {meaning}")
     lines.append("every attack")
-    for name, default, meaning in describe_options(Options):
+    for name, default, meaning in describe_options(Attack.options_model):
         lines.append(f"      {name}={_shown(default)}  {meaning}")
     return "\n".join(lines)
 
 
 def _shown(default: Any) -> str:
-    if default is None:
-        return ""
-    return (
-        str(default).lower()
-        if isinstance(default, bool)
-        else f"{default:g}"
-        if isinstance(default, float)
-        else str(default)
-    )
+    if isinstance(default, bool):
+        return str(default).lower()
+    return "" if default is None else f"{default:g}" if isinstance(default, float) else str(default)

@@ -3,50 +3,32 @@
 from __future__ import annotations
 
 from collections import Counter
-from random import Random
-from typing import ClassVar, Literal
-
-from pydantic import Field
 
 from uavlinkd.core import constants as c
 from uavlinkd.core import wire
-from uavlinkd.lab.mitm.anatomy import HANDSHAKE, DatagramKind, envelope_of, kind_of, mavlink_frame, with_mac1
-from uavlinkd.lab.mitm.attack import (
-    STRANGERS,
-    Action,
-    Alteration,
-    AttackContext,
-    Direction,
-    Options,
-    Timed,
-    TimedOptions,
+from uavlinkd.lab.mitm.anatomy import (
+    HANDSHAKE,
+    DatagramKind,
+    envelope_of,
+    kind_of,
+    matches_kind,
+    mavlink_frame,
+    with_changed_byte,
+    with_mac1,
 )
-from uavlinkd.lab.mitm.kinds import KINDS, KindFilter, matches_kind
+from uavlinkd.lab.mitm.attack import Action, Alteration, Direction, Timed
+
+MOST_APPENDED_BYTES = 64
 
 
-class ForgeryOptions(Options):
-    """The parameters of alterations."""
+class Forgery(Alteration, kinds="envelope", beside=False):
+    """An alteration of datagrams of the kinds in ``kinds``. Some try all positions or lengths in turn."""
 
-    kinds: KindFilter = Field("envelope", description=KINDS)
-    beside: bool = Field(False, description="also pass the genuine datagram, after the altered one")
-
-
-class Forgery(Alteration[ForgeryOptions]):
-    """An alteration of datagrams of the kinds in ``kinds``."""
-
-    options_model: ClassVar[type[Options]] = ForgeryOptions
+    def prepare(self) -> None:
+        self._turns = Counter[DatagramKind]()
 
     def is_target(self, datagram: bytes) -> bool:
-        """Datagrams of these kinds that are not empty."""
         return bool(datagram) and matches_kind(self.options.kinds, datagram)
-
-
-class InTurn(Forgery):
-    """An alteration that tries all positions or lengths in turn, for each kind separately."""
-
-    def __init__(self, options: ForgeryOptions, context: AttackContext, rng: Random, now: float) -> None:
-        super().__init__(options, context, rng, now)
-        self._turns: Counter[DatagramKind] = Counter()
 
     def turn(self, datagram: bytes) -> int:
         """Count 0, 1, 2 and so on, for each kind of datagram."""
@@ -55,19 +37,8 @@ class InTurn(Forgery):
         return self._turns[kind] - 1
 
 
-class BitFlipOptions(ForgeryOptions):
-    """The parameters of ``bit-flip``."""
-
-    repair_mac1: bool = Field(False, description="compute a valid mac1, if the receiver's public key is known")
-
-
-class BitFlip(InTurn):
+class BitFlip(Forgery, name="bit-flip", catalogue=("H18", "D6"), repair_mac1=False):
     """Flips one bit, at all positions in turn."""
-
-    name = "bit-flip"
-    catalogue = ("H18", "D6")
-    options_model = BitFlipOptions
-    options: BitFlipOptions
 
     def alter(self, datagram: bytes, direction: Direction) -> tuple[bytes, str]:
         """The next bit: the first of each byte, then the second of each, and so on."""
@@ -82,117 +53,68 @@ class BitFlip(InTurn):
         return changed, f"bit {bit} of byte {at}"
 
 
-class Truncate(InTurn):
+class Truncate(Forgery, name="truncate", catalogue=("H18", "D7", "D15")):
     """Truncates datagrams by one byte, two bytes, and so on, until they are empty."""
 
-    name = "truncate"
-    catalogue = ("H18", "D7", "D15")
-
     def alter(self, datagram: bytes, direction: Direction) -> tuple[bytes, str]:
-        """The next length."""
         cut = self.turn(datagram) % len(datagram) + 1
         return datagram[:-cut], f"{cut} bytes cut off"
 
 
-class ExtendOptions(ForgeryOptions):
-    """The parameters of ``extend``."""
-
-    at_most: int = Field(64, ge=1, le=1400, description="maximum number of appended bytes")
-
-
-class Extend(InTurn):
+class Extend(Forgery, name="extend", catalogue=("H18", "D8", "D15")):
     """Appends bytes to datagrams: one, two, and so on."""
 
-    name = "extend"
-    catalogue = ("H18", "D8", "D15")
-    options_model = ExtendOptions
-    options: ExtendOptions
-
     def alter(self, datagram: bytes, direction: Direction) -> tuple[bytes, str]:
-        """The next length."""
-        more = self.turn(datagram) % self.options.at_most + 1
+        more = self.turn(datagram) % MOST_APPENDED_BYTES + 1
         return datagram + self.rng.randbytes(more), f"{more} bytes appended"
 
 
-class SpliceOptions(ForgeryOptions):
-    """The parameters of ``splice``."""
+class OfEnvelopes(Forgery):
+    """An alteration of envelopes alone."""
 
-    join: Literal["all", "body", "header", "tag", "both"] = Field(
-        "all",
-        description="the part of the envelope before that replaces this one's: body and tag, header, tag; both: this"
-        " one is appended to the one before; all: each in turn",
-    )
+    def is_target(self, datagram: bytes) -> bool:
+        return envelope_of(datagram) is not None
 
 
-class Splice(InTurn):
+class Splice(OfEnvelopes, name="splice", catalogue=("D6", "D8")):
     """Joins parts of two envelopes: header and body of different ones, swapped tags, two in one datagram."""
 
-    name = "splice"
-    catalogue = ("D6", "D8")
-    options_model = SpliceOptions
-    options: SpliceOptions
-
-    def __init__(self, options: SpliceOptions, context: AttackContext, rng: Random, now: float) -> None:
-        super().__init__(options, context, rng, now)
+    def prepare(self) -> None:
+        super().prepare()
         self._last: dict[Direction, bytes] = {}
-        self._before: bytes | None = None
+        self._before = b""
 
     def observe(self, datagram: bytes, direction: Direction, now: float) -> None:
-        """Record the last envelope of each direction."""
-        self._before = None
+        self._before = b""
         if envelope_of(datagram) is not None:
-            self._before = self._last.get(direction)
-            self._last[direction] = datagram
+            self._before, self._last[direction] = self._last.get(direction, b""), datagram
 
     def is_target(self, datagram: bytes) -> bool:
         """Envelopes that follow a different envelope."""
-        return envelope_of(datagram) is not None and self._before is not None and self._before != datagram
+        return super().is_target(datagram) and self._before not in (b"", datagram)
 
     def alter(self, datagram: bytes, direction: Direction) -> tuple[bytes, str]:
-        """The next kind of join."""
-        before, this = self._before, envelope_of(datagram)
-        assert before is not None
+        before, this, other = self._before, envelope_of(datagram), envelope_of(self._before)
         assert this is not None
-        other = envelope_of(before)
         assert other is not None
-        joins = ["body", "header", "tag", "both"] if self.options.join == "all" else [self.options.join]
-        join = joins[self.turn(datagram) % len(joins)]
-        match join:
-            case "body":
-                spliced = datagram[: this.header_bytes] + before[other.header_bytes :]
-            case "header":
-                spliced = before[: other.header_bytes] + datagram[this.header_bytes :]
-            case "tag":
-                # The length of the shortest tag. Of a longer tag, this replaces the last bytes.
-                spliced = datagram[: -wire.TAG_LENGTHS[0]] + before[-wire.TAG_LENGTHS[0] :]
-            case _:
-                spliced = datagram + before
-        return spliced, f"{join} of envelope {other.counter} in envelope {this.counter}"
+        shortest = wire.TAG_LENGTHS[0]  # of a longer tag, this replaces the last bytes
+        spliced = {
+            "body": datagram[: this.header_bytes] + before[other.header_bytes :],
+            "header": before[: other.header_bytes] + datagram[this.header_bytes :],
+            "tag": datagram[:-shortest] + before[-shortest:],
+            "both": datagram + before,
+        }
+        join = list(spliced)[self.turn(datagram) % len(spliced)]
+        return spliced[join], f"{join} of envelope {other.counter} in envelope {this.counter}"
 
 
-class CounterOptions(ForgeryOptions):
-    """The parameters of ``counter-jump``. The genuine envelope passes too: a moved replay window would show."""
+class CounterJump(OfEnvelopes, name="counter-jump", catalogue=("D5", "D17"), beside=True, to="random"):
+    """Alters the counter of envelopes: to the last valid one, far ahead, a little ahead, or back.
 
-    beside: bool = Field(True, description="also pass the genuine datagram, after the altered one")
-    to: Literal["random", "last", "ahead", "back"] = Field(
-        "random", description="any counter, the last valid one (2^32-2), a little ahead, or a used one"
-    )
-
-
-class CounterJump(Forgery):
-    """Alters the counter of envelopes: to the last valid one, far ahead, a little ahead, or back."""
-
-    name = "counter-jump"
-    catalogue = ("D5", "D17")
-    options_model = CounterOptions
-    options: CounterOptions
-
-    def is_target(self, datagram: bytes) -> bool:
-        """Envelopes with a complete header."""
-        return envelope_of(datagram) is not None
+    The genuine envelope passes too: a moved replay window would show.
+    """
 
     def alter(self, datagram: bytes, direction: Direction) -> tuple[bytes, str]:
-        """Replace the counter, in the encoding that fits it."""
         envelope = envelope_of(datagram)
         assert envelope is not None
         old = envelope.counter
@@ -212,52 +134,30 @@ class CounterJump(Forgery):
         return header + datagram[envelope.header_bytes :], f"counter {old} to {new}"
 
 
-class AlterFrame(Forgery):
-    """Alters the payload of envelopes, but not the header and the tag."""
-
-    name = "alter-frame"
-    catalogue = ("D6",)
+class AlterFrame(Forgery, name="alter-frame", catalogue=("D6",)):
+    """Alters the payload of envelopes, but not the header and the tag, whatever its length."""
 
     def is_target(self, datagram: bytes) -> bool:
-        """Envelopes with a payload, for any length of the tag."""
         envelope = envelope_of(datagram)
         return envelope is not None and len(datagram) > envelope.header_bytes + wire.TAG_LENGTHS[-1]
 
     def alter(self, datagram: bytes, direction: Direction) -> tuple[bytes, str]:
-        """Alter one byte."""
         envelope = envelope_of(datagram)
         assert envelope is not None
         at = self.rng.randrange(envelope.header_bytes, len(datagram) - wire.TAG_LENGTHS[-1])
-        altered = bytearray(datagram)
-        altered[at] ^= self.rng.randrange(1, 256)
-        return bytes(altered), f"byte {at} of envelope {envelope.counter}"
+        return with_changed_byte(datagram, at, self.rng), f"byte {at} of envelope {envelope.counter}"
 
 
-class TagOptions(ForgeryOptions):
-    """The parameters of ``tamper-tag``."""
-
-    tag: Literal["all", "zero", "random", "short", "long", "none"] = Field(
-        "all", description="zeros, random bytes, 8 bytes, 32 bytes, or without a tag; all: each in turn"
-    )
-
-
-class TamperTag(InTurn):
+class TamperTag(Forgery, name="tamper-tag", catalogue=("D6", "D7")):
     """Alters the tag of envelopes: zeros, random bytes, another length, or no tag."""
 
-    name = "tamper-tag"
-    catalogue = ("D6", "D7")
-    options_model = TagOptions
-    options: TagOptions
-
     def is_target(self, datagram: bytes) -> bool:
-        """Envelopes with at least 16 bytes after the header."""
         envelope = envelope_of(datagram)
         return envelope is not None and len(datagram) >= envelope.header_bytes + 16
 
     def alter(self, datagram: bytes, direction: Direction) -> tuple[bytes, str]:
         """The next change, for a tag of the default length of 16 bytes."""
-        tags = ["zero", "random", "short", "long", "none"] if self.options.tag == "all" else [self.options.tag]
-        kind = tags[self.turn(datagram) % len(tags)]
+        kind = ("zero", "random", "short", "long", "none")[self.turn(datagram) % 5]
         head, tag = datagram[:-16], datagram[-16:]
         match kind:
             case "zero" if any(tag):
@@ -269,12 +169,9 @@ class TamperTag(InTurn):
             case "none":
                 altered = head
             case _:
-                first = self.rng.randrange(1, 256) ^ tag[0]
-                altered = head + bytes((first,)) + self.rng.randbytes(15)
+                altered = head + with_changed_byte(tag, 0, self.rng)[:1] + self.rng.randbytes(15)
         return altered, f"tag {kind}"
 
-
-# Injected frames.
 
 COMMAND_FRAMES: tuple[tuple[str, bytes], ...] = (
     # HEARTBEAT 0: custom mode u32, type 6 (ground station), autopilot 8, base mode, status 4, version 3.
@@ -288,58 +185,30 @@ COMMAND_FRAMES: tuple[tuple[str, bytes], ...] = (
 """Name and frame, for an attacker that wants to bring the drone down."""
 
 
-class OriginOptions(TimedOptions):
-    """The parameters of injected frames."""
-
-    origin: Literal["sender", "stranger", "both"] = Field(
-        "both", description="source: a peer's address, strangers, or both in turn"
-    )
-    sources: int = Field(16, ge=1, le=STRANGERS, description="number of strangers that send")
-
-
-class FromAnywhere(Timed[OriginOptions]):
+class FromAnywhere(Timed, origin="both", sources=16):
     """An attack that injects datagrams from a peer's address or from strangers."""
 
-    options_model: ClassVar[type[Options]] = OriginOptions
-
-    def origin(self) -> int | None:
+    def stranger(self) -> int | None:
         """The source: a stranger, or None for the peer's address."""
         # Alternate per direction, because directions alternate too and their number is even.
         is_turn = self.sent_count // len(self.directions) % 2 == 1
         is_stranger = self.options.origin == "stranger" or (self.options.origin == "both" and is_turn)
-        return self.rng.randrange(self.options.sources) if is_stranger else None
+        return self.rng.randrange(max(1, self.options.sources)) if is_stranger else None
 
 
-class RawMavlink(FromAnywhere):
-    """Sends bare MAVLink frames to the peers' ports: disarm, flight termination, mode changes, heartbeats."""
-
-    name = "raw-mavlink"
-    catalogue = ("D12",)
-
-    def send_next(self, now: float) -> list[Action]:
-        """Inject the next frame in the next direction."""
-        name, frame = COMMAND_FRAMES[self.sent_count // (2 * len(self.directions)) % len(COMMAND_FRAMES)]
-        return self.inject(frame, self.directions[self.sent_count % len(self.directions)], now, name, self.origin())
-
-
-class ForgeData(FromAnywhere):
+class ForgeData(FromAnywhere, name="forge-data", catalogue=("D5", "D6", "D16")):
     """Injects forged envelopes: valid session index, a coming counter, a command, a random tag."""
 
-    name = "forge-data"
-    catalogue: ClassVar[tuple[str, ...]] = ("D5", "D6", "D16")
-
-    def __init__(self, options: OriginOptions, context: AttackContext, rng: Random, now: float) -> None:
-        super().__init__(options, context, rng, now)
+    def prepare(self) -> None:
+        super().prepare()
         self._newest: dict[Direction, tuple[int, int]] = {}
 
     def observe(self, datagram: bytes, direction: Direction, now: float) -> None:
-        """Record the session in use and its counter."""
         envelope = envelope_of(datagram)
         if envelope is not None:
             self._newest[direction] = envelope.receiver_index, envelope.counter
 
     def send_next(self, now: float) -> list[Action]:
-        """Inject one envelope in the next direction that has a session."""
         directions = [direction for direction in self.directions if direction in self._newest]
         if not directions:
             return []
@@ -348,19 +217,16 @@ class ForgeData(FromAnywhere):
         counter = (counter + self.rng.randrange(1, 64)) % c.SESSION_ENVELOPE_LIMIT
         name, frame = COMMAND_FRAMES[self.rng.randrange(len(COMMAND_FRAMES))]
         datagram = wire.envelope_header(index, counter) + frame + self.rng.randbytes(16)
-        return self.inject(datagram, direction, now, f"{name} as envelope {counter}", self.origin())
+        return self.inject(datagram, direction, now, f"{name} as envelope {counter}", self.stranger())
 
 
-class FloodEnvelopesOptions(OriginOptions):
-    """The defaults are a higher rate and more strangers."""
-
-    rate_per_s: float = Field(1000.0, gt=0, le=100_000, description="datagrams per second")
-    sources: int = Field(64, ge=1, le=STRANGERS, description="number of strangers that send")
-
-
-class FloodEnvelopes(ForgeData):
+class FloodEnvelopes(ForgeData, name="flood-envelopes", catalogue=("D16",), rate_per_s=1000.0, sources=64):
     """Floods with envelopes that are valid except for the tag."""
 
-    name = "flood-envelopes"
-    catalogue = ("D16",)
-    options_model = FloodEnvelopesOptions
+
+class RawMavlink(FromAnywhere, name="raw-mavlink", catalogue=("D12",)):
+    """Sends bare MAVLink frames to the peers' ports: disarm, flight termination, mode changes, heartbeats."""
+
+    def send_next(self, now: float) -> list[Action]:
+        name, frame = COMMAND_FRAMES[self.sent_count // (2 * len(self.directions)) % len(COMMAND_FRAMES)]
+        return self.inject(frame, self.directions[self.sent_count % len(self.directions)], now, name, self.stranger())

@@ -1,83 +1,57 @@
-"""Replays: now, later, after a rekey or a restart; to the receiver, back to the sender, or to another peer.
+"""Replays: now, later, after a rekey or a restart; to the receiver, back to the sender, or to another peer. Roaming.
 
-The datagrams are unaltered, so each was authentic once.
+The datagrams are unaltered, so each was authentic once. Roaming sends them from a stranger's address.
 """
 
 from __future__ import annotations
 
 import heapq
 from collections import deque
-from random import Random
-from typing import ClassVar, Literal
+from typing import ClassVar
 
-from pydantic import Field
-
-from uavlinkd.lab.mitm.anatomy import DatagramKind, has_cookie, kind_of
+from uavlinkd.lab.mitm.anatomy import DatagramKind, has_cookie, kind_of, matches_kind
 from uavlinkd.lab.mitm.attack import (
     CATCH_UP_LIMIT,
     NEVER,
-    STRANGERS,
     Action,
     Attack,
-    AttackContext,
     AttackError,
     Direction,
     Operation,
-    Options,
     Send,
 )
-from uavlinkd.lab.mitm.kinds import KINDS, KindFilter, matches_kind
+from uavlinkd.lab.mitm.options import STRANGERS
 
 RECORD_LIMIT = 4096
 """Datagrams recorded for a later replay; the oldest are discarded first."""
 SETTLE_S = 0.5
 """The delay after a rekey or a restart, so that the link is up again before the replay."""
+SILENCE_S = 0.3
+"""A peer that was silent for so long and then initiates has been restarted."""
 
 
-class ReplayOptions(Options):
-    """The parameters of all replays."""
-
-    when: Literal["now", "later", "rekey", "restart"] = Field(
-        "now",
-        description="now; later: after delay_s; rekey: after the next handshake; restart: after a peer was silent"
-        " for silence_s and then initiates",
-    )
-    delay_s: float = Field(10.0, ge=0, description="for when=later: seconds until the replay")
-    silence_s: float = Field(0.3, gt=0, description="for when=restart: seconds of silence that mean a restart")
-    rate_per_s: float = Field(200.0, gt=0, le=100_000, description="for rekey and restart: replays per second")
-    copies: int = Field(1, ge=1, le=1000, description="number of replays of each datagram")
-    origin: Literal["sender", "stranger"] = Field(
-        "sender", description="source of the replay: the sender's address, or a stranger's"
-    )
-    onto: int = Field(0, ge=0, description="number of the path along which the replay is sent; 0: the same one")
-
-
-class Replay(Attack[ReplayOptions]):
-    """The base class of replays. A subclass selects the datagrams and the target."""
+class Replay(Attack, kinds="any", when="now", delay_s=10.0, rate_per_s=200.0, copies=1, origin="sender", onto=0):
+    """The base class of replays. ``rate_per_s`` is for those after a rekey or a restart."""
 
     operation: ClassVar[Operation] = Operation.REPLAYED
-    options_model: ClassVar[type[Options]] = ReplayOptions
 
-    def __init__(self, options: ReplayOptions, context: AttackContext, rng: Random, now: float) -> None:
-        super().__init__(options, context, rng, now)
+    def prepare(self) -> None:
         self.recorded: deque[tuple[bytes, Direction]] = deque(maxlen=RECORD_LIMIT)
         """Datagrams that wait for a rekey or a restart."""
         self._scheduled: list[tuple[float, int, bytes, Direction]] = []
         self._number = 0
         self._last_seen_at: dict[str, float] = {}
-        if options.onto:
-            context.check_path(options.onto)
+        if self.options.onto:
+            self.context.check_path(self.options.onto)
 
     def is_target(self, datagram: bytes) -> bool:
         """Whether to replay this datagram."""
-        raise NotImplementedError
+        return bool(datagram) and matches_kind(self.options.kinds, datagram)
 
     def target(self, direction: Direction) -> Direction:
-        """The direction of the replay."""
         return direction.along(self.options.onto) if self.options.onto else direction
 
     def intercept(self, datagram: bytes, direction: Direction, now: float) -> list[Action]:
-        """Pass the datagram and replay or record it."""
         actions: list[Action] = [Send(datagram, direction)]
         if self.is_target(datagram) and self.should_attack():
             match self.options.when:
@@ -105,7 +79,6 @@ class Replay(Attack[ReplayOptions]):
         return actions
 
     def next_deadline(self) -> float:
-        """The time of the next replay."""
         return self._scheduled[0][0] if self._scheduled else NEVER
 
     def _replay(self, datagram: bytes, direction: Direction, now: float) -> list[Action]:
@@ -114,8 +87,8 @@ class Replay(Attack[ReplayOptions]):
         for _ in range(self.options.copies):
             stranger = None if self.options.origin == "sender" else self.rng.randrange(STRANGERS)
             detail = f"recorded on {direction}" + ("" if stranger is None else f", from stranger {stranger}")
-            actions.append(Send(datagram, target, stranger))
-            actions.append(self.note(self.operation, datagram, target, now, detail, own=self.options.when != "now"))
+            log = self.note if self.options.when == "now" else self.own
+            actions += [Send(datagram, target, stranger), log(self.operation, datagram, target, now, detail)]
         return actions
 
     def _schedule(self, at: float, datagram: bytes, direction: Direction) -> None:
@@ -130,7 +103,7 @@ class Replay(Attack[ReplayOptions]):
         match self.options.when:
             case "rekey" if kind is DatagramKind.RESPONSE:
                 triggered = [item for item in self.recorded if item[1] in (direction, direction.reverse)]
-            case "restart" if kind is DatagramKind.INITIATION and now - last_seen_at >= self.options.silence_s:
+            case "restart" if kind is DatagramKind.INITIATION and now - last_seen_at >= SILENCE_S:
                 triggered = [item for item in self.recorded if direction.sender in item[1]]
             case _:
                 return
@@ -139,122 +112,106 @@ class Replay(Attack[ReplayOptions]):
             self._schedule(now + SETTLE_S + number / self.options.rate_per_s, *item)
 
 
-class ReplayInitiation(Replay):
+class ReplayInitiation(Replay, name="replay-initiation", catalogue=("H3",), kinds="initiation"):
     """Replays initiations."""
 
-    name = "replay-initiation"
-    catalogue = ("H3",)
 
-    def is_target(self, datagram: bytes) -> bool:
-        """Initiations."""
-        return kind_of(datagram) is DatagramKind.INITIATION
-
-
-class ReplayResponse(Replay):
+class ReplayResponse(Replay, name="replay-response", catalogue=("H3",), kinds="response"):
     """Replays responses."""
 
-    name = "replay-response"
-    catalogue = ("H3",)
 
-    def is_target(self, datagram: bytes) -> bool:
-        """Responses."""
-        return kind_of(datagram) is DatagramKind.RESPONSE
-
-
-class ReplayCookie(Replay):
+class ReplayCookie(Replay, name="replay-cookie", catalogue=("H19",), kinds="cookie"):
     """Replays cookie replies."""
 
-    name = "replay-cookie"
-    catalogue = ("H19",)
 
-    def is_target(self, datagram: bytes) -> bool:
-        """Cookie replies."""
-        return kind_of(datagram) is DatagramKind.COOKIE
-
-
-class StolenCookieOptions(ReplayOptions):
-    """The default origin is a stranger."""
-
-    origin: Literal["sender", "stranger"] = Field("stranger", description="see replay-initiation")
-
-
-class StolenCookie(Replay):
+class StolenCookie(Replay, name="stolen-cookie", catalogue=("H12", "H19"), origin="stranger"):
     """Replays handshake messages with a mac2 from another address, to use the cookie of their sender."""
 
-    name = "stolen-cookie"
-    catalogue = ("H12", "H19")
-    options_model = StolenCookieOptions
-
     def is_target(self, datagram: bytes) -> bool:
-        """Messages with a mac2."""
         return has_cookie(datagram)
 
 
-class ReplayData(Replay):
+class ReplayData(Replay, name="replay-data", catalogue=("D1", "D2"), kinds="envelope"):
     """Replays envelopes."""
 
-    name = "replay-data"
-    catalogue = ("D1", "D2")
 
-    def is_target(self, datagram: bytes) -> bool:
-        """Envelopes."""
-        return kind_of(datagram) is DatagramKind.ENVELOPE
-
-
-class FilteredReplayOptions(ReplayOptions):
-    """The parameters of a replay of selectable kinds."""
-
-    kinds: KindFilter = Field("any", description=KINDS)
-
-
-class AnyReplay(Replay):
-    """A replay of the kinds in ``kinds``."""
-
-    options_model = FilteredReplayOptions
-    options: FilteredReplayOptions
-
-    def is_target(self, datagram: bytes) -> bool:
-        """Datagrams of these kinds."""
-        return bool(datagram) and matches_kind(self.options.kinds, datagram)
-
-
-class Duplicate(AnyReplay):
+class Duplicate(Replay, name="duplicate", catalogue=("H3", "D1")):
     """Sends everything twice."""
 
-    name = "duplicate"
-    catalogue = ("H3", "D1")
 
-
-class Reflect(AnyReplay):
+class Reflect(Replay, name="reflect", catalogue=("H4", "D3")):
     """Sends datagrams back to their sender, with the other peer's address."""
 
-    name = "reflect"
-    catalogue = ("H4", "D3")
     operation = Operation.REFLECTED
 
     def target(self, direction: Direction) -> Direction:
-        """The opposite direction."""
         return direction.reverse
 
 
-class Misroute(AnyReplay):
+class Misroute(Replay, name="misroute", catalogue=("H5", "D2")):
     """Sends datagrams to a peer that is not their receiver; needs three peers."""
 
-    name = "misroute"
-    catalogue = ("H5", "D2")
     operation = Operation.MISROUTED
 
-    def __init__(self, options: FilteredReplayOptions, context: AttackContext, rng: Random, now: float) -> None:
-        super().__init__(options, context, rng, now)
-        self._others: dict[Direction, tuple[Direction, ...]] = {}
+    def prepare(self) -> None:
+        super().prepare()
+        self._others: dict[Direction, list[Direction]] = {}
         for direction in self.directions:
-            elsewhere = [other for other in context.directions if other.receiver not in direction]
+            elsewhere = [other for other in self.context.directions if other.receiver not in direction]
             # Prefer the true sender's address: then only the keys show that the datagram is misrouted.
-            of_sender = [other for other in elsewhere if other.sender == direction.sender]
-            self._others[direction] = tuple(of_sender or elsewhere)
+            self._others[direction] = [one for one in elsewhere if one.sender == direction.sender] or elsewhere
         if not all(self._others.values()):
             raise AttackError("misroute needs at least three peers: configure another link")
 
     def target(self, direction: Direction) -> Direction:
-        """A random direction to another peer."""
         return self.rng.choice(self._others[direction])
+
+
+class Roam(Attack, name="roam", catalogue=("H20", "D2"), kinds="envelope", mode="race"):
+    """Forwards datagrams from a stranger's address, so that the peer moves the traffic there."""
+
+    def intercept(self, datagram: bytes, direction: Direction, now: float) -> list[Action]:
+        if not matches_kind(self.options.kinds, datagram) or not self.should_attack():
+            return [Send(datagram, direction)]
+        return self.forward(datagram, direction, self._stranger(direction), now)
+
+    def forward(self, datagram: bytes, direction: Direction, stranger: int, now: float) -> list[Action]:
+        note = self.note(Operation.FORWARDED, datagram, direction, now, f"from stranger {stranger}")
+        race = [Send(datagram, direction)] if self.options.mode == "race" else []
+        return [Send(datagram, direction, stranger), note, *race]
+
+    def on_answer(self, datagram: bytes, peer: str, stranger: int, now: float) -> list[Action]:
+        """The peer believes that the stranger's address is the other peer's."""
+        asked = [one for one in self.directions if one.receiver == peer and self._stranger(one) == stranger]
+        if not asked:
+            return []
+        # The other peer gets the answer from a stranger too. This path works while the attack relays.
+        back = asked[0].reverse
+        return self.answer(datagram, back, (stranger, self._stranger(back)), now)
+
+    def answer(self, datagram: bytes, back: Direction, strangers: tuple[int, int | None], now: float) -> list[Action]:
+        """Relay an answer to the first stranger, from the second one or from the peer's address."""
+        note = self.own(Operation.ANSWERED, datagram, back, now, f"to stranger {strangers[0]}")
+        is_relayed = self.is_on(now) and self.options.mode == "relay"
+        return [Send(datagram, back, strangers[1]), note] if is_relayed else [note]
+
+    def _stranger(self, direction: Direction) -> int:
+        """One stranger per direction, so that its answers belong to one direction."""
+        return self.context.directions.index(direction) % STRANGERS
+
+
+class Wander(Roam, name="wander", catalogue=("H20",), kinds="any", mode="relay", sources=64):
+    """Forwards each datagram from another stranger, like a broken NAT. Relays the answers, unless it races."""
+
+    def prepare(self) -> None:
+        self._direction_of: dict[tuple[str, int], Direction] = {}  # at most peers times strangers
+
+    def forward(self, datagram: bytes, direction: Direction, stranger: int, now: float) -> list[Action]:
+        stranger = self.attempts % max(2, self.options.sources)
+        self._direction_of[direction.receiver, stranger] = direction
+        return super().forward(datagram, direction, stranger, now)
+
+    def on_answer(self, datagram: bytes, peer: str, stranger: int, now: float) -> list[Action]:
+        """Relay the answer to the sender of the forwarded datagram."""
+        direction = self._direction_of.get((peer, stranger))
+        return self.answer(datagram, direction.reverse, (stranger, None), now) if direction else []

@@ -1,91 +1,53 @@
-"""Attacks that drop, hold or reorder datagrams. They need no knowledge."""
+"""Attacks that drop, hold, reorder or move datagrams. They need no knowledge."""
 
 from __future__ import annotations
 
 import heapq
 from collections import deque
-from random import Random
-from typing import ClassVar, Literal
 
-from pydantic import Field
-
-from uavlinkd.lab.mitm.anatomy import DatagramKind, envelope_of, kind_of, message_ids
-from uavlinkd.lab.mitm.attack import NEVER, Action, Attack, AttackContext, Direction, Operation, Options, Send
-from uavlinkd.lab.mitm.kinds import KINDS, KindFilter, matches_kind
+from uavlinkd.lab.mitm.anatomy import (
+    HANDSHAKE,
+    DatagramKind,
+    envelope_of,
+    is_echo,
+    kind_of,
+    matches_kind,
+    message_ids,
+)
+from uavlinkd.lab.mitm.attack import NEVER, Action, Attack, Direction, Operation, Send
 
 HELD_LIMIT = 65536
-"""The maximum number of held datagrams, which bounds memory. More pass immediately."""
+"""The maximum number of held datagrams, which bounds memory. More pass immediately, or are dropped by ``stretch``."""
 _AWAITED_LIMIT = 64
 
 
-class Dropping(Attack[Options]):
-    """The base class of attacks that drop datagrams."""
+class DropAny(Attack, name="drop", catalogue=("D10", "H14"), kinds="any"):
+    """Drops datagrams of a kind; direction=A>B makes it one-sided, share=0.3 a loss of 30 %."""
 
-    options_model: ClassVar[type[Options]] = Options
-
-    def drops(self, datagram: bytes, direction: Direction, now: float) -> str | None:
+    def drops(self, datagram: bytes, direction: Direction) -> str | None:
         """The reason to drop a datagram; None to pass it."""
-        raise NotImplementedError
+        del direction
+        return "" if matches_kind(self.options.kinds, datagram) else None
 
     def intercept(self, datagram: bytes, direction: Direction, now: float) -> list[Action]:
-        """Drop the datagram or pass it."""
-        why = self.drops(datagram, direction, now)
+        why = self.drops(datagram, direction)
         if why is None or not self.should_attack():
             return [Send(datagram, direction)]
         return [self.note(Operation.DROPPED, datagram, direction, now, why)]
 
 
-class DropOptions(Options):
-    """The parameters of ``drop``."""
-
-    kinds: KindFilter = Field("any", description=KINDS)
-
-
-class DropAny(Dropping):
-    """Drops datagrams of a kind; direction=A>B makes it one-sided, share=0.3 a loss of 30 %."""
-
-    name = "drop"
-    catalogue = ("D10", "H14")
-    options_model = DropOptions
-    options: DropOptions
-
-    def drops(self, datagram: bytes, direction: Direction, now: float) -> str | None:
-        """All datagrams of these kinds."""
-        return "" if matches_kind(self.options.kinds, datagram) else None
-
-
-class BlockRekeyOptions(DropOptions):
-    """The default is the kinds of the handshake."""
-
-    kinds: KindFilter = Field("handshake", description="dropped kinds")
-
-
-class BlockRekey(DropAny):
+class BlockRekey(DropAny, name="block-rekey", catalogue=("D17", "H14"), kinds="handshake"):
     """Drops handshake messages and passes envelopes, so that keys expire."""
 
-    name = "block-rekey"
-    catalogue = ("D17", "H14")
-    options_model = BlockRekeyOptions
+
+class Blackout(DropAny, name="blackout", catalogue=("D11",), seconds=3.0):
+    """Drops all datagrams for some seconds."""
 
 
-class MessageOptions(Options):
-    """The parameters of ``drop-message``."""
-
-    message: Literal["initiation", "response", "confirmation", "cookie"] = Field(
-        "initiation", description="initiation, response, confirmation (the first envelope of a session), or cookie"
-    )
-
-
-class DropMessage(Dropping):
+class DropMessage(DropAny, name="drop-message", catalogue=("H14",), message="initiation"):
     """Drops exactly one message of each handshake: initiation, response, confirmation or cookie."""
 
-    name = "drop-message"
-    catalogue = ("H14",)
-    options_model = MessageOptions
-    options: MessageOptions
-
-    def __init__(self, options: MessageOptions, context: AttackContext, rng: Random, now: float) -> None:
-        super().__init__(options, context, rng, now)
+    def prepare(self) -> None:
         self._answered: deque[tuple[Direction, int]] = deque(maxlen=_AWAITED_LIMIT)
 
     def on_datagram(self, datagram: bytes, direction: Direction, now: float) -> list[Action]:
@@ -94,90 +56,38 @@ class DropMessage(Dropping):
             self._answered.append((direction.reverse, int.from_bytes(datagram[2:4], "big")))
         return super().on_datagram(datagram, direction, now)
 
-    def drops(self, datagram: bytes, direction: Direction, now: float) -> str | None:
-        """The selected message."""
+    def drops(self, datagram: bytes, direction: Direction) -> str | None:
         if self.options.message != "confirmation":
             return "" if kind_of(datagram).value == self.options.message else None
         envelope = envelope_of(datagram)
-        is_first = (
-            envelope is not None and envelope.counter == 0 and (direction, envelope.receiver_index) in self._answered
-        )
-        return "the first envelope of its session" if is_first else None
+        is_first = envelope is not None and envelope.counter == 0
+        if is_first and envelope is not None and (direction, envelope.receiver_index) in self._answered:
+            return "the first envelope of its session"
+        return None
 
 
-class HeartbeatOptions(Options):
-    """The parameters of ``drop-heartbeats``."""
-
-    message_id: int = Field(0, ge=0, lt=2**24, description="MAVLink message: 0 HEARTBEAT, 77 COMMAND_ACK")
-    size: int = Field(
-        42, ge=0, description="an encrypted envelope of this length, or this plus 2, counts as this message"
-    )
-
-
-class DropHeartbeats(Dropping):
+class DropHeartbeats(DropAny, name="drop-heartbeats", catalogue=("D10", "D18"), message_id=0, size=42):
     """Drops the envelopes that carry heartbeats (or another message), recognised by message ID or by size."""
 
-    name = "drop-heartbeats"
-    catalogue = ("D10", "D18")
-    options_model = HeartbeatOptions
-    options: HeartbeatOptions
-
-    def drops(self, datagram: bytes, direction: Direction, now: float) -> str | None:
-        """By message ID if the frames are readable, otherwise by size."""
+    def drops(self, datagram: bytes, direction: Direction) -> str | None:
         if envelope_of(datagram) is None:
             return None
         ids = message_ids(datagram)
         if ids:
             return f"carries message {self.options.message_id}" if self.options.message_id in ids else None
         # 5 or 7 bytes of header, 21 of HEARTBEAT, 16 of tag.
-        is_of_size = len(datagram) in (self.options.size, self.options.size + 2)
-        return "by its size" if is_of_size else None
+        return "by its size" if len(datagram) - self.options.size in (0, 2) else None
 
 
-class BlackoutOptions(Options):
-    """The default duration is 3 s."""
-
-    seconds: float | None = Field(3.0, gt=0, description="duration in seconds")
-
-
-class Blackout(Dropping):
-    """Drops all datagrams for some seconds."""
-
-    name = "blackout"
-    catalogue = ("D11",)
-    options_model = BlackoutOptions
-
-    def drops(self, datagram: bytes, direction: Direction, now: float) -> str | None:
-        """All datagrams."""
-        return ""
-
-
-class HoldOptions(Options):
-    """The parameters of ``hold``."""
-
-    kinds: KindFilter = Field("envelope", description=KINDS)
-    hold_s: float = Field(30.0, gt=0, description="seconds until the release")
-    at_once: bool = Field(False, description="release all together, hold_s after the first was held")
-
-
-class Hold(Attack[HoldOptions]):
+class Hold(Attack, name="hold", catalogue=("D9", "H15"), kinds="envelope", hold_s=30.0, at_once=False):
     """Holds datagrams and releases them later, unaltered."""
 
-    name = "hold"
-    catalogue = ("D9", "H15")
-    options_model = HoldOptions
-
-    def __init__(self, options: HoldOptions, context: AttackContext, rng: Random, now: float) -> None:
-        super().__init__(options, context, rng, now)
+    def prepare(self) -> None:
         self._held: list[tuple[float, int, bytes, Direction]] = []
 
     def intercept(self, datagram: bytes, direction: Direction, now: float) -> list[Action]:
-        """Hold the datagram."""
-        if (
-            not matches_kind(self.options.kinds, datagram)
-            or len(self._held) >= HELD_LIMIT
-            or not self.should_attack()
-        ):
+        has_room = len(self._held) < HELD_LIMIT
+        if not (matches_kind(self.options.kinds, datagram) and has_room and self.should_attack()):
             return [Send(datagram, direction)]
         is_later = self.options.at_once and bool(self._held)
         until = self._held[0][0] if is_later else now + self.options.hold_s
@@ -185,43 +95,24 @@ class Hold(Attack[HoldOptions]):
         return [self.note(Operation.HELD, datagram, direction, now, f"for {self.options.hold_s:g} s")]
 
     def due(self, now: float) -> list[Action]:
-        """Release the datagrams that are due."""
         actions: list[Action] = []
         while self._held and self._held[0][0] <= now:
             _, number, datagram, direction = heapq.heappop(self._held)
-            detail = f"was number {number}"
-            actions += [
-                Send(datagram, direction),
-                self.note(Operation.RELEASED, datagram, direction, now, detail, own=True),
-            ]
+            note = self.own(Operation.RELEASED, datagram, direction, now, f"was number {number}")
+            actions += [Send(datagram, direction), note]
         return actions
 
     def next_deadline(self) -> float:
-        """The time of the next release."""
         return self._held[0][0] if self._held else NEVER
 
 
-class MoveOptions(Options):
-    """The parameters of ``move``."""
-
-    kinds: KindFilter = Field("envelope", description=KINDS)
-    onto: int = Field(2, ge=1, description="number of the path along which they are sent")
-    beside: bool = Field(False, description="then pass the genuine datagram too")
-
-
-class Move(Attack[MoveOptions]):
+class Move(Attack, name="move", catalogue=("D2", "D10"), kinds="envelope", onto=2, beside=False):
     """Sends datagrams of one path along another, before or instead of along their own."""
 
-    name = "move"
-    catalogue = ("D2", "D10")
-    options_model = MoveOptions
-
-    def __init__(self, options: MoveOptions, context: AttackContext, rng: Random, now: float) -> None:
-        super().__init__(options, context, rng, now)
-        context.check_path(options.onto)
+    def prepare(self) -> None:
+        self.context.check_path(self.options.onto)
 
     def intercept(self, datagram: bytes, direction: Direction, now: float) -> list[Action]:
-        """Send the datagram along the other path."""
         onto = direction.along(self.options.onto)
         if onto == direction or not matches_kind(self.options.kinds, datagram) or not self.should_attack():
             return [Send(datagram, direction)]
@@ -229,19 +120,15 @@ class Move(Attack[MoveOptions]):
         return [Send(datagram, onto), note, *([Send(datagram, direction)] if self.options.beside else [])]
 
 
-class Cross(Attack[Options]):
+class Cross(Attack, name="cross-initiations", catalogue=("H15",)):
     """Holds initiations until both peers have sent one, so that they cross.
 
     An initiation without a counterpart passes after :attr:`patience_s`.
     """
 
-    name = "cross-initiations"
-    catalogue = ("H15",)
-    options_model = Options
     patience_s = 1.0
 
-    def __init__(self, options: Options, context: AttackContext, rng: Random, now: float) -> None:
-        super().__init__(options, context, rng, now)
+    def prepare(self) -> None:
         self._held: dict[Direction, tuple[bytes, float]] = {}
 
     def intercept(self, datagram: bytes, direction: Direction, now: float) -> list[Action]:
@@ -256,60 +143,40 @@ class Cross(Attack[Options]):
         return [self.note(Operation.HELD, datagram, direction, now, "until the other peer initiates")]
 
     def due(self, now: float) -> list[Action]:
-        """Release the initiations without a counterpart."""
         actions: list[Action] = []
         for direction in [direction for direction, (_, until) in self._held.items() if until <= now]:
             datagram, _ = self._held.pop(direction)
-            actions += [
-                Send(datagram, direction),
-                self.note(Operation.RELEASED, datagram, direction, now, "alone", own=True),
-            ]
+            actions += [Send(datagram, direction), self.own(Operation.RELEASED, datagram, direction, now, "alone")]
         return actions
 
     def next_deadline(self) -> float:
-        """The time of the next release."""
         return min((until for _, until in self._held.values()), default=NEVER)
 
 
-class ReorderOptions(Options):
-    """The parameters of ``reorder``."""
-
-    kinds: KindFilter = Field("envelope", description=KINDS)
-    depth: int = Field(8, ge=2, le=4096, description="number of datagrams in a batch")
-    patience_s: float = Field(0.5, gt=0, description="seconds until an incomplete batch is sent")
-
-
-class Reorder(Attack[ReorderOptions]):
+class Reorder(Attack, name="reorder", catalogue=("D4",), kinds="envelope"):
     """Collects datagrams in batches and sends each batch in another order."""
 
-    name = "reorder"
-    catalogue = ("D4",)
-    options_model = ReorderOptions
+    depth = 8
+    patience_s = 0.5
+    """Seconds until an incomplete batch is sent."""
 
-    def __init__(self, options: ReorderOptions, context: AttackContext, rng: Random, now: float) -> None:
-        super().__init__(options, context, rng, now)
+    def prepare(self) -> None:
         self._gathered: dict[Direction, list[bytes]] = {}
         self._until: dict[Direction, float] = {}
 
     def intercept(self, datagram: bytes, direction: Direction, now: float) -> list[Action]:
-        """Collect the datagram. A complete batch is released."""
         if not matches_kind(self.options.kinds, datagram) or not self.should_attack():
             return [Send(datagram, direction)]
         batch = self._gathered.setdefault(direction, [])
-        self._until.setdefault(direction, now + self.options.patience_s)
+        self._until.setdefault(direction, now + self.patience_s)
         batch.append(datagram)
-        return self._release(direction, now) if len(batch) >= self.options.depth else []
+        return self._release(direction, now) if len(batch) >= self.depth else []
 
     def due(self, now: float) -> list[Action]:
-        """Release the incomplete batches that are due."""
-        return [
-            action
-            for direction in [direction for direction, until in self._until.items() if until <= now]
-            for action in self._release(direction, now)
-        ]
+        due = [direction for direction, until in self._until.items() if until <= now]
+        return [action for direction in due for action in self._release(direction, now)]
 
     def next_deadline(self) -> float:
-        """The time of the next release."""
         return min(self._until.values(), default=NEVER)
 
     def _release(self, direction: Direction, now: float) -> list[Action]:
@@ -324,5 +191,67 @@ class Reorder(Attack[ReorderOptions]):
             actions.append(Send(batch[number], direction))
             if position != number:
                 detail = f"{number + 1} of {len(batch)} sent as {position + 1}"
-                actions.append(self.note(Operation.REORDERED, batch[number], direction, now, detail, own=True))
+                actions.append(self.own(Operation.REORDERED, batch[number], direction, now, detail))
         return actions
+
+
+class Stretch(Attack, name="stretch", catalogue=("D9",), interval_s=1.8, block_handshakes=True):
+    """Delays envelopes in order: one passes every 1.8 s, so the delay grows with each. Drops handshake messages."""
+
+    def prepare(self) -> None:
+        self._held = {direction: deque[tuple[int, bytes]]() for direction in self.stretched()}
+        self._next_at: dict[Direction, float] = {}
+
+    def stretched(self) -> tuple[Direction, ...]:
+        """The directions in which envelopes are delayed."""
+        return self.directions
+
+    def on_datagram(self, datagram: bytes, direction: Direction, now: float) -> list[Action]:
+        """Drop handshake messages of both directions, also if ``direction`` selects only one."""
+        self.seen += 1
+        if not self.is_on(now) or not {direction, direction.reverse} & set(self.directions):
+            return [Send(datagram, direction)]
+        if kind_of(datagram) in HANDSHAKE and self.options.block_handshakes:
+            return [self.note(Operation.DROPPED, datagram, direction, now, "a handshake message")]
+        return self.intercept(datagram, direction, now)
+
+    def intercept(self, datagram: bytes, direction: Direction, now: float) -> list[Action]:
+        held = self._held.get(direction)
+        if held is None or kind_of(datagram) is not DatagramKind.ENVELOPE:
+            return [Send(datagram, direction)]
+        if len(held) >= HELD_LIMIT:
+            return [self.note(Operation.DROPPED, datagram, direction, now, "the queue is full")]
+        if not self.should_attack():
+            return [Send(datagram, direction)]
+        held.append((self.seen, datagram))
+        self._next_at.setdefault(direction, now + self.options.interval_s)
+        return [self.note(Operation.HELD, datagram, direction, now, f"{len(held)} wait")]
+
+    def due(self, now: float) -> list[Action]:
+        """Release the oldest envelope of each queue that is due."""
+        actions: list[Action] = []
+        for direction in [direction for direction, next_at in self._next_at.items() if next_at <= now]:
+            number, datagram = self._held[direction].popleft()
+            note = self.own(Operation.RELEASED, datagram, direction, now, f"was number {number}")
+            actions += [Send(datagram, direction), note]
+            self._next_at[direction] += self.options.interval_s
+            if not self._held[direction]:
+                del self._next_at[direction]
+        return actions
+
+    def next_deadline(self) -> float:
+        return min(self._next_at.values(), default=NEVER)
+
+
+class StretchOneWay(Stretch, name="stretch-one-way", catalogue=("D9", "D10"), back="echoes"):
+    """Delays the envelopes of one direction in order, and drops the echo records of the other one, or all of it."""
+
+    def stretched(self) -> tuple[Direction, ...]:
+        """The first of the directions that ``direction`` selects."""
+        return self.directions[:1]
+
+    def intercept(self, datagram: bytes, direction: Direction, now: float) -> list[Action]:
+        """Drop the echoes that would show the age of the delayed frames."""
+        if direction.reverse in self._held and (self.options.back == "all" or is_echo(datagram)):
+            return [self.note(Operation.DROPPED, datagram, direction, now, "the direction of the answers")]
+        return super().intercept(datagram, direction, now)

@@ -1,0 +1,245 @@
+"""What all evaluations share: a run writes records, and a report of tables and figures is made from them alone."""
+
+from __future__ import annotations
+
+import importlib
+import random
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from datetime import UTC, datetime
+from itertools import accumulate, pairwise
+from pathlib import Path
+from statistics import median
+from time import monotonic
+from typing import Any, Generic, Protocol, TypeVar
+
+from uavlinkd.lab.child_processes import private_folder
+from uavlinkd.lab.evaluation.records import Record, RecordWriter, RunRecords, Value, load, machine_facts, read_records
+
+THE_PAPER = (
+    "The paper: Ouadah and Merazka, Securing UAV Communication: Authentication and Integrity, 2024 (arXiv "
+    "2410.09085)."
+)
+NOTHING = "-"
+Show = Callable[[str], None]
+F = TypeVar("F", bound=RunRecords)
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluationSettings:
+    """The options of an evaluation. The names of the fields are those of the options."""
+
+    quick: bool = False
+    seed: int = 0
+
+
+S = TypeVar("S", bound=EvaluationSettings)
+
+
+@dataclass(frozen=True, slots=True)
+class Work(Generic[S]):
+    """What a run gets.
+
+    ``out``: the folder for the results. ``folder``: for keys; it is removed. ``add`` writes a record, ``show`` prints
+    a line of progress.
+    """
+
+    settings: S
+    out: Path
+    folder: Path
+    add: Callable[[Record], None]
+    show: Show
+
+
+class RunFunction(Protocol[S]):
+    """Makes all measurements, and returns further values for the last record."""
+
+    async def __call__(self, work: Work[S], /) -> dict[str, Any]: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """A table with cells of text."""
+
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+
+@dataclass(frozen=True, slots=True)
+class ReportSection:
+    """A heading, paragraphs, tables, and the name of a figure."""
+
+    title: str
+    text: Sequence[str] = ()
+    tables: Sequence[Table] = ()
+    figure: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluation(Generic[F, S]):
+    """One evaluation. In the folder of a run, ``name``.jsonl has its records and ``name``.md its report."""
+
+    name: str
+    title: str
+    settings: type[S]
+    run: RunFunction[S]
+    findings: Callable[[Mapping[str, Value], Sequence[Record]], F]
+    sections: Callable[[F], list[ReportSection]]
+    problems: Callable[[F], list[str]]
+    summary: Callable[[F], dict[str, Value]]
+    draw: str = ""
+    """The function in :mod:`.figures` that draws its figures."""
+
+    async def measure(self, out: Path, settings: S, show: Show) -> None:
+        """Run, and write the records to ``out``."""
+        facts: dict[str, Value] = {"command": command(self.name, settings), **machine_facts()}
+        facts |= {"quick": settings.quick, "seed": settings.seed, "began": datetime.now(UTC).isoformat()[:19]}
+        began_at = monotonic()
+        with RecordWriter(out, self.name, facts) as writer, private_folder("uavlinkd-") as folder:
+            values = await self.run(Work(settings, out, folder, writer.add, show))
+            elapsed_s = round(monotonic() - began_at, 1)
+            writer.add(Record("end", {}, {"elapsed_s": elapsed_s, "load_after": load(), **values}))
+
+    def read(self, folder: Path) -> F:
+        """The findings in a folder.
+
+        Raises:
+            RecordsError: there are no records, or they cannot be read.
+        """
+        return self.findings(*read_records(folder / f"{self.name}.jsonl"))
+
+    def deviations(self, findings: F) -> list[str]:
+        """The problems, also of a run that was interrupted."""
+        interrupted = [] if findings.of("end") else ["the run was interrupted"]
+        return [*self.problems(findings), *interrupted]
+
+    def write(self, folder: Path, page: Path | None = None) -> Path:
+        """Write the report from the records in ``folder``, there or to ``page``. Return its path.
+
+        The figures of a page are in the folder ``results`` beside it.
+        """
+        findings = self.read(folder)
+        beside = "" if page is None else "results/"
+        page = folder / f"{self.name}.md" if page is None else page
+        images = page.parent / beside
+        images.mkdir(parents=True, exist_ok=True)
+        drawn = self._write_figures(findings, images)
+        sections = [*self.sections(findings), _run_section(findings)]
+        problems = [f"Not as expected: {problem}." for problem in self.deviations(findings)]
+        page.write_text(to_markdown(self.title, problems, sections, drawn, beside), encoding="utf-8")
+        return page
+
+    def _write_figures(self, findings: F, folder: Path) -> list[str]:
+        if not self.draw:
+            return []
+        drawing = importlib.import_module("uavlinkd.lab.evaluation.figures")  # late: it imports matplotlib
+        figures: dict[str, bytes] = drawing.to_svg(getattr(drawing, self.draw), findings)
+        for name, svg in figures.items():
+            (folder / f"{name}.svg").write_bytes(svg)
+        return list(figures)
+
+
+def command(name: str, settings: EvaluationSettings) -> str:
+    """The command of a run, with the options that differ from the defaults."""
+    words = [f"uavlinkd evaluate {name} --out DIR"]
+    for item in fields(settings):
+        value, option = getattr(settings, item.name), f"--{item.name.removesuffix('_s').replace('_', '-')}"
+        if value is True:
+            words.append(option)
+        elif isinstance(value, tuple):
+            words += [f"{option} {getattr(part, 'name', part)}" for part in value]
+        elif value != item.default or item.name == "seed":
+            words.append(f"{option} {value}")
+    return " ".join(words)
+
+
+def _run_section(findings: RunRecords) -> ReportSection:
+    facts = {**findings.run, **(findings.of("end")[0].values if findings.of("end") else {})}
+    text = (
+        f"Made by `{facts.pop('command', '')}`. `uavlinkd evaluate report DIR` writes this report again from the "
+        "records. The seed determines the choices of the run, but no key. Times contain other load on the machine."
+    )
+    rows = [
+        [name.replace("_", " "), str(value)]
+        for name, value in facts.items()
+        if name not in ("quick", "seed") and isinstance(value, str | int | float)
+    ]
+    return ReportSection("Run", [text], [Table(["fact", "value"], rows)])
+
+
+def to_markdown(
+    title: str, problems: Sequence[str], sections: Sequence[ReportSection], figures: Sequence[str], where: str
+) -> str:
+    """The report as Markdown. ``where`` is the folder of the figures, relative to the page."""
+    parts = [f"# {title}", *problems]
+    for section in sections:
+        parts.append(f"## {section.title}")
+        if section.figure in figures:
+            parts.append(f"![{section.title}]({where}{section.figure}.svg)")
+        parts += section.text
+        for table in section.tables:
+            lines = [table.head, ["---"] * len(table.head), *table.rows]
+            parts.append("\n".join("| " + " | ".join(map(_safe, line)) + " |" for line in lines))
+    return "\n\n".join(parts) + "\n"
+
+
+def _safe(cell: str) -> str:
+    return cell.replace("|", "\\|").replace("\n", " ")
+
+
+PERMUTATIONS = 2000
+
+
+def spread(values: Sequence[float]) -> str:
+    """Median, range and count of durations in seconds."""
+    if not values:
+        return "-"
+    if len(values) == 1:
+        return f"{duration(values[0])} (once)"
+    return f"{duration(median(values))} ({duration(min(values))} to {duration(max(values))}, n = {len(values)})"
+
+
+def duration(seconds: float) -> str:
+    """The text of a duration: three digits and a suitable unit."""
+    for factor, unit in ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs")):
+        if abs(seconds) >= factor:
+            return f"{seconds / factor:.3g} {unit}" if seconds / factor < 999.5 else f"{seconds / factor:.0f} {unit}"
+    return f"{seconds * 1e9:.3g} ns"
+
+
+def percentile(values: Iterable[float], share: float) -> float:
+    """The smallest value that at least ``share`` (0 to 1) of the values do not exceed."""
+    ordered = sorted(values)
+    return ordered[min(len(ordered) - 1, max(0, -int(-share * len(ordered) // 1) - 1))]
+
+
+def p_value(samples: Sequence[Sequence[float]], permutations: int = PERMUTATIONS) -> float:
+    """The probability that random samples differ as much as these, or more.
+
+    The statistic is that of Kruskal and Wallis. It uses ranks, so that a few very long times have no large effect.
+    Its distribution is computed by shuffling, which is exact for small samples. Equal samples return equal values.
+    """
+    ends = list(accumulate((len(sample) for sample in samples), initial=0))
+    ranks = _ranks([value for sample in samples for value in sample])
+    seen = _between(ranks, ends)
+    rng = random.Random(0)  # noqa: S311  not a key
+    as_far = 0
+    for _ in range(permutations):
+        rng.shuffle(ranks)
+        as_far += _between(ranks, ends) >= seen - 1e-9
+    return (as_far + 1) / (permutations + 1)
+
+
+def _ranks(values: Sequence[float]) -> list[float]:
+    """The ranks from 1; equal values share the mean of their ranks."""
+    ordered = sorted(values)
+    first: dict[float, int] = {}
+    count: dict[float, int] = {}
+    for place, value in enumerate(ordered, 1):
+        first.setdefault(value, place)
+        count[value] = count.get(value, 0) + 1
+    return [first[value] + (count[value] - 1) / 2 for value in values]
+
+
+def _between(ranks: Sequence[float], ends: Sequence[int]) -> float:
+    return sum(sum(ranks[start:end]) ** 2 / (end - start) for start, end in pairwise(ends) if end > start)

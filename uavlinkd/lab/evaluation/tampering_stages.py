@@ -1,0 +1,220 @@
+"""Further stages of real daemons: with two paths, on a serial line, behind a hostile relay, and with refusals."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from struct import Struct
+from time import monotonic
+from typing import Any, Final
+
+from uavlinkd.config import RelayServer
+from uavlinkd.config.keys import encode_key
+from uavlinkd.core import constants as c
+from uavlinkd.core.crypto import KeyPair, Secret
+from uavlinkd.core.settings import Link, PeerSettings
+from uavlinkd.core.suites import SUITES_BY_NAME
+from uavlinkd.lab.evaluation.ledger import Fault
+from uavlinkd.lab.evaluation.middle import HOST, Interventions, interventions, silent_log
+from uavlinkd.lab.evaluation.stage import DaemonStage, until
+from uavlinkd.lab.hostile.hostile_relay import HostileRelay, HostileRelaySettings
+from uavlinkd.lab.mitm.anatomy import mavlink_frame
+from uavlinkd.lab.mitm.attack import AttackObject, Direction
+from uavlinkd.lab.mitm.line_attacks import parse_line_attack
+from uavlinkd.lab.mitm.modem import ModemEnd, ModemSettings
+from uavlinkd.lab.mitm.modem_ports import ModemPorts, PortSettings
+from uavlinkd.lab.mitm.radio import RadioSettings
+from uavlinkd.lab.sim.loopback_ports import free_ports
+from uavlinkd.mavlink.dialect import ids_by_name
+from uavlinkd.mavlink.dialect_table import MESSAGES
+from uavlinkd.relay.member_settings import MemberSettings, RelayLimits
+from uavlinkd.system.addresses import Address
+
+SLOWER: Final = ("both/2", RadioSettings(delay_s=0.02))
+"""The second path: the election prefers the first one."""
+SIK: Final = ModemSettings()
+_ENDS: Final = dict(zip(ModemEnd, ("drone0", "drone1"), strict=True))
+_AMPLE: Final = RelayLimits(1_000_000, 10**10)
+_RELAY_LINK: Final = Link((SUITES_BY_NAME["x25519"],), features=c.FEATURE_REFUSALS | c.FEATURE_RECORDS)
+_RELAY_PEERS: Final = 16
+_REFUSED: Final = "MAV_CMD_COMPONENT_ARM_DISARM"
+_COMMAND: Final = Struct("<7fHBBB")
+_COMMAND_LONG: Final = ids_by_name()["COMMAND_LONG"]
+_ARM: Final = 400
+_COMMANDS_INTERVAL_S: Final = 0.2
+
+
+class TwoPathStage(DaemonStage):
+    """Two configured paths between each pair."""
+
+    async def settle(self) -> None:
+        """Wait until the first path is the best one of every drone.
+
+        Raises:
+            EvaluationError: it does not become the best path.
+        """
+        first = {
+            (way.sender, way.receiver): f"{HOST}:{port}" for way, port in self.middle.ports.items() if way.path == 1
+        }
+
+        async def is_best() -> bool:
+            statuses = {name: (await drone.ask()).get("peers", {}) for name, drone in self.drones.items()}
+            return first == {(one, to): peer["path"] for one, peers in statuses.items() for to, peer in peers.items()}
+
+        await until(is_best, "the faster path did not become the best one")
+
+
+class MiddleLine:
+    """Two emulated modems in this process, with the attacks on their lines.
+
+    The attacker is the modem's firmware, or a device on the wires. It puts bytes on the lines to both hosts, or holds
+    back what they should receive. It has no keys, but it knows the framing: it makes frames with a valid CRC.
+    """
+
+    def __init__(self, names: Sequence[str], folder: Path, log: Path | None, seed: int) -> None:
+        del names
+        self.ports: Mapping[Direction, int] = {}
+        self.devices = {name: folder / end for end, name in _ENDS.items()}
+        left, right = self.devices.values()
+        self._modems = ModemPorts(PortSettings(left, right, SIK, seed=seed, log=log))
+        self._modems.log = silent_log()
+
+    async def start(self, addresses: Mapping[str, int], public_keys: Mapping[str, bytes]) -> None:
+        """Plug both modems in. They need to know nothing about the daemons."""
+        del addresses, public_keys
+        await self._modems.start()
+
+    async def attack(self, specs: Sequence[str], objects: Sequence[AttackObject] = ()) -> None:
+        """Replace the attacks. What the modems hold back is released."""
+        assert not objects, "the attacker on the line has no keys"
+        self._modems.change_attacks([parse_line_attack(text) for text in specs])
+        for end in ModemEnd:
+            self._modems.link.release(end, monotonic())
+
+    async def statistics(self) -> Interventions:
+        counts = self._modems.journal.counts
+        return Interventions({f"{attack}: {operation}": count for (attack, operation), count in counts.items()})
+
+    async def stop(self) -> None:
+        await self._modems.stop()
+
+
+class LineStage(DaemonStage):
+    """Two daemons whose only path is a serial line with two modems."""
+
+    middle: MiddleLine
+
+    def addresses(self, one: str, other: str) -> list[object]:
+        del one, other
+        return [{"network": "sik"}]
+
+    def networks(self, name: str) -> list[dict[str, object]]:
+        return [{"name": "sik", "serial": f"{self.middle.devices[name]}:{SIK.line_baud:.0f}"}]
+
+
+class MiddleRelay:
+    """A hostile relay in this process. ``names``: of its members."""
+
+    def __init__(self, names: Sequence[str], folder: Path, log: Path | None, seed: int) -> None:
+        del folder
+        self.ports: Mapping[Direction, int] = {}
+        """Of a proxy; members reach a relay by its own port."""
+        (self.port,) = free_ports(1)
+        self._names = tuple(names)
+        self._log, self._seed = log, seed
+        self._private = os.urandom(c.KEY_BYTES)
+
+    @property
+    def section(self) -> dict[str, object]:
+        key = encode_key(KeyPair(self._private).public)
+        return {"name": "vps", "public_key": key, "addresses": [f"{HOST}:{self.port}"]}
+
+    async def start(self, addresses: Mapping[str, int], public_keys: Mapping[str, bytes]) -> None:
+        """Start for members with these keys. They reach the relay; it does not need their ports."""
+        del addresses
+        members = (PeerSettings(name, public_keys[name], None, _RELAY_LINK) for name in self._names)
+        settings = HostileRelaySettings(
+            name="vps",
+            private_key=Secret(self._private),
+            listen=(Address(HOST, self.port),),
+            server=RelayServer(tuple(MemberSettings(member, _RELAY_PEERS, _AMPLE) for member in members), _AMPLE),
+            seed=self._seed,
+            log=self._log,
+        )
+        self.relay = HostileRelay(settings)
+        self.relay.log = silent_log()
+        await self.relay.start()
+
+    async def attack(self, specs: Sequence[str], objects: Sequence[AttackObject] = ()) -> None:
+        assert not objects, "this attacker has no key of a member"
+        self.relay.attack(specs)
+
+    async def statistics(self) -> Interventions:
+        return interventions(self.relay.statistics())
+
+    async def stop(self) -> None:
+        await self.relay.stop()
+
+
+class RelayStage(DaemonStage):
+    """Daemons that know only a hostile relay."""
+
+    middle: MiddleRelay
+
+    def addresses(self, one: str, other: str) -> list[object]:
+        del one, other
+        return []
+
+    def relays(self, name: str) -> list[dict[str, object]]:
+        del name
+        return [self.middle.section]
+
+
+class RefusingStage(DaemonStage):
+    """Two drones that refuse commands of each other, and report that: are the claims that they show true?"""
+
+    def rules(self, one: str, other: str) -> dict[str, object]:
+        return {**super().rules(one, other), "deny_in": [_REFUSED]}
+
+    async def _talk(self) -> None:
+        await asyncio.gather(super()._talk(), self._send_commands(), self._check_claims())
+
+    async def _send_commands(self) -> None:
+        seq = 0
+        while True:
+            for number, name in enumerate(self.names):
+                self.send(name, arm_command(number + 1, seq))
+            seq = (seq + 1) % 256
+            await asyncio.sleep(_COMMANDS_INTERVAL_S)
+
+    async def _check_claims(self) -> None:
+        """A drone claims at most what it has refused when it is asked afterwards."""
+        while True:
+            await asyncio.sleep(_COMMANDS_INTERVAL_S)
+            for shown_by, claimed_by in (self.names, self.names[::-1]):
+                claims = claims_of(await self.drones[shown_by].ask(), claimed_by)
+                refused = refused_by(await self.drones[claimed_by].ask(), shown_by)
+                if false := (claims - refused).total():
+                    self.ledger.faults[Fault.FALSELY_CLAIMED] += false
+
+
+def arm_command(system: int, seq: int) -> bytes:
+    payload = _COMMAND.pack(1.0, *(0.0,) * 6, _ARM, 3 - system, 1, 0)
+    return mavlink_frame(_COMMAND_LONG, payload, MESSAGES[_COMMAND_LONG][1], system, seq)
+
+
+def claims_of(status: Mapping[str, Any], peer: str) -> Counter[str]:
+    """What a drone's status shows as the claims of its peer."""
+    peers = status.get("peers", {})
+    listed = peers[peer]["refused_there"] if peer in peers else []
+    return Counter({f"{claim['command'] or claim['message']} {claim['reason']}": claim["count"] for claim in listed})
+
+
+def refused_by(status: Mapping[str, Any], peer: str) -> Counter[str]:
+    """What a drone has refused of its peer's commands."""
+    peers = status.get("peers", {})
+    commands = peers[peer]["refused_commands"]["in"] if peer in peers else {}
+    return Counter({f"{command} {reason}": n for command, counts in commands.items() for reason, n in counts.items()})

@@ -1,0 +1,221 @@
+"""``uavlinkd evaluate timing``: how long the paper's method takes over its grid, and a link of ours."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import random
+import sys
+from collections.abc import Iterable
+from contextlib import AsyncExitStack
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from uavlinkd.core.suites import SUITES, X25519
+from uavlinkd.lab.child_processes import end_with_parent
+from uavlinkd.lab.evaluation.frame import Evaluation, EvaluationSettings, Work
+from uavlinkd.lab.evaluation.records import EvaluationError, Record, Status, Value
+from uavlinkd.lab.evaluation.timing_daemons import (
+    LinkChoice,
+    measure_core,
+    measure_tags,
+    measured,
+    time_frames,
+    time_handshake,
+)
+from uavlinkd.lab.evaluation.timing_report import TimingFindings, sections, summary, timing_problems
+
+T = TypeVar("T")
+
+MAC_KEY_BITS = (256, 512, 1024, 2048)
+"""The lengths that a configuration may have."""
+PAPER_DH_BITS = (256, 512, 1024, 2048, 4096)
+"""The paper's sizes; its text has 2028 for 2048 in one place."""
+PAPER_MAC_KEY_BITS = (512, 1024, 2048)
+STANDARD_BITS = (2048, 4096)
+"""The sizes of the paper for which RFC 7919 has a group."""
+DATA_BYTES = 280
+"""The largest MAVLink 2 frame."""
+_ANSWER_S = 60.0
+"""How long an end of the paper's method may take to start, or to verify."""
+_NOT_IN_QUICK = "not in a quick run"
+
+
+@dataclass(frozen=True, slots=True)
+class TimingSettings(EvaluationSettings):
+    """The options of the evaluation.
+
+    ``repeats``: of each point. ``quick``: some points, once. ``paper``: also the paper's largest group, each
+    point once. ``limit_s``: the time limit of one exchange of the paper's method, ten minutes in the paper. ``seed``:
+    of the order of the measurements and of their data; keys come from the system.
+    """
+
+    repeats: int = 30
+    paper: bool = False
+    limit_s: float = 600.0
+
+
+def grid() -> list[LinkChoice]:
+    """Every suite with every length of the HMAC key."""
+    return [LinkChoice(suite, bits) for suite in SUITES.values() for bits in MAC_KEY_BITS]
+
+
+def paper_points() -> list[dict[str, Value]]:
+    """The paper's grid, then the same method in standard groups, which need no generated parameters."""
+    groups = [("made", bits) for bits in PAPER_DH_BITS] + [("standard", bits) for bits in STANDARD_BITS]
+    return [
+        {"dh_bits": bits, "mac_key_bits": mac_bits, "group": group}
+        for group, bits in groups
+        for mac_bits in PAPER_MAC_KEY_BITS
+    ]
+
+
+async def run_timing(work: Work[TimingSettings]) -> dict[str, Any]:
+    run = _Run(work)
+    work.show("tags, and handshakes in the core")
+    for record in measure_tags(500 if work.settings.quick else 20_000):
+        work.add(record)
+    measure_core(LinkChoice(X25519))  # the first use is slow
+    for choice in run.shuffled(grid()):
+        work.add(measure_core(choice))
+    await run.frames()
+    await run.exchanges()
+    return {}
+
+
+class _Run:
+    def __init__(self, work: Work[TimingSettings]) -> None:
+        self._work = work
+        self._settings = work.settings
+        self._random = random.Random(work.settings.seed)  # noqa: S311  not for keys
+
+    def shuffled(self, points: Iterable[T]) -> list[T]:
+        """Every point some times in random order, so that load affects all points equally."""
+        repeats = 1 if self._settings.quick else self._settings.repeats
+        work = [point for point in points for _ in range(repeats)]
+        self._random.shuffle(work)
+        return work
+
+    async def frames(self) -> None:
+        links = [LinkChoice(suite) for suite in SUITES.values()]
+        links += [LinkChoice(X25519, bits) for bits in MAC_KEY_BITS if bits != 256]
+        links += [LinkChoice(X25519, confidential=True)]
+        count = 100 if self._settings.quick else 1000
+        for choice, with_proxy in [*((link, False) for link in links), (LinkChoice(X25519), True)]:
+            point = {**choice.point, "proxy": with_proxy}
+            if self._settings.quick and choice != LinkChoice(X25519):
+                self._skip("frames", point, _NOT_IN_QUICK)
+                continue
+            self._work.show(f"{count} frames, {choice.suite.name}")
+            self._work.add(await measured("frames", point, time_frames(choice, count, with_proxy=with_proxy)))
+
+    async def exchanges(self) -> None:
+        """Measure the daemons and the paper's method in random order, so that load affects both equally."""
+        chosen = [choice for choice in grid() if not self._settings.quick or _is_quick(choice)]
+        for choice in grid():
+            if choice not in chosen:
+                self._skip("handshake", choice.point, _NOT_IN_QUICK)
+        # Each exchange at the largest size takes up to the limit: these points run once and last.
+        last = [point for point in paper_points() if (point["dh_bits"], point["group"]) == (4096, "made")]
+        work: list[LinkChoice | dict[str, Value]] = [
+            *chosen,
+            *(point for point in paper_points() if point not in last),
+        ]
+        work = self.shuffled(work)
+        if self._settings.paper:
+            work += last
+        else:
+            for point in last:
+                self._skip("paper", point, "runs only with --paper")
+        limit_s = min(self._settings.limit_s, 2.0) if self._settings.quick else self._settings.limit_s
+        for number, item in enumerate(work, 1):
+            if isinstance(item, LinkChoice):
+                self._work.show(f"{number} of {len(work)}: {item.suite.name}, HMAC key of {item.mac_key_bits} bits")
+                self._work.add(await measured("handshake", item.point, time_handshake(item)))
+            else:
+                self._work.show(f"{number} of {len(work)}: the paper's method, {item['dh_bits']} bits")
+                self._work.add(await measure_paper(item, limit_s, self._random.randbytes(DATA_BYTES)))
+
+    def _skip(self, kind: str, point: dict[str, Value], reason: str) -> None:
+        self._work.add(Record(kind, point, {}, Status.SKIPPED, reason))
+
+
+def _is_quick(choice: LinkChoice) -> bool:
+    """Every suite with the shortest key, and the longest key once."""
+    return choice.mac_key_bits == MAC_KEY_BITS[0] or (
+        choice.suite is X25519 and choice.mac_key_bits == MAC_KEY_BITS[-1]
+    )
+
+
+async def measure_paper(point: dict[str, Value], limit_s: float, data: bytes) -> Record:
+    """One exchange of the paper's method between two new processes, at a point of :func:`paper_points`."""
+    try:
+        async with AsyncExitStack() as stack:
+            responder, initiator = [await _end(stack, role) for role in ("responder", "initiator")]
+            ports = [(await _answer(end, _ANSWER_S))["port"] for end in (responder, initiator)]
+            request = {
+                "port": ports[0],
+                "bits": point["dh_bits"],
+                "mac_bits": point["mac_key_bits"],
+                "standard": point["group"] == "standard",
+                "data": data.hex(),
+            }
+            assert initiator.stdin is not None
+            initiator.stdin.write(json.dumps(request).encode() + b"\n")
+            try:
+                values = await _answer(initiator, limit_s)
+            except TimeoutError:
+                reason = f"not finished in {limit_s:g} s"
+                return Record("paper", point, {"limit_s": limit_s}, Status.NOT_FINISHED, reason)
+            values |= await _answer(responder, _ANSWER_S)
+    except (EvaluationError, OSError) as error:
+        return Record("paper", point, {}, Status.FAILED, str(error) or type(error).__name__)
+    if not values.pop("verified"):
+        return Record("paper", point, {}, Status.FAILED, "the tag did not verify")
+    # Both ends have the same monotonic clock.
+    total_s = values.pop("verified_at") - values.pop("started_at")
+    return Record("paper", point, {"total_s": total_s, **values})
+
+
+async def _end(stack: AsyncExitStack, role: str) -> asyncio.subprocess.Process:
+    process = await asyncio.create_subprocess_exec(
+        *end_with_parent(sys.executable, "-m", "uavlinkd.lab.evaluation.paper", role),
+        stdin=asyncio.subprocess.PIPE,
+        stdout=asyncio.subprocess.PIPE,
+    )
+
+    async def end() -> None:
+        if process.returncode is None:
+            process.kill()
+        await process.wait()
+
+    stack.push_async_callback(end)
+    return process
+
+
+async def _answer(process: asyncio.subprocess.Process, limit_s: float) -> dict[str, Any]:
+    """The next line of an end.
+
+    Raises:
+        TimeoutError: there is no line within the limit.
+        EvaluationError: the process has ended.
+    """
+    assert process.stdout is not None
+    line = await asyncio.wait_for(process.stdout.readline(), limit_s)
+    if not line:
+        raise EvaluationError(f"an end of the exchange ended with status {await process.wait()}")
+    answer: dict[str, Any] = json.loads(line)
+    return answer
+
+
+TIMING = Evaluation(
+    name="timing",
+    title="How long a link takes: the paper's method and uavlinkd's",
+    settings=TimingSettings,
+    run=run_timing,
+    findings=TimingFindings,
+    sections=sections,
+    problems=timing_problems,
+    summary=summary,
+    draw="draw_timing",
+)
