@@ -68,6 +68,11 @@ def _pauses() -> _Pauses:
     return pauses
 
 
+def note_pauses() -> None:
+    """Have a thread note pauses of this process from now on."""
+    _pauses()
+
+
 def _stalled_s() -> float:
     return _pressure_s() + _stolen_s() + _pauses().total_s
 
@@ -85,12 +90,12 @@ def _stolen_s() -> float:
     return int(_STAT.read_text().split(maxsplit=9)[8]) / os.sysconf("SC_CLK_TCK")
 
 
-async def until(condition: Callable[[], bool]) -> None:
-    """Wait for a condition that changes in a thread, another process or a server.
+async def until(condition: Callable[[], bool], timeout_s: float = PATIENCE_S) -> None:
+    """Wait for a condition that changes in a task, a thread or another process.
 
     Raises:
         TimeoutError: it does not hold in time.
     """
-    async with asyncio.timeout(PATIENCE_S):
+    async with asyncio.timeout(timeout_s):
         while not condition():  # noqa: ASYNC110  there is no event to wait for
             await asyncio.sleep(0.001)

@@ -7,16 +7,15 @@ import subprocess
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from tests.compose import images, outages
-from tests.compose.cluster import Cluster, run
+from tests.compose.cluster import SYSTEM_IDS, Cluster, run
 from uavlinkd.fleet import operations
 from uavlinkd.fleet.manifest import FleetSettings
 from uavlinkd.ops.control import ControlError, ask
 
 USER = 10001
-"""Of the daemons in the image."""
 NETWORK = f"10.{64 + os.getpid() % 128}"
 """The first half of the addresses. Another checkout may test on the same machine."""
 SUBNET, MITM_SUBNET = f"{NETWORK}.0.0/24", f"{NETWORK}.1.0/24"
@@ -26,8 +25,6 @@ class Containers(Cluster):
     """The services of compose.yaml."""
 
     cut_s = outages.OUTAGE_S
-    file = "compose.yaml"
-    drones = 3
 
     def __init__(self, folder: Path, image: str, *, mitm: bool = False) -> None:
         self._folder = folder
@@ -35,7 +32,7 @@ class Containers(Cluster):
         self._mitm = mitm
         compose = images.compose_command()
         assert compose is not None
-        self._compose = [*compose, "--project-name", self.project, "--file", str(images.HERE / self.file)]
+        self._compose = [*compose, "--project-name", self.project, "--file", str(images.HERE / "compose.yaml")]
         if mitm:
             self._compose += ["--profile", "mitm"]
         self.environ = {
@@ -48,7 +45,6 @@ class Containers(Cluster):
         self._logs = ""
 
     async def open(self) -> None:
-        """Make the fleet, and start everything."""
         settings = FleetSettings(
             address_plan="{name}:5790",
             psk=True,
@@ -56,8 +52,10 @@ class Containers(Cluster):
             ground_station_url="udpin:127.0.0.1:14550",
         )
         fleet = self._folder / "fleet"
-        operations.init(fleet, settings, self.drones, 1, 0)
-        self.change(fleet)
+        operations.init(fleet, settings, 3, 1, 0)
+        if self._mitm:
+            replace(fleet / "drone1" / "drone1.toml", '"ground-station:5790"', '"mitm:5801"')
+            replace(fleet / "ground-station" / "ground-station.toml", '"drone1:5790"', '"mitm:5802"')
         for path in (fleet, *fleet.rglob("*")):
             os.chown(path, USER, USER)
         for path in (fleet, *fleet.parents):
@@ -67,19 +65,12 @@ class Containers(Cluster):
         await self.compose("up", "--detach", "--no-build")
         await self._look_up()
 
-    def change(self, fleet: Path) -> None:
-        """Change the configurations of the fleet before it starts."""
-        if self._mitm:
-            replace(fleet / "drone1" / "drone1.toml", '"ground-station:5790"', '"mitm:5801"')
-            replace(fleet / "ground-station" / "ground-station.toml", '"drone1:5790"', '"mitm:5802"')
-
     async def close(self) -> None:
         """Stop and remove everything but the image."""
         self._logs = await self.compose("logs", "--no-color", check=False)
         await self.compose("down", "--volumes", "--timeout", "1", check=False)
 
     async def compose(self, *arguments: str, check: bool = True) -> str:
-        """One compose command."""
         return await run(*self._compose, *arguments, environ=self.environ, check=check)
 
     async def container(self, service: str) -> str:
@@ -90,11 +81,10 @@ class Containers(Cluster):
         return containers.strip()
 
     async def inspect(self, service: str, what: str) -> str:
-        """A fact about a service's container, as a template names it."""
         return (await run("docker", "inspect", "--format", what, await self.container(service))).strip()
 
     async def _look_up(self, *names: str) -> None:
-        for name in names or (*self.names, *(("mitm",) if self._mitm else ())):
+        for name in names or (*SYSTEM_IDS, *(("mitm",) if self._mitm else ())):
             self._pids[name] = int(await self.inspect(name, "{{.State.Pid}}"))
 
     def namespace_of(self, name: str) -> Path:
@@ -115,10 +105,11 @@ class Containers(Cluster):
         await self._look_up(name)
 
     async def pause(self, name: str) -> None:
-        await run("docker", "pause", await self.container(name))
+        # `docker pause` needs the freezer of the control groups, which now and then answers "unable to freeze".
+        await run("docker", "kill", "--signal", "STOP", await self.container(name))
 
     async def resume(self, name: str) -> None:
-        await run("docker", "unpause", await self.container(name))
+        await run("docker", "kill", "--signal", "CONT", await self.container(name))
 
     async def cut(self, name: str) -> None:
         await run("docker", "network", "disconnect", f"{self.project}_air", await self.container(name))
@@ -143,13 +134,11 @@ class Containers(Cluster):
             return {}
 
     def interventions(self, attack: str) -> int:
-        """How often an attack did something."""
         counts: dict[str, int] = self.ask_mitm("statistics").get("interventions", {})
         return sum(count for name, count in counts.items() if name.partition(":")[0] == attack)
 
 
 def health(container: str) -> str:
-    """What a container's health check says."""
     command = ("docker", "inspect", "--format", "{{.State.Health.Status}}", container)
     return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
 
@@ -161,11 +150,8 @@ def replace(path: Path, old: str, new: str) -> None:
     path.write_text(text.replace(old, new))
 
 
-Cluster_T = TypeVar("Cluster_T", bound=Containers)
-
-
 @asynccontextmanager
-async def opened(cluster: Cluster_T) -> AsyncIterator[Cluster_T]:
+async def opened(cluster: Containers) -> AsyncIterator[Containers]:
     """A cluster from `up` to `down`."""
     try:
         await cluster.open()

@@ -90,7 +90,8 @@ def _build(base: str) -> str:
 _REQUIREMENTS = """
 import json, sys, tomllib
 with open(sys.argv[1], "rb") as file:
-    print(json.dumps(tomllib.load(file)["project"]["dependencies"]))
+    project = tomllib.load(file)["project"]
+print(json.dumps([*project["dependencies"], *project["optional-dependencies"]["lab"]]))
 """
 
 
@@ -128,7 +129,6 @@ def _make_debian(codename: str, image: str) -> None:
 
 
 def has_image(name: str) -> bool:
-    """Whether the engine has it."""
     return not _try("docker", "image", "inspect", name)
 
 

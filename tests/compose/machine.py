@@ -88,7 +88,6 @@ class Machine:
         _call("docker", "rm", "--force", self._id)
 
     def run(self, script: str) -> subprocess.CompletedProcess[str]:
-        """Run a shell script in it, with any exit status."""
         return subprocess.run(
             ["docker", "exec", "--interactive", self._id, "bash", "-eu"],
             input=script,

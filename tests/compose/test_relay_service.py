@@ -25,8 +25,6 @@ INNER = b"\x40datagram"
 
 
 class RelayService:
-    """The service, with two members in its file."""
-
     def __init__(self, folder: Path, image: str) -> None:
         compose = images.compose_command()
         assert compose is not None
@@ -55,28 +53,23 @@ class RelayService:
             path.chmod(0o755)
 
     async def up(self) -> None:
-        """Start it."""
         await run(*self._compose, "up", "--detach", "--no-build", environ=self._environ)
 
     async def down(self) -> None:
-        """Stop and remove it."""
         for member in self.members:
             member.close()
         print(await run(*self._compose, "logs", "--no-color", environ=self._environ, check=False))
         await run(*self._compose, "down", "--timeout", "1", environ=self._environ)
 
     async def container(self) -> str:
-        """The container's id."""
         return (await run(*self._compose, "ps", "-q", environ=self._environ)).strip()
 
     async def inspect(self, what: str) -> str:
-        """A fact about the container, as a template names it."""
         return (await run("docker", "inspect", "--format", what, await self.container())).strip()
 
 
 @pytest_asyncio.fixture(scope="module", loop_scope="module")
 async def service(image: str, tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[RelayService]:
-    """It runs."""
     service = RelayService(tmp_path_factory.mktemp("service"), image)
     try:
         await service.up()

@@ -16,7 +16,6 @@ from tests.needs import need
 pytestmark = pytest.mark.long
 
 WATCHDOG_S = 6.0
-"""Of the unit."""
 
 _CONFIGURE = """
 uavlinkd=/opt/uavlinkd/bin/uavlinkd

@@ -4,27 +4,21 @@ from __future__ import annotations
 
 import asyncio
 import os
-import pty
-import tty
 from collections import Counter
-from collections.abc import Callable, Sequence
-from contextlib import suppress
-from time import monotonic
+from collections.abc import Callable
 from typing import Any, Self
 
-from tests.daemon.frames import GROUND_SYSTEM, frames_in
+from tests import waiting
+from tests.daemon.frames import GROUND_SYSTEM
 from tests.daemon.harness import Stage
 from tests.daemon.process import DaemonProcess, Status
-from tests.daemon.relay import End, Relay
-from tests.daemon.udp import Client, open_socket
-from tests.waiting import PATIENCE_S
+from tests.daemon.udp import open_socket
 from uavlinkd.config.keys import decode_key
 from uavlinkd.core.crypto import Secret
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Deliver, Dropped, Output, Transmit
 from uavlinkd.core.path import Path
 from uavlinkd.core.settings import PeerSettings
-from uavlinkd.lab.sim.links import ChangeNotifier
 
 # What each side of a link between a drone and its ground station says of the other.
 AN_OPERATOR: dict[str, object] = {"role": "operator", "system_ids": [GROUND_SYSTEM]}
@@ -44,39 +38,11 @@ FAST: dict[str, object] = {"rate_in": {"heartbeat": 1000, "position": 1000, "PIN
 """In place of a role's own rates, where a test sends faster than they allow."""
 
 
-def introduce(
-    stage: Stage,
-    a: DaemonProcess,
-    b: DaemonProcess,
-    *,
-    a_sees_b: dict[str, object],
-    b_sees_a: dict[str, object],
-    through: Relay | None = None,
-) -> str:
-    """Make two daemons peers that see each other differently; the key that they share."""
-    psk = stage.psk()
-    if through is not None:
-        through.attach(End.A, a.sockaddr)
-        through.attach(End.B, b.sockaddr)
-    at = {end: "{}:{}".format(*through.address_for(end)) for end in End} if through else {}
-    a.add_peer(b, [at.get(End.A, b.address)], psk, **a_sees_b)
-    b.add_peer(a, [at.get(End.B, a.address)], psk, **b_sees_a)
-    return psk
-
-
-def drone_and_ground(
-    stage: Stage, relay: Relay | None = None, system: int = 1, **settings: Any
-) -> tuple[DaemonProcess, DaemonProcess]:
-    """A drone and its ground station, each with the role that the other has in force; ``settings`` for both."""
-    drone, ground = stage.daemon(f"drone{system}"), stage.daemon("ground")
-    introduce(
-        stage,
-        drone,
-        ground,
-        a_sees_b={**AN_OPERATOR, **settings},
-        b_sees_a={**a_vehicle(system), **settings},
-        through=relay,
-    )
+def drone_and_ground(stage: Stage, system: int = 1) -> tuple[DaemonProcess, DaemonProcess]:
+    """A drone and its ground station, each with the role that the other has in force."""
+    drone, ground, psk = stage.daemon(f"drone{system}"), stage.daemon("ground"), stage.psk()
+    drone.add_peer(ground, [ground.address], psk, **AN_OPERATOR)
+    ground.add_peer(drone, [drone.address], psk, **a_vehicle(system))
     return drone, ground
 
 
@@ -95,41 +61,6 @@ def make_relay(relay: DaemonProcess, *members: DaemonProcess) -> None:
     for member in members:
         section = {"name": relay.name, "public_key": relay.public_key, "addresses": [relay.address]}
         member.config.setdefault("relay", []).append(section)
-
-
-class Station(Client):
-    """A client at a daemon's UDP endpoint that knows when each frame came."""
-
-    def __init__(self, *args: Any) -> None:
-        super().__init__(*args)
-        self.arrivals: list[tuple[float, bytes]] = []
-
-    @property
-    def frames(self) -> list[bytes]:
-        """What came, in its order."""
-        return [frame for _, frame in self.arrivals]
-
-    def count(self, frame: bytes) -> int:
-        """How many times this frame came."""
-        return self.frames.count(frame)
-
-    def clear(self) -> None:
-        """Forget what has come."""
-        super().clear()
-        self.arrivals.clear()
-
-    def datagram_received(self, data: bytes, addr: tuple[str | Any, int]) -> None:
-        now = monotonic()
-        self.arrivals += [(now, frame) for frame in frames_in(data)]
-        super().datagram_received(data, addr)
-
-
-async def station(stage: Stage) -> Station:
-    """A station on loopback, closed when the stage ends."""
-    sock = open_socket("127.0.0.1")
-    _, station = await asyncio.get_running_loop().create_datagram_endpoint(lambda: Station(sock), sock=sock)
-    stage._clients.append(station)
-    return station
 
 
 async def beat(send: Callable[[int], None], every_s: float = 1.0) -> None:
@@ -158,18 +89,14 @@ class Rogue(asyncio.DatagramProtocol):
         self._sock = open_socket("127.0.0.1")
         self._transport: asyncio.BaseTransport
         self._timer: asyncio.TimerHandle | None = None
-        self._changes = ChangeNotifier()
         self.received = bytearray()
-        """The frames that the victim sent it."""
 
     @property
     def is_up(self) -> bool:
-        """Whether the victim talks to it."""
         return self._peer.is_up
 
     async def until(self, condition: Callable[[], bool]) -> None:
-        """Wait for a condition on what the victim said."""
-        await self._changes.until(condition, PATIENCE_S)
+        await waiting.until(condition)
 
     def say(self, payload: bytes) -> None:
         """Send a payload in an envelope of its own, whatever it holds."""
@@ -213,7 +140,6 @@ class Rogue(asyncio.DatagramProtocol):
                 self._sock.sendto(output.datagram, output.path.address)
             elif isinstance(output, Deliver):
                 self.received += output.payload
-        self._changes.notify()
 
 
 # Counters.
@@ -235,48 +161,3 @@ def held_back(status: Status, kind: str, name: str, way: str = "in") -> Tally:
     for reason, number_of in reported.get("drops", {}).items():
         tally["dropped", reason] += number_of
     return tally
-
-
-# Serial cables.
-
-
-class Cable:
-    """A serial cable between two pseudo-terminals: what is written to one end comes out of the other."""
-
-    def __init__(self) -> None:
-        self._loop = asyncio.get_running_loop()
-        self._masters: list[int] = []
-        self._slaves: list[int] = []
-
-    @property
-    def ends(self) -> Sequence[str]:
-        """The devices, to be opened by the two clients."""
-        return [os.ttyname(slave) for slave in self._slaves]
-
-    def __enter__(self) -> Self:
-        for _ in range(2):
-            master, slave = pty.openpty()
-            tty.setraw(slave)
-            os.set_blocking(master, False)
-            self._masters.append(master)
-            self._slaves.append(slave)  # held open: a master without an open slave returns errors
-        there, back = self._masters
-        self._loop.add_reader(there, self._copy, there, back)
-        self._loop.add_reader(back, self._copy, back, there)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for master in self._masters:
-            self._loop.remove_reader(master)
-        for fd in self._masters + self._slaves:
-            os.close(fd)
-        self._masters.clear()
-
-    def _copy(self, source: int, sink: int) -> None:
-        with suppress(BlockingIOError):
-            data = os.read(source, 4096)
-            while data:
-                try:
-                    data = data[os.write(sink, data) :]
-                except BlockingIOError:
-                    return  # no reader: as on a wire, what is not read is lost

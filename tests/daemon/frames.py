@@ -3,25 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from tests.samples import pack
 
 GROUND_SYSTEM = 255
 
 
 def frame(number: int, system: int = 1, component: int = 1) -> bytes:
-    """A genuine MAVLink 2 frame that differs from that of every other number."""
-    codec = mavlink.MAVLink(None, system, component)
-    codec.seq = number % 256
-    return bytes(mavlink.MAVLink_named_value_int_message(number, b"number", number).pack(codec))
-
-
-def pack(message: Any, system: int, component: int = 1, *, seq: int = 0, version: int = 2) -> bytes:
-    """A message as a genuine frame."""
-    codec = mavlink.MAVLink(None, system, component)
-    codec.seq = seq % 256
-    return bytes(message.pack(codec, force_mavlink1=version == 1))
+    return pack(mavlink.MAVLink_named_value_int_message(number, b"number", number), system, component, seq=number)
 
 
 def heartbeat(
@@ -32,7 +23,6 @@ def heartbeat(
 
 
 def ground_heartbeat(seq: int = 0, system: int = GROUND_SYSTEM) -> bytes:
-    """A ground station's sign of life."""
     message = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, 4, 3)
     return pack(message, system, 190, seq=seq)
 
@@ -49,12 +39,6 @@ def numbered(number: int, system: int) -> bytes:
     """Telemetry that says its number, of some 40 bytes."""
     position = mavlink.MAVLink_global_position_int_message(number, 473977420, 85455940, 488000, 3000, 0, 0, 0, 0)
     return pack(position, system, seq=number)
-
-
-def number_in(frame: bytes) -> int | None:
-    """The number in a frame of :func:`numbered`; None for any other."""
-    is_one = frame[0] == 0xFD and int.from_bytes(frame[7:10], "little") == mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT
-    return int.from_bytes(frame[10:14], "little") if is_one else None
 
 
 SEPARATOR = 2
@@ -82,5 +66,4 @@ def name_of(frame: bytes) -> str:
 
 
 def sender_of(frame: bytes) -> int:
-    """The system that a frame says it is of."""
     return frame[3] if frame[0] == 0xFE else frame[5]

@@ -20,7 +20,6 @@ async def lost_to_waiting(daemon: DaemonProcess, peer: DaemonProcess) -> int:
 
 
 def kernel_drops(daemon: DaemonProcess) -> int:
-    """Datagrams that found no room in a socket of the daemon."""
     urls = [str(endpoint["url"]) for endpoint in daemon.config["endpoint"]]
     ports = [daemon.sockaddr[1], *(int(url.rpartition(":")[2]) for url in urls if url.startswith("udpin"))]
     return sum(receive_queue(port).dropped for port in ports)

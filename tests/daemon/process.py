@@ -7,18 +7,18 @@ import json
 import os
 import signal
 import sys
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
+from tests import waiting
 from tests.daemon.toml import to_toml
 from tests.daemon.udp import Sockaddr
 from tests.waiting import PATIENCE_S
 from uavlinkd.config import keys
 from uavlinkd.lab.child_processes import end_with_parent
-from uavlinkd.lab.sim.links import ChangeNotifier
 from uavlinkd.lab.sim.loopback_ports import free_port
 
 POLL_S = 0.01
@@ -35,18 +35,6 @@ ODD = ("1", "3", "5", "7", "9")
 
 
 Status = dict[str, Any]
-
-
-def drops(status: Status) -> dict[str, int]:
-    """What a daemon discarded, by reason.
-
-    Without the answers to a call that was over by then: where two daemons call each other at the same moment, one of
-    the two answers is no longer waited for.
-    """
-    counts: Counter[str] = Counter(status["drops"])
-    for peer in status["peers"].values():
-        counts.update(peer["drops"])
-    return {reason: count for reason, count in counts.items() if reason != "unexpected_response"}
 
 
 class DaemonProcess:
@@ -72,11 +60,9 @@ class DaemonProcess:
             "peer": [],
         }
         self.lines: list[str] = []
-        """All that its processes wrote to standard error and output."""
         self.statuses: list[str] = []
         """All that it answered, as JSON."""
         self.exit_status: int | None = None
-        """Of the last process; None while it runs."""
         self.command = "run"
         self.launcher: tuple[str, ...] = ()
         """The command that starts the daemon, such as ``ip netns exec NAME``. It execs the daemon: one process."""
@@ -86,7 +72,6 @@ class DaemonProcess:
         """The version of the protocol that it uses; None for its own."""
         self._process: asyncio.subprocess.Process | None = None
         self._reading: asyncio.Task[None] | None = None
-        self._changes = ChangeNotifier()
 
     # Its configuration.
 
@@ -124,7 +109,6 @@ class DaemonProcess:
         self.config["peer"].append({**section, **_open_policy(settings)})
 
     def write_config(self) -> Path:
-        """Write the configuration file."""
         self.config_file.write_text(to_toml(self.config))
         return self.config_file
 
@@ -132,39 +116,28 @@ class DaemonProcess:
 
     @property
     def pid(self) -> int:
-        """Of the process."""
         assert self._process is not None
         return self._process.pid
 
     @property
     def is_running(self) -> bool:
-        """Whether there is a process."""
         return self._process is not None and self._process.returncode is None
 
-    async def start(self, environ: Mapping[str, str] | None = None, *, on_terminal: bool = False) -> None:
+    async def start(self, environ: Mapping[str, str] | None = None) -> None:
         """Start a process with the configuration as it is now. It is not yet ready then."""
         assert not self.is_running
         self.write_config()
         self.exit_status = None
-        master, slave = os.openpty() if on_terminal else (None, asyncio.subprocess.PIPE)
         self._process = await asyncio.create_subprocess_exec(
             *end_with_parent(*self.launcher, sys.executable, *self._executable(), self.command),
             *("--config", str(self.config_file)),
             stdin=asyncio.subprocess.DEVNULL,
-            stdout=slave if on_terminal else asyncio.subprocess.PIPE,
-            stderr=slave if on_terminal else asyncio.subprocess.STDOUT,
+            stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.STDOUT,
             env={**os.environ, **self.environ, **(environ or {})},
         )
-        if master is not None:
-            os.close(slave)
-            stream = asyncio.StreamReader()
-            await asyncio.get_running_loop().connect_read_pipe(
-                lambda: asyncio.StreamReaderProtocol(stream), os.fdopen(master, "rb", 0)
-            )
-        else:
-            assert self._process.stdout is not None
-            stream = self._process.stdout
-        self._reading = asyncio.create_task(self._read(stream))
+        assert self._process.stdout is not None
+        self._reading = asyncio.create_task(self._read(self._process.stdout))
 
     def _executable(self) -> tuple[str, str]:
         """The daemon, as it is; every other one as if uvloop were not installed, so that both loops are tested."""
@@ -177,7 +150,6 @@ class DaemonProcess:
         return await self.until(lambda status: True)
 
     async def send_signal(self, number: signal.Signals) -> None:
-        """Send it a signal."""
         assert self._process is not None
         self._process.send_signal(number)
 
@@ -190,7 +162,6 @@ class DaemonProcess:
         return self.exit_status
 
     async def stop(self, number: signal.Signals = signal.SIGTERM) -> int:
-        """Send a signal, and wait for the end."""
         await self.send_signal(number)
         return await self.ended()
 
@@ -199,10 +170,8 @@ class DaemonProcess:
         assert await self.stop(signal.SIGKILL) == -signal.SIGKILL
 
     async def _read(self, stream: asyncio.StreamReader) -> None:
-        with suppress(OSError):  # EIO: how a terminal says that its other end has gone
-            async for line in stream:
-                self.lines.append(line.decode(errors="backslashreplace").rstrip("\r\n"))
-                self._changes.notify()
+        async for line in stream:
+            self.lines.append(line.decode(errors="backslashreplace").rstrip("\n"))
 
     # What it says.
 
@@ -235,22 +204,19 @@ class DaemonProcess:
     async def until(self, condition: Callable[[Status], bool], timeout_s: float = PATIENCE_S) -> Status:
         """Ask it until what it answers fulfils a condition, and return that."""
         latest: Status = {}
-        try:
-            async with asyncio.timeout(timeout_s):
-                while True:
-                    with suppress(OSError, ValueError):
-                        latest = await self.status()
-                        if condition(latest):
-                            return latest
-                    if not self.is_running:
-                        await self.ended()
-                        raise AssertionError("\n".join([f"{self.name} ended with {self.exit_status}:", *self.lines]))
-                    await asyncio.sleep(POLL_S)
-        except TimeoutError:
-            raise AssertionError(f"{self.name} did not come to that; it says: {json.dumps(latest)}") from None
+        give_up_at = monotonic() + timeout_s
+        while monotonic() < give_up_at:
+            with suppress(OSError, ValueError):
+                latest = await self.status()
+                if condition(latest):
+                    return latest
+            if not self.is_running:
+                await self.ended()
+                raise AssertionError("\n".join([f"{self.name} ended with {self.exit_status}:", *self.lines]))
+            await asyncio.sleep(POLL_S)
+        raise AssertionError(f"{self.name} did not come to that; it says: {json.dumps(latest)}")
 
     async def until_linked(self, timeout_s: float = PATIENCE_S) -> Status:
-        """Wait until every peer is up."""
         return await self.until(
             lambda status: all(peer["state"] == "up" for peer in status["peers"].values()), timeout_s
         )
@@ -263,7 +229,7 @@ class DaemonProcess:
 
     async def until_logged(self, name: str, *, timeout_s: float = PATIENCE_S, **facts: object) -> dict[str, Any]:
         """Wait for a log line, and return the newest such."""
-        await self._changes.until(lambda: bool(self.events(name, **facts)), timeout_s)
+        await waiting.until(lambda: bool(self.events(name, **facts)), timeout_s)
         return self.events(name, **facts)[-1]
 
     @property

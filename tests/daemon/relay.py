@@ -11,14 +11,11 @@ from tests.daemon.udp import Sockaddr, open_socket
 
 
 class End(StrEnum):
-    """The two ends of a relay."""
-
     A = "a"
     B = "b"
 
     @property
     def other(self) -> End:
-        """The other one."""
         return End.B if self is End.A else End.A
 
 
@@ -48,14 +45,12 @@ class Relay:
             side.sock.sendto(datagram, side.correspondent)
 
     async def open(self) -> None:
-        """Open both sockets."""
         loop = asyncio.get_running_loop()
         for end in End:
             side = self._sides[end] = _RelaySide(self, end)
             await loop.create_datagram_endpoint(lambda side=side: side, sock=side.sock)  # type: ignore[misc]
 
     def close(self) -> None:
-        """Close both sockets."""
         for side in self._sides.values():
             side.transport.close()
 

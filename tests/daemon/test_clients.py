@@ -11,11 +11,14 @@ from pathlib import Path
 
 import pytest
 
-from tests.daemon.fleet import Cable, drone_and_ground, held_back
+from tests import waiting
+from tests.daemon.fleet import drone_and_ground, held_back
 from tests.daemon.harness import Stage
 from tests.daemon.process import DaemonProcess
 from tests.lab.sim import scenarios
 from tests.lab.sim.scenarios import Seen
+from uavlinkd.lab.mitm.modem import ModemSettings
+from uavlinkd.lab.mitm.modem_ports import ModemPorts, PortSettings
 from uavlinkd.lab.sim.autopilot import AutopilotSettings
 from uavlinkd.lab.sim.flight import Flight
 from uavlinkd.lab.sim.loopback_ports import free_port
@@ -25,7 +28,7 @@ SYSTEM = 3
 
 @asynccontextmanager
 async def flying(
-    stage: Stage, *, drone_url: str, flight_url: str, ground_url: str
+    stage: Stage, drone_url: str, flight_url: str, ground_url: str
 ) -> AsyncIterator[tuple[Flight, DaemonProcess, DaemonProcess]]:
     """An autopilot, its daemon, and the ground station's: all linked."""
     drone, ground = drone_and_ground(stage, system=SYSTEM)
@@ -55,7 +58,7 @@ async def check(
         if daemon is drone:
             assert reported["frames_received"] > 15, "it went another way"
             arrived = reported["frames_received"]
-            await flight.until(lambda arrived=arrived: flight.report().frames_received >= arrived)  # type: ignore[misc]
+            await waiting.until(lambda arrived=arrived: flight.report().frames_received >= arrived)  # type: ignore[misc]
         else:
             assert reported["frames_received"] > 200, "it went another way"
 
@@ -64,15 +67,19 @@ async def test_mavutil_flies_through_a_serial_port(stage: Stage) -> None:
     """mavutil on a serial port, the autopilot a TCP server: connect, parameters, mission, arm, up, down."""
     scenarios.need("pymavlink.mavutil")
     port = free_port()
-    with Cable() as cable:
-        daemons_end, stations_end = cable.ends
+    fast = ModemSettings(air_bits_s=1e6, line_baud=115_200, turn_around_s=0.0, queue_bytes=1 << 16)
+    ports = ModemPorts(PortSettings(stage.folder / "left", stage.folder / "right", fast))
+    await ports.start()
+    try:
         async with flying(
             stage,
             drone_url=f"tcp:127.0.0.1:{port}",
             flight_url=f"tcpin:127.0.0.1:{port}",
-            ground_url=f"serial:{daemons_end}:115200",
+            ground_url=f"serial:{ports.settings.left}:115200",
         ) as (flight, drone, ground):
-            await check(flight, drone, ground, lambda: scenarios.fly_with_mavutil(stations_end))
+            await check(flight, drone, ground, lambda: scenarios.fly_with_mavutil(str(ports.settings.right)))
+    finally:
+        await ports.stop()
 
 
 @pytest.mark.long
@@ -91,28 +98,19 @@ async def test_mavproxy_flies_through_tcp(stage: Stage, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("client", "drone_url", "flight_url", "ground_url", "station_url", "fly"),
+    ("client", "kinds", "fly"),
     [
-        ("pymavlink.mavutil", "udpin", "udpout", "udpout", "udpin", scenarios.fly_with_mavutil),
-        ("mavsdk.asyncio", "tcpin", "tcp", "udpin", "udpout", scenarios.fly_with_mavsdk),
+        ("pymavlink.mavutil", ("udpin", "udpout", "udpout", "udpin"), scenarios.fly_with_mavutil),
+        ("mavsdk.asyncio", ("tcpin", "tcp", "udpin", "udpout"), scenarios.fly_with_mavsdk),
     ],
 )
 async def test_client_flies_through_udp(
-    stage: Stage,
-    client: str,
-    drone_url: str,
-    flight_url: str,
-    ground_url: str,
-    station_url: str,
-    fly: Callable[[str], Awaitable[Seen]],
+    stage: Stage, client: str, kinds: tuple[str, str, str, str], fly: Callable[[str], Awaitable[Seen]]
 ) -> None:
     """A client that listens or calls on UDP: connect, parameters, mission, arm, up, down."""
     scenarios.need(client)
     air, ground_at = f"127.0.0.1:{free_port()}", f"127.0.0.1:{free_port()}"
-    urls = {
-        "drone_url": f"{drone_url}:{air}",
-        "flight_url": f"{flight_url}:{air}",
-        "ground_url": f"{ground_url}:{ground_at}",
-    }
-    async with flying(stage, **urls) as (flight, drone, ground):
-        await check(flight, drone, ground, lambda: fly(f"{station_url}:{ground_at}"))
+    drone_kind, flight_kind, ground_kind, station_kind = kinds
+    urls = f"{drone_kind}:{air}", f"{flight_kind}:{air}", f"{ground_kind}:{ground_at}"
+    async with flying(stage, *urls) as (flight, drone, ground):
+        await check(flight, drone, ground, lambda: fly(f"{station_kind}:{ground_at}"))

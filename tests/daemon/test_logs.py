@@ -1,4 +1,4 @@
-"""What a daemon writes: for people on a terminal, JSON elsewhere, and no secret in either."""
+"""What a daemon writes: for people on a terminal, JSON elsewhere; lost peers, and peers of another version."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from datetime import datetime
 
 from tests.daemon.frames import frame
 from tests.daemon.harness import Stage
+from tests.daemon.process import Status
+from uavlinkd.core.constants import PROTOCOL_VERSION
 
 
 async def test_lines_are_json_without_a_terminal(stage: Stage) -> None:
@@ -15,10 +17,9 @@ async def test_lines_are_json_without_a_terminal(stage: Stage) -> None:
     a, b = stage.pair()
     await stage.start(a, b)
     await a.stop()
-    parsed = [json.loads(line) for line in a.lines]
     (started,) = a.events("daemon_started")
     assert (started["listen"], started["peers"]) == (a.config["listen"], ["drone1"])
-    for line in parsed:
+    for line in map(json.loads, a.lines):
         assert re.fullmatch("[a-z][a-z_]*", line["event"])
         assert line["level"] in ("info", "warning")
         assert line["daemon"] == "drone0"
@@ -27,21 +28,9 @@ async def test_lines_are_json_without_a_terminal(stage: Stage) -> None:
         assert not offset
 
 
-async def test_a_terminal_gets_lines_for_people(stage: Stage) -> None:
-    """On a terminal the lines are coloured text and no JSON."""
-    a, b = stage.pair()
-    await a.start(on_terminal=True)
-    await stage.start(b)
-    await a.stop()
-    text = "\n".join(a.lines)
-    assert "daemon_started" in text
-    assert "\x1b[" in text
-    assert not a.events()
-
-
 async def test_a_peer_that_falls_silent_is_reported_lost_and_found(stage: Stage) -> None:
     """A peer whose power fails is lost in the log and the status within its time, and up again when it is back."""
-    a, b = stage.pair(echo_after_s=0.1, handshake_after_s=0.2, lost_after_s=0.5, probe_interval_s=0.2)
+    a, b = stage.pair(lost_after_s=0.5, probe_interval_s=0.2)
     into = a.add_endpoint("autopilot")
     await stage.start(a, b)
     client = await stage.client()
@@ -56,12 +45,20 @@ async def test_a_peer_that_falls_silent_is_reported_lost_and_found(stage: Stage)
     assert len(a.events("peer_up")) == 2
 
 
-async def test_a_wrong_psk_is_explained(stage: Stage) -> None:
-    """Two daemons with different PSKs do not link, and the log says what that may be; the PSK is not in it."""
-    a, b = stage.daemon("drone0"), stage.daemon("drone1")
-    a.add_peer(b, [b.address], stage.psk())
-    b.add_peer(a, [a.address], stage.psk())
-    await stage.start(a, b, linked=False)
-    reported = await a.until_logged("datagrams_dropped", reason="bad_handshake")
-    assert "PSK" in reported["meaning"]
-    assert (await a.status())["peers"]["drone1"]["state"] == "waiting"
+def remedies(status: Status, name: str) -> dict[str, str]:
+    """What to do about a peer, by cause."""
+    return {one["cause"]: one["remedy"] for one in status["findings"] if one["name"] == name}
+
+
+async def test_both_name_the_older_side_if_versions_differ(stage: Stage) -> None:
+    """The log and the status of both say which side to update, and that no key seems to be wrong."""
+    older, newer = stage.pair()
+    newer.protocol_version = PROTOCOL_VERSION + 1
+    await stage.start(older, newer, linked=False)
+    for daemon, peer in ((older, newer), (newer, older)):
+        status = await daemon.until(lambda status, name=peer.name: "other_version" in remedies(status, name))  # type: ignore[misc]
+        found = remedies(status, peer.name)
+        assert found["other_version"].startswith(f"update uavlinkd at {older.name}")
+        assert not {"wrong_key_here", "wrong_key_there"} & set(found)
+        line = await daemon.until_logged("datagrams_dropped", reason="other_version")
+        assert peer.address in line["last"]

@@ -8,7 +8,6 @@ from typing import Any
 
 
 def to_toml(config: Mapping[str, Any]) -> str:
-    """A configuration file, of plain values."""
     lines = [f"{key} = {_value(value)}" for key, value in config.items() if not _is_table(value)]
     for key, value in config.items():
         if isinstance(value, dict):

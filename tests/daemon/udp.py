@@ -5,10 +5,12 @@ from __future__ import annotations
 import asyncio
 import socket
 from collections.abc import Callable, Sequence
+from time import monotonic
 from typing import Any
 
+from tests import waiting
+from tests.daemon.frames import frames_in
 from tests.waiting import PATIENCE_S
-from uavlinkd.lab.sim.links import ChangeNotifier
 
 BUFFER_BYTES = 1 << 21
 
@@ -17,7 +19,6 @@ Sockaddr = tuple[str, int]
 
 
 def shown(address: Sockaddr) -> str:
-    """``host:port``, IPv6 in brackets."""
     host, port = address
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
@@ -32,13 +33,13 @@ def open_socket(host: str, port: int = 0) -> socket.socket:
 
 
 class Client(asyncio.DatagramProtocol):
-    """A UDP socket that keeps what comes, byte for byte. It does not know what MAVLink is."""
+    """A UDP socket that keeps what comes, byte for byte, and when."""
 
     def __init__(self, sock: socket.socket) -> None:
         self.datagrams: list[bytes] = []
+        self.arrived_at: list[float] = []
         self.sources: list[Sockaddr] = []
         self.received = bytearray()
-        self._changes = ChangeNotifier()
         self._sock = sock
         self._transport: asyncio.BaseTransport
 
@@ -47,17 +48,26 @@ class Client(asyncio.DatagramProtocol):
 
     @property
     def address(self) -> Sockaddr:
-        """Where it is."""
         host, port = self._sock.getsockname()[:2]
         return host, port
+
+    @property
+    def arrivals(self) -> list[tuple[float, bytes]]:
+        """When each frame came, in their order."""
+        datagrams = zip(self.arrived_at, self.datagrams, strict=True)
+        return [(at, frame) for at, datagram in datagrams for frame in frames_in(datagram)]
+
+    @property
+    def frames(self) -> list[bytes]:
+        return [frame for datagram in self.datagrams for frame in frames_in(datagram)]
 
     def send(self, datagram: bytes, to: Sockaddr) -> None:
         """Send one datagram. Not through the transport: that swallows empty ones."""
         self._sock.sendto(datagram, to)
 
     def clear(self) -> None:
-        """Forget what has come."""
         self.datagrams.clear()
+        self.arrived_at.clear()
         self.sources.clear()
         self.received.clear()
 
@@ -67,14 +77,12 @@ class Client(asyncio.DatagramProtocol):
         Raises:
             TimeoutError: it does not hold in time.
         """
-        await self._changes.until(condition, timeout_s)
+        await waiting.until(condition, timeout_s)
 
     async def until_received(self, data: bytes, timeout_s: float = PATIENCE_S) -> None:
-        """Wait until these bytes are among those that came."""
         await self.until(lambda: data in self.received, timeout_s)
 
     def close(self) -> None:
-        """Close the socket."""
         self._transport.close()
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -82,13 +90,12 @@ class Client(asyncio.DatagramProtocol):
 
     def datagram_received(self, data: bytes, addr: tuple[str | Any, int]) -> None:
         self.datagrams.append(data)
+        self.arrived_at.append(monotonic())
         self.sources.append(addr[:2])
         self.received += data
-        self._changes.notify()
 
 
 async def open_client(host: str = "127.0.0.1", port: int = 0) -> Client:
-    """A client with a socket there."""
     sock = open_socket(host, port)
     _, client = await asyncio.get_running_loop().create_datagram_endpoint(lambda: Client(sock), sock=sock)
     return client
@@ -101,7 +108,6 @@ async def pour(
     sink: Client,
     *,
     lost: frozenset[int] = frozenset(),
-    per_datagram: int = 1,
     window_bytes: int = 32768,
 ) -> None:
     """Send frames, and assert that they come out byte for byte and in order, all but those numbered in ``lost``.
@@ -111,10 +117,9 @@ async def pour(
     assert not sink.received
     expected = b"".join(frame for number, frame in enumerate(frames) if number not in lost)
     due = 0
-    for start in range(0, len(frames), per_datagram):
-        numbers = range(start, min(start + per_datagram, len(frames)))
-        source.send(b"".join(frames[number] for number in numbers), into)
-        due += sum(len(frames[number]) for number in numbers if number not in lost)
+    for number, sent in enumerate(frames):
+        source.send(sent, into)
+        due += len(sent) if number not in lost else 0
         if due - len(sink.received) > window_bytes:
             await _until_received(sink, expected, due - window_bytes // 2)
     await _until_received(sink, expected, len(expected))

@@ -27,7 +27,7 @@ from tests.waiting import Stopwatch, until
 from uavlinkd.lab.sim.loopback_ports import free_port
 
 SUSPENDED_S = float(os.environ.get("UAVLINKD_SIGSTOP_S", FAULT_S))
-"""How long a process is stopped; 30 in CI."""
+"""How long a process is stopped; 10 in CI."""
 LINES_AT_MOST = 12
 """That a daemon may log for one of these faults, and two more each ten seconds."""
 
@@ -77,7 +77,6 @@ class _Exhausted:
         self._ends: tuple[int, int] = (-1, -1)
 
     def exhaust(self) -> None:
-        """Take what is left away, and then ask for some."""
         pid = self.daemon.pid
         self._limits = resource.prlimit(pid, resource.RLIMIT_NOFILE)
         taken = self._descriptors()
@@ -98,11 +97,9 @@ class _Exhausted:
         return socket.create_connection(self._tcp)
 
     def relieve(self) -> None:
-        """Give it back."""
         resource.prlimit(self.daemon.pid, resource.RLIMIT_NOFILE, self._limits)
 
     async def back(self) -> None:
-        """Wait until everybody has got what it wanted."""
         await self.daemon.until(self._is_back)
 
     def _is_back(self, status: Status) -> bool:
@@ -183,7 +180,7 @@ async def recording_disk_full(stage: Stage) -> Outcome:
 
 async def log_disk_full(stage: Stage) -> Outcome:
     """The disk for the log is full, while links go and come; and has room again."""
-    a, b = stage.pair(echo_after_s=0.1, handshake_after_s=0.2, lost_after_s=0.5)
+    a, b = stage.pair(lost_after_s=0.5)
     folder = a.folder / "logs"
     folder.mkdir()
     into, into_other = a.add_endpoint("one"), a.add_endpoint("other")
@@ -307,7 +304,6 @@ class NameServer(asyncio.DatagramProtocol):
         self._transport.sendto(header + data[12:end] + record, addr)
 
     def close(self) -> None:
-        """Be gone."""
         self._transport.close()
 
 

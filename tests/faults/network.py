@@ -4,133 +4,115 @@ from __future__ import annotations
 
 import asyncio
 import os
-from collections.abc import Awaitable, Callable
+from collections.abc import Mapping
 from time import monotonic
+from typing import NamedTuple
 
 from tests.daemon.harness import Stage
 from tests.daemon.process import DaemonProcess
-from tests.faults.cable import ADDRESSES, PORT, Cable
+from tests.daemon.two_hosts import ONLY, PORT, TwoHosts, address_of, interface_of
 from tests.faults.talk import Log, Outcome, grew, reported
 from tests.waiting import PATIENCE_S
-from uavlinkd.link.drop_summary import EVERYDAY
+from uavlinkd.link.drop_summary import EVERYDAY_ERRORS
 
 FAULT_S = float(os.environ.get("UAVLINKD_FAULT_S", "4"))
 """How long a fault lasts: longer than a peer may be silent (3 s)."""
-_NET = f"{ADDRESSES[0].rpartition('.')[0]}.0/24"
+_DEVICE, _PEER = interface_of(ONLY), address_of(ONLY, 2)
+_NET = f"{address_of(ONLY, 0)}/24"
 
-Step = Callable[[Cable], Awaitable[None]]
+
+class NetworkFault(NamedTuple):
+    what: str
+    begin: str
+    """Shell commands there."""
+    end: str
+    errors: tuple[str, ...]
+    """Those that may be counted."""
 
 
-async def _suffer(stage: Stage, victim: str, begin: Step, end: Step, *names: str) -> Outcome:
-    """Break the network of a talking daemon, and mend it. ``names``: of the errors that may be counted."""
-    async with Cable(stage, victim) as cable:
-        daemon = cable.victim
+NETWORK_FAULTS: Mapping[str, NetworkFault] = {
+    "interface_down": NetworkFault(
+        "the interface is down",
+        f"ip link set {_DEVICE} down",
+        f"ip link set {_DEVICE} up",
+        ("ENETUNREACH", "EINVAL"),
+    ),
+    "interface_gone": NetworkFault(
+        "the interface and its address are deleted", f"ip link delete {_DEVICE}", "", ("ENETUNREACH", "EINVAL")
+    ),
+    "route_gone": NetworkFault(
+        "network unreachable: the route is removed",
+        f"ip route delete {_NET} dev {_DEVICE}",
+        f"ip route add {_NET} dev {_DEVICE}",
+        ("ENETUNREACH",),
+    ),
+    "route_prohibited": NetworkFault(
+        "the route is prohibited (`EACCES`)",
+        f"ip route add prohibit {_PEER}",
+        f"ip route delete prohibit {_PEER}",
+        ("EACCES",),
+    ),
+    "firewall": NetworkFault(
+        "a firewall forbids sending (`EPERM`)",
+        "nft 'add table inet fault; add chain inet fault out { type filter hook output priority 0; };"
+        f" add rule inet fault out udp dport {PORT} drop'",
+        "nft delete table inet fault",
+        ("EPERM",),
+    ),
+    "buffers_full": NetworkFault(
+        "no room in the socket's buffer (`EAGAIN`)",
+        f"tc qdisc add dev {_DEVICE} root tbf rate 8kbit burst 2000 limit 50m",
+        f"tc qdisc delete dev {_DEVICE} root",
+        ("EAGAIN", "ENOBUFS"),
+    ),
+}
+
+
+async def suffer(stage: Stage, name: str) -> Outcome:
+    """Break the network of a talking daemon, and mend it. Every other fault befalls one on asyncio's own loop."""
+    fault, names = NETWORK_FAULTS[name], ("drone0", "drone1")
+    is_odd = list(NETWORK_FAULTS).index(name) % 2
+    async with TwoHosts(stage, [ONLY], names[::-1] if is_odd else names) as hosts:
+        await hosts.start()
+        daemon = hosts.vehicle
         before, log = await daemon.status(), Log(daemon)
-        await begin(cable)
+        hosts.run(fault.begin)
+        if name == "buffers_full":
+            await _fill(hosts)
         await asyncio.sleep(FAULT_S)
         during = await daemon.status()
         failures = grew(before, during, "send_failures")
         assert failures, "the fault did not come about"
-        assert set(failures) <= set(names), failures
-        state = during["peers"][cable.other.name]["state"]
-        await end(cable)
-        recovered_s = await cable.talk.back(monotonic())
-        cable.talk.check_no_copies()
-        await check_reported(daemon, *failures)
+        assert set(failures) <= set(fault.errors), failures
+        state = during["peers"][hosts.ground.name]["state"]
+        if fault.end:
+            hosts.run(fault.end)
+        else:
+            hosts.plug_in(ONLY)
+            hosts.configure(ONLY)
+        recovered_s = await hosts.talk.back(monotonic())
+        hosts.talk.check_no_copies()
+        await _check_reported(daemon, *failures)
         return Outcome(f"sends failed: {reported(failures)}; peer {state}", recovered_s, log.count)
 
 
-async def check_reported(daemon: DaemonProcess, *names: str) -> None:
+async def _fill(hosts: TwoHosts) -> None:
+    """Send until the socket's buffer is full of what waits for the interface."""
+    deadline = monotonic() + PATIENCE_S
+    while not (await hosts.vehicle.status())["send_failures"]:
+        assert monotonic() < deadline, "a buffer without end"
+        for _ in range(200):
+            hosts.talk.voices[0].shout()
+        await asyncio.sleep(0.01)
+
+
+async def _check_reported(daemon: DaemonProcess, *names: str) -> None:
     """Each error has a line in the log, under its name; and none more than a line each ten seconds.
 
     A full buffer is an everyday error: the log has it only if it persists for longer than this fault.
     """
     for name in names:
-        if name not in EVERYDAY:
+        if name not in EVERYDAY_ERRORS:
             await daemon.until_logged("sends_failed", reason=name)
         lines = daemon.events("sends_failed", reason=name)
         assert len(lines) <= 2 + FAULT_S / 10, (name, len(lines))
-
-
-async def interface_down(stage: Stage) -> Outcome:
-    """The interface is set down, and up again."""
-
-    async def begin(cable: Cable) -> None:
-        await cable.ip("link", "set", "eth0", "down")
-
-    async def end(cable: Cable) -> None:
-        await cable.ip("link", "set", "eth0", "up")
-
-    return await _suffer(stage, "drone0", begin, end, "ENETUNREACH", "EINVAL")
-
-
-async def interface_gone(stage: Stage) -> Outcome:
-    """The interface is deleted with its address, and another is made."""
-
-    async def begin(cable: Cable) -> None:
-        await cable.ip("link", "delete", "eth0")
-
-    async def end(cable: Cable) -> None:
-        await cable.plug_in()
-        await cable.configure()
-
-    return await _suffer(stage, "drone1", begin, end, "ENETUNREACH", "EINVAL")
-
-
-async def route_gone(stage: Stage) -> Outcome:
-    """No route leads to the peer: the network is unreachable."""
-
-    async def begin(cable: Cable) -> None:
-        await cable.ip("route", "delete", _NET, "dev", "eth0")
-
-    async def end(cable: Cable) -> None:
-        await cable.ip("route", "add", _NET, "dev", "eth0")
-
-    return await _suffer(stage, "drone0", begin, end, "ENETUNREACH")
-
-
-async def route_prohibited(stage: Stage) -> Outcome:
-    """An administrator prohibits the way to the peer."""
-
-    async def begin(cable: Cable) -> None:
-        await cable.ip("route", "add", "prohibit", ADDRESSES[1])
-
-    async def end(cable: Cable) -> None:
-        await cable.ip("route", "delete", "prohibit", ADDRESSES[1])
-
-    return await _suffer(stage, "drone1", begin, end, "EACCES")
-
-
-async def firewall(stage: Stage) -> Outcome:
-    """A firewall forbids sending to the peers' port."""
-
-    async def begin(cable: Cable) -> None:
-        await cable.say("nft", "add table inet fault")
-        await cable.say("nft", "add chain inet fault out { type filter hook output priority 0 ; }")
-        await cable.say("nft", f"add rule inet fault out udp dport {PORT} drop")
-
-    async def end(cable: Cable) -> None:
-        await cable.say("nft", "delete table inet fault")
-
-    return await _suffer(stage, "drone0", begin, end, "EPERM")
-
-
-async def buffers_full(stage: Stage) -> Outcome:
-    """The interface sends next to nothing, and the socket's buffer is full of what waits for it."""
-
-    async def begin(cable: Cable) -> None:
-        await cable.say(
-            *("tc", "qdisc", "add", "dev", "eth0", "root", "tbf", "rate", "8kbit", "burst", "2000", "limit", "50m")
-        )
-        loop = asyncio.get_running_loop()
-        deadline = loop.time() + PATIENCE_S
-        while not (await cable.victim.status())["send_failures"]:
-            assert loop.time() < deadline, "a buffer without end"
-            for _ in range(200):
-                cable.talk.voices[0].shout()
-            await asyncio.sleep(0.01)
-
-    async def end(cable: Cable) -> None:
-        await cable.say("tc", "qdisc", "delete", "dev", "eth0", "root")
-
-    return await _suffer(stage, "drone1", begin, end, "EAGAIN", "ENOBUFS")

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import asyncio
-import os
-import shutil
 from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 
-from tests.compose.test_namespaces import can_make_namespaces
 from tests.daemon.harness import Stage
 from tests.daemon.process import DaemonProcess
 from tests.faults import machine, network
 from tests.faults.talk import Outcome
+from tests.namespaces import why_not as why_no_namespaces
 
 AT_ONCE = 8
 """Faults that are there at the same time: mostly they wait."""
@@ -34,10 +33,7 @@ class _Stage(Stage):
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """One thing that goes wrong."""
-
     what: str
-    """For the table."""
     happen: Callable[[Stage], Awaitable[Outcome]]
     takes_root: bool = False
 
@@ -45,12 +41,10 @@ class Fault:
 FAULTS: Mapping[str, Fault] = {
     "suspended": Fault("the process is stopped (`SIGSTOP`)", machine.suspended),
     "descriptors": Fault("no file descriptors (`RLIMIT_NOFILE`)", machine.descriptors, True),
-    "buffers_full": Fault("no room in the socket's buffer (`EAGAIN`)", network.buffers_full, True),
-    "firewall": Fault("a firewall forbids sending (`EPERM`)", network.firewall, True),
-    "route_prohibited": Fault("the route is prohibited (`EACCES`)", network.route_prohibited, True),
-    "route_gone": Fault("network unreachable: the route is removed", network.route_gone, True),
-    "interface_down": Fault("the interface is down", network.interface_down, True),
-    "interface_gone": Fault("the interface and its address are deleted", network.interface_gone, True),
+    **{
+        name: Fault(fault.what, partial(network.suffer, name=name), True)
+        for name, fault in network.NETWORK_FAULTS.items()
+    },
     "name_service_gone": Fault("no name server, the peer given by name", machine.name_service_gone, True),
     "name_service_silent": Fault("a name server that answers nothing", machine.name_service_silent, True),
     "recording_disk_full": Fault("the disk for recordings is full", machine.recording_disk_full, True),
@@ -62,10 +56,7 @@ FAULTS: Mapping[str, Fault] = {
 
 def why_not() -> str | None:
     """What is missing here for the faults that take root; None for nothing."""
-    if not can_make_namespaces():
-        return "root, and iproute2 with network namespaces"
-    missing = [name for name in ("nft", "tc", "unshare", "mount") if shutil.which(name) is None]
-    return f"{', '.join(missing)} (Debian: nftables, iproute2, util-linux)" if missing else None
+    return why_no_namespaces("nft", "tc", "unshare", "mount")
 
 
 async def happen(names: Iterable[str]) -> dict[str, Outcome | BaseException]:
@@ -82,7 +73,6 @@ async def happen(names: Iterable[str]) -> dict[str, Outcome | BaseException]:
 
 
 def markdown(outcomes: Mapping[str, Outcome | BaseException]) -> str:
-    """The table."""
     rows = ["| fault | what the daemon did | back after | log lines |", "|---|---|--:|--:|"]
     for name, outcome in outcomes.items():
         if isinstance(outcome, Outcome):
@@ -91,8 +81,3 @@ def markdown(outcomes: Mapping[str, Outcome | BaseException]) -> str:
             cells = (f"FAILED: {type(outcome).__name__}: {(str(outcome).splitlines() or [''])[0][:100]}", "", "")
         rows.append(f"| {FAULTS[name].what} | {' | '.join(cells)} |")
     return "\n".join(rows)
-
-
-def fault_seconds() -> str:
-    """How long each lasted, for the table's head."""
-    return os.environ.get("UAVLINKD_FAULT_S", f"{network.FAULT_S:g}")

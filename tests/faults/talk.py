@@ -12,11 +12,12 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from tests.compose.cluster import socket_in
-from tests.daemon.frames import frame, pack
+from tests.daemon.frames import frame
 from tests.daemon.losses import lost_to_waiting
 from tests.daemon.process import DaemonProcess, Status
 from tests.daemon.udp import Sockaddr, open_socket
+from tests.namespaces import udp_socket_in
+from tests.samples import pack
 from tests.waiting import PATIENCE_S, Stopwatch, until
 
 EVERY_S = 0.02
@@ -27,8 +28,6 @@ _SYSTEM_AT = 5
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What a fault did."""
-
     did: str
     """What the daemon did meanwhile, with its own counts."""
     recovered_s: float
@@ -50,7 +49,6 @@ class Voice:
         self._hears = hears
 
     def frame(self, number: int) -> bytes:
-        """Its frame with this number."""
         return frame(number, self._system)
 
     async def speak(self) -> None:
@@ -106,7 +104,6 @@ class Talk:
         await until(lambda: all(voice.received_at for voice in self.voices))
 
     def stop(self) -> None:
-        """Fall silent."""
         for task in self._tasks:
             task.cancel()
 
@@ -157,7 +154,6 @@ class Talk:
         assert lost <= dropped, f"{lost} frames lost, {dropped} of them explained"
 
     def check_no_copies(self) -> None:
-        """No frame was received twice."""
         assert [voice.copies for voice in self.voices] == [0, 0]
 
 
@@ -178,7 +174,7 @@ def prepare(
     """Give each an endpoint, in its network namespace, and a client there."""
     voices = [
         voice(
-            open_socket("127.0.0.1") if namespace is None else socket_in(namespace),
+            open_socket("127.0.0.1") if namespace is None else udp_socket_in(namespace),
             daemon.add_endpoint("talk"),
             system,
             3 - system,
@@ -200,7 +196,6 @@ class Log:
 
     @property
     def count(self) -> int:
-        """How many lines."""
         return len(self.daemon.lines) - self._begin
 
 
@@ -214,5 +209,4 @@ def grew(before: Status, after: Status, *path: str) -> dict[str, int]:
 
 
 def reported(counts: dict[str, int]) -> str:
-    """For the table."""
     return ", ".join(f"{name} {count}" for name, count in sorted(counts.items())) or "nothing"

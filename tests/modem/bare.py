@@ -23,7 +23,6 @@ class CarefulCodec(mavlink.MAVLink):  # type: ignore[misc]  # pymavlink has no t
     """pymavlink's codec, which forgets the timestamp of a frame whose signature is wrong."""
 
     def check_signature(self, *arguments: Any) -> bool:
-        """Verify the signature of a frame."""
         before = dict(self.signing.stream_timestamps)
         is_valid = bool(super().check_signature(*arguments))
         if not is_valid:
@@ -44,7 +43,6 @@ class BareLine:
         self._codecs = {ModemEnd.LEFT: _keyed(codec, 1), ModemEnd.RIGHT: _keyed(codec, 2)}
 
     def send(self, what: Offered) -> None:
-        """Sign and write a message now."""
         end = ModemEnd.LEFT if what.system == VEHICLE else ModemEnd.RIGHT
         codec = self._codecs[end]
         codec.srcSystem, codec.srcComponent = what.system, 1
@@ -53,7 +51,6 @@ class BareLine:
         self.link.write(end, frame, self.now)
 
     def run(self, until: float) -> None:
-        """Let time pass."""
         while (at := self.link.next_deadline()) <= until:
             self.now = max(self.now, at)
             for end, data in self.link.advance(self.now):

@@ -10,20 +10,19 @@ from random import Random
 from typing import Final
 
 from tests.link.two_radios import End, Network, Radio
-from uavlinkd.config.serial_rules import SENDING_SHARE
+from uavlinkd.config.network_rules import SENDING_SHARE
 from uavlinkd.core.constants import LINE_BYTES
-from uavlinkd.core.envelope_limit import limit_at
 from uavlinkd.core.path import SERIAL_HOST, Path
+from uavlinkd.core.path_measures import limit_at
 from uavlinkd.core.settings import Link
 from uavlinkd.endpoints.line_framing import LineDecoder, encode
 from uavlinkd.lab.mitm.attack import Intervention
 from uavlinkd.lab.mitm.line_attacks import LineAttacker
 from uavlinkd.lab.mitm.modem import ModemEnd, ModemLink, ModemSettings
-from uavlinkd.link.line_rate import LineRate
+from uavlinkd.link.serial_networks import LineRate
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
 
 LINE: Final = Path(0, (SERIAL_HOST, 0))
-"""The path of both ends."""
 
 
 class LineNetwork(Network):
@@ -49,7 +48,6 @@ class LineNetwork(Network):
         self._rates_at = 1.0
 
     def transmit(self, sender: End, datagram: bytes, path: Path) -> None:
-        """Write a datagram to the line."""
         assert path == LINE, path
         self.modems.write(self._end_of[sender], encode(datagram), self.now)
 
@@ -71,7 +69,6 @@ class LineNetwork(Network):
         self.now = until
 
     def _follow_rates(self) -> None:
-        """As :func:`uavlinkd.link.network_budgets.follow_rates`."""
         self._rates_at = self.now + 1.0
         for end, rate in self.rates.items():
             for state in end.peer.paths.states:
@@ -97,7 +94,6 @@ class LineNetwork(Network):
         self._set_device(end, is_up=False)
 
     def plug(self, end: ModemEnd) -> None:
-        """Put a modem back; its daemon opens the device again."""
         self.modems.plug(end, self.now)
         self._set_device(end, is_up=True)
 

@@ -28,7 +28,6 @@ class Result:
     linked_after_s: float
     """Time until both ends had a session; 0 on the bare line."""
     offered_s: float
-    """Telemetry frames a second."""
     delivered_s: float
     critical_vehicle: float
     """Share of the vehicle's heartbeats that arrived."""
@@ -50,7 +49,6 @@ class Result:
 def on_bare_line(
     modem: ModemSettings, seconds: float, factor: float, codec: type[Any] = CarefulCodec, seed: int = 1
 ) -> Result:
-    """MAVLink signing alone."""
     line = BareLine(modem, seed, codec)
     messages = offered(seconds, factor)
     for what in messages:

@@ -13,7 +13,6 @@ Message = Any  # a pymavlink message: pymavlink has no types
 Make = Callable[[int], Message]
 
 VEHICLE, STATION = 1, 255
-"""Their system IDs."""
 CRITICAL: Final = frozenset({mavlink.MAVLINK_MSG_ID_HEARTBEAT, mavlink.MAVLINK_MSG_ID_COMMAND_LONG})
 
 # Every field that could be zero is not: pymavlink truncates zeros at the end of a payload.
@@ -43,15 +42,12 @@ def _command(number: int) -> Message:
 
 @dataclass(frozen=True, slots=True)
 class Offered:
-    """A message, when it is sent, and by which system."""
-
     at: float
     system: int
     message: Message
 
     @property
     def is_critical(self) -> bool:
-        """Whether it is a heartbeat or a command."""
         return int(self.message.get_msgId()) in CRITICAL
 
 
@@ -65,7 +61,6 @@ def offered(until: float, factor: float) -> list[Offered]:
 
 
 def telemetry_bytes_s() -> float:
-    """Bytes a second of the telemetry at factor 1, unsigned."""
     codec = mavlink.MAVLink(None)
     return sum(rate * len(make(1).pack(codec)) for make, rate in _TELEMETRY.items())
 
@@ -87,11 +82,9 @@ class Arrivals:
     """Delivered frames that were not sent, or were delivered before."""
 
     def send(self, frame: bytes, what: Offered, now: float) -> None:
-        """A frame was sent."""
         self.sent[frame] = now, what
 
     def deliver(self, frame: bytes, now: float) -> None:
-        """A frame was delivered."""
         if frame not in self.sent or frame in self.ages_s:
             self.foreign += 1
         else:
@@ -107,5 +100,4 @@ class Arrivals:
         return sum(frame in self.ages_s for frame in chosen) / len(chosen)
 
     def delivered(self, system: int) -> list[bytes]:
-        """The frames of a system that arrived."""
         return [frame for frame in self.ages_s if self.sent[frame][1].system == system]

@@ -6,7 +6,6 @@ import asyncio
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 from time import monotonic
 from typing import Final
 
@@ -42,8 +41,6 @@ class Outcome:
 
 @dataclass(frozen=True, slots=True)
 class Ends:
-    """Two daemons, and their clients."""
-
     daemons: tuple[DaemonProcess, DaemonProcess]
     talk: Talk
 
@@ -66,7 +63,6 @@ async def connect_all(
 
 
 def make_relay(stage: Stage, public: Place) -> DaemonProcess:
-    """A relay without members."""
     relay = stage.daemon(RELAY, _addresses(public, public.address, public.ipv6, PORT))
     relay.command = "relay"
     relay.launcher = public.host.launcher
@@ -87,8 +83,8 @@ def make_ends(
     psk = stage.psk()
     one.add_peer(other, [], psk)
     other.add_peer(one, [], psk)
-    first, second = (Path("/run/netns", place.host.name) for place in places)
-    return Ends((one, other), prepare(one, other, (first, second), voice))
+    namespaces = places[0].host.path, places[1].host.path
+    return Ends((one, other), prepare(one, other, namespaces, voice))
 
 
 def _member(stage: Stage, relay: DaemonProcess, name: str, listen: Sequence[str], place: Place) -> DaemonProcess:

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping, Sequence
-from contextlib import redirect_stdout
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
-from io import StringIO
-from statistics import median
 from time import monotonic
 from types import MappingProxyType
 from typing import Final
@@ -22,7 +19,6 @@ from tests.waiting import until
 DELAY_S: Final = 0.025
 """Of each place's line, in each direction: a round trip of 100 ms along the relay."""
 SETTLE_S: Final = 3.0
-"""Between the first frames and the fault."""
 COUNTED_S: Final = 2.0
 """How long losses are counted after the link is back."""
 SILENT_S: Final = 27.0
@@ -35,8 +31,6 @@ RELAYED_PAIR: Final = ("linux-random", "symmetric")
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What a fault did."""
-
     back_s: float
     """From the fault until a frame that was sent after it had arrived, in each direction that has frames."""
     sent: int = 0
@@ -57,15 +51,12 @@ class Scene:
 
     @property
     def talk(self) -> Talk:
-        """Of the clients."""
         return self.ends.talk
 
     def place(self, kind: str) -> Place:
-        """A place with a slow line."""
         return self.laboratory.place(kind, delay_s=DELAY_S)
 
     def join(self, places: tuple[Place, Place], voice: type[Voice] = Voice) -> None:
-        """Make the daemons."""
         self.ends = make_ends(self.stage, self.relay, places, PORT + 1, voice)
 
     async def start(self) -> None:
@@ -223,25 +214,7 @@ FAULTS: Final[Mapping[str, Callable[[Scene], Awaitable[Outcome]]]] = MappingProx
 )
 
 
-async def figures(names: Iterable[str], tries: int) -> AsyncIterator[Sequence[str]]:
-    """Let each of these faults happen so often. A row of a table for each."""
-    for name in names:
-        outcomes = []
-        for _ in range(tries):
-            with Laboratory() as laboratory, redirect_stdout(StringIO()):  # what the daemons said
-                outcomes.append(await play(FAULTS[name], laboratory))
-        back_s, lost = sorted(outcome.back_s for outcome in outcomes), sorted(outcome.lost for outcome in outcomes)
-        sent = sum(outcome.sent for outcome in outcomes)
-        yield (
-            name,
-            f"{median(back_s):.2f} s",
-            f"{back_s[-1]:.2f} s",
-            f"{median(lost):.0f}, {lost[-1]}, of {sent / tries:.0f}" if sent else "",
-        )
-
-
 async def play(fault: Callable[[Scene], Awaitable[Outcome]], laboratory: Laboratory) -> Outcome:
-    """Let a fault happen to new daemons."""
     async with Stage() as stage:
         scene = Scene(laboratory, stage)
         try:

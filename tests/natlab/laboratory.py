@@ -25,8 +25,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Final, Self
 
+from tests.namespaces import Namespace, NamespaceError, connect, need_namespaces, remove_leftovers
 from tests.natlab.kinds import FIREWALL, KINDS, Chain, Filter, LinuxNat, Nat, Router, Wire
-from tests.natlab.namespaces import LaboratoryError, Namespace, connect, remove_leftovers
+from tests.needs import need
 from uavlinkd.lab.child_processes import end_with_parent
 
 SECOND: Final = "wan2"
@@ -42,6 +43,12 @@ _CABLE: Final = IPv4Network("169.254.0.0/16")
 """Every cable between routers has two addresses of its own: Linux does not answer a question (ARP) that seems to come
 from one of its own addresses."""
 _ROOT: Final = Path(__file__).parents[2]
+
+
+def need_laboratory() -> None:
+    """Skip a test that lacks what a laboratory needs."""
+    need_namespaces("nft")
+    need(Path("/dev/net/tun").exists(), "TUN interfaces (/dev/net/tun)")
 
 
 @dataclass(eq=False)
@@ -68,13 +75,11 @@ class Place:
     kind: str
     host: Namespace
     address: str
-    """The host's own."""
     external: str
     """That under which the internet sees it."""
     laboratory: Laboratory
     nodes: tuple[_Node, ...]
     second_address: str = ""
-    """Of a public host that has two."""
     ipv6: str = ""
     """The host's own address of IPv6, if it has one. The internet sees it as it is."""
 
@@ -84,7 +89,6 @@ class Place:
         return self.laboratory.place_behind(self.kind, self.nodes, ())
 
     def neighbour(self) -> Place:
-        """A host in another home behind the same carrier's router."""
         carrier, *_ = translators = [node for node in self.nodes if node.translates]
         assert len(translators) == 2, "no carrier there"
         shared = self.nodes[: self.nodes.index(carrier) + 1]
@@ -177,7 +181,7 @@ class Laboratory:
 
     def _make(self, namespace: Namespace) -> None:
         self._stack.callback(namespace.close)
-        namespace.open()
+        namespace.open(forwards=True)
 
     def _host(self, upper: _Node, addresses: Sequence[str], prefix: str) -> Namespace:
         host = Namespace()
@@ -258,7 +262,7 @@ class Laboratory:
             self._control = self._start_forwarding()
         socket.send_fds(self._control, [json.dumps(message).encode()], descriptors)
         if self._control.recv(16) != b"done":
-            raise LaboratoryError("the process that forwards has ended")
+            raise NamespaceError("the process that forwards has ended")
 
     def _start_forwarding(self) -> socket.socket:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
 from typing import Final
@@ -37,7 +37,6 @@ class Pair:
 
     @property
     def title(self) -> str:
-        """For a row."""
         return self.name or " - ".join(self.kinds)
 
 
@@ -69,17 +68,3 @@ def make_ipv6_pairs(laboratory: Laboratory, *, delay_s: float = 0.0, loss: float
         titles = [f"{kind}{' with IPv6' * has}" for kind, has in zip(kinds, have_ipv6, strict=True)]
         pairs.append(Pair(kinds, (one, other), " - ".join(titles)))
     return pairs
-
-
-def matrix(kinds: Sequence[str], cells: Mapping[tuple[str, str], str]) -> str:
-    """A table in Markdown. It is symmetric, so only its upper half is filled."""
-    rows = [["", *(str(number) for number in range(1, len(kinds) + 1))], ["---", *(["--:"] * len(kinds))]]
-    for number, kind in enumerate(kinds):
-        filled = [cells[kind, other] for other in kinds[number:]]
-        rows.append([f"{number + 1} {kind}", *([""] * number), *filled])
-    return table(rows)
-
-
-def table(rows: Iterable[Sequence[str]]) -> str:
-    """Rows in Markdown."""
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)

@@ -59,7 +59,6 @@ class Forwarding:
         self._selector.register(control, selectors.EVENT_READ)
 
     def run(self) -> None:
-        """Until the laboratory closes its socket."""
         while True:
             timeout_s = max(0.0, self._waiting[0][0] - monotonic()) if self._waiting else None
             for key, _ in self._selector.select(timeout_s):

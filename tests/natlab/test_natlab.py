@@ -13,11 +13,10 @@ from time import monotonic
 
 import pytest
 
-from tests.natlab import namespaces
+from tests import namespaces
 from tests.natlab.behaviour import Behaviour, Reflector, hairpins
-from tests.natlab.kinds import ADDRESS, INDEPENDENT, KINDS, PORT
-from tests.natlab.laboratory import Laboratory
-from tests.needs import need
+from tests.natlab.kinds import ADDRESS, INDEPENDENT, PORT
+from tests.natlab.laboratory import Laboratory, need_laboratory
 from tests.waiting import PATIENCE_S
 
 BEHAVIOURS = {
@@ -41,8 +40,7 @@ BEHAVIOURS = {
 
 @pytest.fixture(scope="module")
 def laboratory() -> Iterator[Laboratory]:
-    reason = namespaces.why_not()
-    need(reason is None, reason or "")
+    need_laboratory()
     with Laboratory() as laboratory:
         yield laboratory
 
@@ -62,11 +60,6 @@ def test_kind_maps_and_filters_as_it_says(kind: str, laboratory: Laboratory, ref
 
     with place.host.udp_socket(timeout_s=PATIENCE_S) as inner:
         assert reflector.seen(inner)[0] == place.external
-
-
-def test_every_kind_is_measured() -> None:
-    """Blocked UDP has a test of its own."""
-    assert BEHAVIOURS.keys() | {"no-udp"} == KINDS.keys()
 
 
 def test_only_udp_is_blocked(laboratory: Laboratory, reflector: Reflector) -> None:
@@ -171,18 +164,6 @@ def test_forgotten_mapping_is_gone(kind: str, laboratory: Laboratory, reflector:
         assert reflector.passes(inner, after, 0) == {0}
 
 
-@pytest.mark.parametrize("kind", ["firewall", "linux", "carrier"])
-def test_routers_find_one_another_again(kind: str, laboratory: Laboratory, reflector: Reflector) -> None:
-    """Linux asks for the addresses of neighbours again after some seconds of silence: inwards too."""
-    place = laboratory.place(kind)
-    with place.host.udp_socket(timeout_s=PATIENCE_S) as inner:
-        source = reflector.seen(inner)
-        for namespace in (laboratory.internet, *(node.namespace for node in place.nodes)):
-            namespace.ip("neigh flush all")
-
-        assert reflector.passes(inner, source, 0) == {0}
-
-
 def test_line_delays_and_loses(laboratory: Laboratory, reflector: Reflector) -> None:
     """By at least that time. On average 30 of 150 are lost; the limits are five standard deviations away."""
     delay_s, loss, count = 0.05, 0.2, 150
@@ -201,8 +182,7 @@ def test_line_delays_and_loses(laboratory: Laboratory, reflector: Reflector) -> 
 
 
 def ours(pid: int) -> list[str]:
-    """The namespaces of a process's laboratories."""
-    return [path.name for path in Path("/run/netns").glob(f"uavnat-{pid}-*")]
+    return [path.name for path in Path("/run/netns").glob(f"uavns-{pid}-*")]
 
 
 def test_nothing_remains(laboratory: Laboratory) -> None:
@@ -227,7 +207,6 @@ def test_nothing_remains(laboratory: Laboratory) -> None:
 
 
 def test_killed_laboratory_is_removed_by_the_next(laboratory: Laboratory) -> None:
-    """Its process cannot do it."""
     killed = subprocess.run(
         [
             *(sys.executable, "-c"),

@@ -128,7 +128,7 @@ def test_two_builds_are_equal(package: Package) -> None:
 
 
 def test_package_holds_what_a_vehicle_needs(package: Package) -> None:
-    """Its Python and no other, neither pip nor pymavlink; root owns every file and only root writes."""
+    """Its Python and no other, neither pip nor the laboratory; root owns every file and only root writes."""
     lowest, beyond = PYTHONS[package.release]
     depends = call("dpkg-deb", "--field", str(package.first), "Depends").strip()
     listing = [line.split(None, 5) for line in call("dpkg-deb", "--contents", str(package.first)).splitlines()]
@@ -139,10 +139,11 @@ def test_package_holds_what_a_vehicle_needs(package: Package) -> None:
 
     assert depends == f"python3 (>= {lowest}), python3 (<< {beyond})"
     assert {"uavlinkd", "uvloop", "cryptography", "rich"} <= packages
-    assert not {"pip", "setuptools", "pymavlink", "lxml"} & packages
+    assert not {"pip", "setuptools", "pymavlink", "matplotlib"} & packages
+    assert not [name for name in names if "/uavlinkd/lab" in name]
     assert {fields[1] for fields in listing} == {"root/root"}
     assert {fields[0] for fields in listing} <= {"drwxr-xr-x", "drwx------", "-rw-r--r--", "-rwxr-xr-x", "lrwxrwxrwx"}
-    assert {"./usr/lib/systemd/system/uavlinkd.service", "./usr/bin/uavlinkd", "./usr/bin/uavlink-mitm"} <= names
+    assert {"./usr/lib/systemd/system/uavlinkd.service", "./usr/bin/uavlinkd"} <= names
 
 
 def test_installation_by_hand_is_refused(package: Package, machine: Machine) -> None:
@@ -160,13 +161,13 @@ def test_installation_by_hand_is_refused(package: Package, machine: Machine) -> 
 
     machine.say("rm -r /opt/uavlinkd; dpkg --install /root/uavlinkd.deb")
     assert machine.say("uavlinkd --version").strip() == f"uavlinkd {__version__}, {PROTOCOL_NAME.decode()}"
-    assert "replay" in machine.say("uavlink-mitm --list")
     assert machine.say("dpkg --verify uavlinkd") == ""
-    for unit in ("uavlinkd.service", "uavlinkd@.service", "uavlinkd-relay.service", "uavlink-mitm.service"):
+    for unit in ("uavlinkd.service", "uavlinkd@.service", "uavlinkd-relay.service"):
         assert machine.run(f"systemctl is-enabled {unit}").stdout.strip() in {"disabled", "static"}
-    without = machine.run("uavlinkd demo")
-    assert without.returncode == 1
-    assert "need pymavlink" in without.stderr
+    for command in ("uavlinkd demo", "uavlinkd sim", "uavlinkd evaluate", "/opt/uavlinkd/bin/uavlink-mitm"):
+        without = machine.run(command)
+        assert (without.returncode, without.stderr.count("\n")) == (1, 1)
+        assert "needs the extra `lab`" in without.stderr
     assert "private keys" not in purge(machine)
     left = files(machine)
     gone = sorted(before - left - {"/opt"})  # the package manager removes this folder, if it is empty

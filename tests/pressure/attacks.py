@@ -45,7 +45,6 @@ class Target:
     port: int
     public_key: str
     captured_key: str
-    """Private key of the captured peer."""
     psk: str
     per_s: float
     suite: str = "x25519"
@@ -55,7 +54,6 @@ class Target:
     peers while the daemon waits for a processor."""
 
     def to_json(self) -> str:
-        """One line."""
         return json.dumps(asdict(self))
 
     @property
@@ -64,7 +62,6 @@ class Target:
         return "127.0.0.1", self.port
 
     def settings(self) -> PeerSettings:
-        """The daemon as a peer of the captured one."""
         link = Link(suites=(SUITES_BY_NAME[self.suite],))
         return PeerSettings("victim", b64decode(self.public_key), Secret(b64decode(self.psk)), link)
 
@@ -199,7 +196,6 @@ def _frames_of_starts(size: int) -> bytes:
 
 
 def _shortest_frames(size: int) -> bytes:
-    """MAVLink 1 frames without a payload, one for each sequence number: 8 bytes each."""
     from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
     frames = []

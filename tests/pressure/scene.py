@@ -21,7 +21,6 @@ from tests.waiting import PATIENCE_S
 from uavlinkd.lab.child_processes import end_with_parent
 
 INTERVAL_S = 0.05
-"""Time between two frames of one direction."""
 LEAD_S = 1.0
 """Duration of the attack before the first frame is sent."""
 ALLOWED_S = 5.0
@@ -46,11 +45,22 @@ class Plan:
     suite: str = "x25519"
     envelope_bytes: int = 1232
     role: str = "swarm-member"
-    """Role of the captured peer."""
     with_latecomer: bool = False
     """Whether another peer, at its configured address, starts during the attack."""
     queue_bytes: int | None = None
     """How much of the daemon's receive buffer the attacker fills; None: it sends whether there is room or not."""
+
+
+PLANS = {
+    plan.name: plan
+    for plan in (
+        Plan("insider initiations", "initiations", 80, suite="ffdhe8192", with_latecomer=True),
+        Plan("spoofed initiations", "spoofed", 10_000, with_latecomer=True),
+        Plan("64 kB envelopes", "envelopes", 40, envelope_bytes=64_000),
+        Plan("agreed envelopes", "envelopes", 2_000),
+        Plan("start bytes", "starts", 2_000, role="vehicle"),
+    )
+}
 
 
 @dataclass
@@ -66,7 +76,6 @@ class Seen:
     unanswered: int = 0
     linked_after_s: float | None = None
     cpu_share: float = 0.0
-    """CPU time of the daemon, as a share of the elapsed time."""
     drops: Counter[str] = field(default_factory=Counter)
     lost_to_waiting: int = 0
     """Honest frames that the kernel or the daemons dropped because a process had to wait for a processor."""
@@ -139,10 +148,8 @@ async def watch(stage: Stage, plan: Plan, seconds: float, launcher: tuple[str, .
         network = _Network(victim, honest)
         await network.begin()
         tasks = [
-            asyncio.create_task(
-                _talk(clients[number], ways[number], clients[1 - number], number + 1, seconds, seen, network)
-            )
-            for number in range(2)
+            asyncio.create_task(_talk((clients[one], ways[one], clients[1 - one]), one + 1, seconds, seen, network))
+            for one in range(2)
         ]
         tasks.append(asyncio.create_task(_ask(victim, seconds, seen)))
         if plan.with_latecomer:
@@ -170,14 +177,11 @@ def _drops(status: Status) -> Counter[str]:
 
 
 class _Network:
-    """What the kernel and the pauses of two daemons cost their frames."""
-
     def __init__(self, victim: DaemonProcess, honest: DaemonProcess) -> None:
         self.victim, self._honest = victim, honest
         self._before = 0
 
     async def begin(self) -> None:
-        """Count from now on."""
         self._before = await self.lost_to_waiting()
 
     async def lost_to_waiting(self) -> int:
@@ -190,8 +194,9 @@ class _Network:
 
 
 async def _talk(
-    source: Client, into: Sockaddr, sink: Client, system: int, seconds: float, seen: Seen, network: _Network
+    way: tuple[Client, Sockaddr, Client], system: int, seconds: float, seen: Seen, network: _Network
 ) -> None:
+    source, into, sink = way
     arrived: dict[bytes, tuple[float, float]] = {}
     sent: dict[bytes, tuple[float, float]] = {}
     received = len(sink.datagrams)

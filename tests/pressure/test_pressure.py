@@ -8,8 +8,7 @@ import pytest
 
 from tests.daemon.harness import Stage
 from tests.kernel_queues import capacity
-from tests.pressure.command import PLANS
-from tests.pressure.scene import FAIR_SHARE, watch
+from tests.pressure.scene import FAIR_SHARE, PLANS, watch
 from tests.waiting import Stopwatch
 
 pytestmark = pytest.mark.long

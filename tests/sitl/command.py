@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from tests.sitl.conditions import BY_NAME
+from tests.sitl.radio import BY_NAME
 from tests.sitl.report import report
 from tests.sitl.scenarios import KINDS, SCENARIOS, Record, Run, fly, runs
 from uavlinkd.lab.sim.real_autopilot import Firmware, RealAutopilotError, binary_of
@@ -32,7 +32,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--kind", action="append", choices=KINDS, help="autopilot (all whose binary is named)")
     parser.add_argument("--scenario", action="append", choices=[s.name for s in SCENARIOS], help="only this one")
     parser.add_argument("--condition", action="append", choices=BY_NAME, help="only this one")
-    parser.add_argument("--report", action="store_true", help="only write the tables of the records")
     options = parser.parse_args(arguments)
     try:
         return run_all(options)
@@ -47,22 +46,21 @@ def run_all(options: argparse.Namespace) -> int:
     Raises:
         RealAutopilotError: a simulator's binary is missing.
         OSError: the folder cannot be read or written.
-        ValueError: nothing was selected, or a line of the records is invalid.
+        ValueError: nothing was selected.
     """
-    selection = [] if options.report else selected(options)
+    selection = selected(options)
     options.out.mkdir(parents=True, exist_ok=True)
-    records = read(options.out)
-    if options.report and not records:
-        raise ValueError(f"{options.out / RECORDS}: no records")
-    flown = {(r.scenario, r.kind, r.condition, r.with_daemons) for r in records if r.error is None}
-    wanted = [run for run in selection if (run.scenario, run.kind, run.condition, run.with_daemons) not in flown]
+    file = options.out / RECORDS
+    records = [Record(**json.loads(line)) for line in file.read_text().splitlines()] if file.exists() else []
+    flown = {r.run for r in records if r.error is None}
+    wanted = [run for run in selection if run not in flown]
     for number, run in enumerate(wanted, 1):
         record = fly_quietly(run, options.out)
         records.append(record)
-        with (options.out / RECORDS).open("a", encoding="utf-8") as file:
-            file.write(json.dumps(asdict(record)) + "\n")
+        with file.open("a") as lines:
+            lines.write(json.dumps(asdict(record)) + "\n")
         print(f"{number} of {len(wanted)}: {run}: {record.error or 'passed'} ({record.seconds} s)", flush=True)
-    latest = {(r.scenario, r.kind, r.condition, r.with_daemons): r for r in records}
+    latest = {r.run: r for r in records}
     (options.out / RESULTS).write_text(report(list(latest.values())), encoding="utf-8")
     return FAILED if any(record.error for record in latest.values()) else OK
 
@@ -74,7 +72,8 @@ def selected(options: argparse.Namespace) -> list[Run]:
         RealAutopilotError: a simulator's binary is missing.
         ValueError: no scenario has this selection.
     """
-    binaries = {firmware.value: binary_of(firmware) for firmware in Firmware if is_asked(firmware, options.kind)}
+    asked = options.kind or [firmware.value for firmware in Firmware]
+    binaries = {firmware.value: binary_of(firmware) for firmware in Firmware if firmware.value in asked}
     missing = [f"UAVLINKD_{kind.upper()}" for kind, binary in binaries.items() if binary is None]
     if missing and (options.kind or not any(binaries.values())):
         raise RealAutopilotError(f"set {' or '.join(missing)} to the path of a simulator's binary")
@@ -90,11 +89,6 @@ def selected(options: argparse.Namespace) -> list[Run]:
     return selection
 
 
-def is_asked(firmware: Firmware, kinds: Sequence[str] | None) -> bool:
-    """Whether the command line asks for this autopilot, or names none."""
-    return not kinds or firmware.value in kinds
-
-
 def fly_quietly(run: Run, folder: Path) -> Record:
     """Fly; the daemons' logs go to a file if the run fails."""
     logs = io.StringIO()
@@ -103,20 +97,3 @@ def fly_quietly(run: Run, folder: Path) -> Record:
     if record.error is not None:
         (folder / f"{run}.log").write_text(logs.getvalue(), encoding="utf-8")
     return record
-
-
-def read(folder: Path) -> list[Record]:
-    """The records of earlier runs.
-
-    Raises:
-        ValueError: a line is not a record.
-    """
-    file = folder / RECORDS
-    lines = file.read_text(encoding="utf-8").splitlines() if file.exists() else []
-    records = []
-    for number, line in enumerate(lines, 1):
-        try:
-            records.append(Record(**json.loads(line)))
-        except (ValueError, TypeError) as error:
-            raise ValueError(f"{file}, line {number} is not a record; delete it, and fly this run again") from error
-    return records

@@ -55,8 +55,6 @@ class Kind:
     """Parameters that make the vehicle return without its ground station."""
     failsafe_s: float = 5.0
     """The time from the last heartbeat until it returns."""
-    failsafe_reason: str = ""
-    """Why the time is not the one that was set."""
     follows: Mapping[str, float] = field(default_factory=dict)
     """Parameters that make it follow vehicle 1, 10 m south of it."""
 
@@ -86,8 +84,7 @@ PX4 = Kind(
     has_home_item=False,
     parameters={"SDLOG_MODE": 0},  # a log from arming to disarming
     failsafe={"NAV_DLL_ACT": 2, "COM_DL_LOSS_T": 5, "COM_FAIL_ACT_T": 0.0},
-    failsafe_s=7.5,
-    failsafe_reason="it notices a lost heartbeat after 2.5 s, then waits 5 s",
+    failsafe_s=7.5,  # it notices a lost heartbeat after 2.5 s, then waits 5 s
 )
 OWN = Kind("uavlinkd sim", _COPTER_MODES)
 ROVER = Kind("ArduRover", {Mode.GUIDED: 15, Mode.MISSION: 10, Mode.RETURN: 11}, flies=False)

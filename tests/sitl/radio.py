@@ -1,4 +1,4 @@
-"""The emulated radio between the two ends: ``uavlink-mitm`` in its own process."""
+"""The emulated radio between the two ends, ``uavlink-mitm`` in its own process, and the conditions of its link."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import asyncio
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,39 @@ from tests.waiting import PATIENCE_S
 from uavlinkd.lab.child_processes import end_with_parent
 from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.ops.control import ControlError, ask
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """The impairments of both directions. ``radio`` has the keys of a ``[[radio]]`` section of ``uavlink-mitm``."""
+
+    name: str
+    about: str
+    radio: Mapping[str, object] = field(default_factory=dict)
+    link: Mapping[str, object] = field(default_factory=dict)
+    """Keys of the daemons' ``[link]`` section."""
+
+    @property
+    def needs_daemons(self) -> bool:
+        """Whether the condition is a setting of daemons."""
+        return bool(self.link)
+
+
+CLEAN = Condition("clean", "no impairment; no radio emulator in the path")
+CONDITIONS = (
+    CLEAN,
+    Condition("loss10", "10 % of datagrams lost", {"loss": 0.1}),
+    Condition("loss30", "30 % of datagrams lost", {"loss": 0.3}),
+    Condition("slow", "250 kbit/s", {"bits_per_s": 250_000.0}),
+    Condition(
+        "slow-budget",
+        "250 kbit/s, and the daemons have budget_bits_s = 250000",
+        {"bits_per_s": 250_000.0},
+        {"budget_bits_s": 250_000},
+    ),
+    Condition("delay", "50 ± 20 ms in each direction", {"delay_s": 0.03, "jitter_s": 0.04}),
+)
+BY_NAME = {condition.name: condition for condition in CONDITIONS}
 
 
 class Radio:

@@ -7,9 +7,8 @@ changed an autopilot. 1: one did, or datagrams were lost. 2: invalid command lin
 from __future__ import annotations
 
 import argparse
-import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Final
 
 from tests.sitl.roles_frames import ROLES_TESTED
@@ -21,17 +20,17 @@ OK, FAILED = 0, 1
 PLACES: Final = {"ground": False, "air": True}
 
 
-def available(environ: Mapping[str, str] = os.environ, speedup: float = 5) -> dict[str, MakeVehicle]:
+def available() -> dict[str, MakeVehicle]:
     """The autopilots that this machine has, by name.
 
     Raises:
         RealAutopilotError: a variable names a file that cannot be executed.
     """
     makers: dict[str, MakeVehicle] = {"sim": SimulatedVehicle}
-    if ardupilot := binary_of(Firmware.ARDUPILOT, environ):
-        makers["ardupilot"] = lambda folder, attach: ArduCopter(folder, ardupilot, attach, speedup)
-    if px4 := binary_of(Firmware.PX4, environ):
-        makers["px4"] = lambda folder, attach: Px4(folder, px4, attach, speedup)
+    if ardupilot := binary_of(Firmware.ARDUPILOT):
+        makers["ardupilot"] = lambda folder: ArduCopter(folder, ardupilot)
+    if px4 := binary_of(Firmware.PX4):
+        makers["px4"] = lambda folder: Px4(folder, px4)
     return makers
 
 
@@ -56,24 +55,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.sitl.roles", description=__doc__)
     parser.add_argument("--frames", type=int, default=1_000_000, help="for each autopilot, over all scenes (1000000)")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--speedup", type=float, default=5, help="of the autopilots' simulators (5)")
     parser.add_argument("--autopilot", action="append", choices=("sim", "ardupilot", "px4"), help="all but sim")
-    parser.add_argument("--role", action="append", choices=ROLES_TESTED, help="both")
-    parser.add_argument("--place", action="append", choices=tuple(PLACES), help="both")
     options = parser.parse_args(arguments)
     try:
-        makers = available(speedup=options.speedup)
+        makers = available()
     except RealAutopilotError as error:
         parser.error(str(error))
     names = options.autopilot or [name for name in makers if name != "sim"]
     missing = [name for name in names if name not in makers]
     if missing or not names:
         parser.error(f"no binary for {', '.join(missing) or 'any autopilot'}: set UAVLINKD_ARDUPILOT or UAVLINKD_PX4")
-    roles, places = options.role or ROLES_TESTED, options.place or tuple(PLACES)
-    share = -(-options.frames // (len(roles) * len(places)))
+    scenes = [(role, place) for role in ROLES_TESTED for place in PLACES]
+    share = -(-options.frames // len(scenes))
     is_ok = True
     for name in names:
-        for number, (role, place) in enumerate((role, place) for role in roles for place in places):
+        for number, (role, place) in enumerate(scenes):
             result = run_scene(makers[name], role, share, options.seed + number, is_flying=PLACES[place], write=_say)
             print("\n".join(lines(name, result)), flush=True)
             is_ok = is_ok and not result.changes and not result.lost

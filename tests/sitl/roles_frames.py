@@ -17,7 +17,7 @@ from typing import Any, Final, NamedTuple
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from uavlinkd.lab.evaluation.hidden_frames import SIGNATURE_BYTES, Carrier
+from tests.mavlink.parsers.hidden_frames import SIGNATURE_BYTES, Carrier
 from uavlinkd.lab.sim.autopilot import HOME
 from uavlinkd.mavlink.dialect_table import COMMANDS, MESSAGES
 from uavlinkd.mavlink.frames import parse_frame

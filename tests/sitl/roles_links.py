@@ -11,8 +11,8 @@ from pathlib import Path
 from time import monotonic, sleep
 from typing import Final
 
+from tests.mavlink.parsers.hidden_frames import frame
 from tests.waiting import PATIENCE_S
-from uavlinkd.lab.evaluation.hidden_frames import frame
 from uavlinkd.mavlink.frames import Frame
 from uavlinkd.mavlink.stream_splitter import StreamSplitter
 

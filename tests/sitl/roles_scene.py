@@ -12,21 +12,18 @@ from typing import Any, Final, NamedTuple, Self
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from tests.sitl.roles_daemons import DaemonPair
 from tests.sitl.roles_frames import RoleFrames
 from tests.sitl.roles_judge import Judge, Snapshot, changed_parameters, differences
 from tests.sitl.roles_links import LinkClosedError, dropped_datagrams
 from tests.sitl.roles_station import Station, StationError
-from tests.sitl.roles_vehicles import Attach, Vehicle, attach_directly
+from tests.sitl.roles_vehicles import Vehicle
 from uavlinkd.lab.sim.autopilot import HOME
 
 BATCH: Final = 100
 """Frames between two barriers: what fits into the queues of the kernel and of the autopilot."""
-DAEMONS_BATCH: Final = 20
-"""The same through daemons, which have smaller queues."""
 CHUNK: Final = 50_000
 """Frames between two whole snapshots."""
-MakeVehicle = Callable[[Path, Attach], Vehicle]
+MakeVehicle = Callable[[Path], Vehicle]
 Say = Callable[[str], None]
 _RELATIVE: Final = mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT
 
@@ -65,9 +62,8 @@ class SceneResult:
 class Trial:
     """One autopilot with a mission, a fence and rally points; in the air, if asked for."""
 
-    def __init__(self, make: MakeVehicle, attach: Attach = attach_directly, *, is_flying: bool) -> None:
+    def __init__(self, make: MakeVehicle, *, is_flying: bool) -> None:
         self._make = make
-        self._attach = attach
         self._is_flying = is_flying
         self._exits = ExitStack()
         self.vehicle: Vehicle
@@ -77,7 +73,7 @@ class Trial:
     def __enter__(self) -> Self:
         with ExitStack() as exits:
             folder = Path(exits.enter_context(tempfile.TemporaryDirectory(prefix="uavlinkd-roles-")))
-            vehicle = self.vehicle = self._make(folder / "autopilot", self._attach)
+            vehicle = self.vehicle = self._make(folder / "autopilot")
             self.station = exits.enter_context(vehicle)
             for plan, items in plans().items():
                 with suppress(StationError):  # the project's simulator has missions only
@@ -95,17 +91,17 @@ class Trial:
     def __exit__(self, *_: object) -> None:
         self._exits.close()
 
-    def send(self, frames: Sequence[bytes], batch: int = BATCH) -> int:
+    def send(self, frames: Sequence[bytes]) -> int:
         """Send frames until the judge reports a change, or the autopilot ends; how many were sent."""
         station = self.station
-        for begin in range(0, len(frames), batch):
+        for begin in range(0, len(frames), BATCH):
             try:
-                station.attacker.send(frames[begin : begin + batch])
+                station.attacker.send(frames[begin : begin + BATCH])
                 station.wait_for_attacker()
             except LinkClosedError:
                 self.judge.changes.append(self.vehicle.why_ended())
             if self.judge.changes:
-                return min(begin + batch, len(frames))
+                return min(begin + BATCH, len(frames))
         return len(frames)
 
     def snapshot_after(self, before: Snapshot, *, with_rates: bool) -> Snapshot:
@@ -172,35 +168,6 @@ def _subject(change: str) -> str:
     return change.partition(":")[0]
 
 
-class DaemonsResult(NamedTuple):
-    """The result of frames through two daemons."""
-
-    sent: int
-    seconds: float
-    changes: tuple[str, ...]
-    refused: Mapping[str, Any]
-    endpoint: Mapping[str, Any]
-
-
-def run_through_daemons(make: MakeVehicle, role: str, frames: int, seed: int, *, is_flying: bool) -> DaemonsResult:
-    """Send frames through two daemons, the victim's with this role for the sender, and compare before and after."""
-    generator = RoleFrames(role, seed)
-    own = run_quiet(make, 1, is_flying=is_flying).parameters
-    with (
-        DaemonPair(role, generator.systems) as daemons,
-        Trial(make, daemons.attach, is_flying=is_flying) as trial,
-    ):
-        before = trial.judge.snapshot()
-        began_s = trial.station.time_s
-        sent = trial.send([generator.draw() for _ in range(frames)], DAEMONS_BATCH)
-        after = trial.snapshot_after(before, with_rates=False)
-        # A simulator that is faster than the machine's clock changes its own by that.
-        changes = (*trial.judge.changes, *differences(replace(before, clock_s=None), after, own))
-        seconds = trial.station.time_s - began_s
-        daemons.stop()
-    return DaemonsResult(sent, seconds, changes, daemons.peer["refused"]["in"], daemons.endpoint)
-
-
 class Calm(NamedTuple):
     """What changes without any frame of an attacker."""
 
@@ -253,8 +220,8 @@ def plans() -> Mapping[int, list[Any]]:
     """A mission, a fence around the vehicle and one rally point."""
     latitude, longitude = round(HOME.latitude_deg * 1e7), round(HOME.longitude_deg * 1e7)
 
-    def item(plan: int, seq: int, command: int, north: int, east: int, height_m: float, first: float = 0) -> Any:
-        place = latitude + north, longitude + east, height_m
+    def item(plan: int, seq: int, command: int, offset: tuple[int, int], height_m: float, first: float = 0) -> Any:
+        place = latitude + offset[0], longitude + offset[1], height_m
         return mavlink.MAVLink_mission_item_int_message(
             1, 1, seq, _RELATIVE, command, 0, 1, first, 0, 0, float("nan") if plan == 0 else 0, *place, plan
         )
@@ -264,11 +231,11 @@ def plans() -> Mapping[int, list[Any]]:
     vertex = mavlink.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_INCLUSION
     return {
         mavlink.MAV_MISSION_TYPE_MISSION: [
-            item(0, 0, mavlink.MAV_CMD_NAV_WAYPOINT, 0, 0, 20),
-            item(0, 1, mavlink.MAV_CMD_NAV_TAKEOFF, 0, 0, 20),
-            item(0, 2, mavlink.MAV_CMD_NAV_WAYPOINT, 3000, 0, 25),
-            item(0, 3, mavlink.MAV_CMD_NAV_WAYPOINT, 3000, 3000, 30),
+            item(0, 0, mavlink.MAV_CMD_NAV_WAYPOINT, (0, 0), 20),
+            item(0, 1, mavlink.MAV_CMD_NAV_TAKEOFF, (0, 0), 20),
+            item(0, 2, mavlink.MAV_CMD_NAV_WAYPOINT, (3000, 0), 25),
+            item(0, 3, mavlink.MAV_CMD_NAV_WAYPOINT, (3000, 3000), 30),
         ],
-        fence: [item(fence, seq, vertex, *corner, 0, 4) for seq, corner in enumerate(corners)],
-        rally: [item(rally, 0, mavlink.MAV_CMD_NAV_RALLY_POINT, 1000, 1000, 20)],
+        fence: [item(fence, seq, vertex, corner, 0, 4) for seq, corner in enumerate(corners)],
+        rally: [item(rally, 0, mavlink.MAV_CMD_NAV_RALLY_POINT, (1000, 1000), 20)],
     }

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 import shutil
-import signal
 import subprocess
 import sys
 from abc import ABC, abstractmethod
@@ -26,6 +25,8 @@ from uavlinkd.lab.sim.loopback_ports import free_port, free_ports
 STATION: Final = (255, 190)
 HEIGHT_M: Final = 20.0
 STOP_S: Final = 20.0
+SPEEDUP: Final = 5
+"""Of the autopilots' simulators, beyond real time."""
 _GUIDED: Final = 4  # ArduCopter's number of the mode
 _PX4_HOLD: Final = 0x03040000  # PX4_CUSTOM_MAIN_MODE_AUTO, PX4_CUSTOM_SUB_MODE_AUTO_LOITER
 _COPTER_PARAMETERS: Final[Mapping[str, float]] = {
@@ -45,29 +46,15 @@ _COPTER_PARAMETERS: Final[Mapping[str, float]] = {
 }
 
 
-Attach = Callable[[str], Link]
-
-
-def attach_directly(url: str) -> Link:
-    """A link to the autopilot, without daemons."""
-    kind, _, address = url.partition(":")
-    port = int(address.rpartition(":")[2])
-    return {"tcp": connected, "udpin": listening, "udpout": speaking}[kind](port, STATION)
-
-
 class Vehicle(ABC):
-    """The process of one autopilot, as a context. ``folder`` is for its files.
-
-    ``attach`` opens the attacker's link to an URL, as an endpoint of a daemon has it.
-    """
+    """The process of one autopilot, as a context. ``folder`` is for its files."""
 
     settle_s = 30.0
     """Until its estimate is steady, in seconds of its own time: home and origin move before."""
 
-    def __init__(self, folder: Path, attach: Attach = attach_directly) -> None:
+    def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.attach = attach
-        self._processes: list[subprocess.Popen[bytes]] = []
+        self._process: subprocess.Popen[bytes]
         self._links: list[Link] = []
 
     def __enter__(self) -> Station:
@@ -93,49 +80,43 @@ class Vehicle(ABC):
         Raises:
             LinkClosedError: it has.
         """
-        if any(process.poll() is not None for process in self._processes):
+        if self._process.poll() is not None:
             raise LinkClosedError
 
     def why_ended(self) -> str:
         """The status of the process that ended, and its last output."""
-        statuses = [process.wait(STOP_S) for process in self._processes]
         lines = (self.folder / "autopilot.log").read_text(errors="replace").splitlines()
         last = [line for line in lines if line.strip()][-8:]
-        return f"the autopilot ended with status {statuses[0]}: {' | '.join(last)}"
+        return f"the autopilot ended with status {self._process.wait(STOP_S)}: {' | '.join(last)}"
 
     @abstractmethod
     def _open(self) -> tuple[Link, Link]:
         """Start the autopilot, and open the station's link and the attacker's."""
 
-    @abstractmethod
     def take_off(self, station: Station) -> None:
-        """Take off and hold the position."""
+        """Take off, here in the mode GUIDED, and hold the position."""
+        _take_off_guided(station)
 
     def _run(self, *command: str, variables: Mapping[str, str] | None = None) -> None:
         with (self.folder / "autopilot.log").open("wb") as log:
-            self._processes.append(
-                subprocess.Popen(
-                    end_with_parent(*command),
-                    cwd=self.folder,
-                    env={**os.environ, **(variables or {})},
-                    stdin=subprocess.DEVNULL,
-                    stdout=log,
-                    stderr=log,
-                )
+            self._process = subprocess.Popen(
+                end_with_parent(*command),
+                cwd=self.folder,
+                env={**os.environ, **(variables or {})},
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
             )
 
     def _end(self) -> None:
         for link in self._links:
             link.close()
-        self._links.clear()
-        for process in self._processes:
-            process.send_signal(signal.SIGTERM)
-            try:
-                process.wait(STOP_S)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
-        self._processes.clear()
+        self._process.terminate()
+        try:
+            self._process.wait(STOP_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
 
 
 class SimulatedVehicle(Vehicle):
@@ -146,54 +127,44 @@ class SimulatedVehicle(Vehicle):
     def _open(self) -> tuple[Link, Link]:
         port = free_port()
         self._run(sys.executable, "-m", "uavlinkd", "sim", "--url", f"udpin:127.0.0.1:{port}")
-        return speaking(port, STATION), self.attach(f"udpout:127.0.0.1:{port}")
-
-    def take_off(self, station: Station) -> None:
-        """In the mode GUIDED."""
-        _take_off_guided(station)
+        return speaking(port, STATION), speaking(port, STATION)
 
 
 class ArduCopter(Vehicle):
     """ArduCopter in its own simulator."""
 
-    def __init__(self, folder: Path, binary: Path, attach: Attach = attach_directly, speedup: float = 5) -> None:
-        super().__init__(folder, attach)
+    def __init__(self, folder: Path, binary: Path) -> None:
+        super().__init__(folder)
         self._binary = binary
-        self._speedup = speedup
 
     def _open(self) -> tuple[Link, Link]:
         defaults = self.folder / "defaults.parm"
         defaults.write_text("".join(f"{name} {value}\n" for name, value in _COPTER_PARAMETERS.items()))
         base, radio_in, simulator_in, simulator_out, own, attacker = free_ports(6)
         self._run(
-            *(str(self._binary), "--model", "quad", "--speedup", f"{self._speedup:g}", "--defaults", str(defaults)),
+            *(str(self._binary), "--model", "quad", "--speedup", str(SPEEDUP), "--defaults", str(defaults)),
             *("--home", f"{HOME.latitude_deg},{HOME.longitude_deg},{HOME.altitude_m},0"),
             *("--base-port", str(base), "--rc-in-port", str(radio_in)),
             *("--sim-port-in", str(simulator_in), "--sim-port-out", str(simulator_out)),
             *("--serial0", f"tcp:{own}:wait", "--serial1", f"tcp:{attacker}:nowait"),
             *("--serial2", "none:2"),
         )
-        return connected(own, STATION), self.attach(f"tcp:127.0.0.1:{attacker}")
-
-    def take_off(self, station: Station) -> None:
-        """In the mode GUIDED."""
-        _take_off_guided(station)
+        return connected(own, STATION), connected(attacker, STATION)
 
 
 class Px4(Vehicle):
     """PX4's quadcopter in SIH. The binary is in ``bin`` of its build folder."""
 
-    def __init__(self, folder: Path, binary: Path, attach: Attach = attach_directly, speedup: float = 5) -> None:
-        super().__init__(folder, attach)
+    def __init__(self, folder: Path, binary: Path) -> None:
+        super().__init__(folder)
         self._binary = binary
-        self._speedup = speedup
         self._instance = 20 + os.getpid() % 200
 
     def _open(self) -> tuple[Link, Link]:
         variables = {
             "PX4_SIM_MODEL": "sihsim_quadx",
             "PX4_SIMULATOR": "sihsim",
-            "PX4_SIM_SPEED_FACTOR": f"{self._speedup:g}",
+            "PX4_SIM_SPEED_FACTOR": str(SPEEDUP),
             "PX4_HOME_LAT": str(HOME.latitude_deg),
             "PX4_HOME_LON": str(HOME.longitude_deg),
             "PX4_HOME_ALT": str(HOME.altitude_m),
@@ -210,13 +181,13 @@ class Px4(Vehicle):
         log = self.folder / "autopilot.log"
         until = monotonic() + PATIENCE_S
         while b"Startup script returned successfully" not in log.read_bytes():
-            if monotonic() > until or self._processes[0].poll() is not None:
+            if monotonic() > until or self._process.poll() is not None:
                 raise StationError(f"PX4 did not start: {log.read_text(errors='replace')[-500:]}")
             sleep(0.1)
         self._shell("mavlink", "stop-all")
         local, local_attacker = free_ports(2)
         own, attacker = free_ports(2)
-        links = listening(own, STATION), self.attach(f"udpin:127.0.0.1:{attacker}")
+        links = listening(own, STATION), listening(attacker, STATION)
         self._start_link(local, own, "-m", "onboard")
         self._start_link(local_attacker, attacker)  # in the mode for a ground station
         return links

@@ -11,14 +11,14 @@ from typing import Any
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from tests.sitl.conditions import BY_NAME, CLEAN
 from tests.sitl.flights import flight, follow_me, outages, restarts, two_radios, two_vehicles
 from tests.sitl.pilots import COPTER, OWN, PX4, ROVER, Kind, Pilot
+from tests.sitl.radio import BY_NAME, CLEAN
 from tests.sitl.relayed import relayed
 from tests.sitl.simulators import OwnSimulator, RealSimulator, Simulator
 from tests.sitl.station import Station
 from tests.sitl.transfers import Figures, FlightError, log_and_file, parameters_and_mission, signing
-from tests.sitl.world import World, flying
+from tests.sitl.world import Layout, World, flying
 from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.lab.sim.real_autopilot import Firmware
 
@@ -30,7 +30,7 @@ Scene = Callable[[World, list[Pilot]], Awaitable[Figures]]
 
 
 @dataclass(frozen=True, slots=True)
-class Scenario:
+class Scenario(Layout):
     """What is flown, with which vehicles, and under which conditions."""
 
     name: str
@@ -38,11 +38,6 @@ class Scenario:
     kinds: tuple[str, ...] = ("ardupilot", "px4")
     conditions: tuple[str, ...] = (CLEAN.name,)
     vehicles: int = 1
-    can_cut: bool = False
-    swarm: bool = False
-    two_radios: bool = False
-    relays: int = 0
-    behind_nats: bool = False
     has_maintenance_port: bool = False
 
     @property
@@ -77,7 +72,6 @@ SCENARIOS = (
     Scenario("restarts", _alone(restarts)),
     Scenario("two-radios", _alone(two_radios), two_radios=True),
     Scenario("relay", _alone(relayed), ("ardupilot", "px4", "own"), relays=1),
-    Scenario("relay-nat", _alone(relayed), ("ardupilot", "px4", "own"), relays=1, behind_nats=True),
     Scenario("two-relays", _alone(relayed), ("ardupilot", "px4", "own"), relays=2),
 )
 SCENARIO_BY_NAME = {scenario.name: scenario for scenario in SCENARIOS}
@@ -109,6 +103,11 @@ class Record:
     seconds: float = 0.0
     error: str | None = None
     figures: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def run(self) -> Run:
+        """What was flown."""
+        return Run(self.scenario, self.kind, self.condition, self.with_daemons)
 
 
 def runs(kinds: tuple[str, ...]) -> list[Run]:
@@ -149,13 +148,9 @@ async def _fly(run: Run, record: Record, folder: Path) -> None:
     ]
     async with flying(
         simulators,
-        condition=BY_NAME[run.condition],
+        scenario,
+        BY_NAME[run.condition],
         with_daemons=run.with_daemons,
-        can_cut=scenario.can_cut,
-        swarm=scenario.swarm,
-        two_radios=scenario.two_radios,
-        relays=scenario.relays,
-        behind_nats=scenario.behind_nats,
         maintenance_port=maintenance_port,
     ) as world:
         pilots = [Pilot(world.station, system, kind) for system in systems]

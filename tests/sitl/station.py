@@ -6,7 +6,6 @@ It decodes with pymavlink, independently of the daemon.
 from __future__ import annotations
 
 import asyncio
-import socket
 import struct
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -54,8 +53,9 @@ class Inbox:
 class Station(asyncio.DatagramProtocol):
     """A ground station. It sends to where it received the target from, and broadcasts to all of these addresses."""
 
-    def __init__(self, system: int = SYSTEM, sock: socket.socket | None = None) -> None:
-        self.system = system
+    system = SYSTEM
+
+    def __init__(self) -> None:
         self.sent: list[Passing] = []
         self.received: list[Passing] = []
         self.latest: dict[tuple[int, str], Any] = {}
@@ -67,12 +67,12 @@ class Station(asyncio.DatagramProtocol):
         self.beats = True
         """Whether heartbeats are sent."""
         self._routes: dict[int, Sockaddr] = {}
-        self.codec = mavlink.MAVLink(None, system, COMPONENT)
+        self.codec = mavlink.MAVLink(None, SYSTEM, COMPONENT)
         self.codec.robust_parsing = True
         self.bad_signatures = 0
         self._inboxes: list[tuple[frozenset[str], int, Inbox]] = []
         self._conditions: list[tuple[Callable[[], bool], asyncio.Future[None]]] = []
-        self._sock = sock or open_socket("127.0.0.1")
+        self._sock = open_socket("127.0.0.1")
         self._transport: asyncio.BaseTransport
         self._beating: asyncio.Task[None]
 

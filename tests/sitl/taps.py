@@ -11,8 +11,6 @@ what lies behind the tap sees the new port.
 from __future__ import annotations
 
 import asyncio
-import socket
-from collections.abc import Callable
 from time import monotonic
 from typing import Any
 
@@ -21,19 +19,10 @@ from tests.sitl.ledger import Passing, split
 from tests.waiting import until
 
 
-def loopback_socket() -> socket.socket:
-    """A socket on any port of loopback."""
-    return open_socket("127.0.0.1")
-
-
 class Tap(asyncio.DatagramProtocol):
-    """The end of the link at an autopilot. The autopilot sends to :attr:`address`, the tap to ``onward``.
+    """The end of the link at an autopilot. The autopilot sends to :attr:`address`, the tap to ``onward``."""
 
-    ``open_face`` opens the sockets that send onward, where they are not to be on the autopilot's host.
-    """
-
-    def __init__(self, open_face: Callable[[], socket.socket] = loopback_socket) -> None:
-        self.open_face = open_face
+    def __init__(self) -> None:
         self.from_autopilot: list[Passing] = []
         self.to_autopilot: list[Passing] = []
         self.stray_bytes = 0
@@ -107,7 +96,7 @@ class _Face(asyncio.DatagramProtocol):
     def __init__(self, tap: Tap, autopilot: Sockaddr) -> None:
         self._tap = tap
         self._autopilot = autopilot
-        self.sock = tap.open_face()
+        self.sock = open_socket("127.0.0.1")
         self.transport: asyncio.BaseTransport
         self.opening: asyncio.Future[None]
 

@@ -6,7 +6,7 @@ import pytest
 
 from tests.sitl.roles import PLACES, available
 from tests.sitl.roles_frames import ROLES_TESTED, RoleFrames
-from tests.sitl.roles_scene import DAEMONS_BATCH, Trial, run_scene, run_through_daemons
+from tests.sitl.roles_scene import Trial, run_scene
 
 FRAMES = 5000
 NO_SIMULATOR = "no autopilot simulator"
@@ -14,31 +14,21 @@ SEED = 11
 RTL = 6  # ArduCopter's number of the mode
 FAILSAFE_S = 120.0
 """In the autopilot's time: FS_GCS_TIMEOUT is 30 s, and a busy machine delays what it reads."""
-REAL = [pytest.param(name, marks=pytest.mark.sitl) for name in ("ardupilot", "px4")]
+SCENES = [
+    pytest.param("sim", "ground", FRAMES // 5, marks=pytest.mark.long),
+    *(pytest.param(name, place, FRAMES, marks=pytest.mark.sitl) for name in ("ardupilot", "px4") for place in PLACES),
+]
 
 
 @pytest.mark.parametrize("role", ROLES_TESTED)
-@pytest.mark.parametrize("place", PLACES)
-@pytest.mark.parametrize("name", REAL)
-def test_role_changes_no_autopilot(name: str, place: str, role: str) -> None:
+@pytest.mark.parametrize(("name", "place", "frames"), SCENES)
+def test_role_changes_no_autopilot(name: str, place: str, frames: int, role: str) -> None:
     """Armed state, mode, parameters, mission, home, origin, targets, position, clock and stream rates stay."""
     make = available().get(name) or pytest.skip(f"{NO_SIMULATOR}: set UAVLINKD_{name.upper()}")
-    result = run_scene(make, role, FRAMES, SEED, is_flying=PLACES[place])
+    result = run_scene(make, role, frames, SEED, is_flying=PLACES[place])
     assert not result.changes, [*result.changes, *(raw.hex() for raw in result.culprits)]
-    assert result.frames == FRAMES
+    assert result.frames == frames
     assert result.lost == 0
-
-
-@pytest.mark.parametrize("role", ROLES_TESTED)
-@pytest.mark.parametrize("name", [pytest.param("sim", marks=pytest.mark.long), *REAL])
-def test_role_changes_no_autopilot_behind_daemons(name: str, role: str) -> None:
-    """The same through the daemons of the captured member and its victim, which deliver every frame."""
-    make = available().get(name) or pytest.skip(f"{NO_SIMULATOR}: set UAVLINKD_{name.upper()}")
-    result = run_through_daemons(make, role, FRAMES // 5, SEED, is_flying=False)
-    assert not result.changes
-    assert result.refused == {}
-    assert result.sent == FRAMES // 5
-    assert result.endpoint["frames_sent"] >= result.sent + result.sent // DAEMONS_BATCH
 
 
 @pytest.mark.sitl

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from tests.sitl.roles_judge import Snapshot, changed_rates, differences, distance
+from tests.sitl.roles_judge import Snapshot, changed_rates, differences
 from tests.sitl.roles_scene import narrow
 
 BERNE = (46.948, 7.4474, 540.0)
@@ -69,11 +69,6 @@ def test_stream_that_ends_or_begins_is_reported() -> None:
         "rate of ATTITUDE to the attacker: 4.00/s became 0.00/s",
         "rate of RAW_IMU: 0.00/s became 2.00/s",
     ]
-
-
-def test_distance_is_in_metres() -> None:
-    """A minute of latitude is a nautical mile."""
-    assert distance((47.0, 8.0, 0.0), (47.0 + 1 / 60, 8.0, 0.0)) == pytest.approx(1852, rel=0.01)
 
 
 def test_one_frame_of_many_is_named() -> None:

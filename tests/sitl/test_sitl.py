@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator, Mapping
-from pathlib import Path
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -13,14 +11,14 @@ from tests.sitl.scenarios import Run, fly, runs
 from uavlinkd.lab.sim.real_autopilot import Firmware, RealAutopilotError, binary_of
 
 
-def flights(environ: Mapping[str, str] = os.environ) -> Iterator[Any]:
+def flights() -> Iterator[Any]:
     """Every run of each simulator that the environment names; a skip for each that it does not name.
 
     The error of a wrong name is a parameter: raised here, it would break the collection of all tests.
     """
     for firmware in Firmware:
         try:
-            binary = binary_of(firmware, environ)
+            binary = binary_of(firmware)
         except RealAutopilotError as error:
             yield pytest.param(error, id=firmware.value)
             continue
@@ -39,11 +37,3 @@ async def test_scenario(run: Run | RealAutopilotError) -> None:
         raise run
     record = await fly(run)
     assert record.error is None, record
-
-
-async def test_wrong_binary_fails_one_test(tmp_path: Path) -> None:
-    """The tests are collected all the same, and one fails with the variable's name."""
-    wrong, *skipped = flights({"UAVLINKD_ARDUPILOT": str(tmp_path / "nothing")})
-    with pytest.raises(RealAutopilotError, match=r"UAVLINKD_ARDUPILOT: .* is not an executable file"):
-        await test_scenario(*wrong.values)
-    assert [mark.name for param in skipped for mark in param.marks] == ["skip", "skip"]

@@ -13,12 +13,10 @@ left out where nothing has to be impaired.
 from __future__ import annotations
 
 import asyncio
-import socket
 from collections import Counter
 from collections.abc import AsyncIterator, Sequence
-from contextlib import AsyncExitStack, ExitStack, asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass, field
-from functools import partial
 from time import monotonic
 
 from tests.daemon.fleet import AN_OPERATOR, a_member, a_vehicle, make_relay
@@ -27,18 +25,13 @@ from tests.daemon.harness import Stage
 from tests.daemon.process import DaemonProcess, Status
 from tests.daemon.udp import shown
 from tests.kernel_queues import cpu_s
-from tests.natlab.laboratory import Laboratory, Place
-from tests.sitl.conditions import CLEAN, Condition
 from tests.sitl.ledger import SETTLED_S, Comparison, compare, compare_messages
-from tests.sitl.radio import Radio
+from tests.sitl.radio import Condition, Radio
 from tests.sitl.simulators import Simulator
 from tests.sitl.station import Station
-from tests.sitl.taps import Tap, loopback_socket
+from tests.sitl.taps import Tap
 
 GROUND, AUTOPILOT_ENDPOINT = "ground", "autopilot"
-NATS = ("carrier", "carrier-symmetric")
-"""Those of the vehicle and of the station. Between these no direct path is found."""
-NAT_PORT = 5790
 LINK_S = 120.0
 """How long a simulator may take to send its first heartbeat."""
 
@@ -53,25 +46,18 @@ class Vehicle:
     daemon: DaemonProcess | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Places:
-    """Hosts for daemons of both ends, behind NATs, and for a relay that both reach."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Layout:
+    """How vehicles and station are connected."""
 
-    vehicle: Place
-    ground: Place
-    relay: Place
-
-    @classmethod
-    def behind_nats(cls, stack: ExitStack | AsyncExitStack) -> Places:
-        """They are there until the stack ends."""
-        laboratory = stack.enter_context(Laboratory())
-        vehicle, ground = map(laboratory.place, NATS)
-        return cls(vehicle, ground, laboratory.public())
-
-
-def _socket_at(place: Place) -> socket.socket:
-    with place.host.entered():
-        return loopback_socket()
+    can_cut: bool = False
+    """Whether the radio must be there, to be cut."""
+    swarm: bool = False
+    """Whether the vehicles are peers of each other, as swarm members."""
+    two_radios: bool = False
+    """Whether there are two radios to each vehicle. It needs daemons."""
+    relays: int = 0
+    """How many relays are between the vehicles and the station, in place of radios. They need daemons."""
 
 
 @dataclass(slots=True)
@@ -88,18 +74,8 @@ class World:
     """Of a vehicle with two radios. Both carry its link all the time."""
     relays: list[DaemonProcess] = field(default_factory=list)
     """The only ways from the vehicles to the station, if there are any."""
-    places: Places | None = None
-    """Where the daemons are, if not all on loopback."""
     maintenance: Tap | None = None
     """The other end of the autopilot's second port."""
-
-    def daemon(self, name: str, place: Place | None) -> DaemonProcess:
-        """A daemon at a place, or on loopback; not started."""
-        if place is None:
-            return self.stage.daemon(name)
-        daemon = self.stage.daemon(name, [f"{place.address}:{NAT_PORT}"])
-        daemon.launcher = place.host.launcher
-        return daemon
 
     @property
     def radios(self) -> list[Radio]:
@@ -203,37 +179,25 @@ def refused_between(before: Status, after: Status) -> Counter[tuple[str, str]]:
 @asynccontextmanager
 async def flying(
     simulators: Sequence[Simulator],
+    layout: Layout,
+    condition: Condition,
     *,
-    condition: Condition = CLEAN,
-    with_daemons: bool = True,
-    can_cut: bool = False,
-    swarm: bool = False,
-    two_radios: bool = False,
-    relays: int = 0,
-    behind_nats: bool = False,
-    maintenance_port: int | None = None,
+    with_daemons: bool,
+    maintenance_port: int | None,
 ) -> AsyncIterator[World]:
     """Start everything, and wait until the station receives each vehicle.
 
-    Args:
-        simulators: one for each vehicle, not yet started.
-        can_cut: whether the radio must be there, to be cut.
-        swarm: whether the vehicles are peers of each other, as swarm members.
-        two_radios: whether there are two radios to each vehicle. It needs daemons.
-        relays: how many relays are between the vehicles and the station, in place of radios. They need daemons.
-        behind_nats: whether vehicle, station and relay are on three hosts, the first two behind NATs. It needs root.
-        maintenance_port: where a simulator sends MAVLink on a second port.
+    ``simulators``: one for each vehicle, not yet started. ``maintenance_port``: where a simulator sends MAVLink on a
+    second port.
     """
-    assert with_daemons or not (condition.needs_daemons or two_radios or relays)
+    assert with_daemons or not (condition.needs_daemons or layout.two_radios or layout.relays)
     async with AsyncExitStack() as stack:
-        places = Places.behind_nats(stack) if behind_nats else None
         stage = await stack.enter_async_context(Stage())
-        station = await stack.enter_async_context(Station(sock=_socket_at(places.ground) if places else None))
-        world = World(stage, condition, station, places=places)
-        if condition.radio or can_cut or two_radios:
+        world = World(stage, condition, await stack.enter_async_context(Station()))
+        if condition.radio or layout.can_cut or layout.two_radios:
             world.radio = Radio(stage.folder, condition.radio)
             stack.push_async_callback(world.radio.stop)
-        if two_radios:
+        if layout.two_radios:
             world.second_radio = Radio(stage.folder, condition.radio, 1, "second-radio")
             stack.push_async_callback(world.second_radio.stop)
         if maintenance_port is not None:
@@ -241,14 +205,14 @@ async def flying(
             await world.maintenance.open(maintenance_port)
             stack.callback(world.maintenance.close)
         for simulator in simulators:
-            tap = Tap(partial(_socket_at, places.vehicle)) if places else Tap()
+            tap = Tap()
             await tap.open()
             stack.callback(tap.close)
             world.vehicles.append(Vehicle(simulator.system, tap, simulator))
         if with_daemons:
-            await _start_daemons(world, swarm=swarm, relays=relays)
+            await _start_daemons(world, swarm=layout.swarm, relays=layout.relays)
         else:
-            await _connect_directly(world, swarm=swarm)
+            await _connect_directly(world, swarm=layout.swarm)
         for vehicle in world.vehicles:
             stack.push_async_callback(vehicle.simulator.stop)
             await vehicle.simulator.start(vehicle.tap.address)
@@ -257,11 +221,11 @@ async def flying(
 
 
 async def _start_daemons(world: World, *, swarm: bool, relays: int) -> None:
-    stage, places = world.stage, world.places
-    ground = world.ground = world.daemon(GROUND, places.ground if places else None)
+    stage = world.stage
+    ground = world.ground = stage.daemon(GROUND)
     ground.add_endpoint("station", f"udpout:{shown(world.station.address)}")
     for vehicle in world.vehicles:
-        drone = vehicle.daemon = world.daemon(f"drone{vehicle.system}", places.vehicle if places else None)
+        drone = vehicle.daemon = stage.daemon(f"drone{vehicle.system}")
         vehicle.tap.onward = drone.add_endpoint(AUTOPILOT_ENDPOINT)
         ways = [radio.connect(drone.name, drone.sockaddr, ground.sockaddr) for radio in world.radios]
         to_ground, to_drone = zip(*(ways or [(ground.sockaddr, drone.sockaddr)]), strict=True)
@@ -275,7 +239,7 @@ async def _start_daemons(world: World, *, swarm: bool, relays: int) -> None:
         one.daemon.add_peer(other.daemon, [other.daemon.address], psk, **a_member(other.system))
         other.daemon.add_peer(one.daemon, [one.daemon.address], psk, **a_member(one.system))
     for number in range(1, relays + 1):
-        relay = world.daemon(f"relay{number}", places.relay if places else None)
+        relay = stage.daemon(f"relay{number}")
         make_relay(relay, *world.daemons)
         world.relays.append(relay)
     for daemon in world.daemons:

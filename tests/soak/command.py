@@ -1,8 +1,8 @@
 """A soak: real daemons over an emulated radio that loses, delays and pauses, with new keys every few seconds.
 
 Two drones and a ground station exchange frames for the given time. The folder gets one line of JSON per sample
-(samples.jsonl), a figure (soak.png) and a verdict (summary.json). Exit status 0 only if the verdict is good. ``python
--m tests.soak report DIR`` makes figure and verdict of the samples so far, also during the run.
+(samples.jsonl) and a verdict (summary.json). Exit status 0 only if the verdict is good. ``python -m tests.soak report
+DIR`` judges the samples so far, also during the run.
 """
 
 from __future__ import annotations
@@ -14,14 +14,12 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from tests.soak.figure import draw
 from tests.soak.judge import SAMPLES, judge, read_samples
 from tests.soak.run import Plan, record
 
 OK, FAILED = 0, 1
-FIGURE, SUMMARY = "soak.png", "summary.json"
+SUMMARY = "summary.json"
 SAMPLES_AT_MOST = 1500
-"""A long run is sampled less often."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -50,13 +48,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def report(folder: Path) -> int:
-    """Write figure and verdict of the samples so far."""
+    """Write the verdict of the samples so far."""
     samples = read_samples(folder)
     if not samples:
         print(f"nothing has been measured yet in {folder}", file=sys.stderr)
         return FAILED
     summary = judge(samples)
-    (folder / FIGURE).write_bytes(draw(samples))
     text = json.dumps(summary, indent=2)
     (folder / SUMMARY).write_text(text + "\n")
     print(text)

@@ -56,7 +56,6 @@ class Flow:
     not_sent: int = 0
     """Sent to a daemon and never seen before the radio: lost by the sending daemon."""
     duplicated: int = 0
-    """Delivered more than once."""
     out_of_order: int = 0
     """Delivered after a later one, which the radio's jitter causes;"""
     reordered: int = 0
@@ -64,14 +63,12 @@ class Flow:
     invented: int = 0
     """Delivered without having been sent, or after it was settled."""
     latencies_s: list[float] = field(default_factory=list)
-    """Latencies since the last call of :meth:`take_latencies`."""
     _ways: dict[int, Way] = field(default_factory=dict)
     _left: int = 0
     _latest: int = -1
     _latest_left: int = -1
 
     def on_sent(self, number: int, now: float) -> None:
-        """The client sent it to its daemon. Numbers rise."""
         self._ways[number] = Way(now)
         self.sent += 1
 
@@ -88,7 +85,6 @@ class Flow:
             way.left_as = self._left
 
     def on_delivered(self, number: int, now: float) -> None:
-        """The other client received it."""
         way = self._ways.get(number)
         if way is None or way.left_as is None:
             self.invented += 1
@@ -120,7 +116,6 @@ class Flow:
                 self.not_sent += 1
 
     def take_latencies(self) -> list[float]:
-        """The latencies of the frames that were delivered since the last call."""
         taken, self.latencies_s = self.latencies_s, []
         return taken
 

@@ -38,30 +38,24 @@ from uavlinkd.ops.control import ControlError, ask
 DRONES = ("drone0", "drone1")
 GROUND = "ground"
 SYSTEMS = {"drone0": 1, "drone1": 2, GROUND: 255}
-RADIO = {
+RADIO: dict[str, Any] = {
     "loss": 0.01,
-    "bursts_begin": 0.01,  # 4 % of datagrams, four at a time
-    "bursts_end": 0.25,
+    "bursts": {"to_bad": 0.01, "to_good": 0.25},  # 4 % of datagrams, four at a time
     "duplication": 0.01,
     "delay_s": 0.03,
     "jitter_s": 0.03,  # more than between two frames: they overtake one another
-    "outage_at_s": 8.0,
-    "outage_s": 0.8,  # shorter than what is late (2 s): a link must come through without losing a frame of its own
-    "outage_every_s": 47.0,
+    # Shorter than what is late (2 s): a link must come through without losing a frame of its own.
+    "outages": [{"down_at_s": 8.0, "up_at_s": 8.8, "every_s": 47.0}],
 }
 RADIO_NAME = "radio"
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """The parameters of a run."""
-
     seconds: float
     rate: float = 50.0
-    """Frames a second, from each client."""
     rekey_s: float = 2.0
     every_s: float = 5.0
-    """Time between two samples."""
     seed: int = 0
 
 
@@ -71,16 +65,13 @@ class Speaker(asyncio.DatagramProtocol):
     def __init__(self, name: str, into: Sockaddr) -> None:
         self.name = name
         self.flows: dict[str, Flow] = {}
-        """Flows to others, by name."""
         self.received: dict[int, Flow] = {}
-        """Flows from others, by system."""
         self.sock = open_socket("127.0.0.1")
         self._into = into
         self._number = 0
         self._transport: asyncio.BaseTransport
 
     async def open(self) -> None:
-        """Open the socket."""
         await asyncio.get_running_loop().create_datagram_endpoint(lambda: self, sock=self.sock)
 
     def greet(self) -> None:
@@ -88,7 +79,6 @@ class Speaker(asyncio.DatagramProtocol):
         self.sock.sendto(frame(2**30, SYSTEMS[self.name]), self._into)
 
     def say(self) -> None:
-        """Send the next frame."""
         self._number += 1
         now = monotonic()
         for flow in self.flows.values():
@@ -106,7 +96,6 @@ class Speaker(asyncio.DatagramProtocol):
                     flow.on_delivered(number, now)
 
     def close(self) -> None:
-        """Close the socket."""
         self._transport.close()
 
 
@@ -226,7 +215,6 @@ class Soak:
         return await asyncio.to_thread(ask, self.radio_socket, "statistics")
 
     async def close(self) -> None:
-        """Stop the radio; the stage stops the rest."""
         if self._radio is not None and self._radio.returncode is None:
             self._radio.terminate()
             await self._radio.wait()
@@ -325,8 +313,6 @@ async def soaking(plan: Plan) -> Any:
 
 
 async def record(plan: Plan, samples: TextIO, say: Callable[[str], None]) -> None:
-    """A whole run, one line of JSON per sample."""
-
     def on_sample(sample: dict[str, Any]) -> None:
         samples.write(json.dumps(sample) + "\n")
         samples.flush()

@@ -16,8 +16,8 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
-from tests.compose.cluster import there
 from tests.compose.machine import Machine
+from tests.namespaces import udp_socket_in
 from tests.waiting import PATIENCE_S
 
 HOME = "/mnt"
@@ -103,7 +103,6 @@ class Host:
 
     @property
     def log(self) -> str:
-        """What its daemons wrote."""
         path = self._network.folder / f"{self.name}.log"
         return path.read_text() if path.exists() else ""
 
@@ -133,11 +132,9 @@ class Host:
         return done.stdout
 
     def save(self, file: str, text: str) -> None:
-        """Save a file in its folder."""
         (self.folder / file).write_text(text)
 
     def start(self, command: str) -> None:
-        """Start a daemon in the background."""
         with (self._network.folder / f"{self.name}.log").open("ab") as log:
             self._daemons.append(
                 subprocess.Popen(
@@ -150,15 +147,7 @@ class Host:
             )
 
     def open_socket(self, port: int) -> socket.socket:
-        """A UDP socket on its loopback."""
-
-        def opened() -> socket.socket:
-            sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-            sock.setblocking(False)
-            sock.bind(("127.0.0.1", port))
-            return sock
-
-        return there(Path(f"/proc/{self.pid}/ns/net"), opened)
+        return udp_socket_in(Path(f"/proc/{self.pid}/ns/net"), port=port)
 
 
 class Container:
@@ -173,7 +162,6 @@ class Container:
 
     @property
     def log(self) -> str:
-        """What its services wrote."""
         return self._machine.run("journalctl --no-pager --output=cat").stdout
 
     def try_to(self, command: str) -> subprocess.CompletedProcess[str]:
@@ -185,7 +173,6 @@ class Container:
         return self._machine.say(f"cd /root; {command} </dev/null")
 
     def save(self, file: str, text: str) -> None:
-        """Save a file at an absolute path."""
         path = self._folder / "saved"
         path.write_text(text)
         self._machine.put(path, file)
@@ -216,7 +203,6 @@ class Autopilot:
             os.write(self._port, frame)
 
     def poll(self) -> bytearray:
-        """All bytes that arrived so far."""
         with suppress(BlockingIOError, OSError):
             while data := os.read(self._port, 4096):
                 self.received += data
@@ -237,7 +223,6 @@ class GroundStation:
             self._socket.sendto(frame, self._daemon)
 
     def poll(self) -> bytearray:
-        """All bytes that arrived so far."""
         with suppress(BlockingIOError, ConnectionError):
             while True:
                 data, self._daemon = self._socket.recvfrom(4096)
@@ -245,5 +230,4 @@ class GroundStation:
         return self.received
 
     def close(self) -> None:
-        """Close the socket."""
         self._socket.close()

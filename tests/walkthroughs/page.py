@@ -23,7 +23,6 @@ class Block(NamedTuple):
 
     @property
     def commands(self) -> list[str]:
-        """One per line."""
         return self.text.splitlines()
 
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from tests.compose.machine import Machine
+from tests.daemon.frames import heartbeat
 from tests.walkthroughs import autopilot
 from tests.walkthroughs.hosts import until
-from tests.walkthroughs.test_walkthroughs import Walk, blocks_of, heartbeat, position, return_home, walk
+from tests.walkthroughs.test_walkthroughs import Walk, blocks_of, position, return_home, walk
 
 __all__ = ["test_raspberry_pi_from_a_fresh_image", "walk"]
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -11,8 +10,9 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from tests.compose.machine import Machine
-from tests.compose.test_namespaces import can_make_namespaces
-from tests.needs import need
+from tests.daemon.frames import GROUND_SYSTEM, command_long, ground_heartbeat, heartbeat, numbered
+from tests.namespaces import need_namespaces
+from tests.samples import pack
 from tests.walkthroughs.hosts import Autopilot, Container, GroundStation, Host, Network, until
 from tests.walkthroughs.page import PLACEHOLDER, Block, sections
 
@@ -44,7 +44,6 @@ class Walk:
         self._public_keys: dict[str, str] = {}
 
     def add_host(self, name: str, *addresses: str) -> Host:
-        """A machine on the bridge."""
         host = Host(self.network, name)
         self.hosts[name] = host
         self._stack.callback(host.close)
@@ -52,23 +51,19 @@ class Walk:
         return host
 
     def add_container(self, name: str, machine: Machine, *addresses: str) -> Container:
-        """A machine with systemd on the bridge."""
         container = self.hosts[name] = Container(name, machine, self.network.folder)
         self.network.connect(container, *addresses)
         return container
 
     def add_ground_station(self, host: Host) -> GroundStation:
-        """QGroundControl on a host."""
         station = GroundStation(host)
         self._stack.callback(station.close)
         return station
 
     def close(self) -> None:
-        """End everything."""
         self._stack.close()
 
     def follow(self, blocks: Sequence[Block]) -> None:
-        """Do what the blocks say."""
         for block in blocks:
             host = self.hosts[block.host]
             if block.file:
@@ -97,8 +92,7 @@ class Walk:
 @pytest.fixture
 def walk(tmp_path: Path) -> Iterator[Walk]:
     """No hosts yet."""
-    need(can_make_namespaces(), "root, and iproute2 with network namespaces")
-    need(shutil.which("nft") is not None, "nft (Debian: nftables)")
+    need_namespaces("nft")
     made = Walk(tmp_path)
     try:
         yield made
@@ -107,36 +101,21 @@ def walk(tmp_path: Path) -> Iterator[Walk]:
 
 
 def blocks_of(number: int) -> list[Block]:
-    """The blocks of a section."""
     return next(blocks for title, blocks in SECTIONS.items() if title.startswith(f"{number} "))
 
 
-def codec(system: int) -> mavlink.MAVLink:
-    """Packs frames of a system's autopilot or ground station."""
-    return mavlink.MAVLink(None, system, 190 if system == 255 else 1)
-
-
-def heartbeat(system: int) -> bytes:
-    """Of a ground station (255) or of an autopilot."""
-    kind = (mavlink.MAV_TYPE_GCS, 8) if system == 255 else (mavlink.MAV_TYPE_QUADROTOR, 3)
-    return bytes(mavlink.MAVLink_heartbeat_message(*kind, 0, 0, 4, 3).pack(codec(system)))
-
-
 def position(system: int) -> bytes:
-    """What a swarm member reports."""
-    message = mavlink.MAVLink_global_position_int_message(1, 2, 3, 4, 5, 6, 7, 8, 9)
-    return bytes(message.pack(codec(system)))
+    return numbered(1, system)
 
 
 def mission_count(system: int, target: int) -> bytes:
     """A vehicle's answer to its operator. To another autopilot it is a write."""
-    return bytes(mavlink.MAVLink_mission_count_message(target, 1, 3).pack(codec(system)))
+    return pack(mavlink.MAVLink_mission_count_message(target, 1, 3), system)
 
 
 def return_home(target: int) -> bytes:
     """A command of the ground station."""
-    command = mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH
-    return bytes(mavlink.MAVLink_command_long_message(target, 1, command, 0, *[0.0] * 7).pack(codec(255)))
+    return command_long(mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH, GROUND_SYSTEM, (target, 1))
 
 
 def converse(walk: Walk, autopilots: dict[int, Autopilot], station: GroundStation) -> None:
@@ -146,7 +125,7 @@ def converse(walk: Walk, autopilots: dict[int, Autopilot], station: GroundStatio
         for system, autopilot in autopilots.items():
             autopilot.send(heartbeat(system) + position(system))
             station.send(return_home(system))
-        station.send(heartbeat(255))
+        station.send(ground_heartbeat())
         return all(
             position(system) in station.poll() and return_home(system) in autopilot.poll()
             for system, autopilot in autopilots.items()

@@ -72,7 +72,6 @@ def conversation(link: Link = PLAIN) -> list[Sent]:
 
 
 def cookie_reply() -> list[Sent]:
-    """An initiation to a responder under load, and its cookie reply."""
     pair = Pair()
     exhaust(pair.b, 0.0)
     initiation = pair.initiation(0.0)

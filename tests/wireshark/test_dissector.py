@@ -34,7 +34,6 @@ RECORDS = ["1", "2", "6", "5", "3", "3", "3", "3"]
 
 @pytest.fixture
 def folder() -> Iterator[Path]:
-    """A folder that another user may read, with the script in it."""
     need((ROOT / "usr/bin/tshark").exists(), "tshark")
     with tempfile.TemporaryDirectory(dir=ROOT / "tmp") as name:
         folder = Path(name)
@@ -44,7 +43,6 @@ def folder() -> Iterator[Path]:
 
 
 def inside(path: Path) -> str:
-    """The path as a process in :data:`ROOT` sees it."""
     return f"/{path.relative_to(ROOT)}"
 
 

@@ -1,0 +1,142 @@
+"""Two hosts (network namespaces) with a cable for each network between them, and a talking daemon on each."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from types import TracebackType
+from typing import Any, Self
+
+from tests.daemon.harness import Stage
+from tests.daemon.process import DaemonProcess
+from tests.faults.talk import Talk, Voice, prepare
+from tests.namespaces import Namespace
+
+PORT = 5790
+LTE, MESH, ONLY = "lte", "mesh", "eth"
+_SUBNETS = {LTE: "10.213.81", MESH: "10.213.82", ONLY: "10.213.77"}
+
+
+def address_of(network: str, place: int) -> str:
+    """The IPv4 address of a host on a network: place 1 is the vehicle, 2 the ground station."""
+    return f"{_SUBNETS[network]}.{place}"
+
+
+def _usable(status: Mapping[str, Any]) -> set[str]:
+    """The subnets with a usable path, in the status of a daemon with one peer."""
+    (peer,) = status["peers"].values()
+    return {path["address"].rpartition(".")[0] for path in peer["paths"] if path["state"] == "usable"}
+
+
+def interface_of(network: str) -> str:
+    """The name of the interface on both hosts."""
+    return f"{network}0"
+
+
+class TwoHosts:
+    """A vehicle and a ground station that can reach each other along each network.
+
+    With several networks, these are in the configurations. Change :attr:`vehicle`, :attr:`ground` and the interfaces
+    before :meth:`start`.
+    """
+
+    def __init__(
+        self, stage: Stage, networks: Sequence[str] = (LTE, MESH), names: tuple[str, str] = ("drone0", "drone1")
+    ) -> None:
+        self.hosts = Namespace(), Namespace()
+        self.talk: Talk
+        self._stage = stage
+        self._networks = networks
+        self.vehicle, self.ground = self._daemons = (
+            stage.daemon(names[0], [f"0.0.0.0:{PORT}"]),
+            stage.daemon(names[1], [f"0.0.0.0:{PORT}"]),
+        )
+        psk = stage.psk()
+        for place, host, daemon in zip((1, 2), self.hosts, self._daemons, strict=True):
+            daemon.launcher = host.launcher
+            daemon.add_peer(self._daemons[2 - place], [], psk)
+            other = {network: f"{address_of(network, 3 - place)}:{PORT}" for network in networks}
+            if len(networks) > 1:
+                daemon.config["network"] = [{"name": name, "interface": interface_of(name)} for name in networks]
+                daemon.config["peer"][0]["addresses"] = [
+                    {"address": address, "network": name} for name, address in other.items()
+                ]
+            else:
+                daemon.config["peer"][0]["addresses"] = list(other.values())
+
+    async def __aenter__(self) -> Self:
+        for host in self.hosts:
+            host.open()
+        for network in self._networks:
+            self.plug_in(network)
+            self.configure(network)
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if hasattr(self, "talk"):
+            self.talk.stop()
+        for daemon in self._daemons:
+            if daemon.is_running:
+                await daemon.stop()
+        for host in self.hosts:
+            host.close()
+
+    async def start(self, voice: type[Voice] = Voice) -> None:
+        """Start both daemons with a talking client each, and wait until each hears the other."""
+        self.talk = prepare(self.vehicle, self.ground, (self.hosts[0].path, self.hosts[1].path), voice)
+        await self._stage.start(*self._daemons)
+        await self.talk.start()
+
+    # The vehicle's host.
+
+    def ip(self, line: str) -> None:
+        self.hosts[0].ip(line)
+
+    def run(self, script: str) -> None:
+        """A shell script there."""
+        self.hosts[0].run("sh", "-euc", script)
+
+    def check(self) -> tuple[int, str]:
+        """What ``uavlinkd check`` says there: its exit status and its output in one line."""
+        command = [*self.hosts[0].launcher, sys.executable, "-m", "uavlinkd", "check"]
+        done = subprocess.run(
+            [*command, "--config", str(self.vehicle.write_config())], capture_output=True, text=True, check=False
+        )
+        return done.returncode, " ".join((done.stdout + done.stderr).split())
+
+    def plug_in(self, network: str) -> None:
+        """Make a cable between the hosts. The interface of the ground station is ready, not that of the vehicle."""
+        (vehicle, ground), interface = self.hosts, interface_of(network)
+        vehicle.ip(f"link add {interface} type veth peer name {interface} netns {ground.name}")
+        ground.ip(f"address add {address_of(network, 2)}/24 dev {interface}", f"link set {interface} up")
+
+    def configure(self, network: str, place: int = 1) -> None:
+        interface = interface_of(network)
+        self.hosts[0].ip(f"address add {address_of(network, place)}/24 dev {interface}", f"link set {interface} up")
+
+    # What the daemons say.
+
+    async def until_present(self, network: str, *, is_present: bool = True) -> dict[str, Any]:
+        """Wait until the vehicle sees the network, or until it does not. Returns its status."""
+        status = await self.vehicle.until(
+            lambda status: bool(status["networks"][network]["is_present"]) is is_present
+        )
+        seen: dict[str, Any] = status["networks"][network]
+        return seen
+
+    async def until_usable(self, *networks: str) -> None:
+        """Wait until both ends say that the paths on all these networks are usable."""
+        for daemon in self._daemons:
+            await daemon.until(lambda status: {_SUBNETS[network] for network in networks} <= _usable(status))
+
+    async def until_path(self, network: str, daemon: DaemonProcess | None = None, place: int | None = None) -> None:
+        """Wait until the vehicle, or another daemon, sends along this network; to this place there."""
+        daemon = daemon or self.vehicle
+        start = f"{_SUBNETS[network]}." if place is None else f"{address_of(network, place)}:"
+        (peer,) = [peer["name"] for peer in daemon.config["peer"]]
+        await daemon.until(
+            lambda status: status["peers"][peer]["state"] == "up" and status["peers"][peer]["path"].startswith(start)
+        )

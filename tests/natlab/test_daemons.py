@@ -1,0 +1,122 @@
+"""Daemons behind NATs: relayed, direct over IPv6, what netcheck reports, and faults after which the link is back."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Final
+
+import pytest
+
+from tests.daemon.harness import Stage
+from tests.natlab import daemons
+from tests.natlab.faults import FAULTS, Outcome, play
+from tests.natlab.kinds import PAIRED
+from tests.natlab.laboratory import Laboratory, need_laboratory
+from tests.natlab.pairs import make_ipv6_pairs, make_pairs
+from tests.waiting import Stopwatch
+from uavlinkd.ops.netcheck import ANY_PEER, FEW_PEERS, MOST_PEERS, Filtered, Mapped, behaviours, meaning
+
+pytestmark = [pytest.mark.alone, pytest.mark.usefixtures("_needs")]
+
+RELAYED_S = 1.0
+"""From when both reached the relay until each has received a frame."""
+DIRECT_S = 10.0
+AT_ONCE = 4
+BACK_S = 2.0
+MOVED_S = 4.0
+"""A relay at another address is lost first; then its name is resolved, once a second."""
+OPEN, BY_PORT = Filtered.NOT_BY_PORT, Filtered.BY_PORT
+REPORTED: Final = {
+    "open": (Mapped.NO_NAT, OPEN, ANY_PEER),
+    "firewall": (Mapped.NO_NAT, BY_PORT, MOST_PEERS),
+    "full-cone": (Mapped.INDEPENDENT, OPEN, ANY_PEER),
+    "address-restricted": (Mapped.INDEPENDENT, OPEN, ANY_PEER),
+    "port-restricted": (Mapped.INDEPENDENT, BY_PORT, MOST_PEERS),
+    "address-dependent": (Mapped.BY_ADDRESS, OPEN, FEW_PEERS),
+    "symmetric": (Mapped.BY_PORT, BY_PORT, FEW_PEERS),
+    "linux": (Mapped.INDEPENDENT, BY_PORT, MOST_PEERS),
+    "linux-random": (Mapped.BY_PORT, BY_PORT, FEW_PEERS),
+    "carrier": (Mapped.INDEPENDENT, BY_PORT, MOST_PEERS),
+    "carrier-symmetric": (Mapped.BY_PORT, BY_PORT, FEW_PEERS),
+    "no-udp": None,
+}
+"""By kind, with a relay that has two addresses, and two ports at one of them. None: no relay answers."""
+
+
+@pytest.fixture(scope="module")
+def _needs() -> None:
+    need_laboratory()
+
+
+@pytest.mark.long
+async def test_every_pair_is_relayed() -> None:
+    """Also those that are never direct; soon, and without the loss of a frame from then on."""
+    watch = Stopwatch()
+    with Laboratory() as laboratory:
+        pairs = make_pairs(laboratory, ("symmetric", "carrier-symmetric"), shared=False)
+        outcomes = await daemons.connect_all(pairs, laboratory.public(), direct_limit_s=0, at_once=2)
+    for outcome in outcomes.values():
+        assert outcome.relayed_s is not None
+        assert outcome.relayed_s < RELAYED_S + watch.contended_s
+        assert outcome.lost == 0
+
+
+@pytest.mark.long
+async def test_pairs_with_ipv6_are_direct_over_it() -> None:
+    """A firewall drops what it did not ask for. If one end has no IPv6, the NATs for IPv4 decide."""
+    with Laboratory() as laboratory:
+        pairs = make_ipv6_pairs(laboratory)
+        public = laboratory.public(has_ipv6=True)
+        outcomes = await daemons.connect_all(pairs, public, direct_limit_s=DIRECT_S, at_once=2)
+    for pair, outcome in outcomes.items():
+        one, other = pair.places
+        assert outcome.relayed_s is not None
+        if one.ipv6 and other.ipv6:
+            assert outcome.direct_to.startswith(f"[{other.ipv6}]:")
+        elif other.kind == "full-cone":
+            assert outcome.direct_to.startswith(f"{other.external}:")
+        else:
+            assert outcome.direct_s is None
+
+
+@pytest.mark.long
+async def test_netcheck_reports_what_the_routers_do() -> None:
+    """Twice in a row: the first tests open no NAT for the second ones. No daemon warns of a token."""
+    assert set(REPORTED) == set(PAIRED)
+    with Laboratory() as laboratory:
+        async with Stage() as stage:
+            members = await daemons.start_members(stage, laboratory, PAIRED)
+            before = {kind: (await member.status())["drops"] for kind, member in members.items()}
+            for _ in range(2):
+                answers = await asyncio.gather(*(member.ask("netcheck") for member in members.values()))
+                for kind, answer in zip(members, answers, strict=True):
+                    reported = [
+                        (mapped, filtered, meaning(mapped, filtered)) for _, mapped, filtered in behaviours(answer)
+                    ]
+                    assert reported == ([REPORTED[kind]] if REPORTED[kind] else []), kind
+            for kind, member in members.items():
+                assert (await member.status())["drops"] == before[kind], kind
+
+
+@pytest.mark.long
+async def test_link_is_back_soon_after_each_fault() -> None:
+    """Frames were lost meanwhile, or none was sent. If one of two networks dies, no critical frame is lost.
+
+    The faults happen at the same time, each in a laboratory of its own: mostly they wait.
+    """
+    watch, turns = Stopwatch(), asyncio.Semaphore(AT_ONCE)
+
+    async def happen(fault: str) -> Outcome:
+        async with turns:
+            with Laboratory() as laboratory:
+                return await play(FAULTS[fault], laboratory)
+
+    outcomes = dict(zip(FAULTS, await asyncio.gather(*map(happen, FAULTS)), strict=True))
+    for fault, outcome in outcomes.items():
+        print(fault, outcome)
+        assert outcome.back_s < (MOVED_S if "address" in fault else BACK_S) + watch.contended_s, fault
+        if "critical frames" in fault:
+            assert outcome.sent > 100
+            assert outcome.lost == 0
+        else:
+            assert 0 < outcome.lost < outcome.sent or outcome.sent == 0, fault
