@@ -1,35 +1,50 @@
-"""Settings of the whole test run: its workers, the order of its tests, the recorded flights, and no skips in CI."""
+"""Settings of the whole test run: its workers, the order of its tests, traces, skips in CI, recorded flights."""
 
 from __future__ import annotations
 
+import asyncio
 import os
 import signal
-from collections.abc import Generator
+from collections.abc import AsyncIterator, Generator, Iterator
 from pathlib import Path
 
 import pytest
+import structlog
+from hypothesis import HealthCheck, settings
 
-MAY_BE_MISSING = (
-    "no ProVerif",
-    "no recorded flights",
-    "no autopilot simulator",
-    "needs a writable cgroup",
-    "needs an interface with a link-local IPv6 address",
-    "this machine does not know its own name",
-)
-"""How the reasons begin for which a test may be skipped in CI too: see tests/README.md."""
-
+from tests.needs import MAY_BE_MISSING
+from tests.traces import END_S, no_trace, open_once
+from uavlinkd.system import core_dumps
 
 WORKERS_PER_CORE = 2
 """Most tests wait for daemons, clients and containers."""
-SLOWEST = ("packages", "compose", "faults", "soak", "evaluation", "bench", "fleet", "pressure", "daemon", "network")
+SLOWEST = (
+    "mitm",
+    "packages",
+    "compose",
+    "faults",
+    "soak",
+    "evaluation",
+    "bench",
+    "fleet",
+    "pressure",
+    "daemon",
+    "network",
+)
 """Folders, the slowest tests first."""
 ALONE = ("pressure", "faults", "soak", "daemon", "link")
 """Folders whose tests measure delays, losses and processor time of real daemons: marked ``alone``."""
 
+settings.register_profile("busy machine", settings(), deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("busy machine")
+
 
 def pytest_configure() -> None:
-    """Accept Ctrl-C, and let children do so: a shell starts what runs in its background without."""
+    """Accept Ctrl-C, and let children do so: a shell starts what runs in its background without.
+
+    pymavlink sets MAVLINK20 itself when it reads the first frame of MAVLink 2.
+    """
+    os.environ.setdefault("MAVLINK20", "1")
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
@@ -41,13 +56,23 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what runs alone. Start the slowest files first, so that no worker starts one at the end."""
+    """Mark what runs alone and what reads recorded flights. Start the slowest files first.
+
+    A worker that starts one at the end makes the others wait. The order within a folder stays random.
+    """
     for item in items:
-        if set(ALONE) & set(item.nodeid.partition("::")[0].split("/")):  # not by the path of the checkout
+        if set(ALONE) & _folders(item):
             item.add_marker("alone")
+        if "shared_data" in getattr(item, "fixturenames", ()):
+            item.add_marker("recorded")
     items.sort(
-        key=lambda item: next((n for n, folder in enumerate(SLOWEST) if folder in item.path.parts), len(SLOWEST))
+        key=lambda item: next((n for n, folder in enumerate(SLOWEST) if folder in _folders(item)), len(SLOWEST))
     )
+
+
+def _folders(item: pytest.Item) -> set[str]:
+    """Those within the project: the checkout may be in a folder of any name."""
+    return set(item.nodeid.partition("::")[0].split("/"))
 
 
 @pytest.hookimpl(wrapper=True)
@@ -62,6 +87,54 @@ def pytest_runtest_makereport(
         if not reason.startswith(MAY_BE_MISSING):
             report.outcome, report.longrepr = "failed", f"skipped, and that in CI: {reason}"
     return report
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _opened_once() -> None:
+    open_once()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _module_leaves_no_trace(_opened_once: None) -> Iterator[None]:
+    with no_trace("this module"):
+        yield
+
+
+@pytest.fixture(autouse=True)
+def _leaves_no_trace(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Fail a test that leaves something in its process: see tests/traces.py."""
+    with no_trace("this test", has_resources=not _shares_a_fixture(request)):
+        yield
+
+
+@pytest.fixture(autouse=True)
+def _leaves_no_task(_leaves_no_trace: None, request: pytest.FixtureRequest) -> None:
+    """Fail a test that leaves a running task in its event loop."""
+    marker = request.node.get_closest_marker("asyncio")
+    if marker is not None and "loop_scope" not in marker.kwargs:
+        request.getfixturevalue("_tasks_end")  # after all other fixtures of the test, before its loop is closed
+
+
+@pytest.fixture
+async def _tasks_end() -> AsyncIterator[None]:
+    yield
+    tasks = asyncio.all_tasks() - {asyncio.current_task()}
+    left = (await asyncio.wait(tasks, timeout=END_S))[1] if tasks else ()
+    assert not left, "\n  ".join(["this test left in its event loop:", *map(str, left)])
+
+
+def _shares_a_fixture(request: pytest.FixtureRequest) -> bool:
+    fixtures = request.node._fixtureinfo.name2fixturedefs
+    return any(fixtures[name][-1].scope == "module" for name in fixtures if name != "_module_leaves_no_trace")
+
+
+@pytest.fixture
+def undone_settings(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Undo what a command of the package sets for its process: the log, and that it dumps no core."""
+    monkeypatch.setattr(core_dumps, "forbid_core_dumps", lambda: None)  # a limit that only root could raise again
+    before = structlog.get_config()
+    yield
+    structlog.configure(**before)
 
 
 def _shared_folder() -> Path | None:

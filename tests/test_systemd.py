@@ -36,11 +36,6 @@ def settings(name: str) -> dict[str, list[str]]:
     return result
 
 
-def test_there_is_a_unit_for_each_purpose() -> None:
-    """The daemon, several daemons, a relay, and the man in the middle."""
-    assert NAMES == ["uavlink-mitm.service", "uavlinkd-relay.service", "uavlinkd.service", "uavlinkd@.service"]
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_unit_has_nothing_wrong(tmp_path: Path, name: str) -> None:
     """In a file system where it is installed as it says."""
@@ -56,16 +51,6 @@ def test_unit_has_nothing_wrong(tmp_path: Path, name: str) -> None:
         (units / f"{target}.target").write_text("[Unit]\nDescription=there\n")
     done = analyze("verify", "--man=no", f"--root={tmp_path}", instance)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
-
-
-def test_verification_sees_a_mistake(tmp_path: Path) -> None:
-    """The test above could fail."""
-    units = tmp_path / "etc/systemd/system"
-    units.mkdir(parents=True)
-    text = (UNITS / "uavlinkd.service").read_text()
-    (units / "uavlinkd.service").write_text(text.replace("PrivateTmp=", "PrivateTemp="))
-    done = analyze("verify", "--man=no", f"--root={tmp_path}", "uavlinkd.service")
-    assert "PrivateTemp" in done.stderr
 
 
 @pytest.mark.parametrize("name", NAMES)
