@@ -21,8 +21,6 @@ BACKEND_LOCK = HERE / "backend.lock"
 """What builds the wheel of uavlinkd."""
 MACHINES = {"amd64": "x86_64", "arm64": "aarch64"}
 """Debian's names of architectures, and those in the names of wheels."""
-LEFT_OUT = frozenset({"pymavlink"})
-"""Only the laboratory imports it (systemd/README.md)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,8 +67,7 @@ def pip(*arguments: str | Path) -> None:
 def requirements() -> list[str]:
     """What a daemon needs on a vehicle, and the faster event loop."""
     project = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"]
-    wanted = [*project["dependencies"], *project["optional-dependencies"]["speed"]]
-    return [text for text in wanted if name_of(text) not in LEFT_OUT]
+    return [*project["dependencies"], *project["optional-dependencies"]["speed"]]
 
 
 def name_of(requirement: str) -> str:
