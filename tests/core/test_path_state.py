@@ -89,19 +89,29 @@ def test_questions_that_wait_are_limited_in_age_and_number() -> None:
 
 
 def test_round_trip_is_smoothed() -> None:
-    """SRTT is the mean of the first eight: a slow first answer fades. Then with 1/8. RTTVAR with 1/4, before SRTT."""
+    """SRTT is the mean of the first eight. Then with 1/8. RTTVAR with 1/4, before SRTT."""
     state = usable(0.1)
     answer(state, ask(state, 1.0), 1.2)
     assert state.rttvar_s == pytest.approx(0.75 * 0.05 + 0.25 * 0.1)
     assert state.srtt_s == pytest.approx(0.15)
     assert state.wait_s == pytest.approx(0.15 + 4 * 0.0625)
-    for number in range(2, 8):
+    for number in range(2, c.SETTLING_ANSWERS):
         answer(state, ask(state, float(number)), number + 0.2)
     assert state.srtt_s == pytest.approx((0.1 + 7 * 0.2) / 8)
     answer(state, ask(state, 9.0), 9.0)
     assert state.srtt_s == pytest.approx(7 / 8 * (0.1 + 7 * 0.2) / 8)
     assert fresh().wait_s == c.FIRST_ANSWER_S
     assert usable(0.001).wait_s == c.LEAST_ANSWER_S
+
+
+def test_radio_that_slept_is_not_slow() -> None:
+    """Until it woke, several questions waited: their answers say nothing of the path."""
+    state = fresh()
+    for question in [ask(state, at) for at in (0.0, 0.1, 0.3, 0.7, 1.5)]:
+        answer(state, question, 2.0)
+    answer(state, ask(state, 2.5), 2.51)
+    assert state.srtt_s == pytest.approx(0.01)
+    assert state.wait_s == c.LEAST_ANSWER_S
 
 
 @given(st.lists(st.floats(0.0, 4.0), min_size=1, max_size=30))

@@ -263,10 +263,14 @@ class PathState:
         self.answered_at = now
         self.answers += 1
         self.is_proven = True
-        self._add_round_trip(now - asked.sent_at)
+        round_trip_s = now - asked.sent_at
+        if self.answers <= c.SETTLING_ANSWERS and self.srtt_s is not None and round_trip_s < self.srtt_s / 2:
+            # A radio that slept answered the waiting questions late. That must not decide an election for long.
+            self.srtt_s, self.round_trips = None, 0
+        self._add_round_trip(round_trip_s)
         if received is not None and asked.sent:
             self._loss_out.add(asked.sent_at, asked.sent, received, asked.repeats)
-        return now - asked.sent_at
+        return round_trip_s
 
     def note_echo(self, round_trip_s: float, now: float) -> None:
         """An echo request along the only path was answered."""
@@ -285,7 +289,7 @@ class PathState:
             self.srtt_s, self.rttvar_s = round_trip_s, round_trip_s / 2
             return
         self.rttvar_s += (abs(self.srtt_s - round_trip_s) - self.rttvar_s) / 4
-        # At first the mean: a slow first answer (of a radio that slept) must not decide an election for many seconds.
+        # At first the mean: one round trip must not decide an election for many seconds.
         self.srtt_s += (round_trip_s - self.srtt_s) / min(8, self.round_trips)
 
     def _expire_questions(self, now: float) -> None:
