@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 from collections.abc import AsyncIterator
 from itertools import combinations
@@ -17,7 +18,7 @@ from uavlinkd.core.outputs import Deliver, Output
 from uavlinkd.core.relay_records import handle_of
 from uavlinkd.core.settings import Link, PeerSettings
 from uavlinkd.lab.hostile.hostile_relay import HostileRelay, HostileRelaySettings
-from uavlinkd.lab.hostile.relay_attacks import ALL_ATTACKS
+from uavlinkd.lab.hostile.relay_attacks import ALL_ATTACKS, REPLAY_EVERY_S
 from uavlinkd.lab.mitm.attacks import parse_attack
 from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.relay.member_settings import MemberSettings, RelayLimits
@@ -74,14 +75,14 @@ class Scene:
             await one.until_bound(other.key)
             await other.until_bound(one.key)
 
-    async def bind_again(self) -> None:
+    async def connect_again(self) -> None:
         """The relay has forgotten all members: they notice that nothing answers, and make new sessions."""
+        await self.members[0].until(lambda: not self.relay.statistics()["members_up"])
         made = [member.peer.traffic.handshakes for member in self.members]
         for member, count in zip(self.members, made, strict=True):
             member.bounds.clear()
             member.send_frames(DATA)
             await member.until(lambda m=member, n=count: m.peer.traffic.handshakes > n)  # type: ignore[misc]
-        await self.bind()
 
     def seen_by(self, number: int) -> set[tuple[str, int]]:
         """The addresses that the relay reported to a member as its own."""
@@ -178,11 +179,16 @@ async def test_lies_about_filters(scene: Scene) -> None:
 
 
 async def test_restarts_and_replays(scene: Scene) -> None:
-    """What it recorded comes again along new handles."""
-    one, other, _ = scene.members
+    """What it recorded comes again along new handles, also if other members have theirs before."""
+    one, other, third = scene.members
     scene.relay.attack(["relay-restart,limit=1,rate_per_s=10"])
     one.send(one.handles(other.key)[0], DATA)
-    await scene.bind_again()
+    await scene.connect_again()
+    await one.bind(third.key)
+    await third.bind(one.key)
+    await third.until_bound(one.key)
+    await asyncio.sleep(3 * REPLAY_EVERY_S)
+    await scene.bind()
     await other.until(lambda: len(other.data) == 2)
     assert other.data[1] == other.handles(one.key)[0].to_bytes(2, "big") + DATA
     assert scene.interventions == {"relay-restart: replayed": 1}

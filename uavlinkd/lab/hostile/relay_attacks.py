@@ -215,12 +215,13 @@ class RestartAndReplay(RelayAttack, name="relay-restart", rate_per_s=0.4):
         actions = super().due(now)
         if now < self._replay_at:
             return actions
-        is_bound = any(self.relay.is_connected(direction) for direction in self.directions)
-        for _ in range(min(REPLAYS_AT_ONCE, len(self._replays)) if is_bound else 0):
+        for _ in range(min(REPLAYS_AT_ONCE, len(self._replays))):
             datagram, direction = self._replays.popleft()
             if self.relay.is_connected(direction):
                 note = self.own(Operation.REPLAYED, datagram, direction, now, "after a restart of the relay")
                 actions += [Send(datagram, direction), note]
+            else:  # the members are not bound to each other again
+                self._replays.append((datagram, direction))
         self._replay_at = now + REPLAY_EVERY_S if self._replays else NEVER
         return actions
 
