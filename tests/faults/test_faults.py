@@ -31,7 +31,7 @@ def outcomes(request: pytest.FixtureRequest) -> Outcomes:
     return outcomes
 
 
-SHORT = ("suspended", "descriptors", "interface_down", "recording_disk_full", "garbage")
+SHORT = ("descriptors", "interface_down", "recording_disk_full", "garbage")
 """Faults of each kind. The others are as long, and run in CI."""
 
 

@@ -202,7 +202,12 @@ def test_copies_of_all_peers_use_half_of_a_budget() -> None:
 
 
 @pytest.mark.parametrize(
-    ("stream_bytes_s", "bytes_s"), [(0, LEAST_BITS_S / 8), (3000, LEAST_BITS_S / 8), (20_000, 20_000)]
+    ("stream_bytes_s", "bytes_s"),
+    [
+        (0, LEAST_BITS_S / 8),
+        pytest.param(3000, LEAST_BITS_S / 8, marks=pytest.mark.long),
+        pytest.param(20_000, 20_000, marks=pytest.mark.long),
+    ],
 )
 def test_copies_use_at_most_the_rate_of_the_stream_or_64_kbit_s(stream_bytes_s: int, bytes_s: float) -> None:
     """On networks without a budget."""

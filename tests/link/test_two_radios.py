@@ -81,6 +81,7 @@ def wire_bits(end: End, radio: int, since: float) -> int:
     return sum(8 * (len(sent.datagram) + 28) for sent in end.sent if sent.radio == radio and sent.at >= since)
 
 
+@pytest.mark.long
 def test_joystick_copies_on_a_slow_radio_are_the_newest_ones() -> None:
     """50 Hz of MANUAL_CONTROL: the modem carries a part of it, in half of its budget. Probes and echoes are extra."""
     pair = network(FAST, TELEMETRY_MODEM)

@@ -14,7 +14,9 @@ BACK_WITHIN_S = 2.0
 STALE: tuple[Address, ...] = (("192.0.2.1", 5790), ("192.0.2.2", 5790), ("192.0.2.3", 5790))
 
 
-@pytest.mark.parametrize("stale", [0, 3], ids=["one address", "three stale addresses more"])
+@pytest.mark.parametrize(
+    "stale", [pytest.param(0, marks=pytest.mark.long), 3], ids=["one address", "three stale addresses more"]
+)
 @pytest.mark.parametrize(
     ("blackout_s", "interval_s"), [(1, 0.02), (1, 0.25), (3, 0.02), (3, 0.25), (10, 0.02), (60, 0.25), (200, 0.25)]
 )

@@ -149,6 +149,7 @@ def test_healthy_fleet_writes_less_than_a_line_an_hour() -> None:
             assert log.events.totals["envelopes_missing"] > 0
 
 
+@pytest.mark.long
 def test_problem_on_a_quiet_link_is_logged() -> None:
     """A link that loses a third, and one that is cut: a line at the beginning, and one at the end."""
     with LoggedNetwork("quiet log, problems") as network:

@@ -23,7 +23,9 @@ def _want_new_keys(drone: Drone, other: Drone) -> None:
     drone.node.set_paths(peer, peer.paths.configured, drone.local_now)  # looks at its timers
 
 
-@pytest.mark.parametrize("delay_s", [0.0, 0.02, 0.3])
+@pytest.mark.parametrize(
+    "delay_s", [*(pytest.param(delay_s, marks=pytest.mark.long) for delay_s in (0.0, 0.02)), 0.3]
+)
 @pytest.mark.parametrize("at_once", [False, True], ids=["in turn", "both at once"])
 def test_rekeying_at_full_traffic_loses_and_reorders_nothing(delay_s: float, at_once: bool) -> None:
     """500 frames a second in each direction, new keys every two seconds or less: no loss, no reordering."""

@@ -24,7 +24,7 @@ BACK_S = 2.0
 STREAM_GAP_S = 0.5
 
 
-@pytest.mark.parametrize("batch", range(2))
+@pytest.mark.parametrize("batch", [pytest.param(0, marks=pytest.mark.long), 1])
 def test_links_along_relays_are_back_soon_after_any_history(batch: int) -> None:
     """Relays die, NATs forget, members roam, data is replayed and forged: links are back. Filters hold."""
     for seed in (19, *range(20, 20 + SEEDS // 4))[batch::2]:
@@ -76,7 +76,9 @@ def test_link_is_back_soon_after_a_nat_has_forgotten_its_mappings(*, of_station:
     assert max(rebound_s(seed, of_station=of_station) for seed in range(TRIES)) < BACK_S
 
 
-@pytest.mark.parametrize("name", FAILURES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.long if name.startswith("the same") else ()) for name in FAILURES]
+)
 def test_no_critical_frame_is_lost_when_a_relay_or_a_network_dies(name: str) -> None:
     """Another one carries copies. The stream stops shortly."""
     for seed in range(TRIES):

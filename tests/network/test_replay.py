@@ -52,7 +52,7 @@ def _triangle(network: Network) -> tuple[Drone, Drone, Drone]:
     return drones
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in (1, 2))])
 def test_replay_storm_delivers_nothing_twice_and_leaves_the_links_as_they_are(seed: int) -> None:
     """500 replays a second against three linked drones: every frame once and in time, nothing lost."""
     with Network(f"storm {seed}", RadioSettings(delay_s=0.02)) as network:
@@ -74,7 +74,9 @@ def test_replay_storm_delivers_nothing_twice_and_leaves_the_links_as_they_are(se
         assert sum(drone.drops["replayed_initiation"] for drone in (a, b, c)) > 10
 
 
-@pytest.mark.parametrize("knows", ["both", "restarted", "other"])
+@pytest.mark.parametrize(
+    "knows", ["both", *(pytest.param(knows, marks=pytest.mark.long) for knows in ("restarted", "other"))]
+)
 def test_link_comes_back_after_a_restart_amid_a_replay_storm(knows: str) -> None:
     """The restarted drone remembers no initiation; hundreds of old ones do not block its link."""
     for seed in range(3):

@@ -46,7 +46,7 @@ def _crossing(network: Network) -> tuple[Drone, Drone]:
     return drones
 
 
-@pytest.mark.parametrize("seeds", [range(begin, begin + 25) for begin in range(0, 100, 25)], ids=str)
+@pytest.mark.parametrize("seeds", [range(20), pytest.param(range(20, 100), marks=pytest.mark.long)], ids=str)
 def test_two_ends_started_at_once_settle_on_the_same_session(seeds: range) -> None:
     """With any crossing messages and stale addresses, both ends settle on one session and stay there."""
     for seed in seeds:
