@@ -34,14 +34,16 @@ def envelope(frames: Sequence[Frame], *paths: Path) -> list[Transmit]:
 
 
 class Scene:
-    """A peer with a free network and a slow one, and a daemon that sends and charges."""
+    """A peer with a free network and a slow one, and a daemon that sends and charges. ``spent``: on the slow one."""
 
-    def __init__(self, budgets: dict[int, int] | None = None) -> None:
+    def __init__(self, budgets: dict[int, int] | None = None, spent: int = 0) -> None:
         limits = {SLOW.socket: SLOW_BITS_S} if budgets is None else budgets
         self.budgets = {number: NetworkBudget(bits_s, 0.0) for number, bits_s in limits.items()}
         self.copies = Copies(self.budgets, 0.0)
         self.sent: list[tuple[float, Transmit]] = []
         self.now = 0.0
+        if spent:
+            self.spend(SLOW, spent, 0.0)
 
     def spend(self, path: Path, size: int, now: float) -> None:
         """Something else uses the network."""
@@ -82,8 +84,7 @@ class Scene:
 
 def test_copy_waits_for_its_network_and_then_goes() -> None:
     """The slow network is in debt by more than a quarter of a second."""
-    scene = Scene()
-    scene.spend(SLOW, 1000, 0.0)  # 0.6 s of debt after its burst
+    scene = Scene(spent=1000)  # 0.6 s of debt after its burst
     assert scene.send([command(1)], 0.0) == [FREE]
     assert scene.copies.count == 1
     scene.run(1.0)
@@ -101,8 +102,7 @@ def test_copy_goes_at_once_on_a_network_in_little_debt() -> None:
 
 def test_copy_that_waited_too_long_is_dropped() -> None:
     """What it carries has arrived along the other path, or comes again."""
-    scene = Scene()
-    scene.spend(SLOW, 1400, 0.0)
+    scene = Scene(spent=1400)
     scene.send([command(1)], 0.0)
     scene.run(MAX_WAIT_S - 0.01)
     assert scene.copies.count == 1
@@ -113,8 +113,7 @@ def test_copy_that_waited_too_long_is_dropped() -> None:
 
 def test_first_datagram_of_an_envelope_goes_where_there_is_room() -> None:
     """The best path's network is far in debt: its datagram waits as the copy of the other one."""
-    scene = Scene()
-    scene.spend(SLOW, 1000, 0.0)
+    scene = Scene(spent=1000)
     assert scene.send([command(1)], 0.0, SLOW, FREE) == [FREE]
     scene.run(1.0)
     assert len(scene.along(SLOW, command(1))) == 1
@@ -130,8 +129,7 @@ def test_envelope_without_room_anywhere_goes_along_the_best_path() -> None:
 
 def test_newer_states_replace_a_waiting_copy_of_states() -> None:
     """Only the newest joystick position is worth the slow network."""
-    scene = Scene()
-    scene.spend(SLOW, 1000, 0.0)
+    scene = Scene(spent=1000)
     for number in range(5):
         scene.send([manual_control(number)], number * 0.04)
     assert scene.copies.count == 1
@@ -154,8 +152,7 @@ def test_newer_states_replace_a_waiting_copy_of_states() -> None:
 )
 def test_newer_envelope_does_not_replace_what_it_does_not_contain(waiting: list[Frame], newer: list[Frame]) -> None:
     """A copy is dropped for a newer one only if that has all its flows, and no event is lost with it."""
-    scene = Scene()
-    scene.spend(SLOW, 1000, 0.0)
+    scene = Scene(spent=1000)
     scene.send(waiting, 0.0)
     scene.send(newer, 0.01)
     assert scene.copies.count == 2
@@ -163,8 +160,7 @@ def test_newer_envelope_does_not_replace_what_it_does_not_contain(waiting: list[
 
 def test_commands_and_heartbeats_go_before_other_events_and_states() -> None:
     """Whatever came first."""
-    scene = Scene()
-    scene.spend(SLOW, 1000, 0.0)
+    scene = Scene(spent=1000)
     for number, frames in enumerate(([manual_control(1)], [parameter(1)], [heartbeat(1)], [command(1)])):
         scene.send(frames, number / 100)
     scene.run(1.0)
@@ -176,8 +172,7 @@ def test_commands_and_heartbeats_go_before_other_events_and_states() -> None:
 
 def test_copy_does_not_overtake_those_that_wait() -> None:
     """A new command waits behind an older one."""
-    scene = Scene()
-    scene.spend(SLOW, 1000, 0.0)
+    scene = Scene(spent=1000)
     scene.send([command(1)], 0.0)
     assert scene.send([command(2)], 0.45) == [FREE]
     scene.run(1.0)
@@ -234,8 +229,7 @@ def test_copies_of_the_stream_do_not_wait() -> None:
 
 def test_waiting_copies_are_bounded_and_the_least_important_go_first() -> None:
     """Different parameters, none of which replaces another, and one command."""
-    scene = Scene()
-    scene.spend(SLOW, 1400, 0.0)
+    scene = Scene(spent=1400)
     scene.send([command(1)], 0.0)
     parameters = [parameter(number) for number in range(200)]
     for sent in parameters:

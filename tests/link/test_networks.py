@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import socket
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import count
 
 import pytest
@@ -59,16 +59,33 @@ class Scene:
         return port
 
 
-@pytest.fixture
-def scene(monkeypatch: pytest.MonkeyPatch) -> Iterator[Scene]:
-    """LTE, which is absent, and MESH, which is there."""
+@pytest.fixture(autouse=True)
+def _on_linux() -> None:
     need(sys.platform == "linux", "Linux")
-    made = Scene(LTE, MESH)
+
+
+@pytest.fixture
+def make_scene(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Scene]]:
+    """Make scenes, whose sockets are closed afterwards. The machine has what the first one says."""
+    scenes: list[Scene] = []
+
+    def make(*configs: NetworkConfig, port: int = 0) -> Scene:
+        scenes.append(Scene(*configs, port=port))
+        return scenes[-1]
+
+    monkeypatch.setattr(module, "look", lambda interface, address: scenes[0].present[interface, address])
+    yield make
+    for scene in scenes:
+        for number in list(scene.sockets):
+            scene.put(number, None)
+
+
+@pytest.fixture
+def scene(make_scene: Callable[..., Scene]) -> Scene:
+    """LTE, which is absent, and MESH, which is there."""
+    made = make_scene(LTE, MESH)
     made.set(MESH, Presence(0, ("127.0.0.2",)))
-    monkeypatch.setattr(module, "look", lambda interface, address: made.present[interface, address])
-    yield made
-    for number in list(made.sockets):
-        made.put(number, None)
+    return made
 
 
 def test_network_that_is_absent_at_the_start_is_used_when_it_appears(scene: Scene) -> None:
@@ -153,40 +170,34 @@ def test_changed_address_keeps_the_socket(scene: Scene) -> None:
     assert [(line["event"], line["addresses"]) for line in logs] == [("network_changed", ["127.0.0.9"])]
 
 
-def test_port_of_listen_is_the_port_of_each_network(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_port_of_listen_is_the_port_of_each_network(make_scene: Callable[..., Scene]) -> None:
     """Also where an interface and an address of it share it. A port that is in use is an error at the start."""
-    need(sys.platform == "linux", "Linux")
     port = free_port()
-    scene = Scene(LTE, MESH, port=port)
-    present = {("lo", None): Presence(1, ("127.0.0.1",)), (None, "127.0.0.2"): Presence(0, ("127.0.0.2",))}
-    monkeypatch.setattr(module, "look", lambda interface, address: present[interface, address])
+    scene = make_scene(LTE, MESH, port=port)
+    scene.set(LTE, Presence(1, ("127.0.0.1",)))
+    scene.set(MESH, Presence(0, ("127.0.0.2",)))
     scene.networks.open(0.0)
     assert (scene.port(V4), scene.port(ALSO_V4)) == (port, port)
     assert [sock.getsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR) for sock in scene.open_sockets()] == [0, 0]
-    second = Scene(LTE, port=port)
+    second = make_scene(LTE, port=port)
     with pytest.raises(BindError, match=r"^network \(lte\): cannot listen on 0\.0\.0\.0:\d+: Address already in use"):
         second.networks.open(0.0)
-    for number in (V4, ALSO_V4):
-        scene.put(number, None)
 
 
-def test_port_of_listen_that_is_taken_meanwhile(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_port_of_listen_that_is_taken_meanwhile(make_scene: Callable[..., Scene]) -> None:
     """Peers know that port: the network waits for it, and the status has the reason."""
-    need(sys.platform == "linux", "Linux")
     port = free_port()
-    scene = Scene(MESH, port=port)
-    present = Presence(reason="gone")
-    monkeypatch.setattr(module, "look", lambda interface, address: present)
+    scene = make_scene(MESH, port=port)
+    scene.set(MESH, Presence(reason="gone"))
     scene.networks.open(0.0)
     with network_socket(Address("127.0.0.2", port), None, []):
-        present = Presence(0, ("127.0.0.2",))
+        scene.set(MESH, Presence(0, ("127.0.0.2",)))
         assert not scene.networks.check(1.0)
         (network,) = scene.networks.networks
         assert "Address already in use" in network.presence.reason
         assert not network.presence.hosts
     assert scene.networks.check(2.0)
     assert scene.port(0) == port
-    scene.put(0, None)
 
 
 @pytest.mark.parametrize(
@@ -200,17 +211,14 @@ def test_port_of_listen_that_is_taken_meanwhile(monkeypatch: pytest.MonkeyPatch)
     ],
 )
 def test_ipv6_address_is_used_where_it_may_be_reached(
-    monkeypatch: pytest.MonkeyPatch, hosts: tuple[str, ...], address: tuple[str, int, int, int], reaches: bool
+    make_scene: Callable[..., Scene], hosts: tuple[str, ...], address: tuple[str, int, int, int], reaches: bool
 ) -> None:
     """Each interface has a link-local address, with which it reaches its neighbours only."""
-    need(sys.platform == "linux", "Linux")
-    scene = Scene(LTE)
-    monkeypatch.setattr(module, "look", lambda interface, address: Presence(1 if hosts else 0, hosts))
+    scene = make_scene(LTE)
+    scene.set(LTE, Presence(1 if hosts else 0, hosts))
     scene.networks.open(0.0)
     assert scene.networks.may_reach(1, address) is reaches
     assert scene.networks.may_reach(0, ("192.0.2.1", 1))
-    for number in list(scene.sockets):
-        scene.put(number, None)
 
 
 def test_flapping_interface_cannot_fill_the_log(scene: Scene) -> None:
@@ -230,7 +238,6 @@ def test_flapping_interface_cannot_fill_the_log(scene: Scene) -> None:
 
 def test_what_the_machine_has() -> None:
     """Loopback is there; another interface and another address are not."""
-    need(sys.platform == "linux", "Linux")
     assert look("lo", None).hosts[0] == "127.0.0.1"
     assert look(None, "127.0.0.1") == Presence(0, ("127.0.0.1",))
     assert look("absent0", None) == Presence(reason="there is no interface absent0")
@@ -240,7 +247,6 @@ def test_what_the_machine_has() -> None:
 
 def test_interface_that_may_not_be_bound_to_is_explained(monkeypatch: pytest.MonkeyPatch) -> None:
     """Before Linux 5.7, and on other systems."""
-    need(sys.platform == "linux", "Linux")
     genuine = socket.socket.setsockopt
 
     def refuse(sock: socket.socket, level: int, option: int, value: int | bytes) -> None:

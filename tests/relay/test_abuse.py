@@ -48,6 +48,13 @@ def connect(relay: FuzzedRelay) -> tuple[int, int]:
     return one.handles[RELAY_AT[0]][KEYS[2]][0], other.handles[RELAY_AT[0]][KEYS[1]][0]
 
 
+def sealed(relay: FuzzedRelay, number: int, record: Record) -> bytes:
+    """The envelope of one member with this record."""
+    session = relay.members[number].peer.sessions.current
+    assert session is not None
+    return session.seal_record(record.encode(), relay.now)
+
+
 # Candidates.
 
 
@@ -107,11 +114,9 @@ def test_spoofed_sources_move_no_path(relay: FuzzedRelay) -> None:
 def test_unproven_address_gets_no_report(relay: FuzzedRelay) -> None:
     """A bind of 16 keys would be answered with 563 bytes. Its path is asked first, with no more than came."""
     connect(relay)
-    session = relay.members[0].peer.sessions.current
-    assert session is not None
     relay.members[0].bounds.clear()
     keys = (KEYS[2], *(bytes((number,)) * c.KEY_BYTES for number in range(1, c.KEYS_PER_BIND)))
-    bind = session.seal_record(Bind(keys).encode(), relay.now)
+    bind = sealed(relay, 0, Bind(keys))
     relay.arrive(bind, ELSEWHERE)
     answers = [datagram for datagram, path in relay._wire if path == ELSEWHERE]
     assert sum(map(len, answers)) <= len(bind)
@@ -141,16 +146,13 @@ def test_strangers_get_nothing_and_change_nothing(relay: FuzzedRelay) -> None:
 def test_ten_thousand_requested_bindings_take_bounded_memory(relay: FuzzedRelay) -> None:
     """A captured member asks for 10,000 keys in a second, along paths that it invents too."""
     handle, _ = connect(relay)
-    member = relay.members[2]
-    session = member.peer.sessions.current
-    assert session is not None
     keys = [number.to_bytes(c.KEY_BYTES, "big") for number in range(10_000)]
     binds = [Bind(tuple(keys[at : at + c.KEYS_PER_BIND])) for at in range(0, len(keys), c.KEYS_PER_BIND)]
-    sealed = [session.seal_record(bind.encode(), relay.now) for bind in binds]
+    datagrams = [sealed(relay, 2, bind) for bind in binds]
     relay.settle()
     tracemalloc.start()
     try:
-        for number, datagram in enumerate(sealed):
+        for number, datagram in enumerate(datagrams):
             path = Path(0, ("203.0.113.5", number)) if number % 2 else HOMES[2][0]
             relay.arrive(datagram, path)
             relay._wire.clear()
@@ -167,12 +169,10 @@ def test_ten_thousand_requested_bindings_take_bounded_memory(relay: FuzzedRelay)
 
 def test_captured_member_that_tests_filters_without_end_costs_few_sockets(relay: FuzzedRelay) -> None:
     """1,000 tests a second for 20.1 s: 16 sockets, then one in 2 s. Another member has its own limit."""
-    session = relay.members[2].peer.sessions.current
-    assert session is not None
     wired_before = len(relay._wire)
     for number in range(20_100):
         relay.now += 0.001
-        test = session.seal_record(FilterTest(number.to_bytes(c.FILTER_TOKEN_BYTES)).encode(), relay.now)
+        test = sealed(relay, 2, FilterTest(number.to_bytes(c.FILTER_TOKEN_BYTES)))
         relay.arrive(test, HOMES[2][0])
     assert relay.tokens_sent == c.FILTER_TESTS + 20 * c.FILTER_TESTS_PER_S
     assert relay.service.members[KEYS[3]].filter_tests_ignored == 20_100 - relay.tokens_sent
@@ -188,9 +188,7 @@ def test_captured_member_that_tests_filters_without_end_costs_few_sockets(relay:
 
 def test_filter_test_from_an_unproven_address_sends_nothing_there(relay: FuzzedRelay) -> None:
     """A captured member cannot name a victim: it is counted, and the victim gets no token."""
-    session = relay.members[0].peer.sessions.current
-    assert session is not None
-    relay.arrive(session.seal_record(FilterTest(TOKEN).encode(), relay.now), ELSEWHERE)
+    relay.arrive(sealed(relay, 0, FilterTest(TOKEN)), ELSEWHERE)
     assert relay.tokens_sent == 0
     assert relay.service.members[KEYS[1]].filter_tests_ignored == 1
     assert not relay.service._filter_tests
@@ -221,10 +219,8 @@ def test_member_that_asks_along_another_relay_harms_no_report(relay: FuzzedRelay
 def test_binds_along_unproven_paths_wait_only_while_the_paths_have_slots(relay: FuzzedRelay) -> None:
     """A captured member names 200 addresses: what waits is bounded, and ends with the slot, not after 5 s."""
     service, peer = relay.service, relay.service.members[KEYS[3]].peer
-    session = relay.members[2].peer.sessions.current
-    assert session is not None
     for number in range(200):
-        bind = session.seal_record(Bind((KEYS[1],)).encode(), relay.now)
+        bind = sealed(relay, 2, Bind((KEYS[1],)))
         relay.arrive(bind, Path(0, ("203.0.113.5", 1000 + number)))
     waiting = service._asked[KEYS[3]]
     assert 0 < len(waiting) <= c.CONFIGURED_PATHS + c.LEARNED_PATHS

@@ -40,10 +40,10 @@ def path(member: bytes, number: int = 0) -> Path:
     return PATHS[member][number]
 
 
-def bindings(seed: int = 1, members: Iterable[bytes] = MEMBERS, most_peers: int = 10) -> Bindings:
-    """Of these members."""
-    made = Bindings(random.Random(seed).randbytes)
-    for member in members:
+def bindings(most_peers: int = 10, draw: Callable[[int], bytes] | None = None) -> Bindings:
+    """Of all members. ``draw``: the random source."""
+    made = Bindings(draw or random.Random(1).randbytes)
+    for member in MEMBERS:
         made.set_member(member, most_peers)
     return made
 
@@ -132,7 +132,7 @@ steps: st.SearchStrategy[Step] = st.one_of(
 @given(st.integers(0, 1000), st.lists(steps, max_size=40))
 def test_random_histories_follow_the_rules(seed: int, history: list[Step]) -> None:
     """Members bind, lose paths, let wishes expire, and are removed and added again. Routes follow."""
-    made, model, now = bindings(seed, most_peers=100), Model(), 0.0
+    made, model, now = bindings(100, random.Random(seed).randbytes), Model(), 0.0
     for kind, member, number, keys in history:
         if kind == "wait":
             now += number
@@ -219,9 +219,7 @@ def test_fifth_path_replaces_the_one_renewed_least_recently() -> None:
 def test_handle_is_quarantined() -> None:
     """It is not given to its member again until then, although the random source returns it."""
     draws = [1, 2, 1, 2, 3, 2, 4]  # A's, B's; then both again
-    made = Bindings(lambda size: (draws.pop(0) if draws else 1).to_bytes(size, "big"))
-    made.set_member(A, 10)
-    made.set_member(B, 10)
+    made = bindings(draw=lambda size: (draws.pop(0) if draws else 1).to_bytes(size, "big"))
     assert {end.handle for end in connect(made)} == {1, 2}
     made.end_path(A, path(A), 1.0)
     made.bind(A, path(A), [B], 2.0)
@@ -237,9 +235,7 @@ def test_handle_is_quarantined() -> None:
 def test_zero_is_not_a_handle() -> None:
     """It stands for none."""
     draws = [0, 7, 0, 8]
-    made = Bindings(lambda size: draws.pop(0).to_bytes(size, "big"))
-    made.set_member(A, 10)
-    made.set_member(B, 10)
+    made = bindings(draw=lambda size: draws.pop(0).to_bytes(size, "big"))
     assert {end.handle for end in connect(made)} == {7, 8}
 
 

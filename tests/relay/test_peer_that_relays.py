@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
 from typing import Any
 
 import pytest
@@ -14,13 +13,6 @@ from tests.daemon.process import DaemonProcess, Status
 from tests.daemon.test_reload import reload
 from uavlinkd.config import keys
 from uavlinkd.core.relay_records import RELAYED, TOKEN
-
-
-@pytest.fixture
-async def stage() -> AsyncIterator[Stage]:
-    """Ends the daemons of a test, and searches their output for tracebacks and secrets."""
-    async with Stage() as stage:
-        yield stage
 
 
 class Fleet:

@@ -28,13 +28,6 @@ MakeMember = Callable[..., CoreMember]
 
 
 @pytest.fixture
-async def stage() -> AsyncIterator[Stage]:
-    """Ends the daemons of a test, and searches their output for tracebacks and secrets."""
-    async with Stage() as stage:
-        yield stage
-
-
-@pytest.fixture
 async def relay(stage: Stage) -> DaemonProcess:
     """A relay without members, not started."""
     return relay_for(stage)
