@@ -3,11 +3,7 @@
 ::
 
     async with Stage() as stage:  # or the fixture `stage`
-        a, b = stage.pair()  # configured to call each other, not yet running
-        into = a.add_endpoint("autopilot")  # a udpin; (host, port)
-        ground = await stage.client()  # a UDP socket with a memory
-        b.add_endpoint("ground", f"udpout:{ground}")
-        await stage.start(a, b)  # both answer, and are linked
+        a, b, into, ground = await stage.one_way()  # linked daemons, a udpin of a, a UDP socket with a memory at b
         autopilot = await stage.client()
         autopilot.send(frame(1), into)
         await ground.until(lambda: ground.received == frame(1))
@@ -29,7 +25,7 @@ from typing import Self
 
 from tests.daemon.process import DaemonProcess
 from tests.daemon.relay import Relay
-from tests.daemon.udp import Client, open_client
+from tests.daemon.udp import Client, Sockaddr, open_client
 from tests.ops.schema import log_names
 from uavlinkd.config import keys
 from uavlinkd.lab.sim.loopback_ports import free_port
@@ -84,6 +80,14 @@ class Stage:
             await daemon.start()
         for daemon in daemons:
             await (daemon.until_linked() if linked else daemon.ready())
+
+    async def one_way(self, **link: object) -> tuple[DaemonProcess, DaemonProcess, Sockaddr, Client]:
+        """A linked pair, the endpoint "autopilot" of the first one, and the client that the second one sends to."""
+        a, b = self.pair(**link)
+        into, ground = a.add_endpoint("autopilot"), await self.client()
+        b.add_endpoint("ground", f"udpout:{ground}")
+        await self.start(a, b)
+        return a, b, into, ground
 
     async def client(self, host: str = "127.0.0.1", port: int = 0) -> Client:
         client = await open_client(host, port)

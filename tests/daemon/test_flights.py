@@ -43,11 +43,7 @@ def drops(status: Status) -> Counter[str]:
 
 async def fly(stage: Stage, frames: list[bytes], lost: frozenset[int], **link: Any) -> None:
     """Play frames into one daemon and compare what comes out of the other."""
-    a, b = stage.pair(**link)
-    into = a.add_endpoint("autopilot")
-    ground = await stage.client()
-    b.add_endpoint("ground", f"udpout:{ground}")
-    await stage.start(a, b)
+    a, b, into, ground = await stage.one_way(**link)
     # While a slow machine starts daemons, initiations may be repeated too often.
     before = [drops(await daemon.status()) for daemon in (a, b)]
     await pour(frames, await stage.client(), into, ground, lost=lost)

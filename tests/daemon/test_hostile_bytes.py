@@ -21,11 +21,7 @@ LARGEST_DATAGRAM = 65507
 
 async def linked_with_clients(stage: Stage) -> tuple[DaemonProcess, Sockaddr, Client, Client]:
     """A daemon linked with another one, its client, and that of the other; each is known to its daemon."""
-    a, b = stage.pair()
-    into = a.add_endpoint("autopilot")
-    ground = await stage.client()
-    b.add_endpoint("ground", f"udpout:{ground}")
-    await stage.start(a, b)
+    a, _, into, ground = await stage.one_way()
     autopilot = await stage.client()
     autopilot.send(frame(0), into)
     await ground.until_received(frame(0))

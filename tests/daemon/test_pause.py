@@ -57,11 +57,7 @@ async def test_slow_computer_does_not_deliver_a_long_backlog() -> None:
     backlog = range(2, 2000)
     with limited_cpu(0.02) as limit:
         async with Stage() as stage:
-            a, b = stage.pair()
-            into = a.add_endpoint("autopilot")
-            sink = await stage.client()
-            b.add_endpoint("ground", f"udpout:{sink}")
-            await stage.start(a, b)
+            a, _, into, sink = await stage.one_way()
             source = await stage.client()
             source.send(frame(1), into)
             await sink.until_received(frame(1))

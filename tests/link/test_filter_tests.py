@@ -2,62 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from itertools import count
 
 import pytest
 
-from tests.core.harness import AT_B, ELSEWHERE, KEY_B, KEY_C, Pair, quiet
-from uavlinkd.config import RelayConfig
+from tests.core.harness import AT_B, ELSEWHERE, KEY_B, KEY_C
+from tests.link.test_relay_link import LINK, RelayMember, T
 from uavlinkd.core import constants as c
 from uavlinkd.core import outputs as o
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.path import Path
 from uavlinkd.core.relay_records import Bind, FilterTest, FilterTested, token_datagram
 from uavlinkd.core.settings import PeerSettings
-from uavlinkd.link.relay_link import RelayHandles, RelayLink
 from uavlinkd.link.relays import FilterTests
 
-LINK = quiet(features=c.FEATURE_RECORDS)
-T = 10.0
 OTHER_PORT = Path(AT_B.socket, (AT_B.host, 50_000))
 
 
-def tokens() -> Iterator[bytes]:
-    """Each is another one."""
-    for number in range(256):
-        yield bytes([number]) * c.FILTER_TOKEN_BYTES
-
-
-class Scene:
-    """Alpha is the member, beta the relay: a session, and one path that works."""
+class Scene(RelayMember):
+    """A member that tests filters."""
 
     def __init__(self) -> None:
-        self.pair = Pair(LINK, LINK)
-        node, peer = self.pair.a.node, self.pair.a.peer
-        node.remove_peer(peer, 0.0)
-        config = RelayConfig(PeerSettings("relay vps", KEY_B.public, None, LINK), ())
-        self.relay = RelayLink(config, node, RelayHandles(), lambda *_: None, 0.0)
-        self.pair.a.peer_name = self.relay.name
-        self.relay.set_paths([AT_B], 0.0)
-        self.pair.establish()
-        assert self.pair.carries(0.0)
-        drawn = tokens()
-        self.tests = FilterTests(node, lambda size: next(drawn)[:size])
+        super().__init__()
+        numbers = count()  # each token is another one
+        self.tests = FilterTests(self.pair.a.node, lambda size: bytes([next(numbers)]) * size)
 
     def asked(self, now: float) -> list[bytes]:
         """The tokens that the relay is asked for now."""
-        received = [
-            output.record
-            for sent in self.tests.do_due(now)
-            if isinstance(sent, o.Transmit)
-            for output in self.pair.b.receive(sent.datagram, now)
-            if isinstance(output, o.RecordReceived)
-        ]
-        return [record.token for record in received if isinstance(record, FilterTest)]
+        records = self.received(self.tests.do_due(now), now)
+        return [record.token for record in records if isinstance(record, FilterTest)]
 
     def answer(self, token: bytes, path: Path = AT_B) -> None:
         """The relay says that it sent a token."""
-        self.tests.on_record(o.RecordReceived(self.relay.peer, path, FilterTested(token), 1))
+        self.tests.on_record(o.RecordReceived(self.link.peer, path, FilterTested(token), 1))
 
     def ask_all(self, *, answers: int) -> bytes:
         """Ask in vain, with answers to the first tries. The token."""
@@ -77,7 +54,7 @@ class Scene:
 def scene() -> Scene:
     """A member with a session, which begins its tests."""
     scene = Scene()
-    scene.tests.begin([scene.relay], T)
+    scene.tests.begin([scene.link], T)
     return scene
 
 
@@ -165,7 +142,7 @@ def test_answers_of_others_do_not_count(scene: Scene) -> None:
     token = scene.ask_all(answers=1)
     scene.answer(token, ELSEWHERE)
     scene.answer(bytes([9]) * c.FILTER_TOKEN_BYTES)
-    for peer, record in ((scene.pair.b.peer, FilterTested(token)), (scene.relay.peer, Bind((KEY_B.public,)))):
+    for peer, record in ((scene.pair.b.peer, FilterTested(token)), (scene.link.peer, Bind((KEY_B.public,)))):
         received = o.RecordReceived(peer, AT_B, record, 1)
         assert scene.tests.on_record(received) is DropReason.UNEXPECTED_RECORD
     scene.asked(T + 9)
@@ -174,12 +151,12 @@ def test_answers_of_others_do_not_count(scene: Scene) -> None:
 
 def test_tests_that_run_are_not_begun_again(scene: Scene) -> None:
     """Two people ask at the same time: both get the same results. Later tests have other tokens."""
-    scene.tests.begin([scene.relay], T)
+    scene.tests.begin([scene.link], T)
     token = scene.ask_all(answers=2)
-    scene.tests.begin([scene.relay], T + 1)
+    scene.tests.begin([scene.link], T + 1)
     scene.asked(T + 9)
     assert scene.passes == [False]
-    scene.tests.begin([scene.relay], T + 10)
+    scene.tests.begin([scene.link], T + 10)
     assert scene.passes == []
     (other,) = scene.asked(T + 10)
     assert other != token
@@ -189,9 +166,9 @@ def test_tests_that_run_are_not_begun_again(scene: Scene) -> None:
 def test_slow_path_has_more_time(srtt_s: float, try_s: float) -> None:
     """Within limits: a person waits."""
     scene = Scene()
-    (state,) = scene.relay.peer.paths.states
+    (state,) = scene.link.peer.paths.states
     state.srtt_s = srtt_s
-    scene.tests.begin([scene.relay], T)
+    scene.tests.begin([scene.link], T)
     assert len(scene.asked(T)) == 1
     assert scene.tests.next_at == T + try_s
 
@@ -200,11 +177,11 @@ def test_best_path_from_each_socket_is_tested() -> None:
     """Others of the same socket lead through the same NAT; serial and relayed ones through none."""
     scene = Scene()
     second, third = Path(0, ("192.0.2.8", 5790)), Path(1, AT_B.address)
-    scene.relay.set_paths([AT_B, second, third], 0.0)
+    scene.link.set_paths([AT_B, second, third], 0.0)
     for path, srtt_s in ((AT_B, 0.2), (second, 0.1), (third, None)):
-        state = scene.relay.peer.paths.find(path)
+        state = scene.link.peer.paths.find(path)
         assert state is not None
         state.srtt_s = srtt_s
         state.set_usable(T)
-    scene.tests.begin([scene.relay], T)
+    scene.tests.begin([scene.link], T)
     assert {(test.path, test.try_s) for test in scene.tests._tests.values()} == {(second, 0.3), (third, 0.3)}

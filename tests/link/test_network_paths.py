@@ -14,6 +14,7 @@ import structlog
 from structlog.testing import capture_logs
 
 from tests.link.socket_states import SocketStateLog
+from tests.link.test_peer_sockets import Refusing
 from tests.needs import need
 from tests.waiting import until
 from uavlinkd.config import NetworkConfig, PeerAddress
@@ -151,19 +152,6 @@ async def test_names_are_resolved_as_often_as_paths_need(
     assert scene.sockets._names["drone1"].interval_s(written) == interval_s
 
 
-class Gone:
-    """A socket whose interface was removed a moment ago."""
-
-    family = socket.AF_INET
-
-    def sendto(self, datagram: bytes, address: object) -> int:
-        """As a socket's."""
-        raise OSError(errno.ENODEV, "No such device")
-
-    def close(self) -> None:
-        """As a socket's."""
-
-
 async def test_failed_send_has_the_networks_looked_at(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """At once, and not at the next second; and not for each datagram of a burst."""
     looks: list[int] = []
@@ -177,7 +165,7 @@ async def test_failed_send_has_the_networks_looked_at(scene: Scene, monkeypatch:
     scene.present["lo", None] = Presence(reason="there is no interface lo")
     scene.sockets._checked_at = 0.0
     slot = scene.sockets._slots[LTE_V4]
-    genuine_socket, slot.sock = slot.sock, cast(socket.socket, Gone())
+    genuine_socket, slot.sock = slot.sock, cast(socket.socket, Refusing(errno.ENODEV))
     slot.send = slot.sock.sendto
     for _ in range(5):
         scene.sockets.send(b"lost", Path(LTE_V4, ("127.0.0.9", 9)))

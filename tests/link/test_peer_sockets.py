@@ -26,6 +26,8 @@ from uavlinkd.system.stall import StallWatch
 class Refusing:
     """A socket that takes nothing while it is out of something."""
 
+    family = socket.AF_INET
+
     def __init__(self, error: int) -> None:
         self.error = error
         self.is_out = True
@@ -45,6 +47,15 @@ class Refusing:
         """As a socket's."""
 
 
+def sockets_with(sock: Refusing, drops: DropSummary) -> PeerSockets:
+    """The sockets of a daemon, of which this is the only one."""
+    stall = StallWatch(0.0, lambda seconds: None)
+    sockets = PeerSockets(stall, drops, Evidence({}, b""), structlog.get_logger(), SocketStateLog())
+    sockets.open([Address("127.0.0.1", 0)])
+    sockets.put(0, cast(socket.socket, sock))
+    return sockets
+
+
 @pytest.mark.parametrize("name", ["ENOBUFS", "ENOMEM", "EPERM", "ENETUNREACH", "EAGAIN"])
 def test_what_is_not_taken_is_counted_and_the_next_is_sent(name: str) -> None:
     """A line for a rare error, a count for each, and datagrams go on when there is room again."""
@@ -54,12 +65,8 @@ def test_what_is_not_taken_is_counted_and_the_next_is_sent(name: str) -> None:
         def warning(self, event: str, **fields: Any) -> None:
             lines.append((event, fields))
 
-    log = cast(Any, Log())
-    stall = StallWatch(0.0, lambda seconds: None)
-    sockets = PeerSockets(stall, DropSummary(log), Evidence({}, b""), structlog.get_logger(), SocketStateLog())
-    sockets.open([Address("127.0.0.1", 0)])
     sock = Refusing(getattr(errno, name))
-    sockets.put(0, cast(socket.socket, sock))
+    sockets = sockets_with(sock, DropSummary(cast(Any, Log())))
     for _ in range(3):
         sockets.send(b"lost", Path(0, ("127.0.0.1", 9)))
     sock.is_out = False
@@ -72,13 +79,10 @@ def test_what_is_not_taken_is_counted_and_the_next_is_sent(name: str) -> None:
 
 def test_relayed_path_goes_to_the_relay_or_nowhere() -> None:
     """Wrapped, along the same socket. Without its handle nothing is sent: its host is not a name to look up."""
-    stall = StallWatch(0.0, lambda seconds: None)
     drops = DropSummary(structlog.get_logger())
-    sockets = PeerSockets(stall, drops, Evidence({}, b""), structlog.get_logger(), SocketStateLog())
-    sockets.open([Address("127.0.0.1", 0)])
     sock = Refusing(errno.EPERM)
     sock.is_out = False
-    sockets.put(0, cast(socket.socket, sock))
+    sockets = sockets_with(sock, drops)
     sockets.use_relays()
     sockets.handles.assign("vps", Path(0, ("127.0.0.1", 9)), [7])
     sockets.send(b"inner", relayed(0, "vps", 7))

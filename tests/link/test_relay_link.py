@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 
 from tests.core.harness import AT_B, KEY_B, Pair, quiet, run
@@ -12,7 +14,7 @@ from uavlinkd.core.constants import NEVER
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.path import Path, relayed
 from uavlinkd.core.peer import Peer
-from uavlinkd.core.relay_records import WAITING, Bind, Bound
+from uavlinkd.core.relay_records import WAITING, Bind, Bound, Record
 from uavlinkd.core.settings import PeerSettings
 from uavlinkd.link.relay_link import BIND_SOON_S, RelayHandles, RelayLink
 from uavlinkd.link.relays import SILENT_RARE_S, SILENT_S, _Silence
@@ -23,35 +25,44 @@ ELSE = bytes([9]) * 32
 T = 10.0
 
 
-class Scene:
-    """Alpha is the member, beta the relay: a session, one path that works, two peers that use the relay."""
+class RelayMember:
+    """Alpha is the member, beta the relay: a session, and one path that works."""
 
-    def __init__(self) -> None:
+    def __init__(self, on_change: Callable[[set[bytes], float], None] = lambda *_: None) -> None:
         self.pair = Pair(LINK, LINK)
-        node, peer = self.pair.a.node, self.pair.a.peer
+        node = self.pair.a.node
+        node.remove_peer(self.pair.a.peer, 0.0)
         self.handles = RelayHandles()
-        self.changed: list[set[bytes]] = []
         config = RelayConfig(PeerSettings("relay vps", KEY_B.public, None, LINK), ())
-        node.remove_peer(peer, 0.0)
-        self.link = RelayLink(config, node, self.handles, lambda keys, _: self.changed.append(keys), 0.0)
+        self.link = RelayLink(config, node, self.handles, on_change, 0.0)
         self.pair.a.peer_name = self.link.name
         self.link.set_paths([AT_B], 0.0)
         self.pair.establish()
         assert self.pair.carries(0.0)
-        self.link.follow([ONE, TWO])
-        self.order = 0
 
-    def binds(self, now: float) -> list[tuple[bytes, ...]]:
-        """The keys of each bind that the relay gets now."""
-        outputs = self.link.do_due(now)
-        received = [
-            output
+    def received(self, outputs: list[o.Output], now: float) -> list[Record]:
+        """The records that the relay gets by these outputs."""
+        return [
+            output.record
             for sent in outputs
             if isinstance(sent, o.Transmit)
             for output in self.pair.b.receive(sent.datagram, now)
             if isinstance(output, o.RecordReceived)
         ]
-        return [output.record.keys for output in received if isinstance(output.record, Bind)]
+
+
+class Scene(RelayMember):
+    """Two peers use the relay."""
+
+    def __init__(self) -> None:
+        self.changed: list[set[bytes]] = []
+        super().__init__(lambda keys, _: self.changed.append(keys))
+        self.link.follow([ONE, TWO])
+        self.order = 0
+
+    def binds(self, now: float) -> list[tuple[bytes, ...]]:
+        """The keys of each bind that the relay gets now."""
+        return [record.keys for record in self.received(self.link.do_due(now), now) if isinstance(record, Bind)]
 
     def bound(
         self, now: float, *entries: tuple[bytes, int], order: int | None = None, path: Path = AT_B

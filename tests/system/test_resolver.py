@@ -8,7 +8,7 @@ import selectors
 import socket
 import threading
 from collections import Counter
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from math import inf
 from typing import Any, NoReturn
 
@@ -90,10 +90,6 @@ class Following:
             keep_resolving(addresses, self._ask, self._on_resolved, structlog.get_logger(), wake=self.wake)
         )
 
-    async def until(self, condition: Callable[[], bool]) -> None:
-        """Run the task until a condition holds."""
-        await until(condition)
-
     async def stop(self) -> None:
         """Cancel the task."""
         self._task.cancel()
@@ -113,27 +109,27 @@ async def test_only_new_results_are_reported(names: Names) -> None:
     """While the name is urgent, after an interval, and when woken; a failing name does not end the last result."""
     names["drone1.test"] = ["10.0.0.1"]
     following = Following([Address("drone1.test", 5790)])
-    await following.until(lambda: bool(following.results))
+    await until(lambda: bool(following.results))
     asked = following.asked
-    await following.until(lambda: following.asked > asked + 3)
+    await until(lambda: following.asked > asked + 3)
     assert following.results == [[(V4, ("10.0.0.1", 5790))]]
     for number, interval_s in enumerate((0.0, 0.05, inf), 2):
         following.interval_s = interval_s
         asked = following.asked
-        await following.until(lambda asked=asked: following.asked > asked + 3)  # type: ignore[misc]
+        await until(lambda asked=asked: following.asked > asked + 3)  # type: ignore[misc]
         names["drone1.test"] = [f"10.0.0.{number}"]
         if interval_s == inf:  # while its address answers, the name is not looked up
             asked = following.asked
-            await following.until(lambda asked=asked: following.asked > asked + 3)  # type: ignore[misc]
+            await until(lambda asked=asked: following.asked > asked + 3)  # type: ignore[misc]
             assert len(following.results) == number - 1
             following.wake.set()
-        await following.until(lambda number=number: len(following.results) == number)  # type: ignore[misc]
+        await until(lambda number=number: len(following.results) == number)  # type: ignore[misc]
         assert following.results[-1] == [(V4, (f"10.0.0.{number}", 5790))]
     assert not following.wake.is_set()
     with capture_logs() as logs:
         del names["drone1.test"]
         following.wake.set()
-        await following.until(lambda: bool(logs))
+        await until(lambda: bool(logs))
         assert len(following.results) == 4
         await following.stop()
 
@@ -205,7 +201,7 @@ async def test_names_without_answer_do_not_delay_others(monkeypatch: pytest.Monk
         await asyncio.sleep(0.1)  # enough time for ten times more queries
         assert Counter(asked) == {f"gone{number}.test": share for number in range(10)}
         there = Following([Address("there.test", 1)])
-        await there.until(lambda: bool(there.results))
+        await until(lambda: bool(there.results))
         await there.stop()
     finally:
         gate.set()
