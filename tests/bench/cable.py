@@ -116,10 +116,7 @@ class Cable:
             connect(self.right, _DEVICE, self.left, _DEVICE)
             for host in (self.left, self.right):
                 # The kernel splits what is sent in one call (UDP_SEGMENT) before the cable, as before a real one.
-                host.ip(
-                    f"link set {_DEVICE} gso_max_segs 1",
-                    f"address add {host.address}/24 dev {_DEVICE}",
-                )
+                host.ip(f"link set {_DEVICE} gso_max_segs 1", f"address add {host.address}/24 dev {_DEVICE}")
             self._stack = stack.pop_all()
         return self
 

@@ -133,11 +133,4 @@ def all_contenders() -> Sequence[Contender]:
     from tests.bench.routers import ROUTERS
     from tests.bench.tunnels import TUNNELS
 
-    return (
-        Direct(),
-        Relay("uvloop"),
-        Relay("blocking"),
-        *DAEMONS,
-        *TUNNELS,
-        *ROUTERS,
-    )
+    return (Direct(), Relay("uvloop"), Relay("blocking"), *DAEMONS, *TUNNELS, *ROUTERS)

@@ -139,11 +139,7 @@ def daemon_command(config: Path, *, python: Path = Path(sys.executable), uvloop:
 
 
 def start_daemon(
-    host: Host,
-    config: Path,
-    *,
-    python: Path = Path(sys.executable),
-    uvloop: bool = True,
+    host: Host, config: Path, *, python: Path = Path(sys.executable), uvloop: bool = True
 ) -> subprocess.Popen[bytes]:
     """Start a daemon on a host; its log is beside its file."""
     command = daemon_command(config, python=python, uvloop=uvloop)

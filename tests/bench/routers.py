@@ -11,13 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from tests.bench.cable import Cable, Host
-from tests.bench.contenders import (
-    INTO_PORT,
-    LINK_PORT,
-    Contender,
-    Running,
-    needs_module,
-)
+from tests.bench.contenders import INTO_PORT, LINK_PORT, Contender, Running, needs_module
 from tests.bench.traffic import REPOSITORY, SINK_PORT
 
 

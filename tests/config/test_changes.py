@@ -66,12 +66,7 @@ _ROWS = [
     (
         relays(_AS_PEER, _AT),
         relays(_AS_PEER, f"{_AT}\nretry_max_s = 3"),
-        {
-            "peers_removed": ["drone1"],
-            "peers_added": ["drone1"],
-            "relays_removed": ["vps"],
-            "relays_added": ["vps"],
-        },
+        {"peers_removed": ["drone1"], "peers_added": ["drone1"], "relays_removed": ["vps"], "relays_added": ["vps"]},
     ),
 ]
 

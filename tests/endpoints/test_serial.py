@@ -15,12 +15,7 @@ from typing import cast
 import pytest
 from serialx import BaseSerial
 
-from tests.endpoints.clients import (
-    Recorder,
-    frame,
-    recorder,
-    write,
-)
+from tests.endpoints.clients import Recorder, frame, recorder, write
 from tests.waiting import until
 from uavlinkd.endpoints import serial
 from uavlinkd.endpoints.serial import SerialChannel, SerialEndpoint

@@ -10,20 +10,10 @@ from time import monotonic
 import pytest
 from structlog.testing import capture_logs
 
-from tests.endpoints.clients import (
-    Recorder,
-    frame,
-    recorder,
-    unused_address,
-    write,
-)
+from tests.endpoints.clients import Recorder, frame, recorder, unused_address, write
 from tests.waiting import Stopwatch, until
 from uavlinkd.endpoints import tcp
-from uavlinkd.endpoints.tcp import (
-    TcpClient,
-    TcpServer,
-    tcp_listener,
-)
+from uavlinkd.endpoints.tcp import TcpClient, TcpServer, tcp_listener
 from uavlinkd.system.addresses import Address
 
 ANY_PORT = Address("127.0.0.1", 0)

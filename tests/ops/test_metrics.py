@@ -123,11 +123,7 @@ STATUS: dict[str, Any] = {
     "unrouted": numbered("unknown_target"),
     "send_failures": numbered("ENETUNREACH"),
     "stale": numbered("autopilot"),
-    "recording": {
-        "is_recording": True,
-        "failures": numbered("ENOSPC"),
-        **numbered("frames", "bytes", "frames_lost"),
-    },
+    "recording": {"is_recording": True, "failures": numbered("ENOSPC"), **numbered("frames", "bytes", "frames_lost")},
 }
 ALL_NUMBERS = set(range(1000, next(_NUMBERS)))
 

@@ -139,10 +139,7 @@ CASES: dict[str, tuple[dict[str, str], list[tuple[str, bool]]]] = {
         },
         [("2m", False), ("3m", False), ("4m30s", True)],
     ),
-    "UavlinkdNotRecording": (
-        {'uavlinkd_recording_up{instance="a"}': "1x4 0x20"},
-        [("1m15s", False), ("4m", True)],
-    ),
+    "UavlinkdNotRecording": ({'uavlinkd_recording_up{instance="a"}': "1x4 0x20"}, [("1m15s", False), ("4m", True)]),
     "UavlinkdRelayOverLimit": (
         {'uavlinkd_relay_member_over_limit_total{instance="a",member="b"}': "0x8 0+30x20"},
         [("2m", False), ("5m", True)],

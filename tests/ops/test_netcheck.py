@@ -6,13 +6,7 @@ from typing import Any
 
 import pytest
 
-from uavlinkd.ops.netcheck import (
-    ONE_VIEW,
-    Filtered,
-    Mapped,
-    behaviours,
-    report,
-)
+from uavlinkd.ops.netcheck import ONE_VIEW, Filtered, Mapped, behaviours, report
 
 PRIVATE, PUBLIC, OTHER = "192.168.1.5:5790", "203.0.113.7:40001", "203.0.113.7:40002"
 
