@@ -15,17 +15,22 @@ from tests.bench.contenders import INTO_PORT, LINK_PORT, Contender, Running, nee
 from tests.bench.traffic import REPOSITORY, SINK_PORT
 
 
-class Mavproxy(Contender):
-    """MAVProxy on both hosts, without console, map and modules; it logs as it always does."""
+class Router(Contender):
+    """A router of a Python package."""
 
-    def __init__(self) -> None:
-        super().__init__("mavproxy")
+    def __init__(self, name: str, package: str) -> None:
+        super().__init__(name)
+        self._package = package
 
     def why_not(self) -> str | None:
-        return needs_module("MAVProxy")
+        return needs_module(self._package)
 
     def version(self) -> str | None:
-        return version("MAVProxy")
+        return version(self._package)
+
+
+class Mavproxy(Router):
+    """MAVProxy on both hosts, without console, map and modules; it logs as it always does."""
 
     def start(self, cable: Cable, folder: Path) -> Running:
         right = self._side(cable.right, folder / "right", f"0.0.0.0:{LINK_PORT}", f"127.0.0.1:{SINK_PORT}")
@@ -45,17 +50,8 @@ class Mavproxy(Contender):
         )
 
 
-class PymavlinkSigning(Contender):
+class PymavlinkSigning(Router):
     """The relays of :mod:`tests.bench.signing`: the left one signs, the right one accepts only signed frames."""
-
-    def __init__(self) -> None:
-        super().__init__("pymavlink-signing")
-
-    def why_not(self) -> str | None:
-        return needs_module("pymavlink")
-
-    def version(self) -> str | None:
-        return version("pymavlink")
 
     def start(self, cable: Cable, folder: Path) -> Running:
         key = folder / "signing.key"
@@ -72,4 +68,4 @@ class PymavlinkSigning(Contender):
         return host.start(command, folder=REPOSITORY, log=log, environ={"MAVLINK20": "1"})
 
 
-ROUTERS: Final = (Mavproxy(), PymavlinkSigning())
+ROUTERS: Final = (Mavproxy("mavproxy", "MAVProxy"), PymavlinkSigning("pymavlink-signing", "pymavlink"))

@@ -29,12 +29,16 @@ TUN: Final = Path("/dev/net/tun")
 class Tunnel(Contender):
     """A VPN between the two hosts."""
 
-    def __init__(self, name: str, *commands: str) -> None:
-        super().__init__(name)
-        self._commands = commands
+    def __init__(self, command: str, *others: str, version_option: str = "--version") -> None:
+        super().__init__(command)
+        self._commands = (command, *others)
+        self._version_option = version_option
 
     def why_not(self) -> str | None:
         return needs_command(*self._commands) or _why_no_tun()
+
+    def version(self) -> str | None:
+        return command_version(self.name, self._version_option)
 
     def start(self, cable: Cable, folder: Path) -> Running:
         try:
@@ -58,12 +62,6 @@ def _why_no_tun() -> str | None:
 
 class WireguardGo(Tunnel):
     """WireGuard in user space."""
-
-    def __init__(self) -> None:
-        super().__init__("wireguard-go", "wireguard-go", "wg")
-
-    def version(self) -> str | None:
-        return command_version("wireguard-go", "--version")
 
     def _start(self, cable: Cable, folder: Path) -> tuple[subprocess.Popen[bytes], subprocess.Popen[bytes]]:
         private = [_output("wg", "genkey") for _ in range(2)]
@@ -96,12 +94,6 @@ class WireguardGo(Tunnel):
 class Nebula(Tunnel):
     """Nebula, an overlay with certificates, the right host as lighthouse."""
 
-    def __init__(self) -> None:
-        super().__init__("nebula", "nebula", "nebula-cert")
-
-    def version(self) -> str | None:
-        return command_version("nebula", "-version")
-
     def _start(self, cable: Cable, folder: Path) -> tuple[subprocess.Popen[bytes], subprocess.Popen[bytes]]:
         _command(folder, "nebula-cert", "ca", "-name", "bench")
         for side, address in (("left", LEFT_TUNNEL), ("right", RIGHT_TUNNEL)):
@@ -128,12 +120,6 @@ class Nebula(Tunnel):
 
 class Openvpn(Tunnel):
     """OpenVPN over UDP, point to point, each side knowing the other's certificate."""
-
-    def __init__(self) -> None:
-        super().__init__("openvpn", "openvpn")
-
-    def version(self) -> str | None:
-        return command_version("openvpn", "--version")
 
     def _start(self, cable: Cable, folder: Path) -> tuple[subprocess.Popen[bytes], subprocess.Popen[bytes]]:
         prints = {side: _certificate(folder, side) for side in ("left", "right")}
@@ -198,4 +184,8 @@ def _output(*command: str, given: str = "") -> str:
     return subprocess.run(command, input=given, check=True, capture_output=True, text=True).stdout.strip()
 
 
-TUNNELS: Final = (WireguardGo(), Nebula(), Openvpn())
+TUNNELS: Final = (
+    WireguardGo("wireguard-go", "wg"),
+    Nebula("nebula", "nebula-cert", version_option="-version"),
+    Openvpn("openvpn"),
+)

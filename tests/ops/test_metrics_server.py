@@ -93,12 +93,7 @@ async def test_prometheus_is_answered(server: MetricsServer) -> None:
     """The response has content and type, whether or not the client ends its side."""
     for end in (True, False):
         request = b"GET /metrics HTTP/1.1\r\nHost: 127.0.0.1:9790\r\nAccept: */*\r\n\r\n"
-        reader, writer = await asyncio.open_connection(*server.address.sockaddr)
-        writer.write(request)
-        if end:
-            writer.write_eof()
-        response = await reader.read()
-        writer.close()
+        response = await exchange(server, request, end=end)
         assert status(response) == 200
         assert b"\r\nContent-Type: text/x-test\r\n" in response
         assert response.endswith(b"\r\n\r\n" + BODY)
