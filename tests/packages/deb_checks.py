@@ -24,6 +24,15 @@ from tests.needs import need
 from uavlinkd import __version__
 from uavlinkd.core.constants import PROTOCOL_NAME
 
+__all__ = [
+    "machine",
+    "package",
+    "test_installation_by_hand_is_refused",
+    "test_package_holds_what_a_vehicle_needs",
+    "test_two_builds_are_equal",
+    "test_upgrade_and_downgrade_under_traffic",
+]
+
 ROOT = Path(__file__).parents[2]
 SCRIPT = ROOT / "systemd/deb/make_deb.py"
 CODENAMES = {12: "bookworm", 13: "trixie"}
