@@ -2,20 +2,35 @@
 
 from __future__ import annotations
 
+import asyncio
 import socket
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Coroutine, Sequence
+
+import pytest
+import uvloop
 
 from tests import samples
 from tests.policies import TRUSTED
 from tests.samples import file_part, frames_of, number_value, raws
 from uavlinkd.endpoints.ports import Endpoint, LocalPort
 from uavlinkd.endpoints.stream_endpoint import StreamEndpoint
+from uavlinkd.endpoints.udp import UdpServer
 from uavlinkd.mavlink.frames import Frame
 from uavlinkd.mavlink.policy.compilation import compile_policy
 from uavlinkd.mavlink.policy.delivery import Source
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.clock import monotonic as boot_time
 from uavlinkd.system.stall import StallWatch
+
+NewLoop = Callable[[], asyncio.AbstractEventLoop]
+LOOPS = pytest.mark.parametrize("new_loop", [asyncio.SelectorEventLoop, uvloop.new_event_loop])
+HOSTS = pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
+
+
+def run_in(new_loop: NewLoop, scene: Coroutine[None, None, None]) -> None:
+    """Run a scene in an event loop of one of `LOOPS`."""
+    with asyncio.Runner(loop_factory=new_loop) as runner:
+        runner.run(scene)
 
 
 def frame(number: int) -> bytes:
@@ -90,7 +105,7 @@ class Recorder:
         self.on_batch()
 
 
-def recorder(endpoint: StreamEndpoint) -> Recorder:
+def recorder(endpoint: StreamEndpoint | UdpServer) -> Recorder:
     """The recorder to which an endpoint reports."""
     assert isinstance(endpoint.handler, Recorder)
     return endpoint.handler

@@ -5,15 +5,15 @@ from __future__ import annotations
 import asyncio
 import errno
 import socket
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
+from contextlib import closing
 from typing import Any, cast
 
 import pytest
 import structlog
-import uvloop
 
 from tests.daemon.udp import open_socket
-from tests.endpoints.clients import Recorder, frame, heartbeat, write
+from tests.endpoints.clients import HOSTS, LOOPS, NewLoop, Recorder, frame, heartbeat, run_in, write
 from tests.needs import need
 from tests.waiting import until
 from uavlinkd.endpoints.error_queue import SEND_ATTEMPTS
@@ -29,9 +29,6 @@ from uavlinkd.mavlink.routing import Router
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.stall import StallWatch
-
-LOOPS = pytest.mark.parametrize("new_loop", [asyncio.SelectorEventLoop, uvloop.new_event_loop])
-NewLoop = Callable[[], asyncio.AbstractEventLoop]
 
 
 class CountingSocket:
@@ -113,7 +110,7 @@ def received(client: socket.socket) -> list[bytes]:
 
 
 @LOOPS
-@pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
+@HOSTS
 def test_forty_restarts_of_a_client_do_not_add_work_per_frame(new_loop: NewLoop, host: str) -> None:
     """Each restart has a new port. The old port refuses the next datagram, and gets no other."""
     need(host != "::1" or has_ipv6(), "an IPv6 loopback")
@@ -137,8 +134,7 @@ def test_forty_restarts_of_a_client_do_not_add_work_per_frame(new_loop: NewLoop,
             assert hub.endpoint.failures["ECONNREFUSED"] >= len(closed) > 20
             assert set(hub.endpoint.failures) == {"ECONNREFUSED"}
 
-    with asyncio.Runner(loop_factory=new_loop) as runner:
-        runner.run(run())
+    run_in(new_loop, run())
 
 
 @LOOPS
@@ -159,8 +155,7 @@ def test_a_pending_error_costs_no_other_client_a_frame(new_loop: NewLoop) -> Non
             await until(lambda: hub.endpoint.ports == [of_receiver])
             await hub.send(receiver, frame(1))
 
-    with asyncio.Runner(loop_factory=new_loop) as runner:
-        runner.run(run())
+    run_in(new_loop, run())
 
 
 @pytest.fixture
@@ -196,9 +191,8 @@ async def test_other_errors_of_earlier_datagrams_forget_no_client(hub: Hub, monk
 async def test_silence_is_reported_once() -> None:
     """And its end before the first frame. A client that is forgotten is not silent any more."""
     recorder = Recorder()
-    endpoint = UdpServer("clients", udp_socket(Address("127.0.0.1", 0)), recorder)
     address = ("127.0.0.1", 9)
-    try:
+    with closing(UdpServer("clients", udp_socket(Address("127.0.0.1", 0)), recorder)) as endpoint:
         endpoint.take([(heartbeat(), address)], 100.0, 0)
         for now, silent in ((104.9, []), (105.0, ["127.0.0.1:9"]), (106.0, ["127.0.0.1:9"])):
             endpoint.do_housekeeping(now)
@@ -208,5 +202,3 @@ async def test_silence_is_reported_once() -> None:
         endpoint.do_housekeeping(112.0)
         endpoint.do_housekeeping(167.0)
         assert (list(endpoint.ports), endpoint._silent) == ([], set())
-    finally:
-        endpoint.close()

@@ -5,13 +5,9 @@ from __future__ import annotations
 import asyncio
 import errno
 import socket
-from collections.abc import Callable
-
-import pytest
-import uvloop
 
 from tests.daemon.udp import open_socket
-from tests.endpoints.clients import Recorder, frame, write
+from tests.endpoints.clients import HOSTS, LOOPS, NewLoop, Recorder, frame, run_in, write
 from tests.needs import need
 from tests.waiting import until
 from uavlinkd.endpoints.error_queue import REPORTS_PER_S, ErrorReports
@@ -21,11 +17,8 @@ from uavlinkd.lab.sim.loopback_ports import free_port, has_ipv6
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.clock import monotonic
 
-NewLoop = Callable[[], asyncio.AbstractEventLoop]
-LOOPS = pytest.mark.parametrize("new_loop", [asyncio.SelectorEventLoop, uvloop.new_event_loop])
 
-
-@pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
+@HOSTS
 def test_reports_are_limited_until_they_are_renewed(host: str) -> None:
     """A flood of errors costs nothing beyond the limit, and leaves no error behind."""
     need(host != "::1" or has_ipv6(), "IPv6 on loopback")
@@ -73,5 +66,4 @@ def test_client_that_does_not_listen_is_counted(new_loop: NewLoop) -> None:
             await until(lambda: endpoint.counters.frames == 1)
         endpoint.close()
 
-    with asyncio.Runner(loop_factory=new_loop) as runner:
-        runner.run(run())
+    run_in(new_loop, run())

@@ -7,6 +7,7 @@ import os
 import select
 import termios
 from collections.abc import AsyncIterator, Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from time import monotonic
 from types import SimpleNamespace
@@ -37,7 +38,11 @@ class Autopilot:
 
     def unplug(self) -> None:
         self.device.unlink()
-        os.close(self.master)
+        self.close()
+
+    def close(self) -> None:
+        if self.master >= 0:
+            os.close(self.master)
         self.master = -1
 
     def read(self) -> bytes:
@@ -50,23 +55,27 @@ class Autopilot:
         return got
 
 
+@contextmanager
+def started(autopilot: Autopilot, name: str = "serial", baud: int = 57600) -> Iterator[SerialEndpoint]:
+    """An endpoint on the autopilot's device."""
+    with closing(SerialEndpoint(name, SerialUrl(str(autopilot.device), baud), Recorder())) as endpoint:
+        endpoint.start()
+        yield endpoint
+
+
 @pytest.fixture
 def autopilot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Autopilot]:
     """Not plugged in yet."""
     monkeypatch.setattr(serial, "RETRY_S", 0.02)
-    other_end = Autopilot(tmp_path / "usb-Autopilot")
-    yield other_end
-    if other_end.master >= 0:
-        os.close(other_end.master)
+    with closing(Autopilot(tmp_path / "usb-Autopilot")) as other_end:
+        yield other_end
 
 
 @pytest.fixture
 async def endpoint(autopilot: Autopilot) -> AsyncIterator[SerialEndpoint]:
     """On the autopilot's device, started."""
-    port = SerialEndpoint("serial", SerialUrl(str(autopilot.device), 57600), Recorder())
-    port.start()
-    yield port
-    port.close()
+    with started(autopilot) as endpoint:
+        yield endpoint
 
 
 async def opened(endpoint: SerialEndpoint) -> None:
@@ -111,15 +120,11 @@ async def test_device_is_opened_exclusively(autopilot: Autopilot, endpoint: Seri
     """Two readers of one wire would get half of the bytes each: the second waits until the first has closed it."""
     autopilot.plug_in()
     await opened(endpoint)
-    second = SerialEndpoint("second", SerialUrl(str(autopilot.device), 57600), Recorder())
-    second.start()
-    try:
+    with started(autopilot, "second") as second:
         await until(lambda: second.failures["EBUSY"] >= 2)
         assert list(second.ports) == []
         endpoint.close()
         await opened(second)
-    finally:
-        second.close()
 
 
 @pytest.mark.parametrize(
@@ -128,16 +133,12 @@ async def test_device_is_opened_exclusively(autopilot: Autopilot, endpoint: Seri
 async def test_baud_rate_is_set(autopilot: Autopilot, baud: int, constant: int | None) -> None:
     """Standard rates, which have a constant in termios, and others."""
     autopilot.plug_in()
-    endpoint = SerialEndpoint("serial", SerialUrl(str(autopilot.device), baud), Recorder())
-    endpoint.start()
-    try:
+    with started(autopilot, baud=baud) as endpoint:
         await opened(endpoint)
         (connection,) = endpoint._connections.values()
         speed = termios.tcgetattr(connection.channel.fileno())[5]
         named = {getattr(termios, name) for name in dir(termios) if name[:1] == "B" and name[1:].isdigit()}
         assert speed == constant if constant is not None else speed not in named
-    finally:
-        endpoint.close()
 
 
 @pytest.mark.parametrize("what", ["/dev/null", "a file", "a folder"])
@@ -217,14 +218,8 @@ async def test_closed_endpoint_leaves_the_device_to_others(autopilot: Autopilot,
     autopilot.plug_in()
     await opened(endpoint)
     endpoint.close()
-    opening = SerialEndpoint("opening", SerialUrl(str(autopilot.device), 57600), Recorder())
-    opening.start()
-    await asyncio.sleep(0)
-    opening.close()
-    last = SerialEndpoint("last", SerialUrl(str(autopilot.device), 57600), Recorder())
-    last.start()
-    try:
+    with started(autopilot, "opening") as opening:
+        await asyncio.sleep(0)
+    with started(autopilot, "last") as last:
         await opened(last)
-    finally:
-        last.close()
     assert recorder(endpoint).closed == recorder(opening).open == []

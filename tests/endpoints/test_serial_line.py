@@ -6,6 +6,7 @@ import os
 import termios
 import threading
 from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -56,10 +57,8 @@ class Received:
 def other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Other]:
     """Not plugged in yet."""
     monkeypatch.setattr(serial, "RETRY_S", 0.02)
-    end = Other(tmp_path / "usb-modem")
-    yield end
-    if end.master >= 0:
-        os.close(end.master)
+    with closing(Other(tmp_path / "usb-modem")) as end:
+        yield end
 
 
 @pytest.fixture
@@ -73,10 +72,9 @@ async def line(other: Other, received: Received) -> AsyncIterator[SerialLine]:
     """On the modem's device, started."""
     stall = StallWatch(monotonic(), lambda pause_s: None)
     url = SerialUrl(str(other.device), 57600)
-    made = SerialLine("sik", url, FAST, received.on_datagrams, received.on_change, stall)
-    made.start()
-    yield made
-    made.close()
+    with closing(SerialLine("sik", url, FAST, received.on_datagrams, received.on_change, stall)) as made:
+        made.start()
+        yield made
 
 
 async def plugged_in(other: Other, line: SerialLine) -> None:

@@ -7,6 +7,7 @@ import resource
 import socket
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from fcntl import ioctl
 from time import monotonic
 
@@ -28,16 +29,8 @@ Connect = Callable[[], socket.socket]
 @pytest.fixture
 def connect(server: TcpServer) -> Iterator[Connect]:
     """Connects a client to the server."""
-    clients: list[socket.socket] = []
-
-    def _connect() -> socket.socket:
-        client = socket.create_connection(server.address, timeout=60)
-        clients.append(client)
-        return client
-
-    yield _connect
-    for client in clients:
-        client.close()
+    with ExitStack() as stack:
+        yield lambda: stack.enter_context(socket.create_connection(server.address, timeout=60))
 
 
 async def test_address_is_free_again_after_a_restart(server: TcpServer, connect: Connect) -> None:
@@ -149,16 +142,11 @@ async def test_without_file_descriptors_the_server_waits(
     await until(lambda: len(server.ports) == 1)
 
 
-def never_read(connect: Connect) -> socket.socket:
-    client = connect()
-    client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-    return client
-
-
 async def test_kernel_holds_little_for_a_client_that_never_reads(server: TcpServer, connect: Connect) -> None:
     """Frames that cannot be sent wait in the endpoint, where they can be dropped. The kernel gets a few dozen."""
     server.on_acceptable(0.0)
-    client = never_read(connect)
+    client = connect()
+    client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
     server.on_acceptable(0.0)
     (port,) = server.ports
     for number in range(2000):

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import socket
-from collections.abc import AsyncIterator
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from time import monotonic
 
 import pytest
@@ -19,20 +20,18 @@ from uavlinkd.system.addresses import Address
 ANY_PORT = Address("127.0.0.1", 0)
 
 
-@pytest.fixture
-async def tcp_client(server: TcpServer) -> AsyncIterator[TcpClient]:
-    """An endpoint that connects to the server, not yet started."""
-    endpoint = TcpClient("tcp_client", Address(*server.address), Recorder())
-    yield endpoint
-    endpoint.close()
+@contextmanager
+def client_of(address: Address) -> Iterator[TcpClient]:
+    """An endpoint that connects to this address."""
+    with closing(TcpClient("tcp_client", address, Recorder())) as endpoint:
+        endpoint.start()
+        yield endpoint
 
 
 async def test_client_waits_for_a_server_that_is_not_there_yet() -> None:
     """The client connects to a server that starts late, and has no port until then."""
     address = unused_address()
-    tcp_client = TcpClient("tcp_client", address, Recorder())
-    tcp_client.start()
-    try:
+    with client_of(address) as tcp_client:
         with capture_logs() as logs:
             await until(lambda: tcp_client.failures["ECONNREFUSED"] >= 3)
         (line,) = logs  # not one a try
@@ -49,32 +48,27 @@ async def test_client_waits_for_a_server_that_is_not_there_yet() -> None:
             tried = tcp_client.failures["ECONNREFUSED"]
             await until(lambda: tcp_client.failures["ECONNREFUSED"] > tried)
         assert logs == []  # it was open for a moment only
-    finally:
-        tcp_client.close()
 
 
-async def test_client_follows_a_server_that_restarts(server: TcpServer, tcp_client: TcpClient) -> None:
+async def test_client_follows_a_server_that_restarts(server: TcpServer) -> None:
     """The port is reported as closed, and a new one as opened, within a second if the server had sent frames."""
     server.start()
-    tcp_client.start()
-    await until(lambda: len(server.ports) == 1)
-    write(server, server.ports[0], [frame(1)], monotonic())
-    await until(lambda: recorder(tcp_client).received == [frame(1)])
-    (before,) = tcp_client.ports
     address = Address(*server.address)
-    server.close()
-    await until(lambda: recorder(tcp_client).closed == [before])
-    again = TcpServer("again", tcp_listener(address), Recorder())
-    again.start()
-    watch = Stopwatch()
-    try:
-        await until(lambda: len(again.ports) == 1)
-        assert watch.calm_s < 1.0
-        write(again, again.ports[0], [frame(2)], monotonic())
-        await until(lambda: recorder(tcp_client).received == [frame(1), frame(2)])
-        assert tcp_client.ports[0] is not before
-    finally:
-        again.close()
+    with client_of(address) as tcp_client:
+        await until(lambda: len(server.ports) == 1)
+        write(server, server.ports[0], [frame(1)], monotonic())
+        await until(lambda: recorder(tcp_client).received == [frame(1)])
+        (before,) = tcp_client.ports
+        server.close()
+        await until(lambda: recorder(tcp_client).closed == [before])
+        with closing(TcpServer("again", tcp_listener(address), Recorder())) as again:
+            again.start()
+            watch = Stopwatch()
+            await until(lambda: len(again.ports) == 1)
+            assert watch.calm_s < 1.0
+            write(again, again.ports[0], [frame(2)], monotonic())
+            await until(lambda: recorder(tcp_client).received == [frame(1), frame(2)])
+            assert tcp_client.ports[0] is not before
 
 
 async def test_waits_grow_where_a_server_only_accepts_and_closes(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -118,15 +112,11 @@ async def test_name_is_looked_up_at_each_attempt(server: TcpServer, monkeypatch:
         return [(socket.AF_INET, socket.SOCK_STREAM, 6, "", sockaddr)]
 
     monkeypatch.setattr(socket, "getaddrinfo", look_up)
-    tcp_client = TcpClient("tcp_client", Address("autopilot.test", 5760), Recorder())
-    tcp_client.start()
-    try:
+    with client_of(Address("autopilot.test", 5760)) as tcp_client:
         await until(lambda: len(tcp_client.ports) == 1)
         assert asked == [("autopilot.test", 5760)] * 3
         assert tcp_client.failures == {"not_resolved": 1, "ECONNREFUSED": 1}
         assert tcp_client.ports[0].name == "autopilot.test:5760"
-    finally:
-        tcp_client.close()
 
 
 async def test_connection_to_oneself_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -140,8 +130,6 @@ async def test_connection_to_oneself_is_refused(monkeypatch: pytest.MonkeyPatch)
         sock.bind(address.sockaddr)
 
     monkeypatch.setattr(tcp, "_prepare", prepare_there)
-    tcp_client = TcpClient("tcp_client", address, Recorder())
-    tcp_client.start()
-    await until(lambda: tcp_client.failures["ECONNREFUSED"] > 0)
-    assert recorder(tcp_client).open == []
-    tcp_client.close()
+    with client_of(address) as tcp_client:
+        await until(lambda: tcp_client.failures["ECONNREFUSED"] > 0)
+        assert recorder(tcp_client).open == []

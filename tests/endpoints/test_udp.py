@@ -9,7 +9,7 @@ from contextlib import ExitStack
 import pytest
 
 from tests.daemon.udp import open_socket
-from tests.endpoints.clients import Recorder, frame, heartbeat, write
+from tests.endpoints.clients import Recorder, frame, heartbeat, recorder, write
 from uavlinkd.endpoints.ports import LocalPort
 from uavlinkd.endpoints.reader import Datagrams, Reader
 from uavlinkd.endpoints.sockets import udp_socket
@@ -27,15 +27,9 @@ from uavlinkd.system.stall import STALE, STALL_S
 
 
 @pytest.fixture
-def recorder() -> Recorder:
-    """An empty one."""
-    return Recorder()
-
-
-@pytest.fixture
-async def server(recorder: Recorder) -> AsyncIterator[UdpServer]:
+async def server() -> AsyncIterator[UdpServer]:
     """A ``udpin`` on a free port. It reads when a test tells it to."""
-    server = UdpServer("autopilot", udp_socket(Address("127.0.0.1", 0)), recorder)
+    server = UdpServer("autopilot", udp_socket(Address("127.0.0.1", 0)), Recorder())
     yield server
     server.close()
 
@@ -79,34 +73,35 @@ def read(server: UdpServer, now: float = 1.0) -> None:
     reader_of(server, now).read(monotonic())
 
 
-async def test_all_datagrams_are_delivered_in_one_batch(server: UdpServer, recorder: Recorder, client: Make) -> None:
+async def test_all_datagrams_are_delivered_in_one_batch(server: UdpServer, client: Make) -> None:
     """One call per client, with all its frames in order."""
     one, other = client(), client()
     one.send(frame(1))
     other.send(frame(2))
     one.send(frame(3) + frame(4))
     read(server)
-    assert recorder.by_client == [(name_of(one), [frame(1), frame(3), frame(4)]), (name_of(other), [frame(2)])]
-    assert names(recorder.open) == [name_of(one), name_of(other)]
+    assert recorder(server).by_client == [
+        (name_of(one), [frame(1), frame(3), frame(4)]),
+        (name_of(other), [frame(2)]),
+    ]
+    assert names(recorder(server).open) == [name_of(one), name_of(other)]
     assert server.counters.frames == 4
     assert server.bytes_received == len(frame(1) + frame(2) + frame(3) + frame(4))
 
 
 @pytest.mark.parametrize("datagram", [b"", b"hello", bytes(60000), heartbeat()[:-1], heartbeat()[:-1] + b"\x00"])
-async def test_garbage_does_not_make_its_sender_a_client(
-    server: UdpServer, recorder: Recorder, client: Make, datagram: bytes
-) -> None:
+async def test_garbage_does_not_make_its_sender_a_client(server: UdpServer, client: Make, datagram: bytes) -> None:
     """Only a genuine frame does."""
     client().send(datagram)
     read(server)
-    assert (list(server.ports), recorder.by_client, recorder.open) == ([], [], [])
+    assert (list(server.ports), recorder(server).by_client, recorder(server).open) == ([], [], [])
     assert server.counters.garbage_bytes == len(datagram) == server.bytes_received
 
 
 @pytest.mark.parametrize("start", [b"\xfd\xff\x00", b"\xfe\xff", frame(7)[:1] + b"\xf0" + frame(7)[2:], b"\xfd"])
 @pytest.mark.parametrize("cuts", [False, True])
 async def test_a_broken_beginning_doubles_nothing_and_holds_nothing_back(
-    server: UdpServer, recorder: Recorder, client: Make, start: bytes, cuts: bool
+    server: UdpServer, client: Make, start: bytes, cuts: bool
 ) -> None:
     """Frames behind a false start are delivered once; if a bridge sent them, within 1.5 s."""
     bridge = client()
@@ -117,15 +112,15 @@ async def test_a_broken_beginning_doubles_nothing_and_holds_nothing_back(
         for datagram in (frame(8)[:20], frame(9)[:20], frame(9)[20:]):
             bridge.send(datagram)
             read(server, 1.0)
-        recorder.by_client[1:] = []
+        recorder(server).by_client[1:] = []
     assert bool(server._splitters) == cuts
     bridge.send(start + sent[1] + sent[2])
     read(server, 1.1)
     server.do_housekeeping(1.1 + MAX_GAP_S + 1.0)
-    assert [raw for _, raws in recorder.by_client for raw in raws] == sent[:3]
+    assert recorder(server).received == sent[:3]
     bridge.send(sent[3])
     read(server, 3.0)
-    assert [raw for _, raws in recorder.by_client for raw in raws] == sent
+    assert recorder(server).received == sent
     assert bool(server._splitters) == cuts
     carried = server.counters.garbage_bytes + sum(map(len, sent))
     assert carried + (len(frame(9)) if cuts else 0) == server.bytes_received
@@ -148,9 +143,7 @@ async def test_frames_share_datagrams_up_to_a_size(server: UdpServer, client: Ma
 
 
 @pytest.mark.parametrize(("now", "is_there"), [(100.0 + CLIENT_IDLE_S - 0.001, True), (100.0 + CLIENT_IDLE_S, False)])
-async def test_idle_clients_are_forgotten(
-    server: UdpServer, recorder: Recorder, client: Make, now: float, is_there: bool
-) -> None:
+async def test_idle_clients_are_forgotten(server: UdpServer, client: Make, now: float, is_there: bool) -> None:
     """A silent client is served until its time is over. A client that sends stays."""
     silent, speaking = client(), client()
     silent.send(heartbeat())
@@ -159,7 +152,7 @@ async def test_idle_clients_are_forgotten(
     read(server, 101.0)
     server.do_housekeeping(now)
     assert names(server.ports) == [*[name_of(silent)] * is_there, name_of(speaking)]
-    assert names(recorder.closed) == ([] if is_there else [name_of(silent)])
+    assert names(recorder(server).closed) == ([] if is_there else [name_of(silent)])
 
 
 async def test_a_forgotten_client_is_not_sent_to(server: UdpServer, client: Make) -> None:
@@ -178,7 +171,7 @@ async def test_a_forgotten_client_is_not_sent_to(server: UdpServer, client: Make
     assert again.delivered is port.delivered
 
 
-async def test_new_clients_cannot_displace_active_ones(server: UdpServer, recorder: Recorder, client: Make) -> None:
+async def test_new_clients_cannot_displace_active_ones(server: UdpServer, client: Make) -> None:
     """All places are taken by clients that sent recently: a new client gets no place, and is counted."""
     for _ in range(CLIENTS_PER_ENDPOINT):
         client().send(heartbeat())
@@ -188,13 +181,11 @@ async def test_new_clients_cannot_displace_active_ones(server: UdpServer, record
     read(server, 100.0 + CLIENT_SILENT_S - 0.001)
     assert len(server.ports) == CLIENTS_PER_ENDPOINT
     assert server.failures["too_many_clients"] == 1
-    assert recorder.closed == []
-    assert name_of(newcomer) not in [name for name, _ in recorder.by_client]
+    assert recorder(server).closed == []
+    assert name_of(newcomer) not in [name for name, _ in recorder(server).by_client]
 
 
-async def test_a_new_client_displaces_the_one_that_is_silent_longest(
-    server: UdpServer, recorder: Recorder, client: Make
-) -> None:
+async def test_a_new_client_displaces_the_one_that_is_silent_longest(server: UdpServer, client: Make) -> None:
     """Not the first one that connected, and only once it has been silent long enough."""
     clients = [client() for _ in range(CLIENTS_PER_ENDPOINT)]
     for sock in clients:
@@ -205,14 +196,12 @@ async def test_a_new_client_displaces_the_one_that_is_silent_longest(
     newcomer = client()
     newcomer.send(heartbeat())
     read(server, 100.0 + CLIENT_SILENT_S)
-    assert names(recorder.closed) == [name_of(clients[1])]
+    assert names(recorder(server).closed) == [name_of(clients[1])]
     assert names(server.ports)[-1] == name_of(newcomer)
     assert len(server.ports) == CLIENTS_PER_ENDPOINT
 
 
-async def test_frame_that_a_bridge_began_before_a_pause_is_stale(
-    server: UdpServer, recorder: Recorder, client: Make
-) -> None:
+async def test_frame_that_a_bridge_began_before_a_pause_is_stale(server: UdpServer, client: Make) -> None:
     """The rest of it comes after the pause; the next frame is new."""
     one = client()
     reader = reader_of(server)
@@ -220,9 +209,9 @@ async def test_frame_that_a_bridge_began_before_a_pause_is_stale(
     for datagram in (frame(1), frame(1) + cut[:10]):
         one.send(datagram)
         reader.read(monotonic())
-    recorder.stall.turn(monotonic() + 2 * STALL_S)
+    recorder(server).stall.turn(monotonic() + 2 * STALL_S)
     for datagram in (cut[10:], frame(3)):
         one.send(datagram)
         reader.read(monotonic())
-    assert [frames for _, frames in recorder.by_client] == [[frame(1)], [frame(1)], [cut], [frame(3)]]
-    assert recorder.epochs == [0, 0, STALE, 1]
+    assert [frames for _, frames in recorder(server).by_client] == [[frame(1)], [frame(1)], [cut], [frame(3)]]
+    assert recorder(server).epochs == [0, 0, STALE, 1]
