@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import shlex
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from tests.fleet.vehicles import loaded
 from uavlinkd.cli import main
-from uavlinkd.config import Config, keys
-from uavlinkd.config.load import load_config
+from uavlinkd.config import keys
 from uavlinkd.fleet import operations, transaction
 from uavlinkd.fleet.manifest import Fleet, FleetSettings, MemberKind, read_manifest
 from uavlinkd.fleet.plan import FleetError
@@ -24,9 +25,13 @@ def snapshot(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def loaded(folder: Path, name: str) -> Config:
-    """A member's configuration as its daemon reads it."""
-    return load_config(folder / name / f"{name}.toml", {})
+@contextmanager
+def refused(folder: Path, reason: str) -> Iterator[None]:
+    """A command fails with this reason, and changes nothing."""
+    before = snapshot(folder)
+    with pytest.raises(FleetError, match=reason):
+        yield
+    assert snapshot(folder) == before
 
 
 def check_fleet(folder: Path) -> Fleet:
@@ -107,10 +112,8 @@ def test_fleet_is_made_whole_or_not_at_all(tmp_path: Path) -> None:
         operations.init(tmp_path / "a" / "b", FleetSettings(drone_url="udpin:127.0.0.1:5790"), 2, 0, 0)
     assert list((tmp_path / "a").iterdir()) == []
     operations.init(tmp_path / "fleet", FleetSettings(), 2, 0, 0)
-    before = snapshot(tmp_path)
-    with pytest.raises(FleetError, match="exists already"):
+    with refused(tmp_path, "exists already"):
         operations.init(tmp_path / "fleet", FleetSettings(), 2, 0, 0)
-    assert snapshot(tmp_path) == before
 
 
 @pytest.mark.parametrize(
@@ -160,10 +163,8 @@ def test_added_member_is_known_to_the_others(folder: Path) -> None:
 )
 def test_impossible_members_are_refused(folder: Path, name: str, options: dict[str, int], reason: str) -> None:
     """The command changes nothing if the member is not possible."""
-    before = snapshot(folder)
-    with pytest.raises(FleetError, match=reason):
+    with refused(folder, reason):
         operations.add(folder, name, MemberKind.DRONE, system_id=options.get("system_id"))
-    assert snapshot(folder) == before
 
 
 def test_removed_member_is_forgotten_by_the_others(folder: Path) -> None:
@@ -181,12 +182,10 @@ def test_removed_key_is_found_under_another_name(folder: Path) -> None:
     """The user renamed a peer, or added one: the error names file and section, and the command changes nothing."""
     path = folder / "drone2" / "drone2.toml"
     path.write_text(path.read_text().replace('name = "drone1"', 'name = "scout"'))
-    before = snapshot(folder)
-    with pytest.raises(FleetError, match=r"drone2\.toml: peer\[0\] \(scout\) has a key of drone1"):
+    with refused(folder, r"drone2\.toml: peer\[0\] \(scout\) has a key of drone1"):
         operations.remove(folder, "drone1")
-    with pytest.raises(FleetError, match=r"drone2\.toml: it has no \[\[peer\]\] with the name .drone1."):
+    with refused(folder, r"drone2\.toml: it has no \[\[peer\]\] with the name .drone1."):
         operations.rotate(folder, "drone1", at_once=True)
-    assert snapshot(folder) == before
     text = path.read_text().replace('name = "scout"', 'name = "drone1"')
     key = read_manifest(folder).member("drone1").public_key
     path.write_text(f'{text}\n[[peer]]\nname = "second"\npublic_key = " {key}"\nrole = "all"\nsystem_ids = [9]\n')
@@ -235,10 +234,8 @@ def test_files_that_cannot_be_edited_safely_are_refused(folder: Path) -> None:
     """The command changes nothing if editing by lines would change something else."""
     path = folder / "drone3" / "drone3.toml"
     path.write_text(path.read_text() + 'description = """\n[[peer]]\nname = "drone1"\n[x]\n"""\n')
-    before = snapshot(folder)
-    with pytest.raises(FleetError, match="cannot be kept"):
+    with refused(folder, "cannot be kept"):
         operations.remove(folder, "drone1")
-    assert snapshot(folder) == before
 
 
 def test_folders_on_their_vehicles_are_not_needed(folder: Path, tmp_path: Path) -> None:
@@ -266,7 +263,6 @@ def test_failed_write_changes_nothing(
     folder: Path, monkeypatch: pytest.MonkeyPatch, action: Callable[[Path], object], step: str
 ) -> None:
     """If the last file cannot be written, the files before it are restored."""
-    before = snapshot(folder)
     genuine = getattr(transaction.Rollback, step)
     is_full = False
 
@@ -278,9 +274,8 @@ def test_failed_write_changes_nothing(
         return genuine(self, path, what)
 
     monkeypatch.setattr(transaction.Rollback, step, fail_at_the_manifest)
-    with pytest.raises(FleetError, match="No space left"):
+    with refused(folder, "No space left"):
         action(folder)
-    assert snapshot(folder) == before
     assert not (folder / "scout").exists()
 
 
@@ -335,11 +330,9 @@ def test_rotation_without_the_old_key_says_what_to_do(folder: Path, tmp_path: Pa
 @pytest.mark.parametrize("address", ["0.0.0.0:5790", "10.13.0.200:14550"])
 def test_member_with_a_configuration_that_is_not_valid_is_not_added(folder: Path, address: str) -> None:
     """The command refuses configurations that `uavlinkd check` refuses, and changes nothing."""
-    before = snapshot(folder)
-    with pytest.raises(FleetError, match="not valid"):
+    with refused(folder, "not valid"):
         operations.add(folder, "scout", MemberKind.DRONE, address=parse_address(address, allow_names=False))
-    assert snapshot(folder) == before
-    with pytest.raises(FleetError, match="1 to 255"):
+    with refused(folder, "1 to 255"):
         operations.add(folder, "scout", MemberKind.DRONE, system_id=0)
 
 

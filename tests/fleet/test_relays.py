@@ -7,10 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.fleet.vehicles import NAMES, RELAY, Vehicles, flying
+from tests.fleet.vehicles import NAMES, RELAY, Vehicles, flying, loaded
 from tests.waiting import until
-from uavlinkd.config import Config
-from uavlinkd.config.load import load_config
 from uavlinkd.fleet import operations
 from uavlinkd.fleet.manifest import FleetSettings, MemberKind, read_manifest
 from uavlinkd.fleet.plan import NO_PLAN, FleetError
@@ -18,11 +16,6 @@ from uavlinkd.fleet.transaction import check_members
 from uavlinkd.system.addresses import Address
 
 AT = Address("relay.example.org", 5790)
-
-
-def loaded(folder: Path, name: str) -> Config:
-    """The configuration of a member, as its daemon reads it."""
-    return load_config(folder / name / f"{name}.toml", {})
 
 
 def check_fleet(folder: Path) -> None:

@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from tests.waiting import until
+from uavlinkd.config import Config
+from uavlinkd.config.load import load_config
 from uavlinkd.config.model import KEY_GRACE_S
 from uavlinkd.fleet import operations
 from uavlinkd.fleet.manifest import FleetSettings, read_manifest
@@ -26,6 +28,11 @@ NAMES = ("drone1", "drone2", "drone3")
 RELAY = "relay"
 END_S = 120.0
 """A daemon ends within a fraction of this."""
+
+
+def loaded(folder: Path, name: str) -> Config:
+    """A member's configuration as its daemon reads it."""
+    return load_config(folder / name / f"{name}.toml", {})
 
 
 class Vehicles:
