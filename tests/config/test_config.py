@@ -30,6 +30,7 @@ from tests.config.files import (
     relay,
     relays,
 )
+from tests.samples import heartbeat
 from uavlinkd.config import ConfigError, NetworkConfig, PeerAddress, Recording, keys
 from uavlinkd.config.load import load_config
 from uavlinkd.config.network_rules import used_networks
@@ -38,7 +39,6 @@ from uavlinkd.core.settings import Link, Redundancy, Timers
 from uavlinkd.core.suites import SUITES_BY_NAME
 from uavlinkd.endpoints.url import SerialUrl
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
-from uavlinkd.mavlink.frames import Frame, SplitCounters, split_payload
 from uavlinkd.mavlink.policy.gate import Refusal
 from uavlinkd.relay.member_settings import RelayLimits
 from uavlinkd.system.addresses import Address
@@ -143,30 +143,24 @@ def test_freshness_is_verified_within_a_share_of_the_budget(tmp_path: Path) -> N
     assert fast.link.verify_interval_s == Link().verify_interval_s == 1.0
 
 
-def _heartbeat(system: int, kind: int = mavlink.MAV_TYPE_QUADROTOR) -> Frame:
-    message = mavlink.MAVLink_heartbeat_message(kind, 3, 0, 0, 4, 3)
-    (frame,) = split_payload(
-        bytes(message.pack(mavlink.MAVLink(None, srcSystem=system, srcComponent=1))), SplitCounters()
-    )
-    return frame
-
-
 def test_policy_reaches_the_gate(tmp_path: Path) -> None:
     """A policy limits a peer or an endpoint to its systems and messages; an endpoint without one sends anything."""
     tablet_keys = 'system_ids = [254]\nrole = "observer"\n'
     tablet_section = ENDPOINT.replace("autopilot", "tablet").replace("14550", "14551") + tablet_keys
     config = load(tmp_path, f"{GOOD}rate_in = {{ HEARTBEAT = 1 }}\n{tablet_section}")
     peer = config.peers[0].make_policy()
-    checked = [peer.incoming.check(_heartbeat(2), 0.0) for _ in range(3)]
+    checked = [peer.incoming.check(heartbeat(system=2), 0.0) for _ in range(3)]
     assert checked == [None, None, Refusal.RATE_LIMITED]
-    assert peer.incoming.check(_heartbeat(1), 0.0) is Refusal.FOREIGN_SYSTEM
-    assert peer.incoming.check(_heartbeat(2, mavlink.MAV_TYPE_GCS), 0.0) is Refusal.GROUND_STATION_NOT_ALLOWED
+    assert peer.incoming.check(heartbeat(system=1), 0.0) is Refusal.FOREIGN_SYSTEM
+    assert (
+        peer.incoming.check(heartbeat(system=2, kind=mavlink.MAV_TYPE_GCS), 0.0) is Refusal.GROUND_STATION_NOT_ALLOWED
+    )
     autopilot, tablet = (endpoint.make_policy() for endpoint in config.endpoints)
-    assert autopilot.incoming.check(_heartbeat(1), 0.0) is None
-    assert tablet.incoming.check(_heartbeat(254), 0.0) is Refusal.MESSAGE_NOT_ALLOWED
-    assert tablet.incoming.check(_heartbeat(2), 0.0) is Refusal.FOREIGN_SYSTEM
+    assert autopilot.incoming.check(heartbeat(system=1), 0.0) is None
+    assert tablet.incoming.check(heartbeat(system=254), 0.0) is Refusal.MESSAGE_NOT_ALLOWED
+    assert tablet.incoming.check(heartbeat(system=2), 0.0) is Refusal.FOREIGN_SYSTEM
     again = config.peers[0].make_policy()  # with its own counters, and its whole rate
-    assert again.incoming.check(_heartbeat(2), 0.0) is None
+    assert again.incoming.check(heartbeat(system=2), 0.0) is None
     assert not again.incoming.refused
 
 

@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from itertools import count
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -150,6 +151,16 @@ def test_every_number_of_the_status_is_exported() -> None:
             assert ("transmit_" in name) is ("sent" in key or "written" in key), name
 
 
+def promtool(*arguments: str | Path, given: str = "") -> tuple[str, str]:
+    """Output and errors of Prometheus's tool, which must succeed."""
+    path = shutil.which("promtool")
+    need(path is not None, "promtool, of Debian's package prometheus")
+    command = [str(path), *map(str, arguments)]
+    done = subprocess.run(command, input=given, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout, done.stderr
+
+
 LTE, OTHER = ("lte", "1", "203.0.113.7:5790"), ("", "2", "learned")
 
 
@@ -225,12 +236,7 @@ def test_process_is_measured() -> None:
 
 def test_prometheus_accepts_the_format() -> None:
     """The checker of Prometheus accepts format and names without a remark."""
-    promtool = shutil.which("promtool")
-    need(promtool is not None, "promtool, of Debian's package prometheus")
-    done = subprocess.run(
-        [str(promtool), "check", "metrics"], input=exposition(STATUS, 1.0), capture_output=True, check=False
-    )
-    assert (done.returncode, done.stdout, done.stderr) == (0, b"", b"")
+    assert promtool("check", "metrics", given=exposition(STATUS, 1.0).decode()) == ("", "")
 
 
 def test_counters_of_attacks_start_at_zero() -> None:

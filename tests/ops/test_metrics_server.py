@@ -60,13 +60,6 @@ async def exchange(server: MetricsServer, request: bytes, *, end: bool = True) -
         writer.close()
 
 
-async def connect(server: MetricsServer, sent: bytes) -> Connection:
-    """A client that sends this and then hangs: it neither reads nor closes."""
-    reader, writer = await asyncio.open_connection(*server.address.sockaddr)
-    writer.write(sent)
-    return reader, writer
-
-
 async def is_closed(connection: Connection) -> bool:
     """Wait until the server closed the connection; False if it does not."""
     try:
@@ -152,7 +145,9 @@ async def test_silent_client_times_out(
 @pytest.mark.parametrize("sent", [b"", b"GET /metr", REQUEST], ids=["nothing", "half a request", "a request"])
 async def test_hung_connections_do_not_block_others(server: MetricsServer, sent: bytes) -> None:
     """With all connections in use, the server closes the oldest and answers the new one at once."""
-    hung = [await connect(server, sent) for _ in range(MAX_CONNECTIONS)]
+    hung = [await asyncio.open_connection(*server.address.sockaddr) for _ in range(MAX_CONNECTIONS)]
+    for _, writer in hung:
+        writer.write(sent)
     await until(lambda: len(server._connections) == MAX_CONNECTIONS)
     assert status(await exchange(server, REQUEST)) == 200
     assert len(server._connections) <= MAX_CONNECTIONS

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
-import subprocess
 from pathlib import Path
 
 import pytest
 
-from tests.needs import need
-from tests.ops.test_metrics import STATUS
+from tests.ops.test_metrics import STATUS, promtool
 from uavlinkd.core.drops import DropReason
 from uavlinkd.ops.metrics import exposition
 
@@ -19,15 +16,6 @@ CONFIGS = Path(__file__).parents[2] / "configs"
 ALERTS = CONFIGS / "prometheus-alerts.yml"
 DASHBOARD = json.loads((CONFIGS / "grafana-dashboard.json").read_text())
 KNOWN = set(re.findall(r"(?m)^(uavlinkd_\w+)", exposition(STATUS, 1.0).decode()))
-
-
-def promtool(*arguments: str | Path) -> str:
-    """The output of Prometheus's tool, which must succeed."""
-    path = shutil.which("promtool")
-    need(path is not None, "promtool, of Debian's package prometheus")
-    done = subprocess.run([str(path), *map(str, arguments)], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
 
 
 def expressions() -> list[str]:
@@ -41,7 +29,7 @@ def expressions() -> list[str]:
 
 def test_prometheus_accepts_the_alerts() -> None:
     """The tool reads all of them."""
-    assert f"SUCCESS: {ALERTS.read_text().count('- alert:')} rules found" in promtool("check", "rules", ALERTS)
+    assert f"SUCCESS: {ALERTS.read_text().count('- alert:')} rules found" in promtool("check", "rules", ALERTS)[0]
 
 
 _REFUSED = 'uavlinkd_peer_refused_frames_total{instance="a",peer="b"'
@@ -198,4 +186,4 @@ def test_prometheus_accepts_the_expressions_of_the_dashboard(tmp_path: Path) -> 
     ]
     path = tmp_path / "rules.yml"
     path.write_text("groups:\n- name: dashboard\n  rules:\n" + "\n".join(rules))
-    assert f"SUCCESS: {len(rules)} rules found" in promtool("check", "rules", path)
+    assert f"SUCCESS: {len(rules)} rules found" in promtool("check", "rules", path)[0]

@@ -8,9 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.config.files import ADDRESSES, ENDPOINT, PEER, TOP, URL, load
 from uavlinkd.cli import main
-from uavlinkd.config import keys
-from uavlinkd.config.load import load_config
 from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.ops import surroundings
 
@@ -20,22 +19,13 @@ Lacks = Callable[..., list[str]]
 @pytest.fixture
 def lacks(tmp_path: Path) -> Lacks:
     """Loads a file with these parts, and returns what the machine lacks for it."""
-    keys.write_secret_file(tmp_path / "drone0.key", keys.generate_private_key())
-    public = keys.public_key_text(keys.generate_private_key())
 
     def loading(
-        listen: str = "", url: str = "", address: str = "127.0.0.1:9", more: str = "", control: str = ""
+        listen: str = "", url: str = "", address: str = "127.0.0.1:9", control: str = "/tmp/drone0.sock"
     ) -> list[str]:
-        path = tmp_path / "drone0.toml"
-        where = f'"{address}"' if ":" in address else f'{{ network = "{address}" }}'
-        path.write_text(
-            f'name = "drone0"\nprivate_key_file = "drone0.key"\ncontrol_socket = "{control or "/tmp/drone0.sock"}"\n'
-            f'listen = ["{listen or f"127.0.0.1:{free_port()}"}"]\n{more}'
-            f'[[endpoint]]\nname = "autopilot"\nurl = "{url or f"udpin:127.0.0.1:{free_port()}"}"\n'
-            f'[[peer]]\nname = "drone1"\npublic_key = "{public}"\naddresses = [{where}]\n'
-            'role = "vehicle"\nsystem_ids = [2]\n'
-        )
-        return surroundings.lacks(load_config(path, {}))
+        text = f'{TOP}control_socket = "{control}"\nlisten = ["{listen or f"127.0.0.1:{free_port()}"}"]\n'
+        text += ENDPOINT.replace(URL, url or f"udpin:127.0.0.1:{free_port()}")
+        return surroundings.lacks(load(tmp_path, text + PEER.replace(ADDRESSES, f'["{address}"]')))
 
     return loading
 
