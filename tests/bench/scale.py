@@ -54,18 +54,9 @@ def hub(bench: Bench, peers: int) -> Iterator[tuple[Bench, Running]]:
         )
         plan = folder / "swarm.json"
         plan.touch(0o600)
-        plan.write_text(
-            json.dumps(
-                {
-                    "host": right.address,
-                    "port": LINK_PORT,
-                    "public_key": keys.public_key_text(own),
-                    "private_keys": private,
-                    "frames": str(bench.frames),
-                    "patience_s": LINKED_S,
-                }
-            )
-        )
+        facts = {"host": right.address, "port": LINK_PORT, "public_key": keys.public_key_text(own)}
+        facts |= {"private_keys": private, "frames": str(bench.frames), "patience_s": LINKED_S}
+        plan.write_text(json.dumps(facts))
         try:
             daemon = start_daemon(right, folder / "hub.toml")
             until(lambda: peers_up(folder / "hub.sock") >= 0, "the daemon answers")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 
 import pytest
@@ -93,11 +93,8 @@ class Walk:
 def walk(tmp_path: Path) -> Iterator[Walk]:
     """No hosts yet."""
     need_namespaces("nft")
-    made = Walk(tmp_path)
-    try:
+    with closing(Walk(tmp_path)) as made:
         yield made
-    finally:
-        made.close()
 
 
 def blocks_of(number: int) -> list[Block]:

@@ -11,23 +11,9 @@ from tests import waiting
 from tests.lab.evaluation.quick_runs import run_quickly
 from uavlinkd.core.settings import Class
 from uavlinkd.lab.evaluation.paths_findings import paths_problems, paths_summary
-from uavlinkd.lab.evaluation.paths_plan import (
-    QUICK_MEANS,
-    STATION,
-    VEHICLE,
-    PathsSettings,
-    RadioChange,
-    Scenario,
-)
+from uavlinkd.lab.evaluation.paths_plan import QUICK_MEANS, STATION, VEHICLE, PathsSettings, RadioChange, Scenario
 from uavlinkd.lab.evaluation.paths_run import PATHS
-from uavlinkd.lab.evaluation.paths_traffic import (
-    NumberedFlow,
-    PathLink,
-    PathRadio,
-    PathWatch,
-    TrafficLog,
-    flows_of,
-)
+from uavlinkd.lab.evaluation.paths_traffic import NumberedFlow, PathLink, PathRadio, PathWatch, TrafficLog, flows_of
 from uavlinkd.lab.mitm.attack import Direction, Send
 from uavlinkd.lab.mitm.radio import RadioSettings
 from uavlinkd.mavlink.frames import SplitCounters, split_datagram

@@ -6,14 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from uavlinkd.lab.evaluation.records import (
-    Record,
-    RecordsError,
-    RecordWriter,
-    Status,
-    Value,
-    read_records,
-)
+from uavlinkd.lab.evaluation.records import Record, RecordsError, RecordWriter, Status, Value, read_records
 
 RUN: dict[str, Value] = {"cpu": "a test", "seed": 7, "uvloop": None}
 FAILED = Record("handshake", {"suite": "mlkem768", "mac_key_bits": 256}, {}, Status.FAILED, "no session in 20 s")

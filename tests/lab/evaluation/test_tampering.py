@@ -15,13 +15,7 @@ from tests.waiting import PATIENCE_S
 from uavlinkd.lab.evaluation import tampering_plan as plans
 from uavlinkd.lab.evaluation.middle import MiddleHere
 from uavlinkd.lab.evaluation.paper_attacks import CHANGES
-from uavlinkd.lab.evaluation.tampering_plan import (
-    LINE_PLANS,
-    PATH_PLANS,
-    RELAYED_PLANS,
-    SPOILED_PLANS,
-    TrialPlan,
-)
+from uavlinkd.lab.evaluation.tampering_plan import LINE_PLANS, PATH_PLANS, RELAYED_PLANS, SPOILED_PLANS, TrialPlan
 from uavlinkd.lab.evaluation.tampering_records import NOT_IN_TIME, OURS, PAPER, RECOVERY_LIMIT_S, RELAY, Verdict
 from uavlinkd.lab.evaluation.tampering_run import TAMPERING
 from uavlinkd.lab.evaluation.tampering_stages import RefusingStage, claims_of, refused_by

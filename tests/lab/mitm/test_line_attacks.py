@@ -8,11 +8,7 @@ import pytest
 
 from uavlinkd.endpoints.line_framing import LineDecoder, encode
 from uavlinkd.lab.mitm.attack import Intervention
-from uavlinkd.lab.mitm.line_attacks import (
-    LineAttack,
-    LineAttacker,
-    parse_line_attack,
-)
+from uavlinkd.lab.mitm.line_attacks import LineAttack, LineAttacker, parse_line_attack
 from uavlinkd.lab.mitm.modem import ModemEnd, ModemLink, ModemSettings
 
 LEFT, RIGHT = ModemEnd.LEFT, ModemEnd.RIGHT

@@ -7,11 +7,7 @@ from pathlib import Path
 import pytest
 
 from uavlinkd.lab.mitm.attack import Direction
-from uavlinkd.lab.mitm.proxy_settings import (
-    ProxySettings,
-    SettingsError,
-    load_proxy_settings,
-)
+from uavlinkd.lab.mitm.proxy_settings import ProxySettings, SettingsError, load_proxy_settings
 from uavlinkd.lab.mitm.radio import Bursts
 from uavlinkd.system.addresses import Address
 

@@ -34,10 +34,7 @@ ATTACKS: dict[str, tuple[str, set[str]]] = {
     ),
     "held": ("hold,kinds=any,direction=both/1,hold_s=10,at_once=true", {"path_changed", "late_copy", "delayed"}),
     "probes copied": ("duplicate,kinds=probe,direction=both/1,onto=2", {"duplicate"}),
-    "probes faster along the other": (
-        "move,kinds=probe,direction=both/2,onto=1,beside=true",
-        {"unexpected_answer"},
-    ),
+    "probes faster along the other": ("move,kinds=probe,direction=both/2,onto=1,beside=true", {"unexpected_answer"}),
     "probes later": ("duplicate,kinds=probe,direction=both/1,when=later,delay_s=1", {"duplicate"}),
     "probes altered": ("bit-flip,kinds=probe,direction=both/1", {"bad_tag", "path_changed"}),
     "racing": ("roam,direction=both/1", {"duplicate", "paths_unproven"}),

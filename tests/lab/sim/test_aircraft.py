@@ -10,14 +10,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from tests import waiting
 from uavlinkd.lab.sim import aircraft as ground_pilot
-from uavlinkd.lab.sim.aircraft import (
-    OUR_SIMULATOR,
-    Aircraft,
-    AircraftChoice,
-    GroundPilot,
-    PilotError,
-    choice_of,
-)
+from uavlinkd.lab.sim.aircraft import OUR_SIMULATOR, Aircraft, AircraftChoice, GroundPilot, PilotError, choice_of
 from uavlinkd.lab.sim.autopilot import HOME
 from uavlinkd.lab.sim.real_autopilot import Firmware, RealAutopilotError
 from uavlinkd.lab.sim.vehicle import Axes, Vehicle

@@ -33,17 +33,22 @@ def test_environment_names_the_binary(firmware: Firmware, tmp_path: Path) -> Non
     assert binary_of(firmware, {variable: str(binary)}) == binary.resolve()
 
 
+def build_folder(folder: Path, commands: str = "") -> Path:
+    """A folder like a build of PX4. Returns its binary, which runs these commands."""
+    binary, script = folder / "bin" / "px4", folder / "etc" / "init.d-posix" / "rcS"
+    for path in (binary, script):
+        path.parent.mkdir(parents=True)
+    binary.write_text(f"#!/bin/sh\n{commands}")
+    binary.chmod(0o700)
+    script.write_text("param set MAV_SYS_ID $((px4_instance+1))\n")
+    (binary.parent / "px4-mavlink").touch()
+    return binary
+
+
 @pytest.mark.parametrize("firmware", Firmware)
 async def test_process_that_ends_is_reported_with_its_output(firmware: Firmware, tmp_path: Path) -> None:
     """The error has the exit status and the last lines. ArduCopter's end shows at the first check."""
-    binary = tmp_path / "bin" / "autopilot"
-    binary.parent.mkdir()
-    binary.write_text("#!/bin/sh\necho no such model\nexit 3\n")
-    binary.chmod(0o700)
-    script = tmp_path / "etc" / "init.d-posix" / "rcS"
-    script.parent.mkdir(parents=True)
-    script.write_text("param set MAV_SYS_ID $((px4_instance+1))\n")
-    (binary.parent / "px4-mavlink").touch()
+    binary = build_folder(tmp_path, "echo no such model\nexit 3\n")
     settings = RealAutopilotSettings(firmware=firmware, binary=binary, udp_port=14550, home=HOME)
     autopilot = RealAutopilot(settings, tmp_path / "flight")
     with pytest.raises(RealAutopilotError, match=r"status 3:\nno such model"):
@@ -61,14 +66,7 @@ async def run_until_failure(autopilot: RealAutopilot) -> None:
 @pytest.mark.parametrize("missing", ["../etc/init.d-posix/rcS", "px4-mavlink"])
 async def test_px4_outside_its_build_folder_is_refused(missing: str, tmp_path: Path) -> None:
     """The error names what is missing. No other folder called ``etc`` is copied."""
-    binary = tmp_path / "bin" / "px4"
-    binary.parent.mkdir()
-    binary.write_text("#!/bin/sh\n")
-    binary.chmod(0o700)
-    script = tmp_path / "etc" / "init.d-posix" / "rcS"
-    script.parent.mkdir(parents=True)
-    for path in (script, binary.parent / "px4-mavlink"):
-        path.touch()
+    binary = build_folder(tmp_path)
     (binary.parent / missing).resolve().unlink()
     settings = RealAutopilotSettings(firmware=Firmware.PX4, binary=binary, udp_port=14550, home=HOME)
 
