@@ -65,14 +65,6 @@ class Drone:
 
     # Its addresses.
 
-    @property
-    def is_behind_nat(self) -> bool:
-        return len(self.nat_sockets) == len(self.addresses)
-
-    @is_behind_nat.setter
-    def is_behind_nat(self, is_behind_nat: bool) -> None:
-        self.nat_sockets = set(range(len(self.addresses))) if is_behind_nat else set()
-
     def move(self, *addresses: Address) -> None:
         """Use other addresses from now on: another network, or a NAT that forgot its mapping."""
         self.contacted.clear()

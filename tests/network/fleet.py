@@ -140,4 +140,4 @@ class Fleet:
             # The first one is fixed. An address that a drone has left is neither useful nor harmful.
             b.knows(a, a.addresses, link)
             a.knows(b, lot.choice(((), b.addresses)), link)
-            b.is_behind_nat = lot.random() < 0.3
+            b.nat_sockets = set(range(len(b.addresses))) if lot.random() < 0.3 else set()

@@ -28,16 +28,16 @@ class Misfortunes(Befalling):
         self._of_paths = PathMisfortunes(fleet)
         self._of_relays = RelayMisfortunes(fleet, self._recorder) if isinstance(fleet, RelayFleet) else None
         self._kinds: list[tuple[str, Callable[[], None]]] = [
-            ("other radios", self._other_radios),
+            ("other radios", lambda: self._network.set_radio(random_radio(fleet))),
             ("cut", self._cut),
-            ("cut one way", self._cut_one_way),
+            ("cut one way", lambda: self._network.cut_one_way(*self._random_peers())),
             ("partition", self._partition),
             ("cuts healed", self._network.heal),
-            ("restart", self._restart),
+            ("restart", lambda: self._random_drone().start(fleet.random_clock())),
             ("off for a while", self._off),
             ("close", self._close),
             ("move", self._move),
-            ("clock ahead", self._jump),
+            ("clock ahead", lambda: self._random_drone().leap(self._lot.choice((0.3, 3.0, 100.0, 5000.0)))),
             ("peer removed", self._remove),
             ("peer back", self._restore),
             ("features offered", self._offer),
@@ -59,15 +59,9 @@ class Misfortunes(Befalling):
             befalls()
         self.events[name] += 1
 
-    def _other_radios(self) -> None:
-        self._network.set_radio(random_radio(self._fleet))
-
     def _cut(self) -> None:
         a, b, _ = self._lot.choice(self._fleet.pairs)
         self._network.cut(a, b)
-
-    def _cut_one_way(self) -> None:
-        self._network.cut_one_way(*self._random_peers())
 
     def _partition(self) -> None:
         drones = self._fleet.drones
@@ -75,9 +69,6 @@ class Misfortunes(Befalling):
         for a, b, _ in self._fleet.pairs:
             if (a.name in here) != (b.name in here):
                 self._network.cut(a, b)
-
-    def _restart(self) -> None:
-        self._random_drone().start(self._fleet.random_clock())
 
     def _off(self) -> None:
         drone = self._random_drone()
@@ -98,9 +89,6 @@ class Misfortunes(Befalling):
     def _move(self) -> None:
         drone = self._lot.choice(self._fleet.wanderers)
         drone.move_socket(0, random_address(self._fleet, drone))
-
-    def _jump(self) -> None:
-        self._random_drone().leap(self._lot.choice((0.3, 3.0, 100.0, 5000.0)))
 
     def _remove(self) -> None:
         a, b = self._random_peers()

@@ -120,25 +120,26 @@ class Network:
             drone.add_line(addresses[end], other)
         return hop
 
-    def pair(self, link: Link | None = None, clocks: tuple[float, float] = (0.0, 0.0)) -> tuple[Drone, Drone]:
-        """Two drones that know each other's address, started now."""
+    def pair(
+        self,
+        link: Link | None = None,
+        clocks: tuple[float, float] = (0.0, 0.0),
+        *,
+        a_knows: bool = True,
+        b_knows: bool = True,
+    ) -> tuple[Drone, Drone]:
+        """Two drones, started now. Each knows the other's address, or not."""
         a, b = self.add("a", clock=clocks[0]), self.add("b", clock=clocks[1])
-        a.knows(b, b.addresses, link)
-        b.knows(a, a.addresses, link)
+        a.knows(b, b.addresses if a_knows else (), link)
+        b.knows(a, a.addresses if b_knows else (), link)
         a.start()
         b.start()
         return a, b
 
-    def linked(
-        self, *, a_knows: bool = True, b_knows: bool = True, interval_s: float = 0.05, clocks: tuple[float, float]
-    ) -> tuple[Drone, Drone]:
-        """Two drones that share a session and talk. Each knows the other's address, or not."""
-        a, b = self.add("a", clock=clocks[0]), self.add("b", clock=clocks[1])
-        a.knows(b, b.addresses if a_knows else ())
-        b.knows(a, a.addresses if b_knows else ())
-        a.start()
-        b.start()
-        self.talk(a, b, interval_s)
+    def linked(self, *, a_knows: bool = True, b_knows: bool = True) -> tuple[Drone, Drone]:
+        """The same with clocks that are far apart, a session, and frames in both directions."""
+        a, b = self.pair(clocks=(1e9, 1e5), a_knows=a_knows, b_knows=b_knows)
+        self.talk(a, b)
         self.run_until(lambda: share_a_session(a, b), within_s=4)
         self.run(2.5)
         return a, b
@@ -163,12 +164,7 @@ class Network:
         return True
 
     def traffic(
-        self,
-        sender: Drone,
-        receiver: Drone,
-        interval_s: float,
-        until: float = math.inf,
-        cls: Class = Class.STREAM,
+        self, sender: Drone, receiver: Drone, interval_s: float, until: float = math.inf, cls: Class = Class.STREAM
     ) -> Flow:
         """Send a frame every ``interval_s`` from now on, while the sender is on and has the receiver as a peer.
 
@@ -201,8 +197,10 @@ class Network:
 
         self.at(self.now + rng.random() * interval_s, tick)
 
-    def talk(self, a: Drone, b: Drone, interval_s: float = 0.05, until: float = math.inf) -> tuple[Flow, Flow]:
-        return self.traffic(a, b, interval_s, until), self.traffic(b, a, interval_s, until)
+    def talk(
+        self, a: Drone, b: Drone, interval_s: float = 0.05, until: float = math.inf, cls: Class = Class.STREAM
+    ) -> tuple[Flow, Flow]:
+        return self.traffic(a, b, interval_s, until, cls), self.traffic(b, a, interval_s, until, cls)
 
     # Radios.
 

@@ -36,13 +36,14 @@ class Befalling:
 class PathMisfortunes(Befalling):
     def __init__(self, fleet: Fleet) -> None:
         super().__init__(fleet)
+        network, lot = self._network, self._lot
         self._kinds: tuple[tuple[str, Callable[[Hop], None]], ...] = (
             ("path dies", self._die),
             ("path dies one way", self._die_one_way),
             ("path heals", self._heal),
-            ("path stalls", self._stall),
+            ("path stalls", lambda hop: network.stall_path(hop, lot.choice((0.3, 1.0, 3.0, 10.0)))),
             ("path degrades", self._degrade),
-            ("path has another radio", self._other_radio),
+            ("path has another radio", lambda hop: network.set_path(hop, random_radio(fleet))),
             ("path loses one way", self._lose_one_way),
             ("path flaps", self._flap),
             ("paths alternate", self._alternate),
@@ -51,8 +52,8 @@ class PathMisfortunes(Befalling):
             ("network metered", self._meter),
         )
         self._of_lines: tuple[tuple[str, Callable[[Hop], None]], ...] = (
-            ("modems lose and alter", self._spoil_modems),
-            ("modems are sound", self._repair_modems),
+            ("modems lose and alter", lambda hop: network.set_modems(hop.sender, random_modems(fleet))),
+            ("modems are sound", lambda hop: network.set_modems(hop.sender, SIK)),
             ("noise on the line", self._make_noise),
             ("modem pulled", self._lose_network),
         )
@@ -80,16 +81,10 @@ class PathMisfortunes(Befalling):
         self._network.heal_path(hop)
         self._network.set_path(hop, self._network.radio)
 
-    def _stall(self, hop: Hop) -> None:
-        self._network.stall_path(hop, self._lot.choice((0.3, 1.0, 3.0, 10.0)))
-
     def _degrade(self, hop: Hop) -> None:
         radio, step_s = random_radio(self._fleet), self._lot.choice((0.5, 2.0))
         for step in range(1, 9):
             self._later(step * step_s, partial(self._network.set_path, hop, replace(radio, loss=step / 10)))
-
-    def _other_radio(self, hop: Hop) -> None:
-        self._network.set_path(hop, random_radio(self._fleet))
 
     def _lose_one_way(self, hop: Hop) -> None:
         bad = replace(self._network.radio, loss=self._lot.choice((0.1, 0.3, 0.6)))
@@ -130,12 +125,6 @@ class PathMisfortunes(Befalling):
         endpoint = self._lot.choice(hop)
         drone = self._network.drones[endpoint.drone]
         drone.set_metered(drone.metered_sockets ^ {endpoint.socket})
-
-    def _spoil_modems(self, hop: Hop) -> None:
-        self._network.set_modems(hop.sender, random_modems(self._fleet))
-
-    def _repair_modems(self, hop: Hop) -> None:
-        self._network.set_modems(hop.sender, SIK)
 
     def _make_noise(self, hop: Hop) -> None:
         """A burst of bytes, several times."""

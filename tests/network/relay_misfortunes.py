@@ -21,7 +21,7 @@ class RelayMisfortunes(Befalling):
         super().__init__(fleet)
         self._recorder = recorder
         self._kinds: tuple[tuple[str, Callable[[], None]], ...] = (
-            ("relay restarts", self._restart),
+            ("relay restarts", lambda: self._lot.choice(fleet.relays).start(fleet.random_clock())),
             ("relay off for a while", self._off),
             ("relay unreachable for a member", self._cut),
             ("NAT forgets", self._forget),
@@ -37,9 +37,6 @@ class RelayMisfortunes(Befalling):
         self._network.note(name)
         befalls()
         return name
-
-    def _restart(self) -> None:
-        self._lot.choice(self._fleet.relays).start(self._fleet.random_clock())
 
     def _off(self) -> None:
         relay = self._lot.choice(self._fleet.relays)

@@ -19,8 +19,7 @@ def _linked(network: Network) -> tuple[Drone, Drone]:
     vehicle, station = linked_vehicle(network, RADIOS)
     vehicle.set_metered([LTE])
     network.talk(vehicle, station)
-    for sender, receiver in ((vehicle, station), (station, vehicle)):
-        network.traffic(sender, receiver, 0.5, cls=Class.CRITICAL)
+    network.talk(vehicle, station, 0.5, cls=Class.CRITICAL)
     network.run(20)
     return vehicle, station
 

@@ -11,6 +11,7 @@ import os
 from collections import Counter
 from collections.abc import MutableMapping
 from functools import partial
+from itertools import combinations, permutations
 from typing import Any
 
 import pytest
@@ -98,16 +99,13 @@ class LoggedNetwork(Network):
         self.checks_bounds = False
         self.logs: dict[str, LoggedDaemon] = {}
         drones = [self.add(name) for name in NAMES]
-        for one in drones:
-            for other in drones:
-                if other is not one:
-                    one.knows(other, other.addresses)
+        for one, other in permutations(drones, 2):
+            one.knows(other, other.addresses)
         for drone in drones:
             drone.start()
             self.logs[drone.name] = LoggedDaemon(drone, self.now)
-        for number, one in enumerate(drones):
-            for other in drones[number + 1 :]:
-                self.talk(one, other, FRAME_INTERVAL_S)
+        for one, other in combinations(drones, 2):
+            self.talk(one, other, FRAME_INTERVAL_S)
         self.at(0.0, self._tick)
         self.at(RESTART_INTERVAL_S, partial(self._restart_clients, 40000))
 

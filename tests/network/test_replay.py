@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from functools import partial
+from itertools import permutations
 
 import pytest
 
@@ -40,15 +41,12 @@ def _storm(network: Network, recorder: Recorder, per_s: float, duration_s: float
 
 def _triangle(network: Network) -> tuple[Drone, Drone, Drone]:
     drones = network.add("a"), network.add("b"), network.add("c")
-    for one in drones:
-        for other in drones:
-            if one is not other:
-                one.knows(other, other.addresses, FAST_REKEY)
-        one.start()
-    for one in drones:
-        for other in drones:
-            if one is not other:
-                network.traffic(one, other, 0.05)
+    for one, other in permutations(drones, 2):
+        one.knows(other, other.addresses, FAST_REKEY)
+    for drone in drones:
+        drone.start()
+    for one, other in permutations(drones, 2):
+        network.traffic(one, other, 0.05)
     return drones
 
 
@@ -81,11 +79,7 @@ def test_link_comes_back_after_a_restart_amid_a_replay_storm(knows: str) -> None
     """The restarted drone remembers no initiation; hundreds of old ones do not block its link."""
     for seed in range(3):
         with Network(f"storm and restart {knows} {seed}", RadioSettings(delay_s=0.02)) as network:
-            a, b = network.add("a"), network.add("b")
-            a.knows(b, b.addresses if knows != "other" else (), FAST_REKEY)
-            b.knows(a, a.addresses if knows != "restarted" else (), FAST_REKEY)
-            a.start()
-            b.start()
+            a, b = network.pair(FAST_REKEY, a_knows=knows != "other", b_knows=knows != "restarted")
             network.talk(a, b)
             recorder = Recorder(network)
             network.run(30)

@@ -30,7 +30,7 @@ def test_link_is_back_after_a_restart_without_state(who_knows: str, delay_s: flo
     """One end restarts with only its key and another clock: frames cross again within two seconds."""
     for seed in range(5):
         with Network(f"restart {who_knows} {delay_s} {clock} {seed}", RadioSettings(delay_s=delay_s)) as network:
-            a, b = network.linked(clocks=(1e9, 1e5), a_knows=who_knows != "other", b_knows=who_knows != "restarted")
+            a, b = network.linked(a_knows=who_knows != "other", b_knows=who_knows != "restarted")
             network.run(network.rng.random())
             a.start(clock)
             _assert_both_hear_within(network, a, b, BACK_WITHIN_S)
@@ -42,7 +42,7 @@ def test_link_is_back_after_both_restart(a_alone_knows: bool, gap_s: float) -> N
     """Both ends restart, together or one after the other: frames cross again within two seconds of the last."""
     for seed in range(5):
         with Network(f"both restart {a_alone_knows} {gap_s} {seed}", RadioSettings(delay_s=0.1)) as network:
-            a, b = network.linked(clocks=(1e9, 1e5), b_knows=not a_alone_knows)
+            a, b = network.linked(b_knows=not a_alone_knows)
             a.start(0.0)
             network.run(gap_s)
             b.start(0.0)
@@ -52,11 +52,7 @@ def test_link_is_back_after_both_restart(a_alone_knows: bool, gap_s: float) -> N
 def test_late_confirmation_from_before_a_restart_does_not_pull_traffic_back() -> None:
     """A confirmation delayed past the restart of its sender makes an older session of equal rank: it is not used."""
     with Network("late confirmation", RadioSettings(delay_s=0.05)) as network:
-        a, b = network.add("a"), network.add("b")
-        a.knows(b, b.addresses)
-        b.knows(a)
-        a.start()
-        b.start()
+        a, b = network.pair(b_knows=False)
         network.run(0.09)  # the response is in flight
         network.set_radio(RadioSettings(delay_s=2.0))
         network.run_until(lambda: a.session(b) is not None, within_s=1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from functools import partial
+from itertools import combinations
 from random import Random
 
 import pytest
@@ -70,11 +71,7 @@ def test_two_ends_started_at_once_settle_on_the_same_session(seeds: range) -> No
 def handshake_time(mode: str, loss: float, seed: int) -> float:
     """Seconds from the start of both ends to a session that both send on."""
     with Network(f"loss {mode} {loss} {seed}", RadioSettings(loss=loss, delay_s=0.05)) as network:
-        a, b = network.add("a"), network.add("b")
-        a.knows(b, b.addresses)
-        b.knows(a, a.addresses if mode == "both know" else ())
-        a.start()
-        b.start()
+        a, b = network.pair(b_knows=mode == "both know")
         network.talk(a, b, interval_s=0.1)
         return network.run_until(partial(share_a_session, a, b), within_s=60)
 
@@ -94,7 +91,7 @@ def test_every_pair_of_a_mesh_comes_up(size: int, loss: float, bound_s: float) -
     """Many drones started together, each knowing all others: every pair has a session within a bound."""
     with Network(f"mesh {size} {loss}", RadioSettings(loss=loss, delay_s=0.03, jitter_s=0.02)) as network:
         drones = [network.add(f"d{number}") for number in range(size)]
-        pairs = [(a, b) for a in drones for b in drones if a.name < b.name]
+        pairs = list(combinations(drones, 2))
         for a, b in pairs:
             a.knows(b, b.addresses)
             b.knows(a, a.addresses)

@@ -75,10 +75,8 @@ def test_path_that_stalls_for_ten_seconds_delivers_nothing_stale(stalled: int, r
     with Network(f"stall {stalled} {rekey_after_s}") as network:
         link = Link(timers=Timers(rekey_after_s=rekey_after_s))
         vehicle, station = linked_vehicle(network, (FAST, SLOW), link)
-        flows = [*network.talk(vehicle, station, 0.02)]
-        critical = [
-            network.traffic(*ends, 0.1, cls=Class.CRITICAL) for ends in ((vehicle, station), (station, vehicle))
-        ]
+        flows = network.talk(vehicle, station, 0.02)
+        critical = network.talk(vehicle, station, 0.1, cls=Class.CRITICAL)
         recorder = Recorder(network)
         network.run(5)
         begin = network.now
