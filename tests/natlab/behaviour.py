@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import socket
 from dataclasses import dataclass
-from types import TracebackType
-from typing import Final, Self
+from typing import Final
 
 from tests.natlab.laboratory import Laboratory, Place
 from tests.natlab.translation import Dependence
@@ -38,12 +37,7 @@ class Reflector:
         self.sockets = [self.host.udp_socket(address, port, PATIENCE_S) for address in addresses for port in PORTS]
         self.addresses: list[Address] = [made.getsockname() for made in self.sockets]
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def close(self) -> None:
         for made in self.sockets:
             made.close()
 

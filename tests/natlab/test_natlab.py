@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from time import monotonic
 
@@ -47,7 +48,7 @@ def laboratory() -> Iterator[Laboratory]:
 
 @pytest.fixture
 def reflector(laboratory: Laboratory) -> Iterator[Reflector]:
-    with Reflector(laboratory) as reflector:
+    with closing(Reflector(laboratory)) as reflector:
         yield reflector
 
 
