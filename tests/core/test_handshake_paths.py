@@ -6,18 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from tests.core.harness import (
-    ELSEWHERE,
-    UNUSED_INDEX,
-    Pair,
-    datagrams,
-    exchange,
-    of,
-    only,
-    probe_in,
-    quiet,
-    reasons,
-)
+from tests.core.harness import ELSEWHERE, UNUSED_INDEX, Pair, datagrams, exchange, of, only, probe_in, quiet, reasons
 from tests.core.radios import Radios, at_a, at_b
 from uavlinkd.core import constants as c
 from uavlinkd.core import establish, wire

@@ -6,18 +6,7 @@ from itertools import pairwise
 
 import pytest
 
-from tests.core.harness import (
-    AT_B,
-    ELSEWHERE,
-    Pair,
-    datagrams,
-    lively,
-    of,
-    only,
-    quiet,
-    reasons,
-    with_macs,
-)
+from tests.core.harness import AT_B, ELSEWHERE, Pair, datagrams, lively, of, only, quiet, reasons, with_macs
 from uavlinkd.core import constants as c
 from uavlinkd.core import establish, wire
 from uavlinkd.core.constants import NEVER

@@ -27,7 +27,6 @@ from uavlinkd.core.refusals import RefusalReport, Refused
 from uavlinkd.core.suites import SUITES, Suite
 from uavlinkd.core.wire import Parameters
 
-ALL_SUITES = [pytest.param(suite, id=suite.name) for suite in SUITES.values()]
 INDEX = st.integers(1, 2**16 - 1)
 U16 = st.integers(0, 2**16 - 1)
 U32 = st.integers(0, 2**32 - 1)

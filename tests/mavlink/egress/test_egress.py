@@ -18,13 +18,7 @@ from tests.samples import ID, attitude, battery, command, frame, heartbeat, para
 from uavlinkd.mavlink.classes import Lane
 from uavlinkd.mavlink.dialect import name_of
 from uavlinkd.mavlink.egress.bucket import BURST_S
-from uavlinkd.mavlink.egress.budgeted import (
-    MAX_FLOWS,
-    MIN_LANE_BYTES,
-    Egress,
-    EgressSettings,
-    EnvelopeShape,
-)
+from uavlinkd.mavlink.egress.budgeted import MAX_FLOWS, MIN_LANE_BYTES, Egress, EgressSettings, EnvelopeShape
 from uavlinkd.mavlink.egress.lanes import EgressDrop
 from uavlinkd.mavlink.flows import FlowKey
 

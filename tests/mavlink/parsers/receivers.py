@@ -29,7 +29,6 @@ _OF_MESSAGES = re.compile(r'#include "[^"]*mavlink_msg_\w+\.h"|#include "[^"]*te
 _FLAGS = ("-std=c11", "-O2", "-shared", "-fPIC", "-w", "-DMAVLINK_COMM_NUM_BUFFERS=1")
 KEY = bytes(range(32))
 """The signing key of receivers that check signatures."""
-LONGEST_LOSS = 300
 EVERY_LOSS = -1
 _ROOM = 4096
 _STATES = 32

@@ -14,7 +14,6 @@ from uavlinkd.mavlink.policy.delivery import Source
 
 ATTITUDE, PARAM_REQUEST_READ, SET_MODE, COMMAND_LONG, HEARTBEAT = 30, 20, 11, 76, 0
 HOME_POSITION, SETUP_SIGNING = 242, 256
-SIGNATURE = bytes(range(13))
 
 
 v2 = build
