@@ -55,10 +55,7 @@ class Couple:
     relays: list[Relay] = field(default_factory=list)
 
     def flows(self, cls: Class) -> tuple[Flow, Flow]:
-        return (
-            self.network.flow(self.vehicle, self.station, cls),
-            self.network.flow(self.station, self.vehicle, cls),
-        )
+        return self.network.flow(self.vehicle, self.station, cls), self.network.flow(self.station, self.vehicle, cls)
 
     def begin(self) -> None:
         self.start()

@@ -98,14 +98,7 @@ def test_every_pair_of_a_mesh_comes_up(size: int, loss: float, bound_s: float) -
         for drone in drones:
             drone.start()
         flows = [flow for a, b in pairs for flow in network.talk(a, b, interval_s=0.2)]
-        waiting = list(pairs)
-
-        def all_are_up() -> bool:
-            while waiting and share_a_session(*waiting[-1]):
-                waiting.pop()
-            return not waiting
-
-        network.run_until(all_are_up, within_s=bound_s)
+        network.run_until(lambda: all(share_a_session(*pair) for pair in pairs), within_s=bound_s)
         begin = network.now
         network.run(5)
         for flow in flows:
