@@ -255,6 +255,11 @@ def unprotected(key: EnvelopeKey, tag_bytes: int, datagram: bytes, header_bytes:
     return covered[header_bytes:] if key.tag(covered)[:tag_bytes] == datagram[-tag_bytes:] else None
 
 
+def stray() -> bytes:
+    """An envelope for an unknown session."""
+    return wire.envelope_header(UNUSED_INDEX, 5) + bytes(24)
+
+
 def initiation_of(version: int, receiver_public_key: bytes, length: int = 147) -> bytes:
     """An initiation as another version of the protocol makes it: only its first byte and its macs are known here."""
     covered = (b"\1" + bytes(range(256)) * (length // 256 + 1))[: length - 2 * c.MAC_BYTES]

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from tests.core.harness import ELSEWHERE, UNUSED_INDEX, Pair, datagrams, exchange, of, only, probe_in, quiet, reasons
+from tests.core.harness import ELSEWHERE, Pair, datagrams, exchange, of, only, probe_in, quiet, reasons, stray
 from tests.core.radios import Radios, at_a, at_b
 from uavlinkd.core import constants as c
 from uavlinkd.core import establish, wire
@@ -208,8 +208,7 @@ def test_nothing_but_its_own_network_hastens_the_tries_along_a_metered_path(hint
     assert due_at > radios.now
     for _ in range(8):
         if hint == "forged index":
-            stray = wire.envelope_header(UNUSED_INDEX, 5) + bytes(24)
-            radios.act(radios.a, radios.a.node.receive(stray, at_b(0), radios.now))
+            radios.act(radios.a, radios.a.node.receive(stray(), at_b(0), radios.now))
         elif hint == "another network":
             radios.a.node.set_socket_state(1, radios.now, is_up=True)
         elif radios.now == 100.0:

@@ -31,6 +31,7 @@ from tests.core.harness import (
     reasons,
     repaired,
     state_of,
+    stray,
     with_cookie,
     with_macs,
 )
@@ -70,11 +71,6 @@ def completes(pair: Pair, initiation: bytes, now: float) -> bool:
     response = only(datagrams(pair.b.receive(initiation, now), wire.RESPONSE))
     pair.b.receive(only(datagrams(pair.a.receive(response, now))), now)
     return pair.carries(now)
-
-
-def stray(index: int = UNUSED_INDEX) -> bytes:
-    """An envelope for an unknown session."""
-    return wire.envelope_header(index, 5) + bytes(24)
 
 
 # Why something is dropped: one row for each reason.

@@ -12,7 +12,6 @@ from tests.core.harness import (
     AT_B,
     ELSEWHERE,
     FRAME,
-    UNUSED_INDEX,
     Pair,
     Side,
     datagrams,
@@ -23,6 +22,7 @@ from tests.core.harness import (
     quiet,
     reasons,
     run,
+    stray,
     unsealed,
 )
 from uavlinkd.core import constants as c
@@ -240,10 +240,7 @@ def test_copy_that_is_not_sent_is_not_counted_and_one_that_waited_is_counted_lat
     state = peer.paths.by_path[AT_B]
 
     def totals() -> tuple[int, ...]:
-        return (
-            *(state.sent, state.datagrams_sent, state.bytes_sent),
-            *(traffic.datagrams_sent, traffic.bytes_sent),
-        )
+        return state.sent, state.datagrams_sent, state.bytes_sent, traffic.datagrams_sent, traffic.bytes_sent
 
     before, size = totals(), len(FRAME)
     node.recount(peer, AT_B, -1, -size)
@@ -429,11 +426,6 @@ def test_a_side_that_leaves_initiations_to_its_peer_only_answers() -> None:
 
 
 # Hints.
-
-
-def stray() -> bytes:
-    """An envelope for an unknown session."""
-    return wire.envelope_header(UNUSED_INDEX, 5) + bytes(24)
 
 
 def test_unknown_envelope_from_the_peers_place_is_a_hint() -> None:
