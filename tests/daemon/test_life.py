@@ -19,9 +19,10 @@ from tests.waiting import PATIENCE_S
 from uavlinkd.lab.sim.loopback_ports import free_port
 
 
-def run(daemon: DaemonProcess, command: str = "run") -> subprocess.CompletedProcess[str]:
+def run(daemon: DaemonProcess, *command: str) -> subprocess.CompletedProcess[str]:
+    """A command with the configuration of a daemon."""
     return subprocess.run(
-        [sys.executable, "-m", "uavlinkd", command, "--config", str(daemon.write_config())],
+        [sys.executable, "-m", "uavlinkd", *command, "--config", str(daemon.write_config())],
         capture_output=True,
         text=True,
         timeout=PATIENCE_S,
@@ -93,7 +94,7 @@ async def test_a_port_in_use_is_reported_in_one_line(stage: Stage, taken: str) -
     else:
         address = second.config["control_socket"] = str(first.folder / "control.sock")
     await stage.start(first, linked=False)
-    result = run(second)
+    result = run(second, "run")
     assert result.returncode == 1
     key = {"endpoint": "endpoint.url (autopilot)", "metrics": "metrics.listen", "control": "control_socket"}
     (line,) = result.stderr.splitlines()

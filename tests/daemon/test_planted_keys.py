@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 import asyncio
-import subprocess
-import sys
 import urllib.request
 from base64 import b64encode
 from pathlib import Path
@@ -14,8 +12,7 @@ import pytest
 
 from tests.daemon.frames import frame
 from tests.daemon.harness import Stage, secret_forms
-from tests.daemon.process import DaemonProcess
-from tests.waiting import PATIENCE_S
+from tests.daemon.test_life import run
 from uavlinkd.config import keys
 from uavlinkd.lab.sim.loopback_ports import free_port
 
@@ -61,13 +58,7 @@ async def test_nothing_that_a_daemon_gives_away_holds_a_key(stage: Stage) -> Non
         output.append(await asyncio.to_thread(lambda url=url: urllib.request.urlopen(url).read()))  # type: ignore[misc]
         output += [path.read_bytes() for path in (daemon.folder / "recordings").iterdir()]
         for command in (["check"], ["status", "--json"], ["status"], ["peer", "list"], ["reload"]):
-            output.append(await asyncio.to_thread(run, daemon, *command))
+            done = await asyncio.to_thread(run, daemon, *command)
+            output.append(f"{done.stdout}{done.stderr} ".encode())
     assert all(output), "something said nothing"
     assert reported(b"\n".join(output), stage.secrets) == []
-
-
-def run(daemon: DaemonProcess, *command: str) -> bytes:
-    """What a command on a daemon's configuration prints; a space, if nothing."""
-    line = [sys.executable, "-m", "uavlinkd", *command, "--config", str(daemon.config_file)]
-    done = subprocess.run(line, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=PATIENCE_S, check=False)
-    return done.stdout + b" "

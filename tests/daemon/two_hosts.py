@@ -70,7 +70,6 @@ class TwoHosts:
             host.open()
         for network in self._networks:
             self.plug_in(network)
-            self.configure(network)
         return self
 
     async def __aexit__(
@@ -108,10 +107,11 @@ class TwoHosts:
         return done.returncode, " ".join((done.stdout + done.stderr).split())
 
     def plug_in(self, network: str) -> None:
-        """Make a cable between the hosts. The interface of the ground station is ready, not that of the vehicle."""
+        """Make a cable between the hosts, and configure the interfaces of both."""
         (vehicle, ground), interface = self.hosts, interface_of(network)
         vehicle.ip(f"link add {interface} type veth peer name {interface} netns {ground.name}")
         ground.ip(f"address add {address_of(network, 2)}/24 dev {interface}", f"link set {interface} up")
+        self.configure(network)
 
     def configure(self, network: str, place: int = 1) -> None:
         interface = interface_of(network)

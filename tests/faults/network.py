@@ -89,7 +89,6 @@ async def suffer(stage: Stage, name: str) -> Outcome:
             hosts.run(fault.end)
         else:
             hosts.plug_in(ONLY)
-            hosts.configure(ONLY)
         recovered_s = await hosts.talk.back(monotonic())
         hosts.talk.check_no_copies()
         await _check_reported(daemon, *failures)

@@ -14,6 +14,7 @@ import pytest
 import structlog
 
 from tests.link.socket_states import SocketStateLog
+from tests.link.test_drop_summary import Recorder
 from uavlinkd.core.path import Path, relayed
 from uavlinkd.core.relay_records import wrap
 from uavlinkd.link.drop_summary import EVERYDAY_ERRORS, DropSummary
@@ -59,14 +60,8 @@ def sockets_with(sock: Refusing, drops: DropSummary) -> PeerSockets:
 @pytest.mark.parametrize("name", ["ENOBUFS", "ENOMEM", "EPERM", "ENETUNREACH", "EAGAIN"])
 def test_what_is_not_taken_is_counted_and_the_next_is_sent(name: str) -> None:
     """A line for a rare error, a count for each, and datagrams go on when there is room again."""
-    lines: list[tuple[str, dict[str, Any]]] = []
-
-    class Log:
-        def warning(self, event: str, **fields: Any) -> None:
-            lines.append((event, fields))
-
-    sock = Refusing(getattr(errno, name))
-    sockets = sockets_with(sock, DropSummary(cast(Any, Log())))
+    log, sock = Recorder(), Refusing(getattr(errno, name))
+    sockets = sockets_with(sock, DropSummary(cast(Any, log)))
     for _ in range(3):
         sockets.send(b"lost", Path(0, ("127.0.0.1", 9)))
     sock.is_out = False
@@ -74,7 +69,7 @@ def test_what_is_not_taken_is_counted_and_the_next_is_sent(name: str) -> None:
     assert sock.sent == [b"there"]
     assert sockets.failures == {name: 3}
     logged = [] if name in EVERYDAY_ERRORS else [("sends_failed", name)]
-    assert [(event, fields["reason"]) for event, fields in lines] == logged
+    assert [(event, fields["reason"]) for event, fields in log.lines] == logged
 
 
 def test_relayed_path_goes_to_the_relay_or_nowhere() -> None:
