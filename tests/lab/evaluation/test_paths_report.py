@@ -39,7 +39,8 @@ def a_trial(
     delivered += [(number, telemetry_s[number] + 0.06) for number in again]
     delivered.sort(key=lambda delivery: delivery[1])
     heartbeats_s = [0.5 + number for number in range(14)]
-    heartbeats = [(n, t + 0.05) for n, t in enumerate(heartbeats_s) if n not in lost]
+    answers = [(n, t + 0.05) for n, t in enumerate(heartbeats_s)]
+    heartbeats = [(n, at_s) for n, at_s in answers if n not in lost]
     critical_s = [t for t in heartbeats_s if not 3.5 < t < 10]
     return [
         *(
@@ -57,36 +58,22 @@ def a_trial(
             for sender, message, cls, sent_s, arrived in (
                 (VEHICLE, "ATTITUDE", Class.STREAM, telemetry_s, delivered),
                 (VEHICLE, "HEARTBEAT", Class.CRITICAL, heartbeats_s, heartbeats),
-                (
-                    STATION,
-                    "HEARTBEAT",
-                    Class.CRITICAL,
-                    heartbeats_s,
-                    [(n, t + 0.05) for n, t in enumerate(heartbeats_s)],
-                ),
+                (STATION, "HEARTBEAT", Class.CRITICAL, heartbeats_s, answers),
             )
         ),
-        Record(
-            "radio",
-            {**point, "radio": 0},
-            {
-                "bytes": 1000,
-                "datagrams": 10,
-                "vehicle_stream_s": [t for t in telemetry_s if t < 3 + moved_after_s],
-                "vehicle_critical_s": critical_s,
-                "station_critical_s": critical_s,
-            },
-        ),
-        Record(
-            "radio",
-            {**point, "radio": 1},
-            {
-                "bytes": 200,
-                "datagrams": 5,
-                "vehicle_stream_s": [t for t in telemetry_s if t >= 3 + moved_after_s],
-                "vehicle_critical_s": heartbeats_s,
-                "station_critical_s": heartbeats_s,
-            },
+        *(
+            Record(
+                "radio",
+                {**point, "radio": radio},
+                {
+                    "bytes": size,
+                    "datagrams": datagrams,
+                    "vehicle_stream_s": [t for t in telemetry_s if (t < 3 + moved_after_s) == (radio == 0)],
+                    "vehicle_critical_s": carried_s,
+                    "station_critical_s": carried_s,
+                },
+            )
+            for radio, size, datagrams, carried_s in ((0, 1000, 10, critical_s), (1, 200, 5, heartbeats_s))
         ),
         Record("failure", {**point, "radio": 0}, {"at_s": 3.0, "until_s": 9.0}),
         Record("trial", point, {"duration_s": 14.0, "sender_late_s": 0.001}),

@@ -54,12 +54,8 @@ async def fly_with_mavsdk(url: str) -> dict[str, Any]:
         await sdk.add_any_connection(url.replace(":", "://", 1))
         system = await sdk.first_autopilot(TIMEOUT_S)
         assert system is not None, "no autopilot was found"
-        parameters, action, missions, telemetry = (
-            ParamAsync(system),
-            ActionAsync(system),
-            MissionRawAsync(system),
-            TelemetryAsync(system),
-        )
+        parameters, action = ParamAsync(system), ActionAsync(system)
+        missions, telemetry = MissionRawAsync(system), TelemetryAsync(system)
         every = await parameters.get_all_params()
         table = {param.name: param.value for param in [*every.int_params, *every.float_params]}
         await parameters.set_param_float("WPNAV_SPEED_UP", 500.0)
