@@ -59,6 +59,6 @@ async def test_nothing_that_a_daemon_gives_away_holds_a_key(stage: Stage) -> Non
         output += [path.read_bytes() for path in (daemon.folder / "recordings").iterdir()]
         for command in (["check"], ["status", "--json"], ["status"], ["peer", "list"], ["reload"]):
             done = await asyncio.to_thread(run, daemon, *command)
-            output.append(f"{done.stdout}{done.stderr} ".encode())
+            output.append(f"{done.stdout}{done.stderr}".encode())
     assert all(output), "something said nothing"
     assert reported(b"\n".join(output), stage.secrets) == []
