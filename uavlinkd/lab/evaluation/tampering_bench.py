@@ -22,7 +22,7 @@ QUICK_AFTER_S = 1.2
 """How long a quick run continues at most after the last attempt."""
 CONTROL_S, QUICK_CONTROL_S = 10.0, 1.0
 """The duration of the control without an attack, before the first attack."""
-_UNTIL_FIRST = 4
+_UNTIL_FIRST = 20
 """An attack that has not reached the network may take so many times as long: on a busy machine, a flood is weaker."""
 _LOOK_S = 0.02
 _SETTLE_S = 0.08
