@@ -55,7 +55,7 @@ async def check(
         reported = status["peers"][peer]
         assert reported["session"]["lost_in"] == 0
         held = held_back(status, "peers", peer) + held_back(status, "peers", peer, "out")
-        # The bytes of one honest frame in some ten thousand hide another one by chance.
+        # Rarely, the bytes of an honest frame hide another one.
         assert all(reason == "hidden_frame" and count == 1 for (_, reason), count in held.items()), held
         if daemon is drone:
             assert reported["frames_received"] > 15, "it went another way"
