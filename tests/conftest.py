@@ -34,6 +34,8 @@ SLOWEST = (
 """Folders, the slowest tests first."""
 ALONE = ("pressure", "faults", "soak", "daemon", "link")
 """Folders whose tests measure delays, losses and processor time of real daemons: marked ``alone``."""
+LONG = ("natlab", "faults", "modem", "compose")
+"""Folders of machines: routers, modems, containers, broken networks. Marked ``long``; most of them need root."""
 
 settings.register_profile("busy machine", settings(), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("busy machine")
@@ -56,13 +58,15 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what runs alone and what reads recorded flights. Start the slowest files first.
+    """Mark what runs alone, what is long and what reads recorded flights. Start the slowest files first.
 
     A worker that starts one at the end makes the others wait. The order within a folder stays random.
     """
     for item in items:
         if set(ALONE) & _folders(item):
             item.add_marker("alone")
+        if set(LONG) & _folders(item):
+            item.add_marker("long")
         if "shared_data" in getattr(item, "fixturenames", ()):
             item.add_marker("recorded")
     items.sort(

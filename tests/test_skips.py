@@ -40,6 +40,7 @@ def outcome(folder: Path, *reasons: str, whole: bool = False, **environ: str) ->
     return shown if whole else shown.strip().splitlines()[-1]
 
 
+@pytest.mark.long
 def test_missing_tool_fails_the_test_in_ci_only(tmp_path: Path) -> None:
     """In the body of the test and in its fixture. Some tools may be missing in CI too: tests/README.md lists them."""
     assert outcome(tmp_path, "needs a tool").startswith("2 skipped")

@@ -12,7 +12,7 @@ from tests.compose import outages
 from tests.compose.cluster import Cluster, Conversation, run, until
 from tests.compose.containers import USER, Containers, health, opened
 
-pytestmark = [pytest.mark.asyncio(loop_scope="module"), pytest.mark.long]
+pytestmark = pytest.mark.asyncio(loop_scope="module")
 
 
 @pytest_asyncio.fixture(scope="module", loop_scope="module")
@@ -55,7 +55,6 @@ async def test_containers_are_healthy_confined_and_unprivileged(cluster: Contain
     assert int(capabilities.split()[1], 16) == 0
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("outage", outages.OUTAGES.values(), ids=outages.OUTAGES)
 async def test_outage_ends_in_time_and_disturbs_no_other_link(
     cluster: Containers, outage: Callable[[Cluster], Awaitable[None]]
@@ -72,7 +71,6 @@ ATTACKS = (
 """On the data of a link that is up: some lose genuine frames, none may add one."""
 
 
-@pytest.mark.long
 async def test_man_in_the_middle_gets_nothing_accepted(image: str, tmp_path: Path) -> None:
     """Through a set of attacks between drone1 and the ground station, every frame arrives at most once and unaltered.
 

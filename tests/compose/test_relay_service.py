@@ -18,7 +18,7 @@ from tests.relay.core_member import CoreMember
 from uavlinkd.config import keys
 from uavlinkd.lab.sim.loopback_ports import free_port
 
-pytestmark = [pytest.mark.asyncio(loop_scope="module"), pytest.mark.long]
+pytestmark = pytest.mark.asyncio(loop_scope="module")
 
 FILE = images.PROJECT / "configs" / "compose.relay.yaml"
 INNER = b"\x40datagram"

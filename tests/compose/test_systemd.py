@@ -13,8 +13,6 @@ from tests.compose import images
 from tests.compose.machine import Machine, build
 from tests.needs import need
 
-pytestmark = pytest.mark.long
-
 WATCHDOG_S = 6.0
 
 _CONFIGURE = """

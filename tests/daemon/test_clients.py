@@ -65,6 +65,7 @@ async def check(
             assert reported["frames_received"] > 200, "it went another way"
 
 
+@pytest.mark.long
 async def test_mavutil_flies_through_a_serial_port(stage: Stage) -> None:
     """mavutil on a serial port, the autopilot a TCP server: connect, parameters, mission, arm, up, down."""
     scenarios.need("pymavlink.mavutil")

@@ -31,17 +31,11 @@ def outcomes(request: pytest.FixtureRequest) -> Outcomes:
     return outcomes
 
 
-SHORT = ("descriptors", "interface_down", "recording_disk_full", "garbage")
-"""Faults of each kind. The others are as long, and run in CI."""
-
-
 CLIENTS_LINES = 6
 """Lines of the clients that connect after the daemon has descriptors again, and of the problems that end then."""
 
 
-@pytest.mark.parametrize(
-    "fault", [pytest.param(fault, marks=() if fault in SHORT else pytest.mark.long) for fault in FAULTS]
-)
+@pytest.mark.parametrize("fault", FAULTS)
 def test_daemon_withstands_it_and_is_back_in_time(fault: str, outcomes: Outcomes) -> None:
     """It keeps running and keeps its log short; the measured time from the fault's end is within the bound."""
     need(fault in outcomes, why_not() or "nothing")

@@ -15,13 +15,16 @@ from tests.fuzz.registry import TARGETS
 from tests.needs import need
 from tests.waiting import PATIENCE_S
 
-names = pytest.mark.parametrize("name", TARGETS)
 SHORT_S = 0.3
+SLOW = ("candidates", "relay")
+"""Targets whose kept corpus takes seconds."""
 MAX_CORPUS_BYTES = 400_000
 RUNS = 4000
 
 
-@names
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.long if name in SLOW else ()) for name in TARGETS]
+)
 def test_short_hunt_finds_no_escape(name: str) -> None:
     """The kept corpus, variations of it, and new scripts, by a seeded generator."""
     target, kept = TARGETS[name], corpus.load(name)
@@ -34,6 +37,7 @@ def test_short_hunt_finds_no_escape(name: str) -> None:
         assert result.executions > 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("about", PLANTS)
 def test_planted_fault_is_found(about: str) -> None:
     """The same scripts fail with the fault, and pass without it."""

@@ -48,7 +48,6 @@ def _needs() -> None:
     need_laboratory()
 
 
-@pytest.mark.long
 async def test_every_pair_is_relayed() -> None:
     """Also those that are never direct; soon, and without the loss of a frame from then on."""
     watch = Stopwatch()
@@ -61,7 +60,6 @@ async def test_every_pair_is_relayed() -> None:
         assert outcome.lost == 0
 
 
-@pytest.mark.long
 async def test_pairs_with_ipv6_are_direct_over_it() -> None:
     """A firewall drops what it did not ask for. If one end has no IPv6, the NATs for IPv4 decide."""
     with Laboratory() as laboratory:
@@ -79,7 +77,6 @@ async def test_pairs_with_ipv6_are_direct_over_it() -> None:
             assert outcome.direct_s is None
 
 
-@pytest.mark.long
 async def test_netcheck_reports_what_the_routers_do() -> None:
     """Twice in a row: the first tests open no NAT for the second ones. No daemon warns of a token."""
     assert set(REPORTED) == set(PAIRED)
@@ -98,7 +95,6 @@ async def test_netcheck_reports_what_the_routers_do() -> None:
                 assert (await member.status())["drops"] == before[kind], kind
 
 
-@pytest.mark.long
 async def test_link_is_back_soon_after_each_fault() -> None:
     """Frames were lost meanwhile, or none was sent. If one of two networks dies, no critical frame is lost.
 

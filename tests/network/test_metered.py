@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from functools import partial
 
+import pytest
+
 from tests.network.drone import Drone, share_a_session
 from tests.network.network import Network
 from tests.network.vehicle import hop, linked_vehicle
@@ -39,6 +41,7 @@ def test_peer_that_closed_is_found_along_the_metered_path_alone() -> None:
             network.run_until(partial(share_a_session, vehicle, station), UP_WITHIN_S)
 
 
+@pytest.mark.long
 def test_critical_frames_cross_where_a_metered_path_returns_as_the_other_one_dies() -> None:
     """The vehicle asks along LTE every 15 s only. It learns that LTE is back from the station's questions."""
     for seed in range(5):

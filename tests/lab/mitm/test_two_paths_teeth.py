@@ -18,6 +18,8 @@ from uavlinkd.core.path import Path
 from uavlinkd.core.path_measures import PathLoss
 from uavlinkd.core.path_state import PathCondition, PathState
 
+pytestmark = pytest.mark.long
+
 
 def attacked(name: str, seconds: float = LASTING_S) -> TwoPaths:
     pair = TwoPaths(name)
