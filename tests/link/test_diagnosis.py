@@ -12,18 +12,16 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from tests.daemon.frames import command_long, ground_heartbeat, heartbeat, numbered
+from tests.daemon.frames import command_long, heartbeat
 from tests.link.test_evidence import HOST, OWN_KEY, THERE, Scene
-from tests.samples import pack
 from tests.test_readmes import ROOT
-from uavlinkd.config import EndpointConfig, PeerConfig
+from uavlinkd.config import PeerConfig
 from uavlinkd.config.keys import encode_key
 from uavlinkd.core import constants as c
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.outputs import Dropped
 from uavlinkd.core.path import Path
 from uavlinkd.core.refusals import RefusalReport, Refused
-from uavlinkd.endpoints.url import parse_url
 from uavlinkd.link import diagnosis, down_problems, facts
 from uavlinkd.link.evidence import MAX_SESSIONS, OWN_FRAMES_S, History, SessionBegin
 from uavlinkd.link.peer_link import PeerLink
@@ -286,19 +284,6 @@ def test_problems_of_the_daemon(daemon: Daemon) -> None:
     assert set(daemon.findings(NOW + 31)) == {"recording_stopped"}
 
 
-def test_strangers_at_a_relay(daemon: Daemon) -> None:
-    """One with a key of no member, and one with another key of the relay while a member is down."""
-    member = SimpleNamespace(peer=SimpleNamespace(is_up=True))
-    daemon.set_up(role="all", system_ids="all")
-    daemon.parts.relay = SimpleNamespace(members={"drone1": member})
-    daemon.dropped(DropReason.UNKNOWN_PEER, STRANGER, bytes([11]) * 32)
-    daemon.dropped(DropReason.BAD_MAC1, STRANGER)
-    assert encode_key(bytes([11]) * 32) in daemon.findings()["not_a_member"].text
-    assert set(daemon.findings()) == {"not_a_member"}
-    member.peer.is_up = False
-    assert encode_key(OWN_KEY) in daemon.findings()["other_relay_key"].remedy
-
-
 # A peer that is up.
 
 
@@ -331,47 +316,6 @@ def test_own_and_foreign_frames_in_different_seconds(daemon: Daemon, pause: int,
         daemon.cross([heartbeat(1)], seconds=pause)
         daemon.cross([heartbeat(2)])
     assert ("impersonation" in daemon.findings()) is is_found
-
-
-def test_autopilot_with_another_system_id(daemon: Daemon) -> None:
-    """All its frames are refused: a fault, which names the parameters. It goes when the autopilot is corrected."""
-    daemon.set_up(role="all", system_ids=[2])
-    daemon.cross([heartbeat(1)])
-    assert set(daemon.findings()) == {"foreign_system"}
-    assert "SYSID_THISMAV" in daemon.findings()["foreign_system"].remedy
-    daemon.cross([heartbeat(2)])
-    assert set(daemon.findings()) == {"other_system"}
-    daemon.cross([heartbeat(2)], seconds=11)
-    assert daemon.findings() == {}
-
-
-REQUEST = pack(mavlink.MAVLink_param_request_list_message(2, 1), 255, 190)
-
-
-@pytest.mark.parametrize(
-    ("role", "received", "sent", "sign"),
-    [
-        ("vehicle", [ground_heartbeat()], [], "a vehicle, but it sends a ground station's heartbeat"),
-        ("vehicle", [], [numbered(1, 1)], "a vehicle, but the client here sends a vehicle's telemetry"),
-        ("operator", [numbered(1, 255)], [], "a ground station, but it sends a vehicle's telemetry"),
-        ("operator", [], [REQUEST], "a ground station, but the client here sends an operator's requests"),
-    ],
-)
-def test_exchanged_roles(daemon: Daemon, role: str, received: list[bytes], sent: list[bytes], sign: str) -> None:
-    """Frames of the other kind are refused. If the daemon forwards for others, what it sends shows nothing."""
-    daemon.set_up(role=role, system_ids=[255])
-    daemon.cross(received, sent)
-    findings = daemon.findings()
-    assert f'role = "{role}" says that it is {sign}' in findings["roles_exchanged"].text
-    assert findings["roles_exchanged"].severity is Severity.FAULT
-    assert "all_refused" not in findings
-    daemon.parts.config.routing.relay = True
-    assert ("roles_exchanged" in daemon.findings()) is bool(received)
-    daemon.parts.config.routing.relay = False
-    daemon.link.counters.frames += 1  # one that passes
-    daemon.link.frames_sent += 1
-    daemon.cross()
-    assert daemon.findings()["roles_exchanged"].severity is Severity.WARNING
 
 
 @pytest.mark.parametrize(("received", "sent", "which"), [([heartbeat(1)], [], "from"), ([], [heartbeat(1)], "to")])
@@ -419,21 +363,6 @@ def test_unverified_freshness(daemon: Daemon) -> None:
 
 
 # What the peer claims to refuse.
-
-
-def test_claims_in_one_sentence(daemon: Daemon) -> None:
-    """Commands first; the remedy is for the owner of this end, or for that of the peer."""
-    claims = daemon.set_up(role="all", system_ids="all").peer.refusal_claims
-    claims.note(RefusalReport((Refused(0, 0, 8, 1), Refused(76, ARM, 2, 3))), NOW)
-    finding = daemon.findings(11.0)["refused_there"]
-    assert finding.text.startswith(
-        "it reports that it refuses COMMAND_LONG COMPONENT_ARM_DISARM"
-        " (the role, or the lists, do not allow the message, 3 frames, 10 s ago); HEARTBEAT ("
-    )
-    assert finding.remedy == "if these frames are needed, change the role or lists of drone0 in drone1's file"
-    claims.note(RefusalReport((Refused(0, 0, 1, 1),)), 12.0)
-    assert daemon.findings(12.0)["refused_there"].remedy.startswith("set SYSID_THISMAV, MAV_SYSID or MAV_SYS_ID of")
-    assert "refused_there" not in daemon.findings(12.0 + 61)
 
 
 def test_a_lying_peer_fills_one_line(daemon: Daemon) -> None:
@@ -485,45 +414,3 @@ def test_many_sessions_of_a_thief_hide_nothing(daemon: Daemon) -> None:
 
 
 # Local endpoints.
-
-
-@pytest.mark.parametrize(
-    ("url", "clients", "failure", "is_garbage", "cause"),
-    [
-        ("udpin:127.0.0.1:1", 0, "", False, "no_client"),
-        ("udpin:127.0.0.1:1", 1, "", False, "client_silent"),
-        ("tcpin:127.0.0.1:1", 1, "", True, "garbage"),
-        ("udpout:127.0.0.1:1", 1, "", False, "client_silent"),
-        ("udpout:127.0.0.1:1", 1, "ECONNREFUSED", False, "client_unreachable"),
-        ("udpout:client.test:1", 0, "", False, "client_unreachable"),
-        ("tcp:127.0.0.1:1", 0, "ECONNREFUSED", False, "client_unreachable"),
-        ("serial:/dev/absent:57600", 0, "ENOENT", False, "device_unavailable"),
-    ],
-)
-def test_each_silent_endpoint_has_its_cause(
-    daemon: Daemon, url: str, clients: int, failure: str, is_garbage: bool, cause: str
-) -> None:
-    """And no other; a device that cannot be opened is a fault, all else a warning."""
-    config = EndpointConfig("autopilot", parse_url(url))
-    counters = SimpleNamespace(frames=0, garbage_bytes=64 * is_garbage)
-    ports = [SimpleNamespace(name=f"client{number}") for number in range(clients)]
-    daemon.local.append(
-        SimpleNamespace(
-            name="autopilot",
-            ports=ports,
-            counters=counters,
-            frames_sent=0,
-            failures={failure: 1} if failure else {},
-            policy=config.make_policy(),
-        )
-    )
-    daemon.parts.config.endpoints.append(config)
-    daemon.set_up(role="all", system_ids="all")
-    daemon.sample()
-    assert daemon.findings() == {}
-    daemon.now += 5.0
-    daemon.sample()
-    (finding,) = daemon.findings().values()
-    assert (finding.cause, finding.name) == (cause, "autopilot")
-    assert finding.severity is (Severity.FAULT if cause == "device_unavailable" else Severity.WARNING)
-    assert not failure or f"({failure})" in finding.text
