@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 
 from tests.core.harness import KEY_B, Pair, quiet
-from tests.daemon.frames import command_long, heartbeat
+from tests.daemon.frames import command_long
 from uavlinkd.config import PeerConfig
 from uavlinkd.core.refusals import RefusalReport, Refused
 from uavlinkd.core.settings import PeerSettings
@@ -97,39 +95,6 @@ def test_one_a_second_and_severe_ones_first() -> None:
         "drone1: (DIS)ARM withheld there, role or list",
         *[""] * 3,
     ]
-
-
-@pytest.mark.parametrize(
-    ("refused", "text"),
-    [
-        (ARM, "drone1: (DIS)ARM withheld there, role or list"),
-        (Refused(75, 22, 4, 1), "drone1: TAKEOFF withheld there, role or list"),
-        (Refused(76, 176, 1, 1), "drone1: SET_MODE withheld there, system id"),
-        (Refused(76, 65000, 9, 1), "drone1: 65000 withheld there, too many"),
-        (Refused(23, 0, 200, 1), "drone1: PARAM_SET withheld there, policy"),
-        (Refused(0, 0, 8, 1), None),
-        (Refused(30, 0, 2, 1), None),
-        (Refused(253, 0, 2, 1), None),
-        (Refused(0xFFFFFF, 0, 2, 1), None),
-    ],
-)
-def test_only_what_a_pilot_sent_on_purpose(refused: Refused, text: str | None) -> None:
-    """Commands, parameters, missions and setpoints; no heartbeats, reports and unknown messages."""
-    cockpit = Cockpit()
-    cockpit.claim(0.5, refused)
-    note = cockpit.next(1.0)
-    assert (note and note.text) == text
-
-
-def test_commands_withheld_here() -> None:
-    """This end's own policy: with its role."""
-    cockpit = Cockpit()
-    cockpit.withhold(command_long(400, 255), heartbeat(9))
-    assert cockpit.next(1.0) == Note(TextSeverity.WARNING, "drone1: (DIS)ARM withheld here, role swarm-member", 1)
-    lists = Cockpit(role="all", deny_out=["MAV_CMD_NAV_TAKEOFF"])
-    lists.link.config = replace(lists.link.config, policy={})
-    lists.withhold(command_long(22, 255))
-    assert lists.next(1.0) == Note(TextSeverity.WARNING, "drone1: TAKEOFF withheld here, role or list", 1)
 
 
 @pytest.mark.parametrize("name", ["d", "n" * 14, "n" * 64])
