@@ -136,18 +136,6 @@ def test_first_security_line_needs_no_limit(monkeypatch: pytest.MonkeyPatch) -> 
     assert written.phases() == [BEGAN]
 
 
-def test_line_that_exceeds_the_limit_follows_later() -> None:
-    """A condition that lasts is logged as soon as the limit permits, with its whole count."""
-    written = Written()
-    for number in range(LINES_BURST):
-        written.conditions.note((f"kind{number}", "b"), 0.0)
-    written.lines.clear()
-    written.run(("late_kind", "b"), begin=1, end=1 / LINES_PER_S)
-    assert written.lines == []
-    written.run(("late_kind", "b"), begin=1 / LINES_PER_S, end=3 / LINES_PER_S)
-    assert any(line[:2] == (BEGAN, ("late_kind", "b")) and line[2] > 100 for line in written.lines)
-
-
 def test_last_lines_are_written_when_the_daemon_stops() -> None:
     """They need no limit: one for each open condition. One that was not logged has its first line."""
     written = Written()
@@ -157,34 +145,6 @@ def test_last_lines_are_written_when_the_daemon_stops() -> None:
     written.conditions.close()
     assert written.phases() == LINES_BURST * [ENDED] + 2 * [BEGAN]
     assert {line[2] for line in written.lines} == {7}
-
-
-def test_omitted_lines_are_counted() -> None:
-    """A condition that ended before the limit permitted its line is counted in the next line."""
-    written = Written()
-    for number in range(LINES_BURST + 3):
-        written.conditions.note((f"kind{number}", "b"), 0.0)
-    written.run(begin=1, end=QUIET_S + 40)
-    written.lines.clear()
-    written.conditions.note(("bad_tag", "b"), QUIET_S + 40)
-    ((phase, key, _, _, omitted),) = written.lines
-    assert (phase, key, omitted) == (BEGAN, ("bad_tag", "b"), 3)
-
-
-def test_removed_peer_has_its_last_lines_and_starts_again() -> None:
-    """Its conditions end at once; those of other peers continue."""
-    limits = LineLimits()
-    written = Written(limits)
-    for name in ("b", "c"):
-        written.conditions.note(("malformed", name), 1.0)
-    written.conditions.close(lambda key: key[1] == "b")
-    limits.omit("drop", "b")
-    limits.forget(lambda name: name == "b")
-    assert [line[:2] for line in written.lines[2:]] == [(ENDED, ("malformed", "b"))]
-    assert ("malformed", "c") in written.conditions
-    assert ("malformed", "b") not in written.conditions
-    written.conditions.note(("malformed", "b"), 2.0)
-    assert written.lines[-1] == (BEGAN, ("malformed", "b"), 1, 0.0, 0)
 
 
 @pytest.mark.parametrize("reason", ["bad_tag", "malformed"])

@@ -9,33 +9,15 @@ from typing import Any, cast
 
 import pytest
 
-from tests.core.harness import KEY_A, Named, Pair
-from tests.policies import TRUSTED
-from uavlinkd.config import PeerConfig as Peer
-from uavlinkd.config.keys import encode_key
-from uavlinkd.core.constants import PROTOCOL_VERSION
-from uavlinkd.core.drops import Detail, DropReason
+from tests.core.harness import Named
+from uavlinkd.core.drops import DropReason
 from uavlinkd.core.outputs import Dropped
 from uavlinkd.core.path import Path
-from uavlinkd.core.settings import PeerSettings
 from uavlinkd.link import drop_summary
 from uavlinkd.link.conditions import HOUR_S
 from uavlinkd.link.drop_summary import PERSISTENT_S, DropSummary, Fact, ShellReason
-from uavlinkd.link.peer_link import Carriage, PeerLink
 from uavlinkd.mavlink.headers import Header
 from uavlinkd.mavlink.policy.gate import Refusal
-from uavlinkd.ops import metrics
-from uavlinkd.ops.link_problems import LinkProblem
-
-
-def test_link_problems_are_what_the_status_counts() -> None:
-    """Status, metrics and log have the same names."""
-    pair = Pair()
-    link = PeerLink(
-        Peer(PeerSettings("alpha", KEY_A.public), (), TRUSTED), Carriage(pair.b.node, lambda _: None), 0.0
-    )
-    link.peers.append(pair.b.peer)
-    assert set(link.problems(0.0)) == set(LinkProblem) <= {key for _, key, *_ in metrics._OF_PEER}
 
 
 class Recorder:
@@ -67,36 +49,6 @@ def recorder() -> Recorder:
 def summary(recorder: Recorder) -> DropSummary:
     """A summary that writes to the recorder."""
     return DropSummary(recorder)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize(
-    ("detail", "last"),
-    [
-        ("", "from 10.0.0.1:5790"),
-        ("x25519", "suite x25519 from 10.0.0.1:5790"),
-        (bytes(32), f"key {encode_key(bytes(32))} from 10.0.0.1:5790"),
-        (1, f"uavlink/1, older than uavlink/{PROTOCOL_VERSION} of this daemon, from 10.0.0.1:5790"),
-        (8, f"uavlink/8, newer than uavlink/{PROTOCOL_VERSION} of this daemon, from 10.0.0.1:5790"),
-    ],
-)
-def test_dropped_datagram_is_logged_with_its_source(
-    recorder: Recorder, summary: DropSummary, detail: Detail, last: str
-) -> None:
-    """The line has the address, and the key, suite or version that the core refused."""
-    summary.add_dropped(Dropped(DropReason.UNKNOWN_PEER, None, Path(0, ("10.0.0.1", 5790)), 1, detail), 100.0)
-    ((event, facts),) = recorder.lines
-    assert (event, facts["last"]) == ("datagrams_dropped", last)
-    assert "who" not in facts
-
-
-def test_refused_frame_is_logged_with_its_message(recorder: Recorder, summary: DropSummary) -> None:
-    """A withheld frame is an info line, not a warning: our own policy works as configured."""
-    header = Header(30, 7, 1)
-    summary.add_refused("drone1", header, Refusal.RATE_LIMITED, 100.0, to_them=False)
-    summary.add_refused("drone1", header, Refusal.RATE_LIMITED, 100.0, to_them=True)
-    facts = {"reason": "rate_limited", "who": "drone1", "last": "ATTITUDE of system 7"}
-    facts["meaning"] = Refusal.RATE_LIMITED.meaning
-    assert recorder.lines == [("frames_refused", {**facts, "count": 1}), ("info: frames_withheld", facts)]
 
 
 def test_flood_formats_text_for_written_lines_only(
