@@ -1,4 +1,4 @@
-"""The paths of a peer in the status, and the figures of a link with several paths."""
+"""The figures of a link with several paths."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from uavlinkd.config import PeerConfig as Peer
 from uavlinkd.core.outputs import Transmit
 from uavlinkd.core.settings import PeerSettings
 from uavlinkd.link.peer_link import PeerLink, Rates
-from uavlinkd.link.status import paths_status
 from uavlinkd.system.addresses import Address
 
 ROUND_TRIP_S = 0.05
@@ -46,24 +45,6 @@ def flown(seconds: float, lost_each: int = 0) -> tuple[Pair, PeerLink]:
         if step % 40 == 0:
             link.measure(now)
     return pair, link
-
-
-def test_each_path_is_described() -> None:
-    """The best one first, with what it carries; the dead one with its reason."""
-    pair, link = flown(30.0)
-    best, dead = paths_status(link, lambda _: ("lte", None), 30.0)
-    assert (best["network"], best["address"], best["is_configured"]) == ("lte", "192.0.2.2:14600", True)
-    assert (best["state"], best["role"], best["carries"]) == ("usable", "best", ["critical", "stream", "bulk"])
-    assert best["round_trip_s"] == pytest.approx(ROUND_TRIP_S, abs=0.03)
-    assert best["loss_in"] == best["loss_out"] == 0
-    state = pair.a.peer.paths.find(AT_B)
-    assert state is not None
-    assert (best["bytes_sent"], best["bytes_received"]) == (state.bytes_sent, state.bytes_received)
-    rate = best["bytes_out_s"]
-    assert isinstance(rate, float)
-    assert 20 * 42 <= rate <= 20 * 42 + 200
-    assert (dead["address"], dead["state"], dead["role"]) == ("198.51.100.9:4000", "unproven", "standby")
-    assert (dead["carries"], dead["answered_s"], dead["round_trip_s"]) == ([], None, None)
 
 
 def test_figures_of_a_link_with_several_paths_are_those_of_the_path_in_use() -> None:

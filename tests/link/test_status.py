@@ -50,20 +50,3 @@ async def test_the_link_is_described(stage: Stage) -> None:
 def refuse(constant: str) -> Any:
     """What JSON does not have."""
     raise AssertionError(constant)
-
-
-async def test_before_and_after_a_link(stage: Stage) -> None:
-    """A peer that was never there is ``waiting``, one that went is ``lost``; nothing is made up for either."""
-    a, b = stage.pair()
-    await stage.start(a, linked=False)
-    waiting = (await a.status())["peers"]["drone1"]
-    assert waiting["state"] == "waiting"
-    assert [waiting[key] for key in ("path", "last_received_s", "handshake_s", "round_trip_s", "session")] == [
-        None
-    ] * 5
-    await stage.start(b)
-    await a.until_linked()
-    await b.stop()
-    lost = (await a.until(lambda status: status["peers"]["drone1"]["state"] == "lost"))["peers"]["drone1"]
-    assert lost["session"] is None
-    assert lost["last_received_s"] >= 0
