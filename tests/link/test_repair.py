@@ -3,18 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from statistics import median
 from typing import cast
 
-import pytest
-
-from tests.link.two_radios import Network, Radio
-from tests.samples import attitude, command, heartbeat
-from uavlinkd.core.drops import DropReason
+from tests.samples import command
 from uavlinkd.core.outputs import Transmit
 from uavlinkd.core.path import Path
 from uavlinkd.core.path_state import PathCondition, PathState
-from uavlinkd.core.settings import Link, Redundancy
 from uavlinkd.link.copies import (
     AVERAGE_S,
     HOLD_S,
@@ -24,7 +18,6 @@ from uavlinkd.link.copies import (
     SPACING_S,
     Copies,
     Repair,
-    transmissions_for,
 )
 from uavlinkd.link.drop_summary import ShellReason
 from uavlinkd.link.networks import NetworkBudget
@@ -54,14 +47,6 @@ class _Lossy:
 def paths(*lossy: _Lossy) -> Sequence[PathState]:
     """As the state of repair wants them."""
     return cast(Sequence[PathState], lossy)
-
-
-@pytest.mark.parametrize(
-    ("loss", "times"), [(0.0, 1), (0.005, 1), (0.05, 2), (0.1, 3), (0.2, 4), (0.3, 5), (0.4, 6), (0.5, 7), (1.0, 7)]
-)
-def test_transmissions_leave_half_a_percent(loss: float, times: int) -> None:
-    """As far as seven do."""
-    assert transmissions_for(loss) == times
 
 
 def test_repair_begins_above_two_percent_and_ends_below_one_for_a_while() -> None:
@@ -226,56 +211,3 @@ def test_rate_of_repeats_is_limited_on_average() -> None:
     assert many.copies.dropped == {ShellReason.COPY_OVER_BUDGET: 10}
     many.copies.clear()
     assert not many.copies.is_waiting
-
-
-def in_use(network: Network, seconds: float) -> None:
-    """Telemetry in one direction, a heartbeat and a command a second in both."""
-    network.establish()
-    for tick in range(int(seconds * 20)):
-        network.alpha.send(attitude(tick))
-        if tick % 20 == 0:
-            for end in (network.alpha, network.bravo):
-                end.send(heartbeat(tick % 250))
-                end.send(command(tick))
-        network.run(network.now + 0.05)
-
-
-def test_lossy_path_is_repaired_and_repair_keeps_on() -> None:
-    """The estimate does not count repaired frames as delivered datagrams, so repair does not switch itself off."""
-    network = Network([Radio(0.01, 0.3)], seed=3)
-    in_use(network, 20.0)
-    estimates: list[float] = []
-    for _ in range(30):
-        in_use(network, 2.0)
-        assert network.alpha.link.is_repairing
-        assert network.bravo.link.is_repairing
-        loss, lost = network.alpha.peer.paths.states[0].loss_to_repair()
-        if lost >= 20:  # of one session
-            estimates.append(loss)
-    assert median(estimates) == pytest.approx(0.3, abs=0.05)
-    commands = [frame for frame in network.bravo.delivered if frame.header.msgid == 76]
-    assert len(commands) >= 0.9 * 80
-    assert network.bravo.peer.traffic.drops[DropReason.DUPLICATE] > 100
-    assert network.bravo.peer.traffic.drops[DropReason.REPLAYED] == 0
-
-
-def test_peer_without_redundancy_is_not_repaired() -> None:
-    """The setting says so."""
-    network = Network([Radio(0.01, 0.3)], Link(redundancy=Redundancy.NONE))
-    in_use(network, 20.0)
-    assert not network.alpha.link.is_repairing
-
-
-def test_nothing_is_repeated_while_the_network_is_gone() -> None:
-    """What repeats cost does not grow."""
-    network = Network([Radio(0.01, 0.3)])
-    in_use(network, 20.0)
-    end = network.alpha
-    end.send(command(1))
-    assert end.link.output.copies.is_waiting
-    end.node.set_socket_state(0, network.now, is_up=False)
-    state, repeats = end.peer.paths.states[0], end.link.output.copies
-    before = state.repeats, repeats.repeats_sent, repeats.repeat_bytes
-    network.run(network.now + 0.5)
-    assert (state.repeats, repeats.repeats_sent, repeats.repeat_bytes) == before
-    assert not repeats.is_waiting

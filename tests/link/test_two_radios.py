@@ -9,21 +9,18 @@ import pytest
 
 from tests.link.two_radios import End, Network, Radio
 from tests.mavlink.egress.links import CLASS_OF
-from tests.samples import attitude, command, manual_control, number_of, read_by_name, value
-from uavlinkd.core.constants import CRITICAL_ENVELOPE_LIMIT
+from tests.samples import attitude, command, manual_control, read_by_name, value
 from uavlinkd.core.path_state import PathCondition
-from uavlinkd.link.drop_summary import ShellReason
 from uavlinkd.link.peer_output import PeerOutput
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
 from uavlinkd.mavlink.frames import Frame
 
 FAST, SLOW = Radio(0.02), Radio(0.1)
-GENTLE = {"alpha": EgressSettings(coalesce_s=0.05)}
 
 
-def network(*radios: Radio, egress: dict[str, EgressSettings] | None = None) -> Network:
+def network(*radios: Radio) -> Network:
     """Both ends have all their paths."""
-    made = Network(radios, egress=egress)
+    made = Network(radios)
     made.establish()
     for end in (made.alpha, made.bravo):
         end.sent.clear()
@@ -33,32 +30,6 @@ def network(*radios: Radio, egress: dict[str, EgressSettings] | None = None) -> 
 def radios_of(end: End, *frames: Frame) -> dict[bytes, Counter[int]]:
     """How many datagrams with each of these frames an end sent on each radio. Frames are readable in an envelope."""
     return {frame.raw: Counter(sent.radio for sent in end.sent if frame.raw in sent.datagram) for frame in frames}
-
-
-def test_critical_envelopes_are_short_and_bit_identical() -> None:
-    """Forty commands together: each envelope fits every path, and its copy is the same datagram."""
-    pair = network(FAST, SLOW)
-    commands = [command(number) for number in range(40)]
-    pair.alpha.send(*commands)
-    pair.run(pair.now + 0.5)
-    datagrams = [sent.datagram for sent in pair.alpha.sent if any(frame.raw in sent.datagram for frame in commands)]
-    assert set(Counter(datagrams).values()) == {2}
-    assert max(map(len, datagrams)) <= CRITICAL_ENVELOPE_LIMIT
-    assert radios_of(pair.alpha, *commands) == {frame.raw: {0: 1, 1: 1} for frame in commands}
-
-
-def test_waiting_frames_are_sent_by_class_too() -> None:
-    """A coalescing delay: the command leaves at once along both paths, the attitudes later along the best one."""
-    pair = network(FAST, SLOW, egress=GENTLE)
-    began = pair.now
-    pair.alpha.send(attitude(1), command(1))
-    pair.run(began + 0.01)
-    pair.alpha.send(attitude(2))
-    assert radios_of(pair.alpha, attitude(1), command(1)) == {attitude(1).raw: {}, command(1).raw: {0: 1, 1: 1}}
-    pair.run(began + 0.2)
-    (envelope,) = [sent for sent in pair.alpha.sent if attitude(1).raw in sent.datagram]
-    assert attitude(2).raw in envelope.datagram
-    assert envelope.at == pytest.approx(began + 0.05)
 
 
 def test_answer_to_a_parameter_request_is_critical_and_a_list_is_not() -> None:
@@ -74,35 +45,6 @@ def test_answer_to_a_parameter_request_is_critical_and_a_list_is_not() -> None:
 
 RADIO_BITS_S = 9600
 TELEMETRY_MODEM = Radio(0.15, budget_bits_s=RADIO_BITS_S)
-
-
-def wire_bits(end: End, radio: int, since: float) -> int:
-    """What an end sent on a radio, with IPv4 and UDP headers."""
-    return sum(8 * (len(sent.datagram) + 28) for sent in end.sent if sent.radio == radio and sent.at >= since)
-
-
-@pytest.mark.long
-def test_joystick_copies_on_a_slow_radio_are_the_newest_ones() -> None:
-    """50 Hz of MANUAL_CONTROL: the modem carries a part of it, in half of its budget. Probes and echoes are extra."""
-    pair = network(FAST, TELEMETRY_MODEM)
-    began, seconds = pair.now, 20
-    for number in range(50 * seconds):
-        pair.alpha.send(manual_control(number))
-        pair.run(pair.now + 0.02)
-    copies = pair.alpha.link.output.copies
-    assert wire_bits(pair.alpha, 1, began) < 0.7 * RADIO_BITS_S * seconds
-    assert copies.dropped[ShellReason.COPY_REPLACED] > 10 * seconds
-    ages = [
-        sent.at - (began + number * 0.02)
-        for number in range(50 * seconds)
-        for sent in pair.alpha.sent
-        if sent.radio == 1 and manual_control(number).raw in sent.datagram
-    ]
-    assert len(ages) > 3 * seconds
-    assert max(ages) < 0.1
-    delivered = [number_of(frame) for frame in pair.bravo.delivered]
-    assert delivered == sorted(delivered)
-    assert len(delivered) == 50 * seconds
 
 
 def test_copies_that_wait_are_not_counted_as_lost_by_their_path() -> None:
