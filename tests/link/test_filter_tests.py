@@ -58,21 +58,6 @@ def scene() -> Scene:
     return scene
 
 
-def test_relay_is_asked_three_times_for_the_same_token(scene: Scene) -> None:
-    """Then nothing waits."""
-    assert not scene.tests.ended.is_set()
-    (token,) = scene.asked(T)
-    assert scene.tests.next_at == T + c.FILTER_TRY_S
-    assert not scene.asked(T + 0.1)
-    assert scene.asked(scene.tests.next_at) == scene.asked(scene.tests.next_at) == [token]
-    assert scene.tests.next_at == pytest.approx(T + 3 * c.FILTER_TRY_S)
-    assert not scene.asked(scene.tests.next_at)
-    assert scene.tests.ended.is_set()
-    assert scene.tests.next_at == float("inf")
-    assert not scene.asked(T + 60)
-    assert scene.passes == [None]
-
-
 @pytest.mark.parametrize(("answers", "passes"), [(0, None), (1, None), (2, False), (3, False)])
 def test_answers_without_a_token_show_a_filter(answers: int, passes: bool | None, scene: Scene) -> None:
     """Unless there is one answer only: the token may have been lost."""
@@ -160,17 +145,6 @@ def test_tests_that_run_are_not_begun_again(scene: Scene) -> None:
     assert scene.passes == []
     (other,) = scene.asked(T + 10)
     assert other != token
-
-
-@pytest.mark.parametrize(("srtt_s", "try_s"), [(0.01, 0.3), (0.25, 0.5), (5.0, 1.2)])
-def test_slow_path_has_more_time(srtt_s: float, try_s: float) -> None:
-    """Within limits: a person waits."""
-    scene = Scene()
-    (state,) = scene.link.peer.paths.states
-    state.srtt_s = srtt_s
-    scene.tests.begin([scene.link], T)
-    assert len(scene.asked(T)) == 1
-    assert scene.tests.next_at == T + try_s
 
 
 def test_best_path_from_each_socket_is_tested() -> None:

@@ -10,14 +10,12 @@ from tests.core.harness import AT_B, KEY_B, Pair, quiet, run
 from uavlinkd.config import RelayConfig
 from uavlinkd.core import constants as c
 from uavlinkd.core import outputs as o
-from uavlinkd.core.constants import NEVER
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.path import Path, relayed
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.relay_records import WAITING, Bind, Bound, Record
 from uavlinkd.core.settings import PeerSettings
 from uavlinkd.link.relay_link import BIND_SOON_S, RelayHandles, RelayLink
-from uavlinkd.link.relays import SILENT_RARE_S, SILENT_S, _Silence
 
 LINK = quiet(features=c.FEATURE_RECORDS)
 ONE, TWO = bytes([7]) * 32, bytes([8]) * 32
@@ -81,17 +79,6 @@ def scene() -> Scene:
     return Scene()
 
 
-def test_bind_is_repeated_until_it_is_answered(scene: Scene) -> None:
-    """Soon at first, then each time after twice as long, up to once a second."""
-    now, waits = T, []
-    for _ in range(7):
-        assert scene.binds(now) == [(ONE, TWO)]
-        assert not scene.binds(now)
-        waits.append(scene.link.next_at - now)
-        now = scene.link.next_at
-    assert waits == pytest.approx([BIND_SOON_S, 0.2, 0.4, 0.8, *[c.BIND_RETRY_S] * 3])
-
-
 def test_bind_that_is_answered_is_repeated_rarely(scene: Scene) -> None:
     """More often while a peer has not asked for this one."""
     assert scene.binds(T)
@@ -152,41 +139,6 @@ def test_relay_is_asked_along_the_socket_of_the_path_that_failed(scene: Scene) -
     assert scene.link.do_due(T + 1.25)
     scene.link.ask(relayed(1, "vps", 5))
     assert not scene.link.do_due(T + 2)
-
-
-def test_peer_whose_path_failed_is_bound_again(scene: Scene) -> None:
-    """The relay may answer and yet drop data: a NAT has given this member another address there."""
-    assert scene.binds(T)
-    scene.bound(T, (ONE, 5), (TWO, 6))
-    scene.link.ask(relayed(0, "vps", 6))
-    assert scene.binds(T + 1) == [(TWO,)]
-    scene.link.ask(relayed(0, "vps", 99))
-    assert scene.binds(T + 2) == []
-
-
-def test_silence_of_a_steady_peer_is_noticed_sooner() -> None:
-    """A ground station that sends a heartbeat a second is not silent between two of them."""
-    steady = _Silence(0.0)
-    assert not any(steady.look(number, number / 10, number / 10) for number in range(1, 31))
-    assert steady.due_at == 3.0 + SILENT_S
-    assert not steady.look(30, 3.0, 3.0 + SILENT_S - 0.1)
-    assert steady.look(30, 3.0, 3.0 + SILENT_S)
-    rare = _Silence(0.0)
-    assert not any(rare.look(quarter // 4, quarter // 4, quarter / 4) for quarter in range(40))
-    assert rare.due_at == 9.0 + SILENT_RARE_S
-    assert rare.look(9, 9.0, 9.0 + SILENT_RARE_S)
-
-
-def test_relay_is_asked_as_long_as_the_peer_is_silent() -> None:
-    """At one interval. A peer that was never there is silent too."""
-    for received_at, asked_at in ((-NEVER, 0.0), (0.5, 1.6)):
-        silence = _Silence(0.0)
-        moments: list[float] = []
-        while len(moments) < 4:
-            now = silence.due_at
-            if silence.look(1, received_at, now):
-                moments.append(now - asked_at)
-        assert moments == pytest.approx([number * SILENT_RARE_S for number in range(4)])
 
 
 def test_previous_key_of_a_relay_is_accepted_until_the_new_one_is_confirmed() -> None:
