@@ -131,18 +131,6 @@ def test_other_keys_do_not_hide_the_own_one(scene: Scene) -> None:
     assert OWN_KEY not in scene.seen(scene.link, 11.0).details
 
 
-def test_errors_of_sending_and_icmp_differ(scene: Scene) -> None:
-    """What this kernel refuses is certain, what a message reports is a hint."""
-    scene.evidence.add_failure("EPERM", THERE, 1.0)
-    scene.evidence.add_failure("ENOMEM", None, 1.0)
-    scene.evidence.add_report(errno.ECONNREFUSED, THERE, 2.0)
-    scene.evidence.add_report(9999, THERE, 2.0)
-    for kind in ("EPERM", f"{REPORTED}ECONNREFUSED", f"{REPORTED}OSError"):
-        assert scene.evidence.seen(kind, scene.link, 3.0) is not None
-    assert scene.evidence.seen("ECONNREFUSED", scene.link, 3.0) is None
-    assert scene.evidence.seen_anywhere("ENOMEM", 3.0) is not None
-
-
 def test_errors_of_a_candidate_are_not_those_of_another_peer_of_its_host(scene: Scene) -> None:
     """A candidate of one peer may be another port of the host of a peer that is well."""
     scene.evidence.add_failure("EPERM", (HOST, 40000), 1.0)

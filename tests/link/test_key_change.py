@@ -69,15 +69,6 @@ def test_every_pair_of_keys_that_may_be_right_is_tried() -> None:
     assert len(pairings(Peer(PeerSettings("b", now), (), TRUSTED), has_previous_key=False)) == 1
 
 
-def test_previous_keys_are_loaded(tmp_path: Path) -> None:
-    """Both kinds of previous keys come from the file."""
-    config = load(tmp_path, OUR_LINE, was(THEIRS_BEFORE))
-    assert config.previous_private_key is not None
-    assert config.previous_private_key.reveal() == keys.decode_key(PREVIOUS)
-    before = keys.decode_key(keys.public_key_text(THEIRS_BEFORE))
-    assert [peer.previous_public_key for peer in config.peers] == [before, None]
-
-
 @pytest.mark.parametrize(
     ("own", "theirs", "key"),
     [

@@ -5,13 +5,9 @@ from __future__ import annotations
 import pytest
 
 from uavlinkd.link.serial_networks import (
-    GROWTH,
     LATER_S,
     LEAST_SHARE,
-    SHARE_AFTER,
-    SHARE_UNANSWERED,
     SHORTEST_OF_S,
-    UNANSWERED,
     LineRate,
 )
 
@@ -27,17 +23,6 @@ def test_rate_stays_while_round_trips_vary_a_little() -> None:
     assert not rate.add_round_trip(0.2, 0.0)
     assert not rate.add_round_trip(0.2 + WAIT_S + LATER_S, 1.0)
     assert rate.bits_s(1.0) == FULL
-
-
-def test_late_answer_halves_the_rate_which_grows_again() -> None:
-    """By 5 % a second, up to the full rate."""
-    rate = LineRate(FULL, ENVELOPE, 0.0)
-    rate.add_round_trip(0.2, 0.0)
-    assert rate.add_round_trip(0.21 + WAIT_S + LATER_S, 5.0)
-    assert rate.bits_s(5.0) == FULL / 2
-    assert rate.bits_s(6.0) == pytest.approx(FULL / 2 * GROWTH)
-    assert rate.bits_s(5.0) == pytest.approx(FULL / 2 * GROWTH)  # time does not go back
-    assert rate.bits_s(60.0) == FULL
 
 
 def test_one_queue_halves_the_rate_once() -> None:
@@ -73,16 +58,3 @@ def test_a_day_without_a_look_grows_to_the_full_rate() -> None:
     rate.add_round_trip(0.2, 0.0)
     assert rate.add_round_trip(5.0, 5.0)
     assert rate.bits_s(86_400.0) == FULL
-
-
-def test_questions_without_answers_lower_the_rate_until_one_is_answered() -> None:
-    """The queue may be longer than answers may take. After the answer the rate grows from half of the full one."""
-    rate = LineRate(FULL, ENVELOPE, 0.0)
-    rate.add_round_trip(0.2, 0.0)
-    rate.add_unanswered(UNANSWERED - 1, 10.0)
-    assert rate.bits_s(10.0) == FULL
-    rate.add_unanswered(1, 11.0)
-    assert rate.bits_s(11.0) == rate.bits_s(100.0) == FULL * SHARE_UNANSWERED
-    rate.add_round_trip(0.2, 101.0)
-    assert rate.bits_s(101.0) == FULL * SHARE_AFTER
-    assert rate.bits_s(102.0) == pytest.approx(FULL * SHARE_AFTER * GROWTH)

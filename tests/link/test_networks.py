@@ -14,7 +14,7 @@ from structlog.testing import capture_logs
 from tests.link.socket_states import SocketStateLog
 from tests.needs import need
 from uavlinkd.config import NetworkConfig
-from uavlinkd.endpoints.sockets import BindError, Presence, look, network_socket
+from uavlinkd.endpoints.sockets import BindError, Presence, network_socket
 from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.link import networks as module
 from uavlinkd.link.conditions import LINES_BURST, LINES_PER_S
@@ -128,33 +128,6 @@ def test_interface_with_another_number_gets_another_socket(scene: Scene) -> None
     assert scene.core.states == [(V4, False), (V4, True)]
 
 
-def test_disappeared_network_is_reported_once(scene: Scene) -> None:
-    """With the reason; another reason of the same absence is not worth a line."""
-    scene.set(LTE, Presence(1, ("127.0.0.1", "::1")))
-    scene.networks.open(0.0)
-    with capture_logs() as logs:
-        scene.networks.check(0.0)
-        for second, reason in ((1.0, "the interface lo is down"), (2.0, "there is no interface lo")):
-            scene.set(LTE, Presence(reason=reason))
-            scene.networks.check(second)
-    assert [(line["event"], line.get("reason")) for line in logs[2:]] == [
-        ("network_disappeared", "the interface lo is down")
-    ]
-    assert set(scene.sockets) == {ALSO_V4}
-    status = scene.networks.status()
-    assert status["lte"] == {
-        "interface": "lo",
-        "address": None,
-        "is_metered": True,
-        "budget_bits_s": 0,
-        "is_present": False,
-        "absent_because": "there is no interface lo",
-        "addresses": [],
-        "ports": [],
-        "serial": None,
-    }
-
-
 def test_changed_address_keeps_the_socket(scene: Scene) -> None:
     """The kernel chooses the source of each datagram; the core probes the paths of that family again."""
     scene.set(LTE, Presence(1, ("127.0.0.1",)))
@@ -200,27 +173,6 @@ def test_port_of_listen_that_is_taken_meanwhile(make_scene: Callable[..., Scene]
     assert scene.port(0) == port
 
 
-@pytest.mark.parametrize(
-    ("hosts", "address", "reaches"),
-    [
-        (("fe80::1",), ("2001:db8::9", 1, 0, 0), False),
-        (("fe80::1", "2001:db8::1"), ("2001:db8::9", 1, 0, 0), True),
-        (("fe80::1",), ("fe80::9", 1, 0, 1), True),
-        (("fe80::1",), ("fe80::9", 1, 0, 2), False),
-        ((), ("2001:db8::9", 1, 0, 0), True),
-    ],
-)
-def test_ipv6_address_is_used_where_it_may_be_reached(
-    make_scene: Callable[..., Scene], hosts: tuple[str, ...], address: tuple[str, int, int, int], reaches: bool
-) -> None:
-    """Each interface has a link-local address, with which it reaches its neighbours only."""
-    scene = make_scene(LTE)
-    scene.set(LTE, Presence(1 if hosts else 0, hosts))
-    scene.networks.open(0.0)
-    assert scene.networks.may_reach(1, address) is reaches
-    assert scene.networks.may_reach(0, ("192.0.2.1", 1))
-
-
 def test_flapping_interface_cannot_fill_the_log(scene: Scene) -> None:
     """The lines are limited, and the log ends with the state of the network."""
     states = (Presence(1, ("127.0.0.1",)), Presence(reason="the interface lo is down"))
@@ -234,15 +186,6 @@ def test_flapping_interface_cannot_fill_the_log(scene: Scene) -> None:
             if logs[-1]["event"] == "network_disappeared":
                 break
     assert len(logs) <= LINES_BURST + second * LINES_PER_S + 2
-
-
-def test_what_the_machine_has() -> None:
-    """Loopback is there; another interface and another address are not."""
-    assert look("lo", None).hosts[0] == "127.0.0.1"
-    assert look(None, "127.0.0.1") == Presence(0, ("127.0.0.1",))
-    assert look("absent0", None) == Presence(reason="there is no interface absent0")
-    assert look(None, "192.0.2.77") == Presence(reason="no interface has 192.0.2.77")
-    assert look(None, "fe80::1%absent0") == Presence(reason="no interface has fe80::1%absent0")
 
 
 def test_interface_that_may_not_be_bound_to_is_explained(monkeypatch: pytest.MonkeyPatch) -> None:

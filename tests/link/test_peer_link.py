@@ -19,7 +19,6 @@ from tests.core.harness import (
     QUIET,
     Pair,
     Side,
-    datagrams,
     exchange,
     of,
     payloads,
@@ -39,7 +38,6 @@ from uavlinkd.core.path import Path
 from uavlinkd.core.settings import Link, PeerSettings
 from uavlinkd.core.timers import Schedule
 from uavlinkd.link.peer_link import Carriage, PeerLink, radio_figures
-from uavlinkd.link.status import peer_status
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
 from uavlinkd.mavlink.frames import Frame, SplitCounters, split_payload
 from uavlinkd.mavlink.radio_status import LinkFigures
@@ -133,26 +131,6 @@ def test_a_peer_whose_addresses_are_other_ones_is_not_called_at_those_before() -
     assert pair.a.peer.path == AT_B
 
 
-@pytest.mark.parametrize(("addresses", "reported_at"), [((PeerAddress(Address("192.0.2.2", 14600)),), 5), ((), 10)])
-def test_silent_peer_is_reported_in_time(addresses: tuple[PeerAddress, ...], reported_at: int) -> None:
-    """After 5 s if this daemon connects to it, after 10 s if it has to connect; again only after it was up."""
-    pair = Pair(link_a=Link(suites=PLAIN.suites, timers=QUIET), link_b=PLAIN)
-    config = Peer(PeerSettings("bravo", KEY_B.public, None, PLAIN), addresses, TRUSTED)
-    link = link_of(pair.a, config, lambda _: None)
-    assert [second for second in range(20) if link.is_overdue(float(second))] == list(range(reported_at, 20))
-    link.change(
-        replace(config, addresses=(PeerAddress(Address("192.0.2.3", 14600)),)), 200.0
-    )  # reported again, with the new address
-    assert [second for second in range(200, 220) if link.is_overdue(float(second))] == list(range(205, 220))
-    link.set_paths([AT_B], 300.0)
-    pair.establish(300.0)
-    assert not link.is_overdue(300.0)
-    link.measure(300.0)
-    link.peer.is_up = False
-    assert not link.is_overdue(304.9)
-    assert link.is_overdue(305.0)
-
-
 def measured(config: Peer, figures: LinkFigures) -> PeerLink:
     """A link that measured this."""
     link = link_of(Pair().a, config, lambda _: None)
@@ -219,27 +197,6 @@ def refuse(link: PeerLink, *raws: bytes) -> None:
         link.policy.incoming.check(frame, 0.0)
 
 
-def test_from_the_refusal_to_the_status() -> None:
-    """Three refused commands and a refused heartbeat: one report, which stays in the status."""
-    pair, sent = Pair().establish(), list[Output]()
-    there = member_of(pair, sent)
-    here = link_of(pair.a, Peer(PeerSettings("bravo", KEY_B.public, None, QUIET_LINK), (), TRUSTED), lambda _: None)
-    refuse(there, frames.ground_heartbeat(), *(frames.command_long(ARM, 255),) * 3, frames.heartbeat(9))
-    for second in range(1, 10):
-        there.report_refusals(float(second))
-        for datagram in datagrams(sent):
-            pair.a.receive(datagram, float(second))
-        sent.clear()
-    claims = peer_status(here, 71.0, lambda _: (None, None))["refused_there"]
-    assert isinstance(claims, list)
-    assert all(claim["last_s"] == 70.0 for claim in claims)
-    assert {(claim["message"], claim["command"], claim["reason"], claim["count"]) for claim in claims} == {
-        ("HEARTBEAT", None, "foreign_system", 1),
-        ("COMMAND_LONG", "MAV_CMD_COMPONENT_ARM_DISARM", "message_not_allowed", 3),
-        ("HEARTBEAT", None, "ground_station_not_allowed", 1),
-    }
-
-
 @pytest.mark.parametrize("budget", [0, 4000])
 def test_reports_leave_room_for_frames(budget: int) -> None:
     """On a link with a budget, a report is sent while no frame waits and the budget covers it, and it is charged."""
@@ -259,16 +216,3 @@ def test_reports_leave_room_for_frames(budget: int) -> None:
         link.report_refusals(30.0)
         assert len(of(sent, Transmit)) == 1
         assert link.output.egress.demand(30.0) > before
-
-
-def test_no_report_while_the_peer_is_lost() -> None:
-    """It is sent when the peer is back."""
-    pair, sent = Pair().establish(), list[Output]()
-    link = member_of(pair, sent)
-    refuse(link, frames.command_long(ARM, 255))
-    pair.b.peer.is_up = False
-    link.report_refusals(1.0)
-    assert sent == []
-    pair.b.peer.is_up = True
-    link.report_refusals(2.0)
-    assert len(of(sent, Transmit)) == 1

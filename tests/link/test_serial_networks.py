@@ -2,29 +2,20 @@
 
 from __future__ import annotations
 
-import errno
 from pathlib import Path as FilePath
 from types import SimpleNamespace
 from typing import Any, cast
-from unittest.mock import patch
 
 import pytest
 import structlog
-from structlog.testing import capture_logs
 
 from tests.endpoints.test_line_framing import report
 from tests.link.socket_states import SocketStateLog
-from tests.waiting import until
-from uavlinkd.config import NetworkConfig, PeerAddress
-from uavlinkd.config.model import SERIAL
-from uavlinkd.core.constants import LINE_BYTES
-from uavlinkd.core.path import Path
-from uavlinkd.endpoints import serial as serial_devices
+from uavlinkd.config import NetworkConfig
 from uavlinkd.endpoints.serial_line import SerialLine
 from uavlinkd.endpoints.url import SerialUrl
 from uavlinkd.link.diagnosis import _line_noise, _modem_reports
-from uavlinkd.link.networks import wire_bytes
-from uavlinkd.link.serial_networks import NOISE_PIECES, PLUG_IN, SHARE_UNANSWERED, UNANSWERED, SerialNetworks
+from uavlinkd.link.serial_networks import NOISE_PIECES, SHARE_UNANSWERED, UNANSWERED, SerialNetworks
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.stall import StallWatch
 
@@ -45,51 +36,6 @@ def serial(tmp_path: FilePath, states: SocketStateLog) -> SerialNetworks:
     sik = NetworkConfig("sik", budget_bits_s=BITS_S, serial=line, air_bits_s=24_000)
     stall = StallWatch(monotonic(), lambda pause_s: None)
     return SerialNetworks([sik], NUMBER, states, stall, structlog.get_logger())
-
-
-async def test_path_and_peer_at_the_other_end(serial: SerialNetworks) -> None:
-    """One path for each line, to the peer that names it; a datagram costs its framing there."""
-    assert serial.path_to("sik") == Path(NUMBER, ("serial", 0))
-    assert serial.path_to("lte") is None
-    links = [
-        SimpleNamespace(config=SimpleNamespace(addresses=[PeerAddress(SERIAL, name)]), peers=[name])
-        for name in ("sik", "other")
-    ]
-    assert list(map(str, serial.peers_at(cast(Any, links))[NUMBER])) == ["sik"]
-    assert wire_bytes(bytes(100), Path(NUMBER, ("serial", 0))) == 100 + LINE_BYTES
-
-
-async def test_absent_device_is_reported(serial: SerialNetworks, states: SocketStateLog) -> None:
-    """To the core after each change of paths, once to the log, and in the status."""
-    with capture_logs() as logs:
-        serial.report_absent()
-        serial.do_housekeeping()
-        serial.do_housekeeping()
-    assert states.states == [(NUMBER, False)]
-    assert [line["event"] for line in logs] == ["network_not_here_yet"]
-    ((absent, remedy),) = serial.absent().items()
-    assert absent.startswith("sik (")
-    assert remedy == PLUG_IN
-    status = serial.networks[0].status(monotonic())
-    assert (status["is_present"], status["addresses"]) == (False, [])
-
-
-@pytest.mark.parametrize(
-    ("error", "remedy"),
-    [("EACCES", "dialout"), ("EBUSY", "ModemManager"), ("ENOENT", "plug it in"), ("ENOTTY", "name")],
-)
-async def test_remedy_names_what_keeps_the_device_closed(serial: SerialNetworks, error: str, remedy: str) -> None:
-    """A missing permission, and another process that has the device, are not mended by the plug."""
-    line = serial.networks[0].line
-    with patch.object(serial_devices, "open_device", side_effect=OSError(getattr(errno, error), "")):
-        line.start()
-        try:
-            await until(lambda: bool(line.failures))
-        finally:
-            line.close()
-    ((absent, text),) = serial.absent().items()
-    assert absent == f"sik ({line.url.device} cannot be opened ({error}))"
-    assert remedy in text
 
 
 async def test_change_is_due_at_once(
