@@ -172,44 +172,6 @@ def test_rule_that_depends_on_the_frame_is_checked_for_each_frame(stage: Stage) 
     assert (stage.withheld, stage.refused) == ([("c", Refusal.RATE_LIMITED)] * 8, [])
 
 
-def test_flow_is_routed_once_even_if_policy_decides_about_each_frame(
-    stage: Stage, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A role that limits the rate of telemetry does not cause a new decision of the router for each frame."""
-    stage.switch.set_policy(stage.a.port, policy(rate_in={"ATTITUDE": 4}))
-    stage.switch.set_policy(stage.b.port, policy(deny_out=["ATTITUDE"]))
-    routed: list[Frame] = []
-    route = stage.router.route
-
-    def count(
-        frame: Frame, source: switch_module.Port, now: float, **options: bool
-    ) -> tuple[switch_module.Port, ...]:
-        routed.append(frame)
-        return route(frame, source, now, **options)
-
-    monkeypatch.setattr(stage.router, "route", count)
-    stage.forward(stage.a.port, [attitude(number) for number in range(10)], 0.0)
-    stage.forward(stage.c.port, [attitude(0)], 0.1)
-    assert len(routed) == 2  # once for each source
-    assert stage.delivered() == (0, 0, 2)
-    assert (len(stage.refused), len(stage.withheld)) == (8, 2)
-    assert stage.router.unrouted == {Unrouted.DUPLICATE: 1}
-
-
-def test_clients_of_an_endpoint_each_have_the_rate(stage: Stage) -> None:
-    """They share one policy. The second one, and one that connects again, receives as much as the first."""
-    shared = policy(rate_out={"ATTITUDE": 1})
-    for client in (stage.b, stage.c):
-        stage.switch.set_policy(client.port, shared)
-    for second in range(30):
-        stage.forward(stage.a.port, [attitude(second)], float(second))
-    assert stage.delivered() == (0, 30, 30)
-    stage.switch.remove(stage.b.port)
-    stage.switch.add(stage.b.port, shared)
-    stage.forward(stage.a.port, [attitude(number) for number in range(31, 41)], 29.0)
-    assert stage.delivered() == (0, 2, 1)
-
-
 def test_system_that_a_port_may_no_longer_send_as_is_not_looked_for_there(stage: Stage) -> None:
     """A reload takes a system from a peer: the peer gets no more copies of frames for that system."""
     stage.forward(stage.b.port, [attitude(1, system=2), attitude(2, system=3)], 0.0)
