@@ -125,17 +125,6 @@ async def test_file_in_place_of_the_socket_is_kept(path: Path) -> None:
     assert path.read_text() == "precious"
 
 
-async def test_missing_folder_has_a_remedy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The message has the command. Only a service's folder is made by the service."""
-    folder = tmp_path / "missing"
-    server = ControlServer(folder / "control.sock", lambda _: {})
-    with pytest.raises(ControlError, match=rf"run `mkdir -p {folder}`; for a service, write control_socket"):
-        await server.start()
-    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
-    with pytest.raises(ControlError, match=rf"run `mkdir -p {folder}`, or start the service, which makes it$"):
-        await server.start()
-
-
 async def test_answer_may_take_long(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With `on_waiting`, neither side times out, and the client is called after each wait."""
     monkeypatch.setattr(control, "REQUEST_TIMEOUT_S", 0.05)

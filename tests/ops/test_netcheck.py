@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from uavlinkd.ops.netcheck import ONE_VIEW, Filtered, Mapped, behaviours, report
+from uavlinkd.ops.netcheck import Filtered, Mapped, behaviours
 
 PRIVATE, PUBLIC, OTHER = "192.168.1.5:5790", "203.0.113.7:40001", "203.0.113.7:40002"
 
@@ -75,19 +75,4 @@ def test_filtering_follows_from_the_tokens(passes: tuple[bool | None, ...], filt
     results = tuple(shown(one) for one in passes)
     assert list(behaviours(answer(view("one", "a:1", PRIVATE), filtering=results))) == [
         (None, Mapped.NO_NAT, filtered)
-    ]
-
-
-def test_report_of_a_machine_behind_nat() -> None:
-    """Line by line."""
-    seen = view("one", "192.0.2.1:5790", PUBLIC, network="lte")
-    assert list(report(answer(seen, filtering=(shown(False),)))) == [
-        "UDP          gets out: 2 of 2 relays answer",
-        "relay        one: up, 23 ms",
-        "relay        two: up, 23 ms",
-        f"seen as      {PUBLIC} by one at 192.0.2.1:5790 on lte",
-        "mapping      unknown on lte",
-        "filtering    address- and port-dependent on lte",
-        f"             {ONE_VIEW}",
-        f"candidates   {PUBLIC}, {PRIVATE}",
     ]

@@ -7,7 +7,6 @@ from typing import Any
 import pytest
 
 from uavlinkd.ops.ping import INTERVAL_S, ping
-from uavlinkd.ops.status_screen import addresses
 
 DIRECT: dict[str, Any] = {
     "address": "203.0.113.7:5790",
@@ -46,28 +45,3 @@ def test_each_question_has_a_line_for_each_path(paths: list[dict[str, Any]], is_
             " bulk",
             "1: relayed via vps, no answer, loss 0 % in, 2 % out, carries no frames",
         ]
-
-
-def test_paths_along_several_ports_of_a_relay_look_different() -> None:
-    """By the address of the relay. If two share that, by their numbers. One that is unique stays short."""
-    other_port = {**RELAYED, "number": 2, "relay_address": "198.51.100.2:5791"}
-    assert addresses([RELAYED, other_port]) == [
-        "relayed via vps at 198.51.100.2:5790",
-        "relayed via vps at 198.51.100.2:5791",
-    ]
-    assert addresses([RELAYED, other_port, {**RELAYED, "number": 3}]) == [
-        "relayed via vps at 198.51.100.2:5790 path 1",
-        "relayed via vps at 198.51.100.2:5791",
-        "relayed via vps at 198.51.100.2:5790 path 3",
-    ]
-    assert addresses([DIRECT, RELAYED, {**RELAYED, "network": "lte"}]) == [
-        "203.0.113.7:5790",
-        "relayed via vps",
-        "relayed via vps",
-    ]
-    lines: list[str] = []
-    ping(lambda: {"paths": [RELAYED, other_port]}, 1, lines.append, lambda _: None)
-    assert [line.split(",")[0] for line in lines] == [
-        "1: relayed via vps at 198.51.100.2:5790",
-        "1: relayed via vps at 198.51.100.2:5791",
-    ]

@@ -60,16 +60,3 @@ def test_table_agrees_with_the_gates(case: str) -> None:
     rows = [row for row in table_rows(policy, data) if row.subject in dialect.GROUPS]
     assert _read({row.subject: row.incoming for row in rows}) == _passing(policy.incoming)
     assert _read({row.subject: row.outgoing for row in rows}) == _passing(policy.outgoing)
-
-
-def test_rates_of_the_role_are_shown() -> None:
-    """A role's rate is shown where no rate of the configuration replaces it."""
-    data: dict[str, object] = {"role": "swarm-member", "system_ids": [1]}
-
-    def shown(**own: object) -> str:
-        (rates,) = (row for row in table_rows(compile_policy(data | own), data | own) if row.subject == "rates")
-        return rates.incoming
-
-    assert shown() == "HEARTBEAT 5/s, position 50/s, VFR_HUD 250/s"
-    assert shown(rate_in={"ATTITUDE": 2}) == "ATTITUDE 2/s, HEARTBEAT 5/s, position 50/s, VFR_HUD 250/s"
-    assert shown(rate_in={"position": 2}) == "position 2/s, HEARTBEAT 5/s"

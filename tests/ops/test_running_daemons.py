@@ -117,15 +117,3 @@ def test_reload_of_several_daemons_needs_a_name(daemons: Daemons, capsys: pytest
     assert main(["reload", "--socket", str(paths[1])]) == OK
     assert capsys.readouterr().out == "drone2 reloaded\n"
     assert daemons.requests == [("drone2", "reload")]
-
-
-@pytest.mark.parametrize("command", ["status", "status --json", "status --watch", "reload", "peer list"])
-def test_without_a_daemon_the_message_says_what_to_do(
-    daemons: Daemons, capsys: pytest.CaptureFixture[str], command: str
-) -> None:
-    """One line names the key of the file and the options."""
-    assert main(command.split()) == FAILED
-    err = capsys.readouterr().err
-    assert err.count("\n") == 1
-    assert "control_socket = " in err
-    assert "--config FILE or --socket PATH" in err
