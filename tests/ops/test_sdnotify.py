@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from uavlinkd.ops import sdnotify
 from uavlinkd.ops.sdnotify import Supervisor
 
 PID = 4242
@@ -46,17 +45,6 @@ def manager(path: str) -> Iterator[Manager]:
     manager.sock.close()
 
 
-def test_states_are_reported_in_order(manager: Manager, path: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The states are ready, reloading with the monotonic time in microseconds, ready again, and stopping."""
-    monkeypatch.setattr(sdnotify, "monotonic", lambda: 12.5)
-    supervisor = Supervisor({"NOTIFY_SOCKET": path}, PID)
-    supervisor.ready()
-    supervisor.reloading()
-    supervisor.ready()
-    supervisor.stopping()
-    assert manager.received() == ["READY=1", "RELOADING=1\nMONOTONIC_USEC=12500000", "READY=1", "STOPPING=1"]
-
-
 @pytest.mark.parametrize("name", [None, "@", "relative/path"])
 def test_without_a_manager_no_message_is_sent(name: str | None) -> None:
     """The variable is missing, or does not name a Unix socket."""
@@ -77,26 +65,6 @@ def test_hanging_manager_does_not_delay_the_daemon(manager: Manager, path: str) 
     manager.received()
     supervisor.turn("at last", 1.0)
     assert manager.received() == ["READY=1", "STATUS=at last"]
-    supervisor.stopping()
-
-
-def test_status_is_reported_when_it_changes(manager: Manager, path: str) -> None:
-    """A note is appended until the next `ready` without a note."""
-    supervisor = Supervisor({"NOTIFY_SOCKET": path}, PID)
-    for status in ("0 of 2 peers up", "0 of 2 peers up", "1 of 2 peers up"):
-        supervisor.turn(status, 0.0)
-    supervisor.ready("the new configuration was refused")
-    supervisor.turn("1 of 2 peers up", 1.0)
-    supervisor.ready()
-    supervisor.turn("1 of 2 peers up", 2.0)
-    assert manager.received() == [
-        "STATUS=0 of 2 peers up",
-        "STATUS=1 of 2 peers up",
-        "READY=1",
-        "STATUS=1 of 2 peers up; the new configuration was refused",
-        "READY=1",
-        "STATUS=1 of 2 peers up",
-    ]
     supervisor.stopping()
 
 
