@@ -24,10 +24,6 @@ from uavlinkd.lab.sim.loopback_ports import free_port
 POLL_S = 0.01
 
 
-OF_ANOTHER_VERSION = (
-    "import sys; from uavlinkd.core import constants; constants.PROTOCOL_VERSION = {0};"
-    " constants.PROTOCOL_NAME = b'uavlink/{0}'; from uavlinkd.cli import main; sys.exit(main())"
-)
 WITHOUT_UVLOOP = "import sys; sys.modules['uvloop'] = None; from uavlinkd.cli import main; sys.exit(main())"
 
 
@@ -68,8 +64,6 @@ class DaemonProcess:
         """The command that starts the daemon, such as ``ip netns exec NAME``. It execs the daemon: one process."""
         self.environ: dict[str, str] = {}
         """Additional variables of its environment, for every start."""
-        self.protocol_version: int | None = None
-        """The version of the protocol that it uses; None for its own."""
         self._process: asyncio.subprocess.Process | None = None
         self._reading: asyncio.Task[None] | None = None
 
@@ -141,8 +135,6 @@ class DaemonProcess:
 
     def _executable(self) -> tuple[str, str]:
         """The daemon, as it is; every other one as if uvloop were not installed, so that both loops are tested."""
-        if self.protocol_version is not None:
-            return "-c", OF_ANOTHER_VERSION.format(self.protocol_version)
         return ("-c", WITHOUT_UVLOOP) if self.name.endswith(ODD) else ("-m", "uavlinkd")
 
     async def ready(self) -> Status:

@@ -1,4 +1,4 @@
-"""Where daemons find each other: IPv6, names, stale addresses, peers that call."""
+"""Daemons and clients at IPv6 addresses."""
 
 from __future__ import annotations
 
@@ -63,14 +63,3 @@ async def test_a_link_between_link_local_addresses(stage: Stage) -> None:
     a.add_peer(b, [f"[{host}%{interface}]:{ports[1]}"], psk)
     b.add_peer(a, [], psk)
     await cross(stage, a, b)
-
-
-async def test_names_are_looked_up(stage: Stage) -> None:
-    """``localhost`` and this machine's own name are addresses too; one that does not resolve is reported once."""
-    a, b = stage.daemon("drone0"), stage.daemon("drone1")
-    psk = stage.psk()
-    port = b.sockaddr[1]
-    a.add_peer(b, [f"no-such-drone.invalid:{port}", f"localhost:{port}"], psk)
-    b.add_peer(a, [a.address.replace("127.0.0.1", "localhost")], psk)
-    await cross(stage, a, b)
-    assert (await a.until_logged("name_not_resolved"))["host"] == "no-such-drone.invalid"

@@ -1,4 +1,4 @@
-"""How a daemon starts, fails to start, and ends."""
+"""How a daemon starts and ends."""
 # ruff: noqa: ASYNC221, ASYNC240  (short commands and small local files; nothing else waits in this loop)
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from tests.daemon.harness import Stage
 from tests.daemon.process import DaemonProcess
 from tests.needs import need
 from tests.waiting import PATIENCE_S
-from uavlinkd.lab.sim.loopback_ports import free_port
 
 
 def run(daemon: DaemonProcess, *command: str) -> subprocess.CompletedProcess[str]:
@@ -72,36 +71,6 @@ async def test_signals_during_a_flood_still_end_it(stage: Stage) -> None:
     finally:
         flooding.cancel()
         await asyncio.gather(flooding, return_exceptions=True)
-
-
-@pytest.mark.parametrize("taken", ["listen", "endpoint", "metrics", "control"])
-async def test_a_port_in_use_is_reported_in_one_line(stage: Stage, taken: str) -> None:
-    """Where an address is taken, the daemon says which in one line and ends with status 1; the first is unharmed."""
-    first, second, peer = stage.daemon("first"), stage.daemon("second"), stage.daemon("peer")
-    for daemon in (first, second):
-        daemon.add_peer(peer, [peer.address])
-    host, port = first.add_endpoint("autopilot")
-    if taken == "listen":
-        second.config["listen"] = first.config["listen"]
-        address = first.address
-    elif taken == "endpoint":
-        second.add_endpoint("autopilot", f"udpin:{host}:{port}")
-        address = f"{host}:{port}"
-    elif taken == "metrics":
-        address = f"127.0.0.1:{free_port()}"
-        for daemon in (first, second):
-            daemon.config["metrics"] = {"listen": address}
-    else:
-        address = second.config["control_socket"] = str(first.folder / "control.sock")
-    await stage.start(first, linked=False)
-    result = run(second, "run")
-    assert result.returncode == 1
-    key = {"endpoint": "endpoint.url (autopilot)", "metrics": "metrics.listen", "control": "control_socket"}
-    (line,) = result.stderr.splitlines()
-    assert line.startswith(f"{second.config_file}: {key.get(taken, taken)}: ")
-    assert address in line
-    assert result.stdout == ""
-    assert (await first.status())["name"] == "first"
 
 
 async def test_check_survives_a_reader_that_leaves(stage: Stage) -> None:
