@@ -8,7 +8,6 @@ import pytest
 
 from tests.daemon.harness import Stage
 from tests.daemon.two_hosts import LTE, MESH, PORT, TwoHosts, address_of, interface_of
-from tests.faults.talk import CriticalVoice
 from tests.namespaces import need_namespaces
 
 pytestmark = pytest.mark.long
@@ -36,59 +35,6 @@ async def test_interface_that_is_removed_and_plugged_in_again(stage: Stage) -> N
         networks.ip(f"link set {interface_of(LTE)} down")
         await networks.until_path(MESH)
         await networks.talk.back(monotonic())
-
-
-async def test_two_networks_on_one_interface(stage: Stage) -> None:
-    """Each with an address of its own; one address is taken away and returns."""
-    need_namespaces()
-    async with TwoHosts(stage) as networks:
-        networks.ip(f"link delete {interface_of(MESH)}")
-        networks.ip(f"address add {address_of(LTE, 11)}/24 dev {interface_of(LTE)}")
-        networks.vehicle.config["network"] = [
-            {"name": "one", "address": address_of(LTE, 1)},
-            {"name": "two", "address": address_of(LTE, 11)},
-        ]
-        networks.vehicle.config["peer"][0]["addresses"] = [f"{address_of(LTE, 2)}:{PORT}"]
-        networks.ground.config["peer"][0]["addresses"] = []
-        await networks.start()
-        for network, place, other in (("one", 1, 11), ("two", 11, 1)):
-            networks.ip(f"address delete {address_of(LTE, place)}/24 dev {interface_of(LTE)}")
-            # Deleting a first address takes the others of its subnet with it.
-            networks.ip(f"address replace {address_of(LTE, other)}/24 dev {interface_of(LTE)}")
-            status = await networks.until_present(network, is_present=False)
-            assert status["absent_because"] == f"no interface has {address_of(LTE, place)}"
-            await networks.until_path(LTE, networks.ground, other)
-            await networks.talk.back(monotonic())
-            networks.ip(f"address replace {address_of(LTE, place)}/24 dev {interface_of(LTE)}")
-            await networks.until_present(network)
-
-
-async def test_no_critical_frame_is_lost_while_networks_come_and_go(stage: Stage) -> None:
-    """Down and up, removed and plugged in again, another address: one at a time, 50 frames/s in both directions."""
-    need_namespaces()
-    async with TwoHosts(stage) as networks:
-        await networks.start(CriticalVoice)
-        await networks.until_usable(LTE, MESH)
-        began = monotonic()
-        for network in (LTE, MESH):
-            networks.ip(f"link set {interface_of(network)} down")
-            await networks.until_present(network, is_present=False)
-            networks.ip(f"link set {interface_of(network)} up")
-            await networks.until_present(network)
-            await networks.until_usable(network)
-        networks.ip(f"link delete {interface_of(LTE)}")
-        await networks.until_present(LTE, is_present=False)
-        await networks.ground.until(lambda status: not status["networks"][LTE]["is_present"])
-        networks.plug_in(LTE)
-        await networks.until_usable(LTE)
-        networks.ip(f"address flush dev {interface_of(MESH)}")
-        networks.configure(MESH, place=7)
-        await networks.vehicle.until(lambda status: status["networks"][MESH]["addresses"][0] == address_of(MESH, 7))
-        ended = monotonic()
-        await networks.talk.check_lost_none(began, ended, networks.vehicle, networks.ground)
-        networks.talk.check_no_copies()
-        sent = [len([at for at in voice.sent_at.values() if began <= at < ended]) for voice in networks.talk.voices]
-        print(f"critical frames: {sent} sent in {ended - began:.1f} s, {networks.talk.lost(began, ended)} lost")
 
 
 async def test_check_shows_what_each_network_reaches(stage: Stage) -> None:

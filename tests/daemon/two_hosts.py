@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from types import TracebackType
 from typing import Any, Self
 
 from tests.daemon.harness import Stage
-from tests.daemon.process import DaemonProcess
-from tests.faults.talk import Talk, Voice, prepare
+from tests.faults.talk import Talk, prepare
 from tests.namespaces import Namespace
 
 PORT = 5790
@@ -21,12 +20,6 @@ _SUBNETS = {LTE: "10.213.81", MESH: "10.213.82", ONLY: "10.213.77"}
 def address_of(network: str, place: int) -> str:
     """The IPv4 address of a host on a network: place 1 is the vehicle, 2 the ground station."""
     return f"{_SUBNETS[network]}.{place}"
-
-
-def _usable(status: Mapping[str, Any]) -> set[str]:
-    """The subnets with a usable path, in the status of a daemon with one peer."""
-    (peer,) = status["peers"].values()
-    return {path["address"].rpartition(".")[0] for path in peer["paths"] if path["state"] == "usable"}
 
 
 def interface_of(network: str) -> str:
@@ -83,9 +76,9 @@ class TwoHosts:
         for host in self.hosts:
             host.close()
 
-    async def start(self, voice: type[Voice] = Voice) -> None:
+    async def start(self) -> None:
         """Start both daemons with a talking client each, and wait until each hears the other."""
-        self.talk = prepare(self.vehicle, self.ground, (self.hosts[0].path, self.hosts[1].path), voice)
+        self.talk = prepare(self.vehicle, self.ground, (self.hosts[0].path, self.hosts[1].path))
         await self._stage.start(*self._daemons)
         await self.talk.start()
 
@@ -111,11 +104,7 @@ class TwoHosts:
         (vehicle, ground), interface = self.hosts, interface_of(network)
         vehicle.ip(f"link add {interface} type veth peer name {interface} netns {ground.name}")
         ground.ip(f"address add {address_of(network, 2)}/24 dev {interface}", f"link set {interface} up")
-        self.configure(network)
-
-    def configure(self, network: str, place: int = 1) -> None:
-        interface = interface_of(network)
-        self.hosts[0].ip(f"address add {address_of(network, place)}/24 dev {interface}", f"link set {interface} up")
+        vehicle.ip(f"address add {address_of(network, 1)}/24 dev {interface}", f"link set {interface} up")
 
     # What the daemons say.
 
@@ -127,16 +116,10 @@ class TwoHosts:
         seen: dict[str, Any] = status["networks"][network]
         return seen
 
-    async def until_usable(self, *networks: str) -> None:
-        """Wait until both ends say that the paths on all these networks are usable."""
-        for daemon in self._daemons:
-            await daemon.until(lambda status: {_SUBNETS[network] for network in networks} <= _usable(status))
-
-    async def until_path(self, network: str, daemon: DaemonProcess | None = None, place: int | None = None) -> None:
-        """Wait until the vehicle, or another daemon, sends along this network; to this place there."""
-        daemon = daemon or self.vehicle
-        start = f"{_SUBNETS[network]}." if place is None else f"{address_of(network, place)}:"
-        (peer,) = [peer["name"] for peer in daemon.config["peer"]]
-        await daemon.until(
+    async def until_path(self, network: str) -> None:
+        """Wait until the vehicle sends along this network."""
+        start = f"{_SUBNETS[network]}."
+        (peer,) = [peer["name"] for peer in self.vehicle.config["peer"]]
+        await self.vehicle.until(
             lambda status: status["peers"][peer]["state"] == "up" and status["peers"][peer]["path"].startswith(start)
         )
