@@ -12,26 +12,6 @@ import pytest
 from uavlinkd.system.threads import Threads
 
 
-async def test_calls_beyond_the_limit_wait_for_a_thread() -> None:
-    """A thread runs the waiting calls one after the other."""
-    some = Threads(2, "test-most")
-    gate, running = threading.Semaphore(0), threading.Semaphore(0)
-
-    def work(number: int) -> tuple[int, str]:
-        running.release()
-        gate.acquire()
-        return number, threading.current_thread().name
-
-    tasks = [asyncio.create_task(some.run(work, number)) for number in range(6)]
-    for _ in range(2):
-        await asyncio.to_thread(running.acquire)
-    assert not running.acquire(blocking=False)
-    assert sum(thread.name == "test-most" for thread in threading.enumerate()) == 2
-    for _ in tasks:
-        gate.release()
-    assert sorted(await asyncio.gather(*tasks)) == [(number, "test-most") for number in range(6)]
-
-
 async def test_cancelled_run_does_not_wait_for_a_hanging_call() -> None:
     """The call keeps its thread, and its late result is ignored."""
     some = Threads(1, "test-gone")
