@@ -60,18 +60,6 @@ def test_batch_is_split_critical_first_and_keeps_the_order_within_a_class() -> N
     assert split_by_class([command(1)], CLASS_OF, 0.0) == [(Class.CRITICAL, [command(1)])]
 
 
-def test_without_a_budget_each_class_leaves_at_once() -> None:
-    """The queues add nothing but the split."""
-    radio = Radio(NO_BUDGET, None)
-    radio.put(attitude(1), command(1), log_data(1), now=1.0)
-    assert [(now, cls) for now, cls, _ in radio.by_class] == [
-        (1.0, Class.CRITICAL),
-        (1.0, Class.STREAM),
-        (1.0, Class.BULK),
-    ]
-    assert radio.egress.next_deadline() == float("inf")
-
-
 def test_together_frames_share_envelopes_whatever_their_class() -> None:
     """A peer with one path, on a network with a budget."""
     radio = Radio(NO_BUDGET, Bucket(FAST_BITS_S, 0.0), is_split=False)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from collections import Counter
+from functools import partial
 from itertools import pairwise
 from math import inf
 from typing import Any
@@ -14,7 +15,7 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import all as mavlink
 
 from tests.mavlink.egress.links import MAKERS, SLOW, Link, every, flow_of, id_of, play
-from tests.samples import ID, attitude, battery, command, frame, heartbeat, parameter, raws
+from tests.samples import ID, attitude, battery, command, frame, heartbeat, parameter, raws, read
 from uavlinkd.mavlink.classes import Lane
 from uavlinkd.mavlink.dialect import name_of
 from uavlinkd.mavlink.egress.bucket import BURST_S
@@ -119,6 +120,17 @@ def test_parameters_and_telemetry_share_the_budget() -> None:
     for _, raw in link.sent:
         sizes[name_of(id_of(raw))] += len(raw)
     assert sizes["ATTITUDE"] == pytest.approx(sizes["PARAM_VALUE"], rel=0.1)
+
+
+def test_all_states_are_thinned_alike() -> None:
+    """No state starves: each that is offered often enough goes as often as any other, give or take."""
+    link = Link(SLOW)
+    periods = {system: (0.05, 0.1, 0.2, 0.5)[system % 4] for system in range(1, 13)}
+    offers = [one for system, s in periods.items() for one in every(s, partial(attitude, system=system), 30.0)]
+    play(link, offers, until=30.0)
+    counts = Counter(read(raw).header.system for _, raw in link.sent)
+    assert len(counts) == 12
+    assert max(counts.values()) - min(counts.values()) <= 3, counts
 
 
 def test_invented_flows_do_not_displace_the_known() -> None:
@@ -257,3 +269,14 @@ def test_whatever_happens_the_rules_hold(seed: int, budget: int, coalesce: float
             assert level <= burst + core + 1
     assert egress.queued_frames == 0
     assert egress.next_deadline() == inf
+
+
+def test_demand_says_how_much_is_sent_and_dropped() -> None:
+    """As a share of the budget: many times the budget under a flood, none once all is quiet."""
+    flooded = Link(SLOW)
+    play(flooded, every(0.002, attitude, 10.0), until=10.0)
+    assert flooded.egress.demand(10.0) > 10
+    fair = Link(SLOW)
+    play(fair, every(0.5, attitude, 20.0), until=20.0)
+    assert fair.egress.demand(20.0) == pytest.approx(2 * (40 + 51) / 500, rel=0.35)
+    assert fair.egress.demand(60.0) < 0.001

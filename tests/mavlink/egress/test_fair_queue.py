@@ -55,16 +55,6 @@ def bytes_by_source(gone: list[tuple[Frame, Source]]) -> Counter[Source]:
     return sums
 
 
-def test_urgent_frames_of_all_sources_go_first() -> None:
-    """A command goes before what came earlier, from whichever source."""
-    queue, dropped = make()
-    queue.put([attitude(0), parameter(0)], CAPTURED, 0.0)
-    queue.put([attitude(1, 3), command(1), heartbeat(1, 255)], HONEST, 0.0)
-    first = popped(queue)[:2]
-    assert first == [(command(1), HONEST), (heartbeat(1, 255), HONEST)]
-    assert not dropped
-
-
 def test_frame_that_does_not_fit_stays() -> None:
     """The frame whose turn it is goes next, or none does."""
     queue, _ = make()
