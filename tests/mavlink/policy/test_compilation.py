@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 
 from tests.samples import ID, blank
-from uavlinkd.mavlink.dialect import GROUPS
 from uavlinkd.mavlink.dialect_table import COMMANDS
 from uavlinkd.mavlink.policy.alternatives import EFFECTS
 from uavlinkd.mavlink.policy.compilation import Policy, PolicyError, PolicyProblem, compile_policy
@@ -91,14 +90,6 @@ def test_mistake_is_named_with_its_remedy(data: dict[str, object], key: str, rem
     assert remedy in problem.remedy
 
 
-def test_all_mistakes_are_named_at_once() -> None:
-    """One run reports every problem of a file."""
-    data = {"allow": [], "role": 3, "system_ids": [0], "allow_in": 1, "deny_in": [True], "mavlink1": 1}
-    assert [problem.key for problem in problems(data)] == [
-        *("allow", "role", "system_ids[0]", "allow_in", "deny_in[0]", "mavlink1"),
-    ]
-
-
 def test_a_mistake_does_not_affect_a_corrected_list() -> None:
     """A refused list has no effect on the corrected list that follows: True equals 1."""
     data = {"system_ids": "all", "allow_out": []}
@@ -107,17 +98,6 @@ def test_a_mistake_does_not_affect_a_corrected_list() -> None:
 
 
 # The table for people.
-
-
-@pytest.mark.parametrize("role", sorted(ROLES))
-def test_role_compiles_and_is_described(role: str) -> None:
-    """Each preset names only messages that exist, and its table has a line for each group."""
-    made = compile_policy({"role": role, "system_ids": [1]})
-    rows = {row.subject: row for row in made.describe()}
-    assert set(GROUPS) <= set(rows)
-    assert rows["signing"][1:] == ("never", "never")
-    assert (rows["may speak as"].incoming, rows["role"].incoming) == ("1", role)
-    assert bool(made.warnings) is (role == "all")
 
 
 def test_table_describes_the_gate() -> None:

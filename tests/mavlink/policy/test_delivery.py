@@ -278,17 +278,6 @@ def test_frame_may_be_read_as_mavlink1_from_its_own_start() -> None:
     assert client.delivered.separators == 1
 
 
-@pytest.mark.parametrize("tail", [b"\xfe", b"\xfd", b"\xfd\x09", b"\xfd\x09\x01", hidden_header(COMMAND_LONG, 33)])
-def test_separator_ends_every_header(tail: bytes) -> None:
-    """Complete or not, signed or not: behind it a parser looks for the next frame."""
-    gap = hidden.separator(tail, [(0, tail[0] == 0xFE)])
-    assert not set(gap) & {0xFD, 0xFE}
-    end = hidden.end_of_checksum(tail + gap, (0, tail[0] == 0xFE))
-    assert end is not None
-    assert end <= len(tail + gap)
-    assert end == hidden.PAST or not hidden.has_checksum(tail + gap, (0, tail[0] == 0xFE), end, any_extra=True)
-
-
 @pytest.mark.parametrize("seed", range(50))
 def test_separator_completes_no_frame(seed: int) -> None:
     """For any number of open frames, and any place where they end."""

@@ -257,15 +257,6 @@ def test_vehicle_does_not_pass_for_a_ground_station(version: int) -> None:
 # Rates.
 
 
-def test_rate_limits_each_message_and_system_separately() -> None:
-    """Over time a limited message passes at its rate, per system; other messages are not limited."""
-    gate = incoming(rate_in={"ATTITUDE": 10})
-    passed = [sum(gate.check(attitude(1, s), i * 0.02) is None for i in range(500)) for s in (1, 2)]
-    assert all(100 <= n <= 105 for n in passed)  # ten seconds, and the half second that may come at once
-    assert all(gate.check(heartbeat(), 0.0) is None for _ in range(500))
-    assert gate.refused == {(30, Refusal.RATE_LIMITED): 1000 - sum(passed)}
-
-
 @pytest.mark.parametrize("way", ["in", "out"])
 @pytest.mark.parametrize("components", [2, gates.SYSTEM_SHARE])
 def test_components_do_not_starve_one_another(way: str, components: int) -> None:

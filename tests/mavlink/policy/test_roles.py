@@ -212,6 +212,3 @@ def test_own_rate_replaces_the_roles() -> None:
         gate = incoming(role="swarm-member", rate_in=own)
         assert sum(gate.check(attitude(n), n / 400) is None for n in range(400)) == 400
         assert sum(gate.check(heartbeat(n), n / 400) is None for n in range(400)) < 10
-
-
-# The loss that ground control software computes from sequence numbers, if a policy refuses frames.
