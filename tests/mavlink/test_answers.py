@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
-from tests.samples import attitude, command, frame, frames_of, read_by_index, read_by_name, value
+from tests.samples import command, frame, frames_of, read_by_index, read_by_name, value
 from uavlinkd.core.settings import Class
 from uavlinkd.mavlink.answers import ANSWERED_S, MAX_REQUESTS, ParameterAnswers
 from uavlinkd.mavlink.frames import Frame
@@ -65,14 +65,6 @@ def test_any_other_value_is_bulk(request_: Frame, other: Frame) -> None:
     answers = ParameterAnswers()
     answers.note(request_, AT_S)
     assert answers.class_of(other, AT_S) is Class.BULK
-
-
-def test_other_messages_have_the_class_of_the_table() -> None:
-    """Whatever was requested."""
-    answers = ParameterAnswers()
-    answers.note(set_to(b"RTL_ALT"), AT_S)
-    assert answers.class_of(attitude(1), AT_S) is Class.STREAM
-    assert answers.class_of(command(1), AT_S) is Class.CRITICAL
 
 
 def test_frames_of_another_definition_count_for_nothing() -> None:

@@ -9,7 +9,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from tests.samples import ID, attitude, build, command, heartbeat
 from uavlinkd.core.settings import Class
-from uavlinkd.mavlink.classes import INSTANCES, KINDS, Lane, MessageKind
+from uavlinkd.mavlink.classes import INSTANCES, KINDS
 from uavlinkd.mavlink.dialect import GROUPS, name_of
 from uavlinkd.mavlink.screening import screen
 
@@ -57,23 +57,6 @@ def test_mission_transactions_must_be_new_and_reports_about_a_mission_need_not()
     assert may_be_old == set(GROUPS["mission"]) & set(GROUPS["telemetry"])
     assert "MISSION_CURRENT" in may_be_old
     assert not may_be_old & {"MISSION_ITEM_INT", "MISSION_COUNT", "MISSION_SET_CURRENT", "SET_HOME_POSITION"}
-
-
-@pytest.mark.parametrize(
-    ("name", "expected"),
-    [
-        ("HEARTBEAT", MessageKind(Class.CRITICAL, may_be_old=True, lane=Lane.URGENT, is_state=True)),
-        ("STATUSTEXT", MessageKind(Class.CRITICAL, may_be_old=True, lane=Lane.EVENTS, is_state=False)),
-        ("COMMAND_ACK", MessageKind(Class.CRITICAL, may_be_old=False, lane=Lane.URGENT, is_state=False)),
-        ("MISSION_ITEM_INT", MessageKind(Class.CRITICAL, may_be_old=False, lane=Lane.EVENTS, is_state=False)),
-        ("ATTITUDE", MessageKind(Class.STREAM, may_be_old=True, lane=Lane.STATES, is_state=True)),
-        ("ADSB_VEHICLE", MessageKind(Class.STREAM, False, Lane.STATES, True, instance_at=0, instance_bytes=4)),
-        ("LOG_DATA", MessageKind(Class.BULK, may_be_old=False, lane=Lane.EVENTS, is_state=False)),
-    ],
-)
-def test_facts_about_a_message(name: str, expected: MessageKind) -> None:
-    """One of each kind."""
-    assert KINDS[ID[name]] == expected
 
 
 # Which frames of a payload may be delivered while their age is not known.

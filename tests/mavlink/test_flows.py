@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import all as mavlink
 
 from tests.mavlink import dialect_generate
-from tests.samples import ID, attitude, battery, command, frame, heartbeat, parameter
+from tests.samples import ID, attitude, battery, command, frame, heartbeat
 from uavlinkd.mavlink.classes import INSTANCES, KINDS
 from uavlinkd.mavlink.flows import MAX_FLOWS, FlowKey, NewestStates, flow_key
 from uavlinkd.mavlink.frames import Frame
@@ -77,20 +77,6 @@ def test_states_for_different_targets_are_different_flows() -> None:
 
 
 # States of a peer with several paths never go back, and no event is dropped.
-
-
-def test_copies_of_one_flow_in_one_envelope_are_all_delivered() -> None:
-    """They have one order, and are in the order of their sender."""
-    together = [attitude(1), attitude(2), command(1), attitude(3)]
-    assert NewestStates().pick(together, 7) is together
-
-
-def test_other_flows_of_an_older_envelope_are_delivered() -> None:
-    """The newer envelope had another battery, and neither the other vehicle nor the parameter."""
-    newest = NewestStates()
-    newest.pick([attitude(9), battery(9, 0)], 10)
-    late = [attitude(1), attitude(1, 2), battery(1, 0), battery(1, 1), parameter(1), heartbeat(1)]
-    assert newest.pick(late, 9) == [attitude(1, 2), battery(1, 1), parameter(1), heartbeat(1)]
 
 
 ENVELOPES = st.lists(

@@ -70,18 +70,6 @@ def test_every_flipped_bit_is_noticed(raw: bytes) -> None:
 
 
 @forgiving
-@pytest.mark.parametrize("before", [b"", TEXT, b"\xfd", b"\xfe\x09", b"\xfd\x00\x01" + bytes(5), b"\xfe\xff" + TEXT])
-@pytest.mark.parametrize("after", [b"", TEXT, b"\xfd", b"\xfe\xff\x00\x01\x01\x00"])
-@pytest.mark.parametrize("raw", [SHAPES["v2"], SHAPES["v1"], SHAPES["v2 signed"]], ids=["v2", "v1", "signed"])
-def test_frame_is_found_between_garbage(before: bytes, raw: bytes, after: bytes, split: Split) -> None:
-    """Text and false starts before and after a frame cost nothing but themselves, and are all counted."""
-    counters = SplitCounters()
-    assert raws(split(before + raw + after, counters)) == [raw]
-    assert counters.garbage_bytes == len(before) + len(after)
-    assert counters.faults.total() == bool(before) + bool(after)
-
-
-@forgiving
 @shapes
 def test_broken_frame_does_not_swallow_the_next(raw: bytes, split: Split) -> None:
     """A frame with a bad checksum or with bytes missing is dropped alone; the genuine one behind it is found."""

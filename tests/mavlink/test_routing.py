@@ -164,28 +164,6 @@ def test_memory_of_frames_and_decisions_is_bounded(monkeypatch: pytest.MonkeyPat
     assert r.route(frame(raw=b"late"), "b", 0.0) == ()
 
 
-@pytest.mark.parametrize("relays", [False, True])
-def test_mesh_of_daemons_delivers_each_frame_once(relays: bool) -> None:
-    """In a full mesh of four daemons every other autopilot gets a broadcast once, and nothing runs in circles."""
-    nodes = ("d0", "d1", "d2", "d3")
-    routers = {n: router("local", peers=tuple(p for p in nodes if p != n), relays=relays) for n in nodes}
-    for turn, origin in enumerate(nodes * 3):
-        sent = frame(turn + 1, 1)
-        delivered = dict.fromkeys(nodes, 0)
-        waiting = [(origin, "local")]
-        hops = 0
-        while waiting:
-            hops += 1
-            assert hops < 50
-            node, source = waiting.pop(0)
-            for port in routers[node].route(sent, source, float(turn)):
-                if port == "local":
-                    delivered[node] += 1
-                else:
-                    waiting.append((str(port), node))
-        assert delivered == {n: int(n != origin) for n in nodes}
-
-
 PORTS = st.sampled_from(["a", "b", "p", "q"])
 ADDRESSES = st.tuples(st.integers(0, 3), st.integers(0, 2))
 STEPS = st.lists(st.tuples(PORTS, ADDRESSES, ADDRESSES, st.integers(0, 30), st.floats(0, 4)), max_size=60)
