@@ -10,25 +10,14 @@ from contextlib import closing
 from typing import Any, cast
 
 import pytest
-import structlog
 
 from tests.daemon.udp import open_socket
-from tests.endpoints.clients import HOSTS, LOOPS, NewLoop, Recorder, frame, heartbeat, run_in, write
-from tests.needs import need
+from tests.endpoints.clients import LOOPS, NewLoop, Recorder, frame, heartbeat, run_in, write
 from tests.waiting import until
 from uavlinkd.endpoints.error_queue import SEND_ATTEMPTS
-from uavlinkd.endpoints.ports import LocalPort
 from uavlinkd.endpoints.sockets import udp_socket
 from uavlinkd.endpoints.udp import UdpServer
-from uavlinkd.lab.sim.loopback_ports import has_ipv6
-from uavlinkd.link.drop_summary import DropSummary
-from uavlinkd.link.switch import Switch
-from uavlinkd.mavlink.frames import Frame
-from uavlinkd.mavlink.policy.compilation import compile_policy
-from uavlinkd.mavlink.routing import Router
 from uavlinkd.system.addresses import Address
-from uavlinkd.system.clock import monotonic
-from uavlinkd.system.stall import StallWatch
 
 
 class CountingSocket:
@@ -50,41 +39,23 @@ class CountingSocket:
 
 
 class Hub:
-    """An endpoint whose clients reach each other through a switch, as in the daemon."""
+    """An endpoint and its clients."""
 
-    def __init__(self, host: str = "127.0.0.1") -> None:
-        self.host = host
-        self.stall = StallWatch(monotonic(), lambda seconds: None)
-        self.switch = Switch(Router[Any](), self.stall, DropSummary(structlog.get_logger()))
-        self.sock = CountingSocket(udp_socket(Address(host, 0)))
-        self.endpoint = UdpServer("clients", cast(socket.socket, self.sock), self)
+    def __init__(self) -> None:
+        self.sock = CountingSocket(udp_socket(Address("127.0.0.1", 0)))
+        self.endpoint = UdpServer("clients", cast(socket.socket, self.sock), Recorder())
         self.clients: list[socket.socket] = []
-
-    def on_port_opened(self, port: LocalPort) -> None:
-        self.switch.add(port, compile_policy({}, is_local=True))
-
-    def on_port_closed(self, port: LocalPort) -> None:
-        self.switch.remove(port)
-
-    def on_port_silent(self, port: LocalPort) -> None:
-        self.switch.set_silent(port, is_silent=True)
-
-    def on_port_active(self, port: LocalPort) -> None:
-        self.switch.set_silent(port, is_silent=False)
-
-    def on_frames(self, port: LocalPort, frames: list[Frame], now: float, epoch: int, waited_s: float = 0.0) -> None:
-        self.switch.forward(port, frames, now, epoch, waited_s)
 
     async def connect(self) -> socket.socket:
         """A client that has sent a frame."""
-        client = open_socket(self.host)
+        client = open_socket("127.0.0.1")
         client.connect(self.endpoint._sock.getsockname())
         self.clients.append(client)
         await self.send(client, heartbeat())
         return client
 
     async def send(self, client: socket.socket, raw: bytes) -> None:
-        """Send a frame, and wait until the endpoint has forwarded it."""
+        """Send a frame, and wait until the endpoint has read it."""
         before = self.endpoint.counters.frames
         client.send(raw)
         await until(lambda: self.endpoint.counters.frames > before)
@@ -110,41 +81,12 @@ def received(client: socket.socket) -> list[bytes]:
 
 
 @LOOPS
-@HOSTS
-def test_forty_restarts_of_a_client_do_not_add_work_per_frame(new_loop: NewLoop, host: str) -> None:
-    """Each restart has a new port. The old port refuses the next datagram, and gets no other."""
-    need(host != "::1" or has_ipv6(), "an IPv6 loopback")
-
-    async def run() -> None:
-        async with Hub(host) as hub:
-            sender, receiver = await hub.connect(), await hub.connect()
-            closed = set()  # the kernel may choose the same port again
-            for _ in range(40):
-                client = await hub.connect()
-                closed.add(client.getsockname())
-                client.close()
-                await hub.send(sender, frame(0))
-            await until(lambda: len(hub.endpoint.ports) == 2)
-            received(receiver)
-            hub.sock.sent = 0
-            for number in range(100):
-                await hub.send(sender, frame(1000 + number))
-            assert hub.sock.sent == 100
-            assert received(receiver) == [frame(1000 + number) for number in range(100)]
-            assert hub.endpoint.failures["ECONNREFUSED"] >= len(closed) > 20
-            assert set(hub.endpoint.failures) == {"ECONNREFUSED"}
-
-    run_in(new_loop, run())
-
-
-@LOOPS
 def test_a_pending_error_costs_no_other_client_a_frame(new_loop: NewLoop) -> None:
     """The kernel reports a refusal at the next call on the socket, also when that sends to another client."""
 
     async def run() -> None:
         async with Hub() as hub:
             gone, receiver = await hub.connect(), await hub.connect()
-            received(receiver)
             of_gone, of_receiver = hub.endpoint.ports
             gone.close()
             for number in range(10):

@@ -5,7 +5,6 @@ from __future__ import annotations
 from binascii import crc_hqx
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from itertools import pairwise
 
 import pytest
 from fastcrc.crc16 import mcrf4xx
@@ -73,17 +72,6 @@ def test_layout_is_that_of_the_specification() -> None:
     assert encode(b"") == b"\x00\x03\xff\xff\x00"
     crc = crc_hqx(b"a\0b", 0xFFFF).to_bytes(2, "big")
     assert encode(b"a\0b") == b"\x00\x02a\x04b" + crc + b"\x00"
-
-
-@given(st.lists(datagrams, max_size=6), st.data())
-def test_any_datagrams_arrive_however_the_stream_is_cut(sent: list[bytes], data: st.DataObject) -> None:
-    """In order, each once, without noise."""
-    stream = b"".join(map(encode, sent))
-    places = st.lists(st.integers(0, len(stream)), max_size=8)
-    cuts = sorted([0, *data.draw(places), len(stream)])
-    received, decoder = feed_all(stream[a:b] for a, b in pairwise(cuts))
-    assert received == sent
-    assert (decoder.line_noise, decoder.pending_bytes) == (0, 0)
 
 
 def pieces(stream: bytes, cuts: Sequence[int]) -> Iterable[bytes]:

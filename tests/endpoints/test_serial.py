@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import os
 import select
 import termios
@@ -211,15 +210,3 @@ def test_line_rate_is_that_of_the_device_behind_a_link(tmp_path: Path, device: s
     link = tmp_path / "usb-Autopilot"
     link.symlink_to(tmp_path / device)
     assert serial.has_line_rate(str(link)) is serial.has_line_rate(str(tmp_path / device)) is is_uart
-
-
-async def test_closed_endpoint_leaves_the_device_to_others(autopilot: Autopilot, endpoint: SerialEndpoint) -> None:
-    """Closed while open, while opening or while waiting: no report follows, and the device is free."""
-    autopilot.plug_in()
-    await opened(endpoint)
-    endpoint.close()
-    with started(autopilot, "opening") as opening:
-        await asyncio.sleep(0)
-    with started(autopilot, "last") as last:
-        await opened(last)
-    assert recorder(endpoint).closed == recorder(opening).open == []

@@ -17,15 +17,6 @@ from uavlinkd.lab.sim.loopback_ports import free_port, has_ipv6
 from uavlinkd.system.addresses import Address
 
 
-def test_socket_is_bound_and_does_not_block() -> None:
-    """Reading an empty socket returns at once."""
-    port = free_port()
-    with udp_socket(Address("127.0.0.1", port)) as sock:
-        assert sock.getsockname() == ("127.0.0.1", port)
-        with pytest.raises(BlockingIOError):
-            sock.recv(1)
-
-
 def test_the_wildcard_of_ipv6_takes_no_ipv4() -> None:
     """[::]:P and 0.0.0.0:P are two sockets."""
     need(has_ipv6(), "an IPv6 loopback")

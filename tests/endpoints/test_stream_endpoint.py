@@ -9,11 +9,10 @@ from time import monotonic
 
 import pytest
 
-from tests.endpoints.clients import frame, heartbeat, large_frame, recorder, source, write
+from tests.endpoints.clients import frame, large_frame, recorder, write
 from tests.endpoints.stream_pair import CAPACITY, Pair, RationedChannel
 from tests.waiting import until
 from uavlinkd.endpoints.stream_endpoint import READ_BYTES, STALLED_S, Connection
-from uavlinkd.mavlink.stream_splitter import StreamSplitter
 from uavlinkd.system.clock import monotonic as boot_time
 from uavlinkd.system.stall import STALE, STALL_S
 
@@ -72,24 +71,6 @@ async def test_write_to_a_closed_connection_reports_later(pair: Pair) -> None:
     assert list(pair.ports) == []
 
 
-async def test_stale_frames_are_not_sent_after_an_outage(pair: Pair) -> None:
-    """When the client reads again, it gets the rest of the half-sent frame and new frames, and no stale ones."""
-    began = monotonic()
-    count = fill(pair, began - 60)
-    write(pair, pair.connection.port, [large_frame(number) for number in range(count, count + 50)], began - 60)
-    write(pair, pair.connection.port, [frame(1), frame(2)], monotonic())
-    got = bytearray()
-    while pair.connection.outgoing:
-        got += read_all(pair.other)
-        await asyncio.sleep(0)
-    got += read_all(pair.other)
-    frames = [frame.raw for frame in StreamSplitter().feed(bytes(got), 0.0)]
-    assert b"".join(frames) == got
-    assert frames[-2:] == [frame(1), frame(2)]
-    assert len(frames) == pair.frames_sent == count + 52 - pair.failures["stale"]
-    assert pair.failures["stale"] >= 50
-
-
 @pytest.mark.parametrize("reads", [False, True])
 async def test_client_that_never_reads_is_closed(pair: Pair, reads: bool) -> None:
     """After `STALLED_S`, not before, and not if the client read something in between."""
@@ -127,17 +108,6 @@ async def test_channel_that_never_gets_room_has_stalled(pair: Pair) -> None:
     assert pair.failures == {"stale": 1}
     pair.do_housekeeping(now + STALLED_S)
     assert pair.failures == {"stale": 1, "stalled": 1}
-
-
-async def test_command_overtakes_waiting_frames(pair: Pair) -> None:
-    """An urgent frame of one source is sent before earlier frames of another source."""
-    pair.channel.left = len(large_frame(0))
-    write(pair, pair.connection.port, [large_frame(number) for number in range(3)], now := monotonic())
-    write(pair, pair.connection.port, [heartbeat()], now, source("operator"))
-    assert read_all(pair.other) == large_frame(0)
-    pair.channel.left = pair.channel.limit_bytes
-    await until(lambda: pair.frames_sent == 4)
-    assert read_all(pair.other) == heartbeat() + large_frame(1) + large_frame(2)
 
 
 @pytest.mark.parametrize("noticed_by", ["reading", "writing", "waiting for room"])
@@ -182,14 +152,6 @@ def said(pair: Pair, data: bytes) -> list[tuple[list[bytes], int]]:
     pair.other.send(data)
     pair.connection.on_readable(now=0.0)
     return list(zip(recorder(pair).batches[before:], recorder(pair).epochs[before:], strict=True))
-
-
-async def test_bytes_that_waited_during_a_pause_are_stale(pair: Pair) -> None:
-    """All that is read until the stream was empty, and nothing after it."""
-    pair.other.send(frame(1))
-    pause(pair)
-    assert said(pair, frame(2)) == [([frame(1), frame(2)], STALE)]
-    assert said(pair, frame(3)) == [([frame(3)], 1)]
 
 
 async def test_stale_bytes_keep_the_stream_in_step(pair: Pair) -> None:

@@ -16,7 +16,7 @@ import pytest
 from tests.endpoints.clients import frame, large_frame, recorder, write
 from tests.waiting import until
 from uavlinkd.endpoints import tcp
-from uavlinkd.endpoints.tcp import CLIENT_SILENT_S, CLIENTS_PER_ENDPOINT, TcpServer, tcp_listener
+from uavlinkd.endpoints.tcp import CLIENT_SILENT_S, CLIENTS_PER_ENDPOINT, TcpServer
 from uavlinkd.system.addresses import Address
 
 SIOCOUTQNSD = 0x894B
@@ -31,17 +31,6 @@ def connect(server: TcpServer) -> Iterator[Connect]:
     """Connects a client to the server."""
     with ExitStack() as stack:
         yield lambda: stack.enter_context(socket.create_connection(server.address, timeout=60))
-
-
-async def test_address_is_free_again_after_a_restart(server: TcpServer, connect: Connect) -> None:
-    """Connections that this side closed do not keep the next daemon from listening."""
-    address = Address(*server.address)
-    client = connect()
-    server.on_acceptable(now=0.0)
-    server.close()
-    assert client.recv(1) == b""
-    client.close()
-    tcp_listener(address).close()
 
 
 async def test_each_client_is_a_port(server: TcpServer, connect: Connect) -> None:
