@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -12,7 +11,6 @@ from typing import Any
 import pytest
 
 from tests.fleet.vehicles import loaded
-from uavlinkd.cli import main
 from uavlinkd.config import keys
 from uavlinkd.fleet import operations, transaction
 from uavlinkd.fleet.manifest import Fleet, FleetSettings, MemberKind, read_manifest
@@ -290,23 +288,6 @@ def test_interrupted_command_changes_nothing(folder: Path, monkeypatch: pytest.M
     with pytest.raises(KeyboardInterrupt):
         operations.rotate(folder, "drone1", at_once=True)
     assert snapshot(folder) == before
-
-
-def test_next_command_works_as_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The command that ends a rotation names the folder, also if the rotation is repeated."""
-    out = ["--out", str(tmp_path / "a fleet")]
-    assert main(["fleet", "init", "--drones", "2", *out]) == 0
-    assert "uavlinkd run --config NAME.toml" in capsys.readouterr().out
-    assert main(["fleet", "rotate", "drone1", *out]) == 0
-    command = capsys.readouterr().out.splitlines()[-1]
-    assert main(["fleet", "rotate", "drone1", *out]) == 2
-    assert f"`{command}`" in capsys.readouterr().err
-    assert main(shlex.split(command)[1:]) == 0
-    assert main(["fleet", "rotate", "drone1", "--out", str(tmp_path)]) == 2
-    assert "name its folder with --out DIR" in capsys.readouterr().err
-    options = ["--control-socket", "/run/uavlinkd/{name}/control.sock", "--out", str(tmp_path / "services")]
-    assert main(["fleet", "init", "--drones", "2", *options]) == 0  # only the service makes such a folder
-    assert "On each machine: systemctl enable --now uavlinkd@NAME." in capsys.readouterr().out
 
 
 def test_rotation_without_the_old_key_says_what_to_do(folder: Path, tmp_path: Path) -> None:

@@ -15,7 +15,6 @@ from typing import Any
 from tests.waiting import until
 from uavlinkd.config import Config
 from uavlinkd.config.load import load_config
-from uavlinkd.config.model import KEY_GRACE_S
 from uavlinkd.fleet import operations
 from uavlinkd.fleet.manifest import FleetSettings, read_manifest
 from uavlinkd.fleet.plan import NO_PLAN
@@ -63,13 +62,11 @@ class Vehicles:
                 path.unlink()
         shutil.copytree(self.fleet / name, self.place(name), dirs_exist_ok=True)
 
-    async def start(self, name: str, *, grace_s: float = KEY_GRACE_S) -> None:
+    async def start(self, name: str) -> None:
         """Start the daemon with the files on the vehicle."""
-        grace = f"from uavlinkd.config import model; model.KEY_GRACE_S = {grace_s}"
-        code = f"{grace}; from uavlinkd.cli import main; main()"
         with (self._folder / f"{name}.log").open("ab") as log:
             self._processes[name] = await asyncio.create_subprocess_exec(
-                *end_with_parent(sys.executable, "-c", code, "run"),
+                *end_with_parent(sys.executable, "-m", "uavlinkd", "run"),
                 *("--config", str(self.place(name) / f"{name}.toml")),
                 stdout=log,
                 stderr=log,
