@@ -358,7 +358,6 @@ def test_daemon_may_be_a_relay_too(tmp_path: Path) -> None:
 
 # Warnings.
 
-_ARM = "MAV_CMD_COMPONENT_ARM_DISARM"
 _PLAN = 'deny_in = ["MAV_CMD_NAV_PATHPLANNING"]\n'
 _TWO = GOOD + OTHER_PEER
 _WARNED = [
@@ -396,10 +395,6 @@ _WARNED = [
     (GOOD.replace("[[peer]]", 'system_ids = "all"\n[[peer]]'), r'^endpoint "autopilot": system_ids is "all"'),
     (GOOD + f'allow_in = ["commands", "files"]\n{_PLAN}', r'^peer "drone1": deny_in.*FILE_TRANSFER_PROTOCOL'),
     (GOOD.replace("[[peer]]", f"{_PLAN}[[peer]]"), r'^endpoint "autopilot": deny_in'),
-    (
-        GOOD + f'allow_in = ["manual", "{_ARM}"]\ndeny_in = ["{_ARM}"]\n',
-        r"arming and disarming stays possible by RC_CHANNELS_OVERRIDE, MANUAL_CONTROL: denial is best effort",
-    ),
     (
         _TWO.replace("[2]", '["1-3"]').replace("[3]", "[1, 3, 4]"),
         r'^peer "drone1" and peer "drone2" may send as the same systems 1, 3:',

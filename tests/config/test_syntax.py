@@ -62,15 +62,6 @@ def test_file_of_another_kind_is_named(tmp_path: Path, text: str, says: str) -> 
 
 
 @pytest.mark.parametrize(
-    "text", ["\x00", '"a = 1', "a = 1\n\x07", "[" * 5000, "=" * 5000, "[a]\n" * 2, "\n" * 9 + "]"]
-)
-def test_other_errors_keep_the_parsers_reason(tmp_path: Path, text: str) -> None:
-    """No rule matches: the message has the place and the parser's own words."""
-    _, _, message = _problem(tmp_path, text)
-    assert "TOML" in message or "brackets" in message
-
-
-@pytest.mark.parametrize(
     "text",
     [
         *("[link.{}", "[log.{}]]", "[link.a\x1b]0;{}\x07", "[peer.{}", "[link.{}]\n[link.{}]", "[peer.{}] x"),
