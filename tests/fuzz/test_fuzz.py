@@ -9,7 +9,7 @@ import pytest
 
 from tests.fuzz import corpus
 from tests.fuzz.__main__ import fuzz, main
-from tests.fuzz.engine import Script, hunt
+from tests.fuzz.engine import hunt
 from tests.fuzz.plants import PLANTS, put
 from tests.fuzz.registry import TARGETS
 from tests.needs import need
@@ -59,27 +59,6 @@ def test_corpus_and_plants_belong_to_targets() -> None:
     kept = list(corpus.KEPT.iterdir())
     assert {path.name for path in kept} == {f"{name}.txt" for name in TARGETS}
     assert sum(path.stat().st_size for path in kept) < MAX_CORPUS_BYTES
-
-
-def test_corpus_is_read_as_it_was_written(tmp_path: Path) -> None:
-    """Smallest first, without duplicates, no more than fit."""
-    inputs = [b"longer", b"\0", b"\xff\xfe", b"longer", b"", bytes(corpus.MAX_FILE_BYTES)]
-    corpus.save("any", inputs, tmp_path)
-    assert corpus.load("any", tmp_path) == [b"\0", b"\xff\xfe", b"longer"]
-
-
-def test_script_is_total_and_a_seed_is_a_hunt() -> None:
-    """Behind its end a script reads zeros, and it ends. The same seed leads to the same result."""
-    script = Script(b"\1\2\3")
-    assert (script.byte(), script.word(), script.long(), script.take(9)) == (1, 0x0203, 0, b"")
-    assert not script
-    about = "a record of the last three bytes"
-    results = []
-    for _ in range(2):
-        take_out = put(about)
-        results.append(hunt(TARGETS["tlog"], kept=corpus.load("tlog"), seed=9, runs=RUNS).script)
-        take_out()
-    assert results[0] == results[1] != b""
 
 
 @pytest.mark.long
