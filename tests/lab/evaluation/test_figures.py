@@ -21,4 +21,4 @@ def test_the_same_records_give_the_same_bytes() -> None:
     """So a report drawn again differs only where its records do. A run without measurements has no flight."""
     assert to_svg(draw_timing, a_run()) == to_svg(draw_timing, a_run())
     assert draw_flight(FlightFindings({}, [])) == draw_paths(findings()) == {}
-    assert set(draw_timing(TimingFindings({}, []))) == {"scatter", "histogram"}
+    assert set(draw_timing(TimingFindings({}, []))) == {"scatter"}

@@ -10,7 +10,6 @@ import argparse
 import asyncio
 import importlib
 import json
-import math
 import sys
 from dataclasses import fields
 from importlib.util import find_spec
@@ -37,15 +36,6 @@ def add_evaluations(commands: _Commands) -> None:
     """Add the evaluations, and ``report``."""
     timing, tampering, _, paths = (_add(commands, name) for name in EVALUATIONS)
     _number(timing, "--repeats", 30, "repetitions of every point")
-    timing.add_argument("--paper", action="store_true", help="also the paper's 4096 bits: three exchanges")
-    timing.add_argument(
-        "--limit",
-        dest="limit_s",
-        metavar="SECONDS",
-        type=_positive,
-        default=600.0,
-        help="time limit of one exchange of the paper's method, at most 2 in a quick run (default: %(default)s)",
-    )
     _number(tampering, "--attempts-data", 10_000, "attempts of each attack on data; a tenth on the paper's protocol")
     _number(tampering, "--attempts-handshake", 200, "attempts of each attack on the handshake; likewise")
     tampering.add_argument(
@@ -85,13 +75,6 @@ def _add(commands: _Commands, name: str) -> argparse.ArgumentParser:
 
 def _number(parser: argparse.ArgumentParser, option: str, default: int, text: str) -> None:
     parser.add_argument(option, metavar="N", type=_count, default=default, help=f"{text} (default: %(default)s)")
-
-
-def _positive(text: str) -> float:
-    number = float(text)
-    if not (math.isfinite(number) and number > 0):
-        raise argparse.ArgumentTypeError("must be a number above 0")
-    return number
 
 
 def _count(text: str) -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import math
 from collections.abc import Callable, Sequence
 from typing import Any, Final, TypeVar
 
@@ -13,12 +12,10 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator
 
 from uavlinkd.core.settings import Class
 from uavlinkd.lab.evaluation.flight_plan import ATTACKS, LINK_NAMES, PAIR, AttackPhase, LinkKind
 from uavlinkd.lab.evaluation.flight_report import FlightFindings
-from uavlinkd.lab.evaluation.frame import duration
 from uavlinkd.lab.evaluation.paths_findings import PathsFindings, TrialView
 from uavlinkd.lab.evaluation.paths_plan import STALE_S, Scenario
 from uavlinkd.lab.evaluation.records import Record, Value
@@ -69,8 +66,8 @@ def to_svg(draw: Callable[[F], dict[str, Figure]], findings: F) -> dict[str, byt
 
 
 def draw_timing(findings: TimingFindings) -> dict[str, Figure]:
-    """The paper's figures 6 and 7, for both methods. Its method takes seconds and ours milliseconds: two panels."""
-    scatter, histogram = (Figure(figsize=(9.6, 4.6), layout="constrained") for _ in range(2))
+    """The paper's figure 6, for both methods. Its method takes seconds and ours milliseconds: two panels."""
+    scatter = Figure(figsize=(9.6, 4.6), layout="constrained")
     for place, series in enumerate(_series(findings)):
         title, factor, unit = (("the paper's method", 1.0, "s"), ("uavlinkd", 1e3, "ms"))[place]
         axes = scatter.add_subplot(1, 2, place + 1)
@@ -86,9 +83,10 @@ def draw_timing(findings: TimingFindings) -> dict[str, Figure]:
         axes.set_ylim(bottom=0)
         axes.set_xlabel("HMAC key (bits)")
         axes.set_ylabel(f"time from start to verified data ({unit})")
-        _finish(axes, title)
-        _draw_distribution(histogram.add_subplot(1, 2, place + 1), series, title)
-    return {"scatter": scatter, "histogram": histogram}
+        axes.set_title(title, loc="left")
+        if series:
+            axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=3)  # outside the points
+    return {"scatter": scatter}
 
 
 def _series(findings: TimingFindings) -> tuple[Series, Series]:
@@ -108,34 +106,6 @@ def _series(findings: TimingFindings) -> tuple[Series, Series]:
 
 def _split(points: Sequence[tuple[float, float]]) -> tuple[list[float], list[float]]:
     return [x for x, _ in points], [y for _, y in points]
-
-
-def _draw_distribution(axes: Axes, series: Series, title: str) -> None:
-    named = [(name, [time for part in times.values() for time in part]) for name, times in series]
-    shown = [number for number, (_, times) in enumerate(named) if times]
-    everything = [time for _, times in named for time in times]
-    if not everything:
-        return
-    low, high = (math.floor(10 * math.log10(end)) for end in (min(everything), max(everything)))
-    bins = [10 ** (number / 10) for number in range(low, high + 2)]
-    names, colours = [named[n][0] for n in shown], [COLOURS[n % len(COLOURS)] for n in shown]
-    axes.hist([named[n][1] for n in shown], bins, stacked=True, color=colours, label=names, edgecolor="white")
-    axes.set_xscale("log")
-    axes.set_xticks([10.0**n for n in range(-4, 4) if bins[0] / 1.3 <= 10.0**n <= bins[-1] * 1.3])
-    axes.set_xlim(bins[0] / 1.3, bins[-1] * 1.3)
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: duration(value)))
-    axes.xaxis.set_minor_locator(NullLocator())
-    axes.yaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.set_xlabel("time from start to verified data")
-    axes.set_ylabel("exchanges")
-    _finish(axes, title)
-
-
-def _finish(axes: Axes, title: str) -> None:
-    """The title, and the legend below the panel, outside the points."""
-    axes.set_title(title, loc="left")
-    if axes.get_legend_handles_labels()[0]:
-        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=3)
 
 
 def draw_flight(findings: FlightFindings) -> dict[str, Figure]:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import importlib
-import random
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from datetime import UTC, datetime
-from itertools import accumulate, pairwise
 from pathlib import Path
 from statistics import median
 from time import monotonic
@@ -143,7 +141,7 @@ def command(name: str, settings: EvaluationSettings) -> str:
     """The command of a run, with the options that differ from the defaults."""
     words = [f"uavlinkd evaluate {name} --out DIR"]
     for item in fields(settings):
-        value, option = getattr(settings, item.name), f"--{item.name.removesuffix('_s').replace('_', '-')}"
+        value, option = getattr(settings, item.name), f"--{item.name.replace('_', '-')}"
         if value is True:
             words.append(option)
         elif isinstance(value, tuple):
@@ -187,9 +185,6 @@ def _safe(cell: str) -> str:
     return cell.replace("|", "\\|").replace("\n", " ")
 
 
-PERMUTATIONS = 2000
-
-
 def spread(values: Sequence[float]) -> str:
     """Median, range and count of durations in seconds."""
     if not values:
@@ -211,35 +206,3 @@ def percentile(values: Iterable[float], share: float) -> float:
     """The smallest value that at least ``share`` (0 to 1) of the values do not exceed."""
     ordered = sorted(values)
     return ordered[min(len(ordered) - 1, max(0, -int(-share * len(ordered) // 1) - 1))]
-
-
-def p_value(samples: Sequence[Sequence[float]], permutations: int = PERMUTATIONS) -> float:
-    """The probability that random samples differ as much as these, or more.
-
-    The statistic is that of Kruskal and Wallis. It uses ranks, so that a few very long times have no large effect.
-    Its distribution is computed by shuffling, which is exact for small samples. Equal samples return equal values.
-    """
-    ends = list(accumulate((len(sample) for sample in samples), initial=0))
-    ranks = _ranks([value for sample in samples for value in sample])
-    seen = _between(ranks, ends)
-    rng = random.Random(0)  # noqa: S311  not a key
-    as_far = 0
-    for _ in range(permutations):
-        rng.shuffle(ranks)
-        as_far += _between(ranks, ends) >= seen - 1e-9
-    return (as_far + 1) / (permutations + 1)
-
-
-def _ranks(values: Sequence[float]) -> list[float]:
-    """The ranks from 1; equal values share the mean of their ranks."""
-    ordered = sorted(values)
-    first: dict[float, int] = {}
-    count: dict[float, int] = {}
-    for place, value in enumerate(ordered, 1):
-        first.setdefault(value, place)
-        count[value] = count.get(value, 0) + 1
-    return [first[value] + (count[value] - 1) / 2 for value in values]
-
-
-def _between(ranks: Sequence[float], ends: Sequence[int]) -> float:
-    return sum(sum(ranks[start:end]) ** 2 / (end - start) for start, end in pairwise(ends) if end > start)

@@ -30,7 +30,7 @@ from functools import cache
 
 from uavlinkd.core import wire
 from uavlinkd.core.crypto import hmac_sha256
-from uavlinkd.lab.evaluation.paper import LibraryKey, Parameters, mac_key, make_key, make_parameters
+from uavlinkd.lab.evaluation.paper import GroupKey, Parameters, mac_key, make_parameters
 
 HELLO, ANSWER = 1, 2
 GROUP_BITS = 2048
@@ -47,9 +47,7 @@ class PaperKey:
 
     def __init__(self) -> None:
         with _ffdh():
-            key = make_key(parameters())
-        assert isinstance(key, LibraryKey)
-        self._key = key
+            self._key = GroupKey(parameters())
 
     @property
     def public(self) -> bytes:

@@ -1,6 +1,6 @@
 """The records of a run: JSON lines. The first line has the facts of the run, each other line one record.
 
-A measurement that failed, did not finish in time or was not requested is a record too, with the reason.
+A measurement that failed or did not finish in time is a record too, with the reason.
 """
 
 from __future__ import annotations
@@ -40,7 +40,6 @@ class Status(StrEnum):
     OK = "ok"
     FAILED = "failed"
     NOT_FINISHED = "not finished"
-    SKIPPED = "skipped"
 
 
 @dataclass(frozen=True, slots=True)

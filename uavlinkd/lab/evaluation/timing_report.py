@@ -7,30 +7,11 @@ from collections.abc import Sequence
 from statistics import median
 
 from uavlinkd.core.suites import SUITES_BY_NAME
-from uavlinkd.lab.evaluation.frame import (
-    NOTHING,
-    THE_PAPER,
-    ReportSection,
-    Table,
-    duration,
-    p_value,
-    percentile,
-    spread,
-)
-from uavlinkd.lab.evaluation.records import Record, RunRecords, Status, Value
+from uavlinkd.lab.evaluation.frame import NOTHING, THE_PAPER, ReportSection, Table, duration, spread
+from uavlinkd.lab.evaluation.records import RunRecords, Status, Value
 
 SUITE_OF_SIZE = {int(name.removeprefix("ffdhe")): name for name in SUITES_BY_NAME if name.startswith("ffdhe")}
 """The suite of each size of a finite-field group, in bits."""
-_LEVEL = 0.05
-"""Probability of a false dependence, for all groups together (Bonferroni)."""
-_CORE_STEPS = {
-    "initiate_s": "make the initiation",
-    "respond_s": "respond",
-    "finish_s": "process the response",
-    "confirm_s": "process the confirmation",
-    "frame_s": "seal and open a frame",
-    "total_s": "all",
-}
 
 
 class TimingFindings(RunRecords):
@@ -67,7 +48,8 @@ class TimingFindings(RunRecords):
 
 def timing_problems(findings: TimingFindings) -> list[str]:
     failed = [record for record in findings.records if record.status is Status.FAILED]
-    return [f"{record.kind}, {_point(record)}: {record.reason}" for record in failed]
+    points = [", ".join(f"{name} {value}" for name, value in record.point.items()) for record in failed]
+    return [f"{record.kind}, {point}: {record.reason}" for record, point in zip(failed, points, strict=True)]
 
 
 def summary(findings: TimingFindings) -> dict[str, Value]:
@@ -85,19 +67,9 @@ def _median(times: Sequence[float]) -> float | None:
 def sections(findings: TimingFindings) -> list[ReportSection]:
     return [
         ReportSection("At equal size of the group", _ON_COMPARISON, [comparison(findings)]),
-        ReportSection(
-            "Time over the length of the HMAC key (the paper's Fig. 6)",
-            _ON_SCATTER,
-            [dependence(findings)],
-            "scatter",
-        ),
-        ReportSection("Distribution of the times (the paper's Fig. 7)", [], [], "histogram"),
+        ReportSection("Time over the length of the HMAC key (the paper's Fig. 6)", _ON_SCATTER, [], "scatter"),
         ReportSection("Does the length of the HMAC key matter?", _ON_TAGS, [tag_times(findings)]),
         ReportSection("The suites", _ON_SUITES, [suites(findings)]),
-        ReportSection("Inside a handshake: the core alone", _ON_CORE, [core_steps(findings)]),
-        ReportSection("Frames on an established link", _ON_FRAMES, [frames(findings)]),
-        ReportSection("The paper's grid", _ON_PAPER, [paper_grid(findings)]),
-        ReportSection("Not measured", [], gaps(findings)),
     ]
 
 
@@ -106,33 +78,21 @@ _ON_COMPARISON = [
     "The paper's method searches a new safe prime for each exchange; the third column is the share of that search. "
     "RFC 7919's groups need no search. A precomputation for a group that many share (Logjam) is feasible up to 1024 "
     "bits and far out of reach from 2048 bits. An unfinished exchange counts as the limit. Cells have the median, "
-    "the range and the number of exchanges.",
+    "the range and the number of exchanges. OpenSSL generates the parameters (`dh.generate_parameters`). "
+    "HMAC-SHA256 over 280 bytes with a key that is derived from the shared secret, between two processes over UDP on "
+    "loopback.",
 ]
-_ON_SCATTER = [
-    "Each point is one exchange. The table is a permutation test on ranks: does the time depend on the length of the "
-    "key within a group? The level is 5 % for all groups together (Bonferroni)."
-]
+_ON_SCATTER = ["Each point is one exchange."]
 _ON_TAGS = [
-    "Time of one tag, least of the batches. `prepared`: the hash states of a session, as uavlinkd keeps them. `from "
-    "the key`: the states are computed for each tag. HMAC pads a key to the hash's block of 512 bits and hashes a "
-    "longer key first (RFC 2104): a longer key costs the extra blocks and is no stronger than its hash of 256 bits."
+    "Time of one tag, least of the batches, with the hash states that uavlinkd prepares for each session. HMAC pads "
+    "a key to the hash's block of 512 bits and hashes a longer key first (RFC 2104): it is no stronger than its hash "
+    "of 256 bits."
 ]
 _ON_SUITES = [
     "Each handshake is between two new processes with new static, pre-shared and ephemeral keys. The time starts "
     "before the initiation is computed (measured in the core). It ends when the other daemon delivers the first "
     "frame (measured at a proxy between both). The start of the processes takes about 0.5 s and is not included. "
     "Bytes and datagrams contain the first frame."
-]
-_ON_CORE = ["Two nodes in one process, without sockets: cryptography and protocol, no transport. Medians."]
-_ON_FRAMES = [
-    "From client to client through both daemons, one frame at a time. The delay of the proxy is not subtracted from "
-    "handshakes, of which four datagrams pass it."
-]
-_ON_PAPER = [
-    "OpenSSL generates the parameters of 512 bits and more (`dh.generate_parameters`) and refuses smaller ones. "
-    "Those of 256 bits are generated and used with Python's integers (Miller-Rabin) and show the order of magnitude. "
-    "HMAC-SHA256 over 280 bytes with a key of the given length, derived from the shared secret, between two "
-    "processes over UDP on loopback."
 ]
 
 
@@ -174,36 +134,14 @@ def _missing(findings: TimingFindings, **point: Value) -> str:
     return "; ".join(f"{reason} ({count})" for reason, count in reasons.items()) or NOTHING
 
 
-def dependence(findings: TimingFindings) -> Table:
-    """Whether the time depends on the length of the HMAC key, in both grids."""
-    groups: list[tuple[str, list[list[float]]]] = []
-    for bits in findings.values("paper", "dh_bits"):
-        points: list[dict[str, Value]] = [
-            {"dh_bits": bits, "mac_key_bits": length} for length in findings.values("paper", "mac_key_bits")
-        ]
-        if findings.paper_times("made", dh_bits=bits):
-            times = [findings.paper_times("made", **at) + findings.paper_late("made", **at) for at in points]
-            groups.append((f"{bits} bits in the paper's method", times))
-    lengths = findings.values("handshake", "mac_key_bits")
-    for suite in findings.suites():
-        groups.append((suite, [findings.daemon_times(suite, mac_key_bits=length) for length in lengths]))
-    tested = {name: p_value(times) for name, times in groups if sum(len(sample) > 1 for sample in times) > 1}
-    dependent = [name for name, value in tested.items() if value < _LEVEL / len(tested)]
-    least = f"{min(tested.values()):.2g}" if tested else "too few repetitions"
-    row = [str(len(tested)), str(len(dependent)), ", ".join(dependent) or NOTHING, least]
-    return Table(["groups tested", "dependent", "which", "smallest p"], [row])
-
-
 def tag_times(findings: TimingFindings) -> Table:
     """The time of a tag by the length of its key."""
     lengths = findings.values("mac", "mac_key_bits")
     rows = []
     for message in findings.values("mac", "message_bytes"):
-        for states in findings.values("mac", "states"):
-            point = {"message_bytes": message, "states": states}
-            times = [findings.numbers("mac", "tag_least_s", mac_key_bits=bits, **point) for bits in lengths]
-            rows.append([f"{message} bytes", str(states), *(duration(min(t)) if t else NOTHING for t in times)])
-    return Table(["message", "states", *(f"key of {bits} bits" for bits in lengths)], rows)
+        times = [findings.numbers("mac", "tag_least_s", mac_key_bits=bits, message_bytes=message) for bits in lengths]
+        rows.append([f"{message} bytes", *(duration(min(t)) if t else NOTHING for t in times)])
+    return Table(["message", *(f"key of {bits} bits" for bits in lengths)], rows)
 
 
 def suites(findings: TimingFindings) -> Table:
@@ -225,64 +163,3 @@ def suites(findings: TimingFindings) -> Table:
         )
     head = ["suite", "handshake, all HMAC keys", "CPU, initiator", "CPU, responder"]
     return Table([*head, "bytes sent + received", "datagrams"], rows)
-
-
-def core_steps(findings: TimingFindings) -> Table:
-    rows = []
-    for suite in SUITES_BY_NAME:
-        times = [findings.numbers("core", step, suite=suite) for step in _CORE_STEPS]
-        if all(times):
-            rows.append([suite, *(duration(median(part)) for part in times)])
-    return Table(["suite", *_CORE_STEPS.values()], rows)
-
-
-def frames(findings: TimingFindings) -> Table:
-    rows = []
-    for record in findings.of("frames"):
-        latencies: list[float] = record.values.get("latency_s", [])
-        if not latencies:
-            continue
-        key = "confidential" if record.point["confidential"] else f"{record.point['mac_key_bits']} bits"
-        cpu = [record.number(f"cpu_{name}_s") / record.number("sent") for name in ("initiator", "responder")]
-        rows.append(
-            [
-                str(record.point["suite"]),
-                key,
-                "yes" if record.point["proxy"] else "no",
-                f"{len(latencies)} of {record.number('sent'):.0f}",
-                *(duration(percentile(latencies, share)) for share in (0.5, 0.99, 1.0)),
-                *map(duration, cpu),
-            ]
-        )
-    head = ["suite", "HMAC key", "proxy", "delivered", "half within", "99 % within", "all within"]
-    return Table([*head, "CPU per frame, initiator", "CPU, responder"], rows)
-
-
-def paper_grid(findings: TimingFindings) -> Table:
-    rows = []
-    for group, name in (("made", "made"), ("standard", "RFC 7919")):
-        for bits in findings.values("paper", "dh_bits"):
-            for length in findings.values("paper", "mac_key_bits"):
-                point: dict[str, Value] = {"group": group, "dh_bits": bits, "mac_key_bits": length}
-                times = findings.numbers("paper", "total_s", **point)
-                made = findings.numbers("paper", "parameters_s", **point)
-                if findings.of("paper", **point):
-                    missing = _missing(findings, **point)
-                    search = duration(median(made)) if made else NOTHING
-                    rows.append([name, str(bits), str(length), spread(times), search, missing])
-    head = ["group", "bits", "HMAC key (bits)", "start to verified", "generating parameters, median", "no time"]
-    return Table(head, rows)
-
-
-def gaps(findings: TimingFindings) -> list[Table]:
-    counts = Counter(
-        (record.status.value, record.kind, _point(record), record.reason)
-        for record in findings.records
-        if not record.is_ok
-    )
-    rows = [[*gap, str(count)] for gap, count in counts.items()]
-    return [Table(["status", "kind", "point", "reason", "count"], rows)] if rows else []
-
-
-def _point(record: Record) -> str:
-    return ", ".join(f"{name} {value}" for name, value in record.point.items())

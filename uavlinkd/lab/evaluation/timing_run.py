@@ -17,10 +17,9 @@ from uavlinkd.lab.evaluation.frame import Evaluation, EvaluationSettings, Work
 from uavlinkd.lab.evaluation.records import EvaluationError, Record, Status, Value
 from uavlinkd.lab.evaluation.timing_daemons import (
     LinkChoice,
-    measure_core,
+    measure_initiation,
     measure_tags,
     measured,
-    time_frames,
     time_handshake,
 )
 from uavlinkd.lab.evaluation.timing_report import TimingFindings, sections, summary, timing_problems
@@ -29,8 +28,8 @@ T = TypeVar("T")
 
 MAC_KEY_BITS = (256, 512, 1024, 2048)
 """The lengths that a configuration may have."""
-PAPER_DH_BITS = (256, 512, 1024, 2048, 4096)
-"""The paper's sizes; its text has 2028 for 2048 in one place."""
+PAPER_DH_BITS = (512, 1024, 2048, 4096)
+"""The paper's sizes, but for 256; its text has 2028 for 2048 in one place."""
 PAPER_MAC_KEY_BITS = (512, 1024, 2048)
 STANDARD_BITS = (2048, 4096)
 """The sizes of the paper for which RFC 7919 has a group."""
@@ -38,21 +37,19 @@ DATA_BYTES = 280
 """The largest MAVLink 2 frame."""
 _ANSWER_S = 60.0
 """How long an end of the paper's method may take to start, or to verify."""
-_NOT_IN_QUICK = "not in a quick run"
+_LIMIT_S, _QUICK_LIMIT_S = 600.0, 2.0
+"""The time limit of one exchange of the paper's method: ten minutes, as in the paper."""
 
 
 @dataclass(frozen=True, slots=True)
 class TimingSettings(EvaluationSettings):
     """The options of the evaluation.
 
-    ``repeats``: of each point. ``quick``: some points, once. ``paper``: also the paper's largest group, each
-    point once. ``limit_s``: the time limit of one exchange of the paper's method, ten minutes in the paper. ``seed``:
-    of the order of the measurements and of their data; keys come from the system.
+    ``repeats``: of each point. ``quick``: some points, once. ``seed``: of the order of the measurements and of their
+    data; keys come from the system.
     """
 
     repeats: int = 30
-    paper: bool = False
-    limit_s: float = 600.0
 
 
 def grid() -> list[LinkChoice]:
@@ -72,13 +69,12 @@ def paper_points() -> list[dict[str, Value]]:
 
 async def run_timing(work: Work[TimingSettings]) -> dict[str, Any]:
     run = _Run(work)
-    work.show("tags, and handshakes in the core")
+    work.show("tags, and initiations in the core")
     for record in measure_tags(500 if work.settings.quick else 20_000):
         work.add(record)
-    measure_core(LinkChoice(X25519))  # the first use is slow
+    measure_initiation(LinkChoice(X25519))  # the first use is slow
     for choice in run.shuffled(grid()):
-        work.add(measure_core(choice))
-    await run.frames()
+        work.add(measure_initiation(choice))
     await run.exchanges()
     return {}
 
@@ -96,38 +92,18 @@ class _Run:
         self._random.shuffle(work)
         return work
 
-    async def frames(self) -> None:
-        links = [LinkChoice(suite) for suite in SUITES.values()]
-        links += [LinkChoice(X25519, bits) for bits in MAC_KEY_BITS if bits != 256]
-        links += [LinkChoice(X25519, confidential=True)]
-        count = 100 if self._settings.quick else 1000
-        for choice, with_proxy in [*((link, False) for link in links), (LinkChoice(X25519), True)]:
-            point = {**choice.point, "proxy": with_proxy}
-            if self._settings.quick and choice != LinkChoice(X25519):
-                self._skip("frames", point, _NOT_IN_QUICK)
-                continue
-            self._work.show(f"{count} frames, {choice.suite.name}")
-            self._work.add(await measured("frames", point, time_frames(choice, count, with_proxy=with_proxy)))
-
     async def exchanges(self) -> None:
         """Measure the daemons and the paper's method in random order, so that load affects both equally."""
-        chosen = [choice for choice in grid() if not self._settings.quick or _is_quick(choice)]
-        for choice in grid():
-            if choice not in chosen:
-                self._skip("handshake", choice.point, _NOT_IN_QUICK)
+        is_quick = self._settings.quick
+        chosen = [choice for choice in grid() if not is_quick or choice.mac_key_bits == MAC_KEY_BITS[0]]
         # Each exchange at the largest size takes up to the limit: these points run once and last.
         last = [point for point in paper_points() if (point["dh_bits"], point["group"]) == (4096, "made")]
         work: list[LinkChoice | dict[str, Value]] = [
             *chosen,
             *(point for point in paper_points() if point not in last),
         ]
-        work = self.shuffled(work)
-        if self._settings.paper:
-            work += last
-        else:
-            for point in last:
-                self._skip("paper", point, "runs only with --paper")
-        limit_s = min(self._settings.limit_s, 2.0) if self._settings.quick else self._settings.limit_s
+        work = [*self.shuffled(work), *last]
+        limit_s = _QUICK_LIMIT_S if is_quick else _LIMIT_S
         for number, item in enumerate(work, 1):
             if isinstance(item, LinkChoice):
                 self._work.show(f"{number} of {len(work)}: {item.suite.name}, HMAC key of {item.mac_key_bits} bits")
@@ -135,16 +111,6 @@ class _Run:
             else:
                 self._work.show(f"{number} of {len(work)}: the paper's method, {item['dh_bits']} bits")
                 self._work.add(await measure_paper(item, limit_s, self._random.randbytes(DATA_BYTES)))
-
-    def _skip(self, kind: str, point: dict[str, Value], reason: str) -> None:
-        self._work.add(Record(kind, point, {}, Status.SKIPPED, reason))
-
-
-def _is_quick(choice: LinkChoice) -> bool:
-    """Every suite with the shortest key, and the longest key once."""
-    return choice.mac_key_bits == MAC_KEY_BITS[0] or (
-        choice.suite is X25519 and choice.mac_key_bits == MAC_KEY_BITS[-1]
-    )
 
 
 async def measure_paper(point: dict[str, Value], limit_s: float, data: bytes) -> Record:
