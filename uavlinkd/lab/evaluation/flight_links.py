@@ -23,7 +23,6 @@ from uavlinkd.lab.evaluation.flight_plan import (
     AttackPhase,
     DisplacePositions,
     Drift,
-    ExchangeWatch,
     FlightSettings,
     LinkKind,
 )
@@ -63,7 +62,6 @@ class PlainLink:
         log.unlink(missing_ok=True)  # of an earlier run
         self.settings = settings
         self.middle = MiddleHere(PAIR, log, settings.seed)
-        self.watch = ExchangeWatch()
         self._on_delivered = on_delivered
         self._clients: dict[str, socket.socket] = {}
 
@@ -126,10 +124,6 @@ class PlainLink:
         """Attack the exchange of keys, if there is one, and move positions."""
         await self.middle.attack([], [self.displacement()])
 
-    async def interventions(self) -> int:
-        """Datagrams that the attacker altered, dropped, held or injected so far."""
-        return sum((await self.middle.statistics()).counts.values())
-
 
 class PaperLink(PlainLink):
     """The paper's protocol: one exchange of keys in flight, then an HMAC for each frame."""
@@ -150,7 +144,6 @@ class PaperLink(PlainLink):
             for name in PAIR
         }
         await self.middle.start({name: end.port for name, end in self._ends.items()}, {})
-        await self.middle.attack([], [self.watch])
         for name, end in self._ends.items():
             end.start((HOST, self._port(name)))
 
@@ -194,7 +187,6 @@ class DaemonLink(PlainLink):
         self._open_clients()
         keys = {name: decode_key(drone.public_key) for name, drone in self._drones.items()}
         await self.middle.start({name: drone.port for name, drone in self._drones.items()}, keys)
-        await self.middle.attack([], [self.watch])
         psk = generate_psk()
         for one, other in _WAYS:
             drone = self._drones[one]

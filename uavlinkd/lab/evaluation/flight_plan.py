@@ -13,10 +13,9 @@ from typing import Final
 
 from fastcrc.crc16 import mcrf4xx
 
-from uavlinkd.lab.evaluation import paper_protocol as paper
 from uavlinkd.lab.evaluation.frame import EvaluationSettings
-from uavlinkd.lab.mitm.anatomy import HANDSHAKE, DatagramKind, envelope_of, kind_of
-from uavlinkd.lab.mitm.attack import Action, Alteration, Direction, PassiveAttack, Send
+from uavlinkd.lab.mitm.anatomy import envelope_of
+from uavlinkd.lab.mitm.attack import Alteration, Direction
 from uavlinkd.lab.sim.vehicle import EARTH_RADIUS_M, Axes
 from uavlinkd.mavlink.dialect_table import MESSAGES
 
@@ -232,31 +231,6 @@ def _frames_at(datagram: bytes) -> list[int]:
         places.append(at)
         at += _OVERHEAD_BYTES + datagram[at + 1]
     return places
-
-
-class ExchangeWatch(PassiveAttack):
-    """Passes everything, and notes the first exchange of keys that led to data."""
-
-    name = "watch"
-
-    def __init__(self) -> None:
-        self.key_at: float | None = None
-        """When the initiator sent the key that was answered first."""
-        self.data_at: float | None = None
-        """When the first data after the answer was sent."""
-        self._asked_at: dict[Direction, float] = {}
-
-    def on_datagram(self, datagram: bytes, direction: Direction, now: float) -> list[Action]:
-        kind = kind_of(datagram)
-        if self.key_at is None:
-            # A first message without an answer is from before the other end had started.
-            if datagram[:1] == bytes((paper.ANSWER,)):
-                self.key_at = self._asked_at.get(direction.reverse)
-            elif paper.is_key(datagram) or kind in HANDSHAKE:
-                self._asked_at[direction] = now
-        elif kind is DatagramKind.ENVELOPE:
-            self.data_at = self.data_at or now
-        return [Send(datagram, direction)]
 
 
 @dataclass(slots=True)

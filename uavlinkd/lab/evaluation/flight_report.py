@@ -16,7 +16,7 @@ from uavlinkd.lab.evaluation.flight_plan import (
     Provenance,
 )
 from uavlinkd.lab.evaluation.frame import NOTHING, THE_PAPER, ReportSection, Table, duration
-from uavlinkd.lab.evaluation.records import Record, RunRecords, Value
+from uavlinkd.lab.evaluation.records import RunRecords, Value
 
 _DELIVERED = (AttackPhase.QUIET, AttackPhase.REPLAY, AttackPhase.ALTER, AttackPhase.KEYS)
 """In these phases, frames must arrive: the attacker passes some of them in time."""
@@ -93,8 +93,6 @@ def summary(findings: FlightFindings) -> dict[str, Value]:
         for phase in AttackPhase:
             errors = findings.numbers("sample", "error_m", link=link, phase=phase)
             facts[f"{name}_max_error_m_{phase.name.lower()}"] = max(errors, default=None)
-        for took_s in findings.numbers("exchange", "took_s", link=link):
-            facts[f"{name}_key_exchange_s"] = took_s
     return facts
 
 
@@ -136,7 +134,6 @@ def sections(findings: FlightFindings) -> list[ReportSection]:
             _ON_ATTACKS,
             [Table(["attack", "what the attacker does"], meanings), _by_phase(findings)],
         ),
-        ReportSection("Keys exchanged in flight", _ON_KEYS, [_exchanges(findings)]),
         ReportSection("What uavlinkd reported", _on_states(settings), [_noticed(findings), _states(findings)]),
     ]
 
@@ -154,11 +151,6 @@ _ON_ATTACKS = [
     "aircraft sent the position; of an altered one, since it was accepted. An attacker on the path can always drop "
     "or delay frames. Then the receiver of every link believes an old position: also uavlinkd's, if the delay is "
     "shorter than a few seconds. Samples after an attack count for it until a position after its end is accepted."
-]
-_ON_KEYS = [
-    "Both aircraft fly when the exchange begins. It lasts from the public key that was answered to the first "
-    "data. The paper's ends exchange keys once, and again when the attack on the exchange begins and "
-    "ends. The daemons start in flight, and repeat their handshake on their own."
 ]
 
 
@@ -192,16 +184,6 @@ def _by_phase(findings: FlightFindings) -> Table:
                 rows.append([phase, LINK_NAMES[link], *counts, " / ".join(_extent(errors)), age])
     head = ["attack", "link", "sent", *Provenance, "error: median / largest", "age: median / largest"]
     return Table(head, rows)
-
-
-def _exchanges(findings: FlightFindings) -> Table:
-    rows = [_exchange(record) for record in findings.of("exchange") if "took_s" in record.values]
-    return Table(["link", "began after take-off", "took", "both aircraft had a position after"], rows)
-
-
-def _exchange(record: Record) -> list[str]:
-    began, first = (f"{record.number(name):.2f} s" for name in ("began_s", "first_position_s"))
-    return [LINK_NAMES[LinkKind(str(record.point["link"]))], began, duration(record.number("took_s")), first]
 
 
 def _on_states(settings: FlightSettings) -> list[str]:

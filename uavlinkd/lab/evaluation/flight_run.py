@@ -104,8 +104,6 @@ class _Run:
     async def _exchange_and_attack(self) -> None:
         async with AsyncExitStack() as stack:
             await self._open_links(stack)
-            for link in self._links:
-                self._add_exchange(link)
             watching = asyncio.create_task(self._watch_states())
             stack.callback(watching.cancel)
             for number, (phase, duration_s) in enumerate(self._settings.phases()):
@@ -134,19 +132,9 @@ class _Run:
                 raise EvaluationError(f"no position arrived within {LINK_UP_S:g} s over: {', '.join(missing)}")
             await asyncio.sleep(_LOOK_S)
 
-    def _add_exchange(self, link: PlainLink) -> None:
-        """Record the exchange of keys in flight: when it began, and how long it took."""
-        first = max(receiver.beliefs[0].accepted_at for receiver in self._receivers[link.kind].values())
-        values: dict[str, Value] = {"first_position_s": round(first, 3)}
-        key_at, data_at = link.watch.key_at, link.watch.data_at
-        if key_at is not None and data_at is not None:
-            values |= {"began_s": round(key_at - self._began_at, 3), "took_s": round(data_at - key_at, 4)}
-            self._work.show(f"{link.kind}: keys exchanged in flight in {1e3 * (data_at - key_at):.1f} ms")
-        self._work.add(Record("exchange", {"link": link.kind.value}, values))
-
     async def _run_phase(self, phase: AttackPhase, attack: AttackPhase | None, duration_s: float) -> None:
         """One phase; ``attack``: what begins with it, None if the attack before goes on."""
-        before = [(await link.notice(), await link.interventions()) for link in self._links]
+        before = [await link.notice() for link in self._links]
         begin_s = self._phases[-1][2] if self._phases else self._now()  # each accepted frame is in a phase
         self._work.show(f"{begin_s:6.1f} s  {phase}")
         if attack is not None:
@@ -155,7 +143,7 @@ class _Run:
         await asyncio.sleep(max(0.0, begin_s + duration_s - self._now()))
         end_s = self._now()
         self._phases.append((phase, begin_s, end_s))
-        for link, (notice, interventions) in zip(self._links, before, strict=True):
+        for link, notice in zip(self._links, before, strict=True):
             counts = (await link.notice()).counts - notice.counts
             frames = Counter(
                 provenance
@@ -167,7 +155,6 @@ class _Run:
                 "begin_s": round(begin_s, 3),
                 "end_s": round(end_s, 3),
                 "sent": sum(begin_s <= at < end_s for sent in self._sent.values() for at in sent.values()),
-                "interventions": await link.interventions() - interventions,
                 **{provenance.value: frames[provenance] for provenance in Provenance},
                 "noticed": ", ".join(f"{count} {reason}" for reason, count in sorted(counts.items())),
             }
