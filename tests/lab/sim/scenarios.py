@@ -77,7 +77,7 @@ def check_flown(flight: Flight) -> None:
     assert {name: events[name] for name in wanted} == dict.fromkeys(wanted, 1)
     assert [flight.autopilot.parameters[name] for name in ("WPNAV_SPEED_UP", "LAND_SPEED")] == [500, 200]
     assert len(flight.autopilot.missions.plan) == len(plan_sent())
-    assert flight.report().bad_bytes == 0
+    assert flight.link.split.garbage_bytes == 0
 
 
 async def fly_with_mavsdk(url: str) -> Seen:

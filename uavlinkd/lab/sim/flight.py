@@ -12,7 +12,7 @@ from types import TracebackType
 from typing import Self
 
 from uavlinkd.lab.sim.autopilot import Autopilot, AutopilotSettings, Event
-from uavlinkd.lab.sim.links import LinkError, LinkURL, MavlinkConnection, OnFrame, open_connection
+from uavlinkd.lab.sim.links import LinkURL, MavlinkConnection, open_connection
 from uavlinkd.lab.sim.tlog import PlaybackReport, play_tlog, read_tlog
 
 
@@ -23,32 +23,19 @@ class FlightReport:
     seconds: float
     frames_sent: int
     frames_received: int
-    bad_bytes: int  # received outside frames
     frames_unsent: int  # without a receiver
 
 
 class Flight:
     """One simulated autopilot at a MAVLink URL, as an asynchronous context.
 
-    ``on_sent`` is called once with each sent frame, for any number of receivers; ``on_received`` with each genuine
-    received frame; both as on the wire. ``on_event`` is called with a name and fields: armed, disarmed,
-    takeoff_started, landed, mode_changed, parameter_set, mission_received, mission_item_reached, gcs_connected,
-    gcs_lost, gcs_failsafe.
+    ``on_event`` is called with a name and fields: armed, disarmed, takeoff_started, landed, mode_changed,
+    parameter_set, mission_received, mission_item_reached, gcs_connected, gcs_lost, gcs_failsafe.
     """
 
-    def __init__(
-        self,
-        url: str,
-        settings: AutopilotSettings | None = None,
-        *,
-        on_sent: OnFrame | None = None,
-        on_received: OnFrame | None = None,
-        on_event: Event | None = None,
-    ) -> None:
+    def __init__(self, url: str, settings: AutopilotSettings | None = None, *, on_event: Event | None = None) -> None:
         self._url = url
         self.link: MavlinkConnection
-        self._on_sent = on_sent
-        self._on_received = on_received
         self._loop = asyncio.get_running_loop()
         self._started_at = self._loop.time()
         self.autopilot = Autopilot(
@@ -67,26 +54,14 @@ class Flight:
             seconds=self._loop.time() - self._started_at,
             frames_sent=self._frames_sent,
             frames_received=self.autopilot.frames_received,
-            bad_bytes=self.link.split.garbage_bytes,
             frames_unsent=self._frames_unsent,
         )
 
     async def run(self, seconds: float | None = None) -> None:
-        """Fly for ``seconds``, or until cancelled.
-
-        Raises:
-            LinkError: The other end closed a TCP connection.
-        """
-        end = asyncio.ensure_future(self.link.lost.wait())
-        try:
-            await asyncio.wait((end, self._failure), timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
-        finally:
-            end.cancel()
-            await asyncio.gather(end, return_exceptions=True)
+        """Fly for ``seconds``, or until cancelled. Raises what a callback raised."""
+        await asyncio.wait((self._failure,), timeout=seconds)
         if self._failure.done():
             self._failure.result()
-        if self.link.lost.is_set():
-            raise LinkError(f"{self._url}: the other end closed the connection")
 
     async def __aenter__(self) -> Self:
         self.link = await open_connection(self._url, self._receive)
@@ -105,8 +80,6 @@ class Flight:
 
     def _receive(self, frame: bytes) -> None:
         with self._failing():
-            if self._on_received:
-                self._on_received(frame)
             self._transmit(self.autopilot.receive(frame, self._loop.time()))
 
     def _on_timer(self) -> None:
@@ -132,8 +105,6 @@ class Flight:
                 self._frames_unsent += 1
                 continue
             self._frames_sent += 1
-            if self._on_sent:
-                self._on_sent(frame)
 
 
 Write = Callable[[str], None]
@@ -157,7 +128,7 @@ async def run_sim(options: SimOptions, write: Write) -> None:
 
     Raises:
         OSError, TlogError: the log cannot be read.
-        LinkError: the connection cannot be opened, or the other end closed it.
+        LinkError: the connection cannot be opened.
         ValueError: a setting is out of range.
     """
     if options.tlog is None:
@@ -209,12 +180,12 @@ async def _play(options: SimOptions, path: Path, write: Write) -> None:
 
 
 def _where(url: LinkURL) -> str:
-    return f"sends to {url}" if url.kind in ("udpout", "tcp") else f"waits for clients at {url}"
+    return f"sends to {url}" if url.kind == "udpout" else f"waits for clients at {url}"
 
 
 async def _watch(link: MavlinkConnection, is_answered: Callable[[], bool], write: Write) -> None:
     """Report the first client, or that nothing listens."""
-    if link.url.kind in ("udpin", "tcpin"):
+    if link.url.kind == "udpin":
         await link.joined.wait()
         write("a client connected")
         return

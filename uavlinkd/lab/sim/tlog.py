@@ -6,11 +6,12 @@ import asyncio
 import math
 import re
 from collections.abc import Callable, Collection
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from uavlinkd.lab.sim.links import LinkError, MavlinkConnection, open_connection
+from uavlinkd.lab.sim.links import MavlinkConnection, open_connection
 from uavlinkd.mavlink.frames import MAVLINK1, MAVLINK2, SplitCounters, split_datagram
 
 STAMP_BYTES: Final = 8
@@ -22,11 +23,7 @@ _START = re.compile(bytes([ord("["), MAVLINK1, MAVLINK2, ord("]")]))
 
 
 class TlogError(ValueError):
-    """The log cannot be read. ``offset`` is the first wrong byte."""
-
-    def __init__(self, text: str, offset: int) -> None:
-        super().__init__(f"{text} at byte {offset}")
-        self.offset = offset
+    """The log cannot be read."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,13 +40,10 @@ class TlogRecord:
 
 @dataclass(slots=True)
 class Tlog:
-    """The records of a log, and counters of its unreadable parts."""
+    """The records of a log, and the size of its unreadable parts."""
 
     records: list[TlogRecord] = field(default_factory=list)
     skipped_bytes: int = 0  # outside records, including those after the last complete record
-    resyncs: int = 0  # how often records followed skipped bytes
-    truncated_bytes: int = 0  # after the last complete record, for example after a power failure
-    first_fault_offset: int | None = None
 
     @property
     def seconds(self) -> float:
@@ -57,7 +51,7 @@ class Tlog:
         return max(0, self.records[-1].time_us - self.records[0].time_us) / 1e6 if self.records else 0.0
 
 
-def parse_tlog(data: bytes, *, strict: bool = False) -> Tlog:
+def parse_tlog(data: bytes) -> Tlog:
     """Parse a log. Accepts any bytes.
 
     ::
@@ -71,30 +65,22 @@ def parse_tlog(data: bytes, *, strict: bool = False) -> Tlog:
     skipped, so that the rest of a damaged log can be played.
 
     Raises:
-        TlogError: There is no record; with ``strict``, also at the first byte outside a record.
+        TlogError: There is no record.
     """
     log = Tlog()
     position, size = 0, len(data)
     while position < size:
         end = _record_end(data, position, searching=False)
         if end is None:
-            if strict:
-                raise TlogError("there is no record", position)
             start = position
             position = _next_record(data, position + 1)
             log.skipped_bytes += position - start
-            if log.first_fault_offset is None:
-                log.first_fault_offset = start
-            if position < size:
-                log.resyncs += 1
-            else:
-                log.truncated_bytes = position - start
             continue
         stamp = int.from_bytes(data[position : position + STAMP_BYTES])
         log.records.append(TlogRecord(stamp, data[position + STAMP_BYTES : end]))
         position = end
     if not log.records:
-        raise TlogError("there is no MAVLink frame with a timestamp", 0)
+        raise TlogError("there is no MAVLink frame with a timestamp")
     return log
 
 
@@ -108,7 +94,7 @@ def read_tlog(path: str | Path) -> Tlog:
     try:
         return parse_tlog(Path(path).read_bytes())
     except TlogError as error:
-        raise TlogError(f"{path}: there is no MAVLink frame with a timestamp", error.offset) from None
+        raise TlogError(f"{path}: {error}") from None
 
 
 def _next_record(data: bytes, position: int) -> int:
@@ -186,7 +172,7 @@ async def play_tlog(
     connection and the counters, which then grow. A decreasing timestamp, as in joined logs, causes no pause.
 
     Raises:
-        LinkError: The connection cannot be opened, or the other end closed it.
+        LinkError: The connection cannot be opened.
     """
     report = PlaybackReport()
 
@@ -195,18 +181,11 @@ async def play_tlog(
 
     link = await open_connection(url, receive)
     on_open(link, report)
-    ended = asyncio.ensure_future(link.lost.wait())
-    playing = asyncio.ensure_future(_play(log, link, report, 0.0 if math.isinf(speed) else speed, system_ids))
     try:
-        await asyncio.wait({playing, ended}, timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
-        if playing.done():
-            playing.result()
-        elif link.lost.is_set():
-            raise LinkError(f"{link.url}: the other end closed the connection")
+        with suppress(TimeoutError):
+            async with asyncio.timeout(seconds):
+                await _play(log, link, report, 0.0 if math.isinf(speed) else speed, system_ids)
     finally:
-        for task in (playing, ended):
-            task.cancel()
-        await asyncio.gather(playing, ended, return_exceptions=True)
         await link.close()
     return report
 
