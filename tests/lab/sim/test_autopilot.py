@@ -79,8 +79,6 @@ def test_it_arms_takes_off_lands_and_disarms() -> None:
         (mavlink.MAV_CMD_DO_SET_MODE, (1, Mode.AUTO), FAILED),  # without a mission
         (mavlink.MAV_CMD_MISSION_START, (), FAILED),
         (mavlink.MAV_CMD_DO_REPOSITION, (), FAILED),
-        (mavlink.MAV_CMD_DO_CHANGE_SPEED, (0, -3), DENIED),
-        (mavlink.MAV_CMD_DO_SET_MISSION_CURRENT, (9,), DENIED),
         (mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, (mavlink.MAVLINK_MSG_ID_HEARTBEAT, -1), FAILED),
         (mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, (math.nan, 1000), DENIED),
         (mavlink.MAV_CMD_REQUEST_MESSAGE, (4711,), UNSUPPORTED),

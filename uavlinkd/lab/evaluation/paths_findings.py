@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -160,10 +160,9 @@ class TrialView:
         """The longest time without a new critical frame, the larger of both directions."""
         return max(self.gap_s(Class.CRITICAL, sender, begin_s, end_s) for sender in (VEHICLE, STATION))
 
-    def bytes(self, header_bytes: int = 0, radios: Collection[int] = (0, 1)) -> float:
-        """Bytes on radios, both directions together, with the headers below UDP's payload if wanted."""
-        chosen = [radio for number, radio in self.radios.items() if number in radios]
-        return sum(radio.number("bytes") + header_bytes * radio.number("datagrams") for radio in chosen)
+    def bytes(self, header_bytes: int = 0) -> float:
+        """Bytes on the radios, both directions together, with the headers below UDP's payload if wanted."""
+        return sum(radio.number("bytes") + header_bytes * radio.number("datagrams") for radio in self.radios.values())
 
     def carried(self, radio: int, sender: str, cls: Class) -> list[float]:
         """When a radio carried frames of a class from one end."""

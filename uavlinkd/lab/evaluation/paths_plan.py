@@ -58,8 +58,6 @@ class Scenario(StrEnum):
     SWAPS = "swaps"
     ASYMMETRIC = "asymmetric"
     METERED = "metered"
-    STANDBY = "standby"
-    OFF = "off"
     MANUAL = "manual"
     DEATHS = "deaths"
     RECORDED = "recorded"
@@ -75,8 +73,6 @@ SCENARIO_MEANINGS: Final = {
     Scenario.SWAPS: "one path fails at the moment at which the other one returns, again and again",
     Scenario.ASYMMETRIC: "one path loses 30 % towards the station, the other one 30 % towards the vehicle",
     Scenario.METERED: "the other path is metered at the vehicle; the unmetered one dies and returns",
-    Scenario.STANDBY: "both paths work, and the other one is metered at the vehicle",
-    Scenario.OFF: "the other path is metered at the vehicle, and the station has been off for ten minutes",
     Scenario.MANUAL: "manual control at 25 Hz; a path of 50 ms loses 30 %, the other one has a round trip of 400 ms",
     Scenario.DEATHS: f"the path that carries the stream is dead for {DEAD_S:g} s, many times",
     Scenario.RECORDED: "a recorded flight over two working paths",
@@ -86,8 +82,6 @@ MEANS_OF: Final[Mapping[Scenario, tuple[Means, ...]]] = {
     Scenario.QUIET: tuple(Means),
     Scenario.DIES: tuple(Means),
     Scenario.SWAPS: (Means.OURS, Means.DUPLICATES),
-    Scenario.STANDBY: (Means.OURS,),
-    Scenario.OFF: (Means.OURS,),
     Scenario.DEATHS: (Means.OURS,),
     Scenario.RECORDED: (Means.OURS, Means.ALL, Means.ONE),
 }
@@ -102,8 +96,6 @@ _AT_ONCE: Final = 2
 """How many scenarios run at the same time: one core carries them."""
 _RECORDED_S: Final = 300.0
 """How much of a recorded flight is played."""
-_OFF_S: Final = 240.0
-"""How long the datagrams to a station that is off are counted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,7 +134,7 @@ class PathsPlan:
     @property
     def is_metered(self) -> bool:
         """Whether the other path is metered at the vehicle."""
-        return self.scenario in (Scenario.METERED, Scenario.STANDBY, Scenario.OFF)
+        return self.scenario is Scenario.METERED
 
     @property
     def point(self) -> dict[str, Value]:
@@ -167,12 +159,12 @@ class PathsSettings(EvaluationSettings):
         """What runs at the same time. A quick run has one round."""
         if self.quick:
             return [[(self.plan(scenario), means) for scenario, chosen in QUICK_MEANS.items() for means in chosen]]
-        slow = (Scenario.DEATHS, Scenario.OFF, Scenario.RECORDED)
+        slow = (Scenario.DEATHS, Scenario.RECORDED)
         plans = [self.plan(scenario) for scenario in Scenario if scenario not in slow]
         rounds = [plans[begin : begin + _AT_ONCE] for begin in range(0, len(plans), _AT_ONCE)]
         rounds.append([replace(_flat(Scenario.RECORDED, _RECORDED_S), tlog=tlog) for tlog in self.tlog])
         deaths = [replace(_flat(Scenario.DEATHS, 0.0, *condition), deaths=self.repeats) for condition in CONDITIONS]
-        rounds.append([*deaths, _flat(Scenario.OFF, _OFF_S)])
+        rounds.append(deaths)
         return [
             [(plan, means) for plan in chosen for means in MEANS_OF.get(plan.scenario, MEANS_ELSEWHERE)]
             for chosen in rounds
@@ -212,8 +204,6 @@ class PathsSettings(EvaluationSettings):
                 return replace(_flat(scenario, 12 * unit_s), changes=changes)
             case Scenario.MANUAL:
                 return PathsPlan(scenario, 12 * unit_s, (replace(_radio(50, JITTER_MS), loss=0.3), _radio(400, 5)))
-            case Scenario.STANDBY:
-                return _flat(scenario, 30 * unit_s)
             case _:
                 return _flat(scenario, 12 * unit_s)
 

@@ -19,7 +19,6 @@ from uavlinkd.lab.evaluation.paths_plan import (
     Scenario,
 )
 
-_DAY_S = 86400
 _HEADERS = (0, HEADER_BYTES)
 
 
@@ -29,7 +28,7 @@ def sections(findings: PathsFindings) -> list[ReportSection]:
         ReportSection("One path dies", _ON_AGES, [], "paths-dies"),
         ReportSection("One path stalls, then delivers everything", _ON_STALLS, [], "paths-stalls"),
         ReportSection("The path that carries the stream dies", _ON_DEATHS, [_deaths(findings)]),
-        ReportSection("Bytes", _ON_BYTES, _bytes(findings)),
+        ReportSection("Bytes", _ON_BYTES, [_bytes(findings)]),
         ReportSection("Scenarios and means", [], [_meanings(findings)]),
     ]
 
@@ -107,7 +106,7 @@ def _spread(values: Sequence[float | None]) -> str:
     return " / ".join(duration(percentile(known, share)) for share in (0.5, 0.95, 1.0)) if known else NOTHING
 
 
-def _bytes(findings: PathsFindings) -> list[Table]:
+def _bytes(findings: PathsFindings) -> Table:
     rows = []
     for trial in findings.trials:
         if trial.scenario in (Scenario.QUIET, Scenario.RECORDED):
@@ -115,16 +114,7 @@ def _bytes(findings: PathsFindings) -> list[Table]:
             cells = [NOTHING if share is None else f"{100 * share:+.1f} %" for share in shares]
             rate = f"{trial.bytes() / trial.duration_s:,.0f}"
             rows.append([trial.flight or "numbered frames", trial.means, rate, *cells])
-    tables = [Table(["frames", "means", "bytes a second", "redundancy", "with headers"], rows)]
-    rows = []
-    for scenario in (Scenario.STANDBY, Scenario.OFF):
-        idle = findings.trial(scenario, Means.OURS)
-        for radio in idle.radios if idle is not None else ():
-            assert idle is not None
-            sizes = [idle.bytes(header, [radio]) / idle.duration_s for header in _HEADERS]
-            cells = [f"{_DAY_S * size / 1e6:,.1f} MB" for size in sizes]
-            rows.append([scenario, "metered" if radio else "unmetered", *cells])
-    return [*tables, Table(["scenario", "path", "a day", "with headers"], rows)] if rows else tables
+    return Table(["frames", "means", "bytes a second", "redundancy", "with headers"], rows)
 
 
 def _meanings(findings: PathsFindings) -> Table:

@@ -23,7 +23,6 @@ from uavlinkd.lab.evaluation.paths_plan import (
     PathsPlan,
     PathsSettings,
     RadioChange,
-    Scenario,
 )
 from uavlinkd.lab.evaluation.paths_report import sections
 from uavlinkd.lab.evaluation.paths_traffic import DaemonsLink, PathLink, PathRadio, TrafficLog, flows_of
@@ -38,8 +37,6 @@ SETTLE_S: Final = 6.0
 """How long a link may take to use all its paths, before the scenario begins."""
 GRACE_S: Final = 1.5
 """How long frames may still arrive after the last one was sent."""
-OFF_AFTER_S: Final = 630.0
-"""From then on a daemon initiates rarely to a peer that is off."""
 RETURN_LIMIT_S: Final = 10.0
 """How long a dead path may take to be used again before it dies again."""
 WORKS_S: Final = 4.0
@@ -104,8 +101,6 @@ class PathTrial:
             DroneError: a daemon ended.
         """
         await self._link.open()
-        if self.plan.scenario is Scenario.OFF:
-            return
         self._talking = asyncio.create_task(self._traffic.talk(self._link.send))
         until = monotonic() + LINK_UP_S
         while self._traffic.arrived_from != {VEHICLE, STATION}:
@@ -118,8 +113,6 @@ class PathTrial:
 
     async def play(self) -> None:
         """Play the scenario: from here on, everything counts."""
-        if self.plan.scenario is Scenario.OFF:
-            await asyncio.sleep(OFF_AFTER_S)
         self._traffic.begin()
         for radio in self._radios.values():
             radio.watch.begin(self._traffic.began_at)
@@ -140,8 +133,7 @@ class PathTrial:
         await self._link.close()
 
     def records(self) -> list[Record]:
-        is_numbered = self.plan.scenario not in (Scenario.RECORDED, Scenario.OFF)
-        records = self._traffic.records(self.point) if is_numbered else []
+        records = self._traffic.records(self.point) if self.plan.tlog is None else []
         for number, radio in self._radios.items():
             watch = radio.watch
             values: dict[str, Value] = {"bytes": watch.bytes, "datagrams": watch.datagrams}

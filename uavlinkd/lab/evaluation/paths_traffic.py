@@ -344,7 +344,6 @@ class DaemonsLink(PathLink):
         for number, name in enumerate((VEHICLE, STATION)):
             self.daemons[name] = DroneProcess(name, folder / name, *ports[2 * number :][:2])
         self._is_metered = plan.is_metered
-        self._running = [VEHICLE] if plan.scenario is Scenario.OFF else [VEHICLE, STATION]
 
     @property
     def endpoints(self) -> dict[str, str]:
@@ -352,7 +351,7 @@ class DaemonsLink(PathLink):
 
     async def open(self) -> None:
         self.configure(await self._start_radios(self.daemons[STATION].port))
-        for name in self._running:
+        for name in self.daemons:
             self._stack.push_async_callback(self.daemons[name].stop)
             await self.daemons[name].start()
             await self._connect(name, self.endpoints[name])

@@ -20,7 +20,6 @@ from uavlinkd.lab.evaluation.frame import Evaluation, Work, duration
 from uavlinkd.lab.evaluation.impostors import key_attacks, run_key_attack, run_paper_relay, run_sealed_cookies
 from uavlinkd.lab.evaluation.middle import MiddleHere
 from uavlinkd.lab.evaluation.paper_attacks import CHANGES, AlterKeys
-from uavlinkd.lab.evaluation.records import Record
 from uavlinkd.lab.evaluation.stage import DaemonStage, PaperStage, Stage
 from uavlinkd.lab.evaluation.tampering_bench import Bench, KeyHolder
 from uavlinkd.lab.evaluation.tampering_plan import TamperingSettings, TrialPlan
@@ -163,15 +162,14 @@ class _Run:
             for plan in rows:
                 await bench.run(plan)
 
-        await self._try(label, stage, work, lane.link)
+        await self._try(label, stage, work)
 
-    async def _try(self, label: str, stage: Stage, work: Callable[[Bench], Awaitable[None]], link: Link) -> None:
+    async def _try(self, label: str, stage: Stage, work: Callable[[Bench], Awaitable[None]]) -> None:
         bench = Bench(stage, self._settings, self._add)
         async with stage:
             await bench.run_control()
             await work(bench)
             counted = {name: set(+counters) for name, counters in (await stage.notices()).items()}
-        self._work.add(Record("stage", {"stage": label}, {"link": dict(link), "control": bench.control}))
         for name, lines in stage.logs().items():
             text = "".join(f"{line}\n" for line in lines)
             (self._work.out / f"{stage.system}-{label}-{name}.log").write_text(text, encoding="utf-8")
@@ -200,7 +198,7 @@ class _Run:
                     await bench.run(plan, phases=(name,))
             await run_paper_relay(bench)
 
-        await self._try("paper", stage, work, {})
+        await self._try("paper", stage, work)
 
     async def _floods(self) -> None:
         rates = (500.0,) if self._settings.quick else (200.0, 1000.0, 2000.0)

@@ -63,15 +63,11 @@ class Commands:
             mavlink.MAV_CMD_NAV_TAKEOFF: self._take_off,
             mavlink.MAV_CMD_NAV_LAND: lambda _command, _now: self.set_mode(Mode.LAND),
             mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH: lambda _command, _now: self.set_mode(Mode.RTL),
-            mavlink.MAV_CMD_NAV_LOITER_UNLIM: lambda _command, _now: self.set_mode(Mode.LOITER),
             mavlink.MAV_CMD_DO_SET_MODE: lambda command, _now: self.set_mode(int(command.parameters[1])),
             mavlink.MAV_CMD_DO_REPOSITION: self._reposition,
-            mavlink.MAV_CMD_DO_CHANGE_SPEED: self._change_speed,
             mavlink.MAV_CMD_MISSION_START: self._start_mission,
-            mavlink.MAV_CMD_DO_SET_MISSION_CURRENT: self._set_current,
             mavlink.MAV_CMD_SET_MESSAGE_INTERVAL: self._set_interval,
             mavlink.MAV_CMD_REQUEST_MESSAGE: self._send_message,
-            mavlink.MAV_CMD_GET_HOME_POSITION: self._send_home,
             mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: self._send_version,
         }
 
@@ -140,23 +136,10 @@ class Commands:
         vehicle.go_to(point_of(vehicle, command.frame, command.x, command.y, command.z))
         return ACCEPTED
 
-    def _change_speed(self, command: Command, _now: float) -> int:
-        speed = command.parameters[1]
-        if not 0 < speed <= 50:
-            return DENIED
-        self._autopilot.vehicle.speeds.travel_m_s = speed
-        return ACCEPTED
-
     def _start_mission(self, _command: Command, _now: float) -> int:
         if not self._autopilot.vehicle.armed:
             return FAILED
         return self.set_mode(Mode.AUTO)
-
-    def _set_current(self, command: Command, _now: float) -> int:
-        if not self._autopilot.missions.set_current(int(command.parameters[0])):
-            return DENIED
-        self._autopilot.pilot.restart()
-        return ACCEPTED
 
     def _set_interval(self, command: Command, now: float) -> int:
         message, interval_us = int(command.parameters[0]), command.parameters[1]
@@ -167,10 +150,6 @@ class Commands:
 
     def _send_message(self, command: Command, now: float) -> int:
         return ACCEPTED if self._autopilot.send_by_number(int(command.parameters[0]), now) else UNSUPPORTED
-
-    def _send_home(self, _command: Command, now: float) -> int:
-        self._autopilot.send_by_number(mavlink.MAVLINK_MSG_ID_HOME_POSITION, now)
-        return ACCEPTED
 
     def _send_version(self, command: Command, now: float) -> int:
         if command.parameters[0] == 1:

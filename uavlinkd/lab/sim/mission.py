@@ -95,7 +95,7 @@ class Missions:
             case "MISSION_REQUEST_LIST":
                 self._send(mavlink.MAVLink_mission_count_message(*partner, count=len(self.plan)))
             case "MISSION_REQUEST_INT" | "MISSION_REQUEST":
-                self._send_item(partner, message.seq, as_float=name == "MISSION_REQUEST")
+                self._send_item(partner, message.seq)
             case "MISSION_COUNT":
                 self._begin(partner, message.count, now)
             case "MISSION_ITEM_INT":
@@ -115,19 +115,15 @@ class Missions:
         self.current = sequence
         return True
 
-    def _send_item(self, partner: Partner, sequence: int, *, as_float: bool) -> None:
+    def _send_item(self, partner: Partner, sequence: int) -> None:
         if sequence >= len(self.plan):
             self._acknowledge(partner, mavlink.MAV_MISSION_INVALID_SEQUENCE)
             return
         item = self.plan[sequence]
         current = int(sequence == self.current)
         head = (*partner, sequence, item.frame, item.command, current, item.autocontinue, *item.parameters)
-        if as_float:
-            # The integers for one degree, or for one metre in a local frame.
-            scale = 1e4 if item.frame in LOCAL_FRAMES else 1e7
-            self._send(mavlink.MAVLink_mission_item_message(*head, item.x / scale, item.y / scale, item.z))
-        else:
-            self._send(mavlink.MAVLink_mission_item_int_message(*head, item.x, item.y, item.z))
+        # Also for the older MISSION_REQUEST, as in PX4.
+        self._send(mavlink.MAVLink_mission_item_int_message(*head, item.x, item.y, item.z))
 
     def _begin(self, partner: Partner, count: int, now: float) -> None:
         running = self._upload

@@ -175,15 +175,14 @@ class Telemetry:
         )
 
     def _sys_status(self, _up_s: float) -> Message:
-        vehicle = self._vehicle
         return mavlink.MAVLink_sys_status_message(
             onboard_control_sensors_present=SENSORS,
             onboard_control_sensors_enabled=SENSORS,
             onboard_control_sensors_health=SENSORS,
             load=230,
-            voltage_battery=round(1000 * vehicle.battery_v),
-            current_battery=round(100 * vehicle.current_a),
-            battery_remaining=vehicle.battery_percent,
+            voltage_battery=16_000,
+            current_battery=1800,
+            battery_remaining=80,
             drop_rate_comm=0,
             errors_comm=0,
             **{f"errors_count{number}": 0 for number in range(1, 5)},
@@ -214,8 +213,8 @@ class Telemetry:
         tremble = 0.01 if vehicle.landed is not Landed.ON_GROUND else 0.0005
         return mavlink.MAVLink_attitude_message(
             _ms(up_s),
-            vehicle.roll_rad + self._noise(tremble),
-            vehicle.pitch_rad + self._noise(tremble),
+            self._noise(tremble),
+            self._noise(tremble),
             vehicle.yaw_rad + self._noise(tremble / 2),
             self._noise(tremble),
             self._noise(tremble),

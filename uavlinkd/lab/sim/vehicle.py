@@ -13,12 +13,7 @@ MAX_STEP_S: Final = 0.1
 MAX_CATCH_UP_S: Final = 5.0
 
 ACCELERATION_M_S2: Final = 2.5
-TURN_RATE_RAD_S: Final = 1.5
 EARTH_RADIUS_M: Final = 6_378_137.0
-GRAVITY_M_S2: Final = 9.806_65
-HOVER_CURRENT_A: Final = 18.0
-IDLE_CURRENT_A: Final = 0.6
-BATTERY_CAPACITY_MAH: Final = 5200.0
 
 
 class Mode(IntEnum):
@@ -74,7 +69,7 @@ class Speeds:
 
 @dataclass(slots=True)
 class Vehicle:
-    """The state of the copter: position, target, attitude, battery.
+    """The state of the copter: position, target, heading.
 
     ``arm``, ``disarm``, ``take_off``, ``go_to`` and ``set_mode`` control it, and ``step`` moves it. Positions are
     relative to home, where it starts on the ground.
@@ -90,9 +85,6 @@ class Vehicle:
     velocity: Axes = field(default_factory=Axes)
     target: Axes = field(default_factory=Axes)
     yaw_rad: float = 0.0
-    roll_rad: float = 0.0
-    pitch_rad: float = 0.0
-    used_mah: float = 0.0
 
     @property
     def altitude_m(self) -> float:
@@ -105,20 +97,6 @@ class Vehicle:
     @property
     def ground_speed_m_s(self) -> float:
         return math.hypot(self.velocity.north, self.velocity.east)
-
-    @property
-    def current_a(self) -> float:
-        return HOVER_CURRENT_A if self.armed and self.landed is not Landed.ON_GROUND else IDLE_CURRENT_A
-
-    @property
-    def battery_percent(self) -> int:
-        """The remaining charge, 0 to 100."""
-        return max(0, round(100 * (1 - self.used_mah / BATTERY_CAPACITY_MAH)))
-
-    @property
-    def battery_v(self) -> float:
-        """The voltage of a battery with four cells."""
-        return 4 * (3.5 + 0.7 * self.battery_percent / 100)
 
     def place_of(self, point: Axes) -> GeoPoint:
         """A point relative to home, on the globe."""
@@ -190,19 +168,17 @@ class Vehicle:
             left -= step_s
 
     def _step(self, step_s: float) -> None:
-        self.used_mah = min(self.used_mah + self.current_a * step_s / 3.6, BATTERY_CAPACITY_MAH)
         if not self.armed or self.landed is Landed.ON_GROUND:
             return
         if self.mode is Mode.RTL and self.landed is Landed.IN_AIR and self.has_arrived():
             self.target = Axes(0.0, 0.0, 0.0)
             self.landed = Landed.LANDING
-        wanted = self._wanted_velocity()
-        before = Axes(self.velocity.north, self.velocity.east, self.velocity.up)
-        self._accelerate(wanted, step_s)
+        self._accelerate(self._wanted_velocity(), step_s)
         self.position.north += self.velocity.north * step_s
         self.position.east += self.velocity.east * step_s
         self.position.up += self.velocity.up * step_s
-        self._lean(before, step_s)
+        if self.ground_speed_m_s > 0.5:
+            self.yaw_rad = math.atan2(self.velocity.east, self.velocity.north)
         if self.landed is Landed.TAKEOFF and self.position.up > 0.9 * self.target.up:
             self.landed = Landed.IN_AIR
         if self.landed is Landed.LANDING and self.position.up <= 0.05:
@@ -234,25 +210,9 @@ class Vehicle:
         self.velocity.east += east * share
         self.velocity.up += max(-most, min(most, wanted.up - self.velocity.up))
 
-    def _lean(self, before: Axes, step_s: float) -> None:
-        """Compute the attitude from the acceleration, and the heading from the course."""
-        forward_n = (self.velocity.north - before.north) / step_s
-        forward_e = (self.velocity.east - before.east) / step_s
-        ahead = forward_n * math.cos(self.yaw_rad) + forward_e * math.sin(self.yaw_rad)
-        aside = -forward_n * math.sin(self.yaw_rad) + forward_e * math.cos(self.yaw_rad)
-        self.pitch_rad = -math.atan2(ahead, GRAVITY_M_S2)
-        self.roll_rad = math.atan2(aside, GRAVITY_M_S2)
-        if self.ground_speed_m_s > 0.5:
-            course = math.atan2(self.velocity.east, self.velocity.north)
-            turn = (course - self.yaw_rad + math.pi) % (2 * math.pi) - math.pi
-            most = TURN_RATE_RAD_S * step_s
-            self.yaw_rad += max(-most, min(most, turn))
-            self.yaw_rad = (self.yaw_rad + math.pi) % (2 * math.pi) - math.pi
-
     def _touch_down(self) -> None:
         self.position.up = 0.0
         self.velocity = Axes()
-        self.roll_rad = self.pitch_rad = 0.0
         self.landed = Landed.ON_GROUND
 
     def _meridians_close(self) -> float:
