@@ -118,7 +118,7 @@ def page_text(findings: Findings) -> str:
     )
     run = Table(("", ""), [(name, _plain(value)) for name, value in facts.items()])
     parts.append(ReportSection("The run", [disturbed], [run]))
-    return to_markdown("What a frame costs", head, parts, (), "")
+    return to_markdown("What a frame costs", head, parts, ())
 
 
 def _point(record: Record) -> str:

@@ -111,20 +111,13 @@ class Evaluation(Generic[F, S]):
         interrupted = [] if findings.of("end") else ["the run was interrupted"]
         return [*self.problems(findings), *interrupted]
 
-    def write(self, folder: Path, page: Path | None = None) -> Path:
-        """Write the report from the records in ``folder``, there or to ``page``. Return its path.
-
-        The figures of a page are in the folder ``results`` beside it.
-        """
-        findings = self.read(folder)
-        beside = "" if page is None else "results/"
-        page = folder / f"{self.name}.md" if page is None else page
-        images = page.parent / beside
-        images.mkdir(parents=True, exist_ok=True)
-        drawn = self._write_figures(findings, images)
+    def write(self, folder: Path) -> Path:
+        """Write the report and the figures from the records in ``folder``. Return the path of the report."""
+        findings, page = self.read(folder), folder / f"{self.name}.md"
+        drawn = self._write_figures(findings, folder)
         sections = [*self.sections(findings), _run_section(findings)]
         problems = [f"Not as expected: {problem}." for problem in self.deviations(findings)]
-        page.write_text(to_markdown(self.title, problems, sections, drawn, beside), encoding="utf-8")
+        page.write_text(to_markdown(self.title, problems, sections, drawn), encoding="utf-8")
         return page
 
     def _write_figures(self, findings: F, folder: Path) -> list[str]:
@@ -166,14 +159,14 @@ def _run_section(findings: RunRecords) -> ReportSection:
 
 
 def to_markdown(
-    title: str, problems: Sequence[str], sections: Sequence[ReportSection], figures: Sequence[str], where: str
+    title: str, problems: Sequence[str], sections: Sequence[ReportSection], figures: Sequence[str]
 ) -> str:
-    """The report as Markdown. ``where`` is the folder of the figures, relative to the page."""
+    """The report as Markdown."""
     parts = [f"# {title}", *problems]
     for section in sections:
         parts.append(f"## {section.title}")
         if section.figure in figures:
-            parts.append(f"![{section.title}]({where}{section.figure}.svg)")
+            parts.append(f"![{section.title}]({section.figure}.svg)")
         parts += section.text
         for table in section.tables:
             lines = [table.head, ["---"] * len(table.head), *table.rows]

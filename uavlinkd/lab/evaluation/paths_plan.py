@@ -94,6 +94,8 @@ QUICK_MEANS: Final[Mapping[Scenario, tuple[Means, ...]]] = {
 }
 _AT_ONCE: Final = 2
 """How many scenarios run at the same time: one core carries them."""
+_DEATHS: Final = 100
+"""For each of :data:`CONDITIONS`; a quick run has none."""
 _RECORDED_S: Final = 300.0
 """How much of a recorded flight is played."""
 
@@ -151,8 +153,6 @@ class PathsPlan:
 class PathsSettings(EvaluationSettings):
     """The settings of one run."""
 
-    repeats: int = 100
-    """Deaths for each of :data:`CONDITIONS`; a quick run has none."""
     tlog: tuple[Path, ...] = ()
 
     def rounds(self) -> list[list[tuple[PathsPlan, Means]]]:
@@ -163,7 +163,7 @@ class PathsSettings(EvaluationSettings):
         plans = [self.plan(scenario) for scenario in Scenario if scenario not in slow]
         rounds = [plans[begin : begin + _AT_ONCE] for begin in range(0, len(plans), _AT_ONCE)]
         rounds.append([replace(_flat(Scenario.RECORDED, _RECORDED_S), tlog=tlog) for tlog in self.tlog])
-        deaths = [replace(_flat(Scenario.DEATHS, 0.0, *condition), deaths=self.repeats) for condition in CONDITIONS]
+        deaths = [replace(_flat(Scenario.DEATHS, 0.0, *condition), deaths=_DEATHS) for condition in CONDITIONS]
         rounds.append(deaths)
         return [
             [(plan, means) for plan in chosen for means in MEANS_OF.get(plan.scenario, MEANS_ELSEWHERE)]

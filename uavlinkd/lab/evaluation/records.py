@@ -183,21 +183,12 @@ def _cpu_name() -> str:
 
 
 def _commit() -> str | None:
-    """The measured commit, with "changed" if files differ from it; None outside a checkout of this project."""
-    answers = []
-    for question in (
-        ("ls-files", "--error-unmatch", __file__),
-        ("rev-parse", "--short", "HEAD"),
-        ("status", "--porcelain", "--", ".."),
-    ):
-        git = ("git", "-C", str(Path(__file__).parent), *question)
-        try:
-            done = subprocess.run(git, capture_output=True, text=True, check=True, timeout=10)  # noqa: S603  constants
-        except (OSError, subprocess.SubprocessError):
-            return None
-        answers.append(done.stdout.strip())
-    _, commit, changes = answers
-    return f"{commit}, changed" if changes else commit
+    """The measured commit, with "-dirty" if files differ from it; None outside a checkout."""
+    git = ("git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--exclude=*")
+    try:
+        return subprocess.run(git, capture_output=True, text=True, check=True, timeout=10).stdout.strip()  # noqa: S603
+    except (OSError, subprocess.SubprocessError):
+        return None
 
 
 def _version_of(package: str) -> str | None:
@@ -208,14 +199,11 @@ def _version_of(package: str) -> str | None:
 
 
 class CpuTimeError(Exception):
-    """The processor time of a process cannot be read: it has ended, or the system is not Linux."""
+    """The processor time of a process cannot be read: it has ended, or the kernel has no schedstat."""
 
 
 def cpu_seconds(pid: int) -> float:
-    """The processor time of all threads of a process.
-
-    It comes from the scheduler, in nanoseconds (``/proc/PID/task/*/schedstat``), or if the kernel does not provide
-    that, from ``/proc/PID/stat`` in steps of 10 ms.
+    """The processor time of all threads of a process, from the scheduler (``/proc/PID/task/*/schedstat``).
 
     Raises:
         CpuTimeError: it cannot be read.
@@ -223,11 +211,5 @@ def cpu_seconds(pid: int) -> float:
     threads = Path(f"/proc/{pid}/task")
     try:
         return sum(int((thread / "schedstat").read_bytes().split()[0]) for thread in threads.iterdir()) / 1e9
-    except (OSError, IndexError, ValueError):
-        pass
-    try:
-        # After the name, which may have any characters: fields 14 and 15 of proc(5).
-        fields = Path(f"/proc/{pid}/stat").read_bytes().rpartition(b")")[2].split()
-        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
     except (OSError, IndexError, ValueError) as error:
         raise CpuTimeError(f"the processor time of process {pid} cannot be read") from error

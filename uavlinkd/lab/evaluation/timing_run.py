@@ -8,7 +8,6 @@ import random
 import sys
 from collections.abc import Iterable
 from contextlib import AsyncExitStack
-from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from uavlinkd.core.suites import SUITES, X25519
@@ -37,19 +36,9 @@ DATA_BYTES = 280
 """The largest MAVLink 2 frame."""
 _ANSWER_S = 60.0
 """How long an end of the paper's method may take to start, or to verify."""
+_REPEATS = 30
 _LIMIT_S, _QUICK_LIMIT_S = 600.0, 2.0
 """The time limit of one exchange of the paper's method: ten minutes, as in the paper."""
-
-
-@dataclass(frozen=True, slots=True)
-class TimingSettings(EvaluationSettings):
-    """The options of the evaluation.
-
-    ``repeats``: of each point. ``quick``: some points, once. ``seed``: of the order of the measurements and of their
-    data; keys come from the system.
-    """
-
-    repeats: int = 30
 
 
 def grid() -> list[LinkChoice]:
@@ -67,7 +56,7 @@ def paper_points() -> list[dict[str, Value]]:
     ]
 
 
-async def run_timing(work: Work[TimingSettings]) -> dict[str, Any]:
+async def run_timing(work: Work[EvaluationSettings]) -> dict[str, Any]:
     run = _Run(work)
     work.show("tags, and initiations in the core")
     for record in measure_tags(500 if work.settings.quick else 20_000):
@@ -80,14 +69,14 @@ async def run_timing(work: Work[TimingSettings]) -> dict[str, Any]:
 
 
 class _Run:
-    def __init__(self, work: Work[TimingSettings]) -> None:
+    def __init__(self, work: Work[EvaluationSettings]) -> None:
         self._work = work
         self._settings = work.settings
         self._random = random.Random(work.settings.seed)  # noqa: S311  not for keys
 
     def shuffled(self, points: Iterable[T]) -> list[T]:
         """Every point some times in random order, so that load affects all points equally."""
-        repeats = 1 if self._settings.quick else self._settings.repeats
+        repeats = 1 if self._settings.quick else _REPEATS
         work = [point for point in points for _ in range(repeats)]
         self._random.shuffle(work)
         return work
@@ -177,7 +166,7 @@ async def _answer(process: asyncio.subprocess.Process, limit_s: float) -> dict[s
 TIMING = Evaluation(
     name="timing",
     title="How long a link takes: the paper's method and uavlinkd's",
-    settings=TimingSettings,
+    settings=EvaluationSettings,
     run=run_timing,
     findings=TimingFindings,
     sections=sections,

@@ -8,7 +8,6 @@ import os
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Final
 
 from uavlinkd.config import ConfigError
 from uavlinkd.config.load import load_config, load_control_socket
@@ -18,36 +17,17 @@ from uavlinkd.lab.hostile.relay_attacks import ALL_ATTACKS
 from uavlinkd.lab.mitm.attack import AttackError
 from uavlinkd.lab.mitm.attack_service import REQUESTS
 from uavlinkd.lab.mitm.attacks import list_attacks, parse_attack
-from uavlinkd.lab.mitm.console import (
-    OK,
-    WRONG,
-    add_attack_options,
-    fail,
-    print_list,
-    send_request,
-)
+from uavlinkd.lab.mitm.console import OK, WRONG, add_attack_options, fail, print_list, send_request
 from uavlinkd.ops.control import ControlError
 from uavlinkd.ops.log import set_up_logging
 from uavlinkd.system import core_dumps
-
-MOST_MEMBERS: Final = 100
-"""Attacks know each pair of members in both directions."""
-_EPILOG = """\
-Example, with the file of `uavlinkd relay`, on the relay's host or another one that its members reach by that address:
-
-  uavlink-mitm relay --config relay.toml --attack misroute,kinds=envelope --log relay.jsonl
-  uavlink-mitm relay --config relay.toml --ask "attack relay-lie relay-frames"
-
-The requests go through the control_socket of the file. Attack only your own members.
-"""
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="uavlink-mitm relay",
         description="A relay that attacks its members. It has a relay's key, and no key of a member.",
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog="The requests of --ask go through the control_socket of the file. Attack only your own members.",
     )
     parser.add_argument("--config", metavar="FILE", type=Path, help="the file of the relay")
     add_attack_options(parser, partial(parse_attack, attacks=ALL_ATTACKS), REQUESTS)
@@ -77,8 +57,6 @@ def _run(options: argparse.Namespace) -> int:
     config = load_config(options.config, os.environ)
     if config.relay_server is None or not config.is_only_relay:
         return fail(f"{options.config}: is not the file of a relay: that has a [[member]], and no [[peer]]", WRONG)
-    if len(config.relay_server.members) > MOST_MEMBERS:
-        return fail(f"{options.config}: member: has more than {MOST_MEMBERS} sections: leave some out", WRONG)
     settings = HostileRelaySettings(
         name=config.name,
         private_key=config.private_key,

@@ -23,23 +23,15 @@ from uavlinkd.lab.mitm.line_attacks import list_line_attacks, parse_line_attack
 from uavlinkd.lab.mitm.modem import ModemSettings
 from uavlinkd.lab.mitm.modem_ports import MODEM_REQUESTS, ModemPorts, PortSettings, parse_modem
 from uavlinkd.lab.mitm.proxy import Proxy
-from uavlinkd.lab.mitm.proxy_settings import (
-    ProxySettings,
-    SettingsError,
-    load_proxy_settings,
-)
+from uavlinkd.lab.mitm.proxy_settings import ProxySettings, SettingsError, load_proxy_settings
 from uavlinkd.ops.control import ControlError
 from uavlinkd.ops.log import set_up_logging
 
-_EPILOG = """\
-Example: `uavlink-mitm --config mitm.toml --attack replay-data,share=0.1`. configs/mitm.toml of this project explains
-peers, links and radios.
-
-`uavlink-mitm modem --help`: emulated telemetry modems between two serial ports, and attacks on the line.
-`uavlink-mitm relay --help`: a relay that attacks its members.
-
-Attack only your own links.
-"""
+_EPILOG = (
+    "See also `uavlink-mitm modem --help` (emulated telemetry modems, and attacks on the line) and"
+    " `uavlink-mitm relay --help` (a relay that attacks its members). configs/mitm.toml of this project explains"
+    " peers, links and radios. Attack only your own links."
+)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -47,7 +39,6 @@ def _parser() -> argparse.ArgumentParser:
         prog="uavlink-mitm",
         description="A proxy between uavlinkd daemons, without their keys. It attacks the link, or emulates a radio.",
         epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"uavlink-mitm {__version__}")
     parser.add_argument("--config", metavar="FILE", type=Path, help="peers, links, attacks and radios")
@@ -90,24 +81,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return OK
 
 
-_MODEM_EPILOG = """\
-Example: two daemons with serial = "/tmp/air/left:57600" and "/tmp/air/right:57600", and modems between them that lose
-packets and alter bytes:
-
-  uavlink-mitm modem --left /tmp/air/left --right /tmp/air/right --control-socket /tmp/air/control \\
-      --set packet_loss=0.05,byte_error_rate=0.0005
-  uavlink-mitm modem --control-socket /tmp/air/control --ask "pull left"
-"""
-
-
 def _modem_parser() -> argparse.ArgumentParser:
     defaults = ModemSettings()
     names = ", ".join(f"{name}={getattr(defaults, name)}" for name in ModemSettings.__slots__)
     parser = argparse.ArgumentParser(
         prog="uavlink-mitm modem",
         description="Two emulated telemetry modems and the air between them, on pseudo-terminals.",
-        epilog=_MODEM_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--left", metavar="PATH", type=Path, help="make the left device here, a symbolic link")
     parser.add_argument("--right", metavar="PATH", type=Path, help="make the right device here")

@@ -23,8 +23,6 @@ from uavlinkd.lab.mitm.attacks import AttackSpec, attack_from_table
 from uavlinkd.lab.mitm.radio import RadioSettings
 from uavlinkd.system.addresses import Address, parse_address
 
-MAX_FILE_BYTES = 1 << 20
-
 
 class SettingsError(ValueError):
     """The settings are wrong: one problem per line."""
@@ -244,13 +242,8 @@ def _problem(location: tuple[int | str, ...], message: str) -> str:
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        with path.open("rb") as file:
-            content = file.read(MAX_FILE_BYTES + 1)
+        return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise SettingsError([f"cannot be read: {error.strerror}"]) from None
-    if len(content) > MAX_FILE_BYTES:
-        raise SettingsError(["is larger than 1 MiB: this is not a configuration"])
-    try:
-        return tomllib.loads(content.decode())
     except (ValueError, RecursionError) as error:
         raise SettingsError([f"is not valid TOML: {error}"]) from None
