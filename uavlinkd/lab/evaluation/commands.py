@@ -27,17 +27,14 @@ EVALUATIONS = {
     "flight": "let two aircraft exchange positions in flight under attack",
     "paths": "let radios between a vehicle and its station fail: two paths, one path, and duplicated frames",
 }
-STAGES = ("handshake", "data", "keys", "paper", "reports", "paths", "spoiled", "line", "relay")
+STAGES = ("handshake", "data", "keys", "paper", "paths", "spoiled", "line", "relay")
 
 _Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 
 def add_evaluations(commands: _Commands) -> None:
     """Add the evaluations, and ``report``."""
-    timing, tampering, _, paths = (_add(commands, name) for name in EVALUATIONS)
-    _number(timing, "--repeats", 30, "repetitions of every point")
-    _number(tampering, "--attempts-data", 10_000, "attempts of each attack on data; a tenth on the paper's protocol")
-    _number(tampering, "--attempts-handshake", 200, "attempts of each attack on the handshake; likewise")
+    _, tampering, _, paths = (_add(commands, name) for name in EVALUATIONS)
     tampering.add_argument(
         "--only",
         metavar="STAGE",
@@ -45,7 +42,6 @@ def add_evaluations(commands: _Commands) -> None:
         action="append",
         help=f"run this stage alone; may be repeated: {', '.join(STAGES)} (default: all, and floods)",
     )
-    _number(paths, "--repeats", 100, "how often a path dies for each round trip and jitter; not in a quick run")
     paths.add_argument(
         "--tlog",
         metavar="FILE",
@@ -55,9 +51,6 @@ def add_evaluations(commands: _Commands) -> None:
     )
     report = commands.add_parser("report", help="write the figures and the report again, from the records")
     report.add_argument("folder", metavar="DIR", type=Path, help="folder with the records")
-    report.add_argument(
-        "--page", metavar="FILE", type=Path, help="write it there, with the figures in results/ beside"
-    )
     report.set_defaults(command=_report)
 
 
@@ -71,17 +64,6 @@ def _add(commands: _Commands, name: str) -> argparse.ArgumentParser:
     )
     parser.set_defaults(command=_evaluate, evaluation=name)
     return parser
-
-
-def _number(parser: argparse.ArgumentParser, option: str, default: int, text: str) -> None:
-    parser.add_argument(option, metavar="N", type=_count, default=default, help=f"{text} (default: %(default)s)")
-
-
-def _count(text: str) -> int:
-    number = int(text)
-    if number < 1:
-        raise argparse.ArgumentTypeError("must be 1 or more")
-    return number
 
 
 def evaluation_of(name: str) -> Evaluation[Any, Any]:
@@ -123,7 +105,7 @@ def _report(options: argparse.Namespace) -> int:
         evaluation = evaluation_of(name)
         if (options.folder / f"{name}.jsonl").exists():
             try:
-                print(evaluation.write(options.folder, options.page))
+                print(evaluation.write(options.folder))
             except _errors() as error:
                 return _fail(error)
             return OK

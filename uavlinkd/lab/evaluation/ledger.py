@@ -38,8 +38,6 @@ class Fault(StrEnum):
     MISROUTED = "misrouted"
     STALE = "stale"
     """Unaltered, but older than :data:`STALE_S`."""
-    FALSELY_CLAIMED = "claimed as refused, and never refused"
-    """Not delivered either: a drone shows a claim that its peer did not make."""
 
 
 def numbered_frame(system: int, number: int, heartbeat_every: int = _HEARTBEAT_EVERY) -> bytes:

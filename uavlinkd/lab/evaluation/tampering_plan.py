@@ -15,7 +15,7 @@ from uavlinkd.lab.evaluation.tampering_records import PAPER
 
 HANDSHAKE, DATA, FLOOD, TRAFFIC, KEYS = "handshake", "data", "flood", "traffic", "keys"
 PATHS, SPOILED, LINE, RELAYED = "paths", "spoiled", "line", "relay"
-STAGES = (HANDSHAKE, DATA, KEYS, "paper", "reports", PATHS, SPOILED, LINE, RELAYED)
+STAGES = (HANDSHAKE, DATA, KEYS, "paper", PATHS, SPOILED, LINE, RELAYED)
 """What a run may be limited to. Each has its own daemons."""
 LOAD: Final = "flood-initiations,rate_per_s=600"
 """The load at which daemons require cookies."""
@@ -25,8 +25,6 @@ LOAD: Final = "flood-initiations,rate_per_s=600"
 class TamperingSettings(EvaluationSettings):
     """The extent of the evaluation."""
 
-    attempts_data: int = 10_000
-    attempts_handshake: int = 200
     only: tuple[str, ...] = ()
     """The stages that run; empty: all of them, and the floods."""
 
@@ -39,8 +37,8 @@ class TamperingSettings(EvaluationSettings):
         """The number of attempts of an attack. On the paper's protocol a tenth is sufficient."""
         if self.quick:
             return 5 if group in (HANDSHAKE, KEYS) else 60
-        wanted = self.attempts_handshake if group in (HANDSHAKE, KEYS) else self.attempts_data
-        return max(1, wanted // 10) if system == PAPER else wanted
+        wanted = 200 if group in (HANDSHAKE, KEYS) else 10_000
+        return wanted // 10 if system == PAPER else wanted
 
     def most_s(self, group: str) -> float:
         if self.quick:
@@ -212,18 +210,6 @@ roam, then gone | roam,mode=instead | noticed_after_s=<question> takes_away need
     paper="same",
 )
 """On a link with a rekey every two seconds. What is held is refused as delayed when it is released."""
-
-REPORT_PLANS: Final = _rows(
-    DATA,
-    """
-bit-flip reports | bit-flip,kinds=report,beside=true
-duplicate reports | duplicate,kinds=report | is_variant
-drop reports | drop,kinds=report | takes_away is_variant
-""",
-    targeted=False,
-    least_s=5.0,
-)
-"""On a link whose ends refuse frames of each other, and report them, one report in 2 s."""
 
 FLOOD_PLANS: Final = _rows(
     FLOOD,

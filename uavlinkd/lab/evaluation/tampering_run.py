@@ -30,7 +30,6 @@ from uavlinkd.lab.evaluation.tampering_stages import (
     LineStage,
     MiddleLine,
     MiddleRelay,
-    RefusingStage,
     RelayStage,
     TwoPathStage,
 )
@@ -82,7 +81,6 @@ _LANES: Final = {
     "handshake-1": _Lane(PAIR, FAST_LINK, 50.0, plans.HANDSHAKE_PLANS[1::2]),
     "data": _Lane(PAIR, _rekeying(2.0, 20.0), 1.0, _DATA_ROWS),
     "keys": _Lane(TRIO, _rekeying(1.0, 10.0), 0.5, _KEYS_ROWS, silent=TRIO[2:]),
-    "reports": _Lane(PAIR, {}, 50.0, plans.REPORT_PLANS, RefusingStage),
     "paths": _Lane(PAIR, _rekeying(5.0, 30.0), 0.5, plans.PATH_PLANS, TwoPathStage, _on_two_paths),
     "spoiled": _Lane(PAIR, {}, 25.0, plans.SPOILED_PLANS, TwoPathStage, _on_two_paths),
     # The radio carries more than ten frames per second, so a lost frame was lost by the attack.

@@ -1,15 +1,12 @@
-"""Further stages of real daemons: with two paths, on a serial line, behind a hostile relay, and with refusals."""
+"""Further stages of real daemons: with two paths, on a serial line, and behind a hostile relay."""
 
 from __future__ import annotations
 
-import asyncio
 import os
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from struct import Struct
 from time import monotonic
-from typing import Any, Final
+from typing import Final
 
 from uavlinkd.config import RelayServer
 from uavlinkd.config.keys import encode_key
@@ -17,19 +14,15 @@ from uavlinkd.core import constants as c
 from uavlinkd.core.crypto import KeyPair, Secret
 from uavlinkd.core.settings import Link, PeerSettings
 from uavlinkd.core.suites import SUITES_BY_NAME
-from uavlinkd.lab.evaluation.ledger import Fault
 from uavlinkd.lab.evaluation.middle import HOST, Interventions, interventions, silent_log
 from uavlinkd.lab.evaluation.stage import DaemonStage, until
 from uavlinkd.lab.hostile.hostile_relay import HostileRelay, HostileRelaySettings
-from uavlinkd.lab.mitm.anatomy import mavlink_frame
 from uavlinkd.lab.mitm.attack import AttackObject, Direction
 from uavlinkd.lab.mitm.line_attacks import parse_line_attack
 from uavlinkd.lab.mitm.modem import ModemEnd, ModemSettings
 from uavlinkd.lab.mitm.modem_ports import ModemPorts, PortSettings
 from uavlinkd.lab.mitm.radio import RadioSettings
 from uavlinkd.lab.sim.loopback_ports import free_ports
-from uavlinkd.mavlink.dialect import ids_by_name
-from uavlinkd.mavlink.dialect_table import MESSAGES
 from uavlinkd.relay.member_settings import MemberSettings, RelayLimits
 from uavlinkd.system.addresses import Address
 
@@ -40,11 +33,6 @@ _ENDS: Final = dict(zip(ModemEnd, ("drone0", "drone1"), strict=True))
 _AMPLE: Final = RelayLimits(1_000_000, 10**10)
 _RELAY_LINK: Final = Link((SUITES_BY_NAME["x25519"],), features=c.FEATURE_REFUSALS | c.FEATURE_RECORDS)
 _RELAY_PEERS: Final = 16
-_REFUSED: Final = "MAV_CMD_COMPONENT_ARM_DISARM"
-_COMMAND: Final = Struct("<7fHBBB")
-_COMMAND_LONG: Final = ids_by_name()["COMMAND_LONG"]
-_ARM: Final = 400
-_COMMANDS_INTERVAL_S: Final = 0.2
 
 
 class TwoPathStage(DaemonStage):
@@ -171,50 +159,3 @@ class RelayStage(DaemonStage):
     def relays(self, name: str) -> list[dict[str, object]]:
         del name
         return [self.middle.section]
-
-
-class RefusingStage(DaemonStage):
-    """Two drones that refuse commands of each other, and report that: are the claims that they show true?"""
-
-    def rules(self, one: str, other: str) -> dict[str, object]:
-        return {**super().rules(one, other), "deny_in": [_REFUSED]}
-
-    async def _talk(self) -> None:
-        await asyncio.gather(super()._talk(), self._send_commands(), self._check_claims())
-
-    async def _send_commands(self) -> None:
-        seq = 0
-        while True:
-            for number, name in enumerate(self.names):
-                self.send(name, arm_command(number + 1, seq))
-            seq = (seq + 1) % 256
-            await asyncio.sleep(_COMMANDS_INTERVAL_S)
-
-    async def _check_claims(self) -> None:
-        """A drone claims at most what it has refused when it is asked afterwards."""
-        while True:
-            await asyncio.sleep(_COMMANDS_INTERVAL_S)
-            for shown_by, claimed_by in (self.names, self.names[::-1]):
-                claims = claims_of(await self.drones[shown_by].ask(), claimed_by)
-                refused = refused_by(await self.drones[claimed_by].ask(), shown_by)
-                if false := (claims - refused).total():
-                    self.ledger.faults[Fault.FALSELY_CLAIMED] += false
-
-
-def arm_command(system: int, seq: int) -> bytes:
-    payload = _COMMAND.pack(1.0, *(0.0,) * 6, _ARM, 3 - system, 1, 0)
-    return mavlink_frame(_COMMAND_LONG, payload, MESSAGES[_COMMAND_LONG][1], system, seq)
-
-
-def claims_of(status: Mapping[str, Any], peer: str) -> Counter[str]:
-    """What a drone's status shows as the claims of its peer."""
-    peers = status.get("peers", {})
-    listed = peers[peer]["refused_there"] if peer in peers else []
-    return Counter({f"{claim['command'] or claim['message']} {claim['reason']}": claim["count"] for claim in listed})
-
-
-def refused_by(status: Mapping[str, Any], peer: str) -> Counter[str]:
-    """What a drone has refused of its peer's commands."""
-    peers = status.get("peers", {})
-    commands = peers[peer]["refused_commands"]["in"] if peer in peers else {}
-    return Counter({f"{command} {reason}": n for command, counts in commands.items() for reason, n in counts.items()})

@@ -201,13 +201,5 @@ class _Demo:
                 zip(("sent", "delivered"), ledger.count(self._began, ledger.mark()), strict=True)
             )
             drops = self.drops() - self._drops_before
-            self._live.update(
-                render(
-                    self._stage.drones.values(),
-                    {**frames, "altered": ledger.faults.total()},
-                    drops,
-                    done_at - monotonic(),
-                    self._results,
-                ),
-                refresh=True,
-            )
+            frames["altered"] = ledger.faults.total()
+            self._live.update(render(frames, drops, done_at - monotonic(), self._results), refresh=True)
