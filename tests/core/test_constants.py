@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
-import re
-
 from uavlinkd.core import constants as c
 from uavlinkd.core import wire
-from uavlinkd.core.drops import DropReason
-from uavlinkd.core.settings import Link, PeerSettings, Timers, link_name, previous_of
-from uavlinkd.core.suites import SUITES, X25519
+from uavlinkd.core.settings import Link, PeerSettings, link_name, previous_of
 
 
 def test_numbers_fit_together() -> None:
@@ -26,15 +21,6 @@ def test_numbers_fit_together() -> None:
     assert c.COOKIE_HELD_S <= c.COOKIE_SECRET_LIFETIME_S
 
 
-def test_defaults_of_a_link() -> None:
-    """Timers are the documented ones. The default is authentication over the suite without a group."""
-    for field in dataclasses.fields(Timers):
-        assert getattr(Timers(), field.name) == getattr(c, field.name.upper())
-    link = Link()
-    assert (link.suites, link.confidential, link.tag_bytes, link.mac_key_bits) == ((X25519,), False, 16, 256)
-    assert SUITES[0] is X25519
-
-
 def test_a_peer_by_its_previous_key_differs_in_name_and_key() -> None:
     """It is another peer of the node, with the same link."""
     settings = PeerSettings("alpha", bytes(32), None, Link(tag_bytes=12), initiates=False)
@@ -43,10 +29,3 @@ def test_a_peer_by_its_previous_key_differs_in_name_and_key() -> None:
     assert link_name(before.name) == settings.name
     assert before.public_key == bytes([1]) * 32
     assert (before.link, before.initiates) == (settings.link, False)
-
-
-def test_reason_names_are_fit_for_metrics() -> None:
-    """Logs, status and metrics use one word for one thing."""
-    for reason in DropReason:
-        assert reason.value == reason.name.lower()
-        assert re.fullmatch(r"[a-z][a-z0-9]*(_[a-z0-9]+)*", reason.value)

@@ -9,10 +9,7 @@ from pathlib import Path
 import pytest
 
 from uavlinkd.core import constants, wire
-from uavlinkd.core import constants as c
 from uavlinkd.core.drops import DropReason
-from uavlinkd.core.probe import Probe
-from uavlinkd.core.refusals import RefusalReport, Refused
 from uavlinkd.core.suites import SUITES
 
 CORE = Path(constants.__file__).parent
@@ -61,11 +58,6 @@ def test_constant_is_the_documented_one(name: str) -> None:
     assert DOCUMENTED.get(name) == DEFINED.get(name)
 
 
-def test_names_in_capitals_are_constants() -> None:
-    """A constant that the text mentions exists."""
-    assert set(re.findall(r"`([A-Z]+(?:_[A-Z]+)+)`", TEXT)) <= set(DEFINED)
-
-
 def test_checks_name_every_reason() -> None:
     """Each reason is listed among the checks on receipt or on sending, and a check names no other."""
     named = set(re.findall(r"`([a-z_]+\d?)`", section("13 Receipt"))) - {"mac1", "mac2"}
@@ -90,39 +82,3 @@ def test_work_of_every_suite() -> None:
     )
     table = {name.strip("`"): units for name, units in table.items()}
     assert table == {suite.name: str(suite.work) for suite in SUITES.values()}
-
-
-def test_sizes_of_envelopes() -> None:
-    """Overheads are those of header and tag, for each form and tag length."""
-    table = {cells[0]: cells[1:] for cells in rows(section("11 Envelopes"))}
-    tags = [int(cell.removeprefix("tag ")) for cell in table["overhead in bytes"]]
-    assert tuple(tags) == wire.TAG_LENGTHS
-    assert table["short form"] == [str(wire.SHORT_HEADER_BYTES + tag) for tag in tags]
-    assert table["long form"] == [str(wire.LONG_HEADER_BYTES + tag) for tag in tags]
-
-
-def test_types_and_sizes_of_records() -> None:
-    """Each control record has the number and length that the document draws."""
-    drawn = re.findall(r"^    (\d) ([a-z ]+?)  +type.*?(\d+) bytes?$", section("12 Control"), re.MULTILINE)
-    records: dict[str, wire.Echo | Probe | wire.Close | RefusalReport] = {
-        "echo request": wire.Echo(False, 1, 2, 3),
-        "echo reply": wire.Echo(True, 1, 2, 3),
-        "probe": Probe(question=1, answer=2, sent=3, received=4),
-        "close": wire.Close(),
-        "refusal report": RefusalReport((Refused(0xFFFFFF, 0xFFFF, 0xFF, 2**32 - 1),) * c.REFUSALS_PER_REPORT),
-    }
-    encoded = {name: record.encode() for name, record in records.items()}
-    assert [(name, int(kind), int(size)) for kind, name, size in drawn] == [
-        (name, data[0], len(data)) for name, data in encoded.items()
-    ]
-
-
-def test_links_lead_somewhere() -> None:
-    """Every link within the document has its heading, every file it names is there."""
-    headings = {
-        re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
-        for heading in re.findall(r"^#+ (.*)$", TEXT, re.MULTILINE)
-    }
-    assert set(re.findall(r"\]\(#([^)]*)\)", TEXT)) <= headings
-    for name in re.findall(r"`(tests/[^`]*)`", TEXT):
-        assert (ROOT / name).exists(), name
