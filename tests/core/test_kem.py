@@ -33,31 +33,6 @@ def test_ffdhe_primes_are_those_of_openssl() -> None:
     assert kem.kem_of(SUITES_BY_NAME["x25519"]) is None
 
 
-@pytest.mark.parametrize("suite", GROUPS)
-def test_both_sides_agree_and_others_do_not(suite: Suite) -> None:
-    """Parts have the lengths of the suite. Each encapsulation is new. An ephemeral key prints its share at most."""
-    seen: list[bytes] = []
-
-    def draw(size: int, /) -> bytes:
-        seen.append(random.Random(9).randbytes(size))
-        return seen[-1]
-
-    group = group_of(suite)
-    private, other = group.generate(draw), group.generate(seeded(3))
-    ciphertext, secret = group.encapsulate(private.share, seeded(2))
-    assert private.decapsulate(ciphertext) == secret
-    assert (len(private.share), len(ciphertext)) == (suite.share_bytes, suite.ciphertext_bytes)
-    assert len(secret) >= 32
-    assert other.share != private.share
-    assert other.decapsulate(ciphertext) != secret
-    again = group.encapsulate(private.share, seeded(4))
-    assert again[0] != ciphertext
-    assert again[1] != secret
-    shown = repr(private)
-    assert seen
-    assert not any(repr(value)[2:20] in shown or value.hex()[:16] in shown for value in seen)
-
-
 @pytest.mark.parametrize("bits", FFDHE_BITS)
 def test_public_value_outside_its_range_is_refused(bits: int) -> None:
     """0, 1, p-1, p, p+1 and the largest number are refused in either message, before any work; 2 and p-2 are not."""
