@@ -11,7 +11,6 @@ from tests.core.harness import FRAME, PLAIN, QUIET, Pair, Side, datagrams, livel
 from uavlinkd.core import constants as c
 from uavlinkd.core import establish, freshness, wire
 from uavlinkd.core.constants import NEVER
-from uavlinkd.core.drops import DropReason
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import FreshnessUnverified, FreshnessVerified, PeerClosed, PeerLost
 from uavlinkd.core.session import Session
@@ -30,44 +29,6 @@ WATCHED = replace(PLAIN, timers=QUIET, verify_interval_s=c.VERIFY_INTERVAL_S)
 def entry(counter: int, payload_bytes: int) -> tuple[int, bytes, float]:
     """Frames of one envelope, held at second 0."""
     return counter, b"\xfd" + bytes(payload_bytes - 1), 0.0
-
-
-def test_held_frames_cause_requests_until_each_has_waited_for_a_second() -> None:
-    """A request is due each tenth of a second; an answer saves what still waits, then another wait can begin."""
-    held = HeldFrames()
-    held.asked(4.0)  # nothing is held: this measures the round trip
-    assert held.due_at == NEVER
-    assert not held.is_request_due(4.0)
-    assert [held.begin(5.0), held.begin(5.1)] == [True, False]
-    held.asked(5.0)
-    assert held.due_at == 5.1
-    held.asked(5.95)
-    assert held.due_at == 6.0
-    assert held.expire(5.99) == 0
-    assert not held.is_request_due(5.99)
-    assert held.expire(6.0) == 0
-    assert held.due_at == NEVER
-    assert held.begin(6.0)
-    held.add(1, b"\xfd\x01", 6.0)
-    held.asked(6.0)
-    held.add(2, b"\xfd\x02", 6.5)
-    held.asked(6.9)
-    assert held.due_at == 7.0
-    assert held.expire(7.0) == 1
-    assert held.is_request_due(7.0)
-    held.asked(7.0)
-    assert held.due_at == 7.1
-    assert held.release(0) == ([(2, b"\xfd\x02")], 0)
-    assert held.due_at == NEVER
-
-
-def test_new_frames_come_out_in_the_order_of_arrival() -> None:
-    """What has a lower counter than the peer said is old; afterwards nothing is held."""
-    held = HeldFrames()
-    for counter in (4, 6, 5, 3, 7):
-        assert held.add(counter, bytes([0xFD, counter]), 0.0) == 0
-    assert held.release(5) == ([(6, b"\xfd\6"), (5, b"\xfd\5"), (7, b"\xfd\7")], 2)
-    assert held.release(0) == ([], 0)
 
 
 def test_what_is_held_is_bounded() -> None:
@@ -119,38 +80,6 @@ def test_verification_lasts_for_two_intervals_or_two_seconds(interval_s: float, 
     for asked_at, now, counts_from in ((10.0, 10.4, 10.4), (11.0, 12.9, 12.0), (9.0, 11.0, 12.0)):
         verification.answered(asked_at, now)
         assert verification.until == counts_from + lifetime_s
-
-
-def test_request_is_repeated_after_a_tenth_of_a_second_once_an_interval_is_unanswered() -> None:
-    """Not before one interval has passed since the last answer: a slow answer may still arrive."""
-    verification = Verification(0.0, 1.0)
-    verification.asked(0.5)  # by another rule: no frames wait for it
-    assert verification.due_at == NEVER
-    assert verification.look_at == verification.ask_at == 1.0
-    verification.begin()
-    verification.asked(1.0)
-    assert (verification.due_at, verification.ask_at) == (1.1, 2.0)
-    verification.answered(1.0, 1.9)
-    assert verification.due_at == NEVER
-    verification.begin()
-    verification.asked(2.0)
-    assert verification.due_at == 2.9
-    verification.asked(2.9)
-    assert verification.due_at == 3.0
-    verification.stop()
-    assert verification.due_at == NEVER
-
-
-def test_verification_is_extended_only_while_it_lasts() -> None:
-    """A recent echo record proves that what comes after it is new, not that what came before it is."""
-    verification = Verification(0.0, 1.0)
-    verification.extend(1.5)
-    assert verification.until == 3.5
-    verification.extend(3.6)
-    assert verification.until == 3.5
-    verification.refute()
-    verification.extend(3.7)
-    assert verification.until == verification.look_at == -NEVER
 
 
 def test_the_last_proof_lasts_as_long_as_on_the_new_best_path() -> None:
@@ -225,19 +154,6 @@ def test_command_waits_while_freshness_is_unverified(pair: Pair) -> None:
     assert payloads(outputs) == [COMMAND]
     assert cross(pair, 2.4, COMMAND) == [COMMAND]
     assert not pair.b.peer.traffic.drops
-
-
-def test_held_command_that_is_old_is_delayed(pair: Pair) -> None:
-    """The answer tells which counters are new: a command that was kept for three seconds is refused by it."""
-    kept = [only(datagrams(pair.a.send(0.5, frame))) for frame in (*[REPORT] * 20, COMMAND)]
-    for number, envelope in enumerate(kept):
-        now = 0.6 + number / 8
-        outputs = pair.b.timeout(now) + pair.b.receive(envelope, now)
-        assert payloads(outputs) == ([] if envelope is kept[-1] else [REPORT])
-    outputs += pair.b.timeout(now + c.HOLD_ASK_S)
-    outputs = pair.b.receive(answer(pair.a, datagrams(outputs)[-1], now + 0.3), now + 0.3)
-    assert payloads(outputs) == []
-    assert reasons(outputs) == [DropReason.DELAYED]
 
 
 @pytest.mark.parametrize("number", [0, 20])
