@@ -10,7 +10,6 @@ from tests.core.harness import (
     Pair,
     Side,
     datagrams,
-    exchange,
     lively,
     of,
     only,
@@ -105,18 +104,6 @@ def test_frames_after_a_silence_wait_for_one_round_trip(pair: Pair) -> None:
     assert not pair.b.peer.traffic.drops
 
 
-def test_frames_of_a_blackout_are_refused_and_new_ones_beside_them_pass(pair: Pair) -> None:
-    """All of thirty seconds was kept and comes at once: only what was sent recently is delivered."""
-    kept = [frame(pair.a, 1.0 + second, second) for second in range(30)]
-    now = 30.5
-    outputs = [out for envelope in kept for out in pair.b.receive(envelope, now)]
-    assert payloads(outputs) == []
-    released = pair.b.receive(only(datagrams(pair.a.receive(only(datagrams(outputs)), now))), now)
-    assert payloads(released) == [numbered(28), numbered(29)]  # of the last two seconds, and a step
-    assert of(released, Dropped) == [Dropped(DropReason.DELAYED, pair.b.peer, None, 28)]
-    assert pair.carries(now)
-
-
 def test_counters_that_the_peer_reported_as_old_stay_refused(pair: Pair) -> None:
     """An envelope that arrives after the answer is dropped as delayed, even if its counter is the highest yet."""
     old = frame(pair.a, 1.0), frame(pair.a, 1.0)
@@ -157,15 +144,6 @@ def test_answer_and_question_from_before_the_silence_vouch_for_nothing(pair: Pai
     assert payloads(pair.b.receive(kept, later)) == []
     assert payloads(pair.b.receive(old_answer, later)) == []
     assert reasons(pair.b.timeout(later + c.HOLD_S)) == [DropReason.DOUBTFUL]
-
-
-def test_a_link_that_never_falls_silent_needs_no_answers(pair: Pair) -> None:
-    """One way alone works, each frame within two seconds of the one before or of the handshake: nothing is asked."""
-    for number in range(60):
-        now = c.LATE_AFTER_S + 1.9 * number
-        outputs = pair.b.receive(frame(pair.a, now, number), now)
-        assert payloads(outputs) == [numbered(number)]
-        assert datagrams(outputs) == []
 
 
 def test_held_frames_can_be_popped_while_requests_continue(pair: Pair) -> None:
@@ -270,32 +248,6 @@ def test_late_frame_of_the_session_before_is_asked_about_on_it() -> None:
     assert isinstance(echo, wire.Echo)
     assert echo.fresh == pair.a.peer.sessions.confirmed[1].fresh(10.1)
     assert payloads(pair.b.receive(answer, 10.2)) == [numbered(5)]
-
-
-def test_old_frame_of_the_session_before_is_refused() -> None:
-    """Held over a change of keys and longer: nothing of the old session is new any more."""
-    pair, old = rekeyed(10.0)
-    assert payloads(exchange(pair.b, pair.a, pair.b.receive(old, 20.0), 20.0)) == []
-    requests = datagrams(pair.b.receive(frame(pair.a, 20.0, 6), 20.0))
-    answers = datagrams(out for request in requests for out in pair.a.receive(request, 20.0))
-    assert payloads(out for answer in answers for out in pair.b.receive(answer, 20.0)) == [numbered(6)]
-
-
-def test_frames_of_the_session_before_end_with_the_first_on_the_next(pair: Pair) -> None:
-    """Let go one by one, so that the old session is never silent, they are two seconds late at most, no minute."""
-    talk(pair, 1.0, 10.0)
-    held = [frame(pair.a, 10.0 + number / 100, number) for number in range(40)]
-    pair.rekey(10.4)
-    came = []
-    for number, envelope in enumerate(held):
-        now = 10.5 + 1.9 * number
-        talk(pair, now, now + 1.8)  # on the new session all is well
-        if payloads(pair.b.receive(envelope, now)):
-            came.append(now)
-    assert came == [10.5]
-    drops = pair.b.peer.traffic.drops
-    assert drops[DropReason.DELAYED] + drops[DropReason.SESSION_EXPIRED] == 39
-    assert drops[DropReason.DELAYED] > 10
 
 
 def test_overtaken_by_the_next_session_frames_have_two_seconds() -> None:
