@@ -208,19 +208,6 @@ def test_only_so_many_initiations_are_read() -> None:
 # Group work.
 
 
-def test_a_peer_may_cause_so_much_group_work() -> None:
-    """Its initiations from many hosts, with cookies or without: the rest is refused before the group."""
-    pair = established()
-    expected = c.GROUP_WORK_PER_PEER_BURST // UNITS
-    answered = 0
-    for number in range(4 * expected):
-        out = initiation(pair, prefix(number), 9.0 + number, cookie=number % 2 == 0)
-        answered += len(datagrams(out, wire.RESPONSE))
-        assert datagrams(out, wire.RESPONSE) or reasons(out) == [DropReason.GROUP_BUDGET_SPENT]
-    assert answered <= expected + 4 * expected * c.GROUP_WORK_PER_PEER_PER_S // UNITS
-    assert pair.b.peer.traffic.drops[DropReason.GROUP_BUDGET_SPENT] == 4 * expected - answered
-
-
 def test_a_peer_that_proves_where_it_is_has_a_bounded_reserve() -> None:
     """With a cookie for where it is known to be, it is answered; elsewhere no cookie helps. X25519 needs none."""
     pair = established()
@@ -271,15 +258,3 @@ def test_burst_grows_with_the_peers_and_is_bounded(peers: int, expected: int) ->
     for peer in added:
         node.remove_peer(peer, 0.0)
     assert not bucket.has(0.0, c.INITIATIONS_BURST + 1)
-
-
-def test_all_peers_are_answered_after_a_restart_although_a_nat_hides_them() -> None:
-    """All initiate at once, from a few addresses. No cookie costs them a round trip."""
-    own = KeyPair(bytes([200]) * 32)
-    relay = Node(Secret(bytes([200]) * 32), seeded(0), 0.0)
-    keys = [KeyPair(number.to_bytes(2, "big") * 16) for number in range(100)]
-    for key in keys:
-        relay.add_peer(PeerSettings(key.public.hex(), key.public), 0.0)
-    for number, key in enumerate(keys * c.INITIATIONS_BURST_PER_PEER):
-        at = Path(0, (f"198.51.100.{number % 4}", 1024 + number))
-        assert datagrams(relay.receive(made_initiation(key, own), at, 0.0), wire.RESPONSE)
