@@ -102,19 +102,6 @@ def test_peer_that_names_victims_causes_a_bounded_number_of_questions(pair: Pair
     assert later == pytest.approx(10 * c.CANDIDATE_QUESTIONS_PER_S, abs=1)
 
 
-def test_path_that_came_by_itself_takes_the_question_too(pair: Pair) -> None:
-    """Bravo's own question arrives first, from a candidate that was asked."""
-    ask(pair, 1.0, DIRECT)
-    assert not pair.b.node.ask_candidates(pair.b.peer, 1.0), "it has none"
-    pair.b.node.set_candidates(pair.b.peer, [HOME])
-    sent = of(pair.b.node.ask_candidates(pair.b.peer, 1.0), Transmit)
-    theirs = only([transmit.datagram for transmit in sent if transmit.path == HOME])
-    answers = of(pair.a.node.receive(theirs, DIRECT, 1.1), Transmit)
-    assert DIRECT in {sent.path for sent in answers}
-    assert pair.a.peer.paths.by_path[DIRECT].waiting_questions > 1
-    assert ask(pair, 1.2, DIRECT) == []
-
-
 def test_forgotten_candidate_answers_in_vain(pair: Pair) -> None:
     """Another list replaced it: its answer is that of an unknown question."""
     answer = answered(pair)

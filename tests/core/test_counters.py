@@ -104,15 +104,6 @@ def test_the_past_of_the_first_counter_and_of_one_out_of_order() -> None:
     assert history.past(9, 11, 1.25 + c.LATE_AFTER_S) == (9, 11)
 
 
-def test_first_arrival_is_remembered_for_a_window() -> None:
-    """Its path, and how long ago it was. A counter from before has no path."""
-    arrivals = Arrivals(100.0)
-    assert arrivals.first(5, 103.0)[0] == 0
-    for counter, path, at in ((5, 2, 101.0), (6, 1, 101.5), (5 + W, 3, 102.0)):
-        arrivals.note(counter, path, at)
-        assert arrivals.first(counter, 103.0) == pytest.approx((path, 103.0 - at))
-
-
 @pytest.mark.parametrize("age_s", [0.7, 1000.0007, 100_000.0007])
 def test_copy_is_never_earlier_than_the_first_and_counts_once_along_each_path(age_s: float) -> None:
     """However long ago the session began, and so however coarse the moments are."""

@@ -9,7 +9,6 @@ import pytest
 from tests.core.harness import AT_B, ELSEWHERE, Pair, datagrams, lively, of, only, quiet, reasons, with_macs
 from uavlinkd.core import constants as c
 from uavlinkd.core import establish, wire
-from uavlinkd.core.constants import NEVER
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.outputs import SessionEstablished, Transmit
 from uavlinkd.core.path import Path
@@ -31,18 +30,6 @@ def initiations(pair: Pair, count: int, start: float = 0.0) -> list[tuple[float,
 
 
 # When.
-
-
-def test_initiations_begin_when_there_is_an_address() -> None:
-    """At once. Until then the peer is waited for, without a timer."""
-    pair = Pair(now=50.0)
-    assert pair.a.node.next_deadline() == 50.0
-    assert only(of(pair.a.timeout(50.0), Transmit)).path == AT_B
-    assert pair.b.timeout(50.0) == establish.initiate(pair.b.peer, 50.0) == []
-    assert pair.b.node.next_deadline() == NEVER
-    pair.b.configure_path(80.0)
-    assert pair.b.node.next_deadline() <= 80.0
-    assert datagrams(pair.b.timeout(80.0), wire.INITIATION)
 
 
 def test_waits_grow_from_the_first_to_the_longest_and_stay_there() -> None:
@@ -120,18 +107,6 @@ def test_initiation_fails_softly_when_no_index_is_free() -> None:
 
 
 # Responses.
-
-
-def test_earlier_initiation_may_still_be_answered() -> None:
-    """On a slow path the response to the first initiation arrives after the second. It still makes the session."""
-    pair = Pair()
-    answers = [only(datagrams(pair.b.receive(out.datagram, 1.0))) for _, out in initiations(pair, 2)]
-    outputs = pair.a.receive(answers[0], 1.0)
-    assert of(outputs, SessionEstablished)
-    pair.b.receive(only(datagrams(outputs)), 1.0)
-    assert pair.carries(1.0)
-    assert reasons(pair.a.receive(answers[1], 1.0)) == [DropReason.UNEXPECTED_RESPONSE]
-    assert pair.carries(1.1)
 
 
 def test_pending_initiations_are_limited_in_number_and_age() -> None:

@@ -55,19 +55,6 @@ def test_peer_is_linked_by_the_key_that_it_knows(known: bytes, name: str) -> Non
 
 
 @either
-def test_node_initiates_with_each_key_that_the_peer_may_know(known: bytes, name: str) -> None:
-    """The Node initiates with both keys, and the peer answers the initiation with the key that it knows."""
-    node, peer = changing(), other(known)
-    for entry in node.peers.values():
-        node.set_paths(entry, [AT_B], 0.0)
-    initiations = datagrams(node.handle_timeout(0.0), wire.INITIATION)
-    outputs = [out for initiation in initiations for out in peer.receive(initiation, AT_A, 0.0)]
-    assert reasons(outputs) == [DropReason.UNKNOWN_PEER]
-    assert len(datagrams(node.receive(only(datagrams(outputs)), AT_B, 0.0))) == 1
-    assert node.peers[name].is_up
-
-
-@either
 def test_cookie_is_for_the_key_of_the_initiation(known: bytes, name: str) -> None:
     """Under load an initiator can open its cookie with either key, and is admitted with it."""
     node, peer = changing(), other(known)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from uavlinkd.core.constants import NEVER
 from uavlinkd.core.timers import MIN_ENTRIES, Schedule, Timer, TimerTable
 
 
@@ -14,29 +13,6 @@ class Stub:
 
     def __init__(self) -> None:
         self.timers = TimerTable()
-
-
-def test_expired_timers_are_stopped_in_order() -> None:
-    """At the moment itself, not before; one that a handler sets for later in the order is handled too."""
-    table = TimerTable()
-    assert table.next_at == NEVER
-    table.set(Timer.KEEPALIVE, 10.0)
-    table.set(Timer.SILENCE, 0.5)
-    assert table.next_at == 0.5
-    table.stop(Timer.SILENCE)
-    assert table.next_at == 10.0
-    table.stop_all()
-    assert table.next_at == NEVER
-    table.set(Timer.KEEPALIVE, 1.0)
-    table.set(Timer.SILENCE, 1.0)
-    assert list(table.expired(0.999)) == []
-    handled = []
-    for timer in table.expired(1.0):
-        handled.append(timer)
-        if timer is Timer.SILENCE:
-            table.set(Timer.INITIATE, 1.0)
-    assert handled == [Timer.SILENCE, Timer.INITIATE, Timer.KEEPALIVE]
-    assert table.next_at == NEVER
 
 
 MOMENTS = st.integers(0, 8).map(float)
