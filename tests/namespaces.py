@@ -123,12 +123,6 @@ class Namespace:
         """Add these rules."""
         _run(*self.launcher, "nft", "-f", "-", text=f"{rules}\n")
 
-    def udp_socket(self, address: str = "0.0.0.0", port: int = 0, timeout_s: float | None = None) -> socket.socket:
-        """A UDP socket of this host. By default it waits without limit."""
-        made = udp_socket_in(self.path, address, port)
-        made.settimeout(timeout_s)
-        return made
-
     def open_tun(self, device: str) -> int:
         """A new TUN interface; it ends with its descriptor."""
         with self.entered():

@@ -96,7 +96,7 @@ async def test_netcheck_reports_what_the_routers_do() -> None:
 
 
 async def test_link_is_back_soon_after_each_fault() -> None:
-    """Frames were lost meanwhile, or none was sent. If one of two networks dies, no critical frame is lost.
+    """Frames were lost meanwhile. If one of two networks dies, no critical frame is lost.
 
     The faults happen at the same time, each in a laboratory of its own: mostly they wait.
     """
@@ -115,4 +115,4 @@ async def test_link_is_back_soon_after_each_fault() -> None:
             assert outcome.sent > 100
             assert outcome.lost == 0
         else:
-            assert 0 < outcome.lost < outcome.sent or outcome.sent == 0, fault
+            assert 0 < outcome.lost < outcome.sent, fault
