@@ -1,1 +1,1 @@
-"""What two emulated telemetry modems carry: MAVLink signing on the bare line, and uavlinkd. In virtual time."""
+"""Attacks on the line between two emulated telemetry modems, in virtual time."""

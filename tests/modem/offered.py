@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from math import inf
 from typing import Any, Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -60,11 +59,6 @@ def offered(until: float, factor: float) -> list[Offered]:
     return sorted(made, key=lambda one: one.at)
 
 
-def telemetry_bytes_s() -> float:
-    codec = mavlink.MAVLink(None)
-    return sum(rate * len(make(1).pack(codec)) for make, rate in _TELEMETRY.items())
-
-
 def _every(interval_s: float, until: float, system: int, make: Make) -> Iterator[Offered]:
     for number in range(int(until / interval_s)):
         # Streams do not begin at one moment: the golden ratio spreads them.
@@ -90,14 +84,11 @@ class Arrivals:
         else:
             self.ages_s[frame] = now - self.sent[frame][0]
 
-    def share(self, system: int, since: float = 0.0, until: float = inf, *, is_critical: bool) -> float:
-        """The share of a system's frames that arrived, of those sent in this time."""
+    def share(self, system: int, since: float, until: float) -> float:
+        """The share of a system's critical frames that arrived, of those sent in this time."""
         chosen = [
             frame
             for frame, (at, what) in self.sent.items()
-            if (what.system, what.is_critical) == (system, is_critical) and since <= at <= until
+            if what.system == system and what.is_critical and since <= at <= until
         ]
         return sum(frame in self.ages_s for frame in chosen) / len(chosen)
-
-    def delivered(self, system: int) -> list[bytes]:
-        return [frame for frame in self.ages_s if self.sent[frame][1].system == system]
