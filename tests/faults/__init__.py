@@ -1,1 +1,1 @@
-"""Faults of the machine and the network around a real daemon, and how soon it is back: ``python -m tests.faults``."""
+"""Faults of the machine and the network around a real daemon, and how soon it is back."""

@@ -40,15 +40,10 @@ class Fault:
 
 FAULTS: Mapping[str, Fault] = {
     "suspended": Fault("the process is stopped (`SIGSTOP`)", machine.suspended),
-    "descriptors": Fault("no file descriptors (`RLIMIT_NOFILE`)", machine.descriptors, True),
     **{
         name: Fault(fault.what, partial(network.suffer, name=name), True)
         for name, fault in network.NETWORK_FAULTS.items()
     },
-    "name_service_gone": Fault("no name server, the peer given by name", machine.name_service_gone, True),
-    "name_service_silent": Fault("a name server that answers nothing", machine.name_service_silent, True),
-    "recording_disk_full": Fault("the disk for recordings is full", machine.recording_disk_full, True),
-    "log_disk_full": Fault("the disk for the log is full", machine.log_disk_full, True),
     "clock_jumps": Fault("the clock leaps ten years ahead, and 54 back", machine.clock_jumps),
     "garbage": Fault("a peer seals garbage with its valid keys", machine.garbage_with_valid_keys),
 }
@@ -56,7 +51,7 @@ FAULTS: Mapping[str, Fault] = {
 
 def why_not() -> str | None:
     """What is missing here for the faults that take root; None for nothing."""
-    return why_no_namespaces("nft", "tc", "unshare", "mount")
+    return why_no_namespaces("nft", "tc")
 
 
 async def happen(names: Iterable[str]) -> dict[str, Outcome | BaseException]:
