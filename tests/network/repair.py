@@ -1,4 +1,4 @@
-"""What arrives over paths that lose datagrams, how old it is, and how long a mission and parameters take.
+"""What arrives over paths that lose datagrams, how old it is, and how long a mission takes.
 
 The stand-ins for ArduPilot and QGroundControl ask again as these do, and after as long. Times are virtual seconds.
 """
@@ -17,7 +17,6 @@ from uavlinkd.mavlink.frames import Frame, SplitCounters, split_payload
 
 DELAY_S: Final = 0.01
 ITEMS: Final = 100
-PARAMETERS: Final = 1370
 SETTLING_S: Final = 20.0
 """The paths are lossy and in use before anything is measured, so the daemons know their loss."""
 USED_S: Final = 5.0
@@ -27,12 +26,6 @@ PATIENCE_S: Final = 900.0
 
 Radios = Sequence[Radio]
 """The paths of two peers."""
-RADIOS: Final[dict[str, Radios]] = {
-    "clean": [Radio(DELAY_S)],
-    "30 % loss": [Radio(DELAY_S, 0.3)],
-    "30 % in bursts of 3": [Radio(DELAY_S, 0.3, burst=3.0)],
-    "30 % in bursts of 5": [Radio(DELAY_S, 0.3, burst=5.0)],
-}
 LOSSES: Final = (0.1, 0.3, 0.5, 0.7)
 BESIDE: Final[dict[str, Radios]] = {"none": [], "drops all": [Radio(DELAY_S, 1.0)], "1.9 s late": [Radio(1.9)]}
 """The other paths than the lossy one."""
@@ -107,36 +100,18 @@ def cross(kind: Kind, radios: Radios, seed: int) -> Crossing:
 
 def mission(radios: Radios, seed: int, *, has_repair: bool = True) -> Transfer:
     """A mission of :data:`ITEMS` items to the vehicle."""
-    return _transfer(radios, seed, Station.upload, lambda vehicle, _: vehicle.stored_at is not None, has_repair)
-
-
-def parameters(radios: Radios, seed: int, *, has_repair: bool = True) -> Transfer:
-    """:data:`PARAMETERS` parameters to the station."""
-    return _transfer(
-        radios, seed, Station.read_parameters, lambda _, station: len(station.values) == PARAMETERS, has_repair
-    )
-
-
-def _transfer(
-    radios: Radios,
-    seed: int,
-    begin: Callable[[Station], None],
-    is_over: Callable[[Autopilot, Station], bool],
-    has_repair: bool,
-) -> Transfer:
     network = _clean(radios, seed, Redundancy.CRITICAL if has_repair else Redundancy.NONE)
-    vehicle = Autopilot(network, network.alpha, PARAMETERS)
-    station = Station(network, network.bravo, ITEMS)
+    vehicle, station = Autopilot(network, network.alpha), Station(network, network.bravo, ITEMS)
     network.radios[:] = radios
     network.run(network.now + SETTLING_S)
     repeats = [end.link.output.copies for end in (network.alpha, network.bravo)]
     before = sum(one.repeats_sent for one in repeats), sum(one.repeat_bytes for one in repeats)
     began_at = network.now
-    begin(station)
-    while not is_over(vehicle, station) and network.now < began_at + PATIENCE_S:
+    station.upload()
+    while vehicle.stored_at is None and network.now < began_at + PATIENCE_S:
         network.run(network.now + 0.01)
     return Transfer(
-        network.now - began_at if is_over(vehicle, station) else float("inf"),
+        network.now - began_at if vehicle.stored_at is not None else float("inf"),
         sum(one.repeats_sent for one in repeats) - before[0],
         sum(one.repeat_bytes for one in repeats) - before[1],
     )
@@ -157,25 +132,14 @@ def _every(network: Network, interval_s: float, act: Callable[[int], None], numb
 
 # The stand-ins.
 
-# ArduPilot: MissionItemProtocol::update, GCS_MAVLINK::queued_param_send.
+# ArduPilot: MissionItemProtocol::update.
 ITEM_AGAIN_S: Final = 1.0
 """The vehicle asks again for an item that did not come."""
 UPLOAD_TIMEOUT_S: Final = 8.0
 """The vehicle cancels an upload after so long without an item."""
-PARAMETERS_S: Final = 300
-"""The vehicle's rate of the list, at 921,600 baud to its companion computer."""
-REPLY_AFTER_S: Final = 0.005
-REPLIES: Final = 20
-"""Requests for single parameters that wait in the vehicle. It ignores more."""
-# QGroundControl: PlanManager, ParameterManager.
+# QGroundControl: PlanManager.
 COUNT_AGAIN_S: Final = 1.5
 """The station sends MISSION_COUNT again if no request comes for so long."""
-LIST_AGAIN_S: Final = 5.0
-"""The station asks for the list again if no parameter comes."""
-SILENCE_S: Final = 3.0
-"""After so long without a parameter it asks for missing ones,"""
-BATCH: Final = 10
-"""so many at a time."""
 TELEMETRY_HZ: Final = 50
 
 Message = Any  # pymavlink has no types
@@ -213,19 +177,15 @@ class _Client:
 
 
 class Autopilot(_Client):
-    """ArduPilot: telemetry, one upload of a mission, its parameters."""
+    """ArduPilot: telemetry, and one upload of a mission."""
 
-    def __init__(self, network: Network, end: End, parameters: int) -> None:
+    def __init__(self, network: Network, end: End) -> None:
         super().__init__(network, end, 1)
         self.stored_at: float | None = None
-        self._parameters = parameters
-        self._listed = parameters
-        self._waiting = 0
         self._count = self._next = 0
         self._asked_at = self._received_at = 0.0
         self.every(1 / TELEMETRY_HZ, self._telemetry)
         self.every(0.1, self._update)
-        self.every(1 / PARAMETERS_S, self._list_next)
 
     def receive(self, message: Message) -> None:
         now = self.network.now
@@ -243,11 +203,6 @@ class Autopilot(_Client):
                 else:
                     self._count, self.stored_at = 0, now
                     self.send(mavlink.MAVLink_mission_ack_message(255, 1, mavlink.MAV_MISSION_ACCEPTED))
-            case "PARAM_REQUEST_LIST":
-                self._listed = 0
-            case "PARAM_REQUEST_READ" if self._waiting < REPLIES:
-                self._waiting += 1
-                self.after(REPLY_AFTER_S * self._waiting, lambda: self._reply(message.param_index))
 
     def _ask(self) -> None:
         self._asked_at = self.network.now
@@ -263,47 +218,24 @@ class Autopilot(_Client):
         elif now - self._asked_at > ITEM_AGAIN_S:
             self._ask()
 
-    def _reply(self, index: int) -> None:
-        self._waiting -= 1
-        self.send(self._value(index))
-
-    def _list_next(self) -> None:
-        if self._listed < self._parameters:
-            self.send(self._value(self._listed))
-            self._listed += 1
-
-    def _value(self, index: int) -> Message:
-        return mavlink.MAVLink_param_value_message(b"P%05d" % index, 1.5, 9, self._parameters, index)
-
     def _telemetry(self) -> None:
         now_ms = int(1000 * self.network.now)
         self.send(mavlink.MAVLink_attitude_message(now_ms, 0.1, 0.2, 0.3, 0.01, 0.02, 0.03))
 
 
 class Station(_Client):
-    """QGroundControl: uploads a mission, or reads all parameters."""
+    """QGroundControl: uploads a mission."""
 
     def __init__(self, network: Network, end: End, items: int) -> None:
         super().__init__(network, end, 255)
-        self.values: set[int] = set()
         self._items = items
         self._is_uploading = False
-        self._parameters = 0
-        self._value_at = 0.0
-        self._wanted: list[int] = []
 
     def upload(self) -> None:
         self._is_uploading = False
         self._count()
 
-    def read_parameters(self) -> None:
-        """Ask for all parameters, and then for missing ones until none is."""
-        self._value_at = self.network.now
-        self.send(mavlink.MAVLink_param_request_list_message(1, 1))
-        self.after(0.1, self._check_parameters)
-
     def receive(self, message: Message) -> None:
-        now = self.network.now
         match message.get_type():
             case "MISSION_REQUEST_INT":
                 self._is_uploading = True
@@ -312,37 +244,11 @@ class Station(_Client):
                 self._items = 0
             case "MISSION_ACK":
                 self.upload()  # what its pilot would do
-            case "PARAM_VALUE":
-                self._parameters, self._value_at = message.param_count, now
-                self.values.add(message.param_index)
-                if message.param_index in self._wanted:
-                    self._wanted.remove(message.param_index)
-                    self._fill()
 
     def _count(self) -> None:
         if self._items and not self._is_uploading:
             self.send(mavlink.MAVLink_mission_count_message(1, 1, self._items))
             self.after(COUNT_AGAIN_S, self._count)
-
-    def _check_parameters(self) -> None:
-        now = self.network.now
-        if self._parameters and len(self.values) == self._parameters:
-            return
-        silence_s = now - self._value_at
-        if self._parameters and silence_s >= SILENCE_S:
-            self._wanted, self._value_at = [], now
-            self._fill()
-        elif not self._parameters and silence_s >= LIST_AGAIN_S:
-            self.read_parameters()
-            return
-        self.after(0.1, self._check_parameters)
-
-    def _fill(self) -> None:
-        missing = (n for n in range(self._parameters) if n not in self.values and n not in self._wanted)
-        asked = [number for number, _ in zip(missing, range(BATCH - len(self._wanted)), strict=False)]
-        self._wanted += asked
-        for index in asked:
-            self.send(mavlink.MAVLink_param_request_read_message(1, 1, b"", index))
 
 
 def _item(sequence: int) -> Message:
