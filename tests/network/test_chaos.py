@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 
-from tests.network.command import main
 from tests.network.histories import Played, play
 from tests.network.plans import BUSY, HOURS, LARGE, LINES, MANY_PATHS, PATHS, Plan
 from uavlinkd.core import constants as c
@@ -156,13 +155,3 @@ def test_the_same_seed_plays_the_same_history() -> None:
     first, again = play(10, BUSY), play(10, BUSY)
     first.cpu_s = again.cpu_s = 0.0
     assert first == again
-
-
-def test_the_command_reports_the_result(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """Histories without violations return 0 and a table; a violation returns 1 and its seed."""
-    assert main(["--minutes", "0.1", "--first-seed", "18"]) == 0
-    output = capsys.readouterr().out
-    assert "virtual minutes" in output
-    monkeypatch.setattr(Indices, "forget", _nothing)
-    assert main(["--seed", "0"]) == 1
-    assert "indices are owned" in capsys.readouterr().out

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from tests.network.liveness import Outcome, main, play
+from tests.network.liveness import Outcome, play
 from uavlinkd.core import constants as c
 from uavlinkd.core import freshness, receive, send
 from uavlinkd.core.paths import PathSet
@@ -72,9 +72,3 @@ def test_a_planted_fault_is_found(monkeypatch: pytest.MonkeyPatch, where: Any, n
     """Within some hundred histories, the rarest one within some thousand."""
     monkeypatch.setattr(where, name, plant)
     assert any(play(seed).violations for seed in range(6000))
-
-
-def test_the_command_reports_what_it_played(capsys: pytest.CaptureFixture[str]) -> None:
-    """Two histories."""
-    assert main(["--histories", "2"]) == 0
-    assert "2 histories" in capsys.readouterr().out

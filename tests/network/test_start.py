@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from functools import partial
-from itertools import combinations
 from random import Random
 
 import pytest
@@ -84,22 +83,3 @@ def test_handshake_over_30_percent_loss_in_each_direction(mode: str) -> None:
     print(f"{mode}, {TRIES} handshakes: {shares}")
     assert shares[0.99] <= 3
     assert shares[1.0] <= 10
-
-
-@pytest.mark.parametrize(("size", "loss", "bound_s"), [(10, 0.0, 1), (5, 0.6, 30), (10, 0.3, 10)])
-def test_every_pair_of_a_mesh_comes_up(size: int, loss: float, bound_s: float) -> None:
-    """Many drones started together, each knowing all others: every pair has a session within a bound."""
-    with Network(f"mesh {size} {loss}", RadioSettings(loss=loss, delay_s=0.03, jitter_s=0.02)) as network:
-        drones = [network.add(f"d{number}") for number in range(size)]
-        pairs = list(combinations(drones, 2))
-        for a, b in pairs:
-            a.knows(b, b.addresses)
-            b.knows(a, a.addresses)
-        for drone in drones:
-            drone.start()
-        flows = [flow for a, b in pairs for flow in network.talk(a, b, interval_s=0.2)]
-        network.run_until(lambda: all(share_a_session(*pair) for pair in pairs), within_s=bound_s)
-        begin = network.now
-        network.run(5)
-        for flow in flows:
-            assert flow.first_delivery(begin) < network.now, f"{flow.sender} to {flow.receiver}"
