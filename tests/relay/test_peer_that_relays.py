@@ -11,7 +11,6 @@ from tests.daemon.frames import heartbeat
 from tests.daemon.harness import Stage
 from tests.daemon.process import DaemonProcess, Status
 from tests.daemon.test_reload import reload
-from uavlinkd.config import keys
 from uavlinkd.core.relay_records import RELAYED, TOKEN
 
 
@@ -104,27 +103,3 @@ async def test_roles_come_and_go_while_the_link_is_up(stage: Stage, fleet: Fleet
         await fleet.a.until(is_counted)
     for daemon in (fleet.a, fleet.station):
         assert len(daemon.events("peer_up", peer=peers[0]["name"] if daemon is fleet.a else "drone1")) == 1
-
-
-async def test_key_of_the_station_changes_in_both_roles(stage: Stage, fleet: Fleet) -> None:
-    """The peer's section has the previous key, for the relay too."""
-    await stage.start(*fleet.daemons)
-    before, private = fleet.station.public_key, keys.generate_private_key()
-    stage.secrets.append(private)
-    fleet.station.public_key = keys.public_key_text(private)
-    for vehicle in (fleet.a, fleet.b):
-        vehicle.config["peer"][0] |= {"public_key": fleet.station.public_key, "previous_public_key": before}
-        vehicle.config["relay"] = [relay_section(fleet.station)]
-        assert await reload(vehicle) == []
-    await fleet.a.until(lambda status: is_relayed(status, "drone2"))
-    assert (await fleet.a.status())["peers"]["station"]["accepts_previous_key"]
-
-    await fleet.station.stop()
-    (fleet.station.folder / "daemon.key").rename(fleet.station.folder / "previous.key")
-    keys.write_secret_file(fleet.station.folder / "daemon.key", private)
-    fleet.station.config["previous_private_key_file"] = "previous.key"
-    await fleet.station.start()
-    for vehicle in (fleet.a, fleet.b):
-        await vehicle.until(lambda status: not status["peers"]["station"]["accepts_previous_key"])
-        await vehicle.until(lambda status: set(status["relays"]["gcs"]["peers"].values()) == {"bound"})
-    await fleet.station.until(lambda status: status["relay"]["connections"] == 1)
