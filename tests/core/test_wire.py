@@ -226,6 +226,7 @@ def test_probe_is_the_documented_record() -> None:
 @pytest.mark.parametrize(
     "payload",
     [
+        pytest.param(ANSWERS.encode()[:-1], id="too short"),
         pytest.param(Probe(0, 0, 1, 1).encode(), id="neither question nor answer"),
         pytest.param(ASKS.encode() + FRAME, id="frames without a flag"),
         pytest.param(ANSWERS.encode() + bytes(2), id="answer with the zero"),
