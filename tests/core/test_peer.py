@@ -95,15 +95,6 @@ def test_responder_sends_nothing_before_confirmation() -> None:
     assert pair.carries(0.0)
 
 
-def test_lost_confirmation_is_repeated_by_the_first_frames() -> None:
-    """Where the keepalive that confirms is lost, the next envelope does its work and delivers its frames."""
-    pair = Pair()
-    pair.a.receive(only(datagrams(pair.b.receive(pair.initiation(0.0), 0.0))), 0.0)
-    outputs = pair.b.receive(only(datagrams(pair.a.send(1.0))), 1.0)
-    assert [type(out) for out in outputs][:3] == [SessionEstablished, Transmit, PeerUp]
-    assert payloads(outputs) == [FRAME]
-
-
 @pytest.mark.parametrize("is_late", [False, True])
 def test_unconfirmed_session_is_forgotten_after_ten_seconds(is_late: bool) -> None:
     """Just before its end a session can still be confirmed; at its end it is gone."""
