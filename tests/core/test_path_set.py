@@ -349,19 +349,6 @@ def test_stream_goes_along_every_path_while_the_best_is_suspect(reason: str) -> 
     assert route(paths, Class.BULK) == [LTE]
 
 
-def test_unproven_path_carries_nothing() -> None:
-    """A question has to be answered first. Without a path there is no route."""
-    paths = path_set(LTE, MESH)
-    answer(paths, LTE, 1.0)
-    assert [route(paths, cls) for cls in Class] == [[LTE]] * 3
-    assert paths.has_several
-    assert not paths.is_multiple
-    paths = path_set()
-    paths.update(PEER, 1.0)
-    assert (paths.best, paths.has_any) == (None, False)
-    assert [route(paths, cls) for cls in Class] == [[]] * 3
-
-
 # Times between questions.
 
 
@@ -424,17 +411,7 @@ def test_idle_and_metered_paths_are_asked_as_configured(idle_probe_s: float, exp
     assert paths.interval_s(of(paths, LTE), 20.0) < expected
 
 
-def test_next_question_is_counted_from_the_last() -> None:
-    """The deadline of the set is the earliest of all."""
-    paths = busy(linked(LTE, MESH), 2.0)
-    of(paths, LTE).questioned_at, of(paths, MESH).questioned_at = 1.9, 1.0
-    paths.schedule(2.0)
-    assert of(paths, LTE).question_at == pytest.approx(1.9 + c.PROBE_FAST_S)
-    assert of(paths, MESH).question_at == 1.0 + c.PROBE_STANDBY_S
-    assert paths.next_at <= of(paths, LTE).question_at
-
-
-# Networks, and what is reported.
+# Networks.
 
 
 def test_path_of_an_absent_network_is_not_used_until_it_is_back() -> None:
@@ -448,12 +425,3 @@ def test_path_of_an_absent_network_is_not_used_until_it_is_back() -> None:
     paths.set_socket_state(LTE.socket, 9.0, is_up=True)
     paths.update(PEER, 9.0)
     assert of(paths, LTE).question_at == 9.0
-
-
-def test_changes_of_one_path_alone_are_not_reported() -> None:
-    """The events of the peer say the same; with a second path they are."""
-    paths = path_set(LTE)
-    paths.prefer(LTE, 0.0)
-    assert [answer(paths, LTE, 1.0), fail(paths, LTE, 5.0), answer(paths, LTE, 6.0)] == [[]] * 3
-    paths.learn(MESH, 6.0)
-    assert paths.update(PEER, 6.0) == [PathStateChanged(PEER, LTE, True, "answered")]
