@@ -42,8 +42,6 @@ class Radio:
     is_dead: bool = False
     loses: Callable[[bytes], bool] = lambda datagram: False
     """Whether it loses this datagram."""
-    hold_until: float = 0.0
-    """What is sent before that moment arrives no earlier."""
 
 
 class Sent(NamedTuple):
@@ -121,7 +119,7 @@ class Radios:
             if out.path != there(out.path.socket) or radio.is_dead or radio.loses(out.datagram):
                 continue
             other = self.b if side is self.a else self.a
-            arrival = max(self.now + radio.delay_s, radio.hold_until)
+            arrival = self.now + radio.delay_s
             heapq.heappush(self._queue, (arrival, len(self.sent), other, out.datagram, here(out.path.socket)))
 
     def send(self, side: Side, cls: Class = Class.STREAM, *frames: bytes) -> None:

@@ -1,9 +1,8 @@
-"""Several paths that carry one link: copies, what is sent where, what is asked when, and what failure costs."""
+"""Several paths that carry one link: copies, what is sent where, and what is asked when."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from itertools import count, pairwise
+from itertools import count
 
 import pytest
 
@@ -12,7 +11,7 @@ from tests.core.radios import Radios, at_a, at_b, link
 from uavlinkd.core import constants as c
 from uavlinkd.core import establish, wire
 from uavlinkd.core.drops import DropReason
-from uavlinkd.core.outputs import Deliver, PathChanged, SessionEstablished, Transmit
+from uavlinkd.core.outputs import Deliver, SessionEstablished, Transmit
 from uavlinkd.core.path import Path
 from uavlinkd.core.path_state import PathCondition
 from uavlinkd.core.send import ask_for_echo
@@ -42,12 +41,6 @@ def cross(radios: Radios, radio: int, datagram: bytes, now: float | None = None)
 def targets(radios: Radios, cls: Class, *frames: bytes) -> list[Path]:
     """Where alpha sends frames (one by default) of a class now."""
     return [out.path for out in of(radios.a.node.send(radios.a.peer, frames or (FRAME,), radios.now, cls), Transmit)]
-
-
-def every(number: int) -> Callable[[bytes], bool]:
-    """Loses each datagram whose number is a multiple of this one."""
-    seen = count(1)
-    return lambda datagram: next(seen) % number == 0
 
 
 # What goes where.
@@ -186,21 +179,6 @@ def test_copy_on_the_previous_session_counts_on_no_path(radios: Radios) -> None:
 # Probes.
 
 
-def test_path_of_the_stream_is_asked_four_times_a_second(radios: Radios) -> None:
-    """And the standby each two seconds. A question shares an envelope of the stream; hardly a probe goes alone."""
-    radios.run(5.0, 0.02, radios.sender(radios.a))
-    since = radios.now
-    radios.run(10.0, 0.02, radios.sender(radios.a))
-    assert 10.0 / c.PROBE_FAST_S - 1 <= len(radios.questions(radios.a, 0, since)) <= 10.0 / 0.2
-    assert 4 <= len(radios.questions(radios.a, 1, since)) <= 6
-    begins = slice(wire.SHORT_HEADER_BYTES, wire.SHORT_HEADER_BYTES + 2)
-    sent = radios.envelopes(radios.a, since)
-    alone = [one for one in sent if one.path == at_b(0) and one.datagram[begins] == b"\3\0"]
-    assert len(alone) <= 1 + len(radios.questions(radios.b, 0, since))
-    assert {out.payload for out in radios.delivered(radios.b, since)} == {FRAME}
-    assert len(radios.delivered(radios.b, since)) >= 499
-
-
 def test_idle_link_is_asked_rarely(radios: Radios) -> None:
     """Each fifteen seconds, until frames are sent: then at once and often."""
     radios.run(30.0)
@@ -210,46 +188,6 @@ def test_idle_link_is_asked_rarely(radios: Radios) -> None:
     since = radios.now
     radios.run(1.0, 0.1, radios.sender(radios.a))
     assert len(radios.questions(radios.a, 0, since)) >= 3
-
-
-def test_loss_of_each_direction_is_measured(radios: Radios) -> None:
-    """Of all datagrams along the path, by the counts in probes. Lost probes of a dead path count on no other."""
-    fifth = every(5)
-    radios.radios[0].loses = lambda datagram: len(datagram) > 300 and fifth(datagram)
-    radios.run(10.0, 0.02, lambda: radios.send(radios.a, STREAM, LONG, LONG))
-    here, there = radios.state(radios.a, 0), radios.state(radios.b, 0)
-    assert [here.loss_out, there.loss_in] == pytest.approx([0.185, 0.185], abs=0.03)
-    assert (here.loss_in, there.loss_out) == (0.0, 0.0)
-    radios = Radios().run(1.0)
-    radios.radios[1].is_dead = True
-    radios.run(20.0, 0.05, radios.sender(radios.a), radios.sender(radios.b))
-    assert (radios.state(radios.a, 0).loss_out, radios.state(radios.b, 0).loss_in) == (0.0, 0.0)
-
-
-# Failure.
-
-
-def gap(radios: Radios, since: float, kind: Class) -> float:
-    """The longest time without a delivered frame at bravo, while alpha sends 50 a second."""
-    seen = len(radios.seen)
-    radios.run(6.0, 0.02, radios.sender(radios.a, kind), radios.sender(radios.b))
-    arrivals = [out.at for out in radios.seen[seen:] if out.side is radios.b and isinstance(out.output, Deliver)]
-    return max(later - earlier for earlier, later in pairwise([since, *arrivals]))
-
-
-@pytest.mark.parametrize(
-    ("delay_s", "kind", "limit_s"),
-    [(0.01, STREAM, 0.5), (0.05, STREAM, 0.5), (0.15, STREAM, 0.9), (0.02, CRITICAL, 0.06)],
-)
-def test_traffic_moves_when_its_path_dies(delay_s: float, kind: Class, limit_s: float) -> None:
-    """The stream within half a second at usual round trips. Critical frames have no gap: all paths carry them."""
-    radios = Radios(delays_s=(delay_s, delay_s + 0.001)).run(1.0)
-    radios.run(5.0, 0.02, radios.sender(radios.a, kind), radios.sender(radios.b))
-    radios.radios[0].is_dead = True
-    assert gap(radios, radios.now, kind) <= limit_s
-    for side, here, there in ((radios.a, at_b(0), at_b(1)), (radios.b, at_a(0), at_a(1))):
-        (change,) = (out for _, out in radios.events(side, PathChanged))
-        assert change == PathChanged(side.peer, there, here, "unanswered")
 
 
 # Echoes, close, and bytes.
