@@ -11,7 +11,7 @@ from tests.core.radios import Radios, at_a, at_b
 from uavlinkd.core import constants as c
 from uavlinkd.core import establish, wire
 from uavlinkd.core.drops import DropReason
-from uavlinkd.core.outputs import PeerUp, SessionEstablished, Transmit
+from uavlinkd.core.outputs import SessionEstablished, Transmit
 from uavlinkd.core.path import Path
 from uavlinkd.core.path_state import PathCondition
 
@@ -46,16 +46,6 @@ def dead(radios: int) -> Radios:
 
 
 # Responses.
-
-
-def test_session_is_made_although_the_fastest_path_loses_responses() -> None:
-    """An attacker on one path cannot deny the handshake: the response goes along the other one too."""
-    radios = Radios(delays_s=(0.02, 0.2))
-    radios.radios[0].loses = lambda datagram: datagram[0] == wire.RESPONSE
-    radios.run(2.0)
-    assert [at for at, _ in radios.events(radios.a, PeerUp)] == [pytest.approx(0.4)]
-    assert radios.b.peer.is_up
-    assert radios.b.peer.traffic.drops[DropReason.DUPLICATE] >= 1
 
 
 def test_copies_of_an_initiation_get_the_same_response_once_along_each_path() -> None:

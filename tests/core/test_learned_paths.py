@@ -52,11 +52,6 @@ def question_to(pair: Pair, now: float, place: Path = ELSEWHERE) -> bytes:
     return asked.datagram
 
 
-def validate(pair: Pair, now: float) -> list[Output]:
-    """Alpha answers the question to another place from there. Bravo's outputs."""
-    return pair.b.receive(only(datagrams(pair.a.receive(question_to(pair, now), now))), now, ELSEWHERE)
-
-
 def targets(side: Side, now: float, cls: Class = Class.STREAM) -> list[Path]:
     """Where frames of a class go."""
     return [out.path for out in of(side.node.send(side.peer, [FRAME], now, cls), Transmit)]
@@ -158,16 +153,6 @@ def test_answer_asks_back_if_it_is_no_longer_than_its_question(pair: Pair, count
 # The answer.
 
 
-def test_answer_makes_the_path_usable(pair: Pair) -> None:
-    """The change is reported. Critical frames go along both paths, the stream along the best one as before."""
-    answer = only(of(pair.a.receive(question_to(pair, 1.0), 1.1), Transmit))
-    assert answer.path == AT_B
-    outputs = pair.b.receive(answer.datagram, 1.2, ELSEWHERE)
-    assert outputs == [PathStateChanged(pair.b.peer, ELSEWHERE, True, "answered")]
-    assert targets(pair.b, 1.2, Class.CRITICAL) == [AT_A, ELSEWHERE]
-    assert targets(pair.b, 1.2) == [AT_A]
-
-
 @pytest.mark.parametrize("place", [AT_A, AT_B, Path(1, ELSEWHERE.address), Path(0, ("198.51.100.9", 4001))])
 def test_answer_from_another_place_is_refused(pair: Pair, place: Path) -> None:
     """The answer proves the path along which it comes, and only the one that was asked."""
@@ -234,17 +219,6 @@ def test_configured_path_that_never_answered_does_not_count(path: Path, pair: Pa
     assert pair.b.peer.traffic.paths_unproven == 0
 
 
-def test_newer_address_replaces_one_that_never_answered(pair: Pair) -> None:
-    """Four learned paths; those that answered stay, and the oldest of the others goes."""
-    validate(pair, 1.0)
-    unproven = [Path(0, (f"203.0.113.{number}", 1)) for number in range(4)]
-    for number, place in enumerate(unproven):
-        pair.b.receive(pair.a.envelope(1.1 + number / 100, FRAME), 1.1 + number / 100, place)
-    kept = [state.path for state in pair.b.peer.paths.states]
-    assert kept == [AT_A, ELSEWHERE, unproven[2], unproven[3]]
-    assert len(kept) == c.LEARNED_PATHS
-
-
 @pytest.mark.parametrize("moves", [False, True])
 def test_first_path_that_never_answers_is_given_up_after_ten_seconds(moves: bool) -> None:
     """A session relayed through an attacker's address carries traffic there no longer, or until the peer answers."""
@@ -263,18 +237,6 @@ def test_first_path_that_never_answers_is_given_up_after_ten_seconds(moves: bool
     assert pair.b.peer.path is None
     assert reasons(pair.b.send(now)) == [DropReason.NO_SESSION]
     assert pair.b.timeout(60.0) == []
-
-
-def test_learned_path_that_went_down_keeps_its_slot_for_half_a_minute() -> None:
-    """It carries critical frames, and counts as the peer's. Then it is forgotten."""
-    radios = Radios().run(3.0, 0.1)
-    path = radios.state(radios.b, 1).path
-    radios.radios[1].is_dead = True
-    traffic = radios.sender(radios.a, Class.CRITICAL), radios.sender(radios.b)
-    radios.run(c.FORMER_PATH_S, 0.1, *traffic)
-    assert radios.b.peer.paths.find(path) is not None
-    radios.run(3.0, 0.1, *traffic)
-    assert radios.b.peer.paths.find(path) is None
 
 
 def test_learned_path_that_answers_now_and_then_keeps_its_slot() -> None:

@@ -47,17 +47,6 @@ def test_direct_path_replaces_relayed_one_immediately(direct_s: float, becomes_b
     assert [change.reason for change in changes if isinstance(change, PathChanged)] == ["direct"] * becomes_best
 
 
-def test_relayed_path_takes_over_only_from_a_direct_one_that_fails() -> None:
-    """Without waiting then. A relay is one more machine that may fail."""
-    paths = linked(LTE, LTE_A)
-    for tenth in range(11, 60):
-        for path in (LTE, LTE_A):
-            answer(paths, path, tenth / 10, 0.1)
-    assert paths.best is of(paths, LTE)
-    fail(paths, LTE, 9.0)
-    assert paths.best is of(paths, LTE_A)
-
-
 # Copies.
 
 

@@ -10,7 +10,7 @@ from tests.core.harness import AT_B, FRAME, KEY_C, Pair, Side
 from tests.core.radios import Radios, link
 from uavlinkd.core import constants as c
 from uavlinkd.core import wire
-from uavlinkd.core.outputs import FreshnessUnverified, PeerLost
+from uavlinkd.core.outputs import PeerLost
 from uavlinkd.core.path import FREE, SERIAL_HOST, Pace, Path, SocketFacts
 from uavlinkd.core.path_measures import limit_at
 from uavlinkd.core.probe import ANSWER_BYTES, QUESTION_BYTES
@@ -21,7 +21,6 @@ LTE, SIK = 0, 1
 BUDGET_BITS_S = 4_000
 AIRTIME_S = 8 * (147 + 103 + 2 * 48) / BUDGET_BITS_S
 """Of an initiation and its response with `x25519`."""
-ECHO_AIRTIME_S = 8 * (76 + 2 * 48) / BUDGET_BITS_S
 LEAST_TRY_S = c.TRY_AIRTIMES * AIRTIME_S
 PLACE, LINE = Path(SIK, ("192.0.2.1", 1)), Path(SIK, (SERIAL_HOST, 0))
 
@@ -48,13 +47,6 @@ def tries(radios: Radios, side: Side, radio: int, since: float = 0.0) -> list[fl
     """When a side initiated along a radio."""
     sent = (one for one in radios.sent if one.side is side and one.at >= since)
     return [one.at for one in sent if one.path.socket == radio and one.datagram[0] == wire.INITIATION]
-
-
-def echoes(radios: Radios, side: Side, radio: int, since: float, *, is_reply: bool) -> list[float]:
-    """When a side sent echo requests, or replies, along a radio."""
-    first = wire.Echo(is_reply, 0, 0, 0).encode()[0]
-    sent = (one for one in radios.envelopes(side, since) if one.path.socket == radio)
-    return [one.at for one in sent if one.datagram[wire.SHORT_HEADER_BYTES] == first]
 
 
 def gaps(moments: list[float]) -> list[float]:
@@ -202,17 +194,6 @@ def test_waits_grow_with_the_round_trip_to_a_bound() -> None:
     radios.state(radios.a, 0).srtt_s = 100.0
     peer.set_waits()
     assert peer.lost_after_s == c.LOST_ROUND_TRIPS * c.LATE_AFTER_S
-
-
-def test_echoes_along_the_only_path_fit_its_budget() -> None:
-    """Requests and the replies to those of the peer take a twentieth, and a little for silences."""
-    radios = slow(0.3, slow_sockets=(0,))
-    radios.run(100.0, 0.5, radios.sender(radios.a), radios.sender(radios.b))
-    requests = echoes(radios, radios.a, 0, 20.0, is_reply=False)
-    interval_s = ECHO_AIRTIME_S / c.ECHO_BUDGET_SHARE
-    assert 80 / interval_s / 2 < len(requests) <= 80 / interval_s + 2
-    assert not radios.events(radios.b, FreshnessUnverified)
-    assert len(radios.delivered(radios.b)) >= 195
 
 
 # The longest envelopes.
