@@ -67,6 +67,8 @@ _COPTER_MODES = {Mode.GUIDED: 4, Mode.MISSION: 3, Mode.RETURN: 6, Mode.FOLLOW: 2
 COPTER = Kind(
     "ArduCopter",
     _COPTER_MODES,
+    # SITL ends itself where a number that is not finite becomes an integer. A flight controller goes on.
+    parameters={"SIM_FLOAT_EXCEPT": 0},
     failsafe={"FS_GCS_ENABLE": 1, "FS_GCS_TIMEOUT": 5},
     follows={
         "FOLL_ENABLE": 1,
@@ -201,7 +203,7 @@ class Pilot:
             status.onboard_control_sensors_health & mavlink.MAV_SYS_STATUS_PREARM_CHECK
         )
 
-    async def go_to(self, place: Place, *, and_wait: bool = True) -> None:
+    async def go_to(self, place: Place) -> None:
         """Fly to a guided waypoint."""
         frame, z = mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT, place.z
         if self.kind.is_px4:  # it expects metres above sea level here
@@ -212,8 +214,7 @@ class Pilot:
         )
         if result != mavlink.MAV_RESULT_ACCEPTED:
             raise RequestError(f"the waypoint was refused with {result}; texts: {self.station.texts[-5:]}")
-        if and_wait:
-            await self.until_at(place)
+        await self.until_at(place)
 
     async def until_at(self, place: Place, timeout_s: float = LEG_S) -> None:
         """Wait until the vehicle is near a point."""

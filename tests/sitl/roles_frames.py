@@ -11,7 +11,6 @@ import random
 import struct
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, Final, NamedTuple
 
@@ -68,34 +67,19 @@ def fields_of(msgid: int) -> tuple[FieldOf, ...]:
     return tuple(FieldOf(name, kind, max(1, count)) for name, kind, count in arrays)
 
 
-@dataclass(slots=True)
-class FrameCounts:
-    """The frames that were made."""
-
-    passed: int = 0
-    by_message: Counter[str] = field(default_factory=Counter)
-    refused_requests: int = 0
-    """Requests of messages that may not go to this role, or of numbers that are not one. They were not sent."""
-    hidden: int = 0
-    """Frames of random bytes that the stream's filter refused. They were not sent."""
-
-
 class RoleFrames:
     """An endless generator of frames that a role passes, from a seed."""
 
-    def __init__(
-        self, role: str, seed: int, *, systems: Sequence[int] = (), parameters: Sequence[bytes] = _NAMES
-    ) -> None:
+    def __init__(self, role: str, seed: int) -> None:
         self.role = role
-        self.systems = tuple(systems or SYSTEMS[role])
+        self.systems = SYSTEMS[role]
         self.policy: Mapping[str, object] = {"role": role, "system_ids": list(self.systems)}
-        self.counts = FrameCounts()
+        self.by_message: Counter[str] = Counter()
         self._rng = random.Random(seed)
         self._gate = compile_policy(self.policy).incoming
         self._stream = DeliveredStream(compile_policy({}, is_local=True).outgoing)
         self._source = Source(role, self._gate)
         self._now = 0.0
-        self._parameters = parameters
         verdicts = {msgid: self._gate.decide(msgid, is_known=True) for msgid in MESSAGES}
         self.messages = tuple(msgid for msgid, verdict in verdicts.items() if not isinstance(verdict, Refusal))
         self._commands = {
@@ -134,15 +118,12 @@ class RoleFrames:
             self._now += INTERVAL_S
             refusal = self._gate.check(frame, self._now)
             if refusal is Refusal.COMMAND_NOT_ALLOWED and frame.header.command == REQUEST_MESSAGE:
-                self.counts.refused_requests += 1
-                continue
+                continue  # of a message that may not go to this role, or of a number that is not one
             assert refusal is None, (refusal, raw.hex(" "))
             delivered = self._stream.admit(frame, self._source, self._now)
-            if delivered:
-                self.counts.passed += 1
-                self.counts.by_message[MESSAGES[msgid][0]] += 1
+            if delivered:  # otherwise its random bytes hide a frame
+                self.by_message[MESSAGES[msgid][0]] += 1
                 return delivered
-            self.counts.hidden += 1
 
     def _carrier(self, msgid: int) -> Carrier:
         rng = self._rng
@@ -211,7 +192,7 @@ class RoleFrames:
 
     def _parameter(self) -> bytes:
         if self._rng.random() < 0.85:
-            return self._parameters[self._rng.randrange(len(self._parameters))]
+            return self._one_of(*_NAMES)
         return self._rng.randbytes(16)
 
     def _near(self, degrees: float) -> int:

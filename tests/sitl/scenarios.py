@@ -15,6 +15,7 @@ from tests.sitl.flights import flight, follow_me, outages, restarts, two_radios,
 from tests.sitl.pilots import COPTER, OWN, PX4, ROVER, Kind, Pilot
 from tests.sitl.radio import BY_NAME, CLEAN
 from tests.sitl.relayed import relayed
+from tests.sitl.roles import roles
 from tests.sitl.simulators import OwnSimulator, RealSimulator, Simulator
 from tests.sitl.station import Station
 from tests.sitl.transfers import Figures, FlightError, log_and_file, parameters_and_mission, signing
@@ -39,6 +40,8 @@ class Scenario(Layout):
     conditions: tuple[str, ...] = (CLEAN.name,)
     vehicles: int = 1
     has_maintenance_port: bool = False
+    is_direct: bool = False
+    """Whether it is flown without daemons only."""
 
     @property
     def needs_daemons(self) -> bool:
@@ -72,6 +75,7 @@ SCENARIOS = (
     Scenario("restarts", _alone(restarts)),
     Scenario("two-radios", _alone(two_radios), two_radios=True),
     Scenario("relay", _alone(relayed), ("ardupilot", "px4", "own"), relays=1),
+    Scenario("roles", _alone(roles), ("ardupilot", "px4", "own"), is_direct=True),
     Scenario("two-relays", _alone(relayed), ("ardupilot", "px4", "own"), relays=2),
 )
 SCENARIO_BY_NAME = {scenario.name: scenario for scenario in SCENARIOS}
@@ -118,7 +122,7 @@ def runs(kinds: tuple[str, ...]) -> list[Run]:
         for scenario in SCENARIOS
         if kind in scenario.kinds
         for condition in (scenario.conditions if KINDS[kind].flies else (CLEAN.name,))
-        for with_daemons in (True, False)
+        for with_daemons in ((False,) if scenario.is_direct else (True, False))
         if with_daemons or not (BY_NAME[condition].needs_daemons or scenario.needs_daemons)
     ]
 

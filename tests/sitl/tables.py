@@ -97,14 +97,16 @@ async def _request_missing(
         return
 
 
-async def upload_mission(station: Station, system: int, items: list[Item], timeout_s: float = 300.0) -> None:
+async def upload_mission(
+    station: Station, system: int, items: list[Item], timeout_s: float = 300.0, *, plan: int = MISSION
+) -> None:
     """Send a mission: the vehicle requests each item, and acknowledges the whole.
 
     Raises:
         RequestError: the vehicle refused it, or did not acknowledge it in time.
     """
     deadline = monotonic() + timeout_s
-    newest = count = mavlink.MAVLink_mission_count_message(system, AUTOPILOT, len(items), MISSION)
+    newest = count = mavlink.MAVLink_mission_count_message(system, AUTOPILOT, len(items), plan)
     last: Any = None
     with station.inbox(system, "MISSION_REQUEST", "MISSION_REQUEST_INT", "MISSION_ACK") as inbox:
         station.send(newest)
@@ -126,20 +128,22 @@ async def upload_mission(station: Station, system: int, items: list[Item], timeo
                 elif answer.type not in (mavlink.MAV_MISSION_ACCEPTED, mavlink.MAV_MISSION_INVALID_SEQUENCE):
                     raise RequestError(f"the mission was refused with {answer.type}; {station.texts[-5:]}")
             elif answer.seq < len(items):
-                newest = _as_message(system, answer.seq, items[answer.seq])
+                newest = _as_message(system, answer.seq, items[answer.seq], plan)
                 last = newest if answer.seq == len(items) - 1 else None
                 station.send(newest)
     raise RequestError(f"the mission was not acknowledged within {timeout_s:.0f} s")
 
 
-def _as_message(system: int, sequence: int, item: Item) -> Any:
+def _as_message(system: int, sequence: int, item: Item, plan: int) -> Any:
     return mavlink.MAVLink_mission_item_int_message(
         *(system, AUTOPILOT, sequence, item.frame, item.command, int(sequence == 0), 1),
-        *(*item.four, item.x, item.y, item.z, MISSION),
+        *(*item.four, item.x, item.y, item.z, plan),
     )
 
 
-async def download_mission(station: Station, system: int, timeout_s: float = 300.0) -> list[Item]:
+async def download_mission(
+    station: Station, system: int, timeout_s: float = 300.0, *, plan: int = MISSION
+) -> list[Item]:
     """Request the number of items, then each item, then acknowledge.
 
     Raises:
@@ -149,7 +153,7 @@ async def download_mission(station: Station, system: int, timeout_s: float = 300
     items: list[Item] = []
     count: int | None = None
     with station.inbox(system, "MISSION_COUNT", "MISSION_ITEM_INT") as inbox:
-        request = mavlink.MAVLink_mission_request_list_message(system, AUTOPILOT, MISSION)
+        request = mavlink.MAVLink_mission_request_list_message(system, AUTOPILOT, plan)
         station.send(request)
         while monotonic() < deadline:
             answer = await inbox.next(ITEM_RETRY_S)
@@ -165,8 +169,8 @@ async def download_mission(station: Station, system: int, timeout_s: float = 300
             else:
                 continue
             if count is not None and len(items) >= count:
-                station.send(mavlink.MAVLink_mission_ack_message(system, AUTOPILOT, 0, MISSION))
+                station.send(mavlink.MAVLink_mission_ack_message(system, AUTOPILOT, 0, plan))
                 return items
-            request = mavlink.MAVLink_mission_request_int_message(system, AUTOPILOT, len(items), MISSION)
+            request = mavlink.MAVLink_mission_request_int_message(system, AUTOPILOT, len(items), plan)
             station.send(request)
     raise RequestError(f"{len(items)} of {count} items within {timeout_s:.0f} s")

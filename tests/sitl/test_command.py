@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.sitl import command, roles
+from tests.sitl import command
 from tests.sitl.scenarios import Record, Run
 
 EXECUTABLE = "/bin/sh"
@@ -67,13 +67,3 @@ def test_missing_binary_is_refused(kind: str, tmp_path: Path, capsys: pytest.Cap
     """Before the first flight: the line names the variable."""
     assert f"set UAVLINKD_{kind.upper()} to" in refused(capsys, "--out", str(tmp_path), "--kind", kind)
     assert "UAVLINKD_ARDUPILOT or UAVLINKD_PX4" in refused(capsys, "--out", str(tmp_path))
-
-
-def test_roles_refuse_a_wrong_binary(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """At once, not after the time that a simulator has for its start."""
-    monkeypatch.setenv("UAVLINKD_ARDUPILOT", str(tmp_path / "arducopter"))
-    with pytest.raises(SystemExit, match="2"):
-        roles.main([])
-    assert "arducopter is not an executable file" in capsys.readouterr().err

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import pytest
 
 from tests.daemon.frames import frame, heartbeat
 from tests.sitl.ledger import Passing, compare, compare_messages, split
+from tests.sitl.pilots import Place
 from tests.sitl.relayed import problem_of
 from tests.sitl.report import report
+from tests.sitl.roles import LIMITS_M, Snapshot, differences
 from tests.sitl.scenarios import Record, Run, fly
 
 SENT = [Passing(10.0 + number / 10, frame(number)) for number in range(20)]
@@ -89,6 +93,45 @@ def test_dead_relay_is_judged(change: dict[str, Any], problem: str) -> None:
 def test_datagram_is_split_into_frames() -> None:
     """Bytes outside frames are counted."""
     assert split(b"boot" + frame(1) + frame(2)) == ([frame(1), frame(2)], 4)
+
+
+CALM_STATE = Snapshot(
+    {"armed": False, "mode": 4, "plan 0": "[]", "FENCE_ENABLE": b"\0\0\0\0"},
+    dict.fromkeys(LIMITS_M, Place(469_480_000, 74_474_000, 540.0)),
+    1_700_000_000.0,
+    {"ATTITUDE": 4.0, "HEARTBEAT": 1.0},
+)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"exact": {**CALM_STATE.exact, "mode": 5}},
+        {"exact": {**CALM_STATE.exact, "FENCE_ENABLE": b"\0\0\0\1"}},
+        {"exact": {**CALM_STATE.exact, "NEW": b""}},
+        {"places": {**CALM_STATE.places, "HOME_POSITION": Place(469_490_000, 74_474_000, 540.0)}},
+        {"places": {**CALM_STATE.places, "HOME_POSITION": Place(469_480_000, 74_474_000, math.nan)}},
+        {"places": {**CALM_STATE.places, "GPS_GLOBAL_ORIGIN": None}},
+        {"clock_s": 0.0},
+        {"rates": {"ATTITUDE": 1.0, "HEARTBEAT": 1.0}},
+        {"rates": {**CALM_STATE.rates, "RAW_IMU": 2.0}},
+    ],
+)
+def test_change_by_a_role_is_reported(change: dict[str, Any]) -> None:
+    """One sentence for each change; none for a centimetre of home, some milliseconds, or one message."""
+    assert len(differences(CALM_STATE, replace(CALM_STATE, **change))) == 1
+    places = {**CALM_STATE.places, "HOME_POSITION": Place(469_480_000, 74_474_001, 540.1)}
+    rates = {"ATTITUDE": 4.1, "HEARTBEAT": 1.1, "AUTOPILOT_VERSION": 0.1}
+    later = replace(CALM_STATE, places=places, clock_s=1_700_000_000.2, rates=rates)
+    assert differences(CALM_STATE, later) == []
+
+
+@pytest.mark.long
+async def test_roles_change_nothing_in_own_simulator() -> None:
+    """On the ground and in the air."""
+    record = await fly(Run("roles", "own", with_daemons=False))
+    assert record.error is None, record
+    assert len(record.figures["attacks"]) == 4
 
 
 @pytest.mark.long

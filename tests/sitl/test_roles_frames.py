@@ -40,7 +40,7 @@ def test_every_message_and_command_is_drawn(role: str) -> None:
         name = name_of(msgid)
         commands = {frame.header.command for frame in split if frame.header.msgid == msgid}
         if msgid in frames.messages:
-            assert frames.counts.by_message[name] > FRAMES // len(frames.messages) // 2
+            assert frames.by_message[name] > FRAMES // len(frames.messages) // 2
             verdict = gate.decide(msgid, is_known=True)
             only = getattr(verdict, "only_commands", None)
             assert only is None or commands == only
