@@ -1,18 +1,15 @@
-"""What a frame costs: uavlinkd beside what else carries MAVLink between two hosts. Takes root, Linux, iproute2.
-
-``python -m tests.bench report DIR`` writes the table again from the records in DIR.
-"""
+"""What a frame costs: uavlinkd beside what else carries MAVLink between two hosts. Takes root, Linux, iproute2."""
 
 from __future__ import annotations
 
 import argparse
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 from tests.bench.contenders import Contender, all_contenders
-from tests.bench.daemons import Uavlinkd
 from tests.bench.frames import FrameSet, load_frames
 from tests.bench.measure import NO_LOSS
 from tests.bench.report import write_report
@@ -28,38 +25,12 @@ RECORDS = "records"
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Exit status: 0 done, 1 failed, 2 the command line is wrong."""
-    given = sys.argv[1:] if arguments is None else list(arguments)
-    if given[:1] == ["report"]:
-        return _report(given[1:])
-    return _measure(given)
-
-
-def _report(arguments: Sequence[str]) -> int:
-    parser = argparse.ArgumentParser(prog="python -m tests.bench report", description="Draw again what was measured.")
-    parser.add_argument("folder", type=Path, help="where the records are")
-    parser.add_argument("--page", type=Path, help="write it there (RESULTS.md in the folder)")
-    options = parser.parse_args(arguments)
-    try:
-        print(write_report(options.folder, RECORDS, options.page))
-    except RecordsError as error:
-        print(error, file=sys.stderr)
-        return FAILED
-    return OK
-
-
-def _measure(arguments: Sequence[str]) -> int:
     contenders = {contender.name: contender for contender in all_contenders()}
     names = [*contenders, *SCALES]
     parser = argparse.ArgumentParser(prog="python -m tests.bench", description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("bench-results"), help="where records and table go")
     parser.add_argument("--rounds", type=int, help=f"how often each is measured, in turn ({Plan().rounds})")
     parser.add_argument("--only", nargs="+", choices=names, metavar="NAME", help=f"of {', '.join(names)}")
-    parser.add_argument(
-        "--against",
-        type=Path,
-        metavar="CHECKOUT",
-        help="measure uavlinkd with the code there as well, in turn with this one: before and after in one run",
-    )
     parser.add_argument("--quick", action="store_true", help="one short round, without the highest rates")
     options = parser.parse_args(arguments)
     plan = QUICK if options.quick else Plan()
@@ -73,17 +44,6 @@ def _measure(arguments: Sequence[str]) -> int:
         return FAILED
     wanted = options.only or names
     chosen = [contender for name, contender in contenders.items() if name in wanted]
-    if options.against is not None:
-        others = {
-            contender.name: contender.of(options.against) for contender in chosen if isinstance(contender, Uavlinkd)
-        }
-        if not others:
-            parser.error("--against compares uavlinkd, which --only leaves out")
-        reasons = {reason for contender in others.values() if (reason := contender.why_not())}
-        if reasons:
-            print(f"cannot measure: {'; '.join(sorted(reasons))}", file=sys.stderr)
-            return FAILED
-        chosen = [one for contender in chosen for one in (contender, others.get(contender.name)) if one is not None]
     scales = [name for name in SCALES if name in wanted]
     return _run(plan, options.out, chosen, scales, _command(options))
 
@@ -93,7 +53,6 @@ def _command(options: argparse.Namespace) -> str:
     words = ["python -m tests.bench", "--out DIR"]
     words += [f"--rounds {options.rounds}"] if options.rounds else []
     words += ["--only", *options.only] if options.only else []
-    words += ["--against CHECKOUT"] if options.against else []
     words += ["--quick"] if options.quick else []
     return " ".join(words)
 
@@ -106,6 +65,8 @@ def _run(plan: Plan, out: Path, contenders: Sequence[Contender], scales: Sequenc
             Run(plan, bench, writer, lambda line: print(line, flush=True)).all(contenders, scales)
     except KeyboardInterrupt:
         print(f"interrupted: what was measured until then is in {out}", file=sys.stderr)
+        with suppress(RecordsError):  # nothing was measured yet
+            write_report(out, RECORDS)
         return FAILED
     except (NamespaceError, TrafficError) as error:
         print(f"cannot measure: {error}", file=sys.stderr)

@@ -62,14 +62,10 @@ class Contender(ABC):
 
 
 class Relay(Contender):
-    """An empty relay of :mod:`tests.bench.relays`, a process on each side."""
-
-    def __init__(self, kind: str) -> None:
-        super().__init__(f"relay-{kind}")
-        self._kind = kind
+    """The empty relay of :mod:`tests.bench.relays`, a process on each side."""
 
     def why_not(self) -> str | None:
-        return needs_module("uvloop") if self._kind == "uvloop" else None
+        return needs_module("uvloop")
 
     def start(self, cable: Cable, folder: Path) -> Running:
         right = self._start(cable.right, LINK_PORT, ("127.0.0.1", SINK_PORT), folder)
@@ -77,18 +73,8 @@ class Relay(Contender):
         return Running([left], [right])
 
     def _start(self, host: Host, port: int, to: tuple[str, int], folder: Path) -> subprocess.Popen[bytes]:
-        command = [sys.executable, "-m", "tests.bench.relays", self._kind, str(port), to[0], str(to[1])]
+        command = [sys.executable, "-m", "tests.bench.relays", str(port), to[0], str(to[1])]
         return host.start(command, folder=REPOSITORY, log=folder / f"{host.name}.log")
-
-
-class Direct(Contender):
-    """No relay: the generator sends directly to the sink, over the cable. The cost of plain UDP."""
-
-    def __init__(self) -> None:
-        super().__init__("plain-udp")
-
-    def start(self, cable: Cable, folder: Path) -> Running:
-        return Running([], [], (cable.right.address, SINK_PORT))
 
 
 def needs_module(name: str) -> str | None:
@@ -133,4 +119,4 @@ def all_contenders() -> Sequence[Contender]:
     from tests.bench.routers import ROUTERS
     from tests.bench.tunnels import TUNNELS
 
-    return (Direct(), Relay("uvloop"), Relay("blocking"), *DAEMONS, *TUNNELS, *ROUTERS)
+    return (Relay("relay-uvloop"), *DAEMONS, *TUNNELS, *ROUTERS)

@@ -8,72 +8,26 @@ import subprocess
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from copy import copy
 from pathlib import Path
 from typing import Final
 
 from tests.bench.cable import Cable, Host
-from tests.bench.contenders import INTO_PORT, LINK_PORT, LOCAL_SINK, Contender, Running, needs_module, until
+from tests.bench.contenders import INTO_PORT, LINK_PORT, LOCAL_SINK, Contender, Running, until
 from tests.bench.frames import SYSTEM
-from tests.daemon.process import WITHOUT_UVLOOP
-from tests.policies import TRUSTED
 from uavlinkd.config import keys
 from uavlinkd.ops.control import ControlError, ask
-
-OF_OTHER: Final = "-against"
-"""How the name of a contender ends that runs the code of another checkout."""
 
 
 class Uavlinkd(Contender):
     """Two daemons that are linked, each with the role of the other in its file, as in flight.
 
-    Without ``has_roles`` policy lets everything pass: the difference is what policy costs. With two ``paths``, the
-    right side listens at two ports.
+    With two ``paths``, the right side listens at two ports.
     """
 
-    def __init__(
-        self, name: str, *, uvloop: bool = True, has_roles: bool = True, paths: int = 1, **link: str
-    ) -> None:
+    def __init__(self, name: str, *, paths: int = 1, **link: str) -> None:
         super().__init__(name)
-        self._uvloop = uvloop
-        self._has_roles = has_roles
         self._paths = paths
         self._link = link
-        self._python = Path(sys.executable)
-        self._checkout: Path | None = None
-
-    def of(self, checkout: Path) -> Uavlinkd:
-        """The same, with the code of another checkout, in that one's environment ``.venv``."""
-        other = copy(self)
-        other.name = f"{self.name}{OF_OTHER}"
-        other._checkout = checkout.resolve()
-        other._python = other._checkout / ".venv" / "bin" / "python"
-        return other
-
-    def why_not(self) -> str | None:
-        if self._checkout is None:
-            return needs_module("uvloop") if self._uvloop else None
-        if not self._python.exists():
-            return f"{self._checkout} has no environment: python3 -m venv .venv && .venv/bin/pip install -e '.[test]'"
-        modules = "uavlinkd, uvloop" if self._uvloop else "uavlinkd"
-        asked = subprocess.run(
-            [self._python, "-c", f"import {modules}; print(uavlinkd.__file__)"],
-            cwd=self._checkout,
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        if asked.returncode:
-            return f"{self._python} cannot import {modules}"
-        where = Path(asked.stdout.strip())
-        # Otherwise a PYTHONPATH, or an environment that was copied, would compare this code with itself.
-        return None if self._checkout in where.parents else f"{self._python} runs {where}"
-
-    def version(self) -> str | None:
-        if self._checkout is None:
-            return None
-        git = ["git", "-C", str(self._checkout), "describe", "--always", "--dirty"]
-        return subprocess.run(git, capture_output=True, text=True, check=False).stdout.strip() or None
 
     def start(self, cable: Cable, folder: Path) -> Running:
         private = {side: keys.generate_private_key() for side in ("left", "right")}
@@ -84,13 +38,13 @@ class Uavlinkd(Contender):
         addresses = [f"{cable.right.address}:{port}" for port in self._ports]
         left = configuration(
             "left",
-            peers=[peer("right", public["right"], self._rules("operator", 255), addresses)],
+            peers=[peer("right", public["right"], rules("operator", 255), addresses)],
             endpoint=f"udpin:127.0.0.1:{INTO_PORT}",
             link=link,
         )
         right = configuration(
             "right",
-            peers=[peer("left", public["left"], self._rules("vehicle", SYSTEM))],
+            peers=[peer("left", public["left"], rules("vehicle", SYSTEM))],
             endpoint=f"udpout:{LOCAL_SINK}",
             link=link,
             ports=self._ports,
@@ -98,7 +52,7 @@ class Uavlinkd(Contender):
         (folder / "left.toml").write_text(left)
         (folder / "right.toml").write_text(right)
         processes = {
-            host: start_daemon(host, folder / f"{side}.toml", python=self._python, uvloop=self._uvloop)
+            host: start_daemon(host, folder / f"{side}.toml")
             for host, side in ((cable.right, "right"), (cable.left, "left"))
         }
         until(lambda: all(peers_up(folder / f"{side}.sock") == 1 for side in private), "the daemons are linked")
@@ -108,11 +62,10 @@ class Uavlinkd(Contender):
     def _ports(self) -> range:
         return range(LINK_PORT, LINK_PORT + self._paths)
 
-    def _rules(self, role: str, system: int) -> dict[str, object]:
-        """Role and systems of a peer."""
-        if self._has_roles:
-            return {"role": role, "system_ids": [system]}
-        return dict(TRUSTED)
+
+def rules(role: str, system: int) -> dict[str, object]:
+    """Role and systems of a peer."""
+    return {"role": role, "system_ids": [system]}
 
 
 def peer(name: str, public: str, rules: Mapping[str, object], addresses: Sequence[str] = ()) -> str:
@@ -133,17 +86,13 @@ def configuration(
     )
 
 
-def daemon_command(config: Path, *, python: Path = Path(sys.executable), uvloop: bool = True) -> list[str]:
-    command = ["-m", "uavlinkd"] if uvloop else ["-c", WITHOUT_UVLOOP]
-    return [str(python), *command, "run", "--config", str(config)]
+def daemon_command(config: Path) -> list[str]:
+    return [sys.executable, "-m", "uavlinkd", "run", "--config", str(config)]
 
 
-def start_daemon(
-    host: Host, config: Path, *, python: Path = Path(sys.executable), uvloop: bool = True
-) -> subprocess.Popen[bytes]:
+def start_daemon(host: Host, config: Path) -> subprocess.Popen[bytes]:
     """Start a daemon on a host; its log is beside its file."""
-    command = daemon_command(config, python=python, uvloop=uvloop)
-    return host.start(command, folder=config.parent, log=config.with_suffix(".log"))
+    return host.start(daemon_command(config), folder=config.parent, log=config.with_suffix(".log"))
 
 
 def peers_up(control_socket: Path) -> int:
@@ -159,8 +108,6 @@ DAEMONS: Final = (
     Uavlinkd("uavlinkd"),  # authenticated
     Uavlinkd("uavlinkd-confidential", confidential="true"),  # encrypted too
     Uavlinkd("uavlinkd-coalesced", coalesce_s="0.002"),  # authenticated, coalesce_s = 0.002
-    Uavlinkd("uavlinkd-all", has_roles=False),  # authenticated, without roles: policy passes everything
     Uavlinkd("uavlinkd-paths", paths=2),  # authenticated, two paths: stream along one of them
     Uavlinkd("uavlinkd-copies", paths=2, redundancy='"all"'),  # authenticated, two paths: every frame along both
-    Uavlinkd("uavlinkd-asyncio", uvloop=False),  # authenticated, without uvloop
 )

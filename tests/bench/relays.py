@@ -1,7 +1,7 @@
-"""Empty relays: each receives from one socket and sends from another, in two ways, and does nothing else.
+"""The empty relay: it receives from one socket and sends from another, and does nothing else.
 
-They are what a figure is compared with: nothing that carries frames in Python can do less with them.
-``relays KIND PORT HOST PORT``: from this port on all addresses to that address.
+It is what a figure is compared with: hardly anything that carries frames in Python can do less.
+``relays PORT HOST PORT``: from this port on all addresses to that address.
 """
 
 from __future__ import annotations
@@ -12,32 +12,22 @@ import sys
 from collections.abc import Callable
 from typing import Final, cast
 
+import uvloop
+
 Address = tuple[str, int]
 
 BUFFER_BYTES: Final = 1 << 20
 """As uavlinkd requests; the kernel may allow less (net.core.rmem_max)."""
-RECEIVE_BYTES: Final = 65536
 
 
-def bound(port: int, *, blocking: bool) -> socket.socket:
+def bound(port: int) -> socket.socket:
     """A UDP socket on this port of all addresses."""
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     for option in (socket.SO_RCVBUF, socket.SO_SNDBUF):
         sock.setsockopt(socket.SOL_SOCKET, option, BUFFER_BYTES)
-    sock.setblocking(blocking)
+    sock.setblocking(False)
     sock.bind(("0.0.0.0", port))
     return sock
-
-
-def relay_blocking(port: int, to: Address) -> None:
-    into, out = bound(port, blocking=True), bound(0, blocking=True)
-    out.connect(to)
-    receive, send = into.recv, out.send
-    while True:
-        try:
-            send(receive(RECEIVE_BYTES))
-        except OSError:  # no listener yet
-            continue
 
 
 class _Out(asyncio.DatagramProtocol):
@@ -53,28 +43,21 @@ class _Into(asyncio.DatagramProtocol):
         self._send(data)
 
 
-async def relay_protocol(port: int, to: Address) -> None:
+async def relay(port: int, to: Address) -> None:
     """A DatagramProtocol on each side."""
     loop = asyncio.get_running_loop()
-    sock = bound(0, blocking=False)
+    sock = bound(0)
     sock.connect(to)
     out, _ = await loop.create_datagram_endpoint(_Out, sock=sock)
-    await loop.create_datagram_endpoint(lambda: _Into(out), sock=bound(port, blocking=False))
+    await loop.create_datagram_endpoint(lambda: _Into(out), sock=bound(port))
     await asyncio.Event().wait()
 
 
 def main() -> None:
-    """Run one until it is ended."""
-    kind, port, to = sys.argv[1], int(sys.argv[2]), (sys.argv[3], int(sys.argv[4]))
-    if kind == "blocking":
-        relay_blocking(port, to)
-    elif kind == "uvloop":
-        import uvloop
-
-        with asyncio.Runner(loop_factory=cast(Callable[[], asyncio.AbstractEventLoop], uvloop.new_event_loop)) as run:
-            run.run(relay_protocol(port, to))
-    else:
-        sys.exit(f"no relay of the kind {kind!r}")
+    """Run it until it is ended."""
+    port, to = int(sys.argv[1]), (sys.argv[2], int(sys.argv[3]))
+    with asyncio.Runner(loop_factory=cast(Callable[[], asyncio.AbstractEventLoop], uvloop.new_event_loop)) as run:
+        run.run(relay(port, to))
 
 
 if __name__ == "__main__":

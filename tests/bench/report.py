@@ -8,7 +8,6 @@ from pathlib import Path
 from statistics import median
 from typing import Final
 
-from tests.bench.daemons import OF_OTHER
 from tests.bench.measure import DISTURBED_MOST, EVEN_S
 from uavlinkd.lab.evaluation.frame import ReportSection, Table, percentile, to_markdown
 from uavlinkd.lab.evaluation.records import Record, Value, read_records
@@ -21,24 +20,10 @@ BASELINE: Final = "relay-uvloop"
 LOSES: Final = 0.001
 """Loss above this share at a rate is marked."""
 _CPU_HEAD: Final = [f"CPU {rate:,}/s, {side}" for rate in RATES for side in ("sending", "receiving")]
-_MEASURED: Final = """\
-Two network namespaces with a veth cable between them; generator → contender → cable → contender → sink. Every
-contender is restarted in every round, one after another, another one first each time. Medians over the rounds; in
-brackets the ratio to the uvloop relay of the same run. Absolute figures hold for this machine alone, and for what
-else it did.
-
-- *CPU*: processor time of all threads of the contender's process on that side, as the scheduler accounts it in
-  nanoseconds, divided by the frames that arrived. One frame a datagram. Work that the kernel does for a packet is on
-  the account of its sender, so part of the way through the cable is with the sending side.
-- *loss* at 10,000/s; *highest*: frames a second at which at most 0.1 % is lost, found by doubling and then halving
-  until 5 % remain between what passed and what did not. A try lasts a second, after which no more than 0.1 s of
-  traffic may wait in buffers; a rate passes if one of two tries does. Generator and sink share the cores with the
-  contender: it is what the whole machine does, and `plain-udp` says what it does with none.
-- *latency*: of each 20th frame, from just before the generator's send to just after the sink's receive; p50 and p99
-  are medians of the rounds', p99.9 is of all rounds' frames together.
-- *bytes*: everything that crossed the cable in both directions, with IP's and UDP's headers, without Ethernet's
-  (14 bytes), over the frames that arrived. *memory*: resident (VmRSS), after the 1,000/s.
-"""
+_MEASURED: Final = (
+    "Medians over the rounds; in brackets the ratio to the uvloop relay of the same run. `tests/bench/RESULTS.md`"
+    " says what each column is. Absolute figures hold for this machine alone, and for what else it did."
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,30 +66,27 @@ class Findings:
         return [record.values["latencies_s"] for record in self.of("rate", contender=contender, rate=rate)]
 
 
-def write_report(folder: Path, name: str, page: Path | None = None) -> str:
-    """Write the page (by default ``RESULTS.md`` in the folder); returns its text.
+def write_report(folder: Path, name: str) -> str:
+    """Write the page, ``RESULTS.md`` in the folder; returns its text.
 
     Raises:
         RecordsError: there are no records in the folder.
     """
     text = page_text(Findings(*read_records(folder / f"{name}.jsonl")))
-    (folder / PAGE if page is None else page).write_text(text, encoding="utf-8")
+    (folder / PAGE).write_text(text, encoding="utf-8")
     return text
 
 
 def page_text(findings: Findings) -> str:
     facts = findings.facts
     head = [
-        f"Made by `{facts.get('command', 'python -m tests.bench')}`, written by `python -m tests.bench report DIR`.",
-        _MEASURED.strip(),
+        f"Made by `{facts.get('command', 'python -m tests.bench')}`.",
+        _MEASURED,
     ]
     parts = [
         ReportSection("CPU and highest rate", tables=[_costs(findings)]),
         ReportSection("Latency, memory, bytes", tables=[_rest(findings)]),
     ]
-    if against := [name for name in findings.contenders if name.endswith(OF_OTHER)]:
-        said = f"There → here, and the ratio. There: `{facts.get(f'version_{against[0]}', 'not known')}`."
-        parts.append(ReportSection("Against the other checkout", [said], [_against(findings, against)]))
     parts.append(ReportSection("uavlinkd alone", tables=[Table(("", ""), _alone(findings))]))
     failed = [record for record in findings.records if not record.is_ok]
     missing = {f"{record.kind}: {_point(record)}": record.reason for record in failed}
@@ -139,18 +121,6 @@ def _costs(findings: Findings) -> Table:
             cells.append("-" if highest is None else f"{highest:,.0f}/s")
         rows.append(cells)
     return Table(["", *_CPU_HEAD, "loss", "highest", "highest, 8 a datagram"], rows)
-
-
-def _against(findings: Findings, others: Sequence[str]) -> Table:
-    rows = []
-    for other in others:
-        name = other.removesuffix(OF_OTHER)
-        pairs = zip(findings.cpu_us(other), findings.cpu_us(name), strict=True)
-        cells = [
-            f"{there:.1f} → {here:.1f} µs ({here / there:.2f})" if there and here else "-" for there, here in pairs
-        ]
-        rows.append([name, *cells])
-    return Table(["", *_CPU_HEAD], rows)
 
 
 def _rest(findings: Findings) -> Table:
