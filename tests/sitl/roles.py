@@ -10,7 +10,6 @@ import math
 import struct
 from collections import Counter
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from time import monotonic, monotonic_ns
 from typing import Any
@@ -68,8 +67,11 @@ async def roles(world: World, pilot: Pilot) -> Figures:
     await pilot.request_streams()
     await _settle(pilot)
     for plan, items in _plans(pilot).items():
-        with suppress(RequestError):  # some have missions only
+        try:
             await upload_mission(world.station, pilot.system, items, plan=plan)
+        except RequestError:  # some have missions only
+            if plan == mavlink.MAV_MISSION_TYPE_MISSION:
+                raise
     results: list[Figures] = []
     for place in ("ground", "air"):
         if place == "air":
@@ -201,9 +203,10 @@ def differences(before: Snapshot, after: Snapshot) -> list[str]:
 
 
 def _apart_m(one: Place, other: Place) -> float:
-    """Metres between two places. Only one height that is NaN makes them infinitely far."""
-    up_m = abs(one.z - other.z) if one.z == one.z or other.z == other.z else 0.0
-    return math.hypot(one.distance_m(other), math.inf if math.isnan(up_m) else up_m)
+    """Metres between two places; infinite if the height of only one is a number."""
+    if math.isnan(one.z) != math.isnan(other.z):
+        return math.inf
+    return math.hypot(one.distance_m(other), 0.0 if math.isnan(one.z) else one.z - other.z)
 
 
 def _plans(pilot: Pilot) -> Mapping[int, list[Item]]:

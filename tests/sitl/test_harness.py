@@ -13,9 +13,8 @@ from tests.daemon.frames import frame, heartbeat
 from tests.sitl.ledger import Passing, compare, compare_messages, split
 from tests.sitl.pilots import Place
 from tests.sitl.relayed import problem_of
-from tests.sitl.report import report
 from tests.sitl.roles import LIMITS_M, Snapshot, differences
-from tests.sitl.scenarios import Record, Run, fly
+from tests.sitl.scenarios import Run, fly
 
 SENT = [Passing(10.0 + number / 10, frame(number)) for number in range(20)]
 
@@ -141,13 +140,3 @@ async def test_own_simulator_flies(with_daemons: bool) -> None:
     record = await fly(Run("parameters-mission", "own", with_daemons=with_daemons))
     assert record.error is None, record
     assert record.figures["frames"]["exact"]
-
-
-def test_report_names_what_was_not_flown() -> None:
-    """A scenario without a record is listed, and a failed one has its reason."""
-    failed = Record("flight", "ardupilot", "clean", True, "4.7.0", 1.0, "it fell")
-    kill = {"what": "the only relay", "up_back_s": None}
-    text = report([failed, Record("relay", "own", "clean", True, figures={"relays": 1, "kills": [kill]})])
-    assert "| flight | ardupilot | clean | daemons | it fell |" in text
-    assert "| own | clean | daemons | the only relay | - |" in text.split("## relay: kills")[1]
-    assert "log-file" in text.split("## Not flown")[1]
