@@ -192,7 +192,7 @@ class RoleFrames:
 
     def _parameter(self) -> bytes:
         if self._rng.random() < 0.85:
-            return self._one_of(*_NAMES)
+            return self._rng.choice(_NAMES)
         return self._rng.randbytes(16)
 
     def _near(self, degrees: float) -> int:
