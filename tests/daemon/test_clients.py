@@ -67,7 +67,7 @@ async def check(
 
 @pytest.mark.long
 async def test_mavutil_flies_through_a_serial_port(stage: Stage) -> None:
-    """mavutil on a serial port, the autopilot a TCP server: connect, parameters, mission, arm, up, down."""
+    """mavutil on a serial port, the autopilot called on UDP: connect, parameters, mission, arm, up, down."""
     scenarios.need("pymavlink.mavutil")
     port = free_port()
     fast = ModemSettings(air_bits_s=1e6, line_baud=115_200, turn_around_s=0.0, queue_bytes=1 << 16)
@@ -76,8 +76,8 @@ async def test_mavutil_flies_through_a_serial_port(stage: Stage) -> None:
     try:
         async with flying(
             stage,
-            drone_url=f"tcp:127.0.0.1:{port}",
-            flight_url=f"tcpin:127.0.0.1:{port}",
+            drone_url=f"udpout:127.0.0.1:{port}",
+            flight_url=f"udpin:127.0.0.1:{port}",
             ground_url=f"serial:{ports.settings.left}:115200",
         ) as (flight, drone, ground):
             await check(flight, drone, ground, lambda: scenarios.fly_with_mavutil(str(ports.settings.right)))
@@ -104,7 +104,7 @@ async def test_mavproxy_flies_through_tcp(stage: Stage, tmp_path: Path) -> None:
     ("client", "kinds", "fly"),
     [
         ("pymavlink.mavutil", ("udpin", "udpout", "udpout", "udpin"), scenarios.fly_with_mavutil),
-        ("mavsdk.asyncio", ("tcpin", "tcp", "udpin", "udpout"), scenarios.fly_with_mavsdk),
+        ("mavsdk.asyncio", ("udpin", "udpout", "udpin", "udpout"), scenarios.fly_with_mavsdk),
     ],
 )
 async def test_client_flies_through_udp(

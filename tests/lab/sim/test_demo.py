@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -11,6 +12,7 @@ from rich.console import Console
 from uavlinkd.core.drops import DropReason
 from uavlinkd.lab.sim.demo import attacks_of
 from uavlinkd.lab.sim.demo_screen import AttackResult, Summary, render
+from uavlinkd.lab.sim.drone_process import DroneProcess
 
 ATTACKED: dict[str, Any] = {"attacks": [AttackResult("drop", 9)]}
 
@@ -36,17 +38,28 @@ def test_good_means_that_nothing_false_arrived(
     assert Summary(2.0, *counts, 3, {"bad_tag": 4}, 0.25, **more).is_good is is_good
 
 
-def test_the_screen_fits_a_small_terminal() -> None:
+def test_the_screen_fits_a_small_terminal(tmp_path: Path) -> None:
     """80 columns and 24 lines, also when every counter has grown: rich cuts off the lines below."""
     drops = {reason.value: 12345 for reason in DropReason}
+    session = {"suite": "ffdhe2048", "generation": 1234}
+    peer = {
+        "state": "up",
+        "session": session,
+        "round_trip_s": 12.34567,
+        "handshake_s": 123.4,
+        "envelopes_sent": 10**7,
+    }
+    drones = [DroneProcess(name, tmp_path / name, 1, 2) for name in ("drone0", "drone1")]
+    for drone in drones:
+        drone.status = {"peers": {"other": {**peer, "envelopes_received": 10**7}}}
     longest = max((str(spec) for spec in attacks_of("all")), key=len)
     results = [AttackResult(longest, 123456, drops) for _ in range(9)]
     file = io.StringIO()
     counts = {"sent": 1234567, "delivered": 1234567, "altered": 0}
-    Console(file=file, width=80).print(render(counts, drops, 123.4, results))
+    Console(file=file, width=80).print(render(drones, counts, drops, 123.4, results))
     lines = file.getvalue().splitlines()
     assert len(lines) <= 24
     assert max(map(len, lines)) <= 80
     assert "123.4 s left" in lines[-1], "nothing is cut off"
-    for text in ("1,234,567 delivered", "dropped", longest, "123,456"):
+    for text in ("link", "1,234,567 delivered", "dropped", longest, "123,456"):
         assert any(text in line for line in lines), text

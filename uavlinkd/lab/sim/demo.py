@@ -202,4 +202,5 @@ class _Demo:
             )
             drops = self.drops() - self._drops_before
             frames["altered"] = ledger.faults.total()
-            self._live.update(render(frames, drops, done_at - monotonic(), self._results), refresh=True)
+            left_s = done_at - monotonic()
+            self._live.update(render(self._stage.drones.values(), frames, drops, left_s, self._results), refresh=True)

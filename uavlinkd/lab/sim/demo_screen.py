@@ -5,12 +5,15 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from rich.console import Group, RenderableType
 from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
+
+if TYPE_CHECKING:
+    from uavlinkd.lab.sim.drone_process import DroneProcess
 
 _SHOWN = 4
 _NOTHING = "none: all datagrams were genuine, some perhaps lost or late"
@@ -62,13 +65,27 @@ class Summary:
 
 
 def render(
-    frames: Mapping[str, int], drops: Mapping[str, int], seconds_left: float, attacks: Sequence[AttackResult]
+    drones: Iterable[DroneProcess],
+    frames: Mapping[str, int],
+    drops: Mapping[str, int],
+    seconds_left: float,
+    attacks: Sequence[AttackResult],
 ) -> RenderableType:
-    """The live screen. Fits 80 columns and 24 lines."""
+    """The live screen: a column per drone, and the frames. Fits 80 columns and 24 lines."""
+    table = Table(box=None, padding=(0, 2), expand=True)
+    columns = [{"": drone.name, **_facts(drone)} for drone in drones]
+    for name, text in columns[0].items():
+        if not name:
+            table.add_column("", style="dim", no_wrap=True)
+            for column in columns:
+                table.add_column(str(column[name]), ratio=1, no_wrap=True, overflow="ellipsis")
+        else:
+            table.add_row(name, text, *(column[name] for column in columns[1:]))
     counts = ", ".join(f"{count:,} {name}" for name, count in frames.items())
     lines = Text(f"frames: {counts}\ndropped: {_counts(drops) or 'none'}", no_wrap=True, overflow="ellipsis")
     return Group(
-        Panel(lines, title="two daemons on this machine, each with a client", border_style="dim"),
+        Panel(table, title="two daemons on this machine, each with a client", border_style="dim"),
+        Panel(lines, title="every frame, byte for byte", border_style="dim"),
         *([Panel(_results(attacks[-_SHOWN:]), title="the man in the middle", border_style="red")] if attacks else []),
         Text(f"{max(0.0, seconds_left):.1f} s left", style="dim", justify="center"),
     )
@@ -119,3 +136,18 @@ def _counts(counts: Mapping[str, int]) -> str:
     """The largest first."""
     by_count = sorted(counts.items(), key=lambda item: item[1], reverse=True)
     return ", ".join(f"{count:,} {reason}" for reason, count in by_count)
+
+
+def _facts(drone: DroneProcess) -> dict[str, str | Text]:
+    status = next(iter(drone.peer_statuses), {})
+    state, session, round_trip_s = (
+        status.get("state", "starting"),
+        status.get("session") or {},
+        status.get("round_trip_s"),
+    )
+    return {
+        "link": Text(f"{state} {session.get('suite', '')}", style="bold green" if state == "up" else "bold yellow"),
+        "keys": f"no. {session['generation']}, {status['handshake_s']:.1f} s old" if session else "-",
+        "round trip": "-" if round_trip_s is None else f"{1000 * round_trip_s:.2f} ms",
+        "envelopes": f"{status.get('envelopes_sent', 0):,} out, {status.get('envelopes_received', 0):,} in",
+    }
