@@ -10,12 +10,9 @@ from pathlib import Path
 import pytest
 
 from uavlinkd.cli import main
-from uavlinkd.lab.evaluation import commands
 from uavlinkd.lab.evaluation.commands import EVALUATIONS, STAGES, add_evaluations, evaluation_of, settings_of
-from uavlinkd.lab.evaluation.frame import command
 from uavlinkd.lab.evaluation.records import Record, RecordWriter
 from uavlinkd.lab.evaluation.tampering_plan import STAGES as PLANNED
-from uavlinkd.lab.evaluation.tampering_plan import TamperingSettings
 
 
 def parse(*arguments: str) -> argparse.Namespace:
@@ -32,39 +29,12 @@ def test_defaults_are_those_of_the_settings(name: str) -> None:
     assert STAGES == PLANNED
 
 
-def test_command_of_a_run_has_the_options_that_were_given() -> None:
-    options = ["--quick", "--seed", "3", "--only", "line", "--only", "relay"]
-    settings = settings_of(evaluation_of("tampering"), parse("tampering", "--out", "x", *options))
-    assert settings == TamperingSettings(quick=True, seed=3, only=("line", "relay"))
-    assert (
-        command("tampering", settings)
-        == "uavlinkd evaluate tampering --out DIR --quick --seed 3 --only line --only relay"
-    )
-
-
-def test_unknown_stage_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    """By the option's name, before anything starts."""
-    with pytest.raises(SystemExit) as ended:
-        parse("tampering", "--out", "x", "--only", "x")
-    assert ended.value.code == 2
-    assert "--only" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize("arguments", [("report", "{}"), ("flight", "--quick", "--out", "{}/file")])
 def test_failure_is_one_line(arguments: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A folder without records, and results that cannot be written."""
     (tmp_path / "file").write_text("")
     assert main(["evaluate", *(text.format(tmp_path) for text in arguments)]) == 1
     assert len(capsys.readouterr().err.splitlines()) == 1
-
-
-@pytest.mark.parametrize("arguments", [("report", "{}"), ("tampering", "--quick", "--out", "{}")])
-def test_without_matplotlib_one_line_says_what_to_install(
-    arguments: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(commands, "find_spec", lambda _name: None)
-    assert main(["evaluate", *(text.format(tmp_path) for text in arguments)]) == 1
-    assert "'.[lab]'" in capsys.readouterr().err
 
 
 def test_the_parsers_and_the_measurements_import_nothing_of_the_figures() -> None:

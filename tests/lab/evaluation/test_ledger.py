@@ -81,18 +81,6 @@ def test_recovery_counts_frames_sent_after_the_moment_alone(ledger: Ledger) -> N
     assert ledger.recovery_s == 1.5
 
 
-def test_heartbeats_are_counted_alone() -> None:
-    """One frame in twenty, from the first one on; here the second heartbeat is lost."""
-    ledger = Ledger(("a", "b"), {"a": {"b"}, "b": set()})
-    begin = ledger.mark()
-    frames = [ledger.next_frame("a", 1.0 + number) for number in range(41)]
-    for number, frame in enumerate(frames):
-        if number != 20:
-            ledger.on_received("b", frame, 1.0 + number)
-    assert ledger.count_critical(begin, ledger.mark()) == (3, 2)
-    assert ledger.count_critical({"a": 1, "b": 0}, {"a": 40, "b": 0}) == (1, 0)
-
-
 def test_late_heartbeats_are_not_in_time() -> None:
     """All frames are heartbeats here: the second one is lost, the third one late."""
     ledger = Ledger(("a", "b"), {"a": {"b"}, "b": set()})

@@ -1,4 +1,4 @@
-"""What the records of ``uavlinkd evaluate paths`` show, and the report of them."""
+"""What is a problem in the records of ``uavlinkd evaluate paths``."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Collection
 import pytest
 
 from uavlinkd.core.settings import Class
-from uavlinkd.lab.evaluation.paths_findings import GAP_LIMIT_S, FlowView, PathsFindings, paths_problems
+from uavlinkd.lab.evaluation.paths_findings import GAP_LIMIT_S, PathsFindings, paths_problems
 from uavlinkd.lab.evaluation.paths_plan import STATION, VEHICLE, Means, Scenario
 from uavlinkd.lab.evaluation.records import Record, Value
 
@@ -82,44 +82,6 @@ def a_trial(
 
 def findings(*trials: list[Record]) -> PathsFindings:
     return PathsFindings(RUN, [*(record for trial in trials for record in trial), Record("end", {}, {})])
-
-
-def test_trial_counts_what_went_wrong() -> None:
-    """Losses, gaps, late and repeated deliveries, states that went back."""
-    (trial,) = findings(a_trial(lost=[2, 3], late=[10, 11], again=[20])).trials
-    assert trial.count(Class.CRITICAL) == (28, 2)
-    assert trial.count(Class.CRITICAL, 3.0, 9.0) == (12, 1)
-    assert trial.critical_gap_s() == pytest.approx(3.0)
-    assert (trial.stale, trial.twice, trial.back) == (2, 1, 3)
-    assert trial.bytes() == 1200
-    assert trial.bytes(28) == 1200 + 15 * 28
-
-
-@pytest.mark.parametrize(("is_state", "lost"), [(True, {3}), (False, {1, 3})])
-def test_state_is_not_lost_if_a_newer_one_arrives_soon(is_state: bool, lost: set[int]) -> None:
-    """Within half a second. An event is lost whatever follows."""
-    deliveries = [(0, 0.1), (2, 0.6), (4, 2.3)]
-    flow = FlowView(VEHICLE, Class.CRITICAL, is_state, [0.0, 0.2, 0.4, 1.0, 2.2], deliveries)
-    assert flow.lost == lost
-
-
-def test_failure_has_detection_return_and_gaps() -> None:
-    """Detection when the stream moved, return when both ends used the path again."""
-    (trial,) = findings(a_trial()).trials
-    (failure,) = trial.failures
-    assert failure.detection_s == pytest.approx(0.3)
-    assert failure.return_s == pytest.approx(1.5)
-    assert failure.stream_gap_s == pytest.approx(0.4)
-    assert (failure.critical_sent, failure.critical_lost) == (22, 0)
-
-
-def test_redundancy_is_compared_to_one_path() -> None:
-    """Of the same scenario; without that trial it is unknown."""
-    ours, one = a_trial(Scenario.QUIET), a_trial(Scenario.QUIET, Means.ONE)
-    one = [record for record in one if record.point.get("radio") != 1]
-    assert findings(ours, one).redundancy(Means.OURS) == pytest.approx(0.2)
-    assert findings(ours, one).redundancy(Means.OURS, 10) == pytest.approx(1350 / 1100 - 1)
-    assert findings(ours).redundancy(Means.OURS) is None
 
 
 @pytest.mark.parametrize(

@@ -11,25 +11,12 @@ from tests.lab.evaluation.quick_runs import run_quickly
 from uavlinkd.core.suites import SUITES, X25519
 from uavlinkd.lab.evaluation.records import Status, Value
 from uavlinkd.lab.evaluation.timing_daemons import (
-    MESSAGE_BYTES,
-    TAG_KEY_BITS,
     LinkChoice,
-    measure_initiation,
-    measure_tags,
     measured,
     time_handshake,
 )
+from uavlinkd.lab.evaluation.timing_report import TimingFindings, timing_problems
 from uavlinkd.lab.evaluation.timing_run import TIMING, measure_paper, paper_points
-
-
-def test_tags_of_every_key_are_measured() -> None:
-    points = {tuple(record.point.values()) for record in measure_tags(5) if record.number("tag_least_s") > 0}
-    assert points == {(bits, size) for bits in TAG_KEY_BITS for size in MESSAGE_BYTES}
-
-
-@pytest.mark.parametrize("number", SUITES)
-def test_initiation_of_every_suite_is_measured(number: int) -> None:
-    assert measure_initiation(LinkChoice(SUITES[number], 1024)).number("initiate_s") > 0
 
 
 async def test_handshake_of_daemons_is_timed() -> None:
@@ -42,10 +29,11 @@ async def test_handshake_of_daemons_is_timed() -> None:
 
 
 async def test_failed_measurement_is_a_record_with_its_reason() -> None:
-    """Here a length that the daemon refuses: the log of the process names the key."""
+    """And a problem of the run. Here a length that the daemon refuses: the log of the process names the key."""
     record = await measured("handshake", {}, time_handshake(LinkChoice(X25519, 257)))
     assert (record.status, record.values) == (Status.FAILED, {})
     assert "mac_key_bits" in record.reason
+    assert timing_problems(TimingFindings({}, [record])) == [f"handshake, : {record.reason}"]
 
 
 def point(dh_bits: int, group: str = "made") -> dict[str, Value]:
