@@ -9,13 +9,11 @@ from uavlinkd.core.crypto import Secret, x25519_public_key
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Deliver, Output, Transmit
 from uavlinkd.core.path import Path
-from uavlinkd.core.settings import Link, PeerSettings
-from uavlinkd.core.suites import X25519, Suite
+from uavlinkd.core.settings import PeerSettings
 from uavlinkd.lab.mitm.anatomy import mavlink_frame
-from uavlinkd.lab.mitm.attack import Action, AttackContext, AttackObject, Direction, Intervention, Send
+from uavlinkd.lab.mitm.attack import Action, AttackContext, AttackObject, Direction, Send
 
 AB = Direction("a", "b")
-BA = AB.reverse
 HEARTBEAT = mavlink_frame(0, bytes((0, 0, 0, 0, 2, 3, 81, 4, 3)), 50, system=1)
 ATTITUDE = mavlink_frame(30, bytes(range(1, 29)), 39, system=1)
 
@@ -27,14 +25,6 @@ class Conversation:
     keys: dict[str, bytes]
     said: list[tuple[bytes, Direction]] = field(default_factory=list)
 
-    @property
-    def initiation(self) -> bytes:
-        return next(datagram for datagram, direction in self.said if datagram[0] == 1 and direction == AB)
-
-    @property
-    def response(self) -> bytes:
-        return next(datagram for datagram, direction in self.said if datagram[0] == 2 and direction == BA)
-
     def envelopes(self, direction: Direction = AB) -> list[bytes]:
         """All of one direction, the confirmation first."""
         return [datagram for datagram, sent_in in self.said if datagram[0] == 0x40 and sent_in == direction]
@@ -45,15 +35,14 @@ class Conversation:
         return AttackContext.between("a", "b", public_keys=self.keys)
 
 
-def converse(seed: int = 0, suite: Suite = X25519, frames: int = 40, *, confidential: bool = False) -> Conversation:
+def converse() -> Conversation:
     """A link from its first initiation on, over a perfect network."""
-    rng = Random(f"conversation {seed}")
+    rng = Random("conversation 0")
     private = {name: rng.randbytes(32) for name in "ab"}
     keys = {name: x25519_public_key(private[name]) for name in "ab"}
     nodes = {name: Node(Secret(private[name]), rng.randbytes, 0.0) for name in "ab"}
-    link = Link(suites=(suite,), confidential=confidential)
-    nodes["a"].add_peer(PeerSettings("b", keys["b"], link=link), 0.0)
-    nodes["b"].add_peer(PeerSettings("a", keys["a"], link=link), 0.0)
+    nodes["a"].add_peer(PeerSettings("b", keys["b"]), 0.0)
+    nodes["b"].add_peer(PeerSettings("a", keys["a"]), 0.0)
     conversation = Conversation(keys)
     now = 0.0
 
@@ -67,7 +56,7 @@ def converse(seed: int = 0, suite: Suite = X25519, frames: int = 40, *, confiden
 
     nodes["a"].set_paths(nodes["a"].peers["b"], [Path(0, ("b", 1))], now)
     deliver("a", nodes["a"].handle_timeout(now))
-    for number in range(frames):
+    for number in range(40):
         now += 0.02
         frame = HEARTBEAT if number % 10 == 0 else ATTITUDE
         for sender, receiver in ("ab", "ba"):
@@ -77,10 +66,6 @@ def converse(seed: int = 0, suite: Suite = X25519, frames: int = 40, *, confiden
 
 def sends(actions: list[Action]) -> list[Send]:
     return [action for action in actions if isinstance(action, Send)]
-
-
-def notes(actions: list[Action]) -> list[Intervention]:
-    return [action for action in actions if isinstance(action, Intervention)]
 
 
 def play(

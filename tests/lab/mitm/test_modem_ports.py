@@ -1,4 +1,4 @@
-"""The emulated modems on pseudo-terminals: bytes, the plug, hosts that do not read, requests, the command line."""
+"""The emulated modems on pseudo-terminals: the plug, requests, the command line."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import asyncio
 import errno
 import json
 import os
-import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
@@ -89,23 +88,6 @@ async def test_pulled_modem_fails_and_comes_back(tmp_path: Path) -> None:
     assert events == ["modem_started", "modem_pulled", "modem_plugged", "modem_stopped"]
 
 
-async def test_emulator_sleeps(tmp_path: Path) -> None:
-    """Also while the host's kernel is full at a slow line: the CPU time is a small part of what a loop would use."""
-    slow = ModemSettings(line_baud=1_200, air_bits_s=1_200)
-    async with running(settings_in(tmp_path, slow)) as ports:
-        left = Host(tmp_path / "left")
-        for _ in range(20):
-            try:
-                os.write(left.fd, bytes(4096))
-            except BlockingIOError:
-                break
-        await until(lambda: ports.link.bytes[LEFT][Fate.WRITTEN] >= slow.host_bytes)
-        began_cpu, began = time.process_time(), time.monotonic()
-        await until(lambda: time.monotonic() - began >= 1)
-        assert time.process_time() - began_cpu < 0.5
-        left.close()
-
-
 async def test_requests(tmp_path: Path) -> None:
     """Each request of the control socket, and refusals that name what is wrong."""
     path = tmp_path / "control"
@@ -154,25 +136,3 @@ def test_stale_link_is_replaced_but_no_other_file(tmp_path: Path, capsys: pytest
     assert main(arguments) == 0
     printed = capsys.readouterr().out
     assert json.loads(printed[printed.index("{\n") :])["modems"]["left"]["is_plugged"] is True
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ([], "--left and --right"),
-        (["--left=a", "--right=a"], "--left and --right"),
-        (["--left=a", "--right=b", "--set=loss=1"], "packet_loss"),
-        (["--left=a", "--right=b", "--attack=drop"], "line-noise"),
-        (["--left=a", "--right=b", "--seconds=0"], "--seconds"),
-        (["--ask=statistics"], "--control-socket"),
-    ],
-)
-def test_wrong_command_line_ends_with_status_2(
-    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    try:
-        status: object = main(["modem", *arguments])
-    except SystemExit as ended:
-        status = ended.code
-    assert status == 2
-    assert message in capsys.readouterr().err

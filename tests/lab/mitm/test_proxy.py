@@ -8,7 +8,6 @@ import signal
 import sys
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from uavlinkd.lab.child_processes import end_with_parent
 from uavlinkd.lab.mitm.attack import Direction
 from uavlinkd.lab.mitm.attacks import ATTACKS, parse_attack
 from uavlinkd.lab.mitm.cli import main
-from uavlinkd.lab.mitm.proxy import Amplification, Proxy
+from uavlinkd.lab.mitm.proxy import Proxy
 from uavlinkd.lab.mitm.proxy_settings import MitmLink, MitmPeer, ProxySettings
 from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.ops.control import ask
@@ -84,21 +83,6 @@ async def test_each_path_has_its_own_addresses() -> None:
         await proxy.stop()
         a.close()
         b.close()
-
-
-async def test_peer_without_an_address_is_learned_from_its_datagrams() -> None:
-    """A daemon with an unknown address initiates from any port."""
-    async with _between() as (a, b, known):
-        settings = replace(known.settings, peers=(MitmPeer("a"), known.settings.peers[1]))
-        proxy = Proxy(settings)
-        await proxy.start()
-        b.send(b"too early", proxy.listeners[Direction("b", "a")])
-        a.send(b"here", proxy.listeners[Direction("a", "b")])
-        await b.until(lambda: b.datagrams == [b"here"])
-        b.send(b"found", proxy.listeners[Direction("b", "a")])
-        await a.until(lambda: a.datagrams == [b"found"])
-        assert proxy.errors["unknown receiver"] == 1
-        await proxy.stop()
 
 
 async def test_strangers_have_addresses_of_their_own_and_hear_answers() -> None:
@@ -182,42 +166,8 @@ async def test_command_runs_until_a_stop_request(tmp_path: Path, capsys: pytest.
     b.close()
 
 
-def excess(back: int, *, questions: int, at: float = 0.0, answered_at: float = 0.01) -> int:
-    """Of a peer that sends so many bytes back after so many questions of a hundred bytes."""
-    amplification = Amplification()
-    for number in range(questions):
-        amplification.sent("drone0", 3, 100, at + number / 1000)
-    amplification.received("drone0", 3, back, answered_at)
-    return amplification.excess["drone0", 3]
-
-
-@pytest.mark.parametrize(("back", "result"), [(0, 0), (100, 0), (101, 1), (200, 100)])
-def test_one_question_is_worth_its_own_size(back: int, result: int) -> None:
-    """An answer as long as the request is not an amplification; one byte more is."""
-    assert excess(back, questions=1) == result
-
-
 def pair_between(a: int, b: int, for_a: int, for_b: int) -> str:
     """A file with two peers at these ports, and the ports for each of them."""
     ends = (("a", a), ("b", b))
     peers = "".join(f'[[peer]]\nname = "{name}"\naddress = "127.0.0.1:{port}"\n' for name, port in ends)
     return f'{peers}[[link]]\nbetween = ["a", "b"]\nlisten = ["127.0.0.1:{for_a}", "127.0.0.1:{for_b}"]\n'
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ([], "--config must name a file"),
-        (["--config={}", "--attack=misroute"], "three peers"),
-        (["--config={}", "--attack=drop,direction=a>z"], "direction must be both"),
-        (["--ask=statistics"], "--control-socket"),
-        (["--config=/nowhere.toml"], "cannot be read"),
-    ],
-)
-def test_wrong_command_line_ends_with_status_2(
-    arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    config = tmp_path / "mitm.toml"
-    config.write_text(pair_between(1, 2, 3, 4))
-    assert main([text.format(config) for text in arguments]) == 2
-    assert message in capsys.readouterr().err
