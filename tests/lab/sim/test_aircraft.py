@@ -10,9 +10,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from tests import waiting
 from uavlinkd.lab.sim import aircraft as ground_pilot
-from uavlinkd.lab.sim.aircraft import OUR_SIMULATOR, Aircraft, AircraftChoice, GroundPilot, PilotError, choice_of
+from uavlinkd.lab.sim.aircraft import OUR_SIMULATOR, Aircraft, AircraftChoice, GroundPilot, PilotError
 from uavlinkd.lab.sim.autopilot import HOME
-from uavlinkd.lab.sim.real_autopilot import Firmware, RealAutopilotError
 from uavlinkd.lab.sim.vehicle import Axes, Vehicle
 
 
@@ -62,17 +61,3 @@ def distance_m(pilot: GroundPilot, point: Axes) -> float:
     assert pilot.place is not None
     offset = Vehicle(Vehicle(HOME).place_of(point)).point_of(pilot.place)
     return max(abs(offset.north), abs(offset.east))
-
-
-def test_environment_chooses_the_autopilot(tmp_path: Path) -> None:
-    """ArduPilot before PX4, ours without either; a wrong path is an error and never ours."""
-    binary = tmp_path / "px4"
-    binary.write_text("#!/bin/sh\n")
-    binary.chmod(0o700)
-
-    assert choice_of({}) == AircraftChoice()
-    assert choice_of({"UAVLINKD_PX4": str(binary)}) == AircraftChoice(Firmware.PX4, binary.resolve())
-    both = {"UAVLINKD_PX4": str(binary), "UAVLINKD_ARDUPILOT": str(binary)}
-    assert choice_of(both).firmware is Firmware.ARDUPILOT
-    with pytest.raises(RealAutopilotError, match="UAVLINKD_ARDUPILOT"):
-        choice_of({**both, "UAVLINKD_ARDUPILOT": str(tmp_path / "missing")})

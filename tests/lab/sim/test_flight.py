@@ -1,10 +1,9 @@
-"""The simulated autopilot on real sockets: reports, frames, and the end of a flight."""
+"""The simulated autopilot on real sockets: its report and frames."""
 
 from __future__ import annotations
 
 from typing import Any
 
-import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from tests import waiting
@@ -34,21 +33,3 @@ async def test_the_report_has_the_frames_of_both_directions() -> None:
             assert flight.report().frames_received == 2
         await station.until(lambda: len(station.frames) == flight.report().frames_sent)
         assert len(of_type(decode(station.frames), "COMMAND_ACK")) == 1
-
-
-async def test_a_fault_in_a_hook_ends_the_flight_where_it_is_awaited() -> None:
-    """An exception out of ``on_event`` is not lost in the event loop."""
-
-    def broken(_name: str, _fields: dict[str, object]) -> None:
-        raise ZeroDivisionError
-
-    async with Collector("udpin:127.0.0.1:0") as station:
-
-        async def fly() -> None:
-            async with Flight(f"udpout:127.0.0.1:{station.address[1]}", on_event=broken) as flight:
-                await station.until(lambda: bool(station.frames))
-                station.send(HEARTBEAT)  # the event: a ground station connected
-                await flight.run()
-
-        with pytest.raises(ZeroDivisionError):
-            await fly()

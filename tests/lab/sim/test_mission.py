@@ -1,4 +1,4 @@
-"""The mission protocol of the simulated autopilot, over a link that loses and repeats, and the mission flown."""
+"""A mission of the simulated autopilot: uploaded and flown."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from tests.lab.sim.station import Station, of_type
 from uavlinkd.lab.sim.autopilot import Autopilot
-from uavlinkd.lab.sim.mission import MAX_REQUESTS_AGAIN, REQUEST_AGAIN_AFTER_S
 from uavlinkd.lab.sim.vehicle import Landed
 
 RELATIVE = mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT
@@ -48,46 +47,6 @@ def upload(here: Station) -> int:
     assert answers[-1].get_type() == "MISSION_ACK"
     assert answers[-1].target_system == 255
     return int(answers[-1].type)
-
-
-def download(here: Station) -> list[tuple[int, int, int, int, float]]:
-    """Fetch a list, item by item."""
-    announced = here.tell(mavlink.MAVLink_mission_request_list_message(1, 1))[-1]
-    got = [
-        here.tell(mavlink.MAVLink_mission_request_int_message(1, 1, sequence))[-1]
-        for sequence in range(announced.count)
-    ]
-    assert [answer.seq for answer in got] == list(range(announced.count))
-    return [(message.command, message.frame, message.x, message.y, message.z) for message in got]
-
-
-def test_what_is_uploaded_comes_back(here: Station) -> None:
-    """Unchanged. Fences and rally points are refused."""
-    assert upload(here) == mavlink.MAV_MISSION_ACCEPTED
-    assert download(here) == PLAN
-    for kind in (1, 2):
-        refused = here.tell(mavlink.MAVLink_mission_count_message(1, 1, 1, kind))[-1]
-        assert (refused.type, refused.mission_type) == (mavlink.MAV_MISSION_UNSUPPORTED, kind)
-
-
-def test_a_lost_item_is_asked_for_again_and_then_given_up(here: Station) -> None:
-    """The request is repeated a bounded number of times, then the upload is cancelled and a new one may start."""
-    here.tell(count(2))
-    received = here.wait(REQUEST_AGAIN_AFTER_S * (MAX_REQUESTS_AGAIN + 3))
-    assert [request.seq for request in of_type(received, "MISSION_REQUEST_INT")] == [0] * MAX_REQUESTS_AGAIN
-    assert [end.type for end in of_type(received, "MISSION_ACK")] == [mavlink.MAV_MISSION_OPERATION_CANCELLED]
-    assert upload(here) == mavlink.MAV_MISSION_ACCEPTED
-
-
-def test_a_repeated_item_is_not_taken_twice(here: Station) -> None:
-    """A repeated or reordered item is ignored."""
-    here.tell(count(3))
-    assert here.tell(item(0))[-1].seq == 1
-    assert here.tell(item(0)) == []
-    assert here.tell(item(2)) == []
-    assert here.tell(item(1))[-1].seq == 2
-    assert here.tell(item(2))[-1].type == mavlink.MAV_MISSION_ACCEPTED
-    assert download(here) == PLAN[:3]
 
 
 def test_a_mission_is_flown_to_its_end(here: Station) -> None:

@@ -61,17 +61,3 @@ async def run_until_failure(autopilot: RealAutopilot) -> None:
         while True:
             autopilot.check()
             await asyncio.sleep(0.01)
-
-
-@pytest.mark.parametrize("missing", ["../etc/init.d-posix/rcS", "px4-mavlink"])
-async def test_px4_outside_its_build_folder_is_refused(missing: str, tmp_path: Path) -> None:
-    """The error names what is missing. No other folder called ``etc`` is copied."""
-    binary = build_folder(tmp_path)
-    (binary.parent / missing).resolve().unlink()
-    settings = RealAutopilotSettings(firmware=Firmware.PX4, binary=binary, udp_port=14550, home=HOME)
-
-    with pytest.raises(RealAutopilotError) as caught:
-        await RealAutopilot(settings, tmp_path / "flight").start()
-
-    assert str(caught.value) == f"UAVLINKD_PX4: {binary} is not bin/px4 of a build folder (no {missing})"
-    assert not (tmp_path / "flight" / "etc").exists()

@@ -44,22 +44,6 @@ def test_it_arrives_and_stays(north: float, east: float, up: float, step_s: floa
     assert vehicle.ground_speed_m_s < 0.5
 
 
-def test_a_return_climbs_first_and_lands_at_home() -> None:
-    """RTL climbs to its altitude, returns home, and lands."""
-    vehicle = in_the_air(4)
-    vehicle.go_to(Axes(40, -20, 4))
-    for _ in range(200):
-        vehicle.step(0.1)
-    vehicle.set_mode(Mode.RTL)
-    highest = 0.0
-    for _ in range(600):
-        vehicle.step(0.1)
-        highest = max(highest, vehicle.altitude_m)
-    assert highest == pytest.approx(vehicle.return_altitude_m, abs=0.5)
-    assert (vehicle.landed, vehicle.armed) == (Landed.ON_GROUND, False)
-    assert math.hypot(vehicle.position.north, vehicle.position.east) < 1
-
-
 @given(st.floats(-85, 85), st.floats(-180, 179.9), st.floats(-3000, 3000), st.floats(-3000, 3000))
 def test_a_place_and_its_point_belong_together(latitude: float, longitude: float, north: float, east: float) -> None:
     """From metres to degrees and back is the same point, also over the 180th meridian."""
