@@ -1,4 +1,4 @@
-"""The command ``uavlink-mitm relay``: its options, and a process between two real daemons."""
+"""The command ``uavlink-mitm relay``: a process between two real daemons."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ from tests.relay.relayed_pair import RelayedPair
 from tests.waiting import until
 from uavlinkd.cli import mitm as main
 from uavlinkd.lab.child_processes import end_with_parent
-from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.ops.control import ask
 
 pytestmark = pytest.mark.usefixtures("undone_settings")
@@ -28,54 +27,6 @@ pytestmark = pytest.mark.usefixtures("undone_settings")
 _COMMAND = "import sys; from uavlinkd.cli import mitm; sys.exit(mitm())"
 SOME = ("relay-frames", "relay-invent", "relay-lie", "bit-flip,beside=true", "replay-data,copies=2")
 """Attacks that withhold nothing."""
-
-
-@pytest.mark.parametrize(
-    ("text", "arguments", "message"),
-    [
-        (None, [], "--config"),
-        (None, ["--config=/nowhere.toml"], "/nowhere.toml"),
-        ("", ["--ask=statistics"], "control_socket is missing"),
-        ('control_socket = ""', ["--ask=statistics"], "control_socket"),
-        ("peer", [], "is not the file of a relay"),
-        ("member", ["--attack=relay-lie,direction=a>z"], "direction must be both"),
-    ],
-    ids=["no file", "missing file", "no socket", "wrong socket", "daemon", "direction"],
-)
-def test_wrong_command_line_ends_with_status_2(
-    text: str | None, arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    if text is not None:
-        arguments = [f"--config={_file(tmp_path, text)}", *arguments]
-    assert main(["relay", *arguments]) == 2
-    assert message in capsys.readouterr().err
-
-
-def _file(folder: Path, text: str, host: str = "127.0.0.1") -> Path:
-    """A file: of a daemon, of a relay, or these lines."""
-    if text in ("peer", "member"):
-        daemon = DaemonProcess("vps", folder / "vps", [f"{host}:{free_port()}"])
-        one = {"name": "a", "public_key": DaemonProcess("a", folder / "a", []).public_key}
-        other = {"name": "b", "public_key": DaemonProcess("b", folder / "b", []).public_key}
-        more = {"role": "all", "system_ids": "all"} if text == "peer" else {}
-        daemon.config = {key: value for key, value in daemon.config.items() if key not in ("peer", "endpoint")}
-        return _with(daemon, **{text: [{**one, **more}, {**other, **more}]})
-    path = folder / "relay.toml"
-    path.write_text(text)
-    return path
-
-
-def _with(daemon: DaemonProcess, **sections: object) -> Path:
-    daemon.config |= sections
-    return daemon.write_config()
-
-
-@pytest.mark.parametrize("log", ["log", "."])
-def test_run_ends_after_its_time(log: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """With status 1 if the journal cannot be written."""
-    at = tmp_path / log
-    status = main(["relay", f"--config={_file(tmp_path, 'member')}", f"--log={at}", "--seconds=0.01"])
-    assert (status, "cannot write the log" in capsys.readouterr().err) == ((1, True) if log == "." else (0, False))
 
 
 @asynccontextmanager
