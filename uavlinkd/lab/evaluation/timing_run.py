@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 import random
+import signal
 import sys
 from collections.abc import Iterable
-from contextlib import AsyncExitStack
+from contextlib import AsyncExitStack, suppress
 from typing import Any, TypeVar
 
 from uavlinkd.core.suites import SUITES, X25519
@@ -141,7 +143,8 @@ async def _end(stack: AsyncExitStack, role: str) -> asyncio.subprocess.Process:
 
     async def end() -> None:
         if process.returncode is None:
-            process.kill()
+            with suppress(ProcessLookupError):
+                os.kill(process.pid, signal.SIGKILL)  # Process.kill may reap it, unknown to asyncio
         await process.wait()
 
     stack.push_async_callback(end)
