@@ -109,6 +109,7 @@ async def test_altered_reports_change_no_claim(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
+@pytest.mark.alone  # a link has two seconds to recover
 async def test_quick_run(tmp_path: Path) -> None:
     """No attack succeeds against the daemons, every attack reaches the network; the relay beats the paper."""
     result = await run_quickly("tampering", tmp_path, "--seed", "3")
