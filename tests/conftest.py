@@ -115,7 +115,7 @@ def _leaves_no_trace(request: pytest.FixtureRequest) -> Iterator[None]:
 def _leaves_no_task(_leaves_no_trace: None, request: pytest.FixtureRequest) -> None:
     """Fail a test that leaves a running task in its event loop."""
     marker = request.node.get_closest_marker("asyncio")
-    if marker is not None and "loop_scope" not in marker.kwargs:
+    if marker is not None and marker.kwargs.get("loop_scope", "function") == "function":
         request.getfixturevalue("_tasks_end")  # after all other fixtures of the test, before its loop is closed
 
 
