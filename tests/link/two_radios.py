@@ -36,8 +36,6 @@ class Radio(NamedTuple):
     loss: float = 0.0
     budget_bits_s: int = 0
     """0: none. Both ends have the same."""
-    burst: float = 1.0
-    """How many datagrams in a row are lost on average; 1: at random."""
 
 
 class Sent(NamedTuple):
@@ -138,28 +136,16 @@ class Network:
         self._rng = random.Random(seed)
         self._arriving: list[tuple[float, int, Callable[[], None]]] = []
         self._number = 0
-        self._losing: set[tuple[str, int]] = set()  # in a burst: sender and radio
         self.alpha.link.set_paths([path_of(number, "bravo") for number in range(len(radios))], 0.0)
 
     def transmit(self, sender: End, datagram: bytes, path: Path) -> None:
         """Put a datagram on the air."""
         radio = self.radios[path.socket]
-        if self._is_lost(sender, path.socket):
+        if self._rng.random() < radio.loss:
             return
         receiver = self.bravo if sender is self.alpha else self.alpha
         source = path_of(path.socket, sender.name)
         self.at(self.now + radio.delay_s, lambda: receiver.perform(receiver.node.receive(datagram, source, self.now)))
-
-    def _is_lost(self, sender: End, number: int) -> bool:
-        radio = self.radios[number]
-        if radio.burst <= 1.0:
-            return self._rng.random() < radio.loss
-        key = sender.name, number
-        again = 1 - 1 / radio.burst if key in self._losing else radio.loss / (radio.burst * (1 - radio.loss))
-        self._losing.discard(key)
-        if self._rng.random() < again:
-            self._losing.add(key)
-        return key in self._losing
 
     def at(self, when: float, action: Callable[[], None]) -> None:
         """Do something later."""
