@@ -220,6 +220,17 @@ def _shown(kind: str, name: Any, value: Any) -> str:
         with suppress(OSError), socket.socket(fileno=os.dup(name)) as copy:
             return repr(copy)
     if kind == "child process":
-        with suppress(OSError), open(f"/proc/{name}/cmdline") as file:
-            return file.read().replace("\0", " ") or "ended, and not waited for"
+        return _command(name) or "ended, and not waited for"
     return str(value)
+
+
+def _command(process: str) -> str:
+    """Empty if the process has ended. For a moment after its start, the kernel does not show the new program's."""
+    deadline = monotonic() + END_S
+    with suppress(OSError):
+        while True:
+            with open(f"/proc/{process}/cmdline") as command, open(f"/proc/{process}/stat") as stat:
+                words, has_ended = command.read(), stat.read().rpartition(")")[2].split()[0] == "Z"
+            if words or has_ended or monotonic() > deadline:
+                return words.replace("\0", " ")
+    return ""
