@@ -225,7 +225,7 @@ def _shown(kind: str, name: Any, value: Any) -> str:
 
 
 def _command(process: str) -> str:
-    """Empty if the process has ended. For a moment after its start, the kernel does not show the new program's."""
+    """Empty if the process has ended. For a moment after its start, the kernel does not show the new command."""
     deadline = monotonic() + END_S
     with suppress(OSError):
         while True:
