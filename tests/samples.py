@@ -8,11 +8,10 @@ from typing import Any
 from fastcrc.crc16 import mcrf4xx
 from pymavlink.dialects.v20 import all as mavlink
 
-from uavlinkd.mavlink.dialect import ids_by_name
-from uavlinkd.mavlink.dialect_table import MESSAGES
+from uavlinkd.mavlink.dialect import IDS, MESSAGES
 from uavlinkd.mavlink.frames import Frame, SplitCounters, split_payload
 
-ID = ids_by_name()
+ID = IDS
 
 
 def pack(

@@ -17,7 +17,7 @@ from typing import Final
 from fastcrc.crc16 import mcrf4xx
 
 from uavlinkd.lab.sim.tlog import parse_tlog
-from uavlinkd.mavlink.dialect_table import MESSAGES
+from uavlinkd.mavlink.dialect import MESSAGES
 from uavlinkd.mavlink.policy.compilation import compile_policy
 
 MAVLINK2: Final = 0xFD

@@ -16,8 +16,7 @@ from uavlinkd.link import switch as switching
 from uavlinkd.link.drop_summary import DropSummary
 from uavlinkd.link.switch import Port, Switch
 from uavlinkd.mavlink import headers, routing
-from uavlinkd.mavlink.dialect import SETUP_SIGNING
-from uavlinkd.mavlink.dialect_table import MESSAGES
+from uavlinkd.mavlink.dialect import MESSAGES, SETUP_SIGNING
 from uavlinkd.mavlink.frames import MAVLINK1, MAX_FRAME_BYTES, Frame, SplitCounters, split_datagram, split_payload
 from uavlinkd.mavlink.headers import Header
 from uavlinkd.mavlink.policy import gate as gates

@@ -1,9 +1,9 @@
-"""Writes `uavlinkd/mavlink/dialect_table.py`: ``python -m tests.mavlink.dialect_generate``.
+"""Writes `uavlinkd/mavlink/dialect.json`: ``python -m tests.mavlink.dialect_generate``.
 
 The daemon needs a few numbers of each message in pymavlink's dialect ``all``. They come from its XML definitions; a
 test compares the table with pymavlink's classes. Other dialects of pymavlink define some of the same numbers
 differently. A parser built with such a dialect accepts frames by its CRC_EXTRA, so the table has these too
-(``OTHER_EXTRAS``).
+(``other_extras``).
 
 ``all`` follows ArduPilot's copy of MAVLink's definitions, which lacks messages that PX4 sends. These, and messages
 with additional fields at their end, are in `upstream_messages.xml`.
@@ -13,35 +13,74 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import json
 import pkgutil
 import sys
-import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from pymavlink.dialects.v20 import all as dialect
 from pymavlink.generator import mavparse
 
-from uavlinkd.mavlink import dialect_table
+from uavlinkd.mavlink.dialect import Row
 
 DIALECT_PACKAGES = ("pymavlink.dialects.v10", "pymavlink.dialects.v20")
+TABLES = Path(__file__).parents[2] / "uavlinkd/mavlink/dialect.json"
 UPSTREAM = Path(__file__).with_name("upstream_messages.xml")
 # COMMAND_ACK has a field ``command`` too, but it reports on a command and carries none.
 REPORTS_A_COMMAND = frozenset({"COMMAND_ACK"})
-
-Row = tuple[str, int, int, int, int | None, int | None, int | None]
+# Where the definition marks no field, or another one too: the neighbouring fields that tell instances apart.
+INSTANCE_FIELDS = {
+    "ACTUATOR_CONTROL_TARGET": "group_mlx",
+    "ADSB_VEHICLE": "ICAO_address",
+    "AIS_VESSEL": "MMSI",
+    "CAMERA_FOV_STATUS": "camera_device_id",
+    "COLLISION": "id",
+    "DEBUG": "ind",
+    "DEBUG_FLOAT_ARRAY": "array_id name",
+    "DISTANCE_SENSOR": "type id orientation",
+    "EFI_STATUS": "ecu_index",
+    "GIMBAL_DEVICE_ATTITUDE_STATUS": "gimbal_device_id",
+    "GPS_RTK": "rtk_receiver_id",
+    "LANDING_TARGET": "target_num",
+    "OBSTACLE_DISTANCE": "sensor_type",
+    "ODOMETRY": "frame_id child_frame_id",
+    "ONBOARD_COMPUTER_STATUS": "type",
+    "OPTICAL_FLOW": "sensor_id",
+    "RAW_RPM": "index",
+    "RC_CHANNELS_RAW": "port",
+    "RC_CHANNELS_SCALED": "port",
+    "SET_ACTUATOR_CONTROL_TARGET": "group_mlx",
+    "UTM_GLOBAL_POSITION": "uas_id",
+}
 
 
 def messages() -> dict[int, Row]:
-    """Each message id's row of `dialect_table.MESSAGES`, in order of id."""
-    rows = {message.id: _row(message) for message in _definitions(Path(str(dialect.__file__)).with_suffix(".xml"))}
+    """Each message id's row, in order of id."""
+    return {msgid: _row(message) for msgid, message in sorted(_messages().items())}
+
+
+def instances() -> dict[str, tuple[str, int, int]]:
+    """By message name: the fields that tell instances apart, their offset and their length in bytes."""
+    places = {}
+    for message in _messages().values():
+        marked = " ".join(field.name for field in message.fields if field.instance)
+        if names := INSTANCE_FIELDS.get(message.name, marked):
+            fields = [field for field in message.fields if field.name in names.split()]
+            length = sum(field.wire_length for field in fields)
+            places[message.name] = (names, min(field.wire_offset for field in fields), length)
+    return dict(sorted(places.items()))
+
+
+def _messages() -> dict[int, Any]:
+    known = {message.id: message for message in _definitions(Path(str(dialect.__file__)).with_suffix(".xml"))}
     for message in upstream():
-        row, known = _row(message), rows.get(message.id)
-        # Where pymavlink has the number, only a longer version of the same message replaces its row.
-        if known is None or (known[:3] == row[:3] and known[3] < row[3]):
-            rows[message.id] = row
-    return dict(sorted(rows.items()))
+        row, other = _row(message), known.get(message.id)
+        # Where pymavlink has the number, only a longer version of the same message replaces its own.
+        if other is None or (_row(other)[:3] == row[:3] and _row(other)[3] < row[3]):
+            known[message.id] = message
+    return known
 
 
 def upstream() -> list[Any]:
@@ -69,32 +108,18 @@ def commands() -> dict[str, int]:
 
 
 def source() -> str:
-    """The text of `dialect_table.py`."""
-    names = textwrap.wrap(" ".join(f"{name}={number}" for name, number in commands().items()), 112)
-    lines = [
-        '"""MAVLink\'s messages and commands as numbers. `tests.mavlink.dialect_generate` writes it; do not edit."""',
-        "",
-        "from __future__ import annotations",
-        "",
-        "# id: (name, CRC_EXTRA, shortest payload, longest payload,",
-        "#      offset of target_system, of target_component, of the number of the command that it carries)",
-        "# in bytes of the payload. The shortest is MAVLink 1's: all fields but the extensions.",
-        "MESSAGES: dict[int, tuple[str, int, int, int, int | None, int | None, int | None]] = {",
-        *(f'    {msgid}: ("{row[0]}", {", ".join(map(str, row[1:]))}),' for msgid, row in messages().items()),
-        "}",
-        "",
-        "# CRC_EXTRAs that other dialects have for the same number, or for one that MESSAGES lacks.",
-        "OTHER_EXTRAS: dict[int, tuple[int, ...]] = {",
-        *(f"    {msgid}: {extras}," for msgid, extras in other_extras().items()),
-        "}",
-        "",
-        '_COMMANDS = """',
-        *names,
-        '"""',
-        'COMMANDS = {f"MAV_CMD_{name}": int(n) for name, n in (pair.split("=") for pair in _COMMANDS.split())}',
-        "",
-    ]
-    return "\n".join(lines)
+    """The text of `dialect.json`: an entry a line."""
+    tables = {
+        "messages": messages(),
+        "other_extras": other_extras(),
+        "instances": instances(),
+        "commands": commands(),
+    }
+    return "{\n" + ",\n".join(f' "{name}": {{\n{_lines(table)}\n }}' for name, table in tables.items()) + "\n}\n"
+
+
+def _lines(table: Mapping[Any, object]) -> str:
+    return ",\n".join(f'  "{key}": {json.dumps(value)}' for key, value in table.items())
 
 
 def _row(message: Any) -> Row:
@@ -124,5 +149,5 @@ def _parsed(definition: Path) -> Any:
 
 
 if __name__ == "__main__":
-    Path(dialect_table.__file__).write_text(source(), encoding="utf-8")
+    TABLES.write_text(source(), encoding="utf-8")
     sys.stdout.write(f"{len(messages())} messages, {len(commands())} commands\n")

@@ -9,8 +9,8 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from tests.samples import ID, attitude, build, command, heartbeat
 from uavlinkd.core.settings import Class
-from uavlinkd.mavlink.classes import INSTANCES, KINDS
-from uavlinkd.mavlink.dialect import GROUPS, name_of
+from uavlinkd.mavlink.classes import KINDS
+from uavlinkd.mavlink.dialect import GROUPS, INSTANCES, name_of
 from uavlinkd.mavlink.screening import screen
 
 

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.mavlink import dialect_generate
-from uavlinkd.mavlink import dialect, dialect_table
+from uavlinkd.mavlink import dialect
 
 
 @pytest.mark.long
 def test_table_equals_what_the_installed_pymavlink_says() -> None:
     """The committed table is the one that the generator would write from the installed pymavlink."""
-    assert Path(dialect_table.__file__).read_text(encoding="utf-8") == dialect_generate.source()
+    assert dialect_generate.TABLES.read_text(encoding="utf-8") == dialect_generate.source()
 
 
 def test_offsets_find_the_fields_that_pymavlink_packs() -> None:
@@ -23,7 +22,7 @@ def test_offsets_find_the_fields_that_pymavlink_packs() -> None:
 
     checked = 0
     for msgid, message in pymavlink.mavlink_map.items():
-        own_name, crc_extra, _, longest, system_at, component_at, command_at = dialect_table.MESSAGES[msgid]
+        own_name, crc_extra, _, longest, system_at, component_at, command_at = dialect.MESSAGES[msgid]
         assert (own_name, crc_extra) == (message.msgname, message.crc_extra)
         if longest != message.unpacker.size:
             continue  # longer upstream than pymavlink packs it
@@ -54,7 +53,7 @@ def test_groups_name_every_message_of_the_dialect() -> None:
     for members in dialect.GROUPS.values():
         assert members
         assert len(set(members)) == len(members)
-    assert {name for members in dialect.GROUPS.values() for name in members} == set(dialect.ids_by_name())
+    assert {name for members in dialect.GROUPS.values() for name in members} == set(dialect.IDS)
 
 
 def test_reports_ask_for_nothing() -> None:
@@ -64,7 +63,7 @@ def test_reports_ask_for_nothing() -> None:
         for group in ("commands", "setpoints", "manual", "shell", "firmware", "control-access", "signing", "rtk")
         for name in dialect.GROUPS[group]
     }
-    doing |= {name for name in dialect.ids_by_name() if "_SET" in name or name.startswith("SET_")}
+    doing |= {name for name in dialect.IDS if "_SET" in name or name.startswith("SET_")}
     doing -= {"CAMERA_SETTINGS", "MANUAL_SETPOINT"}  # these report settings and sticks
     for reports in ("telemetry", "position", "heartbeat"):
         assert not set(dialect.GROUPS[reports]) & doing

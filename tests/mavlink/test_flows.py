@@ -8,7 +8,8 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from tests.mavlink import dialect_generate
 from tests.samples import ID, attitude, battery, command, frame, heartbeat
-from uavlinkd.mavlink.classes import INSTANCES, KINDS
+from uavlinkd.mavlink.classes import KINDS
+from uavlinkd.mavlink.dialect import INSTANCES
 from uavlinkd.mavlink.flows import MAX_FLOWS, FlowKey, NewestStates, flow_key
 from uavlinkd.mavlink.frames import Frame
 

@@ -10,7 +10,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from tests.mavlink.shapes import SHAPES, TEXT, UNKNOWN, Split, mixtures, split_stream
 from tests.samples import build, pack, raws, read
-from uavlinkd.mavlink.dialect_table import MESSAGES
+from uavlinkd.mavlink.dialect import MESSAGES
 from uavlinkd.mavlink.frames import MAX_FALSE_STARTS, FrameFault, SplitCounters, split_datagram, split_payload
 
 shapes = pytest.mark.parametrize("raw", SHAPES.values(), ids=SHAPES.keys())

@@ -48,7 +48,7 @@ def _read(cells: dict[str, str]) -> set[str]:
 
 
 def _passing(gate: Gate) -> set[str]:
-    ids = dialect.ids_by_name()
+    ids = dialect.IDS
     return {name for name, msgid in ids.items() if not isinstance(gate.decide(msgid, is_known=True), Refusal)}
 
 

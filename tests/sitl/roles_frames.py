@@ -18,7 +18,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from tests.mavlink.parsers.hidden_frames import SIGNATURE_BYTES, Carrier
 from uavlinkd.lab.sim.autopilot import HOME
-from uavlinkd.mavlink.dialect_table import COMMANDS, MESSAGES
+from uavlinkd.mavlink.dialect import COMMANDS, MESSAGES
 from uavlinkd.mavlink.frames import parse_frame
 from uavlinkd.mavlink.policy.compilation import compile_policy
 from uavlinkd.mavlink.policy.delivery import DeliveredStream, Source

@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tests.sitl.roles_frames import ROLES_TESTED, RoleFrames
-from uavlinkd.mavlink.dialect import name_of
-from uavlinkd.mavlink.dialect_table import MESSAGES
+from uavlinkd.mavlink.dialect import MESSAGES, name_of
 from uavlinkd.mavlink.frames import SplitCounters, parse_frame, split_datagram
 from uavlinkd.mavlink.policy.compilation import compile_policy
 

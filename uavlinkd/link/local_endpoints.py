@@ -18,7 +18,7 @@ from uavlinkd.link.event_log import EventLog
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.switch import Switch
 from uavlinkd.mavlink.classes import KINDS, UNKNOWN
-from uavlinkd.mavlink.dialect import command_name, ids_by_name, name_of
+from uavlinkd.mavlink.dialect import IDS, command_name, name_of
 from uavlinkd.mavlink.frames import SplitCounters, split_payload
 from uavlinkd.mavlink.policy.compilation import Policy, compile_policy
 from uavlinkd.mavlink.policy.delivery import Source
@@ -242,7 +242,7 @@ REFUSAL_INTERVAL_S: Final = 10.0
 invent refusals, and must not hide this end's own ones."""
 
 _AUTOPILOT: Final = 1  # MAV_COMP_ID_AUTOPILOT1
-_STATUSTEXT: Final = ids_by_name()["STATUSTEXT"]
+_STATUSTEXT: Final = IDS["STATUSTEXT"]
 _LABELS: Final = {400: "(DIS)ARM"}
 _LABEL_CHARACTERS: Final = 20
 _CLAIM: Final = "refused"

@@ -25,7 +25,7 @@ from uavlinkd.link.facts import (
     PeerFacts,
     listed,
 )
-from uavlinkd.mavlink.dialect import GROUPS, command_name, ids_by_name, name_of
+from uavlinkd.mavlink.dialect import GROUPS, IDS, command_name, name_of
 from uavlinkd.mavlink.policy.gate import ANY_OTHER, Gate, Refusal
 from uavlinkd.mavlink.policy.refusal_totals import REFUSALS
 from uavlinkd.mavlink.policy.roles import ROLES
@@ -247,7 +247,7 @@ def _roles_exchanged(peer: PeerFacts) -> Iterator[Found]:
 
 def _has(gate: Gate, messages: frozenset[int]) -> bool:
     """Whether the gate refused one of these messages because of its rules."""
-    carriers = frozenset(ids_by_name()[name] for name in ("COMMAND_LONG", "COMMAND_INT"))
+    carriers = frozenset(IDS[name] for name in ("COMMAND_LONG", "COMMAND_INT"))
     plain = {msgid for msgid, refusal in gate.refused if refusal is Refusal.MESSAGE_NOT_ALLOWED}
     if plain & messages - carriers:
         return True
@@ -262,7 +262,7 @@ def _only(role: str, other: str) -> frozenset[int]:
     sent = {entry: {*GROUPS.get(entry, (entry,))} for name in (role, other) for entry in ROLES[name].allow_in}
     names = {name for entry in ROLES[role].allow_in for name in sent[entry]}
     others = {name for entry in ROLES[other].allow_in for name in sent[entry]}
-    ids = ids_by_name()
+    ids = IDS
     return frozenset(ids[name] for name in names - others if name in ids)
 
 

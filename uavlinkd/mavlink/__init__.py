@@ -1,1 +1,2 @@
-"""MAVLink without decoding: frames, names, policy and routes. Nothing here does I/O or reads a clock."""
+"""MAVLink without decoding: frames, names, policy and routes. Nothing here reads a clock or does I/O, except that
+`dialect` reads its tables at import."""

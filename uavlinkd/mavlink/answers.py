@@ -10,7 +10,7 @@ from typing import Final
 
 from uavlinkd.core.settings import Class
 from uavlinkd.mavlink.classes import KINDS
-from uavlinkd.mavlink.dialect import ids_by_name
+from uavlinkd.mavlink.dialect import IDS
 from uavlinkd.mavlink.frames import MAVLINK2, Frame
 
 ANSWERED_S: Final = 2.0
@@ -18,9 +18,9 @@ ANSWERED_S: Final = 2.0
 MAX_REQUESTS: Final = 256
 """Requests that are remembered. The oldest is forgotten first."""
 
-PARAM_VALUE: Final = ids_by_name()["PARAM_VALUE"]
-PARAM_REQUEST_READ: Final = ids_by_name()["PARAM_REQUEST_READ"]
-PARAM_SET: Final = ids_by_name()["PARAM_SET"]
+PARAM_VALUE: Final = IDS["PARAM_VALUE"]
+PARAM_REQUEST_READ: Final = IDS["PARAM_REQUEST_READ"]
+PARAM_SET: Final = IDS["PARAM_SET"]
 
 VALUE_KIND: Final = KINDS[PARAM_VALUE]
 """The facts about a PARAM_VALUE, except its class."""

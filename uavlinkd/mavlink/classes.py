@@ -30,7 +30,7 @@ from enum import IntEnum
 from typing import Final, NamedTuple
 
 from uavlinkd.core.settings import Class
-from uavlinkd.mavlink.dialect import GROUPS, ids_by_name
+from uavlinkd.mavlink.dialect import GROUPS, IDS, INSTANCES
 
 
 class Lane(IntEnum):
@@ -91,58 +91,6 @@ _EVENTS_AMONG_THEM: Final = _names(
     "PROTOCOL_VERSION COMPONENT_INFORMATION COMPONENT_INFORMATION_BASIC COMPONENT_METADATA EVENT"
 )
 
-INSTANCES: Final[dict[str, tuple[int, int]]] = {
-    # name: (offset, length) in the payload, in bytes, of the field or neighbouring fields that tell instances apart
-    "ACTUATOR_CONTROL_TARGET": (40, 1),  # group_mlx
-    "ADAP_TUNING": (48, 1),  # axis
-    "ADSB_VEHICLE": (0, 4),  # ICAO_address
-    "AIRSPEED": (10, 1),  # id
-    "AIS_VESSEL": (0, 4),  # MMSI
-    "BATTERY_INFO": (44, 1),  # id
-    "BATTERY_STATUS": (32, 1),  # id
-    "CAMERA_FOV_STATUS": (52, 1),  # camera_device_id
-    "CELLULAR_STATUS": (10, 1),  # id
-    "COLLISION": (0, 4),  # id
-    "DEBUG": (8, 1),  # ind
-    "DEBUG_FLOAT_ARRAY": (8, 12),  # array_id, name
-    "DEBUG_VECT": (20, 10),  # name
-    "DISTANCE_SENSOR": (10, 3),  # type, id, orientation
-    "EFI_STATUS": (0, 4),  # ecu_index
-    "ESC_INFO": (42, 1),  # index
-    "ESC_STATUS": (56, 1),  # index
-    "FUEL_STATUS": (24, 1),  # id
-    "GIMBAL_DEVICE_ATTITUDE_STATUS": (48, 1),  # gimbal_device_id
-    "GIMBAL_MANAGER_STATUS": (8, 1),  # gimbal_device_id
-    "GLOBAL_POSITION_SENSOR": (38, 1),  # id
-    "GNSS_INTEGRITY": (8, 1),  # id
-    "GPS_INPUT": (60, 1),  # gps_id
-    "GPS_RTK": (30, 1),  # rtk_receiver_id
-    "HIGHRES_IMU": (62, 1),  # id
-    "HYGROMETER_SENSOR": (4, 1),  # id
-    "LANDING_TARGET": (28, 1),  # target_num
-    "LOWEHEISER_GOV_EFI": (84, 1),  # efi_index
-    "MAG_CAL_PROGRESS": (12, 1),  # compass_id
-    "MCU_STATUS": (8, 1),  # id
-    "NAMED_VALUE_FLOAT": (8, 10),  # name
-    "NAMED_VALUE_INT": (8, 10),  # name
-    "NAMED_VALUE_STRING": (4, 10),  # name
-    "OBSTACLE_DISTANCE": (156, 1),  # sensor_type
-    "ODOMETRY": (228, 2),  # frame_id, child_frame_id
-    "ONBOARD_COMPUTER_STATUS": (196, 1),  # type
-    "OPTICAL_FLOW": (24, 1),  # sensor_id
-    "OPTICAL_FLOW_RAD": (42, 1),  # sensor_id
-    "PID_TUNING": (24, 1),  # axis
-    "RANGING_BEACON": (36, 2),  # beacon_id
-    "RAW_IMU": (26, 1),  # id
-    "RAW_RPM": (4, 1),  # index
-    "RC_CHANNELS_RAW": (20, 1),  # port
-    "RC_CHANNELS_SCALED": (20, 1),  # port
-    "SERVO_OUTPUT_RAW": (20, 1),  # port
-    "SET_ACTUATOR_CONTROL_TARGET": (40, 1),  # group_mlx
-    "UTM_GLOBAL_POSITION": (50, 18),  # uas_id
-    "WATER_DEPTH": (36, 1),  # id
-}
-
 
 def _table() -> dict[int, MessageKind]:
     may_be_old = _names_in(_REPORT_GROUPS) - _names_in(_STEERING_GROUPS)
@@ -159,7 +107,7 @@ def _table() -> dict[int, MessageKind]:
             name in states,
             *INSTANCES.get(name, ()),
         )
-        for name, msgid in ids_by_name().items()
+        for name, msgid in IDS.items()
     }
 
 
@@ -167,5 +115,5 @@ KINDS: Final = _table()
 """By message id. The header of a frame has its row: :attr:`.headers.Header.kind`."""
 UNKNOWN: Final = MessageKind(Class.STREAM, may_be_old=False, lane=Lane.EVENTS, is_state=False)
 """Of a message that the dialect does not have, or has in another form."""
-SAID_ONCE: Final = frozenset(ids_by_name()[name] for name in _EVENTS_AMONG_THEM)
+SAID_ONCE: Final = frozenset(IDS[name] for name in _EVENTS_AMONG_THEM)
 """Message ids in groups of states that no later frame replaces, such as a line of STATUSTEXT."""

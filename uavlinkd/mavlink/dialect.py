@@ -1,4 +1,6 @@
-"""Names of messages, and groups of them.
+"""Messages and commands of MAVLink, and groups of messages.
+
+`dialect.json` has the numbers of each message and command: `tests.mavlink.dialect_generate` writes it.
 
 A *group* is a tuple of message names that a policy can allow or deny by one word. Groups may share messages.
 Each message of the dialect is in at least one group, and in ``all``.
@@ -9,29 +11,36 @@ telemetry to a ground station, and an obstacle to an autopilot. Such a message i
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
-from functools import cache
+from pathlib import Path
 from typing import Final
 
-from uavlinkd.mavlink.dialect_table import COMMANDS, MESSAGES
+_TABLES: Final = json.loads(Path(__file__).with_name("dialect.json").read_bytes())
+
+Row = tuple[str, int, int, int, int | None, int | None, int | None]
+"""Name, CRC_EXTRA, shortest and longest payload, and the offsets of target_system, of target_component and of the
+number of the command that it carries. Lengths and offsets are in bytes of the payload. The shortest payload is
+MAVLink 1's: all fields but the extensions."""
+MESSAGES: Final[Mapping[int, Row]] = {int(msgid): tuple(row) for msgid, row in _TABLES["messages"].items()}
+OTHER_EXTRAS: Final[Mapping[int, list[int]]] = {int(msgid): row for msgid, row in _TABLES["other_extras"].items()}
+"""CRC_EXTRAs that other dialects have for the same message id, or for one that MESSAGES lacks."""
+INSTANCES: Final[Mapping[str, tuple[int, int]]] = {name: (at, n) for name, (_, at, n) in _TABLES["instances"].items()}
+"""By message name: offset and length, in bytes of the payload, of the fields that tell instances apart."""
+COMMANDS: Final[Mapping[str, int]] = {f"MAV_CMD_{name}": number for name, number in _TABLES["commands"].items()}
+IDS: Final[Mapping[str, int]] = {row[0]: msgid for msgid, row in MESSAGES.items()}
+"""Each message's id by its name."""
+_COMMAND_NAMES: Final = {number: name for name, number in COMMANDS.items()}
 
 ALL: Final = "all"
+SETUP_SIGNING: Final = IDS["SETUP_SIGNING"]
+"""Carries the key of MAVLink's own signing, in clear. MAVLink 1 has no room for its number."""
 
 
 def name_of(msgid: int) -> str:
     """The message's name; of an unknown one, its number."""
     row = MESSAGES.get(msgid)
     return row[0] if row else str(msgid)
-
-
-@cache
-def ids_by_name() -> Mapping[str, int]:
-    """Each message's id by its name."""
-    return {row[0]: msgid for msgid, row in MESSAGES.items()}
-
-
-SETUP_SIGNING: Final = ids_by_name()["SETUP_SIGNING"]
-"""Carries the key of MAVLink's own signing, in clear. MAVLink 1 has no room for its number."""
 
 
 def command_number(name: str) -> int | None:
@@ -42,12 +51,7 @@ def command_number(name: str) -> int | None:
 
 def command_name(number: int) -> str:
     """The command's name; of an unknown one, its number."""
-    return _command_names().get(number, str(number))
-
-
-@cache
-def _command_names() -> Mapping[int, str]:
-    return {number: name for name, number in COMMANDS.items()}
+    return _COMMAND_NAMES.get(number, str(number))
 
 
 def _names(text: str) -> tuple[str, ...]:

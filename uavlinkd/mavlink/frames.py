@@ -32,7 +32,7 @@ from typing import Final, NamedTuple, final
 from fastcrc.crc16 import mcrf4xx
 
 from uavlinkd.core.drops import Reason
-from uavlinkd.mavlink.dialect_table import MESSAGES
+from uavlinkd.mavlink.dialect import MESSAGES
 from uavlinkd.mavlink.headers import (
     OTHER_DEFINITION,
     Header,

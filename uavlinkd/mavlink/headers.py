@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from typing import Final, NamedTuple, final
 
 from uavlinkd.mavlink.classes import KINDS, UNKNOWN, MessageKind
-from uavlinkd.mavlink.dialect_table import MESSAGES
+from uavlinkd.mavlink.dialect import MESSAGES, Row
 
 MAX_SENDER_MESSAGES: Final = 2048
 """Messages of one sender each whose headers are kept."""
@@ -51,8 +51,8 @@ class Header:
 class SenderMessage(NamedTuple):
     """The facts that depend on sender and message id alone."""
 
-    definition: tuple[str, int, int, int, int | None, int | None, int | None] | None
-    """The row of :data:`.dialect_table.MESSAGES`; None if the dialect does not define the message."""
+    definition: Row | None
+    """The row of :data:`.dialect.MESSAGES`; None if the dialect does not define the message."""
     longest: int
     """The longest payload by this definition, in bytes; 255 without one."""
     known: Header | None

@@ -45,7 +45,7 @@ from dataclasses import dataclass
 from struct import Struct
 from typing import Final, NamedTuple
 
-from uavlinkd.mavlink.dialect import ids_by_name
+from uavlinkd.mavlink.dialect import IDS
 from uavlinkd.mavlink.frames import pack
 
 SYSTEM: Final = 51
@@ -55,7 +55,7 @@ INTERVAL_S: Final = 1.0
 """How often to send: both autopilots step by each message, made for a radio that sends one a second."""
 
 _PAYLOAD = Struct("<HHBBBBB")  # rxerrors, fixed, rssi, remrssi, txbuf, noise, remnoise
-_MSGID: Final = ids_by_name()["RADIO_STATUS"]
+_MSGID: Final = IDS["RADIO_STATUS"]
 
 
 class Level(NamedTuple):

@@ -13,12 +13,12 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import Final, NamedTuple
 
-from uavlinkd.mavlink.dialect import ids_by_name
+from uavlinkd.mavlink.dialect import IDS
 from uavlinkd.mavlink.frames import pack
 
 COMPONENT: Final = 240
 TEXT_BYTES: Final = 50
-_MSGID: Final = ids_by_name()["STATUSTEXT"]
+_MSGID: Final = IDS["STATUSTEXT"]
 
 
 class TextSeverity(IntEnum):

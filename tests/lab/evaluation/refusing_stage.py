@@ -10,12 +10,11 @@ from typing import Any, Final
 
 from uavlinkd.lab.evaluation.stage import DaemonStage
 from uavlinkd.lab.mitm.anatomy import mavlink_frame
-from uavlinkd.mavlink.dialect import ids_by_name
-from uavlinkd.mavlink.dialect_table import MESSAGES
+from uavlinkd.mavlink.dialect import IDS, MESSAGES
 
 _REFUSED: Final = "MAV_CMD_COMPONENT_ARM_DISARM"
 _COMMAND: Final = Struct("<7fHBBB")
-_COMMAND_LONG: Final = ids_by_name()["COMMAND_LONG"]
+_COMMAND_LONG: Final = IDS["COMMAND_LONG"]
 _ARM: Final = 400
 _COMMANDS_INTERVAL_S: Final = 0.2
 

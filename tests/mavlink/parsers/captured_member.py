@@ -13,8 +13,7 @@ from struct import pack
 from typing import Final, NamedTuple
 
 from tests.mavlink.parsers.hidden_frames import Carrier, frame, hide
-from uavlinkd.mavlink.dialect import ids_by_name
-from uavlinkd.mavlink.dialect_table import COMMANDS, MESSAGES
+from uavlinkd.mavlink.dialect import COMMANDS, IDS, MESSAGES
 from uavlinkd.mavlink.frames import MAVLINK1
 from uavlinkd.mavlink.policy.compilation import compile_policy
 from uavlinkd.mavlink.policy.gate import Refusal
@@ -25,7 +24,7 @@ TABLET: Final = 200
 GROUND: Final = 255
 VICTIM: Final = 1
 
-_ID: Final = ids_by_name()
+_ID: Final = IDS
 EVERYTHING: Final[Mapping[str, object]] = {"role": "all", "system_ids": "all"}
 CAST: Final[Mapping[str, Mapping[str, object]]] = {
     "member": {"role": "swarm-member", "system_ids": [2]},

@@ -18,8 +18,7 @@ from tests.mavlink.parsers.hidden_frames import Carrier, hide
 from tests.mavlink.parsers.hidden_frames import frame as build
 from tests.mavlink.parsers.judge import Deliverer, Judge, Stream, judge_all
 from tests.mavlink.parsers.receivers import Options, Receiver
-from uavlinkd.mavlink.dialect import ids_by_name
-from uavlinkd.mavlink.dialect_table import MESSAGES
+from uavlinkd.mavlink.dialect import IDS, MESSAGES
 from uavlinkd.mavlink.frames import parse_frame
 from uavlinkd.mavlink.policy.compilation import compile_policy
 from uavlinkd.mavlink.policy.delivery import DeliveredStream, Source
@@ -44,7 +43,7 @@ def false_refusals(count: int, seed: int) -> Noise:
     rng = random.Random(seed)
     policy = {"role": "swarm-member", "system_ids": [1]}
     source, stream = Source("member", compile_policy(policy).incoming), DeliveredStream()
-    numbers = [ids_by_name()[name] for name in TELEMETRY]
+    numbers = [IDS[name] for name in TELEMETRY]
     frames = total = refused = 0
     while total < count:
         msgid = numbers[frames % len(numbers)]
@@ -78,9 +77,9 @@ def prepared(lost: int) -> Stream | None:
             break
     else:
         return None
-    home = ids_by_name()["HOME_POSITION"]
+    home = IDS["HOME_POSITION"]
     carriers = [Carrier(home, bytearray(payload), 2) for _ in range(_FRAMES)]
-    wanted = bytes((0, payload, 0, 0, 0, 255, 190)) + ids_by_name()["COMMAND_LONG"].to_bytes(3, "little")
+    wanted = bytes((0, payload, 0, 0, 0, 255, 190)) + IDS["COMMAND_LONG"].to_bytes(3, "little")
     for number in range(_FRAMES - 1):
         hide(carriers[number : number + 2], wanted + bytes(payload + 2), 10 + phase)
     raws = [carrier.build() for carrier in carriers]

@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 from tests.mavlink.parsers.captured_member import CAST, GOALS, command_long, heartbeat_of, set_mode
 from tests.mavlink.parsers.hidden_frames import SIGNATURE_BYTES, Carrier, crc_extra, frame, hide, msgid_of
 from tests.mavlink.parsers.receivers import PRIVATE_EXTRAS
-from uavlinkd.mavlink.dialect_table import COMMANDS, MESSAGES, OTHER_EXTRAS
+from uavlinkd.mavlink.dialect import COMMANDS, MESSAGES, OTHER_EXTRAS
 from uavlinkd.mavlink.policy.compilation import compile_policy
 from uavlinkd.mavlink.policy.gate import Refusal
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 from fastcrc.crc16 import mcrf4xx
 
-from uavlinkd.mavlink.dialect_table import MESSAGES
+from uavlinkd.mavlink.dialect import MESSAGES
 from uavlinkd.mavlink.frames import MAVLINK1, MAVLINK2
 
 SIGNATURE_BYTES = 13

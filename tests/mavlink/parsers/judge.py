@@ -16,7 +16,7 @@ from tests.mavlink.parsers.captured_member import CAST
 from tests.mavlink.parsers.generate import CLIENTS, LETS_UNKNOWN_PASS, Recipe
 from tests.mavlink.parsers.hidden_frames import SIGNATURE_BYTES, crc_extra, msgid_of
 from tests.mavlink.parsers.receivers import Accepted, Batch, Delivery, Receiver
-from uavlinkd.mavlink.dialect_table import OTHER_EXTRAS
+from uavlinkd.mavlink.dialect import OTHER_EXTRAS
 from uavlinkd.mavlink.frames import MAVLINK2, Frame, SplitCounters, parse_frame, split_payload
 from uavlinkd.mavlink.policy.compilation import compile_policy
 from uavlinkd.mavlink.policy.delivery import DeliveredStream, Source

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import pymavlink.generator
 
-from uavlinkd.mavlink.dialect_table import OTHER_EXTRAS
+from uavlinkd.mavlink.dialect import OTHER_EXTRAS
 
 DIALECTS = ("minimal", "common", "ardupilotmega", "all")
 LIBRARIES = ("2.0", "2.0-unknown", "2.0-other", "1.0")

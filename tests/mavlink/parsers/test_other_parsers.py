@@ -18,7 +18,7 @@ from tests.mavlink.parsers.judge import Deliverer, Judge, Stream, unfiltered
 from tests.mavlink.parsers.receivers import DIALECTS
 from tests.mavlink.parsers.targets import concatenated, deliver
 from tests.waiting import PATIENCE_S
-from uavlinkd.mavlink.dialect import ids_by_name, name_of
+from uavlinkd.mavlink.dialect import IDS, name_of
 
 STREAMS = 400
 MARKER_SYSTEM = 77
@@ -134,8 +134,8 @@ TO_ALL = frame(76, bytes(28) + (400).to_bytes(2, "little") + bytes(3), 255)
 def smuggled() -> list[MemberAttack]:
     """The command in a payload, of a member; and where a signed message of an observer shifts a receiver to it."""
     member, observer = CAST["member"], CAST["observer"]
-    home = Carrier(ids_by_name()["HOME_POSITION"], bytearray(60), 2)
-    lacked, carrier = lacking("common", "observer"), ids_by_name()["PARAM_REQUEST_READ"]
+    home = Carrier(IDS["HOME_POSITION"], bytearray(60), 2)
+    lacked, carrier = lacking("common", "observer"), IDS["PARAM_REQUEST_READ"]
     return [
         within("in a payload", member, home, TO_ALL),
         signed_unknown("behind a signature", observer, 200, lacked, carrier, TO_ALL),

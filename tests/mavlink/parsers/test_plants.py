@@ -8,7 +8,7 @@ import pytest
 
 from tests.mavlink.parsers.judge import Admit, MakeStream, filtered
 from tests.mavlink.parsers.run import run
-from uavlinkd.mavlink.dialect_table import MESSAGES, OTHER_EXTRAS
+from uavlinkd.mavlink.dialect import MESSAGES, OTHER_EXTRAS
 from uavlinkd.mavlink.frames import MAVLINK2, Frame
 from uavlinkd.mavlink.policy import hidden
 from uavlinkd.mavlink.policy.delivery import DeliveredStream, Source

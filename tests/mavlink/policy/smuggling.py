@@ -8,7 +8,7 @@ from functools import partial
 from fastcrc.crc16 import mcrf4xx
 
 from tests.samples import build
-from uavlinkd.mavlink.dialect_table import MESSAGES, OTHER_EXTRAS
+from uavlinkd.mavlink.dialect import MESSAGES, OTHER_EXTRAS
 from uavlinkd.mavlink.policy.compilation import compile_policy
 from uavlinkd.mavlink.policy.delivery import Source
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tests.samples import ID, blank
-from uavlinkd.mavlink.dialect_table import COMMANDS
+from uavlinkd.mavlink.dialect import COMMANDS
 from uavlinkd.mavlink.policy.alternatives import EFFECTS
 from uavlinkd.mavlink.policy.compilation import Policy, PolicyError, PolicyProblem, compile_policy
 from uavlinkd.mavlink.policy.roles import ROLES

@@ -24,7 +24,7 @@ from tests.mavlink.policy.smuggling import (
     valid_frames,
 )
 from tests.samples import read
-from uavlinkd.mavlink.dialect_table import MESSAGES
+from uavlinkd.mavlink.dialect import MESSAGES
 from uavlinkd.mavlink.frames import Frame
 from uavlinkd.mavlink.headers import Header
 from uavlinkd.mavlink.policy import hidden

@@ -26,8 +26,7 @@ from tests.samples import (
     mission_item,
     read,
 )
-from uavlinkd.mavlink.dialect import GROUPS
-from uavlinkd.mavlink.dialect_table import COMMANDS, MESSAGES
+from uavlinkd.mavlink.dialect import COMMANDS, GROUPS, MESSAGES
 from uavlinkd.mavlink.frames import Frame
 from uavlinkd.mavlink.policy import gate as gates
 from uavlinkd.mavlink.policy.compilation import Policy, compile_policy

@@ -25,8 +25,7 @@ from tests.samples import (
     position,
 )
 from uavlinkd.lab.sim.tlog import read_tlog
-from uavlinkd.mavlink.dialect import GROUPS
-from uavlinkd.mavlink.dialect_table import COMMANDS
+from uavlinkd.mavlink.dialect import COMMANDS, GROUPS
 from uavlinkd.mavlink.frames import Frame
 from uavlinkd.mavlink.policy.gate import SYSTEM_SHARE, Refusal
 from uavlinkd.mavlink.policy.roles import ROLES

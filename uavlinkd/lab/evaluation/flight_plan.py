@@ -17,7 +17,7 @@ from uavlinkd.lab.evaluation.frame import EvaluationSettings
 from uavlinkd.lab.mitm.anatomy import envelope_of
 from uavlinkd.lab.mitm.attack import Alteration, Direction
 from uavlinkd.lab.sim.vehicle import EARTH_RADIUS_M, Axes
-from uavlinkd.mavlink.dialect_table import MESSAGES
+from uavlinkd.mavlink.dialect import MESSAGES
 
 PAIR: Final = ("drone0", "drone1")
 SYSTEM_IDS: Final = {"drone0": 1, "drone1": 2}

@@ -31,8 +31,7 @@ from uavlinkd.lab.sim.drone_process import DroneProcess
 from uavlinkd.lab.sim.links import MavlinkConnection, open_connection
 from uavlinkd.lab.sim.loopback_ports import free_ports
 from uavlinkd.mavlink.classes import KINDS
-from uavlinkd.mavlink.dialect import ids_by_name
-from uavlinkd.mavlink.dialect_table import COMMANDS, MESSAGES
+from uavlinkd.mavlink.dialect import COMMANDS, IDS, MESSAGES
 from uavlinkd.mavlink.frames import SplitCounters, split_datagram
 from uavlinkd.system.addresses import Address
 
@@ -60,7 +59,7 @@ class NumberedFlow:
 
     @cached_property
     def message_id(self) -> int:
-        return ids_by_name()[self.message]
+        return IDS[self.message]
 
     @property
     def cls(self) -> Class:

@@ -33,7 +33,7 @@ class OpenEffect(NamedTuple):
 
 def _full_names(names: str) -> tuple[str, ...]:
     """The names of a text; what is not a message is a command, without MAV_CMD_."""
-    messages = dialect.ids_by_name()
+    messages = dialect.IDS
     return tuple(name if name in messages else f"MAV_CMD_{name}" for name in names.split())
 
 

@@ -45,7 +45,7 @@ from collections.abc import Mapping
 from typing import Final, NamedTuple
 
 from uavlinkd.mavlink import dialect
-from uavlinkd.mavlink.dialect_table import MESSAGES
+from uavlinkd.mavlink.dialect import MESSAGES
 from uavlinkd.mavlink.policy.alternatives import full_command_name, open_effects
 from uavlinkd.mavlink.policy.gate import REQUEST_MESSAGE, SAME_AS_COMMAND, Condition, Gate, Refusal
 from uavlinkd.mavlink.policy.settings import PolicyError, PolicyProblem, Rules, Settings, read_settings
@@ -164,7 +164,7 @@ def _warnings(settings: Settings, incoming: Gate, outgoing: Gate) -> list[str]:
             )
         if not rules.denied_commands:
             continue
-        ids = dialect.ids_by_name()
+        ids = dialect.IDS
         through = [
             name
             for name in OPAQUE
@@ -181,7 +181,7 @@ def _warnings(settings: Settings, incoming: Gate, outgoing: Gate) -> list[str]:
 
 def _group_text(gate: Gate, members: tuple[str, ...]) -> str:
     """The messages of a group that pass, as text."""
-    ids = dialect.ids_by_name()
+    ids = dialect.IDS
     verdicts = {name: gate.decide(ids[name], is_known=True) for name in members}
     passing = [name for name, verdict in verdicts.items() if not isinstance(verdict, Refusal)]
     conditions = {name: verdict for name in passing if isinstance(verdict := verdicts[name], Condition)}

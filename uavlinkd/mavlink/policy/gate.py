@@ -10,7 +10,7 @@ from typing import Final
 
 from uavlinkd.core.drops import Attention, Reason
 from uavlinkd.mavlink import dialect
-from uavlinkd.mavlink.dialect_table import COMMANDS, MESSAGES
+from uavlinkd.mavlink.dialect import COMMANDS, MESSAGES
 from uavlinkd.mavlink.flows import FlowKey, flow_key
 from uavlinkd.mavlink.frames import Frame
 from uavlinkd.mavlink.headers import Header
@@ -24,7 +24,7 @@ MAX_DECISIONS: Final = 1024  # message ids whose decision is remembered
 BURST_S: Final = 0.5  # how much of a second's frames may come at once
 SYSTEM_SHARE: Final = 16  # what all components of a system may send of a message, in rates of one
 
-_IDS: Final = dialect.ids_by_name()
+_IDS: Final = dialect.IDS
 HEARTBEAT: Final = 0
 TYPE_IN_HEARTBEAT: Final = 4  # offset in its payload
 MAV_TYPE_GCS: Final = 6

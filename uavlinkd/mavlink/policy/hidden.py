@@ -25,7 +25,7 @@ from typing import Final
 
 from fastcrc.crc16 import mcrf4xx
 
-from uavlinkd.mavlink.dialect_table import MESSAGES, OTHER_EXTRAS
+from uavlinkd.mavlink.dialect import MESSAGES, OTHER_EXTRAS
 from uavlinkd.mavlink.frames import (
     CHECKSUM_STEP,
     MAVLINK1,

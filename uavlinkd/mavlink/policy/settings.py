@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 
 from uavlinkd.mavlink import dialect
 from uavlinkd.mavlink.classes import SAID_ONCE
-from uavlinkd.mavlink.dialect_table import COMMANDS
+from uavlinkd.mavlink.dialect import COMMANDS
 from uavlinkd.mavlink.policy.roles import ROLES
 
 MAX_MSGID: Final = 0xFFFFFF
@@ -42,7 +42,7 @@ DONE_BY: Final[Mapping[int, frozenset[int]]] = {
 }
 
 FILES_READ: Final = "files-read"
-FILE_TRANSFER: Final = dialect.ids_by_name()["FILE_TRANSFER_PROTOCOL"]
+FILE_TRANSFER: Final = dialect.IDS["FILE_TRANSFER_PROTOCOL"]
 # MAVLink's MAV_FTP_OPCODE (https://mavlink.io/en/services/ftp.html). The others create, write, truncate, rename or
 # remove; a number outside the definition may have any effect.
 # In this order: TerminateSession, ResetSessions, ListDirectory, OpenFileRO, ReadFile, CalcFileCRC32, BurstReadFile;
@@ -217,14 +217,14 @@ def _entry(item: str | int) -> _Entry | PolicyProblem:
         return _Entry(is_all=True)
     if item.startswith(("MAV_CMD_", "command:")):
         return _command_entry(item)
-    msgid = dialect.ids_by_name().get(item)
+    msgid = dialect.IDS.get(item)
     if msgid is not None:
         return _Entry(messages=(msgid,))
     members = dialect.GROUPS.get(item)
     if members is not None:
-        ids = tuple(dialect.ids_by_name()[name] for name in members)
+        ids = tuple(dialect.IDS[name] for name in members)
         return _Entry(messages=ids, reads_files=item == FILES_READ)
-    known = (*dialect.GROUPS, *dialect.ids_by_name())
+    known = (*dialect.GROUPS, *dialect.IDS)
     remedy = "write groups in small letters, messages in capitals, and an unknown message by its number"
     return PolicyProblem("", f"no such group or message: {item!r}", _did_you_mean(item, known, remedy))
 
@@ -310,7 +310,7 @@ def _rates(data: Mapping[str, object], key: str, report: Report) -> Mapping[int,
                 "write frames a second, above 0; to stop a message, deny it",
             )
             continue
-        if entry.number is not None or name in dialect.ids_by_name():
+        if entry.number is not None or name in dialect.IDS:
             of_messages[entry.messages[0] if entry.number is None else entry.number] = float(rate)
         else:
             thinned = entry.messages if key == "rate_in" else set(entry.messages) - SAID_ONCE
