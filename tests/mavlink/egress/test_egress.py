@@ -150,8 +150,9 @@ def test_invented_flows_do_not_displace_the_known() -> None:
 
 def egress_of(link: Link) -> Egress:
     """The queue of a link with a budget."""
-    assert isinstance(link.egress._together, Egress)
-    return link.egress._together
+    (queue,) = link.egress._queues.values()
+    assert isinstance(queue, Egress)
+    return queue
 
 
 @pytest.mark.parametrize("settings", [EgressSettings(coalesce_s=0.5), EgressSettings(4000, coalesce_s=0.5)])
@@ -187,7 +188,7 @@ def test_lanes_are_bounded_and_drop_the_oldest() -> None:
     frames = [parameter(n) for n in range(500)]
     link.put(*frames, now=0.0)
     egress = egress_of(link)
-    assert MIN_LANE_BYTES / 2 - 50 <= egress.queued_bytes <= MIN_LANE_BYTES / 2
+    assert MIN_LANE_BYTES / 2 - 50 <= egress.lanes.size <= MIN_LANE_BYTES / 2
     kept = egress.queued_frames
     assert link.egress.totals == {EgressDrop.OVERFLOW: 500 - kept}
     link.put(heartbeat(1), now=0.0)
@@ -195,7 +196,7 @@ def test_lanes_are_bounded_and_drop_the_oldest() -> None:
     for n in range(60):
         pings = [frame(mavlink.MAVLink_ping_message(n, k, 1, 1), 1 + k) for k in range(8)]
         link.put(*pings, now=n * 0.001)
-    assert MIN_LANE_BYTES - 50 <= egress.queued_bytes <= MIN_LANE_BYTES
+    assert MIN_LANE_BYTES - 50 <= egress.lanes.size <= MIN_LANE_BYTES
     assert link.egress.totals == {EgressDrop.OVERFLOW: 500 - kept + 480 - egress.queued_frames}
 
 
@@ -204,7 +205,7 @@ def test_memory_is_bounded_under_a_flood_of_replaceable_frames() -> None:
     link = Link(SLOW)
     link.transmit(4000, 0.0)
     link.put(*(attitude(n) for n in range(5000)), now=0.0)
-    lanes = egress_of(link)._lanes
+    lanes = egress_of(link).lanes
     assert len(lanes.queues[Lane.STATES].arrivals) <= 100
     for start in range(0, 3 * MAX_FLOWS, 1024):
         names = (f"{n}".encode() for n in range(start, start + 1024))

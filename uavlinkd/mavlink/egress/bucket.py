@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import exp, inf
-from typing import Final, NamedTuple
+from typing import Final
 
 BURST_S: Final = 0.25
 """The bucket holds this much of the budget: a command waits for no more than this in a radio's own buffer."""
@@ -21,14 +21,6 @@ DEBT_S: Final = 1.0
 """The bucket can be in debt, because the core's own datagrams are never refused. The debt is at most this much: the
 handshakes of a long outage must not silence the link after it."""
 DEMAND_WINDOW_S: Final = 2.0
-
-
-class _Claim(NamedTuple):
-    """What a queue waits for."""
-
-    price: float
-    """In bytes."""
-    is_urgent: bool
 
 
 class Bucket:
@@ -44,7 +36,8 @@ class Bucket:
         self.set_least_burst(least_burst)
         self._bytes = self.burst
         self._offered = 0.0  # bytes sent and dropped, fading over the window
-        self._line: dict[object, _Claim] = {}  # the queues that wait, the longest waiting first
+        # The queues that wait, the longest waiting first: the price in bytes, and whether it is urgent.
+        self._line: dict[object, tuple[float, bool]] = {}
         self._now = now
 
     def set_rate(self, bytes_s: float, now: float) -> None:
@@ -83,9 +76,9 @@ class Bucket:
 
     # Turns.
 
-    def claim(self, queue: object, claim: _Claim) -> None:
+    def claim(self, queue: object, price: float, *, is_urgent: bool) -> None:
         """A queue waits for its turn, or its next envelope has another price now."""
-        self._line[queue] = claim
+        self._line[queue] = price, is_urgent
 
     def leave(self, queue: object) -> None:
         """A queue had its turn, or has no frames."""
@@ -94,11 +87,11 @@ class Bucket:
     def price_before(self, queue: object, *, is_urgent: bool) -> float:
         """The bytes that other queues need before it is this one's turn."""
         before, is_behind = 0.0, False
-        for other, claim in self._line.items():
+        for other, (price, is_other_urgent) in self._line.items():
             if other is queue:
                 is_behind = True
-            elif claim.is_urgent > is_urgent or (claim.is_urgent == is_urgent and not is_behind):
-                before += claim.price
+            elif is_other_urgent > is_urgent or (is_other_urgent == is_urgent and not is_behind):
+                before += price
         return before
 
     # Demand.
@@ -164,7 +157,7 @@ class Supply:
             self.leave(queue)
             return min(own, max(levels))
         for network in self.networks:
-            network.claim(queue, _Claim(price, is_urgent))
+            network.claim(queue, price, is_urgent=is_urgent)
         return 0.0
 
     def leave(self, queue: object) -> None:

@@ -27,7 +27,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import inf
 from typing import Final
 
@@ -72,7 +72,7 @@ class EgressSettings:
         return self.budget_bits_s > 0 or self.coalesce_s > 0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class EnvelopeShape:
     """The payload and the cost of an envelope, in bytes: header and tag, and around it IP and UDP (48 over IPv6).
 
@@ -82,11 +82,11 @@ class EnvelopeShape:
     payload_limit: int = 1200
     seal_bytes: int = 23
     carrier_bytes: int = 28
+    overhead: int = field(init=False)
+    """The bytes of an envelope on the wire besides its frames."""
 
-    @property
-    def overhead(self) -> int:
-        """The bytes of an envelope on the wire besides its frames."""
-        return self.seal_bytes + self.carrier_bytes
+    def __post_init__(self) -> None:
+        self.overhead = self.seal_bytes + self.carrier_bytes
 
 
 class Egress:
@@ -118,34 +118,20 @@ class Egress:
         self._level = supply.level if supply.networks or supply.own is None else supply.own.level
         self._bytes = supply.level(now)  # what may be spent now
         lane_bytes = min(max(supply.rate * settings.max_age_s, MIN_LANE_BYTES), MAX_LANE_BYTES)
-        self._lanes = Lanes(lane_bytes, MAX_FLOWS, self._is_superseded, self._on_drop)
+        self.lanes = Lanes(lane_bytes, MAX_FLOWS, self._is_superseded, self._on_drop)
         self._waiting_since = now  # a newer state in place of an older one changes nothing
         self.shape = shape
-
-    @property
-    def shape(self) -> EnvelopeShape:
         """The payload and the cost of an envelope to this peer."""
-        return self._shape
-
-    @shape.setter
-    def shape(self, shape: EnvelopeShape) -> None:
-        self._shape = shape
-        self._overhead = shape.overhead
 
     @property
     def queued_frames(self) -> int:
         """How many frames wait."""
-        return self._lanes.count
-
-    @property
-    def queued_bytes(self) -> int:
-        """How many bytes of frames wait."""
-        return self._lanes.size
+        return self.lanes.count
 
     def has_room(self, payload_bytes: int, now: float) -> bool:
         """Whether an envelope with this payload may go out now: no frame waits, and the budget covers it."""
         self._advance(now)
-        return not self.queued_frames and self._bytes >= self._overhead + payload_bytes
+        return not self.queued_frames and self._bytes >= self.shape.overhead + payload_bytes
 
     def put(self, frames: Sequence[Frame], now: float) -> None:
         """Let frames for the peer wait, in their order."""
@@ -153,12 +139,12 @@ class Egress:
         if not self.queued_frames:
             self._waiting_since = now
         for frame in frames:
-            self._lanes.put(frame, now)
+            self.lanes.put(frame, now)
 
     def take(self, now: float) -> list[Frame]:
         """Pop the frames of the next envelope, in order. Empty if none is due now."""
         self._advance(now)
-        lanes = self._lanes
+        lanes = self.lanes
         lanes.drop_stale(now, self.settings.max_age_s)
         next_one = lanes.next if self._is_short(0) else lanes.first
         first = next_one()
@@ -169,7 +155,7 @@ class Egress:
         room = self.supply.room_for(self, price, now, is_urgent=self._is_urgent(first))
         if not room:
             return []
-        room = min(self._shape.payload_limit, room + _SLACK_BYTES - self._overhead)
+        room = min(self.shape.payload_limit, room + _SLACK_BYTES - self.shape.overhead)
         batch: list[Waiting] = []
         size = 0
         waiting: Waiting | None = first
@@ -186,7 +172,7 @@ class Egress:
 
     def next_deadline(self) -> float:
         """When :meth:`take` is due next; infinity while no frame waits."""
-        first = self._lanes.next()
+        first = self.lanes.next()
         if first is None:
             return inf
         wait_s = self.supply.wait_s(self, self._price(first), self._now, is_urgent=self._is_urgent(first))
@@ -200,13 +186,13 @@ class Egress:
     def pop_all(self) -> list[tuple[Frame, float]]:
         """Take out all frames that wait, each with the time since when."""
         self.supply.leave(self)
-        return [(waiting.frame, waiting.put_at) for waiting in self._lanes.pop_all()]
+        return [(waiting.frame, waiting.put_at) for waiting in self.lanes.pop_all()]
 
     def clear(self, now: float) -> None:
         """Drop all frames that wait: the peer is lost."""
         self._advance(now)
         self.supply.leave(self)
-        self._lanes.clear()
+        self.lanes.clear()
 
     # The budget.
 
@@ -220,15 +206,15 @@ class Egress:
 
     def _is_short(self, more_bytes: int) -> bool:
         """Whether the bucket holds less than the cost of the waiting frames and of this many bytes more."""
-        size = self.queued_bytes + more_bytes
-        envelopes = 1 + size // self._shape.payload_limit
-        return size + envelopes * self._overhead > self._bytes
+        size = self.lanes.size + more_bytes
+        envelopes = 1 + size // self.shape.payload_limit
+        return size + envelopes * self.shape.overhead > self._bytes
 
     def _price(self, first: Waiting) -> float:
         """What the bucket must hold before an envelope is sent: enough for its first frame and, if others would still
         wait, enough to be worth the overhead."""
-        overhead = self._overhead
-        all_of_it = overhead + min(self.queued_bytes, self._shape.payload_limit)
+        overhead = self.shape.overhead
+        all_of_it = overhead + min(self.lanes.size, self.shape.payload_limit)
         if first.flow.lane is Lane.URGENT:
             worth = min(URGENT_SHARING * overhead, URGENT_SHARING_S * self.supply.rate)
         else:
@@ -237,8 +223,8 @@ class Egress:
 
     def _due_at(self) -> float:
         """When coalescing ends for the waiting frames. There must be one."""
-        urgent = self._lanes.queues[0]
-        if urgent.count or self.queued_bytes >= self._shape.payload_limit:
+        urgent = self.lanes.queues[0]
+        if urgent.count or self.lanes.size >= self.shape.payload_limit:
             return -inf
         return self._waiting_since + self.settings.coalesce_s
 

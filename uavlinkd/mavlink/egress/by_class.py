@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from math import inf
+from operator import itemgetter
 from typing import Final
 
 from uavlinkd.core.constants import CRITICAL_ENVELOPE_LIMIT
@@ -61,10 +62,8 @@ class PeerEgress:
         if settings.budget_bits_s:
             self._own = Bucket(settings.budget_bits_s, now, self._shape.overhead + MAX_FRAME_BYTES)
         self._supplies = dict.fromkeys(_TURNS, Supply(self._own))
-        self._lead = 0  # bytes of the stream sent beyond those of bulk, while both wait
-        self._queues: dict[Class, Egress | Coalescer] = {}  # of each class, if it is split
-        self._together: Egress | Coalescer | None = None  # otherwise
-        self._make_queues(now)
+        self._queues: dict[Class, Egress | Coalescer] = {}  # of the stream alone, unless it is split
+        self._rebuild(now)
 
     @property
     def shape(self) -> EnvelopeShape:
@@ -76,13 +75,13 @@ class PeerEgress:
         self._shape = shape
         if self._own is not None:
             self._own.set_least_burst(shape.overhead + MAX_FRAME_BYTES)
-        for cls, queue in self._all:
+        for cls, queue in self._queues.items():
             queue.shape = self._shape_of(cls)
 
     @property
     def queued_frames(self) -> int:
         """How many frames wait."""
-        return sum(queue.queued_frames for _, queue in self._all)
+        return sum(queue.queued_frames for queue in self._queues.values())
 
     def set_networks(self, networks: Mapping[Class, Sequence[Bucket | None]], now: float) -> None:
         """The networks along which each class goes now, the best first; None for one without a budget.
@@ -98,37 +97,39 @@ class PeerEgress:
 
     def has_room(self, payload_bytes: int, now: float) -> bool:
         """Whether an envelope with this payload may go out now: no frame waits, and the budget covers it."""
-        return all(queue.has_room(payload_bytes, now) for _, queue in self._all)
+        return all(queue.has_room(payload_bytes, now) for queue in self._queues.values())
 
     def put(self, frames: Sequence[Frame], now: float, *, is_split: bool) -> None:
         """Let frames for the peer wait, in their order. ``is_split``: whether the peer has several paths now."""
         if is_split != self.is_split:
             self.is_split = is_split
             self._rebuild(now)
-        if self._together is not None:
-            self._together.put(frames, now)
+        if not is_split:
+            self._queues[Class.STREAM].put(frames, now)
         else:
             for cls, part in split_by_class(frames, self._class_of, now):
                 self._queues[cls].put(part, now)
 
     def take(self, now: float) -> tuple[Class, list[Frame]]:
         """Pop the frames of the next envelope, and their class; without frames if none is due now."""
-        if self._together is not None:
-            return Class.STREAM, self._together.take(now)
+        if not self.is_split:
+            return Class.STREAM, self._queues[Class.STREAM].take(now)
         for cls in self._turns():
             queue = self._queues[cls]
             if batch := queue.take(now):
                 self._note_turn(cls, batch)
                 return cls, batch
             if queue.is_blocked:
-                self._leave_line(cls)
+                if cls is not Class.CRITICAL:  # in line for the networks, each would wait for the other
+                    behind = _other(cls)
+                    self._supplies[behind].leave(self._queues[behind])
                 break  # what is sent in its place would use up what it waits for
         return Class.STREAM, []
 
     def next_deadline(self) -> float:
         """When :meth:`take` is due next; infinity while no frame waits."""
-        if self._together is not None:
-            return self._together.next_deadline()
+        if not self.is_split:
+            return self._queues[Class.STREAM].next_deadline()
         at = inf
         for cls in self._turns():
             at = min(at, self._queues[cls].next_deadline())
@@ -143,21 +144,13 @@ class PeerEgress:
 
     def clear(self, now: float) -> None:
         """Drop all frames that wait: the peer is lost."""
-        for _, queue in self._all:
+        for queue in self._queues.values():
             queue.clear(now)
 
-    @property
-    def _all(self) -> list[tuple[Class, Egress | Coalescer]]:
-        return list(self._queues.items()) if self._together is None else [(Class.STREAM, self._together)]
-
-    def _turns(self) -> tuple[Class, Class, Class]:
+    def _turns(self) -> tuple[Class, ...]:
+        if not self.is_split:
+            return (Class.STREAM,)
         return _BULK_TURNS if self._lead > 0 else _TURNS
-
-    def _leave_line(self, blocked: Class) -> None:
-        """Take the class behind the blocked one out of the line for the networks: each would wait for the other."""
-        if blocked is not Class.CRITICAL:
-            behind = _other(blocked)
-            self._supplies[behind].leave(self._queues[behind])
 
     def _note_turn(self, cls: Class, batch: Sequence[Frame]) -> None:
         if cls is Class.CRITICAL:
@@ -172,14 +165,6 @@ class PeerEgress:
             return shape
         return replace(shape, payload_limit=min(shape.payload_limit, CRITICAL_ENVELOPE_LIMIT - shape.seal_bytes))
 
-    def _make_queues(self, now: float) -> None:
-        if self.is_split:
-            self._together = None
-            self._queues = {cls: self._make_queue(cls, now) for cls in _TURNS}
-        else:
-            self._together = self._make_queue(Class.STREAM, now)
-            self._queues = {}
-
     def _make_queue(self, cls: Class, now: float) -> Egress | Coalescer:
         shape, supply = self._shape_of(cls), self._supplies[cls]
         if supply.is_limited:
@@ -188,18 +173,13 @@ class PeerEgress:
 
     def _rebuild(self, now: float) -> None:
         """Have the frames that wait go on waiting in other queues, with the age that they have."""
-        waiting = sorted((entry for _, queue in self._all for entry in queue.pop_all()), key=_put_at)
-        self._lead = 0
-        self._make_queues(now)
-        for frame, put_at in waiting:
-            queue = self._together or self._queues[self._class_of(frame, now)]
-            queue.put([frame], put_at)
+        waiting = [entry for queue in self._queues.values() for entry in queue.pop_all()]
+        self._lead = 0  # bytes of the stream sent beyond those of bulk, while both wait
+        self._queues = {cls: self._make_queue(cls, now) for cls in self._turns()}
+        for frame, put_at in sorted(waiting, key=itemgetter(1)):
+            self._queues[self._class_of(frame, now) if self.is_split else Class.STREAM].put([frame], put_at)
 
 
 def _other(cls: Class) -> Class:
     """Stream and bulk take turns."""
     return Class.BULK if cls is Class.STREAM else Class.STREAM
-
-
-def _put_at(waiting: tuple[Frame, float]) -> float:
-    return waiting[1]

@@ -20,6 +20,7 @@ Within a flow the order is never reversed. Sans-IO: `now` is monotonic seconds.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from heapq import heappop, heappush, heapreplace
 from typing import Final
 
@@ -46,17 +47,15 @@ URGENT_LEAD_BYTES: Final = 1024
 """So many bytes of urgent frames go first before that ratio holds: a burst of commands is not interrupted."""
 
 
+@dataclass(slots=True, eq=False)
 class _Place:
     """Where one source is in the line of one class of frames."""
 
-    __slots__ = ("frames", "is_in_line", "next_frame", "paid")
-
-    def __init__(self, frames: _SourceFrames, next_frame: Callable[[], Waiting | None]) -> None:
-        self.frames = frames
-        self.next_frame = next_frame
-        """The source's next frame of this class."""
-        self.paid = 0.0  # on the line's clock, in bytes
-        self.is_in_line = False
+    frames: _SourceFrames
+    next_frame: Callable[[], Waiting | None]
+    """The source's next frame of this class."""
+    paid: float = 0.0  # on the line's clock, in bytes
+    is_in_line: bool = False
 
 
 class _SourceFrames:
@@ -148,7 +147,7 @@ class FairQueue:
             else:
                 self._rest.join(waiting.rest)
             while self.size > QUEUE_BYTES:
-                max(self._sources.values(), key=_size_of).lanes.drop_from_largest()
+                max(self._sources.values(), key=lambda frames: frames.lanes.size).lanes.drop_from_largest()
 
     def next_bytes(self, now: float) -> int:
         """How large the frame is whose turn it is; 0 if none waits."""
@@ -211,7 +210,3 @@ class FairQueue:
         self.count -= 1
         self.size -= len(waiting.frame.raw)
         self._report(reason)
-
-
-def _size_of(frames: _SourceFrames) -> int:
-    return frames.lanes.size

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from heapq import heapify, heappop, heappush
+from operator import attrgetter
 from typing import Final
 
 from uavlinkd.core.drops import Reason
@@ -29,17 +31,15 @@ class EgressDrop(Reason):
     CLOSED = "closed", "the peer is lost", "waiting when the link ended"
 
 
+@dataclass(slots=True, eq=False)
 class Waiting:
     """One frame that waits."""
 
-    __slots__ = ("flow", "frame", "is_waiting", "number", "put_at")
-
-    def __init__(self, frame: Frame, flow: Flow, put_at: float, number: int) -> None:
-        self.frame = frame
-        self.flow = flow
-        self.put_at = put_at
-        self.number = number  # in the order of arrival
-        self.is_waiting = True
+    frame: Frame
+    flow: Flow
+    put_at: float
+    number: int  # in the order of arrival
+    is_waiting: bool = True
 
 
 class Flow:
@@ -123,17 +123,11 @@ class Queue:
         self.count -= 1
         self.size -= len(frame.frame.raw)
 
-    def serve(self, frame: Waiting, now: float) -> None:
-        """Take out the first frame of a flow to be sent, which is the flow's turn."""
-        flow = frame.flow
-        self.remove(frame)
-        flow.sent_at = now
-        if flow.frames:
-            flow.since = flow.frames[0].put_at
-
 
 IsSuperseded = Callable[[Waiting, Frame, float], bool]
 """Whether a newer frame of the same state replaces the one that waits: (waiting, newer, now)."""
+by_number: Final = attrgetter("number")
+"""For sorting in the order of arrival."""
 OnDrop = Callable[[Waiting, EgressDrop], None]
 
 
@@ -212,11 +206,14 @@ class Lanes:
     def serve(self, waiting: Waiting, now: float) -> None:
         """Take out a frame to be sent: the first of its flow."""
         _, events, states = self.queues
-        lane = waiting.flow.lane
-        if lane is not Lane.URGENT:
-            size = len(waiting.frame.raw) if lane is Lane.EVENTS else -len(waiting.frame.raw)
+        flow = waiting.flow
+        if flow.lane is not Lane.URGENT:
+            size = len(waiting.frame.raw) if flow.lane is Lane.EVENTS else -len(waiting.frame.raw)
             self._lead = self._lead + size if events.count and states.count else 0
-        self.queues[lane].serve(waiting, now)
+        self.queues[flow.lane].remove(waiting)
+        flow.sent_at = now
+        if flow.frames:
+            flow.since = flow.frames[0].put_at
 
     def drop_stale(self, now: float, max_age_s: float) -> None:
         """Drop the frames that have waited longer than ``max_age_s``."""
@@ -226,7 +223,7 @@ class Lanes:
 
     def drop_from_largest(self) -> None:
         """Drop the oldest frame of the lane that holds most bytes. There must be one."""
-        oldest = max(self.queues, key=_size_of).oldest()
+        oldest = max(self.queues, key=attrgetter("size")).oldest()
         assert oldest is not None
         self.drop(oldest, EgressDrop.OVERFLOW)
 
@@ -240,9 +237,8 @@ class Lanes:
 
     def clear(self) -> None:
         """Drop all frames that wait: the link is lost."""
-        for queue in self.queues:
-            while (oldest := queue.oldest()) is not None:
-                self.drop(oldest, EgressDrop.CLOSED)
+        for waiting in self.pop_all():
+            self._on_drop(waiting, EgressDrop.CLOSED)
 
     def drop(self, waiting: Waiting, reason: EgressDrop) -> None:
         """Take out the first frame of a flow and report it as dropped."""
@@ -258,12 +254,3 @@ class Lanes:
                 self._flows_limit = max(self._max_flows, 2 * len(self._flows))
             flow = self._flows[key] = Flow(frame.header.kind, now)
         return flow
-
-
-def by_number(waiting: Waiting) -> int:
-    """For sorting in the order of arrival."""
-    return waiting.number
-
-
-def _size_of(queue: Queue) -> int:
-    return queue.size
