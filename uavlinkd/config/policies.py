@@ -9,7 +9,8 @@ from typing import Any
 from uavlinkd.config.model import PolicyData
 from uavlinkd.config.problems import Found, Values
 from uavlinkd.config.schema import PolicySection
-from uavlinkd.mavlink.policy.compilation import PolicyError, compile_policy
+from uavlinkd.mavlink.policy.compilation import compile_policy
+from uavlinkd.mavlink.policy.settings import PolicyError
 
 # A policy's messages repeat a group, a message, a command or a number, so that a person can search for it.
 # Any other text may be a secret, or control a terminal, or have a million digits.

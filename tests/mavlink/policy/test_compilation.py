@@ -7,8 +7,9 @@ import pytest
 from tests.samples import ID, blank
 from uavlinkd.mavlink.dialect import COMMANDS
 from uavlinkd.mavlink.policy.alternatives import EFFECTS
-from uavlinkd.mavlink.policy.compilation import Policy, PolicyError, PolicyProblem, compile_policy
+from uavlinkd.mavlink.policy.compilation import Policy, compile_policy
 from uavlinkd.mavlink.policy.roles import ROLES
+from uavlinkd.mavlink.policy.settings import PolicyError, PolicyProblem
 
 LISTS = {"allow_in": ["all"], "allow_out": ["all"]}
 OPERATOR = {"role": "operator", "system_ids": [255]}

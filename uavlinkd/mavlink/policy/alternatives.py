@@ -23,14 +23,6 @@ class Effect(NamedTuple):
     """Messages, and commands that start with MAV_CMD_, that can cause the effect too."""
 
 
-class OpenEffect(NamedTuple):
-    """An effect whose command is denied, and the messages that cause it and that a policy still passes."""
-
-    name: str
-    denied: tuple[str, ...]
-    open: tuple[str, ...]
-
-
 def _full_names(names: str) -> tuple[str, ...]:
     """The names of a text; what is not a message is a command, without MAV_CMD_."""
     messages = dialect.IDS
@@ -140,15 +132,15 @@ def full_command_name(number: int) -> str:
     return f"MAV_CMD_{dialect.command_name(number).removeprefix('MAV_CMD_')}"
 
 
-def open_effects(denied: Iterable[int], passes: Callable[[str], bool]) -> Iterator[OpenEffect]:
-    """The effects of denied commands that a policy leaves open.
+def open_effects(denied: Iterable[int], passes: Callable[[str], bool]) -> Iterator[tuple[str, list[str], list[str]]]:
+    """The effects of denied commands that a policy leaves open: each effect's name, its denied commands, and the
+    messages and commands that cause it and still pass.
 
     ``denied``: numbers of commands. ``passes``: whether the policy lets a message or command of this name through.
     """
     names = {full_command_name(number) for number in denied}
     for effect in EFFECTS:
-        asked = tuple(name for name in effect.commands if name in names)
-        if not asked:
-            continue
-        if through := tuple(name for name in dict.fromkeys((*effect.commands, *effect.alternatives)) if passes(name)):
-            yield OpenEffect(effect.name, asked, through)
+        asked = [name for name in effect.commands if name in names]
+        causes = dict.fromkeys((*effect.commands, *effect.alternatives)) if asked else ()
+        if through := [name for name in causes if passes(name)]:
+            yield effect.name, asked, through

@@ -48,9 +48,7 @@ from uavlinkd.mavlink import dialect
 from uavlinkd.mavlink.dialect import MESSAGES
 from uavlinkd.mavlink.policy.alternatives import full_command_name, open_effects
 from uavlinkd.mavlink.policy.gate import REQUEST_MESSAGE, SAME_AS_COMMAND, Condition, Gate, Refusal
-from uavlinkd.mavlink.policy.settings import PolicyError, PolicyProblem, Rules, Settings, read_settings
-
-__all__ = ["Policy", "PolicyError", "PolicyProblem", "PolicyRow", "compile_policy"]
+from uavlinkd.mavlink.policy.settings import Direction, Rules, Settings, read_settings
 
 # Messages that can contain a command which a policy cannot inspect.
 OPAQUE: Final = (*dialect.GROUPS["shell"], "FILE_TRANSFER_PROTOCOL")
@@ -71,30 +69,15 @@ class Policy:
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
-        self.outgoing = Gate(
-            settings.rules_out,
-            settings.rates_out,
-            is_incoming=False,
-            systems=None,
-            mavlink1=settings.mavlink1,
-            ground_station=True,
-        )
-        self.incoming = Gate(
-            settings.rules_in,
-            settings.rates_in,
-            is_incoming=True,
-            systems=settings.systems,
-            mavlink1=settings.mavlink1,
-            ground_station=settings.ground_station,
-        )
+        self.incoming, self.outgoing = Gate(settings, "in"), Gate(settings, "out")
         self.incoming.opposite, self.outgoing.opposite = self.outgoing, self.incoming
         # Sentences for the operator, the most severe first.
-        self.warnings = tuple(_warnings(settings, self.incoming, self.outgoing))
+        self.warnings = tuple(_warnings(settings, {"in": self.incoming, "out": self.outgoing}))
 
     def describe(self) -> list[PolicyRow]:
         """The policy as a table: each group of messages, and the other rules."""
         settings = self._settings
-        rules = (settings.rules_in, settings.rules_out)
+        rules = settings.rules.values()
         gates = (self.incoming, self.outgoing)
         rows = [
             PolicyRow("role", settings.role or "none", settings.role or "none"),
@@ -113,7 +96,7 @@ class Policy:
         rows.append(
             PolicyRow("ground station's HEARTBEAT", "passes" if settings.ground_station else "refused", "passes")
         )
-        rows.append(PolicyRow("rates", _rates_text(settings.rates_in), _rates_text(settings.rates_out)))
+        rows.append(PolicyRow("rates", *map(_rates_text, settings.rates.values())))
         return rows
 
 
@@ -129,7 +112,7 @@ def compile_policy(data: Mapping[str, object], *, is_local: bool = False) -> Pol
     return Policy(read_settings(data, is_local=is_local))
 
 
-def _warnings(settings: Settings, incoming: Gate, outgoing: Gate) -> list[str]:
+def _warnings(settings: Settings, gates: Mapping[Direction, Gate]) -> list[str]:
     if settings.is_empty:
         return ["no policy: it may send as any system, and any message but SETUP_SIGNING"]
     warnings = []
@@ -137,11 +120,11 @@ def _warnings(settings: Settings, incoming: Gate, outgoing: Gate) -> list[str]:
         warnings.append('role = "all": it may send every message and command that no list denies')
     if settings.systems is None:
         warnings.append('system_ids is "all": it may send as any system, including the ground station')
-    for direction, rules, gate in (("in", settings.rules_in, incoming), ("out", settings.rules_out, outgoing)):
+    for direction, gate in gates.items():
+        rules = settings.rules[direction]
         if rules.denies_all:
             continue
-        opposite = outgoing if gate is incoming else incoming
-        if REQUEST_MESSAGE in rules.allowed_commands and opposite.passes_nothing:
+        if REQUEST_MESSAGE in rules.allowed_commands and gate.opposite.passes_nothing:
             warnings.append(
                 f"allow_{direction} has MAV_CMD_REQUEST_MESSAGE, but the other direction passes no message: every"
                 " request is refused; allow the answers there"

@@ -14,7 +14,7 @@ from uavlinkd.mavlink.dialect import COMMANDS, MESSAGES
 from uavlinkd.mavlink.flows import FlowKey, flow_key
 from uavlinkd.mavlink.frames import Frame
 from uavlinkd.mavlink.headers import Header
-from uavlinkd.mavlink.policy.settings import FILE_TRANSFER, MAX_MSGID, READING_OPCODES, Rules
+from uavlinkd.mavlink.policy.settings import FILE_TRANSFER, MAX_MSGID, READING_OPCODES, Direction, Settings
 
 ANY_OTHER: Final = -1  # stands for every message beyond those that are counted by themselves
 # Limits of one policy in one direction:
@@ -150,25 +150,18 @@ class Condition:
 
 
 class Gate:
-    """One direction of one policy."""
+    """One direction of one policy: "in" from the peer or endpoint, or "out" to it."""
 
-    def __init__(
-        self,
-        rules: Rules,
-        rates: Mapping[int, float],
-        *,
-        is_incoming: bool,
-        systems: frozenset[int] | None,
-        mavlink1: bool,
-        ground_station: bool,
-    ) -> None:
-        self._rules = rules
-        self.opposite: Gate | None = None  # the gate of the other direction, in which requested messages go
-        self._rates = rates
-        self._is_incoming = is_incoming
-        self.systems = systems  # whose frames are let pass; None: any
-        self._mavlink1 = mavlink1
-        self._ground_station = ground_station
+    opposite: Gate
+    """The gate of the other direction, in which requested messages go. :class:`.Policy` sets it."""
+
+    def __init__(self, settings: Settings, direction: Direction) -> None:
+        self._rules = settings.rules[direction]
+        self._rates = settings.rates[direction]
+        self._is_incoming = direction == "in"
+        self.systems = settings.systems if self._is_incoming else None  # whose frames are let pass; None: any
+        self._mavlink1 = settings.mavlink1
+        self._ground_station = settings.ground_station or not self._is_incoming
         self._decisions: dict[int, Refusal | Condition | None] = {}
         self._buckets: _Buckets = {}
         self._of_systems: _Buckets = {}
@@ -185,7 +178,13 @@ class Gate:
         `to`: the client that an outgoing frame goes to, by its number. Each client has a rate limit of its own.
         """
         verdict = self._verdict(frame.header)
-        refusal = self._unmet(verdict, frame, now, to) if isinstance(verdict, Condition) else verdict
+        if isinstance(verdict, Condition):
+            refusal = self._breach(verdict, frame)
+            # The rate comes last, so that only frames which would pass use it up.
+            if refusal is None and verdict.per_second and not self._takes_token(frame, verdict.per_second, now, to):
+                refusal = Refusal.RATE_LIMITED
+        else:
+            refusal = verdict
         if refusal is not None:
             self.count(frame.header, refusal)
         return refusal
@@ -301,20 +300,12 @@ class Gate:
             for verdict in verdicts
         )
 
-    def _unmet(self, condition: Condition, frame: Frame, now: float, to: int) -> Refusal | None:
-        breach = self._breach(condition, frame)
-        # The rate comes last, so that only frames which would pass use it up.
-        if breach or condition.per_second is None or self._takes_token(frame, condition.per_second, now, to):
-            return breach
-        return Refusal.RATE_LIMITED
-
     def _breach(self, condition: Condition, frame: Frame) -> Refusal | None:
         if not condition.takes_command(frame.header.command):
             return Refusal.COMMAND_NOT_ALLOWED
-        if condition.only_commands is not None and frame.header.command == REQUEST_MESSAGE:
-            refusal = self._of_requested(frame)
-            if refusal is not None:
-                return refusal
+        is_request = condition.only_commands is not None and frame.header.command == REQUEST_MESSAGE
+        if is_request and not self._may_be_requested(frame):
+            return Refusal.COMMAND_NOT_ALLOWED
         if condition.never_current and _payload_byte(frame, CURRENT_IN_MISSION_ITEM) in condition.never_current:
             return Refusal.COMMAND_NOT_ALLOWED
         if condition.only_reads_files and _payload_byte(frame, OPCODE_IN_FILE_TRANSFER) not in READING_OPCODES:
@@ -323,15 +314,12 @@ class Gate:
             return Refusal.GROUND_STATION_NOT_ALLOWED
         return None
 
-    def _of_requested(self, frame: Frame) -> Refusal | None:
-        """Whether this message may be requested: it may pass in the other direction, and its number is valid."""
+    def _may_be_requested(self, frame: Frame) -> bool:
+        """Whether the requested message may pass in the other direction, and its number is valid."""
         (number,) = _FLOAT.unpack(bytes(_payload_byte(frame, at) for at in range(_FLOAT.size)))
         if not 0 <= number <= MAX_MSGID or number != int(number):  # neither is true of NaN
-            return Refusal.COMMAND_NOT_ALLOWED
-        if self.opposite is None:
-            return None
-        verdict = self.opposite.decide(int(number), is_known=int(number) in MESSAGES)
-        return Refusal.COMMAND_NOT_ALLOWED if isinstance(verdict, Refusal) else None
+            return False
+        return not isinstance(self.opposite.decide(int(number), is_known=int(number) in MESSAGES), Refusal)
 
     def _takes_token(self, frame: Frame, per_second: float, now: float, to: int) -> bool:
         header = frame.header

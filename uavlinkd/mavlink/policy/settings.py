@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Final, NamedTuple
+from typing import Final, Literal, NamedTuple
 
 from uavlinkd.mavlink import dialect
 from uavlinkd.mavlink.classes import SAID_ONCE
@@ -69,6 +69,9 @@ class PolicyError(ValueError):
         super().__init__("\n".join(map(str, self.problems)))
 
 
+Direction = Literal["in", "out"]
+
+
 @dataclass(frozen=True, slots=True)
 class Rules:
     """The rules for one direction. Numbers are message ids, or commands if the name contains `commands`."""
@@ -91,10 +94,8 @@ class Settings:
     role: str | None
     systems: frozenset[int] | None  # that it may send as; None: any
     systems_text: str
-    rules_in: Rules
-    rules_out: Rules
-    rates_in: Mapping[int, float]  # frames a second, by message id
-    rates_out: Mapping[int, float]
+    rules: Mapping[Direction, Rules]
+    rates: Mapping[Direction, Mapping[int, float]]  # frames a second, by message id
     mavlink1: bool
     ground_station: bool
 
@@ -133,13 +134,12 @@ def read_settings(data: Mapping[str, object], *, is_local: bool) -> Settings:
     if not is_local:
         _check_is_complete(data, report)
     systems, systems_text = _systems(data, report, is_needed=not is_local)
-    rules = {}
-    rates = {}
-    for direction, preset in (("in", role and role.allow_in), ("out", role and role.allow_out)):
-        allow = _list(data, f"allow_{direction}", report)
-        deny = _list(data, f"deny_{direction}", report)
-        _check_entries(f"allow_{direction}", allow, report)
-        _check_entries(f"deny_{direction}", deny, report)
+    rules: dict[Direction, Rules] = {}
+    rates: dict[Direction, Mapping[int, float]] = {}
+    presets: dict[Direction, tuple[str, ...] | None] = {"in": role and role.allow_in, "out": role and role.allow_out}
+    for direction, preset in presets.items():
+        allow = _entries(data, f"allow_{direction}", report)
+        deny = _entries(data, f"deny_{direction}", report)
         allows_all = is_local and preset is None and f"allow_{direction}" not in data
         rules[direction] = _rules((*(preset or ()), *allow), deny, allows_all=allows_all)
         rates[direction] = _rates(data, f"rate_{direction}", report)
@@ -150,10 +150,8 @@ def read_settings(data: Mapping[str, object], *, is_local: bool) -> Settings:
         role=role_name if isinstance(role_name, str) else None,
         systems=systems,
         systems_text=systems_text,
-        rules_in=rules["in"],
-        rules_out=rules["out"],
-        rates_in=rates["in"],
-        rates_out=rates["out"],
+        rules=rules,
+        rates=rates,
         mavlink1=_flag(data, "mavlink1", True, report),
         ground_station=_flag(data, "ground_station", role is None or role.ground_station, report),
     )
@@ -182,13 +180,15 @@ def _check_is_complete(data: Mapping[str, object], report: Report) -> None:
 
 @lru_cache(maxsize=256)  # a fleet's peers mostly have the same lists, and share their rules
 def _rules(allow: tuple[str | int, ...], deny: tuple[str | int, ...], *, allows_all: bool) -> Rules:
-    allowed = [_as_allowed(entry) for entry in map(_entry, allow) if isinstance(entry, _Entry)]
+    allowed = [entry for entry in map(_entry, allow) if isinstance(entry, _Entry)]
+    # Reading files allows a part of FILE_TRANSFER_PROTOCOL; a list that denies reading denies the whole message.
+    by_name = (set(entry.messages) - ({FILE_TRANSFER} if entry.reads_files else set()) for entry in allowed)
     denied = [entry for entry in map(_entry, deny) if isinstance(entry, _Entry)]
     denied_messages = {msgid for entry in denied for msgid in entry.messages}
     denied_commands = {entry.command for entry in denied if entry.command is not None}
     return Rules(
         allows_all=allows_all or any(entry.is_all for entry in allowed),
-        allowed=frozenset(msgid for entry in allowed for msgid in entry.messages),
+        allowed=frozenset[int]().union(*by_name),
         allowed_numbers=frozenset(entry.number for entry in allowed if entry.number is not None),
         allowed_commands=frozenset(entry.command for entry in allowed if entry.command is not None),
         reads_files=any(entry.reads_files for entry in allowed),
@@ -196,13 +196,6 @@ def _rules(allow: tuple[str | int, ...], deny: tuple[str | int, ...], *, allows_
         denied=frozenset(denied_messages | {entry.number for entry in denied if entry.number is not None}),
         denied_commands=frozenset(denied_commands.union(*(DONE_BY.get(number, ()) for number in denied_commands))),
     )
-
-
-def _as_allowed(entry: _Entry) -> _Entry:
-    """Reading files allows a part of FILE_TRANSFER_PROTOCOL; a list that denies reading denies the whole message."""
-    if not entry.reads_files:
-        return entry
-    return entry._replace(messages=tuple(msgid for msgid in entry.messages if msgid != FILE_TRANSFER))
 
 
 def _entry(item: str | int) -> _Entry | PolicyProblem:
@@ -240,22 +233,21 @@ def _command_entry(item: str) -> _Entry | PolicyProblem:
     return _Entry(command=number)
 
 
-def _check_entries(key: str, items: tuple[str | int, ...], report: Report) -> None:
+def _entries(data: Mapping[str, object], key: str, report: Report) -> tuple[str | int, ...]:
+    """A list of the data, with its problems reported."""
+    value = data.get(key, ())
+    if not isinstance(value, (list, tuple)):
+        report(key, f"{value!r} is not a list", f'write {key} = ["telemetry", "PING"]')
+        return ()
+    # True is excluded: it equals 1, also as a key of the cache of `_rules`.
+    items = tuple(item if isinstance(item, str) or type(item) is int else repr(item) for item in value)
     for place, item in enumerate(items):
         entry = _entry(item)
         if isinstance(entry, PolicyProblem):
             report(f"{key}[{place}]", entry.problem, entry.remedy)
         elif key.startswith("allow") and dialect.SETUP_SIGNING in (entry.number, *entry.messages):
             report(f"{key}[{place}]", "SETUP_SIGNING never crosses", "leave it out")
-
-
-def _list(data: Mapping[str, object], key: str, report: Report) -> tuple[str | int, ...]:
-    value = data.get(key, ())
-    if isinstance(value, (list, tuple)):
-        # True is excluded: it equals 1, also as a key of the cache of `_rules`.
-        return tuple(item if isinstance(item, str) or type(item) is int else repr(item) for item in value)
-    report(key, f"{value!r} is not a list", f'write {key} = ["telemetry", "PING"]')
-    return ()
+    return items
 
 
 def _systems(data: Mapping[str, object], report: Report, *, is_needed: bool) -> tuple[frozenset[int] | None, str]:
