@@ -23,7 +23,7 @@ from tests.kernel_queues import cpu_s
 from tests.limited_cpu import limited_cpu
 from tests.waiting import PATIENCE_S, Stopwatch
 from uavlinkd.lab.sim.loopback_ports import free_port
-from uavlinkd.mavlink.stream_splitter import MAX_GAP_S
+from uavlinkd.mavlink.frames import MAX_GAP_S
 from uavlinkd.system.stall import STALL_S
 
 pytestmark = pytest.mark.long

@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 from tests.endpoints.clients import PASSES, frame, heartbeat, large_frame, source
 from tests.samples import frames_of
 from uavlinkd.endpoints.outgoing import OutgoingFrames
-from uavlinkd.mavlink.frames import SplitCounters
+from uavlinkd.mavlink.frames import SplitCounters, StreamSplitter
 from uavlinkd.mavlink.policy.delivery import DeliveredStream
-from uavlinkd.mavlink.stream_splitter import StreamSplitter
 
 A, B, C = large_frame(1), large_frame(2), large_frame(3)
 SIZE = len(A)

@@ -20,7 +20,7 @@ from uavlinkd.endpoints.udp import (
     LOCAL_DATAGRAM_BYTES,
     UdpServer,
 )
-from uavlinkd.mavlink.stream_splitter import MAX_GAP_S
+from uavlinkd.mavlink.frames import MAX_GAP_S
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.stall import STALE, STALL_S

@@ -17,13 +17,20 @@ from uavlinkd.link.drop_summary import DropSummary
 from uavlinkd.link.switch import Port, Switch
 from uavlinkd.mavlink import headers, routing
 from uavlinkd.mavlink.dialect import MESSAGES, SETUP_SIGNING
-from uavlinkd.mavlink.frames import MAVLINK1, MAX_FRAME_BYTES, Frame, SplitCounters, split_datagram, split_payload
+from uavlinkd.mavlink.frames import (
+    MAVLINK1,
+    MAX_FRAME_BYTES,
+    Frame,
+    SplitCounters,
+    StreamSplitter,
+    split_datagram,
+    split_payload,
+)
 from uavlinkd.mavlink.headers import Header
 from uavlinkd.mavlink.policy import gate as gates
 from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.gate import Refusal
 from uavlinkd.mavlink.routing import Router
-from uavlinkd.mavlink.stream_splitter import StreamSplitter
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.stall import StallWatch
 

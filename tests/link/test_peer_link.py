@@ -40,7 +40,7 @@ from uavlinkd.core.timers import Schedule
 from uavlinkd.link.peer_link import Carriage, PeerLink, radio_figures
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
 from uavlinkd.mavlink.frames import Frame, SplitCounters, split_payload
-from uavlinkd.mavlink.radio_status import LinkFigures
+from uavlinkd.mavlink.own_frames import LinkFigures
 from uavlinkd.system.addresses import Address
 
 BUDGET_BITS_S = 4000

@@ -12,8 +12,8 @@ from uavlinkd.core.settings import PeerSettings
 from uavlinkd.link.local_endpoints import PilotNotes
 from uavlinkd.link.peer_link import Carriage, PeerLink
 from uavlinkd.mavlink.frames import SplitCounters, split_payload
+from uavlinkd.mavlink.own_frames import TEXT_BYTES, Note, TextSeverity
 from uavlinkd.mavlink.routing import SystemComponent
-from uavlinkd.mavlink.status_text import TEXT_BYTES, Note, TextSeverity
 
 ARM = Refused(76, 400, 2, 1)
 

@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import all as mavlink
 
 from tests.samples import build, pack
-from uavlinkd.mavlink.frames import Frame, SplitCounters
-from uavlinkd.mavlink.stream_splitter import StreamSplitter
+from uavlinkd.mavlink.frames import Frame, SplitCounters, StreamSplitter
 
 TEXT = b"\r\nInit ArduCopter V4.6\r\nFree RAM: 21345\r\n"
 UNKNOWN = build(0xABCDEF, b"unread", 3, crc_extra=99)

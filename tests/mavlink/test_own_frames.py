@@ -9,8 +9,15 @@ import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
 from tests.samples import read, unpacked
-from uavlinkd.mavlink.radio_status import TXBUF_FULL, LinkFigures, RadioStatusSource
-from uavlinkd.mavlink.status_text import COMPONENT, Note, StatusTextSource, TextSeverity
+from uavlinkd.mavlink.own_frames import (
+    TEXT_COMPONENT,
+    TXBUF_FULL,
+    LinkFigures,
+    Note,
+    RadioStatusSource,
+    StatusTextSource,
+    TextSeverity,
+)
 
 GOOD = LinkFigures(is_up=True, loss_in=0.0, loss_out=0.0, round_trip_s=0.04)
 
@@ -128,7 +135,7 @@ def test_pymavlink_reads_the_text(text: str, shown: str) -> None:
     )
     assert (message.id, message.chunk_seq) == (0, 0)
     assert (message.get_srcSystem(), message.get_srcComponent()) == (7, mavlink.MAV_COMP_ID_UDP_BRIDGE)
-    assert COMPONENT == mavlink.MAV_COMP_ID_UDP_BRIDGE
+    assert TEXT_COMPONENT == mavlink.MAV_COMP_ID_UDP_BRIDGE
     assert all(severity == getattr(mavlink, f"MAV_SEVERITY_{severity.name}") for severity in TextSeverity)
     assert read(raw).header.is_known
 

@@ -9,8 +9,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from tests.samples import raws
 from uavlinkd.lab.sim.tlog import read_tlog
-from uavlinkd.mavlink.frames import SplitCounters, split_datagram, split_payload
-from uavlinkd.mavlink.stream_splitter import StreamSplitter
+from uavlinkd.mavlink.frames import SplitCounters, StreamSplitter, split_datagram, split_payload
 
 
 def frames_of(folder: Path, flight: str) -> list[bytes]:

@@ -20,9 +20,10 @@ from tests.mavlink.parsers.hidden_frames import SIGNATURE_BYTES, Carrier
 from uavlinkd.lab.sim.autopilot import HOME
 from uavlinkd.mavlink.dialect import COMMANDS, MESSAGES
 from uavlinkd.mavlink.frames import parse_frame
+from uavlinkd.mavlink.payloads import HEARTBEAT
 from uavlinkd.mavlink.policy.compilation import compile_policy
 from uavlinkd.mavlink.policy.delivery import DeliveredStream, Source
-from uavlinkd.mavlink.policy.gate import HEARTBEAT, MAV_TYPE_GCS, REQUEST_MESSAGE, Condition, Refusal
+from uavlinkd.mavlink.policy.gate import REQUEST_MESSAGE, Condition, Refusal
 
 ROLES_TESTED: Final = ("observer", "swarm-member")
 SYSTEMS: Final[Mapping[str, Sequence[int]]] = {"observer": (200, 254), "swarm-member": (2, 3)}
@@ -169,7 +170,7 @@ class RoleFrames:
         if one.name == "command":
             return self._one_of(*self._commands.get(msgid) or COMMANDS.values())
         if one.name == "type" and msgid == HEARTBEAT:
-            return self._one_of(2, 2, 1, 5, 13, *(kind for kind in range(48) if kind != MAV_TYPE_GCS), 255)
+            return self._one_of(2, 2, 1, 5, 13, *(kind for kind in range(48) if kind != mavlink.MAV_TYPE_GCS), 255)
         if one.name == "param1" and rng.random() < 0.7:  # of MAV_CMD_REQUEST_MESSAGE
             return float(self._one_of(0, 1, 24, 33, 49, 148, 242, 244, 435, 65535, *MESSAGES))
         special = self._special.get(one.name)

@@ -16,9 +16,8 @@ import structlog
 
 from uavlinkd.endpoints.outgoing import OutgoingFrames
 from uavlinkd.endpoints.ports import Endpoint, LocalPort, PortHandler, failure_name
-from uavlinkd.mavlink.frames import Frame
+from uavlinkd.mavlink.frames import MAX_GAP_S, Frame, StreamSplitter
 from uavlinkd.mavlink.policy.delivery import Source
-from uavlinkd.mavlink.stream_splitter import MAX_GAP_S, StreamSplitter
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.error_meanings import NAME_NOT_RESOLVED, meaning_of
 from uavlinkd.system.stall import STALE, Backlog

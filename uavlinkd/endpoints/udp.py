@@ -19,9 +19,8 @@ from uavlinkd.endpoints.error_queue import ErrorReports, enable_error_queue, rea
 from uavlinkd.endpoints.ports import Endpoint, LocalPort, PortHandler, failure_name
 from uavlinkd.endpoints.reader import Datagrams, Reader
 from uavlinkd.endpoints.sockets import BindError, udp_socket
-from uavlinkd.mavlink.frames import MIN_FRAME_BYTES, Frame, SplitCounters, split_datagram
+from uavlinkd.mavlink.frames import MAX_GAP_S, MIN_FRAME_BYTES, Frame, SplitCounters, StreamSplitter, split_datagram
 from uavlinkd.mavlink.policy.delivery import Source
-from uavlinkd.mavlink.stream_splitter import MAX_GAP_S, StreamSplitter
 from uavlinkd.system.addresses import Address, numeric_host
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.resolver import LONGEST_WAIT_S, Resolved, keep_resolving

@@ -19,7 +19,7 @@ from uavlinkd.link.local_endpoints import PilotNotes
 from uavlinkd.link.parts import DaemonParts, make_parts
 from uavlinkd.link.peer_link import radio_figures
 from uavlinkd.link.status import daemon_status, paths_status, state_of
-from uavlinkd.mavlink.radio_status import INTERVAL_S
+from uavlinkd.mavlink.own_frames import INTERVAL_S
 from uavlinkd.ops.control import ControlServer
 from uavlinkd.ops.recorder import Recorder
 from uavlinkd.ops.schema_versions import LOG_SCHEMA

@@ -20,13 +20,19 @@ from uavlinkd.link.switch import Switch
 from uavlinkd.mavlink.classes import KINDS, UNKNOWN
 from uavlinkd.mavlink.dialect import IDS, command_name, name_of
 from uavlinkd.mavlink.frames import SplitCounters, split_payload
+from uavlinkd.mavlink.own_frames import (
+    TEXT_BYTES,
+    LinkFigures,
+    Note,
+    RadioStatusSource,
+    StatusTextSource,
+    TextSeverity,
+)
 from uavlinkd.mavlink.policy.compilation import Policy, compile_policy
 from uavlinkd.mavlink.policy.delivery import Source
 from uavlinkd.mavlink.policy.gate import Refusal
 from uavlinkd.mavlink.policy.refusal_totals import REFUSALS, TotalsWatch
-from uavlinkd.mavlink.radio_status import LinkFigures, RadioStatusSource
 from uavlinkd.mavlink.routing import SystemComponent
-from uavlinkd.mavlink.status_text import TEXT_BYTES, Note, StatusTextSource, TextSeverity
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.stall import StallWatch
 

@@ -22,8 +22,8 @@ from uavlinkd.link.peer_sockets import PeerSockets
 from uavlinkd.link.relay_link import RelayLink
 from uavlinkd.link.relays import Relays
 from uavlinkd.link.switch import Switch
+from uavlinkd.mavlink.payloads import screen
 from uavlinkd.mavlink.routing import Router
-from uavlinkd.mavlink.screening import screen
 from uavlinkd.ops.recorder import Recorder
 from uavlinkd.relay.service import RelayService, RelayShell
 from uavlinkd.system.clock import monotonic

@@ -19,12 +19,12 @@ from uavlinkd.core.settings import PeerSettings, link_name
 from uavlinkd.core.timers import Deadline, Schedule
 from uavlinkd.link.networks import NetworkBudget
 from uavlinkd.link.peer_output import PeerOutput
-from uavlinkd.mavlink.answers import REQUESTS, ParameterAnswers
 from uavlinkd.mavlink.flows import NewestStates
 from uavlinkd.mavlink.frames import Frame, SplitCounters
+from uavlinkd.mavlink.own_frames import LinkFigures, worst
+from uavlinkd.mavlink.payloads import REQUESTS, ParameterAnswers
 from uavlinkd.mavlink.policy.delivery import Source
 from uavlinkd.mavlink.policy.refusal_totals import TotalsWatch
-from uavlinkd.mavlink.radio_status import LinkFigures, worst
 from uavlinkd.ops.link_problems import LinkProblem
 from uavlinkd.ops.recorder import TO_PEER, Recorder
 

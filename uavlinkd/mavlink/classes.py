@@ -1,13 +1,13 @@
 """All facts about a message, in one table: its class, whether it may be old, how it waits, and its instances.
 
 *Class*: a `critical` frame must arrive, a `stream` frame is followed by another, a `bulk` frame can wait. One message
-has a class that depends on what came before: a PARAM_VALUE (:mod:`.answers`).
+has a class that depends on what came before: a PARAM_VALUE (:mod:`.payloads`).
 
 *Age*: after a silence, or without an answer from the peer, a frame may be old (specification, section 11). Only a
 report may be delivered then: a message that asks its receiver for nothing. Positions of other vehicles are reports.
 A vehicle that follows or avoids by them has to judge their age itself: see section 11 for how old they may be. Any
 other message must be known to be new. That includes a ground station's HEARTBEAT, which silences the failsafe
-(:mod:`.screening`), and a message that the dialect does not have, or not in this form: the effect of an old one is
+(:mod:`.payloads`), and a message that the dialect does not have, or not in this form: the effect of an old one is
 unknown.
 
 *Lane*: on a link that cannot carry all frames, heartbeats, commands, their answers and manual control go before all

@@ -8,13 +8,13 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from tests.samples import attitude, battery, command, frame, heartbeat, parameter, raws, read
 from uavlinkd.core.settings import Class
-from uavlinkd.mavlink.answers import ParameterAnswers
 from uavlinkd.mavlink.dialect import name_of
 from uavlinkd.mavlink.egress.bucket import Bucket
 from uavlinkd.mavlink.egress.budgeted import EgressSettings, EnvelopeShape
 from uavlinkd.mavlink.egress.by_class import PeerEgress
 from uavlinkd.mavlink.flows import FlowKey, flow_key
 from uavlinkd.mavlink.frames import Frame
+from uavlinkd.mavlink.payloads import ParameterAnswers
 
 SHAPE = EnvelopeShape(payload_limit=1200, seal_bytes=23, carrier_bytes=28)
 SLOW = EgressSettings(budget_bits_s=4000)

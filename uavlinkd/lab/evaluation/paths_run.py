@@ -29,7 +29,7 @@ from uavlinkd.lab.evaluation.paths_traffic import DaemonsLink, PathLink, PathRad
 from uavlinkd.lab.evaluation.records import EvaluationError, Record, Value
 from uavlinkd.lab.sim.tlog import play_tlog, read_tlog
 from uavlinkd.mavlink.frames import parse_frame
-from uavlinkd.mavlink.policy.gate import HEARTBEAT, claims_to_be_ground_station
+from uavlinkd.mavlink.payloads import HEARTBEAT, claims_to_be_ground_station
 
 LINK_UP_S: Final = 120.0
 """How long linking may take; 1 s on a quiet machine."""

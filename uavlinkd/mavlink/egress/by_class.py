@@ -15,11 +15,11 @@ from typing import Final
 
 from uavlinkd.core.constants import CRITICAL_ENVELOPE_LIMIT
 from uavlinkd.core.settings import Class
-from uavlinkd.mavlink.answers import VALUE_KIND
 from uavlinkd.mavlink.egress.bucket import Bucket, Supply
 from uavlinkd.mavlink.egress.budgeted import Coalescer, Egress, EgressSettings, EnvelopeShape
 from uavlinkd.mavlink.egress.lanes import EgressDrop
 from uavlinkd.mavlink.frames import MAX_FRAME_BYTES, Frame
+from uavlinkd.mavlink.payloads import VALUE_KIND
 
 ClassOf = Callable[[Frame, float], Class]
 """The class of a frame that is sent at this time. It differs from the table's for PARAM_VALUE only."""

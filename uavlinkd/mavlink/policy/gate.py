@@ -12,8 +12,9 @@ from uavlinkd.core.drops import Attention, Reason
 from uavlinkd.mavlink import dialect
 from uavlinkd.mavlink.dialect import COMMANDS, MESSAGES
 from uavlinkd.mavlink.flows import FlowKey, flow_key
-from uavlinkd.mavlink.frames import Frame
+from uavlinkd.mavlink.frames import Frame, payload_bytes
 from uavlinkd.mavlink.headers import Header
+from uavlinkd.mavlink.payloads import HEARTBEAT, claims_to_be_ground_station
 from uavlinkd.mavlink.policy.settings import FILE_TRANSFER, MAX_MSGID, READING_OPCODES, Direction, Settings
 
 ANY_OTHER: Final = -1  # stands for every message beyond those that are counted by themselves
@@ -25,9 +26,6 @@ BURST_S: Final = 0.5  # how much of a second's frames may come at once
 SYSTEM_SHARE: Final = 16  # what all components of a system may send of a message, in rates of one
 
 _IDS: Final = dialect.IDS
-HEARTBEAT: Final = 0
-TYPE_IN_HEARTBEAT: Final = 4  # offset in its payload
-MAV_TYPE_GCS: Final = 6
 
 NAMED_COMMANDS: Final = frozenset(COMMANDS.values())
 COMMAND_CARRIERS: Final = frozenset(msgid for msgid, row in MESSAGES.items() if row[6] is not None)
@@ -306,17 +304,21 @@ class Gate:
         is_request = condition.only_commands is not None and frame.header.command == REQUEST_MESSAGE
         if is_request and not self._may_be_requested(frame):
             return Refusal.COMMAND_NOT_ALLOWED
-        if condition.never_current and _payload_byte(frame, CURRENT_IN_MISSION_ITEM) in condition.never_current:
-            return Refusal.COMMAND_NOT_ALLOWED
-        if condition.only_reads_files and _payload_byte(frame, OPCODE_IN_FILE_TRANSFER) not in READING_OPCODES:
-            return Refusal.FILE_WRITE_NOT_ALLOWED
+        if condition.never_current:
+            current = int.from_bytes(payload_bytes(frame, CURRENT_IN_MISSION_ITEM, 1), "little")
+            if current in condition.never_current:
+                return Refusal.COMMAND_NOT_ALLOWED
+        if condition.only_reads_files:
+            opcode = int.from_bytes(payload_bytes(frame, OPCODE_IN_FILE_TRANSFER, 1), "little")
+            if opcode not in READING_OPCODES:
+                return Refusal.FILE_WRITE_NOT_ALLOWED
         if condition.refuses_ground_station and claims_to_be_ground_station(frame):
             return Refusal.GROUND_STATION_NOT_ALLOWED
         return None
 
     def _may_be_requested(self, frame: Frame) -> bool:
         """Whether the requested message may pass in the other direction, and its number is valid."""
-        (number,) = _FLOAT.unpack(bytes(_payload_byte(frame, at) for at in range(_FLOAT.size)))
+        (number,) = _FLOAT.unpack(payload_bytes(frame, 0, _FLOAT.size).ljust(_FLOAT.size, b"\0"))
         if not 0 <= number <= MAX_MSGID or number != int(number):  # neither is true of NaN
             return False
         return not isinstance(self.opposite.decide(int(number), is_known=int(number) in MESSAGES), Refusal)
@@ -353,15 +355,3 @@ def _take(limits: tuple[tuple[_Buckets, FlowKey, int], ...], per_second: float, 
             del buckets[next(iter(buckets))]  # the longest unused, so the first to be full again
         buckets[key] = (tokens - passes, now)
     return passes
-
-
-def _payload_byte(frame: Frame, at: int) -> int:
-    """A byte of a frame's payload; 0 where a MAVLink 2 sender cut it off, as for every receiver."""
-    payload_at = 6 if frame.header.is_mavlink1 else 10
-    return frame.raw[payload_at + at] if at < frame.raw[1] else 0
-
-
-def claims_to_be_ground_station(frame: Frame) -> bool:
-    """Whether a HEARTBEAT has the type of a ground station: PX4 takes any for a sign that its own still lives."""
-    # Of one in another definition the type cannot be read.
-    return not frame.header.is_known or _payload_byte(frame, TYPE_IN_HEARTBEAT) == MAV_TYPE_GCS

@@ -1,7 +1,9 @@
-"""Which PARAM_VALUE answers a request for one parameter, and which is a part of the list of all parameters.
+"""Two messages whose facts depend on their payload too, not only on the table in :mod:`.classes`.
 
-An answer to PARAM_REQUEST_READ or PARAM_SET is `critical`: a ground station waits for it. The list of all parameters,
-hundreds of frames, is `bulk`: a ground station asks again for those that it lacks, one by one.
+A HEARTBEAT of a ground station silences the failsafe, so it must be new. That of a vehicle is a report.
+
+A PARAM_VALUE that answers PARAM_REQUEST_READ or PARAM_SET is `critical`: a ground station waits for it. The list of
+all parameters, hundreds of frames, is `bulk`: a ground station asks again for those that it lacks, one by one.
 """
 
 from __future__ import annotations
@@ -11,8 +13,11 @@ from typing import Final
 from uavlinkd.core.settings import Class
 from uavlinkd.mavlink.classes import KINDS
 from uavlinkd.mavlink.dialect import IDS
-from uavlinkd.mavlink.frames import MAVLINK2, Frame
+from uavlinkd.mavlink.frames import Frame, SplitCounters, payload_bytes, split_payload
 
+HEARTBEAT: Final = 0
+_TYPE_IN_HEARTBEAT: Final = 4  # offsets in the payload
+_GROUND_STATION: Final = b"\x06"  # MAV_TYPE_GCS
 ANSWERED_S: Final = 2.0
 """A PARAM_VALUE answers a request that arrived at most so long before."""
 MAX_REQUESTS: Final = 256
@@ -28,7 +33,7 @@ REQUESTS: Final = frozenset({PARAM_REQUEST_READ, PARAM_SET})
 """The messages that :meth:`ParameterAnswers.note` reads."""
 
 _NAME_BYTES: Final = 16
-_NAME_IN_VALUE: Final = 8  # offsets in the payload
+_NAME_IN_VALUE: Final = 8
 _INDEX_IN_VALUE: Final = 6
 _NAME_IN_READ: Final = 4
 _NAME_IN_SET: Final = 6
@@ -37,6 +42,35 @@ _BY_NAME: Final = 0xFFFF  # the index -1
 
 _Parameter = tuple[int, bytes | int]
 """A system, and its parameter's name or index."""
+
+
+def claims_to_be_ground_station(frame: Frame) -> bool:
+    """Whether a HEARTBEAT has the type of a ground station: PX4 takes any for a sign that its own still lives."""
+    # Of one in another definition the type cannot be read.
+    return not frame.header.is_known or payload_bytes(frame, _TYPE_IN_HEARTBEAT, 1) == _GROUND_STATION
+
+
+def may_be_old(frame: Frame) -> bool:
+    """Whether this frame may be delivered while freshness is unverified."""
+    if not frame.header.kind.may_be_old:
+        return False
+    return frame.header.msgid != HEARTBEAT or not claims_to_be_ground_station(frame)
+
+
+def screen(payload: bytes) -> tuple[bytes, bytes]:
+    """The frames of an authentic payload that may be old, and those that must be new. Total.
+
+    Of a payload with anything but frames all must be new: the receiver of the rest counts what is wrong with it.
+    """
+    counters = SplitCounters()
+    frames = split_payload(payload, counters)
+    if counters.garbage_bytes:
+        return b"", payload
+    passing: list[bytes] = []
+    waiting: list[bytes] = []
+    for frame in frames:
+        (passing if may_be_old(frame) else waiting).append(frame.raw)
+    return b"".join(passing), b"".join(waiting)
 
 
 class ParameterAnswers:
@@ -83,16 +117,9 @@ class ParameterAnswers:
         return Class.CRITICAL if max(until) > now else Class.BULK
 
 
-def _payload(frame: Frame, at: int, length: int) -> bytes:
-    raw = frame.raw
-    start = 10 if raw[0] == MAVLINK2 else 6
-    # A MAVLink 2 sender cuts zeros from the payload's end: the checksum begins there.
-    return raw[start + at : min(start + at + length, start + raw[1])]
-
-
 def _name(frame: Frame, at: int) -> bytes:
-    return _payload(frame, at, _NAME_BYTES).partition(b"\0")[0]
+    return payload_bytes(frame, at, _NAME_BYTES).partition(b"\0")[0]
 
 
 def _number(frame: Frame, at: int) -> int:
-    return int.from_bytes(_payload(frame, at, 2), "little")
+    return int.from_bytes(payload_bytes(frame, at, 2), "little")

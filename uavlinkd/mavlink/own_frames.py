@@ -1,7 +1,8 @@
-"""RADIO_STATUS for a local autopilot, from the daemon's measurements of the link.
+"""The daemon's own frames: RADIO_STATUS for a local autopilot, and STATUSTEXT for a local ground station.
 
-An autopilot sends as fast as its own port accepts, and knows nothing of the radio behind it. Radios therefore insert
-RADIO_STATUS once a second, and autopilots slow down by it. How receivers read it, by their sources:
+*RADIO_STATUS* has the daemon's measurements of the link. An autopilot sends as fast as its own port accepts, and
+knows nothing of the radio behind it. Radios therefore insert RADIO_STATUS once a second, and autopilots slow down by
+it. How receivers read it, by their sources:
 
 * ArduPilot (libraries/GCS_MAVLink/GCS_Common.cpp, ``handle_radio_status``): ``txbuf``, free space in the
   transmitter's buffer in percent. Under 20 each message adds 60 ms to the interval of its streams, under 50 it
@@ -36,26 +37,34 @@ field          value
 
 A lost peer is never hidden: rssi and remrssi are 0 from that moment. But an autopilot need not slow down then: no
 frames are sent to the peer, and a slower autopilot would need up to a minute to recover when the peer is back.
+
+*STATUSTEXT* tells the pilot about a link. QGroundControl shows a text under the vehicle that sent it, and ignores
+other system ids (Vehicle, ``_mavlinkMessageReceived``; only RADIO_STATUS is exempt). So a text has the system id of
+the vehicle behind the link. The component id is MAV_COMP_ID_UDP_BRIDGE: the sequence numbers of the vehicle's own
+texts are not disturbed, and a pilot can tell both apart. A text is at most 50 ASCII characters: clients of MAVLink 1
+know no longer ones.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import IntEnum
 from struct import Struct
 from typing import Final, NamedTuple
 
 from uavlinkd.mavlink.dialect import IDS
 from uavlinkd.mavlink.frames import pack
 
-SYSTEM: Final = 51
-COMPONENT: Final = 68
+RADIO_SYSTEM: Final = 51
+RADIO_COMPONENT: Final = 68
+TEXT_COMPONENT: Final = 240
+TEXT_BYTES: Final = 50
 UNKNOWN: Final = 255
 INTERVAL_S: Final = 1.0
 """How often to send: both autopilots step by each message, made for a radio that sends one a second."""
 
 _PAYLOAD = Struct("<HHBBBBB")  # rxerrors, fixed, rssi, remrssi, txbuf, noise, remnoise
-_MSGID: Final = IDS["RADIO_STATUS"]
 
 
 class Level(NamedTuple):
@@ -117,12 +126,13 @@ class RadioStatusSource:
     def frame(self, figures: LinkFigures) -> bytes:
         """The next frame, MAVLink 2. Call it each INTERVAL_S."""
         queueing_s = self._queueing_s(figures.round_trip_s)
-        rssi = _quality(figures.loss_in) if figures.is_up else 0
-        remrssi = _quality(figures.loss_out) if figures.is_up else 0
-        txbuf = _txbuf(figures, queueing_s) if figures.is_up else TXBUF_LOST
+        rssi, remrssi, txbuf = 0, 0, TXBUF_LOST
+        if figures.is_up:
+            rssi, remrssi = _quality(figures.loss_in), _quality(figures.loss_out)
+            txbuf = _txbuf(figures, queueing_s)
         payload = _PAYLOAD.pack(figures.receive_errors % 65536, 0, rssi, remrssi, txbuf, UNKNOWN, UNKNOWN)
-        seq, self._seq = self._seq, (self._seq + 1) % 256
-        return pack(_MSGID, payload, seq, SYSTEM, COMPONENT)
+        seq, self._seq = self._seq, self._seq + 1
+        return pack(IDS["RADIO_STATUS"], payload, seq, RADIO_SYSTEM, RADIO_COMPONENT)
 
     def _queueing_s(self, round_trip_s: float | None) -> float:
         """How much longer a round trip is than the best one: the wait in buffers along the path.
@@ -151,3 +161,37 @@ def _txbuf(figures: LinkFigures, queueing_s: float) -> int:
 def _quality(loss: float) -> int:
     """1 .. 254: from a peer that is up, some envelopes arrive."""
     return max(1, round(254 * (1 - min(max(loss, 0.0), 1.0))))
+
+
+class TextSeverity(IntEnum):
+    """MAV_SEVERITY. A smaller value is more severe."""
+
+    CRITICAL = 2
+    ERROR = 3
+    WARNING = 4
+    NOTICE = 5
+
+
+class Note(NamedTuple):
+    """One text about the link to a vehicle."""
+
+    severity: TextSeverity
+    text: str
+    system: int
+    """Of the vehicle."""
+
+
+class StatusTextSource:
+    """STATUSTEXT frames for one endpoint, with a MAVLink sequence for each vehicle."""
+
+    __slots__ = ("_sequences",)
+
+    def __init__(self) -> None:
+        self._sequences: dict[int, int] = {}
+
+    def frame(self, note: Note) -> bytes:
+        """The next frame, MAVLink 2."""
+        seq = self._sequences.get(note.system, 0)
+        self._sequences[note.system] = seq + 1
+        text = note.text.encode("ascii", "replace")[:TEXT_BYTES]
+        return pack(IDS["STATUSTEXT"], bytes((note.severity,)) + text, seq, note.system, TEXT_COMPONENT)
