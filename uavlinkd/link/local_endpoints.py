@@ -30,8 +30,7 @@ from uavlinkd.mavlink.own_frames import (
 )
 from uavlinkd.mavlink.policy.compilation import Policy, compile_policy
 from uavlinkd.mavlink.policy.delivery import Source
-from uavlinkd.mavlink.policy.gate import Refusal
-from uavlinkd.mavlink.policy.refusal_totals import REFUSALS, TotalsWatch
+from uavlinkd.mavlink.policy.gate import REFUSALS, Refusal
 from uavlinkd.mavlink.routing import SystemComponent
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.stall import StallWatch
@@ -281,7 +280,6 @@ class _Seen:
         self.quiet_until = {"withheld": now, _CLAIM: now}
         self.system: int | None = None
         """Of the vehicle behind the link, when it was seen last."""
-        self.withheld = TotalsWatch()
 
 
 class PilotNotes:
@@ -364,7 +362,7 @@ def _withheld_here(seen: _Seen) -> Iterator[str]:
     link = seen.link
     role = link.config.policy.get("role")
     reason = "role or list" if role is None else f"role {role}"
-    for refused in seen.withheld.changed(link.policy.outgoing):
+    for refused in link.policy.outgoing.changed_totals():
         if _is_wanted(refused):
             yield _fit(link.name, f": {_label(refused)} withheld here, {reason}")
 

@@ -24,7 +24,6 @@ from uavlinkd.mavlink.frames import Frame, SplitCounters
 from uavlinkd.mavlink.own_frames import LinkFigures, worst
 from uavlinkd.mavlink.payloads import REQUESTS, ParameterAnswers
 from uavlinkd.mavlink.policy.delivery import Source
-from uavlinkd.mavlink.policy.refusal_totals import TotalsWatch
 from uavlinkd.ops.link_problems import LinkProblem
 from uavlinkd.ops.recorder import TO_PEER, Recorder
 
@@ -131,7 +130,6 @@ class PeerLink:
         self._perform = carriage.perform
         self._answers = ParameterAnswers()
         self._newest: dict[LinkedPeer, NewestStates] = {}
-        self._refusals = TotalsWatch()
         self._direct: Sequence[Path] = ()
         self._sample: _Sample | None = None
         self.output = PeerOutput(
@@ -239,7 +237,7 @@ class PeerLink:
         """Report to the peer which of its frames the policy refuses. Call it about once a second."""
         if not self.peer.is_up or not self.output.has_room(LARGEST_REPORT, now):
             return  # totals lose nothing until the next call
-        self._perform(self._node.report_refusals(self.peer, self._refusals.changed(self.policy.incoming), now))
+        self._perform(self._node.report_refusals(self.peer, self.policy.incoming.changed_totals(), now))
         self.output.charge(self.peers, now)
 
     def pick_newest(self, peer: LinkedPeer, frames: list[Frame], order: int, now: float) -> list[Frame]:

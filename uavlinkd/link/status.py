@@ -16,8 +16,7 @@ from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.relay_link import RelayLink
 from uavlinkd.mavlink.dialect import command_name, name_of
 from uavlinkd.mavlink.policy.compilation import Policy
-from uavlinkd.mavlink.policy.gate import ANY_OTHER, Refusal
-from uavlinkd.mavlink.policy.refusal_totals import REFUSALS
+from uavlinkd.mavlink.policy.gate import ANY_OTHER, REFUSALS, Refusal
 from uavlinkd.ops.log import shown
 from uavlinkd.ops.recorder import Recorder
 from uavlinkd.ops.schema_versions import STATUS_SCHEMA

@@ -26,8 +26,7 @@ from uavlinkd.link.facts import (
     listed,
 )
 from uavlinkd.mavlink.dialect import GROUPS, IDS, command_name, name_of
-from uavlinkd.mavlink.policy.gate import ANY_OTHER, Gate, Refusal
-from uavlinkd.mavlink.policy.refusal_totals import REFUSALS
+from uavlinkd.mavlink.policy.gate import ANY_OTHER, REFUSALS, Gate, Refusal
 from uavlinkd.mavlink.policy.roles import ROLES
 from uavlinkd.ops.findings import Severity
 from uavlinkd.ops.log import shown

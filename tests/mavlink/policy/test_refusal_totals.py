@@ -12,22 +12,21 @@ from uavlinkd.core import refusals
 from uavlinkd.core.refusals import Refused
 from uavlinkd.mavlink.frames import SplitCounters, split_payload
 from uavlinkd.mavlink.policy import gate as gates
-from uavlinkd.mavlink.policy.compilation import Policy, compile_policy
-from uavlinkd.mavlink.policy.gate import Refusal
-from uavlinkd.mavlink.policy.refusal_totals import CODES, REFUSALS, TotalsWatch, totals
+from uavlinkd.mavlink.policy.compilation import compile_policy
+from uavlinkd.mavlink.policy.gate import CODES, REFUSALS, Gate, Refusal
 
 ARM, TAKE_OFF = 400, 22
 
 
-def member() -> Policy:
-    """A swarm member that is system 1."""
-    return compile_policy({"role": "swarm-member", "system_ids": [1]})
+def member() -> Gate:
+    """What passes from a swarm member that is system 1."""
+    return compile_policy({"role": "swarm-member", "system_ids": [1]}).incoming
 
 
-def check(policy: Policy, *raws: bytes) -> None:
+def check(gate: Gate, *raws: bytes) -> None:
     """Judge frames of the peer."""
     for frame in split_payload(b"".join(raws), SplitCounters()):
-        policy.incoming.check(frame, 0.0)
+        gate.check(frame, 0.0)
 
 
 def test_codes_are_those_of_the_specification() -> None:
@@ -42,9 +41,9 @@ def test_codes_are_those_of_the_specification() -> None:
 
 def test_commands_are_counted_by_number() -> None:
     """Two commands in the same message have an entry each; a frame of a foreign system too."""
-    policy = member()
-    check(policy, *(command_long(ARM, 1),) * 3, command_long(TAKE_OFF, 1), heartbeat(9), command_long(ARM, 9))
-    assert sorted(totals(policy.incoming)) == [
+    gate = member()
+    check(gate, *(command_long(ARM, 1),) * 3, command_long(TAKE_OFF, 1), heartbeat(9), command_long(ARM, 9))
+    assert sorted(gate.changed_totals()) == [
         Refused(0, 0, CODES[Refusal.FOREIGN_SYSTEM], 1),
         Refused(76, TAKE_OFF, CODES[Refusal.MESSAGE_NOT_ALLOWED], 1),
         Refused(76, ARM, CODES[Refusal.FOREIGN_SYSTEM], 1),
@@ -54,31 +53,28 @@ def test_commands_are_counted_by_number() -> None:
 
 def test_commands_are_bounded() -> None:
     """Numbers without a name count for their message alone: however many there are, a known command is counted."""
-    policy = member()
-    check(policy, *(command_long(number, 1) for number in range(50000, 50100)), *(command_long(ARM, 1),) * 2)
+    gate = member()
+    check(gate, *(command_long(number, 1) for number in range(50000, 50100)), *(command_long(ARM, 1),) * 2)
     code = CODES[Refusal.MESSAGE_NOT_ALLOWED]
-    assert sorted(totals(policy.incoming)) == [Refused(76, 0, code, 100), Refused(76, ARM, code, 2)]
-    assert len(policy.incoming.refused_commands) == 2
+    assert sorted(gate.changed_totals()) == [Refused(76, 0, code, 100), Refused(76, ARM, code, 2)]
+    assert len(gate.refused_commands) == 2
 
 
 def test_messages_that_share_a_count_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     """Their message is not known any more."""
     monkeypatch.setattr(gates, "MAX_COUNTED", 0)
-    policy = member()
-    check(policy, heartbeat(9))
-    assert policy.incoming.refused
-    assert list(totals(policy.incoming)) == []
+    gate = member()
+    check(gate, heartbeat(9))
+    assert gate.refused
+    assert gate.changed_totals() == []
 
 
 def test_only_changes_are_reported() -> None:
-    """Unchanged totals are left out, and another policy begins at zero."""
-    policy, watch = member(), TotalsWatch()
-    assert watch.changed(policy.incoming) == []
-    check(policy, heartbeat(9), command_long(ARM, 1))
-    assert len(watch.changed(policy.incoming)) == 2
-    assert watch.changed(policy.incoming) == []
-    check(policy, command_long(ARM, 1))
-    assert watch.changed(policy.incoming) == [Refused(76, ARM, CODES[Refusal.MESSAGE_NOT_ALLOWED], 2)]
-    other = member()
-    check(other, *(command_long(ARM, 1),) * 2)
-    assert watch.changed(other.incoming) == [Refused(76, ARM, CODES[Refusal.MESSAGE_NOT_ALLOWED], 2)]
+    """Unchanged totals are left out."""
+    gate = member()
+    assert gate.changed_totals() == []
+    check(gate, heartbeat(9), command_long(ARM, 1))
+    assert len(gate.changed_totals()) == 2
+    assert gate.changed_totals() == []
+    check(gate, command_long(ARM, 1))
+    assert gate.changed_totals() == [Refused(76, ARM, CODES[Refusal.MESSAGE_NOT_ALLOWED], 2)]

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import struct
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Final
 
 from uavlinkd.core.drops import Attention, Reason
+from uavlinkd.core.refusals import Refused
 from uavlinkd.mavlink import dialect
 from uavlinkd.mavlink.dialect import COMMANDS, MESSAGES
 from uavlinkd.mavlink.flows import FlowKey, flow_key
@@ -126,6 +127,11 @@ class Refusal(Reason):
     )
 
 
+CODES: Final[Mapping[Refusal, int]] = {refusal: code for code, refusal in enumerate(Refusal, 1)}
+"""Of refusal reports (``core/README.md``, section 12), a part of the protocol: a code never changes its meaning. New
+reasons follow the others."""
+REFUSALS: Final[Mapping[int, Refusal]] = {code: refusal for refusal, code in CODES.items()}
+
 _Buckets = dict[FlowKey, tuple[float, float]]
 """Tokens, and when that was, by what shares them."""
 
@@ -169,6 +175,8 @@ class Gate:
         self.refused_commands: Counter[tuple[int, int, Refusal]] = Counter()
         self.refused_systems: Counter[int] = Counter()  # the senders' system ids of FOREIGN_SYSTEM
         self.totals: Counter[Refusal] = Counter()
+        self._reported: dict[tuple[int, int, int], int] = {}  # by message, command and code: the last result
+        self._reported_sum = 0
 
     def check(self, frame: Frame, now: float, to: int = 0) -> Refusal | None:
         """None if the frame may pass, else why not, which is counted. `now` in seconds, monotonic.
@@ -200,6 +208,29 @@ class Gate:
             number = header.command
             named = (ANY_OTHER, ANY_OTHER) if number not in NAMED_COMMANDS else (header.msgid, number)
             self.refused_commands[*named, refusal] += 1
+
+    def changed_totals(self) -> list[Refused]:
+        """The totals of refused frames that changed since the last call, in the codes of refusal reports.
+
+        Messages that share one count are left out. Call it about once a second.
+        """
+        refused = self.totals.total()
+        if refused == self._reported_sum:
+            return []
+        self._reported_sum = refused
+        before, self._reported = self._reported, {entry[:3]: entry.total for entry in self._by_command()}
+        return [Refused(*kind, total) for kind, total in self._reported.items() if before.get(kind) != total]
+
+    def _by_command(self) -> Iterator[Refused]:
+        with_command: Counter[tuple[int, Refusal]] = Counter()
+        for (msgid, command, refusal), count in self.refused_commands.items():
+            if msgid != ANY_OTHER and command > 0:  # others count for their message
+                with_command[msgid, refusal] += count
+                yield Refused(msgid, command, CODES[refusal], count)
+        for (msgid, refusal), count in self.refused.items():
+            rest = count - with_command[msgid, refusal]
+            if msgid != ANY_OTHER and rest > 0:
+                yield Refused(msgid, 0, CODES[refusal], rest)
 
     def permits(self, frame: Frame) -> bool:
         """Whether the frame may pass, at any rate. Counts nothing and uses up no rate."""
