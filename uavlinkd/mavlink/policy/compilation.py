@@ -1,33 +1,12 @@
 """Policies: the messages that one peer or one local endpoint may send and receive.
 
-*In* is the direction from the peer or endpoint, *out* the direction to it. The keys::
+*In* is the direction from the peer or endpoint, *out* the direction to it. ``config/README.md`` has the keys and the
+entries of lists. A peer's policy fails closed: it needs `system_ids`, and a role or both `allow_in` and `allow_out`.
+All keys are optional for a local endpoint, whose wire is trusted. The entries of a list add to those of the role. A
+denied entry is denied even if another entry allows it.
 
-    role = "operator"                    a preset, see `roles`; "all" passes everything
-    system_ids = [1, "10-20"]            MAVLink systems that it may send as; "all" trusts it with every system
-    allow_in  = ["telemetry", "PING"]    what passes
-    deny_in   = ["MAV_CMD_DO_FLIGHTTERMINATION"]            what does not pass, even if allowed
-    allow_out, deny_out                  the same for the other direction
-    rate_in   = { ATTITUDE = 10 }        frames a second of each message and component; also of a group's messages;
-                                         replaces a rate of the role (swarm-member and observer have rates)
-    rate_out                             the same for the other direction, for each target, instance (battery 0, 1)
-                                         and client; telemetry's does not apply to messages sent once (STATUSTEXT)
-    mavlink1 = true                      whether MAVLink 1 frames pass
-    ground_station = true                whether its HEARTBEAT may claim to be a ground station's
-
-A peer's policy fails closed: it needs `system_ids`, and a role or both `allow_in` and `allow_out` ([] passes
-nothing). All keys are optional for a local endpoint, whose wire is trusted. The reasons are in
-`uavlinkd/config/README.md`.
-
-The entries of a list add to those of the role. A denied entry is denied even if another entry allows it. An entry is
-
-``telemetry``            a group of `dialect.GROUPS` (small letters), or ``all``
-``ATTITUDE``             a message by its name (capitals)
-``files-read``           a group that allows only the reading requests of FILE_TRANSFER_PROTOCOL (READING_OPCODES)
-``30``                   a message by its number, for messages that the dialect does not know
-``MAV_CMD_NAV_TAKEOFF``  a command by its name; ``command:22`` by its number. An allowed command passes in
-                         COMMAND_LONG and COMMAND_INT; MAV_CMD_REQUEST_MESSAGE only for a message that may pass in the
-                         other direction. A denied command is refused in all messages that carry commands, and with it
-                         messages and commands with the same effect (`gate.SAME_AS_COMMAND`, `settings.DONE_BY`).
+An allowed command passes in COMMAND_LONG and COMMAND_INT. A denied command is refused in all messages that carry
+commands, and with it messages and commands with the same effect (`gate.SAME_AS_COMMAND`, `settings.DONE_BY`).
 
 Each component has a rate of its own: with a common rate, an autopilot and its gimbal would silence each other. An
 incoming frame may name any component, so all components of a system together have SYSTEM_SHARE times the rate.
@@ -41,13 +20,12 @@ carries a signing key in clear.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Final, NamedTuple
 
 from uavlinkd.mavlink import dialect
-from uavlinkd.mavlink.dialect import MESSAGES
 from uavlinkd.mavlink.policy.alternatives import full_command_name, open_effects
-from uavlinkd.mavlink.policy.gate import REQUEST_MESSAGE, SAME_AS_COMMAND, Condition, Gate, Refusal
+from uavlinkd.mavlink.policy.gate import REQUEST_MESSAGE, SAME_AS_COMMAND, Gate, Refusal
 from uavlinkd.mavlink.policy.settings import Direction, Rules, Settings, read_settings
 
 # Messages that can contain a command which a policy cannot inspect.
@@ -77,27 +55,22 @@ class Policy:
     def describe(self) -> list[PolicyRow]:
         """The policy as a table: each group of messages, and the other rules."""
         settings = self._settings
-        rules = settings.rules.values()
-        gates = (self.incoming, self.outgoing)
-        rows = [
-            PolicyRow("role", settings.role or "none", settings.role or "none"),
+        gates, rules = (self.incoming, self.outgoing), settings.rules.values()
+        role = settings.role or "none"
+        mavlink1 = _passes(settings.mavlink1)
+        unknown = (_passes(side.allows_all and not side.denies_all) for side in rules)
+        groups = dialect.GROUPS.items()
+        return [
+            PolicyRow("role", role, role),
             PolicyRow("may speak as", settings.systems_text, "-"),
+            *(PolicyRow(name, *(_group_text(gate, members) for gate in gates)) for name, members in groups),
+            PolicyRow("commands by number", *map(_commands_text, rules)),
+            PolicyRow("messages by number", *map(_numbers_text, rules)),
+            PolicyRow("messages unknown to the dialect", *unknown),
+            PolicyRow("MAVLink 1", mavlink1, mavlink1),
+            PolicyRow("ground station's HEARTBEAT", _passes(settings.ground_station), "passes"),
+            PolicyRow("rates", *map(_rates_text, settings.rates.values())),
         ]
-        rows += [
-            PolicyRow(name, *(_group_text(gate, members) for gate in gates))
-            for name, members in dialect.GROUPS.items()
-        ]
-        rows.append(PolicyRow("commands by number", *(_commands_text(side) for side in rules)))
-        rows.append(PolicyRow("messages by number", *(_numbers_text(side) for side in rules)))
-        unknown = ("passes" if side.allows_all and not side.denies_all else "refused" for side in rules)
-        rows.append(PolicyRow("messages unknown to the dialect", *unknown))
-        version1 = "passes" if settings.mavlink1 else "refused"
-        rows.append(PolicyRow("MAVLink 1", version1, version1))
-        rows.append(
-            PolicyRow("ground station's HEARTBEAT", "passes" if settings.ground_station else "refused", "passes")
-        )
-        rows.append(PolicyRow("rates", *map(_rates_text, settings.rates.values())))
-        return rows
 
 
 def compile_policy(data: Mapping[str, object], *, is_local: bool = False) -> Policy:
@@ -147,12 +120,11 @@ def _warnings(settings: Settings, gates: Mapping[Direction, Gate]) -> list[str]:
             )
         if not rules.denied_commands:
             continue
-        ids = dialect.IDS
+        allowed = (rules.allowed | rules.allowed_numbers) - rules.denied
         through = [
             name
             for name in OPAQUE
-            if ids[name] not in rules.denied
-            and (rules.allows_all or ids[name] in rules.allowed or ids[name] in rules.allowed_numbers)
+            if dialect.IDS[name] in allowed or (rules.allows_all and dialect.IDS[name] not in rules.denied)
         ]
         if through:
             warnings.append(
@@ -164,16 +136,8 @@ def _warnings(settings: Settings, gates: Mapping[Direction, Gate]) -> list[str]:
 
 def _group_text(gate: Gate, members: tuple[str, ...]) -> str:
     """The messages of a group that pass, as text."""
-    ids = dialect.IDS
-    verdicts = {name: gate.decide(ids[name], is_known=True) for name in members}
-    passing = [name for name, verdict in verdicts.items() if not isinstance(verdict, Refusal)]
-    conditions = {name: verdict for name in passing if isinstance(verdict := verdicts[name], Condition)}
-    limited = [
-        name
-        for name, condition in conditions.items()
-        if condition.only_commands is not None or condition.never_commands
-    ]
-    reading = [name for name, condition in conditions.items() if condition.only_reads_files]
+    verdicts = {name: gate.decide(dialect.IDS[name], is_known=True) for name in members}
+    passing = {name: verdict for name, verdict in verdicts.items() if not isinstance(verdict, Refusal)}
     if not passing:
         return "none" if members != ("SETUP_SIGNING",) else "never"
     if len(passing) == len(members):
@@ -182,22 +146,32 @@ def _group_text(gate: Gate, members: tuple[str, ...]) -> str:
         text = f"all but {', '.join(name for name in members if name not in passing)}"
     else:
         text = f"only {', '.join(passing)}"
+    conditions = {name: verdict for name, verdict in passing.items() if verdict is not None}
+    limited = [name for name, one in conditions.items() if one.only_commands is not None or one.never_commands]
+    reading = [name for name, one in conditions.items() if one.only_reads_files]
     text += f" (by command: {', '.join(limited)})" if limited else ""
     return text + (f" (only reading: {', '.join(reading)})" if reading else "")
 
 
+def _passes(is_allowed: bool) -> str:
+    return "passes" if is_allowed else "refused"
+
+
 def _commands_text(rules: Rules) -> str:
-    allowed = ", ".join(dialect.command_name(number) for number in sorted(rules.allowed_commands))
-    denied = ", ".join(dialect.command_name(number) for number in sorted(rules.denied_commands))
-    parts = ([f"allowed: {allowed}"] if allowed else []) + ([f"denied: {denied}"] if denied else [])
-    return "; ".join(parts) or "-"
+    return _lists_text(
+        *(map(dialect.command_name, sorted(n)) for n in (rules.allowed_commands, rules.denied_commands))
+    )
 
 
 def _numbers_text(rules: Rules) -> str:
-    denied = sorted(number for number in rules.denied if number not in MESSAGES)
-    parts = [f"allowed: {', '.join(map(str, sorted(rules.allowed_numbers)))}"] if rules.allowed_numbers else []
-    parts += [f"denied: {', '.join(map(str, denied))}"] if denied else []
-    return "; ".join(parts) or "-"
+    return _lists_text(
+        *(map(str, sorted(n)) for n in (rules.allowed_numbers, rules.denied - dialect.MESSAGES.keys()))
+    )
+
+
+def _lists_text(allowed: Iterable[str], denied: Iterable[str]) -> str:
+    texts = {"allowed": ", ".join(allowed), "denied": ", ".join(denied)}
+    return "; ".join(f"{verdict}: {text}" for verdict, text in texts.items() if text) or "-"
 
 
 def _rates_text(rates: Mapping[int, float]) -> str:
