@@ -74,7 +74,7 @@ class Policy:
 
 
 def compile_policy(data: Mapping[str, object], *, is_local: bool = False) -> Policy:
-    """The policy that plain data describes, see this module's docstring.
+    """The policy that plain data describes.
 
     `is_local`: for a local endpoint, where every key is optional and everything passes without data. A peer's policy
     must define what passes in each direction, and the systems that the peer may send as.
@@ -165,7 +165,7 @@ def _commands_text(rules: Rules) -> str:
 
 def _numbers_text(rules: Rules) -> str:
     return _lists_text(
-        *(map(str, sorted(n)) for n in (rules.allowed_numbers, rules.denied - dialect.MESSAGES.keys()))
+        *(map(str, sorted(n)) for n in (rules.allowed_numbers, rules.denied.difference(dialect.MESSAGES)))
     )
 
 

@@ -1,4 +1,4 @@
-"""Converts a policy's plain data to sets of numbers, or reports every problem in it. ``config/README.md`` has the syntax."""
+"""Converts a policy's plain data to sets of numbers, or reports every problem in it: see :mod:`.compilation`."""
 
 from __future__ import annotations
 
