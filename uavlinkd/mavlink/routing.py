@@ -32,7 +32,6 @@ from enum import StrEnum
 from typing import Final, Generic, TypeVar
 
 from uavlinkd.mavlink.frames import Frame
-from uavlinkd.mavlink.headers import Header
 
 ROUTE_LIFETIME_S: Final = 120.0
 """MAVLink components send a HEARTBEAT each second. On satellite links the interval is some seconds to a minute."""
@@ -76,9 +75,7 @@ class Router(Generic[P]):
         self._silent: set[P] = set()
         self._received_at: dict[P, dict[SystemComponent, float]] = {}
         """By port: when each address was received last. The least recently received is first."""
-        self._ports_of: dict[int, dict[int, set[P]]] = {}
-        """The reverse: by system and component."""
-        self._decisions: dict[tuple[P, int, int], tuple[P, ...]] = {}
+        self._decisions: dict[tuple[P, int, int], tuple[P, ...] | Unrouted] = {}
         self._seen: dict[bytes, Hashable] = {}
         """The port that each frame came from, in the current half of the window."""
         self._seen_before: dict[bytes, Hashable] = {}
@@ -100,9 +97,8 @@ class Router(Generic[P]):
     def remove_port(self, port: P) -> None:
         """Forget the port and the addresses behind it."""
         self._is_peer.pop(port, None)
+        self._received_at.pop(port, None)
         self._silent.discard(port)
-        for address in self._received_at.pop(port, {}):
-            self._unlink(port, address)
         self._forget_decisions()
 
     def set_silent(self, port: P, *, is_silent: bool) -> None:
@@ -118,7 +114,6 @@ class Router(Generic[P]):
         received_at = self._received_at.get(port, {})
         for address in [address for address in received_at if which(address[0])]:
             del received_at[address]
-            self._unlink(port, address)
         self._forget_decisions()
 
     def refresh(self, now: float) -> None:
@@ -129,10 +124,9 @@ class Router(Generic[P]):
         """
         self.refresh_at = now + ROUTE_LIFETIME_S / LIFETIME_PARTS
         self._forget_decisions()
-        for port, received_at in self._received_at.items():
+        for received_at in self._received_at.values():
             for address in [a for a, at in received_at.items() if now - at >= ROUTE_LIFETIME_S]:
                 del received_at[address]
-                self._unlink(port, address)
 
     def route(self, frame: Frame, source: P, now: float, *, has_one_route: bool = False) -> tuple[P, ...]:
         """The ports to send this frame to. Learns its sender; counts the reason if there is no port.
@@ -152,21 +146,25 @@ class Router(Generic[P]):
         if header.system != 0:  # 0 means all systems: no sender has this id
             address = (header.system, header.component)
             if received_at.pop(address, None) is None:
-                self._learn(source, address)
+                if len(received_at) >= MAX_ADDRESSES_PER_PORT:
+                    # A sender that invents addresses displaces only those behind its own port.
+                    del received_at[next(iter(received_at))]
+                self._forget_decisions()
             received_at[address] = now
         if now >= self.refresh_at:
             self.refresh(now)
 
         question = (source, header.target_system, header.target_component)
-        ports = self._decisions.get(question)
-        if ports is None:
-            ports = self._decide(*question)
+        decision = self._decisions.get(question)
+        if decision is None:
+            decision = self._decide(*question)
             if len(self._decisions) >= MAX_DECISIONS:
                 self._decisions.clear()
-            self._decisions[question] = ports
-        if not ports:
-            self.unrouted[self._why_nowhere(header)] += 1
-        return ports
+            self._decisions[question] = decision
+        if isinstance(decision, Unrouted):
+            self.unrouted[decision] += 1
+            return ()
+        return decision
 
     def is_first(self, raw: bytes, source: P, now: float) -> bool:
         """Whether these bytes did not come from another port recently. Remembers them; counts duplicates."""
@@ -214,46 +212,25 @@ class Router(Generic[P]):
         is_early = now < self._window_ends_at
         self._window_ends_at = (now if is_gap or is_early else self._window_ends_at) + DUPLICATE_WINDOW_S
 
-    def _learn(self, port: P, address: SystemComponent) -> None:
-        received_at = self._received_at[port]
-        if len(received_at) >= MAX_ADDRESSES_PER_PORT:
-            # A sender that invents addresses displaces only those behind its own port.
-            least_recent = next(iter(received_at))
-            del received_at[least_recent]
-            self._unlink(port, least_recent)
-        system, component = address
-        self._ports_of.setdefault(system, {}).setdefault(component, set()).add(port)
-        self._forget_decisions()
-
     def _forget_decisions(self) -> None:
         self._decisions.clear()
         self.edition += 1
 
-    def _unlink(self, port: P, address: SystemComponent) -> None:
-        system, component = address
-        components = self._ports_of[system]
-        components[component].discard(port)
-        if not components[component]:
-            del components[component]
-        if not components:
-            del self._ports_of[system]
-
-    def _decide(self, source: P, target_system: int, target_component: int) -> tuple[P, ...]:
+    def _decide(self, source: P, target_system: int, target_component: int) -> tuple[P, ...] | Unrouted:
+        """The ports for a target, or why there is none."""
         others = [
             port
             for port, is_peer in self._is_peer.items()
             if port != source and (self._relays or not (is_peer and self._is_peer[source]))
         ]
         if target_system == 0:
-            return tuple(port for port in others if port not in self._silent or self._is_peer[source])
-        components = self._ports_of.get(target_system, {})
+            ports = [port for port in others if port not in self._silent or self._is_peer[source]]
+            return tuple(ports) or Unrouted.NO_OTHER_PORT
+        behind = self._received_at.items()
         # Component 0 is not an id of its own, even if a sender uses it: it means the whole system.
-        of_component = components.get(target_component) if target_component != 0 else None
-        matches = of_component or set().union(*components.values())
-        if not matches - {source}:
-            return tuple(others)
-        return tuple(port for port in others if port in matches)
-
-    def _why_nowhere(self, header: Header) -> Unrouted:
-        is_unknown = header.target_system != 0 and header.target_system not in self._ports_of
-        return Unrouted.UNKNOWN_TARGET if is_unknown else Unrouted.NO_OTHER_PORT
+        target = (target_system, target_component) if target_component != 0 else None
+        matches = {port for port, addresses in behind if target in addresses}
+        if not matches:
+            matches = {port for port, addresses in behind if any(system == target_system for system, _ in addresses)}
+        ports = [port for port in others if port in matches] if matches - {source} else others
+        return tuple(ports) or (Unrouted.NO_OTHER_PORT if matches else Unrouted.UNKNOWN_TARGET)
