@@ -71,7 +71,7 @@ def test_frames_of_another_definition_count_for_nothing() -> None:
     """Their payload cannot be read: an unknown request opens nothing, an unknown value is a stream frame."""
     answers = ParameterAnswers()
     answers.note(of_another_definition(set_to(b"RTL_ALT")), AT_S)
-    assert len(answers) == 0
+    assert len(answers._requests) == 0
     assert answers.class_of(of_another_definition(value(b"RTL_ALT")), AT_S) is Class.STREAM
 
 
@@ -90,7 +90,7 @@ def test_memory_is_bounded_and_the_oldest_request_is_forgotten() -> None:
     answers = ParameterAnswers()
     for index in range(MAX_REQUESTS + 1):
         answers.note(read_by_index(index), AT_S)
-    assert len(answers) == MAX_REQUESTS
+    assert len(answers._requests) == MAX_REQUESTS
     assert answers.class_of(value(b"A", 0), AT_S) is Class.BULK
     assert answers.class_of(value(b"B", MAX_REQUESTS), AT_S) is Class.CRITICAL
 
@@ -100,7 +100,7 @@ def test_repeated_request_counts_from_the_last_one() -> None:
     answers = ParameterAnswers()
     answers.note(read_by_name(b"A"), AT_S)
     answers.note(read_by_name(b"A"), AT_S + 1.5)
-    assert len(answers) == 1
+    assert len(answers._requests) == 1
     assert answers.class_of(value(b"A"), AT_S + 3.0) is Class.CRITICAL
 
 

@@ -55,10 +55,6 @@ class NewestStates:
         self._orders: dict[FlowKey, int] = {}
         self._earlier: dict[FlowKey, int] = {}
 
-    def __len__(self) -> int:
-        """How many entries are kept."""
-        return len(self._orders) + len(self._earlier)
-
     def pick(self, frames: list[Frame], order: int) -> list[Frame]:
         """The frames of one envelope without the states that are superseded.
 

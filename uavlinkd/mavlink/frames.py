@@ -59,7 +59,7 @@ _HEADER: Final = Struct("<BBBBBBHB")
 
 CHECKSUM_STEP: Final = tuple(mcrf4xx(bytes([byte]), 0) for byte in range(256))
 """The effect of one more byte on a checksum: new = (old >> 8) ^ CHECKSUM_STEP[(old ^ byte) & 0xFF]."""
-_STEPS = frozenset(CHECKSUM_STEP)
+CHECKSUM_STEPS: Final = frozenset(CHECKSUM_STEP)
 
 
 class FrameFault(Reason):
@@ -208,7 +208,7 @@ def parse_frames(
         checksum = mcrf4xx(data[position + 1 : checksum_at])
         step = (data[checksum_at] | data[checksum_at + 1] << 8) ^ (checksum >> 8)
         if definition is None or step != CHECKSUM_STEP[(checksum ^ definition[1]) & 0xFF]:
-            if not is_expected or step not in _STEPS:
+            if not is_expected or step not in CHECKSUM_STEPS:
                 fault = FrameFault.BAD_CRC
                 break
             header = unknown

@@ -81,10 +81,6 @@ class ParameterAnswers:
     def __init__(self) -> None:
         self._requests: dict[_Parameter, float] = {}  # until when they are answered, the oldest first
 
-    def __len__(self) -> int:
-        """How many requests are remembered."""
-        return len(self._requests)
-
     def note(self, frame: Frame, now: float) -> None:
         """A frame came from the peer. Only a request for one parameter, or to set it, changes anything."""
         header = frame.header

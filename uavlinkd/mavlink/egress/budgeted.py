@@ -322,11 +322,8 @@ class Coalescer:
         return [(frame, self._put_at) for frame in frames]
 
     def _drop_all(self, reason: EgressDrop) -> None:
-        if self._waiting:
-            self.totals[reason] += len(self._waiting)
-        self._waiting.clear()
-        self._size = 0
-        self._due_at = inf
+        if dropped := self.pop_all():
+            self.totals[reason] += len(dropped)
 
 
 def _is_urgent(frame: Frame) -> bool:

@@ -63,9 +63,6 @@ class Source:
         self._report = report
         self._forget = forget
 
-    def __repr__(self) -> str:
-        return f"Source({self.name})"
-
     def refuse(self, frame: Frame, now: float) -> None:
         """Count and report a frame that carries hidden ones."""
         self.gate.count(frame.header, Refusal.HIDDEN_FRAME)
@@ -111,7 +108,7 @@ class DeliveredStream:
         raw = frame.raw
         gap = b""
         if self._starts and not self._is_only(source) and _is_urgent(frame) and self._may_be_rejected(frame):
-            gap = self._gap()
+            gap = hidden.separator(self._tail, self._starts)
         while True:
             begun_at = len(self._tail) + len(gap)
             data = self._tail + gap + raw
@@ -155,7 +152,8 @@ class DeliveredStream:
                 self._note(frame, is_alone=bool(gap))
                 self.separators += bool(gap)
                 return gap + raw
-            gap = self._gap()  # nothing that began before it goes on behind it: this happens once
+            # Nothing that began before it goes on behind it: this happens once.
+            gap = hidden.separator(self._tail, self._starts)
 
     def _may_be_rejected(self, frame: Frame) -> bool:
         """Whether a receiver of this frame may have rejected one before it, in which a header is open."""
@@ -169,9 +167,6 @@ class DeliveredStream:
         is_rare = not header.is_known or msgid > LAST_COMMON_ID or msgid in NOT_COMMON_IDS
         self._has_rare = is_rare or (self._has_rare and not is_alone)
         self._has_mavlink2 = not header.is_mavlink1 or (self._has_mavlink2 and not is_alone)
-
-    def _gap(self) -> bytes:
-        return hidden.separator(self._tail, self._starts)
 
     def _is_forbidden(
         self, data: bytes, start: hidden.Start, end: int, authors: list[tuple[int, Source | None]]

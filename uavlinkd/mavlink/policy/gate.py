@@ -267,7 +267,7 @@ class Gate:
         return self._verdict(header) is None
 
     def _verdict(self, header: Header) -> Refusal | Condition | None:
-        if not self.may_speak_as(header.system):
+        if self.systems is not None and header.system not in self.systems:
             return Refusal.FOREIGN_SYSTEM
         if not self._mavlink1 and header.is_mavlink1:
             return Refusal.MAVLINK1_NOT_ALLOWED

@@ -28,6 +28,7 @@ from fastcrc.crc16 import mcrf4xx
 from uavlinkd.mavlink.dialect import MESSAGES, OTHER_EXTRAS
 from uavlinkd.mavlink.frames import (
     CHECKSUM_STEP,
+    CHECKSUM_STEPS,
     MAVLINK1,
     MAVLINK2,
     MAX_FRAME_BYTES,
@@ -44,8 +45,7 @@ Start = tuple[int, bool]
 
 _PLAUSIBLE = re.compile(rb"\xfe|\xfd(?=.?\Z|.[\x00\x01])", re.DOTALL)
 """A start byte whose flags, as far as the bytes go, are ones that parsers accept."""
-_STEPS = frozenset(CHECKSUM_STEP)
-_HIGH_BYTES: Final = tuple(frozenset(step >> 8 for step in _STEPS if step & 0xFF == low) for low in range(256))
+_HIGH_BYTES: Final = tuple(frozenset(one >> 8 for one in CHECKSUM_STEP if one & 0xFF == low) for low in range(256))
 """Of the steps with this low byte: at most two."""
 _MAVLINK1 = bytes((MAVLINK1,))
 _FILLERS: Final = (*range(2, MAVLINK1 - 1), 0xFF)
@@ -82,7 +82,7 @@ def has_checksum(data: bytes, start: Start, end: int, *, any_extra: bool) -> boo
     at, is_mavlink1 = start
     checksum = mcrf4xx(data[at + 1 : end - 2])
     step = (data[end - 2] | data[end - 1] << 8) ^ (checksum >> 8)
-    if step not in _STEPS:
+    if step not in CHECKSUM_STEPS:
         return False
     if any_extra:
         return True

@@ -21,10 +21,9 @@ from uavlinkd.mavlink.dialect import ALL
 class Role(NamedTuple):
     """The presets of one role."""
 
-    about: str
     allow_in: tuple[str, ...]
     allow_out: tuple[str, ...]
-    ground_station: bool  # whether its HEARTBEAT may claim to be a ground station's
+    ground_station: bool = False  # whether its HEARTBEAT may claim to be a ground station's
     rate_in: Mapping[str, float] = MappingProxyType({})  # frames a second by group or message, as in a configuration
 
 
@@ -72,36 +71,14 @@ _OBSERVER_RATES: Final = MappingProxyType(
 )
 
 ROLES: Final[Mapping[str, Role]] = {
-    "vehicle": Role(
-        "a vehicle that is operated from here: it reports and answers, and requests nothing",
-        allow_in=_FROM_VEHICLE,
-        allow_out=_FROM_OPERATOR,
-        ground_station=False,
-    ),
-    "operator": Role(
-        "a ground station that operates the vehicle here: commands, parameters, missions, files; no shell",
-        allow_in=_FROM_OPERATOR,
-        allow_out=_FROM_VEHICLE,
-        ground_station=True,
-    ),
-    "observer": Role(
-        "reads telemetry, parameters and the mission, and changes nothing",
-        allow_in=_FROM_OBSERVER,
-        allow_out=_TO_OBSERVER,
-        ground_station=False,
-        rate_in=_OBSERVER_RATES,
-    ),
-    "swarm-member": Role(
-        "a vehicle of the same swarm: both exchange presence and position only",
-        allow_in=_BETWEEN_MEMBERS,
-        allow_out=_BETWEEN_MEMBERS,
-        ground_station=False,
-        rate_in=_MEMBER_RATES,
-    ),
-    ALL: Role(
-        "trusted with everything: any message and command in both directions, except SETUP_SIGNING",
-        allow_in=(ALL,),
-        allow_out=(ALL,),
-        ground_station=True,
-    ),
+    # A vehicle that is operated from here: it reports and answers, and requests nothing.
+    "vehicle": Role(allow_in=_FROM_VEHICLE, allow_out=_FROM_OPERATOR),
+    # A ground station that operates the vehicle here.
+    "operator": Role(allow_in=_FROM_OPERATOR, allow_out=_FROM_VEHICLE, ground_station=True),
+    # Reads telemetry, parameters and the mission, and changes nothing.
+    "observer": Role(allow_in=_FROM_OBSERVER, allow_out=_TO_OBSERVER, rate_in=_OBSERVER_RATES),
+    # A vehicle of the same swarm: both exchange presence and position only.
+    "swarm-member": Role(allow_in=_BETWEEN_MEMBERS, allow_out=_BETWEEN_MEMBERS, rate_in=_MEMBER_RATES),
+    # Trusted with everything, except SETUP_SIGNING.
+    ALL: Role(allow_in=(ALL,), allow_out=(ALL,), ground_station=True),
 }

@@ -27,18 +27,15 @@ KEYS: Final = (
 # effect of a switch of the remote control (ArduPilot's RCx_OPTION): modes, arming, a stop.
 DONE_BY: Final[Mapping[int, frozenset[int]]] = {
     COMMANDS[f"MAV_CMD_{name}"]: frozenset(COMMANDS[f"MAV_CMD_{other}"] for other in others.split())
-    for name, others in (
-        ("COMPONENT_ARM_DISARM", "DO_AUX_FUNCTION"),
-        ("DO_FLIGHTTERMINATION", "DO_AUX_FUNCTION"),
-        ("DO_PARACHUTE", "DO_AUX_FUNCTION"),
-        ("DO_FENCE_ENABLE", "DO_AUX_FUNCTION"),
-        ("NAV_LAND", "DO_AUX_FUNCTION"),
-        ("NAV_RETURN_TO_LAUNCH", "DO_AUX_FUNCTION"),
+    for names, others in (
+        ("COMPONENT_ARM_DISARM DO_FLIGHTTERMINATION DO_PARACHUTE DO_FENCE_ENABLE", "DO_AUX_FUNCTION"),
+        ("NAV_LAND NAV_RETURN_TO_LAUNCH", "DO_AUX_FUNCTION"),
         ("DO_SET_MODE", "DO_AUX_FUNCTION DO_SET_STANDARD_MODE"),
         ("DO_SET_STANDARD_MODE", "DO_AUX_FUNCTION DO_SET_MODE"),
         ("DO_CHANGE_ALTITUDE", "GUIDED_CHANGE_ALTITUDE"),
         ("GUIDED_CHANGE_ALTITUDE", "DO_CHANGE_ALTITUDE"),
     )
+    for name in names.split()
 }
 
 FILES_READ: Final = "files-read"
