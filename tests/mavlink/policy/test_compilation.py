@@ -145,11 +145,11 @@ def warnings(data: dict[str, object]) -> str:
 
 def test_effects_name_what_exists() -> None:
     """Every name is a message or a command of the dialect, and no effect is listed twice."""
-    for effect in EFFECTS:
-        assert effect.commands
-        assert {*effect.commands, *effect.alternatives} <= {*COMMANDS, *ID}
-        assert set(effect.commands) <= set(COMMANDS)
-    assert len({effect.name for effect in EFFECTS}) == len(EFFECTS)
+    for _, commands, alternatives in EFFECTS:
+        assert commands
+        assert set(alternatives) <= {*COMMANDS, *ID}
+        assert set(commands) <= set(COMMANDS)
+    assert len({effect for effect, _, _ in EFFECTS}) == len(EFFECTS)
 
 
 @pytest.mark.parametrize(

@@ -8,19 +8,9 @@ of an effect blocks the effect.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from typing import Final, NamedTuple
+from typing import Final
 
 from uavlinkd.mavlink import dialect
-
-
-class Effect(NamedTuple):
-    """An effect on a vehicle, and what can cause it. Names as in MAVLink's definitions."""
-
-    name: str
-    commands: tuple[str, ...]
-    """The commands for this effect: a policy that denies one of them is intended to block the effect."""
-    alternatives: tuple[str, ...]
-    """Messages, and commands that start with MAV_CMD_, that can cause the effect too."""
 
 
 def _full_names(names: str) -> tuple[str, ...]:
@@ -53,7 +43,6 @@ _RETURN: Final = "NAV_RETURN_TO_LAUNCH"
 _HOME: Final = "DO_SET_HOME DO_SET_GLOBAL_ORIGIN"
 _FLIGHT: Final = f"{_RUN} {_SETPOINTS} {_MOVES}"
 
-# The effect; its commands; its alternatives.
 _EFFECTS: Final = (
     # ArduPilot terminates by the parameter AFS_TERMINATE, disarms in flight by force, and kills by a switch.
     (
@@ -122,9 +111,9 @@ _EFFECTS: Final = (
         f"{_OUTPUTS} {_REMOTE} SET_ACTUATOR_CONTROL_TARGET {_PARAMETERS} {_FILES}",
     ),
 )
-EFFECTS: Final = tuple(
-    Effect(name, _full_names(commands), _full_names(others)) for name, commands, others in _EFFECTS
-)
+EFFECTS: Final = tuple((name, _full_names(commands), _full_names(others)) for name, commands, others in _EFFECTS)
+"""Each effect on a vehicle; the commands for it, of which a denied one is intended to block the effect; and its
+alternatives: the messages, and commands that start with MAV_CMD_, that can cause it too."""
 
 
 def full_command_name(number: int) -> str:
@@ -139,8 +128,8 @@ def open_effects(denied: Iterable[int], passes: Callable[[str], bool]) -> Iterat
     ``denied``: numbers of commands. ``passes``: whether the policy lets a message or command of this name through.
     """
     names = {full_command_name(number) for number in denied}
-    for effect in EFFECTS:
-        asked = [name for name in effect.commands if name in names]
-        causes = dict.fromkeys((*effect.commands, *effect.alternatives)) if asked else ()
+    for effect, commands, alternatives in EFFECTS:
+        asked = [name for name in commands if name in names]
+        causes = dict.fromkeys((*commands, *alternatives)) if asked else ()
         if through := [name for name in causes if passes(name)]:
-            yield effect.name, asked, through
+            yield effect, asked, through
