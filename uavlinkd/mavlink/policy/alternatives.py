@@ -15,8 +15,7 @@ from uavlinkd.mavlink import dialect
 
 def _full_names(names: str) -> tuple[str, ...]:
     """The names of a text; what is not a message is a command, without MAV_CMD_."""
-    messages = dialect.IDS
-    return tuple(name if name in messages else f"MAV_CMD_{name}" for name in names.split())
+    return tuple(name if name in dialect.IDS else f"MAV_CMD_{name}" for name in names.split())
 
 
 # A joystick and an overridden transmitter control the sticks and, by RCx_OPTION or a button's function, every switch.
