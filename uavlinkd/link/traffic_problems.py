@@ -261,8 +261,7 @@ def _only(role: str, other: str) -> frozenset[int]:
     sent = {entry: {*GROUPS.get(entry, (entry,))} for name in (role, other) for entry in ROLES[name].allow_in}
     names = {name for entry in ROLES[role].allow_in for name in sent[entry]}
     others = {name for entry in ROLES[other].allow_in for name in sent[entry]}
-    ids = IDS
-    return frozenset(ids[name] for name in names - others if name in ids)
+    return frozenset(IDS[name] for name in names - others if name in IDS)
 
 
 # What the peer reports to refuse of this end's frames: a claim of its own. Nothing acts on it.
