@@ -65,11 +65,14 @@ def instances() -> dict[str, tuple[str, int, int]]:
     """By message name: the fields that tell instances apart, their offset and their length in bytes."""
     places = {}
     for message in _messages().values():
-        marked = " ".join(field.name for field in message.fields if field.instance)
-        if names := INSTANCE_FIELDS.get(message.name, marked):
+        marked = [field.name for field in message.fields if field.instance]
+        if names := INSTANCE_FIELDS.get(message.name, " ".join(marked)):
+            assert {*marked} <= {*names.split()}, message.name
             fields = [field for field in message.fields if field.name in names.split()]
-            length = sum(field.wire_length for field in fields)
-            places[message.name] = (names, min(field.wire_offset for field in fields), length)
+            begin = min(field.wire_offset for field in fields)
+            end = max(field.wire_offset + field.wire_length for field in fields)
+            assert end - begin == sum(field.wire_length for field in fields), "they are neighbours"
+            places[message.name] = (names, begin, end - begin)
     return dict(sorted(places.items()))
 
 

@@ -6,48 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import all as mavlink
 
-from tests.mavlink import dialect_generate
-from tests.samples import ID, attitude, battery, command, frame, heartbeat
-from uavlinkd.mavlink.classes import KINDS
-from uavlinkd.mavlink.dialect import INSTANCES
+from tests.samples import attitude, battery, command, frame, heartbeat
 from uavlinkd.mavlink.flows import MAX_FLOWS, FlowKey, NewestStates, flow_key
 from uavlinkd.mavlink.frames import Frame
-
-
-def layouts() -> dict[str, tuple[str | None, list[tuple[str, int, int]]]]:
-    """Of each message the field that its definition says tells instances apart, and each field's offset and size."""
-    width = {"8": 1, "16": 2, "32": 4, "64": 8, "float": 4, "double": 8, "char": 1}
-    fields_of: dict[str, tuple[str | None, list[tuple[str, int, int]]]] = {}
-    for kind in mavlink.mavlink_map.values():
-        types = dict(zip(kind.fieldnames, kind.fieldtypes, strict=True))
-        offset, fields = 0, []
-        for field, array in zip(kind.ordered_fieldnames, kind.array_lengths, strict=True):
-            bits = types[field].removesuffix("_t").removeprefix("u").removeprefix("int")
-            fields.append((field, offset, width[bits] * max(1, array)))
-            offset += fields[-1][2]
-        fields_of[kind.msgname] = (getattr(kind, "instance_field", None), fields)
-    for message in dialect_generate.upstream():
-        instance = next((field.name for field in message.fields if field.instance), None)
-        fields = [(field.name, field.wire_offset, field.wire_length) for field in message.fields]
-        fields_of[message.name] = (instance, fields)
-    return fields_of
-
-
-def test_instance_fields_stand_where_pymavlink_packs_them() -> None:
-    """The bytes that tell instances apart are the fields that do, whole, and no other."""
-    known = layouts()
-    for name, (at, length) in INSTANCES.items():
-        instance, fields = known[name]
-        covered = [(field, size) for field, offset, size in fields if at <= offset < at + length]
-        assert sum(size for _, size in covered) == length, f"{name}: half of {covered}"
-        assert instance is None or instance in dict(covered), name
-
-
-def test_every_state_whose_definition_numbers_it_has_separate_instances() -> None:
-    """A message whose definition names an instance field is a state only with that field in its flow."""
-    for name, (instance, _) in layouts().items():
-        if instance and KINDS[ID[name]].is_state:
-            assert KINDS[ID[name]].instance_bytes, name
 
 
 def test_cut_instance_is_the_same_instance() -> None:
