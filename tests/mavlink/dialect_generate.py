@@ -112,7 +112,7 @@ def commands() -> dict[str, int]:
 
 def source() -> str:
     """The text of `dialect.json`: an entry a line."""
-    tables = {
+    tables: dict[str, Mapping[Any, object]] = {
         "messages": messages(),
         "other_extras": other_extras(),
         "instances": instances(),

@@ -62,6 +62,7 @@ class PeerEgress:
         if settings.budget_bits_s:
             self._own = Bucket(settings.budget_bits_s, now, self._shape.overhead + MAX_FRAME_BYTES)
         self._supplies = dict.fromkeys(_TURNS, Supply(self._own))
+        self._lead = 0  # bytes of the stream sent beyond those of bulk, while both wait
         self._queues: dict[Class, Egress | Coalescer] = {}  # of the stream alone, unless it is split
         self._rebuild(now)
 
@@ -174,7 +175,7 @@ class PeerEgress:
     def _rebuild(self, now: float) -> None:
         """Have the frames that wait go on waiting in other queues, with the age that they have."""
         waiting = [entry for queue in self._queues.values() for entry in queue.pop_all()]
-        self._lead = 0  # bytes of the stream sent beyond those of bulk, while both wait
+        self._lead = 0
         self._queues = {cls: self._make_queue(cls, now) for cls in self._turns()}
         for frame, put_at in sorted(waiting, key=itemgetter(1)):
             self._queues[self._class_of(frame, now) if self.is_split else Class.STREAM].put([frame], put_at)
