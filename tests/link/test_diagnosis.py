@@ -22,7 +22,7 @@ from uavlinkd.core.drops import DropReason
 from uavlinkd.core.outputs import Dropped
 from uavlinkd.core.path import Path
 from uavlinkd.core.refusals import RefusalReport, Refused
-from uavlinkd.link import diagnosis, down_problems, facts
+from uavlinkd.link import diagnosis, down_problems
 from uavlinkd.link.evidence import MAX_SESSIONS, OWN_FRAMES_S, History, SessionBegin
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.traffic_problems import FLIPS_S, SECURITY_S, alternating
@@ -116,12 +116,14 @@ def test_every_cause_is_documented_with_its_severity() -> None:
     section = (ROOT / "uavlinkd/ops/README.md").read_text().partition("### Causes")[2].partition("\n## ")[0]
     rows = [line.split(" | ") for line in section.splitlines() if line.startswith("| `") and "`cause`" not in line]
     documented = {name: severity for names, severity, *_ in rows for name in re.findall(r"`(\w+)`", names)}
-    tables = [table.rows for name, table in vars(facts).items() if name.startswith("OF_")]
-    causes: dict[str, Severity] = {row.cause: row.severity for row in chain(*tables)}
-    assert {cause for row in chain(*tables) for cause in row.unless} <= set(causes)
+    sources = ((ROOT / "uavlinkd/link").glob(name) for name in ("diagnosis.py", "*_problems.py"))
+    source = "".join(path.read_text() for path in chain(*sources))
+    causes = {
+        cause: severity for severity, cause in re.findall(r"\b(security|fault|warning)\w*\(\s*\"(\w+)\"", source)
+    }
     assert set(documented) == set(causes)
-    assert all(documented[cause].startswith(severity.name.lower()) for cause, severity in causes.items())
-    assert {cause for cause, severity in causes.items() if severity is Severity.SECURITY} == {
+    assert all(documented[cause].startswith(severity) for cause, severity in causes.items())
+    assert {cause for cause, severity in causes.items() if severity == "security"} == {
         *("own_key_elsewhere", "key_on_two_machines", "hidden_frame", "impersonation")
     }
 

@@ -14,7 +14,7 @@ from tests.link.socket_states import SocketStateLog
 from uavlinkd.config import NetworkConfig
 from uavlinkd.endpoints.serial_line import SerialLine
 from uavlinkd.endpoints.url import SerialUrl
-from uavlinkd.link.diagnosis import _line_noise, _modem_reports
+from uavlinkd.link.diagnosis import line_problems
 from uavlinkd.link.serial_networks import NOISE_PIECES, SHARE_UNANSWERED, UNANSWERED, SerialNetworks
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.stall import StallWatch
@@ -97,11 +97,11 @@ async def test_findings_about_modem_and_noise(serial: SerialNetworks) -> None:
     decoder = serial.networks[0].line.decoder
     serial.do_housekeeping()
     moment: Any = SimpleNamespace(daemon=SimpleNamespace(peer_sockets=SimpleNamespace(serial=serial)))
-    assert [*_modem_reports(moment), *_line_noise(moment)] == []
+    assert [*line_problems(moment)] == []
     decoder.feed(report())
     decoder.feed(b"noise\0" * NOISE_PIECES)
     serial.do_housekeeping()
-    (modem,), (noise,) = _modem_reports(moment), _line_noise(moment)
+    modem, noise = line_problems(moment)
     assert "MAVLINK=0" in modem.remedy
     assert "57600" in noise.remedy
     line = cast(Any, serial.networks[0].status(monotonic())["serial"])
@@ -109,5 +109,5 @@ async def test_findings_about_modem_and_noise(serial: SerialNetworks) -> None:
     assert (line["discarded"]["bad_cobs"], line["discarded_bytes"]["bad_cobs"]) == (NOISE_PIECES, 5 * NOISE_PIECES)
     for _ in range(20):
         serial.do_housekeeping()
-    assert [*_modem_reports(moment), *_line_noise(moment)] == []
+    assert [*line_problems(moment)] == []
     assert cast(Any, serial.networks[0].status(monotonic())["serial"])["radio"] is None, "old figures"

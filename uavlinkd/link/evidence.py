@@ -300,6 +300,11 @@ class PartHistory:
         if foreign and now - self.incoming.passed_at <= OWN_FRAMES_S:
             self.mixed.append(now)
 
+    def blocked(self, now: float) -> list[str]:
+        """The directions, ``in`` and ``out``, in which the policy recently refused all frames."""
+        gates = (("in", self.incoming), ("out", self.outgoing))
+        return [direction for direction, gate in gates if gate.is_blocked(now)]
+
 
 class SessionBegin(NamedTuple):
     """A session with a peer began."""
@@ -335,8 +340,7 @@ class History:
             (kind, name, direction)
             for kind, parts in (("peer", self._peers), ("endpoint", self._endpoints))
             for name, part in parts.items()
-            for direction, gate in (("in", part.incoming), ("out", part.outgoing))
-            if gate.is_blocked(now)
+            for direction in part.blocked(now)
         ]
 
     def sessions(self, name: str) -> list[SessionBegin]:

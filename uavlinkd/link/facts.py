@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Final, Generic, NamedTuple, TypeVar
+from functools import cached_property, partial
+from typing import Final, NamedTuple
 
 from uavlinkd.config import EndpointConfig
 from uavlinkd.core.drops import DropReason
@@ -21,10 +21,17 @@ from uavlinkd.ops.log import shown
 class Found(NamedTuple):
     """A problem that is there, and what the operator does: one sentence each, without a full stop."""
 
+    severity: Severity
+    """By this the alerts select."""
+    cause: str
+    """Its code in ``status --json``, in the log and in the label of the metric ``finding``."""
     text: str
     remedy: str
-    severity: Severity | None = None
-    """Another one than that of the problem's row."""
+
+
+security: Final = partial(Found, Severity.SECURITY)
+fault: Final = partial(Found, Severity.FAULT)
+warning: Final = partial(Found, Severity.WARNING)
 
 
 class Moment:
@@ -33,12 +40,8 @@ class Moment:
     def __init__(self, daemon: DaemonParts, now: float) -> None:
         self.daemon = daemon
         self.now = now
-        self.blocked = daemon.history.blocked(now)
-
-    @property
-    def down(self) -> list[PeerLink]:
+        self.down = [link for link in daemon.links.values() if not link.peer.is_up]
         """The peers that are not up."""
-        return [link for link in self.daemon.links.values() if not link.peer.is_up]
 
     @property
     def sole_waiting(self) -> PeerLink | None:
@@ -82,6 +85,11 @@ class PartFacts:
     """Its policy, as the file has it."""
 
     @property
+    def daemon(self) -> DaemonParts:
+        """That of the moment."""
+        return self.moment.daemon
+
+    @property
     def now(self) -> float:
         """Monotonic seconds."""
         return self.moment.now
@@ -90,12 +98,6 @@ class PartFacts:
     def rule(self) -> str:
         """Its policy in two words."""
         return f"role {self.rules['role']}" if "role" in self.rules else "its policy"
-
-    @property
-    def blocked(self) -> set[str]:
-        """The directions, ``in`` and ``out``, in which its policy recently refused all frames."""
-        kind = "peer" if isinstance(self, PeerFacts) else "endpoint"
-        return {direction for one, name, direction in self.moment.blocked if (one, name) == (kind, self.name)}
 
 
 @dataclass(frozen=True)
@@ -111,7 +113,7 @@ class PeerFacts(PartFacts):
 
     def seen(self, kind: str) -> Sighting | None:
         """Evidence since the link went down."""
-        return _since(self.moment.daemon.evidence.seen(kind, self.link, self.now), self.link.silent_since)
+        return _since(self.daemon.evidence.seen(kind, self.link, self.now), self.link.silent_since)
 
     def handshake_seen(self, reason: DropReason) -> Sighting | None:
         """The same; of a peer without addresses, from any sender while it is the only such peer that is not up."""
@@ -119,11 +121,11 @@ class PeerFacts(PartFacts):
             return self.seen(reason)
         if self.moment.sole_waiting is None:
             return None
-        return _since(self.moment.daemon.evidence.seen_elsewhere(reason, self.now), self.link.silent_since)
+        return _since(self.daemon.evidence.seen_elsewhere(reason, self.now), self.link.silent_since)
 
     def seen_at(self, relay: RelayLink, kind: str) -> Sighting | None:
         """Evidence at an address of a relay since that went silent."""
-        return _since(self.moment.daemon.evidence.seen_at_relay(kind, relay, self.now), relay.silent_since)
+        return _since(self.daemon.evidence.seen_at_relay(kind, relay, self.now), relay.silent_since)
 
 
 @dataclass(frozen=True)
@@ -147,48 +149,3 @@ def listed(names: Iterable[str], most: int = 4) -> str:
     """The first names of a list that an attacker may make long."""
     first = list(names)
     return ", ".join(first[:most]) + (f" and {len(first) - most} more" if len(first) > most else "")
-
-
-# The table of problems.
-
-F = TypeVar("F")
-L = TypeVar("L", bound=Callable[..., Iterator[Found]])
-
-
-class ProblemRow(NamedTuple, Generic[F]):
-    """A problem."""
-
-    cause: str
-    """Its code in ``status --json``, in the log and in the label of the metric ``finding``."""
-    severity: Severity
-    """By this the alerts select."""
-    look: Callable[[F], Iterator[Found]]
-    """Yields the problem if it is there: the condition, the text and the remedy."""
-    unless: tuple[str, ...]
-    """Causes that explain it: if one of them is there too, it is not reported."""
-
-
-class ProblemTable(Generic[F]):
-    """The problems of one kind of subject."""
-
-    def __init__(self) -> None:
-        self.rows: list[ProblemRow[F]] = []
-
-    def add(self, severity: Severity, unless: tuple[str, ...] = ()) -> Callable[[L], L]:
-        """Make a function a row. Its name, without the underscore, is the cause."""
-
-        def adding(look: L) -> L:
-            self.rows.append(ProblemRow(look.__name__[1:], severity, look, unless))
-            return look
-
-        return adding
-
-
-OF_DAEMON: Final = ProblemTable[Moment]()
-OF_PEER: Final = ProblemTable[PeerFacts]()
-"""Of any peer."""
-OF_PEER_UP: Final = ProblemTable[PeerFacts]()
-OF_PEER_DOWN: Final = ProblemTable[PeerFacts]()
-OF_PEER_SILENT: Final = ProblemTable[PeerFacts]()
-"""Of one that is down, without any other problem."""
-OF_ENDPOINT: Final = ProblemTable[EndpointFacts]()

@@ -15,20 +15,10 @@ from typing import Final
 from uavlinkd.core.refusals import Claim
 from uavlinkd.endpoints.url import EndpointKind
 from uavlinkd.link.evidence import GateHistory, SessionBegin
-from uavlinkd.link.facts import (
-    OF_ENDPOINT,
-    OF_PEER,
-    OF_PEER_UP,
-    EndpointFacts,
-    Found,
-    PartFacts,
-    PeerFacts,
-    listed,
-)
+from uavlinkd.link.facts import EndpointFacts, Found, PartFacts, PeerFacts, fault, listed, security, warning
 from uavlinkd.mavlink.dialect import GROUPS, IDS, command_name, name_of
 from uavlinkd.mavlink.policy.gate import ANY_OTHER, REFUSALS, Gate, Refusal
 from uavlinkd.mavlink.policy.roles import ROLES
-from uavlinkd.ops.findings import Severity
 from uavlinkd.ops.log import shown
 from uavlinkd.system.error_meanings import meaning_of
 
@@ -57,18 +47,30 @@ _CLAIMS_SHOWN: Final = 3
 _NOT_LISTENING: Final = ("ECONNREFUSED", "connect_timeout", "EHOSTUNREACH", "ENETUNREACH")
 
 
-# Signs that a key is in wrong hands.
-
-
-@OF_PEER.add(Severity.SECURITY)
-def _key_on_two_machines(peer: PeerFacts) -> Iterator[Found]:
-    if addresses := alternating(peer.moment.daemon.history.sessions(peer.name), peer.now):
-        yield Found(
+def peer_problems(peer: PeerFacts) -> Iterator[Found]:
+    """Of any peer: signs that a key is in wrong hands, and what the peer claims."""
+    if addresses := alternating(peer.daemon.history.sessions(peer.name), peer.now):
+        yield security(
+            "key_on_two_machines",
             f"its sessions alternate between {listed(addresses)}: two machines may have its private key, such as a"
             " copied SD card or a stolen key",
             "run `uavlinkd pubkey` on both machines; rotate the key only if a second machine has it: the network may"
             " also switch addresses, or an attacker forward packets",
         )
+    yield from _hidden_frames(peer)
+    mixed = peer.history.mixed
+    is_mixed = len(mixed) == mixed.maxlen and peer.now - mixed[0] <= SECURITY_S
+    if is_mixed and (owned := _owned(peer, peer.history.incoming.systems.within(SECURITY_S, peer.now))):
+        whose = listed(f"{system} ({owner})" for system, owner in owned.items())
+        yield security(
+            "impersonation",
+            f"beside its own frames it sends as system {whose}: it may be captured, relay without leave, or have the"
+            " same id by mistake",
+            f"inspect {peer.name}; if it is captured, delete its [[peer]] and run `uavlinkd reload`",
+        )
+    claims = [claim for claim in peer.link.peer.refusal_claims.recent() if peer.now - claim.changed_at <= CLAIMS_S]
+    if claims:
+        yield _refused_there(peer, claims)
 
 
 def alternating(begins: Sequence[SessionBegin], now: float) -> list[str]:
@@ -88,76 +90,49 @@ def alternating(begins: Sequence[SessionBegin], now: float) -> list[str]:
     return []
 
 
-@OF_PEER.add(Severity.SECURITY)
-@OF_ENDPOINT.add(Severity.SECURITY)
-def _hidden_frame(part: PartFacts) -> Iterator[Found]:
+def _hidden_frames(part: PartFacts) -> Iterator[Found]:
     if count := part.history.incoming.reasons.within(SECURITY_S, part.now).get(Refusal.HIDDEN_FRAME):
-        yield Found(
+        yield security(
+            "hidden_frame",
             f"{count:,} of its frames hid a forbidden frame, and were refused: an attack, or a file with such frames",
             f"if no file transfer of yours explains it, treat {part.name} as captured",
         )
 
 
-@OF_PEER.add(Severity.SECURITY)
-def _impersonation(peer: PeerFacts) -> Iterator[Found]:
-    mixed = peer.history.mixed
-    is_mixed = len(mixed) == mixed.maxlen and peer.now - mixed[0] <= SECURITY_S
-    owned = _owned(peer, peer.history.incoming.systems.within(SECURITY_S, peer.now)) if is_mixed else {}
-    if owned:
-        whose = listed(f"{system} ({owner})" for system, owner in owned.items())
-        yield Found(
-            f"beside its own frames it sends as system {whose}: it may be captured, relay without leave, or have the"
-            " same id by mistake",
-            f"inspect {peer.name}; if it is captured, delete its [[peer]] and run `uavlinkd reload`",
-        )
-
-
-@OF_PEER_UP.add(Severity.FAULT)
-def _freshness_unverified(peer: PeerFacts) -> Iterator[Found]:
+def up_problems(peer: PeerFacts) -> Iterator[Found]:
+    """Of a peer that is up: its freshness, and what its policy refuses."""
     if (since := peer.link.peer.unverified_since) is not None:
-        yield Found(
+        yield fault(
+            "freshness_unverified",
             f"freshness unverified for {peer.now - since:.0f} s: the peer's frames arrive, its echo replies do not:"
             " the direction back is blocked, or an attacker delays frames. Commands, missions, parameters and manual"
             " control are held and dropped; reports pass and may be old",
             "fly by other means until answers return; look for a bad radio in the direction to it",
         )
-
-
-# What a policy refuses.
-
-
-def _foreign(peer: PeerFacts) -> tuple[Mapping[int, int], bool]:
-    """The foreign systems that the peer sent as; whether nothing else arrived from it."""
-    incoming = peer.history.incoming
+    blocked, incoming = peer.history.blocked(peer.now), peer.history.incoming
     foreign = incoming.systems.within(REFUSED_S, peer.now)
-    return foreign, "in" in peer.blocked and set(incoming.reasons.within(REFUSED_S, peer.now)) == {
-        Refusal.FOREIGN_SYSTEM
-    }
+    only_foreign = {*incoming.reasons.within(REFUSED_S, peer.now)} == {Refusal.FOREIGN_SYSTEM}
+    if foreign and "in" not in blocked:
+        yield warning("other_system", *_about_systems(peer, foreign, "some of its frames are"))
+    elif foreign and only_foreign:
+        yield fault("foreign_system", *_about_systems(peer, foreign, "all its frames are"))
+    if exchanged := list(_roles_exchanged(peer, is_blocked=bool(blocked))):
+        yield from exchanged
+    else:
+        yield from _all_refused(peer, [one for one in blocked if one != "in" or not only_foreign])
+    yield from _commands(peer)
 
 
-@OF_PEER_UP.add(Severity.FAULT)
-def _foreign_system(peer: PeerFacts) -> Iterator[Found]:
-    foreign, is_all = _foreign(peer)
-    if foreign and is_all:
-        yield _about_systems(peer, foreign, "all its frames are")
-
-
-@OF_PEER_UP.add(Severity.WARNING)
-def _other_system(peer: PeerFacts) -> Iterator[Found]:
-    foreign, _ = _foreign(peer)
-    if foreign and "in" not in peer.blocked:
-        yield _about_systems(peer, foreign, "some of its frames are")
-
-
-def _about_systems(peer: PeerFacts, systems: Mapping[int, int], which: str) -> Found:
+def _about_systems(peer: PeerFacts, systems: Mapping[int, int], which: str) -> tuple[str, str]:
+    """The text and the remedy."""
     allowed = peer.rules.get("system_ids")
     ids = listed(map(str, allowed)) if isinstance(allowed, list | tuple) else str(allowed)
     text = f"{which} of system {listed(map(str, sorted(systems)), 8)}; its system_ids here are {ids}"
     own = f"set SYSID_THISMAV or MAV_SYSID (ArduPilot), or MAV_SYS_ID (PX4), of its autopilot to {ids}"
     if owned := _owned(peer, systems):  # never advise to trust one peer as another
         whose = listed(f"{system} is {owner}'s" for system, owner in owned.items())
-        return Found(text, f"{own}: {whose}")
-    return Found(text, f"{own}; or, only if you know that {peer.name} has this id, write it into system_ids")
+        return text, f"{own}: {whose}"
+    return text, f"{own}; or, only if you know that {peer.name} has this id, write it into system_ids"
 
 
 def _owned(peer: PeerFacts, systems: Iterable[int]) -> dict[int, str]:
@@ -166,40 +141,30 @@ def _owned(peer: PeerFacts, systems: Iterable[int]) -> dict[int, str]:
     return {system: owner for system, owner in owners.items() if owner is not None}
 
 
-@OF_PEER_UP.add(Severity.FAULT, unless=("roles_exchanged",))
-@OF_ENDPOINT.add(Severity.FAULT)
-def _all_refused(part: PartFacts) -> Iterator[Found]:
-    is_foreign = isinstance(part, PeerFacts) and _foreign(part)[1]  # foreign_system explains it
-    blocked = part.blocked - {"in"} if is_foreign else part.blocked
+def _all_refused(part: PartFacts, blocked: Sequence[str]) -> Iterator[Found]:
     for direction, gate in (("in", part.history.incoming), ("out", part.history.outgoing)):
         reasons = gate.reasons.within(REFUSED_S, part.now)
         if reasons and direction in blocked:
             which = "from it" if direction == "in" else "to it"
-            yield Found(
+            yield fault(
+                "all_refused",
                 f"{part.rule} refuses every frame {which}: {'; '.join(reason.meaning for reason in reasons)}",
                 "`uavlinkd check` prints what passes: write the role that the other end has, or allow what it needs",
             )
 
 
-@OF_PEER_UP.add(Severity.WARNING)
-@OF_ENDPOINT.add(Severity.WARNING)
-def _commands_refused(part: PartFacts) -> Iterator[Found]:
-    yield from _commands(part, part.history.incoming, "refused from it")
+def _commands(part: PartFacts) -> Iterator[Found]:
+    remedy = f"intended, if {part.rule} is right; else write another role, or allow the command"
+    if names := _command_names(part.history.incoming, part.now):
+        yield warning("commands_refused", f"{names} refused from it: {part.rule}", remedy)
+    if names := _command_names(part.history.outgoing, part.now):
+        yield warning("commands_withheld", f"{names} withheld: {part.rule}", remedy)
 
 
-@OF_PEER_UP.add(Severity.WARNING)
-@OF_ENDPOINT.add(Severity.WARNING)
-def _commands_withheld(part: PartFacts) -> Iterator[Found]:
-    yield from _commands(part, part.history.outgoing, "withheld")
-
-
-def _commands(part: PartFacts, gate: GateHistory, what: str) -> Iterator[Found]:
-    counts = [(key, count) for key, count in gate.commands.within(COMMANDS_S, part.now).items() if key[2] in _BY_RULE]
+def _command_names(gate: GateHistory, now: float) -> str:
+    counts = [(key, count) for key, count in gate.commands.within(COMMANDS_S, now).items() if key[2] in _BY_RULE]
     counts.sort(key=lambda entry: _rank(entry[0][1]))
-    if counts:
-        names = listed(f"{_command(msgid, number)} {count:,}x" for (msgid, number, _), count in counts)
-        remedy = f"intended, if {part.rule} is right; else write another role, or allow the command"
-        yield Found(f"{names} {what}: {part.rule}", remedy)
+    return listed(f"{_command(msgid, number)} {count:,}x" for (msgid, number, _), count in counts)
 
 
 def _rank(number: int) -> int:
@@ -216,14 +181,12 @@ def _command(msgid: int, number: int) -> str:
 # Roles that seem to be exchanged: a guess from the kind of frames.
 
 
-@OF_PEER_UP.add(Severity.FAULT)
-def _roles_exchanged(peer: PeerFacts) -> Iterator[Found]:
+def _roles_exchanged(peer: PeerFacts, *, is_blocked: bool) -> Iterator[Found]:
     role, gates = peer.rules.get("role"), peer.link.policy
     refused = peer.history.incoming.reasons.within(REFUSED_S, peer.now)
     withheld = peer.history.outgoing.reasons.within(REFUSED_S, peer.now)
-    is_withheld = Refusal.MESSAGE_NOT_ALLOWED in withheld
-    if peer.moment.daemon.config.routing.relay:  # then the frames may be those of other peers
-        is_withheld = False
+    # With routing.relay the frames may be those of other peers.
+    is_withheld = Refusal.MESSAGE_NOT_ALLOWED in withheld and not peer.daemon.config.routing.relay
     sign = ""
     if role == "vehicle":
         is_one = "a vehicle"
@@ -241,7 +204,8 @@ def _roles_exchanged(peer: PeerFacts) -> Iterator[Found]:
         remedy = 'write role = "vehicle" if it is a vehicle: a role says what the peer is, not what this end is'
     if sign:
         text = f'role = "{role}" says that it is {is_one}, but {sign}: the roles may be exchanged'
-        yield Found(text, remedy, None if peer.blocked else Severity.WARNING)
+        fault_if_blocked = fault if is_blocked else warning
+        yield fault_if_blocked("roles_exchanged", text, remedy)
 
 
 def _has(gate: Gate, messages: frozenset[int]) -> bool:
@@ -267,13 +231,9 @@ def _only(role: str, other: str) -> frozenset[int]:
 # What the peer reports to refuse of this end's frames: a claim of its own. Nothing acts on it.
 
 
-@OF_PEER.add(Severity.WARNING)
-def _refused_there(peer: PeerFacts) -> Iterator[Found]:
-    claims = [claim for claim in peer.link.peer.refusal_claims.recent() if peer.now - claim.changed_at <= CLAIMS_S]
-    if not claims:
-        return
+def _refused_there(peer: PeerFacts, claims: list[Claim]) -> Found:
     claims.sort(key=lambda claim: not claim.refused.command)
-    here, remedies = peer.moment.daemon.config.name, []
+    here, remedies = peer.daemon.config.name, []
     foreign = {REFUSALS.get(claim.refused.reason) is Refusal.FOREIGN_SYSTEM for claim in claims}
     if True in foreign:
         remedies.append(
@@ -289,7 +249,7 @@ def _refused_there(peer: PeerFacts) -> Iterator[Found]:
         by_meaning.setdefault(meaning, []).append(claim)
     kinds = "; ".join(_kinds(meaning, several, peer.now) for meaning, several in by_meaning.items())
     more = f"; and {len(claims) - _CLAIMS_SHOWN} more kinds of frames" if len(claims) > _CLAIMS_SHOWN else ""
-    yield Found(f"it reports that it refuses {kinds}{more}", "; ".join(remedies))
+    return warning("refused_there", f"it reports that it refuses {kinds}{more}", "; ".join(remedies))
 
 
 def _kinds(meaning: str, claims: Sequence[Claim], now: float) -> str:
@@ -307,62 +267,45 @@ def _kind(claim: Claim, now: float, meaning: str = "") -> str:
     return f"{name_of(refused.message)}{command} ({meaning}{refused.total:,} {frames}, {age:.0f} s ago)"
 
 
-# A local endpoint whose client is silent: in the table, the first of these that fits.
+# Local endpoints.
 
 
-def _is_silent(endpoint: EndpointFacts) -> bool:
-    return endpoint.now - endpoint.history.silent_since >= SILENT_S
+def endpoint_problems(endpoint: EndpointFacts) -> Iterator[Found]:
+    """What its policy refuses, and why its client is silent."""
+    yield from _hidden_frames(endpoint)
+    yield from _all_refused(endpoint, endpoint.history.blocked(endpoint.now))
+    yield from _commands(endpoint)
+    if endpoint.now - endpoint.history.silent_since >= SILENT_S:
+        yield _silent(endpoint)
 
 
-def _failures(endpoint: EndpointFacts) -> Mapping[str, int]:
-    return endpoint.history.failures.within(SILENT_S, endpoint.now)
-
-
-@OF_ENDPOINT.add(Severity.WARNING)
-def _garbage(endpoint: EndpointFacts) -> Iterator[Found]:
-    if _is_silent(endpoint) and endpoint.history.garbage.within(SILENT_S, endpoint.now):
-        yield Found(
-            f"bytes arrive at {endpoint.config.url}, and none of them is MAVLink",
+def _silent(endpoint: EndpointFacts) -> Found:
+    silent_s = endpoint.now - endpoint.history.silent_since
+    url, ports = endpoint.config.url, endpoint.endpoint.ports
+    failures = endpoint.history.failures.within(SILENT_S, endpoint.now)
+    not_listening = next((error for error in _NOT_LISTENING if error in failures), "")
+    if endpoint.history.garbage.within(SILENT_S, endpoint.now):
+        return warning(
+            "garbage",
+            f"bytes arrive at {url}, and none of them is MAVLink",
             "correct the baud rate, set the port of the autopilot to MAVLink, and let only this daemon read it",
         )
-
-
-@OF_ENDPOINT.add(Severity.WARNING, unless=("garbage",))
-def _client_silent(endpoint: EndpointFacts) -> Iterator[Found]:
-    ports, kind = endpoint.endpoint.ports, endpoint.config.url.kind
-    is_there = kind is not EndpointKind.UDPOUT or not _failures(endpoint).keys() & {*_NOT_LISTENING}
-    if _is_silent(endpoint) and ports and is_there:
-        silent_s = endpoint.now - endpoint.history.silent_since
-        yield Found(
+    if ports and not (url.kind is EndpointKind.UDPOUT and not_listening):
+        return warning(
+            "client_silent",
             f"the client {listed(port.name for port in ports)} has sent no MAVLink for {silent_s:.0f} s",
             "check that it runs, speaks MAVLink here and sends, not only listens; then power, wiring and baud rate",
         )
-
-
-@OF_ENDPOINT.add(Severity.FAULT, unless=("garbage", "client_silent"))
-def _device_unavailable(endpoint: EndpointFacts) -> Iterator[Found]:
-    if _is_silent(endpoint) and endpoint.config.url.kind is EndpointKind.SERIAL:
-        error = next(iter(_failures(endpoint)), "")
-        text = f"{endpoint.config.url} cannot be opened{f' ({error})' if error else ''}"
-        yield Found(text, meaning_of(error) or "plug the device in")
-
-
-@OF_ENDPOINT.add(Severity.WARNING, unless=("garbage", "client_silent", "device_unavailable"))
-def _no_client(endpoint: EndpointFacts) -> Iterator[Found]:
-    if _is_silent(endpoint) and endpoint.config.url.listens:
-        silent_s = endpoint.now - endpoint.history.silent_since
-        text = f"no client has sent MAVLink to {endpoint.config.url} within {silent_s:.0f} s"
-        yield Found(text, "let the autopilot or ground station send there")
-
-
-@OF_ENDPOINT.add(Severity.WARNING, unless=("garbage", "client_silent", "device_unavailable", "no_client"))
-def _client_unreachable(endpoint: EndpointFacts) -> Iterator[Found]:
-    url, failures = endpoint.config.url, _failures(endpoint)
-    if not _is_silent(endpoint):
-        return
-    if "not_resolved" in failures or (url.kind is EndpointKind.UDPOUT and not endpoint.endpoint.ports):
-        yield Found(f"the host of {url} has no address now", "write an IP address, or see `getent hosts NAME`")
+    if url.kind is EndpointKind.SERIAL:
+        error = next(iter(failures), "")
+        text = f"{url} cannot be opened{f' ({error})' if error else ''}"
+        return fault("device_unavailable", text, meaning_of(error) or "plug the device in")
+    if url.listens:
+        text = f"no client has sent MAVLink to {url} within {silent_s:.0f} s"
+        return warning("no_client", text, "let the autopilot or ground station send there")
+    if "not_resolved" in failures or (url.kind is EndpointKind.UDPOUT and not ports):
+        text, remedy = f"the host of {url} has no address now", "write an IP address, or see `getent hosts NAME`"
     else:
-        error = next((error for error in _NOT_LISTENING if error in failures), "")
-        text = f"no process listens at {url}{f' ({error})' if error else ''}"
-        yield Found(text, "start the client there, or correct the port")
+        text = f"no process listens at {url}{f' ({not_listening})' if not_listening else ''}"
+        remedy = "start the client there, or correct the port"
+    return warning("client_unreachable", text, remedy)
