@@ -20,7 +20,7 @@ from tests.daemon.udp import Client, Sockaddr, assert_same
 from tests.waiting import PATIENCE_S, until
 from uavlinkd.config import keys
 from uavlinkd.core.constants import REKEY_AFTER_S
-from uavlinkd.link.daemon import Reloads
+from uavlinkd.link.daemon import Daemon
 from uavlinkd.ops.control import ask
 from uavlinkd.ops.sdnotify import Supervisor
 
@@ -225,18 +225,25 @@ async def test_many_hangups_are_two_reloads() -> None:
     """One that reads and one that waits, which reads the last file, however many signals came."""
     may_end, reloads_begun = asyncio.Event(), 0
 
-    async def apply() -> None:
-        nonlocal reloads_begun
-        reloads_begun += 1
-        await may_end.wait()
+    class Waiting(Daemon):
+        """Waits instead of reading its file."""
 
-    reloads = Reloads(apply, Mock(spec=Supervisor))
+        def __init__(self) -> None:
+            self._loop, self._reload_lock = asyncio.get_running_loop(), asyncio.Lock()
+            self._hangups, self._supervisor = set(), Mock(spec=Supervisor)
+
+        async def _apply_file(self) -> None:
+            nonlocal reloads_begun
+            reloads_begun += 1
+            await may_end.wait()
+
+    daemon = Waiting()
     for _ in range(20):
-        reloads.on_hangup()
+        daemon.on_hangup()
         await asyncio.sleep(0)
     assert reloads_begun == 1
     may_end.set()
-    await until(lambda: not reloads._hangups)
+    await until(lambda: not daemon._hangups)
     assert reloads_begun == 2
 
 

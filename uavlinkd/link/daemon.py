@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import os
-from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
@@ -13,6 +12,7 @@ import structlog
 from uavlinkd.config import Config, ConfigError
 from uavlinkd.config.changes import compare
 from uavlinkd.config.load import load_in_thread
+from uavlinkd.core.path import Path
 from uavlinkd.link.carrier import FrameCarrier
 from uavlinkd.link.diagnosis import find
 from uavlinkd.link.local_endpoints import PilotNotes
@@ -39,46 +39,6 @@ HOUSEKEEPING_S = INTERVAL_S
 """How often links are measured, and idle clients forgotten."""
 
 
-class Reloads:
-    """Reloads run one at a time, in the order of the requests. The configuration of the last one stays in force.
-
-    ``apply`` reads the configuration, and applies or refuses it as a whole. A refusal is a ConfigError.
-    """
-
-    def __init__(self, apply: Callable[[], Awaitable[None]], supervisor: Supervisor) -> None:
-        self._apply = apply
-        self._supervisor = supervisor
-        self._loop = asyncio.get_running_loop()
-        self._lock = asyncio.Lock()
-        self._hangups: set[asyncio.Task[None]] = set()
-
-    async def run(self) -> None:
-        """Reload when the reloads before have ended.
-
-        Raises:
-            ConfigError: the new configuration was refused.
-        """
-        async with self._lock:
-            self._supervisor.reloading()
-            try:
-                await self._apply()
-            except BaseException:
-                self._supervisor.ready("the new configuration was refused")
-                raise
-            self._supervisor.ready()
-
-    def on_hangup(self) -> None:
-        """SIGHUP came: reload, unless a reload waits already, which will read the file later."""
-        if len(self._hangups) < 2:
-            task = self._loop.create_task(self._reload_for_signal())
-            self._hangups.add(task)
-            task.add_done_callback(self._hangups.discard)
-
-    async def _reload_for_signal(self) -> None:
-        with suppress(ConfigError):  # logged already
-            await self.run()
-
-
 class Daemon:
     """One uavlinkd: the peers on one side, the local MAVLink endpoints on the other.
 
@@ -96,7 +56,8 @@ class Daemon:
         self._control: ControlServer | None = None
         self._metrics: MetricsServer | None = None
         self._supervisor = Supervisor(os.environ, os.getpid())
-        self._reloads = Reloads(self._reload, self._supervisor)
+        self._reload_lock = asyncio.Lock()
+        self._hangups: set[asyncio.Task[None]] = set()
 
     def _perform(self, outputs: Iterable[Output]) -> None:
         self.carrier.perform(outputs)
@@ -114,7 +75,7 @@ class Daemon:
         for name in ("SIGTERM", "SIGINT"):
             on_signal(name, stop.set)
         self._loop.set_exception_handler(self.parts.drops.on_loop_failure)
-        on_signal("SIGHUP", self._reloads.on_hangup)
+        on_signal("SIGHUP", self.on_hangup)
         await self.start()
         try:
             await stop.wait()
@@ -147,7 +108,7 @@ class Daemon:
         self.carrier.peers.start()
         parts.peer_sockets.start(self.carrier.receive, self.carrier.arm)
         parts.local.start(config.endpoints)
-        self._warn()
+        self._write_warnings()
         self.log.info(
             "daemon_started",
             log_schema=LOG_SCHEMA,
@@ -186,7 +147,7 @@ class Daemon:
         if self._metrics is not None:
             self._metrics.stop()
 
-    def _warn(self) -> None:
+    def _write_warnings(self) -> None:
         for warning in self.parts.config.warnings:
             self.log.warning("configuration_warning", warning=warning)
 
@@ -200,7 +161,7 @@ class Daemon:
                 return daemon_status(parts, monotonic())
             case ("reload", "", ""):
                 try:
-                    await self._reloads.run()
+                    await self.reload()
                 except ConfigError as error:
                     return {"problems": str(error).splitlines()}
                 return {"problems": [], "name": parts.config.name}
@@ -214,7 +175,33 @@ class Daemon:
                 return ping(parts, self.carrier, name, monotonic())
         return None
 
-    async def _reload(self) -> None:
+    async def reload(self) -> None:
+        """Reload when the reloads before have ended. The configuration of the last one stays in force.
+
+        Raises:
+            ConfigError: the new configuration was refused, as a whole.
+        """
+        async with self._reload_lock:
+            self._supervisor.reloading()
+            try:
+                await self._apply_file()
+            except BaseException:
+                self._supervisor.ready("the new configuration was refused")
+                raise
+            self._supervisor.ready()
+
+    def on_hangup(self) -> None:
+        """SIGHUP came: reload, unless a reload waits already, which will read the file later."""
+        if len(self._hangups) < 2:
+            task = self._loop.create_task(self._reload_for_signal())
+            self._hangups.add(task)
+            task.add_done_callback(self._hangups.discard)
+
+    async def _reload_for_signal(self) -> None:
+        with suppress(ConfigError):  # logged already
+            await self.reload()
+
+    async def _apply_file(self) -> None:
         """Read the configuration again and apply its changes. Everything else stays as it is.
 
         Raises:
@@ -236,7 +223,7 @@ class Daemon:
             local.add(endpoint, endpoint_config)
         for endpoint_config in changes.changed_endpoints:
             local.change(endpoint_config)
-        self._warn()
+        self._write_warnings()
         self.log.info("configuration_reloaded", **changes.summary())
         self.carrier.arm()
 
@@ -290,7 +277,11 @@ def netcheck(parts: DaemonParts) -> dict[str, object]:
     """How each relay sees each socket, what the last filter tests showed, and the candidates of this daemon."""
     relays, sockets = parts.relays, parts.peer_sockets
     own, candidates = relays.places()
-    network_of = sockets.network_name
+
+    def along(relay: str, path: Path, **facts: object) -> dict[str, object]:
+        address, network = str(Address.of(path.address)), sockets.network_name(path.socket)
+        return {"relay": relay, "relay_address": address, "socket": path.socket, "network": network, **facts}
+
     return {
         "relays": {
             name: {
@@ -302,25 +293,12 @@ def netcheck(parts: DaemonParts) -> dict[str, object]:
             for name, relay in relays.by_name.items()
         },
         "views": [
-            {
-                "relay": name,
-                "relay_address": str(Address.of(path.address)),
-                "socket": path.socket,
-                "network": network_of(path.socket),
-                "seen_as": str(seen),
-            }
+            along(name, path, seen_as=str(seen))
             for name, relay in relays.by_name.items()
             for path, seen in relay.views()
         ],
         "filtering": [
-            {
-                "relay": result.relay,
-                "relay_address": str(Address.of(result.path.address)),
-                "socket": result.path.socket,
-                "network": network_of(result.path.socket),
-                "other_port_passes": result.passes,
-            }
-            for result in relays.filter_tests.results
+            along(test.relay, test.path, other_port_passes=test.passes) for test in relays.filter_tests.results
         ],
         "candidates": [str(Address(*place)) for place in candidates],
         "is_relay": parts.relay is not None,

@@ -199,8 +199,7 @@ class DirectSearches:
         self._sockets = sockets
         self._links = links
         self._searches: dict[LinkedPeer, DirectSearch] = {}
-        self._paused: dict[LinkedPeer, DirectSearch] = {}
-        # Of peers without a handle now. A relay must not reset limits and orders by ending handles.
+        # Also of peers without a handle now. A relay must not reset limits and orders by ending handles.
         self._looked_at = -NEVER
         self._own: list[OwnSocket] = []
 
@@ -214,18 +213,13 @@ class DirectSearches:
 
         ``seen``: this daemon's addresses as relays see them. ``relays``: where relays are.
         """
-        before, paused = self._searches, self._paused
-        self._searches, self._paused = {}, {}
-        for link in self._links.values():
-            peer: Peer = link.peer
-            search = before.get(peer) or paused.get(peer)
-            if link.relayed:
-                self._searches[peer] = search or DirectSearch(self._node, peer, now)
-                if peer in paused:
-                    self._searches[peer].begin(now)
-            elif search is not None:
-                self._paused[peer] = search
-        if not self._searches:
+        before, links = self._searches, self._links.values()
+        self._searches = {
+            link.peer: before.get(link.peer) or DirectSearch(self._node, link.peer, now)
+            for link in links
+            if link.relayed or link.peer in before
+        }
+        if not any(link.relayed for link in links):
             return
         if now >= self._looked_at + LOOK_S:
             self._looked_at = now

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import socket
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 from structlog.typing import FilteringBoundLogger
@@ -156,29 +156,24 @@ class NetworkSocket:
 
     number: int
     family: socket.AddressFamily
-    port: int
-    """The port to open it with: that of ``listen``, else the one that it had before; 0: any."""
-    is_fixed: bool
-    """Whether it is that of ``listen``."""
+    listen_port: int
+    """That of ``listen``; 0: any."""
+    port: int = 0
+    """The one that it had before."""
     index: int | None = None
     """The interface's number when it was opened; None while it is closed."""
     hosts: tuple[str, ...] = ()
     """The addresses of its network and family, while it is open."""
 
 
+@dataclass(slots=True, eq=False)
 class Network:
     """One ``[[network]]``: its sockets, and what the machine had of it when it was last looked at."""
 
-    def __init__(self, config: NetworkConfig, sockets: Sequence[NetworkSocket], log: NetworkLog) -> None:
-        self.config = config
-        self.sockets = sockets
-        self.presence = Presence()
-        self.log = log
-
-    @property
-    def name(self) -> str:
-        """Its name in the configuration."""
-        return self.config.name
+    config: NetworkConfig
+    sockets: Sequence[NetworkSocket]
+    log: NetworkLog
+    presence: Presence = field(default_factory=Presence)
 
 
 class Networks:
@@ -198,34 +193,24 @@ class Networks:
     ) -> None:
         ports = {address.family: address.port for address in listen}
         self.networks: list[Network] = []
-        self._of_socket: dict[int, tuple[Network, NetworkSocket]] = {}
+        self.of_number: dict[int, tuple[Network, NetworkSocket]] = {}
+        """The network of each socket, and the socket."""
         self._put, self._opened = put, opened
         self._states = states
         limits = LineLimits()
         for config in configs:
-            sockets = [
-                NetworkSocket(len(self._of_socket) + place, family, ports.get(family, 0), bool(ports.get(family)))
-                for place, family in enumerate(config.families)
-            ]
+            numbered = enumerate(config.families, len(self.of_number))
+            sockets = [NetworkSocket(number, family, ports.get(family, 0)) for number, family in numbered]
             network = Network(config, sockets, NetworkLog(config.name, limits, log))
             self.networks.append(network)
-            self._of_socket.update({one.number: (network, one) for one in sockets})
-
-    @property
-    def families(self) -> list[socket.AddressFamily]:
-        """The address family of each socket, by number."""
-        return [one.family for _, one in self._of_socket.values()]
-
-    def network_of(self, number: int) -> Network:
-        """The network of a socket."""
-        return self._of_socket[number][0]
+            self.of_number.update({one.number: (network, one) for one in sockets})
 
     def may_reach(self, number: int, address: SocketAddress) -> bool:
         """Whether a socket can send to an address of its family, as far as its own addresses show.
 
         While a network is absent, the answer is yes: it may have any address when it appears.
         """
-        one = self._of_socket[number][1]
+        one = self.of_number[number][1]
         if one.index is None or one.family == socket.AF_INET:
             return True
         if address[0].startswith(LINK_LOCAL):
@@ -238,7 +223,7 @@ class Networks:
         Raises:
             BindError: a network is there, and its socket cannot be opened. The message names the network.
         """
-        metered = [one.number for network, one in self._of_socket.values() if network.config.metered]
+        metered = [one.number for network, one in self.of_number.values() if network.config.metered]
         self._states.set_metered(metered, now)
         for network in self.networks:
             network.presence = look(network.config.interface, network.config.address)
@@ -246,7 +231,7 @@ class Networks:
                 try:
                     self._follow(network, one, now)
                 except BindError as error:
-                    raise BindError(f"network ({network.name}): {error}") from None
+                    raise BindError(f"network ({network.config.name}): {error}") from None
 
     def check(self, now: float) -> bool:
         """Look at all networks, and open and close sockets. Returns whether anything changed."""
@@ -282,7 +267,7 @@ class Networks:
 
     def report_absent(self, now: float) -> None:
         """Report the sockets that are closed. Call it after other paths were set: the core knows states by path."""
-        for _, one in self._of_socket.values():
+        for _, one in self.of_number.values():
             if one.index is None:
                 self._states.set_socket_state(one.number, now, is_up=False)
 
@@ -290,9 +275,9 @@ class Networks:
         host = config.address or _WILDCARDS[one.family]
         others = self._opened()
         try:
-            sock = network_socket(Address(host, one.port), config.interface, others)
+            sock = network_socket(Address(host, one.listen_port or one.port), config.interface, others)
         except BindError as error:
-            if one.is_fixed or not error.is_taken:
+            if one.listen_port or not error.is_taken:
                 raise
             sock = network_socket(Address(host, 0), config.interface, others)
         one.port = sock.getsockname()[1]
@@ -301,7 +286,7 @@ class Networks:
     def absent(self) -> dict[str, str]:
         """The networks that are absent now, each with the reason, and what a person can do."""
         return {
-            f"{network.name} ({network.presence.reason})": BRING_UP
+            f"{network.config.name} ({network.presence.reason})": BRING_UP
             for network in self.networks
             if not network.presence.hosts
         }
@@ -309,7 +294,7 @@ class Networks:
     def status(self) -> dict[str, object]:
         """Each network by name, as plain values."""
         return {
-            network.name: network_status(
+            network.config.name: network_status(
                 network.config, network.presence, [one.port for one in network.sockets if one.index is not None]
             )
             for network in self.networks

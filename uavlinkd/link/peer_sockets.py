@@ -117,7 +117,7 @@ class PeerSockets:
 
     def interface_of(self, number: int) -> str | None:
         """The network interface that a socket is bound to; None if it uses any."""
-        return None if self.networks is None else self.networks.network_of(number).config.interface
+        return None if self.networks is None else self.networks.of_number[number][0].config.interface
 
     def absent_addresses(self) -> list[Address]:
         """The listen addresses that no interface of this machine has now."""
@@ -140,7 +140,7 @@ class PeerSockets:
         """The network of a socket; None if the configuration names no networks."""
         if (line := self.serial.of_number.get(number)) is not None:
             return line.name
-        return None if self.networks is None else self.networks.network_of(number).name
+        return None if self.networks is None else self.networks.of_number[number][0].config.name
 
     def way_of(self, path: Path) -> tuple[str | None, SocketAddress | None]:
         """The network of a path, and the relay's address if it is relayed and has a handle."""
@@ -167,8 +167,8 @@ class PeerSockets:
         """
         if ip_networks := [network for network in networks if network.serial is None]:
             self.networks = Networks(ip_networks, addresses, self.put, self.open_sockets, self._node, self._log)
-            for number, family in enumerate(self.networks.families):
-                self._add_slot(_Slot(number, family))
+            for _, one in self.networks.of_number.values():
+                self._add_slot(_Slot(one.number, one.family))
             self.networks.open(monotonic())
         else:
             self._open_addresses(addresses)
@@ -386,7 +386,8 @@ class PeerSockets:
         networks = self.networks
         if networks is None:
             return True
-        return written.network in ("", networks.network_of(number).name) and networks.may_reach(number, sockaddr)
+        network, _ = networks.of_number[number]
+        return written.network in ("", network.config.name) and networks.may_reach(number, sockaddr)
 
     def stop_following(self, name: str) -> None:
         """Stop resolving this peer's names."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from itertools import zip_longest
 from typing import Final
 
@@ -65,21 +66,20 @@ class _Silence:
         return True
 
 
+@dataclass(slots=True, eq=False)
 class PathTest:
     """Of one path to a relay. It has one token."""
 
-    __slots__ = ("answers", "has_passed", "next_at", "path", "peer", "relay", "tries", "try_s")
-
-    def __init__(self, relay: str, peer: Peer, state: PathState, now: float) -> None:
-        self.relay = relay
-        """Its name."""
-        self.peer = peer
-        self.path = state.path
-        self.try_s = min(max(c.FILTER_TRY_S, 2 * (state.srtt_s or 0.0)), c.FILTER_TRY_MOST_S)
-        self.next_at = now
-        """When the next try is due, or the test ends; infinity after its end."""
-        self.tries = self.answers = 0
-        self.has_passed = False
+    relay: str
+    """Its name."""
+    peer: Peer
+    path: Path
+    try_s: float
+    next_at: float
+    """When the next try is due, or the test ends; infinity after its end."""
+    tries: int = 0
+    answers: int = 0
+    has_passed: bool = False
 
     @property
     def passes(self) -> bool | None:
@@ -115,7 +115,8 @@ class FilterTests:
         for relay in relays:
             for state in _best_paths(relay.peer):
                 token = self._entropy(c.FILTER_TOKEN_BYTES)
-                self._tests[token] = PathTest(relay.config.name, relay.peer, state, now)
+                try_s = min(max(c.FILTER_TRY_S, 2 * (state.srtt_s or 0.0)), c.FILTER_TRY_MOST_S)
+                self._tests[token] = PathTest(relay.config.name, relay.peer, state.path, try_s, now)
         self.results = ()
         if self._tests:
             self.ended.clear()
