@@ -42,7 +42,7 @@ class Link:
     name = "drone1"
 
     def __init__(self, *addresses: PeerAddress) -> None:
-        self.addresses = addresses
+        self.config = SimpleNamespace(addresses=addresses)
         self.states: dict[Path, Any] = {}
         self.peer = SimpleNamespace(is_up=True, paths=SimpleNamespace(find=self.states.get))
         self.paths: list[Path] = []

@@ -90,7 +90,7 @@ class End:
                 frames = split_payload(output.payload, self.link.counters)
                 if output.order:
                     frames = self.link.pick_newest(output.peer, frames, output.order, now)
-                elif self.link.is_repairing:
+                elif self.link.output.repair.is_on:
                     self.link.note_requests(frames, now)
                 self.delivered += frames
                 self.delivered_at += [now] * len(frames)

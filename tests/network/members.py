@@ -191,7 +191,7 @@ class _Sockets:
         relay.set_paths(
             [
                 Path(socket, (written.address.host, written.address.port))
-                for written in relay.addresses
+                for written in relay.config.addresses
                 for socket in range(len(member.addresses))
             ],
             member.local_now,

@@ -288,7 +288,7 @@ class FrameCarrier:
                     self._cost += cost_of(payload, len(frames))
                 if order:  # the peer has several paths
                     frames = self._pick_newest(link, output, frames)
-                elif link.is_repairing:
+                elif link.output.repair.is_on:
                     link.note_requests(frames, self._read_at)
                 if link in self._frames:
                     self._frames[link] += frames

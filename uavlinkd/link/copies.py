@@ -295,15 +295,13 @@ class Repair:
     def __init__(self) -> None:
         self.transmissions = 1
         """How often a critical envelope goes along each path."""
-        self.began_at: float | None = None
+        self.is_on = False
+        """Whether envelopes are repeated,"""
+        self.began_at = 0.0
+        """and since when."""
         self.left_out: Sequence[PathState] = ()
         """Paths without repeats: they do not answer, or are so slow that repeats along another path arrive first."""
         self._losses: deque[tuple[float, float]] = deque()
-
-    @property
-    def is_on(self) -> bool:
-        """Whether envelopes are repeated."""
-        return self.began_at is not None
 
     def update(self, paths: Sequence[PathState], now: float, *, is_allowed: bool) -> None:
         """Judge the paths that carry critical frames. Call it about once a second."""
@@ -323,15 +321,15 @@ class Repair:
         while self._losses[0][0] <= now - HOLD_S:
             self._losses.popleft()
         highest = max(loss for _, loss in self._losses)
-        if self.began_at is None and highest > BEGIN_LOSS:
-            self.began_at = now
+        if not self.is_on and highest > BEGIN_LOSS:
+            self.is_on, self.began_at = True, now
         elif highest < END_LOSS:
-            self.began_at = None
+            self.is_on = False
         self.transmissions = max(2, transmissions_for(highest)) if self.is_on else 1
 
     def end(self) -> None:
         """Stop at once: the peer is lost, or its configuration has changed."""
-        self.transmissions, self.began_at = 1, None
+        self.transmissions, self.is_on = 1, False
         self._losses.clear()
 
     def _loss_of(self, path: PathState) -> float:

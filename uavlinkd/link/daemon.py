@@ -287,7 +287,7 @@ def netcheck(parts: DaemonParts) -> dict[str, object]:
             name: {
                 "state": state_of(relay.peer),
                 "round_trip_s": relay.peer.round_trip_s,
-                "addresses": [str(written) for written in relay.addresses],
+                "addresses": [str(written) for written in relay.config.addresses],
                 "unresolved": sorted(sockets.unresolved(relay.name if relay.link is None else relay.link.name)),
             }
             for name, relay in relays.by_name.items()

@@ -123,7 +123,7 @@ def _at_relays(peer: PeerFacts, relays: Sequence[_RelayProblem]) -> Iterator[Fou
                 " into its file, and a [[member]] for it into the file of the relay",
             )
         elif problem == "relay_not_answering":
-            text = f"the relay {name} does not answer at {listed(map(str, relay.addresses))}: "
+            text = f"the relay {name} does not answer at {listed(map(str, relay.config.addresses))}: "
             remedy = (
                 f"{_ASK_THERE.format(name)}; else open its firewall. `uavlinkd pubkey` there must print the"
                 " public_key of the [[relay]] here, and this daemon must be a [[member]] there"

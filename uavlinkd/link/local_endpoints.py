@@ -201,11 +201,11 @@ class LocalEndpoints:
 
     def on_port_silent(self, port: LocalPort) -> None:
         """A local client is silent and may have gone."""
-        self._switch.set_silent(port, is_silent=True)
+        self._switch.router.set_silent(port, is_silent=True)
 
     def on_port_active(self, port: LocalPort) -> None:
         """A silent local client sends again."""
-        self._switch.set_silent(port, is_silent=False)
+        self._switch.router.set_silent(port, is_silent=False)
 
     # Time.
 

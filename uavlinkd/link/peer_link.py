@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from operator import itemgetter
 from typing import NamedTuple
 
-from uavlinkd.config import PeerAddress, PeerConfig
+from uavlinkd.config import PeerConfig
 from uavlinkd.core.constants import CONFIGURED_PATHS
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import LinkedPeer, Output, Transmit
@@ -121,8 +121,6 @@ class PeerLink:
         self.rates = Rates(now)
         self.figures = LinkFigures(is_up=False, loss_in=0.0, loss_out=0.0, round_trip_s=None)
         """The last result of :meth:`measure`."""
-        self.is_repairing = False
-        """Whether critical frames to it are repeated."""
         self.timers = Deadline()
         """When :meth:`send_waiting` is due."""
         self._carriage = carriage
@@ -169,11 +167,6 @@ class PeerLink:
         config = self.config
         return {key for key in (config.settings.public_key, config.previous_public_key) if key is not None}
 
-    @property
-    def addresses(self) -> tuple[PeerAddress, ...]:
-        """Those of the configuration."""
-        return self.config.addresses
-
     def set_paths(self, paths: Sequence[Path], now: float) -> None:
         """Connect to the peer along these paths, and along the relayed ones."""
         self._direct = paths
@@ -211,7 +204,7 @@ class PeerLink:
         """
         self.frames_sent += len(frames)
         peer = self.peer if self.previous else self.peers[0]
-        if self.output.egress is not None or peer.paths.is_multiple or self.is_repairing:
+        if self.output.egress is not None or peer.paths.is_multiple or self.output.repair.is_on:
             if self.output.send(peer, frames, now, waited_s):
                 self.send_waiting(now)
             return
@@ -278,7 +271,6 @@ class PeerLink:
     def on_down(self, now: float) -> None:
         """The peer is lost: drop what waits, which would be old when it is back."""
         self.output.clear(now)
-        self.is_repairing = False
         self._set_deadline(now)
 
     def is_overdue(self, now: float) -> bool:
@@ -308,7 +300,6 @@ class PeerLink:
                 _lost(there, self._sample.received_there - before.received_there) if there else self.figures.loss_out
             )
         self.output.measure(peer, now)
-        self.is_repairing = self.output.repair.is_on
         self.follow_paths(now)
         self.figures = LinkFigures(
             is_up=peer.is_up,

@@ -30,11 +30,11 @@ class PeerNames:
         self.paths: dict[PeerAddress, Sequence[Path]] | None = None
         """The paths that the core knows, by address of the configuration; None before it knows any."""
         self._on_change = on_change
-        self._answers: dict[PeerAddress, Resolved] = {address: [] for address in link.addresses}
+        self._answers: dict[PeerAddress, Resolved] = {address: [] for address in link.config.addresses}
         self._failing: list[set[str]] = []
         self._wakes: list[asyncio.Event] = []
         self._tasks: list[asyncio.Task[None]] = []
-        for address in link.addresses:
+        for address in link.config.addresses:
             if address.is_serial:
                 continue  # it needs no look-up
             if address.address.ip is not None and "%" not in address.address.host:

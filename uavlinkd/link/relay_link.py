@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
-from uavlinkd.config import PeerAddress, RelayConfig
+from uavlinkd.config import RelayConfig
 from uavlinkd.core import constants as c
 from uavlinkd.core import outputs as o
 from uavlinkd.core.constants import NEVER
@@ -207,11 +207,6 @@ class RelayLink:
         if self.link is not None:
             return self.link.peer
         return next((peer for peer in self._peers if peer.is_up), self._peers[0])
-
-    @property
-    def addresses(self) -> tuple[PeerAddress, ...]:
-        """Those of the configuration."""
-        return self.config.addresses
 
     def views(self) -> list[tuple[Path, Address]]:
         """The paths to the relay, each with this daemon's address as the relay sees it there."""

@@ -119,7 +119,7 @@ def peer_status(link: PeerLink, now: float, way_of: WayOf) -> dict[str, object]:
         "waiting_dropped": {} if link.output.egress is None else _counts(link.output.egress.totals),
         "repair": {
             "is_on": link.output.repair.is_on,
-            "on_s": _age(link.output.repair.began_at, now) or 0.0,
+            "on_s": now - link.output.repair.began_at if link.output.repair.is_on else 0.0,
             "transmissions": link.output.repair.transmissions,
             "datagrams": link.output.copies.repeats_sent,
             "bytes": link.output.copies.repeat_bytes,
@@ -158,7 +158,7 @@ def used_relay_status(relay: RelayLink, daemon: DaemonParts, now: float) -> dict
         "state": state_of(peer),
         "peer": relay.config.peer,
         "public_key": encode_key(peer.settings.public_key),
-        "addresses": [str(written) for written in relay.addresses],
+        "addresses": [str(written) for written in relay.config.addresses],
         "seen_as": [str(seen) for _, seen in relay.views()],
         "last_received_s": _age(peer.received_at, now),
         "handshake_s": _age(peer.established_at, now),

@@ -86,10 +86,6 @@ class Switch:
         self._senders.clear()
         self.router.remove_port(port)
 
-    def set_silent(self, port: Port, *, is_silent: bool) -> None:
-        """Whether a local client is silent: then broadcasts of other local clients do not go to it."""
-        self.router.set_silent(port, is_silent=is_silent)
-
     def forward(self, source: Port, frames: Sequence[Frame], now: float, epoch: int, waited_s: float = 0.0) -> None:
         """Send frames of ``source`` where they belong. A frame that a policy refuses is counted and dropped.
 
