@@ -11,12 +11,11 @@ from structlog import get_logger
 from structlog.testing import capture_logs
 
 from tests.core.harness import Named
-from tests.link.test_switch import Client
 from uavlinkd.config import ConfigError, Problem
 from uavlinkd.core.outputs import PeerLost, PeerUp
 from uavlinkd.link import daemon
 from uavlinkd.link.conditions import HOUR_S, LINES_BURST, LINES_PER_S
-from uavlinkd.link.event_log import CLIENT_RESTART_S, FINDING_DELAY_S, EventLog
+from uavlinkd.link.event_log import ENDPOINT_DELAY_S, FINDING_DELAY_S, EventLog
 from uavlinkd.ops.findings import Finding, Severity, Subject
 
 
@@ -32,26 +31,14 @@ def finding(severity: Severity, cause: str = "wrong_psk") -> Finding:
 
 
 def test_restarted_client_is_not_logged_as_silent(log: EventLog) -> None:
-    """An endpoint that never had frames is reported sooner than one whose client may restart."""
-    endpoint, silent = (
-        Client("autopilot"),
-        Finding("client_silent", Severity.WARNING, Subject.ENDPOINT, "autopilot", "", ""),
-    )
-
-    def began_after() -> float | None:
-        with capture_logs() as lines:
-            for second in range(60):
-                log.note_endpoint(endpoint)
-                log.write_findings([silent], float(second))
-                if lines:
-                    log.forget_endpoint("autopilot")
-                    log.write_findings([], 60.0)
-                    return second
-        return None
-
-    assert began_after() == FINDING_DELAY_S
-    endpoint.counters.frames += 1
-    assert began_after() == CLIENT_RESTART_S
+    """A finding about an endpoint is logged later than one about a peer: its client may restart."""
+    silent = Finding("client_silent", Severity.WARNING, Subject.ENDPOINT, "autopilot", "", "")
+    with capture_logs() as lines:
+        log.write_findings([silent], 0.0)
+        log.write_findings([silent], ENDPOINT_DELAY_S - 1.0)
+        assert not lines
+        log.write_findings([silent], ENDPOINT_DELAY_S)
+    assert [line["event"] for line in lines] == ["problem_began"]
 
 
 def test_withheld_commands_are_not_a_warning(log: EventLog) -> None:
@@ -118,7 +105,7 @@ async def test_problems_of_a_refused_configuration_control_no_terminal(monkeypat
     parts = SimpleNamespace(config=SimpleNamespace(path="a.toml"), local=None)
     stub = SimpleNamespace(parts=parts, log=structlog.get_logger())
     with capture_logs() as lines, pytest.raises(ConfigError):
-        await daemon.Daemon._reload(cast(daemon.Daemon, stub))
+        await daemon.Daemon._apply_file(cast(daemon.Daemon, stub))
     ((problems, event),) = [(line["problems"], line["event"]) for line in lines]
     assert event == "configuration_refused"
     assert problems == [r"a\x1b]0;owned\x07.toml:1:1: name: is missing", "b.toml: empty"]

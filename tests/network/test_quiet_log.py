@@ -18,7 +18,6 @@ import pytest
 import structlog
 from structlog.testing import LogCapture
 
-from tests.link.test_switch import Client
 from tests.network.network import Drone, Network
 from tests.policies import TRUSTED
 from uavlinkd.config import PeerConfig
@@ -58,7 +57,6 @@ class LoggedDaemon:
             link = PeerLink(PeerConfig(peer.settings, (), TRUSTED), Carriage(drone.node, lambda _: None), now)
             link.peers.append(peer)
             self.links.append(link)
-        self.client = Client("autopilot")
 
     @property
     def lines(self) -> list[MutableMapping[str, Any]]:
@@ -73,7 +71,6 @@ class LoggedDaemon:
 
     def tick(self, now: float) -> None:
         """What a daemon does each second, while its autopilot sends frames that roles withhold."""
-        self.client.counters.frames += 100
         findings: list[Finding] = []
         for link in self.links:
             self.drops.add("frames_withheld", Refusal.MESSAGE_NOT_ALLOWED, link.name, 100, now, ATTITUDE)
@@ -81,7 +78,6 @@ class LoggedDaemon:
             self.events.check_link(link, now)
             if link.peer.unverified_since is not None:
                 findings.append(Finding("freshness_unverified", Severity.FAULT, Subject.PEER, link.name, "", ""))
-        self.events.note_endpoint(self.client)
         self.events.write_findings(findings, now)
         self.drops.check(now)
         self.events.check(now)

@@ -11,7 +11,6 @@ from structlog.typing import FilteringBoundLogger
 from uavlinkd.core import outputs as o
 from uavlinkd.core.path import Path
 from uavlinkd.core.settings import link_name
-from uavlinkd.endpoints.ports import Endpoint
 from uavlinkd.link.conditions import Conditions, LineLimits, OpenCondition, Phase
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.ops.findings import Finding, Severity, Subject
@@ -21,8 +20,8 @@ from uavlinkd.ops.log import shown
 FINDING_DELAY_S = 2.0
 """A finding is logged if it lasts for so long; one about an attack at once. Three lost answers in a row make a moment
 of unverified freshness, which 1 % of loss causes about once a day."""
-CLIENT_RESTART_S = 15.0
-"""The same for an endpoint that had frames before: its client may restart."""
+ENDPOINT_DELAY_S = 15.0
+"""The same for an endpoint: its client may restart."""
 FINDING_QUIET_S = 10.0
 """A finding has ended when it was absent for so long, see :data:`uavlinkd.link.conditions.QUIET_S`."""
 
@@ -45,9 +44,7 @@ class EventLog:
         self._limits = limits or LineLimits()
         self._network_of = network_of
         self._states: dict[str, _State] = {}  # of a peer: the latest that was omitted
-        self._used: set[str] = set()  # endpoints that have had frames
         self._watches: dict[str, LinkWatch] = {}
-        self._shares: dict[tuple[str, LinkProblem], float] = {}
         self._findings: dict[_FindingKey, Finding] = {}
         self._present: dict[_FindingKey, float] = {}  # since when
         self._forgotten: Counter[LinkProblem] = Counter()  # problems of peers that were removed
@@ -99,8 +96,6 @@ class EventLog:
             self._forgotten += self._watches.pop(name).totals
         for name in [name for name in self._states if link_name(name) == peer]:
             del self._states[name]
-        for key in [key for key in self._shares if link_name(key[0]) == peer]:
-            del self._shares[key]
         self._limits.forget(lambda name: link_name(name) == peer)
         self._repairs.pop(peer, None)
 
@@ -163,14 +158,8 @@ class EventLog:
 
     # Conditions.
 
-    def note_endpoint(self, endpoint: Endpoint) -> None:
-        """Note whether an endpoint has had frames. Call it about once a second."""
-        if endpoint.counters.frames:
-            self._used.add(endpoint.name)
-
     def forget_endpoint(self, name: str) -> None:
         """The endpoint was closed; a later one of that name starts without history."""
-        self._used.discard(name)
         self._finding_conditions.close(lambda key: key[1] is Subject.ENDPOINT and key[2] == name)
 
     def check_link(self, link: PeerLink, now: float) -> None:
@@ -185,7 +174,7 @@ class EventLog:
             key = peer, problem
             is_open = key in self._problem_conditions
             if growth.minute and is_noteworthy(problem, growth, is_logged=is_open):
-                self._shares[key] = growth.share
+                watch.shares[problem] = growth.share
                 self._problem_conditions.note(key, now, growth.since if is_open else growth.minute)
 
     def _check_repair(self, link: PeerLink, now: float) -> None:
@@ -208,7 +197,7 @@ class EventLog:
             log.info("link_problem_ended", duration_s=condition.duration_s)
             return
         if THRESHOLDS[problem].share:
-            log = log.bind(share=round(self._shares[key], 3))
+            log = log.bind(share=round(self._watches[peer].shares[problem], 3))
         if phase is Phase.BEGAN:
             log.warning("link_problem_began", meaning=problem.meaning)
         else:
@@ -239,15 +228,11 @@ class EventLog:
             key = finding.cause, finding.subject, finding.name
             present[key] = since = self._present.get(key, now)
             self._findings[key] = finding
-            if now - since >= self._delay_s(finding) or key in self._finding_conditions:
+            delay_s = ENDPOINT_DELAY_S if finding.subject is Subject.ENDPOINT else FINDING_DELAY_S
+            is_urgent = finding.severity is Severity.SECURITY or key in self._finding_conditions
+            if is_urgent or now - since >= delay_s:
                 self._finding_conditions.note(key, now)
         self._present = present
-
-    def _delay_s(self, finding: Finding) -> float:
-        if finding.severity is Severity.SECURITY:
-            return 0.0
-        is_restart = finding.subject is Subject.ENDPOINT and finding.name in self._used
-        return CLIENT_RESTART_S if is_restart else FINDING_DELAY_S
 
     def _write_finding(
         self, key: _FindingKey, phase: Phase, condition: OpenCondition, omitted: dict[str, int]
@@ -322,6 +307,8 @@ class LinkWatch:
     def __init__(self) -> None:
         self.totals: Counter[LinkProblem] = Counter()
         """All problems since the start."""
+        self.shares: dict[LinkProblem, float] = {}
+        """Of the envelopes, when a problem was noted last."""
         self._before: dict[LinkProblem, int] = {}
         self._received = self._received_before = 0
         self._steps: deque[tuple[float, Counter[LinkProblem], int]] = deque()

@@ -213,7 +213,6 @@ class LocalEndpoints:
         """Forget clients that have gone, log silent endpoints, and send RADIO_STATUS. Call it once a second."""
         for endpoint in self.endpoints:
             endpoint.do_housekeeping(now)
-            self._events.note_endpoint(endpoint)
             source, _ = self._sources[endpoint.name]
             if source is not None and radio is not None:
                 self._write(endpoint, source.frame(radio), now)
