@@ -70,11 +70,6 @@ class OpenCondition:
     interval_s: float = HOUR_S
     """From its previous line to the next one."""
 
-    def has_grown(self, now: float) -> bool:
-        """Whether it occurs far more often than its previous line says."""
-        is_early = now < self.line_at - self.interval_s + EARLY_S
-        return not is_early and self.count - self.counted >= max(GROWTH_FROM, GROWTH * self.gained)
-
     def note_line(self, now: float) -> None:
         """A line is written now."""
         self.gained, self.counted = self.count - self.counted, self.count
@@ -99,15 +94,15 @@ class LineLimits:
 
     def take(self, kind: str, name: str, now: float, *, is_security: bool = False) -> dict[str, int] | None:
         """The field with the count of omitted lines; None if this line exceeds a limit."""
-        limits, own, all_of_kind = self._limits, (kind, name, is_security), (kind, None, is_security)
-        limit = limits.get(own) or limits.setdefault(own, TokenBucket(LINES_PER_S, LINES_BURST, now))
-        total = limits.get(all_of_kind) or limits.setdefault(
-            all_of_kind, TokenBucket(TOTAL_LINES_PER_S, TOTAL_BURST, now)
-        )
+        limit = self._limit((kind, name, is_security), LINES_PER_S, LINES_BURST, now)
+        total = self._limit((kind, None, is_security), TOTAL_LINES_PER_S, TOTAL_BURST, now)
         if not (limit.has(now) and total.take(now)):
             return None
         limit.take(now)
         return self.pop_omitted(kind, name)
+
+    def _limit(self, key: tuple[str, str | None, bool], rate: float, burst: int, now: float) -> TokenBucket:
+        return self._limits.get(key) or self._limits.setdefault(key, TokenBucket(rate, burst, now))
 
     def pop_omitted(self, kind: str, name: str) -> dict[str, int]:
         """The field with the count of omitted lines, for a line that is written in any case."""
@@ -209,8 +204,11 @@ class Conditions(Generic[K]):
             condition.note_line(now)
             self._write(key, Phase.BEGAN, condition, omitted)
 
-    def _is_flood(self, key: K, condition: OpenCondition, now: float) -> bool:
-        return self._counts_events and condition.has_grown(now) and self._limit_of(key)[1]
+    def _is_flood(self, key: K, one: OpenCondition, now: float) -> bool:
+        """Whether a security condition occurs far more often than its previous line says."""
+        is_early = now < one.line_at - one.interval_s + EARLY_S
+        has_grown = one.count - one.counted >= max(GROWTH_FROM, GROWTH * one.gained)
+        return self._counts_events and not is_early and has_grown and self._limit_of(key)[1]
 
     def _end(self, key: K, condition: OpenCondition, now: float) -> None:
         if not condition.is_logged:

@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Container, Mapping, Sequence
 from math import ceil, inf, log, prod
-from typing import Final, NamedTuple
+from typing import Final
 
 from uavlinkd.core.constants import TRANSMISSIONS
 from uavlinkd.core.outputs import Transmit
@@ -61,17 +61,21 @@ KNOWN_S: Final = 30.0
 """A path that does not answer is considered for this time: at 70 % loss in each direction, answers are rare."""
 
 
-class Released(NamedTuple):
-    """A transmission to send now, and its number along its path: 1 for a copy that waited, from 2 for repeats."""
-
-    transmit: Transmit
-    number: int
-
-
 class _Waiting:
     """A sealed datagram that waits: a copy for one path, or an envelope that is sent again along its paths."""
 
-    __slots__ = ("datagram", "due_at", "is_replaceable", "last", "number", "paths", "put_at", "rank", "states")
+    __slots__ = (
+        "datagram",
+        "due_at",
+        "is_copy",
+        "is_replaceable",
+        "last",
+        "number",
+        "paths",
+        "put_at",
+        "rank",
+        "states",
+    )
 
     def __init__(
         self, datagram: bytes, paths: Sequence[Path], frames: Sequence[Frame], last: int, now: float
@@ -81,17 +85,14 @@ class _Waiting:
         self.number = min(last, 2)
         """Of the next transmission along each path."""
         self.last = last
+        self.is_copy = last == 1
+        """Whether it waits for its first transmission."""
         self.put_at = now
         self.due_at = now if last == 1 else now + SPACING_S
         kinds = [frame.header.kind for frame in frames]
         self.is_replaceable = all(kind.is_state for kind in kinds)
         self.states: set[FlowKey] = {flow_key(frame) for frame in frames if frame.header.kind.is_state}
         self.rank = min(map(_rank_of, frames))
-
-    @property
-    def is_copy(self) -> bool:
-        """Whether it waits for its first transmission."""
-        return self.last == 1
 
 
 def _rank_of(frame: Frame) -> int:
@@ -164,15 +165,19 @@ class Copies:
         """An envelope with these frames was sent along these paths; send it up to so many times in all, from 2."""
         self._put(_Waiting(datagram, paths, frames, transmissions, now))
 
-    def release(self, usable: Container[Path], now: float) -> list[Released]:
-        """What is due and has room. What waited too long is dropped. Repeats go along ``usable`` paths only."""
+    def release(self, usable: Container[Path], now: float) -> list[tuple[Transmit, int]]:
+        """What is due and has room, each with its number along its path: 1 for a copy, from 2 for repeats.
+
+        What waited too long is dropped. Repeats go along ``usable`` paths only.
+        """
         self._drop([one for one in self._waiting if now >= one.put_at + MAX_WAIT_S], ShellReason.COPY_OVER_BUDGET)
         for one in self._waiting:
             if not one.is_copy:
                 one.paths = [path for path in one.paths if path in usable]
-        released: list[Released] = []
+        released: list[tuple[Transmit, int]] = []
         blocked: set[Path] = set()  # copies wait for these
-        for one in sorted((one for one in self._waiting if one.due_at <= now), key=_send_order):
+        due = [one for one in self._waiting if one.due_at <= now]
+        for one in sorted(due, key=lambda one: (not one.is_copy, one.rank, one.number)):
             number, rate = one.number, self._rate if one.is_copy else self._average
             for path in one.paths:
                 transmit = Transmit(one.datagram, path, is_copy=True)
@@ -184,7 +189,7 @@ class Copies:
                 if number > 1:
                     self.repeats_sent += 1
                     self.repeat_bytes += wire_bytes(transmit.datagram, path)
-                released.append(Released(transmit, number))
+                released.append((transmit, number))
                 one.number = number + 1
                 one.due_at = now + SPACING_S * 2 ** (number - 1)
         self._waiting = [one for one in self._waiting if one.number <= one.last and one.paths]
@@ -263,7 +268,7 @@ class Copies:
         rivals = [one for one in rivals if one not in replaced] + [newer]
         size = sum(len(one.datagram) for one in rivals)
         while size > MAX_WAITING_BYTES if newer.is_copy else len(rivals) > MAX_ENVELOPES:
-            least = max(rivals, key=_drop_order)
+            least = max(rivals, key=lambda one: (one.rank, one.number))
             rivals.remove(least)
             size -= len(least.datagram)
             self._drop([least], ShellReason.COPY_OVER_BUDGET)
@@ -272,14 +277,6 @@ class Copies:
         if gone:
             self._waiting = [one for one in self._waiting if one not in gone]
             self.dropped[reason] += len(gone)
-
-
-def _send_order(one: _Waiting) -> tuple[bool, int, int]:
-    return not one.is_copy, one.rank, one.number
-
-
-def _drop_order(one: _Waiting) -> tuple[int, int]:
-    return one.rank, one.number
 
 
 def transmissions_for(loss: float) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from operator import itemgetter
+from operator import itemgetter, sub
 from typing import NamedTuple
 
 from uavlinkd.config import PeerConfig
@@ -129,7 +129,8 @@ class PeerLink:
         self._answers = ParameterAnswers()
         self._newest: dict[LinkedPeer, NewestStates] = {}
         self._direct: Sequence[Path] = ()
-        self._sample: _Sample | None = None
+        self._sample: tuple[int, tuple[int, int, int, int]] | None = None
+        # A session, and its counters at one moment: expected and received here, and as the peer reports.
         self.output = PeerOutput(
             config.egress, carriage.node, carriage.budgets, self._answers.class_of, self._on_sent, now
         )
@@ -286,19 +287,20 @@ class PeerLink:
         peer = self.peer
         if peer.is_up:
             self.silent_since = now
-        before, self._sample = self._sample, _sample(peer)
+        session, before, self._sample = peer.sessions.current, self._sample, None
+        if session is not None:
+            counts = session.expected, session.received, *peer.traffic.reported
+            self._sample = session.local_index, counts
         self.rates.measure(peer, now)
         loss_in = loss_out = 0.0
         best = peer.paths.best
         if best is not None and peer.paths.has_several:
             loss_in, loss_out = best.loss_in, best.loss_out  # gaps in the counters say nothing about one path
-        elif before is not None and before.session == self._sample.session:
-            loss_in = _lost(self._sample.expected - before.expected, self._sample.received - before.received)
-            there = self._sample.expected_there - before.expected_there
+        elif self._sample is not None and before is not None and before[0] == self._sample[0]:
+            expected, received, expected_there, received_there = map(sub, self._sample[1], before[1])
+            loss_in = _lost(expected, received)
             # The peer reports now and then. Until the next report the last one is valid.
-            loss_out = (
-                _lost(there, self._sample.received_there - before.received_there) if there else self.figures.loss_out
-            )
+            loss_out = _lost(expected_there, received_there) if expected_there else self.figures.loss_out
         self.output.measure(peer, now)
         self.follow_paths(now)
         self.figures = LinkFigures(
@@ -343,23 +345,6 @@ def radio_figures(links: Iterable[PeerLink]) -> LinkFigures | None:
     by_role = [(link.config.policy.get("role"), link.figures) for link in links]
     chosen = [figures for role, figures in by_role if role == "operator"] or [figures for _, figures in by_role]
     return worst(chosen) if chosen else None
-
-
-class _Sample(NamedTuple):
-    """Counters of a session at one moment, here and as the peer reports."""
-
-    session: int = 0
-    expected: int = 0
-    received: int = 0
-    expected_there: int = 0
-    received_there: int = 0
-
-
-def _sample(peer: Peer) -> _Sample:
-    session = peer.sessions.current
-    if session is None:
-        return _Sample()
-    return _Sample(session.local_index, session.expected, session.received, *peer.traffic.reported)
 
 
 def _lost(expected: int, received: int) -> float:

@@ -13,7 +13,6 @@ from operator import itemgetter
 from uavlinkd.core.constants import CRITICAL_ENVELOPE_LIMIT, NEVER
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Output, Transmit
-from uavlinkd.core.path import Path
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.settings import Class, Redundancy
 from uavlinkd.link.copies import Copies, Repair
@@ -90,7 +89,7 @@ class PeerOutput:
                     self._node.recount(peer, path, 1, len(datagram))
                 else:
                     self._node.note_repeat(peer, path, number, datagram)
-            self._on_sent([], [one.transmit for one in released], now)
+            self._on_sent([], [transmit for transmit, _ in released], now)
 
     def next_deadline(self, now: float) -> float:
         """When :meth:`send_waiting` is due."""
@@ -144,8 +143,9 @@ class PeerOutput:
 
     def _follow_networks(self, peer: Peer, now: float) -> None:
         routes = {cls: [state for state in route if state.works] or route for cls, route in peer.paths.routes.items()}
+        buckets = {number: budget.all for number, budget in self._budgets.items()}
         networks = {
-            cls: [self._bucket_of(state.path) for state in (route if cls is Class.CRITICAL else route[:1])]
+            cls: [buckets.get(state.path.socket) for state in (route if cls is Class.CRITICAL else route[:1])]
             for cls, route in routes.items()
         }
         if networks == self._networks or not networks[Class.CRITICAL]:
@@ -156,10 +156,6 @@ class PeerOutput:
             self.egress = PeerEgress(self._settings, now, self._class_of)
         if self.egress is not None:
             self.egress.set_networks(networks, now)
-
-    def _bucket_of(self, path: Path) -> Bucket | None:
-        budget = self._budgets.get(path.socket)
-        return None if budget is None else budget.all
 
     def measure(self, peer: Peer, now: float) -> None:
         """Note the rate of the stream, which copies may use too, and the loss of paths. Call it once a second."""
@@ -211,14 +207,10 @@ class PeerOutput:
         if len(outputs) > 1:
             outputs = self._pick_copies(peer, outputs, frames if cls is Class.CRITICAL else None, now)
         if cls is Class.CRITICAL and self.repair.is_on:
-            self._repeat(outputs, frames, now)
+            for datagram, sent in _by_datagram(outputs).items():  # along the same paths
+                paths = [transmit.path for transmit in sent]
+                self.copies.repeat(datagram, paths, frames, self.repair.transmissions, now)
         self._on_sent(raws, outputs, now)
-
-    def _repeat(self, outputs: Sequence[Output], frames: Sequence[Frame], now: float) -> None:
-        """Have what was sent repeated, along the same paths."""
-        for datagram, sent in _by_datagram(outputs).items():
-            along = [transmit.path for transmit in sent]
-            self.copies.repeat(datagram, along, frames, self.repair.transmissions, now)
 
     def _pick_copies(
         self, peer: Peer, outputs: Sequence[Output], frames: Sequence[Frame] | None, now: float

@@ -171,18 +171,15 @@ class PeerSockets:
                 self._add_slot(_Slot(one.number, one.family))
             self.networks.open(monotonic())
         else:
-            self._open_addresses(addresses)
+            for number, address in enumerate(addresses or _EPHEMERAL):
+                try:
+                    sock = udp_socket(address, may_come_later=True)
+                except BindError as error:
+                    raise BindError(f"listen: {error}") from None
+                self._add_slot(_Slot(number, sock.family))
+                self.put(number, sock)
         self._add_serial([network for network in networks if network.serial is not None])
         self._add_budgets(monotonic())
-
-    def _open_addresses(self, addresses: Sequence[Address]) -> None:
-        for number, address in enumerate(addresses or _EPHEMERAL):
-            try:
-                sock = udp_socket(address, may_come_later=True)
-            except BindError as error:
-                raise BindError(f"listen: {error}") from None
-            self._add_slot(_Slot(number, sock.family))
-            self.put(number, sock)
 
     def _add_serial(self, configs: Sequence[NetworkConfig]) -> None:
         self.serial = SerialNetworks(configs, len(self._slots), self._node, self._stall, self._log)
@@ -376,18 +373,12 @@ class PeerSockets:
             if (path := self.serial.path_to(written.network)) is not None:
                 yield path
             return
-        for family, sockaddr in resolved:
-            for slot in self._slots:
-                if slot.family == family and self._may_use(slot.number, written, sockaddr):
-                    yield Path(slot.number, sockaddr)
-
-    def _may_use(self, number: int, written: PeerAddress, sockaddr: SocketAddress) -> bool:
-        """Whether the daemon sends to an address of a peer from a socket of its family."""
         networks = self.networks
-        if networks is None:
-            return True
-        network, _ = networks.of_number[number]
-        return written.network in ("", network.config.name) and networks.may_reach(number, sockaddr)
+        for family, sockaddr in resolved:
+            for number in (slot.number for slot in self._slots if slot.family == family):
+                is_named = networks is not None and written.network in ("", self.network_name(number))
+                if networks is None or (is_named and networks.may_reach(number, sockaddr)):
+                    yield Path(number, sockaddr)
 
     def stop_following(self, name: str) -> None:
         """Stop resolving this peer's names."""
