@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING
 
 import structlog
 
-from uavlinkd.config import Config, ConfigError
+from uavlinkd.config import Config, ConfigError, Problem
 from uavlinkd.config.changes import compare
 from uavlinkd.config.load import load_in_thread
 from uavlinkd.core.path import Path
+from uavlinkd.endpoints.sockets import BindError
 from uavlinkd.link.carrier import FrameCarrier
 from uavlinkd.link.diagnosis import find
 from uavlinkd.link.local_endpoints import PilotNotes
@@ -107,7 +108,7 @@ class Daemon:
             parts.recorder = Recorder(config.recording, self.log)
         self.carrier.peers.start()
         parts.peer_sockets.start(self.carrier.receive, self.carrier.arm)
-        parts.local.start(config.endpoints)
+        parts.local.start()
         self._write_warnings()
         self.log.info(
             "daemon_started",
@@ -212,15 +213,17 @@ class Daemon:
         try:
             config = await load_in_thread(before.path, os.environ)
             changes = compare(before, config)
-            opened = local.open_new(config, before, changes)
+            try:
+                local.open(changes.opened_endpoints, leaving=changes.closed_endpoints)
+            except BindError as error:
+                raise ConfigError((Problem(str(config.path), "", str(error)),)) from None
         except ConfigError as error:
             self.log.error("configuration_refused", problems=[printable(line) for line in str(error).split("\n")])
             raise
         self.carrier.peers.follow(config, changes)
         for name in changes.closed_endpoints:
             local.close_one(name)
-        for endpoint, endpoint_config in zip(opened, changes.opened_endpoints, strict=True):
-            local.add(endpoint, endpoint_config)
+        local.start()
         for endpoint_config in changes.changed_endpoints:
             local.change(endpoint_config)
         self._write_warnings()

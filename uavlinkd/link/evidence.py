@@ -10,6 +10,7 @@ from __future__ import annotations
 import errno
 from collections import deque
 from collections.abc import Hashable, Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Final, Generic, NamedTuple, TypeVar
 
 from uavlinkd.core.drops import Detail, DropReason
@@ -77,10 +78,10 @@ class Evidence:
     """The latest evidence by kind and place. Times are monotonic seconds."""
 
     def __init__(
-        self, links: Mapping[str, PeerLink], own_key: bytes, relays: Mapping[str, RelayLink] | None = None
+        self, links: Mapping[str, PeerLink], own_key: bytes, relays: Mapping[str, RelayLink] = MappingProxyType({})
     ) -> None:
         self._links = links
-        self.relays = {} if relays is None else relays
+        self.relays = relays
         """The relays that this daemon uses, by name."""
         self._own_key = own_key
         self.own_key_elsewhere: tuple[float, SocketAddress | None] | None = None
@@ -322,25 +323,17 @@ class History:
         """When the last pause of the process ended, and its duration in seconds."""
         self.former_keys: dict[bytes, str] = {}
         """Public keys that the configuration had before, with the peer's name. The oldest first."""
-        self._peers: dict[str, PartHistory] = {}
-        self._endpoints: dict[str, PartHistory] = {}
+        self._parts: dict[tuple[str, str], PartHistory] = {}
         self._sessions: dict[str, deque[SessionBegin]] = {}
 
-    def peer(self, name: str) -> PartHistory:
-        """The history of a peer; an empty one before the first sample."""
-        return self._peers.get(name) or PartHistory(self.began_at)
-
-    def endpoint(self, name: str) -> PartHistory:
-        """The history of an endpoint; an empty one before the first sample."""
-        return self._endpoints.get(name) or PartHistory(self.began_at)
+    def part(self, kind: str, name: str) -> PartHistory:
+        """The history of a ``peer`` or ``endpoint``; an empty one before the first sample."""
+        return self._parts.get((kind, name)) or PartHistory(self.began_at)
 
     def blocked(self, now: float) -> list[Blocked]:
         """The directions in which a policy recently refused all frames."""
         return [
-            (kind, name, direction)
-            for kind, parts in (("peer", self._peers), ("endpoint", self._endpoints))
-            for name, part in parts.items()
-            for direction in part.blocked(now)
+            (kind, name, direction) for (kind, name), part in self._parts.items() for direction in part.blocked(now)
         ]
 
     def sessions(self, name: str) -> list[SessionBegin]:
@@ -362,14 +355,15 @@ class History:
 
     def sample(self, links: Iterable[PeerLink], endpoints: Iterable[tuple[Endpoint, Policy]], now: float) -> None:
         """Read the counters. Call it once a second. Peers and endpoints that are not named are forgotten."""
-        peers, self._peers = self._peers, {}
+        before, self._parts = self._parts, {}
         for link in links:
-            history = self._peers[link.name] = peers.get(link.name) or PartHistory(now)
-            history.update(link.counters.frames, link.frames_sent, link.policy, now)
-        before, self._endpoints = self._endpoints, {}
+            part = self._parts["peer", link.name] = before.get(("peer", link.name)) or PartHistory(now)
+            part.update(link.counters.frames, link.frames_sent, link.policy, now)
         for endpoint, policy in endpoints:
-            history = self._endpoints[endpoint.name] = before.get(endpoint.name) or PartHistory(now)
-            history.update(endpoint.counters.frames, endpoint.frames_sent, policy, now)
-            history.failures.update(endpoint.failures, now)
-            history.garbage.update({"bytes": endpoint.counters.garbage_bytes}, now)
-        self._sessions = {name: begins for name, begins in self._sessions.items() if name in self._peers}
+            part = self._parts["endpoint", endpoint.name] = before.get(("endpoint", endpoint.name)) or PartHistory(
+                now
+            )
+            part.update(endpoint.counters.frames, endpoint.frames_sent, policy, now)
+            part.failures.update(endpoint.failures, now)
+            part.garbage.update({"bytes": endpoint.counters.garbage_bytes}, now)
+        self._sessions = {name: begins for name, begins in self._sessions.items() if ("peer", name) in self._parts}

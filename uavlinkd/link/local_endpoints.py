@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from typing import Final, NamedTuple
 
-from uavlinkd.config import Config, ConfigError, EndpointConfig, Problem
-from uavlinkd.config.changes import ConfigChanges
+from uavlinkd.config import EndpointConfig
 from uavlinkd.core.constants import NEVER
 from uavlinkd.core.refusals import Refused
 from uavlinkd.core.settings import Class
@@ -73,10 +72,6 @@ def open_endpoint(config: EndpointConfig, handler: PortHandler, instead_of: Endp
     raise AssertionError(f"no endpoint is of the kind {config.url.kind}")
 
 
-def _key(config: EndpointConfig) -> str:
-    return f"endpoint.url ({config.name})"
-
-
 class LocalEndpoints:
     """Opens and closes the endpoints, adds their clients to the switch, and sends them RADIO_STATUS."""
 
@@ -90,6 +85,8 @@ class LocalEndpoints:
         """Of :class:`uavlinkd.endpoints.ports.PortHandler`, without a call in between."""
         self._switch = switch
         self._events = events
+        self._opened: list[tuple[Endpoint, EndpointConfig]] = []  # and not started yet
+        self._urls: dict[str, NetworkUrl | SerialUrl] = {}
         self._sources: dict[str, tuple[RadioStatusSource | None, StatusTextSource | None]] = {}
         self._own = Source(name, compile_policy({}, is_local=True).incoming)
         self._gather_s = 0.0
@@ -101,57 +98,40 @@ class LocalEndpoints:
 
     # From the configuration.
 
-    def open(self, configs: Sequence[EndpointConfig]) -> None:
-        """Bind the endpoints of a daemon that starts.
+    def open(self, configs: Sequence[EndpointConfig], leaving: Collection[str] = ()) -> None:
+        """Bind endpoints. :meth:`start` starts them.
+
+        One with the URL of an endpoint in ``leaving``, which is about to be closed, takes over its socket. So
+        endpoints can be renamed, or swap ports.
 
         Raises:
-            BindError: if the daemon cannot listen on an address. The message names the key.
+            BindError: one cannot be opened. Then none is, and the others are as they were. The message names the key.
         """
+        shared = {self._urls[one.name]: one for one in self.endpoints if one.name in leaving}
         for config in configs:
             try:
-                self.endpoints.append(open_endpoint(config, self))
-            except BindError as error:
-                raise BindError(f"{_key(config)}: {error}") from None
-
-    def start(self, configs: Sequence[EndpointConfig]) -> None:
-        """Start the endpoints that :meth:`open` has bound."""
-        for endpoint, config in zip(self.endpoints, configs, strict=True):
-            self._start(endpoint, config)
-
-    def open_new(self, config: Config, before: Config, changes: ConfigChanges) -> list[Endpoint]:
-        """Bind the endpoints that a new configuration adds. :meth:`add` starts them.
-
-        An endpoint that listens at the same address as one that is closed takes over its socket. So endpoints can be
-        renamed, or swap ports.
-
-        Raises:
-            ConfigError: if one cannot be opened. Then none is, and the others are as they were.
-        """
-        urls = {endpoint.name: endpoint.url for endpoint in before.endpoints}
-        leaving = {
-            urls[endpoint.name]: endpoint for endpoint in self.endpoints if endpoint.name in changes.closed_endpoints
-        }
-        opened: list[Endpoint] = []
-        for endpoint_config in changes.opened_endpoints:
-            try:
-                opened.append(open_endpoint(endpoint_config, self, leaving.get(endpoint_config.url)))
+                self._opened.append((open_endpoint(config, self, shared.get(config.url)), config))
             except (BindError, OSError) as error:
-                for endpoint in opened:
+                for endpoint, _ in self._opened:
                     endpoint.close()
-                is_taken = isinstance(error, BindError) and error.is_taken
-                remedy = "; if it is this daemon, restart it" if is_taken else ""
-                problem = Problem(str(config.path), _key(endpoint_config), f"{error}{remedy}")
-                raise ConfigError((problem,)) from None
-        return opened
+                self._opened.clear()
+                is_own = bool(self.endpoints) and isinstance(error, BindError) and error.is_taken
+                remedy = "; if it is this daemon, restart it" if is_own else ""
+                raise BindError(f"endpoint.url ({config.name}): {error}{remedy}") from None
 
-    def add(self, endpoint: Endpoint, config: EndpointConfig) -> None:
-        """Start an endpoint that :meth:`open_new` has bound."""
-        self.endpoints.append(endpoint)
-        self._start(endpoint, config)
+    def start(self) -> None:
+        """Start the endpoints that :meth:`open` has bound."""
+        for endpoint, config in self._opened:
+            self.endpoints.append(endpoint)
+            self.change(config)
+            endpoint.gather(self._gather_s)
+            endpoint.start()
+        self._opened.clear()
 
     def change(self, config: EndpointConfig) -> None:
         """Apply other rules to an endpoint. Its clients stay connected."""
         policy = self.policies[config.name] = config.make_policy()
+        self._urls[config.name] = config.url
         for endpoint in self.endpoints:
             if endpoint.name == config.name:
                 for port in endpoint.ports:
@@ -168,12 +148,12 @@ class LocalEndpoints:
         for port in endpoint.ports:
             self._switch.remove(port)
         endpoint.close()
-        del self.policies[name], self._sources[name]
+        del self.policies[name], self._sources[name], self._urls[name]
         self._events.forget_endpoint(name)
 
     def close(self) -> None:
         """Close all endpoints."""
-        for endpoint in self.endpoints:
+        for endpoint in (*self.endpoints, *(opened for opened, _ in self._opened)):
             endpoint.close()
 
     def gather(self, seconds: float) -> None:
@@ -181,11 +161,6 @@ class LocalEndpoints:
         self._gather_s = seconds
         for endpoint in self.endpoints:
             endpoint.gather(seconds)
-
-    def _start(self, endpoint: Endpoint, config: EndpointConfig) -> None:
-        self.change(config)
-        endpoint.gather(self._gather_s)
-        endpoint.start()
 
     # Reports of the endpoints.
 
