@@ -12,7 +12,7 @@ from uavlinkd.core.settings import Class
 from uavlinkd.endpoints.ports import Endpoint, LocalPort, PortHandler
 from uavlinkd.endpoints.sockets import BindError, udp_socket
 from uavlinkd.endpoints.udp import UdpClient, UdpServer
-from uavlinkd.endpoints.url import EndpointKind, NetworkUrl, SerialUrl
+from uavlinkd.endpoints.url import EndpointKind, EndpointUrl, NetworkUrl, SerialUrl
 from uavlinkd.link.event_log import EventLog
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.switch import Switch
@@ -86,7 +86,7 @@ class LocalEndpoints:
         self._switch = switch
         self._events = events
         self._opened: list[tuple[Endpoint, EndpointConfig]] = []  # and not started yet
-        self._urls: dict[str, NetworkUrl | SerialUrl] = {}
+        self._urls: dict[str, EndpointUrl] = {}
         self._sources: dict[str, tuple[RadioStatusSource | None, StatusTextSource | None]] = {}
         self._own = Source(name, compile_policy({}, is_local=True).incoming)
         self._gather_s = 0.0

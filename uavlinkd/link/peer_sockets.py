@@ -267,7 +267,8 @@ class PeerSockets:
         """Close the sockets and stop resolving names."""
         for name in list(self._names):
             self.stop_following(name)
-        self.serial.close()
+        for line in self.serial.networks:
+            line.line.close()
         for slot in self._slots:
             self.put(slot.number, None)
 
@@ -365,7 +366,8 @@ class PeerSockets:
         """Report the sockets of absent networks to the core. Call it after other paths were set."""
         if self.networks is not None:
             self.networks.report_absent(now)
-        self.serial.report_absent()
+        for line in self.serial.networks:
+            line.report_state()
 
     def _paths_to(self, written: PeerAddress, resolved: Resolved) -> Iterator[Path]:
         """The paths to an address of a peer."""

@@ -272,10 +272,10 @@ class Relays:
             relay.on_event(event, now)
             if event.peer in relay.peers:  # not of a previous key that is not accepted any more
                 self._write(relay.config.name, event, now)
-        if isinstance(event, o.PathSuspected):
-            self.on_suspected(event.path)
-        else:
+        if not isinstance(event, o.PathSuspected):
             self._searches.on_event(event, now)
+        elif (relay := self._relay_of(event.path)) is not None:  # ask it on the same socket, bind the peer again
+            relay.ask(event.path)
 
     def _write(self, name: str, event: o.Event, now: float) -> None:
         """Log that a relay is reached or lost."""
@@ -300,11 +300,6 @@ class Relays:
         if (relay := self._of_peer.get(received.peer)) is None:
             return DropReason.UNEXPECTED_RECORD
         return relay.on_record(received, now)
-
-    def on_suspected(self, path: Path) -> None:
-        """A relayed path of a peer failed a moment ago: ask the relay on the same socket, and bind the peer again."""
-        if (relay := self._relay_of(path)) is not None:
-            relay.ask(path)
 
     def do_housekeeping(self, now: float) -> None:
         """Call it about once a second."""

@@ -20,6 +20,7 @@ from uavlinkd.core.constants import LINE_BYTES
 from uavlinkd.core.node import Node
 from uavlinkd.core.path import SERIAL_HOST, Path, SocketAddress
 from uavlinkd.core.path_measures import limit_at
+from uavlinkd.core.path_state import PathState
 from uavlinkd.core.peer import Peer
 from uavlinkd.endpoints.sockets import Presence
 from uavlinkd.link.conditions import LineLimits
@@ -125,6 +126,7 @@ class SerialNetwork:
     ) -> None:
         assert config.serial is not None, "a serial network has a device"
         self.config = config
+        self.name = config.name
         self.number = number
         self.path = Path(number, (SERIAL_HOST, 0))
         self.envelope_limit = limit_at(config.budget_bits_s)
@@ -147,11 +149,6 @@ class SerialNetwork:
             partial(self.report_state, is_change=True),
             stall,
         )
-
-    @property
-    def name(self) -> str:
-        """Its name in the configuration."""
-        return self.config.name
 
     def start(self, receive: Receive, on_change: Callable[[], None]) -> None:
         """Open the device, whenever it is present. ``on_change`` is called after the core got a change."""
@@ -187,23 +184,17 @@ class SerialNetwork:
         """Whether the device is open."""
         return Presence(hosts=(SERIAL_HOST,)) if self.line.is_open else Presence(reason=self.line.reason)
 
-    def add_round_trip(self, round_trip_s: float, answered_at: float) -> None:
-        """Note the last round trip along the line. One that was noted before does not count again."""
-        if answered_at > self._answered_at:
-            self._answered_at = answered_at
-            self.rate.add_round_trip(round_trip_s, answered_at)
-
-    def add_unanswered(self, total: int, now: float, *, is_asked: bool) -> None:
-        """Note the total of the peer's unanswered echo requests. ``is_asked``: they went along this line."""
-        if is_asked and total > self._unanswered:
-            self.rate.add_unanswered(total - self._unanswered, now)
-        self._unanswered = total
-
-    def bits_s(self, now: float) -> float:
-        """The rate at which this end sends now. The line is written at it from now on."""
-        bits_s = self.rate.bits_s(now)
-        self.line.set_rate(bits_s / 8)
-        return bits_s
+    def note_answers(self, peer: Peer, state: PathState, now: float) -> None:
+        """Note the last round trip along the line, and echo requests without an answer. Each counts once."""
+        if state.round_trip_s is not None and state.answered_at > self._answered_at:
+            self._answered_at = state.answered_at
+            self.rate.add_round_trip(state.round_trip_s, state.answered_at)
+        unanswered, self._unanswered = (
+            peer.traffic.echoes_unanswered - self._unanswered,
+            peer.traffic.echoes_unanswered,
+        )
+        if unanswered > 0 and state is peer.paths.best and not state.is_off:  # they went along this line
+            self.rate.add_unanswered(unanswered, now)
 
     @property
     def recent_reports(self) -> int:
@@ -302,34 +293,20 @@ class SerialNetworks:
             return {}
         for link in links:
             for state in link.peer.paths.states:
-                if (line := self.of_number.get(state.path.socket)) is None:
-                    continue
-                if state.round_trip_s is not None:
-                    line.add_round_trip(state.round_trip_s, state.answered_at)
-                unanswered = link.peer.traffic.echoes_unanswered
-                is_asked = state is link.peer.paths.best and not state.is_off
-                line.add_unanswered(unanswered, now, is_asked=is_asked)
+                if (line := self.of_number.get(state.path.socket)) is not None:
+                    line.note_answers(link.peer, state, now)
         has_changed = False
         for line in self.networks:
-            budget, bits_s = budgets[line.number], line.bits_s(now)
+            budget, bits_s = budgets[line.number], line.rate.bits_s(now)
+            line.line.set_rate(bits_s / 8)
             budget.set_rate(bits_s, now)
             has_changed |= budget.update_core(bits_s)
         return {line.number: budgets[line.number].core_bits_s for line in self.networks} if has_changed else {}
-
-    def report_absent(self) -> None:
-        """Report the devices that are not open. Call it after other paths were set: the core knows states by path."""
-        for network in self.networks:
-            network.report_state()
 
     def do_housekeeping(self) -> None:
         """Note what the lines received. Call it once a second."""
         for network in self.networks:
             network.do_housekeeping()
-
-    def close(self) -> None:
-        """Close the devices."""
-        for network in self.networks:
-            network.line.close()
 
     @property
     def totals(self) -> dict[str, int]:

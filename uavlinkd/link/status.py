@@ -18,7 +18,6 @@ from uavlinkd.mavlink.dialect import command_name, name_of
 from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.gate import ANY_OTHER, REFUSALS, Refusal
 from uavlinkd.ops.log import shown
-from uavlinkd.ops.recorder import Recorder
 from uavlinkd.ops.schema_versions import STATUS_SCHEMA
 from uavlinkd.relay.service import RelayMember, RelayService
 from uavlinkd.system.addresses import Address
@@ -57,7 +56,15 @@ def daemon_status(daemon: DaemonParts, now: float) -> dict[str, object]:
         "unrouted": _counts(daemon.switch.router.unrouted),
         "send_failures": dict(daemon.peer_sockets.failures),
         "relay": None if daemon.relay is None else relay_status(daemon.relay, now),
-        "recording": None if daemon.recorder is None else recording_status(daemon.recorder),
+        "recording": None
+        if (recorder := daemon.recorder) is None
+        else {
+            "is_recording": recorder.is_recording,
+            "frames": recorder.frames,
+            "bytes": recorder.bytes,
+            "frames_lost": recorder.frames_lost,
+            "failures": dict(recorder.failures),
+        },
     }
 
 
@@ -191,32 +198,23 @@ def endpoint_status(endpoint: Endpoint, policy: Policy, now: float) -> dict[str,
     }
 
 
-def recording_status(recorder: Recorder) -> dict[str, object]:
-    """The counts of recorded and lost frames."""
-    return {
-        "is_recording": recorder.is_recording,
-        "frames": recorder.frames,
-        "bytes": recorder.bytes,
-        "frames_lost": recorder.frames_lost,
-        "failures": dict(recorder.failures),
-    }
-
-
 def _refusals(policy: Policy) -> dict[str, object]:
     """Refused frames by direction, message and reason; COMMAND_LONG and COMMAND_INT also by command."""
     messages, commands = {}, {}
     for direction, gate in (("in", policy.incoming), ("out", policy.outgoing)):
-        messages[direction] = _by_name((name_of, *key, count) for key, count in gate.refused.items())
+        messages[direction] = _by_name(name_of, gate.refused.items())
         commands[direction] = _by_name(
-            (command_name, *key[1:], count) for key, count in gate.refused_commands.items()
+            command_name, ((key[1:], count) for key, count in gate.refused_commands.items())
         )
     return {"refused": messages, "refused_commands": commands}
 
 
-def _by_name(counts: Iterable[tuple[Callable[[int], str], int, Refusal, int]]) -> dict[str, dict[str, int]]:
+def _by_name(
+    name_of_number: Callable[[int], str], counts: Iterable[tuple[tuple[int, Refusal], int]]
+) -> dict[str, dict[str, int]]:
     named: dict[str, dict[str, int]] = {}
-    for name, number, refusal, count in counts:
-        reasons = named.setdefault("others" if number == ANY_OTHER else name(number), {})
+    for (number, refusal), count in counts:
+        reasons = named.setdefault("others" if number == ANY_OTHER else name_of_number(number), {})
         reasons[refusal.value] = reasons.get(refusal.value, 0) + count
     return named
 
