@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from socket import socket
+import math
 from types import SimpleNamespace
+from typing import Any
+from unittest.mock import Mock
 
 import pytest
+from structlog import get_logger
 
 from tests.core.harness import Pair, Side, of, quiet
 from uavlinkd.core import constants as c
@@ -17,7 +20,6 @@ from uavlinkd.link.direct_search import (
     LISTS,
     LISTS_PER_S,
     DirectSearch,
-    DirectSearches,
     OwnSocket,
     Place,
     is_private,
@@ -26,6 +28,8 @@ from uavlinkd.link.direct_search import (
     places_of,
 )
 from uavlinkd.link.event_log import LinkWatch, is_noteworthy
+from uavlinkd.link.peer_sockets import PeerSockets
+from uavlinkd.link.relays import Relays
 from uavlinkd.ops.link_problems import LinkProblem
 
 LINK = quiet(features=c.FEATURE_RECORDS)
@@ -231,35 +235,30 @@ def test_search_begins_again_when_it_may_help(is_relayed: bool, is_usable: bool,
     assert (network.search["a"].next_at == 3.0) is begins
 
 
-class _Sockets:
-    """Of a daemon without networks of its own."""
-
-    def numbered_sockets(self) -> list[tuple[int, socket]]:
-        """None."""
-        return []
-
-
 def test_relay_that_ends_handles_renews_no_limit() -> None:
     """It ends the handles and assigns them again ten times a second. The lists are limited, and keep their order."""
     network = Network()
     peer, path = network.pair.a.peer, network.pair.a.peer_at
     link = SimpleNamespace(peer=peer, relayed=[path])
-    links = {"bravo": link}
-    searches = DirectSearches(network.pair.a.node, _Sockets(), links)  # type: ignore[arg-type]
-    searches.follow([HOME_A], set(), 0.0)
-    assert searches.on_record(RecordReceived(peer, path, Candidates((HOME_B,)), 5), 0.0) is None
+    links: dict[str, Any] = {"bravo": link}
+    relays = Relays(network.pair.a.node, Mock(spec=PeerSockets, handles=None), links, {}, get_logger())
+    relays._looked_at, relays._own = math.inf, [OwnSocket(0, is_ipv6=False, places=(HOME_A,), leads_to=bool)]
+    relays.do_housekeeping(0.0)
+    assert relays.on_record(RecordReceived(peer, path, Candidates((HOME_B,)), 5), 0.0) is None
     lists = 0
     for round_ in range(200):
         now = 0.1 + round_ / 10
         for link.relayed in ([], [path]):
-            searches.follow([HOME_A], set(), now)
-        lists += sum(transmit.path.is_relayed for transmit in of(searches.handle_timeout(now), Transmit))
+            relays.do_housekeeping(now)
+        relays.on_event(PathStateChanged(peer, path, True, "answered"), now)
+        outputs = relays._searches[peer].do_due(now)
+        lists += sum(transmit.path.is_relayed for transmit in of(outputs, Transmit))
     assert LISTS <= lists <= LISTS + 20 * LISTS_PER_S + 1
     older = RecordReceived(peer, path, Candidates((HOME_A,)), 4)
-    assert searches.on_record(older, now) is DropReason.OLD_RECORD
+    assert relays.on_record(older, now) is DropReason.OLD_RECORD
     links.clear()
-    searches.follow([HOME_A], set(), now)
-    assert searches.on_record(older, now) is DropReason.UNEXPECTED_RECORD
+    relays.do_housekeeping(now)
+    assert relays.on_record(older, now) is DropReason.UNEXPECTED_RECORD
 
 
 def test_captured_member_cannot_make_a_peer_ask_without_end() -> None:

@@ -347,8 +347,8 @@ class Member(Drone):
         """What a daemon reads of its machine for the search of direct paths."""
         assert self.relays is not None
         places = enumerate(self.addresses) if self.searches else ()
-        self.relays._searches._looked_at = math.inf
-        self.relays._searches._own = [
+        self.relays._looked_at = math.inf
+        self.relays._own = [
             OwnSocket(number, is_ipv6=False, places=(address,), leads_to=lambda host: False)
             for number, address in places
         ]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import socket
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from functools import partial
 from ipaddress import ip_address, ip_network
 from typing import Final, NamedTuple
@@ -18,12 +18,11 @@ from uavlinkd.core.constants import NEVER
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.limits import TokenBucket
 from uavlinkd.core.node import Node
-from uavlinkd.core.outputs import Event, LinkedPeer, Output, PathStateChanged, RecordReceived, SessionEstablished
+from uavlinkd.core.outputs import Event, Output, PathStateChanged, RecordReceived, SessionEstablished
 from uavlinkd.core.path import Path
 from uavlinkd.core.path_state import PathCondition
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.relay_records import Candidates
-from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.peer_sockets import PeerSockets
 from uavlinkd.system.interfaces import find_interface, interface_names
 from uavlinkd.system.routes import leads_to, specific_routes
@@ -43,8 +42,6 @@ LISTS: Final = 20
 LISTS_PER_S: Final = 0.2
 """Lists of candidates that the peer gets at most, whatever a relay or the peer says: first so many, then so many a
 second."""
-LOOK_S: Final = 5.0
-"""How often the addresses and routes of this machine are read, while a peer is reached along a relay."""
 
 
 class OwnSocket(NamedTuple):
@@ -189,59 +186,6 @@ class DirectSearch:
         if later < 0:
             return min(c.CANDIDATE_TRY_S * 2.0**self._tries, c.CANDIDATE_TRY_MOST_S)
         return min(c.CANDIDATE_ROUND_S * 2.0 ** min(later, 8), c.CANDIDATE_ROUND_MOST_S)
-
-
-class DirectSearches:
-    """One :class:`.DirectSearch` for each peer that uses relays. Look at :attr:`next_at` after each call."""
-
-    def __init__(self, node: Node, sockets: PeerSockets, links: Mapping[str, PeerLink]) -> None:
-        self._node = node
-        self._sockets = sockets
-        self._links = links
-        self._searches: dict[LinkedPeer, DirectSearch] = {}
-        # Also of peers without a handle now. A relay must not reset limits and orders by ending handles.
-        self._looked_at = -NEVER
-        self._own: list[OwnSocket] = []
-
-    @property
-    def next_at(self) -> float:
-        """When :meth:`handle_timeout` has something to do."""
-        return min((search.next_at for search in self._searches.values()), default=NEVER)
-
-    def follow(self, seen: Iterable[Place], relays: set[Place], now: float) -> None:
-        """Begin and end searches. Call it about once a second.
-
-        ``seen``: this daemon's addresses as relays see them. ``relays``: where relays are.
-        """
-        before, links = self._searches, self._links.values()
-        self._searches = {
-            link.peer: before.get(link.peer) or DirectSearch(self._node, link.peer, now)
-            for link in links
-            if link.relayed or link.peer in before
-        }
-        if not any(link.relayed for link in links):
-            return
-        if now >= self._looked_at + LOOK_S:
-            self._looked_at = now
-            self._own = own_sockets(self._sockets)
-        places = places_of(seen, self._own)
-        for search in self._searches.values():
-            search.set_own(places, self._own, relays, now)
-
-    def on_event(self, event: Event, now: float) -> None:
-        """An event of a peer."""
-        if (search := self._searches.get(event.peer)) is not None:
-            search.on_event(event, now)
-
-    def on_record(self, received: RecordReceived, now: float) -> DropReason | None:
-        """A peer named its candidates. Returns why that has no effect; None if it has one."""
-        if (search := self._searches.get(received.peer)) is None:
-            return DropReason.UNEXPECTED_RECORD
-        return search.on_record(received, now)
-
-    def handle_timeout(self, now: float) -> list[Output]:
-        """Name candidates and ask. Call it at :attr:`next_at`."""
-        return [out for search in self._searches.values() if now >= search.next_at for out in search.do_due(now)]
 
 
 def own_sockets(sockets: PeerSockets) -> list[OwnSocket]:

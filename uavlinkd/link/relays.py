@@ -24,7 +24,7 @@ from uavlinkd.core.path_state import PathState
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.relay_records import TOKEN, Candidates, FilterTest, FilterTested, token_of
 from uavlinkd.link.conditions import LineLimits
-from uavlinkd.link.direct_search import DirectSearches, Place, own_sockets, places_of
+from uavlinkd.link.direct_search import DirectSearch, OwnSocket, Place, own_sockets, places_of
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.peer_sockets import PeerSockets
 from uavlinkd.link.relay_link import RelayLink
@@ -36,6 +36,8 @@ SILENT_RARE_S: Final = 1.1
 """The same for a peer that sends less: a ground station may send one heartbeat a second. While the silence lasts, the
 relay is asked again after each such time: a peer that wants to send cannot wake this end."""
 STEADY: Final = 4
+LOOK_S: Final = 5.0
+"""How often the addresses and routes of this machine are read, while a peer is reached along a relay."""
 TOKEN_START: Final = bytes((TOKEN,))
 
 
@@ -202,14 +204,22 @@ class Relays:
         self._limits = LineLimits()
         self._look_at = NEVER
         self._silences: dict[PeerLink, _Silence] = {}
-        self._searches = DirectSearches(node, sockets, links)
+        self._searches: dict[LinkedPeer, DirectSearch] = {}
+        # Also of peers without a handle now. A relay must not reset limits and orders by ending handles.
+        self._looked_at = -NEVER
+        self._own: list[OwnSocket] = []
         self.filter_tests = FilterTests(node, entropy)
 
     @property
     def next_at(self) -> float:
         """When :meth:`handle_timeout` has something to do."""
-        of_relays = (relay.next_at for relay in self.by_name.values())
-        return min((self._look_at, self._searches.next_at, self.filter_tests.next_at, *of_relays))
+        return min(self._look_at, *(part.next_at for part in self._parts()))
+
+    def _parts(self) -> Iterator[RelayLink | DirectSearch | FilterTests]:
+        """All that has times of its own."""
+        yield from self.by_name.values()
+        yield from self._searches.values()
+        yield self.filter_tests
 
     # The configuration.
 
@@ -260,11 +270,10 @@ class Relays:
     # Time and events.
 
     def handle_timeout(self, now: float) -> list[Output]:
-        """Ask relays and bind peers. Call it at :attr:`next_at`."""
+        """Ask relays, bind peers, name candidates and ask those of peers. Call it at :attr:`next_at`."""
         if now >= self._look_at:
             self._look(now)
-        out = [output for relay in self.by_name.values() if now >= relay.next_at for output in relay.do_due(now)]
-        return out + self._searches.handle_timeout(now) + self.filter_tests.do_due(now)
+        return [output for part in self._parts() if now >= part.next_at for output in part.do_due(now)]
 
     def on_event(self, event: o.Event, now: float) -> None:
         """An event of a relay, or of any other peer."""
@@ -273,7 +282,8 @@ class Relays:
             if event.peer in relay.peers:  # not of a previous key that is not accepted any more
                 self._write(relay.config.name, event, now)
         if not isinstance(event, o.PathSuspected):
-            self._searches.on_event(event, now)
+            if (search := self._searches.get(event.peer)) is not None:
+                search.on_event(event, now)
         elif (relay := self._relay_of(event.path)) is not None:  # ask it on the same socket, bind the peer again
             relay.ask(event.path)
 
@@ -295,11 +305,10 @@ class Relays:
         """A relay's record, or candidates of a peer. Returns why it has no effect; None if it has one."""
         if isinstance(received.record, FilterTested):
             return self.filter_tests.on_record(received)
-        if isinstance(received.record, Candidates):
-            return self._searches.on_record(received, now)
-        if (relay := self._of_peer.get(received.peer)) is None:
-            return DropReason.UNEXPECTED_RECORD
-        return relay.on_record(received, now)
+        owners: Mapping[LinkedPeer, DirectSearch | RelayLink]
+        owners = self._searches if isinstance(received.record, Candidates) else self._of_peer
+        owner = owners.get(received.peer)
+        return DropReason.UNEXPECTED_RECORD if owner is None else owner.on_record(received, now)
 
     def do_housekeeping(self, now: float) -> None:
         """Call it about once a second."""
@@ -316,12 +325,23 @@ class Relays:
         return list({(relay, path.socket): place.sockaddr for relay, path, place in views}.values())
 
     def _search(self, now: float) -> None:
-        """Have direct paths searched with what is known now."""
-        seen = self._seen()
+        """Have direct paths searched with what is known now, of the peers that use relays."""
+        before, links = self._searches, self._links.values()
+        self._searches = {
+            link.peer: before.get(link.peer) or DirectSearch(self._node, link.peer, now)
+            for link in links
+            if link.relayed or link.peer in before
+        }
+        if not any(link.relayed for link in links):
+            return
+        if now >= self._looked_at + LOOK_S:
+            self._looked_at, self._own = now, own_sockets(self._sockets)
         states = (state for relay in self.by_name.values() for state in relay.peer.paths.states)
         # Not where its datagrams only seem to come from: a relay could forge the address of a peer, to stay between.
         at = {state.path.address[:2] for state in states if state.is_configured or state.is_validated}
-        self._searches.follow(seen, at, now)
+        candidates = places_of(self._seen(), self._own)
+        for search in self._searches.values():
+            search.set_own(candidates, self._own, at, now)
 
     def _look(self, now: float) -> None:
         """Ask the relays of silent peers, and bind those again: once if they are up.
