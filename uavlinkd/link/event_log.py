@@ -49,10 +49,7 @@ class EventLog:
         self._present: dict[_FindingKey, float] = {}  # since when
         self._forgotten: Counter[LinkProblem] = Counter()  # problems of peers that were removed
         self._problem_conditions = Conditions[tuple[str, LinkProblem]](
-            "link",
-            self._limits,
-            self._write_problem,
-            lambda key: (key[0], key[1] is LinkProblem.PATHS_UNPROVEN),
+            "link", self._limits, self._write_problem, lambda key: (key[0], key[1] is LinkProblem.PATHS_UNPROVEN)
         )
         self._pauses = Conditions[str]("pause", self._limits, self._write_pause, lambda _: ("", False))
         self._repairs: dict[str, tuple[float, int]] = {}  # by peer: when repair began, and the bytes of repeats then

@@ -116,14 +116,7 @@ class LineRate:
 class SerialNetwork:
     """One serial network."""
 
-    def __init__(
-        self,
-        config: NetworkConfig,
-        number: int,
-        states: Node,
-        stall: StallWatch,
-        log: NetworkLog,
-    ) -> None:
+    def __init__(self, config: NetworkConfig, number: int, states: Node, stall: StallWatch, log: NetworkLog) -> None:
         assert config.serial is not None, "a serial network has a device"
         self.config = config
         self.name = config.name
