@@ -253,7 +253,7 @@ class Daemon:
             link.report_refusals(now)
             parts.events.check_link(link, now)
         self.carrier.peers.end_graces(now)
-        parts.history.sample(links, parts.local.judged, now)
+        parts.history.sample(links, ((one, parts.local.policies[one.name]) for one in parts.local.endpoints), now)
         parts.local.do_housekeeping(radio_figures(links), now)
         parts.local.write_note(self._notes.next(links, now), now)
         parts.events.write_findings(find(parts, now), now)

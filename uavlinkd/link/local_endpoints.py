@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from typing import Final, NamedTuple
 
 from uavlinkd.config import EndpointConfig
@@ -90,11 +90,6 @@ class LocalEndpoints:
         self._sources: dict[str, tuple[RadioStatusSource | None, StatusTextSource | None]] = {}
         self._own = Source(name, compile_policy({}, is_local=True).incoming)
         self._gather_s = 0.0
-
-    @property
-    def judged(self) -> Iterator[tuple[Endpoint, Policy]]:
-        """Each endpoint with its policy."""
-        return ((endpoint, self.policies[endpoint.name]) for endpoint in self.endpoints)
 
     # From the configuration.
 
@@ -313,32 +308,33 @@ class PilotNotes:
                 self._put(link, "freshness", TextSeverity.ERROR, text, now)
             else:
                 self._waiting.pop((name, "freshness"), None)
-        for topic, texts in (("withheld", _withheld_here(seen)), (_CLAIM, self._refused_there(seen))):
-            first = next(texts, None)
-            if first is not None and now >= seen.quiet_until[topic]:
+        for topic, text in (("withheld", _withheld_here(seen)), (_CLAIM, _refused_there(seen))):
+            if text and now >= seen.quiet_until[topic]:
                 seen.quiet_until[topic] = now + REFUSAL_INTERVAL_S
-                self._put(link, topic, TextSeverity.WARNING, first, now)
+                self._put(link, topic, TextSeverity.WARNING, text, now)
         seen.claims_until = now
-
-    def _refused_there(self, seen: _Seen) -> Iterator[str]:
-        for claim in seen.link.peer.refusal_claims.recent():
-            if claim.changed_at < seen.claims_until:
-                return
-            if _is_wanted(claim.refused):
-                reason = _REASONS.get(REFUSALS.get(claim.refused.reason, Refusal.HIDDEN_FRAME), "policy")
-                yield _fit(seen.link.name, f": {_label(claim.refused)} withheld there, {reason}")
 
     def _put(self, link: PeerLink, topic: str, severity: TextSeverity, text: str, now: float) -> None:
         self._waiting[link.name, topic] = _Waiting(severity, text, now, link)
 
 
-def _withheld_here(seen: _Seen) -> Iterator[str]:
+def _refused_there(seen: _Seen) -> str:
+    """The latest claim since the last look, if the pilot needs to know it."""
+    for claim in seen.link.peer.refusal_claims.recent():
+        if claim.changed_at >= seen.claims_until and _is_wanted(claim.refused):
+            reason = _REASONS.get(REFUSALS.get(claim.refused.reason, Refusal.HIDDEN_FRAME), "policy")
+            return _fit(seen.link.name, f": {_label(claim.refused)} withheld there, {reason}")
+    return ""
+
+
+def _withheld_here(seen: _Seen) -> str:
     link = seen.link
     role = link.config.policy.get("role")
     reason = "role or list" if role is None else f"role {role}"
     for refused in link.policy.outgoing.changed_totals():
         if _is_wanted(refused):
-            yield _fit(link.name, f": {_label(refused)} withheld here, {reason}")
+            return _fit(link.name, f": {_label(refused)} withheld here, {reason}")
+    return ""
 
 
 def _is_wanted(refused: Refused) -> bool:

@@ -225,15 +225,9 @@ class Networks:
         """
         metered = [one.number for network, one in self.of_number.values() if network.config.metered]
         self._states.set_metered(metered, now)
-        for network in self.networks:
-            network.presence = look(network.config.interface, network.config.address)
-            for one in network.sockets:
-                try:
-                    self._follow(network, one, now)
-                except BindError as error:
-                    raise BindError(f"network ({network.config.name}): {error}") from None
+        self.check(now, is_start=True)
 
-    def check(self, now: float) -> bool:
+    def check(self, now: float, *, is_start: bool = False) -> bool:
         """Look at all networks, and open and close sockets. Returns whether anything changed."""
         has_changed = False
         for network in self.networks:
@@ -242,9 +236,12 @@ class Networks:
                 try:
                     has_changed |= self._follow(network, one, now)
                 except BindError as error:  # it is tried again at the next call
+                    if is_start:
+                        raise BindError(f"network ({network.config.name}): {error}") from None
                     if all(other.index is None for other in network.sockets):
                         network.presence = Presence(reason=str(error))
-            network.log.note(network.presence, now)
+            if not is_start:
+                network.log.note(network.presence, now)
         return has_changed
 
     def _follow(self, network: Network, one: NetworkSocket, now: float) -> bool:

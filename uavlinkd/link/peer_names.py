@@ -31,9 +31,7 @@ class PeerNames:
         """The paths that the core knows, by address of the configuration; None before it knows any."""
         self._on_change = on_change
         self._answers: dict[PeerAddress, Resolved] = {address: [] for address in link.config.addresses}
-        self._failing: list[set[str]] = []
-        self._wakes: list[asyncio.Event] = []
-        self._tasks: list[asyncio.Task[None]] = []
+        self._searches: list[tuple[asyncio.Task[None], asyncio.Event, set[str]]] = []  # those: names that fail
         for address in link.config.addresses:
             if address.is_serial:
                 continue  # it needs no look-up
@@ -44,9 +42,7 @@ class PeerNames:
             failing, wake = set[str](), asyncio.Event()
             interval_s, on_resolved = partial(self.interval_s, address), partial(self._set, address)
             work = keep_resolving((address.address,), interval_s, on_resolved, log, failing, wake)
-            self._failing.append(failing)
-            self._wakes.append(wake)
-            self._tasks.append(keep_running(work, f"the search for {address}"))
+            self._searches.append((keep_running(work, f"the search for {address}"), wake, failing))
 
     def _set(self, address: PeerAddress, resolved: Resolved) -> bool:
         self._answers[address] = resolved
@@ -66,7 +62,7 @@ class PeerNames:
     @property
     def unresolved(self) -> set[str]:
         """The host names that had no address at the last look-up."""
-        return set().union(*self._failing)
+        return {name for _, _, failing in self._searches for name in failing}
 
     def __iter__(self) -> Iterator[tuple[PeerAddress, Resolved]]:
         """Each configured address in the order of the file, with its last answer."""
@@ -74,10 +70,10 @@ class PeerNames:
 
     def wake(self) -> None:
         """Look all names up again now."""
-        for wake in self._wakes:
+        for _, wake, _ in self._searches:
             wake.set()
 
     def stop(self) -> None:
         """Stop resolving."""
-        for task in self._tasks:
+        for task, _, _ in self._searches:
             task.cancel()

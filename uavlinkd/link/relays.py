@@ -196,7 +196,6 @@ class Relays:
     ) -> None:
         self.by_name = by_name
         self.handles = sockets.handles
-        self._of_peer: dict[LinkedPeer, RelayLink] = {}
         self._node = node
         self._sockets = sockets
         self._links = links
@@ -236,9 +235,7 @@ class Relays:
         """Do not use a relay any more."""
         relay = self.by_name.pop(name)
         self._sockets.stop_following(relay.name)
-        out = relay.leave(now)
-        self._follow_peers()
-        return out
+        return relay.leave(now)
 
     def change(self, config: RelayConfig, now: float) -> list[Output]:
         """Its addresses changed, or its previous key is not accepted any more."""
@@ -251,14 +248,13 @@ class Relays:
 
     def follow_links(self, now: float) -> None:
         """The relays, the peers, their keys or their relays changed."""
-        self._follow_peers()
         for name, relay in self.by_name.items():
             links = [link for link in self._links.values() if name in link.config.relays]
             relay.follow([key for link in links for key in link.keys])
         self._set_paths(self._links.values(), now)
 
-    def _follow_peers(self) -> None:
-        self._of_peer = {peer: relay for relay in self.by_name.values() for peer in relay.peers}
+    def _of_peer(self, peer: LinkedPeer) -> RelayLink | None:
+        return next((relay for relay in self.by_name.values() if peer in relay.peers), None)
 
     # Facts.
 
@@ -277,10 +273,9 @@ class Relays:
 
     def on_event(self, event: o.Event, now: float) -> None:
         """An event of a relay, or of any other peer."""
-        if (relay := self._of_peer.get(event.peer)) is not None:
+        if (relay := self._of_peer(event.peer)) is not None:
             relay.on_event(event, now)
-            if event.peer in relay.peers:  # not of a previous key that is not accepted any more
-                self._write(relay.config.name, event, now)
+            self._write(relay.config.name, event, now)
         if not isinstance(event, o.PathSuspected):
             if (search := self._searches.get(event.peer)) is not None:
                 search.on_event(event, now)
@@ -305,9 +300,8 @@ class Relays:
         """A relay's record, or candidates of a peer. Returns why it has no effect; None if it has one."""
         if isinstance(received.record, FilterTested):
             return self.filter_tests.on_record(received)
-        owners: Mapping[LinkedPeer, DirectSearch | RelayLink]
-        owners = self._searches if isinstance(received.record, Candidates) else self._of_peer
-        owner = owners.get(received.peer)
+        is_search = isinstance(received.record, Candidates)
+        owner = self._searches.get(received.peer) if is_search else self._of_peer(received.peer)
         return DropReason.UNEXPECTED_RECORD if owner is None else owner.on_record(received, now)
 
     def do_housekeeping(self, now: float) -> None:

@@ -222,13 +222,13 @@ def _by_name(
 def relay_status(relay: RelayService, now: float) -> dict[str, object]:
     """The members, and what was forwarded and dropped. Times are ages in seconds."""
     return {
-        "members": {member.settings.name: _member(relay, member, now) for member in relay.members.values()},
+        "members": {member.settings.name: _member_status(relay, member, now) for member in relay.members.values()},
         "connections": relay.bindings.connections,
         "dropped": _counts(relay.forwarding.dropped),
     }
 
 
-def _member(relay: RelayService, member: RelayMember, now: float) -> dict[str, object]:
+def _member_status(relay: RelayService, member: RelayMember, now: float) -> dict[str, object]:
     peer, meter = member.peer, member.meter
     bound, waiting = relay.bindings.peers_of(member.key)
     return {
