@@ -47,7 +47,7 @@ class Daemon(Scene):
             without_socket=set(),
             absent_addresses=list,
             absent_networks=dict,
-            networks=None,
+            networks=SimpleNamespace(networks=[]),
             is_own=lambda address: False,
             serial=SimpleNamespace(networks=[]),
         )
@@ -176,7 +176,7 @@ def test_addresses_that_cannot_be_used(daemon: Daemon) -> None:
     assert "[fe80::1%wlan0]:5790" in daemon.findings()["zone_missing"].remedy
     daemon.sockets.without_socket = {"drone1"}
     assert "listen" in daemon.findings()["family_missing"].text
-    daemon.sockets.networks = [object()]
+    daemon.sockets.networks.networks = [object()]
     assert "no network has" in daemon.findings()["family_missing"].text
 
 

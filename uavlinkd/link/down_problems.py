@@ -88,7 +88,7 @@ def _here(peer: PeerFacts, relays: Sequence[_RelayProblem]) -> Iterator[Found]:
                 f"{shown(path.address)} is valid on one interface only, and names none",
                 f'write it with its interface, as in "[{path.host}%wlan0]:{path.address[1]}"',
             )
-    if peer.name in sockets.without_socket and sockets.networks is None:
+    if peer.name in sockets.without_socket and not sockets.networks.networks:
         yield fault(
             "family_missing",
             f"no address in listen is of the family of {peer.addresses}",

@@ -30,9 +30,6 @@ from uavlinkd.link.conditions import LineLimits
 from uavlinkd.mavlink.egress.bucket import Bucket
 from uavlinkd.system.addresses import IPV4_UDP_BYTES, IPV6_UDP_BYTES, Address
 
-BRING_UP: Final = (
-    "plug the modem in, or bring the interface up (`ip -brief address`): the daemon uses it within a second"
-)
 COPIES_SHARE: Final = 0.5
 """The part of a budget that copies may use. The rest is for what only this network carries."""
 LARGEST_BYTES: Final = 400
@@ -174,6 +171,15 @@ class Network:
     sockets: Sequence[NetworkSocket]
     log: NetworkLog
     presence: Presence = field(default_factory=Presence)
+    remedy: str = (
+        "plug the modem in, or bring the interface up (`ip -brief address`): the daemon uses it within a second"
+    )
+    """What a person can do while it is absent."""
+
+    def status(self, _now: float) -> dict[str, object]:
+        """As plain values."""
+        ports = [one.port for one in self.sockets if one.index is not None]
+        return network_status(self.config, self.presence, ports)
 
 
 class Networks:
@@ -193,8 +199,10 @@ class Networks:
     ) -> None:
         ports = {address.family: address.port for address in listen}
         self.networks: list[Network] = []
-        self.of_number: dict[int, tuple[Network, NetworkSocket]] = {}
-        """The network of each socket, and the socket."""
+        self.of_number: dict[int, Network] = {}
+        """The network of each socket."""
+        self.sockets: dict[int, NetworkSocket] = {}
+        """By number."""
         self._put, self._opened = put, opened
         self._states = states
         limits = LineLimits()
@@ -203,15 +211,16 @@ class Networks:
             sockets = [NetworkSocket(number, family, ports.get(family, 0)) for number, family in numbered]
             network = Network(config, sockets, NetworkLog(config.name, limits, log))
             self.networks.append(network)
-            self.of_number.update({one.number: (network, one) for one in sockets})
+            for one in sockets:
+                self.of_number[one.number], self.sockets[one.number] = network, one
 
     def may_reach(self, number: int, address: SocketAddress) -> bool:
         """Whether a socket can send to an address of its family, as far as its own addresses show.
 
         While a network is absent, the answer is yes: it may have any address when it appears.
         """
-        one = self.of_number[number][1]
-        if one.index is None or one.family == socket.AF_INET:
+        one = self.sockets.get(number)
+        if one is None or one.index is None or one.family == socket.AF_INET:
             return True
         if address[0].startswith(LINK_LOCAL):
             return one.index in (0, address[-1])
@@ -223,7 +232,7 @@ class Networks:
         Raises:
             BindError: a network is there, and its socket cannot be opened. The message names the network.
         """
-        metered = [one.number for network, one in self.of_number.values() if network.config.metered]
+        metered = [number for number, network in self.of_number.items() if network.config.metered]
         self._states.set_metered(metered, now)
         self.check(now, is_start=True)
 
@@ -264,7 +273,7 @@ class Networks:
 
     def report_absent(self, now: float) -> None:
         """Report the sockets that are closed. Call it after other paths were set: the core knows states by path."""
-        for _, one in self.of_number.values():
+        for one in self.sockets.values():
             if one.index is None:
                 self._states.set_socket_state(one.number, now, is_up=False)
 
@@ -279,20 +288,3 @@ class Networks:
             sock = network_socket(Address(host, 0), config.interface, others)
         one.port = sock.getsockname()[1]
         self._put(one.number, sock)
-
-    def absent(self) -> dict[str, str]:
-        """The networks that are absent now, each with the reason, and what a person can do."""
-        return {
-            f"{network.config.name} ({network.presence.reason})": BRING_UP
-            for network in self.networks
-            if not network.presence.hosts
-        }
-
-    def status(self) -> dict[str, object]:
-        """Each network by name, as plain values."""
-        return {
-            network.config.name: network_status(
-                network.config, network.presence, [one.port for one in network.sockets if one.index is not None]
-            )
-            for network in self.networks
-        }

@@ -77,9 +77,9 @@ class PeerSockets:
         """Datagrams to peers that the kernel did not accept, by the name of the error."""
         self.without_socket = set[str]()
         """The peers none of whose addresses is of a socket's family."""
-        self.networks: Networks | None = None
-        """Those of interfaces and addresses, if the configuration has any."""
-        self.serial: SerialNetworks
+        self.networks = Networks((), (), self.put, self.open_sockets, node, log)
+        """Those of interfaces and addresses."""
+        self.serial = SerialNetworks((), 0, node, stall, log)
         self.handles = RelayHandles()
         """Those that relays assigned to this daemon."""
         self.budgets: dict[int, NetworkBudget] = {}
@@ -100,7 +100,6 @@ class PeerSockets:
         self._checked_at = 0.0
         self._on_change: Callable[[], None] = lambda: None
         self._names: dict[str, PeerNames] = {}
-        self._add_serial(())
 
     @property
     def addresses(self) -> list[Address]:
@@ -117,11 +116,12 @@ class PeerSockets:
 
     def interface_of(self, number: int) -> str | None:
         """The network interface that a socket is bound to; None if it uses any."""
-        return None if self.networks is None else self.networks.of_number[number][0].config.interface
+        network = self.networks.of_number.get(number)
+        return None if network is None else network.config.interface
 
     def absent_addresses(self) -> list[Address]:
         """The listen addresses that no interface of this machine has now."""
-        if self.networks is not None:
+        if self.networks.networks:
             return []
         absent = zip(self.open_sockets(), self.addresses, strict=True)
         return [address for sock, address in absent if is_absent(sock)]
@@ -138,9 +138,8 @@ class PeerSockets:
 
     def network_name(self, number: int) -> str | None:
         """The network of a socket; None if the configuration names no networks."""
-        if (line := self.serial.of_number.get(number)) is not None:
-            return line.name
-        return None if self.networks is None else self.networks.of_number[number][0].config.name
+        network = self.serial.of_number.get(number) or self.networks.of_number.get(number)
+        return None if network is None else network.config.name
 
     def way_of(self, path: Path) -> tuple[str | None, SocketAddress | None]:
         """The network of a path, and the relay's address if it is relayed and has a handle."""
@@ -148,12 +147,14 @@ class PeerSockets:
 
     def absent_networks(self) -> dict[str, str]:
         """The networks that are absent now, each with the reason, and what a person can do."""
-        return {**({} if self.networks is None else self.networks.absent()), **self.serial.absent()}
+        networks = (*self.networks.networks, *self.serial.networks)
+        absent = [network for network in networks if not network.presence.hosts]
+        return {f"{network.config.name} ({network.presence.reason})": network.remedy for network in absent}
 
     def network_status(self, now: float) -> dict[str, object]:
         """Each network by name, as plain values."""
-        serial = {network.name: network.status(now) for network in self.serial.networks}
-        return {**({} if self.networks is None else self.networks.status()), **serial}
+        networks = (*self.networks.networks, *self.serial.networks)
+        return {network.config.name: network.status(now) for network in networks}
 
     def unresolved(self, name: str) -> set[str]:
         """The host names of a peer that have no address now."""
@@ -167,7 +168,7 @@ class PeerSockets:
         """
         if ip_networks := [network for network in networks if network.serial is None]:
             self.networks = Networks(ip_networks, addresses, self.put, self.open_sockets, self._node, self._log)
-            for _, one in self.networks.of_number.values():
+            for one in self.networks.sockets.values():
                 self._add_slot(_Slot(one.number, one.family))
             self.networks.open(monotonic())
         else:
@@ -178,18 +179,16 @@ class PeerSockets:
                     raise BindError(f"listen: {error}") from None
                 self._add_slot(_Slot(number, sock.family))
                 self.put(number, sock)
-        self._add_serial([network for network in networks if network.serial is not None])
+        lines = [network for network in networks if network.serial is not None]
+        self.serial = SerialNetworks(lines, len(self._slots), self._node, self._stall, self._log)
+        for line in self.serial.networks:
+            self._add_slot(_Slot(line.number, socket.AF_UNSPEC, line.send))
         self._add_budgets(monotonic())
-
-    def _add_serial(self, configs: Sequence[NetworkConfig]) -> None:
-        self.serial = SerialNetworks(configs, len(self._slots), self._node, self._stall, self._log)
-        for network in self.serial.networks:
-            self._add_slot(_Slot(network.number, socket.AF_UNSPEC, network.send))
 
     def _add_budgets(self, now: float) -> None:
         """The sockets of a network share its budget."""
         self.budgets.update(self.serial.budgets(now))
-        for network in () if self.networks is None else self.networks.networks:
+        for network in self.networks.networks:
             if network.config.budget_bits_s:
                 budget = NetworkBudget(network.config.budget_bits_s, now)
                 self.budgets.update({sock.number: budget for sock in network.sockets})
@@ -229,7 +228,7 @@ class PeerSockets:
         for slot in self._slots:
             self._read(slot)
         self.serial.start(receive, on_change)
-        if self.networks is not None:
+        if self.networks.networks:
             self.check_networks()
 
     def _read(self, slot: _Slot) -> None:
@@ -257,7 +256,7 @@ class PeerSockets:
     def check_networks(self) -> None:
         """Open and close the sockets of the networks that changed, and resolve names again."""
         self._checked_at = now = monotonic()
-        if self.networks is not None and self.networks.check(now):
+        if self.networks.check(now):
             for names in self._names.values():
                 names.wake()
                 self._set_paths(names)
@@ -316,7 +315,7 @@ class PeerSockets:
         # Full buffers, no route, a firewall: as if the network had lost it. The core's timers do the rest.
         self._count_failure(last, address)
         is_due = monotonic() - self._checked_at >= LOOK_AGAIN_S
-        if self.networks is not None and is_due and last.errno in _NETWORK_CHANGED:
+        if self.networks.networks and is_due and last.errno in _NETWORK_CHANGED:
             self._checked_at = monotonic()
             # Not now: the core may be in the middle of its outputs.
             asyncio.get_running_loop().call_soon(self.check_networks)
@@ -356,7 +355,7 @@ class PeerSockets:
             self.without_socket.discard(link.name)
         elif link.name not in self.without_socket:
             self.without_socket.add(link.name)
-            reason = "no listen address of its family" if self.networks is None else "no network of its family"
+            reason = "no network of its family" if self.networks.networks else "no listen address of its family"
             self._log.warning("peer_unreachable", peer=link.name, reason=reason)
         link.set_paths([path for group in paths.values() for path in group], monotonic())
         self.report_absent(monotonic())
@@ -364,8 +363,7 @@ class PeerSockets:
 
     def report_absent(self, now: float) -> None:
         """Report the sockets of absent networks to the core. Call it after other paths were set."""
-        if self.networks is not None:
-            self.networks.report_absent(now)
+        self.networks.report_absent(now)
         for line in self.serial.networks:
             line.report_state()
 
@@ -375,11 +373,9 @@ class PeerSockets:
             if (path := self.serial.path_to(written.network)) is not None:
                 yield path
             return
-        networks = self.networks
         for family, sockaddr in resolved:
             for number in (slot.number for slot in self._slots if slot.family == family):
-                is_named = networks is not None and written.network in ("", self.network_name(number))
-                if networks is None or (is_named and networks.may_reach(number, sockaddr)):
+                if written.network in ("", self.network_name(number)) and self.networks.may_reach(number, sockaddr):
                     yield Path(number, sockaddr)
 
     def stop_following(self, name: str) -> None:

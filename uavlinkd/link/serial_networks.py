@@ -35,7 +35,6 @@ RECENT_S: Final = 10
 NOISE_PIECES: Final = 10
 """Damaged pieces in :data:`RECENT_S` that are reported, if they are more than :data:`NOISE_SHARE` of all."""
 NOISE_SHARE: Final = 0.1
-PLUG_IN: Final = "plug the modem in: the daemon uses it within a second"
 LATER_S: Final = 0.5
 """A round trip that is longer than the shortest one by more than this shows a queue in a modem."""
 SHORTEST_OF_S: Final = 60.0
@@ -177,6 +176,11 @@ class SerialNetwork:
         """Whether the device is open."""
         return Presence(hosts=(SERIAL_HOST,)) if self.line.is_open else Presence(reason=self.line.reason)
 
+    @property
+    def remedy(self) -> str:
+        """What a person can do while it is absent."""
+        return meaning_of(self.line.error) or "plug the modem in: the daemon uses it within a second"
+
     def note_answers(self, peer: Peer, state: PathState, now: float) -> None:
         """Note the last round trip along the line, and echo requests without an answer. Each counts once."""
         if state.round_trip_s is not None and state.answered_at > self._answered_at:
@@ -306,8 +310,3 @@ class SerialNetworks:
         """The number of damaged pieces since the start, by its name in the log. Without such pieces: empty."""
         noise = sum(network.line.decoder.line_noise for network in self.networks)
         return {"line_noise": noise} if noise else {}
-
-    def absent(self) -> dict[str, str]:
-        """The serial networks that are absent now, each with the reason, and what a person can do."""
-        lines = {network.name: network.line for network in self.networks if not network.line.is_open}
-        return {f"{name} ({line.reason})": meaning_of(line.error) or PLUG_IN for name, line in lines.items()}
