@@ -35,7 +35,7 @@ class Scene:
         self.core = SocketStateLog()
         self.present = {(config.interface, config.address): Presence() for config in configs}
         listen = [Address("0.0.0.0", port)] if port else []
-        self.networks = Networks(configs, listen, self.put, self.open_sockets, self.core, structlog.get_logger())
+        self.networks = Networks(configs, listen, self.put, lambda: self.sockets, self.core, structlog.get_logger())
 
     def put(self, number: int, sock: socket.socket | None) -> None:
         """As the daemon's sockets."""
@@ -44,10 +44,6 @@ class Scene:
             before.close()
         if sock is not None:
             self.sockets[number] = sock
-
-    def open_sockets(self) -> list[socket.socket]:
-        """As the daemon's sockets."""
-        return list(self.sockets.values())
 
     def set(self, config: NetworkConfig, presence: Presence) -> None:
         """What the machine has of a network from now on."""
@@ -151,7 +147,7 @@ def test_port_of_listen_is_the_port_of_each_network(make_scene: Callable[..., Sc
     scene.set(MESH, Presence(0, ("127.0.0.2",)))
     scene.networks.open(0.0)
     assert (scene.port(V4), scene.port(ALSO_V4)) == (port, port)
-    assert [sock.getsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR) for sock in scene.open_sockets()] == [0, 0]
+    assert [sock.getsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR) for sock in scene.sockets.values()] == [0, 0]
     second = make_scene(LTE, port=port)
     with pytest.raises(BindError, match=r"^network \(lte\): cannot listen on 0\.0\.0\.0:\d+: Address already in use"):
         second.networks.open(0.0)

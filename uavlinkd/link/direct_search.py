@@ -192,7 +192,7 @@ def own_sockets(sockets: PeerSockets) -> list[OwnSocket]:
     """The open UDP sockets, with the addresses of this machine that lead to them."""
     routes, of_machine = specific_routes(), _machine_hosts()
     own = []
-    for number, sock in sockets.numbered_sockets():
+    for number, sock in sockets.open_sockets().items():
         host, port = sock.getsockname()[:2]
         interface = sockets.interface_of(number)
         is_ipv6 = sock.family == socket.AF_INET6

@@ -14,7 +14,7 @@ of the paths detect a dead radio.
 from __future__ import annotations
 
 import socket
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -193,7 +193,7 @@ class Networks:
         configs: Iterable[NetworkConfig],
         listen: Iterable[Address],
         put: Callable[[int, socket.socket | None], None],
-        opened: Callable[[], list[socket.socket]],
+        opened: Callable[[], Mapping[int, socket.socket]],
         states: Node,
         log: FilteringBoundLogger,
     ) -> None:
@@ -279,7 +279,7 @@ class Networks:
 
     def _open(self, config: NetworkConfig, one: NetworkSocket) -> None:
         host = config.address or _WILDCARDS[one.family]
-        others = self._opened()
+        others = self._opened().values()
         try:
             sock = network_socket(Address(host, one.listen_port or one.port), config.interface, others)
         except BindError as error:

@@ -104,15 +104,11 @@ class PeerSockets:
     @property
     def addresses(self) -> list[Address]:
         """The addresses that the sockets are bound to."""
-        return [Address(*sock.getsockname()[:2]) for sock in self.open_sockets()]
+        return [Address(*sock.getsockname()[:2]) for sock in self.open_sockets().values()]
 
-    def open_sockets(self) -> list[socket.socket]:
+    def open_sockets(self) -> dict[int, socket.socket]:
         """The sockets that are open, by number."""
-        return [sock for _, sock in self.numbered_sockets()]
-
-    def numbered_sockets(self) -> list[tuple[int, socket.socket]]:
-        """The sockets that are open, each with its number."""
-        return [(slot.number, slot.sock) for slot in self._slots if slot.sock is not None]
+        return {slot.number: slot.sock for slot in self._slots if slot.sock is not None}
 
     def interface_of(self, number: int) -> str | None:
         """The network interface that a socket is bound to; None if it uses any."""
@@ -123,7 +119,7 @@ class PeerSockets:
         """The listen addresses that no interface of this machine has now."""
         if self.networks.networks:
             return []
-        absent = zip(self.open_sockets(), self.addresses, strict=True)
+        absent = zip(self.open_sockets().values(), self.addresses, strict=True)
         return [address for sock, address in absent if is_absent(sock)]
 
     def is_own(self, address: SocketAddress) -> bool:
@@ -132,7 +128,7 @@ class PeerSockets:
         return relay_name(address) is None and any(
             sock.getsockname()[1] == port
             and (own.host == host or (own.is_wildcard and is_here(sock.family, (host, 0, *rest))))
-            for sock, own in zip(self.open_sockets(), self.addresses, strict=True)
+            for sock, own in zip(self.open_sockets().values(), self.addresses, strict=True)
             if (sock.family == socket.AF_INET6) == (":" in host)
         )
 

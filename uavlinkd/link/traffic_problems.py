@@ -242,29 +242,18 @@ def _refused_there(peer: PeerFacts, claims: list[Claim]) -> Found:
         )
     if False in foreign:
         remedies.append(f"if these frames are needed, change the role or lists of {here} in {peer.name}'s file")
-    by_meaning: dict[str, list[Claim]] = {}
-    for claim in claims[:_CLAIMS_SHOWN]:
-        refusal = REFUSALS.get(claim.refused.reason)
-        meaning = "a reason that this version does not know" if refusal is None else refusal.meaning
-        by_meaning.setdefault(meaning, []).append(claim)
-    kinds = "; ".join(_kinds(meaning, several, peer.now) for meaning, several in by_meaning.items())
+    kinds = "; ".join(_refused_kind(claim, peer.now) for claim in claims[:_CLAIMS_SHOWN])
     more = f"; and {len(claims) - _CLAIMS_SHOWN} more kinds of frames" if len(claims) > _CLAIMS_SHOWN else ""
     return warning("refused_there", f"it reports that it refuses {kinds}{more}", "; ".join(remedies))
 
 
-def _kinds(meaning: str, claims: Sequence[Claim], now: float) -> str:
-    """Claims that share a reason, which is written once."""
-    if len(claims) == 1:
-        return _kind(claims[0], now, f"{meaning}, ")
-    return f"{', '.join(_kind(claim, now) for claim in claims)}: {meaning}"
-
-
-def _kind(claim: Claim, now: float, meaning: str = "") -> str:
-    refused = claim.refused
+def _refused_kind(claim: Claim, now: float) -> str:
+    refused, refusal = claim.refused, REFUSALS.get(claim.refused.reason)
+    meaning = "a reason that this version does not know" if refusal is None else refusal.meaning
     command = f" {command_name(refused.command).removeprefix('MAV_CMD_')}" if refused.command else ""
     frames = "frame" if refused.total == 1 else "frames"
     age = now - claim.changed_at
-    return f"{name_of(refused.message)}{command} ({meaning}{refused.total:,} {frames}, {age:.0f} s ago)"
+    return f"{name_of(refused.message)}{command} ({meaning}, {refused.total:,} {frames}, {age:.0f} s ago)"
 
 
 # Local endpoints.
