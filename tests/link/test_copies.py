@@ -64,7 +64,7 @@ class Scene:
                 self.now = until
                 return
             self.now = max(self.now, deadline)
-            self._send([one.transmit for one in self.copies.release((), self.now)], self.now)
+            self._send([transmit for transmit, _ in self.copies.release((), self.now)], self.now)
         raise AssertionError("deadlines without end")
 
     def _send(self, transmits: Sequence[Transmit], now: float) -> None:
@@ -189,7 +189,7 @@ def test_copies_of_all_peers_use_half_of_a_budget() -> None:
         scene.send([command(tick)], now)
         scene._send(other.pick(envelope([command(-tick)], FREE, SLOW), [command(-tick)], now), now)
         scene.run(now)
-        scene._send([one.transmit for one in other.release((), now)], now)
+        scene._send([transmit for transmit, _ in other.release((), now)], now)
     used = sum(wire_bytes(sent.datagram, SLOW) for _, sent in scene.sent if sent.path == SLOW)
     half = SLOW_BITS_S / 8 / 2 * seconds
     assert 0.9 * half < used < half + 600

@@ -189,8 +189,8 @@ def test_nothing_is_repeated_along_a_path_that_is_gone() -> None:
     scene = Scene()
     scene.copies.repeat(b"both", [HERE, THERE], [command(1)], 5, 0.0)
     scene.copies.repeat(b"there", [THERE], [command(1)], 5, 0.0)
-    (repeat,) = scene.copies.release((HERE,), SPACING_S)
-    assert (repeat.transmit.datagram, repeat.transmit.path) == (b"both", HERE)
+    ((repeat, _),) = scene.copies.release((HERE,), SPACING_S)
+    assert (repeat.datagram, repeat.path) == (b"both", HERE)
     assert (scene.copies.repeats_sent, len(scene.copies._waiting)) == (1, 1)
     assert scene.copies.release((), 1.0) == []
     assert not scene.copies.is_waiting

@@ -6,7 +6,7 @@ accepts a key, a name or an address because it arrived.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Final
 
@@ -101,7 +101,9 @@ def _here(peer: PeerFacts, relays: Sequence[_RelayProblem]) -> Iterator[Found]:
             "compare the address families with `ip -brief address`",
         )
     # Errors of sending to the peer, and to the relays to which nothing could be sent.
-    for seen in (peer.seen, *(partial(peer.seen_at, relay) for problem, relay in relays if problem == "not_sent")):
+    look_ups: list[Callable[[str], Sighting | None]] = [peer.seen]
+    look_ups += [partial(peer.seen_at, relay) for problem, relay in relays if problem == "not_sent"]
+    for seen in look_ups:
         if (sighting := seen("EPERM")) is not None:
             remedy = "allow outgoing UDP from the daemon's port: see `sudo nft list ruleset`"
             yield fault("firewall_here", f"this machine refuses to send to {at(sighting)} (EPERM)", remedy)

@@ -22,11 +22,11 @@ from uavlinkd.endpoints.reader import PAUSE_S, Reader
 from uavlinkd.endpoints.sockets import BindError, is_absent, is_here, send_from_new_port, udp_socket
 from uavlinkd.link.drop_summary import DropSummary, ShellReason
 from uavlinkd.link.evidence import Evidence
-from uavlinkd.link.networks import NetworkBudget, Networks, Receive
+from uavlinkd.link.networks import Network, NetworkBudget, Networks, Receive
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.peer_names import PeerNames
 from uavlinkd.link.relay_link import RelayHandles, RelayLink
-from uavlinkd.link.serial_networks import SerialNetworks
+from uavlinkd.link.serial_networks import SerialNetwork, SerialNetworks
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.resolver import Resolved
@@ -143,14 +143,16 @@ class PeerSockets:
 
     def absent_networks(self) -> dict[str, str]:
         """The networks that are absent now, each with the reason, and what a person can do."""
-        networks = (*self.networks.networks, *self.serial.networks)
-        absent = [network for network in networks if not network.presence.hosts]
+        absent = [network for network in self._networks() if not network.presence.hosts]
         return {f"{network.config.name} ({network.presence.reason})": network.remedy for network in absent}
 
     def network_status(self, now: float) -> dict[str, object]:
         """Each network by name, as plain values."""
-        networks = (*self.networks.networks, *self.serial.networks)
-        return {network.config.name: network.status(now) for network in networks}
+        return {network.config.name: network.status(now) for network in self._networks()}
+
+    def _networks(self) -> Iterator[Network | SerialNetwork]:
+        yield from self.networks.networks
+        yield from self.serial.networks
 
     def unresolved(self, name: str) -> set[str]:
         """The host names of a peer that have no address now."""
