@@ -132,8 +132,7 @@ class Switch:
         if refusal is not None:
             self._report(_owner(source), header, refusal, now)
             return ()
-        has_one_route = self._has_one_route(header.system)
-        ports = self.router.route(frame, source, now, has_one_route=has_one_route)
+        ports = self.router.route(frame, source, now)
         if ports:
             if self.router.edition != self._edition:
                 self._forget_flows()
@@ -142,7 +141,7 @@ class Switch:
                 del flows[next(iter(flows))]
             gates = (incoming, *(self._policies[port].outgoing for port in ports))
             is_conditional = not all(gate.always_passes(header) for gate in gates)
-            flows[header] = Route(ports, has_one_route, is_conditional)
+            flows[header] = Route(ports, self._has_one_route(header.system), is_conditional)
         return self._pass_outgoing(frame, ports, now)
 
     def _pass(self, frame: Frame, source: Port, route: Route, now: float) -> tuple[Port, ...]:

@@ -45,7 +45,6 @@ MAX_ADDRESSES_PER_PORT: Final = 512
 MAX_FRAMES_REMEMBERED: Final = 4096
 """In each half of the window."""
 MAX_DECISIONS: Final = 4096
-MAX_OWN_FRAMES: Final = 64
 
 SystemComponent = tuple[int, int]
 """A MAVLink address: system id and component id."""
@@ -80,8 +79,6 @@ class Router(Generic[P]):
         """The port that each frame came from, in the current half of the window."""
         self._seen_before: dict[bytes, Hashable] = {}
         """The same for the previous half."""
-        self._own: dict[bytes, None] = {}
-        """The daemon's own frames, the oldest first."""
         self._window_ends_at = float("-inf")
         self.refresh_at = float("-inf")
         """When :meth:`refresh` is due."""
@@ -128,19 +125,14 @@ class Router(Generic[P]):
             for address in [a for a, at in received_at.items() if now - at >= ROUTE_LIFETIME_S]:
                 del received_at[address]
 
-    def route(self, frame: Frame, source: P, now: float, *, has_one_route: bool = False) -> tuple[P, ...]:
+    def route(self, frame: Frame, source: P, now: float) -> tuple[P, ...]:
         """The ports to send this frame to. Learns its sender; counts the reason if there is no port.
-
-        ``has_one_route``: no other port may send frames of this system, so this is not a duplicate.
 
         Raises:
             KeyError: the source is not a port that was added.
         """
         received_at = self._received_at[source]
-        if frame.raw in self._own:
-            self.unrouted[Unrouted.DUPLICATE] += 1
-            return ()
-        if not has_one_route and not self.is_first(frame.raw, source, now):
+        if not self.is_first(frame.raw, source, now):
             return ()
         header = frame.header
         if header.system != 0:  # 0 means all systems: no sender has this id
@@ -183,14 +175,7 @@ class Router(Generic[P]):
         return False
 
     def note_own(self, raw: bytes, now: float) -> None:
-        """The daemon itself sent these bytes to local clients: if a client returns them, they are a duplicate.
-
-        Until the client sends other frames with that header, this holds for the last :data:`MAX_OWN_FRAMES`, else
-        for the window of duplicates.
-        """
-        self._own[raw] = None
-        if len(self._own) > MAX_OWN_FRAMES:
-            del self._own[next(iter(self._own))]
+        """The daemon itself sent these bytes to local clients: if a client returns them, they are a duplicate."""
         if now >= self._window_ends_at or len(self._seen) >= MAX_FRAMES_REMEMBERED:
             self._turn_window(now)
         self._seen[raw] = _OWN
