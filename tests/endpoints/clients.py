@@ -12,7 +12,7 @@ import uvloop
 from tests import samples
 from tests.policies import TRUSTED
 from tests.samples import file_part, frames_of, number_value, raws
-from uavlinkd.endpoints.ports import Endpoint, LocalPort
+from uavlinkd.endpoints.ports import LocalPort
 from uavlinkd.endpoints.stream_endpoint import StreamEndpoint
 from uavlinkd.endpoints.udp import UdpServer
 from uavlinkd.mavlink.frames import Frame
@@ -57,9 +57,9 @@ PASSES = source("peer")
 """A peer that may send everything."""
 
 
-def write(endpoint: Endpoint, port: LocalPort, raws: Sequence[bytes], now: float, source: Source = PASSES) -> None:
+def write(port: LocalPort, raws: Sequence[bytes], now: float, source: Source = PASSES) -> None:
     """Send these frames of one source to a port, as the switch does."""
-    endpoint.write(port, frames_of(raws), source, now)
+    port.send(frames_of(raws), source, now, 0.0)
 
 
 class Recorder:

@@ -90,8 +90,8 @@ def test_a_pending_error_costs_no_other_client_a_frame(new_loop: NewLoop) -> Non
             of_gone, of_receiver = hub.endpoint.ports
             gone.close()
             for number in range(10):
-                write(hub.endpoint, of_gone, [frame(number)], 1.0)
-                write(hub.endpoint, of_receiver, [frame(number)], 1.0)
+                write(of_gone, [frame(number)], 1.0)
+                write(of_receiver, [frame(number)], 1.0)
             assert received(receiver) == [frame(number) for number in range(10)]
             assert hub.endpoint.ports == [of_gone, of_receiver], "not forgotten within a write"
             await until(lambda: hub.endpoint.ports == [of_receiver])
@@ -113,7 +113,7 @@ async def test_attempts_to_send_are_bounded(hub: Hub, monkeypatch: pytest.Monkey
     (port,) = hub.endpoint.ports
     monkeypatch.setattr(UdpServer, "_take_errors", lambda self: True)
     hub.sock.sent, hub.sock.fails_with = 0, [errno.ECONNREFUSED] * 100
-    write(hub.endpoint, port, [frame(1)], 1.0)
+    write(port, [frame(1)], 1.0)
     assert hub.sock.sent == 1 + SEND_ATTEMPTS
     assert hub.endpoint.failures == {"ECONNREFUSED": 1}
 

@@ -52,7 +52,7 @@ def test_client_that_does_not_listen_is_counted(new_loop: NewLoop) -> None:
         await until(lambda: bool(endpoint.ports))
         (target,) = endpoint.ports
         for number in range(REPORTS_PER_S):
-            write(endpoint, target, [frame(number)], monotonic())
+            write(target, [frame(number)], monotonic())
             await asyncio.sleep(0)
         await until(lambda: endpoint.failures["ECONNREFUSED"] > 0)
         assert set(endpoint.failures) == {"ECONNREFUSED"}
@@ -60,7 +60,7 @@ def test_client_that_does_not_listen_is_counted(new_loop: NewLoop) -> None:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
             client.bind(("127.0.0.1", port))
             client.setblocking(False)
-            write(endpoint, target, [frame(7)], monotonic())
+            write(target, [frame(7)], monotonic())
             assert client.recv(1000) == frame(7)
             client.sendto(frame(8), endpoint.address)
             await until(lambda: endpoint.counters.frames == 1)

@@ -29,8 +29,8 @@ def test_committed_frame_is_finished_first(written: int) -> None:
     waiting, dropped = outgoing()
     waiting.commit(frames_of([A, B]), PASSES, 0.0)
     assert waiting.mark_written(written) == written // SIZE
-    waiting.put(frames_of([heartbeat()]), source("operator"), now=50.0)
-    waiting.drop_stale(now=50.0)
+    waiting.queue.put(frames_of([heartbeat()]), source("operator"), now=50.0)
+    waiting.queue.drop_stale(now=50.0)
     waiting.commit_next(0, 1000, now=50.0)
     assert waiting.committed == (A + B)[written:] + heartbeat()
     assert waiting.mark_written(len(waiting.committed)) == 3 - written // SIZE
@@ -46,7 +46,7 @@ def test_frame_is_committed_where_it_fits_or_the_kernel_holds_nothing(
 ) -> None:
     """A frame larger than the limit is sent whole. Otherwise the slowest line would carry no frame."""
     waiting, _ = outgoing()
-    waiting.put(frames_of([A, B, C]), PASSES, now=0.0)
+    waiting.queue.put(frames_of([A, B, C]), PASSES, now=0.0)
     waiting.commit_next(held, limit, now=0.0)
     assert waiting.committed == committed
 
@@ -55,19 +55,19 @@ def test_what_waits_at_the_end_is_counted() -> None:
     """A frame that was written in part counts as unsent."""
     waiting, dropped = outgoing()
     waiting.commit(frames_of([A, B]), PASSES, 0.0)
-    waiting.put(frames_of([C]), PASSES, now=0.0)
+    waiting.queue.put(frames_of([C]), PASSES, now=0.0)
     assert waiting.mark_written(SIZE + 6) == 1
     waiting.drop_all()
     assert dropped == {"unsent": 2}
-    assert (len(waiting), waiting.committed, waiting.next_bytes(now=0.0)) == (0, b"", 0)
+    assert (len(waiting), waiting.committed, waiting.queue.next_bytes(now=0.0)) == (0, b"", 0)
 
 
 @pytest.mark.parametrize(("now", "left"), [(1.0, A + B), (1.01, B), (1.5, B), (1.51, b"")])
 def test_frame_that_waited_too_long_is_dropped(now: float, left: bytes) -> None:
     """A frame of the maximum age is sent. An older one is counted as stale and dropped."""
     waiting, dropped = outgoing()
-    waiting.put(frames_of([A]), PASSES, now=0.0)
-    waiting.put(frames_of([B]), PASSES, now=0.5)
+    waiting.queue.put(frames_of([A]), PASSES, now=0.0)
+    waiting.queue.put(frames_of([B]), PASSES, now=0.5)
     waiting.commit_next(0, 1000, now)
     assert waiting.committed == left
     assert dropped["stale"] == 2 - len(left) // SIZE
@@ -89,7 +89,7 @@ def test_stream_is_whole_frames_in_order_whatever_the_kernel_takes(steps: list[t
     for step, count, detail in steps:
         if step == "put":
             now += detail
-            waiting.put(frames_of([frame(number + offset) for offset in range(count)]), PASSES, now)
+            waiting.queue.put(frames_of([frame(number + offset) for offset in range(count)]), PASSES, now)
             number += count
         else:
             waiting.commit_next(int(detail), 90, now)

@@ -91,7 +91,7 @@ async def test_frames_go_in_both_directions(autopilot: Autopilot, endpoint: Seri
     await until(lambda: recorder(endpoint).received == from_autopilot)
     assert endpoint.ports[0].received_at is not None
     assert autopilot.read() == b""
-    write(endpoint, endpoint.ports[0], from_autopilot, monotonic())
+    write(endpoint.ports[0], from_autopilot, monotonic())
     await until(lambda: bool(select.select([autopilot.master], [], [], 0)[0]))
     assert autopilot.read() == b"".join(from_autopilot)
 
@@ -109,7 +109,7 @@ async def test_unplugged_device_is_opened_again(autopilot: Autopilot, endpoint: 
         autopilot.unplug()
         await until(lambda: recorder(endpoint).open == [])
         assert recorder(endpoint).closed[-1] is port
-        write(endpoint, port, [frame(99)], monotonic())
+        write(port, [frame(99)], monotonic())
         assert list(endpoint.ports) == []
     assert recorder(endpoint).received == [frame(0), frame(1), frame(2)]
     assert endpoint.failures["unsent"] == 3
@@ -134,7 +134,7 @@ async def test_baud_rate_is_set(autopilot: Autopilot, baud: int, constant: int |
     autopilot.plug_in()
     with started(autopilot, baud=baud) as endpoint:
         await opened(endpoint)
-        (connection,) = endpoint._connections.values()
+        (connection,) = endpoint.ports
         speed = termios.tcgetattr(connection.channel.fileno())[5]
         named = {getattr(termios, name) for name in dir(termios) if name[:1] == "B" and name[1:].isdigit()}
         assert speed == constant if constant is not None else speed not in named

@@ -21,7 +21,7 @@ def fill(pair: Pair, now: float) -> int:
     """Write until a frame has to wait. Returns the count of frames."""
     count = 0
     while not pair.connection.outgoing:
-        write(pair, pair.connection.port, [large_frame(count)], now)
+        write(pair.connection, [large_frame(count)], now)
         count += 1
     return count
 
@@ -43,7 +43,7 @@ async def test_one_wake_up_delivers_one_batch(pair: Pair) -> None:
         pair.other.send(stream[at : at + 61])
     pair.connection.on_readable(now=3.0)
     assert recorder(pair).batches == [[frame(number) for number in range(20)]]
-    assert pair.connection.port.received_at == 3.0
+    assert pair.connection.received_at == 3.0
     assert pair.bytes_received == len(stream)
 
 
@@ -60,12 +60,12 @@ async def test_one_connection_reads_no_more_than_its_turn(pair: Pair) -> None:
 async def test_write_to_a_closed_connection_reports_later(pair: Pair) -> None:
     """The daemon may be in the middle of a batch. The port is reported as closed in the loop's next turn."""
     pair.other.close()
-    write(pair, pair.connection.port, [frame(1)], now=0.0)
-    write(pair, pair.connection.port, [frame(2)], now=0.0)
+    write(pair.connection, [frame(1)], now=0.0)
+    write(pair.connection, [frame(2)], now=0.0)
     assert recorder(pair).closed == []
     await pair.connection.lost.wait()
-    write(pair, pair.connection.port, [frame(3)], now=0.0)
-    assert recorder(pair).closed == [pair.connection.port]
+    write(pair.connection, [frame(3)], now=0.0)
+    assert recorder(pair).closed == [pair.connection]
     assert pair.failures == {"EPIPE": 1, "unsent": 3}
     assert pair.channel.aborted is True
     assert list(pair.ports) == []
@@ -92,7 +92,7 @@ async def test_kernel_gets_no_more_than_the_channel_has_room_for(pair: Pair) -> 
     """Frames wait in the endpoint, where they can become stale, and are sent as soon as there is room."""
     size = len(large_frame(0))
     pair.channel.left = 2 * size
-    write(pair, pair.connection.port, [large_frame(number) for number in range(5)], monotonic())
+    write(pair.connection, [large_frame(number) for number in range(5)], monotonic())
     assert read_all(pair.other) == large_frame(0) + large_frame(1)
     assert len(pair.connection.outgoing) == 3
     pair.channel.left = size
@@ -103,7 +103,7 @@ async def test_kernel_gets_no_more_than_the_channel_has_room_for(pair: Pair) -> 
 async def test_channel_that_never_gets_room_has_stalled(pair: Pair) -> None:
     """A stall is detected even if all waiting frames became stale."""
     pair.channel.left = 0
-    write(pair, pair.connection.port, [frame(1)], now := monotonic())
+    write(pair.connection, [frame(1)], now := monotonic())
     pair.do_housekeeping(now + STALLED_S - 0.01)
     assert pair.failures == {"stale": 1}
     pair.do_housekeeping(now + STALLED_S)
@@ -115,13 +115,13 @@ async def test_error_of_the_kernel_ends_the_connection(pair: Pair, noticed_by: s
     """The error is counted once by its name, and the port is reported as closed."""
     if noticed_by == "waiting for room":
         pair.channel.left = 0
-        write(pair, pair.connection.port, [frame(1)], monotonic())
+        write(pair.connection, [frame(1)], monotonic())
     pair.channel.error = OSError(errno.EIO, "unplugged")
     if noticed_by == "reading":
         pair.other.send(frame(2))
     elif noticed_by == "writing":
-        write(pair, pair.connection.port, [frame(1)], monotonic())
-    await until(lambda: recorder(pair).closed == [pair.connection.port])
+        write(pair.connection, [frame(1)], monotonic())
+    await until(lambda: recorder(pair).closed == [pair.connection])
     assert pair.failures == {"EIO": 1} | ({} if noticed_by == "reading" else {"unsent": 1})
     assert pair.channel.sock.fileno() == -1
 
@@ -129,12 +129,12 @@ async def test_error_of_the_kernel_ends_the_connection(pair: Pair, noticed_by: s
 async def test_closed_endpoint_reports_nothing_more(pair: Pair) -> None:
     """It reports no port as closed, neither a lost one nor an open one."""
     pair.other.close()
-    write(pair, pair.connection.port, [frame(1)], now=0.0)
+    write(pair.connection, [frame(1)], now=0.0)
     pair.close()
     await asyncio.sleep(0)
     assert recorder(pair).closed == []
     assert pair.channel.sock.fileno() == -1
-    write(pair, pair.connection.port, [frame(2)], now=0.0)
+    write(pair.connection, [frame(2)], now=0.0)
     assert pair.failures == {"EPIPE": 1, "unsent": 2}
 
 
@@ -183,7 +183,7 @@ async def test_stream_that_is_never_empty_is_stale_for_what_the_kernel_can_hold(
 async def test_connection_that_was_being_opened_during_a_pause_is_stale(pair: Pair) -> None:
     """What came before the endpoint could read it may be old."""
     connection = Connection(pair, pair.channel, "late", opened_at=0.0, opened_in=pair.handler.stall.epoch - 1)
-    pair.handler.on_port_opened(connection.port)
+    pair.handler.on_port_opened(connection)
     pair.other.send(frame(1))
     connection.on_readable(now=0.0)
     assert recorder(pair).epochs == [STALE]
@@ -191,14 +191,14 @@ async def test_connection_that_was_being_opened_during_a_pause_is_stale(pair: Pa
 
 async def test_device_that_is_opened_again_has_the_same_stream(pair: Pair) -> None:
     """The parser behind it may have kept its state."""
-    before = pair.connection.port.delivered
+    before = pair.connection.delivered
     pair.connection.lose("unplugged")
     await pair.connection.lost.wait()
     ours, other = socket.socketpair()
     pair.channel = RationedChannel(ours)
     with other:
         again = pair.open_now()
-        assert again.port.delivered is before
+        assert again.delivered is before
         again.lose("unplugged")
         await again.lost.wait()
 

@@ -45,7 +45,7 @@ async def test_each_client_is_a_port(server: TcpServer, connect: Connect) -> Non
     for number, client in enumerate((first, second)):
         port = ports[str(Address(*client.getsockname()))]
         assert (port.received_at is not None) == (client is second)
-        write(server, port, [frame(10 + number)], monotonic())
+        write(port, [frame(10 + number)], monotonic())
         assert client.recv(100) == frame(10 + number)
     first.close()
     await until(lambda: len(server.ports) == 1)
@@ -74,7 +74,7 @@ async def test_new_client_displaces_the_one_that_is_silent_longest(server: TcpSe
     there = list(server.ports)
     speaks = next(client for client in clients if str(Address(*client.getsockname())) == there[0].name)
     speaks.sendall(frame(1))
-    server._connections[there[0]].on_readable(now=104.0)
+    there[0].on_readable(now=104.0)
     newcomer = connect()
     server.on_acceptable(now=100.0 + CLIENT_SILENT_S)
     assert recorder(server).closed == [there[1]]
@@ -139,12 +139,11 @@ async def test_kernel_holds_little_for_a_client_that_never_reads(server: TcpServ
     server.on_acceptable(0.0)
     (port,) = server.ports
     for number in range(2000):
-        write(server, port, [large_frame(number)], monotonic())
+        write(port, [large_frame(number)], monotonic())
         await asyncio.sleep(0)
     on_our_side = server.bytes_sent - len(client.recv(1 << 20, socket.MSG_PEEK))
     assert on_our_side < 65536
-    connection = server._connections[port]
-    not_sent = int.from_bytes(ioctl(connection.channel.fileno(), SIOCOUTQNSD, bytes(4)), sys.byteorder)
+    not_sent = int.from_bytes(ioctl(port.channel.fileno(), SIOCOUTQNSD, bytes(4)), sys.byteorder)
     assert not_sent < 1024 + 1400
-    waiting = len(connection.outgoing)
+    waiting = len(port.outgoing)
     assert server.frames_sent + server.failures["outgoing_full"] + server.failures["stale"] + waiting == 2000

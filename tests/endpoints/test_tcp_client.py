@@ -56,7 +56,7 @@ async def test_client_follows_a_server_that_restarts(server: TcpServer) -> None:
     address = Address(*server.address)
     with client_of(address) as tcp_client:
         await until(lambda: len(server.ports) == 1)
-        write(server, server.ports[0], [frame(1)], monotonic())
+        write(server.ports[0], [frame(1)], monotonic())
         await until(lambda: recorder(tcp_client).received == [frame(1)])
         (before,) = tcp_client.ports
         server.close()
@@ -66,7 +66,7 @@ async def test_client_follows_a_server_that_restarts(server: TcpServer) -> None:
             watch = Stopwatch()
             await until(lambda: len(again.ports) == 1)
             assert watch.calm_s < 1.0
-            write(again, again.ports[0], [frame(2)], monotonic())
+            write(again.ports[0], [frame(2)], monotonic())
             await until(lambda: recorder(tcp_client).received == [frame(1), frame(2)])
             assert tcp_client.ports[0] is not before
 

@@ -132,7 +132,7 @@ async def test_frames_share_datagrams_up_to_a_size(server: UdpServer, client: Ma
     one.send(heartbeat())
     read(server)
     frames = [frame(number) for number in range(100)]
-    write(server, server.ports[0], frames, 1.0)
+    write(server.ports[0], frames, 1.0)
     received: list[bytes] = []
     while sum(map(len, received)) < sum(map(len, frames)):
         received.append(one.recv(65536))
@@ -162,7 +162,7 @@ async def test_a_forgotten_client_is_not_sent_to(server: UdpServer, client: Make
     read(server, 100.0)
     (port,) = server.ports
     server.do_housekeeping(1000.0)
-    write(server, port, [frame(1)], 1000.0)
+    write(port, [frame(1)], 1000.0)
     with pytest.raises(BlockingIOError):
         one.recv(1000)
     one.send(heartbeat())

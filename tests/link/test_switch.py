@@ -25,13 +25,22 @@ from uavlinkd.system.clock import monotonic
 from uavlinkd.system.stall import STALL_S, StallWatch
 
 
+class ClientPort(LocalPort):
+    """Keeps the frames that it receives."""
+
+    endpoint: Client
+
+    def send(self, frames: Sequence[Frame], source: Source, now: float, waited_s: float) -> None:
+        self.endpoint.received += [raw for raw, _ in frames]
+
+
 class Client(Endpoint):
     """An endpoint with one client, which keeps the frames that it receives."""
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, kind: type[ClientPort] = ClientPort) -> None:
         super().__init__(name, cast(PortHandler, None))
         self.received: list[bytes] = []
-        self.port = LocalPort(self, name, None, self.delivered.of(name))
+        self.port = kind(self, name, None)
 
     @property
     def ports(self) -> Sequence[LocalPort]:
@@ -39,10 +48,6 @@ class Client(Endpoint):
 
     def start(self) -> None:
         """Nothing to start."""
-
-    def write(self, port: LocalPort, frames: Sequence[Frame], source: Source, now: float) -> None:
-        """Keep them."""
-        self.received += [raw for raw, _ in frames]
 
     def do_housekeeping(self, now: float) -> None:
         """Nothing to do."""
@@ -204,19 +209,18 @@ def test_memory_is_bounded(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> Non
     assert stage.delivered() == (0, 199, 199)
 
 
-class StreamClient(Client):
-    """A client that receives what a real endpoint would send it."""
+class StreamPort(ClientPort):
+    """Keeps what a real endpoint would send."""
 
-    def write(self, port: LocalPort, frames: Sequence[Frame], source: Source, now: float) -> None:
-        """Keep the frames that are delivered."""
-        self.received += [frame.raw for frame in frames if port.delivered.admit(frame, source, now)]
+    def send(self, frames: Sequence[Frame], source: Source, now: float, waited_s: float) -> None:
+        self.endpoint.received += [frame.raw for frame in frames if self.delivered.admit(frame, source, now)]
 
 
 def test_refused_frame_does_not_make_the_same_frame_of_another_port_a_duplicate() -> None:
     """A captured operator sends the other's next heartbeat first, made to complete a hidden command of its own."""
     scene = Stage()
     scene.switch.remove(scene.a.port)
-    scene.a = StreamClient("a")
+    scene.a = Client("a", StreamPort)
     scene.switch.add(scene.a.port, policy())
     scene.switch.set_policy(scene.b.port, policy(role="operator", system_ids=[255], deny_in=["SET_MODE"]))
     beat = made(mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3), 255)

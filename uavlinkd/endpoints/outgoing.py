@@ -29,31 +29,19 @@ class OutgoingFrames:
     def __init__(self, dropped: Counter[str], delivered: DeliveredStream) -> None:
         self._dropped = dropped
         self._admit = delivered.admit
-        self._queue = FairQueue(self._on_drop)
+        self.queue = FairQueue(self._on_drop)
+        """The frames that are not committed."""
         self._committed = b""
         self._ends: deque[int] = deque()  # sizes of the committed frames; for the first, of its unwritten rest
 
     def __len__(self) -> int:
         """How many frames are not completely written."""
-        return self._queue.count + len(self._ends)
+        return self.queue.count + len(self._ends)
 
     @property
     def committed(self) -> bytes:
         """The bytes to write next."""
         return self._committed
-
-    @property
-    def waiting(self) -> int:
-        """How many frames wait that are not committed."""
-        return self._queue.count
-
-    def put(self, frames: Sequence[Frame], source: Source, now: float) -> None:
-        """Queue frames of one source."""
-        self._queue.put(frames, source, now)
-
-    def next_bytes(self, now: float) -> int:
-        """The size of the next frame in the queue; 0 if the queue is empty."""
-        return self._queue.next_bytes(now)
 
     def commit(self, frames: Sequence[Frame], source: Source, now: float) -> None:
         """Commit these frames without queueing. Call it only while the queue is empty."""
@@ -69,7 +57,7 @@ class OutgoingFrames:
         """
         held += len(self._committed)
         parts = []
-        while (popped := self._queue.pop(limit - held if held else inf, now)) is not None:
+        while (popped := self.queue.pop(limit - held if held else inf, now)) is not None:
             if data := self._admit(*popped, now):
                 parts.append(data)
                 self._ends.append(len(data))
@@ -91,13 +79,9 @@ class OutgoingFrames:
         self._ends[0] -= count
         return completed
 
-    def drop_stale(self, now: float) -> None:
-        """Drop frames that waited too long. Committed frames are kept."""
-        self._queue.drop_stale(now)
-
     def drop_all(self) -> None:
         """The connection ended: count frames that are not completely written as ``unsent``."""
-        self._queue.clear()
+        self.queue.clear()
         if self._ends:
             self._dropped["unsent"] += len(self._ends)
         self._ends.clear()

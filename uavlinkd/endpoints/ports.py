@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from typing import Protocol
 
 from uavlinkd.mavlink.frames import Frame, SplitCounters
-from uavlinkd.mavlink.policy.delivery import DeliveredStream, DeliveredStreams, Source
+from uavlinkd.mavlink.policy.delivery import DeliveredStreams, Source
 from uavlinkd.system.stall import StallWatch
 
 
@@ -22,21 +22,24 @@ class LocalPort:
 
     __slots__ = ("delivered", "endpoint", "name", "received_at")
 
-    def __init__(self, endpoint: Endpoint, name: str, received_at: float | None, delivered: DeliveredStream) -> None:
+    def __init__(self, endpoint: Endpoint, name: str, received_at: float | None) -> None:
         self.endpoint = endpoint
         self.name = name
         """Its address, for people: ``127.0.0.1:14550``, ``/dev/ttyACM0``."""
         self.received_at = received_at
         """When its last frame was received, in monotonic seconds; None before the first frame."""
-        self.delivered = delivered
+        self.delivered = endpoint.delivered.of(name)
         """The byte stream that it reads. It decides which bytes a frame becomes, in the order of delivery."""
 
     def __repr__(self) -> str:
         return f"LocalPort({self.endpoint.name}, {self.name})"
 
     def send(self, frames: Sequence[Frame], source: Source, now: float, waited_s: float) -> None:
-        """Send frames that arrived together, all from one source, to the client."""
-        self.endpoint.write(self, frames, source, now)
+        """Send frames that arrived together, all from one source, to the client, or drop and count them.
+
+        Returns at once and reports no event.
+        """
+        raise NotImplementedError
 
 
 class PortHandler(Protocol):
@@ -88,10 +91,6 @@ class Endpoint(ABC):
     @abstractmethod
     def start(self) -> None:
         """Begin to work, in the running event loop. Sockets that listen are bound already."""
-
-    @abstractmethod
-    def write(self, port: LocalPort, frames: Sequence[Frame], source: Source, now: float) -> None:
-        """Send frames of one source to one client, or drop and count them. Returns at once and reports no event."""
 
     @abstractmethod
     def do_housekeeping(self, now: float) -> None:

@@ -77,19 +77,20 @@ class ByteChannel(Protocol):
         """Close it; ``abort`` discards the kernel's unsent bytes."""
 
 
-class Connection:
+class Connection(LocalPort):
     """One open byte stream and the client at its other end."""
+
+    endpoint: StreamEndpoint
 
     def __init__(
         self, endpoint: StreamEndpoint, channel: ByteChannel, name: str, opened_at: float, opened_in: int
     ) -> None:
-        self.port = LocalPort(endpoint, name, None, endpoint.delivered.of(name))
+        super().__init__(endpoint, name, None)
         self.channel = channel
         self.opened_at = opened_at
-        self.outgoing = OutgoingFrames(endpoint.failures, self.port.delivered)
+        self.outgoing = OutgoingFrames(endpoint.failures, self.delivered)
         self.lost = asyncio.Event()
         """Set when the port has been reported as closed."""
-        self._endpoint = endpoint
         self._splitter = StreamSplitter(endpoint.counters, endpoint.max_gap_s, endpoint.max_hold_s)
         self._loop = asyncio.get_running_loop()
         self._fd = channel.fileno()
@@ -108,7 +109,7 @@ class Connection:
     @property
     def silent_since(self) -> float:
         """When it last sent a genuine frame; if it never did, when it was opened."""
-        return self.opened_at if self.port.received_at is None else self.port.received_at
+        return self.opened_at if self.received_at is None else self.received_at
 
     def on_readable(self, now: float) -> None:
         """Read the received bytes and deliver their frames."""
@@ -133,10 +134,10 @@ class Connection:
         self._backlog.end(len(data), is_empty=is_empty)
         if data and not self._has_read:
             self._has_read = True
-            if (reason := self._endpoint.objection(data)) is not None:
-                self.lose(reason)
+            if data.startswith(self.endpoint.refused_starts):
+                self.lose("http")
                 return
-        self._endpoint.bytes_received += len(data)
+        self.endpoint.bytes_received += len(data)
         self._age(epoch)
         # Stale bytes are split too: otherwise the stream would go on in the middle of a frame.
         is_fresh = self._splitter.is_fresh
@@ -144,17 +145,17 @@ class Connection:
         if ended is not None:
             frames += self._splitter.end()
         if frames:
-            self.port.received_at = now
-            self._endpoint.handler.on_frames(self.port, frames, now, epoch if is_fresh else STALE)
+            self.received_at = now
+            self.endpoint.handler.on_frames(self, frames, now, epoch if is_fresh else STALE)
         if ended is not None:
             self.lose(ended)
 
-    def write(self, frames: Sequence[Frame], source: Source, now: float) -> None:
-        """Send frames, or queue them behind those that wait already."""
+    def send(self, frames: Sequence[Frame], source: Source, now: float, waited_s: float = 0.0) -> None:
+        """Write frames, or queue them behind those that wait already."""
         if not self._is_open:
-            self._endpoint.failures["unsent"] += len(frames)
+            self.endpoint.failures["unsent"] += len(frames)
         elif self._awaits_writable or self._room_timer is not None:
-            self.outgoing.put(frames, source, now)
+            self.outgoing.queue.put(frames, source, now)
         else:
             self._write_at_once(frames, source, now)
 
@@ -170,8 +171,8 @@ class Connection:
         self._age(self._stall.epoch)
         epoch = self._epoch if self._splitter.is_fresh else STALE
         if frames := self._splitter.give_up(now):
-            self._endpoint.handler.on_frames(self.port, frames, now, epoch)
-        self.outgoing.drop_stale(now)
+            self.endpoint.handler.on_frames(self, frames, now, epoch)
+        self.outgoing.queue.drop_stale(now)
         if self._blocked_since is not None and now - self._blocked_since >= STALLED_S:
             self.lose("stalled")
 
@@ -182,12 +183,12 @@ class Connection:
             self._splitter.age()
 
     def lose(self, reason: str) -> None:
-        """Stop, count the reason, and report the port as closed in the loop's next turn: never within ``write``."""
+        """Stop, count the reason, and report the port as closed in the loop's next turn, never in :meth:`send`."""
         if self._is_open:
-            self._endpoint.failures[reason] += 1
+            self.endpoint.failures[reason] += 1
             self.ended_well = reason == DISCONNECTED
             self.stop()
-            self._loop.call_soon(self._endpoint.forget, self)
+            self._loop.call_soon(self.endpoint.forget, self)
 
     def stop(self) -> None:
         """Stop watching the channel, and drop the frames that wait."""
@@ -211,11 +212,11 @@ class Connection:
                 count = fitting
                 self._write_committed(now)
         except OSError as error:
-            self.outgoing.put(frames[count:], source, now)
+            self.outgoing.queue.put(frames[count:], source, now)
             self.lose(failure_name(error))
             return
         if count < len(frames):
-            self.outgoing.put(frames[count:], source, now)
+            self.outgoing.queue.put(frames[count:], source, now)
             if not self._awaits_writable:
                 self._flush(now)
 
@@ -243,7 +244,7 @@ class Connection:
                     break
                 if not self._write_committed(now):
                     return
-            if outgoing.waiting:
+            if outgoing.queue.count:
                 self._await_room(now)
         except OSError as error:
             self.lose(failure_name(error))
@@ -260,8 +261,8 @@ class Connection:
         except BlockingIOError:
             self._await_writable(now)
             return False
-        self._endpoint.bytes_sent += count
-        self._endpoint.frames_sent += self.outgoing.mark_written(count)
+        self.endpoint.bytes_sent += count
+        self.endpoint.frames_sent += self.outgoing.mark_written(count)
         self._blocked_since = None
         if count < len(data):
             self._await_writable(now)
@@ -280,7 +281,7 @@ class Connection:
             OSError: the connection has ended.
         """
         self._blocked_since = self._blocked_since if self._blocked_since is not None else now
-        size = self.outgoing.next_bytes(now)
+        size = self.outgoing.queue.next_bytes(now)
         to_bytes = max(0, self.channel.limit_bytes - size) if size else 0
         self._room_timer = self._loop.call_later(self.channel.drain_s(to_bytes, now), self._on_room_timer)
 
@@ -291,7 +292,7 @@ class Connection:
         try:
             if self.channel.held(now) == 0:
                 self._blocked_since = None
-            elif not self.outgoing.waiting:
+            elif not self.outgoing.queue.count:
                 self._await_room(now)
                 return
         except OSError as error:
@@ -303,7 +304,7 @@ class Connection:
 class StreamEndpoint(Endpoint):
     """An endpoint whose clients are connected by byte streams.
 
-    Every frame passed to ``write`` is counted in ``frames_sent``, or waits, or was refused
+    Every frame passed to a port is counted in ``frames_sent``, or waits, or was refused
     (:mod:`uavlinkd.mavlink.policy.delivery`), or is counted in ``failures``: ``outgoing_full``, ``stale``,
     ``thinned`` (a newer state replaced it), or ``unsent`` (its connection ended). ``failures`` also counts the
     connections that ended: ``disconnected`` (by the client), ``stalled``, or the kernel's error.
@@ -313,47 +314,36 @@ class StreamEndpoint(Endpoint):
     """A frame with a longer gap inside counts as broken."""
     max_hold_s = inf
     """How long a frame may take as a whole. Serial lines have no limit."""
+    refused_starts: tuple[bytes, ...] = ()
+    """A connection that begins with one of these comes from a browser and is closed."""
 
     def __init__(self, name: str, handler: PortHandler) -> None:
         super().__init__(name, handler)
-        self._connections: dict[LocalPort, Connection] = {}
+        self._connections: list[Connection] = []
         self._logged: set[str] = set()  # reasons of failures to open it, since it was last open for long
 
     @property
-    def ports(self) -> Sequence[LocalPort]:
+    def ports(self) -> Sequence[Connection]:
         """The present clients."""
         return list(self._connections)
 
-    def write(self, port: LocalPort, frames: Sequence[Frame], source: Source, now: float) -> None:
-        """Send frames to one client, now or when it has room."""
-        connection = self._connections.get(port)
-        if connection is None:
-            self.failures["unsent"] += len(frames)
-        else:
-            connection.write(frames, source, now)
-
     def do_housekeeping(self, now: float) -> None:
         """Close connections that have stalled."""
-        for connection in list(self._connections.values()):
+        for connection in self.ports:
             connection.check(now)
 
     def close(self) -> None:
         """Stop and close every connection."""
-        connections = list(self._connections.values())
-        self._connections.clear()
+        connections, self._connections = self._connections, []
         for connection in connections:
             connection.stop()
             connection.channel.close(abort=False)
 
-    def objection(self, first_bytes: bytes) -> str | None:
-        """The reason to close a connection that begins with these bytes, or None."""
-        return None
-
     def open(self, channel: ByteChannel, name: str, now: float, opened_in: int) -> Connection:
         """Add a connection and report its port. ``opened_in`` is the epoch in which opening it began."""
         connection = Connection(self, channel, name, now, opened_in)
-        self._connections[connection.port] = connection
-        self.handler.on_port_opened(connection.port)
+        self._connections.append(connection)
+        self.handler.on_port_opened(connection)
         return connection
 
     def could_not_open(self, reason: str) -> None:
@@ -366,10 +356,11 @@ class StreamEndpoint(Endpoint):
 
     def forget(self, connection: Connection) -> None:
         """Report the port of a lost connection as closed, once."""
-        if self._connections.pop(connection.port, None) is not None:
+        if connection in self._connections:
+            self._connections.remove(connection)
             if monotonic() - connection.opened_at >= LASTED_S:
                 self._logged.clear()
-            self.handler.on_port_closed(connection.port)
+            self.handler.on_port_closed(connection)
             self.dispose(connection)
             connection.lost.set()
 

@@ -115,6 +115,7 @@ class TcpServer(StreamEndpoint):
     """
 
     max_gap_s = max_hold_s = MAX_GAP_S
+    refused_starts = _BROWSER
 
     def __init__(self, name: str, listener: socket.socket, handler: PortHandler) -> None:
         super().__init__(name, handler)
@@ -160,10 +161,6 @@ class TcpServer(StreamEndpoint):
             _prepare(sock)
             self.open(SocketChannel(sock), str(Address(*sockaddr[:2])), now, epoch)
 
-    def objection(self, first_bytes: bytes) -> str | None:
-        """``http`` for the first bytes of a browser."""
-        return "http" if first_bytes.startswith(_BROWSER) else None
-
     def close(self) -> None:
         """Stop listening and close every connection."""
         if self._resume is not None:
@@ -177,7 +174,7 @@ class TcpServer(StreamEndpoint):
         """Whether there is a place for one more client. A client that has been silent for long loses its place."""
         if len(self._connections) < CLIENTS_PER_ENDPOINT:
             return True
-        silent = min(self._connections.values(), key=lambda connection: connection.silent_since)
+        silent = min(self._connections, key=lambda connection: connection.silent_since)
         if now - silent.silent_since < CLIENT_SILENT_S:
             return False
         silent.lose("displaced")
@@ -226,7 +223,7 @@ class TcpClient(StreamEndpoint):
                 connection = self.open(SocketChannel(sock), str(self._address), monotonic(), epoch)
                 await connection.lost.wait()
                 # A server that only accepts and closes is not tried again at once.
-                if connection.port.received_at is not None or monotonic() - connection.opened_at >= LONGEST_WAIT_S:
+                if connection.received_at is not None or monotonic() - connection.opened_at >= LONGEST_WAIT_S:
                     wait_s = FIRST_WAIT_S
             await asyncio.sleep(wait_s * rng.uniform(1.0, 1.25))
             wait_s = min(2 * wait_s, LONGEST_WAIT_S)

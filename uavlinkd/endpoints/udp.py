@@ -49,12 +49,12 @@ SocketAddress = tuple[Any, ...]
 class UdpPort(LocalPort):
     """A client of a UDP endpoint."""
 
-    __slots__ = ("_udp", "address")
+    __slots__ = ("address",)
+    endpoint: UdpEndpoint
 
     def __init__(self, endpoint: UdpEndpoint, name: str, address: SocketAddress, received_at: float | None) -> None:
-        super().__init__(endpoint, name, received_at, endpoint.delivered.of(name))
+        super().__init__(endpoint, name, received_at)
         self.address = address
-        self._udp = endpoint
 
     def send(self, frames: Sequence[Frame], source: Source, now: float, waited_s: float = 0.0) -> None:
         """Send frames to the client, together where they fit. The endpoint counts what the kernel refuses."""
@@ -67,16 +67,16 @@ class UdpPort(LocalPort):
                 continue
             if size + len(data) > LOCAL_DATAGRAM_BYTES:
                 if batch:
-                    self._udp.send(b"".join(batch), self.address, len(batch))
+                    self.endpoint.send(b"".join(batch), self.address, len(batch))
                     batch, size = [], 0
                 if len(data) > LOCAL_DATAGRAM_BYTES:  # a separator and the frame
                     cut = len(data) - len(frame.raw)
-                    self._udp.send(data[:cut], self.address, 0)
+                    self.endpoint.send(data[:cut], self.address, 0)
                     data = data[cut:]
             batch.append(data)
             size += len(data)
         if batch:
-            self._udp.send(b"".join(batch), self.address, len(batch))
+            self.endpoint.send(b"".join(batch), self.address, len(batch))
 
 
 class UdpEndpoint(Endpoint):
@@ -166,10 +166,6 @@ class UdpEndpoint(Endpoint):
         self._epoch = epoch
         for splitter in self._splitters.values():
             splitter.age()
-
-    def write(self, port: LocalPort, frames: Sequence[Frame], source: Source, now: float) -> None:
-        """Send frames of one source to one client, at once."""
-        port.send(frames, source, now, 0.0)
 
     def send(self, datagram: bytes, address: SocketAddress, frames: int) -> None:
         """Send a datagram with so many frames, and count it."""

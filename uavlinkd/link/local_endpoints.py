@@ -201,7 +201,7 @@ class LocalEndpoints:
     def _write(self, endpoint: Endpoint, raw: bytes, now: float) -> None:
         frames = split_payload(raw, SplitCounters())
         for port in endpoint.ports:
-            endpoint.write(port, frames, self._own, now)
+            port.send(frames, self._own, now, 0.0)
 
 
 # What the pilot should know about the links, as short texts for the ground station: at most one a second. Texts wait,
