@@ -20,7 +20,7 @@ from uavlinkd.core.admission import Admission
 from uavlinkd.core.crypto import KeyPair
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.limits import GroupShare, TokenBucket
-from uavlinkd.core.noise import HandshakeState, Token
+from uavlinkd.core.noise import HandshakeState
 from uavlinkd.core.outputs import Dropped, Output, SessionEstablished, Transmit
 
 LINK: Final = replace(LINKS[0], suites=GROUPS)
@@ -32,20 +32,20 @@ _REFUSALS = (DropReason.MALFORMED, DropReason.HEADER_MISMATCH, DropReason.BAD_PA
 
 
 def write(
-    state: HandshakeState, tokens: tuple[Token, ...], payload: bytes, share: bytes | None, entropy: SeededEntropy
+    state: HandshakeState, payload: bytes, share: bytes | None, entropy: SeededEntropy
 ) -> tuple[HandshakeState, bytes]:
     """WriteMessage; ``share``: these bytes instead of an honest share or ciphertext. Then no secret is common."""
     if share is None or not state.suite.has_group:
-        return state.write(tokens, payload, entropy)
+        return state.write(payload, entropy)
     message = b""
-    for token in tokens:
+    for token in noise.tokens_of(state.suite)[not state.is_initiator]:
         symmetric = state.symmetric
-        if token is Token.E:
+        if token == "e":
             e = KeyPair(entropy(c.KEY_BYTES))
             message += e.public
-            state = replace(state, e=e, symmetric=state._mix_ephemeral(e.public))
-        elif token in (Token.S, Token.E1, Token.EKEM1):
-            symmetric, sealed = symmetric.encrypt_and_hash(state.s.public if token is Token.S else share)
+            state = replace(state, e=e, symmetric=symmetric.mix_hash(e.public).mix_key(e.public))
+        elif token in ("s", "e1", "ekem1"):
+            symmetric, sealed = symmetric.encrypt_and_hash(state.s.public if token == "s" else share)
             message += sealed
             state = replace(state, symmetric=symmetric)
         else:
@@ -131,8 +131,8 @@ def call(pair: Pair, script: Script, entropy: SeededEntropy) -> None:
     header = wire.initiation_header(suite, script.word())
     payload = _payload(script, header)
     share = _share(script, suite.share_bytes)
-    start = noise.initiator(handshake.pattern_of(suite), suite, wire.prologue(suite), initiator, KEY_B.public)
-    state, message = write(start, start.pattern.initiation, payload, share, entropy)
+    start = noise.initiator(suite, wire.prologue(suite), initiator, KEY_B.public)
+    state, message = write(start, payload, share, entropy)
     datagram = with_macs(header + message, KEY_B.public)
     path = (AT_A, ELSEWHERE)[what >> 6 & 1]
     outputs = pair.b.node.receive(datagram, path, NOW)
@@ -172,8 +172,7 @@ def answer(pair: Pair, script: Script, initiation: bytes, entropy: SeededEntropy
     header = wire.response_header(suite, script.word(), received.initiation.sender_index)
     payload = _payload(script, header)
     share = _share(script, suite.ciphertext_bytes)
-    pattern = handshake.pattern_of(suite)
-    _, message = write(received.state.with_psk(noise.NO_PSK), pattern.response, payload, share, entropy)
+    _, message = write(received.state, payload, share, entropy)
     datagram = with_macs(header + message, KEY_A.public)
     if what & 7 == 7 and pair.a.peer.initiator.pending:  # with an invalid tag
         datagram = datagram[:-33] + bytes((datagram[-33] ^ 1,)) + datagram[-32:]

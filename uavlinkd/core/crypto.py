@@ -10,7 +10,6 @@ import hashlib
 import hmac
 import warnings
 from collections.abc import Callable
-from typing import Protocol
 
 from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives.asymmetric import dh, mlkem
@@ -18,6 +17,7 @@ from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X
 from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.hmac import HMAC
+from cryptography.hazmat.primitives.kdf.hkdf import HKDFExpand
 
 from uavlinkd.core.constants import KEY_BYTES
 from uavlinkd.core.drops import Drop, DropReason
@@ -28,11 +28,8 @@ equal: Callable[[Bytes, Bytes], bool] = hmac.compare_digest
 """Whether two byte strings are the same, in time that tells nothing of where they differ."""
 
 
-class Entropy(Protocol):
-    """Where randomness comes from: ``os.urandom`` in the daemon, a seeded generator in a simulation."""
-
-    def __call__(self, size: int, /) -> bytes:
-        """``size`` unpredictable bytes."""
+Entropy = Callable[[int], bytes]
+"""Returns so many unpredictable bytes: ``os.urandom`` in the daemon, a seeded generator in a simulation."""
 
 
 class Secret:
@@ -72,12 +69,7 @@ def hmac_sha256(key: bytes, data: bytes) -> bytes:
 
 def hkdf_expand(key: bytes, info: bytes, length: int) -> bytes:
     """HKDF-Expand with SHA-256 (RFC 5869, section 2.3); ``length`` up to 8,160 bytes."""
-    output, block, counter = b"", b"", 1
-    while len(output) < length:
-        block = hmac_sha256(key, block + info + bytes((counter,)))
-        output += block
-        counter += 1
-    return output[:length]
+    return HKDFExpand(SHA256(), length, info).derive(key)
 
 
 class MacKey:
@@ -186,20 +178,14 @@ def ffdhe_power(prime: int, base: int, exponent: bytes) -> bytes:
     return power.rjust((prime.bit_length() + 7) // 8, b"\0")
 
 
-class MlkemPrivateKey(Protocol):
-    """What ML-KEM-768 and ML-KEM-1024 private keys share."""
+def mlkem_generate(bits: int, seed: bytes) -> tuple[bytes, Callable[[bytes], bytes]]:
+    """Encapsulation key of ML-KEM-``bits`` from a 64-byte seed d || z (FIPS 203, section 7.1), and its decapsulation.
 
-    def decapsulate(self, ciphertext: bytes) -> bytes:
-        """The shared secret; a wrong ciphertext leads to a secret that the peer does not have (FIPS 203)."""
-
-
-def mlkem_generate(bits: int, seed: bytes) -> tuple[MlkemPrivateKey, bytes]:
-    """Private key and encapsulation key of ML-KEM-``bits`` from a 64-byte seed d || z (FIPS 203, section 7.1)."""
-    if bits == 768:
-        small = mlkem.MLKEM768PrivateKey.from_seed_bytes(seed)
-        return small, small.public_key().public_bytes_raw()
-    large = mlkem.MLKEM1024PrivateKey.from_seed_bytes(seed)
-    return large, large.public_key().public_bytes_raw()
+    A wrong ciphertext leads to a secret that the peer does not have.
+    """
+    kind = mlkem.MLKEM768PrivateKey if bits == 768 else mlkem.MLKEM1024PrivateKey
+    private = kind.from_seed_bytes(seed)
+    return private.public_key().public_bytes_raw(), private.decapsulate
 
 
 def mlkem_encapsulate(bits: int, public: bytes) -> tuple[bytes, bytes]:

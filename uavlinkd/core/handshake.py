@@ -6,13 +6,13 @@ or written, and what it changes.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from uavlinkd.core import noise, wire
 from uavlinkd.core.crypto import Entropy, KeyPair, Secret
 from uavlinkd.core.drops import Drop, DropReason
-from uavlinkd.core.noise import HandshakeState, Pattern
+from uavlinkd.core.noise import HandshakeState
 from uavlinkd.core.settings import Link, PeerSettings
 from uavlinkd.core.suites import Suite
 from uavlinkd.core.wire import Parameters
@@ -46,11 +46,6 @@ class Keys:
     remote_index: int
 
 
-def pattern_of(suite: Suite) -> Pattern:
-    """The Noise pattern of a suite."""
-    return noise.IK_HFS_PSK2 if suite.has_group else noise.IK_PSK2
-
-
 def parameters_of(link: Link, generation: int) -> Parameters:
     """What this side asks of a session."""
     least = link.confidential, link.tag_bytes, link.mac_key_bits, link.max_envelope
@@ -60,12 +55,10 @@ def parameters_of(link: Link, generation: int) -> Parameters:
 def initiate(identity: KeyPair, peer: PeerSettings, index: int, generation: int, entropy: Entropy) -> Initiated:
     """Message 1 to ``peer``: always the first suite of its list, whatever was lost or refused before."""
     suite = peer.link.suites[0]
-    state = noise.initiator(
-        pattern_of(suite), suite, wire.prologue(suite), identity, peer.public_key, peer.psk or noise.NO_PSK
-    )
+    state = noise.initiator(suite, wire.prologue(suite), identity, peer.public_key, peer.psk or noise.NO_PSK)
     parameters = parameters_of(peer.link, generation)
     header = wire.initiation_header(suite, index)
-    state, message = state.write(state.pattern.initiation, header[1:] + parameters.encode(), entropy)
+    state, message = state.write(header[1:] + parameters.encode(), entropy)
     return Initiated(state, parameters, header + message)
 
 
@@ -76,8 +69,8 @@ def receive_initiation(identity: KeyPair, initiation: wire.Initiation) -> Receiv
         Drop: ``BAD_HANDSHAKE``, ``INVALID_KEY_SHARE``, ``HEADER_MISMATCH`` or ``BAD_PARAMETERS``.
     """
     suite = initiation.suite
-    state = noise.responder(pattern_of(suite), suite, wire.prologue(suite), identity)
-    state, payload = state.read(state.pattern.initiation, initiation.noise)
+    state = noise.responder(suite, wire.prologue(suite), identity)
+    state, payload = state.read(initiation.noise)
     parameters = _open_payload(payload, initiation.header)
     return Received(state, parameters, state.rs, initiation)
 
@@ -93,8 +86,8 @@ def respond(
     initiation = received.initiation
     header = wire.response_header(initiation.suite, index, initiation.sender_index)
     ours = parameters_of(peer.link, generation)
-    state = received.state.with_psk(peer.psk or noise.NO_PSK)
-    state, message = state.write(state.pattern.response, header[1:] + ours.encode(), entropy)
+    state = replace(received.state, psk=peer.psk or noise.NO_PSK)
+    state, message = state.write(header[1:] + ours.encode(), entropy)
     return header + message, _keys(state, ours.stronger(received.parameters), initiation.sender_index)
 
 
@@ -106,7 +99,7 @@ def receive_response(initiated: Initiated, response: wire.Response) -> Keys:
     """
     if response.suite != initiated.state.suite:
         raise Drop(DropReason.HEADER_MISMATCH)
-    state, payload = initiated.state.read(initiated.state.pattern.response, response.noise)
+    state, payload = initiated.state.read(response.noise)
     theirs = _open_payload(payload, response.header)
     return _keys(state, initiated.parameters.stronger(theirs), response.sender_index)
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from uavlinkd.core import constants as c
 from uavlinkd.core import handshake, wire
 from uavlinkd.core.cookie import MacKeys, mac1_of
 from uavlinkd.core.crypto import Entropy, KeyPair
 from uavlinkd.core.handshake import Initiated, Keys
-from uavlinkd.core.kem import OneCiphertext
 from uavlinkd.core.path import Path, SocketFacts
 from uavlinkd.core.sessions import Indices
 from uavlinkd.core.settings import PeerSettings
@@ -30,12 +29,6 @@ class Pending:
     """Whether it was sent along a slow network: its response may take as long as several tries along others."""
     cookied: set[Path] = field(default_factory=set)
     """Paths along which a cookie reply to it was accepted: a second one is not."""
-    once: OneCiphertext | None = field(init=False, default=None)
-    """The secret for its suite's group, which a response may use; None without a group."""
-
-    def __post_init__(self) -> None:
-        if (key := self.initiated.state.e1) is not None:
-            self.once = OneCiphertext(key)
 
 
 class Initiator:
@@ -156,8 +149,7 @@ class Initiator:
         Raises:
             Drop: as :func:`handshake.receive_response`; then the genuine response can still come.
         """
-        state = replace(pending.initiated.state, e1=pending.once)
-        keys = handshake.receive_response(pending.initiated._replace(state=state), response)
+        keys = handshake.receive_response(pending.initiated, response)
         del self.pending[response.receiver_index]
         return keys
 

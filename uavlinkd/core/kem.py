@@ -5,12 +5,12 @@ FFDHE and ML-KEM look alike from outside. For FFDHE the ciphertext is the respon
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cache
-from typing import Protocol
 
 from uavlinkd.core import crypto
-from uavlinkd.core.crypto import Entropy, MlkemPrivateKey, Secret
+from uavlinkd.core.crypto import Entropy, Secret
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.suites import Suite
 
@@ -22,38 +22,20 @@ MLKEM_SEED_BYTES = 64
 _FFDHE_OFFSETS = {2048: 560316, 3072: 2625351, 4096: 5736041, 6144: 15705020, 8192: 10965728}
 
 
-class KemPrivateKey(Protocol):
-    """The initiator's ephemeral secret, for one decapsulation."""
-
-    @property
-    def share(self) -> bytes:
-        """What goes to the responder."""
-
-    def decapsulate(self, ciphertext: bytes) -> bytes:
-        """The shared secret.
-
-        Raises:
-            Drop: ``INVALID_KEY_SHARE``.
-        """
-
-
-class OneCiphertext:
-    """An ephemeral secret that computes for one ciphertext only, the first that the responder sealed.
+class KemPrivateKey:
+    """The initiator's ephemeral secret. It computes for one ciphertext only, the first that the responder sealed.
 
     An honest responder answers an initiation once. Without this, one that holds the keys could answer it many times
     and cause as much work each time. The same ciphertext in an altered copy of the response costs nothing again.
     """
 
-    __slots__ = ("_computed", "_key")
+    __slots__ = ("_compute", "_computed", "share")
 
-    def __init__(self, key: KemPrivateKey) -> None:
-        self._key = key
-        self._computed: tuple[bytes, Secret] | None = None
-
-    @property
-    def share(self) -> bytes:
+    def __init__(self, share: bytes, compute: Callable[[bytes], bytes]) -> None:
+        self.share = share
         """What goes to the responder."""
-        return self._key.share
+        self._compute = compute
+        self._computed: tuple[bytes, Secret] | None = None
 
     def decapsulate(self, ciphertext: bytes) -> bytes:
         """The shared secret.
@@ -62,25 +44,11 @@ class OneCiphertext:
             Drop: ``INVALID_KEY_SHARE``, or ``GROUP_BUDGET_SPENT`` for another ciphertext than the first.
         """
         if self._computed is None:
-            self._computed = ciphertext, Secret(self._key.decapsulate(ciphertext))
+            self._computed = ciphertext, Secret(self._compute(ciphertext))
         first, secret = self._computed
         if ciphertext != first:
             raise Drop(DropReason.GROUP_BUDGET_SPENT)
         return secret.reveal()
-
-
-class Kem(Protocol):
-    """One group."""
-
-    def generate(self, entropy: Entropy) -> KemPrivateKey:
-        """A fresh key pair."""
-
-    def encapsulate(self, share: bytes, entropy: Entropy) -> tuple[bytes, bytes]:
-        """Ciphertext and shared secret for the holder of ``share``.
-
-        Raises:
-            Drop: ``INVALID_KEY_SHARE``.
-        """
 
 
 @cache
@@ -103,13 +71,17 @@ class FfdheGroup:
 
     bits: int
 
-    def generate(self, entropy: Entropy) -> FfdhePrivateKey:
+    def generate(self, entropy: Entropy) -> KemPrivateKey:
         """A fresh key pair."""
         exponent = entropy(FFDHE_EXPONENT_BYTES)
-        return FfdhePrivateKey(self, exponent, self.power(2, exponent))
+        return KemPrivateKey(self.power(2, exponent), lambda value: self.power(self.element(value), exponent))
 
     def encapsulate(self, share: bytes, entropy: Entropy) -> tuple[bytes, bytes]:
-        """The responder's public value, and the secret shared with the holder of ``share``."""
+        """The responder's public value, and the secret shared with the holder of ``share``.
+
+        Raises:
+            Drop: ``INVALID_KEY_SHARE``.
+        """
         base = self.element(share)  # refused before any work is done for it
         exponent = entropy(FFDHE_EXPONENT_BYTES)
         return self.power(2, exponent), self.power(base, exponent)
@@ -131,52 +103,27 @@ class FfdheGroup:
 
 
 @dataclass(frozen=True, slots=True)
-class FfdhePrivateKey:
-    """An ephemeral exponent and its public value."""
-
-    group: FfdheGroup
-    exponent: bytes = field(repr=False)
-    share: bytes
-
-    def decapsulate(self, ciphertext: bytes) -> bytes:
-        """The secret shared with the sender of the public value ``ciphertext``."""
-        return self.group.power(self.group.element(ciphertext), self.exponent)
-
-
-@dataclass(frozen=True, slots=True)
 class Mlkem:
     """ML-KEM (FIPS 203); ``bits`` is 768 or 1024."""
 
     bits: int
 
-    def generate(self, entropy: Entropy) -> MlkemKeyPair:
-        """A fresh key pair."""
-        return MlkemKeyPair(*crypto.mlkem_generate(self.bits, entropy(MLKEM_SEED_BYTES)))
+    def generate(self, entropy: Entropy) -> KemPrivateKey:
+        """A fresh key pair. An altered ciphertext gives another secret (implicit rejection), never an error."""
+        return KemPrivateKey(*crypto.mlkem_generate(self.bits, entropy(MLKEM_SEED_BYTES)))
 
-    def encapsulate(self, share: bytes, entropy: Entropy) -> tuple[bytes, bytes]:
-        """Ciphertext and secret; the randomness is the library's own (see ``crypto.mlkem_encapsulate``)."""
+    def encapsulate(self, share: bytes, _entropy: Entropy) -> tuple[bytes, bytes]:
+        """Ciphertext and secret; the randomness is the library's own. Raises as :func:`crypto.mlkem_encapsulate`."""
         return crypto.mlkem_encapsulate(self.bits, share)
 
 
-@dataclass(frozen=True, slots=True)
-class MlkemKeyPair:
-    """An ephemeral decapsulation key and its encapsulation key."""
-
-    private: MlkemPrivateKey = field(repr=False)
-    share: bytes
-
-    def decapsulate(self, ciphertext: bytes) -> bytes:
-        """The shared secret. An altered ciphertext gives another one (implicit rejection), never an error."""
-        return self.private.decapsulate(ciphertext)
-
-
-_KEMS: dict[str, Kem] = {
+_KEMS: dict[str, FfdheGroup | Mlkem] = {
     **{f"ffdhe{bits}": FfdheGroup(bits) for bits in _FFDHE_OFFSETS},
     "mlkem768": Mlkem(768),
     "mlkem1024": Mlkem(1024),
 }
 
 
-def kem_of(suite: Suite) -> Kem | None:
-    """The group of a suite; None for ``x25519``, which has no extra exchange."""
-    return _KEMS.get(suite.name)
+def kem_of(suite: Suite) -> FfdheGroup | Mlkem:
+    """The group of a suite that has one."""
+    return _KEMS[suite.name]
